@@ -1,0 +1,1 @@
+"""Calibration from a recording itself: `contrast`, the thresholds of the event pixels."""

@@ -1,0 +1,133 @@
+"""Contrast thresholds from a recording: log frame differences against event counts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux.augmentation.deblur import between, count_events
+from kalux.events import EVENT_DTYPE, EventArray
+from kalux.filters.methods import Shot, take_shot
+from kalux.models.camera import Camera, Response, log_intensity
+from kalux.recording import Recording
+from kalux.settings import CameraSettings
+
+Array = NDArray[np.float64]
+
+MAX_SAMPLES: Final = 400_000
+"""Pixels that are enough: the standard error of the fit is then below 0.1 %."""
+
+_MIN_SAMPLES: Final = 200
+_WELL_EXPOSED: Final = (0.05, 0.95)  # of the response: away from black, noise and saturation
+_HUBER: Final = 1.345  # 95 % efficiency for normal residuals (Huber 1981)
+_MAX_FRAMES: Final = 200
+
+
+class ThresholdEstimate(NamedTuple):
+    """Fitted contrast thresholds.
+
+    Attributes
+    ----------
+    on, off
+        Thresholds, log intensity, both positive.
+    residual
+        Robust standard deviation of the fit, log intensity.
+    samples
+        Pixels and frame intervals used.
+    """
+
+    on: float
+    off: float
+    residual: float
+    samples: int
+
+
+def estimate_thresholds(recording: Recording, camera: CameraSettings) -> ThresholdEstimate | None:
+    """Global on and off thresholds, by robust regression of log frame differences on event counts.
+
+    For every pixel that is well exposed in two successive frames and saw at least two events between the
+    middles of their exposures: log(I' + I_0) - log(I + I_0) = c_on n_on - c_off n_off, fitted with Huber's
+    weights. A single event says little: it may be noise, and the rest of the threshold that it leaves over is
+    as large as its step. Looks at the first 200 frames, or at fewer when those give enough pixels.
+
+    Returns None where the recording has too few such pixels (200), e.g. because nothing moves.
+
+    Raises
+    ------
+    ExposureError
+        If the frames' exposures are not known.
+    """
+    differences: list[Array] = []
+    ons: list[Array] = []
+    offs: list[Array] = []
+    count = 0
+    for difference, on, off in _samples(recording, camera):
+        differences.append(difference)
+        ons.append(on)
+        offs.append(off)
+        count += len(difference)
+        if count >= MAX_SAMPLES:
+            break
+    if count < _MIN_SAMPLES:
+        return None
+    return fit_thresholds(np.concatenate(differences), np.concatenate(ons), np.concatenate(offs))
+
+
+def fit_thresholds(difference: Array, on: Array, off: Array) -> ThresholdEstimate | None:
+    """The regression itself, by iteratively reweighted least squares; None if a threshold is not determined.
+
+    ``difference`` (N,) log intensity; ``on``, ``off`` (N,) event counts.
+    """
+    design = np.column_stack([on, -off])
+    weights = np.ones(len(difference))
+    solution: Array = np.zeros(2)
+    scale = 0.0
+    for _ in range(20):
+        weighted = design * weights[:, None]
+        normal = weighted.T @ design
+        if np.linalg.cond(normal) > 1e8:
+            return None
+        previous, solution = solution, np.linalg.solve(normal, weighted.T @ difference)
+        residual = difference - design @ solution
+        scale = 1.4826 * float(np.median(np.abs(residual)))
+        weights = np.minimum(1.0, _HUBER * scale / np.maximum(np.abs(residual), 1e-12))
+        if np.abs(solution - previous).max() < 1e-5:
+            break
+    if not (solution > 0).all():
+        return None
+    return ThresholdEstimate(float(solution[0]), float(solution[1]), scale, len(difference))
+
+
+def _samples(recording: Recording, camera: CameraSettings) -> Iterator[tuple[Array, Array, Array]]:
+    """Log difference and on and off counts of the usable pixels, one frame interval at a time."""
+    model = Camera(Response.named(camera.response), None, camera.saturation)
+    low, high = _WELL_EXPOSED
+    chunks = iter(recording.events())
+    buffer: EventArray = np.empty(0, EVENT_DTYPE)
+    previous: Shot | None = None
+    previous_usable: NDArray[np.bool_] | None = None
+    reference = 0.0
+    for index, frame in enumerate(recording.frames()):
+        if index == _MAX_FRAMES:
+            return
+        reference = reference or float(frame.exposure)
+        shot = take_shot(frame, model, reference)
+        response = frame.normalised()
+        usable = (response > low) & (response < high)
+        while len(buffer) == 0 or buffer["t"][-1] <= shot.middle:
+            chunk = next(chunks, None)
+            if chunk is None:
+                break
+            buffer = np.concatenate([buffer, chunk])
+        if previous is not None and previous_usable is not None:
+            on, off = count_events(between(buffer, previous.middle, shot.middle), recording.sensor_size)
+            chosen = usable & previous_usable & (on + off >= 2)
+            change = log_intensity(shot.intensity, camera.log_offset) - log_intensity(
+                previous.intensity, camera.log_offset
+            )
+            yield change[chosen], on[chosen], off[chosen]
+        buffer = buffer[buffer["t"].searchsorted(shot.middle, "right") :]
+        previous, previous_usable = shot, usable

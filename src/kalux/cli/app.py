@@ -1,0 +1,97 @@
+"""`main`: runs a command and turns whatever happens into an exit code and, at most, one line."""
+
+from __future__ import annotations
+
+import sys
+import traceback
+from collections.abc import Sequence
+
+from kalux.cli import demo, info, reconstruct
+from kalux.cli.parser import Parser, UsageError, normalised
+from kalux.cli.signals import termination_as_interrupt
+from kalux.cli.terminal import close_output, error_line
+from kalux.errors import KaluxError
+
+DONE, BUG, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+
+_DESCRIPTION = """\
+HDR video with per-pixel uncertainty from cameras that give events and frames.
+
+commands:
+  info         what is in a recording, and what kalux would use of it
+  reconstruct  make images or a video from a recording
+  demo         simulate a scene, reconstruct it, and compare with the truth
+
+kalux COMMAND --help says more."""
+
+_EXAMPLES = """\
+examples:
+  kalux demo
+  kalux info night_drive.aedat4
+  kalux reconstruct night_drive.aedat4 -o night.mp4
+  kalux reconstruct night_drive.aedat4 -o night/ --format exr --rate 300"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Parameters
+    ----------
+    argv
+        Arguments without the program's name. Default: those of the process.
+
+    Returns
+    -------
+    int
+        0 done, 1 an error in kalux, 2 bad input or usage, 130 interrupted.
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    try:
+        with termination_as_interrupt():
+            return _guarded(arguments)
+    finally:
+        close_output()
+
+
+def _guarded(arguments: list[str]) -> int:
+    try:
+        return _run(arguments)
+    except KaluxError as error:
+        error_line(f"error: {error}", *_notes(error))
+        return BAD_INPUT
+    except KeyboardInterrupt as interrupt:
+        error_line("interrupted", *(_notes(interrupt) or ["nothing was written"]))
+        return INTERRUPTED
+    except Exception as error:
+        traceback.print_exc()
+        error_line(
+            f"error: {type(error).__name__} inside kalux; this is an error in kalux, please report it with the "
+            "lines above and the command"
+        )
+        return BUG
+
+
+def _notes(error: BaseException) -> list[str]:
+    return list(getattr(error, "__notes__", []))
+
+
+def _run(arguments: list[str]) -> int:
+    parser = make_parser()
+    try:
+        options = parser.parse_args(normalised(arguments))
+    except SystemExit as done:  # --help and --version have printed what was asked for
+        return int(done.code or 0)
+    if options.command is None:
+        raise UsageError("no command is given; kalux --help lists them, kalux demo shows what kalux does")
+    options.run(options, ["kalux", *arguments])
+    return DONE
+
+
+def make_parser() -> Parser:
+    """The parser of all commands."""
+    parser = Parser(prog="kalux", description=_DESCRIPTION, epilog=_EXAMPLES, usage="kalux COMMAND ...")
+    parser.add_version()
+    commands = parser.add_subparsers(dest="command", prog="kalux", parser_class=Parser)
+    for command in (info, reconstruct, demo):
+        command.add_command(commands)
+    return parser

@@ -1,0 +1,86 @@
+"""``kalux info``: what is in a recording."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from kalux.cli.parser import Parser, UsageError, whole
+from kalux.cli.terminal import say
+
+if TYPE_CHECKING:
+    from kalux.recording import Recording
+
+_DESCRIPTION = """\
+Say what is in a recording: the sensor, frames and events, exposures, what is missing. Where it states no
+contrast threshold, that is estimated as reconstruct would do it."""
+
+_EXAMPLES = """\
+examples:
+  kalux info night_drive.aedat4
+  kalux info slider_depth --exposure 10000 --stamp start"""
+
+
+def add_command(commands: Any) -> None:
+    """Add ``info`` to the parser."""
+    parser: Parser = commands.add_parser(
+        "info",
+        description=_DESCRIPTION,
+        epilog=_EXAMPLES,
+        usage="kalux info REC [flags]",
+    )
+    add_recording(parser)
+    group = parser.add_argument_group("contrast thresholds")
+    group.add_argument("--no-estimate", action="store_true", help="do not estimate contrast thresholds")
+    parser.set_defaults(run=run)
+
+
+def add_recording(parser: Parser) -> None:
+    """Add what says which recording it is, and what it does not say itself."""
+    group = parser.add_argument_group("recording")
+    group.add_argument("recording", metavar="REC", help="file or folder, of any format that kalux reads")
+    group.add_argument(
+        "--exposure",
+        type=whole,
+        metavar="US",
+        help="exposure time of all frames, us; needed where the recording has none",
+    )
+    group.add_argument(
+        "--stamp",
+        choices=("start", "middle", "end"),
+        help="with --exposure: what a frame's time stamp marks (default start)",
+    )
+
+
+def open_recording(options: argparse.Namespace) -> Recording:
+    """Open the recording that the flags name."""
+    import kalux
+
+    if options.stamp is not None and options.exposure is None:
+        raise UsageError("--stamp says what a frame's time marks for --exposure; give --exposure, too")
+    return kalux.open(Path(options.recording), exposure=options.exposure, stamp=options.stamp or "start")
+
+
+def run(options: argparse.Namespace, command: list[str]) -> None:
+    """Run the command."""
+    from kalux.info import describe, format_description
+
+    recording = open_recording(options)
+    say(format_description(describe(recording)))
+    if not options.no_estimate and recording.contrast_threshold is None and recording.exposure_known:
+        say(estimate_text(recording))
+
+
+def estimate_text(recording: Recording) -> str:
+    """The estimated contrast thresholds, and how well they are known."""
+    from kalux.calibration.contrast import estimate_thresholds
+    from kalux.settings import CameraSettings
+
+    estimate = estimate_thresholds(recording, CameraSettings())
+    if estimate is None:
+        return "estimated thresholds: none, too little moves before well exposed pixels"
+    return (
+        f"estimated thresholds: on {estimate.on:.3f}, off {estimate.off:.3f} "
+        f"(residual {estimate.residual:.3f}, {estimate.samples:,} samples)"
+    )

@@ -1,0 +1,139 @@
+"""`argparse`, with errors as one line and help that keeps its paragraphs."""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import re
+from collections.abc import Callable, Sequence
+from typing import Any, Never
+
+from kalux.errors import InputError
+
+
+class UsageError(InputError):
+    """The command line cannot be understood."""
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser that raises `UsageError` instead of printing its usage and ending the process."""
+
+    def __init__(self, **options: Any) -> None:
+        options = {"formatter_class": HelpFormatter, "allow_abbrev": False, "add_help": False, **options}
+        super().__init__(**options)
+        self._help_group = self.add_argument_group("help")
+        self._help_group.add_argument("-h", "--help", action="help", help="this text")
+
+    def add_version(self) -> None:
+        """Add ``--version``, read only when it is asked for."""
+        self._help_group.add_argument("--version", action=_Version, nargs=0, help="the version of kalux")
+
+    def add_help_flag(self, flag: str, action: type[argparse.Action], text: str) -> None:
+        """Add a flag that prints something else than `--help` does."""
+        self._help_group.add_argument(flag, action=action, nargs=0, help=text)
+
+    def format_help(self) -> str:
+        """The help, with the flags that print help last."""
+        self._action_groups.sort(key=lambda group: group is self._help_group)
+        return super().format_help()
+
+    def error(self, message: str) -> Never:
+        """Raise `UsageError`."""
+        hint = f"{self.prog} --help lists what is possible"
+        raise UsageError(f"{plainer(message)}; {hint}")
+
+    def parse_args(  # type: ignore[override]
+        self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
+    ) -> argparse.Namespace:
+        """Parse; an unknown flag is an error that names the nearest known one."""
+        options, unknown = self.parse_known_args(args, namespace)
+        if unknown:
+            parser = self._command_parser(getattr(options, "command", None))
+            parser.error(_unknown(unknown[0], list(parser._option_string_actions)))
+        return options
+
+    def _command_parser(self, command: str | None) -> Parser:
+        for action in self._actions:
+            if isinstance(action, argparse._SubParsersAction) and command in action.choices:
+                return action.choices[command]  # type: ignore[no-any-return]
+        return self
+
+
+class HelpFormatter(argparse.RawDescriptionHelpFormatter):
+    """Help with room for the flags."""
+
+    def __init__(self, prog: str, **options: Any) -> None:
+        super().__init__(prog, max_help_position=28, width=100, **options)
+
+    def _metavar_formatter(
+        self, action: argparse.Action, default_metavar: str
+    ) -> Callable[[int], tuple[str, ...]]:
+        if action.metavar is None and action.choices is not None:
+            return lambda size: ("|".join(str(choice) for choice in action.choices or ()),) * size
+        return super()._metavar_formatter(action, default_metavar)
+
+    def add_argument(self, action: argparse.Action) -> None:
+        """Add an argument's help; the commands are in the description already."""
+        if not isinstance(action, argparse._SubParsersAction):
+            super().add_argument(action)
+
+
+class _Version(argparse.Action):
+    def __call__(self, parser: argparse.ArgumentParser, *unused: Any) -> None:
+        from kalux import __version__
+
+        parser.exit(message=f"kalux {__version__}\n")
+
+
+def normalised(arguments: Sequence[str]) -> list[str]:
+    """Arguments with dashes in flags, so that ``--camera.log_offset`` is understood, too."""
+    return [_normalised(argument) for argument in arguments]
+
+
+def _normalised(argument: str) -> str:
+    if not argument.startswith("--"):
+        return argument
+    flag, equals, value = argument.partition("=")
+    return flag.replace("_", "-") + equals + value
+
+
+def plainer(message: str) -> str:
+    """The messages of `argparse` in plainer words."""
+    message = re.sub(r"^argument ([^:]+): ", lambda match: f"{match[1]}: ", message)
+    message = message.replace("the following arguments are required:", "still needed:")
+    message = message.replace("invalid choice: ", "there is no ")
+    return re.sub(r"invalid ([\w ]+) value: (.*)", r"\2 is not \1", message)
+
+
+def _unknown(argument: str, known: list[str]) -> str:
+    flag = argument.partition("=")[0]
+    if not flag.startswith("-"):
+        return f"{argument}: one argument too many"
+    near = difflib.get_close_matches(flag, known, 1)
+    return f"unknown flag {flag}" + (f", did you mean {near[0]}?" if near else "")
+
+
+# Types of arguments: their names stand in messages ("'x' is not a number").
+
+
+def number(text: str) -> float:
+    """A float."""
+    return float(text)
+
+
+def whole(text: str) -> int:
+    """An int."""
+    return int(text)
+
+
+def true_or_false(text: str) -> bool:
+    """A bool, as in TOML, or yes and no."""
+    try:
+        return {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}[
+            text.lower()
+        ]
+    except KeyError:
+        raise ValueError(text) from None
+
+
+number.__name__, whole.__name__, true_or_false.__name__ = "a number", "a whole number", "true or false"

@@ -1,0 +1,119 @@
+"""Progress on stderr: a bar on a terminal, else a line every few seconds."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+import time
+from types import TracebackType
+from typing import Self
+
+from rich.console import Console
+from rich.progress import BarColumn, TextColumn
+from rich.progress import Progress as Bar
+
+LINE_EVERY = 5.0
+"""Seconds between lines where stderr is not a terminal."""
+
+BAR_EVERY = 0.1
+"""Seconds between updates of the bar."""
+
+
+class Progress:
+    """Counts images and events; a context manager that draws meanwhile.
+
+    Parameters
+    ----------
+    title
+        What is being done, a word.
+    images
+        How many images there will be; 0: none are made.
+    events
+        How many events there will be, where only those are counted; 0: unknown.
+    quiet
+        Draw nothing.
+    """
+
+    def __init__(self, title: str, *, images: int = 0, events: int = 0, quiet: bool = False) -> None:
+        self._title = title
+        self._total_images, self._total_events = images, events
+        self.images = self.events = 0
+        self._quiet = quiet
+        self._started = self._drawn = time.monotonic()
+        self._bar: Bar | None = None
+
+    @property
+    def seconds(self) -> float:
+        """Time since the start."""
+        return time.monotonic() - self._started
+
+    def __enter__(self) -> Self:
+        self._started = self._drawn = time.monotonic()
+        if not self._quiet and sys.stderr.isatty():
+            self._bar = Bar(
+                TextColumn("{task.description}"),
+                BarColumn(bar_width=24),
+                TextColumn("{task.fields[text]}"),
+                console=Console(stderr=True),
+                transient=True,
+            )
+            self._bar.add_task(self._title, total=self._total_images or self._total_events or None, text="")
+            self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+    def add(self, *, images: int = 0, events: int = 0) -> None:
+        """Count, and draw if it is time to."""
+        self.images += images
+        self.events += events
+        now = time.monotonic()
+        if self._quiet or now - self._drawn < (LINE_EVERY if self._bar is None else BAR_EVERY):
+            return
+        self._drawn = now
+        self._draw()
+
+    def _draw(self) -> None:
+        text = progress_text(self.images, self._total_images, self.events, self._total_events, self.seconds)
+        if self._bar is not None:
+            done = self.images if self._total_images else self.events
+            self._bar.update(self._bar.task_ids[0], completed=done, text=text)
+            return
+        with contextlib.suppress(OSError):
+            print(f"kalux: {self._title}: {text}", file=sys.stderr, flush=True)
+
+
+def progress_text(images: int, total_images: int, events: int, total_events: int, seconds: float) -> str:
+    """Such as ``120/360 images, 85 images/s, 4.2M events/s, 0:03 left``."""
+    seconds = max(seconds, 1e-3)
+    parts = []
+    if total_images:
+        parts.append(f"{images}/{total_images} images")
+        if images:
+            parts.append(f"{short_number(images / seconds)} images/s")
+    else:
+        parts.append(f"{short_number(events)} events")
+    parts.append(f"{short_number(events / seconds)} events/s")
+    done, total = (images, total_images) if total_images else (events, total_events)
+    if done and total:
+        parts.append(f"{clock(seconds * max(total - done, 0) / done)} left")
+    return ", ".join(parts)
+
+
+def short_number(value: float) -> str:
+    """Three digits and a unit: ``12.3M``."""
+    for size, unit in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if value >= 0.9995 * size:
+            return f"{value / size:.3g}{unit}"
+    return f"{value:.3g}"
+
+
+def clock(seconds: float) -> str:
+    """``1:02:03`` or ``2:03``."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"

@@ -1,0 +1,448 @@
+"""``kalux reconstruct``: images or a video from a recording."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import dataclasses
+import importlib.metadata
+import shlex
+import tomllib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from kalux.cli.checking import Contents, check_recording
+from kalux.cli.flags import HelpSettings, add_display, add_settings, given_display, given_settings
+from kalux.cli.info import add_recording, open_recording
+from kalux.cli.parser import Parser, UsageError, number
+from kalux.cli.progress import Progress, short_number
+from kalux.cli.terminal import say, warn
+from kalux.cli.times import load_times
+from kalux.display import CURVES, DisplaySettings
+from kalux.errors import InputError, OutputError
+from kalux.pipeline import Plan, execute, plan
+from kalux.reconstructor import Image, Reconstructor
+from kalux.recording import Recording
+from kalux.settings import PRESETS, Settings, from_dict, load, preset, to_dict
+
+if TYPE_CHECKING:
+    from kalux.writers import ImageLike, VideoSettings, Writer
+
+DEFAULT_RATE: Final = 100.0
+"""Images per second where nothing is said: several per frame, and a video that plays in real time."""
+
+_FOLDER_FORMATS = ("png", "exr", "npy")
+_NOT_FOLDERS = {".avi", ".mkv", ".mov", ".webm", ".gif", ".m4v", ".png", ".exr", ".npy", ".tif", ".jpg"}
+
+_DESCRIPTION = """\
+Reconstruct HDR images, at any rate, from a recording of events and frames. The whole recording is checked
+before anything is written."""
+
+_EXAMPLES = """\
+examples:
+  kalux reconstruct drive.aedat4 -o drive.mp4
+  kalux reconstruct drive.aedat4 -o drive/ --format exr --rate 300
+  kalux reconstruct slider_depth -o slider.mp4 --exposure 10000 --stamp start --slow-motion 4
+  kalux reconstruct drive.aedat4 -o again.mp4 --settings drive/kalux.toml --camera.log-offset 0.05"""
+
+_ORIGINS = {
+    "settings": "given",
+    "recording": "from the recording",
+    "estimate": "estimated",
+    "assumed": "assumed",
+}
+
+
+def add_command(commands: Any) -> None:
+    """Add ``reconstruct`` to the parser."""
+    parser: Parser = commands.add_parser(
+        "reconstruct",
+        description=_DESCRIPTION,
+        epilog=_EXAMPLES,
+        usage="kalux reconstruct REC -o OUT [flags]",
+    )
+    add_recording(parser)
+    _add_images(parser)
+    _add_output(parser)
+    _add_settings(parser)
+    _add_display(parser)
+    parser.set_defaults(run=run)
+
+
+def _add_images(parser: Parser) -> None:
+    group = parser.add_argument_group("which images (one of --rate, --times and --at)")
+    one = group.add_mutually_exclusive_group()
+    one.add_argument(
+        "--rate", type=number, metavar="HZ", help=f"images per second (default {DEFAULT_RATE:g})"
+    )
+    one.add_argument(
+        "--times", type=Path, metavar="FILE", help="at the times in a file, us: a line each, or .npy"
+    )
+    one.add_argument("--at", choices=("frames",), help="one in the middle of each frame's exposure")
+    group.add_argument(
+        "--start", type=number, metavar="S", help="none before this time, s after the first frame begins"
+    )
+    group.add_argument("--end", type=number, metavar="S", help="none after this time, counted likewise")
+    group.add_argument(
+        "--causal", action="store_true", help="use the past only, as a robot must (default: one frame ahead)"
+    )
+
+
+def _add_output(parser: Parser) -> None:
+    group = parser.add_argument_group("output")
+    group.add_argument(
+        "-o", "--out", type=Path, required=True, metavar="OUT", help="name.mp4 for a video, else a folder"
+    )
+    group.add_argument(
+        "--format",
+        choices=_FOLDER_FORMATS,
+        help="of a folder: png is a picture (default), exr and npy hold linear intensity and variance",
+    )
+    group.add_argument("--overwrite", action="store_true", help="replace a former output of kalux")
+    group.add_argument("--quiet", action="store_true", help="print warnings and errors only")
+
+
+def _add_settings(parser: Parser) -> None:
+    group = parser.add_argument_group("settings")
+    group.add_argument(
+        "--preset", default="default", metavar="NAME", help=f"{', '.join(PRESETS)} (default: default)"
+    )
+    group.add_argument(
+        "--settings", type=Path, metavar="FILE", help="TOML that changes the preset; an output's kalux.toml"
+    )
+    # Not a flag: a line of help for all of them.
+    group.add_argument(
+        "--GROUP.NAME",
+        dest="_",
+        metavar="VALUE",
+        help="any setting, e.g. --camera.log-offset 0.05, --events.threshold-on 0.2, --filter.kind cf",
+    )
+    parser.add_help_flag("--help-settings", HelpSettings, "all settings, with units, defaults and reasons")
+    add_settings(parser)
+
+
+def _add_display(parser: Parser) -> None:
+    group = parser.add_argument_group("display (png and mp4)")
+    group.add_argument("--display", choices=tuple(CURVES), help="tone curve (default auto)")
+    group.add_argument(
+        "--display.PARAMETER",
+        dest="_",
+        metavar="VALUE",
+        help="e.g. --display linear --display.white 4, --display.encoding srgb; see --help-settings",
+    )
+    group.add_argument("--png-bits", type=int, choices=(8, 16), help="bits of a png (default 16)")
+    group.add_argument(
+        "--crf", type=number, metavar="Q", help="quality of an mp4, 0 (best) to 51 (default 18)"
+    )
+    group.add_argument(
+        "--slow-motion", type=number, metavar="X", help="play an mp4 X times slower (default 1)"
+    )
+    add_display(parser)
+
+
+@dataclass(frozen=True)
+class Output:
+    """What is to be written where."""
+
+    path: Path
+    format: str
+    display: DisplaySettings
+    video: VideoSettings
+    png_bits: int
+    rate_hz: float | None
+    overwrite: bool
+
+
+def run(options: argparse.Namespace, command: list[str]) -> None:
+    """Run the command."""
+    if options._ is not None:
+        raise UsageError("GROUP.NAME stands for the name of a setting; --help-settings lists them")
+    output = chosen_output(options)
+    settings = chosen_settings(options)
+    check_output(output)
+    times = None if options.times is None else load_times(options.times)
+    recording = open_recording(options)
+    with Progress("checking", quiet=options.quiet) as progress:
+        contents = check_recording(recording, lambda count: progress.add(events=count))
+    for text in contents.warnings():
+        warn(text)
+    made = make_plan(recording, contents, settings, times, options)
+    if made.threshold_origin in ("estimate", "assumed"):
+        warn(threshold_warning(made))
+    if not options.quiet:
+        say("\n".join(decided(recording, contents, made, output, options)))
+    seconds, images = write_images(
+        recording, made, output, metadata(recording, made, options, command), options
+    )
+    if not options.quiet:
+        say(
+            f"wrote       {images:,} images to {output.path} in {seconds:.1f} s "
+            f"({short_number(images / seconds)} images/s), settings in {settings_path(output)}"
+        )
+
+
+# Decide.
+
+
+def chosen_output(options: argparse.Namespace) -> Output:
+    """What the flags say of the output.
+
+    Raises
+    ------
+    UsageError
+        Flags contradict each other or the name.
+    """
+    from kalux.writers import VideoSettings
+
+    path: Path = options.out
+    is_video = path.suffix.lower() == ".mp4"
+    if is_video and options.format is not None:
+        raise UsageError(
+            f"--format {options.format}: {path} is a video; give a folder with -o, or no --format"
+        )
+    if not is_video and path.suffix.lower() in _NOT_FOLDERS and not path.is_dir():
+        raise UsageError(f"{path}: give a name that ends in .mp4 for a video, or the name of a folder")
+    format = "mp4" if is_video else options.format or "png"
+    _check_flags(options, format)
+    rate = None if options.times is not None or options.at is not None else options.rate or DEFAULT_RATE
+    video = VideoSettings(
+        crf=18.0 if options.crf is None else options.crf,
+        slow_motion=1.0 if options.slow_motion is None else options.slow_motion,
+    )
+    return Output(
+        path, format, given_display(options), video, options.png_bits or 16, rate, options.overwrite
+    )
+
+
+def _check_flags(options: argparse.Namespace, format: str) -> None:
+    """Refuse flags that would have no effect."""
+    uses = {"png_bits": ("png",), "crf": ("mp4",), "slow_motion": ("mp4",), "display": ("png", "mp4")}
+    for name, formats in uses.items():
+        if getattr(options, name) is not None and format not in formats:
+            flag = "--" + name.replace("_", "-")
+            raise UsageError(f"{flag} is for {' and '.join(formats)}, the output is {format}")
+
+
+def check_output(output: Output) -> None:
+    """Check that the output can be made, before the work; the writer checks again.
+
+    Raises
+    ------
+    OutputError
+        It is there already, or its folder cannot be written.
+    """
+    path = output.path
+    with _system_errors(path):
+        is_folder = path.is_dir()
+        if is_folder and output.format == "mp4":
+            raise OutputError(f"{path}: a folder of this name is there; choose another name for the video")
+        if not is_folder and path.exists() and output.format != "mp4":
+            raise OutputError(f"{path}: a file of this name is there; choose another name for the folder")
+        taken = any(path.iterdir()) if is_folder else path.exists()
+        if taken and not output.overwrite:
+            what = "the folder is not empty" if is_folder else "there already"
+            raise OutputError(f"{path}: {what}; choose another name, or replace it with --overwrite")
+        _check_writable(path if is_folder else path.absolute().parent)
+
+
+def _check_writable(folder: Path) -> None:
+    import os
+
+    existing = next(place for place in (folder, *folder.parents) if place.exists())
+    if not existing.is_dir():
+        raise OutputError(f"{existing}: not a folder; choose another place for the output")
+    if not os.access(existing, os.W_OK | os.X_OK):
+        raise OutputError(f"{existing}: no permission to write there; choose another place for the output")
+
+
+@contextlib.contextmanager
+def _system_errors(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OutputError:
+        raise
+    except OSError as error:
+        raise OutputError(f"{path}: {error.strerror or error}") from error
+
+
+def chosen_settings(options: argparse.Namespace) -> Settings:
+    """The preset, changed by the file, changed by the flags."""
+    settings = preset(options.preset)
+    if options.settings is not None:
+        settings = load(options.settings, settings)
+    settings = from_dict(given_settings(options), settings)
+    Reconstructor((1, 1), settings=settings)  # refuses what only the engine can judge, before the work
+    return settings
+
+
+def make_plan(
+    recording: Recording,
+    contents: Contents,
+    settings: Settings,
+    times: Any,
+    options: argparse.Namespace,
+) -> Plan:
+    """Decide everything.
+
+    Raises
+    ------
+    InputError
+        No image lies in the part that was asked for, or as of `kalux.pipeline.plan`.
+    """
+    rate = None if times is not None or options.at is not None else options.rate or DEFAULT_RATE
+    made = plan(
+        recording, rate_hz=rate, times=times, at=options.at, settings=settings, lookahead=not options.causal
+    )
+    made = dataclasses.replace(made, threshold_origin=_origin(made, options))
+    for flag, value in (("--start", options.start), ("--end", options.end)):
+        if value is not None and not np.isfinite(value):
+            raise UsageError(f"{flag} is {value}; seconds are needed")
+    first = -np.inf if options.start is None else contents.start + 1e6 * options.start
+    last = np.inf if options.end is None else contents.start + 1e6 * options.end
+    kept = made.times[(made.times >= first) & (made.times <= last)]
+    if len(kept) == 0:
+        raise UsageError(
+            f"no image lies in the part that --start and --end leave of the recording's {contents.seconds:.3f} s"
+        )
+    return dataclasses.replace(made, times=kept)
+
+
+def _origin(made: Plan, options: argparse.Namespace) -> Any:
+    """Where the thresholds come from; those of a former run's `kalux.toml` come from where they did then."""
+    flags = given_settings(options).get("events", {})
+    if (
+        made.threshold_origin != "settings"
+        or options.settings is None
+        or {"threshold_on", "threshold_off"} & {*flags}
+    ):
+        return made.threshold_origin
+    former = tomllib.loads(options.settings.read_text(encoding="utf-8")).get("thresholds", {})
+    origin = former.get("origin") if isinstance(former, dict) else None
+    return origin if origin in _ORIGINS else made.threshold_origin
+
+
+# Say.
+
+
+def threshold_warning(made: Plan) -> str:
+    """What it means that nobody knows the thresholds."""
+    how = "estimated from the recording" if made.threshold_origin == "estimate" else "unknown and assumed"
+    return (
+        f"the contrast thresholds are {how}, so brightness above white is uncertain; "
+        "if you know them, give --events.threshold-on and --events.threshold-off"
+    )
+
+
+def decided(
+    recording: Recording, contents: Contents, made: Plan, output: Output, options: argparse.Namespace
+) -> list[str]:
+    """What is about to be done, in a few lines."""
+    height, width = recording.sensor_size
+    source, events, camera = recording.source, made.settings.events, made.settings.camera
+    origin = _ORIGINS[made.threshold_origin]
+    if made.estimate is not None:
+        origin += f" from {made.estimate.samples:,} samples, residual {made.estimate.residual:.2f}"
+    begin, end = ((int(t) - contents.start) * 1e-6 for t in (made.times[0], made.times[-1]))
+    spacing = "at given times" if output.rate_hz is None else f"at {output.rate_hz:g} Hz"
+    if options.at is not None:
+        spacing = "at the frames"
+    ahead = "one frame ahead" if made.lookahead else "causal"
+    return [
+        f"recording   {source.path}: {source.format}, {width}x{height} pixels, {contents.seconds:.3f} s, "
+        f"{contents.frames:,} frames, {contents.events:,} events",
+        f"thresholds  on {events.threshold_on:.3f}, off {events.threshold_off:.3f} ({origin})",
+        f"exposure    {(camera.reference_exposure or 0) * 1e-3:g} ms makes a saturated pixel 1.0",
+        f"filter      {made.settings.filter.kind}, preset {options.preset}"
+        f"{'' if options.settings is None else f' changed by {options.settings}'}, {ahead}",
+        f"images      {len(made.times):,} {spacing}, {begin:.3f} to {end:.3f} s -> {output.path} ({output.format})",
+    ]
+
+
+def settings_path(output: Output) -> Path:
+    """Where the settings are written."""
+    if output.format == "mp4":
+        return output.path.with_name(f"{output.path.name}.kalux.toml")
+    return output.path / "kalux.toml"
+
+
+def metadata(
+    recording: Recording, made: Plan, options: argparse.Namespace, command: list[str]
+) -> dict[str, Any]:
+    """What `kalux.toml` tells of the run; `kalux reconstruct --settings` reads the settings from it."""
+    height, width = recording.sensor_size
+    estimate = None if made.estimate is None else made.estimate._asdict()
+    return {
+        "command": shlex.join(command),
+        "preset": options.preset,
+        "settings": to_dict(made.settings),
+        "thresholds": {"origin": made.threshold_origin, "estimate": estimate},
+        "input": {
+            "path": options.recording,
+            "format": recording.source.format,
+            "height": height,
+            "width": width,
+            "exposure": options.exposure,
+            "stamp": options.stamp,
+        },
+        "images_wanted": {
+            "count": len(made.times),
+            "times_file": options.times,
+            "at": options.at,
+            "start": options.start,
+            "end": options.end,
+            "lookahead": made.lookahead,
+        },
+        "versions": {"numba": importlib.metadata.version("numba")},
+    }
+
+
+# Do.
+
+
+def write_images(
+    recording: Recording, made: Plan, output: Output, described: dict[str, Any], options: argparse.Namespace
+) -> tuple[float, int]:
+    """Carry out the plan; returns the seconds it took and the number of images."""
+    writer = _open_writer(output, described)
+    progress = Progress("reconstructing", images=len(made.times), quiet=options.quiet)
+    try:
+        with writer, progress:
+            for image in execute(recording, made, lambda count: progress.add(events=count)):
+                writer.write(writable(image))
+                progress.add(images=1)
+    except (KeyboardInterrupt, InputError) as error:
+        error.add_note(_what_is_left(writer, output))
+        raise
+    return max(progress.seconds, 1e-3), writer.images
+
+
+def _open_writer(output: Output, described: dict[str, Any]) -> Writer:
+    from kalux.writers import open_writer
+
+    return open_writer(
+        output.path,
+        format=output.format,
+        display=output.display,
+        rate_hz=output.rate_hz,
+        overwrite=output.overwrite,
+        metadata=described,
+        png_bits=8 if output.png_bits == 8 else 16,
+        video=output.video,
+    )
+
+
+def _what_is_left(writer: Writer, output: Output) -> str:
+    if writer.images == 0 or (output.format == "mp4" and not output.path.exists()):
+        return f"no image was finished in {output.path}"
+    return f"{writer.images:,} images are finished and valid in {output.path}"
+
+
+def writable(image: Image) -> ImageLike:
+    """The image with a variance: infinite, which is unknown, where the filter has none."""
+    if image.variance is None:
+        return dataclasses.replace(image, variance=np.full_like(image.intensity, np.inf))  # type: ignore[return-value]
+    return image  # type: ignore[return-value]

@@ -1,0 +1,53 @@
+"""What is printed: results on stdout; warnings, errors and progress on stderr."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+
+from kalux.errors import OutputError
+
+
+def say(text: str = "") -> None:
+    """Print to stdout. A reader that has gone away (``| head``) is no error: the work goes on in silence.
+
+    Raises
+    ------
+    OutputError
+        Stdout cannot be written for another reason, e.g. a full disk.
+    """
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        _discard_output()
+    except OSError as error:
+        _discard_output()
+        raise OutputError(f"standard output: {error.strerror or error}") from error
+
+
+def warn(text: str) -> None:
+    """Print a warning, one line."""
+    error_line(f"warning: {text}")
+
+
+def error_line(*parts: str) -> None:
+    """Print one line to stderr, whatever line breaks file names or libraries put into it."""
+    line = " ".join("; ".join(parts).split())
+    with contextlib.suppress(OSError):
+        print(f"kalux: {line}", file=sys.stderr, flush=True)
+
+
+def close_output() -> None:
+    """Flush stdout, so that a reader that has gone away is not reported when Python ends."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        _discard_output()
+
+
+def _discard_output() -> None:
+    with contextlib.suppress(OSError, ValueError):
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, sys.stdout.fileno())
+        os.close(null)

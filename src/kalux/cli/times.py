@@ -1,0 +1,85 @@
+"""The times of images from a file: text or NumPy, in us."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux.cli.parser import UsageError
+
+Times = NDArray[np.int64]
+
+
+def load_times(path: Path) -> Times:
+    """Read the times of images.
+
+    Parameters
+    ----------
+    path
+        A ``.npy`` file; or text with a time per line, us, in which ``#`` begins a comment; or the
+        ``timestamps.csv`` of an output of kalux.
+
+    Raises
+    ------
+    UsageError
+        The file cannot be read, a time is not a whole number, or they do not increase; names the line.
+    """
+    try:
+        times = _from_numpy(path) if path.suffix == ".npy" else _from_text(path)
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be read: {error.strerror or error}") from error
+    if len(times) == 0:
+        raise UsageError(f"{path}: no times; one time per line is needed, in us")
+    falls = np.flatnonzero(np.diff(times) <= 0)
+    if len(falls):
+        i = int(falls[0])
+        raise UsageError(
+            f"{path}: time {i + 2} is {times[i + 1]} us, not after the one before it ({times[i]} us); "
+            "times must increase"
+        )
+    return times
+
+
+def _from_numpy(path: Path) -> Times:
+    try:
+        values = np.load(path, allow_pickle=False)
+    except (ValueError, EOFError) as error:
+        raise UsageError(f"{path}: not a NumPy array of numbers") from error
+    if values.ndim != 1 or values.dtype.kind not in "iuf":
+        raise UsageError(
+            f"{path}: an array of shape {values.shape} and type {values.dtype}; (N,) us is needed"
+        )
+    if values.dtype.kind == "f" and not (np.abs(values) < 2**62).all():
+        raise UsageError(f"{path}: a time is not finite; whole us are needed")
+    if (values != np.rint(values)).any():
+        raise UsageError(f"{path}: times are not whole; us are needed, not seconds")
+    times: Times = values.astype(np.int64)
+    return times
+
+
+def _from_text(path: Path) -> Times:
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except UnicodeDecodeError as error:
+        raise UsageError(f"{path}: neither text nor .npy; one time per line is needed, in us") from error
+    column = 0
+    if lines and lines[0].startswith("index,t_us"):
+        lines[0], column = "", 1
+    times = [
+        _whole(line.split(",")[column], path, number)
+        for number, line in enumerate((line.partition("#")[0] for line in lines), start=1)
+        if line.strip()
+    ]
+    return np.array(times, np.int64)
+
+
+def _whole(text: str, path: Path, line: int) -> int:
+    try:
+        value = int(text)
+    except ValueError:
+        raise UsageError(f"{path}: line {line}: {text.strip()!r} is not a whole number of us") from None
+    if abs(value) >= 2**62:
+        raise UsageError(f"{path}: line {line}: {value} us is out of range")
+    return value

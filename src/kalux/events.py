@@ -1,0 +1,232 @@
+"""The event array: one documented dtype, coercion from the layouts in use, and checks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux.errors import EventError
+
+EVENT_DTYPE: Final = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "?")], align=True)
+"""Dtype of an event: ``t`` int64 microseconds, ``x`` column and ``y`` row (uint16, 0-based), ``p`` bool,
+True where the pixel became brighter. 16 bytes, aligned."""
+
+EventArray = NDArray[np.void]
+"""A 1-D array of `EVENT_DTYPE`, sorted by ``t``."""
+
+# The names under which peers store each field: tonic and Prophesee (t, x, y, p), dv-processing
+# (timestamp, x, y, polarity), Metavision CSV, event_stream, DSEC and IJRR tables.
+_FIELD_NAMES: Final = {
+    "t": ("t", "ts", "timestamp", "timestamps", "time", "times"),
+    "x": ("x", "xs"),
+    "y": ("y", "ys"),
+    "p": ("p", "ps", "pol", "polarity", "polarities", "on"),
+}
+_TIME_UNITS: Final = {"us": 1.0, "s": 1e6, "ms": 1e3, "ns": 1e-3}
+_UINT16_MAX: Final = np.iinfo(np.uint16).max
+
+
+def make_events(t: Any, x: Any, y: Any, p: Any) -> EventArray:
+    """Join four columns into an event array.
+
+    Parameters are 1-D and of equal length: ``t`` in microseconds (integer), ``x`` and ``y`` 0-based pixel
+    coordinates, ``p`` polarity as bool, {0, 1} or {-1, +1}.
+
+    Raises
+    ------
+    EventError
+        If lengths differ, a coordinate is negative or beyond 65535, times are not integers, or polarity has
+        other values.
+    """
+    t, x, y, p = (np.asarray(column) for column in (t, x, y, p))
+    if t.ndim != 1 or not t.shape == x.shape == y.shape == p.shape:
+        raise EventError(
+            f"events: columns t, x, y, p have shapes {t.shape}, {x.shape}, {y.shape}, {p.shape}; "
+            "they must be 1-D and equally long"
+        )
+    if t.dtype.kind not in "iu":
+        raise EventError(
+            f"events: times are {t.dtype}, not integer microseconds; convert them or name time_unit='s'"
+        )
+    events = np.empty(t.shape, EVENT_DTYPE)
+    events["t"] = t
+    events["x"] = _coordinate("x", x)
+    events["y"] = _coordinate("y", y)
+    events["p"] = _polarity(p)
+    return events
+
+
+def as_events(data: Any, *, columns: str | None = None, time_unit: str | None = None) -> EventArray:
+    """Accept any common event container and return it as an `EVENT_DTYPE` array.
+
+    Parameters
+    ----------
+    data
+        A structured array (tonic, Metavision, dv-processing), a dv-processing ``EventStore``, a pandas
+        ``DataFrame``, a mapping of columns, or an (N, 4) array. Not copied when already of `EVENT_DTYPE`.
+    columns
+        For an (N, 4) array: the order of its columns, a permutation of ``"txyp"``.
+    time_unit
+        ``"s"``, ``"ms"``, ``"us"`` or ``"ns"``. Integer times are microseconds unless said otherwise; for
+        floating-point times it must be given.
+
+    Raises
+    ------
+    EventError
+        If the layout is not recognised or a column has unusable values.
+    """
+    if isinstance(data, np.ndarray) and data.dtype == EVENT_DTYPE and time_unit in (None, "us"):
+        return data
+    found = _columns(data, columns)
+    t = found["t"]
+    if time_unit is not None and time_unit not in _TIME_UNITS:
+        raise EventError(f"events: unknown time_unit {time_unit!r}; known are {', '.join(_TIME_UNITS)}")
+    if t.dtype.kind == "f":
+        if time_unit is None:
+            raise EventError(
+                "events: times are floating point, so their unit cannot be known; "
+                "give time_unit='s' (or 'ms', 'us', 'ns')"
+            )
+        if not np.isfinite(t).all():
+            index = int(np.flatnonzero(~np.isfinite(t))[0])
+            raise EventError(f"events: time of event {index} is not finite")
+        t = np.rint(t * _TIME_UNITS[time_unit]).astype(np.int64)
+    elif time_unit not in (None, "us"):
+        scale = _TIME_UNITS[time_unit]
+        t = t.astype(np.int64) * int(scale) if scale >= 1 else t.astype(np.int64) // round(1 / scale)
+    return make_events(t, found["x"], found["y"], found["p"])
+
+
+def check_events(
+    events: EventArray,
+    sensor_size: tuple[int, int],
+    *,
+    where: str = "events",
+    first_index: int = 0,
+    previous_t: int | None = None,
+) -> None:
+    """Check one chunk of a stream: sorted in time, and inside the sensor.
+
+    Parameters
+    ----------
+    events
+        A chunk of `EVENT_DTYPE`.
+    sensor_size
+        (height, width) in pixels.
+    where
+        Named in the message, e.g. the file.
+    first_index
+        Index of the chunk's first event in the stream, for the message.
+    previous_t
+        Time of the event before the chunk, us.
+
+    Raises
+    ------
+    EventError
+        With the index of the first offending event.
+    """
+    if len(events) == 0:
+        return
+    t = events["t"]
+    if previous_t is not None and t[0] < previous_t:
+        raise EventError(
+            f"{where}: event {first_index} at {t[0]} us comes after one at {previous_t} us; "
+            "sort the events by time"
+        )
+    backwards = t[1:] < t[:-1]
+    if backwards.any():
+        i = int(np.argmax(backwards)) + 1
+        raise EventError(
+            f"{where}: event {first_index + i} at {t[i]} us comes after one at {t[i - 1]} us; "
+            "sort the events by time"
+        )
+    height, width = sensor_size
+    if int(events["x"].max()) >= width or int(events["y"].max()) >= height:
+        i = int(np.argmax((events["x"] >= width) | (events["y"] >= height)))
+        raise EventError(
+            f"{where}: event {first_index + i} at x={events['x'][i]}, y={events['y'][i]} is outside the sensor "
+            f"of {width}x{height} pixels (x and y are 0-based)"
+        )
+
+
+def _columns(data: Any, order: str | None) -> dict[str, NDArray[Any]]:
+    """Find the four columns of any supported container."""
+    if hasattr(data, "numpy") and not isinstance(data, np.ndarray):
+        data = data.numpy()  # dv-processing EventStore
+    if isinstance(data, np.ndarray):
+        if data.dtype.names is not None:
+            return _named(data.ravel(), list(data.dtype.names))
+        if data.ndim == 2 and data.shape[1] == 4:
+            if order is None or sorted(order) != sorted("txyp"):
+                raise EventError(
+                    "events: an (N, 4) array needs the order of its columns, e.g. columns='txyp' or 'xytp'; "
+                    f"got {order!r}"
+                )
+            return {name: data[:, order.index(name)] for name in "txyp"} | _integers(data, order)
+        raise EventError(
+            f"events: cannot read an array of shape {data.shape} and dtype {data.dtype}; "
+            "expected a structured array with t, x, y, p or an (N, 4) array"
+        )
+    if isinstance(data, Mapping):
+        return _named(data, list(data))
+    if hasattr(data, "columns"):  # a pandas DataFrame
+        return _named(data, [str(name) for name in data.columns])
+    raise EventError(
+        f"events: cannot read a {type(data).__name__}; expected an array, a mapping or a table with t, x, y, p"
+    )
+
+
+def _integers(data: NDArray[Any], order: str) -> dict[str, NDArray[Any]]:
+    """Coordinates and polarity of a floating-point (N, 4) table as integers, if they are whole numbers."""
+    if data.dtype.kind != "f":
+        return {}
+    out = {}
+    for name in "xyp":
+        column = data[:, order.index(name)]
+        whole = np.rint(column)
+        if not np.array_equal(whole, column):
+            index = int(np.flatnonzero(whole != column)[0])
+            raise EventError(f"events: {name} of event {index} is {column[index]}, not a whole number")
+        out[name] = whole.astype(np.int64)
+    return out
+
+
+def _named(data: Any, names: list[str]) -> dict[str, NDArray[Any]]:
+    lower = {name.lower(): name for name in names}
+    found = {}
+    for field, aliases in _FIELD_NAMES.items():
+        match = next((lower[alias] for alias in aliases if alias in lower), None)
+        if match is None:
+            raise EventError(
+                f"events: no column for {field!r} among {', '.join(names) or 'no columns'}; "
+                f"one of {', '.join(aliases)} is needed"
+            )
+        found[field] = np.asarray(data[match])
+    return found
+
+
+def _coordinate(name: str, values: NDArray[Any]) -> NDArray[Any]:
+    if values.dtype.kind not in "iu":
+        raise EventError(f"events: {name} is {values.dtype}, not an integer pixel coordinate")
+    if values.dtype != np.uint16 and len(values) and (values.min() < 0 or values.max() > _UINT16_MAX):
+        index = int(np.flatnonzero((values < 0) | (values > _UINT16_MAX))[0])
+        raise EventError(
+            f"events: {name} of event {index} is {values[index]}; 0 to {_UINT16_MAX} is possible"
+        )
+    return values
+
+
+def _polarity(values: NDArray[Any]) -> NDArray[np.bool_]:
+    if values.dtype == np.bool_:
+        return values
+    if values.dtype.kind not in "iu":
+        raise EventError(f"events: polarity is {values.dtype}; bool, 0/1 or -1/+1 is needed")
+    if len(values) and (values.min() < -1 or values.max() > 1):
+        index = int(np.flatnonzero((values < -1) | (values > 1))[0])
+        raise EventError(
+            f"events: polarity of event {index} is {values[index]}; bool, 0/1 or -1/+1 is needed"
+        )
+    return values > 0

@@ -1,0 +1,80 @@
+"""From the state to an intensity: I = exp(L) - I_0, with what is known of highlights."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+class HighlightPrior(NamedTuple):
+    """How far beyond white an estimate is believed (docs/equations.md, K6).
+
+    Attributes
+    ----------
+    white
+        log(1 + I_0) of the brightest level that a frame can show.
+    scale2
+        Variance of the log of highlights over white; 0 turns the prior off.
+    stretch
+        Variance of the log of the scale that events have there, over the scale.
+    """
+
+    white: float
+    scale2: float
+    stretch: float
+
+
+@nb.njit(cache=True, inline="always")
+def believed_highlight(excess, variance, scale2, stretch):  # type: ignore[no-untyped-def]
+    """Posterior of L - white > 0, given its estimate ``excess`` and the filter's ``variance``.
+
+    Additive noise: a normal prior of variance ``scale2`` shrinks the excess. Unknown scale of the events: with
+    a log-normal scale and an exponential prior the mode solves d exp(stretch d) = excess, i.e.
+    d = W(stretch excess) / stretch with Lambert's W, here by Newton's iteration.
+    """
+    shrunk = excess * scale2 / (scale2 + variance)
+    if stretch * shrunk < 1e-6:
+        return shrunk
+    target = stretch * shrunk
+    w = np.log1p(target)
+    for _ in range(4):
+        e = np.exp(w)
+        w -= (w * e - target) / (e * (w + 1.0))
+    return w / stretch
+
+
+def intensity(
+    log_intensity: Array, variance: Array, log_offset: float, prior: HighlightPrior
+) -> NDArray[np.float32]:
+    """I of a state, (H, W) float32: linear, 1 = a saturated frame pixel at the reference exposure, never negative.
+
+    Parameters
+    ----------
+    log_intensity, variance
+        (H, W) L = log(I + I_0) and P.
+    log_offset
+        I_0.
+    prior
+        Of highlights.
+    """
+    out = np.empty(log_intensity.shape, np.float32)
+    _intensity(log_intensity, variance, log_offset, prior, out)
+    return out
+
+
+@nb.njit(cache=True, nogil=True)
+def _intensity(log_intensity, variance, log_offset, prior, out):  # type: ignore[no-untyped-def]
+    height, width = log_intensity.shape
+    for row in range(height):
+        for column in range(width):
+            value = log_intensity[row, column]
+            if prior.scale2 > 0.0 and value > prior.white:
+                value = prior.white + believed_highlight(
+                    value - prior.white, variance[row, column], prior.scale2, prior.stretch
+                )
+            out[row, column] = max(np.exp(value) - log_offset, 0.0)

@@ -1,0 +1,196 @@
+"""The frame camera: response, certainty, weighting and covariance, equations (3)-(9)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux.errors import SettingsError
+
+Array = NDArray[np.float64]
+
+_LEVELS: Final = 256
+"""Samples of a curve: the levels of an 8-bit camera, below which a slope cannot be told from quantisation."""
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """A camera response function CRF and its inverse, as a table.
+
+    Attributes
+    ----------
+    irradiance, response
+        Two increasing (n,) curves, both from 0 to 1 = a saturated pixel: response[i] = CRF(irradiance[i]).
+
+    Raises
+    ------
+    SettingsError
+        If the curves differ in length, are shorter than 2, are not finite, or do not increase from 0 to 1.
+    """
+
+    irradiance: Array
+    response: Array
+
+    def __post_init__(self) -> None:
+        i, r = self.irradiance, self.response
+        if i.ndim != 1 or i.shape != r.shape or len(i) < 2:
+            raise SettingsError(
+                f"response: curves of shapes {i.shape} and {r.shape}; two equal (n,) are needed"
+            )
+        if not (np.isfinite(i).all() and np.isfinite(r).all()):
+            raise SettingsError("response: the curve is not finite")
+        if (np.diff(i) <= 0).any() or (np.diff(r) <= 0).any():
+            raise SettingsError("response: the curve must increase strictly with irradiance")
+        if (i[0], r[0], i[-1], r[-1]) != (0.0, 0.0, 1.0, 1.0):
+            raise SettingsError("response: the curve must run from 0 to 1 in both irradiance and response")
+
+    @classmethod
+    def linear(cls) -> Response:
+        """I^F = I, as the raw values of DAVIS and machine vision cameras."""
+        return cls(np.array([0.0, 1.0]), np.array([0.0, 1.0]))
+
+    @classmethod
+    def gamma(cls, exponent: float) -> Response:
+        """I^F = I^(1/exponent), e.g. 2.2."""
+        if not (np.isfinite(exponent) and exponent > 0):
+            raise SettingsError(f"response: gamma is {exponent}; a positive exponent, e.g. 2.2, is needed")
+        response = np.linspace(0.0, 1.0, _LEVELS)
+        return cls(response**exponent, response)
+
+    @classmethod
+    def srgb(cls) -> Response:
+        """The sRGB transfer function (IEC 61966-2-1)."""
+        response = np.linspace(0.0, 1.0, _LEVELS)
+        linear = np.where(response <= 0.04045, response / 12.92, ((response + 0.055) / 1.055) ** 2.4)
+        return cls(linear, response)
+
+    @classmethod
+    def tabulated(cls, irradiance: Any) -> Response:
+        """From the irradiance of equally spaced response levels, e.g. 256 values of a measured inverse CRF.
+
+        The curve is shifted and scaled to run from 0 to 1.
+        """
+        table = np.asarray(irradiance, dtype=np.float64).ravel()
+        if len(table) < 2 or not table[-1] > table[0]:
+            raise SettingsError("response: a table of at least two increasing irradiances is needed")
+        table = (table - table[0]) / (table[-1] - table[0])
+        return cls(table, np.linspace(0.0, 1.0, len(table)))
+
+    @classmethod
+    def named(cls, name: str) -> Response:
+        """``"linear"``, ``"srgb"`` or ``"gamma:2.2"``."""
+        if name == "linear":
+            return cls.linear()
+        if name == "srgb":
+            return cls.srgb()
+        kind, _, exponent = name.partition(":")
+        if kind == "gamma":
+            try:
+                return cls.gamma(float(exponent))
+            except ValueError:
+                pass
+        raise SettingsError(f"response: unknown response {name!r}; known are linear, srgb and gamma:EXPONENT")
+
+    def __call__(self, irradiance: Array) -> Array:
+        """CRF: response, 0 to 1, of an irradiance; clipped at 1."""
+        return np.interp(irradiance, self.irradiance, self.response)
+
+    def inverse(self, response: Array) -> Array:
+        """CRF^-1 of equation (3), without its noise. Linear beyond the ends, so that nothing is clipped."""
+        inside = np.interp(response, self.response, self.irradiance)
+        return inside + np.maximum(response - 1.0, 0.0) + np.minimum(response, 0.0)
+
+    @cached_property
+    def _certainty(self) -> tuple[Array, Array]:
+        response = np.linspace(0.0, 1.0, _LEVELS)
+        irradiance = np.interp(response, self.response, self.irradiance)
+        slope = np.diff(response) / np.diff(irradiance)
+        return (irradiance[1:] + irradiance[:-1]) / 2.0, slope / slope.max()
+
+    def certainty(self, irradiance: Array) -> Array:
+        """f^c of equation (4): slope of the CRF over irradiance, its largest value scaled to 1."""
+        return np.interp(irradiance, *self._certainty)
+
+    def weight(self, response: Array) -> Array:
+        """f^w of equation (5): the certainty as a function of the response."""
+        return self.certainty(self.inverse(response))
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """Everything that is known of the frame camera.
+
+    Attributes
+    ----------
+    response
+        CRF of equation (3).
+    weight_table
+        (n,) f^w at n equally spaced response levels from 0 to 1, largest 1, where it was measured; None takes
+        it from the response, equation (5).
+    saturation
+        Response, 0 to 1, from which a pixel counts as clipped.
+    """
+
+    response: Response
+    weight_table: Array | None = None
+    saturation: float = 0.98
+
+    @classmethod
+    def from_inverse_covariance(cls, f_Q: Any, response: Response, saturation: float) -> Camera:  # noqa: N803
+        """From a released ``f_Q`` table: 1 / R_bar for every level, which is sigma_im^-2 f^w.
+
+        Raises
+        ------
+        SettingsError
+            If the table is not a finite, non-negative curve with a positive maximum.
+        """
+        table = np.asarray(f_Q, dtype=np.float64).ravel()
+        if len(table) < 2 or not np.isfinite(table).all() or table.min() < 0 or not table.max() > 0:
+            raise SettingsError("f_Q: 1/R_bar must be a finite, non-negative table with a positive maximum")
+        return cls(response, table / table.max(), saturation)
+
+    def weight(self, response: Array) -> Array:
+        """f^w of equation (5), measured or from the response, 0 to 1."""
+        if self.weight_table is None:
+            return self.response.weight(response)
+        return np.interp(response, np.linspace(0.0, 1.0, len(self.weight_table)), self.weight_table)
+
+
+def inverse_response(camera: Camera, response: Array, exposure_ratio: float) -> Array:
+    """Irradiance I of equation (3), scaled to the reference exposure (section 3.2.1).
+
+    Parameters
+    ----------
+    response
+        (H, W) I^F, 0 to 1.
+    exposure_ratio
+        Reference exposure time over this frame's: 1.0 in the result is a saturated pixel at the reference.
+    """
+    return camera.response.inverse(response) * exposure_ratio
+
+
+def covariance(weight: Array, sigma_im2: float, floor: float) -> Array:
+    """R_bar of equation (6): sigma_im^2 / f^w, saturated by a floor of f^w.
+
+    The paper's numbers, 7e5 and 7e7, are inverse variances (docs/equations.md): sigma_im2 = 1 / 7e5.
+    """
+    return sigma_im2 / np.maximum(weight, floor)
+
+
+def log_intensity(intensity: Array, log_offset: float) -> Array:
+    """log(I + I_0), the state of the filter; negative intensities (noise below black) count as 0."""
+    return np.log(np.maximum(intensity, 0.0) + log_offset)
+
+
+def log_bias(intensity: Array, r_bar: Array, log_offset: float) -> Array:
+    """The bias term of equation (8): R_bar / (2 (I + I_0)^2)."""
+    return log_covariance(intensity, r_bar, log_offset) / 2.0
+
+
+def log_covariance(intensity: Array, r_bar: Array, log_offset: float) -> Array:
+    """R of equation (9): R_bar / (I + I_0)^2."""
+    return r_bar / (np.maximum(intensity, 0.0) + log_offset) ** 2

@@ -1,0 +1,256 @@
+"""Reconstruct a whole recording: choose what is missing, drive the engine over the file, nothing else."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux.calibration.contrast import ThresholdEstimate, estimate_thresholds
+from kalux.errors import FrameError, InputError
+from kalux.events import EventArray
+from kalux.frames import Frame
+from kalux.reconstructor import Image, Reconstructor
+from kalux.recording import Recording
+from kalux.settings import Settings, preset
+
+ThresholdOrigin = Literal["settings", "recording", "estimate", "assumed"]
+
+_ASSUMED_THRESHOLD: Final = 0.2
+"""Where nothing moves enough to estimate the thresholds they hardly matter: a usual setting of DVS sensors."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Everything that a reconstruction will use, decided before it starts.
+
+    Attributes
+    ----------
+    settings
+        With thresholds and reference exposure filled in.
+    threshold_origin
+        Whether the thresholds come from the settings, the recording, an estimate, or are assumed.
+    estimate
+        The fit, where there was one.
+    times
+        (N,) int64 us, increasing: the images to make.
+    lookahead
+        Whether images use the frame after them.
+    """
+
+    settings: Settings
+    threshold_origin: ThresholdOrigin
+    estimate: ThresholdEstimate | None
+    times: NDArray[np.int64]
+    lookahead: bool
+
+
+def plan(
+    recording: Recording,
+    *,
+    rate_hz: float | None = None,
+    times: Any = None,
+    at: Literal["frames"] | None = None,
+    preset: str = "default",
+    settings: Settings | None = None,
+    lookahead: bool = True,
+) -> Plan:
+    """Decide what a reconstruction will do. See `reconstruct` for the parameters and errors."""
+    chosen = settings if settings is not None else _preset(preset)
+    if sum(choice is not None for choice in (rate_hz, times, at)) != 1:
+        raise InputError("reconstruct: give exactly one of rate_hz, times and at")
+    exposures = _exposures(recording)
+    reference = chosen.camera.reference_exposure or round(float(np.median(exposures[:, 1] - exposures[:, 0])))
+    chosen = dataclasses.replace(
+        chosen, camera=dataclasses.replace(chosen.camera, reference_exposure=reference)
+    )
+    chosen, origin, estimate = _with_thresholds(recording, chosen)
+    wanted = _times(recording, exposures, rate_hz, times, at, chosen, lookahead)
+    return Plan(chosen, origin, estimate, wanted, lookahead)
+
+
+def reconstruct(
+    recording: Recording,
+    *,
+    rate_hz: float | None = None,
+    times: Any = None,
+    at: Literal["frames"] | None = None,
+    preset: str = "default",
+    settings: Settings | None = None,
+    lookahead: bool = True,
+) -> Iterator[Image]:
+    """Images of a recording, in time order; memory is bounded whatever the recording's length.
+
+    Parameters
+    ----------
+    recording
+        From `kalux.open` or `Recording.from_arrays`.
+    rate_hz
+        Images per second, from the start of the first exposure to the end of the last.
+    times
+        (N,) increasing times, us.
+    at
+        ``"frames"``: one image at the middle of each exposure.
+    preset, settings
+        Name of a preset, or whole `Settings`, which win.
+    lookahead
+        Whether an image uses the frame after it too; False is what a robot would see.
+
+    Raises
+    ------
+    InputError
+        If not exactly one of rate_hz, times and at is given, or times lie outside the recording.
+    FrameError
+        If the recording has no frames.
+    EventError, ExposureError
+        If the recording is damaged; images before the damage have been returned.
+    """
+    return execute(
+        recording,
+        plan(
+            recording,
+            rate_hz=rate_hz,
+            times=times,
+            at=at,
+            preset=preset,
+            settings=settings,
+            lookahead=lookahead,
+        ),
+    )
+
+
+def execute(
+    recording: Recording, plan: Plan, on_events: Callable[[int], None] | None = None
+) -> Iterator[Image]:
+    """Carry out a plan. ``on_events`` is told the number of events of every chunk read, for progress."""
+    engine = Reconstructor(
+        recording.sensor_size,
+        settings=plan.settings,
+        lookahead=plan.lookahead,
+        threshold_is_estimate=plan.threshold_origin in ("estimate", "assumed"),
+        inverse_covariance=recording.source.inverse_covariance,
+    )
+    pending = iter(plan.times.tolist())
+    t = next(pending, None)
+    chunks = iter(recording.events())
+    ended = False
+    for frame in recording.frames():
+        engine.push_frame(frame)
+        while not ended and not engine.covers(frame.exposure_end):
+            ended = not _push_next(engine, chunks, on_events)
+        if ended:
+            engine.advance(frame.exposure_end)
+        final_until = engine.final_until
+        while t is not None and final_until is not None and t <= final_until:
+            yield engine.read(t)
+            t = next(pending, None)
+        if t is None:
+            return
+    while not ended:
+        ended = not _push_next(engine, chunks, on_events)
+    engine.finish()
+    while t is not None:
+        yield engine.read(t)
+        t = next(pending, None)
+
+
+def _push_next(
+    engine: Reconstructor, chunks: Iterator[EventArray], on_events: Callable[[int], None] | None
+) -> bool:
+    chunk = next(chunks, None)
+    if chunk is None:
+        return False
+    engine.push_events(chunk)
+    if on_events is not None:
+        on_events(len(chunk))
+    return True
+
+
+def _preset(name: str) -> Settings:
+    return preset(name)
+
+
+def _exposures(recording: Recording) -> NDArray[np.int64]:
+    """(K, 2) exposure starts and ends, us."""
+    exposures = [(frame.exposure_start, frame.exposure_end) for frame in recording.frames()]
+    if not exposures:
+        raise FrameError(f"{recording.source.path}: no frames; kalux needs frames as well as events")
+    return np.array(exposures, np.int64)
+
+
+def _with_thresholds(
+    recording: Recording, settings: Settings
+) -> tuple[Settings, ThresholdOrigin, ThresholdEstimate | None]:
+    """Fill in the thresholds: from the settings, else the recording, else an estimate."""
+    events = settings.events
+    if events.threshold_on is not None and events.threshold_off is not None:
+        return settings, "settings", None
+    estimate = None
+    origin: ThresholdOrigin = "recording"
+    found = recording.contrast_threshold
+    if found is None:
+        estimate = estimate_thresholds(recording, settings.camera)
+        origin = "assumed" if estimate is None else "estimate"
+        found = (_ASSUMED_THRESHOLD, _ASSUMED_THRESHOLD) if estimate is None else (estimate.on, estimate.off)
+    events = dataclasses.replace(
+        events,
+        threshold_on=events.threshold_on if events.threshold_on is not None else found[0],
+        threshold_off=events.threshold_off if events.threshold_off is not None else found[1],
+    )
+    return dataclasses.replace(settings, events=events), origin, estimate
+
+
+def _times(
+    recording: Recording,
+    exposures: NDArray[np.int64],
+    rate_hz: float | None,
+    times: Any,
+    at: str | None,
+    settings: Settings,
+    lookahead: bool,
+) -> NDArray[np.int64]:
+    """The times to read, checked against the recording."""
+    first = Frame(np.empty((0, 0)), int(exposures[0, 0]), int(exposures[0, 1]))
+    begin = _begin_time(first, settings, lookahead)
+    end = int(exposures[-1, 1])
+    if at is not None:
+        if at != "frames":
+            raise InputError(f"reconstruct: at is {at!r}; only 'frames' is known")
+        middles: NDArray[np.int64] = exposures.sum(axis=1) // 2
+        return middles[middles >= begin]
+    if rate_hz is not None:
+        if not (np.isfinite(rate_hz) and 0 < rate_hz <= 1e6):
+            raise InputError(
+                f"reconstruct: the image rate is {rate_hz} Hz; more than 0 and at most 1e6 is possible"
+            )
+        count = int(np.floor((end - begin) * 1e-6 * rate_hz + 1e-9)) + 1
+        grid: NDArray[np.int64] = np.rint(np.arange(count) * (1e6 / rate_hz)).astype(np.int64)
+        return begin + grid
+    wanted = np.asarray(times)
+    if wanted.ndim != 1 or len(wanted) == 0 or wanted.dtype.kind not in "iu":
+        raise InputError("reconstruct: times must be a list of whole microseconds, with at least one entry")
+    wanted = wanted.astype(np.int64)
+    if (np.diff(wanted) < 0).any():
+        raise InputError("reconstruct: times must increase")
+    if wanted[0] < begin:
+        raise InputError(
+            f"reconstruct: {wanted[0]} us lies before {begin} us, the earliest time the recording's frames allow"
+        )
+    if wanted[-1] > end:
+        last = max((int(chunk["t"][-1]) for chunk in recording.events()), default=end)
+        if wanted[-1] > max(last, end):
+            raise InputError(
+                f"reconstruct: {wanted[-1]} us lies after the recording's end at {max(last, end)} us"
+            )
+    return wanted
+
+
+def _begin_time(first: Frame, settings: Settings, lookahead: bool) -> int:
+    """The first time that can be read, as the engine says."""
+    if not lookahead:
+        return first.exposure_end
+    return first.middle if settings.filter.kind == "cf" else first.exposure_start

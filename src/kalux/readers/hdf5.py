@@ -1,0 +1,327 @@
+"""kalux's own HDF5 layout, described in ``docs/formats.md``: everything a `Source` can hold."""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any, Final, TypeVar
+
+import h5py
+import hdf5plugin
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux.errors import FormatError, FrameError, OutputError
+from kalux.events import EVENT_DTYPE, EventArray
+from kalux.frames import Frame
+from kalux.readers.source import CHUNK_EVENTS, GroundTruth, Source, one_line, reading
+
+T = TypeVar("T")
+MAJOR_VERSION: Final = 1
+"""Files with a greater major version are refused; a minor version only adds."""
+
+_VERSION: Final = f"{MAJOR_VERSION}.0"
+_SIGNATURE: Final = b"\x89HDF\r\n\x1a\n"
+_EVENTS_PER_CHUNK: Final = 1 << 17
+_COLUMNS: Final = ("t", "x", "y", "p")
+_DAMAGE: Final = (KeyError, ValueError, TypeError, RuntimeError, AttributeError, IndexError, MemoryError)
+
+
+def recognises(path: Path) -> bool:
+    """Whether it is an HDF5 file that says it is kalux's, or one too damaged to say."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        if file.read(len(_SIGNATURE)) != _SIGNATURE:
+            return False
+    try:
+        with h5py.File(path, "r") as file:
+            return _text(file.attrs.get("format", "")) == "kalux"
+    except (OSError, *_DAMAGE):
+        return True
+
+
+def read(path: Path) -> Source:
+    """Open a kalux HDF5 file.
+
+    Raises
+    ------
+    FormatError
+        If it is cut short or damaged, or was written by a newer, incompatible kalux.
+    InputError
+        If it cannot be read.
+    """
+    with reading(path, *_DAMAGE), h5py.File(path, "r") as file:
+        _check_version(path, _text(file.attrs.get("version", "")))
+        event_count = _common_length(path, file, "events", _COLUMNS)
+        frame_count = _common_length(path, file, "frames", ("image", "exposure_start", "exposure_end"))
+        exposure_known = bool(file["frames"].attrs["exposure_known"])
+        height, width = (int(n) for n in file.attrs["sensor_size"])
+        threshold = file.attrs.get("contrast_threshold")
+        inverse_covariance = file["inverse_covariance"][...] if "inverse_covariance" in file else None
+        has_ground_truth = "ground_truth" in file
+        contrast_threshold = None if threshold is None else (float(threshold[0]), float(threshold[1]))
+    missing: tuple[str, ...] = ()
+    if not event_count:
+        missing += ("The file has no events.",)
+    if not frame_count:
+        missing += ("The file has no frames.",)
+    elif not exposure_known:
+        missing += ("The exposure times of the frames are not recorded.",)
+    return Source(
+        path=path,
+        format="kalux",
+        sensor_size=(height, width),
+        events=lambda: _events(path),
+        frames=lambda: _frames(path),
+        count_events=lambda: event_count,
+        count_frames=lambda: frame_count,
+        exposure_known=exposure_known,
+        contrast_threshold=contrast_threshold,
+        inverse_covariance=inverse_covariance,
+        ground_truth=(lambda: _ground_truth(path)) if has_ground_truth else None,
+        missing=missing,
+    )
+
+
+def _text(value: Any) -> str:
+    return value.decode() if isinstance(value, bytes) else str(value)
+
+
+def _check_version(path: Path, version: str) -> None:
+    major = version.split(".")[0]
+    if not major.isdigit():
+        raise FormatError(f"{path}: states no version of the kalux layout ({version!r}); write it again")
+    if int(major) > MAJOR_VERSION:
+        raise FormatError(
+            f"{path}: has version {version} of the kalux layout, this kalux reads up to {MAJOR_VERSION}.x; "
+            "update kalux"
+        )
+
+
+def _common_length(path: Path, file: Any, group: str, names: tuple[str, ...]) -> int:
+    lengths = {name: len(file[group][name]) for name in names}
+    if len(set(lengths.values())) != 1:
+        found = ", ".join(f"{name} {length}" for name, length in lengths.items())
+        raise FormatError(
+            f"{path}: {group} have columns of different lengths ({found}); write the file again"
+        )
+    return next(iter(lengths.values()))
+
+
+def _events(path: Path) -> Iterator[EventArray]:
+    with reading(path, *_DAMAGE), h5py.File(path, "r") as file:
+        columns = [file["events"][name] for name in _COLUMNS]
+        # Whole chunks of the file: reading across their borders decompresses each twice.
+        stored = (columns[0].chunks or (CHUNK_EVENTS,))[0]
+        step = max(CHUNK_EVENTS // stored, 1) * stored
+        for start in range(0, len(columns[0]), step):
+            events: EventArray = np.empty(min(step, len(columns[0]) - start), EVENT_DTYPE)
+            for name, column in zip(_COLUMNS, columns, strict=True):
+                events[name] = column[start : start + step]
+            yield events
+
+
+def _frames(path: Path) -> Iterator[Frame]:
+    with reading(path, *_DAMAGE), h5py.File(path, "r") as file:
+        group = file["frames"]
+        white = float(group.attrs["white"]) if "white" in group.attrs else None
+        starts, ends = group["exposure_start"][...], group["exposure_end"][...]
+        for index, (start, end) in enumerate(zip(starts, ends, strict=True)):
+            yield Frame(group["image"][index], int(start), int(end), white)
+
+
+def _ground_truth(path: Path) -> GroundTruth:
+    with reading(path, *_DAMAGE), h5py.File(path, "r") as file:
+        group = file["ground_truth"]
+        times, images = group["times"][...].astype(np.int64), group["images"][...].astype(np.float32)
+    if images.ndim != 3 or len(times) != len(images):
+        raise FormatError(
+            f"{path}: ground truth has {len(times)} times for {images.shape} images; write it again"
+        )
+    return GroundTruth(times, images)
+
+
+def write(
+    path: str | Path,
+    *,
+    sensor_size: tuple[int, int],
+    events: Iterable[EventArray],
+    frames: Iterable[Frame],
+    exposure_known: bool = True,
+    contrast_threshold: tuple[float, float] | None = None,
+    inverse_covariance: NDArray[np.float64] | None = None,
+    ground_truth: GroundTruth | None = None,
+) -> None:
+    """Write a recording, chunk by chunk, in bounded memory.
+
+    The file appears under its name only when it is complete.
+
+    Parameters
+    ----------
+    path
+        Replaced if it exists.
+    sensor_size
+        (height, width), pixels.
+    events
+        Chunks of `EVENT_DTYPE` in time order, of any length.
+    frames
+        In time order, of one dtype, size and white value.
+    exposure_known
+        Whether the frames carry their exposure, or only a stamp (start and end equal).
+    contrast_threshold
+        (on, off), log intensity.
+    inverse_covariance
+        (256,) 1 / R_bar per 8-bit value, 1/s.
+    ground_truth
+        Reference images.
+
+    Raises
+    ------
+    FrameError
+        If frames differ in dtype, size or white value.
+    OutputError
+        If the file cannot be written.
+    """
+    path = Path(path)
+    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        with _Sink(partial) as sink:
+            # Of all layouts of HDF5, this one has a checksum on every piece of metadata, except on strings of
+            # variable length: damage is then reported, where HDF5 otherwise may crash or never return.
+            with h5py.File(sink, "w", libver=("v110", "v110")) as file:
+                file.attrs["format"] = np.bytes_("kalux")
+                file.attrs["version"] = np.bytes_(_VERSION)
+                file.attrs["sensor_size"] = sensor_size
+                if contrast_threshold is not None:
+                    file.attrs["contrast_threshold"] = contrast_threshold
+                if inverse_covariance is not None:
+                    file["inverse_covariance"] = np.asarray(inverse_covariance, np.float64)
+                if ground_truth is not None:
+                    _write_ground_truth(file.create_group("ground_truth"), ground_truth)
+                _write_events(file.create_group("events"), sink.checked(events))
+                _write_frames(file.create_group("frames"), sink.checked(frames), sensor_size, exposure_known)
+            sink.check()
+        os.replace(partial, path)
+    except OSError as error:
+        reason = one_line(error) if error.errno is None else os.strerror(error.errno)
+        raise OutputError(f"{path}: cannot be written: {reason}") from error
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+class _Sink(io.FileIO):
+    """A file whose failures are reported by `check`, not to HDF5: it crashes when a disk is full."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, "w+")
+        self._error: OSError | None = None
+
+    def write(self, data: Any, /) -> int:
+        view = memoryview(data).cast("B")
+        done = 0
+        while done < len(view) and self._error is None:
+            try:
+                done += super().write(view[done:])
+            except OSError as error:
+                self._error = error
+        return len(view)
+
+    def readinto(self, buffer: Any, /) -> int:
+        view = memoryview(buffer).cast("B")
+        got = super().readinto(view) or 0
+        view[got:] = bytes(len(view) - got)
+        return len(view)
+
+    def check(self) -> None:
+        if self._error is not None:
+            raise self._error
+
+    def checked(self, items: Iterable[T]) -> Iterator[T]:
+        """The same items, as long as the file takes them."""
+        for item in items:
+            self.check()
+            yield item
+
+
+def _packing() -> dict[str, Any]:
+    """Compression, with a checksum of each chunk, which Blosc lacks."""
+    return {"fletcher32": True, **hdf5plugin.Blosc(cname="zstd", clevel=3, shuffle=hdf5plugin.Blosc.SHUFFLE)}
+
+
+def _write_events(group: Any, chunks: Iterable[EventArray]) -> None:
+    columns = {
+        name: group.create_dataset(
+            name, (0,), EVENT_DTYPE[name], maxshape=(None,), chunks=(_EVENTS_PER_CHUNK,), **_packing()
+        )
+        for name in _COLUMNS
+    }
+    count = 0
+    for events in _aligned(chunks):
+        for name, column in columns.items():
+            column.resize((count + len(events),))
+            column[count:] = events[name]
+        count += len(events)
+
+
+def _aligned(chunks: Iterable[EventArray]) -> Iterator[EventArray]:
+    """The same events in whole chunks of the file, so that each is compressed once."""
+    held: list[EventArray] = []
+    count = 0
+    for chunk in chunks:
+        held.append(chunk)
+        count += len(chunk)
+        if count >= _EVENTS_PER_CHUNK:
+            joined = np.concatenate(held)
+            whole = count - count % _EVENTS_PER_CHUNK
+            yield joined[:whole]
+            held, count = [joined[whole:].copy()], count - whole
+    if count:
+        yield np.concatenate(held)
+
+
+def _write_frames(
+    group: Any, frames: Iterable[Frame], sensor_size: tuple[int, int], exposure_known: bool
+) -> None:
+    group.attrs["exposure_known"] = exposure_known
+    images = None
+    starts: list[int] = []
+    ends: list[int] = []
+    for index, frame in enumerate(frames):
+        if images is None:
+            images = _create_images(group, frame.image.shape, frame.image.dtype)
+            first = frame
+            if frame.white is not None:
+                group.attrs["white"] = frame.white
+        if (frame.image.shape, frame.image.dtype, frame.white) != (
+            first.image.shape,
+            first.image.dtype,
+            first.white,
+        ):
+            raise FrameError(
+                f"frame {index} has another size, dtype or white value than frame 0; the file holds one of each"
+            )
+        images.resize(index + 1, axis=0)
+        images[index] = frame.image
+        starts.append(frame.exposure_start)
+        ends.append(frame.exposure_end)
+    if images is None:
+        _create_images(group, sensor_size, np.dtype(np.uint8))
+    group["exposure_start"] = np.array(starts, np.int64)
+    group["exposure_end"] = np.array(ends, np.int64)
+
+
+def _create_images(group: Any, size: tuple[int, ...], dtype: np.dtype[Any]) -> Any:
+    return group.create_dataset(
+        "image", (0, *size), dtype, maxshape=(None, *size), chunks=(1, *size), **_packing()
+    )
+
+
+def _write_ground_truth(group: Any, ground_truth: GroundTruth) -> None:
+    images = np.asarray(ground_truth.images, np.float32)
+    group["times"] = np.asarray(ground_truth.times, np.int64)
+    group.create_dataset(
+        "images", data=images, maxshape=(None, *images.shape[1:]), chunks=(1, *images.shape[1:]), **_packing()
+    )

@@ -1,0 +1,419 @@
+"""The text layout of the IJRR 2017 event camera dataset (Mueggler et al.), as a folder or zipped.
+
+``events.txt`` has a line ``t x y p`` per event, ``images.txt`` a line ``t file`` per frame; ``t`` is in
+seconds, ``x`` and ``y`` 0-based, ``p`` 0 or 1. See https://rpg.ifi.uzh.ch/davis_data.html.
+"""
+
+from __future__ import annotations
+
+import re
+import zipfile
+import zlib
+from collections.abc import Iterator
+from decimal import ROUND_HALF_UP, Decimal
+from functools import cache
+from pathlib import Path
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from kalux.errors import FormatError
+from kalux.events import EVENT_DTYPE, EventArray
+from kalux.frames import Frame
+from kalux.readers.source import Source, reading
+
+_EVENTS: Final = "events.txt"
+_IMAGES: Final = "images.txt"
+# The shortest line, "0 0 0 0\n", has 8 bytes: a block holds at most CHUNK_EVENTS events.
+_BLOCK_BYTES: Final = 8 << 20
+_LONGEST_LINE: Final = 4096
+_PLAIN_DECIMAL: Final = re.compile(r"\d{1,12}(\.\d*)?|\.\d+")
+_DAMAGE: Final = (
+    zipfile.BadZipFile,
+    zlib.error,
+    EOFError,
+    NotImplementedError,  # a compression that zipfile lacks
+    RuntimeError,  # an encrypted member
+    ValueError,
+    KeyError,
+)
+
+_Place = Path | zipfile.Path
+
+
+def recognises(path: Path) -> bool:
+    """Whether the folder or zip has ``events.txt``, at its root or in its one folder."""
+    if path.is_dir():
+        return (path / _EVENTS).is_file()
+    try:
+        return path.is_file() and zipfile.is_zipfile(path) and _root(path) is not None
+    except _DAMAGE:
+        return False
+
+
+def read(path: Path) -> Source:
+    """Open a recording in the IJRR text layout.
+
+    Times are rounded to the nearest microsecond from their decimal digits, not through floating point. The
+    layout has no exposure times. The sensor size is that of the first image; without images, that of a
+    first line ``width height`` of ``events.txt``, else the smallest that holds all events.
+
+    Raises
+    ------
+    FormatError
+        If a line cannot be read (named by its number), or an image is missing, damaged or in colour.
+    InputError
+        If a file cannot be read.
+    """
+    with reading(path, *_DAMAGE):
+        root = _root(path)
+        if root is None:
+            raise FormatError(f"{path}: has no {_EVENTS}; give the folder or zip that contains it")
+        declared_size = _check_beginning(path, root)
+        images, missing = _image_list(path, root)
+    if images:
+        size = _load(path, root, images[0][1]).shape
+        sensor_size = (int(size[0]), int(size[1]))
+        missing += ("The exposure times of the frames are not recorded.",)
+    elif declared_size is not None:
+        sensor_size = declared_size
+    else:
+        sensor_size = _extent(path)
+        missing += ("The sensor size is not recorded; the smallest that holds all events is taken.",)
+
+    @cache
+    def count_events() -> int:
+        return sum(len(chunk) for chunk in _read_events(path))
+
+    def read_frames() -> Iterator[Frame]:
+        place = _root_again(path)
+        for stamp, name in images:
+            yield Frame(_load(path, place, name), stamp, stamp)
+
+    return Source(
+        path=path,
+        format="ijrr",
+        sensor_size=sensor_size,
+        events=lambda: _read_events(path),
+        frames=read_frames,
+        count_events=count_events,
+        count_frames=lambda: len(images),
+        exposure_known=not images,
+        missing=missing,
+    )
+
+
+def _root(path: Path) -> _Place | None:
+    """The folder that holds ``events.txt``, in the file system or inside a zip."""
+    if path.is_dir():
+        return path
+    top = zipfile.Path(path)
+    if (top / _EVENTS).is_file():
+        return top
+    folders = [entry for entry in top.iterdir() if entry.is_dir() and not entry.name.startswith("__MACOSX")]
+    if len(folders) == 1 and (folders[0] / _EVENTS).is_file():
+        return folders[0]
+    return None
+
+
+def _root_again(path: Path) -> _Place:
+    """A handle of its own for each iteration, so that several may run at once."""
+    with reading(path, *_DAMAGE):
+        root = _root(path)
+    if root is None:
+        raise FormatError(f"{path}: {_EVENTS} has gone since the recording was opened")
+    return root
+
+
+# Events
+
+
+def _check_beginning(path: Path, root: _Place) -> tuple[int, int] | None:
+    """Check the unit of time; return (height, width) if the first line is a header ``width height``."""
+    with (root / _EVENTS).open("rb") as file:
+        lines = [line.split() for line in file.read(_LONGEST_LINE).splitlines()[:-1]]
+    size = None
+    if lines and len(lines[0]) == 2 and all(field.isdigit() for field in lines[0]):
+        width, height = map(int, lines[0])
+        size = height, width
+    times = [line[0] for line in lines if len(line) == 4]
+    if times and all(time.isdigit() for time in times) and int(times[-1]) > 0:
+        raise FormatError(
+            f"{path}: the times in {_EVENTS} have no decimal point ({times[-1][:20].decode()!r}), but this layout "
+            "is in seconds; convert them to seconds"
+        )
+    return size
+
+
+def _read_events(path: Path) -> Iterator[EventArray]:
+    root = _root_again(path)
+    buffer = bytearray(_BLOCK_BYTES)  # used again and again: fresh memory costs as much as the parsing
+    filled = line_number = 0
+    with reading(path, *_DAMAGE), (root / _EVENTS).open("rb") as file:
+        while True:
+            got = file.readinto(memoryview(buffer)[filled:])  # type: ignore[attr-defined]
+            if not got and filled:
+                buffer[filled] = _NEWLINE  # the last line may lack its end
+                got = 1
+            if not got:
+                return
+            filled += got
+            end = buffer.rfind(b"\n", 0, filled) + 1
+            if filled - end > _LONGEST_LINE:
+                number = line_number + buffer.count(b"\n", 0, end) + 1
+                raise _bad_line(path, number, bytes(buffer[end:filled]), "the line is too long")
+            if end:
+                events, lines = _parse_block(path, memoryview(buffer)[:end], line_number)
+                buffer[: filled - end] = buffer[end:filled]
+                filled -= end
+                line_number += lines
+                yield events
+
+
+def _parse_block(path: Path, text: memoryview, lines_before: int) -> tuple[EventArray, int]:
+    """The events of whole lines of text, and the number of lines."""
+    array = np.frombuffer(text, np.uint8)
+    events: EventArray = np.empty(np.count_nonzero(array == _NEWLINE), EVENT_DTYPE)
+    count, lines, fault, start = _parse(
+        array, lines_before == 0, events["t"], events["x"], events["y"], events["p"]
+    )
+    if fault:
+        line = bytes(text[int(start) : int(start) + _LONGEST_LINE]).split(b"\n", 1)[0]
+        raise _bad_line(path, lines_before + lines + 1, line, _FAULTS[fault])
+    return events[:count], lines
+
+
+def _bad_line(path: Path, number: int, line: bytes, fault: str) -> FormatError:
+    shown = line[:60].decode("ascii", "replace").strip()
+    return FormatError(
+        f"{path}: {_EVENTS}, line {number}: {fault}: {shown!r}; a line is 't x y p', t in seconds as a plain "
+        "decimal, x and y from 0, p 0 or 1"
+    )
+
+
+def _extent(path: Path) -> tuple[int, int]:
+    height = width = 0
+    for chunk in _read_events(path):
+        height = max(height, int(chunk["y"].max(initial=0)) + 1)
+        width = max(width, int(chunk["x"].max(initial=0)) + 1)
+    if not height:
+        raise FormatError(f"{path}: {_EVENTS} and {_IMAGES} hold neither events nor images")
+    return height, width
+
+
+_FAULTS: Final = {
+    1: "the time is not a plain decimal number of seconds",
+    2: "x is not a pixel coordinate",
+    3: "y is not a pixel coordinate",
+    4: "the polarity is not 0 or 1",
+    5: "there are more than four columns",
+    6: "there are fewer than four columns",
+}
+# Unsigned, of the width of what they are compared with: that keeps the compiled loops free of conversions
+# and of the test for negative indices, and doubles their speed.
+_ONE: Final = np.uint64(1)
+_TEN: Final = np.uint64(10)
+_SECONDS_DIGITS: Final = np.uint64(12)  # keeps microseconds within 64 bits
+_MICRO_DIGITS: Final = np.uint64(6)
+_ZERO: Final = np.uint8(ord("0"))
+_NINE: Final = np.uint8(9)
+_FIVE: Final = np.uint8(5)
+_SPACE, _NEWLINE, _DOT, _HASH = (np.uint8(ord(c)) for c in " \n.#")
+
+
+@njit(cache=True, nogil=True)
+def _parse(
+    text: NDArray[np.uint8],
+    skip_header: bool,
+    t: NDArray[np.int64],
+    x: NDArray[np.uint16],
+    y: NDArray[np.uint16],
+    p: NDArray[np.bool_],
+) -> tuple[int, int, int, np.uint64]:
+    """Parse whole lines. Returns events, whole lines read, fault (0: none), start of the faulty line.
+
+    Blank lines and lines that begin with # are skipped, as is a first line of two numbers (a header).
+    """
+    end = np.uint64(len(text))
+    i = np.uint64(0)
+    count = 0
+    lines = 0
+    while i < end:
+        start = i
+        i = _skip_blanks(text, i)
+        if text[i] == _NEWLINE or text[i] == _HASH:
+            while text[i] != _NEWLINE:
+                i += _ONE
+            i += _ONE
+            lines += 1
+            continue
+        micros, i = _parse_time(text, i)
+        if micros < 0:
+            return count, lines, 1, start
+        column = 1
+        while column < 4:
+            i = _skip_blanks(text, i)
+            if text[i] == _NEWLINE:
+                break
+            value, i = _parse_integer(text, i)
+            if value < 0 or (column == 3 and value > 1):
+                return count, lines, column + 1, start
+            if column == 1:
+                x[count] = value
+            elif column == 2:
+                y[count] = value
+            else:
+                p[count] = value == 1
+            column += 1
+        i = _skip_blanks(text, i)
+        if text[i] != _NEWLINE:
+            return count, lines, 5, start
+        if column == 4:
+            t[count] = micros
+            count += 1
+        elif not (skip_header and lines == 0 and column == 2):
+            return count, lines, 6, start
+        i += _ONE
+        lines += 1
+    return count, lines, 0, end
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _skip_blanks(text: NDArray[np.uint8], i: np.uint64) -> np.uint64:
+    """Skip spaces, tabs and carriage returns, but not the end of the line."""
+    while text[i] <= _SPACE and text[i] != _NEWLINE:
+        i += _ONE
+    return i
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _parse_digits(text: NDArray[np.uint8], i: np.uint64, value: np.uint64) -> tuple[np.uint64, np.uint64]:
+    """Append decimal digits to a number; overlong ones wrap and are refused by their length."""
+    while True:
+        digit = np.uint8(text[i] - _ZERO)
+        if digit > _NINE:
+            return value, i
+        value = value * _TEN + np.uint64(digit)
+        i += _ONE
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _parse_integer(text: NDArray[np.uint8], i: np.uint64) -> tuple[np.int64, np.uint64]:
+    """An integer up to 65535 that ends at a blank; -1 if it is none."""
+    start = i
+    value, i = _parse_digits(text, i, np.uint64(0))
+    if i == start or i - start > _TEN or value > np.uint64(65535) or text[i] > _SPACE:
+        return np.int64(-1), i
+    return np.int64(value), i
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _parse_time(text: NDArray[np.uint8], i: np.uint64) -> tuple[np.int64, np.uint64]:
+    """Seconds as microseconds, rounded half up; -1 if it is not a plain decimal."""
+    start = i
+    value, i = _parse_digits(text, i, np.uint64(0))
+    digits = i - start
+    if digits > _SECONDS_DIGITS:
+        return np.int64(-1), i
+    decimals = np.uint64(0)
+    if text[i] == _DOT:
+        i += _ONE
+        while decimals < _MICRO_DIGITS:
+            digit = np.uint8(text[i] - _ZERO)
+            if digit > _NINE:
+                break
+            value = value * _TEN + np.uint64(digit)
+            decimals += _ONE
+            i += _ONE
+    digits += decimals
+    if decimals == _MICRO_DIGITS:
+        next_digit = np.uint8(text[i] - _ZERO)
+        if next_digit <= _NINE:
+            value += np.uint64(next_digit >= _FIVE)
+            _, i = _parse_digits(text, i, np.uint64(0))
+    while decimals < _MICRO_DIGITS:
+        value *= _TEN
+        decimals += _ONE
+    if digits == np.uint64(0) or text[i] > _SPACE:
+        return np.int64(-1), i
+    return np.int64(value), i
+
+
+# Images
+
+
+def _image_list(path: Path, root: _Place) -> tuple[list[tuple[int, str]], tuple[str, ...]]:
+    """(stamp in us, file name) of each frame, and what is missing."""
+    if not (root / _IMAGES).is_file():
+        return [], (f"There is no {_IMAGES}, so there are no frames.",)
+    images = []
+    for number, line in enumerate((root / _IMAGES).read_bytes().decode("utf-8").splitlines(), 1):
+        fields = line.split(maxsplit=1)
+        if not fields or fields[0].startswith("#"):
+            continue
+        if len(fields) != 2 or not _PLAIN_DECIMAL.fullmatch(fields[0]):
+            raise FormatError(
+                f"{path}: {_IMAGES}, line {number}: {line[:60]!r} is not 't file' with t in seconds as a plain decimal"
+            )
+        images.append((_microseconds(fields[0]), fields[1].strip()))
+    absent = [name for _, name in images if not (root / name).is_file()]
+    if absent:
+        raise FormatError(
+            f"{path}: {len(absent)} of {len(images)} images listed in {_IMAGES} are missing, the first is "
+            f"{absent[0][:60]!r}; copy or download the recording again"
+        )
+    return images, () if images else (f"{_IMAGES} is empty, so there are no frames.",)
+
+
+def _microseconds(seconds: str) -> int:
+    return int((Decimal(seconds) * 1_000_000).to_integral_value(ROUND_HALF_UP))
+
+
+def _load(path: Path, root: _Place, name: str) -> NDArray[Any]:
+    """A grey image of 8 or 16 bits."""
+    with reading(path, *_DAMAGE):
+        data = (root / name).read_bytes()
+    image = None
+    if _is_whole(data):
+        try:
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        except cv2.error:
+            image = None
+    if image is None:
+        raise FormatError(f"{path}: {name!r} is not an image, or damaged; copy or download it again")
+    if image.ndim == 3:
+        if not (image[..., :3] == image[..., :1]).all():
+            raise FormatError(
+                f"{path}: {name!r} is in colour, which kalux does not read yet; convert the images to grey"
+            )
+        image = np.ascontiguousarray(image[..., 0])
+    return image
+
+
+_PNG_SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
+_JPEG_START, _JPEG_END = b"\xff\xd8\xff", b"\xff\xd9"
+
+
+def _is_whole(data: bytes) -> bool:
+    """Whether an image file has its end and its checksums are right.
+
+    Checked before decoding, because decoders fill a truncated image with grey, or print to the terminal.
+    """
+    if data.startswith(_JPEG_START):
+        return _JPEG_END in data[-64:]
+    if not data.startswith(_PNG_SIGNATURE):
+        return len(data) > 0
+    position = len(_PNG_SIGNATURE)
+    while position + 12 <= len(data):
+        length = int.from_bytes(data[position : position + 4], "big")
+        kind_and_content = data[position + 4 : position + 8 + length]
+        checksum = data[position + 8 + length : position + 12 + length]
+        if zlib.crc32(kind_and_content) != int.from_bytes(checksum, "big") or len(checksum) < 4:
+            return False
+        if kind_and_content.startswith(b"IEND"):
+            return True
+        position += 12 + length
+    return False

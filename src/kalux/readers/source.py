@@ -1,0 +1,123 @@
+"""What a reader returns: a description of the recording, and ways to stream it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux.errors import FormatError, InputError, KaluxError
+from kalux.events import EventArray
+from kalux.frames import Frame
+
+CHUNK_EVENTS: Final = 1 << 20
+"""Events in a chunk, at most, where a format leaves the choice to the reader: 16 MiB."""
+
+
+@dataclass(frozen=True)
+class GroundTruth:
+    """Reference images that came with a recording.
+
+    Attributes
+    ----------
+    times
+        (T,) int64, us.
+    images
+        (T, height, width) float32, linear, 1.0 = a saturated frame pixel.
+    """
+
+    times: NDArray[np.int64]
+    images: NDArray[np.float32]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Source:
+    """A recording as a reader found it, before any check of its contents.
+
+    Attributes
+    ----------
+    path
+        The file or folder.
+    format
+        Short name of the format, e.g. ``"aedat4"``.
+    sensor_size
+        (height, width), pixels.
+    events
+        Called for a fresh iterator over time-ordered, bounded chunks of `EVENT_DTYPE`.
+    frames
+        Called for a fresh iterator over frames. Where ``exposure_known`` is False, start and end of the
+        exposure both hold the frame's stamp.
+    count_events, count_frames
+        Number of events and frames; may read through the file.
+    exposure_known
+        Whether the recording stores the exposure times of its frames.
+    contrast_threshold
+        (on, off) thresholds in log intensity, both positive, if the recording states them.
+    inverse_covariance
+        (256,) the released datasets' ``f_Q``: 1 / R_bar for each 8-bit value, 1/s; None if absent.
+    ground_truth
+        Called for the reference images; None if there are none.
+    missing
+        What the recording lacks, one sentence each, for the user.
+    """
+
+    path: Path
+    format: str
+    sensor_size: tuple[int, int]
+    events: Callable[[], Iterator[EventArray]]
+    frames: Callable[[], Iterator[Frame]]
+    count_events: Callable[[], int]
+    count_frames: Callable[[], int]
+    exposure_known: bool = True
+    contrast_threshold: tuple[float, float] | None = None
+    inverse_covariance: NDArray[np.float64] | None = None
+    ground_truth: Callable[[], GroundTruth] | None = None
+    missing: tuple[str, ...] = field(default=())
+
+
+def one_line(error: BaseException) -> str:
+    """What another library's error says, on one line of printable characters."""
+    text = " ".join(str(error).split()) or type(error).__name__
+    text = "".join(c if c.isprintable() else "?" for c in text)
+    return text if len(text) <= 200 else text[:200] + "..."
+
+
+@contextmanager
+def reading(path: Path, *damage: type[Exception]) -> Iterator[None]:
+    """Turn what other libraries raise inside the block into kalux errors.
+
+    Parameters
+    ----------
+    path
+        The file, for the message.
+    damage
+        Exceptions that mean that the content is damaged. An ``OSError`` without an error number means that
+        too: that is how HDF5 reports it.
+
+    Raises
+    ------
+    FormatError
+        For damage.
+    InputError
+        Where the operating system refuses to read.
+    """
+    try:
+        yield
+    except KaluxError:
+        raise
+    except OSError as error:
+        if error.errno is not None:
+            raise InputError(f"{path}: cannot be read: {os.strerror(error.errno)}") from error
+        raise _damaged(path, error) from error
+    except damage as error:
+        raise _damaged(path, error) from error
+
+
+def _damaged(path: Path, error: Exception) -> FormatError:
+    return FormatError(f"{path}: damaged or incomplete ({one_line(error)}); copy or download it again")

@@ -1,0 +1,398 @@
+"""The engine: push events, push frames, read at any time.
+
+Time is cut into segments, one per frame (`kalux.filters.methods`). The engine holds the filter's state at the
+start of the current segment and a cursor that has moved over some of its events. Reading evaluates the
+cursor's closed form and changes nothing, so results depend neither on when and how often one reads nor on how
+events were split into pushes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux.errors import InputError
+from kalux.events import EVENT_DTYPE, EventArray, as_events, check_events
+from kalux.filters.akf import State
+from kalux.filters.methods import Method, Segment, Shot, make_method, take_shot
+from kalux.filters.readout import HighlightPrior, intensity
+from kalux.frames import Frame, check_frame
+from kalux.models.camera import Camera, Response
+from kalux.settings import Settings, preset
+
+_UNKNOWN_THRESHOLD: Final = 0.25
+"""Contrast threshold assumed where neither a recording nor the user says one: in the middle of what DAVIS and
+Prophesee sensors are set to (0.1 to 0.4). kalux.reconstruct estimates it instead."""
+
+
+@dataclass(frozen=True, eq=False)
+class Image:
+    """One reconstructed image.
+
+    Attributes
+    ----------
+    t
+        Its time, int us.
+    intensity
+        float32 (H, W), linear: 1.0 = a saturated frame pixel at the reference exposure; more in highlights.
+    variance
+        float32 (H, W), P: the variance of the log intensity (20). None for the complementary filter.
+    final
+        Whether more data can no longer change it. With lookahead an image is final one frame later.
+    """
+
+    t: int
+    intensity: NDArray[np.float32]
+    variance: NDArray[np.float32] | None
+    final: bool
+
+
+class _Progress:
+    """A segment under way: its cursor, and how many buffered events it has taken."""
+
+    def __init__(self, segment: Segment, memory: Any, cursor: Any, ready: bool, starts_frame: bool) -> None:
+        self.segment, self.memory, self.cursor = segment, memory, cursor
+        self.ready = ready  # the segment will not change any more
+        self.starts_frame = starts_frame  # False for the lead-in before the first frame's node
+        self.taken = 0
+        self.latest = segment.start  # time of the last event taken
+
+
+class Reconstructor:
+    """Reconstruct from a live stream, or from anything that can be pushed in time order.
+
+    Frames and events may arrive in any interleaving; each kind must be in time order. ``read(t)`` returns the
+    best estimate that what was pushed allows.
+
+    Parameters
+    ----------
+    sensor_size
+        (height, width), pixels.
+    preset, settings
+        Name of a preset, or a whole `Settings`, which wins.
+    lookahead
+        True: an image uses the frame after it too (11)-(13), so that it is final one frame later. False: only
+        the past, for robots.
+    contrast_threshold
+        Log-intensity step of an event, or (on, off). Settings win. Default 0.25, and the pixels' own are learned.
+    threshold_is_estimate
+        Whether the threshold was estimated: highlights beyond white, where no frame checks it, are then
+        believed less.
+    reference_exposure
+        Exposure time, us, at which a saturated pixel is 1.0; default: that of the first frame. Settings win.
+    inverse_covariance
+        A released ``f_Q``: 1 / R_bar for each level of the response, its shape used as f^w (5).
+
+    Raises
+    ------
+    SettingsError
+        If a setting or preset is unknown or out of range.
+    """
+
+    def __init__(
+        self,
+        sensor_size: tuple[int, int],
+        *,
+        preset: str = "default",
+        settings: Settings | None = None,
+        lookahead: bool = True,
+        contrast_threshold: float | tuple[float, float] | None = None,
+        threshold_is_estimate: bool = False,
+        reference_exposure: int | None = None,
+        inverse_covariance: NDArray[np.float64] | None = None,
+    ) -> None:
+        height, width = (int(n) for n in sensor_size)
+        if height <= 0 or width <= 0:
+            raise InputError(f"sensor_size is {sensor_size}; (height, width) in pixels is needed")
+        self.sensor_size = (height, width)
+        self.settings = settings if settings is not None else _preset(preset)
+        self.lookahead = lookahead
+        on, off = _pair(contrast_threshold)
+        chosen = self.settings.events
+        self._estimated = threshold_is_estimate or (on is None and chosen.threshold_on is None)
+        self.thresholds = (
+            chosen.threshold_on or on or _UNKNOWN_THRESHOLD,
+            chosen.threshold_off or off or _UNKNOWN_THRESHOLD,
+        )
+        camera = self.settings.camera
+        response = Response.named(camera.response)
+        self._camera = (
+            Camera(response, None, camera.saturation)
+            if inverse_covariance is None
+            else Camera.from_inverse_covariance(inverse_covariance, response, camera.saturation)
+        )
+        self._reference = camera.reference_exposure or reference_exposure
+        self._method: Method = make_method(self.settings, self.thresholds, lookahead, self.sensor_size)
+        self._shots: list[Shot] = []  # from the current segment's frame on
+        self._chunks: list[EventArray] = []  # events after the current segment's start
+        self._state: State | None = None  # at the current segment's start
+        self._memory: Any = None
+        self._progress: _Progress | None = None
+        self._last_frame: Frame | None = None
+        self._frame_count = 0
+        self._event_count = 0
+        self._last_event: int | None = None
+        self._complete_until: int | None = None
+        self._finished = False
+
+    # Pushing.
+
+    def push_frame(self, frame: Frame) -> None:
+        """Add the next frame.
+
+        Raises
+        ------
+        FrameError, ExposureError
+            Wrong size, not finite, out of order, empty exposure.
+        """
+        self._require_open()
+        check_frame(frame, self.sensor_size, index=self._frame_count, previous=self._last_frame)
+        self._reference = self._reference or frame.exposure
+        self._shots.append(take_shot(frame, self._camera, self._reference))
+        self._last_frame = frame
+        self._frame_count += 1
+
+    def push_events(self, events: Any) -> None:
+        """Add the next events, in any layout that `as_events` takes: times in us, 0-based coordinates.
+
+        Raises
+        ------
+        EventError
+            Unknown layout, unsorted, older than what was pushed or declared complete, outside the sensor.
+        """
+        self._require_open()
+        array = as_events(events)
+        previous = self._last_event
+        if self._complete_until is not None:
+            previous = max(self._complete_until + 1, previous or 0)
+        check_events(array, self.sensor_size, first_index=self._event_count, previous_t=previous)
+        if len(array) == 0:
+            return
+        self._event_count += len(array)
+        self._last_event = int(array["t"][-1])
+        self.advance(self._last_event - 1)  # more events may carry the last one's time
+        start = self._start_time()
+        self._chunks.append(array if start is None else array[array["t"].searchsorted(start, "right") :])
+
+    def advance(self, t: int) -> None:
+        """Declare that all events up to ``t`` (us) have been pushed: silence is information too."""
+        self._complete_until = t if self._complete_until is None else max(t, self._complete_until)
+
+    def covers(self, t: int) -> bool:
+        """Whether all events up to ``t`` (us) are known to be here."""
+        return self._finished or (self._complete_until is not None and self._complete_until >= t)
+
+    def finish(self) -> None:
+        """Declare that nothing more comes: what is left becomes final."""
+        self._finished = True
+
+    # Reading.
+
+    @property
+    def begin_time(self) -> int | None:
+        """The first time, us, that can be read; None before the first frame."""
+        if self._state is None and self._shots:
+            return self._method.begin_time(self._shots[0])
+        return self._start_time()
+
+    @property
+    def final_until(self) -> int | None:
+        """Images up to this time, us, are final; None if none is. It grows with what is pushed."""
+        if not self._shots:
+            return None
+        if self._finished:
+            return np.iinfo(np.int64).max
+        if not self.lookahead:
+            return self._complete_until
+        complete = [shot for shot in self._shots if self._is_complete(shot)]
+        return self._method.node(complete[-1]) if complete else self._start_time()
+
+    def read(self, t: int) -> Image:
+        """The image at time ``t`` (us). Never changes the result of any other read.
+
+        Reads may repeat, and go back as far as the newest frame that is final.
+
+        Raises
+        ------
+        InputError
+            If no frame has been pushed, or ``t`` lies before what can still be read.
+        """
+        t = int(t)
+        if not self._shots:
+            raise InputError("read: no frame has been pushed yet; events alone say nothing of the intensity")
+        begin = self.begin_time
+        assert begin is not None
+        if t < begin:
+            raise InputError(
+                f"read: {t} us lies before {begin} us, the earliest time that can be read "
+                "(the first frame, or what later reads have passed)"
+            )
+        progress = self._progress_to(t)
+        self._take(progress, t)
+        final_until = self.final_until
+        return self._image(progress, t, final_until is not None and t <= final_until)
+
+    def _image(self, progress: _Progress, t: int, final: bool) -> Image:
+        log_intensity, variance = self._method.read(progress.segment, progress.cursor, t)
+        shots = self._shots[:2] if progress.starts_frame else self._shots[:1]
+        offset, scale = self.settings.camera.log_offset, self.settings.filter.highlight_scale
+        events = self.settings.events
+        spread = events.extrapolation_spread if self._estimated else events.threshold_spread
+        prior = HighlightPrior(
+            white=float(np.log(max(shot.white for shot in shots) + offset)),
+            scale2=scale**2 if variance is not None else 0.0,
+            stretch=spread**2 / scale if scale > 0 else 0.0,
+        )
+        return Image(
+            t=t,
+            intensity=intensity(
+                log_intensity, np.zeros_like(log_intensity) if variance is None else variance, offset, prior
+            ),
+            variance=None if variance is None else variance.astype(np.float32),
+            final=final,
+        )
+
+    # Segments.
+
+    def _require_open(self) -> None:
+        if self._finished:
+            raise InputError("push: finish() was called, nothing can be pushed after it")
+
+    def _is_complete(self, shot: Shot) -> bool:
+        """Whether all events that the frame's segment boundary needs are here."""
+        return self.covers(self._method.needed_until(shot))
+
+    def _start_time(self) -> int | None:
+        """Start of the current segment."""
+        if self._progress is not None:
+            return self._progress.segment.start
+        if self._state is not None:
+            return self._method.node(self._shots[0])
+        return None
+
+    def _buffer(self) -> EventArray:
+        if len(self._chunks) != 1:
+            self._chunks = [np.concatenate(self._chunks) if self._chunks else np.empty(0, EVENT_DTYPE)]
+        return self._chunks[0]
+
+    def _progress_to(self, t: int) -> _Progress:
+        """The segment that holds ``t``, with a cursor that has taken no event after it; commits those before."""
+        if self._state is None:
+            if not self._is_complete(self._shots[0]):
+                return self._provisional(t)
+            self._begin()
+        while True:
+            progress = self._open()
+            if t <= progress.segment.end:
+                return progress if t >= progress.latest else self._restart(progress)
+            self._take(progress, progress.segment.end)
+            self._commit(progress)
+
+    def _begin(self) -> None:
+        """Take the first frame, now that the events of its exposure are here."""
+        shot = self._shots[0]
+        self._memory, lead_in, self._state = self._method.start(shot, self._buffer())
+        self._drop_events(self._method.begin_time(shot))
+        if lead_in is not None:
+            self._progress = _Progress(
+                lead_in,
+                self._memory,
+                self._method.begin(lead_in, self._state),
+                ready=True,
+                starts_frame=False,
+            )
+
+    def _provisional(self, t: int) -> _Progress:
+        """The same with what there is of the first exposure's events; made anew for every read."""
+        shot, buffer = self._shots[0], self._buffer()
+        memory, lead_in, state = self._method.start(shot, buffer)
+        segment, starts_frame = lead_in, False
+        if segment is not None and t > segment.end:
+            lead = _Progress(segment, memory, self._method.begin(segment, state), False, starts_frame=False)
+            lead.taken = int(buffer["t"].searchsorted(segment.start, "right"))
+            self._take(lead, segment.end)
+            state, segment = self._end_state(lead), None
+        if segment is None:
+            segment, memory = self._method.segment(memory, shot, None, buffer)
+            starts_frame = True
+        progress = _Progress(segment, memory, self._method.begin(segment, state), False, starts_frame)
+        progress.taken = int(buffer["t"].searchsorted(segment.start, "right"))
+        return progress
+
+    def _open(self) -> _Progress:
+        """The current segment; made anew when what was pushed meanwhile completes it."""
+        assert self._state is not None
+        complete = len(self._shots) > 1 and self._is_complete(self._shots[1])
+        if self._progress is None or (complete and not self._progress.ready):
+            segment, memory = self._method.segment(
+                self._memory, self._shots[0], self._shots[1] if complete else None, self._buffer()
+            )
+            cursor = self._method.begin(segment, self._state)
+            self._progress = _Progress(segment, memory, cursor, complete, starts_frame=True)
+        return self._progress
+
+    def _end_state(self, progress: _Progress) -> State:
+        value, variance = self._method.read(progress.segment, progress.cursor, progress.segment.end)
+        newest = self._method.newest(progress.cursor)
+        return State(value, np.zeros_like(value) if variance is None else variance, newest)
+
+    def _commit(self, progress: _Progress) -> None:
+        """Move the state to the end of a final segment; forget its frame and events."""
+        self._state = self._end_state(progress)
+        self._memory = progress.memory
+        self._progress = None
+        if progress.starts_frame:
+            self._shots.pop(0)
+        self._drop_events(progress.segment.end)
+
+    def _restart(self, progress: _Progress) -> _Progress:
+        """The same segment with a fresh cursor, to read at an earlier time."""
+        assert self._state is not None
+        cursor = self._method.begin(progress.segment, self._state)
+        self._progress = _Progress(
+            progress.segment, progress.memory, cursor, progress.ready, progress.starts_frame
+        )
+        return self._progress
+
+    def _drop_events(self, until: int) -> None:
+        """Forget the events up to ``until``."""
+        kept = []
+        for chunk in self._chunks:
+            rest = chunk[chunk["t"].searchsorted(until, "right") :]
+            if len(rest):
+                # A small rest must not keep a large chunk in memory.
+                whole = rest.base if rest.base is not None else rest
+                kept.append(rest.copy() if 2 * len(rest) < whole.size else rest)
+        self._chunks = kept
+
+    def _take(self, progress: _Progress, t: int) -> None:
+        """Take the cursor over the events up to ``t`` that it has not taken yet."""
+        first = 0
+        for chunk in self._chunks:
+            last = first + len(chunk)
+            if progress.taken < last:
+                fresh = chunk[progress.taken - first :]
+                fresh = fresh[: fresh["t"].searchsorted(t, "right")]
+                if len(fresh) == 0:
+                    return
+                self._method.advance(progress.segment, progress.cursor, fresh)
+                progress.taken += len(fresh)
+                progress.latest = int(fresh["t"][-1])
+            first = last
+
+
+def _preset(name: str) -> Settings:
+    return preset(name)
+
+
+def _pair(threshold: float | tuple[float, float] | None) -> tuple[float | None, float | None]:
+    if threshold is None:
+        return None, None
+    on, off = (threshold, threshold) if isinstance(threshold, (int, float)) else threshold
+    for value in (on, off):
+        if not (np.isfinite(value) and value > 0):
+            raise InputError(f"contrast threshold is {value}; it must be positive (log intensity, e.g. 0.2)")
+    return float(on), float(off)

@@ -1,0 +1,222 @@
+"""A recording: sensor size, events and frames as bounded, time-ordered, checked streams."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux import readers
+from kalux.errors import ExposureError, InputError
+from kalux.events import EventArray, as_events, check_events
+from kalux.frames import Frame, Stamp, check_frame, place_exposure
+from kalux.readers import CHUNK_EVENTS, GroundTruth, Source
+
+
+class EventStream:
+    """The events of a recording: iterate for chunks of `EVENT_DTYPE`; ``len()`` is the number of events."""
+
+    def __init__(self, chunks: Callable[[], Iterator[EventArray]], count: Callable[[], int]) -> None:
+        self._chunks, self._count = chunks, count
+
+    def __iter__(self) -> Iterator[EventArray]:
+        return self._chunks()
+
+    def __len__(self) -> int:
+        return self._count()
+
+
+class FrameStream:
+    """The frames of a recording: iterate for `Frame` objects; ``len()`` is the number of frames."""
+
+    def __init__(self, frames: Callable[[], Iterator[Frame]], count: Callable[[], int]) -> None:
+        self._frames, self._count = frames, count
+
+    def __iter__(self) -> Iterator[Frame]:
+        return self._frames()
+
+    def __len__(self) -> int:
+        return self._count()
+
+
+class Recording:
+    """A hybrid recording, opened with `kalux.open` or made with `Recording.from_arrays`.
+
+    Iterating the same recording twice gives the same chunks and frames twice. Every chunk and frame is
+    checked on the way (order, sensor bounds, sizes, exposure times); what is wrong is raised with its index.
+
+    Attributes
+    ----------
+    source
+        What the reader found: path, format, thresholds, ground truth.
+    sensor_size
+        (height, width), pixels.
+    exposure_known
+        Whether every frame has an exposure interval, from the file or from ``exposure``.
+    """
+
+    def __init__(self, source: Source, *, exposure: int | None = None, stamp: Stamp = "start") -> None:
+        if exposure is not None and exposure <= 0:
+            raise ExposureError(f"exposure is {exposure} us; it must be positive")
+        if stamp not in ("start", "middle", "end"):
+            raise InputError(f"stamp is {stamp!r}; it must be 'start', 'middle' or 'end'")
+        self.source = source
+        self.sensor_size = source.sensor_size
+        self.exposure_known = source.exposure_known or exposure is not None
+        self._exposure = exposure
+        self._stamp: Stamp = stamp
+
+    @classmethod
+    def from_arrays(
+        cls,
+        events: Any,
+        frames: Iterable[Frame],
+        *,
+        sensor_size: tuple[int, int],
+        columns: str | None = None,
+        time_unit: str | None = None,
+        contrast_threshold: float | tuple[float, float] | None = None,
+        inverse_covariance: NDArray[np.float64] | None = None,
+        ground_truth: GroundTruth | None = None,
+        name: str = "arrays",
+    ) -> Recording:
+        """A recording in memory.
+
+        Parameters
+        ----------
+        events
+            Any container that `as_events` accepts, with its ``columns`` and ``time_unit``.
+        frames
+            `Frame` objects in time order.
+        sensor_size
+            (height, width), pixels.
+        contrast_threshold
+            Log-intensity step of an event, or (on, off), if known.
+        inverse_covariance
+            (256,) 1 / R_bar per 8-bit value (the released ``f_Q``), if known.
+        ground_truth
+            Reference images, if any.
+        name
+            Stands for the path in messages.
+
+        Raises
+        ------
+        EventError, FrameError, ExposureError
+            At once, not only when iterated.
+        """
+        array = as_events(events, columns=columns, time_unit=time_unit)
+        frame_list = list(frames)
+        if isinstance(contrast_threshold, (int, float)):
+            contrast_threshold = (float(contrast_threshold), float(contrast_threshold))
+
+        def chunks() -> Iterator[EventArray]:
+            for start in range(0, len(array), CHUNK_EVENTS):
+                yield array[start : start + CHUNK_EVENTS]
+
+        recording = cls(
+            Source(
+                path=Path(name),
+                format="arrays",
+                sensor_size=(int(sensor_size[0]), int(sensor_size[1])),
+                events=chunks,
+                frames=lambda: iter(frame_list),
+                count_events=lambda: len(array),
+                count_frames=lambda: len(frame_list),
+                contrast_threshold=contrast_threshold,
+                inverse_covariance=inverse_covariance,
+                ground_truth=None if ground_truth is None else lambda: ground_truth,
+            )
+        )
+        for _ in recording.events():
+            pass
+        for _ in recording.frames():
+            pass
+        return recording
+
+    @property
+    def contrast_threshold(self) -> tuple[float, float] | None:
+        """(on, off) thresholds in log intensity that the recording states, or None."""
+        return self.source.contrast_threshold
+
+    def ground_truth(self) -> GroundTruth | None:
+        """Reference images that came with the recording, or None."""
+        return None if self.source.ground_truth is None else self.source.ground_truth()
+
+    def events(self) -> EventStream:
+        """The events, as checked, time-ordered chunks of bounded size."""
+        return EventStream(self._checked_events, self.source.count_events)
+
+    def frames(self) -> FrameStream:
+        """The frames, checked, in time order, with their exposures.
+
+        Raises
+        ------
+        ExposureError
+            If the recording has no exposure times and none was given.
+        """
+        if not self.exposure_known:
+            raise ExposureError(
+                f"{self.source.path}: no exposure times are recorded; give the exposure time in us "
+                "(--exposure 10000 or exposure=10000) and what the frame stamp marks (--stamp start, middle or end)"
+            )
+        return self.stamped_frames()
+
+    def stamped_frames(self) -> FrameStream:
+        """The frames even where their exposure is unknown: start and end then both hold the stamp."""
+        return FrameStream(self._checked_frames, self.source.count_frames)
+
+    def _checked_events(self) -> Iterator[EventArray]:
+        count, previous_t = 0, None
+        for chunk in self.source.events():
+            check_events(
+                chunk,
+                self.sensor_size,
+                where=str(self.source.path),
+                first_index=count,
+                previous_t=previous_t,
+            )
+            if len(chunk):
+                count += len(chunk)
+                previous_t = int(chunk["t"][-1])
+                yield chunk
+
+    def _checked_frames(self) -> Iterator[Frame]:
+        previous = None
+        for index, frame in enumerate(self.source.frames()):
+            if self._exposure is not None:
+                frame = place_exposure(frame, self._exposure, self._stamp)
+            check_frame(
+                frame,
+                self.sensor_size,
+                where=str(self.source.path),
+                index=index,
+                previous=previous,
+                exposure_known=self.exposure_known,
+            )
+            previous = frame
+            yield frame
+
+
+def open(path: str | Path, *, exposure: int | None = None, stamp: Stamp = "start") -> Recording:
+    """Open a recording of any known format, recognised by its content.
+
+    Parameters
+    ----------
+    path
+        File or folder: AEDAT4, IJRR text folder or zip, released ``.mat``, kalux HDF5.
+    exposure
+        Exposure time of all frames, us, for recordings that do not store it. Given explicitly, it
+        replaces stored exposure times.
+    stamp
+        With ``exposure``: whether a frame's time stamp (or stored exposure start) is the start, the middle or
+        the end of its exposure.
+
+    Raises
+    ------
+    InputError, FormatError
+        If the file is missing, unknown or damaged.
+    """
+    return Recording(readers.read(path), exposure=exposure, stamp=stamp)

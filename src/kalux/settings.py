@@ -1,0 +1,276 @@
+"""Settings: frozen dataclasses with units and reasons, presets, TOML in and out."""
+
+from __future__ import annotations
+
+import dataclasses
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+
+from kalux.errors import SettingsError
+
+FilterName = Literal["akf", "cf"]
+AugmentationName = Literal["bridge", "paper"]
+SolutionName = Literal["exact", "printed"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraSettings:
+    """The frame camera, equations (3)-(9).
+
+    Attributes
+    ----------
+    response
+        ``"linear"`` (raw sensor values: DAVIS, machine vision), ``"srgb"`` or ``"gamma:EXPONENT"``.
+    log_offset
+        I_0 of equation (8); white = 1. Events are steps of log I, so it must be small; below the noise of a
+        dark pixel it only magnifies that noise. 0.03 (docs/tuning.md). The paper's code: 1.
+    frame_noise
+        sigma_im of equation (6) as the standard deviation of a well exposed pixel of one frame; white = 1.
+        0.006 is what the paper's 7e5 1/s amounts to at 40 frames/s.
+    confidence
+        1 / sigma_im^2 of equation (6) as the paper uses it, a rate in 1/s: 7e5 (DAVIS), 7e7 (FLIR). For
+        augmentation "paper" only.
+    weight_floor
+        Smallest f^w, which caps R_bar. 0.09 is the released code's; for augmentation "paper" only, since
+        the other gives clipped pixels no weight at all.
+    saturation
+        Response, 0 to 1, from which a pixel counts as clipped. 0.98: a few levels below 255, for sensors with
+        fixed pattern noise at the top.
+    reference_exposure
+        Exposure time, us, at which a saturated pixel has intensity 1; None: the recording's median.
+    """
+
+    response: str = "linear"
+    log_offset: float = 0.03
+    frame_noise: float = 0.006
+    confidence: float = 7e5
+    weight_floor: float = 0.09
+    saturation: float = 0.98
+    reference_exposure: int | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class EventSettings:
+    """Event noise, equations (1)-(2), and the calibration of the contrast threshold, (12).
+
+    Attributes
+    ----------
+    threshold_on, threshold_off
+        Contrast thresholds c, log intensity; None: what the recording states, else an estimate from it.
+    threshold_spread
+        Relative standard deviation of the threshold between pixels, prior of its calibration. 0.1: data
+        sheets and the literature give 2 to 10 % (Lichtsteiner 2008: 2.1 % of contrast at c = 0.2), real
+        recordings more.
+    step_variance
+        Variance of one event's step in units of c^2. 0.2 (docs/tuning.md).
+    quantisation_variance
+        Variance, in c^2, of the change that events have not yet told at both ends of a frame interval: two
+        uniform distributions one threshold wide, 2/12.
+    deblur_variance
+        Variance, in c^2, that each event of an exposure adds to the deblurred frame. 0.05 (docs/tuning.md).
+    noise_rate
+        Background noise, Hz per pixel, that makes isolated events doubtful. 3: typical of a DAVIS at its
+        default biases in room light.
+    extrapolation_spread
+        Standard deviation of the log of the scale of what events say of highlights beyond white, where no
+        frame can check it, when the threshold is only an estimate. 1.3 (docs/tuning.md).
+    sigma_proc2, sigma_iso2, sigma_ref2, refractory_bound
+        The paper's event noise: 0.0005 1/s, 0.03 1/s, 0.01, and 10 ms (released code), in s. For
+        augmentation "paper" only.
+    """
+
+    threshold_on: float | None = None
+    threshold_off: float | None = None
+    threshold_spread: float = 0.1
+    step_variance: float = 0.2
+    quantisation_variance: float = 1 / 6
+    deblur_variance: float = 0.05
+    noise_rate: float = 3.0
+    extrapolation_spread: float = 1.3
+    sigma_proc2: float = 0.0005
+    sigma_iso2: float = 0.03
+    sigma_ref2: float = 0.01
+    refractory_bound: float = 0.01
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilterSettings:
+    """The filter, equations (14)-(21).
+
+    Attributes
+    ----------
+    kind
+        ``"akf"``, the asynchronous Kalman filter, or ``"cf"``, the complementary filter.
+    augmentation
+        ``"bridge"``: frames joined by events weighted by their uncertainties; ``"paper"``: (10)-(13).
+    solution
+        Of (16) and (19): ``"exact"`` for a moving L^A and a varying R, or ``"printed"``, (17) and (20).
+        Augmentation "bridge" is always exact.
+    deblur
+        Remove motion blur with the events of the exposure (EDI).
+    initial_variance
+        P at the start: 0.09 in the released code; 0.3 where the first frame is clipped.
+    highlight_scale
+        Standard deviation, in log intensity, of how far scenes go beyond white: what is not known of a
+        highlight is drawn towards white by it. 0 turns it off. 1.0: highlights up to e times white are usual.
+    cutoff
+        Of the complementary filter, Hz. 1.0 (Scheerlinck 2018 uses 2 pi rad/s).
+    """
+
+    kind: FilterName = "akf"
+    augmentation: AugmentationName = "bridge"
+    solution: SolutionName = "exact"
+    deblur: bool = True
+    initial_variance: float = 0.3
+    highlight_scale: float = 1.0
+    cutoff: float = 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """All settings of a reconstruction. Start from `preset` and change with `dataclasses.replace`."""
+
+    camera: CameraSettings = field(default_factory=CameraSettings)
+    events: EventSettings = field(default_factory=EventSettings)
+    filter: FilterSettings = field(default_factory=FilterSettings)
+
+    def __post_init__(self) -> None:
+        _check(self)
+
+
+def preset(name: str) -> Settings:
+    """The settings of a preset.
+
+    Raises
+    ------
+    SettingsError
+        If there is no such preset.
+    """
+    try:
+        return PRESETS[name]
+    except KeyError:
+        raise SettingsError(f"preset: unknown preset {name!r}; known are {', '.join(PRESETS)}") from None
+
+
+def to_dict(settings: Settings) -> dict[str, dict[str, Any]]:
+    """As nested plain values, for TOML; values that are None are left out."""
+    return {
+        group: {name: value for name, value in values.items() if value is not None}
+        for group, values in dataclasses.asdict(settings).items()
+    }
+
+
+def from_dict(values: Mapping[str, Any], base: Settings) -> Settings:
+    """Change ``base`` by nested plain values.
+
+    Raises
+    ------
+    SettingsError
+        If a group or a setting is unknown, or a value has the wrong type or range.
+    """
+    groups = {}
+    for group, entries in values.items():
+        if group not in ("camera", "events", "filter"):
+            raise SettingsError(f"settings: unknown group [{group}]; known are camera, events, filter")
+        current = getattr(base, group)
+        known = {entry.name for entry in dataclasses.fields(current)}
+        if not isinstance(entries, Mapping):
+            raise SettingsError(f"settings: {group} is not a table of settings")
+        for name in entries:
+            if name not in known:
+                raise SettingsError(
+                    f"settings: unknown setting {group}.{name}; known are {', '.join(sorted(known))}"
+                )
+        groups[group] = dataclasses.replace(current, **entries)
+    return dataclasses.replace(base, **groups)
+
+
+def load(path: str | Path, base: Settings) -> Settings:
+    """Change ``base`` by a TOML file: tables ``[camera]``, ``[events]``, ``[filter]``, as in ``kalux.toml``.
+
+    An output's ``kalux.toml`` can be given as it is: its ``[settings.*]`` tables are used.
+
+    Raises
+    ------
+    SettingsError
+        If the file cannot be read, is not TOML, or holds an unknown setting.
+    """
+    try:
+        values = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise SettingsError(f"{path}: cannot be read: {error}") from error
+    except tomllib.TOMLDecodeError as error:
+        raise SettingsError(f"{path}: not valid TOML: {error}") from error
+    try:
+        return from_dict(values.get("settings", values), base)
+    except SettingsError as error:
+        raise SettingsError(f"{path}: {error}") from None
+
+
+_POSITIVE: Final = {
+    "log_offset",
+    "frame_noise",
+    "confidence",
+    "saturation",
+    "reference_exposure",
+    "threshold_on",
+    "threshold_off",
+    "initial_variance",
+    "cutoff",
+}
+_CHOICES: Final = {
+    "kind": ("akf", "cf"),
+    "augmentation": ("bridge", "paper"),
+    "solution": ("exact", "printed"),
+}
+
+
+def _check(settings: Settings) -> None:
+    for group in ("camera", "events", "filter"):
+        values = getattr(settings, group)
+        for entry in dataclasses.fields(values):
+            _check_value(f"{group}.{entry.name}", entry.name, getattr(values, entry.name), entry.default)
+    if settings.camera.saturation > 1 or settings.camera.weight_floor > 1:
+        raise SettingsError("settings: camera.saturation and camera.weight_floor must be at most 1")
+
+
+def _check_value(label: str, name: str, value: Any, default: Any) -> None:
+    if name in _CHOICES:
+        if value not in _CHOICES[name]:
+            raise SettingsError(
+                f"settings: {label} is {value!r}; it must be one of {', '.join(_CHOICES[name])}"
+            )
+    elif isinstance(default, (bool, str)):
+        if not isinstance(value, type(default)):
+            raise SettingsError(f"settings: {label} is {value!r}; {type(default).__name__} is needed")
+    elif value is None:
+        if default is not None:
+            raise SettingsError(f"settings: {label} needs a number")
+    elif isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
+        raise SettingsError(f"settings: {label} is {value!r}; a finite number is needed")
+    elif value < 0 or (name in _POSITIVE and value == 0):
+        raise SettingsError(
+            f"settings: {label} is {value}; it must be {'positive' if name in _POSITIVE else '0 or more'}"
+        )
+
+
+_PAPER: Final = Settings(
+    camera=CameraSettings(log_offset=1.0),
+    filter=FilterSettings(
+        augmentation="paper", solution="printed", initial_variance=0.09, highlight_scale=0.0
+    ),
+)
+
+PRESETS: Final[Mapping[str, Settings]] = {
+    "default": Settings(),
+    "iccv2021": _PAPER,
+    "iccv2021-flir": dataclasses.replace(_PAPER, camera=dataclasses.replace(_PAPER.camera, confidence=7e7)),
+    "cf": Settings(filter=FilterSettings(kind="cf", deblur=False, highlight_scale=0.0)),
+}
+"""``default``: best on ground truth. ``iccv2021``: the paper to the letter with the confidence of its DAVIS,
+``iccv2021-flir`` of its FLIR. ``cf``: the complementary filter."""

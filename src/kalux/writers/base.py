@@ -1,0 +1,166 @@
+"""What all writers share: the image they take, the checks, and how they end."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Protocol, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux.errors import InputError, KaluxError, OutputError
+from kalux.writers.files import uninterrupted
+
+
+class ImageLike(Protocol):
+    """An image that can be written."""
+
+    @property
+    def t(self) -> int:
+        """Time, us."""
+
+    @property
+    def intensity(self) -> NDArray[np.float32]:
+        """(height, width), linear, 1.0 = a saturated frame pixel, more in highlights."""
+
+    @property
+    def variance(self) -> NDArray[np.float32]:
+        """(height, width), variance of the log intensity; infinite where nothing is known."""
+
+
+class Writer(ABC):
+    """Writes images one by one; a context manager.
+
+    Leaving the ``with`` block normally is `close`, leaving it by an exception, KeyboardInterrupt included, is
+    `stop`. A signal that would interrupt a single write or the closing is handled right after it.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._times: tuple[int, int] | None = None
+        self._images = 0
+        self._shape: tuple[int, ...] | None = None
+        self._failed = False
+        self._closed = False
+
+    @property
+    def images(self) -> int:
+        """The number of images written."""
+        return self._images
+
+    def write(self, image: ImageLike) -> None:
+        """Write the next image.
+
+        Raises
+        ------
+        InputError
+            The image is not float32 (height, width), or of another size than those before it; in a video,
+            also where it is not later than the one before it or does not fit the rate.
+        OutputError
+            It cannot be written (full disk, no permission), the writer is closed or has failed before, or
+            the image has an intensity that is not finite or a variance that is NaN. The last is an error in
+            kalux: such an image is never written.
+        """
+        if self._closed or self._failed:
+            state = "closed" if self._closed else "unusable after an error"
+            raise OutputError(f"{self.path}: cannot write an image, the writer is {state}")
+        try:
+            check_image(image, self._images, self._shape)
+            with uninterrupted():
+                self._write(image)
+                first = self._times[0] if self._times else int(image.t)
+                self._times = first, int(image.t)
+                self._shape = image.intensity.shape
+                self._images += 1
+                self._written()
+        except BaseException:
+            # An interrupt is raised here only before the image or after all of it.
+            self._failed = True
+            raise
+
+    def close(self) -> None:
+        """Finish the output and mark it complete (incomplete if a write has failed). Twice is once.
+
+        Raises
+        ------
+        OutputError
+            The output cannot be finished; or a video has no images.
+        """
+        self._end(complete=not self._failed)
+
+    def stop(self) -> None:
+        """Finish the output with the images so far and mark it incomplete.
+
+        Raises
+        ------
+        OutputError
+            The output cannot be finished.
+        """
+        self._end(complete=False)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if error is None:
+            self.close()
+            return
+        try:
+            self.stop()
+        except KaluxError as second:
+            error.add_note(str(second))
+
+    def _end(self, *, complete: bool) -> None:
+        if self._closed:
+            return
+        self._closed = True
+        with uninterrupted():
+            self._finish(complete)
+
+    @abstractmethod
+    def _write(self, image: ImageLike) -> None:
+        """Write a checked image, all of it or nothing."""
+
+    def _written(self) -> None:  # noqa: B027
+        """Called when the counts include the image."""
+
+    @abstractmethod
+    def _finish(self, complete: bool) -> None:
+        """Finish the files. Called once."""
+
+
+def check_image(image: ImageLike, index: int, shape: tuple[int, ...] | None) -> None:
+    """Check the type, the size and the values of an image; ``shape`` is that of the images before it.
+
+    Raises
+    ------
+    InputError
+        Wrong dtype or size.
+    OutputError
+        An intensity is not finite, or a variance is NaN.
+    """
+    for name, values in (("intensity", image.intensity), ("variance", image.variance)):
+        if values.dtype != np.float32 or values.ndim != 2 or values.size == 0:
+            raise InputError(
+                f"image {index}: the {name} is {values.dtype} of shape {values.shape}; "
+                "float32 of shape (height, width) is needed"
+            )
+        if values.shape != (shape or image.intensity.shape):
+            wanted = " x ".join(str(n) for n in shape or image.intensity.shape)
+            found = " x ".join(str(n) for n in values.shape)
+            raise InputError(f"image {index}: the {name} is {found} (height x width), {wanted} is needed")
+    _refuse(~np.isfinite(image.intensity), "intensity", "not finite", image.t, index)
+    _refuse(np.isnan(image.variance), "variance", "NaN", image.t, index)
+
+
+def _refuse(bad: NDArray[Any], name: str, what: str, t: int, index: int) -> None:
+    if bad.any():
+        y, x = (int(i[0]) for i in np.nonzero(bad))
+        raise OutputError(
+            f"image {index} at {t} us: the {name} at x={x}, y={y} is {what}, so it is not written; "
+            "this is an error in kalux, please report it"
+        )

@@ -1,0 +1,289 @@
+"""A video: H.264 in MP4."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+from av.container import OutputContainer
+from av.video.stream import VideoStream
+from numpy.typing import NDArray
+
+from kalux.display import DisplaySettings, Float32, ToneState, tone_map_next
+from kalux.errors import InputError, MissingDependencyError, OutputError, SettingsError
+from kalux.writers.base import ImageLike, Writer
+from kalux.writers.files import output_errors, remove_quietly, temporary_path
+from kalux.writers.settings_file import SettingsFile, require_ours
+
+PRESETS = (
+    "ultrafast",
+    "superfast",
+    "veryfast",
+    "faster",
+    "fast",
+    "medium",
+    "slow",
+    "slower",
+    "veryslow",
+)
+MICROSECOND = Fraction(1, 1_000_000)
+
+
+@dataclass(frozen=True)
+class VideoSettings:
+    """How a video is compressed.
+
+    Attributes
+    ----------
+    crf
+        Constant rate factor of x264, 0 to 51: less is better and larger; 18 looks like the original.
+    preset
+        Of x264, ``ultrafast`` to ``veryslow``: slower is smaller.
+    slow_motion
+        Times are stretched by this factor: 10 shows 300 images per second at 30.
+    """
+
+    crf: float = 18.0
+    preset: str = "veryfast"
+    slow_motion: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.crf <= 51:
+            raise SettingsError(f"video: crf is {self.crf}; it must be 0 to 51")
+        if self.preset not in PRESETS:
+            raise SettingsError(f"video: preset is {self.preset!r}; it must be one of {', '.join(PRESETS)}")
+        if not 1e-3 <= self.slow_motion <= 1e6:
+            raise SettingsError(f"video: slow_motion is {self.slow_motion}; it must be 0.001 to 1000000")
+
+
+@dataclass(frozen=True)
+class Ticks:
+    """The clock of a video.
+
+    Attributes
+    ----------
+    rate
+        Images per second of the recording, or None to count microseconds.
+    slow_motion
+        Factor by which a tick lasts longer in the video than in the recording.
+    """
+
+    rate: Fraction | None
+    slow_motion: Fraction
+
+    @property
+    def time_base(self) -> Fraction:
+        """Length of a tick in the video, seconds."""
+        return (1 / self.rate if self.rate else MICROSECOND) * self.slow_motion
+
+    def count(self, microseconds: int) -> int:
+        """The ticks in a time since the first image.
+
+        Raises
+        ------
+        InputError
+            The time is not a multiple of 1 / rate, by more than a tenth or a microsecond.
+        """
+        if self.rate is None:
+            return microseconds
+        exact = microseconds * MICROSECOND * self.rate
+        ticks = round(exact)
+        if abs(exact - ticks) > max(Fraction(1, 10), self.rate * MICROSECOND):
+            raise InputError(
+                f"video: an image {microseconds} us after the first does not fit {float(self.rate):g} images "
+                "per second; leave the rate out to keep the time stamps as they are"
+            )
+        return ticks
+
+
+class VideoWriter(Writer):
+    """Encodes into a temporary file beside the output, which gets its name when it is finished."""
+
+    def __init__(
+        self,
+        path: Path,
+        display: DisplaySettings,
+        video: VideoSettings,
+        ticks: Ticks,
+        settings: SettingsFile,
+        *,
+        overwrite: bool,
+    ) -> None:
+        super().__init__(path)
+        self._display = display
+        self._video = video
+        self._ticks = ticks
+        self._settings = settings
+        self._state: ToneState | None = None
+        self._open: tuple[OutputContainer, VideoStream] | None = None
+        self._temporary = temporary_path(path)
+        self._last = -1
+        self._whole = True
+        with output_errors(path, "the video cannot be written"):
+            check_replaceable(path, settings.path, overwrite=overwrite)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._temporary.touch()
+
+    def _write(self, image: ImageLike) -> None:
+        first = self._times[0] if self._times else int(image.t)
+        pts = self._ticks.count(int(image.t) - first)
+        if pts <= self._last:
+            raise InputError(
+                f"video: the image at {image.t} us is not later than the one before it; "
+                "the images of a video must be in time order"
+            )
+        mapped, following = tone_map_next(image, self._display, self._state)
+        frame = video_frame(mapped)
+        frame.pts, frame.time_base = pts, self._ticks.time_base
+        if self._open is None:
+            with encoder_errors(self.path, "the video cannot be written"):
+                self._open = open_container(
+                    self._temporary, frame.width, frame.height, self._ticks, self._video
+                )
+        container, stream = self._open
+        self._whole = False
+        with encoder_errors(self.path, f"the video failed after {self._images} images and is removed"):
+            container.mux(stream.encode(frame))
+        self._whole = True
+        self._state, self._last = following, pts
+
+    def _finish(self, complete: bool) -> None:
+        try:
+            if self._open is None and complete:
+                raise OutputError(f"{self.path}: not written, there was no image")
+            if not self._whole:
+                raise OutputError(f"{self.path}: not written, the encoder has failed")
+            if self._open is not None:
+                self._finish_container(*self._open)
+                self._publish(complete)
+        finally:
+            if self._open is not None:
+                with contextlib.suppress(OSError, av.FFmpegError):
+                    self._open[0].close()
+            remove_quietly(self._temporary)
+
+    def _finish_container(self, container: OutputContainer, stream: VideoStream) -> None:
+        with encoder_errors(self.path, "the video cannot be finished and is removed"):
+            container.mux(stream.encode(None))
+            container.close()
+            finished = frames_of(self._temporary)
+        if finished != self._images:
+            raise OutputError(
+                f"{self.path}: {finished} of {self._images} images are in the video, so it is removed"
+            )
+
+    def _publish(self, complete: bool) -> None:
+        with output_errors(self.path, "the video cannot get its name and is removed"):
+            # The settings of a former video must not stand beside the new one, not even for a moment.
+            self._settings.path.unlink(missing_ok=True)
+            os.replace(self._temporary, self.path)
+        with output_errors(self._settings.path, f"the video {self.path} is whole, its settings are missing"):
+            self._settings.write(complete=complete, images=self._images, times=self._times)
+
+
+@contextlib.contextmanager
+def encoder_errors(path: Path, consequence: str) -> Iterator[None]:
+    """Turn errors of the system and of FFmpeg into an OutputError."""
+    with output_errors(path, consequence):
+        try:
+            yield
+        except av.FFmpegError as error:
+            if isinstance(error, OSError):
+                raise
+            raise OutputError(f"{path}: {error}; {consequence}") from error
+
+
+def make_ticks(rate_hz: float | None, video: VideoSettings) -> Ticks:
+    """The clock for a rate, or for time stamps as they are.
+
+    Raises
+    ------
+    SettingsError
+        The rate is not positive, or above 1 MHz.
+    """
+    if rate_hz is not None and not (math.isfinite(rate_hz) and 1e-3 <= rate_hz <= 1e6):
+        raise SettingsError(f"rate: {rate_hz} images per second; it must be 0.001 to 1000000")
+    rate = None if rate_hz is None else Fraction(rate_hz).limit_denominator(100_000)
+    return Ticks(rate, Fraction(video.slow_motion).limit_denominator(1000))
+
+
+def check_replaceable(path: Path, settings: Path, *, overwrite: bool) -> None:
+    """Check that a video and its settings file are not there, or may be replaced.
+
+    Raises
+    ------
+    OutputError
+        One is there and ``overwrite`` is False, or it is not a file, or the settings are not of kalux.
+    """
+    if os.path.lexists(path) and not path.is_file():
+        raise OutputError(f"{path}: not a file; choose another name for the video")
+    for existing in (path, settings):
+        if os.path.lexists(existing) and not overwrite:
+            raise OutputError(f"{existing}: there already; choose another name, or allow overwriting")
+    require_ours(settings)
+
+
+def open_container(
+    path: Path, width: int, height: int, ticks: Ticks, video: VideoSettings
+) -> tuple[OutputContainer, VideoStream]:
+    """A new MP4 file and its stream, for frames of even width and height.
+
+    Raises
+    ------
+    MissingDependencyError
+        PyAV was built without x264.
+    OSError
+        The file cannot be opened.
+    """
+    rate = ticks.rate / ticks.slow_motion if ticks.rate else Fraction(30)
+    container = av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"})
+    try:
+        stream = container.add_stream("libx264", rate=rate)
+    except (av.codec.codec.UnknownCodecError, ValueError) as error:
+        raise MissingDependencyError(
+            "video: this build of PyAV has no H.264 encoder (libx264); install the wheel: pip install av"
+        ) from error
+    stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+    stream.time_base = ticks.time_base
+    stream.codec_context.time_base = ticks.time_base
+    stream.codec_context.color_range = 1  # limited, 16 to 235, which every player takes
+    stream.options = {"crf": f"{video.crf:g}", "preset": video.preset}
+    return container, stream
+
+
+def video_frame(mapped: Float32) -> av.VideoFrame:
+    """A grey frame, yuv420p in the limited range, from values 0 to 1; odd sizes are padded.
+
+    Parameters
+    ----------
+    mapped
+        (height, width). Where a size is odd, the last row or column is repeated.
+    """
+    height, width = mapped.shape
+    padded = np.pad(mapped, ((0, height % 2), (0, width % 2)), mode="edge")
+    frame = av.VideoFrame(padded.shape[1], padded.shape[0], "yuv420p")
+    luma = np.rint(16 + 219 * padded).astype(np.uint8)
+    neutral = np.full((luma.shape[0] // 2, luma.shape[1] // 2), 128, np.uint8)
+    for plane, values in zip(frame.planes, (luma, neutral, neutral), strict=True):
+        plane.update(_plane_bytes(values, plane.line_size, plane.buffer_size))
+    frame.color_range = 1
+    return frame
+
+
+def frames_of(path: Path) -> int:
+    """The number of frames that a video's header counts, without decoding it."""
+    with av.open(str(path)) as container:
+        return container.streams.video[0].frames
+
+
+def _plane_bytes(values: NDArray[np.uint8], line_size: int, buffer_size: int) -> bytes:
+    buffer = np.zeros((buffer_size // line_size, line_size), np.uint8)
+    buffer[: values.shape[0], : values.shape[1]] = values
+    return buffer.tobytes()

@@ -1,0 +1,221 @@
+"""Two frames joined by events: conservation, its limits, and what it learns of the thresholds."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kalux.augmentation.bridge import (
+    UNMEASURED,
+    BridgeNoise,
+    Latent,
+    Thresholds,
+    bridge,
+    extend,
+    extend_backward,
+    nominal_thresholds,
+)
+
+NOISE = BridgeNoise(threshold_on=0.3, threshold_off=0.2, step_variance=0.012, quantisation_variance=0.01)
+START, END = 10_000, 50_000
+SECONDS = 0.04
+
+
+def latent(value, variance):
+    value, variance = np.broadcast_arrays(np.asarray(value, float), np.asarray(variance, float))
+    return Latent(np.atleast_2d(value).copy(), np.atleast_2d(variance).copy())
+
+
+def counts(*values):
+    return np.atleast_2d(np.array(values, float))
+
+
+def join(first, second, on, off, thresholds=None, noise=NOISE):
+    thresholds = thresholds or nominal_thresholds(first.value.shape, 0.1)
+    return bridge(first, second, on, off, thresholds, noise, START, END)
+
+
+def reached(segment, on, off):
+    """L^A at the end: from the start by all steps and by the slope."""
+    seconds = (segment.end - segment.start) * 1e-6
+    return segment.augmented + segment.step_on * on - segment.step_off * off + segment.slope * seconds
+
+
+variances = st.floats(1e-8, 1.0) | st.just(UNMEASURED)
+
+
+# --- conservation ---------------------------------------------------------------------------------------
+
+
+@given(
+    values=st.tuples(st.floats(-4, 1), st.floats(-4, 1)),
+    spreads=st.tuples(st.floats(1e-8, 1.0), variances),
+    on=st.integers(0, 60),
+    off=st.integers(0, 60),
+    scales=st.tuples(st.floats(0.3, 3.0), st.floats(0.3, 3.0)),
+    doubts=st.tuples(st.floats(0.0, 0.3), st.floats(0.0, 0.3)),
+    noise=st.tuples(st.floats(0.0, 0.1), st.floats(1e-6, 0.1)),
+)
+def test_the_mismatch_is_shared_out_to_the_last_bit(values, spreads, on, off, scales, doubts, noise):
+    """K1: what frames, thresholds, steps and slope take is the mismatch: L^A ends at the second frame's posterior."""
+    first, second = latent(values[0], spreads[0]), latent(values[1], spreads[1])
+    on, off = counts(on), counts(off)
+    thresholds = Thresholds(*(np.full((1, 1), v) for v in (*scales, *doubts)))
+    scalars = BridgeNoise(0.3, 0.2, *noise)
+    segment, _ = bridge(first, second, on, off, thresholds, scalars, START, END)
+    gain = (segment.slope * SECONDS) / scalars.quantisation_variance
+    np.testing.assert_allclose(segment.augmented, first.value + gain * first.variance, rtol=1e-9, atol=1e-9)
+    if spreads[1] < UNMEASURED:
+        expected = second.value - gain * second.variance
+        np.testing.assert_allclose(reached(segment, on, off), expected, rtol=1e-7, atol=1e-7)
+
+
+@given(st.floats(-4, 1), st.floats(-4, 1), st.integers(0, 30), st.integers(0, 30))
+def test_sure_frames_are_both_hit(a, b, on, off):
+    segment, _ = join(latent(a, 1e-14), latent(b, 1e-14), counts(on), counts(off))
+    np.testing.assert_allclose(segment.augmented, a, atol=1e-10)
+    np.testing.assert_allclose(reached(segment, counts(on), counts(off)), b, atol=1e-10)
+
+
+def test_posterior_by_hand():
+    """Two frames of variance .02 and .03, nothing else uncertain but .01 of quantisation: shares 2, 3 and 1 of 6."""
+    noise = BridgeNoise(0.3, 0.2, 0.0, 0.01)
+    segment, _ = join(latent(0.0, 0.02), latent(0.6, 0.03), counts(0), counts(0), noise=noise)
+    np.testing.assert_allclose(segment.augmented, 0.2, rtol=1e-12)
+    np.testing.assert_allclose(segment.slope * SECONDS, 0.1, rtol=1e-12)
+    np.testing.assert_allclose(reached(segment, 0, 0), 0.3, rtol=1e-12)
+
+
+def test_the_threshold_takes_the_mismatch_where_it_is_what_is_unknown():
+    """Then it is equation (12): four events of 0.3 nominal span 1.6, so each is a step of 0.4."""
+    thresholds = nominal_thresholds((1, 1), 10.0)
+    noise = BridgeNoise(0.3, 0.2, 1e-12, 1e-12)
+    segment, learned = join(latent(0.0, 1e-9), latent(1.6, 1e-9), counts(4), counts(0), thresholds, noise)
+    np.testing.assert_allclose(segment.step_on, 0.4, rtol=1e-6)
+    np.testing.assert_allclose(learned.on, 0.4 / 0.3, rtol=1e-6)
+    np.testing.assert_allclose(segment.slope, 0.0, atol=1e-6)
+
+
+def test_on_and_off_thresholds_move_in_opposite_directions():
+    """The pixel got brighter than its events tell: on steps were larger, off steps smaller."""
+    segment, learned = join(latent(0.0, 1e-6), latent(0.9, 1e-6), counts(3), counts(3))
+    assert segment.step_on > NOISE.threshold_on
+    assert segment.step_off < NOISE.threshold_off
+    assert learned.on > 1 > learned.off
+
+
+# --- limits ---------------------------------------------------------------------------------------------
+
+
+def test_a_silent_pixel_is_a_straight_line():
+    segment, learned = join(latent(-1.0, 1e-14), latent(-0.8, 1e-14), counts(0), counts(0))
+    np.testing.assert_allclose(segment.augmented, -1.0, atol=1e-10)
+    np.testing.assert_allclose(segment.slope, 0.2 / SECONDS, rtol=1e-9)
+    np.testing.assert_allclose([learned.on, learned.off], 1.0, rtol=1e-12)
+
+
+@pytest.mark.parametrize("clipped", ["first", "second", "both"])
+def test_a_clipped_end_leaves_the_steps_alone(clipped):
+    on, off = counts(5), counts(2)
+    first = latent(0.5, UNMEASURED if clipped != "second" else 1e-4)
+    second = latent(-1.0, UNMEASURED if clipped != "first" else 1e-4)
+    segment, learned = join(first, second, on, off)
+    np.testing.assert_allclose(segment.step_on, 0.3, rtol=1e-9)
+    np.testing.assert_allclose(segment.step_off, 0.2, rtol=1e-9)
+    np.testing.assert_allclose(segment.slope, 0.0, atol=1e-9)
+    np.testing.assert_allclose([learned.on, learned.off], 1.0, rtol=1e-9)
+    if clipped == "first":  # back from the end: -1.0 - (5 x 0.3 - 2 x 0.2)
+        np.testing.assert_allclose(segment.augmented, -2.1, rtol=1e-3)
+    elif clipped == "second":
+        np.testing.assert_allclose(segment.augmented, 0.5, rtol=1e-9)
+
+
+def test_information_goes_from_one_end_to_the_other():
+    """Each event moves its variance; all events together leave what the frame at the other end has."""
+    segment, _ = join(latent(0.0, 0.02), latent(0.1, 0.03), counts(4), counts(3))
+    assert (segment.start, segment.end) == (START, END)
+    np.testing.assert_allclose(segment.forward_variance, 0.02, rtol=1e-12)
+    np.testing.assert_allclose(segment.backward_variance - 7 * segment.step_variance, 0.03, rtol=1e-9)
+    assert segment.step_variance == NOISE.step_variance
+    np.testing.assert_allclose(segment.rate * SECONDS, 0.5, rtol=1e-12)
+
+
+def test_extend_holds_one_frame():
+    frame, thresholds = latent([0.1, -2.0], [0.02, UNMEASURED]), nominal_thresholds((1, 2), 0.1)
+    segment = extend(frame, thresholds, NOISE, START, END, SECONDS)
+    np.testing.assert_array_equal(segment.augmented, frame.value)
+    np.testing.assert_array_equal(segment.forward_variance, frame.variance)
+    assert (segment.slope == 0).all()
+    assert (segment.backward_variance >= UNMEASURED).all()
+    np.testing.assert_allclose((segment.step_on, segment.step_off), ([[0.3, 0.3]], [[0.2, 0.2]]))
+    assert segment.rate == 1 / SECONDS
+
+
+def test_extend_backward_arrives_at_the_frame():
+    on, off = counts(2, 0), counts(1, 0)
+    frame, thresholds = latent([0.1, -2.0], [0.02, 0.03]), nominal_thresholds((1, 2), 0.1)
+    segment = extend_backward(frame, on, off, thresholds, NOISE, START, END)
+    np.testing.assert_allclose(reached(segment, on, off), frame.value, rtol=1e-12)
+    np.testing.assert_allclose(segment.augmented, [[0.1 - 0.4, -2.0]], rtol=1e-12)
+    np.testing.assert_allclose(segment.backward_variance, [[0.02 + 3 * 0.012, 0.03]], rtol=1e-12)
+    assert (segment.forward_variance >= UNMEASURED).all()
+
+
+# --- learning -------------------------------------------------------------------------------------------
+
+
+@given(
+    mismatch=st.floats(-3, 3),
+    spread=variances,
+    on=st.integers(0, 200),
+    off=st.integers(0, 200),
+    before=st.floats(1e-6, 0.2),
+)
+def test_variances_stay_positive_and_never_grow_but_by_drift(mismatch, spread, on, off, before):
+    thresholds = Thresholds(np.ones((1, 1)), np.ones((1, 1)), counts(before), counts(before))
+    _, learned = join(latent(0.0, 1e-4), latent(mismatch, spread), counts(on), counts(off), thresholds)
+    for after, count in ((learned.on_variance, on), (learned.off_variance, off)):
+        assert 0 < after <= before + 1.001e-5
+        if count >= 5 and spread < 0.01 and before > 0.01 and on + off == count:
+            assert after < before
+    assert 0.3 <= learned.on <= 3.0
+    assert 0.3 <= learned.off <= 3.0
+
+
+def test_thresholds_of_the_pixels_are_learned():
+    """Thirty intervals of a pixel population with a spread of 10 %, frames noisy: the errors fall to a third."""
+    rng = np.random.default_rng(0)
+    shape = (40, 50)
+    true_on, true_off = 1 + 0.1 * rng.standard_normal((2, *shape))
+    noise = BridgeNoise(0.3, 0.2, 0.0, 0.3 * 0.2 / 6)
+    thresholds = nominal_thresholds(shape, 0.1)
+    level = np.zeros(shape)
+    spreads = [thresholds.on_variance.mean()]
+    for _ in range(30):
+        on, off = rng.integers(0, 8, (2, *shape)).astype(float)
+        change = 0.3 * true_on * on - 0.2 * true_off * off
+        unseen = np.sqrt(noise.quantisation_variance) * rng.standard_normal(shape)
+        seen = latent(level, 1e-4), latent(level + change + unseen, 1e-4)
+        _, thresholds = bridge(*seen, on, off, thresholds, noise, START, END)
+        spreads.append(thresholds.on_variance.mean())
+    assert np.abs(thresholds.on - true_on).mean() < np.abs(1 - true_on).mean() / 3
+    assert np.abs(thresholds.off - true_off).mean() < np.abs(1 - true_off).mean() / 3
+    assert (np.diff(spreads) < 0).all()
+
+
+def test_the_learned_variance_tells_the_error():
+    """The posterior is calibrated: errors over their standard deviation have a variance of about 1."""
+    rng = np.random.default_rng(1)
+    shape = (60, 60)
+    true_on = 1 + 0.1 * rng.standard_normal(shape)
+    noise = BridgeNoise(0.3, 0.2, 0.005, 0.01)
+    thresholds, none = nominal_thresholds(shape, 0.1), np.zeros(shape)
+    for _ in range(10):
+        on = rng.integers(1, 6, shape).astype(float)
+        error = np.sqrt(2 * 1e-3 + 0.005 * on + 0.01) * rng.standard_normal(shape)
+        second = latent(0.3 * true_on * on + error, 1e-3)
+        _, thresholds = bridge(latent(none, 1e-3), second, on, none, thresholds, noise, START, END)
+    z2 = (thresholds.on - true_on) ** 2 / thresholds.on_variance
+    assert 0.85 < z2.mean() < 1.15

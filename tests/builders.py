@@ -1,0 +1,107 @@
+"""Small recordings for tests: by hand, at random, and simulated."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from kalux import PRESETS, EVENT_DTYPE, Frame, Recording, Settings
+from kalux.datasets import SensorSettings, Simulation, pan, photograph_scene, simulate
+from kalux.events import make_events
+
+
+def events(*rows):
+    """Rows of (t, x, y, p), in us and 0-based, to an event array."""
+    columns = list(zip(*rows, strict=True)) if rows else [(), (), (), ()]
+    return make_events(*(np.array(column, np.int64) for column in columns))
+
+
+def pixel_events(times, polarities, x=0, y=0):
+    """Events of one pixel."""
+    return events(*((t, x, y, p) for t, p in zip(times, polarities, strict=True)))
+
+
+def frame(value, start, end, size=(1, 1), dtype=np.uint8):
+    """A frame of one value, or of an array."""
+    return Frame(np.broadcast_to(np.asarray(value, dtype), np.shape(value) or size).copy(), start, end)
+
+
+def altered(settings: Settings, group: str, **values) -> Settings:
+    """Settings with some values of one group changed."""
+    return dataclasses.replace(settings, **{group: dataclasses.replace(getattr(settings, group), **values)})
+
+
+VARIANTS = {
+    "default": PRESETS["default"],
+    "iccv2021": PRESETS["iccv2021"],
+    "iccv2021-exact": altered(PRESETS["iccv2021"], "filter", solution="exact"),
+    "cf": PRESETS["cf"],
+}
+
+
+class Stream(NamedTuple):
+    """Events and frames to push."""
+
+    sensor_size: tuple[int, int]
+    events: np.ndarray
+    frames: list[Frame]
+
+
+@lru_cache(maxsize=64)
+def random_stream(seed: int, *, frames: int = 4, count: int = 150, shift: int = 0) -> Stream:
+    """Exposures of uneven length, clipped pixels, events on the exposures' edges and at the same times."""
+    rng = np.random.default_rng(seed)
+    height, width = 3, 4
+    t, shots, edges = 20_000, [], []
+    for _ in range(frames):
+        length = int(rng.integers(2_000, 16_000))
+        levels = rng.integers(0, 300, (height, width)).clip(0, 255).astype(np.uint8)
+        shots.append(Frame(levels, t + shift, t + length + shift))
+        edges += [t, t + length // 2, t + length]
+        t += length + int(rng.integers(0, 25_000))
+    times = rng.integers(0, t + 20_000, count)
+    on_edge = rng.random(count) < 0.3
+    times[on_edge] = rng.choice(edges, int(on_edge.sum()))
+    times.sort()
+    out = np.empty(count, EVENT_DTYPE)
+    out["t"] = times + shift
+    out["x"], out["y"] = rng.integers(0, width, count), rng.integers(0, height, count)
+    out["p"] = rng.random(count) < 0.5
+    return Stream((height, width), out, shots)
+
+
+def blocks(low=0.02, high=0.6, *, shape=(300, 300), seed=0, count=400):
+    """A picture of overlapping rectangles of radiance ``low`` to ``high``, evenly in the logarithm."""
+    rng = np.random.default_rng(seed)
+    picture = np.full(shape, np.sqrt(low * high))
+    for _ in range(count):
+        y, x = rng.integers(0, shape[0]), rng.integers(0, shape[1])
+        h, w = rng.integers(6, 40, 2)
+        picture[y : y + h, x : x + w] = np.exp(rng.uniform(np.log(low), np.log(high)))
+    return picture
+
+
+@lru_cache(maxsize=8)
+def moving_blocks(
+    low: float = 0.02,
+    high: float = 0.6,
+    *,
+    sensor: SensorSettings | None = None,
+    exposures: tuple[int, ...] | None = None,
+    duration: int = 500_000,
+    size: tuple[int, int] = (32, 40),
+    speed: float = 60.0,
+) -> Simulation:
+    """A camera that pans over `blocks`, ``speed`` in pixels/s; what is more than 1 saturates."""
+    scene = photograph_scene(blocks(low, high), pan(speed), sensor_size=size, duration=duration)
+    return simulate(scene, sensor, exposures=exposures)
+
+
+def unlabelled(simulation: Simulation) -> Recording:
+    """The simulated recording without its contrast thresholds."""
+    return Recording.from_arrays(
+        simulation.events, simulation.frames, sensor_size=simulation.scene.sensor_size, name="unlabelled"
+    )

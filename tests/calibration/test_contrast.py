@@ -1,0 +1,176 @@
+"""Contrast thresholds from recordings whose thresholds are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from builders import events, moving_blocks, unlabelled
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kalux import Frame, Recording
+from kalux.calibration.contrast import estimate_thresholds, fit_thresholds
+from kalux.datasets import SensorSettings, simulate, static
+from kalux.errors import ExposureError
+from kalux.settings import CameraSettings
+
+CAMERA = CameraSettings()
+
+
+def counts(rng, n=2000):
+    return rng.integers(0, 9, (2, n)).astype(np.float64)
+
+
+# --- the fit --------------------------------------------------------------------------------------------
+
+
+@given(st.floats(0.02, 1.0), st.floats(0.02, 1.0), st.integers(0, 1000))
+@settings(max_examples=30)
+def test_fit_is_exact_without_noise(on, off, seed):
+    n_on, n_off = counts(np.random.default_rng(seed))
+    found = fit_thresholds(on * n_on - off * n_off, n_on, n_off)
+    assert found.on == pytest.approx(on, rel=1e-9)
+    assert found.off == pytest.approx(off, rel=1e-9)
+    assert found.residual < 1e-9
+    assert found.samples == 2000
+
+
+def test_fit_is_exact_where_most_residuals_are_zero():
+    """Binary fractions leave no rounding errors; the robust scale is then zero."""
+    n_on, n_off = counts(np.random.default_rng(0))
+    difference = 0.25 * n_on - 0.5 * n_off
+    difference[::10] += 3.0
+    found = fit_thresholds(difference, n_on, n_off)
+    assert found is not None
+    assert (found.on, found.off) == pytest.approx((0.25, 0.5), rel=1e-3)
+
+
+def test_fit_stands_a_fifth_of_outliers():
+    """Huber's weights bound what an outlier can do; least squares is an order of magnitude further off."""
+    rng = np.random.default_rng(1)
+    n_on, n_off = counts(rng, 20_000)
+    difference = 0.2 * n_on - 0.3 * n_off + 0.05 * rng.standard_normal(20_000)
+    wrong = rng.random(20_000) < 0.2
+    difference[wrong] = rng.uniform(-3, 3, int(wrong.sum()))
+    found = fit_thresholds(difference, n_on, n_off)
+    assert found.on == pytest.approx(0.2, rel=0.06)
+    assert found.off == pytest.approx(0.3, rel=0.06)
+    design = np.column_stack([n_on, -n_off])
+    plain = np.linalg.lstsq(design, difference, rcond=None)[0]
+    assert abs(found.on - 0.2) < 0.5 * abs(plain[0] - 0.2)
+    assert abs(found.off - 0.3) < 0.5 * abs(plain[1] - 0.3)
+
+
+def test_residual_is_a_standard_deviation():
+    rng = np.random.default_rng(2)
+    n_on, n_off = counts(rng, 20_000)
+    found = fit_thresholds(0.2 * n_on - 0.3 * n_off + 0.05 * rng.standard_normal(20_000), n_on, n_off)
+    assert found.residual == pytest.approx(0.05, rel=0.03)
+
+
+def test_no_fit_where_a_threshold_is_not_determined():
+    n_on, n_off = counts(np.random.default_rng(3))
+    none = np.zeros_like(n_on)
+    assert fit_thresholds(0.2 * n_on, n_on, none) is None  # no off event at all
+    assert fit_thresholds(0.2 * n_on, n_on, n_on) is None  # always as many
+    assert fit_thresholds(-0.2 * n_on + 0.2 * n_off, n_on, n_off) is None  # the wrong way round
+
+
+# --- from recordings ------------------------------------------------------------------------------------
+
+SENSORS = {
+    "ideal": SensorSettings(),
+    "asymmetric": SensorSettings(threshold_on=0.15, threshold_off=0.28),
+    "mismatch": SensorSettings(threshold_off=0.25, threshold_mismatch=0.1),
+    "noise": SensorSettings(noise_rate=3.0, read_noise=0.006),
+    "small": SensorSettings(threshold_on=0.08, threshold_off=0.1),
+}
+SIZE = (48, 64)
+
+
+def ratios(found, sensor):
+    """Estimated over true thresholds."""
+    return [found.on / sensor.threshold_on, found.off / sensor.threshold_off]
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_thresholds_of_a_well_lit_recording(name):
+    sensor = SENSORS[name]
+    found = estimate_thresholds(unlabelled(moving_blocks(0.08, 0.9, sensor=sensor, size=SIZE)), CAMERA)
+    np.testing.assert_allclose(ratios(found, sensor), 1.0, atol=0.12)
+
+
+def test_thresholds_in_spite_of_saturation():
+    """Intervals that begin or end in saturation are left out."""
+    sensor = SENSORS["asymmetric"]
+    simulation = moving_blocks(0.1, 4.0, sensor=sensor, size=SIZE)
+    assert np.mean([frame.image == 255 for frame in simulation.frames]) > 0.2
+    found = estimate_thresholds(unlabelled(simulation), CAMERA)
+    np.testing.assert_allclose(ratios(found, sensor), 1.0, atol=0.12)
+
+
+def test_the_estimate_is_low_in_the_dark_because_of_the_offset():
+    """I_0 = 0.03 flattens log(I + I_0) in the dark; with the sensor's own offset the bias is gone."""
+    sensor = SENSORS["ideal"]
+    recording = unlabelled(moving_blocks(0.02, 0.6, sensor=sensor, size=SIZE))
+    usual = ratios(estimate_thresholds(recording, CAMERA), sensor)
+    same = ratios(estimate_thresholds(recording, CameraSettings(log_offset=sensor.log_offset)), sensor)
+    np.testing.assert_allclose(same, 1.0, atol=0.08)
+    assert 0.75 < min(usual) and max(usual) < 0.95
+
+
+def test_varying_exposures_do_not_disturb():
+    sensor = SENSORS["ideal"]
+    simulation = moving_blocks(0.08, 0.9, sensor=sensor, size=SIZE, exposures=(8_000, 4_000, 12_000) * 4)
+    found = estimate_thresholds(unlabelled(simulation), CAMERA)
+    np.testing.assert_allclose(ratios(found, sensor), 1.0, atol=0.12)
+
+
+def test_the_reference_exposure_is_that_of_the_settings():
+    """Half of the intensities with half of the offset are the same logarithms, but for a constant."""
+    recording = unlabelled(moving_blocks(0.08, 0.9, sensor=SENSORS["ideal"], size=SIZE))
+    one = estimate_thresholds(recording, CameraSettings(log_offset=0.03, reference_exposure=10_000))
+    half = estimate_thresholds(recording, CameraSettings(log_offset=0.015, reference_exposure=5_000))
+    np.testing.assert_allclose(half, one, rtol=1e-6)
+
+
+def test_response_is_inverted():
+    """The same with a gamma camera, when it is known to be one; far off when it is taken for linear."""
+    sensor = SensorSettings(response=_gamma)
+    recording = unlabelled(moving_blocks(0.08, 0.9, sensor=sensor, size=SIZE))
+    known = estimate_thresholds(recording, CameraSettings(response="gamma:2.2"))
+    np.testing.assert_allclose(ratios(known, sensor), 1.0, atol=0.12)
+    assert max(ratios(estimate_thresholds(recording, CAMERA), sensor)) < 0.6
+
+
+def _gamma(irradiance):
+    return irradiance ** (1 / 2.2)
+
+
+def test_chunks_do_not_matter(monkeypatch):
+    recording = unlabelled(moving_blocks(0.08, 0.9, sensor=SENSORS["ideal"], size=SIZE))
+    whole = estimate_thresholds(recording, CAMERA)
+    monkeypatch.setattr("kalux.recording.CHUNK_EVENTS", 777)
+    assert len(list(recording.events())) > 10
+    assert estimate_thresholds(recording, CAMERA) == whole
+
+
+@pytest.mark.parametrize("noise_rate", [0.0, 1.0])
+def test_a_still_scene_tells_nothing(noise_rate):
+    scene = static(0.4, sensor_size=(32, 40), duration=300_000)
+    recording = unlabelled(simulate(scene, SensorSettings(noise_rate=noise_rate)))
+    assert estimate_thresholds(recording, CAMERA) is None
+
+
+def test_frames_alone_tell_nothing():
+    frames = [Frame(np.full((32, 40), v, np.uint8), t, t + 5000) for t, v in ((0, 90), (40_000, 120))]
+    assert (
+        estimate_thresholds(Recording.from_arrays(events(), frames, sensor_size=(32, 40)), CAMERA) is None
+    )
+
+
+def test_unknown_exposures_are_an_error():
+    recording = unlabelled(moving_blocks(0.08, 0.9, sensor=SENSORS["ideal"], size=SIZE))
+    recording.exposure_known = False
+    with pytest.raises(ExposureError, match="no exposure times"):
+        estimate_thresholds(recording, CAMERA)

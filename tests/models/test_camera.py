@@ -1,0 +1,242 @@
+"""The frame camera, equations (3)-(9), against numbers worked by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kalux.errors import SettingsError
+from kalux.models.camera import (
+    Camera,
+    Response,
+    covariance,
+    inverse_response,
+    log_bias,
+    log_covariance,
+    log_intensity,
+)
+
+RESPONSES = {
+    "linear": Response.linear(),
+    "gamma": Response.gamma(2.2),
+    "expanding gamma": Response.gamma(0.5),
+    "srgb": Response.srgb(),
+    "tabulated": Response.tabulated([3.0, 4.0, 6.0, 10.0, 40.0]),
+}
+every_response = pytest.mark.parametrize("response", RESPONSES.values(), ids=RESPONSES.keys())
+unit = st.floats(0.0, 1.0)
+
+
+# --- (3) ------------------------------------------------------------------------------------------------
+
+
+@every_response
+@given(irradiance=unit)
+def test_inverse_undoes_the_response(response, irradiance):
+    value = np.array([irradiance])
+    np.testing.assert_allclose(response.inverse(response(value)), value, rtol=1e-9, atol=1e-12)
+
+
+@every_response
+@given(level=unit)
+def test_response_undoes_the_inverse(response, level):
+    value = np.array([level])
+    np.testing.assert_allclose(response(response.inverse(value)), value, rtol=1e-9, atol=1e-12)
+
+
+@every_response
+@given(a=st.floats(-0.5, 1.5), b=st.floats(-0.5, 1.5))
+def test_inverse_never_falls(response, a, b):
+    low, high = response.inverse(np.sort([a, b]))
+    assert low <= high
+
+
+@every_response
+def test_curves_run_from_black_to_white(response):
+    np.testing.assert_array_equal(response(np.array([0.0, 1.0, 1.7])), [0.0, 1.0, 1.0])
+    np.testing.assert_array_equal(response.inverse(np.array([0.0, 1.0])), [0.0, 1.0])
+
+
+@every_response
+def test_inverse_does_not_clip_beyond_the_ends(response):
+    """Float frames may exceed white, and noise may lie below black."""
+    np.testing.assert_allclose(response.inverse(np.array([1.25, -0.01])), [1.25, -0.01])
+
+
+def test_gamma_is_the_power_law():
+    level = np.arange(256) / 255
+    np.testing.assert_allclose(Response.gamma(2.2).inverse(level), level**2.2, rtol=1e-12)
+
+
+def test_srgb_agrees_with_the_standard():
+    """IEC 61966-2-1: the linear toe, the known middle grey, and white."""
+    levels = np.array([0.0, 10 / 255, 188 / 255, 1.0])
+    expected = [0.0, 10 / 255 / 12.92, 0.50289, 1.0]
+    np.testing.assert_allclose(Response.srgb().inverse(levels), expected, rtol=1e-4)
+
+
+def test_a_table_is_shifted_and_scaled():
+    response = Response.tabulated([3.0, 4.0, 6.0, 10.0, 40.0])
+    np.testing.assert_allclose(
+        response.inverse(np.linspace(0, 1, 5)), [0.0, 1 / 37, 3 / 37, 7 / 37, 1.0], rtol=1e-12
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "same"),
+    [("linear", Response.linear()), ("srgb", Response.srgb()), ("gamma:2.2", Response.gamma(2.2))],
+)
+def test_named_responses(name, same):
+    level = np.linspace(0, 1, 50)
+    np.testing.assert_array_equal(Response.named(name).inverse(level), same.inverse(level))
+
+
+@pytest.mark.parametrize("name", ["", "lin", "gamma", "gamma:", "gamma:two", "srgb:2", "LINEAR"])
+def test_unknown_names_say_what_is_known(name):
+    with pytest.raises(SettingsError, match="known are linear, srgb and gamma:EXPONENT"):
+        Response.named(name)
+
+
+@pytest.mark.parametrize("name", ["gamma:0", "gamma:-1", "gamma:inf", "gamma:nan"])
+def test_a_bad_exponent_is_named_as_such(name):
+    with pytest.raises(SettingsError, match="positive exponent"):
+        Response.named(name)
+
+
+@pytest.mark.parametrize(
+    ("irradiance", "response", "message"),
+    [
+        ([0.0, 1.0], [0.0, 0.5, 1.0], "shapes"),
+        ([0.0], [0.0], "shapes"),
+        ([[0.0, 1.0]], [[0.0, 1.0]], "shapes"),
+        ([0.0, np.nan, 1.0], [0.0, 0.5, 1.0], "not finite"),
+        ([0.0, 0.5, 0.5, 1.0], [0.0, 0.2, 0.4, 1.0], "increase"),
+        ([0.0, 0.2, 0.4, 1.0], [0.0, 0.5, 0.4, 1.0], "increase"),
+        ([0.1, 1.0], [0.0, 1.0], "from 0 to 1"),
+        ([0.0, 1.0], [0.0, 0.9], "from 0 to 1"),
+    ],
+)
+def test_unusable_curves(irradiance, response, message):
+    with pytest.raises(SettingsError, match=message):
+        Response(np.array(irradiance), np.array(response))
+
+
+@pytest.mark.parametrize("table", [[], [1.0], [1.0, 1.0], [2.0, 1.0], [0.0, np.nan], [0.0, 2.0, 1.0, 3.0]])
+def test_unusable_tables(table):
+    with pytest.raises(SettingsError, match="response"):
+        Response.tabulated(table)
+
+
+@given(level=unit, ratio=st.floats(0.01, 100.0))
+def test_irradiance_is_scaled_to_the_reference_exposure(level, ratio):
+    camera = Camera(RESPONSES["srgb"])
+    value = np.array([level])
+    expected = camera.response.inverse(value) * ratio
+    np.testing.assert_allclose(inverse_response(camera, value, ratio), expected, rtol=1e-12)
+
+
+# --- (4), (5) -------------------------------------------------------------------------------------------
+
+
+@every_response
+def test_certainty_is_the_slope_with_largest_value_one(response):
+    """(4), against central differences of the response itself, away from black."""
+    middle = np.linspace(0.25, 0.98, 60)
+    assert response.certainty(np.linspace(0, 1, 5000)).max() == pytest.approx(1.0, abs=1e-9)
+    assert (response.certainty(np.linspace(0, 1, 5000)) > 0).all()
+    if response is not RESPONSES["tabulated"]:  # its slope has steps
+        h = 0.01
+        slope = (response(middle + h) - response(middle - h)) / (2 * h)
+        ratio = response.certainty(middle) / slope
+        np.testing.assert_allclose(ratio, np.median(ratio), rtol=0.08)
+
+
+def test_certainty_of_a_table_is_its_slopes():
+    """Four stretches of slopes 1/4 over 1/37, 2/37, 4/37 and 30/37."""
+    response = RESPONSES["tabulated"]
+    inside = np.array([0.5, 2.0, 5.0, 20.0]) / 37
+    np.testing.assert_allclose(response.certainty(inside), [1.0, 1 / 2, 1 / 4, 1 / 30], rtol=1e-9)
+
+
+@every_response
+@given(level=unit)
+def test_weight_is_certainty_after_inverse(response, level):
+    """(5)."""
+    value = np.array([level])
+    np.testing.assert_array_equal(response.weight(value), response.certainty(response.inverse(value)))
+
+
+def test_linear_camera_weighs_all_levels_alike():
+    level = np.arange(256) / 255
+    np.testing.assert_allclose(Camera(Response.linear()).weight(level), 1.0, rtol=1e-9)
+
+
+def test_gamma_weighs_dark_more_than_bright():
+    """The slope of I^(1/2.2) falls with I: at response v it is proportional to v^-1.2."""
+    weight = Camera(Response.gamma(2.2)).weight(np.array([0.25, 0.5, 1.0]))
+    np.testing.assert_allclose(weight[:-1] / weight[1:], 2**1.2, rtol=0.01)
+
+
+def test_released_table_is_a_weight_with_largest_value_one():
+    table = 7e5 * np.concatenate([np.linspace(0.1, 1.0, 128), np.linspace(1.0, 0.0, 128)])
+    camera = Camera.from_inverse_covariance(table, Response.linear(), 0.9)
+    level = np.arange(256) / 255
+    np.testing.assert_allclose(camera.weight(level), table / 7e5, rtol=1e-12)
+    assert camera.saturation == 0.9
+    between = camera.weight(np.array([10.5 / 255]))
+    np.testing.assert_allclose(between, (table[10] + table[11]) / 2 / 7e5, rtol=1e-12)
+
+
+@pytest.mark.parametrize("table", [[], [1.0], [0.0, 0.0], [1.0, -0.1], [1.0, np.nan], [1.0, np.inf]])
+def test_unusable_released_tables(table):
+    with pytest.raises(SettingsError, match="f_Q"):
+        Camera.from_inverse_covariance(table, Response.linear(), 0.98)
+
+
+# --- (6), (8), (9) --------------------------------------------------------------------------------------
+
+
+def test_covariance_by_hand():
+    """(6): sigma_im^2 / f^w, and the floor caps it."""
+    weight = np.array([1.0, 0.5, 0.09, 0.01, 0.0])
+    expected = np.array([1.0, 2.0, 1 / 0.09, 1 / 0.09, 1 / 0.09]) / 7e5
+    np.testing.assert_allclose(covariance(weight, 1 / 7e5, 0.09), expected, rtol=1e-12)
+
+
+@given(weight=unit, floor=st.floats(1e-6, 1.0))
+def test_floor_caps_the_covariance(weight, floor):
+    r_bar = covariance(np.array([weight]), 2.0, floor)[0]
+    assert 2.0 <= r_bar <= 2.0 / floor * (1 + 1e-12)
+
+
+def test_log_intensity_and_its_covariance_by_hand():
+    """(8) and (9) at I = 0.2, I_0 = 0.05, R_bar = 0.01: (I + I_0)^2 = 1/16."""
+    intensity, r_bar = np.array([0.2]), np.array([0.01])
+    np.testing.assert_allclose(log_intensity(intensity, 0.05), -np.log(4), rtol=1e-12)
+    np.testing.assert_allclose(log_bias(intensity, r_bar, 0.05), 0.08, rtol=1e-12)
+    np.testing.assert_allclose(log_covariance(intensity, r_bar, 0.05), 0.16, rtol=1e-12)
+
+
+def test_noise_below_black_counts_as_black():
+    dark = np.array([-0.5, 0.0])
+    np.testing.assert_array_equal(log_intensity(dark, 0.03), np.log([0.03, 0.03]))
+    np.testing.assert_allclose(log_covariance(dark, np.ones(2), 0.5), [4.0, 4.0], rtol=1e-12)
+    np.testing.assert_allclose(log_bias(dark, np.ones(2), 0.5), [2.0, 2.0], rtol=1e-12)
+
+
+@given(st.floats(0.0, 5.0), st.floats(1e-3, 2.0))
+def test_bias_and_covariance_are_those_of_a_noisy_logarithm(intensity, offset):
+    """By Taylor's series the mean of log(x + noise) falls by half of its variance."""
+    i, r = np.array([intensity]), np.array([1e-3])
+    np.testing.assert_allclose(log_bias(i, r, offset), log_covariance(i, r, offset) / 2, rtol=1e-12)
+
+
+def test_bias_against_a_sampled_logarithm():
+    noise = np.random.default_rng(0).normal(0.0, 0.02, 2_000_000)
+    sampled = np.log(0.3 + noise + 0.1)
+    bias = log_bias(np.array([0.3]), np.array([0.02**2]), 0.1)[0]
+    variance = log_covariance(np.array([0.3]), np.array([0.02**2]), 0.1)[0]
+    assert np.log(0.4) - sampled.mean() == pytest.approx(bias, rel=0.1)
+    assert sampled.var() == pytest.approx(variance, rel=0.02)

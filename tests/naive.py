@@ -1,0 +1,354 @@
+"""The slow oracle: float64, one pixel at a time, the paper's equations (and docs/equations.md, K1 to K7) as written.
+
+Nothing here is incremental: L^A(t) is summed from the events anew at every t, integrals are taken by Gauss-Legendre
+quadrature where a closed form would repeat the code under test. Lookahead mode only; 8-bit frames, linear response.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import lambertw
+
+US = 1e-6
+NODES, WEIGHTS = np.polynomial.legendre.leggauss(24)
+UNMEASURED = 1e12
+
+
+@dataclass
+class Pixel:
+    """What one pixel sees. Events: time, polarity, newest event in the 3x3 pixels, newest of its own."""
+
+    starts: list[int]
+    middles: list[int]
+    ends: list[int]
+    intensity: list[float]
+    white: list[float]
+    clipped: list[bool]
+    events: list[tuple[int, bool, int, int]]
+
+
+def pixels(events, frames, sensor_size, settings, begin):
+    """Split a recording into pixels. The newest event around each event is looked up in the whole stream."""
+    height, width = sensor_size
+    reference = settings.camera.reference_exposure
+    out = {}
+    for row in range(height):
+        for column in range(width):
+            ratio = [reference / (f.exposure_end - f.exposure_start) for f in frames]
+            response = [float(f.image[row, column]) / 255 for f in frames]
+            own = []
+            for i, e in enumerate(events):
+                if (e["y"], e["x"]) != (row, column) or e["t"] <= begin:
+                    continue
+                earlier = [q for q in events[:i] if q["t"] > begin]
+                near = [
+                    q["t"] for q in earlier if abs(int(q["y"]) - row) <= 1 and abs(int(q["x"]) - column) <= 1
+                ]
+                same = [q["t"] for q in earlier if (q["y"], q["x"]) == (row, column)]
+                own.append(
+                    (int(e["t"]), bool(e["p"]), int(max(near, default=begin)), int(max(same, default=begin)))
+                )
+            out[row, column] = Pixel(
+                [f.exposure_start for f in frames],
+                [(f.exposure_start + f.exposure_end) // 2 for f in frames],
+                [f.exposure_end for f in frames],
+                [r * q for r, q in zip(response, ratio, strict=True)],
+                ratio,
+                [r >= settings.camera.saturation for r in response],
+                own,
+            )
+    return out
+
+
+def event_sum(pixel, a, b, on, off):
+    """int_a^b e(gamma) d gamma: the steps of the events with a < t <= b."""
+    return sum((on if p else -off) for t, p, _, _ in pixel.events if a < t <= b)
+
+
+def edi(pixel, k, log_frame, on, off):
+    """EDI: (L^D(start), largest L^D in the exposure), straight from B + I_0 = 1/T int exp(L(t)) dt."""
+    s, e = pixel.starts[k], pixel.ends[k]
+    inside = [(t, on if p else -off) for t, p, *_ in pixel.events if s < t <= e]
+    edges = [s, *[t for t, _ in inside], e]
+    levels = [0.0, *np.cumsum([step for _, step in inside])]  # after each event, also of several at one time
+    mean = sum(np.exp(v) * (b - a) for v, a, b in zip(levels, edges[:-1], edges[1:], strict=True)) / (e - s)
+    start = log_frame - np.log(mean)
+    return start, start + max(levels)
+
+
+# The paper.
+
+
+def paper(pixel, settings, times, on, off):
+    """L(t) and P(t) of one pixel, equations (6) to (21)."""
+    c, ev, fl = settings.camera, settings.events, settings.filter
+    i0, count = c.log_offset, len(pixel.starts)
+    r_bar = [w**2 / c.confidence / max(1.0, c.weight_floor) for w in pixel.white]  # (6), linear: f^w = 1
+    log_frame = [
+        np.log(i + i0) - r / (2 * (i + i0) ** 2)
+        for i, r in zip(pixel.intensity, r_bar, strict=True)  # (8)
+    ]
+    if fl.deblur:
+        start = [edi(pixel, k, log_frame[k], on, off)[0] for k in range(count)]
+        end = [start[k] + event_sum(pixel, pixel.starts[k], pixel.ends[k], on, off) for k in range(count)]
+    else:
+        start, end = list(log_frame), list(log_frame)
+    scale = []
+    for k in range(count - 1):  # (12)
+        integral = event_sum(pixel, pixel.starts[k], pixel.ends[k + 1], on, off)
+        difference = end[k + 1] - start[k]
+        usable = difference != 0 and 0.6 <= integral / difference <= 100
+        scale.append(difference / integral if usable else 1.0)
+
+    def forward(k, t, factor):  # (10)
+        return start[k] + factor * event_sum(pixel, pixel.starts[k], t, on, off)
+
+    def backward(k, t):  # (11), of the interval from k to k + 1
+        return end[k + 1] - scale[k] * event_sum(pixel, t, pixel.ends[k + 1], on, off)
+
+    def augmented(k, t, known_until=None):  # (13); events up to known_until
+        u = min(max((t - pixel.starts[k]) / (pixel.ends[k] - pixel.starts[k]), 0.0), 1.0)
+        at = t if known_until is None else known_until
+        if k == 0:
+            before = forward(0, at, scale[0] if scale else 1.0)
+        else:
+            before = forward(k - 1, at, scale[k - 1])
+        if k < count - 1:
+            after = backward(k, at)
+        else:
+            after = forward(k, at, scale[k - 1] if k else 1.0)
+        return (1 - u) * before + u * after
+
+    def covariance(k, t, after):  # (7), (9)
+        if after:
+            if k == count - 1:
+                return r_bar[k] / (pixel.intensity[k] + i0) ** 2
+            f = (t - pixel.middles[k]) / (pixel.middles[k + 1] - pixel.middles[k])
+            r = (1 - f) * r_bar[k] + f * r_bar[k + 1]
+            return r / (pixel.intensity[k] + i0) ** 2
+        if k == 0:
+            return r_bar[0] / (pixel.intensity[0] + i0) ** 2
+        f = (t - pixel.middles[k - 1]) / (pixel.middles[k] - pixel.middles[k - 1])
+        return ((1 - f) * r_bar[k - 1] + f * r_bar[k]) / (pixel.intensity[k - 1] + i0) ** 2
+
+    def predict(k, state, ti, t):
+        value, variance = state
+        if fl.solution == "printed":
+            p = 1 / (1 / variance + (t - ti) * US / covariance(k, t, t >= pixel.middles[k]))  # (20)
+            deviation = value - augmented(k, ti)
+            return deviation * (1 / variance) * p + augmented(k, t, ti), p  # (17)
+        # J L = J_i L_i + int L^A / R, J = J_i + int 1/R
+        j, z = 1 / variance, value / variance
+        cuts = sorted({ti, t, *[q for q in (pixel.middles[k], pixel.ends[k]) if ti < q < t]})
+        for a, b in itertools.pairwise(cuts):
+            # Sixteen panels: 1/R of a line that R falls along is all but singular at its end.
+            panels = np.linspace(a, b, 17)
+            q = (panels[:-1, None] + np.diff(panels)[:, None] * (NODES + 1) / 2).ravel()
+            w = np.tile(WEIGHTS / 2, 16) * (b - a) / 16 * US
+            w /= np.array([covariance(k, x, a >= pixel.middles[k]) for x in q])
+            j += w.sum()
+            z += (w * np.array([augmented(k, x, ti) for x in q])).sum()
+        return z / j, 1 / j
+
+    begin = pixel.starts[0]
+    state = (augmented(0, begin), fl.initial_variance)
+    out, at, k = [], begin, 0
+    pending = list(pixel.events)
+
+    def step_to(limit):
+        nonlocal state, at
+        while pending and pending[0][0] <= limit:
+            t, polarity, near, same = pending.pop(0)
+            value, variance = predict(k, state, at, t)
+            q = ev.sigma_proc2 * (t - same) * US + ev.sigma_iso2 * (t - near) * US  # (2)
+            q += ev.sigma_ref2 if (t - same) * US <= ev.refractory_bound else 0.0
+            state = (value + (on if polarity else -off), variance + q)  # (15), (21)
+            at = t
+
+    for t in times:
+        while k + 1 < count and t > pixel.starts[k + 1]:
+            step_to(pixel.starts[k + 1])
+            state, at = predict(k, state, at, pixel.starts[k + 1]), pixel.starts[k + 1]
+            k += 1
+        step_to(t)
+        out.append(predict(k, state, at, t))
+    return np.array(out)
+
+
+# kalux's own.
+
+
+def bridged(pixel, settings, times, on, off):
+    """L(t) and P(t) of one pixel, docs/equations.md, K1 to K5 and K7."""
+    c, ev = settings.camera, settings.events
+    i0, count, c2 = c.log_offset, len(pixel.starts), on * off
+    scale_on, scale_off = 1.0, 1.0
+    var_on = var_off = ev.threshold_spread**2
+    learned = []
+
+    def latent(k):  # K3
+        log_frame = np.log(pixel.intensity[k] + i0)
+        a, b = on * scale_on, off * scale_off
+        start, peak = edi(pixel, k, log_frame, a, b) if settings.filter.deblur else (log_frame, log_frame)
+        middle = start
+        inside = 0
+        if settings.filter.deblur:
+            middle += event_sum(pixel, pixel.starts[k], pixel.middles[k], a, b)
+            inside = sum(pixel.starts[k] < t <= pixel.ends[k] for t, *_ in pixel.events)
+        variance = (c.frame_noise * pixel.white[k]) ** 2 / (pixel.intensity[k] + i0) ** 2
+        variance += ev.deblur_variance * c2 * inside
+        clipped = pixel.clipped[k] or peak >= np.log(c.saturation * pixel.white[k] + i0)
+        return middle, UNMEASURED if clipped else variance
+
+    def counts(a, b):
+        inside = [p for t, p, *_ in pixel.events if a < t <= b]
+        return sum(inside), len(inside) - sum(inside)
+
+    begin = pixel.starts[0]
+    first = latent(0)
+    intervals = [(begin, pixel.middles[0], None, first, scale_on, scale_off, var_on, var_off, 0.0)]
+    for k in range(count - 1):
+        second = latent(k + 1)
+        a, b = pixel.middles[k], pixel.middles[k + 1]
+        n_on, n_off = counts(a, b)
+        mismatch = second[0] - first[0] - (on * scale_on * n_on - off * scale_off * n_off)
+        total = first[1] + second[1] + var_on * (on * n_on) ** 2 + var_off * (off * n_off) ** 2
+        total += ev.step_variance * c2 * (n_on + n_off) + ev.quantisation_variance * c2
+        intervals.append((a, b, first, second, scale_on, scale_off, var_on, var_off, mismatch / total))
+        gain_on, gain_off = var_on * on * n_on / total, -var_off * off * n_off / total  # K2
+        scale_on = min(max(scale_on + gain_on * mismatch, 0.3), 3.0)
+        scale_off = min(max(scale_off + gain_off * mismatch, 0.3), 3.0)
+        var_on += 1e-5 - gain_on**2 * total
+        var_off += 1e-5 - gain_off**2 * total
+        learned.append((scale_on, scale_off))
+        first = second
+    last = (pixel.middles[-1], None, first, None, scale_on, scale_off, var_on, var_off, 0.0)
+    intervals.append(last)
+
+    def augmented(interval, t, known_until):  # K1: posterior mean of the level at t, given both frames
+        a, b, left, right, s_on, s_off, v_on, v_off, gain = interval
+        if left is None:
+            return right[0] - event_sum(pixel, known_until, b, on * s_on, off * s_off)
+        prior = left[0] + event_sum(pixel, a, known_until, on * s_on, off * s_off)
+        if right is None:
+            return prior
+        (t_on, t_off), (n_on, n_off) = counts(a, known_until), counts(a, b)
+        shared = left[1] + v_on * on**2 * t_on * n_on + v_off * off**2 * t_off * n_off
+        shared += ev.step_variance * c2 * (t_on + t_off) + ev.quantisation_variance * c2 * (t - a) / (b - a)
+        return prior + shared * gain
+
+    def rate(interval, known_until):  # K4
+        a, b, left, right, *_ = interval
+        if right is None:
+            # All of the last frame's information, spread over the last interval.
+            spread = (pixel.middles[-1] - pixel.middles[-2]) * US if count > 1 else 0.04
+            return (
+                1 / (left[1] + ev.step_variance * c2 * sum(counts(a, known_until))) + 1 / UNMEASURED
+            ) / spread
+        forward = UNMEASURED if left is None else left[1]
+        forward += ev.step_variance * c2 * sum(counts(a, known_until))
+        backward = right[1] + ev.step_variance * c2 * sum(counts(known_until, b))
+        return 0.5 / ((b - a) * US) * (1 / forward + 1 / backward)
+
+    value = augmented(intervals[0], begin, begin)
+    variance = first_variance(intervals[0], counts, ev, c2, settings)
+    state = (value, variance)
+    out, at, index = [], begin, 0
+    pending = list(pixel.events)
+
+    def predict(t):
+        interval = intervals[index]
+        value, variance = state
+        information = 1 / variance + rate(interval, at) * (t - at) * US  # (20)
+        deviation = (value - augmented(interval, at, at)) / variance / information  # (17)
+        return augmented(interval, t, at) + deviation, 1 / information
+
+    def step_to(limit):
+        nonlocal state, at
+        while pending and pending[0][0] <= limit:
+            t, polarity, near, _ = pending.pop(0)
+            value, variance = predict(t)
+            signal = 1 / (1 + 9 * ev.noise_rate * (t - near) * US)  # K5
+            # Several events may share a time: this one alone moves L^A by its own step.
+            step = own_step(intervals[index], polarity, on, off, ev, c2, counts)
+            q = c2 * (ev.step_variance + signal * (1 - signal))
+            state = (value + signal * step, variance + q)
+            at = t
+
+    for t in times:
+        while intervals[index][1] is not None and t > intervals[index][1]:
+            step_to(intervals[index][1])
+            (value, variance), at = predict(intervals[index][1]), intervals[index][1]
+            index += 1
+            frame = intervals[index][2]
+            state = (max(value, frame[0]) if frame[1] >= UNMEASURED else value, variance)  # K7
+        step_to(t)
+        out.append(predict(t))
+    return np.array(out)
+
+
+def own_step(interval, polarity, on, off, ev, c2, counts):
+    """By how much one event moves L^A: its nominal step and its share of the mismatch (K1)."""
+    a, b, left, right, s_on, s_off, v_on, v_off, gain = interval
+    nominal = on * s_on if polarity else -off * s_off
+    if left is None or right is None:
+        return nominal
+    n_on, n_off = counts(a, b)
+    shared = v_on * on**2 * n_on if polarity else v_off * off**2 * n_off
+    return nominal + gain * (shared + ev.step_variance * c2)
+
+
+def first_variance(interval, counts, ev, c2, settings):
+    """P at the start: that of L^A, or the setting where the first frame is clipped."""
+    a, b, _, right, *_ = interval
+    variance = right[1] + ev.step_variance * c2 * sum(counts(a, b))
+    return settings.filter.initial_variance if variance >= UNMEASURED else variance
+
+
+def complementary(pixel, settings, times, on, off):
+    """L(t) of one pixel: dL/dt = e - alpha (L - L^F), frames held from the middle of their exposure."""
+    i0, alpha = settings.camera.log_offset, 2 * np.pi * settings.filter.cutoff
+    frames = [np.log(i + i0) for i in pixel.intensity]
+    out = []
+    for t in times:
+        value, at = frames[0], pixel.middles[0]
+        changes = [(m, 0, k) for k, m in enumerate(pixel.middles[1:], 1) if m < t]
+        changes += [(q, -1, on if p else -off) for q, p, *_ in pixel.events if at < q <= t]
+        k = 0
+        for q, kind, what in sorted(changes, key=lambda change: change[:2]):
+            value = frames[k] + (value - frames[k]) * np.exp(-alpha * (q - at) * US)
+            at = q
+            if kind == 0:
+                k = what
+            else:
+                value += what
+        out.append((frames[k] + (value - frames[k]) * np.exp(-alpha * (t - at) * US), np.nan))
+    return np.array(out)
+
+
+def intensity(log_intensity, variance, settings, white, stretch):
+    """Read-out, K6."""
+    i0, scale2 = settings.camera.log_offset, settings.filter.highlight_scale**2
+    top = np.log(white + i0)
+    if scale2 > 0 and log_intensity > top:
+        excess = (log_intensity - top) * scale2 / (scale2 + variance)
+        log_intensity = top + (lambertw(stretch * excess).real / stretch if stretch > 0 else excess)
+    return max(np.exp(log_intensity) - i0, 0.0)
+
+
+def reconstruct(events, frames, sensor_size, settings, times):
+    """L and P at ``times``, two (T, H, W) arrays."""
+    kind = settings.filter.kind
+    if kind == "cf":
+        method, begin = complementary, (frames[0].exposure_start + frames[0].exposure_end) // 2
+    else:
+        method = bridged if settings.filter.augmentation == "bridge" else paper
+        begin = frames[0].exposure_start
+    on, off = settings.events.threshold_on, settings.events.threshold_off
+    out = np.empty((2, len(times), *sensor_size))
+    for (row, column), pixel in pixels(events, frames, sensor_size, settings, begin).items():
+        out[:, :, row, column] = method(pixel, settings, times, on, off).T
+    return out[0], out[1]

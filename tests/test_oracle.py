@@ -1,0 +1,92 @@
+"""The engine against the slow oracle (`naive`), over random streams."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kalux import PRESETS, Frame, Reconstructor
+from kalux.events import make_events
+
+import naive
+
+HEIGHT, WIDTH = 2, 3
+
+VARIANTS = {
+    "default": PRESETS["default"],
+    "default-blurred": dataclasses.replace(
+        PRESETS["default"], filter=dataclasses.replace(PRESETS["default"].filter, deblur=False)
+    ),
+    "iccv2021": PRESETS["iccv2021"],
+    "iccv2021-exact": dataclasses.replace(
+        PRESETS["iccv2021"], filter=dataclasses.replace(PRESETS["iccv2021"].filter, solution="exact")
+    ),
+    "cf": PRESETS["cf"],
+}
+
+
+@st.composite
+def streams(draw):
+    """A few frames with uneven exposures and gaps, and events that also fall on edges and on each other."""
+    count = draw(st.integers(1, 4))
+    t, frames = draw(st.integers(0, 10**6)), []
+    for _ in range(count):
+        exposure = draw(st.integers(1000, 30_000))
+        levels = draw(st.lists(st.integers(0, 255), min_size=HEIGHT * WIDTH, max_size=HEIGHT * WIDTH))
+        frames.append(Frame(np.array(levels, np.uint8).reshape(HEIGHT, WIDTH), t, t + exposure))
+        t += exposure + draw(st.integers(0, 40_000))
+    begin, end = frames[0].exposure_start - 1000, frames[-1].exposure_end + 20_000
+    edges = [edge for f in frames for edge in (f.exposure_start, f.middle, f.exposure_end)]
+    moments = st.one_of(st.integers(begin, end), st.sampled_from(edges))
+    events = draw(
+        st.lists(
+            st.tuples(moments, st.integers(0, WIDTH - 1), st.integers(0, HEIGHT - 1), st.booleans()),
+            max_size=30,
+        )
+    )
+    events.sort(key=lambda event: event[0])
+    columns = list(zip(*events, strict=True)) if events else [(), (), (), ()]
+    array = make_events(*(np.array(column, np.int64) for column in columns))
+    times = sorted(draw(st.lists(st.integers(frames[0].middle, end), min_size=1, max_size=6)))
+    return array, frames, times
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+@given(data=st.data())
+@settings(max_examples=40, deadline=None)
+def test_engine_agrees_with_the_oracle(name, data):
+    """Log intensity to 1e-4, variance to 1e-4 of itself, intensity to what float32 holds."""
+    events, frames, times = data.draw(streams())
+    chosen = VARIANTS[name]
+    chosen = dataclasses.replace(
+        chosen,
+        events=dataclasses.replace(chosen.events, threshold_on=0.21, threshold_off=0.17),
+        camera=dataclasses.replace(chosen.camera, reference_exposure=10_000),
+    )
+    expected, variance = naive.reconstruct(events, frames, (HEIGHT, WIDTH), chosen, times)
+    engine = Reconstructor((HEIGHT, WIDTH), settings=chosen)
+    for frame in frames:
+        engine.push_frame(frame)
+    engine.push_events(events)
+    engine.finish()
+    for i, t in enumerate(times):
+        image = engine.read(t)
+        k = max([j for j, f in enumerate(frames) if engine_node(f, name) < t], default=-1)
+        white = max(10_000 / f.exposure for f in frames[max(k, 0) : k + 2])
+        stretch = chosen.events.threshold_spread**2
+        level = np.vectorize(lambda v, p: naive.intensity(v, p, chosen, white, stretch))(  # noqa: B023
+            expected[i], np.nan_to_num(variance[i])
+        )
+        offset = chosen.camera.log_offset
+        np.testing.assert_allclose(np.log(image.intensity + offset), np.log(level + offset), atol=1e-4)
+        if image.variance is not None:
+            np.testing.assert_allclose(image.variance, variance[i], rtol=1e-4)
+
+
+def engine_node(frame, name):
+    """Where a frame's segment begins."""
+    return frame.exposure_start if name.startswith("iccv2021") else frame.middle

@@ -1,0 +1,201 @@
+"""Settings: the paper's numbers, TOML there and back, and errors that name what is wrong."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import tomli_w
+from builders import altered
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kalux import PRESETS, Reconstructor, Settings, preset
+from kalux.errors import InputError, KaluxError, SettingsError
+from kalux.settings import CameraSettings, EventSettings, FilterSettings, from_dict, load, to_dict
+
+DEFAULT = PRESETS["default"]
+GROUPS = {"camera": CameraSettings, "events": EventSettings, "filter": FilterSettings}
+NUMBERS = [
+    (group, field.name)
+    for group, kind in GROUPS.items()
+    for field in dataclasses.fields(kind)
+    if not isinstance(field.default, (str, bool))
+]
+
+
+# --- presets --------------------------------------------------------------------------------------------
+
+
+def test_presets():
+    assert list(PRESETS) == ["default", "iccv2021", "iccv2021-flir", "cf"]
+    assert all(preset(name) is PRESETS[name] for name in PRESETS)
+    assert preset("default") == Settings()
+
+
+def test_the_papers_numbers():
+    """Section 5 of the paper; what it leaves open from the released code."""
+    paper = preset("iccv2021")
+    assert paper.events.sigma_proc2 == 0.0005
+    assert paper.events.sigma_iso2 == 0.03
+    assert paper.events.sigma_ref2 == 0.01
+    assert paper.events.refractory_bound == 0.010
+    assert paper.camera.confidence == 7e5
+    assert paper.camera.log_offset == 1.0
+    assert paper.camera.weight_floor == 0.09
+    assert paper.filter.initial_variance == 0.09
+    assert paper.filter.kind == "akf"
+    assert paper.filter.augmentation == "paper"
+    assert paper.filter.solution == "printed"
+    assert paper.filter.deblur is True
+    assert paper.filter.highlight_scale == 0.0
+
+
+def test_flir_differs_in_its_confidence_only():
+    flir = preset("iccv2021-flir")
+    assert flir.camera.confidence == 7e7
+    assert altered(flir, "camera", confidence=7e5) == preset("iccv2021")
+
+
+def test_complementary_preset():
+    """Held frames, as published: no deblurring, and no prior, since it has no covariance."""
+    cf = preset("cf")
+    assert (cf.filter.kind, cf.filter.cutoff, cf.filter.deblur) == ("cf", 1.0, False)
+    assert cf.filter.highlight_scale == 0.0
+
+
+def test_unknown_preset():
+    with pytest.raises(SettingsError, match="'iccv2022'; known are default, iccv2021, iccv2021-flir, cf"):
+        preset("iccv2022")
+
+
+def test_settings_cannot_be_changed_in_place():
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        preset("default").camera.log_offset = 0.5
+
+
+# --- TOML -----------------------------------------------------------------------------------------------
+
+
+def through_toml(settings, path, base=DEFAULT):
+    path.write_text(tomli_w.dumps(to_dict(settings)), encoding="utf-8")
+    return load(path, base)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize("base", PRESETS)
+def test_a_file_holds_all_settings_whatever_the_base(name, base, tmp_path):
+    assert through_toml(preset(name), tmp_path / "kalux.toml", preset(base)) == preset(name)
+
+
+@given(
+    offset=st.floats(1e-6, 10.0),
+    threshold=st.none() | st.floats(0.01, 1.0),
+    exposure=st.none() | st.integers(1, 10**7),
+    deblur=st.booleans(),
+    kind=st.sampled_from(["akf", "cf"]),
+)
+def test_round_trip(tmp_path_factory, offset, threshold, exposure, deblur, kind):
+    changed = altered(DEFAULT, "camera", log_offset=offset, reference_exposure=exposure)
+    changed = altered(changed, "events", threshold_on=threshold)
+    changed = altered(changed, "filter", deblur=deblur, kind=kind)
+    assert through_toml(changed, tmp_path_factory.getbasetemp() / "round_trip.toml") == changed
+
+
+def test_what_is_not_said_stays(tmp_path):
+    path = tmp_path / "few.toml"
+    path.write_text("[camera]\nlog_offset = 0.25\n[filter]\nkind = 'cf'\n")
+    base = altered(preset("iccv2021"), "events", threshold_on=0.3)
+    expected = altered(altered(base, "camera", log_offset=0.25), "filter", kind="cf")
+    assert load(path, base) == expected
+
+
+def test_an_outputs_settings_tables_are_used(tmp_path):
+    path = tmp_path / "kalux.toml"
+    path.write_text("version = '0.1.0'\n[recording]\npath = 'x'\n[settings.events]\nnoise_rate = 7\n")
+    assert load(path, DEFAULT) == altered(DEFAULT, "events", noise_rate=7)
+
+
+def test_values_that_are_none_are_left_out():
+    assert "threshold_on" not in to_dict(DEFAULT)["events"]
+    assert "reference_exposure" not in to_dict(DEFAULT)["camera"]
+    assert to_dict(altered(DEFAULT, "events", threshold_on=0.3))["events"]["threshold_on"] == 0.3
+
+
+# --- errors ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[sensor]\nx = 1", r"unknown group \[sensor\]; known are camera, events, filter"),
+        ("camera = 3", "camera is not a table"),
+        ("[camera]\nlog_ofset = 1", "unknown setting camera.log_ofset; known are .*log_offset"),
+        ("[camera]\nlog_offset = '1'", "camera.log_offset is '1'; a finite number is needed"),
+        ("[camera]\nlog_offset = true", "camera.log_offset is True; a finite number is needed"),
+        ("[camera]\nlog_offset = nan", "camera.log_offset is nan; a finite number is needed"),
+        ("[camera]\nlog_offset = inf", "finite number is needed"),
+        ("[camera]\nlog_offset = 0", "camera.log_offset is 0; it must be positive"),
+        ("[camera]\nlog_offset = -1", "camera.log_offset is -1; it must be positive"),
+        ("[camera]\nresponse = 2.2", "camera.response is 2.2; str is needed"),
+        ("[camera]\nsaturation = 1.01", "at most 1"),
+        ("[camera]\nweight_floor = 1.01", "at most 1"),
+        ("[events]\nnoise_rate = -0.1", "events.noise_rate is -0.1; it must be 0 or more"),
+        ("[events]\nthreshold_on = 0.0", "events.threshold_on is 0.0; it must be positive"),
+        ("[filter]\nkind = 'kf'", "filter.kind is 'kf'; it must be one of akf, cf"),
+        ("[filter]\naugmentation = 1", "filter.augmentation is 1; it must be one of bridge, paper"),
+        ("[filter]\nsolution = ''", "must be one of exact, printed"),
+        ("[filter]\ndeblur = 1", "filter.deblur is 1; bool is needed"),
+        ("[filter", "not valid TOML"),
+        ("settings = 3", "settings"),
+    ],
+)
+def test_errors_name_the_file_and_the_setting(text, message, tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text(text)
+    with pytest.raises(SettingsError, match=message) as caught:
+        load(path, DEFAULT)
+    assert str(caught.value).startswith(str(path))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_file(tmp_path):
+    with pytest.raises(SettingsError, match="cannot be read"):
+        load(tmp_path / "none.toml", DEFAULT)
+
+
+def test_a_file_that_is_not_text(tmp_path):
+    path = tmp_path / "image.toml"
+    path.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(SettingsError, match="cannot be read"):
+        load(path, DEFAULT)
+
+
+@pytest.mark.parametrize(("group", "name"), NUMBERS)
+@pytest.mark.parametrize("value", [-1.0, float("nan"), float("inf"), "0.1", True])
+def test_every_number_is_checked(group, name, value):
+    with pytest.raises(SettingsError, match=f"{group}.{name}"):
+        altered(DEFAULT, group, **{name: value})
+
+
+def test_none_is_only_for_what_can_be_unknown():
+    with pytest.raises(SettingsError, match="camera.log_offset needs a number"):
+        altered(DEFAULT, "camera", log_offset=None)
+
+
+def test_from_dict_does_not_change_its_base():
+    base = preset("default")
+    from_dict({"camera": {"log_offset": 0.5}}, base)
+    assert base.camera.log_offset == 0.03
+
+
+def test_settings_errors_are_input_errors():
+    """So that one except clause, and exit code 2, serve them all."""
+    assert issubclass(SettingsError, InputError)
+    assert issubclass(SettingsError, KaluxError)
+    assert issubclass(SettingsError, ValueError)
+
+
+def test_a_response_that_does_not_exist_is_found_before_any_frame():
+    with pytest.raises(SettingsError, match="unknown response 'log'"):
+        Reconstructor((2, 2), settings=altered(DEFAULT, "camera", response="log"))

@@ -1,0 +1,333 @@
+"""Videos: frames, times and pixels; interrupts, full disks, overwriting."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import signal
+import subprocess
+import sys
+import time
+import tomllib
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+
+from kalux.display import DisplaySettings, Linear
+from kalux.errors import InputError, OutputError, SettingsError
+from kalux.writers import VideoSettings, open_writer, video
+from kalux.writers.video import video_frame
+
+LINEAR = DisplaySettings(Linear())
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Image:
+    t: int
+    intensity: np.ndarray
+    variance: np.ndarray
+
+
+def make_image(t: int, shape: tuple[int, int] = (48, 64), phase: float = 0.0) -> Image:
+    x, y = np.meshgrid(np.linspace(0, 1, shape[1]), np.linspace(0, 1, shape[0]))
+    intensity = (0.5 + 0.45 * np.sin(6 * x + 4 * y + phase)).astype(np.float32)
+    return Image(t, intensity, np.ones(shape, np.float32))
+
+
+def decoded(path: Path) -> tuple[list[float], list[np.ndarray], tuple[int, int]]:
+    """Times in seconds, luma as 0 to 1, and (height, width)."""
+    with av.open(str(path)) as container:
+        frames = list(container.decode(video=0))
+        times = [float(frame.time) for frame in frames]
+        size = frames[0].height, frames[0].width
+        return times, [(luma(frame) - 16) / 219 for frame in frames], size
+
+
+def luma(frame: av.VideoFrame) -> np.ndarray:
+    plane = frame.planes[0]
+    values = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)
+    return values[: frame.height, : frame.width].astype(float)
+
+
+def settings_of(path: Path) -> dict:
+    return tomllib.loads(path.with_name(f"{path.name}.kalux.toml").read_text())
+
+
+def names(folder: Path) -> set[str]:
+    return {p.name for p in folder.iterdir()}
+
+
+def test_frames_times_and_pixels(tmp_path):
+    out = tmp_path / "new" / "v.mp4"
+    images = [make_image(5_000_000 + round(k * 1e6 / 300), phase=0.1 * k) for k in range(40)]
+    with open_writer(out, display=LINEAR, rate_hz=300, metadata={"preset": "default"}) as writer:
+        for image in images:
+            writer.write(image)
+        assert not out.exists()
+    times, pictures, size = decoded(out)
+    assert size == (48, 64)
+    np.testing.assert_allclose(times, np.arange(40) / 300, atol=1e-6)
+    for image, picture in zip(images, pictures, strict=True):
+        assert np.abs(picture - image.intensity).mean() < 0.01
+    with av.open(str(out)) as container:
+        stream = container.streams.video[0]
+        assert stream.frames == 40
+        assert stream.codec_context.name == "h264"
+        assert stream.pix_fmt == "yuv420p"
+        assert stream.average_rate == 300
+    written = settings_of(out)
+    assert written["complete"] is True
+    assert written["images"] == 40
+    assert written["first_t_us"] == 5_000_000
+    assert written["preset"] == "default"
+    assert written["output"]["video"]["crf"] == 18
+    assert names(out.parent) == {"v.mp4", "v.mp4.kalux.toml"}
+
+
+def test_times_as_they_are(tmp_path):
+    stamps = [100, 10_100, 12_345, 50_000, 50_001, 2_000_000]
+    with open_writer(tmp_path / "v.mp4", display=LINEAR) as writer:
+        for t in stamps:
+            writer.write(make_image(t))
+    times, _, _ = decoded(tmp_path / "v.mp4")
+    np.testing.assert_allclose(times, (np.array(stamps) - 100) * 1e-6, atol=1e-7)
+
+
+def test_slow_motion(tmp_path):
+    slow = VideoSettings(slow_motion=10)
+    with open_writer(tmp_path / "v.mp4", rate_hz=300, video=slow) as writer:
+        for k in range(5):
+            writer.write(make_image(round(k * 1e6 / 300)))
+    times, _, _ = decoded(tmp_path / "v.mp4")
+    np.testing.assert_allclose(times, np.arange(5) / 30, atol=1e-6)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (2, 3), (47, 63), (180, 240), (261, 346)])
+def test_odd_sizes_are_padded_by_the_edge(tmp_path, shape):
+    with open_writer(tmp_path / "v.mp4", display=LINEAR, video=VideoSettings(crf=1)) as writer:
+        writer.write(make_image(0, shape))
+    _, pictures, size = decoded(tmp_path / "v.mp4")
+    assert size == (shape[0] + shape[0] % 2, shape[1] + shape[1] % 2)
+    expected = np.pad(make_image(0, shape).intensity, [(0, n % 2) for n in shape], mode="edge")
+    assert np.abs(pictures[0] - expected).max() < 0.03
+
+
+def test_a_frame_is_the_limited_range():
+    frame = video_frame(np.array([[0.0, 1.0], [0.5, 0.25]], np.float32))
+    np.testing.assert_array_equal(luma(frame), [[16, 235], [126, 71]])
+    np.testing.assert_array_equal(np.frombuffer(frame.planes[1], np.uint8)[0], 128)
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
+def test_an_interrupted_video_plays(tmp_path, error):
+    def interrupted():
+        with open_writer(tmp_path / "v.mp4", display=LINEAR) as writer:
+            for k in range(7):
+                writer.write(make_image(1000 * k))
+            raise error
+
+    with pytest.raises(error):
+        interrupted()
+    times, _, _ = decoded(tmp_path / "v.mp4")
+    assert len(times) == 7
+    assert settings_of(tmp_path / "v.mp4")["complete"] is False
+    assert settings_of(tmp_path / "v.mp4")["images"] == 7
+    assert names(tmp_path) == {"v.mp4", "v.mp4.kalux.toml"}
+
+
+def test_an_interrupt_before_the_first_image_leaves_nothing(tmp_path):
+    def interrupted():
+        with open_writer(tmp_path / "v.mp4"):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert names(tmp_path) == set()
+
+
+def test_a_video_without_images_is_an_error(tmp_path):
+    with pytest.raises(OutputError, match="there was no image"):
+        open_writer(tmp_path / "v.mp4").close()
+    assert names(tmp_path) == set()
+
+
+CHILD = """
+import resource, sys
+sys.path.insert(0, sys.argv[2])
+import numpy as np
+from test_video_writer import Image
+from kalux.errors import OutputError
+from kalux.writers import open_writer
+limit = int(sys.argv[3])
+rng = np.random.default_rng(0)
+noise = [rng.uniform(0, 1, (120, 160)).astype(np.float32) for _ in range(8)]
+if limit:
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+try:
+    with open_writer(sys.argv[1]) as writer:
+        for k in range(10**6 if not limit else 200):
+            writer.write(Image(1000 * k, noise[k % 8], noise[0]))
+            print(k, flush=True)
+except OutputError as error:
+    print(error, flush=True)
+    sys.exit(2)
+except KeyboardInterrupt:
+    sys.exit(130)
+"""
+
+
+def child(out: Path, limit: int = 0) -> subprocess.Popen:
+    arguments = [sys.executable, "-c", CHILD, str(out), str(Path(__file__).parent), str(limit)]
+    return subprocess.Popen(arguments, stdout=subprocess.PIPE, text=True)
+
+
+def wait_for(process: subprocess.Popen, line: str) -> None:
+    assert process.stdout is not None
+    for read in process.stdout:
+        if read.strip() == line:
+            return
+
+
+@pytest.mark.parametrize("limit", [1, 50_000, 500_000])
+def test_a_disk_that_is_really_full(tmp_path, limit):
+    process = child(tmp_path / "v.mp4", limit)
+    output, _ = process.communicate(timeout=20)
+    assert process.returncode == 2
+    assert "v.mp4: the file would be larger than allowed; the video" in output.splitlines()[-1]
+    assert names(tmp_path) == set()
+
+
+def test_ctrl_c_while_encoding(tmp_path):
+    process = child(tmp_path / "v.mp4")
+    wait_for(process, "30")
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=20)
+    assert process.returncode == 130
+    written = settings_of(tmp_path / "v.mp4")
+    assert written["complete"] is False
+    times, _, _ = decoded(tmp_path / "v.mp4")
+    assert len(times) == written["images"] >= 31
+    assert names(tmp_path) == {"v.mp4", "v.mp4.kalux.toml"}
+
+
+def test_a_killed_process_leaves_no_video(tmp_path):
+    process = child(tmp_path / "v.mp4")
+    wait_for(process, "10")
+    process.kill()
+    process.communicate(timeout=20)
+    assert names(tmp_path) == {".v.mp4.part"}
+    with open_writer(tmp_path / "v.mp4") as writer:
+        writer.write(make_image(0))
+    assert names(tmp_path) == {"v.mp4", "v.mp4.kalux.toml"}
+
+
+def test_a_video_that_lacks_frames_is_removed(tmp_path, monkeypatch):
+    monkeypatch.setattr(video, "frames_of", lambda path: 0)
+    writer = open_writer(tmp_path / "v.mp4")
+    writer.write(make_image(0))
+    with pytest.raises(OutputError, match="0 of 1 images"):
+        writer.close()
+    assert names(tmp_path) == set()
+
+
+def test_overwriting(tmp_path):
+    out = tmp_path / "v.mp4"
+    out.write_bytes(b"former")
+    with pytest.raises(OutputError, match=r"there already.*overwriting"):
+        open_writer(out)
+    writer = open_writer(out, overwrite=True)
+    writer.write(make_image(0))
+    assert out.read_bytes() == b"former"
+    writer.close()
+    assert len(decoded(out)[0]) == 1
+
+
+def test_a_failed_overwrite_keeps_the_former_video(tmp_path, monkeypatch):
+    out = tmp_path / "v.mp4"
+    with open_writer(out) as writer:
+        writer.write(make_image(0))
+    before = out.read_bytes(), settings_of(out)
+
+    def failing(*arguments):
+        raise OSError(28, os.strerror(28))
+
+    monkeypatch.setattr(video.os, "replace", failing)
+    writer = open_writer(out, overwrite=True)
+    monkeypatch.setattr(video, "frames_of", failing)
+    writer.write(make_image(0))
+    with pytest.raises(OutputError, match="no space is left"):
+        writer.close()
+    assert (out.read_bytes(), settings_of(out)) == before
+    assert names(tmp_path) == {"v.mp4", "v.mp4.kalux.toml"}
+
+
+def test_foreign_settings_and_folders_are_left(tmp_path):
+    (tmp_path / "v.mp4.kalux.toml").write_text("mine = 1")
+    with pytest.raises(OutputError, match="there already"):
+        open_writer(tmp_path / "v.mp4")
+    with pytest.raises(OutputError, match="not an output of kalux"):
+        open_writer(tmp_path / "v.mp4", overwrite=True)
+    (tmp_path / "f.mp4").mkdir()
+    with pytest.raises(OutputError, match="not a file"):
+        open_writer(tmp_path / "f.mp4", overwrite=True)
+
+
+@pytest.mark.parametrize("times", [(0, 0), (0, 10_000, 5000)])
+def test_times_that_do_not_increase_are_refused(tmp_path, times):
+    writer = open_writer(tmp_path / "v.mp4")
+    for t in times[:-1]:
+        writer.write(make_image(t))
+    with pytest.raises(InputError, match="time order"):
+        writer.write(make_image(times[-1]))
+    writer.close()
+    assert settings_of(tmp_path / "v.mp4")["complete"] is False
+
+
+def test_times_that_do_not_fit_the_rate_are_refused(tmp_path):
+    writer = open_writer(tmp_path / "v.mp4", rate_hz=100)
+    writer.write(make_image(0))
+    writer.write(make_image(10_001))
+    with pytest.raises(InputError, match="does not fit 100 images per second"):
+        writer.write(make_image(25_000))
+    writer.stop()
+
+
+def test_a_long_recording_stays_on_the_grid():
+    ticks = video.make_ticks(29.97, VideoSettings())
+    assert ticks.rate == Fraction(2997, 100)
+    for k in (1, 1000, 10**7):
+        assert ticks.count(round(k * 1e6 / 29.97)) == k
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"rate_hz": 0},
+        {"rate_hz": float("nan")},
+        {"rate_hz": 2e6},
+        {"png_bits": 12},
+    ],
+)
+def test_options_out_of_range(tmp_path, options):
+    with pytest.raises(SettingsError):
+        open_writer(tmp_path / "v.mp4", **options)
+
+
+@pytest.mark.parametrize("options", [{"crf": 60}, {"preset": "fastest"}, {"slow_motion": 0}])
+def test_video_settings_out_of_range(options):
+    with pytest.raises(SettingsError):
+        VideoSettings(**options)
+
+
+def test_in_another_thread(tmp_path):
+    from concurrent.futures import ThreadPoolExecutor
+
+    with open_writer(tmp_path / "v.mp4") as writer, ThreadPoolExecutor(1) as pool:
+        for k in range(3):
+            pool.submit(writer.write, make_image(1000 * k)).result()
+    start = time.monotonic()
+    assert len(decoded(tmp_path / "v.mp4")[0]) == 3
+    assert time.monotonic() - start < 5
