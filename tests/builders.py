@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kalux import PRESETS, EVENT_DTYPE, Frame, Recording, Settings
+from kalux import EVENT_DTYPE, PRESETS, Frame, Recording, Settings
 from kalux.datasets import SensorSettings, Simulation, pan, photograph_scene, simulate
 from kalux.events import make_events
 

@@ -266,6 +266,11 @@ def bridged(pixel, settings, times, on, off):
         deviation = (value - augmented(interval, at, at)) / variance / information  # (17)
         return augmented(interval, t, at) + deviation, 1 / information
 
+    def bounded(t):  # K7
+        value, variance = predict(t)
+        _, b, _, right, *_ = intervals[index]
+        return (max(value, right[0]) if t == b and right[1] >= UNMEASURED else value), variance
+
     def step_to(limit):
         nonlocal state, at
         while pending and pending[0][0] <= limit:
@@ -281,12 +286,10 @@ def bridged(pixel, settings, times, on, off):
     for t in times:
         while intervals[index][1] is not None and t > intervals[index][1]:
             step_to(intervals[index][1])
-            (value, variance), at = predict(intervals[index][1]), intervals[index][1]
+            state, at = bounded(intervals[index][1]), intervals[index][1]
             index += 1
-            frame = intervals[index][2]
-            state = (max(value, frame[0]) if frame[1] >= UNMEASURED else value, variance)  # K7
         step_to(t)
-        out.append(predict(t))
+        out.append(bounded(t))
     return np.array(out)
 
 

@@ -76,15 +76,28 @@ def test_engine_agrees_with_the_oracle(name, data):
     for i, t in enumerate(times):
         image = engine.read(t)
         k = max([j for j, f in enumerate(frames) if engine_node(f, name) < t], default=-1)
-        white = max(10_000 / f.exposure for f in frames[max(k, 0) : k + 2])
+        white = white_at(t, k, frames, name, chosen.camera.log_offset)
         stretch = chosen.events.threshold_spread**2
         level = np.vectorize(lambda v, p: naive.intensity(v, p, chosen, white, stretch))(  # noqa: B023
             expected[i], np.nan_to_num(variance[i])
         )
         offset = chosen.camera.log_offset
         np.testing.assert_allclose(np.log(image.intensity + offset), np.log(level + offset), atol=1e-4)
-        if image.variance is not None:
+        if name != "cf":
             np.testing.assert_allclose(image.variance, variance[i], rtol=1e-4)
+
+
+def white_at(t, k, frames, name, offset):
+    """The level that frames show, from one frame's to the next's: linear in log(white + I_0)."""
+    levels = [10_000 / f.exposure for f in frames]
+    if k < 0 or k + 1 == len(frames):
+        return levels[max(k, 0)]
+    start, end = engine_node(frames[k], name), engine_node(frames[k + 1], name)
+    fraction = (t - start) / (end - start)
+    return (
+        np.exp((1 - fraction) * np.log(levels[k] + offset) + fraction * np.log(levels[k + 1] + offset))
+        - offset
+    )
 
 
 def engine_node(frame, name):

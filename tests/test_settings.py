@@ -6,13 +6,14 @@ import dataclasses
 
 import pytest
 import tomli_w
-from builders import altered
 from hypothesis import given
 from hypothesis import strategies as st
 
 from kalux import PRESETS, Reconstructor, Settings, preset
 from kalux.errors import InputError, KaluxError, SettingsError
 from kalux.settings import CameraSettings, EventSettings, FilterSettings, from_dict, load, to_dict
+
+from builders import altered
 
 DEFAULT = PRESETS["default"]
 GROUPS = {"camera": CameraSettings, "events": EventSettings, "filter": FilterSettings}
@@ -140,6 +141,7 @@ def test_values_that_are_none_are_left_out():
         ("[camera]\nresponse = 2.2", "camera.response is 2.2; str is needed"),
         ("[camera]\nsaturation = 1.01", "at most 1"),
         ("[camera]\nweight_floor = 1.01", "at most 1"),
+        ("[camera]\nweight_floor = 0", "camera.weight_floor is 0; it must be positive"),  # f^w may be 0
         ("[events]\nnoise_rate = -0.1", "events.noise_rate is -0.1; it must be 0 or more"),
         ("[events]\nthreshold_on = 0.0", "events.threshold_on is 0.0; it must be positive"),
         ("[filter]\nkind = 'kf'", "filter.kind is 'kf'; it must be one of akf, cf"),
@@ -179,7 +181,7 @@ def test_every_number_is_checked(group, name, value):
 
 
 def test_none_is_only_for_what_can_be_unknown():
-    with pytest.raises(SettingsError, match="camera.log_offset needs a number"):
+    with pytest.raises(SettingsError, match=r"camera\.log_offset needs a number"):
         altered(DEFAULT, "camera", log_offset=None)
 
 

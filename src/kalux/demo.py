@@ -84,7 +84,7 @@ def run_demo(
     out: Path,
     *,
     scene: Scene | None = None,
-    moment: int = MOMENT,
+    moment: int | None = None,
     overwrite: bool = False,
     say: Callable[[str], None] = lambda text: None,
 ) -> list[Score]:
@@ -97,7 +97,7 @@ def run_demo(
     scene
         What to simulate. Default: `kalux.datasets.demo_scene`.
     moment
-        Time of the picture, us.
+        Time of the picture, us. Default: `MOMENT`.
     overwrite
         Replace these three files in a folder that is not empty.
     say
@@ -115,6 +115,7 @@ def run_demo(
     OutputError
         The folder is not empty, or cannot be written.
     """
+    moment = MOMENT if moment is None else moment
     prepare(out, overwrite=overwrite)
     say("simulating a dim room with a bright window, seen by a moving event camera ...")
     simulation = simulate(scene or demo_scene(), DEMO_SENSOR)
@@ -244,7 +245,7 @@ def write_video(path: Path, compared: Comparison, *, overwrite: bool) -> None:
     )
     with writer:
         for held, image in zip(compared.held, compared.akf, strict=True):
-            pair = np.concatenate([held, image.intensity], axis=1)
+            pair = np.concatenate([held, image.intensity], axis=1).repeat(2, axis=0).repeat(2, axis=1)
             writer.write(_Pair(image.t, pair, np.zeros_like(pair)))
 
 

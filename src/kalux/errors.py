@@ -10,9 +10,10 @@
     │   ├── ExposureError     exposure times are missing, empty or overlap
     │   └── SettingsError     a setting is unknown or out of its range
     ├── OutputError           an output cannot be written
-    └── MissingDependencyError  an optional library is not installed
+    ├── MissingDependencyError  an optional library is not installed
+    └── InternalError         kalux itself is wrong: please report it
 
-Messages are one line. The command line prints them as they are and exits with code 2.
+Messages are one line. The command line prints them as they are and exits with code 2, or 1 for an InternalError.
 """
 
 from __future__ import annotations
@@ -52,3 +53,7 @@ class OutputError(KaluxError, OSError):
 
 class MissingDependencyError(KaluxError, ImportError):
     """An optional library is not installed; the message names the extra that brings it."""
+
+
+class InternalError(KaluxError, RuntimeError):
+    """A result of kalux is not what it must be: an error in kalux, not in what it was given."""

@@ -16,7 +16,8 @@ from kalux.events import EventArray
 from kalux.frames import Frame
 from kalux.reconstructor import Image, Reconstructor
 from kalux.recording import Recording
-from kalux.settings import Settings, preset
+from kalux.settings import Settings
+from kalux.settings import preset as named_preset
 
 ThresholdOrigin = Literal["settings", "recording", "estimate", "assumed"]
 
@@ -60,7 +61,7 @@ def plan(
     lookahead: bool = True,
 ) -> Plan:
     """Decide what a reconstruction will do. See `reconstruct` for the parameters and errors."""
-    chosen = settings if settings is not None else _preset(preset)
+    chosen = settings if settings is not None else named_preset(preset)
     if sum(choice is not None for choice in (rate_hz, times, at)) != 1:
         raise InputError("reconstruct: give exactly one of rate_hz, times and at")
     exposures = _exposures(recording)
@@ -144,18 +145,28 @@ def execute(
             ended = not _push_next(engine, chunks, on_events)
         if ended:
             engine.advance(frame.exposure_end)
-        final_until = engine.final_until
-        while t is not None and final_until is not None and t <= final_until:
+        while t is not None and _is_final(engine, t):
             yield engine.read(t)
             t = next(pending, None)
         if t is None:
             return
-    while not ended:
+        engine.forget(t)
+    engine.end_frames()
+    while not ended and t is not None:
         ended = not _push_next(engine, chunks, on_events)
+        while t is not None and _is_final(engine, t):
+            yield engine.read(t)
+            t = next(pending, None)
+        if t is not None:
+            engine.forget(t)
     engine.finish()
     while t is not None:
         yield engine.read(t)
         t = next(pending, None)
+
+
+def _is_final(engine: Reconstructor, t: int) -> bool:
+    return engine.final_until is not None and t <= engine.final_until
 
 
 def _push_next(
@@ -168,10 +179,6 @@ def _push_next(
     if on_events is not None:
         on_events(len(chunk))
     return True
-
-
-def _preset(name: str) -> Settings:
-    return preset(name)
 
 
 def _exposures(recording: Recording) -> NDArray[np.int64]:

@@ -21,7 +21,8 @@ from kalux.filters.methods import Method, Segment, Shot, make_method, take_shot
 from kalux.filters.readout import HighlightPrior, intensity
 from kalux.frames import Frame, check_frame
 from kalux.models.camera import Camera, Response
-from kalux.settings import Settings, preset
+from kalux.settings import Settings
+from kalux.settings import preset as named_preset
 
 _UNKNOWN_THRESHOLD: Final = 0.25
 """Contrast threshold assumed where neither a recording nor the user says one: in the middle of what DAVIS and
@@ -39,14 +40,15 @@ class Image:
     intensity
         float32 (H, W), linear: 1.0 = a saturated frame pixel at the reference exposure; more in highlights.
     variance
-        float32 (H, W), P: the variance of the log intensity (20). None for the complementary filter.
+        float32 (H, W), P: the variance of the log intensity (20); infinite for the complementary filter, which
+        knows none.
     final
         Whether more data can no longer change it. With lookahead an image is final one frame later.
     """
 
     t: int
     intensity: NDArray[np.float32]
-    variance: NDArray[np.float32] | None
+    variance: NDArray[np.float32]
     final: bool
 
 
@@ -108,7 +110,7 @@ class Reconstructor:
         if height <= 0 or width <= 0:
             raise InputError(f"sensor_size is {sensor_size}; (height, width) in pixels is needed")
         self.sensor_size = (height, width)
-        self.settings = settings if settings is not None else _preset(preset)
+        self.settings = settings if settings is not None else named_preset(preset)
         self.lookahead = lookahead
         on, off = _pair(contrast_threshold)
         chosen = self.settings.events
@@ -136,7 +138,9 @@ class Reconstructor:
         self._event_count = 0
         self._last_event: int | None = None
         self._complete_until: int | None = None
+        self._frames_ended = False
         self._finished = False
+        self._earliest: int | None = None  # what `forget` was told
 
     # Pushing.
 
@@ -167,15 +171,18 @@ class Reconstructor:
         array = as_events(events)
         previous = self._last_event
         if self._complete_until is not None:
-            previous = max(self._complete_until + 1, previous or 0)
+            earliest = self._complete_until + 1
+            previous = earliest if previous is None else max(previous, earliest)
         check_events(array, self.sensor_size, first_index=self._event_count, previous_t=previous)
         if len(array) == 0:
             return
         self._event_count += len(array)
         self._last_event = int(array["t"][-1])
         self.advance(self._last_event - 1)  # more events may carry the last one's time
-        start = self._start_time()
-        self._chunks.append(array if start is None else array[array["t"].searchsorted(start, "right") :])
+        if self._needed_from is not None:
+            array = array[array["t"].searchsorted(self._needed_from, "right") :]
+        # A copy: drivers fill the same buffer again.
+        self._chunks.append(array.copy() if array.base is not None or array is events else array)
 
     def advance(self, t: int) -> None:
         """Declare that all events up to ``t`` (us) have been pushed: silence is information too."""
@@ -185,9 +192,36 @@ class Reconstructor:
         """Whether all events up to ``t`` (us) are known to be here."""
         return self._finished or (self._complete_until is not None and self._complete_until >= t)
 
+    def end_frames(self) -> None:
+        """Declare that no more frames come."""
+        self._frames_ended = True
+
     def finish(self) -> None:
         """Declare that nothing more comes: what is left becomes final."""
-        self._finished = True
+        self._finished = self._frames_ended = True
+
+    def forget(self, t: int) -> None:
+        """Promise not to read before ``t`` (us), so that the memory of what led there can be freed.
+
+        Frees what is final; reading frees in the same way, but only up to the segment that is read.
+        """
+        final_until = self.final_until
+        if (
+            not self._shots
+            or final_until is None
+            or (self._state is None and not self._is_complete(self._shots[0]))
+        ):
+            return
+        begin = self.begin_time
+        limit = min(t, final_until)
+        if begin is None or limit <= begin:
+            return
+        progress = self._progress_to(limit)
+        if progress.ready or self._frames_ended:
+            self._take(progress, limit)
+            self._drop_events(progress.latest)
+            progress.taken = 0
+            self._earliest = limit
 
     # Reading.
 
@@ -196,7 +230,8 @@ class Reconstructor:
         """The first time, us, that can be read; None before the first frame."""
         if self._state is None and self._shots:
             return self._method.begin_time(self._shots[0])
-        return self._start_time()
+        start = self._start_time()
+        return start if start is None or self._earliest is None else max(start, self._earliest)
 
     @property
     def final_until(self) -> int | None:
@@ -205,8 +240,12 @@ class Reconstructor:
             return None
         if self._finished:
             return np.iinfo(np.int64).max
-        if not self.lookahead:
+        if self._frames_ended and self._complete_until is not None:
             return self._complete_until
+        if not self.lookahead:
+            # A frame that is still to come ends after the last one, and changes images from there on.
+            until = self._complete_until
+            return None if until is None else min(until, self._shots[-1].end)
         complete = [shot for shot in self._shots if self._is_complete(shot)]
         return self._method.node(complete[-1]) if complete else self._start_time()
 
@@ -228,7 +267,7 @@ class Reconstructor:
         if t < begin:
             raise InputError(
                 f"read: {t} us lies before {begin} us, the earliest time that can be read "
-                "(the first frame, or what later reads have passed)"
+                "(the first frame, or what later reads have passed or forget() has freed)"
             )
         progress = self._progress_to(t)
         self._take(progress, t)
@@ -237,25 +276,42 @@ class Reconstructor:
 
     def _image(self, progress: _Progress, t: int, final: bool) -> Image:
         log_intensity, variance = self._method.read(progress.segment, progress.cursor, t)
-        shots = self._shots[:2] if progress.starts_frame else self._shots[:1]
-        offset, scale = self.settings.camera.log_offset, self.settings.filter.highlight_scale
+        offset = self.settings.camera.log_offset
+        # The prior needs a variance, which the complementary filter has not.
+        scale = self.settings.filter.highlight_scale if self.settings.filter.kind == "akf" else 0.0
         events = self.settings.events
         spread = events.extrapolation_spread if self._estimated else events.threshold_spread
         prior = HighlightPrior(
-            white=float(np.log(max(shot.white for shot in shots) + offset)),
-            scale2=scale**2 if variance is not None else 0.0,
+            white=self._white(progress, t),
+            scale2=scale**2,
             stretch=spread**2 / scale if scale > 0 else 0.0,
         )
         return Image(
             t=t,
-            intensity=intensity(
-                log_intensity, np.zeros_like(log_intensity) if variance is None else variance, offset, prior
-            ),
-            variance=None if variance is None else variance.astype(np.float32),
+            intensity=intensity(log_intensity, variance, offset, prior),
+            variance=variance.astype(np.float32),
             final=final,
         )
 
+    def _white(self, progress: _Progress, t: int) -> float:
+        """log(I + I_0) of the brightest level that frames show at ``t``: from one frame's to the next's."""
+        offset = self.settings.camera.log_offset
+        white = float(np.log(self._shots[0].white + offset))
+        if not (self.lookahead and progress.ready and progress.starts_frame):
+            return white
+        segment = progress.segment
+        fraction = (t - segment.start) / (segment.end - segment.start)
+        return white + fraction * (float(np.log(self._shots[1].white + offset)) - white)
+
     # Segments.
+
+    @property
+    def _needed_from(self) -> int | None:
+        """No event up to this time is needed any more."""
+        start = self._start_time()
+        if start is None:
+            return self._shots[0].start if self._shots else None
+        return start if self._earliest is None else max(start, self._earliest)
 
     def _require_open(self) -> None:
         if self._finished:
@@ -337,7 +393,7 @@ class Reconstructor:
     def _end_state(self, progress: _Progress) -> State:
         value, variance = self._method.read(progress.segment, progress.cursor, progress.segment.end)
         newest = self._method.newest(progress.cursor)
-        return State(value, np.zeros_like(value) if variance is None else variance, newest)
+        return State(value, variance, newest)
 
     def _commit(self, progress: _Progress) -> None:
         """Move the state to the end of a final segment; forget its frame and events."""
@@ -384,15 +440,11 @@ class Reconstructor:
             first = last
 
 
-def _preset(name: str) -> Settings:
-    return preset(name)
-
-
 def _pair(threshold: float | tuple[float, float] | None) -> tuple[float | None, float | None]:
     if threshold is None:
         return None, None
-    on, off = (threshold, threshold) if isinstance(threshold, (int, float)) else threshold
+    on, off = (float(value) for value in np.broadcast_to(np.asarray(threshold, np.float64), 2))
     for value in (on, off):
         if not (np.isfinite(value) and value > 0):
             raise InputError(f"contrast threshold is {value}; it must be positive (log intensity, e.g. 0.2)")
-    return float(on), float(off)
+    return on, off

@@ -206,8 +206,11 @@ def load(path: str | Path, base: Settings) -> Settings:
         raise SettingsError(f"{path}: cannot be read: {error}") from error
     except tomllib.TOMLDecodeError as error:
         raise SettingsError(f"{path}: not valid TOML: {error}") from error
+    chosen = values.get("settings", values)
+    if not isinstance(chosen, Mapping):
+        raise SettingsError(f"{path}: settings is not a table of settings")
     try:
-        return from_dict(values.get("settings", values), base)
+        return from_dict(chosen, base)
     except SettingsError as error:
         raise SettingsError(f"{path}: {error}") from None
 
@@ -216,6 +219,7 @@ _POSITIVE: Final = {
     "log_offset",
     "frame_noise",
     "confidence",
+    "weight_floor",
     "saturation",
     "reference_exposure",
     "threshold_on",

@@ -198,12 +198,12 @@ def test_the_neighbourhood_is_clipped_at_the_border():
 
 
 def test_a_clipped_frame_lifts_the_state_to_its_bound():
-    """K7: a saturated pixel cannot be darker than white; one that is brighter already stays."""
-    pair = np.array([[-1.0, 2.0]])
+    """K7: where a frame is saturated the state is no darker than white; one that is brighter already stays."""
     ones = np.ones((1, 2))
     segment = BridgedSegment(
         0, 1000, ones * 0, ones * 0, ones, ones, ones * 1e12, ones * 1e12, 0.0, 1.0, ones * 0.03
     )
-    start = State(pair, ones * 0.1, np.zeros((1, 2), np.int64))
-    value, _ = akf.read_bridged(segment, akf.begin_bridged(segment, start), 0)
-    np.testing.assert_allclose(value, [[0.03, 2.0]], atol=1e-9)
+    start = State(np.array([[-1.0, 2.0]]), ones * 0.1, np.zeros((1, 2), np.int64))
+    cursor = akf.begin_bridged(segment, start)
+    np.testing.assert_allclose(akf.read_bridged(segment, cursor, 999)[0], [[-1.0, 2.0]], atol=1e-9)
+    np.testing.assert_allclose(akf.read_bridged(segment, cursor, 1000)[0], [[0.03, 2.0]], atol=1e-9)

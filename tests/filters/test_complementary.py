@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
-from builders import events, pixel_events
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from kalux.filters.complementary import HeldSegment, advance, begin, read
+
+from builders import events, pixel_events
 
 ON, OFF = 0.3, 0.2
 
@@ -21,7 +24,7 @@ def held(log_frame=0.0, gain=6.0, start=1000, shape=(1, 1)):
 def solved(value, target, gain, times, polarities, start, t):
     """dL/dt = -gain (L - target), with a jump at every event, by Runge and Kutta."""
     edges = [start, *times, t]
-    for i, (a, b) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+    for i, (a, b) in enumerate(pairwise(edges)):
         if b > a:
             solution = solve_ivp(
                 lambda _, y: -gain * (y - target), (a * 1e-6, b * 1e-6), [value], rtol=1e-10, atol=1e-12

@@ -31,9 +31,7 @@ def test_after_the_refractory_bound_only_two_terms_are_left():
 
 @given(rates, rates, rates, st.floats(0.0, 1.0), seconds, seconds)
 def test_event_noise_is_the_sum_of_its_three_parts(proc, iso, ref, bound, pixel, neighbour):
-    parts = (
-        process_noise(proc, pixel) + isolated_noise(iso, neighbour) + refractory_noise(ref, pixel, bound)
-    )
+    parts = process_noise(proc, pixel) + isolated_noise(iso, neighbour) + refractory_noise(ref, pixel, bound)
     assert event_noise(proc, iso, ref, bound, pixel, neighbour) == pytest.approx(parts, rel=1e-12)
 
 

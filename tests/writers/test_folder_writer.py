@@ -20,7 +20,7 @@ import OpenEXR
 import pytest
 
 from kalux.display import DisplaySettings, Linear, tone_map_next
-from kalux.errors import InputError, OutputError, SettingsError
+from kalux.errors import InputError, InternalError, OutputError, SettingsError
 from kalux.writers import files, open_writer
 from kalux.writers.files import uninterrupted
 from kalux.writers.folder import append_line
@@ -417,7 +417,7 @@ def test_intensities_that_are_not_finite_are_never_written(tmp_path, bad, format
     image.intensity[2, 5] = bad
     writer = open_writer(tmp_path / "o", format=format)
     writer.write(make_image(0))
-    with pytest.raises(OutputError, match="image 1 at 1003333 us: the intensity at x=5, y=2 is not finite"):
+    with pytest.raises(InternalError, match="image 1 at 1003333 us: the intensity at x=5, y=2 is not finite"):
         writer.write(image)
     assert len(listed(tmp_path / "o")) == 1
 
@@ -428,7 +428,7 @@ def test_a_variance_may_be_infinite_but_not_nan(tmp_path):
     writer = open_writer(tmp_path / "o", format="npy")
     writer.write(image)
     image.variance[0, 0] = np.nan
-    with pytest.raises(OutputError, match="variance at x=0, y=0 is NaN"):
+    with pytest.raises(InternalError, match="variance at x=0, y=0 is NaN"):
         writer.write(image)
 
 

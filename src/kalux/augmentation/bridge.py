@@ -60,8 +60,8 @@ class BridgedSegment(NamedTuple):
     Times are int us, arrays (H, W) float64, log intensity. Between events L^A moves by ``slope`` (1/s); an
     event moves it by ``step_on`` or -``step_off`` (both usually positive) and moves ``step_variance`` from
     ``backward_variance`` to ``forward_variance``. The covariance of L^A as a measurement is
-    R = 1 / (rate (1/forward + 1/backward)), ``rate`` in 1/s. At ``start`` the pixel cannot be darker than
-    ``lower_bound``.
+    R = 1 / (rate (1/forward + 1/backward)), ``rate`` in 1/s. At ``end`` the pixel is no darker than
+    ``end_bound``.
     """
 
     start: int
@@ -74,7 +74,7 @@ class BridgedSegment(NamedTuple):
     backward_variance: Array
     step_variance: float
     rate: float
-    lower_bound: Array
+    end_bound: Array
 
 
 def lower_bound(frame: Latent) -> Array:
@@ -143,7 +143,7 @@ def bridge(
         backward_variance=second.variance + of_events,
         step_variance=noise.step_variance,
         rate=0.5 / seconds,
-        lower_bound=lower_bound(first),
+        end_bound=lower_bound(second),
     )
     low, high = _SCALE_BOUNDS
     learned = Thresholds(
@@ -156,11 +156,18 @@ def bridge(
 
 
 def extend(
-    frame: Latent, thresholds: Thresholds, noise: BridgeNoise, start: int, end: int, seconds: float
+    frame: Latent,
+    thresholds: Thresholds,
+    noise: BridgeNoise,
+    start: int,
+    end: int,
+    seconds: float,
+    end_bound: Array,
 ) -> BridgedSegment:
     """L^A from one frame alone, forward in time (10): causal mode, and after the last frame.
 
-    ``seconds`` is the time over which the frame's information is spread, that to the next frame.
+    ``seconds`` is the time over which the frame's information is spread, that to the next frame; ``end_bound``
+    what the next frame says if it is clipped, -inf elsewhere.
     """
     return BridgedSegment(
         start=start,
@@ -173,7 +180,7 @@ def extend(
         backward_variance=np.full_like(frame.value, UNMEASURED),
         step_variance=noise.step_variance,
         rate=1.0 / seconds,
-        lower_bound=lower_bound(frame),
+        end_bound=end_bound,
     )
 
 
@@ -193,5 +200,5 @@ def extend_backward(
         backward_variance=frame.variance + noise.step_variance * (on + off),
         step_variance=noise.step_variance,
         rate=0.5 / ((end - start) * 1e-6),
-        lower_bound=np.full_like(frame.value, -np.inf),
+        end_bound=lower_bound(frame),
     )

@@ -21,7 +21,9 @@ MAX_SAMPLES: Final = 400_000
 """Pixels that are enough: the standard error of the fit is then below 0.1 %."""
 
 _MIN_SAMPLES: Final = 200
+_UNEXPLAINED: Final = 0.8  # of the typical change; 0.3 to 0.6 on recordings of moving scenes, 3 on flicker
 _WELL_EXPOSED: Final = (0.05, 0.95)  # of the response: away from black, noise and saturation
+_NORMAL_MAD: Final = 1.4826  # standard deviation over median absolute deviation, of a normal distribution
 _HUBER: Final = 1.345  # 95 % efficiency for normal residuals (Huber 1981)
 _MAX_FRAMES: Final = 200
 
@@ -53,7 +55,11 @@ def estimate_thresholds(recording: Recording, camera: CameraSettings) -> Thresho
     weights. A single event says little: it may be noise, and the rest of the threshold that it leaves over is
     as large as its step. Looks at the first 200 frames, or at fewer when those give enough pixels.
 
-    Returns None where the recording has too few such pixels (200), e.g. because nothing moves.
+    The thresholds are steps of log(I + I_0): with a large I_0, as in the paper, they come out smaller than the
+    sensor's.
+
+    Returns None where the recording has too few such pixels (200), e.g. because nothing moves, or where the
+    events hardly explain how the frames change (residual above 0.8 of the change), e.g. because they are flicker.
 
     Raises
     ------
@@ -73,7 +79,10 @@ def estimate_thresholds(recording: Recording, camera: CameraSettings) -> Thresho
             break
     if count < _MIN_SAMPLES:
         return None
-    return fit_thresholds(np.concatenate(differences), np.concatenate(ons), np.concatenate(offs))
+    difference = np.concatenate(differences)
+    fit = fit_thresholds(difference, np.concatenate(ons), np.concatenate(offs))
+    typical = _NORMAL_MAD * float(np.median(np.abs(difference)))
+    return None if fit is None or fit.residual > _UNEXPLAINED * typical else fit
 
 
 def fit_thresholds(difference: Array, on: Array, off: Array) -> ThresholdEstimate | None:
@@ -90,9 +99,12 @@ def fit_thresholds(difference: Array, on: Array, off: Array) -> ThresholdEstimat
         normal = weighted.T @ design
         if np.linalg.cond(normal) > 1e8:
             return None
-        previous, solution = solution, np.linalg.solve(normal, weighted.T @ difference)
+        previous = solution
+        solution = np.linalg.solve(normal, weighted.T @ difference).astype(np.float64)
         residual = difference - design @ solution
-        scale = 1.4826 * float(np.median(np.abs(residual)))
+        scale = _NORMAL_MAD * float(np.median(np.abs(residual)))
+        if scale < 1e-9:
+            break  # an exact fit: nothing to weigh down
         weights = np.minimum(1.0, _HUBER * scale / np.maximum(np.abs(residual), 1e-12))
         if np.abs(solution - previous).max() < 1e-5:
             break
@@ -109,7 +121,7 @@ def _samples(recording: Recording, camera: CameraSettings) -> Iterator[tuple[Arr
     buffer: EventArray = np.empty(0, EVENT_DTYPE)
     previous: Shot | None = None
     previous_usable: NDArray[np.bool_] | None = None
-    reference = 0.0
+    reference = float(camera.reference_exposure or 0)
     for index, frame in enumerate(recording.frames()):
         if index == _MAX_FRAMES:
             return

@@ -10,7 +10,7 @@ from kalux.cli import demo, info, reconstruct
 from kalux.cli.parser import Parser, UsageError, normalised
 from kalux.cli.signals import termination_as_interrupt
 from kalux.cli.terminal import close_output, error_line
-from kalux.errors import KaluxError
+from kalux.errors import InternalError, KaluxError
 
 DONE, BUG, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 
@@ -56,6 +56,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _guarded(arguments: list[str]) -> int:
     try:
         return _run(arguments)
+    except InternalError as error:
+        error_line(f"error: {error}", *_notes(error))
+        return BUG
     except KaluxError as error:
         error_line(f"error: {error}", *_notes(error))
         return BAD_INPUT

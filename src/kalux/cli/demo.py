@@ -47,7 +47,11 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     from kalux.demo import run_demo
 
     started = time.monotonic()
-    found = run_demo(options.out, overwrite=options.overwrite, say=say)
+    try:
+        found = run_demo(options.out, overwrite=options.overwrite, say=say)
+    except KeyboardInterrupt as interrupt:
+        interrupt.add_note(f"what is in {options.out} is whole; kalux demo --overwrite makes the rest")
+        raise
     say(f"done in {time.monotonic() - started:.0f} s\n")
     say(score_table(found))
     say(_guide(options.out))

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from typing import Any, Literal, NamedTuple
 
 from kalux.cli.parser import number, true_or_false, whole
+from kalux.cli.terminal import say
 from kalux.display import CURVES, DisplaySettings, curve_from_name
 from kalux.errors import SettingsError
 from kalux.settings import Settings
@@ -139,7 +140,8 @@ class HelpSettings(argparse.Action):
 
     def __call__(self, parser: argparse.ArgumentParser, *unused: Any) -> None:
         """Print and end."""
-        parser.exit(message=settings_help())
+        say(settings_help())
+        parser.exit()
 
 
 def settings_help() -> str:
@@ -157,7 +159,7 @@ def settings_help() -> str:
     for name, flags in display_flags().items():
         title = f"--display {name}: {_summary(CURVES[name])}" if name else "every display:"
         lines += ["", title, *(line for flag in flags for line in _described(flag))]
-    return "\n".join(lines) + "\n"
+    return "\n".join(lines)
 
 
 def _described(flag: Flag) -> list[str]:

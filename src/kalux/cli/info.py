@@ -68,8 +68,8 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
 
     recording = open_recording(options)
     say(format_description(describe(recording)))
-    if not options.no_estimate and recording.contrast_threshold is None and recording.exposure_known:
-        say(estimate_text(recording))
+    if not options.no_estimate and recording.contrast_threshold is None:
+        say(f"  estimate   {estimate_text(recording)}")
 
 
 def estimate_text(recording: Recording) -> str:
@@ -77,10 +77,12 @@ def estimate_text(recording: Recording) -> str:
     from kalux.calibration.contrast import estimate_thresholds
     from kalux.settings import CameraSettings
 
+    if not recording.exposure_known:
+        return "thresholds cannot be estimated without exposure times; give --exposure"
     estimate = estimate_thresholds(recording, CameraSettings())
     if estimate is None:
-        return "estimated thresholds: none, too little moves before well exposed pixels"
+        return "thresholds cannot be estimated, too little moves before well exposed pixels"
     return (
-        f"estimated thresholds: on {estimate.on:.3f}, off {estimate.off:.3f} "
-        f"(residual {estimate.residual:.3f}, {estimate.samples:,} samples)"
+        f"threshold ON {estimate.on:.3f}, OFF {estimate.off:.3f}; "
+        f"residual {estimate.residual:.2f} of {estimate.samples:,} samples"
     )

@@ -8,6 +8,7 @@ import re
 from collections.abc import Callable, Sequence
 from typing import Any, Never
 
+from kalux.cli.terminal import say
 from kalux.errors import InputError
 
 
@@ -82,7 +83,8 @@ class _Version(argparse.Action):
     def __call__(self, parser: argparse.ArgumentParser, *unused: Any) -> None:
         from kalux import __version__
 
-        parser.exit(message=f"kalux {__version__}\n")
+        say(f"kalux {__version__}")
+        parser.exit()
 
 
 def normalised(arguments: Sequence[str]) -> list[str]:

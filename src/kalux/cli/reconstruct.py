@@ -3,40 +3,32 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import dataclasses
 import importlib.metadata
 import shlex
 import tomllib
-from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from kalux.cli.checking import Contents, check_recording
-from kalux.cli.flags import HelpSettings, add_display, add_settings, given_display, given_settings
+from kalux.cli.flags import HelpSettings, add_display, add_settings, given_settings
 from kalux.cli.info import add_recording, open_recording
+from kalux.cli.output import DEFAULT_RATE, FOLDER_FORMATS, Output, check_output, chosen_output
 from kalux.cli.parser import Parser, UsageError, number
 from kalux.cli.progress import Progress, short_number
 from kalux.cli.terminal import say, warn
 from kalux.cli.times import load_times
-from kalux.display import CURVES, DisplaySettings
-from kalux.errors import InputError, OutputError
+from kalux.display import CURVES
+from kalux.errors import InputError
 from kalux.pipeline import Plan, execute, plan
-from kalux.reconstructor import Image, Reconstructor
+from kalux.reconstructor import Reconstructor
 from kalux.recording import Recording
 from kalux.settings import PRESETS, Settings, from_dict, load, preset, to_dict
 
 if TYPE_CHECKING:
-    from kalux.writers import ImageLike, VideoSettings, Writer
-
-DEFAULT_RATE: Final = 100.0
-"""Images per second where nothing is said: several per frame, and a video that plays in real time."""
-
-_FOLDER_FORMATS = ("png", "exr", "npy")
-_NOT_FOLDERS = {".avi", ".mkv", ".mov", ".webm", ".gif", ".m4v", ".png", ".exr", ".npy", ".tif", ".jpg"}
+    from kalux.writers import Writer
 
 _DESCRIPTION = """\
 Reconstruct HDR images, at any rate, from a recording of events and frames. The whole recording is checked
@@ -99,7 +91,7 @@ def _add_output(parser: Parser) -> None:
     )
     group.add_argument(
         "--format",
-        choices=_FOLDER_FORMATS,
+        choices=FOLDER_FORMATS,
         help="of a folder: png is a picture (default), exr and npy hold linear intensity and variance",
     )
     group.add_argument("--overwrite", action="store_true", help="replace a former output of kalux")
@@ -144,19 +136,6 @@ def _add_display(parser: Parser) -> None:
     add_display(parser)
 
 
-@dataclass(frozen=True)
-class Output:
-    """What is to be written where."""
-
-    path: Path
-    format: str
-    display: DisplaySettings
-    video: VideoSettings
-    png_bits: int
-    rate_hz: float | None
-    overwrite: bool
-
-
 def run(options: argparse.Namespace, command: list[str]) -> None:
     """Run the command."""
     if options._ is not None:
@@ -181,92 +160,11 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     if not options.quiet:
         say(
             f"wrote       {images:,} images to {output.path} in {seconds:.1f} s "
-            f"({short_number(images / seconds)} images/s), settings in {settings_path(output)}"
+            f"({short_number(images / seconds)} images/s), settings in {output.settings_path}"
         )
 
 
 # Decide.
-
-
-def chosen_output(options: argparse.Namespace) -> Output:
-    """What the flags say of the output.
-
-    Raises
-    ------
-    UsageError
-        Flags contradict each other or the name.
-    """
-    from kalux.writers import VideoSettings
-
-    path: Path = options.out
-    is_video = path.suffix.lower() == ".mp4"
-    if is_video and options.format is not None:
-        raise UsageError(
-            f"--format {options.format}: {path} is a video; give a folder with -o, or no --format"
-        )
-    if not is_video and path.suffix.lower() in _NOT_FOLDERS and not path.is_dir():
-        raise UsageError(f"{path}: give a name that ends in .mp4 for a video, or the name of a folder")
-    format = "mp4" if is_video else options.format or "png"
-    _check_flags(options, format)
-    rate = None if options.times is not None or options.at is not None else options.rate or DEFAULT_RATE
-    video = VideoSettings(
-        crf=18.0 if options.crf is None else options.crf,
-        slow_motion=1.0 if options.slow_motion is None else options.slow_motion,
-    )
-    return Output(
-        path, format, given_display(options), video, options.png_bits or 16, rate, options.overwrite
-    )
-
-
-def _check_flags(options: argparse.Namespace, format: str) -> None:
-    """Refuse flags that would have no effect."""
-    uses = {"png_bits": ("png",), "crf": ("mp4",), "slow_motion": ("mp4",), "display": ("png", "mp4")}
-    for name, formats in uses.items():
-        if getattr(options, name) is not None and format not in formats:
-            flag = "--" + name.replace("_", "-")
-            raise UsageError(f"{flag} is for {' and '.join(formats)}, the output is {format}")
-
-
-def check_output(output: Output) -> None:
-    """Check that the output can be made, before the work; the writer checks again.
-
-    Raises
-    ------
-    OutputError
-        It is there already, or its folder cannot be written.
-    """
-    path = output.path
-    with _system_errors(path):
-        is_folder = path.is_dir()
-        if is_folder and output.format == "mp4":
-            raise OutputError(f"{path}: a folder of this name is there; choose another name for the video")
-        if not is_folder and path.exists() and output.format != "mp4":
-            raise OutputError(f"{path}: a file of this name is there; choose another name for the folder")
-        taken = any(path.iterdir()) if is_folder else path.exists()
-        if taken and not output.overwrite:
-            what = "the folder is not empty" if is_folder else "there already"
-            raise OutputError(f"{path}: {what}; choose another name, or replace it with --overwrite")
-        _check_writable(path if is_folder else path.absolute().parent)
-
-
-def _check_writable(folder: Path) -> None:
-    import os
-
-    existing = next(place for place in (folder, *folder.parents) if place.exists())
-    if not existing.is_dir():
-        raise OutputError(f"{existing}: not a folder; choose another place for the output")
-    if not os.access(existing, os.W_OK | os.X_OK):
-        raise OutputError(f"{existing}: no permission to write there; choose another place for the output")
-
-
-@contextlib.contextmanager
-def _system_errors(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except OutputError:
-        raise
-    except OSError as error:
-        raise OutputError(f"{path}: {error.strerror or error}") from error
 
 
 def chosen_settings(options: argparse.Namespace) -> Settings:
@@ -362,13 +260,6 @@ def decided(
     ]
 
 
-def settings_path(output: Output) -> Path:
-    """Where the settings are written."""
-    if output.format == "mp4":
-        return output.path.with_name(f"{output.path.name}.kalux.toml")
-    return output.path / "kalux.toml"
-
-
 def metadata(
     recording: Recording, made: Plan, options: argparse.Namespace, command: list[str]
 ) -> dict[str, Any]:
@@ -407,12 +298,12 @@ def write_images(
     recording: Recording, made: Plan, output: Output, described: dict[str, Any], options: argparse.Namespace
 ) -> tuple[float, int]:
     """Carry out the plan; returns the seconds it took and the number of images."""
-    writer = _open_writer(output, described)
+    writer = output.open(described)
     progress = Progress("reconstructing", images=len(made.times), quiet=options.quiet)
     try:
         with writer, progress:
             for image in execute(recording, made, lambda count: progress.add(events=count)):
-                writer.write(writable(image))
+                writer.write(image)
                 progress.add(images=1)
     except (KeyboardInterrupt, InputError) as error:
         error.add_note(_what_is_left(writer, output))
@@ -420,29 +311,7 @@ def write_images(
     return max(progress.seconds, 1e-3), writer.images
 
 
-def _open_writer(output: Output, described: dict[str, Any]) -> Writer:
-    from kalux.writers import open_writer
-
-    return open_writer(
-        output.path,
-        format=output.format,
-        display=output.display,
-        rate_hz=output.rate_hz,
-        overwrite=output.overwrite,
-        metadata=described,
-        png_bits=8 if output.png_bits == 8 else 16,
-        video=output.video,
-    )
-
-
 def _what_is_left(writer: Writer, output: Output) -> str:
     if writer.images == 0 or (output.format == "mp4" and not output.path.exists()):
         return f"no image was finished in {output.path}"
     return f"{writer.images:,} images are finished and valid in {output.path}"
-
-
-def writable(image: Image) -> ImageLike:
-    """The image with a variance: infinite, which is unknown, where the filter has none."""
-    if image.variance is None:
-        return dataclasses.replace(image, variance=np.full_like(image.intensity, np.inf))  # type: ignore[return-value]
-    return image  # type: ignore[return-value]

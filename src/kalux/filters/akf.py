@@ -111,10 +111,10 @@ class BridgedNoise(NamedTuple):
 
 
 def begin_bridged(segment: BridgedSegment, state: State) -> BridgedCursor:
-    """The cursor at the start of a segment: L stays, if the frame there allows it (K7); L^A is the segment's."""
+    """The cursor at the start of a segment: L stays, L^A is the segment's."""
     return BridgedCursor(
         information=1.0 / state.variance,
-        deviation=np.maximum(state.log_intensity, segment.lower_bound) - segment.augmented,
+        deviation=state.log_intensity - segment.augmented,
         augmented=segment.augmented.copy(),
         forward_variance=segment.forward_variance.copy(),
         backward_variance=segment.backward_variance.copy(),
@@ -132,9 +132,11 @@ def advance_bridged(
 
 def read_bridged(segment: BridgedSegment, cursor: BridgedCursor, t: int) -> tuple[Array, Array]:
     """L and P at ``t`` (us), which must not lie before an event the cursor has taken. Changes nothing."""
-    out = np.empty_like(cursor.information), np.empty_like(cursor.information)
-    _read_bridged(segment, cursor, t, *out)
-    return out
+    log_intensity, variance = np.empty_like(cursor.information), np.empty_like(cursor.information)
+    _read_bridged(segment, cursor, t, log_intensity, variance)
+    if t == segment.end:
+        np.maximum(log_intensity, segment.end_bound, out=log_intensity)  # K7
+    return log_intensity, variance
 
 
 @nb.njit(cache=True, nogil=True)

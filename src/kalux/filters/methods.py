@@ -134,8 +134,8 @@ class Method(Protocol):
     def advance(self, segment: Any, cursor: Any, events: EventArray) -> None:
         """Take the cursor over events, in place."""
 
-    def read(self, segment: Any, cursor: Any, t: int) -> tuple[Array, Array | None]:
-        """L and P at ``t``; P is None where the method has none."""
+    def read(self, segment: Any, cursor: Any, t: int) -> tuple[Array, Array]:
+        """L and P at ``t``; P is infinite where the method has none."""
 
     def newest(self, cursor: Any) -> NDArray[np.int64]:
         """The newest event of each pixel, us."""
@@ -212,31 +212,32 @@ class BridgedFrames(_Common):
         """The frame without blur at the middle (or end) of its exposure, and its variance (K3)."""
         integrals = self.integrals(shot, events, self.on * thresholds.on, self.off * thresholds.off)
         log_frame = self.log_frame(shot)
-        latent = deblur.latent_end if at_end else deblur.latent_middle
         r_bar = covariance(shot.weight, (self.settings.camera.frame_noise * shot.white) ** 2, 1e-6)
         variance = log_covariance(shot.intensity, r_bar, self.offset)
         variance = variance + self.settings.events.deblur_variance * self.on * self.off * integrals.events
         white = np.log(self.settings.camera.saturation * shot.white + self.offset)
         clipped = shot.clipped | (deblur.latent_peak(log_frame, integrals) >= white)
-        return Latent(latent(log_frame, integrals), np.where(clipped, bridge.UNMEASURED, variance))
+        return Latent(
+            deblur.latent_middle(log_frame, integrals), np.where(clipped, bridge.UNMEASURED, variance)
+        )
 
     def start(self, shot: Shot, events: EventArray) -> tuple[BridgeMemory, Segment | None, State]:
         thresholds = bridge.nominal_thresholds(self.shape, self.settings.events.threshold_spread)
         latent = self.latent(shot, events, thresholds)
         begin = self.begin_time(shot)
         newest = np.full(self.shape, shot.start, np.int64)
+        lead_in = None
         if self.lookahead:
             on, off = count_events(between(events, begin, shot.middle), self.shape)
             memory = BridgeMemory(latent, thresholds, 0.0, on, off)
-            lead_in = bridge.extend_backward(
-                latent, on, off, thresholds, self.noise, begin, max(shot.middle, begin + 1)
-            )
-            value, variance = lead_in.augmented, lead_in.backward_variance
+            value, variance = latent
+            if shot.middle > begin:
+                lead_in = bridge.extend_backward(latent, on, off, thresholds, self.noise, begin, shot.middle)
+                value, variance = lead_in.augmented, lead_in.backward_variance
         else:
             on, off = count_events(between(events, shot.middle, shot.end), self.shape)
-            at_end = self.latent(shot, events, thresholds, at_end=True)
-            memory, lead_in = BridgeMemory(latent, thresholds, 0.0, on, off), None
-            value, variance = at_end
+            memory = BridgeMemory(latent, thresholds, 0.0, on, off)
+            value, variance = self._carried(memory)
         unmeasured = variance >= bridge.UNMEASURED
         variance = np.where(unmeasured, self.settings.filter.initial_variance, variance)
         return memory, lead_in, State(value, variance, newest)
@@ -250,7 +251,11 @@ class BridgedFrames(_Common):
             latent = memory.latent
             if not self.lookahead:
                 latent = self._carried(memory)
-            return bridge.extend(latent, memory.thresholds, self.noise, start, FAR_FUTURE, seconds), memory
+            unbound = np.full(self.shape, -np.inf)
+            return (
+                bridge.extend(latent, memory.thresholds, self.noise, start, FAR_FUTURE, seconds, unbound),
+                memory,
+            )
         interval = (following.middle - shot.middle) * 1e-6
         second = self.latent(following, events, memory.thresholds)
         on, off = count_events(between(events, start, following.middle), self.shape)
@@ -269,12 +274,18 @@ class BridgedFrames(_Common):
             shot.middle,
             following.middle,
         )
-        seconds = memory.interval or self._FIRST_INTERVAL
-        forward = bridge.extend(
-            self._carried(memory), memory.thresholds, self.noise, start, following.end, seconds
-        )
         tail = count_events(between(events, following.middle, following.end), self.shape)
-        return forward, BridgeMemory(second, learned, interval, *tail)
+        after = BridgeMemory(second, learned, interval, *tail)
+        forward = bridge.extend(
+            self._carried(memory),
+            memory.thresholds,
+            self.noise,
+            start,
+            following.end,
+            memory.interval or self._FIRST_INTERVAL,
+            bridge.lower_bound(self._carried(after)),
+        )
+        return forward, after
 
     def _carried(self, memory: BridgeMemory) -> Latent:
         """The latest frame from the middle to the end of its exposure, with the events between (10)."""
@@ -466,7 +477,7 @@ class HeldFrames(_Common):
 
     def start(self, shot: Shot, events: EventArray) -> tuple[None, None, State]:
         newest = np.full(self.shape, self.node(shot), np.int64)
-        return None, None, State(self.log_frame(shot), np.zeros(self.shape), newest)
+        return None, None, State(self.log_frame(shot), np.full(self.shape, np.inf), newest)
 
     def segment(
         self, memory: None, shot: Shot, following: Shot | None, events: EventArray
@@ -484,8 +495,8 @@ class HeldFrames(_Common):
     def advance(self, segment: Any, cursor: complementary.Cursor, events: EventArray) -> None:
         complementary.advance(segment, cursor, events)
 
-    def read(self, segment: Any, cursor: complementary.Cursor, t: int) -> tuple[Array, None]:
-        return complementary.read(segment, cursor, t), None
+    def read(self, segment: Any, cursor: complementary.Cursor, t: int) -> tuple[Array, Array]:
+        return complementary.read(segment, cursor, t), np.full(self.shape, np.inf)
 
     def newest(self, cursor: complementary.Cursor) -> NDArray[np.int64]:
         return cursor.since

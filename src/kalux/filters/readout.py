@@ -38,11 +38,11 @@ def believed_highlight(excess, variance, scale2, stretch):  # type: ignore[no-un
     d = W(stretch excess) / stretch with Lambert's W, here by Newton's iteration.
     """
     shrunk = excess * scale2 / (scale2 + variance)
-    if stretch * shrunk < 1e-6:
+    if stretch * shrunk < 1e-8:
         return shrunk
     target = stretch * shrunk
     w = np.log1p(target)
-    for _ in range(4):
+    for _ in range(6):
         e = np.exp(w)
         w -= (w * e - target) / (e * (w + 1.0))
     return w / stretch

@@ -88,11 +88,12 @@ class Response:
         if name == "srgb":
             return cls.srgb()
         kind, _, exponent = name.partition(":")
+        try:
+            value = float(exponent)
+        except ValueError:
+            kind = ""
         if kind == "gamma":
-            try:
-                return cls.gamma(float(exponent))
-            except ValueError:
-                pass
+            return cls.gamma(value)
         raise SettingsError(f"response: unknown response {name!r}; known are linear, srgb and gamma:EXPONENT")
 
     def __call__(self, irradiance: Array) -> Array:
@@ -140,7 +141,7 @@ class Camera:
     saturation: float = 0.98
 
     @classmethod
-    def from_inverse_covariance(cls, f_Q: Any, response: Response, saturation: float) -> Camera:  # noqa: N803
+    def from_inverse_covariance(cls, f_Q: Any, response: Response, saturation: float) -> Camera:
         """From a released ``f_Q`` table: 1 / R_bar for every level, which is sigma_im^-2 f^w.
 
         Raises

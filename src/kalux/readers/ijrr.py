@@ -27,6 +27,7 @@ from kalux.readers.source import Source, reading
 
 _EVENTS: Final = "events.txt"
 _IMAGES: Final = "images.txt"
+_ZIP_SIGNATURE: Final = b"PK\x03\x04"
 # The shortest line, "0 0 0 0\n", has 8 bytes: a block holds at most CHUNK_EVENTS events.
 _BLOCK_BYTES: Final = 8 << 20
 _LONGEST_LINE: Final = 4096
@@ -45,13 +46,18 @@ _Place = Path | zipfile.Path
 
 
 def recognises(path: Path) -> bool:
-    """Whether the folder or zip has ``events.txt``, at its root or in its one folder."""
+    """Whether the folder or zip has ``events.txt``, at its root or in its one folder; or is a broken zip."""
     if path.is_dir():
         return (path / _EVENTS).is_file()
-    try:
-        return path.is_file() and zipfile.is_zipfile(path) and _root(path) is not None
-    except _DAMAGE:
+    if not path.is_file():
         return False
+    with path.open("rb") as file:
+        if file.read(len(_ZIP_SIGNATURE)) != _ZIP_SIGNATURE:
+            return False
+    try:
+        return _root(path) is not None
+    except _DAMAGE:
+        return True  # so that the reader can say that it is damaged
 
 
 def read(path: Path) -> Source:
@@ -138,7 +144,7 @@ def _check_beginning(path: Path, root: _Place) -> tuple[int, int] | None:
     size = None
     if lines and len(lines[0]) == 2 and all(field.isdigit() for field in lines[0]):
         width, height = map(int, lines[0])
-        size = height, width
+        size = (height, width) if min(height, width) > 0 else None
     times = [line[0] for line in lines if len(line) == 4]
     if times and all(time.isdigit() for time in times) and int(times[-1]) > 0:
         raise FormatError(
@@ -221,7 +227,7 @@ _MICRO_DIGITS: Final = np.uint64(6)
 _ZERO: Final = np.uint8(ord("0"))
 _NINE: Final = np.uint8(9)
 _FIVE: Final = np.uint8(5)
-_SPACE, _NEWLINE, _DOT, _HASH = (np.uint8(ord(c)) for c in " \n.#")
+_SPACE, _TAB, _RETURN, _NEWLINE, _DOT, _HASH = (np.uint8(ord(c)) for c in " \t\r\n.#")
 
 
 @njit(cache=True, nogil=True)
@@ -283,8 +289,8 @@ def _parse(
 
 @njit(cache=True, nogil=True, inline="always")
 def _skip_blanks(text: NDArray[np.uint8], i: np.uint64) -> np.uint64:
-    """Skip spaces, tabs and carriage returns, but not the end of the line."""
-    while text[i] <= _SPACE and text[i] != _NEWLINE:
+    """Skip spaces, tabs and carriage returns; not the zeros of a hole in a damaged file."""
+    while text[i] == _SPACE or text[i] == _TAB or text[i] == _RETURN:
         i += _ONE
     return i
 

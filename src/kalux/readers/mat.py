@@ -270,8 +270,8 @@ def _frame(image: NDArray[Any], start: int, end: int) -> Frame:
 def _numbers(path: Path, variables: _Variables, name: str) -> NDArray[np.float64]:
     """A small variable as a flat array."""
     values = variables.array(name)
-    if values.dtype.kind not in "iufb" or not np.isfinite(values).all():
-        raise FormatError(f"{path}: {name} is not an array of finite numbers; write the file again")
+    if values.dtype.kind not in "iufb" or not (np.abs(values) < 2.0**62).all():
+        raise FormatError(f"{path}: {name} is not an array of reasonable numbers; write the file again")
     return np.asarray(values.ravel(order="F"), dtype=np.float64)
 
 
@@ -429,6 +429,8 @@ class _Version73:
         with self._file() as file:
             matrix = file[name]
             count = self._shape(matrix)[0]
+            if not count:
+                return
             stored = (matrix.chunks or matrix.shape)[1]
             step = max(CHUNK_EVENTS // max(stored, 1), 1) * stored if stored < CHUNK_EVENTS else CHUNK_EVENTS
             for start in range(0, count, step):

@@ -10,7 +10,7 @@ from typing import Any, Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.errors import InputError, KaluxError, OutputError
+from kalux.errors import InputError, InternalError, KaluxError, OutputError
 from kalux.writers.files import uninterrupted
 
 
@@ -59,9 +59,10 @@ class Writer(ABC):
             The image is not float32 (height, width), or of another size than those before it; in a video,
             also where it is not later than the one before it or does not fit the rate.
         OutputError
-            It cannot be written (full disk, no permission), the writer is closed or has failed before, or
-            the image has an intensity that is not finite or a variance that is NaN. The last is an error in
-            kalux: such an image is never written.
+            It cannot be written (full disk, no permission), or the writer is closed or has failed before.
+        InternalError
+            The image has an intensity that is not finite or a variance that is NaN: such an image is never
+            written.
         """
         if self._closed or self._failed:
             state = "closed" if self._closed else "unusable after an error"
@@ -140,7 +141,7 @@ def check_image(image: ImageLike, index: int, shape: tuple[int, ...] | None) -> 
     ------
     InputError
         Wrong dtype or size.
-    OutputError
+    InternalError
         An intensity is not finite, or a variance is NaN.
     """
     for name, values in (("intensity", image.intensity), ("variance", image.variance)):
@@ -160,7 +161,7 @@ def check_image(image: ImageLike, index: int, shape: tuple[int, ...] | None) -> 
 def _refuse(bad: NDArray[Any], name: str, what: str, t: int, index: int) -> None:
     if bad.any():
         y, x = (int(i[0]) for i in np.nonzero(bad))
-        raise OutputError(
+        raise InternalError(
             f"image {index} at {t} us: the {name} at x={x}, y={y} is {what}, so it is not written; "
             "this is an error in kalux, please report it"
         )

@@ -1,0 +1,153 @@
+"""The output that the flags ask for."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from kalux.cli.flags import given_display
+from kalux.cli.parser import UsageError
+from kalux.display import DisplaySettings
+from kalux.errors import OutputError
+
+if TYPE_CHECKING:
+    from kalux.writers import VideoSettings, Writer
+
+DEFAULT_RATE: Final = 100.0
+"""Images per second where nothing is said: several per frame, and a video that plays in real time."""
+
+FOLDER_FORMATS = ("png", "exr", "npy")
+_NOT_FOLDERS = {".avi", ".mkv", ".mov", ".webm", ".gif", ".m4v", ".png", ".exr", ".npy", ".tif", ".jpg"}
+
+
+@dataclass(frozen=True)
+class Output:
+    """What is to be written where.
+
+    Attributes
+    ----------
+    path
+        A video or a folder.
+    format
+        One of `kalux.writers.FORMATS`.
+    display, video, png_bits
+        How it looks.
+    rate_hz
+        Images per second; None: they have no common rate.
+    overwrite
+        Whether a former output is replaced.
+    """
+
+    path: Path
+    format: str
+    display: DisplaySettings
+    video: VideoSettings
+    png_bits: int
+    rate_hz: float | None
+    overwrite: bool
+
+    @property
+    def settings_path(self) -> Path:
+        """Where the settings are written."""
+        if self.format == "mp4":
+            return self.path.with_name(f"{self.path.name}.kalux.toml")
+        return self.path / "kalux.toml"
+
+    def open(self, described: dict[str, Any]) -> Writer:
+        """The writer, with ``described`` for the settings file."""
+        from kalux.writers import open_writer
+
+        return open_writer(
+            self.path,
+            format=self.format,
+            display=self.display,
+            rate_hz=self.rate_hz,
+            overwrite=self.overwrite,
+            metadata=described,
+            png_bits=8 if self.png_bits == 8 else 16,
+            video=self.video,
+        )
+
+
+def chosen_output(options: argparse.Namespace) -> Output:
+    """What the flags say of the output.
+
+    Raises
+    ------
+    UsageError
+        Flags contradict each other or the name.
+    """
+    from kalux.writers import VideoSettings
+
+    path: Path = options.out
+    is_video = path.suffix.lower() == ".mp4"
+    if is_video and options.format is not None:
+        raise UsageError(
+            f"--format {options.format}: {path} is a video; give a folder with -o, or no --format"
+        )
+    if not is_video and path.suffix.lower() in _NOT_FOLDERS and not path.is_dir():
+        raise UsageError(f"{path}: give a name that ends in .mp4 for a video, or the name of a folder")
+    format = "mp4" if is_video else options.format or "png"
+    _check_flags(options, format)
+    rate = None if options.times is not None or options.at is not None else options.rate or DEFAULT_RATE
+    video = VideoSettings(
+        crf=18.0 if options.crf is None else options.crf,
+        slow_motion=1.0 if options.slow_motion is None else options.slow_motion,
+    )
+    return Output(
+        path, format, given_display(options), video, options.png_bits or 16, rate, options.overwrite
+    )
+
+
+def _check_flags(options: argparse.Namespace, format: str) -> None:
+    """Refuse flags that would have no effect."""
+    uses = {"png_bits": ("png",), "crf": ("mp4",), "slow_motion": ("mp4",), "display": ("png", "mp4")}
+    for name, formats in uses.items():
+        if getattr(options, name) is not None and format not in formats:
+            flag = "--" + name.replace("_", "-")
+            raise UsageError(f"{flag} is for {' and '.join(formats)}, the output is {format}")
+
+
+def check_output(output: Output) -> None:
+    """Check that the output can be made, before the work; the writer checks again.
+
+    Raises
+    ------
+    OutputError
+        It is there already, or its folder cannot be written.
+    """
+    path = output.path
+    with _system_errors(path):
+        is_folder = path.is_dir()
+        if is_folder and output.format == "mp4":
+            raise OutputError(f"{path}: a folder of this name is there; choose another name for the video")
+        if not is_folder and path.exists() and output.format != "mp4":
+            raise OutputError(f"{path}: a file of this name is there; choose another name for the folder")
+        taken = any(path.iterdir()) if is_folder else path.exists()
+        if taken and not output.overwrite:
+            what = "the folder is not empty" if is_folder else "there already"
+            raise OutputError(f"{path}: {what}; choose another name, or replace it with --overwrite")
+        _check_writable(path if is_folder else path.absolute().parent)
+
+
+def _check_writable(folder: Path) -> None:
+    existing = next(place for place in (folder, *folder.parents) if place.exists())
+    if not existing.is_dir():
+        raise OutputError(f"{existing}: not a folder; choose another place for the output")
+    if not os.access(existing, os.W_OK | os.X_OK):
+        raise OutputError(f"{existing}: no permission to write there; choose another place for the output")
+
+
+@contextlib.contextmanager
+def _system_errors(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OutputError:
+        raise
+    except OSError as error:
+        raise OutputError(f"{path}: {error.strerror or error}") from error

@@ -1,0 +1,332 @@
+"""What a recording holds, in numbers and as text: the library side of ``kalux info``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from kalux.events import EventArray
+from kalux.frames import Frame
+from kalux.recording import Recording
+
+_RATE_BIN: Final = 10_000  # us, over which the peak event rate is taken
+_SATURATED: Final = 0.99  # of white: DAVIS frames clip a few values below it
+_NEAR_BLACK: Final = 0.02  # of white
+_LARGE_GAP: Final = 1.5  # of the median frame interval
+
+
+@dataclass(frozen=True)
+class EventSummary:
+    """Numbers about the events of a recording.
+
+    Attributes
+    ----------
+    count
+        Number of events.
+    on_share
+        Share of ON events, 0 to 1; None without events.
+    first, last
+        Times of the first and last event, us; None without events.
+    mean_rate
+        Events per second from the first to the last; None where these coincide.
+    peak_rate
+        Events per second in the busiest 10 ms; None without events.
+    largest_gap
+        Longest time without any event, us; None below two events.
+    """
+
+    count: int
+    on_share: float | None = None
+    first: int | None = None
+    last: int | None = None
+    mean_rate: float | None = None
+    peak_rate: float | None = None
+    largest_gap: int | None = None
+
+
+@dataclass(frozen=True)
+class FrameSummary:
+    """Numbers about the frames of a recording.
+
+    Attributes
+    ----------
+    count
+        Number of frames.
+    first, last
+        Start of the first and end of the last exposure, us (stamps where exposures are unknown); None
+        without frames.
+    rate
+        Frames per second, from the median interval; None below two frames.
+    exposure_min, exposure_median, exposure_max
+        Exposure times, us; None where unknown.
+    saturated_share
+        Share of pixels of at least 99 % of white; None without frames.
+    near_black_share
+        Share of pixels of at most 2 % of white; None without frames.
+    gap_count
+        Intervals longer than 1.5 times the median: frames that were dropped, perhaps.
+    largest_gap
+        Longest interval between the starts of two frames, us; None below two frames.
+    """
+
+    count: int
+    first: int | None = None
+    last: int | None = None
+    rate: float | None = None
+    exposure_min: int | None = None
+    exposure_median: float | None = None
+    exposure_max: int | None = None
+    saturated_share: float | None = None
+    near_black_share: float | None = None
+    gap_count: int = 0
+    largest_gap: int | None = None
+
+
+@dataclass(frozen=True)
+class Description:
+    """What `describe` found in a recording.
+
+    Attributes
+    ----------
+    path, format
+        Of the file or folder.
+    sensor_size
+        (height, width), pixels.
+    events, frames
+        Numbers about each stream.
+    overlap
+        Time that both streams cover, us; None where one is empty.
+    exposure_known
+        Whether the frames have exposure times.
+    contrast_threshold
+        (on, off), log intensity, as the recording states it; None if it does not.
+    estimated_threshold
+        (on, off), as given to `describe`.
+    has_ground_truth
+        Whether reference images come with the recording.
+    missing
+        What the recording lacks, one sentence each.
+    """
+
+    path: str
+    format: str
+    sensor_size: tuple[int, int]
+    events: EventSummary
+    frames: FrameSummary
+    overlap: int | None
+    exposure_known: bool
+    contrast_threshold: tuple[float, float] | None
+    estimated_threshold: tuple[float, float] | None
+    has_ground_truth: bool
+    missing: tuple[str, ...]
+
+
+def describe(recording: Recording, *, estimated_threshold: tuple[float, float] | None = None) -> Description:
+    """Read through a recording once and describe it, in bounded memory.
+
+    Parameters
+    ----------
+    recording
+        Any recording; events or frames may be absent, exposures unknown.
+    estimated_threshold
+        (on, off) contrast thresholds estimated elsewhere, to be reported with the rest.
+
+    Raises
+    ------
+    InputError
+        If the recording is damaged or its contents are not usable, whatever `Recording` checks.
+    """
+    source = recording.source
+    events = summarise_events(recording.events())
+    frames = summarise_frames(recording.stamped_frames(), exposure_known=recording.exposure_known)
+    return Description(
+        path=str(source.path),
+        format=source.format,
+        sensor_size=recording.sensor_size,
+        events=events,
+        frames=frames,
+        overlap=_overlap(events, frames),
+        exposure_known=recording.exposure_known,
+        contrast_threshold=source.contrast_threshold,
+        estimated_threshold=estimated_threshold,
+        has_ground_truth=source.ground_truth is not None,
+        missing=source.missing,
+    )
+
+
+def summarise_events(chunks: Iterable[EventArray]) -> EventSummary:
+    """Numbers about a stream of event chunks in time order."""
+    count = on_count = peak = largest_gap = 0
+    first = last = None
+    open_bin, open_count = -1, 0  # the last bin of one chunk may go on in the next
+    for chunk in chunks:
+        t = chunk["t"]
+        if not len(t):
+            continue
+        if first is None or last is None:
+            first = last = int(t[0])
+        largest_gap = max(largest_gap, int(t[0]) - last, int(np.diff(t).max(initial=0)))
+        bins, counts = np.unique((t - first) // _RATE_BIN, return_counts=True)
+        if bins[0] == open_bin:
+            counts[0] += open_count
+        peak = max(peak, int(counts.max()))
+        open_bin, open_count = int(bins[-1]), int(counts[-1])
+        count += len(t)
+        on_count += int(np.count_nonzero(chunk["p"]))
+        last = int(t[-1])
+    if first is None or last is None:
+        return EventSummary(0)
+    return EventSummary(
+        count=count,
+        on_share=on_count / count,
+        first=first,
+        last=last,
+        mean_rate=count * 1e6 / (last - first) if last > first else None,
+        peak_rate=peak * 1e6 / _RATE_BIN,
+        largest_gap=largest_gap if count > 1 else None,
+    )
+
+
+def summarise_frames(frames: Iterable[Frame], *, exposure_known: bool = True) -> FrameSummary:
+    """Numbers about frames in time order, one in memory at a time."""
+    starts: list[int] = []
+    exposures: list[int] = []
+    pixels = saturated = near_black = 0
+    last = None
+    for frame in frames:
+        starts.append(frame.exposure_start)
+        exposures.append(frame.exposure)
+        last = frame.exposure_end
+        pixels += frame.image.size
+        saturated += int(np.count_nonzero(frame.image >= _SATURATED * frame.white_value))
+        near_black += int(np.count_nonzero(frame.image <= _NEAR_BLACK * frame.white_value))
+    if last is None:
+        return FrameSummary(0)
+    intervals = np.diff(np.array(starts, np.float64))
+    median_interval = float(np.median(intervals)) if len(intervals) else None
+    return FrameSummary(
+        count=len(starts),
+        first=starts[0],
+        last=last,
+        rate=1e6 / median_interval if median_interval else None,
+        exposure_min=min(exposures) if exposure_known else None,
+        exposure_median=float(np.median(exposures)) if exposure_known else None,
+        exposure_max=max(exposures) if exposure_known else None,
+        saturated_share=saturated / pixels,
+        near_black_share=near_black / pixels,
+        gap_count=int(np.count_nonzero(intervals > _LARGE_GAP * median_interval)) if median_interval else 0,
+        largest_gap=int(intervals.max()) if len(intervals) else None,
+    )
+
+
+def _overlap(events: EventSummary, frames: FrameSummary) -> int | None:
+    if events.first is None or events.last is None or frames.first is None or frames.last is None:
+        return None
+    return max(min(events.last, frames.last) - max(events.first, frames.first), 0)
+
+
+# Text
+
+
+def format_description(description: Description) -> str:
+    """A `Description` as lines of text, without a final newline."""
+    height, width = description.sensor_size
+    rows = [
+        ("format", description.format),
+        ("sensor", f"{width} x {height} pixels"),
+        *_event_rows(description.events),
+        *_frame_rows(description.frames, description.exposure_known),
+    ]
+    if description.overlap is not None:
+        overlap = "none: events and frames do not overlap in time" if not description.overlap else None
+        rows.append(("overlap", overlap or f"{_time(description.overlap)} covered by both events and frames"))
+    rows.append(("threshold", _threshold_text(description)))
+    if description.has_ground_truth:
+        rows.append(("reference", "ground truth images are included"))
+    rows += [("note", sentence) for sentence in description.missing]
+    label_width = max(len(label) for label, _ in rows)
+    return "\n".join([description.path, *(f"  {label:<{label_width}}  {text}" for label, text in rows)])
+
+
+def _event_rows(events: EventSummary) -> list[tuple[str, str]]:
+    if events.first is None or events.last is None:
+        return [("events", "none")]
+    rows = [
+        ("events", f"{events.count:,} ({_percent(events.on_share)} ON)"),
+        ("", _span(events.first, events.last)),
+    ]
+    if events.mean_rate is not None:
+        rows.append(
+            ("", f"{_rate(events.mean_rate)} on average, {_rate(events.peak_rate)} in the busiest 10 ms")
+        )
+    if events.largest_gap is not None:
+        rows.append(("", f"longest gap {_time(events.largest_gap)}"))
+    return rows
+
+
+def _frame_rows(frames: FrameSummary, exposure_known: bool) -> list[tuple[str, str]]:
+    if frames.first is None or frames.last is None:
+        return [("frames", "none")]
+    rate = "" if frames.rate is None else f" at {frames.rate:.4g} Hz"
+    rows = [("frames", f"{frames.count:,}{rate}"), ("", _span(frames.first, frames.last))]
+    if frames.gap_count and frames.largest_gap is not None:
+        gaps = "1 gap" if frames.gap_count == 1 else f"{frames.gap_count} gaps"
+        rows.append(("", f"{gaps} of over 1.5 intervals, the longest {_time(frames.largest_gap)}"))
+    rows.append(
+        (
+            "",
+            f"{_percent(frames.saturated_share)} of pixels saturated, "
+            f"{_percent(frames.near_black_share)} near black",
+        )
+    )
+    rows.append(("exposure", _exposure_text(frames) if exposure_known else "unknown"))
+    return rows
+
+
+def _exposure_text(frames: FrameSummary) -> str:
+    if frames.exposure_min is None or frames.exposure_median is None or frames.exposure_max is None:
+        return "unknown"
+    if frames.exposure_min == frames.exposure_max:
+        return _time(frames.exposure_min)
+    return f"{_time(frames.exposure_min)} to {_time(frames.exposure_max)}, median {_time(frames.exposure_median)}"
+
+
+def _threshold_text(description: Description) -> str:
+    texts = [
+        f"ON {threshold[0]:.3g}, OFF {threshold[1]:.3g} {origin}"
+        for threshold, origin in (
+            (description.contrast_threshold, "as recorded"),
+            (description.estimated_threshold, "estimated"),
+        )
+        if threshold is not None
+    ]
+    return "; ".join(texts) or "not recorded"
+
+
+def _span(first: int, last: int) -> str:
+    return f"{_time(last - first)}, from {first / 1e6:.6f} s to {last / 1e6:.6f} s"
+
+
+def _time(us: float) -> str:
+    for limit, unit, factor in ((1e3, "us", 1.0), (1e6, "ms", 1e3)):
+        if us < limit:
+            return f"{us / factor:.4g} {unit}"
+    return f"{us / 1e6:,.3f} s"
+
+
+def _rate(per_second: float | None) -> str:
+    if per_second is None:
+        return "unknown"
+    for limit, unit, factor in ((1e3, "events/s", 1.0), (1e6, "thousand events/s", 1e3)):
+        if per_second < limit:
+            return f"{per_second / factor:.3g} {unit}"
+    return f"{per_second / 1e6:.3g} million events/s"
+
+
+def _percent(share: float | None) -> str:
+    if share is None:
+        return "unknown"
+    return f"{100 * share:.1f} %" if share == 0 or share >= 0.001 else f"{100 * share:.2g} %"

@@ -1,0 +1,149 @@
+"""The command line as a whole: help, exit codes, one line per error, pipes."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+
+import pytest
+
+import kalux
+from kalux.cli.flags import setting_flags
+from kalux.cli.signals import termination_as_interrupt
+from kalux.settings import Settings, to_dict
+
+
+@pytest.mark.parametrize("command", [[], ["info"], ["reconstruct"], ["demo"]])
+def test_help_has_examples_and_fits_a_screen(cli, command):
+    found = cli(*command, "--help")
+    assert (found.code, found.err) == (0, "")
+    assert "examples:\n  kalux " in found.out
+    assert len(found.out.splitlines()) < 60
+    assert max(map(len, found.out.splitlines())) <= 110
+
+
+def test_help_names_every_command(cli):
+    found = cli("--help").out
+    for command in ("info", "reconstruct", "demo"):
+        assert f"\n  {command} " in found
+
+
+def test_every_setting_is_a_flag_with_its_default_and_text(cli):
+    text = cli("reconstruct", "--help-settings").out
+    flags = list(setting_flags())
+    assert {flag.key for flag in flags} >= {f"{g}.{n}" for g, v in to_dict(Settings()).items() for n in v}
+    for flag in flags:
+        assert f"\n  {flag.name} " in text
+        assert flag.text, f"{flag.key} is not explained in its docstring"
+
+
+def test_version(cli):
+    assert cli("--version").out == f"kalux {kalux.__version__}\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        ([], "no command"),
+        (["reconstrct"], "'reconstrct'"),
+        (["--fast"], "--fast"),
+        (["info"], "still needed: REC"),
+        (["info", "x", "--exposre", "3"], "did you mean --exposure?"),
+        (["reconstruct", "x"], "still needed: -o"),
+    ],
+)
+def test_usage_errors_are_one_line(cli, arguments, told):
+    found = cli(*arguments)
+    assert found.code == 2
+    assert told in found.error
+    assert "--help" in found.error
+
+
+def test_an_error_of_ours_shows_the_traceback_and_asks_for_a_report(cli, recording, monkeypatch):
+    def broken(options):
+        raise ZeroDivisionError("ours")
+
+    monkeypatch.setattr("kalux.cli.info.open_recording", broken)
+    found = cli("info", recording)
+    assert found.code == 1
+    assert found.err.startswith("Traceback")
+    assert "please report" in found.err.splitlines()[-1]
+
+
+def test_help_starts_without_heavy_libraries(start_cli):
+    process = start_cli("--help")
+    assert process.wait(timeout=30) == 0
+    process.communicate()
+    code = "import sys, kalux.cli.app as app; app.make_parser(); print(*sys.modules)"
+    env = {**os.environ, "PYTHONPATH": os.path.dirname(os.path.dirname(kalux.__file__))}
+    modules = subprocess.run(
+        [sys.executable, "-c", code], env=env, capture_output=True, text=True, check=True
+    )
+    assert not {"av", "skimage", "OpenEXR", "kalux.writers"} & {*modules.stdout.split()}
+
+
+def test_a_reader_that_goes_away_is_no_error(start_cli):
+    process = start_cli("reconstruct", "--help-settings")
+    process.stdout.close()
+    assert process.wait(timeout=30) == 0
+    assert process.stderr.read() == ""
+    process.stderr.close()
+
+
+def test_work_goes_on_when_nobody_reads_what_is_said(start_cli, recording, tmp_path):
+    process = start_cli("reconstruct", recording, "-o", tmp_path / "out", "--at", "frames")
+    process.stdout.close()
+    assert process.wait(timeout=60) == 0
+    assert process.stderr.read() == ""
+    process.stderr.close()
+    assert "complete = true" in (tmp_path / "out" / "kalux.toml").read_text()
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="this system has no /dev/full")
+def test_standard_output_that_is_full_is_told(recording):
+    env = {**os.environ, "PYTHONPATH": os.path.dirname(os.path.dirname(kalux.__file__))}
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "kalux", "info", str(recording)],
+            env=env,
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+        )
+    assert done.returncode == 2
+    assert done.stderr == "kalux: error: standard output: No space left on device\n"
+
+
+class TestSignals:
+    def test_termination_is_an_interrupt_even_where_interrupts_are_ignored(self):
+        previous = signal.signal(signal.SIGINT, signal.SIG_IGN)
+        try:
+            with termination_as_interrupt():
+                os.kill(os.getpid(), signal.SIGINT)  # ignored
+                with pytest.raises(KeyboardInterrupt):
+                    os.kill(os.getpid(), signal.SIGTERM)
+            assert signal.getsignal(signal.SIGINT) == signal.SIG_IGN
+        finally:
+            signal.signal(signal.SIGINT, previous)
+
+    def test_handlers_are_put_back(self):
+        before = signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT)
+        with termination_as_interrupt():
+            assert signal.getsignal(signal.SIGTERM) != before[0]
+        assert (signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT)) == before
+
+    def test_other_threads_have_no_signals(self):
+        done = []
+
+        def work():
+            with termination_as_interrupt():
+                done.append(True)
+
+        thread = threading.Thread(target=work)
+        thread.start()
+        thread.join()
+        assert done

@@ -1,0 +1,400 @@
+"""``kalux reconstruct``: outputs that are right and reproducible, and nothing half-written."""
+
+from __future__ import annotations
+
+import csv
+import errno
+import os
+import signal
+import time
+import tomllib
+
+import av
+import numpy as np
+import pytest
+
+import kalux
+from kalux.writers import folder
+
+
+def times_in(path):
+    with (path / "timestamps.csv").open() as file:
+        return [int(row["t_us"]) for row in csv.DictReader(file)]
+
+
+def images_in(path):
+    return [np.load(file) for file in sorted(path.glob("*.npy"))]
+
+
+class TestOutput:
+    def test_npy_holds_what_the_api_returns(self, cli, recording, tmp_path):
+        assert (
+            cli("reconstruct", recording, "-o", tmp_path / "out", "--format", "npy", "--rate", 40).code == 0
+        )
+        expected = list(kalux.reconstruct(kalux.open(recording), rate_hz=40))
+        assert times_in(tmp_path / "out") == [image.t for image in expected]
+        for found, image in zip(images_in(tmp_path / "out"), expected, strict=True):
+            np.testing.assert_array_equal(found, np.stack([image.intensity, image.variance]))
+
+    def test_a_folder_gets_png_at_100_hz_by_default(self, cli, recording, tmp_path):
+        assert cli("reconstruct", recording, "-o", tmp_path / "out").code == 0
+        assert {file.suffix for file in (tmp_path / "out").iterdir()} == {".png", ".csv", ".toml"}
+        assert set(np.diff(times_in(tmp_path / "out"))) == {10_000}
+
+    def test_a_name_with_mp4_gets_a_video(self, cli, recording, tmp_path):
+        found = cli("reconstruct", recording, "-o", tmp_path / "out.mp4", "--crf", 30, "--slow-motion", 4)
+        assert found.code == 0
+        with av.open(str(tmp_path / "out.mp4")) as video:
+            assert float(video.streams.video[0].average_rate) == 25
+        assert (tmp_path / "out.mp4.kalux.toml").exists()
+
+    def test_at_frames_gives_the_middles_of_the_exposures(self, cli, recording, simulation, tmp_path):
+        assert cli("reconstruct", recording, "-o", tmp_path / "out", "--at", "frames").code == 0
+        assert times_in(tmp_path / "out") == [frame.middle for frame in simulation.frames]
+
+    def test_times_come_from_text_npy_or_a_former_output(self, cli, recording, tmp_path):
+        wanted = [100_000, 150_001, 300_000]
+        (tmp_path / "t.txt").write_text("# us\n100000\n150001\n\n300000\n")
+        np.save(tmp_path / "t.npy", wanted)
+        for name, file in (("a", "t.txt"), ("b", "t.npy"), ("c", "a/timestamps.csv")):
+            assert cli("reconstruct", recording, "-o", tmp_path / name, "--times", tmp_path / file).code == 0
+            assert times_in(tmp_path / name) == wanted
+
+    def test_a_part_has_the_same_images_as_the_whole(self, cli, recording, simulation, tmp_path):
+        flags = ("--format", "npy", "--rate", 50)
+        cli("reconstruct", recording, "-o", tmp_path / "whole", *flags)
+        cli("reconstruct", recording, "-o", tmp_path / "part", *flags, "--start", 0.1, "--end", 0.2)
+        begin = simulation.frames[0].exposure_start
+        kept = [i for i, t in enumerate(times_in(tmp_path / "whole")) if 1e5 <= t - begin <= 2e5]
+        whole, part = images_in(tmp_path / "whole"), images_in(tmp_path / "part")
+        assert len(part) == len(kept) > 3
+        for i, image in zip(kept, part, strict=True):
+            np.testing.assert_array_equal(image, whole[i])
+
+    def test_the_complementary_filter_has_an_infinite_variance(self, cli, recording, tmp_path):
+        found = cli("reconstruct", recording, "-o", tmp_path / "out", "--preset", "cf", "--format", "npy")
+        assert found.code == 0
+        assert np.isinf(images_in(tmp_path / "out")[0][1]).all()
+
+    def test_causal_begins_when_the_first_frame_is_finished(self, cli, recording, simulation, tmp_path):
+        assert cli("reconstruct", recording, "-o", tmp_path / "out", "--causal").code == 0
+        assert times_in(tmp_path / "out")[0] == simulation.frames[0].exposure_end
+
+    def test_display_flags_reach_the_pictures(self, cli, recording, tmp_path):
+        flags = ("--display", "linear", "--display.white", 4, "--display.encoding", "srgb", "--png-bits", 8)
+        assert cli("reconstruct", recording, "-o", tmp_path / "out", "--at", "frames", *flags).code == 0
+        output = tomllib.loads((tmp_path / "out" / "kalux.toml").read_text())["output"]
+        assert output["display"]["linear"] == {"black": 0.0, "white": 4.0}
+        assert (output["display"]["encoding"], output["bits"]) == ("srgb", 8)
+
+    def test_a_former_output_is_replaced_only_on_request(self, cli, recording, tmp_path):
+        command = ("reconstruct", recording, "-o", tmp_path / "out", "--at", "frames")
+        assert cli(*command).code == 0
+        refused = cli(*command)
+        assert refused.code == 2
+        assert "--overwrite" in refused.error
+        assert cli(*command, "--overwrite").code == 0
+
+
+class TestSettings:
+    def test_flags_win_over_the_file_and_the_file_over_the_preset(self, cli, recording, tmp_path):
+        (tmp_path / "s.toml").write_text("[camera]\nlog_offset = 0.1\n[filter]\ncutoff = 3.0\n")
+        flags = ("--preset", "cf", "--settings", tmp_path / "s.toml", "--camera.log-offset", 0.2)
+        assert cli("reconstruct", recording, "-o", tmp_path / "out", "--at", "frames", *flags).code == 0
+        used = tomllib.loads((tmp_path / "out" / "kalux.toml").read_text())["settings"]
+        assert (used["camera"]["log_offset"], used["filter"]["cutoff"], used["filter"]["kind"]) == (
+            0.2,
+            3.0,
+            "cf",
+        )
+
+    @pytest.mark.parametrize("threshold", [None, (0.2, 0.2)])
+    def test_an_outputs_settings_reproduce_it(self, cli, write_recording, tmp_path, threshold):
+        """Also where thresholds were estimated, which makes the engine believe highlights less."""
+        recording = write_recording(tmp_path / "rec.h5", contrast_threshold=threshold)
+        flags = ("--at", "frames", "--format", "npy")
+        first = (*flags, "--camera.log-offset", 0.05, "--events.step-variance", 0.3, "--filter.deblur", "no")
+        cli("reconstruct", recording, "-o", tmp_path / "a", *first)
+        again = (*flags, "--settings", tmp_path / "a" / "kalux.toml", "--preset", "iccv2021")
+        cli("reconstruct", recording, "-o", tmp_path / "b", *again)
+        a, b = (tomllib.loads((tmp_path / name / "kalux.toml").read_text()) for name in "ab")
+        assert a["settings"] == b["settings"]
+        assert (
+            a["thresholds"]["origin"]
+            == b["thresholds"]["origin"]
+            == ("recording" if threshold else "estimate")
+        )
+        for first_image, second_image in zip(
+            images_in(tmp_path / "a"), images_in(tmp_path / "b"), strict=True
+        ):
+            np.testing.assert_array_equal(first_image, second_image)
+
+    def test_the_settings_file_says_what_was_run(self, cli, recording, tmp_path):
+        cli("reconstruct", recording, "-o", tmp_path / "out", "--rate", 20, "--end", 0.2)
+        told = tomllib.loads((tmp_path / "out" / "kalux.toml").read_text())
+        assert told["complete"] is True
+        assert told["command"].startswith("kalux reconstruct ")
+        assert told["input"] == {"path": str(recording), "format": "kalux", "height": 32, "width": 40}
+        assert {"kalux", "python", "numpy", "numba"} - {*told["versions"]} <= {
+            "kalux"
+        }  # not when not installed
+        assert (told["preset"], told["images_wanted"]["end"], told["output"]["rate_hz"]) == (
+            "default",
+            0.2,
+            20.0,
+        )
+
+
+class TestWhatIsSaid:
+    def test_decisions_before_and_a_summary_after(self, cli, recording, tmp_path):
+        lines = cli("reconstruct", recording, "-o", tmp_path / "out").out.splitlines()
+        assert [line.split()[0] for line in lines] == [
+            "recording",
+            "thresholds",
+            "exposure",
+            "filter",
+            "images",
+            "wrote",
+        ]
+        assert "40x32 pixels" in lines[0]
+        assert "from the recording" in lines[1]
+
+    def test_estimated_thresholds_are_a_warning(self, cli, write_recording, tmp_path):
+        recording = write_recording(tmp_path / "rec.h5", contrast_threshold=None)
+        found = cli("reconstruct", recording, "-o", tmp_path / "out", "--at", "frames", "--quiet")
+        assert (found.code, found.out) == (0, "")
+        assert found.err.startswith("kalux: warning: the contrast thresholds are estimated")
+        assert found.err.count("\n") == 1
+
+    @pytest.mark.parametrize("shift", [None, 10**9])
+    def test_events_that_say_nothing_of_the_frames_are_a_warning(
+        self, cli, write_recording, simulation, tmp_path, shift
+    ):
+        events = simulation.events[:0] if shift is None else simulation.events.copy()
+        events["t"] += shift or 0
+        recording = write_recording(tmp_path / "rec.h5", events=[events])
+        found = cli("reconstruct", recording, "-o", tmp_path / "out", "--at", "frames")
+        assert found.code == 0
+        assert ("no events" if shift is None else "same clock") in found.err
+
+
+DAMAGES = {
+    "event outside the sensor": "sensor",
+    "events not sorted": "event",
+    "no frames": "no frames",
+    "zero exposure": "exposure of 0 us",
+    "frames overlap": "exposure of frame",
+    "NaN": "x=5, y=3",
+    "frames of another size": "40x32",
+    "no exposure times": "--exposure",
+}
+
+
+class TestBadInput:
+    @pytest.mark.parametrize("damage", DAMAGES)
+    @pytest.mark.parametrize("name", ["out", "out.mp4"])
+    def test_damage_is_one_line_and_nothing_is_written(self, cli, damaged, tmp_path, damage, name):
+        found = cli("reconstruct", damaged(damage), "-o", tmp_path / name, "--rate", 20)
+        assert found.code == 2
+        assert DAMAGES[damage] in found.error
+        assert found.out == ""
+        assert [file.name for file in tmp_path.iterdir()] == ["damaged.h5"]
+
+    def test_a_truncated_file(self, cli, recording, tmp_path):
+        (tmp_path / "cut.h5").write_bytes(recording.read_bytes()[:-2000])
+        found = cli("reconstruct", tmp_path / "cut.h5", "-o", tmp_path / "out")
+        assert found.code == 2
+        assert "cut.h5" in found.error
+        assert not (tmp_path / "out").exists()
+
+    def test_a_missing_file(self, cli, tmp_path):
+        found = cli("reconstruct", tmp_path / "none.aedat4", "-o", tmp_path / "out")
+        assert (found.code, found.error) == (2, f"{tmp_path}/none.aedat4: no such file or folder")
+
+    def test_a_line_break_in_a_name_stays_one_line(self, cli, tmp_path):
+        assert "a b" in cli("reconstruct", tmp_path / "a\nb", "-o", tmp_path / "out").error
+
+    @pytest.mark.parametrize(
+        ("flags", "told"),
+        [
+            (["--exposure", "0"], "must be positive"),
+            (["--exposure", "soon"], "'soon' is not a whole number"),
+            (["--stamp", "end"], "--exposure"),
+            (["--rate", "fast"], "'fast' is not a number"),
+            (["--rate", "-3"], "rate is -3"),
+            (["--rate", "nan"], "rate is nan"),
+            (["--rate", "10", "--at", "frames"], "not allowed with"),
+            (["--start", "100"], "no image"),
+            (["--end", "nan"], "--end is nan"),
+            (["--preset", "best"], "unknown preset 'best'; known are default"),
+            (["--camera.log-ofset", "1"], "did you mean --camera.log-offset?"),
+            (["--camera.log-offset", "-1"], "camera.log_offset is -1.0"),
+            (["--camera.response", "film"], "unknown response 'film'"),
+            (["--filter.kind", "kalman"], "'akf', 'cf'"),
+            (["--filter.deblur", "perhaps"], "'perhaps' is not true or false"),
+            (["--GROUP.NAME", "1"], "--help-settings"),
+            (["--display", "bright"], "'auto', 'linear'"),
+            (["--display", "linear", "--display.knee", "1"], "it has black, white"),
+            (["--display.lift", "99"], "lift is 99"),
+            (["--png-bits", "12"], "--png-bits"),
+            (["--crf", "20"], "--crf is for mp4"),
+            (["--format", "exr", "--display", "drago"], "--display is for png and mp4"),
+            (["--format", "tiff"], "'tiff'"),
+            (["--settings", "none.toml"], "none.toml"),
+            (["--times", "none.txt"], "none.txt: cannot be read"),
+            (["extra"], "extra: one argument too many"),
+        ],
+    )
+    def test_flags(self, cli, recording, tmp_path, flags, told):
+        found = cli("reconstruct", recording, "-o", tmp_path / "out", *flags)
+        assert found.code == 2
+        assert told in found.error
+        assert not (tmp_path / "out").exists()
+
+    @pytest.mark.parametrize(
+        ("name", "content", "told"),
+        [
+            ("t.txt", "100000\n90000\n", "time 2 is 90000 us"),
+            ("t.txt", "100000\n100000\n", "must increase"),
+            ("t.txt", "100000\n0.5 s\n", "line 2: '0.5 s'"),
+            ("t.txt", "# nothing\n", "no times"),
+            ("t.txt", "9" * 40, "out of range"),
+            ("t.txt", b"\xff\xfe\x00", "neither text"),
+            ("t.txt", "1\n", "1 us lies before"),
+            ("t.txt", "900000000\n", "after the recording's end"),
+            ("t.npy", b"not an array", "not a NumPy array"),
+            ("t.npy", np.array([0.5]), "not whole"),
+            ("t.npy", np.array([np.nan]), "not finite"),
+            ("t.npy", np.array([[1, 2]]), "(1, 2)"),
+        ],
+    )
+    def test_times(self, cli, recording, tmp_path, name, content, told):
+        path = tmp_path / name
+        if isinstance(content, np.ndarray):
+            np.save(path, content)
+        else:
+            path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        found = cli("reconstruct", recording, "-o", tmp_path / "out", "--times", path)
+        assert found.code == 2
+        assert told in found.error
+        assert not (tmp_path / "out").exists()
+
+    @pytest.mark.parametrize(
+        ("content", "told"),
+        [("camera = 3", "not a table"), ("[lens]\nf = 1", "unknown group"), ("[camera", "not valid TOML")],
+    )
+    def test_settings_files(self, cli, recording, tmp_path, content, told):
+        (tmp_path / "s.toml").write_text(content)
+        found = cli("reconstruct", recording, "-o", tmp_path / "out", "--settings", tmp_path / "s.toml")
+        assert found.code == 2
+        assert told in found.error
+        assert "s.toml" in found.error
+
+
+class TestBadOutput:
+    def test_other_files_are_left_alone(self, cli, recording, tmp_path):
+        (tmp_path / "out").mkdir()
+        (tmp_path / "out" / "kalux.toml").write_text("mine")
+        for flags, told in (((), "not empty"), (("--overwrite",), "not an output of kalux")):
+            found = cli("reconstruct", recording, "-o", tmp_path / "out", "--quiet", *flags)
+            assert found.code == 2
+            assert told in found.error
+        assert (tmp_path / "out" / "kalux.toml").read_text() == "mine"
+
+    @pytest.mark.parametrize("name", ["out.avi", "file", "file/out", "folder.mp4"])
+    def test_names_that_cannot_be_used(self, cli, recording, tmp_path, name):
+        (tmp_path / "file").write_text("")
+        (tmp_path / "folder.mp4").mkdir()
+        found = cli("reconstruct", recording, "-o", tmp_path / name)
+        assert found.code == 2
+        assert str(tmp_path) in found.error
+
+    @pytest.mark.skipif(os.getuid() == 0, reason="root may write everywhere")
+    def test_a_folder_without_permission(self, cli, recording, tmp_path):
+        (tmp_path / "closed").mkdir(mode=0o500)
+        found = cli("reconstruct", recording, "-o", tmp_path / "closed" / "out")
+        assert found.code == 2
+        assert "no permission" in found.error
+
+    def test_a_full_disk(self, cli, recording, tmp_path, monkeypatch):
+        """The images before it stay, and one line says so."""
+        whole = folder.write_whole
+
+        def full(path, data):
+            if path.name == "000003.png":
+                raise OSError(errno.ENOSPC, "No space left on device")
+            whole(path, data)
+
+        monkeypatch.setattr(folder, "write_whole", full)
+        found = cli("reconstruct", recording, "-o", tmp_path / "out", "--quiet")
+        assert found.code == 2
+        assert "no space is left" in found.error
+        assert "the 3 images" in found.error
+        assert len(times_in(tmp_path / "out")) == 3
+
+
+class TestRealRecordings:
+    @pytest.mark.parametrize(
+        ("name", "flags"),
+        [
+            ("newton_davis346.aedat4", ()),
+            ("slider_depth", ("--exposure", 10_000, "--stamp", "start", "--end", 0.5)),
+        ],
+    )
+    def test_become_a_video(self, cli, shared_data, tmp_path, name, flags):
+        found = cli("reconstruct", shared_data / name, "-o", tmp_path / "v.mp4", "--rate", 100, *flags)
+        assert found.code == 0
+        with av.open(str(tmp_path / "v.mp4")) as video:
+            assert video.streams.video[0].frames == 51
+
+    def test_exposures_that_are_missing_are_asked_for(self, cli, shared_data, tmp_path):
+        found = cli("reconstruct", shared_data / "slider_depth", "-o", tmp_path / "v.mp4")
+        assert found.code == 2
+        assert "--exposure 10000" in found.error
+
+
+class TestInterrupt:
+    @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+    def test_what_is_finished_stays_valid(self, start_cli, recording, tmp_path, number):
+        out = tmp_path / "out"
+        process = start_cli("reconstruct", recording, "-o", out, "--rate", 100_000, "--format", "npy")
+        wait_for(process, lambda: (out / "000020.npy").exists())
+        process.send_signal(number)
+        _, stderr = process.communicate(timeout=30)
+        assert process.returncode == 130
+        finished = len(times_in(out))
+        assert stderr.splitlines()[-1] == (
+            f"kalux: interrupted; {finished:,} images are finished and valid in {out}"
+        )
+        assert "Traceback" not in stderr
+        assert len(images_in(out)) == finished >= 20
+        told = tomllib.loads((out / "kalux.toml").read_text())
+        assert (told["complete"], told["images"]) == (False, finished)
+
+    def test_a_video_can_be_played(self, start_cli, recording, tmp_path):
+        out = tmp_path / "out.mp4"
+        process = start_cli("reconstruct", recording, "-o", out, "--rate", 20_000, "--crf", 0)
+        part = tmp_path / ".out.mp4.part"
+        wait_for(process, lambda: part.exists() and part.stat().st_size > 0)
+        process.terminate()
+        _, stderr = process.communicate(timeout=30)
+        assert process.returncode == 130
+        with av.open(str(out)) as video:
+            assert f"{video.streams.video[0].frames:,} images are finished and valid in {out}" in stderr
+
+    def test_before_the_first_image(self, cli, recording, tmp_path, monkeypatch):
+        def interrupt(*arguments):
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr("kalux.cli.reconstruct.check_recording", interrupt)
+        found = cli("reconstruct", recording, "-o", tmp_path / "out")
+        assert (found.code, found.err) == (130, "kalux: interrupted; nothing was written\n")
+        assert not (tmp_path / "out").exists()
+
+
+def wait_for(process, ready):
+    deadline = time.monotonic() + 60
+    while not ready():
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.01)

@@ -1,0 +1,271 @@
+"""The AEDAT 4 reader, on files built here byte by byte, and on real ones against dv-processing."""
+
+from __future__ import annotations
+
+import struct
+
+import lz4.frame
+import numpy as np
+import pytest
+import zstandard
+
+from kalux import readers
+from kalux.errors import FormatError
+from kalux.frames import Frame
+from kalux.readers import CHUNK_EVENTS, aedat4
+from recordings import (
+    SIZE,
+    all_events,
+    assert_only_clear_errors,
+    damaged,
+    same_frames,
+    small_events,
+    small_frames,
+)
+
+COMPRESS = {0: bytes, 1: lz4.frame.compress, 3: zstandard.ZstdCompressor().compress}
+
+
+def flatbuffer(identifier, fields):
+    """A size-prefixed FlatBuffers table. Fields: number -> (struct code, value) or bytes (a vector)."""
+    last = max(fields, default=-1)
+    table, vectors, offsets = bytearray(4), {}, [0] * (last + 1)
+    for number, field in fields.items():
+        code, value = ("<I", 0) if isinstance(field, tuple) and field[0] == "vector" else field
+        table += bytes(-len(table) % 8)
+        offsets[number] = len(table)
+        if field[0] == "vector":
+            vectors[number] = field[1:]
+        table += struct.pack(code, value)
+    vtable = struct.pack(f"<HH{len(offsets)}H", 4 + 2 * len(offsets), len(table), *offsets)
+    vtable += bytes(-len(vtable) % 8)
+    start = 8 + len(vtable)  # after root offset, identifier
+    struct.pack_into("<i", table, 0, len(vtable))
+    body = bytearray(struct.pack("<I", start) + identifier.encode() + vtable + table)
+    for number, (length, content) in vectors.items():
+        body += bytes(-len(body) % 8)
+        struct.pack_into("<I", body, start + offsets[number], len(body) - start - offsets[number])
+        body += struct.pack("<I", length) + content
+    return struct.pack("<I", len(body)) + bytes(body)
+
+
+def event_packet(events):
+    return flatbuffer("EVTS", {0: ("vector", len(events), events.tobytes())})
+
+
+def frame_packet(frame, *, kind=0, exposure="both"):
+    height, width = frame.image.shape
+    fields = {0: ("<q", frame.exposure_start), 1: ("<q", 0), 2: ("<q", 0)}
+    if exposure == "both":
+        fields |= {3: ("<q", frame.exposure_start), 4: ("<q", frame.exposure_end)}
+    content = frame.image.tobytes()
+    fields |= {5: ("<b", kind), 6: ("<h", width), 7: ("<h", height), 10: ("vector", len(content), content)}
+    if exposure == "duration":
+        fields[11] = ("<q", frame.exposure)
+    return flatbuffer("FRME", fields)
+
+
+def aedat4_file(packets, *, streams=(("EVTS", SIZE), ("FRME", SIZE)), compression=0, closed=True):
+    """A file of (stream, packet) pairs."""
+    nodes = "".join(
+        f'<node name="{i}"><attr key="typeIdentifier" type="string">{kind}</attr><node name="info">'
+        f'<attr key="sizeX" type="int">{width}</attr><attr key="sizeY" type="int">{height}</attr></node></node>'
+        for i, (kind, (height, width)) in enumerate(streams)
+    )
+    info = f'<dv version="2.0"><node name="outInfo">{nodes}</node></dv>'.encode()
+    body = b"".join(
+        struct.pack("<ii", stream, len(packed)) + packed
+        for stream, packed in ((stream, COMPRESS[compression](packet)) for stream, packet in packets)
+    )
+
+    def header(table_position):
+        return b"#!AER-DAT4.0\r\n" + flatbuffer(
+            "IOHE", {0: ("<i", compression), 1: ("<q", table_position), 2: ("vector", len(info), info)}
+        )
+
+    end = len(header(0)) + len(body)
+    return header(end if closed else -1) + body + (b"data table" if closed else b"")
+
+
+def small_file(**options):
+    events, frames = small_events(), small_frames()
+    packets = [(0, event_packet(part)) for part in np.array_split(events, 7)]
+    packets += [(1, frame_packet(frame)) for frame in frames]
+    return aedat4_file(packets, **options)
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "recording.aedat4"
+
+
+@pytest.mark.parametrize("compression", [0, 1, 3])
+@pytest.mark.parametrize("closed", [True, False])
+def test_reads_what_was_written(path, compression, closed):
+    path.write_bytes(small_file(compression=compression, closed=closed))
+    source = readers.read(path)
+    assert (source.format, source.sensor_size, source.exposure_known) == ("aedat4", SIZE, True)
+    assert source.missing == ()
+    for _ in range(2):
+        assert np.array_equal(all_events(source), small_events())
+        assert same_frames(source.frames(), small_frames())
+    assert (source.count_events(), source.count_frames()) == (500, 4)
+
+
+def test_large_packets_are_split_and_small_ones_joined(path):
+    count = CHUNK_EVENTS + 10
+    many = np.tile(small_events(1), count)
+    path.write_bytes(aedat4_file([(0, event_packet(many)), (0, event_packet(many[:3]))]))
+    assert [len(chunk) for chunk in readers.read(path).events()] == [CHUNK_EVENTS, 13]
+    path.write_bytes(aedat4_file([(0, event_packet(many[:5]))] * 10))
+    assert [len(chunk) for chunk in readers.read(path).events()] == [50]
+
+
+def test_late_frames_are_put_in_order(path):
+    frames = small_frames(20)
+    shuffled = [*frames[5:8], *frames[:5], *frames[8:]]
+    path.write_bytes(aedat4_file([(1, frame_packet(frame)) for frame in shuffled]))
+    assert same_frames(readers.read(path).frames(), frames)
+
+
+def test_exposure_from_its_duration(path):
+    frames = small_frames()
+    path.write_bytes(aedat4_file([(1, frame_packet(frame, exposure="duration")) for frame in frames]))
+    source = readers.read(path)
+    assert source.exposure_known
+    assert same_frames(source.frames(), frames)
+
+
+def test_unknown_exposure_is_said(path):
+    frames = small_frames()
+    path.write_bytes(aedat4_file([(1, frame_packet(frame, exposure="none")) for frame in frames]))
+    source = readers.read(path)
+    assert not source.exposure_known
+    assert "exposure times" in source.missing[-1]
+    assert [(f.exposure_start, f.exposure_end) for f in source.frames()] == [
+        (f.exposure_start, f.exposure_start) for f in frames
+    ]
+
+
+def test_events_only_and_frames_only(path):
+    path.write_bytes(aedat4_file([(0, event_packet(small_events()))], streams=[("EVTS", SIZE)]))
+    source = readers.read(path)
+    assert source.count_frames() == 0
+    assert list(source.frames()) == []
+    assert any("no frames" in sentence for sentence in source.missing)
+    path.write_bytes(aedat4_file([(0, frame_packet(small_frames()[0]))], streams=[("FRME", SIZE)]))
+    source = readers.read(path)
+    assert source.count_events() == 0
+    assert list(source.events()) == []
+    assert any("no event" in sentence for sentence in source.missing)
+
+
+def test_of_several_streams_those_of_equal_size_are_read(path):
+    streams = [("EVTS", SIZE), ("FRME", (60, 80)), ("FRME", SIZE), ("IMUS", (0, 0))]
+    big = Frame(np.zeros((60, 80), np.uint8), 0, 10)
+    packets = [(0, event_packet(small_events())), (1, frame_packet(big))]
+    packets += [(2, frame_packet(frame)) for frame in small_frames()]
+    path.write_bytes(aedat4_file(packets, streams=streams))
+    source = readers.read(path)
+    assert same_frames(source.frames(), small_frames())
+    assert any("2 frame streams" in sentence and "stream 2" in sentence for sentence in source.missing)
+
+
+def test_16_bit_frames(path):
+    image = np.arange(1200, dtype=np.uint16).reshape(SIZE) * 50
+    path.write_bytes(aedat4_file([(1, frame_packet(Frame(image, 5, 9), kind=2))]))
+    frame = next(readers.read(path).frames())
+    assert frame.image.dtype == np.uint16
+    assert np.array_equal(frame.image, image)
+
+
+def test_colour_is_refused(path):
+    image = np.zeros((SIZE[0], SIZE[1] * 3), np.uint8)
+    packet = frame_packet(Frame(image, 5, 9), kind=16)
+    path.write_bytes(aedat4_file([(1, packet)]))
+    with pytest.raises(FormatError, match=r"in colour \(BGR\)"):
+        list(readers.read(path).frames())
+
+
+def test_a_file_without_events_and_frames_is_refused(path):
+    path.write_bytes(aedat4_file([], streams=[("IMUS", (0, 0))]))
+    with pytest.raises(FormatError, match="neither events nor frames"):
+        readers.read(path)
+
+
+@pytest.mark.parametrize("closed", [True, False])
+def test_a_file_cut_short_is_refused(path, closed):
+    data = small_file(closed=closed)
+    end = data.rindex(b"data table") if closed else len(data)
+    first_packet = data.index(b"EVTS", data.index(b"</dv>"))
+    for cut in (20, 200, first_packet, first_packet + 100, end // 2, end - 1):
+        path.write_bytes(data[:cut])
+        with pytest.raises(FormatError, match=str(path)):
+            readers.read(path)
+
+
+def test_a_file_cut_between_packets_is_refused(path):
+    data = small_file()
+    packet = len(frame_packet(small_frames()[-1])) + 8
+    path.write_bytes(data[: data.rindex(b"data table") - packet])
+    with pytest.raises(FormatError, match="cut short"):
+        readers.read(path)
+
+
+@pytest.mark.parametrize("compression", [0, 1, 3])
+def test_damage_gives_clear_errors(path, compression):
+    assert_only_clear_errors(path, damaged(small_file(compression=compression), 300, header=700))
+
+
+# Real files
+
+
+@pytest.mark.parametrize(
+    ("name", "size", "events", "frames", "exposure"),
+    [
+        ("street_davis346", (260, 346), 78_830, 59, 500),
+        ("newton_davis346", (260, 346), 319_512, 13, 20_000),
+        ("bench_davis346", (260, 346), 117_667, 3, 4_773),
+        ("formats/dvxplorer", (240, 320), 111_954, 0, None),
+    ],
+)
+def test_real_recordings(shared_data, name, size, events, frames, exposure):
+    source = readers.read(shared_data / f"{name}.aedat4")
+    assert (source.sensor_size, source.count_events(), source.count_frames()) == (size, events, frames)
+    assert len(all_events(source)) == events
+    assert {frame.exposure for frame in source.frames()} == ({exposure} if frames else set())
+    assert bool(frames) != any("no frames" in sentence for sentence in source.missing)
+
+
+def test_real_16_bit_frame(shared_data):
+    frame = next(readers.read(shared_data / "formats" / "test_data_gray16.aedat4").frames())
+    assert frame.image.tolist() == [[1, 2], [3, 1023]]
+    assert (frame.exposure_start, frame.exposure_end) == (950, 1050)
+
+
+@pytest.mark.parametrize("name", ["street_davis346", "newton_davis346"])
+def test_agrees_with_dv_processing(shared_data, name):
+    dv = pytest.importorskip("dv_processing")
+    path = shared_data / f"{name}.aedat4"
+    source = aedat4.read(path)
+    other = dv.io.MonoCameraRecording(str(path))
+    batches, images = [], []
+    while (batch := other.getNextEventBatch()) is not None:
+        batches.append(batch.numpy())
+    while (image := other.getNextFrame()) is not None:
+        images.append(image)
+    theirs, ours = np.concatenate(batches), all_events(source)
+    for field, their_field in zip("txyp", ("timestamp", "x", "y", "polarity"), strict=True):
+        assert np.array_equal(ours[field], theirs[their_field])
+    for frame, image in zip(source.frames(), images, strict=True):
+        assert np.array_equal(frame.image, image.image)
+        assert frame.exposure == image.exposure.total_seconds() * 1e6
+
+
+@pytest.mark.parametrize("share", [0.001, 0.1, 0.5, 0.9, 0.99])
+def test_a_real_file_cut_short_is_refused(shared_data, tmp_path, share):
+    data = (shared_data / "street_davis346.aedat4").read_bytes()
+    path = tmp_path / "cut.aedat4"
+    path.write_bytes(data[: int(share * len(data))])
+    with pytest.raises(FormatError, match=r"cut\.aedat4"):
+        readers.read(path)

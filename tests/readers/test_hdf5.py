@@ -1,0 +1,204 @@
+"""kalux's own HDF5: everything comes back, nothing partial is left, damage is told."""
+
+from __future__ import annotations
+
+import resource
+
+import h5py
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from kalux import readers
+from kalux.errors import FormatError, FrameError, OutputError
+from kalux.frames import Frame
+from kalux.readers import hdf5
+from kalux.readers.source import GroundTruth
+from recordings import (
+    SIZE,
+    all_events,
+    assert_only_clear_errors,
+    damaged,
+    same_frames,
+    small_events,
+    small_frames,
+)
+
+REFERENCE = GroundTruth(
+    np.array([10, 20, 30]), np.random.default_rng(0).uniform(0, 9, (3, *SIZE)).astype(np.float32)
+)
+
+
+def write(path, **changes):
+    found = {
+        "sensor_size": SIZE,
+        "events": [small_events()],
+        "frames": small_frames(),
+        "contrast_threshold": (0.1, 0.2),
+        "inverse_covariance": np.linspace(1, 2, 256),
+        "ground_truth": REFERENCE,
+    }
+    hdf5.write(path, **(found | changes))
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "recording.h5"
+
+
+def test_round_trip(path):
+    write(path)
+    source = readers.read(path)
+    assert (source.format, source.sensor_size, source.missing) == ("kalux", SIZE, ())
+    assert (source.count_events(), source.count_frames()) == (500, 4)
+    assert source.exposure_known
+    assert source.contrast_threshold == (0.1, 0.2)
+    assert np.array_equal(source.inverse_covariance, np.linspace(1, 2, 256))
+    reference = source.ground_truth()
+    assert np.array_equal(reference.times, REFERENCE.times)
+    assert np.array_equal(reference.images, REFERENCE.images)
+    for _ in range(2):
+        assert np.array_equal(all_events(source), small_events())
+        assert same_frames(source.frames(), small_frames())
+
+
+def test_a_copy_of_a_copy_is_the_same(path, tmp_path):
+    write(path)
+    source = readers.read(path)
+    copy = tmp_path / "copy.h5"
+    write(copy, events=source.events(), frames=source.frames(), ground_truth=source.ground_truth())
+    assert np.array_equal(all_events(readers.read(copy)), small_events())
+    assert same_frames(readers.read(copy).frames(), small_frames())
+
+
+@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.lists(st.integers(0, 300), max_size=6))
+def test_any_chunks_give_the_same_events(path, monkeypatch, lengths):
+    monkeypatch.setattr(hdf5, "_EVENTS_PER_CHUNK", 128)
+    events = small_events(sum(lengths))
+    parts = np.split(events, np.cumsum(lengths))
+    write(path, events=parts, ground_truth=None)
+    assert np.array_equal(all_events(readers.read(path)), events)
+
+
+@pytest.mark.parametrize(
+    ("dtype", "white"), [(np.uint8, None), (np.uint16, 1023), (np.float32, None), (np.float64, 4.0)]
+)
+def test_frames_keep_type_and_white(path, dtype, white):
+    frames = [
+        Frame(frame.image.astype(dtype), 10 * i, 10 * i + 5, white) for i, frame in enumerate(small_frames())
+    ]
+    write(path, frames=frames)
+    assert same_frames(readers.read(path).frames(), frames)
+
+
+def test_nothing_but_a_sensor(path):
+    hdf5.write(path, sensor_size=SIZE, events=[], frames=[])
+    source = readers.read(path)
+    assert (source.sensor_size, source.count_events(), source.count_frames()) == (SIZE, 0, 0)
+    assert list(source.events()) == list(source.frames()) == []
+    assert source.contrast_threshold is source.inverse_covariance is source.ground_truth is None
+    assert len(source.missing) == 2
+
+
+def test_unknown_exposures(path):
+    frames = [Frame(frame.image, frame.middle, frame.middle) for frame in small_frames()]
+    write(path, frames=frames, exposure_known=False)
+    source = readers.read(path)
+    assert not source.exposure_known
+    assert "exposure times" in source.missing[0]
+    assert same_frames(source.frames(), frames)
+
+
+def test_frames_must_be_alike(path):
+    frames = small_frames()
+    frames[2] = Frame(frames[2].image.astype(np.uint16), frames[2].exposure_start, frames[2].exposure_end)
+    with pytest.raises(FrameError, match="frame 2 has another size, dtype"):
+        write(path, frames=frames)
+    assert list(path.parent.iterdir()) == []
+
+
+@pytest.mark.parametrize("kind", [KeyboardInterrupt, RuntimeError])
+def test_an_interruption_leaves_the_old_file(path, kind):
+    def interrupted():
+        yield small_events()
+        raise kind
+
+    write(path)
+    with pytest.raises(kind):
+        write(path, events=interrupted())
+    assert list(path.parent.iterdir()) == [path]
+    assert readers.read(path).count_events() == 500
+
+
+def test_unwritable(path):
+    with pytest.raises(OutputError, match="No such file or directory"):
+        write(path / "below" / "recording.h5")
+    path.mkdir()
+    with pytest.raises(OutputError, match="cannot be written"):
+        write(path)
+    assert list(path.parent.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("room", [0, 3_000, 20_000])
+def test_a_full_disk_is_told(path, room):
+    # HDF5 itself crashes when a write fails, so kalux keeps the failure from it.
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (room, limits[1]))
+    try:
+        with pytest.raises(OutputError, match="cannot be written: File too large"):
+            write(path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert list(path.parent.iterdir()) == []
+
+
+def test_a_newer_layout_is_refused(path):
+    write(path)
+    with h5py.File(path, "r+") as file:
+        file.attrs["version"] = np.bytes_("1.7")
+    assert readers.read(path).count_events() == 500
+    with h5py.File(path, "r+") as file:
+        file.attrs["version"] = np.bytes_("2.0")
+    with pytest.raises(FormatError, match=r"version 2\.0 .* update kalux"):
+        readers.read(path)
+
+
+def test_columns_must_be_equally_long(path):
+    write(path)
+    with h5py.File(path, "r+") as file:
+        file["events/x"].resize((499,))
+    with pytest.raises(FormatError, match="x 499"):
+        readers.read(path)
+
+
+def test_other_hdf5_files_are_not_recognised(path):
+    with h5py.File(path, "w") as file:
+        file["events/t"] = np.arange(5)
+    assert not hdf5.recognises(path)
+    with pytest.raises(FormatError, match="not a recording that kalux knows"):
+        readers.read(path)
+
+
+def test_a_file_cut_short_is_refused(path):
+    write(path)
+    data = path.read_bytes()
+    for share in (0.01, 0.3, 0.6, 0.9, 0.999):
+        path.write_bytes(data[: int(share * len(data))])
+        with pytest.raises(FormatError, match=str(path)):
+            readers.read(path)
+
+
+def test_damage_gives_clear_errors(path):
+    write(path)
+    assert_only_clear_errors(path, damaged(path.read_bytes(), 300))
+
+
+def test_a_real_recording_comes_back(shared_data, path):
+    source = readers.read(shared_data / "newton_davis346.aedat4")
+    hdf5.write(path, sensor_size=source.sensor_size, events=source.events(), frames=source.frames())
+    copy = readers.read(path)
+    assert copy.count_events() == 319_512
+    assert np.array_equal(all_events(copy), all_events(source))
+    assert same_frames(copy.frames(), source.frames())

@@ -1,0 +1,49 @@
+"""The public names."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import kalux
+
+
+def test_all_is_what_there_is():
+    assert sorted(set(kalux.__all__)) == sorted(kalux.__all__)
+    assert len(kalux.__all__) <= 25
+    for name in kalux.__all__:
+        assert getattr(kalux, name) is not None
+
+
+def test_the_names_that_users_were_promised():
+    """The design's examples: a name may come, none may go."""
+    promised = {"open", "Recording", "reconstruct", "Reconstructor", "Frame", "Image", "Settings", "preset"}
+    assert promised | {"PRESETS", "KaluxError", "EVENT_DTYPE", "as_events"} <= set(kalux.__all__)
+
+
+def test_a_star_import_does_not_hide_the_builtin_that_tests_rely_on():
+    """`kalux.open` opens recordings; the package itself must not be broken by it."""
+    names: dict[str, object] = {}
+    exec("from kalux import *", names)
+    assert names["open"] is kalux.open
+    assert set(kalux.__all__) <= set(names)
+
+
+def test_import_reads_nothing_and_prints_nothing():
+    done = subprocess.run(
+        [sys.executable, "-c", "import kalux; print(kalux.__version__)"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout.strip() == kalux.__version__
+    assert done.stderr == ""
+
+
+def test_every_error_is_a_kalux_error():
+    from kalux import errors
+
+    kinds = [v for v in vars(errors).values() if isinstance(v, type) and issubclass(v, Exception)]
+    assert len(kinds) >= 9
+    assert all(issubclass(kind, kalux.KaluxError) for kind in kinds)
+    assert all(kind.__doc__ for kind in kinds)

@@ -1,0 +1,147 @@
+"""Events from every layout in use, and the checks on them."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kalux.errors import EventError
+from kalux.events import EVENT_DTYPE, as_events, check_events, make_events
+
+rows = st.lists(
+    st.tuples(
+        st.integers(0, 2**53), st.integers(0, 65535), st.integers(0, 65535), st.booleans()
+    ),
+    max_size=30,
+)  # fmt: skip
+
+
+def columns(values):
+    arrays = zip(*values, strict=True) if values else ([], [], [], [])
+    return [np.array(list(column), np.int64) for column in arrays]
+
+
+def structured(t, x, y, p, names="txyp", dtypes=("i8", "u2", "u2", "?")):
+    out = np.empty(len(t), list(zip(names, dtypes, strict=True)))
+    for name, column in zip(names, (t, x, y, p), strict=True):
+        out[name] = column
+    return out
+
+
+def test_the_dtype_is_documented():
+    assert EVENT_DTYPE.itemsize == 16
+    assert EVENT_DTYPE.names == ("t", "x", "y", "p")
+
+
+@given(rows)
+def test_every_layout_gives_the_same_events(values):
+    t, x, y, p = columns(values)
+    expected = make_events(t, x, y, p)
+    assert expected.tolist() == [(a, b, c, d) for a, b, c, d in values]
+    sign = 2 * p - 1
+    dv_names = ("timestamp", "x", "y", "polarity")
+    layouts = [
+        structured(t, x, y, p, dtypes=("i8", "i2", "i2", "?")) if max([*x, *y, 0]) < 2**15 else expected,
+        structured(t, x, y, p, dv_names),
+        structured(x, y, p, t, ("x", "y", "p", "t"), ("u2", "u2", "i2", "i8")),  # Metavision
+        {"ts": t, "x": x, "y": y, "pol": sign},
+        {"T": t, "X": x, "Y": y, "On": p.astype(bool)},
+        SimpleNamespace(numpy=lambda: structured(t, x, y, p, dv_names)),  # an EventStore
+    ]
+    for layout in layouts:
+        assert np.array_equal(as_events(layout), expected)
+    table = np.column_stack([x, y, t, sign])
+    assert np.array_equal(as_events(table, columns="xytp"), expected)
+    as_float = table.astype(np.float64)
+    assert np.array_equal(as_events(as_float, columns="xytp", time_unit="us"), expected)
+
+
+def test_a_data_frame():
+    class DataFrame(dict):
+        @property
+        def columns(self):
+            return list(self)
+
+    expected = make_events(*columns([(1, 2, 3, True)]))
+    assert np.array_equal(as_events(DataFrame(timestamp=[1], x=[2], y=[3], polarity=[1])), expected)
+
+
+def test_events_of_the_dtype_are_not_copied():
+    events = make_events(*columns([(1, 2, 3, True)]))
+    assert as_events(events) is events
+
+
+@pytest.mark.parametrize(
+    ("t", "unit", "expected"),
+    [
+        ([0.5, 1.0000004], "s", [500_000, 1_000_000]),
+        ([0.5, 1.25], "ms", [500, 1250]),
+        ([1_500, 2_400], "ns", [1, 2]),
+        ([1, 2], "s", [1_000_000, 2_000_000]),
+        ([1, 2], None, [1, 2]),
+    ],
+)
+def test_units_of_time(t, unit, expected):
+    data = {"t": np.array(t), "x": [0, 1], "y": [0, 1], "p": [0, 1]}
+    assert as_events(data, time_unit=unit)["t"].tolist() == expected
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"t": [1]}, "equally long"),
+        ({"t": [0.1, 0.2]}, "time_unit='s'"),
+        ({"x": [-1, 0]}, "x of event 0 is -1"),
+        ({"y": [0, 70_000]}, "y of event 1 is 70000"),
+        ({"x": [0.5, 1.0]}, "not an integer"),
+        ({"p": [0, 2]}, "polarity of event 1 is 2"),
+        ({"p": [0.0, 1.0]}, "polarity is float64"),
+    ],
+)
+def test_unusable_columns_are_refused(changes, message):
+    data = {"t": [1, 2], "x": [0, 1], "y": [0, 1], "p": [0, 1]} | changes
+    with pytest.raises(EventError, match=message):
+        as_events({name: np.array(column) for name, column in data.items()})
+
+
+@pytest.mark.parametrize(
+    ("data", "options", "message"),
+    [
+        ({"t": [1], "x": [1], "y": [1]}, {}, "no column for 'p'"),
+        ({"t": [1.0], "x": [1], "y": [1], "p": [1]}, {"time_unit": "min"}, "unknown time_unit"),
+        ({"t": [np.inf], "x": [1], "y": [1], "p": [1]}, {"time_unit": "s"}, "time of event 0 is not finite"),
+        (np.zeros((3, 4), int), {}, "order of its columns"),
+        (np.zeros((3, 5), int), {"columns": "txyp"}, "cannot read an array of shape"),
+        (np.array([[1, 0.5, 1, 1]]), {"columns": "txyp", "time_unit": "us"}, "x of event 0 is 0.5"),
+        ("events", {}, "cannot read a str"),
+    ],
+)
+def test_unknown_layouts_are_refused(data, options, message):
+    if isinstance(data, dict):
+        data = {name: np.array(column) for name, column in data.items()}
+    with pytest.raises(EventError, match=message):
+        as_events(data, **options)
+
+
+@pytest.mark.parametrize(
+    ("values", "previous_t", "message"),
+    [
+        ([(5, 0, 0, True), (4, 0, 0, True)], None, r"event 11 at 4 us comes after one at 5 us"),
+        ([(5, 0, 0, True)], 6, r"event 10 at 5 us comes after one at 6 us"),
+        ([(5, 4, 0, True)], None, r"event 10 at x=4, y=0 is outside the sensor of 4x3"),
+        ([(5, 0, 0, True), (5, 0, 3, True)], None, r"event 11 at x=0, y=3 is outside"),
+    ],
+)
+def test_checks_name_the_event(values, previous_t, message):
+    events = make_events(*columns(values))
+    with pytest.raises(EventError, match="here: " + message):
+        check_events(events, (3, 4), where="here", first_index=10, previous_t=previous_t)
+
+
+def test_good_events_pass():
+    check_events(make_events(*columns([(5, 3, 2, True), (5, 0, 0, False)])), (3, 4), previous_t=5)
+    check_events(make_events(*columns([])), (3, 4), previous_t=5)

@@ -1,0 +1,76 @@
+"""Frames: white, exposures, and the checks on a sequence."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kalux.errors import ExposureError, FrameError
+from kalux.frames import Frame, check_frame, place_exposure
+
+
+def frame(start=100, end=200, dtype=np.uint8, shape=(3, 4), white=None):
+    return Frame(np.ones(shape, dtype), start, end, white)
+
+
+@pytest.mark.parametrize(
+    ("dtype", "white", "expected"),
+    [
+        (np.uint8, None, 255),
+        (np.uint16, None, 65535),
+        (np.uint16, 1023, 1023),
+        (np.float32, None, 1),
+        (np.float64, 4.0, 4),
+    ],
+)
+def test_white(dtype, white, expected):
+    one = frame(dtype=dtype, white=white)
+    assert one.white_value == expected
+    assert np.allclose(one.normalised(), 1 / expected)
+    assert one.normalised().dtype == np.float64
+
+
+def test_exposure_and_middle():
+    one = frame(100, 205)
+    assert (one.exposure, one.middle) == (105, 152)
+
+
+@pytest.mark.parametrize(("stamp", "start"), [("start", 100), ("middle", 95), ("end", 89)])
+def test_place_exposure(stamp, start):
+    placed = place_exposure(frame(100, 100), 11, stamp)
+    assert (placed.exposure_start, placed.exposure_end) == (start, start + 11)
+
+
+def check(one, **options):
+    check_frame(one, (3, 4), where="here", index=7, **options)
+
+
+def test_good_frames_pass():
+    check(frame(), previous=frame(0, 100))
+    check(frame(100, 100), exposure_known=False, previous=frame(50, 50))
+    for dtype in (np.uint16, np.float32, np.float64):
+        check(frame(dtype=dtype))
+
+
+def not_finite():
+    image = np.ones((3, 4), np.float32)
+    image[1, 2] = np.nan
+    return Frame(image, 100, 200)
+
+
+@pytest.mark.parametrize(
+    ("one", "options", "kind", "message"),
+    [
+        (frame(shape=(4, 3)), {}, FrameError, "frame 7 is 3x4 pixels, the sensor is 4x3"),
+        (frame(shape=(3, 4, 3)), {}, FrameError, "must be grey"),
+        (frame(dtype=np.int16), {}, FrameError, "dtype int16"),
+        (not_finite(), {}, FrameError, "not finite .* at x=2, y=1"),
+        (frame(100, 100), {}, ExposureError, "exposure of 0 us"),
+        (frame(100, 90), {}, ExposureError, "exposure of -10 us"),
+        (frame(), {"previous": frame(100, 150)}, FrameError, "not after the frame before it"),
+        (frame(), {"previous": frame(50, 101)}, ExposureError, "has ended"),
+    ],
+)
+def test_bad_frames_are_named(one, options, kind, message):
+    with pytest.raises(kind, match="here.*" + message):
+        check(one, **options)

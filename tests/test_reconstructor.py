@@ -1,0 +1,666 @@
+"""The engine: the same bits whatever the way in, finality, every edge of a stream, and errors that say where."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kalux import PRESETS, Frame, Reconstructor
+from kalux.errors import EventError, ExposureError, FrameError, InputError, KaluxError, SettingsError
+
+from builders import VARIANTS, Stream, altered, events, frame, pixel_events, random_stream
+
+HOUR = 3_600_000_000
+THRESHOLD = (0.25, 0.2)
+
+every_variant = pytest.mark.parametrize("variant", VARIANTS)
+both_modes = pytest.mark.parametrize("lookahead", [True, False], ids=["lookahead", "causal"])
+
+
+def engine(sensor_size, variant="default", lookahead=True, **arguments):
+    arguments = {"contrast_threshold": THRESHOLD, "reference_exposure": 10_000} | arguments
+    return Reconstructor(sensor_size, settings=VARIANTS[variant], lookahead=lookahead, **arguments)
+
+
+def filled(stream: Stream, variant="default", lookahead=True, finished=True, **arguments):
+    """An engine to which all of a stream has been pushed, frames first."""
+    out = engine(stream.sensor_size, variant, lookahead, **arguments)
+    for shot in stream.frames:
+        out.push_frame(shot)
+    out.push_events(stream.events)
+    if finished:
+        out.finish()
+    return out
+
+
+def target_times(stream: Stream):
+    """From the first time that every variant can read to after the last frame: a grid, and all exposure edges."""
+    first, last = stream.frames[0].exposure_end, stream.frames[-1].exposure_end
+    edges = [t for f in stream.frames for t in (f.exposure_start, f.middle, f.exposure_end)]
+    grid = range(first, last + 15_000, 3_001)
+    return sorted({t for t in (*edges, *grid) if t >= first})
+
+
+@lru_cache(maxsize=256)
+def reference(seed, variant, lookahead):
+    """Images of a random stream, all pushed at once and read in order, by time."""
+    stream = random_stream(seed)
+    whole = filled(stream, variant, lookahead)
+    return {t: whole.read(t) for t in target_times(stream)}
+
+
+def assert_same(image, expected):
+    np.testing.assert_array_equal(image.intensity, expected.intensity)
+    np.testing.assert_array_equal(image.variance, expected.variance)
+
+
+@st.composite
+def schedules(draw):
+    """A seed of a stream, and one way to push it: frames and events cut anywhere, in any interleaving."""
+    seed = draw(st.integers(0, 7))
+    stream = random_stream(seed)
+    count = len(stream.events)
+    cuts = sorted(draw(st.lists(st.integers(0, count), max_size=8)))
+    chunks = [("events", stream.events[a:b]) for a, b in zip([0, *cuts], [*cuts, count], strict=True)]
+    shots = [("frame", shot) for shot in stream.frames]
+    order = draw(st.permutations([0] * len(chunks) + [1] * len(shots)))
+    queues = [iter(chunks), iter(shots)]
+    return seed, [next(queues[k]) for k in order]
+
+
+def push(target, kind, what):
+    if kind == "frame":
+        target.push_frame(what)
+    else:
+        target.push_events(what)
+
+
+# --- the same bits --------------------------------------------------------------------------------------
+
+
+@every_variant
+@both_modes
+@given(schedule=schedules(), probes=st.lists(st.integers(0, 130_000), max_size=6))
+@settings(max_examples=25, deadline=None)
+def test_any_split_and_interleaving_gives_the_same_bits(variant, lookahead, schedule, probes):
+    """Also with reads in between, at any time that is allowed just then, forward and back."""
+    seed, operations = schedule
+    stream = random_stream(seed)
+    live = engine(stream.sensor_size, variant, lookahead)
+    probes = iter(probes)
+    for kind, what in operations:
+        push(live, kind, what)
+        probe = next(probes, None)
+        if probe is not None and live.begin_time is not None and probe >= live.begin_time:
+            live.read(probe)
+    live.finish()
+    begin = live.begin_time
+    for t, expected in reference(seed, variant, lookahead).items():
+        if t > begin or begin == stream.frames[0].exposure_end:
+            assert_same(live.read(t), expected)
+
+
+@every_variant
+@both_modes
+@given(schedule=schedules(), probes=st.lists(st.integers(0, 130_000), max_size=12))
+@settings(max_examples=25, deadline=None)
+def test_final_images_never_change(variant, lookahead, schedule, probes):
+    """What is final at any moment is what it is when everything has been pushed, however late frames are."""
+    seed, operations = schedule
+    stream = random_stream(seed)
+    live = engine(stream.sensor_size, variant, lookahead)
+    expected = reference(seed, variant, lookahead)
+    waiting, probes, known = list(expected), iter(probes), -1
+    for kind, what in operations:
+        push(live, kind, what)
+        until = live.final_until
+        assert until is None or until >= known
+        known = known if until is None else until
+        while waiting and waiting[0] <= known:
+            image = live.read(waiting[0])
+            assert image.final
+            assert_same(image, expected[waiting.pop(0)])
+        probe = next(probes, None)
+        if probe is not None and live.begin_time is not None and probe >= live.begin_time:
+            assert live.read(probe).final == (probe <= known)
+    live.finish()
+    for t in waiting:
+        image = live.read(t)
+        assert image.final
+        assert_same(image, expected[t])
+
+
+@every_variant
+@both_modes
+def test_a_robot_sees_the_same_as_a_recording(variant, lookahead):
+    """Frames pushed the moment their exposure ends, events one by one, every time declared complete."""
+    stream, expected = random_stream(3), reference(3, variant, lookahead)
+    live, frames = engine(stream.sensor_size, variant, lookahead), list(stream.frames)
+    images, taken = {}, 0
+    for t in expected:
+        while frames and frames[0].exposure_end <= t:
+            live.push_frame(frames.pop(0))
+        while taken < len(stream.events) and stream.events["t"][taken] <= t:
+            live.push_events(stream.events[taken : taken + 1])
+            taken += 1
+        live.advance(t)
+        image = live.read(t)
+        if not lookahead:
+            assert_same(image, expected[t])
+        images[t] = image
+    assert len(images) == len(expected)
+
+
+@every_variant
+@both_modes
+def test_reading_more_often_changes_nothing(variant, lookahead):
+    """50 Hz and 300 Hz agree to the bit where they meet."""
+    stream = random_stream(1)
+    begin = stream.frames[0].exposure_end
+    slow, fast = (filled(stream, variant, lookahead) for _ in range(2))
+    at_300 = {t: fast.read(t) for t in (begin + np.rint(np.arange(0, 36) * 1e6 / 300)).astype(int)}
+    at_50 = {t: slow.read(t) for t in range(begin, begin + 120_000, 20_000)}
+    assert set(at_50) <= set(at_300)
+    for t, image in at_50.items():
+        assert_same(image, at_300[t])
+
+
+@every_variant
+@both_modes
+@given(seed=st.integers(0, 7), data=st.data())
+@settings(max_examples=15, deadline=None)
+def test_reading_twice_and_back_within_a_segment(variant, lookahead, seed, data):
+    stream = random_stream(seed)
+    live, fresh = (filled(stream, variant, lookahead) for _ in range(2))
+    first = data.draw(st.integers(live.begin_time, stream.frames[-1].exposure_end + 10_000))
+    live.read(first)
+    back = data.draw(st.integers(live.begin_time + 1, first + 1))
+    again = live.read(back)
+    assert_same(live.read(back), again)
+    assert_same(fresh.read(back), again)
+    assert_same(live.read(first + 1), fresh.read(first + 1))
+
+
+@every_variant
+@pytest.mark.parametrize("exposures", [(2_000, 2_000, 2_000, 2_000), (2_000, 4_000, 4_000, 1_000)])
+def test_the_moment_between_two_segments_is_one_image(variant, exposures):
+    """Read before and after later reads have passed it, also where exposures vary and highlights are bright."""
+    live = engine((1, 2), variant, reference_exposure=2_000)
+    for k, exposure in enumerate(exposures):
+        live.push_frame(frame([[255, 100]], 40_000 * k, 40_000 * k + exposure))
+        live.push_events(pixel_events(range(40_000 * k + 5_000, 40_000 * k + 39_000, 2_000), [1] * 17))
+    live.finish()
+    node = 80_000 if variant.startswith("iccv") else 80_000 + exposures[2] // 2
+    before = live.read(node)
+    live.read(node + 1)
+    after = live.read(node)
+    np.testing.assert_allclose(after.intensity, before.intensity, rtol=1e-6)
+
+
+@every_variant
+@both_modes
+@pytest.mark.parametrize("shift", [HOUR, 1_700_000_000_000_000, -HOUR], ids=["hour", "epoch", "negative"])
+def test_the_origin_of_time_does_not_matter(variant, lookahead, shift):
+    moved = filled(random_stream(2, shift=shift), variant, lookahead)
+    for t, expected in reference(2, variant, lookahead).items():
+        image = moved.read(t + shift)
+        assert image.t == t + shift
+        assert_same(image, expected)
+
+
+def test_the_callers_arrays_may_be_reused():
+    """Drivers fill the same buffer again; what was pushed must not change with it."""
+    stream = random_stream(0)
+    expected = reference(0, "default", True)
+    live = engine(stream.sensor_size)
+    for shot in stream.frames:
+        pixels = shot.image.copy()
+        live.push_frame(Frame(pixels, shot.exposure_start, shot.exposure_end))
+        pixels[:] = 0
+    buffer = stream.events.copy()
+    live.push_events(buffer)
+    buffer["p"] = ~buffer["p"]
+    live.finish()
+    for t, image in expected.items():
+        assert_same(live.read(t), image)
+
+
+def test_events_in_any_layout():
+    stream, dtype = random_stream(0), [("x", "i2"), ("y", "i2"), ("timestamp", "i8"), ("polarity", "i1")]
+    other = np.empty(len(stream.events), dtype)
+    for name, field in zip("xytp", other.dtype.names, strict=True):
+        other[field] = stream.events[name]
+    other["polarity"] = np.where(stream.events["p"], 1, -1)
+    live = filled(stream._replace(events=other))
+    for t, image in reference(0, "default", True).items():
+        assert_same(live.read(t), image)
+
+
+# --- images ---------------------------------------------------------------------------------------------
+
+
+@every_variant
+@both_modes
+def test_what_an_image_holds(variant, lookahead):
+    for t, image in reference(4, variant, lookahead).items():
+        assert image.t == t
+        assert isinstance(image.t, int)
+        assert image.intensity.dtype == np.float32
+        assert image.intensity.shape == (3, 4)
+        assert np.isfinite(image.intensity).all()
+        assert (image.intensity >= 0).all()
+        assert image.variance.dtype == np.float32
+        assert image.variance.shape == (3, 4)
+        assert (image.variance > 0).all()
+        assert np.isfinite(image.variance).all() == (variant != "cf")  # which has none
+
+
+def test_an_image_becomes_final_one_frame_later():
+    live = engine((1, 1))
+    live.push_frame(frame(100, 0, 1000))
+    assert live.final_until is None
+    assert not live.read(0).final
+    live.push_events(pixel_events([5_000], [1]))
+    assert live.final_until == 500
+    assert live.read(500).final
+    assert not live.read(501).final
+    live.push_frame(frame(120, 40_000, 41_000))
+    assert not live.read(20_000).final
+    live.advance(40_999)
+    assert not live.read(20_000).final
+    live.advance(41_000)
+    assert live.final_until == 40_500
+    assert live.read(40_500).final
+    assert not live.read(40_501).final
+    live.finish()
+    assert live.read(10**9).final
+
+
+def test_a_later_frame_changes_what_was_provisional():
+    live = engine((1, 1), reference_exposure=1_000)
+    live.push_frame(frame(100, 0, 1000))
+    live.advance(1000)
+    alone = live.read(30_000).intensity[0, 0]
+    live.push_frame(frame(200, 40_000, 41_000))
+    live.advance(41_000)
+    joined = live.read(30_000).intensity[0, 0]
+    assert alone == pytest.approx(100 / 255, rel=1e-4)
+    assert 100 / 255 < joined < 200 / 255
+
+
+def test_a_frame_that_comes_late_to_a_causal_reader():
+    """Until it is there, the images do without it; afterwards they are what they would have been in time."""
+    late, in_time = (engine((1, 1), lookahead=False, reference_exposure=1_000) for _ in range(2))
+    for target in (late, in_time):
+        target.push_frame(frame(100, 0, 1000))
+    in_time.push_frame(frame(200, 40_000, 41_000))
+    for target in (late, in_time):
+        target.advance(80_000)
+    assert late.read(60_000).intensity[0, 0] == pytest.approx(100 / 255, rel=1e-4)
+    late.push_frame(frame(200, 40_000, 41_000))
+    assert late.read(60_000).intensity[0, 0] > 120 / 255
+    for t in (50_000, 60_000, 70_000):
+        assert_same(late.read(t), in_time.read(t))
+
+
+@every_variant
+def test_a_causal_image_does_not_know_the_next_frame(variant):
+    """A frame that is pushed already but exposed later changes nothing, also with another exposure time."""
+    images = []
+    for knows in (False, True):
+        live = engine((1, 1), variant, lookahead=False)
+        live.push_frame(frame(200, 0, 10_000))
+        live.push_events(pixel_events(range(12_000, 28_000, 2_000), [1] * 8))
+        live.advance(30_000)
+        if knows:
+            live.push_frame(frame(50, 40_000, 41_000))
+        images.append(live.read(29_000))
+    assert_same(*images)
+
+
+# --- the edges of a stream ------------------------------------------------------------------------------
+
+
+@every_variant
+@both_modes
+def test_equal_frames_without_events_are_the_image(variant, lookahead):
+    levels = np.array([[0, 1, 30], [100, 200, 240]], np.uint8)
+    live = engine((2, 3), variant, lookahead)
+    for k in range(3):
+        live.push_frame(frame(levels, 40_000 * k, 40_000 * k + 10_000))
+    live.finish()
+    for t in range(live.begin_time, 150_000, 7_000):
+        np.testing.assert_allclose(live.read(t).intensity, levels / 255, rtol=2e-5, atol=2e-6)
+
+
+@every_variant
+@both_modes
+def test_one_frame_is_held(variant, lookahead):
+    live = engine((1, 1), variant, lookahead)
+    live.push_frame(frame(100, 0, 10_000))
+    live.finish()
+    for t in (live.begin_time, 10_000, 10_001, 500_000, HOUR):
+        assert live.read(t).intensity[0, 0] == pytest.approx(100 / 255, rel=1e-5)
+
+
+@every_variant
+@both_modes
+@pytest.mark.parametrize(("polarity", "step"), [(1, 0.25), (0, -0.2)])
+def test_one_frame_and_one_event(variant, lookahead, polarity, step):
+    """A step of the threshold in log(I + I_0); a little less where a lonely event may be noise."""
+    offset = VARIANTS[variant].camera.log_offset
+    live = engine((1, 1), variant, lookahead)
+    live.push_frame(frame(100, 0, 10_000))
+    live.push_events(pixel_events([12_000], [polarity]))
+    live.finish()
+    before, after = (np.log(live.read(t).intensity[0, 0] + offset) for t in (11_999, 12_000))
+    assert 0.6 <= (after - before) / step <= 1.0001
+    if variant != "default":
+        assert after - before == pytest.approx(step, rel=1e-3)
+
+
+@every_variant
+@both_modes
+def test_silent_pixels_do_not_see_the_events_of_others(variant, lookahead):
+    stream = random_stream(5)
+    silent = (stream.events["x"] != 0) | (stream.events["y"] != 0)
+    quiet = filled(stream._replace(events=stream.events[:0]), variant, lookahead)
+    busy = filled(stream._replace(events=stream.events[silent]), variant, lookahead)
+    for t in target_times(stream):
+        a, b = quiet.read(t), busy.read(t)
+        assert a.intensity[0, 0] == b.intensity[0, 0]
+        assert a.variance[0, 0] == b.variance[0, 0]
+
+
+@every_variant
+@both_modes
+def test_events_before_and_after_everything_are_harmless(variant, lookahead):
+    """Before the first exposure they say nothing; after the last frame they still move the image."""
+    stream = random_stream(6)
+    extra = np.concatenate([events((1, 0, 0, 1), (2, 3, 2, 0)), stream.events])
+    live, usual = (
+        filled(stream._replace(events=extra), variant, lookahead),
+        filled(stream, variant, lookahead),
+    )
+    for t in target_times(stream):
+        assert_same(live.read(t), usual.read(t))
+    end = int(stream.events["t"][-1])
+    held = filled(
+        stream._replace(events=stream.events[stream.events["t"] <= end - 8_000]), variant, lookahead
+    )
+    assert (live.read(end).intensity != held.read(end).intensity).any()
+
+
+@every_variant
+@both_modes
+def test_events_on_the_edges_belong_to_what_ends_there(variant, lookahead):
+    """An event at the first moment that can be read is in it already, and not counted twice."""
+    live = engine((1, 1), variant, lookahead)
+    live.push_frame(frame(100, 10_000, 20_000))
+    begin = live.begin_time
+    live.push_events(pixel_events([begin], [1]))
+    live.finish()
+    first, later = live.read(begin).intensity[0, 0], live.read(begin + 3_000_000).intensity[0, 0]
+    if begin == 10_000:
+        assert first == pytest.approx(100 / 255, rel=1e-5)
+    assert later == pytest.approx(first, rel=0.3)
+
+
+def test_an_exposure_of_one_microsecond():
+    """Its event at the end is not lost: as with an exposure of two."""
+    images = []
+    for exposure in (1, 2):
+        live = engine((1, 1), reference_exposure=exposure)
+        live.push_frame(frame(100, 0, exposure))
+        live.push_events(pixel_events([exposure], [1]))
+        live.push_frame(frame(135, 40_000, 40_000 + exposure))
+        live.finish()
+        images.append(live.read(5_000).intensity[0, 0])
+    assert images[0] == pytest.approx(images[1], rel=0.01)
+
+
+@every_variant
+@both_modes
+def test_exposure_changes_do_not_show(variant, lookahead):
+    """A still scene under automatic exposure, times four and back: the same intensity within quantisation."""
+    truth = np.linspace(0.02, 0.24, 12).reshape(3, 4)
+    live = engine((3, 4), variant, lookahead, reference_exposure=4_000)
+    for k, exposure in enumerate((4_000, 16_000, 16_000, 4_000, 8_000)):
+        image = np.rint(truth * exposure / 4_000 * 255)
+        live.push_frame(frame(image, 40_000 * k, 40_000 * k + exposure))
+    live.finish()
+    for t in range(live.begin_time, 190_000, 5_000):
+        np.testing.assert_allclose(live.read(t).intensity, truth, atol=0.6 / 255)
+
+
+def test_the_reference_exposure_is_the_first_frames_unless_given():
+    for given_one, scale in ((None, 1.0), (20_000, 2.0), (5_000, 0.5)):
+        live = engine((1, 1), reference_exposure=given_one)
+        live.push_frame(frame(100, 0, 10_000))
+        live.finish()
+        assert live.read(5_000).intensity[0, 0] == pytest.approx(scale * 100 / 255, rel=1e-4)
+
+
+@both_modes
+def test_a_clipped_frame_says_nothing(lookahead):
+    """The default keeps what shorter exposures have told; a pull to white would be 0.25 here."""
+    live = engine((1, 1), "default", lookahead, reference_exposure=4_000)
+    for k, (level, exposure) in enumerate(((128, 4_000), (255, 16_000), (255, 16_000), (128, 4_000))):
+        live.push_frame(frame(level, 40_000 * k, 40_000 * k + exposure))
+    live.finish()
+    for t in range(live.begin_time, 150_000, 5_000):
+        assert live.read(t).intensity[0, 0] == pytest.approx(128 / 255, rel=0.01)
+
+
+def test_highlights_beyond_white_come_from_events():
+    """Clipped in both frames, with five events between: brighter than white, and doubted when c is a guess."""
+    believed = []
+    for estimate in (False, True):
+        live = engine((1, 1), threshold_is_estimate=estimate)
+        live.push_frame(frame(240, 0, 10_000))
+        live.push_events(pixel_events(range(20_000, 25_000, 1_000), [1] * 5))
+        live.push_frame(frame(255, 40_000, 50_000))
+        live.finish()
+        believed.append(live.read(30_000).intensity[0, 0])
+    assert 1.0 < believed[1] < believed[0] <= 1.03 * np.exp(5 * 0.25)
+
+
+@pytest.mark.parametrize(
+    ("image", "white"),
+    [
+        (np.full((1, 1), 0.5, np.float32), None),
+        (np.full((1, 1), 0.5, np.float64), None),
+        (np.full((1, 1), 32768, np.uint16), None),
+        (np.full((1, 1), 512, np.uint16), 1023),
+        (np.full((1, 1), 127.5, np.float32), 255.0),
+    ],
+)
+def test_frames_of_any_depth(image, white):
+    live = engine((1, 1))
+    live.push_frame(Frame(image, 0, 10_000, white))
+    live.finish()
+    assert live.read(5_000).intensity[0, 0] == pytest.approx(0.5, rel=2e-3)
+
+
+def test_a_released_weight_table_is_used():
+    """Where the table says the level is worthless, the paper's filter believes it least."""
+    variances = []
+    for table in (None, 7e5 * np.linspace(1.0, 0.0, 256)):
+        live = engine((1, 1), "iccv2021", inverse_covariance=table)
+        for k in range(2):
+            live.push_frame(frame(250, 40_000 * k, 40_000 * k + 10_000))
+        live.finish()
+        variances.append(live.read(40_000).variance[0, 0])
+    assert variances[1] > 5 * variances[0]
+
+
+# --- where one may read ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("variant", "lookahead", "begin"),
+    [
+        ("default", True, 1000),
+        ("default", False, 3000),
+        ("iccv2021", True, 1000),
+        ("iccv2021", False, 3000),
+        ("cf", True, 2000),
+        ("cf", False, 3000),
+    ],
+)
+def test_the_first_time_that_can_be_read(variant, lookahead, begin):
+    live = engine((1, 1), variant, lookahead)
+    assert live.begin_time is None
+    live.push_events(pixel_events([500], [1]))
+    assert live.begin_time is None
+    with pytest.raises(InputError, match="no frame has been pushed yet"):
+        live.read(1000)
+    live.push_frame(frame(100, 1000, 3000))
+    assert live.begin_time == begin
+    with pytest.raises(InputError, match=f"{begin - 1} us lies before {begin} us, the earliest time"):
+        live.read(begin - 1)
+    live.read(begin)
+    live.finish()
+    live.read(begin)
+
+
+def test_what_later_reads_have_passed_cannot_be_read_again():
+    live = filled(random_stream(0))
+    nodes = [shot.middle for shot in random_stream(0).frames]
+    live.read(nodes[2] + 1)
+    assert live.begin_time == nodes[2]
+    with pytest.raises(InputError, match="what later reads have passed"):
+        live.read(nodes[2] - 1)
+    live.read(nodes[2])
+
+
+def test_memory_is_bounded_when_one_reads_along():
+    live, held = engine((4, 4)), []
+    rng = np.random.default_rng(0)
+    for k in range(300):
+        t = 10_000 * k
+        times = np.sort(rng.integers(t, t + 10_000, 50))
+        rows = [(int(u), int(rng.integers(4)), int(rng.integers(4)), int(rng.integers(2))) for u in times]
+        live.push_frame(frame(np.full((4, 4), 100), t, t + 5_000))
+        live.push_events(events(*rows))
+        if live.final_until is not None:
+            live.read(live.final_until)
+        held.append((sum(len(chunk) for chunk in live._chunks), len(live._shots)))
+    assert max(count for count, _ in held) <= 200
+    assert max(shots for _, shots in held) <= 4
+
+
+# --- errors ---------------------------------------------------------------------------------------------
+
+
+def test_nothing_may_come_after_the_end():
+    live = filled(random_stream(0))
+    with pytest.raises(InputError, match=r"finish\(\) was called"):
+        live.push_events(events())
+    with pytest.raises(InputError, match=r"finish\(\) was called"):
+        live.push_frame(frame(np.zeros((3, 4)), HOUR, HOUR + 1))
+
+
+BAD_FRAMES = {
+    "zero exposure": (frame(1, 9_000, 9_000), ExposureError, "frame 1 has an exposure of 0 us"),
+    "negative exposure": (frame(1, 9_000, 8_000), ExposureError, "frame 1 has an exposure of -1000 us"),
+    "nan": (frame([[1.0, np.nan]], 9_000, 9_500, dtype=np.float32), FrameError, "frame 1 .* x=1, y=0"),
+    "infinite": (frame([[np.inf, 1.0]], 9_000, 9_500, dtype=np.float64), FrameError, "frame 1 .* x=0, y=0"),
+    "wrong size": (frame([[1], [2]], 9_000, 9_500), FrameError, "frame 1 is 1x2 pixels, the sensor is 2x1"),
+    "colour": (frame(np.ones((1, 2, 3)), 9_000, 9_500), FrameError, "frame 1 .* must be grey"),
+    "wrong type": (frame([[1, 2]], 9_000, 9_500, dtype=np.int32), FrameError, "frame 1 has dtype int32"),
+    "earlier": (frame([[1, 2]], 0, 1_000), FrameError, "frame 1 starts at 0 us, not after"),
+    "overlap": (frame([[1, 2]], 1_999, 3_000), ExposureError, "frame 1 starts at 1999 us"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_FRAMES)
+def test_bad_frames_are_named_and_leave_the_engine_as_it_was(name):
+    bad, kind, message = BAD_FRAMES[name]
+    if bad.image.shape == (1, 1):
+        bad = Frame(np.ones((1, 2), np.uint8), bad.exposure_start, bad.exposure_end)
+    good = frame([[100, 50]], 1_000, 2_000), frame([[120, 60]], 9_000, 9_500)
+    live, other = engine((1, 2)), engine((1, 2))
+    live.push_frame(good[0])
+    other.push_frame(good[0])
+    with pytest.raises(kind, match=message):
+        live.push_frame(bad)
+    for target in (live, other):
+        target.push_frame(good[1])
+        target.finish()
+    for t in (1_500, 5_000, 12_000):
+        assert_same(live.read(t), other.read(t))
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        ([(50, 0, 0, 1)], "event 2 at 50 us comes after one at 100 us"),
+        ([(100, 0, 0, 1), (300, 0, 0, 1), (299, 0, 0, 1)], "event 4 at 299 us comes after one at 300 us"),
+        ([(100, 0, 0, 1), (300, 2, 0, 1)], "event 3 at x=2, y=0 is outside the sensor of 2x1"),
+        ([(300, 0, 1, 1)], "event 2 at x=0, y=1 is outside"),
+    ],
+)
+def test_bad_events_are_named_by_their_place_in_the_stream(rows, message):
+    live = engine((1, 2))
+    live.push_events(events((10, 0, 0, 1), (100, 1, 0, 0)))
+    with pytest.raises(EventError, match=message):
+        live.push_events(events(*rows))
+    live.push_events(events((100, 0, 0, 1)))  # the same time is fine, and nothing was taken
+    with pytest.raises(EventError, match="event 3 at 99 us"):
+        live.push_events(events((99, 0, 0, 1)))
+
+
+@pytest.mark.parametrize("complete", [5_000, -5_000])
+def test_events_that_come_after_their_time_was_declared_complete(complete):
+    live = engine((1, 1))
+    live.advance(complete)
+    with pytest.raises(EventError, match=f"event 0 at {complete} us"):
+        live.push_events(pixel_events([complete], [1]))
+    live.push_events(pixel_events([complete + 1], [1]))
+
+
+def test_events_of_an_unknown_layout():
+    with pytest.raises(EventError, match="cannot read"):
+        engine((1, 1)).push_events([1, 2, 3])
+
+
+@pytest.mark.parametrize("size", [(0, 3), (3, 0), (-1, 3)])
+def test_a_sensor_without_pixels(size):
+    with pytest.raises(InputError, match="sensor_size"):
+        Reconstructor(size)
+
+
+@pytest.mark.parametrize("threshold", [0.0, -0.2, float("nan"), float("inf"), (0.2, 0.0)])
+def test_a_threshold_that_is_none(threshold):
+    with pytest.raises(InputError, match="must be positive"):
+        Reconstructor((1, 1), contrast_threshold=threshold)
+
+
+@pytest.mark.parametrize("threshold", [0.2, np.float32(0.2), np.float64(0.2), (0.2, 0.2), [0.2, 0.2], 1])
+def test_thresholds_of_any_type(threshold):
+    found = Reconstructor((1, 1), contrast_threshold=threshold).thresholds
+    assert found == pytest.approx((1, 1) if threshold == 1 else (0.2, 0.2))
+
+
+def test_settings_win_over_arguments():
+    chosen = altered(PRESETS["default"], "events", threshold_on=0.4)
+    chosen = altered(chosen, "camera", reference_exposure=20_000)
+    live = Reconstructor(
+        (1, 1), settings=chosen, preset="cf", contrast_threshold=(0.1, 0.15), reference_exposure=10_000
+    )
+    assert live.thresholds == (0.4, 0.15)
+    assert live.settings is chosen
+    live.push_frame(frame(100, 0, 10_000))
+    live.finish()
+    assert live.read(5_000).intensity[0, 0] == pytest.approx(200 / 255, rel=1e-4)
+
+
+def test_unknown_presets_and_responses():
+    with pytest.raises(SettingsError, match="unknown preset"):
+        Reconstructor((1, 1), preset="best")
+    assert issubclass(SettingsError, KaluxError)

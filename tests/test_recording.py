@@ -1,0 +1,140 @@
+"""Recordings in memory and from files: streams that can be iterated twice, checks, exposures given by the user."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import pytest
+
+from kalux import readers, recording
+from kalux.errors import EventError, ExposureError, FormatError, FrameError, InputError
+from kalux.frames import Frame
+from kalux.readers import hdf5
+from kalux.recording import Recording
+from recordings import SIZE, same_frames, small_events, small_frames
+
+
+def in_memory(**changes):
+    return Recording.from_arrays(
+        **({"events": small_events(), "frames": small_frames(), "sensor_size": SIZE} | changes)
+    )
+
+
+@pytest.fixture
+def stamped(tmp_path):
+    """A file whose frames have stamps only."""
+    path = tmp_path / "stamped.h5"
+    frames = [
+        Frame(frame.image, frame.exposure_start + 5_000, frame.exposure_start + 5_000)
+        for frame in small_frames()
+    ]
+    hdf5.write(path, sensor_size=SIZE, events=[small_events()], frames=frames, exposure_known=False)
+    return path
+
+
+def test_streams_can_be_iterated_again():
+    rec = in_memory()
+    for _ in range(2):
+        assert np.array_equal(np.concatenate(list(rec.events())), small_events())
+        assert same_frames(rec.frames(), small_frames())
+    assert (len(rec.events()), len(rec.frames())) == (500, 4)
+
+
+def test_chunks_are_bounded(monkeypatch):
+    monkeypatch.setattr(recording, "CHUNK_EVENTS", 64)
+    assert [len(chunk) for chunk in in_memory().events()] == [64] * 7 + [52]
+
+
+def test_what_is_given_is_kept():
+    reference = readers.GroundTruth(np.array([1]), np.ones((1, *SIZE), np.float32))
+    rec = in_memory(contrast_threshold=0.2, ground_truth=reference, inverse_covariance=np.ones(256))
+    assert rec.contrast_threshold == (0.2, 0.2)
+    assert rec.ground_truth() is reference
+    assert in_memory(contrast_threshold=(0.1, 0.2)).contrast_threshold == (0.1, 0.2)
+    assert in_memory().contrast_threshold is None
+    assert in_memory().ground_truth() is None
+
+
+def test_a_bad_recording_is_refused_at_once():
+    with pytest.raises(EventError, match="outside the sensor"):
+        in_memory(sensor_size=(10, 10), frames=[])
+    with pytest.raises(EventError, match="comes after"):
+        in_memory(events=small_events()[::-1])
+    with pytest.raises(FrameError, match="time order"):
+        in_memory(frames=small_frames()[::-1])
+
+
+def test_order_is_checked_across_chunks(tmp_path):
+    path = tmp_path / "unsorted.h5"
+    events = small_events()
+    hdf5.write(path, sensor_size=SIZE, events=[events[250:], events[:250]], frames=[])
+    with pytest.raises(EventError, match="event 250 at"):
+        list(recording.open(path).events())
+
+
+def test_unknown_exposures_must_be_given(stamped):
+    rec = recording.open(stamped)
+    assert not rec.exposure_known
+    with pytest.raises(ExposureError, match="--exposure 10000"):
+        rec.frames()
+    assert [frame.exposure for frame in rec.stamped_frames()] == [0] * 4
+
+
+@pytest.mark.parametrize(("stamp", "start"), [("start", 5_000), ("middle", 4_500), ("end", 4_000)])
+def test_exposures_given(stamped, stamp, start):
+    rec = recording.open(stamped, exposure=1_000, stamp=stamp)
+    assert rec.exposure_known
+    assert [frame.exposure_start for frame in rec.frames()] == [start + 20_000 * i for i in range(4)]
+    assert {frame.exposure for frame in rec.frames()} == {1_000}
+
+
+def test_impossible_exposures_are_refused(stamped):
+    with pytest.raises(ExposureError, match="must be positive"):
+        recording.open(stamped, exposure=0)
+    with pytest.raises(InputError, match="stamp is 'centre'"):
+        recording.open(stamped, exposure=10, stamp="centre")
+    with pytest.raises(ExposureError, match="is the exposure time too long"):
+        list(recording.open(stamped, exposure=30_000).frames())
+
+
+def test_open_refuses_what_it_does_not_know(tmp_path):
+    with pytest.raises(InputError, match="no such file or folder"):
+        recording.open(tmp_path / "absent.aedat4")
+    (tmp_path / "notes.txt").write_text("events")
+    for path in (tmp_path, tmp_path / "notes.txt"):
+        with pytest.raises(FormatError, match="not a recording that kalux knows"):
+            recording.open(path)
+
+
+def test_empty_files_are_refused(tmp_path):
+    for suffix in (".aedat4", ".mat", ".h5", ".zip"):
+        path = tmp_path / f"empty{suffix}"
+        path.touch()
+        with pytest.raises(FormatError, match="not a recording that kalux knows"):
+            recording.open(path)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
+def test_an_unreadable_file_is_an_input_error(stamped):
+    stamped.chmod(0)
+    with pytest.raises(InputError, match="Permission denied"):
+        recording.open(stamped)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["slider_depth", "street_davis346.aedat4", "newton_davis346.aedat4", "hdr_pan/Oxford_Church_clean.mat"],
+)
+def test_real_recordings_pass_every_check(shared_data, name):
+    rec = recording.open(shared_data / name)
+    assert sum(len(chunk) for chunk in rec.events()) == len(rec.events())
+    assert sum(1 for _ in rec.stamped_frames()) == len(rec.stamped_frames())
+
+
+@pytest.mark.parametrize(
+    "name", ["evt2.raw", "evt3.raw", "gen4.dat", "davis240_dvs_imu.aedat", "event_packet_ros1.bag"]
+)
+def test_real_files_of_other_formats_are_refused(shared_data, name):
+    with pytest.raises(FormatError, match="not a recording that kalux knows"):
+        recording.open(shared_data / "formats" / name)
