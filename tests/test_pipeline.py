@@ -362,6 +362,15 @@ def test_memory_is_bounded_however_few_images_are_wanted(when, lookahead, watche
     assert watched.most_frames <= 5
 
 
+def test_memory_is_bounded_where_events_end_early(watched):
+    rec = long_recording()
+    few = Recording.from_arrays(
+        next(iter(rec.events())), rec.frames(), sensor_size=(4, 5), contrast_threshold=0.2
+    )
+    assert list(reconstruct(few, rate_hz=50))
+    assert watched.most_frames <= 5
+
+
 def test_memory_is_bounded_where_frames_begin_late(watched):
     """Events before the first exposure say nothing and need not be kept."""
     assert list(reconstruct(long_recording(first_frame=190), rate_hz=50))

@@ -395,6 +395,19 @@ def test_events_before_and_after_everything_are_harmless(variant, lookahead):
     assert (live.read(end).intensity != held.read(end).intensity).any()
 
 
+def test_events_before_the_first_exposure_say_nothing_while_it_is_provisional():
+    images = []
+    for early in (0, 3):
+        live = engine((1, 1))
+        live.push_events(pixel_events(range(1_000, 1_000 + early), [1] * early))
+        live.push_events(pixel_events([16_000], [1]))
+        live.push_frame(frame(100, 10_000, 20_000))
+        image = live.read(18_000)
+        assert not image.final
+        images.append(image)
+    assert_same(*images)
+
+
 @every_variant
 @both_modes
 def test_events_on_the_edges_belong_to_what_ends_there(variant, lookahead):
@@ -443,6 +456,17 @@ def test_the_reference_exposure_is_the_first_frames_unless_given():
         live.push_frame(frame(100, 0, 10_000))
         live.finish()
         assert live.read(5_000).intensity[0, 0] == pytest.approx(scale * 100 / 255, rel=1e-4)
+
+
+@both_modes
+def test_short_exposures_measure_beyond_one(lookahead):
+    """At a quarter of the reference exposure, half of the range is 2.0: measured, so not doubted."""
+    live = engine((1, 1), "default", lookahead, reference_exposure=16_000, threshold_is_estimate=True)
+    for k in range(3):
+        live.push_frame(frame(128, 40_000 * k, 40_000 * k + 4_000))
+    live.finish()
+    for t in range(live.begin_time, 130_000, 5_000):
+        assert live.read(t).intensity[0, 0] == pytest.approx(4 * 128 / 255, rel=1e-4)
 
 
 @both_modes

@@ -78,6 +78,15 @@ def test_the_prior_only_concerns_highlights():
     assert 1.0 < with_prior[0, 2] < without[0, 2]
 
 
+def test_white_is_that_of_the_shortest_exposure():
+    """A short exposure measures more than 1: what it can show is no highlight."""
+    prior = HighlightPrior(white=np.log(4.03), scale2=1.0, stretch=1.0)
+    value, variance = np.log(np.array([[1.03, 2.0, 4.02]])), np.full((1, 3), 0.5)
+    np.testing.assert_array_equal(
+        intensity(value, variance, 0.03, prior), intensity(value, variance, 0.03, OFF)
+    )
+
+
 def test_the_white_level_is_continuous():
     prior = HighlightPrior(white=0.0, scale2=1.0, stretch=1.7)
     low, high = intensity(np.array([[-1e-7, 1e-7]]), np.ones((1, 2)), 0.03, prior)[0]

@@ -1,0 +1,68 @@
+"""Checks that every metric makes of the two images it is given."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kalux.errors import InputError
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+def checked_pair(
+    test: ArrayLike, reference: ArrayLike, mask: ArrayLike | None = None
+) -> tuple[Array, Array, Mask | None]:
+    """Both images as float64, and the mask, once it is sure that they can be compared.
+
+    Parameters
+    ----------
+    test, reference
+        Real numbers of one shape.
+    mask
+        Boolean of the same shape, True = counted; what is not counted may hold anything.
+
+    Raises
+    ------
+    InputError
+        If shapes differ, nothing is counted, or a counted value is not finite.
+    """
+    first, second = _numbers(test, "test"), _numbers(reference, "reference")
+    if first.shape != second.shape:
+        raise InputError(f"test image {first.shape} and reference {second.shape} differ in shape")
+    if first.size == 0:
+        raise InputError(f"test image and reference are empty: shape {first.shape}")
+    counted = None if mask is None else _checked_mask(mask, first.shape)
+    check_none(~np.isfinite(first), "test", "not finite", counted)
+    check_none(~np.isfinite(second), "reference", "not finite", counted)
+    return first, second, counted
+
+
+def check_none(bad: Mask, image: str, what: str, counted: Mask | None = None) -> None:
+    """Raise an `InputError` with the number of counted pixels that are bad, if any."""
+    within = bad if counted is None else bad & counted
+    number = int(np.count_nonzero(within))
+    if number:
+        total = bad.size if counted is None else int(np.count_nonzero(counted))
+        raise InputError(
+            f"{image}: {number} of {total} values are {what}; mend them, or mask them where the metric takes a mask"
+        )
+
+
+def _numbers(image: ArrayLike, name: str) -> Array:
+    given = np.asarray(image)
+    if given.dtype.kind not in "fiub":
+        raise InputError(f"{name}: an image of real numbers is needed, not {given.dtype}")
+    return given.astype(np.float64)
+
+
+def _checked_mask(mask: ArrayLike, shape: tuple[int, ...]) -> Mask:
+    given = np.asarray(mask)
+    if given.dtype != bool:
+        raise InputError(f"mask: booleans are needed (True = counted), not {given.dtype}")
+    if given.shape != shape:
+        raise InputError(f"mask {given.shape} and images {shape} differ in shape")
+    if not given.any():
+        raise InputError("mask: no pixel is counted")
+    return given
