@@ -337,7 +337,7 @@ def intensity(log_intensity, variance, settings, white, stretch):
     i0, scale2 = settings.camera.log_offset, settings.filter.highlight_scale**2
     top = np.log(white + i0)
     if scale2 > 0 and log_intensity > top:
-        excess = (log_intensity - top) * scale2 / (scale2 + variance)
+        excess = (log_intensity - top) * scale2 / (scale2 + min(variance, 0.3))
         log_intensity = top + (lambertw(stretch * excess).real / stretch if stretch > 0 else excess)
     return max(np.exp(log_intensity) - i0, 0.0)
 

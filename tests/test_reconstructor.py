@@ -136,6 +136,65 @@ def test_final_images_never_change(variant, lookahead, schedule, probes):
 
 @every_variant
 @both_modes
+@given(schedule=schedules(), ends=st.integers(0, 8), look=st.booleans())
+@settings(max_examples=25, deadline=None)
+def test_forgetting_and_the_end_of_frames_change_nothing(variant, lookahead, schedule, ends, look):
+    """Memory freed after every push, and the end of frames told some pushes after the last."""
+    seed, operations = schedule
+    stream = random_stream(seed)
+    live = engine(stream.sensor_size, variant, lookahead)
+    expected = reference(seed, variant, lookahead)
+    waiting, frames = list(expected), 0
+    for kind, what in [*operations, *[("events", stream.events[:0])] * 2]:
+        push(live, kind, what)
+        frames += kind == "frame"
+        if frames == len(stream.frames):
+            if ends == 0:
+                live.end_frames()
+            ends -= 1
+        until = live.final_until
+        while waiting and until is not None and waiting[0] <= until:
+            image = live.read(waiting[0])
+            assert image.final
+            assert_same(image, expected[waiting.pop(0)])
+        if waiting:
+            live.forget(waiting[0])
+            if look and frames:
+                live.read(waiting[0])
+    live.finish()
+    for t in waiting:
+        assert_same(live.read(t), expected[t])
+
+
+def test_what_is_forgotten_cannot_be_read_and_is_freed():
+    stream = random_stream(0)
+    live = filled(stream)
+    middle = (stream.frames[1].middle + stream.frames[2].middle) // 2
+    live.forget(middle)
+    assert live.begin_time == middle
+    assert sum(len(chunk) for chunk in live._chunks) == np.sum(stream.events["t"] > middle)
+    with pytest.raises(InputError, match=r"forget\(\) has freed"):
+        live.read(middle - 1)
+    assert_same(live.read(middle), filled(stream).read(middle))
+    live.forget(middle - 5_000)  # an earlier promise is kept already
+    assert live.begin_time == middle
+
+
+def test_nothing_is_forgotten_that_is_not_final():
+    live = engine((1, 1))
+    live.forget(10**9)
+    live.push_frame(frame(100, 0, 10_000))
+    live.push_events(pixel_events([2_000, 6_000, 8_000], [1, 1, 0]))
+    live.forget(10**9)
+    assert live.begin_time == 0
+    live.advance(20_000)
+    live.forget(10**9)
+    assert live.begin_time == 5_000
+    live.read(5_000)
+
+
+@every_variant
+@both_modes
 def test_a_robot_sees_the_same_as_a_recording(variant, lookahead):
     """Frames pushed the moment their exposure ends, events one by one, every time declared complete."""
     stream, expected = random_stream(3), reference(3, variant, lookahead)

@@ -52,6 +52,29 @@ class Image:
     final: bool
 
 
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """The filter's raw estimate at one moment, before what is known of highlights is applied.
+
+    Attributes
+    ----------
+    t
+        Its time, int us.
+    log_intensity, variance
+        float64 (H, W): L = log(I + I_0), and P.
+    white
+        log(1 + I_0) of the brightest level that frames show there.
+    final
+        As of `Image`.
+    """
+
+    t: int
+    log_intensity: NDArray[np.float64]
+    variance: NDArray[np.float64]
+    white: float
+    final: bool
+
+
 class _Progress:
     """A segment under way: its cursor, and how many buffered events it has taken."""
 
@@ -217,7 +240,7 @@ class Reconstructor:
         if begin is None or limit <= begin:
             return
         progress = self._progress_to(limit)
-        if progress.ready or self._frames_ended:
+        if progress.ready or (self._frames_ended and len(self._shots) == 1):  # no frame will change it
             self._take(progress, limit)
             self._drop_events(progress.latest)
             progress.taken = 0
@@ -240,7 +263,7 @@ class Reconstructor:
             return None
         if self._finished:
             return np.iinfo(np.int64).max
-        if self._frames_ended and self._complete_until is not None:
+        if self._frames_ended and self._is_complete(self._shots[-1]):
             return self._complete_until
         if not self.lookahead:
             # A frame that is still to come ends after the last one, and changes images from there on.
@@ -250,7 +273,11 @@ class Reconstructor:
         return self._method.node(complete[-1]) if complete else self._start_time()
 
     def read(self, t: int) -> Image:
-        """The image at time ``t`` (us). Never changes the result of any other read.
+        """The image at time ``t`` (us). Never changes the result of any other read. See `estimate`."""
+        return self.image(self.estimate(t))
+
+    def estimate(self, t: int) -> Estimate:
+        """The raw estimate at time ``t`` (us). Never changes the result of any other read.
 
         Reads may repeat, and go back as far as the newest frame that is final.
 
@@ -271,26 +298,27 @@ class Reconstructor:
             )
         progress = self._progress_to(t)
         self._take(progress, t)
-        final_until = self.final_until
-        return self._image(progress, t, final_until is not None and t <= final_until)
-
-    def _image(self, progress: _Progress, t: int, final: bool) -> Image:
         log_intensity, variance = self._method.read(progress.segment, progress.cursor, t)
-        offset = self.settings.camera.log_offset
+        final_until = self.final_until
+        final = final_until is not None and t <= final_until
+        return Estimate(t, log_intensity, variance, self._white(progress, t), final)
+
+    def image(self, estimate: Estimate) -> Image:
+        """The image of an estimate: its intensity, with highlights as far as they are believed (K6)."""
         # The prior needs a variance, which the complementary filter has not.
         scale = self.settings.filter.highlight_scale if self.settings.filter.kind == "akf" else 0.0
         events = self.settings.events
         spread = events.extrapolation_spread if self._estimated else events.threshold_spread
         prior = HighlightPrior(
-            white=self._white(progress, t),
-            scale2=scale**2,
-            stretch=spread**2 / scale if scale > 0 else 0.0,
+            white=estimate.white, scale2=scale**2, stretch=spread**2 / scale if scale > 0 else 0.0
         )
         return Image(
-            t=t,
-            intensity=intensity(log_intensity, variance, offset, prior),
-            variance=variance.astype(np.float32),
-            final=final,
+            t=estimate.t,
+            intensity=intensity(
+                estimate.log_intensity, estimate.variance, self.settings.camera.log_offset, prior
+            ),
+            variance=estimate.variance.astype(np.float32),
+            final=estimate.final,
         )
 
     def _white(self, progress: _Progress, t: int) -> float:

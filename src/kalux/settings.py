@@ -114,7 +114,8 @@ class FilterSettings:
     deblur
         Remove motion blur with the events of the exposure (EDI).
     initial_variance
-        P at the start: 0.09 in the released code; 0.3 where the first frame is clipped.
+        P at the start where the first frame is clipped, and everywhere with augmentation "paper" (0.09 in
+        the released code). 1.0: a clipped pixel is white or up to a few times brighter.
     highlight_scale
         Standard deviation, in log intensity, of how far scenes go beyond white: what is not known of a
         highlight is drawn towards white by it. 0 turns it off. 1.0: highlights up to e times white are usual.
@@ -126,7 +127,7 @@ class FilterSettings:
     augmentation: AugmentationName = "bridge"
     solution: SolutionName = "exact"
     deblur: bool = True
-    initial_variance: float = 0.3
+    initial_variance: float = 1.0
     highlight_scale: float = 1.0
     cutoff: float = 1.0
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import lambertw
 
-from kalux.filters.readout import HighlightPrior, believed_highlight, intensity
+from kalux.filters.readout import MOST_VARIANCE, HighlightPrior, believed_highlight, intensity
 
 OFF = HighlightPrior(white=0.0, scale2=0.0, stretch=0.0)
 excesses = st.floats(0.0, 12.0)
@@ -70,12 +70,20 @@ def test_intensity_is_never_negative_and_inverts_the_logarithm(value, variance, 
 
 def test_the_prior_only_concerns_highlights():
     prior = HighlightPrior(white=np.log(1.03), scale2=1.0, stretch=1.0)
-    value, variance = np.log(np.array([[0.5, 1.03, 3.0]])), np.full((1, 3), 0.5)
+    value, variance = np.log(np.array([[0.5, 1.03, 3.0]])), np.full((1, 3), 0.2)
     with_prior, without = intensity(value, variance, 0.03, prior), intensity(value, variance, 0.03, OFF)
     np.testing.assert_array_equal(with_prior[0, :2], without[0, :2])
-    believed = believed_highlight(np.log(3.0 / 1.03), 0.5, 1.0, 1.0)
+    believed = believed_highlight(np.log(3.0 / 1.03), 0.2, 1.0, 1.0)
     assert with_prior[0, 2] == pytest.approx(1.03 * np.exp(believed) - 0.03, rel=1e-6)
     assert 1.0 < with_prior[0, 2] < without[0, 2]
+
+
+def test_a_variance_beyond_what_events_add_shrinks_no_more():
+    """A pixel never seen below white has the prior's variance already."""
+    prior = HighlightPrior(white=0.0, scale2=1.0, stretch=0.1)
+    value = np.ones((1, 3))
+    out = intensity(value, np.array([[MOST_VARIANCE, 1.0, np.inf]]), 0.0, prior)
+    assert out[0, 0] == out[0, 1] == out[0, 2] > 1
 
 
 def test_white_is_that_of_the_shortest_exposure():

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+
+
+MOST_VARIANCE: Final = 0.3
+"""Largest variance that an excess is shrunk for. A pixel that was never seen below white has the variance of its
+start, white, which is the prior itself: what events add to it must not be shrunk for it a second time."""
 
 
 class HighlightPrior(NamedTuple):
@@ -75,6 +80,9 @@ def _intensity(log_intensity, variance, log_offset, prior, out):  # type: ignore
             value = log_intensity[row, column]
             if prior.scale2 > 0.0 and value > prior.white:
                 value = prior.white + believed_highlight(
-                    value - prior.white, variance[row, column], prior.scale2, prior.stretch
+                    value - prior.white,
+                    min(variance[row, column], MOST_VARIANCE),
+                    prior.scale2,
+                    prior.stretch,
                 )
             out[row, column] = max(np.exp(value) - log_offset, 0.0)
