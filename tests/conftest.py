@@ -5,6 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+
+# The first call of a compiled function compiles it, which takes longer than any deadline.
+settings.register_profile("kalux", deadline=None)
+settings.load_profile("kalux")
 
 
 @pytest.fixture(scope="session")

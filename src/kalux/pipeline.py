@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -14,10 +16,11 @@ from kalux.calibration.contrast import ThresholdEstimate, estimate_thresholds
 from kalux.errors import FrameError, InputError
 from kalux.events import EventArray
 from kalux.frames import Frame
-from kalux.reconstructor import Image, Reconstructor
+from kalux.reconstructor import Estimate, Image, Reconstructor
 from kalux.recording import Recording
 from kalux.settings import Settings
 from kalux.settings import preset as named_preset
+from kalux.smoothing import Backward, combine, reversed_settings
 
 ThresholdOrigin = Literal["settings", "recording", "estimate", "assumed"]
 
@@ -41,6 +44,8 @@ class Plan:
         (N,) int64 us, increasing: the images to make.
     lookahead
         Whether images use the frame after them.
+    smooth
+        Whether images use all of the recording after them.
     """
 
     settings: Settings
@@ -48,6 +53,7 @@ class Plan:
     estimate: ThresholdEstimate | None
     times: NDArray[np.int64]
     lookahead: bool
+    smooth: bool
 
 
 def plan(
@@ -59,11 +65,20 @@ def plan(
     preset: str = "default",
     settings: Settings | None = None,
     lookahead: bool = True,
+    smooth: bool = False,
 ) -> Plan:
     """Decide what a reconstruction will do. See `reconstruct` for the parameters and errors."""
     chosen = settings if settings is not None else named_preset(preset)
     if sum(choice is not None for choice in (rate_hz, times, at)) != 1:
         raise InputError("reconstruct: give exactly one of rate_hz, times and at")
+    if smooth and not lookahead:
+        raise InputError(
+            "reconstruct: smooth uses the future, lookahead=False (causal) forbids it; choose one"
+        )
+    if smooth and chosen.filter.kind == "cf":
+        raise InputError(
+            "reconstruct: the complementary filter has no variance, so that it cannot be smoothed"
+        )
     exposures = _exposures(recording)
     reference = chosen.camera.reference_exposure or round(float(np.median(exposures[:, 1] - exposures[:, 0])))
     chosen = dataclasses.replace(
@@ -71,7 +86,7 @@ def plan(
     )
     chosen, origin, estimate = _with_thresholds(recording, chosen)
     wanted = _times(recording, exposures, rate_hz, times, at, chosen, lookahead)
-    return Plan(chosen, origin, estimate, wanted, lookahead)
+    return Plan(chosen, origin, estimate, wanted, lookahead, smooth)
 
 
 def reconstruct(
@@ -83,6 +98,7 @@ def reconstruct(
     preset: str = "default",
     settings: Settings | None = None,
     lookahead: bool = True,
+    smooth: bool = False,
 ) -> Iterator[Image]:
     """Images of a recording, in time order; memory is bounded whatever the recording's length.
 
@@ -100,6 +116,9 @@ def reconstruct(
         Name of a preset, or whole `Settings`, which win.
     lookahead
         Whether an image uses the frame after it too; False is what a robot would see.
+    smooth
+        Whether an image uses everything after it: the filter runs backward too (`kalux.smoothing`). Takes
+        three times as long, and room for the events and some states in the folder for temporary files.
 
     Raises
     ------
@@ -120,21 +139,52 @@ def reconstruct(
             preset=preset,
             settings=settings,
             lookahead=lookahead,
+            smooth=smooth,
         ),
     )
 
 
 def execute(
-    recording: Recording, plan: Plan, on_events: Callable[[int], None] | None = None
+    recording: Recording,
+    plan: Plan,
+    on_events: Callable[[int], None] | None = None,
+    on_backward: Callable[[int], None] | None = None,
 ) -> Iterator[Image]:
-    """Carry out a plan. ``on_events`` is told the number of events of every chunk read, for progress."""
-    engine = Reconstructor(
+    """Carry out a plan. The callbacks are told the number of events of every chunk read, for progress:
+
+    ``on_backward`` in the backward pass of a smoothed reconstruction, ``on_events`` in the pass that makes the images.
+    """
+    engine = _engine(recording, plan, plan.settings)
+    if not plan.smooth:
+        for estimate in _estimates(recording, engine, plan, on_events):
+            yield engine.image(estimate)
+        return
+    with tempfile.TemporaryDirectory(prefix="kalux-") as folder:
+        backward = Backward(
+            recording,
+            _engine(recording, plan, reversed_settings(plan.settings)),
+            plan.times,
+            Path(folder),
+            on_backward,
+        )
+        for estimate in _estimates(recording, engine, plan, on_events):
+            yield engine.image(combine(estimate, backward.estimate(estimate.t)))
+
+
+def _engine(recording: Recording, plan: Plan, settings: Settings) -> Reconstructor:
+    return Reconstructor(
         recording.sensor_size,
-        settings=plan.settings,
+        settings=settings,
         lookahead=plan.lookahead,
         threshold_is_estimate=plan.threshold_origin in ("estimate", "assumed"),
         inverse_covariance=recording.source.inverse_covariance,
     )
+
+
+def _estimates(
+    recording: Recording, engine: Reconstructor, plan: Plan, on_events: Callable[[int], None] | None
+) -> Iterator[Estimate]:
+    """Drive the engine over the recording, reading each time of the plan as soon as it is final."""
     pending = iter(plan.times.tolist())
     t = next(pending, None)
     chunks = iter(recording.events())
@@ -146,7 +196,7 @@ def execute(
         if ended:
             engine.advance(frame.exposure_end)
         while t is not None and _is_final(engine, t):
-            yield engine.read(t)
+            yield engine.estimate(t)
             t = next(pending, None)
         if t is None:
             return
@@ -155,13 +205,13 @@ def execute(
     while not ended and t is not None:
         ended = not _push_next(engine, chunks, on_events)
         while t is not None and _is_final(engine, t):
-            yield engine.read(t)
+            yield engine.estimate(t)
             t = next(pending, None)
         if t is not None:
             engine.forget(t)
     engine.finish()
     while t is not None:
-        yield engine.read(t)
+        yield engine.estimate(t)
         t = next(pending, None)
 
 

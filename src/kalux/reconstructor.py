@@ -211,6 +211,11 @@ class Reconstructor:
         """Declare that all events up to ``t`` (us) have been pushed: silence is information too."""
         self._complete_until = t if self._complete_until is None else max(t, self._complete_until)
 
+    @property
+    def newest_frame_end(self) -> int | None:
+        """End of the newest frame's exposure, us; None before the first frame."""
+        return None if self._last_frame is None else self._last_frame.exposure_end
+
     def covers(self, t: int) -> bool:
         """Whether all events up to ``t`` (us) are known to be here."""
         return self._finished or (self._complete_until is not None and self._complete_until >= t)

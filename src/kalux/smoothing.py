@@ -1,0 +1,243 @@
+"""Both ways in time: the filter run backward too, and the two combined by their information.
+
+A highlight that leaves saturation later tells what it was before. The backward filter is the same engine on the
+recording in reverse: times negated, polarities flipped, exposures mirrored. With L and P of the forward filter and
+L' and P' of the backward one, the estimate is the two-filter smoother (Fraser and Potter 1969)
+
+    L_s = (L / P + L' / P') / (1 / P + 1 / P').
+
+Both have seen the frames around the image, so their variances are not independent where frames are well exposed;
+the smaller of the two is given out.
+
+Memory is bounded: the recording is spilled to disk, where it can be read backward, and the backward pass is done
+twice, first to save its state before every window of images, then window by window for the images themselves.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux.errors import OutputError
+from kalux.events import EVENT_DTYPE, EventArray
+from kalux.frames import Frame
+from kalux.reconstructor import Estimate, Reconstructor
+from kalux.recording import Recording
+from kalux.settings import Settings
+
+_WINDOW_BYTES: Final = 256 << 20
+"""Estimates of the backward pass that are held in memory at a time."""
+
+_BLOCK_EVENTS: Final = 1 << 18
+
+
+class Spill:
+    """A recording on disk, in a form that can be read backward.
+
+    Parameters
+    ----------
+    recording
+        Copied when the spill is made: events into one file, every frame into one.
+    folder
+        An existing folder, the caller's to remove.
+
+    Raises
+    ------
+    OutputError
+        The disk is full or the folder cannot be written.
+    """
+
+    def __init__(self, recording: Recording, folder: Path) -> None:
+        self._folder = folder
+        self._events = folder / "events.bin"
+        self._exposures: list[tuple[int, int, float | None]] = []
+        self.count = 0
+        try:
+            with self._events.open("wb") as file:
+                for chunk in recording.events():
+                    chunk.tofile(file)
+                    self.count += len(chunk)
+            for index, frame in enumerate(recording.frames()):
+                np.save(self._frame_path(index), frame.image)
+                self._exposures.append((frame.exposure_start, frame.exposure_end, frame.white))
+        except OSError as error:
+            raise OutputError(
+                f"{folder}: the recording cannot be spilled for the backward pass: {error.strerror or error}"
+            ) from error
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return len(self._exposures)
+
+    @property
+    def end(self) -> int:
+        """End of the last exposure, us: before it, reversed, the backward pass knows nothing."""
+        return self._exposures[-1][1]
+
+    def reversed_frame(self, index: int) -> Frame:
+        """The frame ``index`` of the reversed recording."""
+        forward = len(self) - 1 - index
+        start, end, white = self._exposures[forward]
+        return Frame(np.load(self._frame_path(forward)), -end, -start, white)
+
+    def reversed_events(self, first: int) -> EventArray:
+        """A block of the reversed recording's events, from its event ``first`` on; empty at the end."""
+        last = min(first + _BLOCK_EVENTS, self.count)
+        block = np.fromfile(
+            self._events,
+            EVENT_DTYPE,
+            count=last - first,
+            offset=(self.count - last) * EVENT_DTYPE.itemsize,
+        )[::-1].copy()
+        block["t"] = -block["t"]
+        block["p"] = ~block["p"]
+        return block
+
+    def _frame_path(self, index: int) -> Path:
+        return self._folder / f"frame_{index:06d}.npy"
+
+
+class BackwardPass:
+    """The engine on a reversed recording, and how much of it has been pushed. It can be pickled."""
+
+    def __init__(self, engine: Reconstructor) -> None:
+        self.engine = engine
+        self.frames = 0
+        self.events = 0
+
+    def reach(self, spill: Spill, t: int, on_events: Callable[[int], None] | None = None) -> None:
+        """Push until ``t`` (us, reversed) is final, freeing what lies before it."""
+        engine = self.engine
+        while True:
+            if engine.final_until is not None and engine.final_until >= t:
+                engine.forget(t)
+                return
+            newest = engine.newest_frame_end
+            if newest is not None and not engine.covers(newest):
+                self._push_events(spill, on_events)
+            elif self.frames < len(spill):
+                if engine.final_until is not None:
+                    engine.forget(engine.final_until)
+                engine.push_frame(spill.reversed_frame(self.frames))
+                self.frames += 1
+            else:
+                engine.end_frames()
+                self._push_events(spill, on_events)
+
+    def _push_events(self, spill: Spill, on_events: Callable[[int], None] | None) -> None:
+        block = spill.reversed_events(self.events)
+        if len(block) == 0:
+            if self.frames == len(spill):
+                self.engine.finish()
+            else:
+                newest = self.engine.newest_frame_end
+                assert newest is not None
+                self.engine.advance(newest)
+            return
+        self.engine.push_events(block)
+        self.events += len(block)
+        if on_events is not None:
+            on_events(len(block))
+
+
+class Backward:
+    """The backward pass over a recording, ready to be asked for its estimates in ascending order of time.
+
+    Parameters
+    ----------
+    recording, engine
+        The recording, and a fresh engine for the reversed one.
+    times
+        (N,) int64 us, ascending: the images that will be asked for.
+    folder
+        An existing folder for what is spilled, the caller's to remove.
+    on_events
+        Told the number of events of every block that the first pass has taken.
+
+    Raises
+    ------
+    OutputError
+        The folder cannot be written.
+    """
+
+    def __init__(
+        self,
+        recording: Recording,
+        engine: Reconstructor,
+        times: NDArray[np.int64],
+        folder: Path,
+        on_events: Callable[[int], None] | None = None,
+    ) -> None:
+        height, width = recording.sensor_size
+        self._spill = Spill(recording, folder)
+        times = times[times <= self._spill.end]
+        window = max(1, _WINDOW_BYTES // (16 * height * width))
+        self._windows = [times[i : i + window] for i in range(0, len(times), window)]
+        self._folder = folder
+        self._current: dict[int, Estimate] = {}
+        self._next_window = 0
+        backward = BackwardPass(engine)
+        for index in reversed(range(len(self._windows))):
+            backward.reach(self._spill, -int(self._windows[index][-1]), on_events)
+            self._save(index, backward)
+
+    def estimate(self, t: int) -> Estimate | None:
+        """L' and P' at ``t`` (us), one of the times announced, in ascending order; None after the last frame."""
+        if t > self._spill.end:
+            return None
+        while t not in self._current:
+            self._load()
+        return self._current[t]
+
+    def _load(self) -> None:
+        """Run the next window."""
+        backward: BackwardPass = pickle.loads(self._state_path(self._next_window).read_bytes())
+        self._current = {}
+        for t in self._windows[self._next_window][::-1].tolist():
+            if t in self._current:
+                continue
+            backward.reach(self._spill, -t)
+            self._current[t] = backward.engine.estimate(-t)
+        self._state_path(self._next_window).unlink()
+        self._next_window += 1
+
+    def _save(self, index: int, backward: BackwardPass) -> None:
+        try:
+            self._state_path(index).write_bytes(pickle.dumps(backward, pickle.HIGHEST_PROTOCOL))
+        except OSError as error:
+            raise OutputError(
+                f"{self._folder}: the backward pass cannot be spilled: {error.strerror or error}"
+            ) from error
+
+    def _state_path(self, index: int) -> Path:
+        return self._folder / f"state_{index:06d}.pickle"
+
+
+def combine(forward: Estimate, backward: Estimate | None) -> Estimate:
+    """The smoothed estimate of two filters, in the forward one's time; the forward one where it is alone."""
+    if backward is None:
+        return forward
+    first, second = 1.0 / forward.variance, 1.0 / backward.variance
+    return Estimate(
+        t=forward.t,
+        log_intensity=(first * forward.log_intensity + second * backward.log_intensity) / (first + second),
+        variance=np.minimum(forward.variance, backward.variance),
+        white=forward.white,
+        final=forward.final,
+    )
+
+
+def reversed_settings(settings: Settings) -> Settings:
+    """Those of the reversed recording, in which an on event is a step down by the on threshold."""
+    events = dataclasses.replace(
+        settings.events,
+        threshold_on=settings.events.threshold_off,
+        threshold_off=settings.events.threshold_on,
+    )
+    return dataclasses.replace(settings, events=events)
