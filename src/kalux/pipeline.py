@@ -250,7 +250,8 @@ def _with_thresholds(
     origin: ThresholdOrigin = "recording"
     found = recording.contrast_threshold
     if found is None:
-        estimate = estimate_thresholds(recording, settings.camera)
+        paper = settings.filter.augmentation == "paper"
+        estimate = estimate_thresholds(recording, settings.camera, of_log_offset=paper)
         origin = "assumed" if estimate is None else "estimate"
         found = (_ASSUMED_THRESHOLD, _ASSUMED_THRESHOLD) if estimate is None else (estimate.on, estimate.off)
     events = dataclasses.replace(

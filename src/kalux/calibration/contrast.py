@@ -47,16 +47,25 @@ class ThresholdEstimate(NamedTuple):
     samples: int
 
 
-def estimate_thresholds(recording: Recording, camera: CameraSettings) -> ThresholdEstimate | None:
+def estimate_thresholds(
+    recording: Recording, camera: CameraSettings, *, of_log_offset: bool = False
+) -> ThresholdEstimate | None:
     """Global on and off thresholds, by robust regression of log frame differences on event counts.
 
-    For every pixel that is well exposed in two successive frames and saw at least two events between the
-    middles of their exposures: log(I' + I_0) - log(I + I_0) = c_on n_on - c_off n_off, fitted with Huber's
-    weights. A single event says little: it may be noise, and the rest of the threshold that it leaves over is
-    as large as its step. Looks at the first 200 frames, or at fewer when those give enough pixels.
+    For every pixel that is well exposed in two successive frames and saw two events more of one kind than of the
+    other between the middles of their exposures: log(I' + I_0) - log(I + I_0) = s (c_on n_on - c_off n_off), with
+    s = I / (I + I_0) the share of a step of log I that shows in log(I + I_0), fitted with Huber's weights. A net
+    count of one says little: it may be noise, and the rest of the threshold that it leaves over is as large as its
+    step. Looks at the first 200 frames, or at fewer when those give enough pixels.
 
-    The thresholds are steps of log(I + I_0): with a large I_0, as in the paper, they come out smaller than the
-    sensor's.
+    Parameters
+    ----------
+    recording
+        With frames and exposures.
+    camera
+        Response and I_0.
+    of_log_offset
+        Steps of log(I + I_0) instead of log I, s = 1, as in the paper's model.
 
     Returns None where the recording has too few such pixels (200), e.g. because nothing moves, or where the
     events hardly explain how the frames change (residual above 0.8 of the change), e.g. because they are flicker.
@@ -70,7 +79,7 @@ def estimate_thresholds(recording: Recording, camera: CameraSettings) -> Thresho
     ons: list[Array] = []
     offs: list[Array] = []
     count = 0
-    for difference, on, off in _samples(recording, camera):
+    for difference, on, off in _samples(recording, camera, of_log_offset):
         differences.append(difference)
         ons.append(on)
         offs.append(off)
@@ -113,8 +122,10 @@ def fit_thresholds(difference: Array, on: Array, off: Array) -> ThresholdEstimat
     return ThresholdEstimate(float(solution[0]), float(solution[1]), scale, len(difference))
 
 
-def _samples(recording: Recording, camera: CameraSettings) -> Iterator[tuple[Array, Array, Array]]:
-    """Log difference and on and off counts of the usable pixels, one frame interval at a time."""
+def _samples(
+    recording: Recording, camera: CameraSettings, of_log_offset: bool
+) -> Iterator[tuple[Array, Array, Array]]:
+    """Log difference and on and off counts (times s) of the usable pixels, one frame interval at a time."""
     model = Camera(Response.named(camera.response), None, camera.saturation)
     low, high = _WELL_EXPOSED
     chunks = iter(recording.events())
@@ -133,13 +144,16 @@ def _samples(recording: Recording, camera: CameraSettings) -> Iterator[tuple[Arr
             chunk = next(chunks, None)
             if chunk is None:
                 break
-            buffer = np.concatenate([buffer, chunk])
+            # Before the first frame nothing is counted, and nothing needs to be kept.
+            buffer = chunk if previous is None else np.concatenate([buffer, chunk])
         if previous is not None and previous_usable is not None:
             on, off = count_events(between(buffer, previous.middle, shot.middle), recording.sensor_size)
-            chosen = usable & previous_usable & (on + off >= 2)
+            chosen = usable & previous_usable & (np.abs(on - off) >= 2)
             change = log_intensity(shot.intensity, camera.log_offset) - log_intensity(
                 previous.intensity, camera.log_offset
             )
-            yield change[chosen], on[chosen], off[chosen]
+            level = (shot.intensity + previous.intensity)[chosen] / 2
+            share = np.ones_like(level) if of_log_offset else level / (level + camera.log_offset)
+            yield change[chosen], share * on[chosen], share * off[chosen]
         buffer = buffer[buffer["t"].searchsorted(shot.middle, "right") :]
         previous, previous_usable = shot, usable
