@@ -40,12 +40,15 @@ def scores(estimate, truth, data_range):
     return 100 * mse, structure, 100 * log
 
 
+SMOOTHED = "default, both ways"
+
+
 def variants(ablation: bool) -> dict[str, Settings]:
     chosen = {name: PRESETS[name] for name in ("cf", "iccv2021")}
     exact = dataclasses.replace(PRESETS["iccv2021"].filter, solution="exact")
     chosen["iccv2021, exact"] = dataclasses.replace(PRESETS["iccv2021"], filter=exact)
     default = PRESETS["default"]
-    chosen["default"] = default
+    chosen["default"] = chosen[SMOOTHED] = default
     if ablation:
         for label, group, change in (
             ("no deblurring", "filter", {"deblur": False}),
@@ -74,13 +77,12 @@ def truth_of(path: Path, recording):
     return None if found is None else (found.times, found.images)
 
 
-def ascending(recording, times, settings):
+def ascending(recording, times, settings, smooth):
     """Images at times in any order."""
     order = np.argsort(times, kind="stable")
     out = None
-    for index, image in zip(
-        order, kalux.reconstruct(recording, times=np.asarray(times)[order], settings=settings), strict=True
-    ):
+    images = kalux.reconstruct(recording, times=np.asarray(times)[order], settings=settings, smooth=smooth)
+    for index, image in zip(order, images, strict=True):
         out = np.empty((len(times), *image.intensity.shape), np.float32) if out is None else out
         out[index] = image.intensity
     return out
@@ -95,7 +97,7 @@ def with_truth(recording, times, truth, chosen):
     top = float(truth.max())
     yield "hold the last frame", scores(held, truth, top)
     for name, settings in chosen.items():
-        yield name, scores(ascending(recording, times, settings), truth, top)
+        yield name, scores(ascending(recording, times, settings, name == SMOOTHED), truth, top)
 
 
 def held_out(recording, chosen):
@@ -121,7 +123,7 @@ def held_out(recording, chosen):
         [(frames[i].exposure_start + fractions * frames[i].exposure).astype(np.int64) for i in dropped]
     )
     for name, settings in chosen.items():
-        images = ascending(kept, times, settings)
+        images = ascending(kept, times, settings, name == SMOOTHED)
         mean = images.reshape(len(dropped), len(fractions), *recording.sensor_size).mean(axis=1)
         yield name, scores(mean / scale, truth, 1.0)
 

@@ -78,7 +78,7 @@ class EventSettings:
         default biases in room light.
     extrapolation_spread
         Standard deviation of the log of the scale of what events say of highlights beyond white, where no
-        frame can check it, when the threshold is only an estimate. 1.3 (docs/tuning.md).
+        frame can check it, when the threshold is only an estimate. 1.5 (docs/tuning.md).
     sigma_proc2, sigma_iso2, sigma_ref2, refractory_bound
         The paper's event noise: 0.0005 1/s, 0.03 1/s, 0.01, and 10 ms (released code), in s. For
         augmentation "paper" only.
@@ -91,7 +91,7 @@ class EventSettings:
     quantisation_variance: float = 1 / 6
     deblur_variance: float = 0.05
     noise_rate: float = 3.0
-    extrapolation_spread: float = 1.3
+    extrapolation_spread: float = 1.5
     sigma_proc2: float = 0.0005
     sigma_iso2: float = 0.03
     sigma_ref2: float = 0.01

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
 import importlib.metadata
+import itertools
 import shlex
 import tomllib
 from pathlib import Path
@@ -81,6 +83,9 @@ def _add_images(parser: Parser) -> None:
     group.add_argument("--end", type=number, metavar="S", help="none after this time, counted likewise")
     group.add_argument(
         "--causal", action="store_true", help="use the past only, as a robot must (default: one frame ahead)"
+    )
+    group.add_argument(
+        "--smooth", action="store_true", help="use all of the future too: best quality, three times the work"
     )
 
 
@@ -193,7 +198,13 @@ def make_plan(
     """
     rate = None if times is not None or options.at is not None else options.rate or DEFAULT_RATE
     made = plan(
-        recording, rate_hz=rate, times=times, at=options.at, settings=settings, lookahead=not options.causal
+        recording,
+        rate_hz=rate,
+        times=times,
+        at=options.at,
+        settings=settings,
+        lookahead=not options.causal,
+        smooth=options.smooth,
     )
     made = dataclasses.replace(made, threshold_origin=_origin(made, options))
     for flag, value in (("--start", options.start), ("--end", options.end)):
@@ -204,7 +215,8 @@ def make_plan(
     kept = made.times[(made.times >= first) & (made.times <= last)]
     if len(kept) == 0:
         raise UsageError(
-            f"no image lies in the part that --start and --end leave of the recording's {contents.seconds:.3f} s"
+            "no image lies in the part that --start and --end leave of the recording's "
+            f"{contents.seconds:.3f} s"
         )
     return dataclasses.replace(made, times=kept)
 
@@ -248,7 +260,7 @@ def decided(
     spacing = "at given times" if output.rate_hz is None else f"at {output.rate_hz:g} Hz"
     if options.at is not None:
         spacing = "at the frames"
-    ahead = "one frame ahead" if made.lookahead else "causal"
+    ahead = "both ways in time" if made.smooth else "one frame ahead" if made.lookahead else "causal"
     return [
         f"recording   {source.path}: {source.format}, {width}x{height} pixels, {contents.seconds:.3f} s, "
         f"{contents.frames:,} frames, {contents.events:,} events",
@@ -286,6 +298,7 @@ def metadata(
             "start": options.start,
             "end": options.end,
             "lookahead": made.lookahead,
+            "smooth": made.smooth,
         },
         "versions": {"numba": importlib.metadata.version("numba")},
     }
@@ -300,11 +313,22 @@ def write_images(
     """Carry out the plan; returns the seconds it took and the number of images."""
     writer = output.open(described)
     progress = Progress("reconstructing", images=len(made.times), quiet=options.quiet)
+    backward = Progress("backward pass", quiet=options.quiet)
+    images = execute(
+        recording,
+        made,
+        lambda count: progress.add(events=count),
+        lambda count: backward.add(events=count),
+    )
     try:
-        with writer, progress:
-            for image in execute(recording, made, lambda count: progress.add(events=count)):
-                writer.write(image)
-                progress.add(images=1)
+        with writer:
+            # The first image comes when the backward pass, if there is one, is done.
+            with backward if made.smooth else contextlib.nullcontext():
+                first = next(images, None)
+            with progress:
+                for image in itertools.chain([] if first is None else [first], images):
+                    writer.write(image)
+                    progress.add(images=1)
     except (KeyboardInterrupt, InputError) as error:
         error.add_note(_what_is_left(writer, output))
         raise

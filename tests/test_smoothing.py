@@ -1,0 +1,173 @@
+"""Both ways in time."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import kalux
+from kalux import PRESETS, Frame, Recording, smoothing
+from kalux.datasets import SensorSettings, demo_scene, simulate
+from kalux.errors import InputError, OutputError
+from kalux.events import make_events
+from kalux.pipeline import plan
+from kalux.reconstructor import Estimate, Reconstructor
+from kalux.smoothing import Spill, combine, reversed_settings
+
+SIZE = (6, 8)
+
+
+def recording(seed=0, threshold=(0.2, 0.25), span=200_000, events=600):
+    rng = np.random.default_rng(seed)
+    t = np.sort(rng.integers(0, span, events))
+    array = make_events(
+        t, rng.integers(0, SIZE[1], events), rng.integers(0, SIZE[0], events), rng.random(events) < 0.5
+    )
+    starts = [0, 41_000, 80_001, 120_000, 163_000]
+    frames = [
+        Frame(rng.integers(0, 256, SIZE).astype(np.uint8), s, s + exposure)
+        for s, exposure in zip(starts, (9_001, 5_000, 9_000, 20_000, 9_000), strict=True)
+    ]
+    return Recording.from_arrays(array, frames, sensor_size=SIZE, contrast_threshold=threshold)
+
+
+def mirrored(source):
+    """The recording seen backward, made without the code under test."""
+    events = np.concatenate(list(source.events()))[::-1]
+    on, off = source.contrast_threshold
+    return Recording.from_arrays(
+        make_events(-events["t"], events["x"], events["y"], ~events["p"]),
+        [Frame(f.image, -f.exposure_end, -f.exposure_start) for f in list(source.frames())[::-1]],
+        sensor_size=SIZE,
+        contrast_threshold=(off, on),
+    )
+
+
+def engine_over(source):
+    settings = plan(source, rate_hz=10).settings
+    engine = Reconstructor(SIZE, settings=settings)
+    for frame in source.frames():
+        engine.push_frame(frame)
+    for chunk in source.events():
+        engine.push_events(chunk)
+    engine.finish()
+    return engine
+
+
+def test_smoothing_is_two_filters_combined_by_information():
+    source = recording()
+    forward, backward = engine_over(source), engine_over(mirrored(source))
+    times = list(range(1_000, 172_000, 7_000))
+    seen_backward = {t: backward.estimate(-t) for t in times[::-1]}
+    for image, t in zip(kalux.reconstruct(source, times=times, smooth=True), times, strict=True):
+        a, b = forward.estimate(t), seen_backward[t]
+        weights = 1 / a.variance, 1 / b.variance
+        level = (weights[0] * a.log_intensity + weights[1] * b.log_intensity) / (weights[0] + weights[1])
+        expected = forward.image(Estimate(t, level, np.minimum(a.variance, b.variance), a.white, final=True))
+        np.testing.assert_allclose(image.intensity, expected.intensity, rtol=1e-6)
+        np.testing.assert_allclose(image.variance, expected.variance, rtol=1e-6)
+
+
+def test_the_mirrored_recording_gives_the_mirrored_video():
+    """Nothing in a smoothed image knows the direction of time."""
+    source = recording(1)
+    times = np.arange(2_500, 171_000, 8_000)  # no event or edge falls on them
+    ahead = list(kalux.reconstruct(source, times=times, smooth=True))
+    back = list(kalux.reconstruct(mirrored(source), times=-times[::-1], smooth=True))[::-1]
+    for one, other in zip(ahead, back, strict=True):
+        np.testing.assert_allclose(one.variance, other.variance, rtol=1e-5)
+        np.testing.assert_allclose(one.intensity, other.intensity, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("window", [1, 16 * 48 * 3, 16 * 48 * 1000])
+@pytest.mark.parametrize("block", [1, 100, 10_000])
+def test_windows_and_blocks_change_nothing(monkeypatch, window, block):
+    source = recording(2)
+    times = np.sort(np.r_[np.arange(0, 172_000, 5_000), 45_000, 80_001])
+    expected = list(kalux.reconstruct(source, times=times, smooth=True))
+    monkeypatch.setattr(smoothing, "_WINDOW_BYTES", window)
+    monkeypatch.setattr(smoothing, "_BLOCK_EVENTS", block)
+    for one, other in zip(kalux.reconstruct(source, times=times, smooth=True), expected, strict=True):
+        np.testing.assert_array_equal(one.intensity, other.intensity)
+        np.testing.assert_array_equal(one.variance, other.variance)
+
+
+def test_after_the_last_frame_the_forward_pass_is_alone():
+    source = recording(3)
+    times = [171_000, 190_000, 199_000]
+    smooth = list(kalux.reconstruct(source, times=times, smooth=True))
+    forward = list(kalux.reconstruct(source, times=times))
+    for one, other in zip(smooth[1:], forward[1:], strict=True):
+        np.testing.assert_array_equal(one.intensity, other.intensity)
+
+
+@pytest.mark.parametrize("events", [0, 5])
+def test_a_recording_with_few_events(events):
+    source = recording(4, events=events)
+    images = list(kalux.reconstruct(source, at="frames", smooth=True))
+    assert len(images) == 5
+    assert all(np.isfinite(image.intensity).all() for image in images)
+
+
+def test_smoothing_is_closer_to_the_truth():
+    """A dim room with a bright window: the highlights, most of the error, are told from both sides."""
+    sensor = SensorSettings(threshold_on=0.2, threshold_off=0.24, noise_rate=1.0, read_noise=0.004)
+    simulation = simulate(demo_scene(sensor_size=(60, 80), duration=600_000), sensor, seed=3)
+    source = simulation.recording()
+    truth = source.ground_truth()
+    errors = []
+    for smooth in (False, True):
+        images = list(kalux.reconstruct(source, times=truth.times, smooth=smooth))
+        logs = [
+            (np.log(i.intensity + 0.02), np.log(g + 0.02)) for i, g in zip(images, truth.images, strict=True)
+        ]
+        errors.append(np.mean([(a - b) ** 2 for a, b in logs]))
+    assert errors[1] < 0.9 * errors[0]
+
+
+def test_the_spilled_recording_is_the_recording_reversed(tmp_path):
+    source, expected = recording(5), mirrored(recording(5))
+    spill = Spill(source, tmp_path)
+    events = [spill.reversed_events(first) for first in range(0, spill.count, 10**6)]
+    np.testing.assert_array_equal(np.concatenate(events), np.concatenate(list(expected.events())))
+    for index, frame in enumerate(expected.frames()):
+        found = spill.reversed_frame(index)
+        assert (found.exposure_start, found.exposure_end) == (frame.exposure_start, frame.exposure_end)
+        np.testing.assert_array_equal(found.image, frame.image)
+    assert len(spill.reversed_events(spill.count)) == 0
+
+
+def test_thresholds_change_sides():
+    settings = PRESETS["default"]
+    events = dataclasses.replace(settings.events, threshold_on=0.1, threshold_off=0.3)
+    found = reversed_settings(dataclasses.replace(settings, events=events)).events
+    assert (found.threshold_on, found.threshold_off) == (0.3, 0.1)
+
+
+def test_where_one_filter_knows_nothing_the_other_is_taken():
+    level, ones = np.array([[1.0]]), np.ones((1, 1))
+    forward = Estimate(5, level, ones * 0.01, 0.0, final=True)
+    backward = Estimate(-5, level + 3, ones * 1e9, 0.0, final=True)
+    assert combine(forward, None) is forward
+    found = combine(forward, backward)
+    assert found.log_intensity[0, 0] == pytest.approx(1.0, abs=1e-9)
+    assert (found.t, found.variance[0, 0]) == (5, 0.01)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"), [({"lookahead": False}, "causal"), ({"preset": "cf"}, "has no variance")]
+)
+def test_what_cannot_be_smoothed(change, message):
+    with pytest.raises(InputError, match=message):
+        list(kalux.reconstruct(recording(), rate_hz=50, smooth=True, **change))
+
+
+def test_a_full_disk_is_one_line(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(np, "save", full)
+    with pytest.raises(OutputError, match="backward pass: No space left"):
+        Spill(recording(), tmp_path)
