@@ -117,9 +117,12 @@ def test_an_outputs_settings_tables_are_used(tmp_path):
     assert load(path, DEFAULT) == altered(DEFAULT, "events", noise_rate=7)
 
 
-def test_values_that_are_none_are_left_out():
-    assert "threshold_on" not in to_dict(DEFAULT)["events"]
-    assert "reference_exposure" not in to_dict(DEFAULT)["camera"]
+def test_none_is_auto_in_files():
+    """TOML has no None; left out, it could not undo the value of another preset."""
+    assert to_dict(DEFAULT)["events"]["threshold_on"] == "auto"
+    assert from_dict({"events": {"delay": "auto"}}, PRESETS["iccv2021"]).events.delay is None
+    with pytest.raises(SettingsError, match=r"events.noise_rate is 'auto'"):
+        from_dict({"events": {"noise_rate": "auto"}}, DEFAULT)
     assert to_dict(altered(DEFAULT, "events", threshold_on=0.3))["events"]["threshold_on"] == 0.3
 
 

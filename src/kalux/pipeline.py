@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.calibration.contrast import ThresholdEstimate, estimate_thresholds
+from kalux.calibration.delay import DelayEstimate, estimate_delay
 from kalux.errors import FrameError, InputError
 from kalux.events import EventArray
 from kalux.frames import Frame
@@ -40,6 +41,8 @@ class Plan:
         Whether the thresholds come from the settings, the recording, an estimate, or are assumed.
     estimate
         The fit, where there was one.
+    delay_estimate
+        The fit of the events' delay, where there was one.
     times
         (N,) int64 us, increasing: the images to make.
     lookahead
@@ -51,6 +54,7 @@ class Plan:
     settings: Settings
     threshold_origin: ThresholdOrigin
     estimate: ThresholdEstimate | None
+    delay_estimate: DelayEstimate | None
     times: NDArray[np.int64]
     lookahead: bool
     smooth: bool
@@ -84,9 +88,10 @@ def plan(
     chosen = dataclasses.replace(
         chosen, camera=dataclasses.replace(chosen.camera, reference_exposure=reference)
     )
+    chosen, delay = _with_delay(recording, chosen)
     chosen, origin, estimate = _with_thresholds(recording, chosen)
     wanted = _times(recording, exposures, rate_hz, times, at, chosen, lookahead)
-    return Plan(chosen, origin, estimate, wanted, lookahead, smooth)
+    return Plan(chosen, origin, estimate, delay, wanted, lookahead, smooth)
 
 
 def reconstruct(
@@ -194,7 +199,7 @@ def _estimates(
         while not ended and not engine.covers(frame.exposure_end):
             ended = not _push_next(engine, chunks, on_events)
         if ended:
-            engine.advance(frame.exposure_end)
+            engine.advance(frame.exposure_end + (plan.settings.events.delay or 0))
         while t is not None and _is_final(engine, t):
             yield engine.estimate(t)
             t = next(pending, None)
@@ -239,6 +244,15 @@ def _exposures(recording: Recording) -> NDArray[np.int64]:
     return np.array(exposures, np.int64)
 
 
+def _with_delay(recording: Recording, settings: Settings) -> tuple[Settings, DelayEstimate | None]:
+    """Fill in the events' delay: from the settings, else an estimate, else 0."""
+    if settings.events.delay is not None:
+        return settings, None
+    estimate = estimate_delay(recording, settings.camera)
+    delay = 0 if estimate is None else estimate.delay
+    return dataclasses.replace(settings, events=dataclasses.replace(settings.events, delay=delay)), estimate
+
+
 def _with_thresholds(
     recording: Recording, settings: Settings
 ) -> tuple[Settings, ThresholdOrigin, ThresholdEstimate | None]:
@@ -251,7 +265,9 @@ def _with_thresholds(
     found = recording.contrast_threshold
     if found is None:
         paper = settings.filter.augmentation == "paper"
-        estimate = estimate_thresholds(recording, settings.camera, of_log_offset=paper)
+        estimate = estimate_thresholds(
+            recording, settings.camera, of_log_offset=paper, delay=events.delay or 0
+        )
         origin = "assumed" if estimate is None else "estimate"
         found = (_ASSUMED_THRESHOLD, _ASSUMED_THRESHOLD) if estimate is None else (estimate.on, estimate.off)
     events = dataclasses.replace(

@@ -142,6 +142,7 @@ class Reconstructor:
             chosen.threshold_on or on or _UNKNOWN_THRESHOLD,
             chosen.threshold_off or off or _UNKNOWN_THRESHOLD,
         )
+        self._delay = chosen.delay or 0
         camera = self.settings.camera
         response = Response.named(camera.response)
         self._camera = (
@@ -194,7 +195,7 @@ class Reconstructor:
         array = as_events(events)
         previous = self._last_event
         if self._complete_until is not None:
-            earliest = self._complete_until + 1
+            earliest = self._complete_until + 1 + self._delay
             previous = earliest if previous is None else max(previous, earliest)
         check_events(array, self.sensor_size, first_index=self._event_count, previous_t=previous)
         if len(array) == 0:
@@ -203,12 +204,15 @@ class Reconstructor:
         self._last_event = int(array["t"][-1])
         self.advance(self._last_event - 1)  # more events may carry the last one's time
         if self._needed_from is not None:
-            array = array[array["t"].searchsorted(self._needed_from, "right") :]
-        # A copy: drivers fill the same buffer again.
-        self._chunks.append(array.copy() if array.base is not None or array is events else array)
+            array = array[array["t"].searchsorted(self._needed_from + self._delay, "right") :]
+        if array.base is not None or array is events:
+            array = array.copy()  # drivers fill the same buffer again
+        array["t"] -= self._delay
+        self._chunks.append(array)
 
     def advance(self, t: int) -> None:
-        """Declare that all events up to ``t`` (us) have been pushed: silence is information too."""
+        """Declare that all events stamped up to ``t`` (us) have been pushed: silence is information too."""
+        t -= self._delay
         self._complete_until = t if self._complete_until is None else max(t, self._complete_until)
 
     @property
@@ -217,7 +221,7 @@ class Reconstructor:
         return None if self._last_frame is None else self._last_frame.exposure_end
 
     def covers(self, t: int) -> bool:
-        """Whether all events up to ``t`` (us) are known to be here."""
+        """Whether all events up to ``t`` (us, in the frames' clock) are known to be here."""
         return self._finished or (self._complete_until is not None and self._complete_until >= t)
 
     def end_frames(self) -> None:

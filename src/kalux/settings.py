@@ -15,6 +15,9 @@ from kalux.errors import SettingsError
 
 FilterName = Literal["akf", "cf"]
 AugmentationName = Literal["bridge", "paper"]
+AUTO: Final = "auto"
+"""Stands in files for None: found out from the recording."""
+
 SolutionName = Literal["exact", "printed"]
 
 
@@ -62,6 +65,9 @@ class EventSettings:
     ----------
     threshold_on, threshold_off
         Contrast thresholds c, log intensity; None: what the recording states, else an estimate from it.
+    delay
+        How much later than the frames' clock events are stamped, us, e.g. by the latency of their pixels; None: an
+        estimate from the recording (0 for a live stream).
     threshold_spread
         Relative standard deviation of the threshold between pixels, prior of its calibration. 0.1: data
         sheets and the literature give 2 to 10 % (Lichtsteiner 2008: 2.1 % of contrast at c = 0.2), real
@@ -86,6 +92,7 @@ class EventSettings:
 
     threshold_on: float | None = None
     threshold_off: float | None = None
+    delay: int | None = None
     threshold_spread: float = 0.1
     step_variance: float = 0.2
     quantisation_variance: float = 1 / 6
@@ -159,9 +166,9 @@ def preset(name: str) -> Settings:
 
 
 def to_dict(settings: Settings) -> dict[str, dict[str, Any]]:
-    """As nested plain values, for TOML; values that are None are left out."""
+    """As nested plain values, for TOML; None, which TOML has not, is ``"auto"``."""
     return {
-        group: {name: value for name, value in values.items() if value is not None}
+        group: {name: AUTO if value is None else value for name, value in values.items()}
         for group, values in dataclasses.asdict(settings).items()
     }
 
@@ -187,7 +194,11 @@ def from_dict(values: Mapping[str, Any], base: Settings) -> Settings:
                 raise SettingsError(
                     f"settings: unknown setting {group}.{name}; known are {', '.join(sorted(known))}"
                 )
-        groups[group] = dataclasses.replace(current, **entries)
+        optional = {entry.name for entry in dataclasses.fields(current) if entry.default is None}
+        chosen = {
+            name: None if name in optional and value == AUTO else value for name, value in entries.items()
+        }
+        groups[group] = dataclasses.replace(current, **chosen)
     return dataclasses.replace(base, **groups)
 
 
@@ -228,6 +239,8 @@ _POSITIVE: Final = {
     "initial_variance",
     "cutoff",
 }
+_WHOLE: Final = {"delay", "reference_exposure"}
+_SIGNED: Final = {"delay"}
 _CHOICES: Final = {
     "kind": ("akf", "cf"),
     "augmentation": ("bridge", "paper"),
@@ -256,9 +269,11 @@ def _check_value(label: str, name: str, value: Any, default: Any) -> None:
     elif value is None:
         if default is not None:
             raise SettingsError(f"settings: {label} needs a number")
+    elif name in _WHOLE and not (isinstance(value, int) and not isinstance(value, bool)):
+        raise SettingsError(f"settings: {label} is {value!r}; whole microseconds are needed")
     elif isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
         raise SettingsError(f"settings: {label} is {value!r}; a finite number is needed")
-    elif value < 0 or (name in _POSITIVE and value == 0):
+    elif (value < 0 and name not in _SIGNED) or (name in _POSITIVE and value == 0):
         raise SettingsError(
             f"settings: {label} is {value}; it must be {'positive' if name in _POSITIVE else '0 or more'}"
         )
@@ -266,6 +281,7 @@ def _check_value(label: str, name: str, value: Any, default: Any) -> None:
 
 _PAPER: Final = Settings(
     camera=CameraSettings(log_offset=1.0),
+    events=EventSettings(delay=0),
     filter=FilterSettings(
         augmentation="paper", solution="printed", initial_variance=0.09, highlight_scale=0.0
     ),

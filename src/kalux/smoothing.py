@@ -138,7 +138,7 @@ class BackwardPass:
             else:
                 newest = self.engine.newest_frame_end
                 assert newest is not None
-                self.engine.advance(newest)
+                self.engine.advance(newest + (self.engine.settings.events.delay or 0))
             return
         self.engine.push_events(block)
         self.events += len(block)
@@ -234,10 +234,11 @@ def combine(forward: Estimate, backward: Estimate | None) -> Estimate:
 
 
 def reversed_settings(settings: Settings) -> Settings:
-    """Those of the reversed recording, in which an on event is a step down by the on threshold."""
+    """Those of the reversed recording: an on event is a step down by the on threshold, and late is early."""
     events = dataclasses.replace(
         settings.events,
         threshold_on=settings.events.threshold_off,
         threshold_off=settings.events.threshold_on,
+        delay=-(settings.events.delay or 0),
     )
     return dataclasses.replace(settings, events=events)

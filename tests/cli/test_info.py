@@ -20,7 +20,8 @@ def test_estimates_nothing_where_it_need_not(cli, recording, write_recording, tm
     path = write_recording(tmp_path / "rec.h5", contrast_threshold=None) if flags else recording
     found = cli("info", path, *flags)
     assert found.code == 0
-    assert "  estimate " not in found.out
+    assert "threshold ON" not in found.out
+    assert ("events' delay" in found.out or "ms late" in found.out) == (not flags)
 
 
 def test_a_recording_without_exposures_is_described(cli, damaged):

@@ -151,6 +151,7 @@ class TestWhatIsSaid:
         assert [line.split()[0] for line in lines] == [
             "recording",
             "thresholds",
+            "delay",
             "exposure",
             "filter",
             "images",

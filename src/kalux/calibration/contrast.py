@@ -22,8 +22,8 @@ MAX_SAMPLES: Final = 400_000
 
 _MIN_SAMPLES: Final = 200
 _UNEXPLAINED: Final = 0.8  # of the typical change; 0.3 to 0.6 on recordings of moving scenes, 3 on flicker
-_WELL_EXPOSED: Final = (0.05, 0.95)  # of the response: away from black, noise and saturation
-_NORMAL_MAD: Final = 1.4826  # standard deviation over median absolute deviation, of a normal distribution
+WELL_EXPOSED: Final = (0.05, 0.95)  # of the response: away from black, noise and saturation
+NORMAL_MAD: Final = 1.4826  # standard deviation over median absolute deviation, of a normal distribution
 _HUBER: Final = 1.345  # 95 % efficiency for normal residuals (Huber 1981)
 _MAX_FRAMES: Final = 200
 
@@ -48,7 +48,7 @@ class ThresholdEstimate(NamedTuple):
 
 
 def estimate_thresholds(
-    recording: Recording, camera: CameraSettings, *, of_log_offset: bool = False
+    recording: Recording, camera: CameraSettings, *, of_log_offset: bool = False, delay: int = 0
 ) -> ThresholdEstimate | None:
     """Global on and off thresholds, by robust regression of log frame differences on event counts.
 
@@ -66,6 +66,8 @@ def estimate_thresholds(
         Response and I_0.
     of_log_offset
         Steps of log(I + I_0) instead of log I, s = 1, as in the paper's model.
+    delay
+        How much later than the frames' clock events are stamped, us.
 
     Returns None where the recording has too few such pixels (200), e.g. because nothing moves, or where the
     events hardly explain how the frames change (residual above 0.8 of the change), e.g. because they are flicker.
@@ -79,7 +81,7 @@ def estimate_thresholds(
     ons: list[Array] = []
     offs: list[Array] = []
     count = 0
-    for difference, on, off in _samples(recording, camera, of_log_offset):
+    for difference, on, off in _samples(recording, camera, of_log_offset, delay):
         differences.append(difference)
         ons.append(on)
         offs.append(off)
@@ -90,7 +92,7 @@ def estimate_thresholds(
         return None
     difference = np.concatenate(differences)
     fit = fit_thresholds(difference, np.concatenate(ons), np.concatenate(offs))
-    typical = _NORMAL_MAD * float(np.median(np.abs(difference)))
+    typical = NORMAL_MAD * float(np.median(np.abs(difference)))
     return None if fit is None or fit.residual > _UNEXPLAINED * typical else fit
 
 
@@ -111,7 +113,7 @@ def fit_thresholds(difference: Array, on: Array, off: Array) -> ThresholdEstimat
         previous = solution
         solution = np.linalg.solve(normal, weighted.T @ difference).astype(np.float64)
         residual = difference - design @ solution
-        scale = _NORMAL_MAD * float(np.median(np.abs(residual)))
+        scale = NORMAL_MAD * float(np.median(np.abs(residual)))
         if scale < 1e-9:
             break  # an exact fit: nothing to weigh down
         weights = np.minimum(1.0, _HUBER * scale / np.maximum(np.abs(residual), 1e-12))
@@ -123,11 +125,11 @@ def fit_thresholds(difference: Array, on: Array, off: Array) -> ThresholdEstimat
 
 
 def _samples(
-    recording: Recording, camera: CameraSettings, of_log_offset: bool
+    recording: Recording, camera: CameraSettings, of_log_offset: bool, delay: int
 ) -> Iterator[tuple[Array, Array, Array]]:
     """Log difference and on and off counts (times s) of the usable pixels, one frame interval at a time."""
     model = Camera(Response.named(camera.response), None, camera.saturation)
-    low, high = _WELL_EXPOSED
+    low, high = WELL_EXPOSED
     chunks = iter(recording.events())
     buffer: EventArray = np.empty(0, EVENT_DTYPE)
     previous: Shot | None = None
@@ -140,14 +142,15 @@ def _samples(
         shot = take_shot(frame, model, reference)
         response = frame.normalised()
         usable = (response > low) & (response < high)
-        while len(buffer) == 0 or buffer["t"][-1] <= shot.middle:
+        until = shot.middle + delay
+        while len(buffer) == 0 or buffer["t"][-1] <= until:
             chunk = next(chunks, None)
             if chunk is None:
                 break
             # Before the first frame nothing is counted, and nothing needs to be kept.
             buffer = chunk if previous is None else np.concatenate([buffer, chunk])
         if previous is not None and previous_usable is not None:
-            on, off = count_events(between(buffer, previous.middle, shot.middle), recording.sensor_size)
+            on, off = count_events(between(buffer, previous.middle + delay, until), recording.sensor_size)
             chosen = usable & previous_usable & (np.abs(on - off) >= 2)
             change = log_intensity(shot.intensity, camera.log_offset) - log_intensity(
                 previous.intensity, camera.log_offset
@@ -155,5 +158,5 @@ def _samples(
             level = (shot.intensity + previous.intensity)[chosen] / 2
             share = np.ones_like(level) if of_log_offset else level / (level + camera.log_offset)
             yield change[chosen], share * on[chosen], share * off[chosen]
-        buffer = buffer[buffer["t"].searchsorted(shot.middle, "right") :]
+        buffer = buffer[buffer["t"].searchsorted(until, "right") :]
         previous, previous_usable = shot, usable

@@ -10,6 +10,7 @@ from kalux.cli.parser import Parser, UsageError, whole
 from kalux.cli.terminal import say
 
 if TYPE_CHECKING:
+    from kalux.calibration.delay import DelayEstimate
     from kalux.recording import Recording
 
 _DESCRIPTION = """\
@@ -68,18 +69,34 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
 
     recording = open_recording(options)
     say(format_description(describe(recording)))
-    if not options.no_estimate and recording.contrast_threshold is None:
-        say(f"  estimate   {estimate_text(recording)}")
+    if not options.no_estimate:
+        say("\n".join(f"  estimate   {text}" for text in estimates(recording)))
 
 
-def estimate_text(recording: Recording) -> str:
+def estimates(recording: Recording) -> list[str]:
+    """What the recording itself says of its sensor: a line each."""
+    from kalux.calibration.delay import estimate_delay
+    from kalux.settings import CameraSettings
+
+    if not recording.exposure_known:
+        return ["nothing can be estimated without exposure times; give --exposure"]
+    found = estimate_delay(recording, CameraSettings())
+    delay = "the events' delay cannot be told"
+    if found is not None:
+        delay = (
+            f"events explain the frames best when taken as {found.apparent * 1e-3:.1f} ms late "
+            f"({100 * found.improvement:.0f} % better than as stamped)"
+        )
+    thresholds = [] if recording.contrast_threshold is not None else [estimate_text(recording, found)]
+    return [delay, *thresholds]
+
+
+def estimate_text(recording: Recording, delay: DelayEstimate | None) -> str:
     """The estimated contrast thresholds, and how well they are known."""
     from kalux.calibration.contrast import estimate_thresholds
     from kalux.settings import CameraSettings
 
-    if not recording.exposure_known:
-        return "thresholds cannot be estimated without exposure times; give --exposure"
-    estimate = estimate_thresholds(recording, CameraSettings())
+    estimate = estimate_thresholds(recording, CameraSettings(), delay=0 if delay is None else delay.delay)
     if estimate is None:
         return "thresholds cannot be estimated, too little moves before well exposed pixels"
     return (

@@ -1,0 +1,150 @@
+"""How late events are: the shift of their clock at which they explain the frames best."""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux.augmentation.deblur import between, count_events
+from kalux.calibration.contrast import NORMAL_MAD, WELL_EXPOSED, fit_thresholds
+from kalux.events import EVENT_DTYPE, EventArray
+from kalux.filters.methods import Shot, take_shot
+from kalux.models.camera import Camera, Response, log_intensity
+from kalux.recording import Recording
+from kalux.settings import CameraSettings
+
+Array = NDArray[np.float64]
+
+STEP: Final = 1_000
+"""Grid of delays that are tried, us; between its points a parabola decides."""
+
+LARGEST: Final = 12_000
+"""Largest delay that is tried, us: the photoreceptor's, in the dark, is some milliseconds (Lichtsteiner 2008)."""
+
+_MIN_SAMPLES: Final = 500
+_MAX_SAMPLES: Final = 60_000
+_MAX_FRAMES: Final = 60
+_SHARE: Final = 0.7
+"""Share of the apparent delay that is corrected. Events trail the light by half a threshold, which looks like delay
+too: an ideal sensor shows 1 to 4 ms of it, real ones 2 to 7. On both 0.7 of it is best (docs/tuning.md)."""
+
+
+class DelayEstimate(NamedTuple):
+    """A fitted delay.
+
+    Attributes
+    ----------
+    delay
+        By how much to shift the events, us: the share that is corrected of the apparent delay.
+    apparent
+        The delay at which the events explain the frames best, us.
+    improvement
+        Share of the residual at no delay that the apparent one removes, 0 to 1.
+    samples
+        Pixels and frame intervals used.
+    """
+
+    delay: int
+    apparent: int
+    improvement: float
+    samples: int
+
+
+def estimate_delay(recording: Recording, camera: CameraSettings) -> DelayEstimate | None:
+    """The delay of the events against the frames, by fitting log frame differences with event counts.
+
+    For every delay of a grid the events between the middles of two exposures, shifted by it, are fitted to the
+    change between the frames as in `estimate_thresholds`; the delay with the smallest residual wins. Latency of the
+    event pixels (which grows in the dark), a wrong stamp or a guessed exposure time all look alike, and are all
+    mended by it. Looks at the first 60 frames.
+
+    Returns None where too few pixels change, or where no delay within 12 ms explains the frames best.
+
+    Raises
+    ------
+    ExposureError
+        If the frames' exposures are not known.
+    """
+    difference, nets = _samples(recording, camera)
+    if len(difference) < _MIN_SAMPLES:
+        return None
+    residuals = np.array([_residual(difference, on, off) for on, off in nets])
+    return best_delay(delays(), residuals, len(difference))
+
+
+def delays() -> NDArray[np.int64]:
+    """The grid of delays, us."""
+    return np.arange(-LARGEST, LARGEST + 1, STEP, dtype=np.int64)
+
+
+def best_delay(grid: NDArray[np.int64], residuals: Array, samples: int) -> DelayEstimate | None:
+    """The minimum of the residuals over the grid, refined by a parabola through its neighbours.
+
+    None where it is at an end of the grid, or where a fit failed.
+    """
+    if not np.isfinite(residuals).all():
+        return None
+    best = int(np.argmin(residuals))
+    if best in (0, len(grid) - 1):
+        return None
+    before, here, after = residuals[best - 1 : best + 2]
+    curvature = before - 2 * here + after
+    shift = 0.0 if curvature <= 0 else 0.5 * (before - after) / curvature
+    improvement = 1.0 - here / residuals[int(np.flatnonzero(grid == 0)[0])]
+    apparent = float(grid[best]) + shift * STEP
+    return DelayEstimate(round(_SHARE * apparent), round(apparent), float(improvement), samples)
+
+
+def _residual(difference: Array, on: Array, off: Array) -> float:
+    fit = fit_thresholds(difference, on, off)
+    if fit is None:
+        return float("nan")
+    return NORMAL_MAD * float(np.median(np.abs(difference - fit.on * on + fit.off * off)))
+
+
+def _samples(recording: Recording, camera: CameraSettings) -> tuple[Array, list[tuple[Array, Array]]]:
+    """Log differences of usable pixels, and for every delay their on and off counts."""
+    model = Camera(Response.named(camera.response), None, camera.saturation)
+    grid = delays()
+    differences: list[Array] = []
+    counts: list[list[tuple[Array, Array]]] = []
+    chunks = iter(recording.events())
+    buffer: EventArray = np.empty(0, EVENT_DTYPE)
+    previous: tuple[Shot, NDArray[np.bool_]] | None = None
+    total = 0
+    reference = float(camera.reference_exposure or 0)
+    for index, frame in enumerate(recording.frames()):
+        if index == _MAX_FRAMES or total >= _MAX_SAMPLES:
+            break
+        reference = reference or float(frame.exposure)
+        shot = take_shot(frame, model, reference)
+        response = frame.normalised()
+        usable = (response > WELL_EXPOSED[0]) & (response < WELL_EXPOSED[1])
+        while len(buffer) == 0 or buffer["t"][-1] <= shot.middle + LARGEST:
+            chunk = next(chunks, None)
+            if chunk is None:
+                break
+            buffer = chunk if previous is None else np.concatenate([buffer, chunk])
+        if previous is not None:
+            before, was_usable = previous
+            everything = between(buffer, before.middle - LARGEST, shot.middle + LARGEST)
+            chosen = usable & was_usable & (sum(count_events(everything, recording.sensor_size)) >= 2)
+            change = log_intensity(shot.intensity, camera.log_offset) - log_intensity(
+                before.intensity, camera.log_offset
+            )
+            differences.append(change[chosen])
+            shifted = (between(everything, before.middle + d, shot.middle + d) for d in grid.tolist())
+            pairs = (count_events(events, recording.sensor_size) for events in shifted)
+            counts.append([(on[chosen], off[chosen]) for on, off in pairs])
+            total += int(chosen.sum())
+        buffer = buffer[buffer["t"].searchsorted(shot.middle - LARGEST, "right") :]
+        previous = shot, usable
+    if not differences:
+        return np.empty(0), []
+    joined = [
+        (np.concatenate([c[i][0] for c in counts]), np.concatenate([c[i][1] for c in counts]))
+        for i in range(len(grid))
+    ]
+    return np.concatenate(differences), joined

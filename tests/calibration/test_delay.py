@@ -1,0 +1,104 @@
+"""The delay of events against frames."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from kalux import PRESETS, Recording, reconstruct
+from kalux.calibration import delay
+from kalux.calibration.delay import best_delay, delays, estimate_delay
+from kalux.datasets import SensorSettings
+from kalux.pipeline import plan
+from kalux.settings import CameraSettings
+
+from builders import altered, moving_blocks
+
+CAMERA = CameraSettings()
+
+
+def late(simulation, by):
+    """The simulated recording with all events stamped ``by`` us later."""
+    events = simulation.events.copy()
+    events["t"] += by
+    frames, size = simulation.frames, simulation.frames[0].image.shape
+    return Recording.from_arrays(events, frames, sensor_size=size)
+
+
+@pytest.fixture(scope="module")
+def simulation():
+    return moving_blocks(
+        0.05, 0.8, sensor=SensorSettings(threshold_on=0.15, threshold_off=0.15), size=(48, 64)
+    )
+
+
+@pytest.mark.parametrize("by", [-5_000, -2_000, 3_000, 6_000])
+def test_a_shift_of_the_events_is_found(simulation, by):
+    """To 0.6 ms of what is found without one, which is the half threshold by which events trail."""
+    trail = estimate_delay(late(simulation, 0), CAMERA).apparent
+    assert 0 <= trail < 5_000
+    assert estimate_delay(late(simulation, by), CAMERA).apparent == pytest.approx(trail + by, abs=600)
+
+
+def test_not_all_of_it_is_corrected(simulation):
+    found = estimate_delay(late(simulation, 4_000), CAMERA)
+    assert found.delay == pytest.approx(0.7 * found.apparent, abs=1)
+
+
+def test_a_still_scene_says_nothing(simulation):
+    frames = simulation.frames[:1] * 1
+    recording = Recording.from_arrays(simulation.events[:0], frames, sensor_size=frames[0].image.shape)
+    assert estimate_delay(recording, CAMERA) is None
+
+
+def test_a_parabola_finds_the_minimum_between_points():
+    grid = delays()
+    found = best_delay(grid, 0.2 + 1e-9 * (grid - 2_300.0) ** 2, 1_000)
+    assert found.apparent == 2_300
+    assert found.samples == 1_000
+    assert found.improvement == pytest.approx(1 - 0.2 / (0.2 + 1e-9 * 2_300**2), abs=1e-3)
+
+
+@pytest.mark.parametrize("residuals", [np.arange(25.0) + 1, np.arange(25.0, 0, -1), np.full(25, np.nan)])
+def test_no_minimum_inside_is_no_delay(residuals):
+    assert best_delay(delays(), residuals, 1_000) is None
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+def test_a_stated_delay_is_taken_back(simulation, smooth):
+    """Late events with their delay stated give the images of the events in time, to the bit."""
+    images = []
+    for by in (0, 3_500):
+        settings = altered(PRESETS["default"], "events", delay=by, threshold_on=0.15, threshold_off=0.15)
+        recording = late(simulation, by)
+        images.append(list(reconstruct(recording, at="frames", settings=settings, smooth=smooth)))
+    for one, other in zip(*images, strict=True):
+        np.testing.assert_array_equal(one.intensity, other.intensity)
+        np.testing.assert_array_equal(one.variance, other.variance)
+
+
+def test_the_plan_fills_it_in(simulation):
+    recording = late(simulation, 4_000)
+    made = plan(recording, rate_hz=10)
+    assert made.settings.events.delay == made.delay_estimate.delay > 2_000
+    assert plan(recording, rate_hz=10, preset="iccv2021").settings.events.delay == 0
+    given = altered(PRESETS["default"], "events", delay=-7)
+    assert plan(recording, rate_hz=10, settings=given).settings.events.delay == -7
+    assert plan(recording, rate_hz=10, settings=given).delay_estimate is None
+
+
+def test_long_recordings_are_not_read_to_the_end(simulation, monkeypatch):
+    monkeypatch.setattr(delay, "_MAX_FRAMES", 3)
+    read = []
+
+    def watched(frames):
+        for frame in frames:
+            read.append(frame)
+            yield frame
+
+    recording = late(simulation, 0)
+    source = dataclasses.replace(recording.source, frames=lambda: watched(simulation.frames))
+    estimate_delay(Recording(source), CAMERA)
+    assert len(read) <= 4 < len(simulation.frames)
