@@ -235,14 +235,28 @@ class _Sink(io.FileIO):
         view[got:] = bytes(len(view) - got)
         return len(view)
 
+    def truncate(self, size: int | None = None, /) -> int:
+        try:
+            return super().truncate(size)
+        except OSError as error:
+            self._error = self._error or error
+            return self.tell() if size is None else size
+
+    def flush(self) -> None:
+        """Nothing is buffered. h5py calls this while it handles other errors, and then finds no inherited method."""
+
     def check(self) -> None:
         if self._error is not None:
             raise self._error
 
     def checked(self, items: Iterable[T]) -> Iterator[T]:
-        """The same items, as long as the file takes them."""
+        """The same items, as long as the file takes them.
+
+        Ends early rather than raise: an error on its way through an open h5py file disturbs its closing.
+        """
         for item in items:
-            self.check()
+            if self._error is not None:
+                return
             yield item
 
 
