@@ -61,8 +61,8 @@ def added_noise(information, noise):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, inline="always")
 def measurement_rate(rate, forward_variance, backward_variance):  # type: ignore[no-untyped-def]
-    """1/R of a bridged L^A (docs/equations.md, K4)."""
-    return rate * (1.0 / forward_variance + 1.0 / backward_variance)
+    """1/R of a bridged L^A (docs/equations.md, K4): rate (1/forward + 1/backward), in one division."""
+    return rate * (forward_variance + backward_variance) / (forward_variance * backward_variance)
 
 
 @nb.njit(cache=True, inline="always")
