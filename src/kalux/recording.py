@@ -13,7 +13,7 @@ from kalux import readers
 from kalux.errors import ExposureError, InputError
 from kalux.events import EventArray, as_events, check_events
 from kalux.frames import Frame, Stamp, check_frame, place_exposure
-from kalux.readers import CHUNK_EVENTS, GroundTruth, Source
+from kalux.readers import CHUNK_EVENTS, GroundTruth, Source, joined
 
 
 class EventStream:
@@ -200,23 +200,49 @@ class Recording:
             yield frame
 
 
-def open(path: str | Path, *, exposure: int | None = None, stamp: Stamp = "start") -> Recording:
+def open(
+    path: str | Path,
+    *,
+    exposure: int | None = None,
+    stamp: Stamp = "start",
+    frames: str | Path | None = None,
+    frames_start: int | None = None,
+    frames_rate: float | None = None,
+    replace_frames: bool = False,
+) -> Recording:
     """Open a recording of any known format, recognised by its content.
 
     Parameters
     ----------
     path
-        File or folder: AEDAT4, IJRR text folder or zip, released ``.mat``, kalux HDF5.
+        File or folder, of any format in ``docs/formats.md``.
     exposure
         Exposure time of all frames, us, for recordings that do not store it. Given explicitly, it
         replaces stored exposure times.
     stamp
         With ``exposure``: whether a frame's time stamp (or stored exposure start) is the start, the middle or
         the end of its exposure.
+    frames
+        Frames from elsewhere: a folder of grey images with their times, or a video; see ``docs/formats.md``.
+    frames_start, frames_rate
+        For a video: time of its first frame, us, in the clock of the events; frames per second.
+    replace_frames
+        Whether ``frames`` may replace frames that the recording has itself.
 
     Raises
     ------
     InputError, FormatError
-        If the file is missing, unknown or damaged.
+        If a file is missing, unknown or damaged, or the frames are not wanted as they are given.
+    FrameError
+        If ``frames`` have not the size of the sensor.
     """
-    return Recording(readers.read(path), exposure=exposure, stamp=stamp)
+    source = readers.read(path)
+    if frames is not None:
+        source = joined.join(
+            source, Path(frames), start=frames_start, rate_hz=frames_rate, replace=replace_frames
+        )
+    elif frames_start is not None or frames_rate is not None or replace_frames:
+        raise InputError(
+            "frames_start, frames_rate and replace_frames say what to do with frames; give frames"
+        )
+    return Recording(source, exposure=exposure, stamp=stamp)

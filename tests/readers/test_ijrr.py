@@ -172,9 +172,11 @@ def test_without_images(folder):
     assert list(source.frames()) == []
     assert any(r"images.txt" in sentence for sentence in source.missing)
     assert any("sensor size" in sentence for sentence in source.missing)
+    assert not source.sensor_size_known
     text = (folder / "events.txt").read_text()
     (folder / "events.txt").write_text("240 180\n" + text)
-    assert readers.read(folder).sensor_size == (180, 240)
+    source = readers.read(folder)
+    assert (source.sensor_size, source.sensor_size_known) == ((180, 240), True)
 
 
 def test_nothing_at_all(folder):

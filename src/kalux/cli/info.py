@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from kalux.cli.parser import Parser, UsageError, whole
+from kalux.cli.parser import Parser, UsageError, number, whole
 from kalux.cli.terminal import say
 
 if TYPE_CHECKING:
@@ -52,6 +52,19 @@ def add_recording(parser: Parser) -> None:
         choices=("start", "middle", "end"),
         help="with --exposure: what a frame's time stamp marks (default start)",
     )
+    group.add_argument(
+        "--frames",
+        type=Path,
+        metavar="FRAMES",
+        help="frames from elsewhere: image folder with times, or video",
+    )
+    group.add_argument(
+        "--frames-start", type=whole, metavar="US", help="of a video: time of its first frame, us"
+    )
+    group.add_argument("--frames-rate", type=number, metavar="HZ", help="of a video: frames per second")
+    group.add_argument(
+        "--replace-frames", action="store_true", help="--frames instead of the recording's own"
+    )
 
 
 def open_recording(options: argparse.Namespace) -> Recording:
@@ -60,7 +73,21 @@ def open_recording(options: argparse.Namespace) -> Recording:
 
     if options.stamp is not None and options.exposure is None:
         raise UsageError("--stamp says what a frame's time marks for --exposure; give --exposure, too")
-    return kalux.open(Path(options.recording), exposure=options.exposure, stamp=options.stamp or "start")
+    if options.frames is None:
+        for name in ("frames_start", "frames_rate", "replace_frames"):
+            if getattr(options, name) not in (None, False):
+                raise UsageError(
+                    f"--{name.replace('_', '-')} is for frames from elsewhere; give --frames, too"
+                )
+    return kalux.open(
+        Path(options.recording),
+        exposure=options.exposure,
+        stamp=options.stamp or "start",
+        frames=options.frames,
+        frames_start=options.frames_start,
+        frames_rate=options.frames_rate,
+        replace_frames=options.replace_frames,
+    )
 
 
 def run(options: argparse.Namespace, command: list[str]) -> None:

@@ -135,6 +135,25 @@ def check_output(output: Output) -> None:
         _check_writable(path if is_folder else path.absolute().parent)
 
 
+def check_file(path: Path, *, overwrite: bool) -> None:
+    """Check that a file of this name can be made, before the work.
+
+    Raises
+    ------
+    OutputError
+        It is there already, or its folder is not there or cannot be written.
+    """
+    with _system_errors(path):
+        if path.is_dir():
+            raise OutputError(f"{path}: a folder of this name is there; choose another name for the file")
+        if path.exists() and not overwrite:
+            raise OutputError(f"{path}: there already; choose another name, or replace it with --overwrite")
+        folder = path.absolute().parent
+        if not folder.exists():
+            raise OutputError(f"{folder}: no such folder; make it, or choose another place for the output")
+        _check_writable(folder)
+
+
 def _check_writable(folder: Path) -> None:
     existing = next(place for place in (folder, *folder.parents) if place.exists())
     if not existing.is_dir():

@@ -300,6 +300,9 @@ def metadata(
             "width": width,
             "exposure": options.exposure,
             "stamp": options.stamp,
+            "frames": options.frames,
+            "frames_start": options.frames_start,
+            "frames_rate": options.frames_rate,
         },
         "images_wanted": {
             "count": len(made.times),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from types import FrameType
 
 
@@ -36,3 +36,33 @@ def termination_as_interrupt() -> Iterator[None]:
     finally:
         for number, handler in zip((signal.SIGTERM, signal.SIGINT), previous, strict=True):
             signal.signal(number, handler if handler is not None else signal.SIG_DFL)
+
+
+@contextlib.contextmanager
+def interrupts_held() -> Iterator[Callable[[], None]]:
+    """Inside the block, an interrupt waits until the function that the block gets is called, or for its end.
+
+    For libraries that cannot bear an exception in the middle of their work.
+    """
+    received = False
+
+    def hold(number: int, frame: FrameType | None) -> None:
+        nonlocal received
+        received = True
+
+    def let_through() -> None:
+        if received:
+            raise KeyboardInterrupt
+
+    previous = signal.getsignal(signal.SIGINT)
+    in_main = threading.current_thread() is threading.main_thread()
+    if not in_main or previous is None or previous == signal.SIG_IGN:
+        yield let_through
+        return
+    signal.signal(signal.SIGINT, hold)
+    try:
+        yield let_through
+    finally:
+        signal.signal(signal.SIGINT, previous)
+    if received:
+        signal.raise_signal(signal.SIGINT)

@@ -7,26 +7,55 @@ from pathlib import Path
 from typing import NamedTuple
 
 from kalux.errors import FormatError, InputError
-from kalux.readers import aedat4, hdf5, ijrr, mat
+from kalux.readers import (
+    aedat4,
+    dsec,
+    es,
+    hdf5,
+    hqf,
+    ijrr,
+    mat,
+    metavision_hdf5,
+    mvsec,
+    numpy_files,
+    prophesee,
+    rosbag,
+    table,
+)
 from kalux.readers.source import CHUNK_EVENTS, GroundTruth, Source
 
 __all__ = ["CHUNK_EVENTS", "READERS", "GroundTruth", "Reader", "Source", "read"]
 
 
 class Reader(NamedTuple):
-    """One format: its name, a one-line description, how to recognise it and how to open it."""
+    """One format: its name, a one-line description, how to recognise it and how to open it.
+
+    ``choose`` opens what is named after a ``?`` in the path, where a format may hold several recordings.
+    """
 
     name: str
     description: str
     recognises: Callable[[Path], bool]
     open: Callable[[Path], Source]
+    choose: Callable[[Path, str], Source] | None = None
 
 
 READERS: tuple[Reader, ...] = (
     Reader("aedat4", "AEDAT 4 (iniVation DV)", aedat4.recognises, aedat4.read),
     Reader("kalux", "kalux HDF5", hdf5.recognises, hdf5.read),
     Reader("mat", "MATLAB file of the AKF authors' datasets (v5, v7.3)", mat.recognises, mat.read),
+    Reader("raw", "Prophesee RAW (EVT 2.0, 2.1, 3.0)", prophesee.recognises_raw, prophesee.read_raw),
+    Reader("dat", "Prophesee DAT", prophesee.recognises_dat, prophesee.read_dat),
+    Reader("ros", "ROS 1 bag, ROS 2 db3 or MCAP", rosbag.recognises, rosbag.read, rosbag.read),
+    Reader("dsec", "DSEC folder or events.h5", dsec.recognises, dsec.read),
+    Reader("hqf", "HDF5 of HQF and E2VID+ (ECNN)", hqf.recognises, hqf.read),
+    Reader("mvsec", "HDF5 of MVSEC", mvsec.recognises, mvsec.read),
+    Reader("metavision", "Metavision HDF5", metavision_hdf5.recognises, metavision_hdf5.read),
+    Reader("es", "Event Stream (.es, DVS)", es.recognises, es.read),
+    # Before IJRR, whose zips could also be .npz; a broken zip is left to IJRR to report.
+    Reader("numpy", "NumPy .npz or .npy", numpy_files.recognises, numpy_files.read),
     Reader("ijrr", "IJRR text folder or zip (events.txt, images.txt)", ijrr.recognises, ijrr.read),
+    Reader("table", "CSV or text with named columns", table.recognises, table.read),
 )
 
 
@@ -40,7 +69,7 @@ def read(path: str | Path) -> Source:
     FormatError
         If no reader recognises it, or the one that does finds it damaged.
     """
-    path = Path(path)
+    path, choice = _split(Path(path))
     if not path.exists():
         raise InputError(f"{path}: no such file or folder")
     try:
@@ -50,4 +79,16 @@ def read(path: str | Path) -> Source:
     if reader is None:
         known = "; ".join(reader.description for reader in READERS)
         raise FormatError(f"{path}: not a recording that kalux knows. It reads: {known}")
-    return reader.open(path)
+    if not choice:
+        return reader.open(path)
+    if reader.choose is None:
+        raise InputError(
+            f"{path}: nothing can be chosen after '?' in a recording of this format ({reader.name})"
+        )
+    return reader.choose(path, choice)
+
+
+def _split(path: Path) -> tuple[Path, str]:
+    """A path and the choice after its ``?``, unless that belongs to the name of the file."""
+    name, mark, choice = str(path).partition("?")
+    return (Path(name), choice) if mark and not path.exists() else (path, "")

@@ -7,12 +7,11 @@ https://docs.inivation.com/software/software-advanced-usage/file-formats/aedat-4
 
 from __future__ import annotations
 
-import heapq
 import struct
 import xml.etree.ElementTree as ElementTree
 from array import array
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -25,12 +24,12 @@ import zstandard
 from kalux.errors import FormatError
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.frames import Frame
-from kalux.readers.source import CHUNK_EVENTS, Source, one_line, reading
+from kalux.readers.source import Source, one_line, reading
+from kalux.readers.streams import in_order, rechunk
 
 T = TypeVar("T")
 _MAGIC: Final = b"#!AER-DAT4.0\r\n"
 _PACKET_HEADER: Final = struct.Struct("<ii")  # stream, size in bytes
-_REORDERED_FRAMES: Final = 8  # frames held back to put late ones in order
 # OpenCV's numbers for 8 and 16 bits, one channel
 _GREY_DTYPES: Final[dict[int, np.dtype[Any]]] = {0: np.dtype("u1"), 2: np.dtype("<u2")}
 _COLOUR: Final = {16: "BGR", 24: "BGRA", 18: "16-bit BGR", 26: "16-bit BGRA"}
@@ -124,12 +123,12 @@ def read(path: Path) -> Source:
         missing += ("The exposure times of the frames are not recorded.",)
 
     def read_events() -> Iterator[EventArray]:
-        return iter(()) if events is None else _rechunk(container.read(events, _events))
+        return iter(()) if events is None else rechunk(container.read(events, _events))
 
     def read_frames() -> Iterator[Frame]:
         if frames is None:
             return iter(())
-        ordered = _in_order(_stored_frames(container, frames))
+        ordered = in_order(_stored_frames(container, frames))
         return ordered if exposure_known else map(_stamp_only, ordered)
 
     @cache
@@ -168,39 +167,6 @@ def _others(name: str, chosen: _Stream | None, streams: list[_Stream]) -> tuple[
         f"The file has {len(streams)} {name} streams; only stream {chosen.number} ({width}x{height}) "
         "is read.",
     )
-
-
-def _rechunk(packets: Iterable[EventArray]) -> Iterator[EventArray]:
-    """Join packets, a few thousand events each, to chunks that are worth a loop."""
-    held: list[EventArray] = []
-    count = 0
-    for packet in packets:
-        if count + len(packet) > CHUNK_EVENTS and held:
-            yield _join(held)
-            held, count = [], 0
-        for start in range(0, max(len(packet) - CHUNK_EVENTS, 0), CHUNK_EVENTS):
-            yield packet[start : start + CHUNK_EVENTS]
-            packet = packet[start + CHUNK_EVENTS :]
-        held.append(packet)
-        count += len(packet)
-    if count:
-        yield _join(held)
-
-
-def _join(packets: list[EventArray]) -> EventArray:
-    # As plain numbers: NumPy joins structured arrays field by field, five times slower.
-    return np.concatenate([packet.view(np.uint64) for packet in packets]).view(EVENT_DTYPE)
-
-
-def _in_order(frames: Iterable[Frame]) -> Iterator[Frame]:
-    """Frames by exposure start, if none is more than a few places late."""
-    held: list[tuple[int, int, Frame]] = []
-    for index, frame in enumerate(frames):
-        heapq.heappush(held, (frame.exposure_start, index, frame))
-        if len(held) > _REORDERED_FRAMES:
-            yield heapq.heappop(held)[-1]
-    while held:
-        yield heapq.heappop(held)[-1]
 
 
 def _stamp_only(frame: Frame) -> Frame:

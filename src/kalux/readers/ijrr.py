@@ -15,7 +15,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
-import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -23,7 +22,8 @@ from numpy.typing import NDArray
 from kalux.errors import FormatError
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.frames import Frame
-from kalux.readers.source import Source, reading
+from kalux.readers.images import grey_image
+from kalux.readers.source import SIZE_UNKNOWN, Source, reading
 
 _EVENTS: Final = "events.txt"
 _IMAGES: Final = "images.txt"
@@ -88,7 +88,7 @@ def read(path: Path) -> Source:
         sensor_size = declared_size
     else:
         sensor_size = _extent(path)
-        missing += ("The sensor size is not recorded; the smallest that holds all events is taken.",)
+        missing += (SIZE_UNKNOWN,)
 
     @cache
     def count_events() -> int:
@@ -109,6 +109,7 @@ def read(path: Path) -> Source:
         count_frames=lambda: len(images),
         exposure_known=not images,
         missing=missing,
+        sensor_size_known=bool(images) or declared_size is not None,
     )
 
 
@@ -379,47 +380,6 @@ def _microseconds(seconds: str) -> int:
 
 
 def _load(path: Path, root: _Place, name: str) -> NDArray[Any]:
-    """A grey image of 8 or 16 bits."""
     with reading(path, *_DAMAGE):
         data = (root / name).read_bytes()
-    image = None
-    if _is_whole(data):
-        try:
-            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-        except cv2.error:
-            image = None
-    if image is None:
-        raise FormatError(f"{path}: {name!r} is not an image, or damaged; copy or download it again")
-    if image.ndim == 3:
-        if not (image[..., :3] == image[..., :1]).all():
-            raise FormatError(
-                f"{path}: {name!r} is in colour, which kalux does not read yet; convert the images to grey"
-            )
-        image = np.ascontiguousarray(image[..., 0])
-    return image
-
-
-_PNG_SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
-_JPEG_START, _JPEG_END = b"\xff\xd8\xff", b"\xff\xd9"
-
-
-def _is_whole(data: bytes) -> bool:
-    """Whether an image file has its end and its checksums are right.
-
-    Checked before decoding, because decoders fill a truncated image with grey, or print to the terminal.
-    """
-    if data.startswith(_JPEG_START):
-        return _JPEG_END in data[-64:]
-    if not data.startswith(_PNG_SIGNATURE):
-        return len(data) > 0
-    position = len(_PNG_SIGNATURE)
-    while position + 12 <= len(data):
-        length = int.from_bytes(data[position : position + 4], "big")
-        kind_and_content = data[position + 4 : position + 8 + length]
-        checksum = data[position + 8 + length : position + 12 + length]
-        if zlib.crc32(kind_and_content) != int.from_bytes(checksum, "big") or len(checksum) < 4:
-            return False
-        if kind_and_content.startswith(b"IEND"):
-            return True
-        position += 12 + length
-    return False
+    return grey_image(path, name, data)

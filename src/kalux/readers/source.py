@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +18,12 @@ from kalux.frames import Frame
 
 CHUNK_EVENTS: Final = 1 << 20
 """Events in a chunk, at most, where a format leaves the choice to the reader: 16 MiB."""
+
+TRIGGER_DTYPE: Final = np.dtype([("t", "<i8"), ("id", "u1"), ("rising", "?")], align=True)
+"""Dtype of an edge on a camera's trigger input: ``t`` int64 microseconds, ``id`` of the input, ``rising``."""
+
+TriggerArray = NDArray[np.void]
+"""A 1-D array of `TRIGGER_DTYPE`, sorted by ``t``."""
 
 
 @dataclass(frozen=True)
@@ -63,8 +69,12 @@ class Source:
         (256,) the released datasets' ``f_Q``: 1 / R_bar for each 8-bit value, 1/s; None if absent.
     ground_truth
         Called for the reference images; None if there are none.
+    triggers
+        Called for a fresh iterator over bounded chunks of `TRIGGER_DTYPE`; None where the format has none.
     missing
         What the recording lacks, one sentence each, for the user.
+    sensor_size_known
+        Whether the recording states its sensor size; otherwise it is the smallest that holds all events.
     """
 
     path: Path
@@ -78,7 +88,30 @@ class Source:
     contrast_threshold: tuple[float, float] | None = None
     inverse_covariance: NDArray[np.float64] | None = None
     ground_truth: Callable[[], GroundTruth] | None = None
+    triggers: Callable[[], Iterator[TriggerArray]] | None = None
     missing: tuple[str, ...] = field(default=())
+    sensor_size_known: bool = True
+
+
+SIZE_UNKNOWN: Final = "The sensor size is not recorded; the smallest that holds all events is taken."
+"""For `Source.missing`, where the size comes from `smallest_size`."""
+
+
+def smallest_size(path: Path, chunks: Iterable[EventArray]) -> tuple[int, int]:
+    """(height, width) of the smallest sensor that holds all events.
+
+    Raises
+    ------
+    FormatError
+        If there are no events.
+    """
+    height = width = 0
+    for chunk in chunks:
+        height = max(height, int(chunk["y"].max(initial=0)) + 1)
+        width = max(width, int(chunk["x"].max(initial=0)) + 1)
+    if not height:
+        raise FormatError(f"{path}: has no events, and does not say how large the sensor is")
+    return height, width
 
 
 def one_line(error: BaseException) -> str:

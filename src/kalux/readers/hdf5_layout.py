@@ -1,0 +1,181 @@
+"""What the readers of other people's HDF5 layouts share: opening, checking, reading whole chunks of the file."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Final
+
+import h5py
+import hdf5plugin  # noqa: F401 - registers Blosc, LZ4, ZSTD and others with HDF5
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux.errors import EventError, FormatError
+from kalux.events import EventArray, make_events
+from kalux.readers.source import CHUNK_EVENTS, reading
+
+DAMAGE: Final = (KeyError, ValueError, TypeError, RuntimeError, AttributeError, IndexError, MemoryError)
+"""What h5py raises for damaged files, besides OSError."""
+
+LARGEST_IMAGE: Final = 1 << 28
+"""Pixels; more is damage, and would need much memory."""
+
+LARGEST_CHUNK: Final = 1 << 29
+"""Bytes of a chunk of the file, which HDF5 unpacks as a whole; more is damage."""
+
+_SIGNATURE: Final = b"\x89HDF\r\n\x1a\n"
+_ECF: Final = 0x8ECF
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[Any]:
+    """The file, open for reading; damage becomes a FormatError."""
+    with reading(path, *DAMAGE), h5py.File(path, "r") as file:
+        yield file
+
+
+def holds(path: Path, names: tuple[str, ...]) -> bool:
+    """Whether it is an HDF5 file with datasets of all these names."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        if file.read(len(_SIGNATURE)) != _SIGNATURE:
+            return False
+    try:
+        with h5py.File(path, "r") as file:
+            return all(isinstance(file.get(name), h5py.Dataset) for name in names)
+    except (OSError, *DAMAGE):
+        return False
+
+
+def common_length(path: Path, file: Any, names: tuple[str, ...]) -> int:
+    """The length of columns, which must be equal, of one dimension, and really there.
+
+    Raises
+    ------
+    FormatError
+        If they are not, or compressed with a filter that is not installed.
+    """
+    lengths = {name: file[name].shape[0] for name in names}
+    if len(set(lengths.values())) != 1:
+        found = ", ".join(f"{name} {length}" for name, length in lengths.items())
+        raise FormatError(f"{path}: columns have different lengths ({found}); copy or download it again")
+    for name in names:
+        check_dataset(path, file[name])
+    return int(next(iter(lengths.values())))
+
+
+def check_dataset(path: Path, dataset: Any) -> None:
+    """Check that a dataset is stored in full, in chunks of a reasonable size, and can be unpacked.
+
+    HDF5 reads what is not stored as zeros: without this check, a damaged length would be a flood of them.
+
+    Raises
+    ------
+    FormatError
+        If it is not.
+    """
+    plist = dataset.id.get_create_plist()
+    for index in range(plist.get_nfilters()):
+        code, _, _, name = plist.get_filter(index)
+        if not h5py.h5z.filter_avail(code):
+            raise FormatError(f"{path}: {_missing_filter(code, name)}")
+    if dataset.chunks is not None and math.prod(dataset.chunks) * dataset.dtype.itemsize > LARGEST_CHUNK:
+        raise FormatError(
+            f"{path}: {dataset.name} is stored in chunks of {dataset.chunks}; repack it in smaller ones"
+        )
+    if dataset.size == 0:
+        return
+    if dataset.chunks is None:
+        whole = dataset.id.get_storage_size() >= dataset.size * dataset.dtype.itemsize
+    else:
+        wanted = math.prod(-(-n // c) for n, c in zip(dataset.shape, dataset.chunks, strict=True))
+        whole = dataset.id.get_num_chunks() >= wanted
+    if not whole:
+        raise FormatError(f"{path}: {dataset.name} is not stored in full; copy or download it again")
+
+
+def _missing_filter(code: int, name: bytes) -> str:
+    if code == _ECF:
+        return (
+            "is compressed with Prophesee's ECF, and no HDF5 filter for it is installed; install hdf5_ecf "
+            "(github.com/prophesee-ai/hdf5_ecf) and set HDF5_PLUGIN_PATH to it, or use the RAW file"
+        )
+    shown = name.decode("ascii", "replace").strip("\0") or "unnamed"
+    return f"is compressed with an HDF5 filter that is not installed ({shown}, number {code}); install it"
+
+
+def slices(dataset: Any, length: int) -> Iterator[slice]:
+    """Slices of whole chunks of the file: reading across their borders decompresses each twice."""
+    stored = min((dataset.chunks or (CHUNK_EVENTS,))[0], 8 * CHUNK_EVENTS)
+    step = max(CHUNK_EVENTS // stored, 1) * stored
+    for start in range(0, length, step):
+        yield slice(start, min(start + step, length))
+
+
+def column_events(
+    path: Path,
+    names: tuple[str, str, str, str],
+    convert: Callable[[NDArray[Any], NDArray[Any]], tuple[NDArray[Any], NDArray[Any]]],
+) -> Iterator[EventArray]:
+    """Events from four columns, ``names`` of t, x, y, p.
+
+    Parameters
+    ----------
+    convert
+        Makes integer microseconds and 0/1 (or -1/+1) of t and p.
+    """
+    with opened(path) as file:
+        length = common_length(path, file, names)
+        columns = [file[name] for name in names]
+        for part in slices(columns[0], length):
+            t, x, y, p = (column[part] for column in columns)
+            t, p = convert(t, p)
+            yield checked_events(path, t, x, y, p)
+
+
+def checked_events(path: Path, t: Any, x: Any, y: Any, p: Any) -> EventArray:
+    """As `make_events`; what is wrong is a FormatError that names the file."""
+    try:
+        return make_events(t, x, y, p)
+    except EventError as error:
+        raise FormatError(f"{path}: {str(error).removeprefix('events: ')}") from error
+
+
+def microseconds(path: Path, seconds: NDArray[Any]) -> NDArray[np.int64]:
+    """Floating-point seconds to the nearest microsecond.
+
+    Raises
+    ------
+    FormatError
+        If one is not finite, or too large.
+    """
+    scaled = np.rint(np.asarray(seconds, np.float64) * 1e6)
+    # Also refuses NaN, of which no comparison is true.
+    if scaled.size and not (np.abs(scaled).max() < 2.0**62):
+        raise FormatError(f"{path}: has times that are not finite or out of range; copy or download it again")
+    return scaled.astype(np.int64)
+
+
+def size_of(path: Path, shape: tuple[int, ...]) -> tuple[int, int]:
+    """(height, width) of a grey image's shape.
+
+    Raises
+    ------
+    FormatError
+        If it is in colour, or no image.
+    """
+    if len(shape) == 3 and shape[2] in (3, 4):
+        raise FormatError(f"{path}: its images are in colour, which kalux does not read yet; {JOIN_GREY}")
+    if len(shape) == 3 and shape[2] == 1:
+        shape = shape[:2]
+    if len(shape) != 2 or not 0 < shape[0] * shape[1] <= LARGEST_IMAGE:
+        raise FormatError(f"{path}: its images have the shape {shape}; (height, width) is needed")
+    return int(shape[0]), int(shape[1])
+
+
+JOIN_GREY: Final = "join grey images of the events' pixels instead (--frames FOLDER --replace-frames)"
+"""What to do about images in colour."""

@@ -1,0 +1,290 @@
+"""Frames from elsewhere, joined to the events of a recording: an image folder with times, or a video.
+
+Times are in the clock of the events. A folder has a CSV with a line per image, or the ``images.txt`` of the IJRR
+layout; a video has a start and a rate, which the user gives, because the times that a video states are rarely those of
+a camera.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import re
+from collections.abc import Iterator
+from decimal import ROUND_HALF_UP, Decimal
+from functools import cache
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux.errors import FormatError, FrameError, InputError
+from kalux.frames import Frame
+from kalux.readers.columns import ALIASES, find_name, find_time
+from kalux.readers.images import SUFFIXES, grey_image
+from kalux.readers.source import SIZE_UNKNOWN, Source, reading
+
+_LISTS: Final = ("frames.csv", "timestamps.csv", "images.txt")
+_EXPOSURE: Final = ("exposure", "exposure_time")
+_FILE: Final = ("file", "filename", "file_name", "image", "name", "path")
+_LARGEST_LIST: Final = 1 << 27  # bytes; it is read as a whole
+_NUMBER: Final = re.compile(r"\d{1,18}(\.\d{0,12})?")
+_PER_UNIT: Final = {"s": Decimal(10**6), "ms": Decimal(1000), "us": Decimal(1), "ns": Decimal("0.001")}
+_WANTED: Final = (
+    "a CSV named frames.csv with a line per image and the columns timestamp_us, perhaps exposure_us and file, or the "
+    "images.txt of the IJRR layout"
+)
+_ABOUT_FRAMES: Final = re.compile(r"\b(frames?|images?)\b")
+
+
+class _Listed(NamedTuple):
+    """An image file and its exposure, us; start and end are both the stamp where that is all that is known."""
+
+    file: Path
+    start: int
+    end: int
+
+
+def join(source: Source, frames: Path, *, start: int | None, rate_hz: float | None, replace: bool) -> Source:
+    """A recording with frames from elsewhere.
+
+    Parameters
+    ----------
+    source
+        The recording; its events stay as they are.
+    frames
+        A folder of grey images with `frames.csv`, `timestamps.csv` or `images.txt` (or that file itself); or a video,
+        of which the luma is taken.
+    start, rate_hz
+        For a video: the time of the first frame, us, in the clock of the events, and frames per second.
+    replace
+        Whether frames that the recording has itself are replaced; otherwise they are an error.
+
+    Raises
+    ------
+    InputError
+        If the recording has frames of its own, or start and rate are missing or have no use.
+    FormatError
+        If the frames cannot be read.
+    FrameError
+        If they have not the size of the sensor.
+    """
+    if not frames.exists():
+        raise InputError(f"{frames}: no such file or folder")
+    if not replace and source.count_frames():
+        raise InputError(
+            f"{source.path}: has {source.count_frames()} frames of its own; leave --frames out, or replace them with "
+            "--replace-frames (replace_frames=True)"
+        )
+    joined = _images(frames, start, rate_hz) if _is_list(frames) else _video(frames, start, rate_hz)
+    size = _joint_size(source, frames, joined)
+    kept = (text for text in source.missing if not _ABOUT_FRAMES.search(text))
+    adopted = not source.sensor_size_known
+    return dataclasses.replace(
+        joined,
+        path=source.path,
+        format=f"{source.format} + {joined.format}",
+        sensor_size=size,
+        events=source.events,
+        count_events=source.count_events,
+        contrast_threshold=source.contrast_threshold,
+        ground_truth=source.ground_truth,
+        missing=(*(text for text in kept if not (adopted and text == SIZE_UNKNOWN)), *joined.missing),
+    )
+
+
+def _joint_size(source: Source, frames: Path, joined: Source) -> tuple[int, int]:
+    """The size of the frames, which must be that of the sensor; or hold all events, if that is not known."""
+    height, width = source.sensor_size
+    size = joined.sensor_size
+    if size == (height, width) or (not source.sensor_size_known and size[0] >= height and size[1] >= width):
+        return size
+    needed = "is" if source.sensor_size_known else "is at least"
+    raise FrameError(
+        f"{frames}: its frames have {size[1]}x{size[0]} pixels, but the sensor of {source.path} {needed} "
+        f"{width}x{height}; resize, crop or warp them to the events' pixels first"
+    )
+
+
+def _frames_only(place: Path, format: str, **found: Any) -> Source:
+    """A source without events, which `join` takes from the recording."""
+    return Source(path=place, format=format, events=lambda: iter(()), count_events=lambda: 0, **found)
+
+
+# Images
+
+
+def _is_list(frames: Path) -> bool:
+    return frames.is_dir() or frames.suffix.lower() in (".csv", ".txt")
+
+
+def _images(frames: Path, start: int | None, rate_hz: float | None) -> Source:
+    if start is not None or rate_hz is not None:
+        raise InputError(
+            f"{frames}: --frames-start and --frames-rate are for a video; images have their own times"
+        )
+    path = _list_file(frames) if frames.is_dir() else frames
+    with reading(path, UnicodeError, csv.Error):
+        if path.stat().st_size > _LARGEST_LIST:
+            raise FormatError(f"{path}: is too large for a list of images; {_WANTED} is needed")
+        text = path.read_text("utf-8-sig")
+        read = _read_ijrr if path.suffix.lower() == ".txt" else _read_csv
+        listed, exposure_known = read(path, text)
+    if not listed:
+        raise FormatError(f"{path}: lists no images; {_WANTED} is needed")
+    absent = [image.file for image in listed if not image.file.is_file()]
+    if absent:
+        raise FormatError(
+            f"{path}: {len(absent)} of {len(listed)} images are missing, the first is {absent[0]}"
+        )
+    first = _load(frames, listed[0].file)
+    return _frames_only(
+        frames,
+        "images",
+        sensor_size=first.shape,
+        frames=lambda: (Frame(_load(frames, image.file), image.start, image.end) for image in listed),
+        count_frames=lambda: len(listed),
+        exposure_known=exposure_known,
+        missing=() if exposure_known else ("The exposure times of the frames are not recorded.",),
+    )
+
+
+def _list_file(folder: Path) -> Path:
+    with reading(folder):
+        named = next((folder / name for name in _LISTS if (folder / name).is_file()), None)
+        others = sorted(folder.glob("*.csv"))
+    if named is not None:
+        return named
+    if len(others) != 1:
+        found = f"{len(others)} CSV files" if others else "no list of times"
+        raise FormatError(f"{folder}: has {found}; {_WANTED} is needed")
+    return others[0]
+
+
+def _read_csv(path: Path, text: str) -> tuple[list[_Listed], bool]:
+    lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
+    if not lines or "\0" in text:
+        raise FormatError(f"{path}: is empty, or no text; {_WANTED} is needed")
+    separator = next((c for c in ",;\t" if c in lines[0][1]), ",")
+    header = [name.strip() for name in next(csv.reader([lines[0][1].lstrip("# ")], delimiter=separator))]
+    time, exposure = find_time(header, ALIASES["t"]), find_time(header, _EXPOSURE)
+    name = find_name(header, _FILE)
+    if time is None:
+        raise FormatError(f"{path}: has the columns {', '.join(header)[:80]}; {_WANTED} is needed")
+    rows = []
+    for number, line in lines[1:]:
+        if line.lstrip().startswith("#"):
+            continue
+        fields = next(csv.reader([line], delimiter=separator, skipinitialspace=True))
+        if len(fields) != len(header):
+            raise FormatError(
+                f"{path}: line {number}: {line[:60]!r} has {len(fields)} columns, not {len(header)}"
+            )
+        rows.append((number, dict(zip(header, fields, strict=True))))
+    files = (
+        _sorted_images(path.parent) if name is None else [path.parent / row[name].strip() for _, row in rows]
+    )
+    if len(files) != len(rows):
+        raise FormatError(
+            f"{path}: lists {len(rows)} times, but there are {len(files)} images beside it; add a column file"
+        )
+    listed = []
+    for (number, row), file in zip(rows, files, strict=True):
+        stamp = _microseconds(path, number, row[time[0]], time[1])
+        length = 0 if exposure is None else _microseconds(path, number, row[exposure[0]], exposure[1])
+        listed.append(_Listed(file, stamp, stamp + length))
+    return listed, exposure is not None
+
+
+def _read_ijrr(path: Path, text: str) -> tuple[list[_Listed], bool]:
+    listed = []
+    for number, line in enumerate(text.splitlines(), 1):
+        fields = line.split(maxsplit=1)
+        if not fields or fields[0].startswith("#"):
+            continue
+        if len(fields) != 2:
+            raise FormatError(f"{path}: line {number}: {line[:60]!r} is not 't file' with t in seconds")
+        stamp = _microseconds(path, number, fields[0], "s")
+        listed.append(_Listed(path.parent / fields[1].strip(), stamp, stamp))
+    return listed, False
+
+
+def _sorted_images(folder: Path) -> list[Path]:
+    with reading(folder):
+        return sorted(file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES)
+
+
+def _microseconds(path: Path, number: int, text: str, unit: str | None) -> int:
+    """A time, rounded to the nearest microsecond from its digits."""
+    text = text.strip()
+    if not _NUMBER.fullmatch(text):
+        raise FormatError(f"{path}: line {number}: {text[:40]!r} is not a plain number that can be a time")
+    if unit is None and "." in text:
+        raise FormatError(
+            f"{path}: line {number}: {text[:40]!r} has decimals, but no unit; name it in the column, as timestamp_s"
+        )
+    return int((Decimal(text) * _PER_UNIT[unit or "us"]).to_integral_value(ROUND_HALF_UP))
+
+
+def _load(frames: Path, file: Path) -> NDArray[Any]:
+    with reading(file):
+        data = file.read_bytes()
+    return grey_image(frames, file.name, data)
+
+
+# Video
+
+
+def _video(path: Path, start: int | None, rate_hz: float | None) -> Source:
+    if start is None or rate_hz is None:
+        raise InputError(
+            f"{path}: a video needs the time of its first frame and its rate in the clock of the events; give "
+            "--frames-start US and --frames-rate HZ (frames_start, frames_rate)"
+        )
+    if not 0 < rate_hz < 1e6:  # also refuses NaN
+        raise InputError(f"{path}: the rate of the frames is {rate_hz} Hz; it must be between 0 and 1 MHz")
+    first = next(_pictures(path), None)
+    if first is None:
+        raise FormatError(f"{path}: has no picture that can be decoded; copy or download it again")
+
+    @cache
+    def count_frames() -> int:
+        return sum(1 for _ in _pictures(path))
+
+    def read_frames() -> Iterator[Frame]:
+        for index, image in enumerate(_pictures(path)):
+            stamp = start + round(index * 1e6 / rate_hz)
+            yield Frame(image, stamp, stamp)
+
+    return _frames_only(
+        path,
+        "video",
+        sensor_size=first.shape,
+        frames=read_frames,
+        count_frames=count_frames,
+        exposure_known=False,
+        missing=(
+            "The exposure times of the frames are not recorded.",
+            "The frames are the luma of a video, with whatever its encoder did to them.",
+        ),
+    )
+
+
+def _pictures(path: Path) -> Iterator[NDArray[Any]]:
+    """The luma of each picture, uint8, or uint16 where it has more than 8 bits."""
+    import av
+
+    with reading(path, av.FFmpegError, ValueError, IndexError), av.open(str(path)) as container:
+        if not container.streams.video:
+            raise FormatError(f"{path}: neither an image folder nor a video; {_WANTED}, or a video is needed")
+        stream = container.streams.video[0]
+        count = 0
+        for picture in container.decode(stream):
+            deep = picture.format.components[0].bits > 8
+            yield np.ascontiguousarray(picture.to_ndarray(format="gray16le" if deep else "gray"))
+            count += 1
+        if count < stream.frames:
+            raise FormatError(
+                f"{path}: holds {count} of {stream.frames} pictures; copy it again, or encode it anew"
+            )

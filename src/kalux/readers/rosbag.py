@@ -1,0 +1,351 @@
+"""Recordings of ROS 1 and ROS 2: events, images and exposure times from the topics of a bag.
+
+Times are those of the messages' header stamps, not of their recording. Topics are chosen by what they hold; where
+that is not clear, the path says which: ``recording.bag?events=/dvs/events&frames=/dvs/image_raw``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, Final
+from urllib.parse import parse_qsl
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux.errors import FormatError, InputError
+from kalux.events import EventArray
+from kalux.frames import Frame
+from kalux.readers import event_packet
+from kalux.readers.event_packet import EVENT_ARRAYS, EVENT_PACKETS, EventTopic, Message
+from kalux.readers.images import grey_image
+from kalux.readers.ros_bags import BAG_MAGIC, DAMAGE, Bag, Topic, container, open_bag, parts
+from kalux.readers.source import Source, TriggerArray, reading
+from kalux.readers.streams import in_order
+
+_IMAGE: Final = "sensor_msgs/Image"
+_COMPRESSED: Final = "sensor_msgs/CompressedImage"
+_EXPOSURE: Final = "std_msgs/Int32"
+_GREY: Final = {"mono8": "u1", "8UC1": "u1", "mono16": "u2", "16UC1": "u2"}
+_CHOICES: Final = ("events", "frames", "exposure")
+_NO_EXPOSURE: Final = "The exposure times of the frames are not recorded."
+
+
+def recognises(path: Path) -> bool:
+    """Whether this is a ROS 1 bag, a ROS 2 SQLite or MCAP file, or a folder with such."""
+    if path.is_dir():
+        return bool(parts(path))
+    return path.is_file() and container(path) is not None
+
+
+def read(path: Path, choice: str = "") -> Source:
+    """Open a recording of ROS 1 or ROS 2.
+
+    Parameters
+    ----------
+    path
+        A bag, an SQLite (db3) or MCAP file, or the folder of a ROS 2 recording.
+    choice
+        The topics to read where that is not clear: ``events=/a&frames=/b&exposure=/c``. An empty name means none.
+
+    Raises
+    ------
+    MissingDependencyError
+        If the library for the container is not installed.
+    FormatError
+        If the file is damaged, or holds neither events nor images.
+    InputError
+        If it cannot be read, or it is not clear which topics are meant.
+    """
+    chosen = _parse_choice(path, choice)
+    with reading(path):
+        if path.is_file():
+            _check_version(path)
+        bag = open_bag(path)
+    for name in chosen.values():
+        if name and not any(topic.name == name for topic in bag.topics):
+            names = ", ".join(topic.name for topic in bag.topics)
+            raise InputError(f"{path}: has no topic {name!r}; its topics are {names}")
+    events, images = _choose(path, bag, chosen)
+    exposures = None if images is None else _exposures(path, bag, images.topic, chosen.get("exposure"))
+    return _source(path, bag, events, images, exposures)
+
+
+def _check_version(path: Path) -> None:
+    with path.open("rb") as file:
+        start = file.read(len(BAG_MAGIC) + 3)
+    if start.startswith(BAG_MAGIC) and start != BAG_MAGIC + b"2.0":
+        raise FormatError(f"{path}: a ROS bag of an old version; convert it with 'rosbag fix'")
+
+
+def _parse_choice(path: Path, choice: str) -> dict[str, str]:
+    pairs = parse_qsl(choice, keep_blank_values=True)
+    chosen = dict(pairs)
+    if unknown := [name for name in chosen if name not in _CHOICES]:
+        raise InputError(
+            f"{path}: {unknown[0]!r} cannot be chosen; after '?' go {', '.join(_CHOICES)}, as name=topic"
+        )
+    return chosen
+
+
+# Which topics
+
+
+@dataclass(frozen=True)
+class _Events:
+    topic: Topic
+    content: EventTopic
+
+    @property
+    def size(self) -> tuple[int, int]:
+        return self.content.size
+
+
+@dataclass(frozen=True)
+class _Images:
+    """``fault``: why the images cannot be read, if so."""
+
+    topic: Topic
+    size: tuple[int, int]
+    fault: FormatError | None
+
+
+def _choose(path: Path, bag: Bag, chosen: dict[str, str]) -> tuple[_Events | None, _Images | None]:
+    """The topics asked for; else the only pair of equal size, or the only one.
+
+    Raises
+    ------
+    InputError
+        That lists the topics and says how to choose, where it is not clear.
+    """
+    event_topics = [
+        _Events(topic, content)
+        for topic in _candidates(bag, (*EVENT_ARRAYS, *EVENT_PACKETS), chosen.get("events"))
+        if (content := _open_events(path, bag, topic)) is not None
+    ]
+    image_topics = [
+        images
+        for topic in _candidates(bag, (_IMAGE, _COMPRESSED), chosen.get("frames"))
+        if (images := _open_images(path, bag, topic)) is not None
+    ]
+    for name, found in (("events", event_topics), ("frames", image_topics)):
+        if chosen.get(name) and not found:
+            raise InputError(f"{path}: topic {chosen[name]!r} has no {name} that kalux reads")
+    if not event_topics and not image_topics:
+        held = ", ".join(sorted({topic.kind for topic in bag.topics})) or "no topics"
+        raise FormatError(f"{path}: holds neither events nor images, but {held[:200]}")
+    # Images that cannot be read, such as coloured drawings of the events, do not stand in the way of others.
+    readable = [images for images in image_topics if images.fault is None]
+    if image_topics and not readable:
+        assert image_topics[0].fault is not None
+        raise image_topics[0].fault
+    if not readable and len(event_topics) == 1:
+        return event_topics[0], None
+    if not event_topics and len(readable) == 1:
+        return None, readable[0]
+    pairs = [(e, i) for e in event_topics for i in readable if e.size == i.size]
+    if len(pairs) == 1:
+        return pairs[0]
+    fits = (
+        "no two topics have"
+        if event_topics and readable and not pairs
+        else "several topics have, or may have,"
+    )
+    topics: list[_Events | _Images] = [*event_topics, *readable]
+    listed = ", ".join(f"{t.topic.name} ({t.size[1]}x{t.size[0]})" for t in topics)
+    raise InputError(
+        f"{path}: {fits} the same size: {listed}; choose with '{path.name}?events=/topic&frames=/topic' "
+        "(frames= for no frames)"
+    )
+
+
+def _candidates(bag: Bag, kinds: tuple[str, ...], name: str | None) -> list[Topic]:
+    return [topic for topic in bag.topics if topic.kind in kinds and name in (None, topic.name)]
+
+
+def _messages(bag: Bag, topic: Topic) -> Iterator[Message]:
+    return (Message(record.data, topic.cdr) for record in bag.records(topic))
+
+
+def _open_events(path: Path, bag: Bag, topic: Topic) -> EventTopic | None:
+    """None where the topic has no messages."""
+    if next(bag.records(topic), None) is None:
+        return None
+    with _decoding(path, topic):
+        content = event_packet.open_topic(topic.kind, lambda: _messages(bag, topic))
+    if min(content.size) < 1 or max(content.size) > 1 << 16:
+        raise FormatError(f"{path}: topic {topic.name!r} states {content.size[1]}x{content.size[0]} pixels")
+    return content
+
+
+def _open_images(path: Path, bag: Bag, topic: Topic) -> _Images | None:
+    message = next(_messages(bag, topic), None)
+    if message is None:
+        return None
+    with _decoding(path, topic):
+        if topic.kind == _COMPRESSED:
+            try:
+                size = _compressed_image(path, topic, message)[1].shape
+            except FormatError as fault:
+                return _Images(topic, (0, 0), fault)
+            return _Images(topic, (size[0], size[1]), None)
+        message.stamp()
+        height, width = message.numbers("II")
+        encoding = message.text()
+    return _Images(topic, (height, width), None if encoding in _GREY else _not_grey(path, topic, encoding))
+
+
+def _decoding(path: Path, topic: Topic) -> Any:
+    return reading(Path(f"{path}: topic {topic.name!r}"), *DAMAGE)
+
+
+def _not_grey(path: Path, topic: Topic, encoding: str) -> FormatError:
+    return FormatError(
+        f"{path}: topic {topic.name!r}: its images are {encoding[:40]!r}; colour is not supported yet, only "
+        f"{', '.join(_GREY)} ('{path.name}?frames=' reads the events alone)"
+    )
+
+
+# Images
+
+
+def _image(path: Path, topic: Topic, message: Message) -> tuple[int, NDArray[Any]]:
+    """(stamp in us, image)."""
+    if topic.kind == _COMPRESSED:
+        return _compressed_image(path, topic, message)
+    stamp = message.stamp() // 1000
+    height, width = message.numbers("II")
+    encoding = message.text()
+    if encoding not in _GREY:
+        raise _not_grey(path, topic, encoding)
+    dtype = np.dtype(_GREY[encoding]).newbyteorder(">" if message.number("B") else "<")
+    step = message.number("I")
+    start, length = message.sequence()
+    if step < width * dtype.itemsize or length < height * step or step == 0:
+        raise ValueError(f"{length} bytes in rows of {step} for {width}x{height} pixels of {encoding}")
+    rows = np.frombuffer(message.data, np.uint8, height * step, start).reshape(height, step)
+    pixels = np.ascontiguousarray(rows[:, : width * dtype.itemsize]).view(dtype)
+    return stamp, pixels.astype(dtype.newbyteorder("="))
+
+
+def _compressed_image(path: Path, topic: Topic, message: Message) -> tuple[int, NDArray[Any]]:
+    stamp = message.stamp() // 1000
+    message.text()  # what the data say better
+    start, length = message.sequence()
+    hint = f"colour is not supported yet ('{path.name}?frames=' reads the events alone)"
+    return stamp, grey_image(path, topic.name, message.data[start : start + length], hint=hint)
+
+
+# Exposure times
+
+
+@dataclass(frozen=True)
+class _Exposures:
+    """``recorded``: when each message was recorded, ns, in order; ``exposure`` in us."""
+
+    topic: Topic
+    recorded: NDArray[np.int64]
+    exposure: NDArray[np.int64]
+
+    def of(self, recorded: int) -> int:
+        """The exposure whose message was recorded nearest to that of an image."""
+        after = int(np.searchsorted(self.recorded, recorded))
+        nearest = [i for i in (after - 1, after) if 0 <= i < len(self.recorded)]
+        return int(self.exposure[min(nearest, key=lambda i: abs(int(self.recorded[i]) - recorded))])
+
+
+def _exposures(path: Path, bag: Bag, images: Topic, name: str | None) -> _Exposures | None:
+    """The topic ``exposure`` beside that of the images, or as asked for."""
+    found = _candidates(bag, (_EXPOSURE,), name)
+    if name is None:
+        found = [topic for topic in found if topic.name == f"{_namespace(images)}/exposure"]
+    if not found:
+        if name:
+            raise InputError(f"{path}: topic {name!r} has no exposure times; they are {_EXPOSURE}, in us")
+        return None
+    with _decoding(path, found[0]):
+        records = [
+            (record.time, Message(record.data, found[0].cdr).number("i")) for record in bag.records(found[0])
+        ]
+    if not records:
+        return None
+    table = np.array(sorted(records), np.int64)
+    return _Exposures(found[0], table[:, 0], table[:, 1])
+
+
+def _namespace(images: Topic) -> str:
+    """``/dvs`` of ``/dvs/image_raw`` and of ``/dvs/image_raw/compressed``."""
+    name = images.name.removesuffix("/compressed") if images.kind == _COMPRESSED else images.name
+    return name.rpartition("/")[0]
+
+
+# The recording
+
+
+def _source(
+    path: Path, bag: Bag, events: _Events | None, images: _Images | None, exposures: _Exposures | None
+) -> Source:
+    def read_events() -> Iterator[EventArray]:
+        if events is not None:
+            with _decoding(path, events.topic):
+                yield from events.content.events()
+
+    def read_triggers() -> Iterator[TriggerArray]:
+        if events is not None and events.content.triggers is not None:
+            with _decoding(path, events.topic):
+                yield from events.content.triggers()
+
+    def read_frames() -> Iterator[Frame]:
+        return iter(()) if images is None else in_order(_frames(path, bag, images.topic, exposures))
+
+    @cache
+    def count_events() -> int:
+        if events is None:
+            return 0
+        with _decoding(path, events.topic):
+            return events.content.count()
+
+    missing = _unread(bag, events, images)
+    if events is None:
+        missing += ("The recording has no events.",)
+    if images is None:
+        missing += ("The recording has no frames.",)
+    elif exposures is None:
+        missing += (_NO_EXPOSURE,)
+    found = events or images
+    assert found is not None
+    return Source(
+        path=path,
+        format="ros",
+        sensor_size=found.size,
+        events=read_events,
+        frames=read_frames,
+        count_events=count_events,
+        count_frames=lambda: 0 if images is None else bag.count(images.topic),
+        exposure_known=images is None or exposures is not None,
+        triggers=None if events is None or events.content.triggers is None else read_triggers,
+        missing=missing,
+    )
+
+
+def _frames(path: Path, bag: Bag, topic: Topic, exposures: _Exposures | None) -> Iterator[Frame]:
+    with _decoding(path, topic):
+        for record in bag.records(topic):
+            stamp, image = _image(path, topic, Message(record.data, topic.cdr))
+            if exposures is None:
+                yield Frame(image, stamp, stamp)
+                continue
+            exposure = exposures.of(record.time)
+            start = stamp - exposure // 2  # the driver stamps the middle
+            yield Frame(image, start, start + exposure)
+
+
+def _unread(bag: Bag, events: _Events | None, images: _Images | None) -> tuple[str, ...]:
+    """A sentence about other topics that hold events or images, if there are any."""
+    kinds = (*EVENT_ARRAYS, *EVENT_PACKETS, _IMAGE, _COMPRESSED)
+    read = [found.topic for found in (events, images) if found is not None]
+    others = [topic.name for topic in bag.topics if topic.kind in kinds and topic not in read]
+    return (f"Other topics are not read: {', '.join(others)}.",) if others else ()

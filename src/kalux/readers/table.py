@@ -1,0 +1,456 @@
+"""Events in a text table whose first line names its columns: CSV, TSV, or separated by blanks.
+
+The columns may have any order and any of the names in `kalux.readers.columns`; others are skipped. Lines that begin
+with # are comments; the one with the names may begin with it, too (as ``numpy.savetxt`` writes it).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from kalux.errors import FormatError
+from kalux.events import EVENT_DTYPE, EventArray
+from kalux.readers.columns import RENAME, UNIT_ASSUMED, Columns, find_columns
+from kalux.readers.source import SIZE_UNKNOWN, Source, reading, smallest_size
+
+# The shortest line, "0,0,0,0\n", has 8 bytes: a block holds at most CHUNK_EVENTS events.
+_BLOCK_BYTES: Final = 8 << 20
+_LONGEST_LINE: Final = 4096
+_MOST_COLUMNS: Final = 64
+_NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+_DECIMALS: Final = {"s": 6, "ms": 3, "us": 0, "ns": -3, None: 0}
+"""How many decimals of each unit a microsecond needs."""
+
+
+class _Header(NamedTuple):
+    """The first line: where the data begin (bytes, lines), what separates columns, which column is what."""
+
+    begin: int
+    lines: int
+    separator: str
+    roles: tuple[int, ...]
+    unit: str | None
+
+
+def recognises(path: Path) -> bool:
+    """Whether the first line names columns for t, x, y and p; or is a line of numbers, to say what is needed."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        lines = _first_lines(file.read(_LONGEST_LINE))
+    if not lines:
+        return False
+    return _columns_of(lines) is not None or _has_numbers(lines[-1])
+
+
+def read(path: Path) -> Source:
+    """Open events in a text table.
+
+    Integer times are microseconds unless the name of the column ends in a unit (``t_ns``); for times with decimals
+    it must. They are rounded to the nearest microsecond from their digits, not through floating point.
+
+    Raises
+    ------
+    FormatError
+        If the columns have no names, or a line (named by its number) cannot be read.
+    InputError
+        If the file cannot be read.
+    """
+    with reading(path), path.open("rb") as file:
+        header = _read_header(path, file.read(_LONGEST_LINE))
+
+    @cache
+    def count_events() -> int:
+        return sum(len(chunk) for chunk in _events(path, header))
+
+    return Source(
+        path=path,
+        format="table",
+        sensor_size=smallest_size(path, _events(path, header)),
+        events=lambda: _events(path, header),
+        frames=lambda: iter(()),
+        count_events=count_events,
+        count_frames=lambda: 0,
+        missing=(
+            "The file has no frames.",
+            *(() if header.unit else (UNIT_ASSUMED,)),
+            SIZE_UNKNOWN,
+        ),
+        sensor_size_known=False,
+    )
+
+
+# The line with the names
+
+
+def _first_lines(data: bytes) -> list[str]:
+    """The lines up to the first that is neither blank nor a comment, which is the last; empty if not text."""
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        text = data[: error.start].decode("utf-8-sig")
+        if len(data) - error.start >= 4:  # more than a character that is cut off
+            return []
+    whole = text.splitlines()
+    if len(data) == _LONGEST_LINE:
+        whole = whole[:-1]
+    lines: list[str] = []
+    for line in whole:
+        if "\0" in line:
+            return []
+        lines.append(line)
+        if line.strip() and not line.lstrip().startswith("#"):
+            return lines
+    return lines
+
+
+def _separator(line: str) -> str:
+    return next((c for c in ",;\t" if c in line), " ")
+
+
+def _names(line: str) -> list[str]:
+    line = line.strip().lstrip("#").strip()
+    separator = _separator(line)
+    fields = line.split() if separator == " " else line.split(separator)
+    return [field.strip().strip("\"'").strip() for field in fields]
+
+
+def _columns_of(lines: list[str]) -> tuple[int, list[str], Columns] | None:
+    """Index of the line with names, its names, and which of them are an event's fields."""
+    for index, line in enumerate(lines):
+        names = _names(line)
+        columns = find_columns(names)
+        if columns is not None:
+            return index, names, columns
+    return None
+
+
+def _has_numbers(line: str) -> bool:
+    fields = _names(line)
+    return len(fields) >= 4 and all(_NUMBER.fullmatch(field) for field in fields)
+
+
+def _read_header(path: Path, data: bytes) -> _Header:
+    lines = _first_lines(data)
+    found = _columns_of(lines)
+    if found is None:
+        raise FormatError(
+            f"{path}: its first line does not name the columns; put a line such as 't_us,x,y,p' there, in their order "
+            "(a folder in the IJRR layout is opened as a whole)"
+        )
+    index, names, columns = found
+    if len(names) > _MOST_COLUMNS:
+        raise FormatError(
+            f"{path}: has {len(names)} columns, kalux reads up to {_MOST_COLUMNS}; leave some out"
+        )
+    begin = 0
+    for _ in range(index + 1):
+        begin = data.index(b"\n", begin) + 1 if b"\n" in data[begin:] else len(data)
+    roles = tuple(columns[:4].index(name) + 1 if name in columns[:4] else 0 for name in names)
+    separator = _separator(lines[index].strip().lstrip("#").strip())
+    return _Header(begin, index + 1, separator, _once(roles), columns.unit)
+
+
+def _once(roles: tuple[int, ...]) -> tuple[int, ...]:
+    """A name that occurs twice counts where it comes first."""
+    return tuple(0 if role in roles[:i] else role for i, role in enumerate(roles))
+
+
+# The lines with numbers
+
+
+def _events(path: Path, header: _Header) -> Iterator[EventArray]:
+    buffer = bytearray(_BLOCK_BYTES)  # used again and again: fresh memory costs as much as the parsing
+    filled, line_number = 0, header.lines
+    with reading(path), path.open("rb") as file:
+        file.seek(header.begin)
+        while True:
+            got = file.readinto(memoryview(buffer)[filled:])
+            if not got and filled:
+                buffer[filled] = _NEWLINE  # the last line may lack its end
+                got = 1
+            if not got:
+                return
+            filled += got
+            end = buffer.rfind(b"\n", 0, filled) + 1
+            if filled - end > _LONGEST_LINE:
+                number = line_number + buffer.count(b"\n", 0, end) + 1
+                raise _bad_line(path, number, bytes(buffer[end:filled]), "it is too long")
+            if end:
+                events, lines = _parse_block(path, memoryview(buffer)[:end], header, line_number)
+                buffer[: filled - end] = buffer[end:filled]
+                filled -= end
+                line_number += lines
+                yield events
+
+
+def _parse_block(path: Path, text: memoryview, header: _Header, lines_before: int) -> tuple[EventArray, int]:
+    """The events of whole lines of text, and the number of lines."""
+    array = np.frombuffer(text, np.uint8)
+    events: EventArray = np.empty(np.count_nonzero(array == _NEWLINE), EVENT_DTYPE)
+    roles = np.array(header.roles, np.uint8)
+    separator = np.uint8(ord(header.separator))
+    count, lines, fault, start = _parse(
+        array,
+        separator,
+        roles,
+        header.unit is None,
+        _DECIMALS[header.unit],
+        events["t"],
+        events["x"],
+        events["y"],
+        events["p"],
+    )
+    if fault:
+        line = bytes(text[int(start) : int(start) + _LONGEST_LINE]).split(b"\n", 1)[0]
+        raise _bad_line(path, lines_before + lines + 1, line, _FAULTS[fault])
+    return events[:count], lines
+
+
+def _bad_line(path: Path, number: int, line: bytes, fault: str) -> FormatError:
+    shown = line[:60].decode("ascii", "replace").strip()
+    return FormatError(f"{path}: line {number}: {fault}: {shown!r}")
+
+
+_T, _X, _Y, _P, _FEW, _MANY, _UNITLESS = range(1, 8)
+_FAULTS: Final = {
+    _T: "the time is not a number from 0 to 10^18 us",
+    _X: "x is not a pixel coordinate",
+    _Y: "y is not a pixel coordinate",
+    _P: "the polarity is none of 0, 1, -1, true and false",
+    _FEW: "it has fewer columns than the first line",
+    _MANY: "it has more columns than the first line",
+    _UNITLESS: f"the time has decimals, but no unit; {RENAME}",
+}
+_BAD: Final = np.int64(-2)
+_MOST_DIGITS: Final = 18  # that surely fit into 64 bits
+_ZERO, _NINE, _FIVE = np.uint8(ord("0")), np.uint8(9), np.uint8(5)
+_SPACE, _TAB, _RETURN, _NEWLINE, _DOT, _HASH, _MINUS, _PLUS = (np.uint8(ord(c)) for c in " \t\r\n.#-+")
+_LOWER: Final = np.uint8(0x20)
+_E, _LETTER_T, _LETTER_F = (np.uint8(ord(c)) for c in "etf")
+# Unsigned positions keep the loops free of the test for negative indices.
+_ONE: Final = np.uint64(1)
+_TEN: Final = np.int64(10)
+
+
+@njit(cache=True, nogil=True)
+def _parse(
+    text: NDArray[np.uint8],
+    separator: np.uint8,
+    roles: NDArray[np.uint8],
+    whole_times: bool,
+    decimals: int,
+    t: NDArray[np.int64],
+    x: NDArray[np.uint16],
+    y: NDArray[np.uint16],
+    p: NDArray[np.bool_],
+) -> tuple[int, int, int, np.uint64]:
+    """Parse whole lines. Returns events, whole lines read, fault (0: none), start of the faulty line."""
+    end = np.uint64(len(text))
+    i = np.uint64(0)
+    count = lines = 0
+    blank = separator == _SPACE
+    while i < end:
+        start = i
+        i = _skip_blanks(text, i)
+        if text[i] == _NEWLINE or text[i] == _HASH:
+            while text[i] != _NEWLINE:
+                i += _ONE
+            i += _ONE
+            lines += 1
+            continue
+        column = np.uint64(0)
+        while True:
+            if column == np.uint64(len(roles)):
+                return count, lines, _MANY, start
+            role = roles[column]
+            if role == 0:
+                while text[i] != _NEWLINE and text[i] != separator and not (blank and text[i] == _TAB):
+                    i += _ONE
+            elif role == 1:
+                t[count], fraction, i = _parse_value(text, i, decimals)
+                if whole_times and fraction:
+                    return count, lines, _UNITLESS, start
+                if t[count] < 0:
+                    return count, lines, _T, start
+            else:
+                value, fraction, i = _parse_value(text, i, 0)
+                if fraction or value < (-1 if role == 4 else 0) or value > (1 if role == 4 else 65535):
+                    return count, lines, int(role), start
+                if role == 2:
+                    x[count] = value
+                elif role == 3:
+                    y[count] = value
+                else:
+                    p[count] = value == 1
+            column += _ONE
+            before = i
+            i = _skip_blanks(text, i)
+            if text[i] == _NEWLINE:
+                break
+            if text[i] == separator:  # blanks have been skipped: a comma or semicolon
+                i = _skip_blanks(text, i + _ONE)
+            elif i == before or not (blank or separator == _TAB):
+                return count, lines, int(max(role, 1)), start
+        if column < np.uint64(len(roles)):
+            return count, lines, _FEW, start
+        count += 1
+        i += _ONE
+        lines += 1
+    return count, lines, 0, end
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _skip_blanks(text: NDArray[np.uint8], i: np.uint64) -> np.uint64:
+    while text[i] == _SPACE or text[i] == _TAB or text[i] == _RETURN:
+        i += _ONE
+    return i
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _parse_value(text: NDArray[np.uint8], i: np.uint64, decimals: int) -> tuple[np.int64, bool, np.uint64]:
+    """A number times 10^decimals, rounded half up; whether it had a fraction; where it ends.
+
+    ``_BAD`` for what is no number, for numbers below -1, and for those that do not fit. True and false are 1 and 0.
+    This is the way of plain decimals; all others take the slow one.
+    """
+    begin = i
+    value = np.int64(0)
+    while True:
+        digit = np.uint8(text[i] - _ZERO)
+        if digit > _NINE:
+            break
+        value = value * _TEN + np.int64(digit)
+        i += _ONE
+    places = np.int64(decimals)
+    fraction = False
+    if text[i] == _DOT:
+        i += _ONE
+        while places > 0:
+            digit = np.uint8(text[i] - _ZERO)
+            if digit > _NINE:
+                break
+            value = value * _TEN + np.int64(digit)
+            fraction = fraction or bool(digit > 0)
+            places -= 1
+            i += _ONE
+        next_digit = np.uint8(text[i] - _ZERO)
+        round_up = _FIVE <= next_digit <= _NINE
+        while True:
+            digit = np.uint8(text[i] - _ZERO)
+            if digit > _NINE:
+                break
+            fraction = fraction or bool(digit > 0)
+            i += _ONE
+        value += np.int64(round_up)
+    while places > 0:
+        value *= _TEN
+        places -= 1
+    plain = text[i] <= _SPACE or text[i] == np.uint8(44) or text[i] == np.uint8(59)  # , ;
+    no_digits = i == begin or (text[begin] == _DOT and i == begin + _ONE)
+    if not plain or no_digits or i - begin > np.uint64(12) or decimals < 0:
+        return _parse_slowly(text, begin, decimals)
+    return value, fraction, i
+
+
+@njit(cache=True, nogil=True)
+def _parse_slowly(text: NDArray[np.uint8], i: np.uint64, decimals: int) -> tuple[np.int64, bool, np.uint64]:
+    """As `_parse_value`, for signs, exponents, many digits, true and false."""
+    letter = text[i] | _LOWER
+    if letter in (_LETTER_T, _LETTER_F):
+        return _parse_truth(text, i)
+    negative = text[i] == _MINUS
+    if negative or text[i] == _PLUS:
+        i += _ONE
+    value = np.int64(0)
+    digits = scale = 0  # value * 10^scale is the number
+    seen = point = False
+    while True:
+        digit = np.uint8(text[i] - _ZERO)
+        if digit <= _NINE:
+            seen = True
+            if digits < _MOST_DIGITS:
+                value = value * _TEN + np.int64(digit)
+                digits += int(value > 0)
+                scale -= point
+            else:
+                scale += not point
+        elif text[i] == _DOT and not point:
+            point = True
+        else:
+            break
+        i += _ONE
+    if not seen:
+        return _BAD, False, i
+    if (text[i] | _LOWER) == _E:
+        exponent, i = _parse_exponent(text, i + _ONE)
+        scale += exponent
+    fraction = _has_fraction(value, scale)
+    value = _scaled(value, digits, scale + decimals)
+    if negative:
+        value = -value if 0 <= value <= 1 else _BAD
+    return value, fraction, i
+
+
+@njit(cache=True, nogil=True)
+def _parse_truth(text: NDArray[np.uint8], i: np.uint64) -> tuple[np.int64, bool, np.uint64]:
+    """``true`` or ``false``, in small or capital letters."""
+    word = b"true" if (text[i] | _LOWER) == _LETTER_T else b"false"
+    for letter in word:
+        if (text[i] | _LOWER) != letter:
+            return _BAD, False, i
+        i += _ONE
+    return np.int64(len(word) == 4), False, i
+
+
+@njit(cache=True, nogil=True)
+def _parse_exponent(text: NDArray[np.uint8], i: np.uint64) -> tuple[int, np.uint64]:
+    """What follows the e. Without digits it stops before what is there, which then ends no number."""
+    down = text[i] == _MINUS
+    begin = i
+    if down or text[i] == _PLUS:
+        i += _ONE
+    exponent = 0
+    first = i
+    while np.uint8(text[i] - _ZERO) <= _NINE:
+        exponent = min(exponent * 10 + int(text[i] - _ZERO), 10_000)
+        i += _ONE
+    if i == first:
+        return 0, begin - _ONE
+    return -exponent if down else exponent, i
+
+
+@njit(cache=True, nogil=True)
+def _has_fraction(value: np.int64, scale: int) -> bool:
+    """Whether value * 10^scale is not whole."""
+    while scale < 0 and value > 0:
+        if value % _TEN != 0:
+            return True
+        value //= _TEN
+        scale += 1
+    return False
+
+
+@njit(cache=True, nogil=True)
+def _scaled(value: np.int64, digits: int, scale: int) -> np.int64:
+    """value * 10^scale, rounded half up; ``_BAD`` if it has more than 18 digits."""
+    while scale > 0 and value > 0:
+        if digits >= _MOST_DIGITS:
+            return _BAD
+        value *= _TEN
+        digits += 1
+        scale -= 1
+    last = np.int64(0)
+    while scale < 0 and (value > 0 or last > 0):
+        last = value % _TEN
+        value //= _TEN
+        scale += 1
+    return value + np.int64(last >= 5)

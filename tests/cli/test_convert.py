@@ -1,0 +1,226 @@
+"""``kalux convert``: the copy holds what the recording holds, and is whole or not there."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import signal
+import threading
+import time
+
+import numpy as np
+import pytest
+
+import kalux
+from kalux import readers
+from kalux.cli.signals import interrupts_held
+from kalux.frames import Frame
+from kalux.readers import GroundTruth
+
+
+def same_frame(a, b):
+    return (
+        np.array_equal(a.image, b.image)
+        and a.image.dtype == b.image.dtype
+        and (a.exposure_start, a.exposure_end, a.white_value)
+        == (b.exposure_start, b.exposure_end, b.white_value)
+    )
+
+
+def assert_same(left, right):
+    """All that two recordings hold is equal."""
+    assert left.sensor_size == right.sensor_size
+    assert left.exposure_known == right.exposure_known
+    assert left.contrast_threshold == right.contrast_threshold
+    a, b = (np.concatenate(list(rec.events())) for rec in (left, right))
+    assert a.dtype == b.dtype
+    assert np.array_equal(a, b)
+    for ours, theirs in zip(left.stamped_frames(), right.stamped_frames(), strict=True):
+        assert same_frame(ours, theirs)
+    first, second = left.ground_truth(), right.ground_truth()
+    assert (first is None) == (second is None)
+    if first is not None:
+        assert np.array_equal(first.times, second.times)
+        assert np.array_equal(first.images, second.images)
+    covariances = left.source.inverse_covariance, right.source.inverse_covariance
+    assert (covariances[0] is None) == (covariances[1] is None)
+    if covariances[0] is not None:
+        assert np.array_equal(*covariances)
+
+
+def test_everything_is_copied(cli, write_recording, simulation, tmp_path):
+    size = simulation.scene.sensor_size
+    reference = GroundTruth(np.array([5, 2**40]), np.random.default_rng(0).random((2, *size), np.float32))
+    frames = [
+        Frame(f.image.astype(np.uint16), f.exposure_start, f.exposure_end, 300.0) for f in simulation.frames
+    ]
+    path = write_recording(
+        tmp_path / "rec.h5",
+        frames=frames,
+        ground_truth=reference,
+        inverse_covariance=np.linspace(1, 2, 256),
+        contrast_threshold=(0.11, 0.23),
+    )
+    found = cli("convert", path, tmp_path / "copy.h5")
+    assert (found.code, found.err) == (0, "")
+    assert f"{len(simulation.events):,} events and {len(frames)} frames" in found.out
+    copy = kalux.open(tmp_path / "copy.h5")
+    assert_same(copy, kalux.open(path))
+    assert next(iter(copy.frames())).white_value == 300
+
+
+def test_exposures_that_are_given_are_put_in(cli, damaged, tmp_path):
+    path = damaged("no exposure times")
+    flags = ("--exposure", 3000, "--stamp", "end")
+    assert cli("convert", path, tmp_path / "copy.h5", *flags).code == 0
+    assert_same(kalux.open(tmp_path / "copy.h5"), kalux.open(path, exposure=3000, stamp="end"))
+
+
+def test_exposures_that_are_unknown_stay_unknown(cli, damaged, tmp_path):
+    path = damaged("no exposure times")
+    found = cli("convert", path, tmp_path / "copy.h5", "--quiet")
+    assert (found.code, found.out) == (0, "")
+    assert found.err.startswith("kalux: warning: the recording has no exposure times")
+    copy = kalux.open(tmp_path / "copy.h5")
+    assert not copy.exposure_known
+    assert_same(copy, kalux.open(path))
+
+
+def test_a_sensor_size_that_is_a_guess_is_a_warning(cli, simulation, tmp_path):
+    events = simulation.events
+    np.savez(tmp_path / "rec.npz", t_us=events["t"], x=events["x"], y=events["y"], p=events["p"])
+    found = cli("convert", tmp_path / "rec.npz", tmp_path / "copy.h5")
+    assert found.code == 0
+    assert "does not say how large the sensor is; the copy says 40x32" in found.err
+
+
+def test_a_recording_without_frames(cli, damaged, tmp_path):
+    path = damaged("no frames")
+    assert cli("convert", path, tmp_path / "copy.h5").code == 0
+    assert_same(kalux.open(tmp_path / "copy.h5"), kalux.open(path))
+
+
+@pytest.mark.parametrize("damage", ["event outside the sensor", "events not sorted", "frames overlap", "NaN"])
+def test_damage_is_one_line_and_nothing_is_written(cli, damaged, tmp_path, damage):
+    path = damaged(damage)
+    found = cli("convert", path, tmp_path / "copy.h5")
+    assert found.code == 2
+    assert str(path) in found.error
+    assert [file.name for file in tmp_path.iterdir()] == ["damaged.h5"]
+
+
+def test_a_former_copy_is_replaced_only_on_request(cli, recording, tmp_path):
+    out = tmp_path / "copy.h5"
+    out.write_text("mine")
+    refused = cli("convert", recording, out)
+    assert refused.code == 2
+    assert "--overwrite" in refused.error
+    assert out.read_text() == "mine"
+    assert cli("convert", recording, out, "--overwrite").code == 0
+    assert_same(kalux.open(out), kalux.open(recording))
+
+
+def test_damage_leaves_the_former_copy(cli, damaged, tmp_path):
+    out = tmp_path / "copy.h5"
+    out.write_text("mine")
+    assert cli("convert", damaged("NaN"), out, "--overwrite").code == 2
+    assert out.read_text() == "mine"
+
+
+def test_the_recording_itself_is_not_replaced(cli, recording):
+    found = cli("convert", recording, recording, "--overwrite")
+    assert found.code == 2
+    assert "the recording itself" in found.error
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [("copy.aedat4", "ends in .h5"), ("copy", "ends in .h5"), ("none/copy.h5", "no such folder")],
+)
+def test_names_that_cannot_be_used(cli, recording, tmp_path, name, told):
+    found = cli("convert", recording, tmp_path / name)
+    assert found.code == 2
+    assert told in found.error
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_of_that_name(cli, recording, tmp_path):
+    (tmp_path / "copy.h5").mkdir()
+    assert "a folder of this name" in cli("convert", recording, tmp_path / "copy.h5", "--overwrite").error
+
+
+@pytest.mark.skipif(os.getuid() == 0, reason="root may write everywhere")
+def test_a_folder_without_permission(cli, recording, tmp_path):
+    (tmp_path / "closed").mkdir(mode=0o500)
+    assert "no permission" in cli("convert", recording, tmp_path / "closed" / "copy.h5").error
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_leaves_nothing(start_cli, write_recording, simulation, tmp_path, number):
+    path = tmp_path / "rec.h5"
+    gap = simulation.frames[-1].exposure_end + 10_000
+    many = [
+        dataclasses.replace(
+            f, exposure_start=f.exposure_start + i * gap, exposure_end=f.exposure_end + i * gap
+        )
+        for i in range(400)
+        for f in simulation.frames
+    ]
+    write_recording(path, frames=many)
+    process = start_cli("convert", path, tmp_path / "copy.h5")
+    deadline = time.monotonic() + 60
+    while not any(tmp_path.glob(".copy.h5.*.part")):
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+    process.send_signal(number)
+    _, stderr = process.communicate(timeout=30)
+    assert (process.returncode, stderr) == (130, "kalux: interrupted; nothing was written\n")
+    assert list(tmp_path.iterdir()) == [path]
+
+
+class TestInterruptsHeld:
+    def test_until_they_are_let_through(self):
+        done = []
+
+        def work():
+            with interrupts_held() as let_through:
+                let_through()
+                signal.raise_signal(signal.SIGINT)
+                done.append("held")
+                let_through()
+                done.append("never")
+
+        before = signal.getsignal(signal.SIGINT)
+        with pytest.raises(KeyboardInterrupt):
+            work()
+        assert done == ["held"]
+        assert signal.getsignal(signal.SIGINT) == before
+
+    def test_at_the_latest_until_the_end(self):
+        with pytest.raises(KeyboardInterrupt), interrupts_held():
+            signal.raise_signal(signal.SIGINT)
+
+    def test_other_threads_have_no_signals(self):
+        done = []
+
+        def work():
+            with interrupts_held() as let_through:
+                let_through()
+                done.append(True)
+
+        thread = threading.Thread(target=work)
+        thread.start()
+        thread.join()
+        assert done
+
+
+@pytest.mark.parametrize(
+    "name", ["newton_davis346.aedat4", "slider_depth", "hdr_pan/Oxford_Church_noisy.mat"]
+)
+def test_real_recordings_are_copied(cli, shared_data, tmp_path, name):
+    assert cli("convert", shared_data / name, tmp_path / "copy.h5").code == 0
+    copy = kalux.open(tmp_path / "copy.h5")
+    assert copy.source.format == "kalux"
+    assert_same(copy, kalux.open(shared_data / name))
+    assert (readers.read(tmp_path / "copy.h5").count_events()) > 300_000

@@ -1,0 +1,317 @@
+"""Frames from elsewhere: folders with times, videos, and what does not fit the events."""
+
+from __future__ import annotations
+
+import av
+import cv2
+import numpy as np
+import pytest
+
+import kalux
+from kalux.errors import ExposureError, FormatError, FrameError, InputError
+from kalux.frames import Frame
+from kalux.readers import hdf5
+from recordings import SIZE, damaged, same_frames, small_events, small_frames
+
+EVENTS = small_events()
+
+
+@pytest.fixture
+def events_only(tmp_path):
+    """A recording without frames that states its sensor."""
+    path = tmp_path / "events.h5"
+    hdf5.write(path, sensor_size=SIZE, events=[EVENTS], frames=[], contrast_threshold=(0.1, 0.2))
+    return path
+
+
+@pytest.fixture
+def sizeless(tmp_path):
+    """Events in a file that does not say how large the sensor is."""
+    np.savez(tmp_path / "events.npz", t_us=EVENTS["t"], x=EVENTS["x"], y=EVENTS["y"], p=EVENTS["p"])
+    return tmp_path / "events.npz"
+
+
+def write_images(folder, frames=None, names=None):
+    folder.mkdir()
+    frames = small_frames() if frames is None else frames
+    names = names or [f"{index:03d}.png" for index in range(len(frames))]
+    for frame, name in zip(frames, names, strict=True):
+        cv2.imwrite(str(folder / name), frame.image)
+    return names
+
+
+def write_list(folder, header, row, name="frames.csv", names=None):
+    """A folder of the small frames with a list, ``row`` of a frame and its file name."""
+    names = write_images(folder, names=names)
+    lines = [header, *(row(frame, file) for frame, file in zip(small_frames(), names, strict=True))]
+    (folder / name).write_text("\n".join(lines) + "\n")
+    return folder
+
+
+LISTS = {
+    "exposures in us": ("timestamp_us,exposure_us", lambda f, n: f"{f.exposure_start},{f.exposure}"),
+    "other units": ("t_ns;exposure_ms", lambda f, n: f"{f.exposure_start * 1000}; {f.exposure / 1000}"),
+    "files": ("file,t_s,gain,exposure", lambda f, n: f"{n},{f.exposure_start / 1e6:.6f},,{f.exposure}"),
+    "comment": ("# timestamp, exposure_time", lambda f, n: f"{f.exposure_start}, {f.exposure}"),
+}
+
+
+@pytest.mark.parametrize("kind", LISTS)
+def test_a_folder_with_exposures(events_only, tmp_path, kind):
+    folder = write_list(tmp_path / "images", *LISTS[kind])
+    rec = kalux.open(events_only, frames=folder)
+    assert (rec.exposure_known, rec.sensor_size, rec.source.format) == (True, SIZE, "kalux + images")
+    assert (rec.contrast_threshold, rec.source.missing) == ((0.1, 0.2), ())
+    assert (len(rec.events()), len(rec.frames())) == (500, 4)
+    for _ in range(2):
+        assert same_frames(rec.frames(), small_frames())
+        assert np.array_equal(np.concatenate(list(rec.events())), EVENTS)
+
+
+def test_files_are_taken_in_the_order_of_the_list(events_only, tmp_path):
+    names = ["d.png", "c.png", "b.png", "a.png"]
+    row = LISTS["files"][1]
+    folder = write_list(tmp_path / "images", LISTS["files"][0], row, names=names)
+    assert same_frames(kalux.open(events_only, frames=folder).frames(), small_frames())
+
+
+@pytest.mark.parametrize("name", ["frames.csv", "timestamps.csv", "mine.csv"])
+@pytest.mark.parametrize("given", ["folder", "file"])
+def test_lists_have_other_names_and_can_be_given(events_only, tmp_path, name, given):
+    folder = write_list(tmp_path / "images", *LISTS["exposures in us"], name=name)
+    rec = kalux.open(events_only, frames=folder if given == "folder" else folder / name)
+    assert same_frames(rec.frames(), small_frames())
+
+
+def test_stamps_alone_need_an_exposure(events_only, tmp_path):
+    folder = write_list(tmp_path / "images", "timestamp_us", lambda f, n: str(f.exposure_start))
+    rec = kalux.open(events_only, frames=folder)
+    assert any("exposure times" in text for text in rec.source.missing)
+    with pytest.raises(ExposureError, match="--exposure"):
+        rec.frames()
+    rec = kalux.open(events_only, frames=folder, exposure=3_000, stamp="middle")
+    assert [frame.exposure_start for frame in rec.frames()] == [
+        f.exposure_start - 1_500 for f in small_frames()
+    ]
+
+
+def test_the_list_of_ijrr(events_only, tmp_path):
+    row = lambda f, n: f"{f.exposure_start / 1e6:.9f} {n}"  # noqa: E731
+    folder = write_list(tmp_path / "images", "# t file", row, name="images.txt")
+    rec = kalux.open(events_only, frames=folder)
+    assert [frame.exposure_start for frame in rec.stamped_frames()] == [
+        f.exposure_start for f in small_frames()
+    ]
+
+
+def test_times_are_rounded_from_their_digits(events_only, tmp_path):
+    folder = tmp_path / "images"
+    write_images(folder, small_frames(1))
+    (folder / "frames.csv").write_text("t_s\n123456789012.0000005\n")
+    rec = kalux.open(events_only, frames=folder)
+    assert next(iter(rec.stamped_frames())).exposure_start == 123_456_789_012_000_001
+
+
+class TestSize:
+    def test_another_size_is_refused(self, events_only, tmp_path):
+        folder = tmp_path / "images"
+        write_images(folder, [Frame(np.zeros((31, 40), np.uint8), 0, 1)])
+        (folder / "frames.csv").write_text("t_us\n0\n")
+        with pytest.raises(FrameError, match=r"40x31 pixels, but the sensor of .* is 40x30"):
+            kalux.open(events_only, frames=folder)
+
+    def test_a_size_that_the_recording_does_not_know_is_that_of_the_frames(self, sizeless, tmp_path):
+        assert kalux.open(sizeless).sensor_size != (60, 80)
+        folder = tmp_path / "images"
+        write_images(folder, [Frame(np.zeros((60, 80), np.uint8), 0, 1)])
+        (folder / "frames.csv").write_text("t_us,exposure_us\n0,5\n")
+        rec = kalux.open(sizeless, frames=folder)
+        assert (rec.sensor_size, rec.source.missing) == ((60, 80), ())
+        assert next(iter(rec.frames())).image.shape == (60, 80)
+
+    def test_but_all_events_must_lie_in_it(self, sizeless, tmp_path):
+        folder = tmp_path / "images"
+        write_images(folder, [Frame(np.zeros((60, 20), np.uint8), 0, 1)])
+        (folder / "frames.csv").write_text("t_us\n0\n")
+        with pytest.raises(FrameError, match="is at least"):
+            kalux.open(sizeless, frames=folder)
+
+
+class TestOwnFrames:
+    @pytest.fixture
+    def hybrid(self, tmp_path):
+        path = tmp_path / "hybrid.h5"
+        frames = small_frames(3, seed=9)
+        hdf5.write(path, sensor_size=SIZE, events=[EVENTS], frames=frames, inverse_covariance=np.ones(256))
+        return path
+
+    def test_are_kept_unless_told_otherwise(self, hybrid, tmp_path):
+        folder = write_list(tmp_path / "images", *LISTS["exposures in us"])
+        with pytest.raises(InputError, match=r"3 frames of its own.*--replace-frames"):
+            kalux.open(hybrid, frames=folder)
+        rec = kalux.open(hybrid, frames=folder, replace_frames=True)
+        assert same_frames(rec.frames(), small_frames())
+        assert rec.source.inverse_covariance is None, "it describes the frames that were replaced"
+
+    def test_flags_without_frames_are_refused(self, hybrid):
+        for flag in ({"frames_start": 5}, {"frames_rate": 5.0}, {"replace_frames": True}):
+            with pytest.raises(InputError, match="give frames"):
+                kalux.open(hybrid, **flag)
+
+
+class TestBadLists:
+    @pytest.mark.parametrize(
+        ("text", "told"),
+        [
+            ("", "is empty"),
+            ("exposure_us\n5\n", "has the columns exposure_us"),
+            ("t_us,file\n", "lists no images"),
+            ("t_us\n1\n2\n", "lists 2 times, but there are 4 images"),
+            ("t_us\n1\n-2\n3\n4\n", "line 3: '-2' is not a plain number"),
+            ("t_us\n1\nnan\n3\n4\n", "line 3: 'nan'"),
+            ("t_us\n1\n2,5\n3\n4\n", "line 3: '2,5' has 2 columns, not 1"),
+            ("t\n1\n2.5\n3\n4\n", "line 3: '2.5' has decimals, but no unit"),
+            ("t_us,file\n1,none.png\n", "1 of 1 images are missing"),
+            ("t_us,file\n1,frames.csv\n", "not an image"),
+            (b"\xff\xfe", "damaged"),
+            ("\0\0", "is empty, or no text"),
+            ("t_us,file\n1," + "a" * 200_000, "field larger than field limit"),
+        ],
+    )
+    def test_are_one_line(self, events_only, tmp_path, text, told):
+        folder = tmp_path / "images"
+        write_images(folder)
+        (folder / "frames.csv").write_bytes(text if isinstance(text, bytes) else text.encode())
+        with pytest.raises(FormatError, match=told) as caught:
+            kalux.open(events_only, frames=folder)
+        assert "\n" not in str(caught.value)
+
+    def test_no_list_or_several(self, events_only, tmp_path):
+        folder = tmp_path / "images"
+        write_images(folder)
+        with pytest.raises(FormatError, match=r"has no list of times; a CSV named frames\.csv"):
+            kalux.open(events_only, frames=folder)
+        for name in ("a.csv", "b.csv"):
+            (folder / name).write_text("t_us\n0\n")
+        with pytest.raises(FormatError, match="has 2 CSV files"):
+            kalux.open(events_only, frames=folder)
+
+    def test_colour(self, events_only, tmp_path):
+        folder = tmp_path / "images"
+        colour = np.random.default_rng(0).integers(0, 256, (*SIZE, 3), np.uint8)
+        write_images(folder, [Frame(colour, 0, 1)])
+        (folder / "frames.csv").write_text("t_us\n0\n")
+        with pytest.raises(FormatError, match="in colour"):
+            kalux.open(events_only, frames=folder)
+
+    def test_nothing_there(self, events_only, tmp_path):
+        with pytest.raises(InputError, match="no such file"):
+            kalux.open(events_only, frames=tmp_path / "none")
+
+    def test_a_start_for_images(self, events_only, tmp_path):
+        folder = write_list(tmp_path / "images", *LISTS["exposures in us"])
+        with pytest.raises(InputError, match="are for a video"):
+            kalux.open(events_only, frames=folder, frames_start=0)
+
+    def test_damage_gives_clear_errors(self, events_only, tmp_path):
+        folder = write_list(tmp_path / "images", *LISTS["files"])
+        whole = (folder / "frames.csv").read_bytes()
+        for changed in damaged(whole, 150):
+            (folder / "frames.csv").write_bytes(changed)
+            message = complaint(events_only, frames=folder)
+            assert "\n" not in message
+            assert not message or str(tmp_path) in message
+
+
+def complaint(path, **options):
+    try:
+        rec = kalux.open(path, **options)
+        for _ in rec.stamped_frames():
+            pass
+    except kalux.KaluxError as error:
+        return str(error)
+    return ""
+
+
+def write_video(path, images, *, codec="ffv1", pixels="gray", rate=25):
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate)
+        stream.height, stream.width = images[0].shape
+        stream.pix_fmt = pixels
+        kind = "gray16le" if images[0].dtype == np.uint16 else "gray"
+        for image in images:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format=kind)))
+        container.mux(stream.encode())
+    return path
+
+
+class TestVideo:
+    images = tuple(frame.image for frame in small_frames(6))
+
+    def test_lossless(self, events_only, tmp_path):
+        video = write_video(tmp_path / "v.mkv", self.images)
+        rec = kalux.open(events_only, frames=video, frames_start=1_000, frames_rate=30, exposure=2_000)
+        assert (len(rec.frames()), rec.source.format, rec.source.exposure_known) == (
+            6,
+            "kalux + video",
+            False,
+        )
+        stamps = [1_000, 34_333, 67_667, 101_000, 134_333, 167_667]
+        expected = [Frame(image, t, t + 2_000) for image, t in zip(self.images, stamps, strict=True)]
+        for _ in range(2):
+            assert same_frames(rec.frames(), expected)
+
+    def test_more_than_8_bits(self, events_only, tmp_path):
+        images = [image.astype(np.uint16) * 257 for image in self.images]
+        video = write_video(tmp_path / "v.mkv", images, pixels="gray16le")
+        rec = kalux.open(events_only, frames=video, frames_start=0, frames_rate=30)
+        for frame, image in zip(rec.stamped_frames(), images, strict=True):
+            assert np.array_equal(frame.image, image)
+
+    def test_the_luma_of_an_ordinary_video(self, events_only, tmp_path):
+        levels = [np.full(SIZE, level, np.uint8) for level in (0, 100, 255)]
+        video = write_video(tmp_path / "v.mp4", levels, codec="h264", pixels="yuv420p")
+        rec = kalux.open(events_only, frames=video, frames_start=0, frames_rate=30)
+        means = [frame.image.mean() for frame in rec.stamped_frames()]
+        assert means == pytest.approx([0, 100, 255], abs=3)
+
+    @pytest.mark.parametrize("given", [{}, {"frames_start": 0}, {"frames_rate": 30.0}])
+    def test_start_and_rate_are_needed(self, events_only, tmp_path, given):
+        video = write_video(tmp_path / "v.mkv", self.images)
+        with pytest.raises(InputError, match="--frames-start US and --frames-rate HZ"):
+            kalux.open(events_only, frames=video, **given)
+
+    @pytest.mark.parametrize("rate", [0, -5, float("nan"), float("inf")])
+    def test_impossible_rates(self, events_only, tmp_path, rate):
+        video = write_video(tmp_path / "v.mkv", self.images)
+        with pytest.raises(InputError, match="the rate of the frames is"):
+            kalux.open(events_only, frames=video, frames_start=0, frames_rate=rate)
+
+    def test_no_video(self, events_only, tmp_path):
+        (tmp_path / "v.mp4").write_bytes(b"nothing" * 100)
+        with pytest.raises(FormatError, match=r"v\.mp4: damaged"):
+            kalux.open(events_only, frames=tmp_path / "v.mp4", frames_start=0, frames_rate=30)
+
+    @pytest.mark.parametrize(
+        ("name", "codec", "pixels"), [("v.mkv", "ffv1", "gray"), ("v.mp4", "h264", "yuv420p")]
+    )
+    def test_damage_gives_clear_errors(self, events_only, tmp_path, name, codec, pixels):
+        video = write_video(tmp_path / name, self.images, codec=codec, pixels=pixels)
+        for changed in damaged(video.read_bytes(), 60):
+            video.write_bytes(changed)
+            message = complaint(events_only, frames=video, frames_start=0, frames_rate=30)
+            assert "\n" not in message
+            assert not message or str(tmp_path) in message
+
+
+def test_a_real_recording_taken_apart(shared_data, tmp_path):
+    """Real payload, our writer: events alone, and the frames as PNG with their exposures."""
+    whole = kalux.open(shared_data / "street_davis346.aedat4")
+    frames = list(whole.frames())
+    hdf5.write(tmp_path / "events.h5", sensor_size=whole.sensor_size, events=whole.events(), frames=[])
+    names = write_images(tmp_path / "images", frames)
+    rows = (f"{n},{f.exposure_start},{f.exposure}" for f, n in zip(frames, names, strict=True))
+    (tmp_path / "images" / "frames.csv").write_text("\n".join(["file,timestamp_us,exposure_us", *rows]))
+    joined = kalux.open(tmp_path / "events.h5", frames=tmp_path / "images")
+    assert same_frames(joined.frames(), frames)
+    assert len(joined.events()) == len(whole.events())

@@ -1,0 +1,181 @@
+"""Text tables: names, separators, units, exact decimals, every malformed line."""
+
+from __future__ import annotations
+
+import io
+from decimal import ROUND_HALF_UP, Decimal
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from kalux import readers
+from kalux.errors import FormatError
+from kalux.readers import table
+from recordings import all_events, assert_only_clear_errors, damaged, small_events
+
+EVENTS = small_events()
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "events.csv"
+
+
+def written(header="t_us,x,y,p", events=EVENTS, separator=","):
+    rows = (separator.join(map(str, (t, x, y, int(p)))) for t, x, y, p in events.tolist())
+    return "\n".join([header, *rows, ""])
+
+
+def parse(path, text):
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return all_events(readers.read(path)).tolist()
+
+
+def test_a_table(path):
+    path.write_text(written())
+    source = readers.read(path)
+    assert (source.format, source.count_events(), source.count_frames()) == ("table", 500, 0)
+    assert source.sensor_size == (EVENTS["y"].max() + 1, EVENTS["x"].max() + 1)
+    assert not source.sensor_size_known
+    for _ in range(2):
+        assert np.array_equal(all_events(source), EVENTS)
+
+
+def test_blocks_of_text_join_without_a_seam(path, monkeypatch):
+    path.write_text(written())
+    monkeypatch.setattr(table, "_BLOCK_BYTES", 600)
+    monkeypatch.setattr(table, "_LONGEST_LINE", 100)
+    chunks = list(readers.read(path).events())
+    assert len(chunks) > 5
+    assert np.array_equal(np.concatenate(chunks), EVENTS)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "t_us,x,y,p\n1000000,2,3,1\n1500000,4,5,0\n",
+        "t_us,x,y,p\n1000000,2,3,1\n1500000,4,5,0",  # no end of the last line
+        "timestamp,x,y,polarity\n1000000,2,3,1\n1500000,4,5,0\n",  # dv, as exported
+        '\ufeff"t_us";"x";"y";"p"\r\n1000000; 2; 3; 1\r\n1500000;4 ;5;-1\r\n',
+        "# t_s x y p\n1.0 2 3 1\n\n# comment\n 1.500000\t4  5 0 \n",
+        "# a recording\n# t_s x y p\n1 2 3 1\n1.5 4 5 0\n",
+        "x y pol time(ms)\n2 3 true 1e3\n4 5 False 1.5E+3\n",
+        "t_ns\tx\ty\tp\n1000000000\t2\t3\t+1\n1500000000\t4\t5\t0\n",
+        "id,t_us,note,x,y,p,t_us\n7,1000000,abc,2,3,1,9\n8,1500000,,4,5,0,9\n",
+        "t_us,x,y,p\n1.000000000000000000e+06,2.0e+00,3.0,1.0\n1500000.,4,5,-1.0\n",
+    ],
+)
+def test_other_spellings(path, text):
+    assert parse(path, text) == [(1_000_000, 2, 3, True), (1_500_000, 4, 5, False)]
+
+
+def test_what_numpy_writes(path):
+    rows = np.array([EVENTS["t"] / 1e6, EVENTS["x"], EVENTS["y"], EVENTS["p"]], float).T
+    text = io.BytesIO()
+    np.savetxt(text, rows, header="t_s x y p")
+    assert parse(path, text.getvalue()) == EVENTS.tolist()
+
+
+@settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    unit=st.sampled_from(["s", "ms", "us", "ns"]),
+    times=st.lists(
+        st.one_of(
+            st.decimals(min_value=0, max_value=10**9, allow_nan=False, places=9).map(lambda v: f"{v:f}"),
+            st.decimals(min_value=0, max_value=3, allow_nan=False, places=4).map(lambda v: f"{v:f}"),
+            st.floats(0, 1e9, allow_nan=False).map(lambda v: f"{v:.12e}"),
+            st.integers(0, 10**15).map(str),
+        ).filter(lambda text: Decimal(text) < 10**11),
+        min_size=1,
+        max_size=20,
+    ),
+)
+def test_times_are_rounded_from_their_digits(path, unit, times):
+    path.write_text(f"t_{unit},x,y,p\n" + "".join(f"{time},1,1,1\n" for time in times))
+    factor = {"s": Decimal(10**6), "ms": Decimal(1000), "us": Decimal(1), "ns": Decimal("0.001")}[unit]
+    exact = [int((Decimal(time) * factor).to_integral_value(ROUND_HALF_UP)) for time in times]
+    assert [event[0] for event in parse(path, path.read_text())] == exact
+
+
+def test_times_with_decimals_need_a_unit(path):
+    assert parse(path, "t,x,y,p\n1.0,2,3,1\n") == [(1, 2, 3, True)]
+    with pytest.raises(FormatError, match="line 3: the time has decimals, but no unit; name the unit"):
+        parse(path, "t,x,y,p\n1.0,2,3,1\n1.5,2,3,1\n")
+
+
+def test_an_assumed_unit_is_told(path):
+    path.write_text(written("t,x,y,p"))
+    assert any("unit of time" in sentence for sentence in readers.read(path).missing)
+    path.write_text(written())
+    assert not any("unit of time" in sentence for sentence in readers.read(path).missing)
+
+
+@pytest.mark.parametrize(
+    ("line", "fault"),
+    [
+        ("-5,1,2,1", "time"),
+        ("nan,1,2,1", "time"),
+        ("1.2.3,1,2,1", "time"),
+        (".,1,2,1", "time"),
+        ("5e,1,2,1", "time"),
+        ("1e30,1,2,1", "time"),
+        (",1,2,1", "time"),
+        ("5,-1,2,1", "x is not"),
+        ("5,1.5,2,1", "x is not"),
+        ("5,70000,2,1", "x is not"),
+        ("5,1 1,2,1", "x is not"),
+        ("5,,2,1", "x is not"),
+        ("5,1,b,1", "y is not"),
+        ("5,1,2,2", "polarity"),
+        ("5,1,2,tru", "polarity"),
+        ("5,1,2,truer", "polarity"),
+        ("5,1,2,1,7", "more columns"),
+        ("5,1,2,1,", "more columns"),
+        ("5,1,2", "fewer columns"),
+        ("5 1 2 1", "time"),
+        ("5,1\0\0,2,1", "x is not"),
+    ],
+)
+def test_a_malformed_line_is_named(path, line, fault):
+    good = "1,1,1,1\n" * 7
+    with pytest.raises(FormatError, match=rf"line 9: .*{fault}"):
+        parse(path, f"t_us,x,y,p\n{good}{line}\n{good}")
+
+
+def test_an_endless_line_is_refused(path):
+    with pytest.raises(FormatError, match="line 4: it is too long"):
+        parse(path, "t,x,y,p\n" + "1,1,1,1\n" * 2 + "7" * 20_000)
+
+
+def test_numbers_without_names_are_refused_with_a_hint(path):
+    with pytest.raises(FormatError, match="put a line such as 't_us,x,y,p'"):
+        parse(path, "1,2,3,1\n5,2,3,1\n")
+
+
+@pytest.mark.parametrize(
+    "text", ["events", "", "a,b,c,d\n1,2,3,4\n", "t,x,y\n1,2,3\n", "\0" * 50, b"\xff\xfe\x00t"]
+)
+def test_other_files_are_not_recognised(path, text):
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    assert not table.recognises(path)
+
+
+def test_no_events(path):
+    with pytest.raises(FormatError, match="no events"):
+        parse(path, "t_us,x,y,p\n")
+
+
+def test_damage_gives_clear_errors(path):
+    assert_only_clear_errors(path, damaged(written(events=EVENTS[:100]).encode(), 300, 60))
+
+
+def test_a_real_payload(shared_data, path):
+    """Real payload, our writer: slider_depth with commas and names."""
+    with (shared_data / "slider_depth" / "events.txt").open("rb") as file:
+        lines = file.readlines(1_000_000)
+    path.write_bytes(b"t_s,x,y,p\n" + b"".join(lines).replace(b" ", b","))
+    ours = all_events(readers.read(path))
+    assert len(ours) == len(lines)
+    assert np.array_equal(ours, next(readers.read(shared_data / "slider_depth").events())[: len(ours)])
