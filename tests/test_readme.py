@@ -1,0 +1,46 @@
+"""What the README shows runs."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+import kalux
+from kalux.readers import hdf5
+
+from builders import moving_blocks
+
+ROOT = Path(__file__).resolve().parent.parent
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def test_the_python_example_runs(tmp_path, monkeypatch):
+    simulation = moving_blocks(0.05, 0.8, size=(24, 32))
+    frames = simulation.frames
+    hdf5.write(
+        tmp_path / "night_drive.aedat4",  # recognised by its content
+        sensor_size=(24, 32),
+        events=iter([simulation.events]),
+        frames=iter(frames),
+    )
+    monkeypatch.chdir(tmp_path)
+    code = re.search(r"```python\n(.*?)```", README, re.DOTALL).group(1)
+    names = {
+        "pixels": np.zeros((260, 346), np.uint8),
+        "t0": 0,
+        "t1": 10_000,
+        "events": {"t": np.array([12_000]), "x": np.array([3]), "y": np.array([4]), "p": np.array([1])},
+        "t": 13_000,
+    }
+    exec(code, names)
+    assert isinstance(names["image"], kalux.Image)
+    assert names["image"].intensity.shape == (260, 346)
+
+
+def test_its_links_lead_somewhere():
+    links = re.findall(r"\]\(((?!http)[^)#]+)\)", README)
+    assert "docs/equations.md" in links
+    for link in links:
+        assert (ROOT / link).exists(), link
