@@ -747,3 +747,21 @@ def test_unknown_presets_and_responses():
     with pytest.raises(SettingsError, match="unknown preset"):
         Reconstructor((1, 1), preset="best")
     assert issubclass(SettingsError, KaluxError)
+
+
+def test_an_unknown_threshold_is_learned():
+    """Two events a frame interval, each truly 0.125 while 0.25 is assumed: the steps come down towards the truth."""
+    live = engine_without_threshold()
+    for k in range(8):
+        level = round(80 * np.exp(0.25 * (k % 2)))
+        live.push_frame(frame(level, 40_000 * k, 40_000 * k + 2_000))
+        start = 40_000 * k
+        live.push_events(pixel_events([start + 10_000, start + 20_000], [1, 1] if k % 2 == 0 else [0, 0]))
+    live.read(40_000 * 6 + 5_000)
+    thresholds = live._memory.thresholds
+    assert 0.4 < thresholds.on[0, 0] < 0.75
+    assert 0.4 < thresholds.off[0, 0] < 0.75
+
+
+def engine_without_threshold():
+    return Reconstructor((1, 1))
