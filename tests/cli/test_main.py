@@ -16,7 +16,7 @@ from kalux.cli.signals import termination_as_interrupt
 from kalux.settings import Settings, to_dict
 
 
-@pytest.mark.parametrize("command", [[], ["info"], ["reconstruct"], ["convert"], ["demo"]])
+@pytest.mark.parametrize("command", [[], ["info"], ["reconstruct"], ["convert"], ["evaluate"], ["demo"]])
 def test_help_has_examples_and_fits_a_screen(cli, command):
     found = cli(*command, "--help")
     assert (found.code, found.err) == (0, "")
@@ -27,7 +27,7 @@ def test_help_has_examples_and_fits_a_screen(cli, command):
 
 def test_help_names_every_command(cli):
     found = cli("--help").out
-    for command in ("info", "reconstruct", "convert", "demo"):
+    for command in ("info", "reconstruct", "convert", "evaluate", "demo"):
         assert f"\n  {command} " in found
 
 

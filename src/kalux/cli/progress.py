@@ -97,7 +97,8 @@ def progress_text(images: int, total_images: int, events: int, total_events: int
             parts.append(f"{short_number(images / seconds)} images/s")
     else:
         parts.append(f"{short_number(events)} events")
-    parts.append(f"{short_number(events / seconds)} events/s")
+    if events or not total_images:
+        parts.append(f"{short_number(events / seconds)} events/s")
     done, total = (images, total_images) if total_images else (events, total_events)
     if done and total:
         parts.append(f"{clock(seconds * max(total - done, 0) / done)} left")

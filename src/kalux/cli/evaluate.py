@@ -1,0 +1,303 @@
+"""``kalux evaluate``: how good reconstructions of a recording are, by several methods."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import dataclasses
+import io
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from kalux.cli.checking import check_recording
+from kalux.cli.info import add_recording, open_recording
+from kalux.cli.parser import Parser, UsageError, whole
+from kalux.cli.terminal import say, warn
+
+if TYPE_CHECKING:
+    from kalux.evaluation.baselines import Method
+    from kalux.evaluation.consistency import BlurConsistency
+    from kalux.evaluation.scores import Scores
+    from kalux.recording import Recording
+
+_DESCRIPTION = """\
+Compare what methods reconstruct from a recording with its ground truth or, where it has none, with frames
+that were held out from them. Needs the extra kalux[evaluation].
+
+methods: hold (the last frame), mean (of the frames around; held-out frames only), edi (nearest frame,
+deblurred and moved by events), cf, iccv2021, iccv2021-flir, default, smooth (default, both ways in time).
+Without --methods all but iccv2021-flir."""
+
+_EXAMPLES = """\
+examples:
+  kalux evaluate night_drive.aedat4
+  kalux evaluate pan.mat --truth pan_gt.npz --hdrvdp -o scores.csv
+  kalux evaluate slider_depth --exposure 10000 --hold-out-frames 4 --methods hold,cf,default"""
+
+_SUFFIXES: Final = (".csv", ".json")
+_OWN: Final = Path()  # --truth without a file
+
+
+def add_command(commands: Any) -> None:
+    """Add ``evaluate`` to the parser."""
+    parser: Parser = commands.add_parser(
+        "evaluate", description=_DESCRIPTION, epilog=_EXAMPLES, usage="kalux evaluate REC [flags]"
+    )
+    add_recording(parser)
+    group = parser.add_argument_group(
+        "compared with (default: its truth if it has any, else every 2nd frame)"
+    )
+    one = group.add_mutually_exclusive_group()
+    one.add_argument("--hold-out-frames", type=whole, metavar="N", help="every N-th frame, held out")
+    one.add_argument(
+        "--truth",
+        type=Path,
+        nargs="?",
+        const=_OWN,
+        metavar="FILE",
+        help="the recording's ground truth, or that of an .npz with times (us) and images, maybe mask",
+    )
+    group.add_argument("--clip", action="store_true", help="held-out: clip images where the camera clips")
+    group.add_argument("--response", default="linear", help="of the camera: linear, srgb or gamma:EXPONENT")
+    group = parser.add_argument_group("what is computed")
+    group.add_argument("--methods", metavar="A,B", help="names, in this order, with commas")
+    group.add_argument("--hdrvdp", action="store_true", help="HDR-VDP's Q as well, 0.2 s per VGA image")
+    group.add_argument(
+        "--blur-consistency", action="store_true", help="do images, integrated, give the frames? PSNR"
+    )
+    group = parser.add_argument_group("output")
+    group.add_argument(
+        "-o", "--out", type=Path, metavar="OUT", help=".csv: the table; .json: that and every image's scores"
+    )
+    group.add_argument("--overwrite", action="store_true", help="replace the file if it is there")
+    group.add_argument("--quiet", action="store_true", help="no progress")
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace, command: list[str]) -> None:
+    """Run the command."""
+    from kalux.cli.output import check_file
+    from kalux.cli.progress import Progress
+    from kalux.evaluation.scores import require_dependencies
+
+    if options.out is not None:
+        if options.out.suffix.lower() not in _SUFFIXES:
+            raise UsageError(f"{options.out}: the output is a table; give a name that ends in .csv or .json")
+        check_file(options.out, overwrite=options.overwrite)
+    if options.clip and options.truth is not None:
+        raise UsageError("--clip is for held-out frames, which clip; ground truth does not")
+    require_dependencies()
+    recording = open_recording(options)
+    with Progress("checking", quiet=options.quiet) as progress:
+        contents = check_recording(recording, lambda count: progress.add(events=count))
+    for text in contents.warnings():
+        warn(text)
+    protocol = Protocol(recording, options)
+    say(f"{recording.source.path}: {protocol.described}")
+    say(table_head(options))
+    found, consistent = [], []
+    for method in protocol.methods:
+        scores = protocol.score(method)
+        consistency = protocol.consistency(method) if options.blur_consistency else None
+        say(table_row(scores, consistency))
+        found.append(scores)
+        consistent.append(consistency)
+    for line in notes(found):
+        say(line)
+    if options.out is not None:
+        write(options.out, recording, protocol.described, found, consistent)
+        say(f"wrote {options.out}")
+
+
+class Protocol:
+    """What the flags say to compare with what.
+
+    Parameters
+    ----------
+    recording
+        Checked.
+    options
+        The flags.
+
+    Raises
+    ------
+    InputError
+        There is no truth, too few frames, no such method.
+    """
+
+    def __init__(self, recording: Recording, options: argparse.Namespace) -> None:
+        from kalux.evaluation import baselines, held_out, truth
+
+        self._recording, self._options = recording, options
+        self._score: Callable[[Method, Callable[[], None]], Scores]
+        reference = None
+        if options.hold_out_frames is None:
+            reference = _reference(recording, options)
+        if reference is None:
+            every = 2 if options.hold_out_frames is None else options.hold_out_frames
+            held = held_out.hold_out_frames(recording, every, response=options.response)
+            self.described, self._images = held.described(), len(held.compared)
+            self._score = lambda method, count: held_out.evaluate_held_out(
+                held, method, clip=options.clip, hdr_vdp=options.hdrvdp, on_image=count
+            )
+        else:
+            self.described, self._images = reference.described(), len(reference.times)
+            self._score = lambda method, count: truth.evaluate_truth(
+                recording, reference, method, hdr_vdp=options.hdrvdp, on_image=count
+            )
+        names = None if options.methods is None else [n.strip() for n in options.methods.split(",")]
+        self.methods = baselines.chosen_methods(names, response=options.response, held_out=reference is None)
+
+    def score(self, method: Method) -> Scores:
+        """Score one method, with progress."""
+        from kalux.cli.progress import Progress
+
+        with Progress(method.label, images=self._images, quiet=self._options.quiet) as progress:
+            return self._score(method, lambda: progress.add(images=1))
+
+    def consistency(self, method: Method) -> BlurConsistency | None:
+        """Blur consistency of one method, with progress; None for those that look at the very frame."""
+        from kalux.cli.progress import Progress
+        from kalux.evaluation.consistency import blur_consistency
+
+        if method.needs_held_out:
+            return None
+        title = f"{method.label}, blur consistency"
+        count = len(self._recording.frames()) - 2
+        with Progress(title, images=max(count, 0), quiet=self._options.quiet) as progress:
+            return blur_consistency(
+                self._recording,
+                method,
+                response=self._options.response,
+                on_image=lambda: progress.add(images=1),
+            )
+
+
+def _reference(recording: Recording, options: argparse.Namespace) -> Any:
+    """The ground truth that is asked for, or there; None: none."""
+    from kalux.evaluation.truth import load_truth, prepare_reference
+
+    if options.truth is None or options.truth == _OWN:
+        images, mask = recording.ground_truth(), None
+        if images is None and options.truth == _OWN:
+            raise UsageError(
+                f"{recording.source.path}: has no ground truth; give --truth FILE.npz, or --hold-out-frames 2"
+            )
+    else:
+        images, mask = load_truth(options.truth)
+    if images is None:
+        return None
+    if options.clip:
+        raise UsageError("--clip is for held-out frames, the recording has ground truth; --hold-out-frames 2")
+    return prepare_reference(recording, images, mask)
+
+
+# Say.
+
+_COLUMNS: Final[tuple[tuple[str, Callable[[Scores], str]], ...]] = (
+    ("MSE x100", lambda s: f"{100 * s.mse:.3f}"),
+    ("PSNR dB", lambda s: f"{s.psnr:.2f}"),
+    ("SSIM", lambda s: f"{s.ssim:.3f}"),
+    ("log-MSE x100", lambda s: f"{100 * s.log_mse:.2f}"),
+)
+
+
+def table_head(options: argparse.Namespace) -> str:
+    """The names of the columns."""
+    head = f"{'method':<26}" + "".join(f"{name:>14}" for name, _ in _COLUMNS)
+    head += f"{'HDR-VDP Q':>14}" if options.hdrvdp else ""
+    return head + (f"{'blur dB':>14}" if options.blur_consistency else "")
+
+
+def table_row(scores: Scores, consistency: BlurConsistency | None) -> str:
+    """The means of a method."""
+    row = f"{scores.method:<26}" + "".join(f"{shown(scores):>14}" for _, shown in _COLUMNS)
+    row += "" if scores.q is None else f"{scores.q:>14.3f}"
+    return row + ("" if consistency is None else f"{consistency.psnr:>14.2f}")
+
+
+def notes(found: list[Scores]) -> list[str]:
+    """How many pixels, and what was done to images before they were compared."""
+    first = found[0]
+    lines = [
+        f"{len(first.images):,} images, {first.pixels:,} pixels compared; data range {first.data_range:.4g}"
+    ]
+    for scores in found:
+        lines += [
+            f"{scores.method}: {text}" for text in scores.adjustments() if text not in first.adjustments()
+        ]
+    return lines[:1] + [f"all: {text}" for text in first.adjustments()] + lines[1:]
+
+
+# Write.
+
+
+def write(
+    out: Path,
+    recording: Recording,
+    protocol: str,
+    found: list[Scores],
+    consistent: list[BlurConsistency | None],
+) -> None:
+    """Write the scores; the file is whole or not there.
+
+    Raises
+    ------
+    OutputError
+        The file cannot be written.
+    """
+    from kalux.writers.files import output_errors, write_whole
+
+    as_text = as_csv if out.suffix.lower() == ".csv" else as_json
+    with output_errors(out):
+        write_whole(out, as_text(str(recording.source.path), protocol, found, consistent).encode())
+
+
+def as_csv(path: str, protocol: str, found: list[Scores], consistent: list[BlurConsistency | None]) -> str:
+    """A row of means per method."""
+    text = io.StringIO()
+    rows = [_row(path, protocol, *pair) for pair in zip(found, consistent, strict=True)]
+    table = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    table.writeheader()
+    table.writerows(rows)
+    return text.getvalue()
+
+
+def as_json(path: str, protocol: str, found: list[Scores], consistent: list[BlurConsistency | None]) -> str:
+    """The same, and the scores of every image; infinite values (PSNR of equal images) as null."""
+    import kalux
+
+    rows = []
+    for scores, consistency in zip(found, consistent, strict=True):
+        row = _row(path, protocol, scores, consistency)
+        row["adjustments"] = scores.adjustments()
+        row["per_image"] = [dataclasses.asdict(image) for image in scores.images]
+        rows.append(row)
+    return json.dumps(_finite({"kalux": kalux.__version__, "methods": rows}), indent=1) + "\n"
+
+
+def _row(path: str, protocol: str, scores: Scores, consistency: BlurConsistency | None) -> dict[str, Any]:
+    return {
+        "recording": path,
+        "protocol": protocol,
+        "method": scores.method,
+        "images": len(scores.images),
+        "pixels": scores.pixels,
+        **scores.means(),
+        "blur_psnr": None if consistency is None else consistency.psnr,
+        "data_range": scores.data_range,
+        "scale": scores.scale,
+        "clipped": scores.clipped,
+        "negative": scores.negative,
+    }
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(part) for key, part in value.items()}
+    if isinstance(value, list):
+        return [_finite(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,216 @@
+"""What reconstructions are compared with, and kalux's own, all of one kind: (recording, times) to images.
+
+A `Method` is given a recording and ascending times, us, and yields one image per time: (H, W) float32, linear,
+1 = a saturated frame pixel at the recording's median exposure.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from itertools import chain, pairwise
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux.augmentation.deblur import between, count_events, integrate_exposure, latent_middle
+from kalux.errors import InputError
+from kalux.evaluation.exposures import linear_frame, reference_exposure
+from kalux.events import EVENT_DTYPE, EventArray
+from kalux.frames import Frame
+from kalux.models.camera import log_intensity
+from kalux.pipeline import plan, reconstruct
+from kalux.recording import Recording
+from kalux.settings import PRESETS, Settings
+
+Image = NDArray[np.float32]
+Times = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Method:
+    """A way to make images.
+
+    Attributes
+    ----------
+    label
+        For tables.
+    images
+        From a recording and ascending times (N,) int64, us, to N images.
+    needs_held_out
+        Whether it looks at the frames before and after, which would be unfair where they are not held out.
+    """
+
+    label: str
+    images: Callable[[Recording, Times], Iterable[Image]]
+    needs_held_out: bool = False
+
+
+def hold_last_frame(recording: Recording, times: Times, *, response: str = "linear") -> Iterator[Image]:
+    """The last frame whose exposure's middle has passed; before the first, the first."""
+    reference = reference_exposure(recording)
+    for before, after, _ in frames_around(recording.frames(), times):
+        held = before or after
+        assert held is not None
+        yield linear_frame(held, reference, response).astype(np.float32)
+
+
+def mean_of_neighbours(recording: Recording, times: Times, *, response: str = "linear") -> Iterator[Image]:
+    """The mean of the frames before and after, each by the middle of its exposure."""
+    reference = reference_exposure(recording)
+    for before, after, _ in frames_around(recording.frames(), times):
+        pair = [linear_frame(frame, reference, response) for frame in (before, after) if frame is not None]
+        yield np.mean(pair, axis=0).astype(np.float32)
+
+
+def edi_video(recording: Recording, times: Times, *, settings: Settings | None = None) -> Iterator[Image]:
+    """EDI: the nearest frame, deblurred by its events, and moved to the time by the events in between.
+
+    The thresholds are nominal, the same for all pixels: those of the settings, the recording, or an estimate.
+    Nothing is known of clipped pixels: they are taken as they are.
+    """
+    chosen = plan(recording, times=times, settings=settings or PRESETS["default"]).settings
+    on, off = (
+        np.full(recording.sensor_size, c) for c in (chosen.events.threshold_on, chosen.events.threshold_off)
+    )
+    camera, reference = chosen.camera, reference_exposure(recording)
+    window = EventWindow(recording.events())
+    for frame, wanted in nearest_frames(recording.frames(), times):
+        first = min(frame.exposure_start, int(wanted[0]))
+        events = window.between(first, max(frame.exposure_end, int(wanted[-1])))
+        blurred = log_intensity(linear_frame(frame, reference, camera.response), camera.log_offset)
+        integrals = integrate_exposure(events, frame.exposure_start, frame.exposure_end, on, off)
+        sharp = latent_middle(blurred, integrals)
+        for t in wanted.tolist():
+            moved = sharp + _change(events, frame.middle, t, on, off)
+            yield np.maximum(np.exp(moved) - camera.log_offset, 0.0).astype(np.float32)
+
+
+def filtered(
+    recording: Recording, times: Times, *, settings: Settings, smooth: bool = False
+) -> Iterator[Image]:
+    """`kalux.reconstruct` with given settings: the AKF, the complementary filter."""
+    for image in reconstruct(recording, times=times, settings=settings, smooth=smooth):
+        yield image.intensity
+
+
+_FILTERS: Final = {
+    "cf": "CF",
+    "iccv2021": "AKF iccv2021",
+    "iccv2021-flir": "AKF iccv2021-flir",
+    "default": "AKF default",
+}
+
+OPTIONAL: Final = ("iccv2021-flir",)
+"""Not among those that are compared if nothing is said: for one camera only."""
+
+
+def methods(response: str = "linear") -> dict[str, Method]:
+    """All methods by name; ``response`` is the camera's, as in `kalux.settings.CameraSettings`."""
+    presets = {name: _with_response(PRESETS[name], response) for name in _FILTERS}
+    return {
+        "hold": Method("hold the last frame", partial(hold_last_frame, response=response)),
+        "mean": Method("mean of the neighbours", partial(mean_of_neighbours, response=response), True),
+        "edi": Method("EDI video", partial(edi_video, settings=presets["default"])),
+        **{name: filter_method(label, presets[name]) for name, label in _FILTERS.items()},
+        "smooth": filter_method("AKF default, both ways", presets["default"], smooth=True),
+    }
+
+
+def filter_method(label: str, settings: Settings, *, smooth: bool = False) -> Method:
+    """`kalux.reconstruct` with these settings as a method."""
+    return Method(label, partial(filtered, settings=settings, smooth=smooth))
+
+
+def chosen_methods(
+    names: Iterable[str] | None = None, *, response: str = "linear", held_out: bool = False
+) -> list[Method]:
+    """Methods by name, in that order.
+
+    Parameters
+    ----------
+    names
+        Of `methods`. Default: all that can be compared, without `OPTIONAL`.
+    response
+        Of the camera, as in `kalux.settings.CameraSettings`.
+    held_out
+        Whether frames are held out.
+
+    Raises
+    ------
+    InputError
+        If a name is unknown, or the method needs frames to be held out.
+    """
+    known = methods(response)
+    if names is None:
+        names = [n for n, m in known.items() if n not in OPTIONAL and (held_out or not m.needs_held_out)]
+    chosen = []
+    for name in names:
+        if name not in known:
+            raise InputError(f"there is no method {name!r}; known are {', '.join(known)}")
+        if known[name].needs_held_out and not held_out:
+            raise InputError(
+                f"method {name!r} looks at the frames around an image, which is a comparison only where frames "
+                "are held out"
+            )
+        chosen.append(known[name])
+    if not chosen:
+        raise InputError(f"no method is given; known are {', '.join(known)}")
+    return chosen
+
+
+def frames_around(frames: Iterable[Frame], times: Times) -> Iterator[tuple[Frame | None, Frame | None, int]]:
+    """For every time (ascending, us) the last frame with its middle at or before it, the next one, and the time."""
+    remaining = iter(frames)
+    before, after = None, next(remaining, None)
+    for t in times.tolist():
+        while after is not None and after.middle <= t:
+            before, after = after, next(remaining, None)
+        yield before, after, t
+
+
+def nearest_frames(frames: Iterable[Frame], times: Times) -> Iterator[tuple[Frame, Times]]:
+    """The frames with the times (ascending, us) that are nearer to their middles than to others'; none without."""
+    first = 0
+    for frame, following in pairwise(chain(frames, [None])):
+        assert frame is not None
+        last = len(times)
+        if following is not None:
+            last = int(np.searchsorted(times, (frame.middle + following.middle) // 2, side="right"))
+        if last > first:
+            yield frame, times[first:last]
+            first = last
+
+
+class EventWindow:
+    """Events by ever later intervals, of a stream that is read once and forgotten."""
+
+    def __init__(self, chunks: Iterable[EventArray]) -> None:
+        self._chunks = iter(chunks)
+        self._held: EventArray = np.empty(0, EVENT_DTYPE)
+
+    def between(self, start: int, end: int) -> EventArray:
+        """The events with start < t <= end, us; later calls may not start earlier."""
+        while len(self._held) == 0 or self._held["t"][-1] <= end:
+            chunk = next(self._chunks, None)
+            if chunk is None:
+                break
+            kept = between(self._held, start, np.iinfo(np.int64).max)
+            self._held = np.concatenate([kept, chunk])
+        return between(self._held, start, end)
+
+
+def _change(
+    events: EventArray, start: int, end: int, on: NDArray[np.float64], off: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """What events say of the log intensity from start to end (us), which may be earlier."""
+    rises, falls = count_events(between(events, min(start, end), max(start, end)), on.shape)
+    change = on * rises - off * falls
+    return change if end >= start else -change
+
+
+def _with_response(settings: Settings, response: str) -> Settings:
+    return dataclasses.replace(settings, camera=dataclasses.replace(settings.camera, response=response))

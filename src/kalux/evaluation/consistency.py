@@ -1,0 +1,119 @@
+"""Blur consistency: does the reconstruction, integrated over an exposure, give the frame that was taken?
+
+It needs no truth and holds nothing out. The frame is known to the method, so that a good value proves only that
+images agree with their frames; a bad one tells of images whose motion, deblurring or brightness is wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from kalux.errors import FrameError, InputError
+from kalux.evaluation.baselines import Method
+from kalux.evaluation.exposures import exposure_times, linear_frame, means_of, reference_exposure
+from kalux.evaluation.metrics import psnr
+from kalux.frames import Frame
+from kalux.recording import Recording
+from kalux.settings import CameraSettings
+
+READS: Final = 9
+"""Reads across an exposure."""
+
+
+@dataclass(frozen=True)
+class BlurConsistency:
+    """How well integrated images agree with the frames.
+
+    Attributes
+    ----------
+    method
+        Label of the method.
+    reads
+        Images per exposure, from its start to its end.
+    frames
+        (t, pixels, PSNR in dB) of each frame with pixels that can be compared: its middle, us; how many are neither
+        clipped nor black; data range: white.
+    skipped
+        Frames that are clipped or black everywhere.
+    """
+
+    method: str
+    reads: int
+    frames: tuple[tuple[int, int, float], ...]
+    skipped: int
+
+    @property
+    def psnr(self) -> float:
+        """Mean over the frames, dB."""
+        return float(np.mean([decibel for _, _, decibel in self.frames]))
+
+    @property
+    def pixels(self) -> int:
+        """How many pixels were compared, over all frames."""
+        return sum(pixels for _, pixels, _ in self.frames)
+
+
+def blur_consistency(
+    recording: Recording,
+    method: Method,
+    *,
+    reads: int = READS,
+    response: str = "linear",
+    on_image: Callable[[], None] = lambda: None,
+) -> BlurConsistency:
+    """Integrate a method's images over every exposure but the first and the last, and compare them with the frames.
+
+    Parameters
+    ----------
+    recording
+        With known exposures.
+    method
+        From `kalux.evaluation.baselines`, or one's own.
+    reads
+        Images per exposure, at least 2.
+    response
+        Of the camera, as in `kalux.settings.CameraSettings`.
+    on_image
+        Called after every frame.
+
+    Raises
+    ------
+    FrameError
+        If there are fewer than three frames, or no pixel can be compared.
+    KaluxError
+        Whatever the method says.
+    """
+    if reads < 2:
+        raise InputError(f"blur consistency: reads are {reads}; at least 2 are needed")
+    reference = reference_exposure(recording)
+    inner = [exposure_times(frame, reads) for frame in recording.frames()][1:-1]
+    if not inner:
+        raise FrameError(f"{recording.source.path}: blur consistency needs at least three frames")
+    images = means_of(method.images(recording, np.concatenate(inner)), reads)
+    found, skipped = [], 0
+    frames = iter(recording.frames())
+    next(frames)
+    for image, frame in zip(images, frames, strict=False):
+        valid = valid_pixels(frame)
+        if valid.any():
+            ratio = frame.exposure / reference
+            taken = linear_frame(frame, frame.exposure, response)
+            decibel = psnr(np.clip(image * ratio, 0, 1), taken, data_range=1.0, mask=valid)
+            found.append((frame.middle, int(np.count_nonzero(valid)), decibel))
+        else:
+            skipped += 1
+        on_image()
+    if not found:
+        raise FrameError(f"{recording.source.path}: all frames are clipped or black everywhere")
+    return BlurConsistency(method.label, reads, tuple(found), skipped)
+
+
+def valid_pixels(frame: Frame) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+    """Where a frame is neither clipped nor black: (H, W) bool."""
+    values = frame.normalised()
+    valid = (values > 0) & (values < CameraSettings().saturation)
+    return np.asarray(valid, np.bool_)

@@ -1,0 +1,211 @@
+"""Truth from any recording: frames are held out, and compared with what is reconstructed without them.
+
+A frame shows the mean of the intensity over its exposure, so it is compared with the mean of several reads across it.
+Frames clip: by default nothing is clipped, and a method that reconstructs highlights beyond white is punished where
+the held-out frame cannot show them. With ``clip`` the reconstruction is clipped as the camera would have.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux.errors import FrameError, InputError
+from kalux.evaluation.baselines import Method
+from kalux.evaluation.exposures import exposure_times, linear_frame, means_of, reference_exposure
+from kalux.evaluation.pairs import Array
+from kalux.evaluation.scores import Pair, Scores, score
+from kalux.frames import Frame
+from kalux.recording import Recording
+
+READS: Final = 5
+"""Reads across the exposure of a held-out frame."""
+
+MARGIN: Final = 3
+"""Frames at either end that are never compared, so that a filter has started and has a frame ahead."""
+
+SCALE_PERCENTILE: Final = 99.5
+"""Of all frames' intensities: what becomes 1. Below white in a dark recording, so that scores are comparable."""
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOut:
+    """A recording with frames held out.
+
+    Attributes
+    ----------
+    whole, kept
+        The recording with all frames, and without every n-th.
+    every
+        n.
+    compared
+        (C,) int64, indices in ``whole`` of the held-out frames that are compared: those at least 3 from either end.
+    times
+        (C, reads) int64 us, across the exposures of these frames.
+    reference_exposure
+        us, of ``kept``: at this exposure a saturated pixel is 1.
+    scale
+        99.5th percentile of the intensities of all frames.
+    response
+        Of the camera, as in `kalux.settings.CameraSettings`.
+    """
+
+    whole: Recording
+    kept: Recording
+    every: int
+    compared: NDArray[np.int64]
+    times: NDArray[np.int64]
+    reference_exposure: int
+    scale: float
+    response: str
+
+    def described(self) -> str:
+        """The protocol in words."""
+        return (
+            f"held-out frames: every {_ordinal(self.every)} dropped, {len(self.compared)} of them compared "
+            f"(numbers {self.compared[0]} to {self.compared[-1]}, from 0), mean of {self.times.shape[1]} reads "
+            "across each exposure"
+        )
+
+
+def hold_out_frames(
+    recording: Recording, every: int = 2, *, reads: int = READS, response: str = "linear"
+) -> HeldOut:
+    """Hold out every ``every``-th frame (numbers every - 1, 2 every - 1 ..., from 0).
+
+    Parameters
+    ----------
+    recording
+        With known exposures.
+    every
+        At least 2.
+    reads
+        Reads across the exposure of every held-out frame, at least 2.
+    response
+        Of the camera, as in `kalux.settings.CameraSettings`.
+
+    Raises
+    ------
+    InputError
+        If ``every`` or ``reads`` is less than 2.
+    FrameError
+        If there are too few frames to compare any, or all are black.
+    """
+    if every < 2 or reads < 2:
+        raise InputError(f"held-out frames: every is {every}, reads are {reads}; at least 2 are needed")
+    count = sum(1 for _ in recording.frames())
+    compared = np.arange(MARGIN, count - MARGIN)
+    compared = compared[compared % every == every - 1]
+    if len(compared) == 0:
+        raise FrameError(
+            f"{recording.source.path}: {count} frames are too few to hold out every {_ordinal(every)}: "
+            f"a frame that is compared needs {MARGIN} before and {MARGIN} after it"
+        )
+    kept = without_frames(recording, every)
+    reference = reference_exposure(kept)
+    chosen = {*compared.tolist()}
+    times = [exposure_times(f, reads) for i, f in enumerate(recording.frames()) if i in chosen]
+    scale = intensity_percentile(recording, SCALE_PERCENTILE, reference, response)
+    if scale <= 0:
+        raise FrameError(f"{recording.source.path}: the frames are black; there is nothing to compare")
+    return HeldOut(recording, kept, every, compared, np.stack(times), reference, scale, response)
+
+
+def without_frames(recording: Recording, every: int) -> Recording:
+    """The recording without every ``every``-th frame, and without its ground truth; nothing is copied."""
+
+    def frames() -> Iterator[Frame]:
+        return (frame for i, frame in enumerate(recording.frames()) if i % every != every - 1)
+
+    return Recording(
+        dataclasses.replace(
+            recording.source,
+            events=lambda: iter(recording.events()),
+            frames=frames,
+            count_frames=lambda: sum(1 for _ in frames()),
+            exposure_known=True,
+            ground_truth=None,
+        )
+    )
+
+
+def evaluate_held_out(
+    held: HeldOut,
+    method: Method,
+    *,
+    clip: bool = False,
+    hdr_vdp: bool = False,
+    on_image: Callable[[], None] = lambda: None,
+) -> Scores:
+    """Compare a method's images with the frames that were held out.
+
+    Parameters
+    ----------
+    held
+        From `hold_out_frames`.
+    method
+        From `kalux.evaluation.baselines`, or one's own.
+    clip
+        Clip the reconstruction where the camera does, before it is compared.
+    hdr_vdp
+        Whether Q is computed, which takes most of the time.
+    on_image
+        Called after every image.
+
+    Raises
+    ------
+    KaluxError
+        Whatever the method or the metrics say.
+    """
+    return score(
+        _pairs(held, method, clip),
+        method=method.label,
+        protocol=held.described(),
+        data_range=1.0,
+        scale=held.scale,
+        clipped=clip,
+        hdr_vdp=hdr_vdp,
+        on_image=on_image,
+    )
+
+
+def _pairs(held: HeldOut, method: Method, clip: bool) -> Iterator[Pair]:
+    images = means_of(method.images(held.kept, held.times.ravel()), held.times.shape[1])
+    chosen = {*held.compared.tolist()}
+    frames = (frame for i, frame in enumerate(held.whole.frames()) if i in chosen)
+    for frame, image in zip(frames, images, strict=True):
+        if clip:
+            image = clipped_as(image, frame, held.reference_exposure)
+        yield Pair(frame.middle, image, linear_frame(frame, held.reference_exposure, held.response))
+
+
+def clipped_as(image: Array, frame: Frame, reference: int) -> Array:
+    """An image (1 = saturated at the reference exposure, us) clipped where a frame of this exposure saturates."""
+    return np.clip(image, 0.0, reference / frame.exposure)
+
+
+def intensity_percentile(recording: Recording, percent: float, reference: int, response: str) -> float:
+    """A percentile of the intensities of all frames, in little memory: frames repeat their values."""
+    values, counts = np.empty(0), np.empty(0, np.int64)
+    for frame in recording.frames():
+        found, number = np.unique(linear_frame(frame, reference, response), return_counts=True)
+        values, index = np.unique(np.concatenate([values, found]), return_inverse=True)
+        counts = np.bincount(index, np.concatenate([counts, number])).astype(np.int64)
+    return percentile_of_counts(values, counts, percent)
+
+
+def percentile_of_counts(values: Array, counts: NDArray[np.int64], percent: float) -> float:
+    """`numpy.percentile` of increasing values that occur ``counts`` times each."""
+    last = np.cumsum(counts)
+    position = percent / 100 * (int(last[-1]) - 1)
+    below, above = values[np.searchsorted(last, [np.floor(position), np.ceil(position)], side="right")]
+    return float(below + (above - below) * (position - np.floor(position)))
+
+
+def _ordinal(n: int) -> str:
+    return {2: "2nd", 3: "3rd"}.get(n, f"{n}th")

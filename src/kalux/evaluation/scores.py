@@ -1,0 +1,222 @@
+"""What an evaluation finds: scores per image, their means, and what was done to the images beforehand."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kalux.errors import InputError
+from kalux.evaluation.hdr_vdp import hdrvdp
+from kalux.evaluation.metrics import log_mse, mse, psnr, ssim
+
+LOG_OFFSET: Final = 0.02
+"""Of the log-MSE, in units of white."""
+
+DISPLAY_LUMINANCE: Final = 255.0
+"""cd/m2 at which HDR-VDP is shown an intensity of 1, as in the paper's evaluation."""
+
+METRICS: Final = ("mse", "psnr", "ssim", "log_mse", "q")
+
+
+@dataclass(frozen=True)
+class ImageScores:
+    """One image against its reference.
+
+    Attributes
+    ----------
+    t
+        Time of the reference, us; the middle of a frame.
+    pixels
+        How many were compared.
+    mse, psnr, ssim, log_mse
+        As in `kalux.evaluation.metrics`; psnr in dB, log_mse of log(I + 0.02).
+    q
+        HDR-VDP's Q; None where it was not asked for.
+    """
+
+    t: int
+    pixels: int
+    mse: float
+    psnr: float
+    ssim: float
+    log_mse: float
+    q: float | None
+
+
+@dataclass(frozen=True)
+class Scores:
+    """A method's images against their references. The means are over images.
+
+    Attributes
+    ----------
+    method
+        Label of the method.
+    protocol
+        What the images were compared with.
+    images
+        Scores of every image, in time order.
+    data_range
+        That of PSNR and SSIM, in units of the compared images.
+    scale
+        Images and references were both divided by this before they were compared.
+    clipped
+        Whether the images were clipped as the camera clips before they were compared.
+    negative
+        How many compared values of the method's images are below 0. They count as 0 in log-MSE and HDR-VDP.
+    """
+
+    method: str
+    protocol: str
+    images: tuple[ImageScores, ...]
+    data_range: float
+    scale: float
+    clipped: bool
+    negative: int
+
+    @property
+    def pixels(self) -> int:
+        """How many pixels were compared, over all images."""
+        return sum(image.pixels for image in self.images)
+
+    @property
+    def mse(self) -> float:
+        """Mean of the images' MSE."""
+        return self._mean("mse")
+
+    @property
+    def psnr(self) -> float:
+        """Mean of the images' PSNR, dB."""
+        return self._mean("psnr")
+
+    @property
+    def ssim(self) -> float:
+        """Mean of the images' SSIM."""
+        return self._mean("ssim")
+
+    @property
+    def log_mse(self) -> float:
+        """Mean of the images' log-MSE."""
+        return self._mean("log_mse")
+
+    @property
+    def q(self) -> float | None:
+        """Mean of the images' HDR-VDP Q; None where it was not asked for."""
+        return None if self.images[0].q is None else self._mean("q")
+
+    def means(self) -> dict[str, float | None]:
+        """All means by name."""
+        return {name: getattr(self, name) for name in METRICS}
+
+    def adjustments(self) -> list[str]:
+        """What was done to the images, in words; empty: nothing."""
+        done = []
+        if self.scale != 1.0:
+            done.append(f"intensities divided by {self.scale:.4g}")
+        if self.clipped:
+            done.append("the reconstruction clipped where the camera clips")
+        if self.negative:
+            done.append(f"{self.negative} negative values taken as 0 in log-MSE and HDR-VDP")
+        return done
+
+    def _mean(self, name: str) -> float:
+        return float(np.mean([getattr(image, name) for image in self.images]))
+
+
+class Pair(NamedTuple):
+    """An image and what it is compared with.
+
+    Attributes
+    ----------
+    t
+        Of the reference, us.
+    test, reference
+        (H, W) linear intensity.
+    mask
+        (H, W) bool, True = compared; None: all.
+    """
+
+    t: int
+    test: NDArray[Any]
+    reference: NDArray[Any]
+    mask: NDArray[np.bool_] | None = None
+
+
+def score(
+    pairs: Iterable[Pair],
+    *,
+    method: str,
+    protocol: str,
+    data_range: float,
+    scale: float = 1.0,
+    clipped: bool = False,
+    hdr_vdp: bool = False,
+    on_image: Callable[[], None] = lambda: None,
+) -> Scores:
+    """Score every pair; ``on_image`` is called after each, the rest is as in `Scores`.
+
+    Raises
+    ------
+    InputError
+        If there are no pairs, or a pair cannot be compared; says which.
+    MissingDependencyError
+        If scikit-image is not installed.
+    """
+    images, negative = [], 0
+    for t, test, reference, mask in pairs:
+        test, reference = np.asarray(test) / scale, np.asarray(reference) / scale
+        try:
+            images.append(score_image(t, test, reference, data_range, mask=mask, hdr_vdp=hdr_vdp))
+        except InputError as error:
+            raise InputError(f"{method}, image at {t} us: {error}") from error
+        negative += int(np.count_nonzero(test < 0 if mask is None else (test < 0) & mask))
+        on_image()
+    if not images:
+        raise InputError(f"{method}: no images to compare")
+    return Scores(method, protocol, tuple(images), data_range, scale, clipped, negative)
+
+
+def score_image(
+    t: int,
+    test: ArrayLike,
+    reference: ArrayLike,
+    data_range: float,
+    *,
+    mask: NDArray[np.bool_] | None = None,
+    hdr_vdp: bool = False,
+) -> ImageScores:
+    """All metrics of one image; see `ImageScores`. HDR-VDP is shown the reference where pixels are not compared."""
+    test, reference = np.asarray(test, np.float64), np.asarray(reference, np.float64)
+    error = mse(test, reference, mask=mask)
+    lit = np.maximum(test, 0.0)
+    return ImageScores(
+        t=t,
+        pixels=test.size if mask is None else int(np.count_nonzero(mask)),
+        mse=error,
+        psnr=psnr(test, reference, data_range=data_range, mask=mask),
+        ssim=ssim(test, reference, data_range=data_range, mask=mask),
+        log_mse=log_mse(lit, reference, offset=LOG_OFFSET, mask=mask),
+        q=_quality(lit, reference, mask) if hdr_vdp else None,
+    )
+
+
+def _quality(test: NDArray[np.float64], reference: NDArray[np.float64], mask: Any) -> float:
+    if mask is not None:
+        reference = np.where(mask, reference, 0.0)
+        test = np.where(mask, test, reference)
+    return hdrvdp(DISPLAY_LUMINANCE * test, DISPLAY_LUMINANCE * reference).Q
+
+
+def require_dependencies() -> None:
+    """Find out before the work whether the metrics can be computed.
+
+    Raises
+    ------
+    MissingDependencyError
+        If scikit-image is not installed; names the extra.
+    """
+    blank = np.zeros((11, 11))
+    ssim(blank, blank, data_range=1.0)

@@ -1,0 +1,204 @@
+"""Against ground truth: images at the times of the reference images, nothing scaled and nothing clipped."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux.errors import FormatError, FrameError, InputError
+from kalux.evaluation.baselines import Method
+from kalux.evaluation.scores import Pair, Scores, score
+from kalux.readers import GroundTruth
+from kalux.recording import Recording
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """Reference images that a recording's reconstruction can be compared with.
+
+    Attributes
+    ----------
+    times
+        (T,) int64 us, ascending.
+    images
+        (T, H, W), linear, 1 = a saturated pixel at the recording's median exposure.
+    masks
+        (T, H, W) bool, True = compared; None: all.
+    left_out
+        How many images lie outside the time from the middle of the first exposure to the end of the last.
+    data_range
+        The largest compared value: the data range of PSNR and SSIM.
+    """
+
+    times: NDArray[np.int64]
+    images: NDArray[np.float32]
+    masks: NDArray[np.bool_] | None
+    left_out: int
+    data_range: float
+
+    def described(self) -> str:
+        """The protocol in words."""
+        said = f"ground truth: {len(self.times)} images"
+        if self.masks is not None:
+            said += ", unregistered pixels not compared"
+        if self.left_out:
+            said += f"; {self.left_out} more lie before the first or after the last frame"
+        return said
+
+
+def prepare_reference(
+    recording: Recording, truth: GroundTruth, mask: NDArray[np.bool_] | None = None
+) -> Reference:
+    """Check reference images, put them in order, and leave out those before the first and after the last frame.
+
+    Parameters
+    ----------
+    recording
+        With known exposures.
+    truth
+        Reference images, in any order.
+    mask
+        (T, H, W) or (H, W) bool, True = compared; where it is False an image may hold anything, NaN included.
+
+    Raises
+    ------
+    InputError
+        If images, times, mask and sensor do not fit together, a compared value is not finite or negative, or no
+        image lies within the frames.
+    FrameError
+        If the recording has no frames.
+    """
+    times, images = np.asarray(truth.times), np.asarray(truth.images)
+    if images.ndim != 3 or images.shape[1:] != recording.sensor_size or times.shape != images.shape[:1]:
+        raise InputError(
+            f"ground truth: images {images.shape} at {len(times)} times for a sensor of {recording.sensor_size}; "
+            "(T, height, width) at T times is needed"
+        )
+    masks = None if mask is None else _masks(mask, images.shape)
+    first, last = _span(recording)
+    order = np.argsort(times, kind="stable")
+    chosen = order[(times[order] >= first) & (times[order] <= last)]
+    if len(chosen) == 0:
+        raise InputError(
+            f"ground truth: none of {len(times)} images lies within the frames, {first} to {last} us; "
+            "is its clock that of the recording?"
+        )
+    images = images[chosen]
+    masks = None if masks is None else masks[chosen]
+    compared = images if masks is None else images[masks]
+    bad = int(np.count_nonzero(~(compared >= 0) | ~np.isfinite(compared)))
+    if bad:
+        raise InputError(
+            f"ground truth: {bad} of {compared.size} values are negative or not finite; mend or mask them"
+        )
+    if compared.size == 0 or not compared.max() > 0:
+        raise InputError("ground truth: nothing to compare, all of it is black or masked")
+    left_out = len(times) - len(chosen)
+    return Reference(times[chosen].astype(np.int64), images, masks, left_out, float(compared.max()))
+
+
+def evaluate_truth(
+    recording: Recording,
+    reference: Reference,
+    method: Method,
+    *,
+    hdr_vdp: bool = False,
+    on_image: Callable[[], None] = lambda: None,
+) -> Scores:
+    """Compare a method's images with the truth.
+
+    Parameters
+    ----------
+    recording
+        With known exposures.
+    reference
+        From `prepare_reference`.
+    method
+        From `kalux.evaluation.baselines`, or one's own.
+    hdr_vdp
+        Whether Q is computed, which takes most of the time.
+    on_image
+        Called after every image.
+
+    Raises
+    ------
+    KaluxError
+        Whatever the method or the metrics say.
+    """
+
+    def pairs() -> Iterator[Pair]:
+        made = method.images(recording, reference.times)
+        for i, image in enumerate(made):
+            mask = None if reference.masks is None else reference.masks[i]
+            yield Pair(int(reference.times[i]), image, reference.images[i], mask)
+
+    return score(
+        pairs(),
+        method=method.label,
+        protocol=reference.described(),
+        data_range=reference.data_range,
+        hdr_vdp=hdr_vdp,
+        on_image=on_image,
+    )
+
+
+def load_truth(path: Path) -> tuple[GroundTruth, NDArray[np.bool_] | None]:
+    """Reference images from a ``.npz``: ``times_us`` or ``times`` (T, us), ``gt`` or ``images`` (T, H, W).
+
+    Returns
+    -------
+    The images, and the ``mask`` where there is one: (T, H, W) or (H, W) bool, True = compared.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read.
+    FormatError
+        If it is no ``.npz``, or an array is missing or of the wrong type.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files if name in _KEYS}
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or 'not an .npz file'}") from error
+    except (ValueError, TypeError, EOFError, AttributeError, zipfile.BadZipFile) as error:
+        raise FormatError(f"{path}: not an .npz file of plain arrays, or damaged") from error
+    times, images = _array(path, arrays, "times_us", "times"), _array(path, arrays, "gt", "images")
+    if times.ndim != 1 or times.dtype.kind not in "iu":
+        raise FormatError(f"{path}: the times are {times.dtype} {times.shape}; whole us, (T,), are needed")
+    if images.ndim != 3 or images.dtype.kind not in "fiu":
+        raise FormatError(f"{path}: the images are {images.dtype} {images.shape}; (T, H, W) is needed")
+    return GroundTruth(times.astype(np.int64), images.astype(np.float32)), arrays.get("mask")
+
+
+_KEYS = ("times_us", "times", "gt", "images", "mask")
+
+
+def _array(path: Path, arrays: dict[str, NDArray[Any]], *names: str) -> NDArray[Any]:
+    for name in names:
+        if name in arrays:
+            return arrays[name]
+    raise FormatError(f"{path}: has no array {' or '.join(names)}")
+
+
+def _masks(mask: NDArray[np.bool_], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    given = np.asarray(mask)
+    if given.dtype != bool or given.shape not in (shape, shape[1:]):
+        raise InputError(
+            f"ground truth: the mask is {given.dtype} {given.shape}; bool {shape} or {shape[1:]} is needed"
+        )
+    return np.broadcast_to(given, shape)
+
+
+def _span(recording: Recording) -> tuple[int, int]:
+    """Middle of the first exposure, where every method can begin, and end of the last, us."""
+    frames = [(frame.middle, frame.exposure_end) for frame in recording.frames()]
+    if not frames:
+        raise FrameError(f"{recording.source.path}: no frames; an evaluation needs frames")
+    return frames[0][0], frames[-1][1]

@@ -1,0 +1,145 @@
+"""``kalux evaluate``: its table and files, what it compares with, errors."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+import sys
+
+import numpy as np
+import pytest
+
+from kalux.evaluation.baselines import methods
+from kalux.evaluation.held_out import evaluate_held_out, hold_out_frames
+from kalux.recording import open as open_recording
+
+
+@pytest.fixture(scope="session")
+def with_truth(tmp_path_factory, write_recording, simulation):
+    return write_recording(tmp_path_factory.mktemp("truth") / "rec.h5", ground_truth=simulation.truth())
+
+
+def labels(out):
+    return [line[:26].strip() for line in out.splitlines()[2:] if not line.startswith(("all", "wrote"))]
+
+
+def test_frames_are_held_out_where_there_is_no_truth(cli, recording):
+    found = cli("evaluate", recording)
+    assert found.code == 0, found.err
+    lines = found.out.splitlines()
+    assert "held-out frames: every 2nd dropped" in lines[0]
+    assert lines[1].split() == ["method", "MSE", "x100", "PSNR", "dB", "SSIM", "log-MSE", "x100"]
+    assert labels(found.out)[:7] == [m.label for n, m in methods().items() if n != "iccv2021-flir"]
+    assert "images, " in lines[9]
+    assert "pixels compared; data range 1" in lines[9]
+
+
+def test_truth_where_the_recording_has_it(cli, with_truth):
+    found = cli("evaluate", with_truth, "--methods", "hold,default")
+    assert "ground truth:" in found.out
+    assert labels(found.out)[:2] == ["hold the last frame", "AKF default"]
+    assert "held-out" in cli("evaluate", with_truth, "--hold-out-frames", "3", "--methods", "hold").out
+
+
+def test_truth_from_a_file_is_that_of_the_recording(cli, recording, with_truth, simulation, tmp_path):
+    truth = simulation.truth()
+    np.savez(tmp_path / "rec_gt.npz", times_us=truth.times, gt=truth.images)
+    from_file = cli("evaluate", recording, "--truth", tmp_path / "rec_gt.npz", "--methods", "hold").out
+    own = cli("evaluate", with_truth, "--truth", "--methods", "hold").out
+    assert from_file.splitlines()[1:] == own.splitlines()[1:]
+
+
+def test_the_numbers_are_those_of_the_library_in_table_and_files(cli, recording, tmp_path):
+    table, whole = tmp_path / "s.csv", tmp_path / "s.json"
+    arguments = ("evaluate", recording, "--methods", "hold,cf", "--hdrvdp", "--blur-consistency", "--quiet")
+    out = cli(*arguments, "-o", table).out
+    assert cli(*arguments, "-o", whole).code == 0
+    held = hold_out_frames(open_recording(recording))
+    rows = list(csv.DictReader(table.open()))
+    parsed = json.loads(whole.read_text())["methods"]
+    for name, row, entry in zip(("hold", "cf"), rows, parsed, strict=True):
+        scores = evaluate_held_out(held, methods()[name], hdr_vdp=True)
+        assert {key: float(row[key]) for key in scores.means()} == scores.means()
+        assert {key: entry[key] for key in scores.means()} == scores.means()
+        assert [image["mse"] for image in entry["per_image"]] == [image.mse for image in scores.images]
+        assert float(row["blur_psnr"]) == entry["blur_psnr"] > 10
+        assert (row["pixels"], row["clipped"]) == (str(scores.pixels), "False")
+        assert f"{100 * scores.mse:.3f}" in out
+    assert [path.name for path in tmp_path.iterdir() if path.name.startswith(".")] == []
+
+
+def test_equal_images_are_valid_json(cli, write_recording, simulation, tmp_path):
+    """White, held: the PSNR is infinite, which JSON has not."""
+    frames = [dataclasses.replace(f, image=np.full_like(f.image, 255)) for f in simulation.frames]
+    path = write_recording(tmp_path / "still.h5", frames=frames)
+    assert cli("evaluate", path, "--methods", "hold", "-o", tmp_path / "s.json").code == 0
+    text = (tmp_path / "s.json").read_text()
+    assert json.loads(text, parse_constant=pytest.fail)["methods"][0]["psnr"] is None
+
+
+def test_clipping_is_asked_for_and_told(cli, recording):
+    assert "clipped" not in cli("evaluate", recording, "--methods", "hold").out
+    assert "all: the reconstruction clipped" in cli("evaluate", recording, "--methods", "hold", "--clip").out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["--methods", "e2vid"], "no method 'e2vid'"),
+        (["--truth"], "has no ground truth; give --truth FILE.npz"),
+        (["--truth", "missing.npz"], "missing.npz: cannot be read"),
+        (["--truth", "x.npz", "--clip"], "--clip is for held-out frames"),
+        (["--truth", "x.npz", "--hold-out-frames", "2"], "not allowed with"),
+        (["--hold-out-frames", "0"], "at least 2"),
+        (["--hold-out-frames", "11"], "too few"),
+        (["--response", "log"], "unknown response"),
+        (["-o", "scores.txt"], ".csv or .json"),
+        (["-o", "no/such/scores.csv"], "no such folder"),
+    ],
+)
+def test_errors_are_one_line(cli, recording, tmp_path, monkeypatch, arguments, told):
+    monkeypatch.chdir(tmp_path)
+    found = cli("evaluate", recording, *arguments)
+    assert found.code == 2
+    assert told in found.error
+
+
+def test_the_neighbours_are_no_baseline_where_they_are_not_held_out(cli, with_truth):
+    assert "held out" in cli("evaluate", with_truth, "--methods", "mean").error
+
+
+@pytest.mark.parametrize("damage", ["event outside the sensor", "no frames", "no exposure times", "NaN"])
+def test_damage_is_found_before_the_table(cli, damaged, damage):
+    found = cli("evaluate", damaged(damage))
+    assert (found.code, found.out) == (2, "")
+    assert found.error
+
+
+def test_a_file_is_replaced_only_if_asked_for(cli, recording, tmp_path):
+    out = tmp_path / "s.csv"
+    out.write_text("mine")
+    arguments = ("evaluate", recording, "--methods", "hold", "-o", out)
+    assert "--overwrite" in cli(*arguments).error
+    assert out.read_text() == "mine"
+    assert cli(*arguments, "--overwrite").code == 0
+    assert out.read_text().startswith("recording,")
+
+
+def test_without_scikit_image_the_extra_is_named(cli, recording, monkeypatch):
+    for name in [name for name in sys.modules if name.split(".")[0] == "skimage"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "skimage", None)
+    found = cli("evaluate", recording)
+    assert (found.code, found.out) == (2, "")
+    assert "kalux[evaluation]" in found.error
+
+
+def test_an_interrupt_leaves_no_file(cli, recording, tmp_path, monkeypatch):
+    def interrupted(*unused, **options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("kalux.evaluation.held_out.evaluate_held_out", interrupted)
+    found = cli("evaluate", recording, "-o", tmp_path / "s.csv")
+    assert found.code == 130
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,180 @@
+"""Held-out frames, and blur consistency: which frames, what is compared with them, in which unit."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import kalux
+from kalux import Recording
+from kalux.datasets import SensorSettings
+from kalux.errors import FrameError, InputError
+from kalux.evaluation.baselines import Method, methods
+from kalux.evaluation.consistency import blur_consistency, valid_pixels
+from kalux.evaluation.held_out import (
+    clipped_as,
+    evaluate_held_out,
+    hold_out_frames,
+    intensity_percentile,
+    percentile_of_counts,
+)
+
+from builders import frame, moving_blocks, pixel_events
+
+
+def still(levels, exposures=None, size=(12, 12)):
+    """A recording of frames of one value each."""
+    exposures = exposures or [10] * len(levels)
+    frames = [
+        frame(level, 100 * i, 100 * i + exposure, size)
+        for i, (level, exposure) in enumerate(zip(levels, exposures, strict=True))
+    ]
+    return Recording.from_arrays(pixel_events([], []), frames, sensor_size=size, contrast_threshold=0.2)
+
+
+def constant(value):
+    return Method("constant", lambda recording, times: (np.full(recording.sensor_size, value) for _ in times))
+
+
+def test_every_nth_frame_is_dropped_and_compared_if_three_from_either_end():
+    recording = still(range(100, 112))
+    held = hold_out_frames(recording, 2)
+    assert held.compared.tolist() == [3, 5, 7]
+    assert [f.image[0, 0] for f in held.kept.frames()] == [100, 102, 104, 106, 108, 110]
+    assert len(held.kept.frames()) == 6
+    held = hold_out_frames(recording, 3)
+    assert held.compared.tolist() == [5, 8]
+    assert [f.image[0, 0] for f in held.kept.frames()] == [100, 101, 103, 104, 106, 107, 109, 110]
+    assert "every 3rd dropped, 2 of them compared (numbers 5 to 8" in held.described()
+    assert held.times.tolist() == [[500, 502, 505, 507, 510], [800, 802, 805, 807, 810]]
+
+
+def test_the_scale_is_the_percentile_of_all_frames():
+    rng = np.random.default_rng(0)
+    frames = [frame(rng.integers(0, 256, (9, 11)), 100 * i, 100 * i + 10) for i in range(8)]
+    recording = Recording.from_arrays(pixel_events([], []), frames, sensor_size=(9, 11))
+    expected = np.percentile(np.stack([f.normalised() for f in frames]), 99.5)
+    assert intensity_percentile(recording, 99.5, 10, "linear") == pytest.approx(expected, rel=1e-12)
+    for percent in (0, 37.3, 100):
+        assert percentile_of_counts(np.array([1.0, 2, 5]), np.array([2, 1, 3]), percent) == pytest.approx(
+            np.percentile([1, 1, 2, 5, 5, 5], percent)
+        )
+
+
+def test_scores_by_hand():
+    """Scale 0.8 (all frames 204 of 255), reconstruction 1.0: an error of (1.0 - 0.8) / 0.8."""
+    held = hold_out_frames(still([204] * 8))
+    scores = evaluate_held_out(held, constant(1.0))
+    assert scores.mse == pytest.approx(0.25**2)
+    assert scores.psnr == pytest.approx(10 * np.log10(16))
+    assert scores.log_mse == pytest.approx(np.log(1.27 / 1.02) ** 2)
+    assert [(image.t, image.pixels) for image in scores.images] == [(305, 144)]
+    assert scores.scale == pytest.approx(0.8)
+    assert scores.adjustments() == ["intensities divided by 0.8"]
+
+
+def test_nothing_is_clipped_unless_asked_for():
+    held = hold_out_frames(still([255] * 8))
+    assert evaluate_held_out(held, constant(3.0)).mse == pytest.approx(4.0)
+    clipped = evaluate_held_out(held, constant(3.0), clip=True)
+    assert clipped.mse == 0
+    assert "clipped" in clipped.adjustments()[0]
+    assert evaluate_held_out(held, constant(-0.5)).negative == 144
+
+
+def test_auto_exposure_frames_are_scaled_to_the_kept_frames_median():
+    """The same light, 0.4 at 20 us, seen with exposures of 10 and 20 us."""
+    held = hold_out_frames(
+        still([51 if i % 2 else 102 for i in range(9)], [10 if i % 2 else 20 for i in range(9)])
+    )
+    assert held.reference_exposure == 20
+    assert evaluate_held_out(held, methods()["hold"]).mse == pytest.approx(0, abs=1e-12)
+    short = frame(255, 0, 10)
+    assert clipped_as(np.array([[5.0, -1.0]]), short, 20).tolist() == [[2.0, 0.0]]
+
+
+def test_reads_are_averaged_across_the_exposure():
+    """An image that brightens linearly with time is, at the middle, the frame."""
+    recording = still([102] * 8, [40] * 8)
+    rising = Method("rising", lambda rec, ts: (np.full((12, 12), 0.4 + (t - 320) / 100) for t in ts.tolist()))
+    assert evaluate_held_out(hold_out_frames(recording), rising).mse == pytest.approx(0, abs=1e-12)
+
+
+def test_what_a_method_does_not_know_is_interpolated_by_events():
+    simulation = moving_blocks()
+    held = hold_out_frames(simulation.recording())
+    found = {name: evaluate_held_out(held, methods()[name]) for name in ("hold", "mean", "edi", "default")}
+    assert found["default"].mse < 0.3 * found["mean"].mse
+    assert found["default"].mse < found["edi"].mse < found["hold"].mse
+    assert found["default"].ssim > found["hold"].ssim
+    assert held.kept.ground_truth() is None
+
+
+def test_hdr_vdp_is_computed_only_if_asked_for():
+    held = hold_out_frames(moving_blocks().recording())
+    assert evaluate_held_out(held, methods()["hold"]).q is None
+    found = [evaluate_held_out(held, methods()[n], hdr_vdp=True).q for n in ("hold", "default")]
+    assert found[0] < found[1] <= 10
+
+
+def test_values_that_are_not_finite_are_told_with_method_and_time():
+    with pytest.raises(
+        InputError, match=r"constant, image at 305 us: test: 144 of 144 values are not finite"
+    ):
+        evaluate_held_out(hold_out_frames(still([204] * 8)), constant(np.nan))
+
+
+@pytest.mark.parametrize(
+    ("levels", "every", "told"),
+    [([9] * 6, 2, "too few"), ([0] * 9, 2, "black"), ([9] * 9, 1, "at least 2"), ([9] * 9, 40, "too few")],
+)
+def test_what_cannot_be_held_out(levels, every, told):
+    with pytest.raises((FrameError, InputError), match=told):
+        hold_out_frames(still(levels), every)
+
+
+def test_the_numbers_of_the_published_protocol(shared_data):
+    """Drop, scale and average as docs/tuning.md says, written out for the simplest methods."""
+    recording = kalux.open(shared_data / "newton_davis346.aedat4")
+    values = np.stack([f.normalised() for f in recording.frames()])
+    dropped = np.arange(3, len(values) - 3, 2)
+    scale = np.percentile(values, 99.5)
+    held = hold_out_frames(recording)
+    for name, expected in (
+        ("hold", values[dropped - 1]),
+        ("mean", (values[dropped - 1] + values[dropped + 1]) / 2),
+    ):
+        error = np.mean(((expected - values[dropped]) / scale) ** 2)
+        assert evaluate_held_out(held, methods()[name]).mse == pytest.approx(error, rel=1e-6)
+    assert evaluate_held_out(held, methods()["default"]).ssim > 0.94
+
+
+class TestBlurConsistency:
+    def test_images_that_are_right_give_the_frames(self):
+        """Long exposures in motion: sharp truth integrates to the blurred frame, held frames do not."""
+        simulation = moving_blocks(sensor=SensorSettings(exposure=30_000), speed=120.0)
+        truth = Method("truth", lambda rec, times: (simulation.scene.at(float(t)) for t in times))
+        recording = simulation.recording()
+        found = {
+            m.label: blur_consistency(recording, m) for m in (truth, methods()["cf"], methods()["default"])
+        }
+        assert found["truth"].psnr > 40
+        assert found["AKF default"].psnr > 35
+        assert found["AKF default"].psnr > found["CF"].psnr + 5
+        assert len(found["truth"].frames) == len(simulation.frames) - 2
+
+    def test_clipped_and_black_pixels_do_not_count(self):
+        levels = np.full((12, 12), 102)
+        levels[0], levels[1] = 255, 0
+        frames = [frame(levels, 100 * i, 100 * i + 10) for i in range(3)]
+        recording = Recording.from_arrays(pixel_events([], []), frames, sensor_size=(12, 12))
+        assert np.count_nonzero(valid_pixels(frames[0])) == 120
+        found = blur_consistency(recording, constant(0.5))
+        assert found.frames == ((105, 120, pytest.approx(20.0)),)
+
+    def test_frames_without_such_pixels_are_counted(self):
+        assert blur_consistency(still([102, 255, 102, 102]), constant(0.4)).skipped == 1
+        with pytest.raises(FrameError, match="clipped or black"):
+            blur_consistency(still([255] * 4), constant(1.0))
+        with pytest.raises(FrameError, match="three frames"):
+            blur_consistency(still([102] * 2), constant(1.0))

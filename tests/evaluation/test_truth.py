@@ -1,0 +1,136 @@
+"""Ground truth: its order, span and mask, and what is refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import kalux
+from kalux.errors import FormatError, InputError
+from kalux.evaluation.baselines import Method, methods
+from kalux.evaluation.truth import evaluate_truth, load_truth, prepare_reference
+from kalux.readers import GroundTruth
+
+from builders import moving_blocks
+
+
+@pytest.fixture(scope="module")
+def simulation():
+    return moving_blocks(high=2.0)
+
+
+@pytest.fixture(scope="module")
+def recording(simulation):
+    return simulation.recording()
+
+
+def perfect(simulation):
+    return Method(
+        "truth", lambda rec, times: (simulation.scene.at(float(t)).astype(np.float32) for t in times)
+    )
+
+
+def test_the_truth_itself_has_no_error(simulation, recording):
+    scores = evaluate_truth(recording, prepare_reference(recording, simulation.truth()), perfect(simulation))
+    assert scores.mse == scores.log_mse == 0
+    assert scores.psnr == np.inf
+    assert scores.ssim == pytest.approx(1)
+    assert scores.pixels == len(scores.images) * 32 * 40
+    assert scores.adjustments() == []
+    assert scores.data_range == simulation.truth().images.max()
+
+
+def test_scores_are_means_over_images(simulation, recording):
+    truth = simulation.truth()
+    scores = evaluate_truth(recording, prepare_reference(recording, truth), methods()["hold"])
+    held = np.stack(list(methods()["hold"].images(recording, truth.times)))
+    assert scores.mse == pytest.approx(np.mean((held.astype(float) - truth.images) ** 2))
+    assert [image.t for image in scores.images] == truth.times.tolist()
+
+
+def test_images_may_come_in_any_order(simulation, recording):
+    truth = simulation.truth()
+    shuffled = np.random.default_rng(0).permutation(len(truth.times))
+    reference = prepare_reference(recording, GroundTruth(truth.times[shuffled], truth.images[shuffled]))
+    assert evaluate_truth(recording, reference, perfect(simulation)).mse == 0
+
+
+def test_images_before_and_after_the_frames_are_left_out_and_told(simulation, recording):
+    ends = simulation.frames[0].middle, simulation.frames[-1].exposure_end
+    times = np.array([0, ends[0] - 1, *ends, ends[1] + 1])
+    reference = prepare_reference(recording, simulation.truth(times))
+    assert reference.times.tolist() == list(ends)
+    assert "3 more lie before" in reference.described()
+    for method in methods().values():
+        assert len(evaluate_truth(recording, reference, method).images) == 2
+
+
+def test_masked_pixels_may_hold_anything(simulation, recording):
+    truth = simulation.truth()
+    images, mask = truth.images.copy(), np.ones(truth.images.shape[1:], bool)
+    mask[:, :10], images[:, :, :10] = False, np.nan
+    spoilt = GroundTruth(truth.times, images)
+    with pytest.raises(InputError, match="not finite; mend or mask them"):
+        prepare_reference(recording, spoilt)
+    reference = prepare_reference(recording, spoilt, mask)
+    hold = evaluate_truth(recording, reference, methods()["hold"], hdr_vdp=True)
+    assert hold.images[0].pixels == 32 * 30
+    assert "not compared" in hold.protocol
+    whole = evaluate_truth(recording, prepare_reference(recording, truth), methods()["hold"])
+    assert hold.mse != whole.mse
+    right = evaluate_truth(recording, reference, perfect(simulation), hdr_vdp=True)
+    assert (right.mse, right.q) == (0, pytest.approx(10))
+
+
+def test_what_does_not_fit_is_refused(simulation, recording):
+    truth = simulation.truth()
+    for bad, mask, told in (
+        (GroundTruth(truth.times[1:], truth.images), None, "T times"),
+        (GroundTruth(truth.times, truth.images[:, 1:]), None, "sensor"),
+        (GroundTruth(truth.times + 10**9, truth.images), None, "is its clock"),
+        (GroundTruth(truth.times, -truth.images), None, "negative"),
+        (GroundTruth(truth.times, 0 * truth.images), None, "black"),
+        (truth, np.ones((3, 3), bool), "mask"),
+        (truth, np.zeros(truth.images.shape, bool), "masked"),
+    ):
+        with pytest.raises(InputError, match=told):
+            prepare_reference(recording, bad, mask)
+
+
+class TestFiles:
+    @pytest.mark.parametrize("names", [("times_us", "gt"), ("times", "images")])
+    def test_both_names(self, tmp_path, simulation, names):
+        truth = simulation.truth()
+        mask = truth.images[0] > 0.1
+        np.savez(tmp_path / "t.npz", **dict(zip(names, (truth.times, truth.images), strict=True)), mask=mask)
+        found, read_mask = load_truth(tmp_path / "t.npz")
+        assert np.array_equal(found.times, truth.times)
+        assert np.array_equal(found.images, truth.images)
+        assert np.array_equal(read_mask, mask)
+
+    def test_errors_name_the_file(self, tmp_path):
+        path = tmp_path / "t.npz"
+        with pytest.raises(InputError, match=r"t\.npz: cannot be read"):
+            load_truth(path)
+        for content in (b"", b"text", b"PK\x03\x04 cut"):
+            path.write_bytes(content)
+            with pytest.raises(FormatError, match=r"t\.npz: not an \.npz file"):
+                load_truth(path)
+        for arrays, told in (
+            ({"gt": np.ones((1, 2, 2))}, "no array times_us or times"),
+            ({"times": np.ones(1), "gt": np.ones((1, 2, 2))}, "whole us"),
+            ({"times": np.ones(1, int), "gt": np.ones((2, 2))}, "T, H, W"),
+            ({"times": np.array([None]), "gt": np.ones((1, 2, 2))}, "plain arrays"),
+        ):
+            np.savez(path, **arrays)
+            with pytest.raises(FormatError, match=told):
+                load_truth(path)
+
+
+def test_ground_truth_of_a_simulated_pan(shared_data):
+    folder = shared_data / "hdr_pan"
+    recording = kalux.open(folder / "Oxford_Church_clean.mat")
+    reference = prepare_reference(recording, *load_truth(folder / "Oxford_Church_clean_gt.npz"))
+    found = {name: evaluate_truth(recording, reference, methods()[name]) for name in ("hold", "default")}
+    assert (100 * found["hold"].mse, found["hold"].ssim) == pytest.approx((7.950, 0.935), abs=5e-4)
+    assert found["default"].mse < found["hold"].mse / 2
