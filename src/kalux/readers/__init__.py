@@ -8,6 +8,8 @@ from typing import NamedTuple
 
 from kalux.errors import FormatError, InputError
 from kalux.readers import (
+    aedat2,
+    aedat3,
     aedat4,
     dsec,
     es,
@@ -42,6 +44,8 @@ class Reader(NamedTuple):
 
 READERS: tuple[Reader, ...] = (
     Reader("aedat4", "AEDAT 4 (iniVation DV)", aedat4.recognises, aedat4.read),
+    Reader("aedat2", "AEDAT 2.0 (jAER, DAVIS)", aedat2.recognises, aedat2.read),
+    Reader("aedat3", "AEDAT 3.1 (cAER, libcaer)", aedat3.recognises, aedat3.read),
     Reader("kalux", "kalux HDF5", hdf5.recognises, hdf5.read),
     Reader("mat", "MATLAB file of the AKF authors' datasets (v5, v7.3)", mat.recognises, mat.read),
     Reader("raw", "Prophesee RAW (EVT 2.0, 2.1, 3.0)", prophesee.recognises_raw, prophesee.read_raw),

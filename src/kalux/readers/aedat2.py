@@ -1,0 +1,386 @@
+"""AEDAT 2.0, the format of jAER, of the DAVIS sensors: header lines, then pairs of address and time.
+
+Both are 32 bits, big-endian; times are us and wrap around. The file is described at
+https://docs.inivation.com/software/software-advanced-usage/file-formats/aedat-2.0.html, and how words become events and
+samples by jAER (https://github.com/SensorsINI/jaer: ``DavisChip``, ``DavisBaseCamera.DavisEventExtractor``):
+
+======  =====================================================================================
+bit     meaning
+======  =====================================================================================
+31      0: event; 1: sample of the frame, or of the inertial unit
+30-22   row, from the bottom
+21-12   column: of events from the right, of samples from the left
+11      of events: polarity
+10      of events: 1 = not of a pixel, but of the external input (bits 2-0: 2 falling, 3 rising)
+11-10   of samples: 0 reset read, 1 signal read, 3 inertial unit
+9-0     of samples: value of the converter
+======  =====================================================================================
+
+A pixel of a frame is its reset read less its signal read. No word marks the exposure: it is taken from the times of
+the reads, as jAER does.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from kalux.errors import FormatError
+from kalux.events import EventArray
+from kalux.frames import Frame
+from kalux.readers import evt
+from kalux.readers.source import Source, TriggerArray, reading
+
+_MAGIC: Final = b"#!AER-DAT2."
+_WORD: Final = np.dtype(">u8")  # address and time
+_BLOCK_WORDS: Final = 1 << 16
+_LONGEST_LINE: Final = 1 << 16
+_LARGEST_HEADER: Final = 1 << 24
+_WHITE: Final = 1023  # the converter has 10 bits
+_SIZES: Final = {"128": (128, 128), "240": (180, 240), "346": (260, 346), "640": (480, 640)}
+
+_NO_FRAMES: Final = "The file has no complete frames."
+_ROLLING: Final = (
+    "The frames have a rolling shutter; their exposure is that of the first pixel that was read, "
+    "others are exposed later by up to the time of the readout."
+)
+_SHUTTER_UNKNOWN: Final = (
+    "The file does not say whether the shutter is global or rolling; "
+    "the exposure is that of a global shutter."
+)
+
+
+@dataclass(frozen=True)
+class _Header:
+    """What the header says, and where it ends, bytes. ``rolling`` is None where it does not say."""
+
+    chip: str
+    rolling: bool | None
+    end: int
+
+
+@dataclass(frozen=True)
+class _Survey:
+    """What a file holds."""
+
+    events: int
+    frames: int
+    incomplete_frames: int
+    interleaved: bool
+
+
+def recognises(path: Path) -> bool:
+    """Whether the file begins like AEDAT 2."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(len(_MAGIC)) == _MAGIC
+
+
+def read(path: Path) -> Source:
+    """Open an AEDAT 2.0 file of a DAVIS with 128x128, 240x180, 346x260 or 640x480 grey pixels.
+
+    It is read through once. Frames are uint16, white is 1023.
+
+    Raises
+    ------
+    FormatError
+        If the sensor is another one or not named, the file ends within a word, or its clock goes back.
+    InputError
+        If it cannot be read.
+    """
+    with reading(path):
+        header = _header(path)
+        size = _sensor_size(path, header.chip)
+        excess = (path.stat().st_size - header.end) % _WORD.itemsize
+    if excess:
+        raise FormatError(
+            f"{path}: cut short: it ends {excess} bytes into an event of {_WORD.itemsize}; copy or download it again"
+        )
+    words = _Words(path, header.end, size)
+    survey = words.survey()
+    rolling = survey.interleaved or bool(header.rolling)
+    return Source(
+        path=path,
+        format="aedat2",
+        sensor_size=size,
+        events=words.events,
+        frames=partial(words.frames, rolling),
+        count_events=lambda: survey.events,
+        count_frames=lambda: survey.frames,
+        triggers=words.triggers,
+        missing=_missing(survey, header, rolling),
+    )
+
+
+def _missing(survey: _Survey, header: _Header, rolling: bool) -> tuple[str, ...]:
+    lost = survey.incomplete_frames
+    missing = (f"{lost} incomplete frame{'s are' if lost > 1 else ' is'} left out.",) if lost else ()
+    if not survey.frames:
+        return (*missing, _NO_FRAMES)
+    if rolling:
+        return (*missing, _ROLLING)
+    return (*missing, _SHUTTER_UNKNOWN) if header.rolling is None else missing
+
+
+@dataclass(frozen=True)
+class _Words:
+    """The words of a file: where they begin, and of which sensor they are."""
+
+    path: Path
+    start: int
+    size: tuple[int, int]
+
+    def blocks(self) -> Iterator[NDArray[np.uint64]]:
+        with self.path.open("rb") as file:
+            file.seek(self.start)
+            while len(words := np.fromfile(file, _WORD, _BLOCK_WORDS)):
+                yield words.astype(np.uint64)
+
+    def events(self) -> Iterator[EventArray]:
+        with reading(self.path, evt.ClockError):
+            yield from evt.decode_events(_DAVIS, self.blocks(), self.size)
+
+    def triggers(self) -> Iterator[TriggerArray]:
+        with reading(self.path, evt.ClockError):
+            yield from evt.decode_triggers(_DAVIS, self.blocks(), self.size)
+
+    def frames(self, rolling: bool) -> Iterator[Frame]:
+        with reading(self.path, evt.ClockError):
+            for image, state in decode_frames(self.blocks(), self.size):
+                start = state[_FIRST_RESET if rolling else _LAST_RESET]
+                yield Frame(image, int(start), int(state[_FIRST_SIGNAL]), _WHITE)
+
+    def survey(self) -> _Survey:
+        frames, interleaved = 0, False
+        state = new_frame_state()
+        with reading(self.path, evt.ClockError):
+            for _ in decode_frames(self.blocks(), self.size, state):
+                frames += 1
+                interleaved |= bool(state[_INTERLEAVED])
+        return _Survey(int(state[_EVENTS]), frames, int(state[_INCOMPLETE]), interleaved)
+
+
+# The header
+
+
+def _header(path: Path) -> _Header:
+    """The lines at the beginning that are text and begin with ``#``."""
+    chip = ""
+    shutters: dict[str, bool] = {}
+    end = 0
+    with path.open("rb") as file:
+        while end < _LARGEST_HEADER:
+            line = file.readline(_LONGEST_LINE)
+            # Events may begin with the byte of a '#', too, but are not text.
+            if not line.startswith(b"#") or not line.endswith(b"\n") or not _is_text(line):
+                break
+            end += len(line)
+            text = line.decode("utf-8").strip("# \r\n\t")
+            if text.lower().startswith("aechip:"):
+                chip = text.partition(":")[2].strip().rpartition(".")[2]
+            elif shutter := re.search(
+                r'key="([^"]*globalshutter)" value="(true|false)"', text, re.IGNORECASE
+            ):
+                shutters[shutter[1]] = shutter[2].lower() == "false"
+            elif text.lower() == "end of ascii header":
+                break
+    return _Header(chip, _rolling(chip, shutters), end)
+
+
+def _is_text(line: bytes) -> bool:
+    try:
+        return line.decode("utf-8").strip("\r\n").replace("\t", " ").isprintable()
+    except UnicodeDecodeError:
+        return False
+
+
+def _rolling(chip: str, shutters: dict[str, bool]) -> bool | None:
+    """Whether the preferences of a chip, as ``CHIP.APS.GlobalShutter`` or older names, all say so."""
+    own = [key for key in shutters if key.lower().startswith(f"{chip.lower()}.")]
+    newest = [key for key in own if ".aps" in key.lower()] or own
+    said = {shutters[key] for key in newest}
+    return said.pop() if len(said) == 1 else None
+
+
+def _sensor_size(path: Path, chip: str) -> tuple[int, int]:
+    if not chip:
+        raise FormatError(
+            f"{path}: does not say which sensor it is from; its header needs a line such as "
+            "'# AEChip: eu.seebetter.ini.chips.davis.DAVIS240C'"
+        )
+    name = chip.lower()
+    if re.search(r"colou?r|rgb|cdavis", name):
+        raise FormatError(f"{path}: the sensor {chip[:40]} has colour pixels, which kalux does not read")
+    model = re.match(r"davi(?:s)?(\d{3})", name)
+    if model is None or model[1] not in _SIZES:
+        raise FormatError(
+            f"{path}: words of the sensor {chip[:40]} cannot be read; known are DAVIS128, DAVIS240, DAVIS346 "
+            "and DAVIS640"
+        )
+    return _SIZES[model[1]]
+
+
+# The words
+
+
+def new_frame_state() -> NDArray[np.int64]:
+    """What `decode_frames` remembers, before the first word."""
+    return np.zeros(_STATE_SIZE, np.int64)
+
+
+def decode_frames(
+    blocks: Iterator[NDArray[np.uint64]],
+    sensor_size: tuple[int, int],
+    state: NDArray[np.int64] | None = None,
+) -> Iterator[tuple[NDArray[np.uint16], NDArray[np.int64]]]:
+    """The complete frames among the words, each with the state right after it.
+
+    A frame begins at the first reset read, and again at the reset read of a pixel that was read before. It is complete
+    when the signals of all pixels are read.
+
+    Parameters
+    ----------
+    blocks
+        Consecutive words, of any lengths: the address in the upper half, the time in the lower.
+    sensor_size
+        (height, width), pixels.
+    state
+        Changed in place, also by the words after the last frame.
+
+    Raises
+    ------
+    ClockError
+        Where the time goes back.
+    """
+    state = new_frame_state() if state is None else state
+    resets = np.zeros(sensor_size, np.int16)
+    marks = np.zeros(sensor_size, np.uint8)
+    image = np.zeros(sensor_size, np.uint16)
+    position = 0
+    for words in blocks:
+        while len(words):
+            used = _decode_samples(words, state, resets, marks, image)
+            if state[_BACK]:
+                raise evt.ClockError(
+                    f"the sensor's clock goes back from {state[_LATEST]} to {state[_CLOCK]} us "
+                    f"at word {position + used}"
+                )
+            position += used
+            words = words[used:]
+            if state[_DONE]:
+                yield image.copy(), state
+    state[_INCOMPLETE] += state[_ACTIVE]
+
+
+# What is remembered of frames from word to word, int64. Times are in us, without wrap-around.
+_BEGUN, _CLOCK, _LATEST, _BACK = range(4)
+_ACTIVE, _SIGNALS, _FIRST_RESET, _LAST_RESET, _FIRST_SIGNAL, _INTERLEAVED, _DONE = range(4, 11)
+_EVENTS, _INCOMPLETE = range(11, 13)
+_STATE_SIZE: Final = 13
+
+_STARTED, _HIGH, _NOW, _ERROR = evt._STARTED, evt._HIGH, evt._NOW, evt._ERROR
+_ROOM: Final = evt._ROOM
+_BACKWARDS_US: Final = evt._BACKWARDS_US
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _tick(clock, stamp):  # type: ignore[no-untyped-def]
+    """The time nearest to the clock, us, that is meant by its lowest 32 bits."""
+    step = (stamp - clock) & 0xFFFFFFFF
+    return clock + step - (step >> 31 << 32)
+
+
+@njit(cache=True, nogil=True)
+def _decode_events(words, state, events, triggers, height, width):  # type: ignore[no-untyped-def]
+    started, clock, now = state[_STARTED], state[_HIGH], state[_NOW]
+    capacity, trigger_capacity = len(events) - _ROOM, len(triggers)
+    count, count_triggers, i = 0, 0, 0
+    while i < len(words) and count < capacity and count_triggers < trigger_capacity:
+        address = np.int64(words[i] >> np.uint64(32))
+        clock = _tick(clock, np.int64(words[i] & np.uint64(0xFFFFFFFF)))
+        if not started:
+            started, now = 1, clock
+        if clock + _BACKWARDS_US < now:
+            state[_ERROR] = 1
+            break
+        i += 1
+        now = max(now, clock)
+        if address & 0x80000400 == 0:
+            x = address >> 12 & 0x3FF
+            y = address >> 22 & 0x1FF
+            # One that lies outside stays there.
+            x = width - 1 - x if x < width else x
+            y = height - 1 - y if y < height else y
+            events[count, 0] = now
+            events[count, 1] = (
+                np.uint64(x) | np.uint64(y) << np.uint64(16) | np.uint64(address >> 11 & 1) << np.uint64(32)
+            )
+            count += 1
+        elif address & 0x80000C06 == 0x402:
+            triggers[count_triggers, 0] = now
+            triggers[count_triggers, 1] = address & 1
+            count_triggers += 1
+    state[_STARTED], state[_HIGH], state[_NOW] = started, clock, now
+    return i, count, count_triggers
+
+
+@njit(cache=True, nogil=True)
+def _decode_samples(words, state, resets, marks, image):  # type: ignore[no-untyped-def]
+    """Use words up to the end of a frame, or all; how many."""
+    begun, clock, now, events = state[_BEGUN], state[_CLOCK], state[_LATEST], state[_EVENTS]
+    height, width = image.shape
+    state[_DONE] = 0
+    i = 0
+    while i < len(words):
+        address = np.int64(words[i] >> np.uint64(32))
+        clock = _tick(clock, np.int64(words[i] & np.uint64(0xFFFFFFFF)))
+        if not begun:
+            begun, now = 1, clock
+        if clock + _BACKWARDS_US < now:
+            state[_BACK] = 1
+            break
+        i += 1
+        now = max(now, clock)
+        if address & 0x80000000 == 0:
+            events += address >> 10 & 1 ^ 1
+            continue
+        if address & 0x800:  # of the inertial unit, or of an old way of reading frames
+            continue
+        x = address >> 12 & 0x3FF
+        y = height - 1 - (address >> 22 & 0x1FF)
+        if y < 0 or x >= width:
+            continue  # its frame will be incomplete
+        if address & 0x400 == 0:  # reset read
+            if not state[_ACTIVE] or marks[y, x]:
+                state[_INCOMPLETE] += state[_ACTIVE]
+                state[_ACTIVE], state[_SIGNALS], state[_INTERLEAVED] = 1, 0, 0
+                state[_FIRST_RESET] = state[_FIRST_SIGNAL] = now
+                marks[:] = 0
+            state[_INTERLEAVED] |= np.int64(state[_SIGNALS] > 0)
+            state[_LAST_RESET] = now
+            resets[y, x] = address & 0x3FF
+            marks[y, x] = 1
+        elif state[_ACTIVE]:  # signal read
+            if marks[y, x] == 1:
+                if state[_SIGNALS] == 0:
+                    state[_FIRST_SIGNAL] = now
+                state[_SIGNALS] += 1
+                image[y, x] = max(resets[y, x] - (address & 0x3FF), 0)
+            marks[y, x] = 2
+            if state[_SIGNALS] == height * width:
+                state[_DONE], state[_ACTIVE] = 1, 0
+                break
+    state[_BEGUN], state[_CLOCK], state[_LATEST], state[_EVENTS] = begun, clock, now, events
+    return i
+
+
+_DAVIS: Final[Any] = evt.Encoding("AEDAT 2.0", _WORD, _decode_events)
