@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from kalux.errors import FormatError
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.frames import Frame
+from kalux.readers.characters import DOT, FIVE, NEWLINE, NINE, ONE, SPACE, ZERO, skip_blanks
 from kalux.readers.images import grey_image
 from kalux.readers.source import SIZE_UNKNOWN, Source, reading
 
@@ -163,7 +164,7 @@ def _read_events(path: Path) -> Iterator[EventArray]:
         while True:
             got = file.readinto(memoryview(buffer)[filled:])  # type: ignore[attr-defined]
             if not got and filled:
-                buffer[filled] = _NEWLINE  # the last line may lack its end
+                buffer[filled] = NEWLINE  # the last line may lack its end
                 got = 1
             if not got:
                 return
@@ -183,7 +184,7 @@ def _read_events(path: Path) -> Iterator[EventArray]:
 def _parse_block(path: Path, text: memoryview, lines_before: int) -> tuple[EventArray, int]:
     """The events of whole lines of text, and the number of lines."""
     array = np.frombuffer(text, np.uint8)
-    events: EventArray = np.empty(np.count_nonzero(array == _NEWLINE), EVENT_DTYPE)
+    events: EventArray = np.empty(np.count_nonzero(array == NEWLINE), EVENT_DTYPE)
     count, lines, fault, start = _parse(
         array, lines_before == 0, events["t"], events["x"], events["y"], events["p"]
     )
@@ -221,14 +222,10 @@ _FAULTS: Final = {
 }
 # Unsigned, of the width of what they are compared with: that keeps the compiled loops free of conversions
 # and of the test for negative indices, and doubles their speed.
-_ONE: Final = np.uint64(1)
 _TEN: Final = np.uint64(10)
 _SECONDS_DIGITS: Final = np.uint64(12)  # keeps microseconds within 64 bits
 _MICRO_DIGITS: Final = np.uint64(6)
-_ZERO: Final = np.uint8(ord("0"))
-_NINE: Final = np.uint8(9)
-_FIVE: Final = np.uint8(5)
-_SPACE, _TAB, _RETURN, _NEWLINE, _DOT, _HASH = (np.uint8(ord(c)) for c in " \t\r\n.#")
+_HASH: Final = np.uint8(ord("#"))
 
 
 @njit(cache=True, nogil=True)
@@ -250,11 +247,11 @@ def _parse(
     lines = 0
     while i < end:
         start = i
-        i = _skip_blanks(text, i)
-        if text[i] == _NEWLINE or text[i] == _HASH:
-            while text[i] != _NEWLINE:
-                i += _ONE
-            i += _ONE
+        i = skip_blanks(text, i)
+        if text[i] == NEWLINE or text[i] == _HASH:
+            while text[i] != NEWLINE:
+                i += ONE
+            i += ONE
             lines += 1
             continue
         micros, i = _parse_time(text, i)
@@ -262,8 +259,8 @@ def _parse(
             return count, lines, 1, start
         column = 1
         while column < 4:
-            i = _skip_blanks(text, i)
-            if text[i] == _NEWLINE:
+            i = skip_blanks(text, i)
+            if text[i] == NEWLINE:
                 break
             value, i = _parse_integer(text, i)
             if value < 0 or (column == 3 and value > 1):
@@ -275,36 +272,28 @@ def _parse(
             else:
                 p[count] = value == 1
             column += 1
-        i = _skip_blanks(text, i)
-        if text[i] != _NEWLINE:
+        i = skip_blanks(text, i)
+        if text[i] != NEWLINE:
             return count, lines, 5, start
         if column == 4:
             t[count] = micros
             count += 1
         elif not (skip_header and lines == 0 and column == 2):
             return count, lines, 6, start
-        i += _ONE
+        i += ONE
         lines += 1
     return count, lines, 0, end
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _skip_blanks(text: NDArray[np.uint8], i: np.uint64) -> np.uint64:
-    """Skip spaces, tabs and carriage returns; not the zeros of a hole in a damaged file."""
-    while text[i] == _SPACE or text[i] == _TAB or text[i] == _RETURN:
-        i += _ONE
-    return i
 
 
 @njit(cache=True, nogil=True, inline="always")
 def _parse_digits(text: NDArray[np.uint8], i: np.uint64, value: np.uint64) -> tuple[np.uint64, np.uint64]:
     """Append decimal digits to a number; overlong ones wrap and are refused by their length."""
     while True:
-        digit = np.uint8(text[i] - _ZERO)
-        if digit > _NINE:
+        digit = np.uint8(text[i] - ZERO)
+        if digit > NINE:
             return value, i
         value = value * _TEN + np.uint64(digit)
-        i += _ONE
+        i += ONE
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -312,7 +301,7 @@ def _parse_integer(text: NDArray[np.uint8], i: np.uint64) -> tuple[np.int64, np.
     """An integer up to 65535 that ends at a blank; -1 if it is none."""
     start = i
     value, i = _parse_digits(text, i, np.uint64(0))
-    if i == start or i - start > _TEN or value > np.uint64(65535) or text[i] > _SPACE:
+    if i == start or i - start > _TEN or value > np.uint64(65535) or text[i] > SPACE:
         return np.int64(-1), i
     return np.int64(value), i
 
@@ -326,25 +315,25 @@ def _parse_time(text: NDArray[np.uint8], i: np.uint64) -> tuple[np.int64, np.uin
     if digits > _SECONDS_DIGITS:
         return np.int64(-1), i
     decimals = np.uint64(0)
-    if text[i] == _DOT:
-        i += _ONE
+    if text[i] == DOT:
+        i += ONE
         while decimals < _MICRO_DIGITS:
-            digit = np.uint8(text[i] - _ZERO)
-            if digit > _NINE:
+            digit = np.uint8(text[i] - ZERO)
+            if digit > NINE:
                 break
             value = value * _TEN + np.uint64(digit)
-            decimals += _ONE
-            i += _ONE
+            decimals += ONE
+            i += ONE
     digits += decimals
     if decimals == _MICRO_DIGITS:
-        next_digit = np.uint8(text[i] - _ZERO)
-        if next_digit <= _NINE:
-            value += np.uint64(next_digit >= _FIVE)
+        next_digit = np.uint8(text[i] - ZERO)
+        if next_digit <= NINE:
+            value += np.uint64(next_digit >= FIVE)
             _, i = _parse_digits(text, i, np.uint64(0))
     while decimals < _MICRO_DIGITS:
         value *= _TEN
-        decimals += _ONE
-    if digits == np.uint64(0) or text[i] > _SPACE:
+        decimals += ONE
+    if digits == np.uint64(0) or text[i] > SPACE:
         return np.int64(-1), i
     return np.int64(value), i
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from kalux.errors import FormatError
 from kalux.events import EVENT_DTYPE, EventArray
+from kalux.readers.characters import DOT, FIVE, NEWLINE, NINE, ONE, SPACE, TAB, ZERO, skip_blanks
 from kalux.readers.columns import RENAME, UNIT_ASSUMED, Columns, find_columns
 from kalux.readers.source import SIZE_UNKNOWN, Source, reading, smallest_size
 
@@ -175,7 +176,7 @@ def _events(path: Path, header: _Header) -> Iterator[EventArray]:
         while True:
             got = file.readinto(memoryview(buffer)[filled:])
             if not got and filled:
-                buffer[filled] = _NEWLINE  # the last line may lack its end
+                buffer[filled] = NEWLINE  # the last line may lack its end
                 got = 1
             if not got:
                 return
@@ -195,7 +196,7 @@ def _events(path: Path, header: _Header) -> Iterator[EventArray]:
 def _parse_block(path: Path, text: memoryview, header: _Header, lines_before: int) -> tuple[EventArray, int]:
     """The events of whole lines of text, and the number of lines."""
     array = np.frombuffer(text, np.uint8)
-    events: EventArray = np.empty(np.count_nonzero(array == _NEWLINE), EVENT_DTYPE)
+    events: EventArray = np.empty(np.count_nonzero(array == NEWLINE), EVENT_DTYPE)
     roles = np.array(header.roles, np.uint8)
     separator = np.uint8(ord(header.separator))
     count, lines, fault, start = _parse(
@@ -232,12 +233,9 @@ _FAULTS: Final = {
 }
 _BAD: Final = np.int64(-2)
 _MOST_DIGITS: Final = 18  # that surely fit into 64 bits
-_ZERO, _NINE, _FIVE = np.uint8(ord("0")), np.uint8(9), np.uint8(5)
-_SPACE, _TAB, _RETURN, _NEWLINE, _DOT, _HASH, _MINUS, _PLUS = (np.uint8(ord(c)) for c in " \t\r\n.#-+")
+_HASH, _MINUS, _PLUS = (np.uint8(ord(c)) for c in "#-+")
 _LOWER: Final = np.uint8(0x20)
 _E, _LETTER_T, _LETTER_F = (np.uint8(ord(c)) for c in "etf")
-# Unsigned positions keep the loops free of the test for negative indices.
-_ONE: Final = np.uint64(1)
 _TEN: Final = np.int64(10)
 
 
@@ -257,14 +255,14 @@ def _parse(
     end = np.uint64(len(text))
     i = np.uint64(0)
     count = lines = 0
-    blank = separator == _SPACE
+    blank = separator == SPACE
     while i < end:
         start = i
-        i = _skip_blanks(text, i)
-        if text[i] == _NEWLINE or text[i] == _HASH:
-            while text[i] != _NEWLINE:
-                i += _ONE
-            i += _ONE
+        i = skip_blanks(text, i)
+        if text[i] == NEWLINE or text[i] == _HASH:
+            while text[i] != NEWLINE:
+                i += ONE
+            i += ONE
             lines += 1
             continue
         column = np.uint64(0)
@@ -273,8 +271,8 @@ def _parse(
                 return count, lines, _MANY, start
             role = roles[column]
             if role == 0:
-                while text[i] != _NEWLINE and text[i] != separator and not (blank and text[i] == _TAB):
-                    i += _ONE
+                while text[i] != NEWLINE and text[i] != separator and not (blank and text[i] == TAB):
+                    i += ONE
             elif role == 1:
                 t[count], fraction, i = _parse_value(text, i, decimals)
                 if whole_times and fraction:
@@ -291,28 +289,21 @@ def _parse(
                     y[count] = value
                 else:
                     p[count] = value == 1
-            column += _ONE
+            column += ONE
             before = i
-            i = _skip_blanks(text, i)
-            if text[i] == _NEWLINE:
+            i = skip_blanks(text, i)
+            if text[i] == NEWLINE:
                 break
             if text[i] == separator:  # blanks have been skipped: a comma or semicolon
-                i = _skip_blanks(text, i + _ONE)
-            elif i == before or not (blank or separator == _TAB):
+                i = skip_blanks(text, i + ONE)
+            elif i == before or not (blank or separator == TAB):
                 return count, lines, int(max(role, 1)), start
         if column < np.uint64(len(roles)):
             return count, lines, _FEW, start
         count += 1
-        i += _ONE
+        i += ONE
         lines += 1
     return count, lines, 0, end
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _skip_blanks(text: NDArray[np.uint8], i: np.uint64) -> np.uint64:
-    while text[i] == _SPACE or text[i] == _TAB or text[i] == _RETURN:
-        i += _ONE
-    return i
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -325,37 +316,37 @@ def _parse_value(text: NDArray[np.uint8], i: np.uint64, decimals: int) -> tuple[
     begin = i
     value = np.int64(0)
     while True:
-        digit = np.uint8(text[i] - _ZERO)
-        if digit > _NINE:
+        digit = np.uint8(text[i] - ZERO)
+        if digit > NINE:
             break
         value = value * _TEN + np.int64(digit)
-        i += _ONE
+        i += ONE
     places = np.int64(decimals)
     fraction = False
-    if text[i] == _DOT:
-        i += _ONE
+    if text[i] == DOT:
+        i += ONE
         while places > 0:
-            digit = np.uint8(text[i] - _ZERO)
-            if digit > _NINE:
+            digit = np.uint8(text[i] - ZERO)
+            if digit > NINE:
                 break
             value = value * _TEN + np.int64(digit)
             fraction = fraction or bool(digit > 0)
             places -= 1
-            i += _ONE
-        next_digit = np.uint8(text[i] - _ZERO)
-        round_up = _FIVE <= next_digit <= _NINE
+            i += ONE
+        next_digit = np.uint8(text[i] - ZERO)
+        round_up = FIVE <= next_digit <= NINE
         while True:
-            digit = np.uint8(text[i] - _ZERO)
-            if digit > _NINE:
+            digit = np.uint8(text[i] - ZERO)
+            if digit > NINE:
                 break
             fraction = fraction or bool(digit > 0)
-            i += _ONE
+            i += ONE
         value += np.int64(round_up)
     while places > 0:
         value *= _TEN
         places -= 1
-    plain = text[i] <= _SPACE or text[i] == np.uint8(44) or text[i] == np.uint8(59)  # , ;
-    no_digits = i == begin or (text[begin] == _DOT and i == begin + _ONE)
+    plain = text[i] <= SPACE or text[i] == np.uint8(44) or text[i] == np.uint8(59)  # , ;
+    no_digits = i == begin or (text[begin] == DOT and i == begin + ONE)
     if not plain or no_digits or i - begin > np.uint64(12) or decimals < 0:
         return _parse_slowly(text, begin, decimals)
     return value, fraction, i
@@ -369,13 +360,13 @@ def _parse_slowly(text: NDArray[np.uint8], i: np.uint64, decimals: int) -> tuple
         return _parse_truth(text, i)
     negative = text[i] == _MINUS
     if negative or text[i] == _PLUS:
-        i += _ONE
+        i += ONE
     value = np.int64(0)
     digits = scale = 0  # value * 10^scale is the number
     seen = point = False
     while True:
-        digit = np.uint8(text[i] - _ZERO)
-        if digit <= _NINE:
+        digit = np.uint8(text[i] - ZERO)
+        if digit <= NINE:
             seen = True
             if digits < _MOST_DIGITS:
                 value = value * _TEN + np.int64(digit)
@@ -383,15 +374,15 @@ def _parse_slowly(text: NDArray[np.uint8], i: np.uint64, decimals: int) -> tuple
                 scale -= point
             else:
                 scale += not point
-        elif text[i] == _DOT and not point:
+        elif text[i] == DOT and not point:
             point = True
         else:
             break
-        i += _ONE
+        i += ONE
     if not seen:
         return _BAD, False, i
     if (text[i] | _LOWER) == _E:
-        exponent, i = _parse_exponent(text, i + _ONE)
+        exponent, i = _parse_exponent(text, i + ONE)
         scale += exponent
     fraction = _has_fraction(value, scale)
     value = _scaled(value, digits, scale + decimals)
@@ -407,7 +398,7 @@ def _parse_truth(text: NDArray[np.uint8], i: np.uint64) -> tuple[np.int64, bool,
     for letter in word:
         if (text[i] | _LOWER) != letter:
             return _BAD, False, i
-        i += _ONE
+        i += ONE
     return np.int64(len(word) == 4), False, i
 
 
@@ -417,14 +408,14 @@ def _parse_exponent(text: NDArray[np.uint8], i: np.uint64) -> tuple[int, np.uint
     down = text[i] == _MINUS
     begin = i
     if down or text[i] == _PLUS:
-        i += _ONE
+        i += ONE
     exponent = 0
     first = i
-    while np.uint8(text[i] - _ZERO) <= _NINE:
-        exponent = min(exponent * 10 + int(text[i] - _ZERO), 10_000)
-        i += _ONE
+    while np.uint8(text[i] - ZERO) <= NINE:
+        exponent = min(exponent * 10 + int(text[i] - ZERO), 10_000)
+        i += ONE
     if i == first:
-        return 0, begin - _ONE
+        return 0, begin - ONE
     return -exponent if down else exponent, i
 
 
