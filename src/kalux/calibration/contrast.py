@@ -9,9 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.deblur import between, count_events
-from kalux.events import EVENT_DTYPE, EventArray
-from kalux.filters.methods import Shot, take_shot
-from kalux.models.camera import Camera, Response, log_intensity
+from kalux.calibration.intervals import intervals
 from kalux.recording import Recording
 from kalux.settings import CameraSettings
 
@@ -22,7 +20,6 @@ MAX_SAMPLES: Final = 400_000
 
 _MIN_SAMPLES: Final = 200
 _UNEXPLAINED: Final = 0.8  # of the typical change; 0.3 to 0.6 on recordings of moving scenes, 3 on flicker
-WELL_EXPOSED: Final = (0.05, 0.95)  # of the response: away from black, noise and saturation
 NORMAL_MAD: Final = 1.4826  # standard deviation over median absolute deviation, of a normal distribution
 _HUBER: Final = 1.345  # 95 % efficiency for normal residuals (Huber 1981)
 _MAX_FRAMES: Final = 200
@@ -128,35 +125,10 @@ def _samples(
     recording: Recording, camera: CameraSettings, of_log_offset: bool, delay: int
 ) -> Iterator[tuple[Array, Array, Array]]:
     """Log difference and on and off counts (times s) of the usable pixels, one frame interval at a time."""
-    model = Camera(Response.named(camera.response), None, camera.saturation)
-    low, high = WELL_EXPOSED
-    chunks = iter(recording.events())
-    buffer: EventArray = np.empty(0, EVENT_DTYPE)
-    previous: Shot | None = None
-    previous_usable: NDArray[np.bool_] | None = None
-    reference = float(camera.reference_exposure or 0)
-    for index, frame in enumerate(recording.frames()):
-        if index == _MAX_FRAMES:
-            return
-        reference = reference or float(frame.exposure)
-        shot = take_shot(frame, model, reference)
-        response = frame.normalised()
-        usable = (response > low) & (response < high)
-        until = shot.middle + delay
-        while len(buffer) == 0 or buffer["t"][-1] <= until:
-            chunk = next(chunks, None)
-            if chunk is None:
-                break
-            # Before the first frame nothing is counted, and nothing needs to be kept.
-            buffer = chunk if previous is None else np.concatenate([buffer, chunk])
-        if previous is not None and previous_usable is not None:
-            on, off = count_events(between(buffer, previous.middle + delay, until), recording.sensor_size)
-            chosen = usable & previous_usable & (np.abs(on - off) >= 2)
-            change = log_intensity(shot.intensity, camera.log_offset) - log_intensity(
-                previous.intensity, camera.log_offset
-            )
-            level = (shot.intensity + previous.intensity)[chosen] / 2
-            share = np.ones_like(level) if of_log_offset else level / (level + camera.log_offset)
-            yield change[chosen], share * on[chosen], share * off[chosen]
-        buffer = buffer[buffer["t"].searchsorted(until, "right") :]
-        previous, previous_usable = shot, usable
+    for interval in intervals(recording, camera, margin=abs(delay), most_frames=_MAX_FRAMES):
+        inside = between(interval.events, interval.start + delay, interval.end + delay)
+        on, off = count_events(inside, recording.sensor_size)
+        chosen = interval.usable & (np.abs(on - off) >= 2)
+        level = interval.level[chosen]
+        share = np.ones_like(level) if of_log_offset else level / (level + camera.log_offset)
+        yield interval.change[chosen], share * on[chosen], share * off[chosen]

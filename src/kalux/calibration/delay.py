@@ -8,10 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.deblur import between, count_events
-from kalux.calibration.contrast import NORMAL_MAD, WELL_EXPOSED, fit_thresholds
-from kalux.events import EVENT_DTYPE, EventArray
-from kalux.filters.methods import Shot, take_shot
-from kalux.models.camera import Camera, Response, log_intensity
+from kalux.calibration.contrast import NORMAL_MAD, fit_thresholds
+from kalux.calibration.intervals import intervals
 from kalux.recording import Recording
 from kalux.settings import CameraSettings
 
@@ -106,41 +104,20 @@ def _residual(difference: Array, on: Array, off: Array) -> float:
 
 def _samples(recording: Recording, camera: CameraSettings) -> tuple[Array, list[tuple[Array, Array]]]:
     """Log differences of usable pixels, and for every delay their on and off counts."""
-    model = Camera(Response.named(camera.response), None, camera.saturation)
-    grid = delays()
+    grid = delays().tolist()
     differences: list[Array] = []
     counts: list[list[tuple[Array, Array]]] = []
-    chunks = iter(recording.events())
-    buffer: EventArray = np.empty(0, EVENT_DTYPE)
-    previous: tuple[Shot, NDArray[np.bool_]] | None = None
     total = 0
-    reference = float(camera.reference_exposure or 0)
-    for index, frame in enumerate(recording.frames()):
-        if index == _MAX_FRAMES or total >= _MAX_SAMPLES:
+    for interval in intervals(recording, camera, margin=LARGEST, most_frames=_MAX_FRAMES):
+        seen = sum(count_events(interval.events, recording.sensor_size))
+        chosen = interval.usable & (seen >= 2)
+        differences.append(interval.change[chosen])
+        shifted = (between(interval.events, interval.start + d, interval.end + d) for d in grid)
+        pairs = (count_events(events, recording.sensor_size) for events in shifted)
+        counts.append([(on[chosen], off[chosen]) for on, off in pairs])
+        total += int(chosen.sum())
+        if total >= _MAX_SAMPLES:
             break
-        reference = reference or float(frame.exposure)
-        shot = take_shot(frame, model, reference)
-        response = frame.normalised()
-        usable = (response > WELL_EXPOSED[0]) & (response < WELL_EXPOSED[1])
-        while len(buffer) == 0 or buffer["t"][-1] <= shot.middle + LARGEST:
-            chunk = next(chunks, None)
-            if chunk is None:
-                break
-            buffer = chunk if previous is None else np.concatenate([buffer, chunk])
-        if previous is not None:
-            before, was_usable = previous
-            everything = between(buffer, before.middle - LARGEST, shot.middle + LARGEST)
-            chosen = usable & was_usable & (sum(count_events(everything, recording.sensor_size)) >= 2)
-            change = log_intensity(shot.intensity, camera.log_offset) - log_intensity(
-                before.intensity, camera.log_offset
-            )
-            differences.append(change[chosen])
-            shifted = (between(everything, before.middle + d, shot.middle + d) for d in grid.tolist())
-            pairs = (count_events(events, recording.sensor_size) for events in shifted)
-            counts.append([(on[chosen], off[chosen]) for on, off in pairs])
-            total += int(chosen.sum())
-        buffer = buffer[buffer["t"].searchsorted(shot.middle - LARGEST, "right") :]
-        previous = shot, usable
     if not differences:
         return np.empty(0), []
     joined = [

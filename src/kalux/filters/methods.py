@@ -159,7 +159,6 @@ class _Common:
         self.settings, self.lookahead, self.shape = settings, lookahead, shape
         self.on, self.off = thresholds
         self.offset = settings.camera.log_offset
-        self.period = 0.0
 
     def integrals(self, shot: Shot, events: EventArray, step_on: Array, step_off: Array) -> ExposureIntegrals:
         """EDI over the frame's exposure, or nothing moving where deblurring is off."""
@@ -206,10 +205,8 @@ class BridgedFrames(_Common):
         events, c2 = self.settings.events, self.on * self.off
         return BridgeNoise(self.on, self.off, events.step_variance * c2, events.quantisation_variance * c2)
 
-    def latent(
-        self, shot: Shot, events: EventArray, thresholds: Thresholds, *, at_end: bool = False
-    ) -> Latent:
-        """The frame without blur at the middle (or end) of its exposure, and its variance (K3)."""
+    def latent(self, shot: Shot, events: EventArray, thresholds: Thresholds) -> Latent:
+        """The frame without blur at the middle of its exposure, and its variance (K3)."""
         integrals = self.integrals(shot, events, self.on * thresholds.on, self.off * thresholds.off)
         log_frame = self.log_frame(shot)
         r_bar = covariance(shot.weight, (self.settings.camera.frame_noise * shot.white) ** 2, 1e-6)
