@@ -66,8 +66,9 @@ def intervals(
             chunk = next(chunks, None)
             if chunk is None:
                 break
-            # Before the first frame nothing is counted, and nothing but a margin needs to be kept.
-            buffer = chunk if previous is None else np.concatenate([buffer, chunk])
+            if previous is None:  # only the margin before the first interval needs to be kept
+                buffer = buffer[buffer["t"].searchsorted(shot.middle - margin, "right") :]
+            buffer = np.concatenate([buffer, chunk])
         if previous is not None:
             before, was_usable = previous
             yield Interval(

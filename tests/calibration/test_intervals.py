@@ -1,0 +1,51 @@
+"""Intervals between frames, which all calibrations look at."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+
+from kalux import Recording
+from kalux.calibration.intervals import intervals
+from kalux.settings import CameraSettings
+
+from builders import frame, pixel_events, random_stream
+
+CAMERA = CameraSettings(reference_exposure=10_000)
+
+
+def recording(stream, chunk):
+    whole = Recording.from_arrays(stream.events, stream.frames, sensor_size=stream.sensor_size)
+    parts = [stream.events[i : i + chunk] for i in range(0, len(stream.events), chunk)]
+    return Recording(dataclasses.replace(whole.source, events=lambda: iter(parts)))
+
+
+@pytest.mark.parametrize("chunk", [1, 7, 10_000])
+@pytest.mark.parametrize("margin", [0, 12_000])
+def test_every_interval_has_its_events_whatever_the_chunks(chunk, margin):
+    """Also those of the margin before the first frame, where a chunk ends within it."""
+    stream = random_stream(4)
+    found = list(intervals(recording(stream, chunk), CAMERA, margin=margin, most_frames=100))
+    middles = [shot.middle for shot in stream.frames]
+    assert [(i.start, i.end) for i in found] == list(itertools.pairwise(middles))
+    for interval in found:
+        t = stream.events["t"]
+        inside = (t > interval.start - margin) & (t <= interval.end + margin)
+        np.testing.assert_array_equal(interval.events, stream.events[inside])
+
+
+def test_change_level_and_what_is_usable():
+    frames = [frame([[51, 255, 0]], 0, 10_000), frame([[102, 100, 100]], 40_000, 50_000)]
+    events = pixel_events([20_000], [1])
+    rec = Recording.from_arrays(events, frames, sensor_size=(1, 3))
+    (interval,) = intervals(rec, CAMERA, margin=0, most_frames=2)
+    assert interval.usable.tolist() == [[True, False, False]]  # saturated, black
+    assert interval.change[0, 0] == pytest.approx(np.log(0.43 / 0.23))
+    assert interval.level[0, 0] == pytest.approx(0.3)
+
+
+def test_no_more_frames_than_asked_for():
+    assert len(list(intervals(recording(random_stream(4), 50), CAMERA, margin=0, most_frames=2))) == 1
