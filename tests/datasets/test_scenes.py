@@ -21,7 +21,7 @@ from kalux.datasets import (
     spin,
     still,
 )
-from kalux.datasets.scenes import pink_noise
+from kalux.datasets.room import pink_noise
 from kalux.errors import InputError
 
 SIZE = (20, 30)

@@ -27,8 +27,10 @@ from kalux.datasets import (
     simulate,
     static,
 )
-from kalux.datasets.scenes import LOG_OFFSET, pink_noise
-from kalux.datasets.simulate import draw_thresholds, mean_radiance
+from kalux.datasets.event_stream import draw_thresholds
+from kalux.datasets.exposure import mean_radiance
+from kalux.datasets.room import pink_noise
+from kalux.datasets.scenes import LOG_OFFSET
 from kalux.errors import ExposureError, InputError, SettingsError
 from kalux.events import EVENT_DTYPE, EventArray, check_events
 from kalux.frames import check_frame

@@ -55,7 +55,7 @@ def setting_flags() -> Iterator[Flag]:
     """A flag for every setting: ``--camera.log-offset``."""
     defaults = Settings()
     for group in dataclasses.fields(Settings):
-        yield from _flags_of(getattr(defaults, group.name), group.name)
+        yield from flags_of(getattr(defaults, group.name), group.name)
 
 
 def add_settings(parser: argparse.ArgumentParser) -> None:
@@ -87,8 +87,8 @@ def given_settings(options: argparse.Namespace) -> dict[str, dict[str, Any]]:
 
 def display_flags() -> dict[str, list[Flag]]:
     """Flags for the parameters of every curve, and under ``""`` for what all curves have."""
-    flags = {name: list(_flags_of(curve(), "display")) for name, curve in CURVES.items()}
-    common = [flag for flag in _flags_of(DisplaySettings(), "display") if flag.key != "display.curve"]
+    flags = {name: list(flags_of(curve(), "display")) for name, curve in CURVES.items()}
+    common = [flag for flag in flags_of(DisplaySettings(), "display") if flag.key != "display.curve"]
     return {**flags, "": common}
 
 
@@ -155,14 +155,15 @@ def settings_help() -> str:
         if flag.key.split(".")[0] != group:
             group = flag.key.split(".")[0]
             lines += ["", f"{group}: {_summary(type(getattr(Settings(), group)))}"]
-        lines += _described(flag)
+        lines += described(flag)
     for name, flags in display_flags().items():
         title = f"--display {name}: {_summary(CURVES[name])}" if name else "every display:"
-        lines += ["", title, *(line for flag in flags for line in _described(flag))]
+        lines += ["", title, *(line for flag in flags for line in described(flag))]
     return "\n".join(lines)
 
 
-def _described(flag: Flag) -> list[str]:
+def described(flag: Flag) -> list[str]:
+    """Lines of help for a flag."""
     default = _shown(flag.default)
     value = "|".join(flag.choices) if flag.choices else _KINDS[flag.kind]
     head = f"  {flag.name} {value}  (default {default})"
@@ -185,7 +186,8 @@ def _summary(kind: type) -> str:
 # Dataclasses to flags.
 
 
-def _flags_of(instance: Any, group: str) -> Iterator[Flag]:
+def flags_of(instance: Any, group: str) -> Iterator[Flag]:
+    """A flag for every field of a dataclass, ``--group.field-name``, with the instance's values as defaults."""
     kind = type(instance)
     hints = typing.get_type_hints(kind)
     texts = attribute_texts(kind)

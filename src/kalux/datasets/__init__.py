@@ -2,32 +2,20 @@
 
 from __future__ import annotations
 
-from kalux.datasets.scenes import (
-    Motion,
-    Pose,
-    Scene,
-    combine,
-    demo_scene,
-    dolly,
-    handheld,
-    linear_ramp,
-    log_ramp,
-    moving_edge,
-    pan,
-    photograph_scene,
-    shake,
-    spin,
-    static,
-    still,
-)
-from kalux.datasets.simulate import DEMO_SENSOR, Sampling, SensorSettings, Simulation, simulate
+from kalux.datasets.motion import Motion, Pose, combine, dolly, handheld, pan, shake, spin, still
+from kalux.datasets.room import demo_scene
+from kalux.datasets.scenes import Scene, linear_ramp, log_ramp, moving_edge, photograph_scene, static
+from kalux.datasets.sensors import DEMO_SENSOR, PRESETS, Sampling, SensorPreset, SensorSettings, sensor_preset
+from kalux.datasets.simulate import Simulation, simulate
 
 __all__ = [
     "DEMO_SENSOR",
+    "PRESETS",
     "Motion",
     "Pose",
     "Sampling",
     "Scene",
+    "SensorPreset",
     "SensorSettings",
     "Simulation",
     "combine",
@@ -39,6 +27,7 @@ __all__ = [
     "moving_edge",
     "pan",
     "photograph_scene",
+    "sensor_preset",
     "shake",
     "simulate",
     "spin",

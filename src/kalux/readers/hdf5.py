@@ -6,7 +6,7 @@ import io
 import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final, NamedTuple, TypeVar
 
 import h5py
 import hdf5plugin
@@ -144,6 +144,21 @@ def _ground_truth(path: Path) -> GroundTruth:
     return GroundTruth(times, images)
 
 
+class TruthStream(NamedTuple):
+    """Reference images that are made while they are written, for memory that does not grow with their number.
+
+    Attributes
+    ----------
+    times
+        (T,) int64 us.
+    images
+        As many images (height, width) float32, as of `GroundTruth`.
+    """
+
+    times: NDArray[np.int64]
+    images: Iterable[NDArray[np.float32]]
+
+
 def write(
     path: str | Path,
     *,
@@ -153,7 +168,7 @@ def write(
     exposure_known: bool = True,
     contrast_threshold: tuple[float, float] | None = None,
     inverse_covariance: NDArray[np.float64] | None = None,
-    ground_truth: GroundTruth | None = None,
+    ground_truth: GroundTruth | TruthStream | None = None,
 ) -> None:
     """Write a recording, chunk by chunk, in bounded memory.
 
@@ -176,7 +191,7 @@ def write(
     inverse_covariance
         (256,) 1 / R_bar per 8-bit value, 1/s.
     ground_truth
-        Reference images.
+        Reference images, or a stream of them.
 
     Raises
     ------
@@ -200,7 +215,10 @@ def write(
                 if inverse_covariance is not None:
                     file["inverse_covariance"] = np.asarray(inverse_covariance, np.float64)
                 if ground_truth is not None:
-                    _write_ground_truth(file.create_group("ground_truth"), ground_truth)
+                    images = sink.checked(iter(ground_truth.images))
+                    _write_ground_truth(
+                        file.create_group("ground_truth"), ground_truth.times, images, sensor_size
+                    )
                 _write_events(file.create_group("events"), sink.checked(events))
                 _write_frames(file.create_group("frames"), sink.checked(frames), sensor_size, exposure_known)
             sink.check()
@@ -333,9 +351,17 @@ def _create_images(group: Any, size: tuple[int, ...], dtype: np.dtype[Any]) -> A
     )
 
 
-def _write_ground_truth(group: Any, ground_truth: GroundTruth) -> None:
-    images = np.asarray(ground_truth.images, np.float32)
-    group["times"] = np.asarray(ground_truth.times, np.int64)
-    group.create_dataset(
-        "images", data=images, maxshape=(None, *images.shape[1:]), chunks=(1, *images.shape[1:]), **_packing()
+def _write_ground_truth(
+    group: Any, times: NDArray[np.int64], images: Iterable[NDArray[Any]], sensor_size: tuple[int, int]
+) -> None:
+    group["times"] = np.asarray(times, np.int64)
+    stored = group.create_dataset(
+        "images",
+        (len(times), *sensor_size),
+        np.float32,
+        maxshape=(None, *sensor_size),
+        chunks=(1, *sensor_size),
+        **_packing(),
     )
+    for index, image in enumerate(images):
+        stored[index] = image

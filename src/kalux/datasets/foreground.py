@@ -1,0 +1,119 @@
+"""Things that move before the scene: a sprite, with its shape as alpha, on a path of its own."""
+
+from __future__ import annotations
+
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux.datasets.motion import Motion, Pose
+from kalux.datasets.scenes import Image, Scene, blurred, overlay
+from kalux.errors import InputError
+
+_BALL: Final = 129  # pixels
+
+
+class Sprite(NamedTuple):
+    """A thing to lay over a scene: (H, W) linear radiance, 1 = frame white, and (H, W) alpha, 0 to 1."""
+
+    radiance: NDArray[Any]
+    alpha: NDArray[Any]
+
+
+def ball() -> Sprite:
+    """A beach ball with six segments and a cap; its brightest paint is 1."""
+    middle = (_BALL - 1) / 2
+    radius = middle - 2.0
+    y, x = np.mgrid[:_BALL, :_BALL].astype(np.float32) - np.float32(middle)
+    distance, angle = np.hypot(x, y), np.arctan2(y, x)
+    segment = np.floor((angle + np.pi) / (np.pi / 3)).astype(int) % 6
+    paint = np.array([0.76, 0.11, 0.55, 0.16, 0.87, 0.25], np.float32)[segment]
+    paint[distance < 0.22 * radius] = 1.0
+    shade = np.clip(1.0 - 0.6 * (distance / radius) ** 4, 0.2, 1.0)
+    return Sprite(paint * shade, np.clip(radius - distance + 0.5, 0.0, 1.0))
+
+
+def crossing(
+    sensor_size: tuple[int, int], reach: float, speed: float, *, turn: float = 0.0, height: float = 0.5
+) -> Motion:
+    """From one side of the sensor to the other, again and again.
+
+    Parameters
+    ----------
+    sensor_size
+        (height, width), pixels.
+    reach
+        Radius of the sprite, pixels: it starts and ends outside of the view.
+    speed
+        Pixels per second, positive to the right.
+    turn
+        Radians per second, clockwise.
+    height
+        Where on the sensor, 0 = top, 1 = bottom.
+
+    Returns
+    -------
+    Where the sprite's middle is on the sensor, and how it is turned.
+    """
+    rows, columns = sensor_size
+    way = columns + 2 * reach
+
+    def pose(t: float) -> Pose:
+        gone = speed * t * 1e-6 % way
+        return Pose(gone - reach, height * (rows - 1), turn * t * 1e-6)
+
+    return pose
+
+
+def with_foreground(scene: Scene, sprite: Sprite, path: Motion, *, size: float, level: float = 1.0) -> Scene:
+    """A scene with a sprite that moves before it.
+
+    Parameters
+    ----------
+    scene
+        The background.
+    sprite
+        What is laid over it.
+    path
+        Position of the sprite's middle on the sensor (x right, y down, pixels), its angle and zoom.
+    size
+        Its height at zoom 1, sensor pixels.
+    level
+        Factor of its radiance.
+
+    Raises
+    ------
+    InputError
+        If the sprite is not two equal grey images, is negative or not finite, or its size is not positive.
+    """
+    radiance, alpha = np.asarray(sprite.radiance, np.float32), np.asarray(sprite.alpha, np.float32)
+    if radiance.ndim != 2 or radiance.shape != alpha.shape or min(radiance.shape) < 2:
+        raise InputError(
+            f"foreground: radiance {radiance.shape} and alpha {alpha.shape}; two equal (height, width) are needed"
+        )
+    if not (radiance.min() >= 0 and radiance.max() < np.inf and alpha.min() >= 0 and alpha.max() <= 1):
+        raise InputError("foreground: radiance is negative or not finite, or alpha is not from 0 to 1")
+    if not size > 0 or not level >= 0:
+        raise InputError(f"foreground: size is {size} and level {level}; they must be positive")
+    scale = radiance.shape[0] / size
+    # Premultiplied, so that smoothing and interpolation keep the edge's colour.
+    paint = blurred(_padded(radiance * alpha * np.float32(level)), 0.5 * scale)
+    shape = blurred(_padded(alpha), 0.5 * scale)
+    middle = np.array([(paint.shape[1] - 1) / 2, (paint.shape[0] - 1) / 2])
+
+    def view(t: float) -> Image:
+        out = np.array(scene.radiance(t), np.float32)
+        x, y, angle, zoom = path(t)
+        step = scale / zoom
+        cos, sin = step * np.cos(angle), step * np.sin(angle)
+        rotation = np.array([[cos, sin], [-sin, cos]])
+        overlay(paint, shape, np.column_stack([rotation, middle - rotation @ np.array([x, y])]), out)
+        return out
+
+    return Scene(view, scene.sensor_size, scene.start, scene.end, scene.name)
+
+
+def _padded(image: Image) -> Image:
+    """With an empty border for the edge to fade into."""
+    return np.ascontiguousarray(np.pad(image, max(2, image.shape[0] // 16)))
