@@ -7,6 +7,7 @@ import itertools
 import json
 import signal
 import time
+import tomllib
 
 import cv2
 import numpy as np
@@ -14,7 +15,7 @@ import pytest
 
 import kalux
 from kalux.cli.simulate import _sensor_fields
-from kalux.datasets import SensorSettings
+from kalux.datasets import SensorSettings, sensor_preset
 
 
 @pytest.fixture(scope="module")
@@ -99,6 +100,19 @@ def test_the_same_flags_give_the_same_file(cli, photograph, tmp_path):
         == 0
     )
     assert (tmp_path / "c.h5").read_bytes() != (tmp_path / "a.h5").read_bytes()
+
+
+def test_the_settings_are_beside_the_recording(cli, photograph, tmp_path):
+    flags = ("--seed", "5", "--sensor.latency", "7", "--white", "2")
+    assert cli("simulate", photograph, "-o", tmp_path / "a.h5", *SHORT, *flags).code == 0
+    settings = tomllib.loads((tmp_path / "a.h5.kalux.toml").read_text())
+    expected = dataclasses.replace(sensor_preset("davis346").settings, latency=7.0)
+    assert SensorSettings(**settings["sensor"]) == expected
+    assert settings["simulation"]["white_radiance"] == 2
+    assert settings["command"].startswith("kalux simulate ")
+    (tmp_path / "a.h5.kalux.toml").write_text("mine")
+    refused = cli("simulate", photograph, "-o", tmp_path / "a.h5", *SHORT, "--overwrite")
+    assert "not an output of kalux" in refused.error
 
 
 def test_a_folder_needs_its_rate(cli, folder, tmp_path):

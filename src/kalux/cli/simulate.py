@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import re
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -267,10 +268,12 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     from kalux.cli.progress import Progress
     from kalux.cli.signals import interrupts_held
     from kalux.datasets.record import Watch, record
+    from kalux.writers.settings_file import require_ours
 
     if options.out.suffix.lower() not in (".h5", ".hdf5"):
         raise UsageError(f"{options.out}: the output is a kalux HDF5 file; give a name that ends in .h5")
     check_file(options.out, overwrite=options.overwrite)
+    require_ours(settings_path(options.out))
     settings, size = chosen_sensor(options)
     scene, white = chosen_scene(options, size)
     total = scene.duration // 1000
@@ -292,8 +295,52 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
             truth_rate=options.truth_rate,
             watch=Watch(on_time, let_through),
         )
+    write_settings(options, command, settings, scene, white, recorded)
     if not options.quiet:
         say(summary(options.out, scene, recorded, white, progress.seconds))
+
+
+def settings_path(out: Path) -> Path:
+    """Where the settings of a simulation are written: beside it."""
+    return out.with_name(f"{out.name}.kalux.toml")
+
+
+def write_settings(
+    options: argparse.Namespace,
+    command: list[str],
+    settings: SensorSettings,
+    scene: Scene,
+    white: float,
+    recorded: Recorded,
+) -> None:
+    """Write what made the recording: the command, the sensor, what is white, and the versions.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written; the recording is whole.
+    """
+    from kalux.writers.files import output_errors
+    from kalux.writers.settings_file import settings_file
+
+    path = settings_path(options.out)
+    metadata = {
+        "command": shlex.join(command),
+        "simulation": {
+            "source": options.source,
+            "seed": options.seed,
+            "sensor_size": scene.sensor_size,
+            "duration_us": scene.duration,
+            "white_radiance": white,
+            "events": recorded.events,
+            "frames": recorded.frames,
+        },
+        "sensor": settings,
+    }
+    with output_errors(path, f"the recording {options.out} is whole, its settings are missing"):
+        settings_file(path, metadata, {"format": "kalux"}).write(
+            complete=True, images=recorded.truth, times=None
+        )
 
 
 def summary(out: Path, scene: Scene, recorded: Recorded, white: float, seconds: float) -> str:

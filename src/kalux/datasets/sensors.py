@@ -339,7 +339,7 @@ PRESETS: Final[Mapping[str, SensorPreset]] = {
         ),
         {
             **_V2E_NOISE,
-            "threshold_on": "12 % at the most sensitive [5]; the nearest step above it",
+            "threshold_on": "12 % contrast sensitivity [5]; biases are set a little above the most sensitive",
             "threshold_off": "as threshold_on",
             "threshold_mismatch": "as of the DAVIS sensors; not published",
             "cutoff": "latency of 40 to 200 us [5]: 160 us as the time constant at white",
