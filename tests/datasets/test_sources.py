@@ -204,6 +204,8 @@ def test_sequences_that_cannot_be_used(tmp_path: Path, hdr_folder: Path) -> None
         sequence_scene(
             open_sequence(hdr_folder), still(), sensor_size=(20, 30), rate_hz=100.0, duration=1_000_000
         )
+    with pytest.raises(InputError, match="scale is 0"):
+        sequence_scene(open_sequence(hdr_folder), still(), sensor_size=(20, 30), rate_hz=100.0, scale=0.0)
     with pytest.raises(InputError, match="the rate is 0"):
         sequence_scene(open_sequence(hdr_folder), still(), sensor_size=(20, 30), rate_hz=0.0)
     write_exr(hdr_folder / "f11.exr", Y=np.ones((5, 5)))

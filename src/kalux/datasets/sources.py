@@ -306,7 +306,7 @@ def sequence_scene(
     Raises
     ------
     InputError
-        If the rate is not positive, or the sequence is shorter than the duration.
+        If the rate or the scale is not positive, or the sequence is shorter than the duration.
     """
     if not 0 < rate_hz < 1e6:  # also refuses NaN
         raise InputError(f"{sequence.path}: the rate is {rate_hz} Hz; it must be above 0, less than 1 MHz")
@@ -317,6 +317,10 @@ def sequence_scene(
             f"{duration * 1e-6:g} s are wanted; give a shorter duration or a lower rate"
         )
     step = fitting_scale(sequence.size, sensor_size) if scale is None else scale
+    if not step > 0:
+        raise InputError(
+            f"{sequence.path}: scale is {step}; it must be positive, in image pixels per sensor pixel"
+        )
     center = ((sequence.size[1] - 1) / 2, (sequence.size[0] - 1) / 2)
     source = interpolated(sequence, rate_hz)
 
