@@ -207,6 +207,7 @@ def test_every_setting_of_the_sensor_is_a_flag(cli):
         assert f"--sensor.{name.replace('_', '-')} " in told.out
     assert "davis346" in told.out
     assert "Lichtsteiner" in told.out
+    assert "]_" not in told.out
 
 
 @pytest.mark.parametrize(

@@ -222,7 +222,7 @@ def sensor_help() -> str:
     lines += ["", "Every setting as a flag, with its default in the preset ideal:"]
     for flag in flags_of(SensorSettings(), "sensor"):
         lines += described(flag)
-    return "\n".join(lines)
+    return "\n".join(lines).replace("]_", "]").replace("``", "")
 
 
 def chosen_sensor(options: argparse.Namespace) -> tuple[SensorSettings, tuple[int, int]]:
