@@ -17,8 +17,9 @@ MOST_VARIANCE: Final = 0.3
 """Largest variance that an excess is shrunk for. A pixel that was never seen below white has the variance of its
 start, white, which is the prior itself: what events add to it must not be shrunk for it a second time."""
 
-_BLOCK: Final = 64
-"""Pixels that are looked at together: what highlights cost, only blocks with highlights pay."""
+_BLOCK: Final = 256
+"""Pixels that are looked at together: the highlights of a block are brought together, so that they go through vector
+code and the others do not pay for them."""
 
 
 class HighlightPrior(NamedTuple):
@@ -97,8 +98,10 @@ def intensity(
 def _intensity(log_intensity, variance, log_offset, prior, out):  # type: ignore[no-untyped-def]
     zero, most_variance = np.float32(0.0), np.float32(MOST_VARIANCE)
     white, scale2, stretch = np.float32(prior.white), np.float32(prior.scale2), np.float32(prior.stretch)
+    places = np.empty(_BLOCK, np.int64)
+    excess, doubt = np.empty(_BLOCK, np.float32), np.empty(_BLOCK, np.float32)
     for first in range(0, len(out), _BLOCK):
-        logs, doubts = log_intensity[first : first + _BLOCK], variance[first : first + _BLOCK]
+        logs, variances = log_intensity[first : first + _BLOCK], variance[first : first + _BLOCK]
         block = out[first : first + _BLOCK]
         highlights = 0
         for i in range(len(block)):
@@ -107,9 +110,15 @@ def _intensity(log_intensity, variance, log_offset, prior, out):  # type: ignore
             block[i] = max(exponential(value) - log_offset, zero)
         if highlights == 0 or scale2 == zero:
             continue
+        count = 0
         for i in range(len(block)):
-            value = np.float32(logs[i])
-            doubt = min(np.float32(doubts[i]), most_variance)
-            excess = believed_highlight(value - white, doubt, scale2, stretch)
-            value = white + excess if value > white else value
-            block[i] = max(exponential(value) - log_offset, zero)
+            places[count] = i
+            count += int(np.float32(logs[i]) > white)
+        for k in range(highlights):
+            excess[k] = np.float32(logs[places[k]]) - white
+            doubt[k] = min(np.float32(variances[places[k]]), most_variance)
+        for k in range(highlights):
+            believed = white + believed_highlight(excess[k], doubt[k], scale2, stretch)
+            excess[k] = max(exponential(believed) - log_offset, zero)
+        for k in range(highlights):
+            block[places[k]] = excess[k]
