@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from kalux.compiled import (
     AHEAD,
+    FUSED,
     ONE,
     event_column,
     event_is_on,
@@ -52,9 +53,6 @@ EXPOSURE_PIXEL: Final = np.dtype(
     align=True,
 )
 """What a pixel remembers within an exposure: 32 bytes, half a cache line, fetched and stored at once."""
-
-_LEVELS: Final = (np.float32(1e-30), np.float32(1e30))
-"""The level stays within: more than 69 in log intensity is a broken pixel, and must not become infinite or 0."""
 
 
 class ExposureIntegrals(NamedTuple):
@@ -182,9 +180,9 @@ def _begin_exposure(pixels, step_on, step_off):  # type: ignore[no-untyped-def]
             pixel.up, pixel.down = up[column], down[column]
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@nb.njit(cache=True, nogil=True, error_model="numpy", fastmath=FUSED)
 def _integrate(words, pixels, width, start, middle):  # type: ignore[no-untyped-def]
-    lowest, highest = _LEVELS
+    # A level beyond float32 (88 in log intensity: a broken pixel) becomes infinite or 0; `logarithm` is finite there.
     last = len(words) - 1
     for i in range(len(words)):
         ahead = words[min(i + AHEAD, last), 1]
@@ -195,9 +193,10 @@ def _integrate(words, pixels, width, start, middle):  # type: ignore[no-untyped-
         level, up, down = pixel.level, pixel.up, pixel.down
         pixel.integral += level * (now - pixel.since)
         pixel.since = now
-        level = min(max(level * (up if event_is_on(word) else down), lowest), highest)
+        level *= up if event_is_on(word) else down
+        peak = pixel.peak
         pixel.level = level
-        pixel.peak = max(pixel.peak, level)
+        pixel.peak = level if level > peak else peak
         pixel.events += ONE
         if words[i, 0] <= middle:
             pixel.at_middle = level

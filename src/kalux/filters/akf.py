@@ -26,6 +26,7 @@ from kalux.augmentation.deblur import events_until
 from kalux.augmentation.interpolation import InterpolatedSegment
 from kalux.compiled import (
     AHEAD,
+    FUSED,
     MICROSECOND32,
     ONE,
     event_column,
@@ -242,7 +243,7 @@ def _begin_bridged(segment, log_intensity, variance, pixels):  # type: ignore[no
             pixel.coming = segment.events[row, column]
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@nb.njit(cache=True, nogil=True, error_model="numpy", fastmath=FUSED)
 def _advance_bridged(words, pixels, clock, stride, origin, scalars):  # type: ignore[no-untyped-def]
     corner = stride + np.uint64(1)
     last = len(words) - 1

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from kalux.augmentation.deblur import events_until
 from kalux.compiled import (
     AHEAD,
+    FUSED,
     MICROSECOND32,
     event_column,
     event_is_on,
@@ -108,7 +109,7 @@ def decayed(deviation, gain, seconds):  # type: ignore[no-untyped-def]
     return deviation * exponential(-gain * seconds)
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@nb.njit(cache=True, nogil=True, error_model="numpy", fastmath=FUSED)
 def _advance(words, pixels, width, origin, scalars):  # type: ignore[no-untyped-def]
     last = len(words) - 1
     for i in range(len(words)):
