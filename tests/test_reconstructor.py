@@ -172,7 +172,7 @@ def test_what_is_forgotten_cannot_be_read_and_is_freed():
     middle = (stream.frames[1].middle + stream.frames[2].middle) // 2
     live.forget(middle)
     assert live.begin_time == middle
-    assert sum(len(chunk) for chunk in live._chunks) == np.sum(stream.events["t"] > middle)
+    assert len(live._events) == np.sum(stream.events["t"] > middle)
     with pytest.raises(InputError, match=r"forget\(\) has freed"):
         live.read(middle - 1)
     assert_same(live.read(middle), filled(stream).read(middle))
@@ -632,7 +632,7 @@ def test_memory_is_bounded_when_one_reads_along():
         live.push_events(events(*rows))
         if live.final_until is not None:
             live.read(live.final_until)
-        held.append((sum(len(chunk) for chunk in live._chunks), len(live._shots)))
+        held.append((len(live._events), len(live._shots)))
     assert max(count for count, _ in held) <= 200
     assert max(shots for _, shots in held) <= 4
 

@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.errors import InputError
-from kalux.events import EVENT_DTYPE, EventArray, as_events, check_events
+from kalux.events import as_events, check_events
 from kalux.filters.akf import State
+from kalux.filters.buffer import EventBuffer
 from kalux.filters.methods import Method, Segment, Shot, make_method, take_shot
 from kalux.filters.readout import HighlightPrior, intensity
 from kalux.frames import Frame, check_frame
@@ -67,7 +68,7 @@ class Estimate:
     t
         Its time, int us.
     log_intensity, variance
-        float64 (H, W): L = log(I + I_0), and P.
+        (H, W): L = log(I + I_0), and P. float32; float64 with augmentation "paper".
     white
         log(1 + I_0) of the brightest level that frames show there.
     final
@@ -75,20 +76,20 @@ class Estimate:
     """
 
     t: int
-    log_intensity: NDArray[np.float64]
-    variance: NDArray[np.float64]
+    log_intensity: NDArray[np.floating[Any]]
+    variance: NDArray[np.floating[Any]]
     white: float
     final: bool
 
 
 class _Progress:
-    """A segment under way: its cursor, and how many buffered events it has taken."""
+    """A segment under way: its cursor, and which of the buffered events it has taken."""
 
     def __init__(self, segment: Segment, memory: Any, cursor: Any, ready: bool, starts_frame: bool) -> None:
         self.segment, self.memory, self.cursor = segment, memory, cursor
         self.ready = ready  # the segment will not change any more
         self.starts_frame = starts_frame  # False for the lead-in before the first frame's node
-        self.taken = 0
+        self.taken = 0  # number of the first event that the cursor has not taken, or an earlier one
         self.latest = segment.start  # time of the last event taken
 
 
@@ -161,7 +162,7 @@ class Reconstructor:
         used = _with_spread(self.settings, _UNKNOWN_SPREAD) if unknown else self.settings
         self._method: Method = make_method(used, self.thresholds, lookahead, self.sensor_size)
         self._shots: list[Shot] = []  # from the current segment's frame on
-        self._chunks: list[EventArray] = []  # events after the current segment's start
+        self._events = EventBuffer()  # those after the current segment's start
         self._state: State | None = None  # at the current segment's start
         self._memory: Any = None
         self._progress: _Progress | None = None
@@ -205,18 +206,15 @@ class Reconstructor:
         if self._complete_until is not None:
             earliest = self._complete_until + 1 + self._delay
             previous = earliest if previous is None else max(previous, earliest)
-        check_events(array, self.sensor_size, first_index=self._event_count, previous_t=previous)
+        if not self._events.append(array, self.sensor_size, earliest=previous, delay=self._delay):
+            check_events(array, self.sensor_size, first_index=self._event_count, previous_t=previous)
         if len(array) == 0:
             return
         self._event_count += len(array)
         self._last_event = int(array["t"][-1])
         self.advance(self._last_event - 1)  # more events may carry the last one's time
         if self._needed_from is not None:
-            array = array[array["t"].searchsorted(self._needed_from + self._delay, "right") :]
-        if array.base is not None or array is events:
-            array = array.copy()  # drivers fill the same buffer again
-        array["t"] -= self._delay
-        self._chunks.append(array)
+            self._events.drop(self._needed_from)
 
     def advance(self, t: int) -> None:
         """Declare that all events stamped up to ``t`` (us) have been pushed: silence is information too."""
@@ -259,8 +257,7 @@ class Reconstructor:
         progress = self._progress_to(limit)
         if progress.ready or (self._frames_ended and len(self._shots) == 1):  # no frame will change it
             self._take(progress, limit)
-            self._drop_events(progress.latest)
-            progress.taken = 0
+            self._events.drop(progress.latest)
             self._earliest = limit
 
     # Reading.
@@ -334,7 +331,7 @@ class Reconstructor:
             intensity=intensity(
                 estimate.log_intensity, estimate.variance, self.settings.camera.log_offset, prior
             ),
-            variance=estimate.variance.astype(np.float32),
+            variance=estimate.variance.astype(np.float32, copy=False),
             final=estimate.final,
         )
 
@@ -374,11 +371,6 @@ class Reconstructor:
             return self._method.node(self._shots[0])
         return None
 
-    def _buffer(self) -> EventArray:
-        if len(self._chunks) != 1:
-            self._chunks = [np.concatenate(self._chunks) if self._chunks else np.empty(0, EVENT_DTYPE)]
-        return self._chunks[0]
-
     def _progress_to(self, t: int) -> _Progress:
         """The segment that holds ``t``, with a cursor that has taken no event after it; commits those before."""
         if self._state is None:
@@ -395,8 +387,8 @@ class Reconstructor:
     def _begin(self) -> None:
         """Take the first frame, now that the events of its exposure are here."""
         shot = self._shots[0]
-        self._memory, lead_in, self._state = self._method.start(shot, self._buffer())
-        self._drop_events(self._method.begin_time(shot))
+        self._memory, lead_in, self._state = self._method.start(shot, self._events.chunks)
+        self._events.drop(self._method.begin_time(shot))
         if lead_in is not None:
             self._progress = _Progress(
                 lead_in,
@@ -408,19 +400,19 @@ class Reconstructor:
 
     def _provisional(self, t: int) -> _Progress:
         """The same with what there is of the first exposure's events; made anew for every read."""
-        shot, buffer = self._shots[0], self._buffer()
-        memory, lead_in, state = self._method.start(shot, buffer)
+        shot, chunks = self._shots[0], self._events.chunks
+        memory, lead_in, state = self._method.start(shot, chunks)
         segment, starts_frame = lead_in, False
         if segment is not None and t > segment.end:
             lead = _Progress(segment, memory, self._method.begin(segment, state), False, starts_frame=False)
-            lead.taken = int(buffer["t"].searchsorted(segment.start, "right"))
+            lead.taken = self._events.number(segment.start)
             self._take(lead, segment.end)
-            state, segment = self._end_state(lead), None
+            state, segment = self._method.end(lead.segment, lead.cursor), None
         if segment is None:
-            segment, memory = self._method.segment(memory, shot, None, buffer)
+            segment, memory = self._method.segment(memory, shot, None, chunks)
             starts_frame = True
         progress = _Progress(segment, memory, self._method.begin(segment, state), False, starts_frame)
-        progress.taken = int(buffer["t"].searchsorted(segment.start, "right"))
+        progress.taken = self._events.number(segment.start)
         return progress
 
     def _open(self) -> _Progress:
@@ -429,25 +421,20 @@ class Reconstructor:
         complete = len(self._shots) > 1 and self._is_complete(self._shots[1])
         if self._progress is None or (complete and not self._progress.ready):
             segment, memory = self._method.segment(
-                self._memory, self._shots[0], self._shots[1] if complete else None, self._buffer()
+                self._memory, self._shots[0], self._shots[1] if complete else None, self._events.chunks
             )
             cursor = self._method.begin(segment, self._state)
             self._progress = _Progress(segment, memory, cursor, complete, starts_frame=True)
         return self._progress
 
-    def _end_state(self, progress: _Progress) -> State:
-        value, variance = self._method.read(progress.segment, progress.cursor, progress.segment.end)
-        newest = self._method.newest(progress.cursor)
-        return State(value, variance, newest)
-
     def _commit(self, progress: _Progress) -> None:
         """Move the state to the end of a final segment; forget its frame and events."""
-        self._state = self._end_state(progress)
+        self._state = self._method.end(progress.segment, progress.cursor)
         self._memory = progress.memory
         self._progress = None
         if progress.starts_frame:
             self._shots.pop(0)
-        self._drop_events(progress.segment.end)
+        self._events.drop(progress.segment.end)
 
     def _restart(self, progress: _Progress) -> _Progress:
         """The same segment with a fresh cursor, to read at an earlier time."""
@@ -458,31 +445,12 @@ class Reconstructor:
         )
         return self._progress
 
-    def _drop_events(self, until: int) -> None:
-        """Forget the events up to ``until``."""
-        kept = []
-        for chunk in self._chunks:
-            rest = chunk[chunk["t"].searchsorted(until, "right") :]
-            if len(rest):
-                # A small rest must not keep a large chunk in memory.
-                whole = rest.base if rest.base is not None else rest
-                kept.append(rest.copy() if 2 * len(rest) < whole.size else rest)
-        self._chunks = kept
-
     def _take(self, progress: _Progress, t: int) -> None:
         """Take the cursor over the events up to ``t`` that it has not taken yet."""
-        first = 0
-        for chunk in self._chunks:
-            last = first + len(chunk)
-            if progress.taken < last:
-                fresh = chunk[progress.taken - first :]
-                fresh = fresh[: fresh["t"].searchsorted(t, "right")]
-                if len(fresh) == 0:
-                    return
-                self._method.advance(progress.segment, progress.cursor, fresh)
-                progress.taken += len(fresh)
-                progress.latest = int(fresh["t"][-1])
-            first = last
+        for events in self._events.after(progress.taken, t):
+            self._method.advance(progress.segment, progress.cursor, events)
+            progress.latest = int(events["t"][-1])
+        progress.taken = self._events.number(t)
 
 
 def _with_spread(settings: Settings, least: float) -> Settings:

@@ -15,7 +15,7 @@ from kalux.augmentation.bridge import (
     bridge,
     extend,
     extend_backward,
-    lower_bound,
+    lift,
     nominal_thresholds,
 )
 
@@ -138,15 +138,16 @@ def test_information_goes_from_one_end_to_the_other():
     segment, _ = join(latent(0.0, 0.02), latent(0.1, 0.03), counts(4), counts(3))
     assert (segment.start, segment.end) == (START, END)
     np.testing.assert_allclose(segment.forward_variance, 0.02, rtol=1e-12)
-    np.testing.assert_allclose(segment.backward_variance - 7 * segment.step_variance, 0.03, rtol=1e-9)
+    np.testing.assert_allclose(segment.backward_variance, 0.03, rtol=1e-12)
+    np.testing.assert_array_equal(segment.events, 7)
     assert segment.step_variance == NOISE.step_variance
     np.testing.assert_allclose(segment.rate * SECONDS, 0.5, rtol=1e-12)
 
 
 def test_extend_holds_one_frame():
     frame, thresholds = latent([0.1, -2.0], [0.02, UNMEASURED]), nominal_thresholds((1, 2), 0.1)
-    segment = extend(frame, thresholds, NOISE, START, END, SECONDS, lower_bound(frame))
-    np.testing.assert_array_equal(segment.end_bound, [[-np.inf, -2.0]])
+    segment = extend(frame, thresholds, NOISE, START, END, SECONDS, frame)
+    assert segment.bound is frame
     np.testing.assert_array_equal(segment.augmented, frame.value)
     np.testing.assert_array_equal(segment.forward_variance, frame.variance)
     assert (segment.slope == 0).all()
@@ -161,8 +162,38 @@ def test_extend_backward_arrives_at_the_frame():
     segment = extend_backward(frame, on, off, thresholds, NOISE, START, END)
     np.testing.assert_allclose(reached(segment, on, off), frame.value, rtol=1e-12)
     np.testing.assert_allclose(segment.augmented, [[0.1 - 0.4, -2.0]], rtol=1e-12)
-    np.testing.assert_allclose(segment.backward_variance, [[0.02 + 3 * 0.012, 0.03]], rtol=1e-12)
+    np.testing.assert_array_equal(segment.backward_variance, frame.variance)
+    np.testing.assert_array_equal(segment.events, [[3, 0]])
     assert (segment.forward_variance >= UNMEASURED).all()
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_only_what_is_clipped_is_a_bound(dtype):
+    """K7: up to it, never down, and a measured pixel says nothing of the kind. The first is just short of clipped."""
+    frame = Latent(*np.array([[[0.5, 0.5, 0.5, 0.5]], [[1e11, UNMEASURED, UNMEASURED, 0.1]]], dtype))
+    level = np.array([[0.0, 0.0, 2.0, 0.0]], dtype)
+    lift(level, frame)
+    np.testing.assert_array_equal(level, np.array([[0.0, 0.5, 2.0, 0.0]], dtype))
+
+
+def test_float32_frames_make_a_float32_segment():
+    """Of the same numbers, to its rounding: the arithmetic is float64 either way."""
+    rng = np.random.default_rng(2)
+    shape = (5, 6)
+    frames = [Latent(rng.normal(size=shape), rng.uniform(1e-4, 0.1, shape)) for _ in range(2)]
+    on, off = rng.integers(0, 9, (2, *shape)).astype(float)
+    wide = join(*frames, on, off)
+    narrow = join(
+        *(Latent(*(part.astype(np.float32) for part in frame)) for frame in frames),
+        on.astype(np.float32),
+        off.astype(np.float32),
+        nominal_thresholds(shape, 0.1, np.float32),
+    )
+    for a, b in zip(wide, narrow, strict=True):
+        for name, values in a._asdict().items():
+            if isinstance(values, np.ndarray):
+                assert getattr(b, name).dtype == np.float32
+                np.testing.assert_allclose(getattr(b, name), values, rtol=2e-6, atol=2e-6, err_msg=name)
 
 
 # --- learning -------------------------------------------------------------------------------------------

@@ -50,37 +50,45 @@ def test_no_events_leave_the_frame_as_it_is():
 def test_one_event_a_quarter_into_the_exposure():
     """Before it the level is 0 for 250 us, after it c for 750 us."""
     integrals = integrate(pixel_events([1250], [1]))
-    np.testing.assert_allclose(integrals.log_mean, np.log(0.25 + 0.75 * np.exp(ON)), rtol=1e-14)
-    assert integrals.to_middle == ON
-    assert integrals.to_end == ON
-    assert integrals.peak == ON
+    np.testing.assert_allclose(integrals.log_mean, np.log(0.25 + 0.75 * np.exp(ON)), rtol=1e-6)
+    assert integrals.to_middle == pytest.approx(ON, rel=1e-6)
+    assert integrals.to_end == pytest.approx(ON, rel=1e-6)
+    assert integrals.peak == pytest.approx(ON, rel=1e-6)
     assert integrals.events == 1
     frame = np.zeros((1, 1))
-    np.testing.assert_allclose(latent_start(frame, integrals), -integrals.log_mean, rtol=1e-14)
-    np.testing.assert_allclose(latent_end(frame, integrals), ON - integrals.log_mean, rtol=1e-14)
+    np.testing.assert_allclose(latent_start(frame, integrals), -integrals.log_mean, rtol=1e-6)
+    np.testing.assert_allclose(latent_end(frame, integrals), ON - integrals.log_mean, rtol=1e-6)
 
 
 def test_one_event_after_the_middle():
     integrals = integrate(pixel_events([1750], [0]))
-    np.testing.assert_allclose(integrals.log_mean, np.log(0.75 + 0.25 * np.exp(-OFF)), rtol=1e-14)
+    np.testing.assert_allclose(integrals.log_mean, np.log(0.75 + 0.25 * np.exp(-OFF)), rtol=1e-6)
     assert integrals.to_middle == 0.0
-    assert integrals.to_end == -OFF
+    assert integrals.to_end == pytest.approx(-OFF, rel=1e-6)
     assert integrals.peak == 0.0
 
 
 def test_two_events_up_and_down():
     integrals = integrate(pixel_events([1100, 1600], [1, 0]))
     expected = np.log(0.1 + 0.5 * np.exp(ON) + 0.4 * np.exp(ON - OFF))
-    np.testing.assert_allclose(integrals.log_mean, expected, rtol=1e-14)
-    np.testing.assert_allclose(integrals.to_middle, ON, rtol=1e-14)
-    np.testing.assert_allclose(integrals.to_end, ON - OFF, rtol=1e-14)
-    np.testing.assert_allclose(integrals.peak, ON, rtol=1e-14)
+    np.testing.assert_allclose(integrals.log_mean, expected, rtol=1e-6)
+    np.testing.assert_allclose(integrals.to_middle, ON, rtol=1e-6)
+    np.testing.assert_allclose(integrals.to_end, ON - OFF, rtol=1e-6)
+    np.testing.assert_allclose(integrals.peak, ON, rtol=1e-6)
     assert integrals.events == 2
+
+
+def test_a_broken_pixel_stays_finite():
+    """A thousand steps of 0.3 within an exposure, up or down."""
+    for polarity in (1, 0):
+        integrals = integrate(pixel_events(range(1001, 2001), [polarity] * 1000))
+        for values in integrals:
+            assert np.isfinite(values).all()
 
 
 def test_events_at_the_same_time_count_one_after_another():
     both = integrate(pixel_events([1500, 1500], [1, 1]))
-    np.testing.assert_allclose(both.log_mean, np.log(0.5 + 0.5 * np.exp(2 * ON)), rtol=1e-14)
+    np.testing.assert_allclose(both.log_mean, np.log(0.5 + 0.5 * np.exp(2 * ON)), rtol=1e-6)
 
 
 def test_exposures_are_open_at_the_start_and_closed_at_the_end():
@@ -88,16 +96,17 @@ def test_exposures_are_open_at_the_start_and_closed_at_the_end():
     at_start = integrate(pixel_events([1000], [1]))
     assert (at_start.events, at_start.to_end, at_start.log_mean) == (0, 0.0, 0.0)
     at_end = integrate(pixel_events([2000], [1]))
-    assert (at_end.events, at_end.to_end, at_end.log_mean) == (1, ON, 0.0)
+    assert (at_end.events, at_end.log_mean) == (1, 0.0)
+    assert at_end.to_end == pytest.approx(ON, rel=1e-6)
     at_middle = integrate(pixel_events([1500], [1]))
-    assert at_middle.to_middle == ON
+    assert at_middle.to_middle == pytest.approx(ON, rel=1e-6)
     assert integrate(pixel_events([1501], [1])).to_middle == 0.0
 
 
 def test_every_pixel_has_its_own_events_and_steps():
     on = np.array([[0.1, 0.2, 0.3]])
     integrals = integrate_exposure(events((1500, 2, 0, 1), (1500, 0, 0, 0)), 1000, 2000, on, 2 * on)
-    np.testing.assert_allclose(integrals.to_end, [[-0.2, 0.0, 0.3]], rtol=1e-14)
+    np.testing.assert_allclose(integrals.to_end, [[-0.2, 0.0, 0.3]], rtol=1e-6)
     np.testing.assert_array_equal(integrals.events, [[1, 0, 1]])
 
 
@@ -123,7 +132,7 @@ def test_the_mean_of_the_latent_image_is_the_frame(rows, log_frame):
     inside = [(t, p) for t, p in rows if 1000 < t <= 2000]
     edges = sorted({1000, 2000, *(t for t, _ in inside)})
     mean = sum(np.exp(latent_at(a, start, inside)) * (b - a) for a, b in pairwise(edges))
-    np.testing.assert_allclose(mean / 1000, np.exp(log_frame), rtol=1e-10)
+    np.testing.assert_allclose(mean / 1000, np.exp(log_frame), rtol=5e-6)
     assert integrals.events == len(inside)
 
 
@@ -134,9 +143,9 @@ def test_middle_end_and_peak_follow_from_the_start(rows):
     frame = np.zeros((1, 1))
     start = latent_start(frame, integrals)[0, 0]
     levels = [start, *(start + np.cumsum([ON if p else -OFF for _, p in inside]))]
-    np.testing.assert_allclose(latent_middle(frame, integrals), latent_at(1500, start, inside), atol=1e-12)
-    np.testing.assert_allclose(latent_end(frame, integrals), latent_at(2000, start, inside), atol=1e-12)
-    np.testing.assert_allclose(latent_peak(frame, integrals), max(levels), atol=1e-12)
+    np.testing.assert_allclose(latent_middle(frame, integrals), latent_at(1500, start, inside), atol=2e-6)
+    np.testing.assert_allclose(latent_end(frame, integrals), latent_at(2000, start, inside), atol=2e-6)
+    np.testing.assert_allclose(latent_peak(frame, integrals), max(levels), atol=2e-6)
 
 
 @given(moments)

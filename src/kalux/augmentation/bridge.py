@@ -14,16 +14,17 @@ docs/equations.md, K1 to K3.
 
 from __future__ import annotations
 
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
+import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating[Any]]
 
-UNMEASURED: Final = 1e12
-"""Variance of a clipped or masked pixel. 1/R is then 1e-12, which a double cannot tell from 0 beside any
-information in use (1e-2 and more), and the formulas need no special case."""
+UNMEASURED: Final = 2.0**40
+"""Variance of a clipped or masked pixel, a number that float32 holds too. 1/R is then 1e-12, which cannot be told
+from 0 beside any information in use (1e-2 and more), and the formulas need no special case."""
 
 _SCALE_BOUNDS: Final = (0.3, 3.0)
 _SCALE_DRIFT: Final = 1e-5  # variance per frame: a calibration never becomes certain, temperatures drift
@@ -57,11 +58,12 @@ class BridgeNoise(NamedTuple):
 class BridgedSegment(NamedTuple):
     """L^A and its uncertainty from one moment to the next.
 
-    Times are int us, arrays (H, W) float64, log intensity. Between events L^A moves by ``slope`` (1/s); an
-    event moves it by ``step_on`` or -``step_off`` (both usually positive) and moves ``step_variance`` from
-    ``backward_variance`` to ``forward_variance``. The covariance of L^A as a measurement is
-    R = 1 / (rate (1/forward + 1/backward)), ``rate`` in 1/s. At ``end`` the pixel is no darker than
-    ``end_bound``.
+    Times are int us, arrays (H, W) in the type of the frames, log intensity. Between events L^A moves by ``slope``
+    (1/s); an event moves it by ``step_on`` or -``step_off`` (both usually positive) and moves ``step_variance`` from
+    the way to the end to the way from the start. The covariance of L^A as a measurement is
+    R = 1 / (rate (1/forward + 1/backward)), ``rate`` in 1/s, where ``forward`` is ``forward_variance`` and
+    ``step_variance`` for each event since the start, and ``backward`` is ``backward_variance`` and ``step_variance``
+    for each of the ``events`` still to come. At ``end`` the pixel obeys the frame ``bound`` (`lift`).
     """
 
     start: int
@@ -72,23 +74,31 @@ class BridgedSegment(NamedTuple):
     step_off: Array
     forward_variance: Array
     backward_variance: Array
+    events: Array
     step_variance: float
     rate: float
-    end_bound: Array
+    bound: Latent | None
 
 
-def lower_bound(frame: Latent) -> Array:
-    """What a clipped pixel does say: it was no darker than this (docs/equations.md, K7); -inf elsewhere.
+def lift(log_intensity: Array, frame: Latent) -> None:
+    """A clipped pixel does say one thing: it was no darker than this (docs/equations.md, K7). In place.
 
     A frame integrates: where its value is clipped, the mean over the exposure was at least the value, and the
     latent value computed from it is a bound for every moment.
     """
-    return np.where(frame.variance >= UNMEASURED, frame.value, -np.inf)
+    _lift(log_intensity.reshape(-1), frame.value.reshape(-1), frame.variance.reshape(-1))
 
 
-def nominal_thresholds(shape: tuple[int, int], spread: float) -> Thresholds:
+@nb.njit(cache=True, nogil=True)
+def _lift(log_intensity, value, variance):  # type: ignore[no-untyped-def]
+    for i in range(len(value)):
+        if variance[i] >= UNMEASURED and value[i] > log_intensity[i]:
+            log_intensity[i] = value[i]
+
+
+def nominal_thresholds(shape: tuple[int, int], spread: float, dtype: Any = np.float64) -> Thresholds:
     """Before any calibration: factor 1 with the variance that pixels have among each other."""
-    return Thresholds(np.ones(shape), np.ones(shape), np.full(shape, spread**2), np.full(shape, spread**2))
+    return Thresholds(*(np.full(shape, value, dtype) for value in (1.0, 1.0, spread**2, spread**2)))
 
 
 def bridge(
@@ -116,43 +126,71 @@ def bridge(
     -------
     The segment, and the thresholds with what this interval says of them.
     """
-    step_on = noise.threshold_on * thresholds.on
-    step_off = noise.threshold_off * thresholds.off
-    mismatch = second.value - first.value - (step_on * on - step_off * off)
-    on_covariance = thresholds.on_variance * noise.threshold_on * on
-    off_covariance = -thresholds.off_variance * noise.threshold_off * off
-    of_events = noise.step_variance * (on + off)
-    total = (
-        first.variance
-        + second.variance
-        + on_covariance * noise.threshold_on * on
-        - off_covariance * noise.threshold_off * off
-        + of_events
-        + noise.quantisation_variance
-    )
-    gain = mismatch / total
     seconds = (end - start) * 1e-6
+    augmented, slope, step_on, step_off, events, *factors = np.empty(
+        (9, *first.value.shape), first.value.dtype
+    )
     segment = BridgedSegment(
         start=start,
         end=end,
-        augmented=first.value + gain * first.variance,
-        slope=gain * noise.quantisation_variance / seconds,
-        step_on=step_on + gain * (noise.threshold_on * on_covariance + noise.step_variance),
-        step_off=step_off + gain * (noise.threshold_off * off_covariance - noise.step_variance),
+        augmented=augmented,
+        slope=slope,
+        step_on=step_on,
+        step_off=step_off,
         forward_variance=first.variance,
-        backward_variance=second.variance + of_events,
+        backward_variance=second.variance,
+        events=events,
         step_variance=noise.step_variance,
         rate=0.5 / seconds,
-        end_bound=lower_bound(second),
+        bound=second,
     )
-    low, high = _SCALE_BOUNDS
-    learned = Thresholds(
-        np.clip(thresholds.on + gain * on_covariance, low, high),
-        np.clip(thresholds.off + gain * off_covariance, low, high),
-        thresholds.on_variance - on_covariance**2 / total + _SCALE_DRIFT,
-        thresholds.off_variance - off_covariance**2 / total + _SCALE_DRIFT,
-    )
+    learned = Thresholds(*factors)
+    _bridge(first, second, on, off, thresholds, noise, seconds, segment, learned)
     return segment, learned
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _bridge(first, second, on, off, thresholds, noise, seconds, segment, learned):  # type: ignore[no-untyped-def]
+    """Fill ``segment`` and ``learned``; in float64, whatever the arrays' type."""
+    low, high = _SCALE_BOUNDS
+    height, width = on.shape
+    for row in range(height):
+        for column in range(width):
+            i = row, column
+            n_on, n_off = np.float64(on[i]), np.float64(off[i])
+            scale_on, scale_off = np.float64(thresholds.on[i]), np.float64(thresholds.off[i])
+            nominal_on, nominal_off = noise.threshold_on * scale_on, noise.threshold_off * scale_off
+            change = np.float64(second.value[i]) - np.float64(first.value[i])
+            mismatch = change - (nominal_on * n_on - nominal_off * n_off)
+            on_variance, off_variance = (
+                np.float64(thresholds.on_variance[i]),
+                np.float64(thresholds.off_variance[i]),
+            )
+            on_covariance = on_variance * noise.threshold_on * n_on
+            off_covariance = -off_variance * noise.threshold_off * n_off
+            total = (
+                np.float64(first.variance[i])
+                + np.float64(second.variance[i])
+                + on_covariance * noise.threshold_on * n_on
+                - off_covariance * noise.threshold_off * n_off
+                + noise.step_variance * (n_on + n_off)
+                + noise.quantisation_variance
+            )
+            inverse = 1.0 / total
+            gain = mismatch * inverse
+            segment.augmented[i] = first.value[i] + gain * first.variance[i]
+            segment.slope[i] = gain * noise.quantisation_variance / seconds
+            segment.step_on[i] = nominal_on + gain * (
+                noise.threshold_on * on_covariance + noise.step_variance
+            )
+            segment.step_off[i] = nominal_off + gain * (
+                noise.threshold_off * off_covariance - noise.step_variance
+            )
+            segment.events[i] = n_on + n_off
+            learned.on[i] = min(max(scale_on + gain * on_covariance, low), high)
+            learned.off[i] = min(max(scale_off + gain * off_covariance, low), high)
+            learned.on_variance[i] = on_variance - on_covariance * on_covariance * inverse + _SCALE_DRIFT
+            learned.off_variance[i] = off_variance - off_covariance * off_covariance * inverse + _SCALE_DRIFT
 
 
 def extend(
@@ -162,12 +200,12 @@ def extend(
     start: int,
     end: int,
     seconds: float,
-    end_bound: Array,
+    bound: Latent | None,
 ) -> BridgedSegment:
     """L^A from one frame alone, forward in time (10): causal mode, and after the last frame.
 
-    ``seconds`` is the time over which the frame's information is spread, that to the next frame; ``end_bound``
-    what the next frame says if it is clipped, -inf elsewhere.
+    ``seconds`` is the time over which the frame's information is spread, that to the next frame; ``bound`` is the
+    next frame, which is a bound where it is clipped.
     """
     return BridgedSegment(
         start=start,
@@ -178,9 +216,10 @@ def extend(
         step_off=noise.threshold_off * thresholds.off,
         forward_variance=frame.variance,
         backward_variance=np.full_like(frame.value, UNMEASURED),
+        events=np.zeros_like(frame.value),
         step_variance=noise.step_variance,
         rate=1.0 / seconds,
-        end_bound=end_bound,
+        bound=bound,
     )
 
 
@@ -197,8 +236,9 @@ def extend_backward(
         step_on=step_on,
         step_off=step_off,
         forward_variance=np.full_like(frame.value, UNMEASURED),
-        backward_variance=frame.variance + noise.step_variance * (on + off),
+        backward_variance=frame.variance,
+        events=on + off,
         step_variance=noise.step_variance,
         rate=0.5 / ((end - start) * 1e-6),
-        end_bound=lower_bound(frame),
+        bound=frame,
     )

@@ -7,23 +7,56 @@ A frame is the mean of the intensity over its exposure, and events tell how the 
 with E(s, t) the sum of the events' steps from the start s of the exposure. So the latent (sharp) image is
 L^D(t) = log(B + I_0) - log(mean of exp E(s, .)) + E(s, t). Each interval between two events is weighted by the
 level that holds during it, and the mean runs over the whole exposure.
+
+The level exp E is kept as a product: an event multiplies it by e^c or e^-c of its pixel, so that there is one
+exponential per pixel and none per event.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, Final, NamedTuple
 
 import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.compiled import (
+    AHEAD,
+    FUSED,
+    ONE,
+    event_column,
+    event_is_on,
+    event_row,
+    event_words,
+    exponential,
+    logarithm,
+    prefetch,
+)
 from kalux.events import EventArray
 
 Array = NDArray[np.float64]
+Floats = NDArray[np.floating[Any]]
+FloatArray = NDArray[np.float32]
+
+EXPOSURE_PIXEL: Final = np.dtype(
+    [
+        ("level", "f4"),  # exp E(s, t) after the pixel's latest event
+        ("integral", "f4"),  # of the level until then, us
+        ("since", "f4"),  # time of that event, us after s
+        ("peak", "f4"),  # largest level
+        ("at_middle", "f4"),  # level at the middle
+        ("events", "f4"),  # number
+        ("up", "f4"),  # e^c of an on event, e^-c of an off event
+        ("down", "f4"),
+    ],
+    align=True,
+)
+"""What a pixel remembers within an exposure: 32 bytes, half a cache line, fetched and stored at once."""
 
 
 class ExposureIntegrals(NamedTuple):
-    """What the events of one exposure say, per pixel; all (H, W) float64, log intensity.
+    """What the events of one exposure say, per pixel; all (H, W) float32, log intensity.
 
     Attributes
     ----------
@@ -37,46 +70,45 @@ class ExposureIntegrals(NamedTuple):
         Number of events within the exposure.
     """
 
-    log_mean: Array
-    to_middle: Array
-    to_end: Array
-    peak: Array
-    events: Array
+    log_mean: FloatArray
+    to_middle: FloatArray
+    to_end: FloatArray
+    peak: FloatArray
+    events: FloatArray
 
 
 def integrate_exposure(
-    events: EventArray, start: int, end: int, step_on: Array, step_off: Array
+    events: EventArray | Sequence[EventArray],
+    start: int,
+    end: int,
+    step_on: Floats,
+    step_off: Floats,
 ) -> ExposureIntegrals:
     """The double integral over one exposure.
 
     Parameters
     ----------
     events
-        Time-ordered; those outside (start, end] are ignored.
+        Time-ordered, in one array or several; those outside (start, end] are ignored.
     start, end
         The exposure, us.
     step_on, step_off
         (H, W) positive log-intensity steps of an event of either polarity.
     """
-    inside = between(events, start, end)
-    return ExposureIntegrals(
-        *_integrate(
-            inside["t"],
-            inside["x"],
-            inside["y"],
-            inside["p"],
-            start,
-            (start + end) // 2,
-            end,
-            step_on,
-            step_off,
-        )
-    )
+    height, width = step_on.shape
+    pixels = np.empty(height * width, EXPOSURE_PIXEL)
+    _begin_exposure(pixels, step_on, step_off)
+    for chunk in [events] if isinstance(events, np.ndarray) else events:
+        inside = between(chunk, start, end)
+        _integrate(event_words(inside), pixels, np.uint64(width), start, (start + end) // 2)
+    integrals = ExposureIntegrals(*np.empty((5, height, width), np.float32))
+    _finish_exposure(pixels, end - start, *integrals)
+    return integrals
 
 
 def still_exposure(shape: tuple[int, int]) -> ExposureIntegrals:
     """The integrals of an exposure in which nothing is taken to move (deblurring off)."""
-    return ExposureIntegrals(*(np.zeros(shape) for _ in range(5)))
+    return ExposureIntegrals(*(np.zeros(shape, np.float32) for _ in range(5)))
 
 
 def latent_start(log_frame: Array, integrals: ExposureIntegrals) -> Array:
@@ -101,46 +133,113 @@ def latent_peak(log_frame: Array, integrals: ExposureIntegrals) -> Array:
 
 def between(events: EventArray, start: int, end: int) -> EventArray:
     """The events with start < t <= end."""
-    first, last = np.searchsorted(events["t"], [start, end], side="right")
-    return events[first:last]
+    return events[events_until(events, start) : events_until(events, end)]
+
+
+def all_between(chunks: Sequence[EventArray], start: int, end: int) -> list[EventArray]:
+    """The same of events in several arrays."""
+    inside = (between(chunk, start, end) for chunk in chunks)
+    return [events for events in inside if len(events)]
+
+
+def events_until(events: EventArray, t: int) -> int:
+    """Number of events up to and at ``t`` (us). NumPy's search would copy the whole column first."""
+    return int(_events_until(event_words(events), t))
 
 
 @nb.njit(cache=True, nogil=True)
-def _integrate(t, x, y, p, start, middle, end, step_on, step_off):  # type: ignore[no-untyped-def]
+def _events_until(words, t):  # type: ignore[no-untyped-def]
+    first, last = 0, len(words)
+    while first < last:
+        middle = (first + last) // 2
+        if words[middle, 0] <= t:
+            first = middle + 1
+        else:
+            last = middle
+    return first
+
+
+# Elementary functions go over a row of the image at a time, in arrays of their own: vector code would pick the fields
+# of the packed pixels one by one, which is slower than plain code. `prefetch` keeps the compiler from it.
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _begin_exposure(pixels, step_on, step_off):  # type: ignore[no-untyped-def]
     height, width = step_on.shape
-    mean = np.zeros((height, width))
-    to_middle = np.zeros((height, width))
-    level = np.zeros((height, width))
-    peak = np.zeros((height, width))
-    count = np.zeros((height, width))
-    since = np.full((height, width), start, np.int64)
-    for i in range(len(t)):
-        row, column = y[i], x[i]
-        mean[row, column] += np.exp(level[row, column]) * (t[i] - since[row, column])
-        since[row, column] = t[i]
-        level[row, column] += step_on[row, column] if p[i] else -step_off[row, column]
-        peak[row, column] = max(peak[row, column], level[row, column])
-        count[row, column] += 1
-        if t[i] <= middle:
-            to_middle[row, column] = level[row, column]
+    up, down = np.empty(width, np.float32), np.empty(width, np.float32)
     for row in range(height):
         for column in range(width):
-            mean[row, column] += np.exp(level[row, column]) * (end - since[row, column])
-            mean[row, column] = np.log(mean[row, column] / (end - start))
-    return mean, to_middle, level, peak, count
+            up[column] = exponential(np.float32(step_on[row, column]))
+            down[column] = exponential(-np.float32(step_off[row, column]))
+        for column in range(width):
+            i = row * width + column
+            prefetch(pixels, i)
+            pixel = pixels[i]
+            pixel.level = pixel.peak = pixel.at_middle = ONE
+            pixel.integral = pixel.since = pixel.events = np.float32(0.0)
+            pixel.up, pixel.down = up[column], down[column]
 
 
-@nb.njit(cache=True, nogil=True)
-def _count(x, y, p, on, off):  # type: ignore[no-untyped-def]
-    for i in range(len(x)):
-        if p[i]:
-            on[y[i], x[i]] += 1.0
-        else:
-            off[y[i], x[i]] += 1.0
+@nb.njit(cache=True, nogil=True, error_model="numpy", fastmath=FUSED)
+def _integrate(words, pixels, width, start, middle):  # type: ignore[no-untyped-def]
+    # A level beyond float32 (88 in log intensity: a broken pixel) becomes infinite or 0; `logarithm` is finite there.
+    last = len(words) - 1
+    for i in range(len(words)):
+        ahead = words[min(i + AHEAD, last), 1]
+        prefetch(pixels, event_row(ahead) * width + event_column(ahead))
+        word = words[i, 1]
+        pixel = pixels[event_row(word) * width + event_column(word)]
+        now = np.float32(words[i, 0] - start)
+        level, up, down = pixel.level, pixel.up, pixel.down
+        pixel.integral += level * (now - pixel.since)
+        pixel.since = now
+        level *= up if event_is_on(word) else down
+        peak = pixel.peak
+        pixel.level = level
+        pixel.peak = level if level > peak else peak
+        pixel.events += ONE
+        if words[i, 0] <= middle:
+            pixel.at_middle = level
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _finish_exposure(pixels, exposure, log_mean, to_middle, to_end, peak, events):  # type: ignore[no-untyped-def]
+    height, width = events.shape
+    duration = np.float32(exposure)
+    for row in range(height):
+        for column in range(width):
+            i = row * width + column
+            prefetch(pixels, min(i + AHEAD, len(pixels) - 1))
+            pixel = pixels[i]
+            log_mean[row, column] = pixel.integral + pixel.level * (duration - pixel.since)
+            to_middle[row, column] = pixel.at_middle
+            to_end[row, column] = pixel.level
+            peak[row, column] = pixel.peak
+            events[row, column] = pixel.events
+        for column in range(width):
+            log_mean[row, column] = logarithm(log_mean[row, column] / duration)
+        for plane in (to_middle, to_end, peak):
+            for column in range(width):
+                plane[row, column] = logarithm(plane[row, column])
 
 
 def count_events(events: EventArray, shape: tuple[int, int]) -> tuple[Array, Array]:
     """Number of on and off events of every pixel, two (H, W) float64."""
-    on, off = np.zeros(shape), np.zeros(shape)
-    _count(events["x"], events["y"], events["p"], on, off)
-    return on, off
+    on, off = count_chunks([events], shape)
+    return on.astype(np.float64), off.astype(np.float64)
+
+
+def count_chunks(chunks: Sequence[EventArray], shape: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
+    """The same of events in several arrays, two (H, W) float32."""
+    height, width = shape
+    counts = np.zeros((2, height * width), np.float32)
+    for chunk in chunks:
+        _count(event_words(chunk), counts, np.uint64(width))
+    return counts[1].reshape(shape), counts[0].reshape(shape)
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _count(words, counts, width):  # type: ignore[no-untyped-def]
+    for i in range(len(words)):
+        word = words[i, 1]
+        counts[np.uint64(event_is_on(word)), event_row(word) * width + event_column(word)] += ONE

@@ -14,28 +14,45 @@ and (20), which is exact only while neither L^A nor R moves.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
 
 import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.bridge import BridgedSegment
+from kalux.augmentation.bridge import BridgedSegment, lift
+from kalux.augmentation.deblur import events_until
 from kalux.augmentation.interpolation import InterpolatedSegment
+from kalux.compiled import (
+    AHEAD,
+    FUSED,
+    MICROSECOND32,
+    ONE,
+    event_column,
+    event_is_on,
+    event_row,
+    event_words,
+    prefetch,
+)
 from kalux.events import EventArray
-from kalux.filters.common import MICROSECOND, newest_around
+from kalux.filters.common import EPOCH, MICROSECOND, Clock, moved_clock, newest_around, newest_around_inside
 from kalux.models.events import event_noise, signal_probability, threshold_noise
 
 Array = NDArray[np.float64]
+FloatArray = NDArray[np.float32]
 Times = NDArray[np.int64]
 
 
 class State(NamedTuple):
-    """The filter at one moment: (H, W) log intensity, its variance P, and the newest event of each pixel (us)."""
+    """The filter at one moment: (H, W) log intensity, its variance P, and the newest event of each pixel.
 
-    log_intensity: Array
-    variance: Array
-    newest: Times
+    float32 and a `Clock` whose origin is that moment in the bridged form; float64 and (H, W) int64 us in the paper's.
+    """
+
+    log_intensity: NDArray[np.floating[Any]]
+    variance: NDArray[np.floating[Any]]
+    newest: NDArray[np.signedinteger[Any]]
 
 
 # Equations, each once.
@@ -48,15 +65,15 @@ def predicted_information(information, rate, seconds):  # type: ignore[no-untype
 
 
 @nb.njit(cache=True, inline="always")
-def predicted_deviation(deviation, information, predicted):  # type: ignore[no-untyped-def]
-    """L - L^A of equation (17): J D stands still."""
-    return deviation * (information / predicted)
+def information_kept(information, noise):  # type: ignore[no-untyped-def]
+    """Equation (21), P + Q, as the factor by which it lessens J = 1/P; J D is lessened by the same."""
+    return ONE / (ONE + noise * information)
 
 
 @nb.njit(cache=True, inline="always")
-def added_noise(information, noise):  # type: ignore[no-untyped-def]
-    """Equation (21), P + Q, in terms of J = 1/P."""
-    return information / (1.0 + noise * information)
+def predicted_deviation(deviation, information, predicted):  # type: ignore[no-untyped-def]
+    """L - L^A of equation (17): J D stands still."""
+    return deviation * (information / predicted)
 
 
 @nb.njit(cache=True, inline="always")
@@ -89,17 +106,43 @@ def linear_covariance_integrals(first, second, seconds):  # type: ignore[no-unty
 
 # The bridged form.
 
+BRIDGED_PIXEL: Final = np.dtype(
+    [
+        ("information", "f4"),  # J = 1/P after the pixel's latest event, or at the origin of the clock
+        ("weighted", "f4"),  # J D, which stands still between events
+        ("augmented", "f4"),  # L^A without the part of its slope
+        ("step_on", "f4"),
+        ("step_off", "f4"),
+        ("forward", "f4"),  # variance of L^A as seen from the start
+        ("backward", "f4"),  # the same from the end, without the events still to come
+        (
+            "coming",
+            "f4",
+        ),  # number of those; exact, where taking away their variances would leave rounding errors
+    ],
+    align=True,
+)
+"""What the bridged form knows of a pixel: 32 bytes, half a cache line, fetched and stored at once."""
 
-class BridgedCursor(NamedTuple):
-    """Working arrays of the bridged form, (H, W); changed in place by `advance_bridged`."""
 
-    information: Array
-    deviation: Array
-    augmented: Array
-    forward_variance: Array
-    backward_variance: Array
-    since: Times
-    newest: Times
+@dataclass
+class BridgedCursor:
+    """Working arrays of the bridged form; changed in place by `advance_bridged`.
+
+    Attributes
+    ----------
+    pixels
+        (H + 2, W + 2) of `BRIDGED_PIXEL`, laid out as the clock is.
+    clock
+        Newest event of every pixel, us after ``origin``. The pixel's state holds from there, or from ``origin``
+        if that is later.
+    origin
+        us: the segment's start, then a whole number of epochs later.
+    """
+
+    pixels: NDArray[np.void]
+    clock: Clock
+    origin: int
 
 
 class BridgedNoise(NamedTuple):
@@ -110,81 +153,160 @@ class BridgedNoise(NamedTuple):
     threshold2: float
 
 
+class _Scalars(NamedTuple):
+    """Of the segment and the noise, float32."""
+
+    rate: np.float32
+    step_variance: np.float32
+    noise_rate: np.float32
+    event_variance: np.float32
+    threshold2: np.float32
+
+
 def begin_bridged(segment: BridgedSegment, state: State) -> BridgedCursor:
-    """The cursor at the start of a segment: L stays, L^A is the segment's."""
-    return BridgedCursor(
-        information=1.0 / state.variance,
-        deviation=state.log_intensity - segment.augmented,
-        augmented=segment.augmented.copy(),
-        forward_variance=segment.forward_variance.copy(),
-        backward_variance=segment.backward_variance.copy(),
-        since=np.full(state.newest.shape, segment.start, np.int64),
-        newest=state.newest.copy(),
-    )
+    """The cursor at the start of a segment: L stays, L^A is the segment's. The clock's origin is the start."""
+    clock: Clock = state.newest.astype(np.int32)
+    pixels = np.empty(clock.shape, BRIDGED_PIXEL)
+    _begin_bridged(segment, state.log_intensity, state.variance, pixels)
+    return BridgedCursor(pixels, clock, segment.start)
 
 
 def advance_bridged(
     segment: BridgedSegment, cursor: BridgedCursor, events: EventArray, noise: BridgedNoise
 ) -> None:
     """Take the cursor over events of the segment, in place."""
-    _advance_bridged(segment, cursor, events["t"], events["x"], events["y"], events["p"], noise)
+    scalars = _Scalars(*(np.float32(value) for value in (segment.rate, segment.step_variance, *noise)))
+    stride = np.uint64(cursor.clock.shape[1])
+    while len(events):
+        pixels, clock = cursor.pixels.reshape(-1), cursor.clock.reshape(-1)
+        count = events_until(events, cursor.origin + EPOCH)
+        _advance_bridged(event_words(events[:count]), pixels, clock, stride, cursor.origin, scalars)
+        events = events[count:]
+        if len(events):
+            epochs = (int(events["t"][0]) - 1 - segment.start) // EPOCH
+            _move_origin(segment, cursor, segment.start + epochs * EPOCH)
 
 
-def read_bridged(segment: BridgedSegment, cursor: BridgedCursor, t: int) -> tuple[Array, Array]:
+def read_bridged(segment: BridgedSegment, cursor: BridgedCursor, t: int) -> tuple[FloatArray, FloatArray]:
     """L and P at ``t`` (us), which must not lie before an event the cursor has taken. Changes nothing."""
-    log_intensity, variance = np.empty_like(cursor.information), np.empty_like(cursor.information)
-    _read_bridged(segment, cursor, t, log_intensity, variance)
-    if t == segment.end:
-        np.maximum(log_intensity, segment.end_bound, out=log_intensity)  # K7
+    log_intensity, variance = np.empty((2, *segment.augmented.shape), np.float32)
+    within = min(t - cursor.origin, EPOCH)
+    beyond = np.float32((t - cursor.origin - within) * 1e-6)
+    since_start = np.float32((t - segment.start) * 1e-6)
+    pixels, clock = cursor.pixels.reshape(-1), cursor.clock.reshape(-1)
+    _read_bridged(segment, pixels, clock, within, beyond, since_start, log_intensity, variance)
+    if t == segment.end and segment.bound is not None:
+        lift(log_intensity, segment.bound)  # K7
     return log_intensity, variance
 
 
-@nb.njit(cache=True, nogil=True)
-def _advance_bridged(segment, cursor, t, x, y, p, noise):  # type: ignore[no-untyped-def]
-    for i in range(len(t)):
-        row, column, now = y[i], x[i], t[i]
-        seconds = (now - cursor.since[row, column]) * MICROSECOND
-        rate = measurement_rate(
-            segment.rate, cursor.forward_variance[row, column], cursor.backward_variance[row, column]
-        )
-        before = cursor.information[row, column]
-        information = predicted_information(before, rate, seconds)
-        deviation = predicted_deviation(cursor.deviation[row, column], before, information)
-        age = (now - newest_around(cursor.newest, row, column)) * MICROSECOND
-        signal = signal_probability(noise.noise_rate, age)
-        step = segment.step_on[row, column] if p[i] else -segment.step_off[row, column]
-        # The state moves by the expected step, L^A by the whole one: the frames have told which it was.
-        cursor.deviation[row, column] = deviation - (1.0 - signal) * step
-        cursor.information[row, column] = added_noise(
-            information, threshold_noise(noise.step_variance, noise.threshold2, signal)
-        )
-        cursor.augmented[row, column] += segment.slope[row, column] * seconds + step
-        cursor.forward_variance[row, column] += segment.step_variance
-        # Subtraction may leave a rounding error where the last event has been taken.
-        cursor.backward_variance[row, column] = max(
-            cursor.backward_variance[row, column] - segment.step_variance, 1e-9
-        )
-        cursor.since[row, column] = now
-        cursor.newest[row, column] = now
+def end_bridged(segment: BridgedSegment, cursor: BridgedCursor) -> State:
+    """The state at the end of the segment."""
+    log_intensity, variance = read_bridged(segment, cursor, segment.end)
+    return State(log_intensity, variance, moved_clock(cursor.clock, segment.end - cursor.origin))
 
 
-@nb.njit(cache=True, nogil=True)
-def _read_bridged(segment, cursor, t, log_intensity, variance):  # type: ignore[no-untyped-def]
-    height, width = variance.shape
+def _move_origin(segment: BridgedSegment, cursor: BridgedCursor, origin: int) -> None:
+    """Predict every pixel at a later origin of the clock, so that its times do not overflow."""
+    _predict_bridged(segment, cursor.pixels, cursor.clock, origin - cursor.origin)
+    cursor.clock = moved_clock(cursor.clock, origin - cursor.origin)
+    cursor.origin = origin
+
+
+@nb.njit(cache=True, inline="always")
+def _since(clock, now):  # type: ignore[no-untyped-def]
+    """Seconds from the time for which a pixel's state holds until ``now``; both us after the origin."""
+    return np.float32(np.int32(now - max(clock, np.int32(0)))) * MICROSECOND32
+
+
+@nb.njit(cache=True, inline="always")
+def _pixel_rate(pixel, rate, step_variance):  # type: ignore[no-untyped-def]
+    """1/R of a pixel until its next event."""
+    return measurement_rate(rate, pixel.forward, pixel.backward + pixel.coming * step_variance)
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _begin_bridged(segment, log_intensity, variance, pixels):  # type: ignore[no-untyped-def]
+    height, width = log_intensity.shape
     for row in range(height):
         for column in range(width):
-            seconds = (t - cursor.since[row, column]) * MICROSECOND
-            rate = measurement_rate(
-                segment.rate, cursor.forward_variance[row, column], cursor.backward_variance[row, column]
+            pixel = pixels[row + 1, column + 1]
+            information = ONE / np.float32(variance[row, column])
+            augmented = np.float32(segment.augmented[row, column])
+            pixel.information = information
+            pixel.weighted = information * (np.float32(log_intensity[row, column]) - augmented)
+            pixel.augmented = augmented
+            pixel.step_on = segment.step_on[row, column]
+            pixel.step_off = segment.step_off[row, column]
+            pixel.forward = segment.forward_variance[row, column]
+            pixel.backward = segment.backward_variance[row, column]
+            pixel.coming = segment.events[row, column]
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy", fastmath=FUSED)
+def _advance_bridged(words, pixels, clock, stride, origin, scalars):  # type: ignore[no-untyped-def]
+    corner = stride + np.uint64(1)
+    last = len(words) - 1
+    for i in range(len(words)):
+        ahead = words[min(i + AHEAD, last), 1]
+        place = event_row(ahead) * stride + event_column(ahead) + corner
+        prefetch(pixels, place)
+        prefetch(clock, place)
+        word = words[i, 1]
+        at = event_row(word) * stride + event_column(word) + corner
+        pixel = pixels[at]
+        now = np.int32(words[i, 0] - origin)
+        rate = _pixel_rate(pixel, scalars.rate, scalars.step_variance)
+        information = predicted_information(pixel.information, rate, _since(clock[at], now))
+        age = np.float32(np.int32(now - newest_around_inside(clock, at, stride))) * MICROSECOND32
+        signal = signal_probability(scalars.noise_rate, age)
+        step_on, step_off = pixel.step_on, pixel.step_off
+        step = step_on if event_is_on(word) else -step_off
+        kept = information_kept(
+            information, threshold_noise(scalars.event_variance, scalars.threshold2, signal)
+        )
+        # The state moves by the expected step, L^A by the whole one: the frames have told which it was.
+        pixel.weighted = (pixel.weighted - information * (ONE - signal) * step) * kept
+        pixel.information = information * kept
+        pixel.augmented += step
+        pixel.forward += scalars.step_variance
+        pixel.coming -= ONE
+        clock[at] = now
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _read_bridged(  # type: ignore[no-untyped-def]
+    segment, pixels, clock, now, beyond, since_start, log_intensity, variance
+):
+    rate, step_variance = np.float32(segment.rate), np.float32(segment.step_variance)
+    height, width = variance.shape
+    stride = width + 2
+    for row in range(height):
+        for column in range(width):
+            at = (row + 1) * stride + column + 1
+            prefetch(pixels, at + AHEAD)  # also keeps the compiler from vector code, which gathers: slower
+            pixel = pixels[at]
+            seconds = _since(clock[at], now) + beyond
+            information = predicted_information(
+                pixel.information, _pixel_rate(pixel, rate, step_variance), seconds
             )
-            before = cursor.information[row, column]
-            information = predicted_information(before, rate, seconds)
-            log_intensity[row, column] = (
-                cursor.augmented[row, column]
-                + segment.slope[row, column] * seconds
-                + predicted_deviation(cursor.deviation[row, column], before, information)
+            inverse = ONE / information
+            moved = pixel.augmented + np.float32(segment.slope[row, column]) * since_start
+            log_intensity[row, column] = moved + pixel.weighted * inverse
+            variance[row, column] = inverse
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _predict_bridged(segment, pixels, clock, span):  # type: ignore[no-untyped-def]
+    rate, step_variance = np.float32(segment.rate), np.float32(segment.step_variance)
+    height, width = clock.shape
+    for row in range(1, height - 1):
+        for column in range(1, width - 1):
+            pixel = pixels[row, column]
+            seconds = np.float32(span - max(clock[row, column], 0)) * MICROSECOND32
+            pixel.information = predicted_information(
+                pixel.information, _pixel_rate(pixel, rate, step_variance), seconds
             )
-            variance[row, column] = 1.0 / information
 
 
 # The paper's form.
@@ -214,12 +336,12 @@ class PaperNoise(NamedTuple):
 def begin_interpolated(segment: InterpolatedSegment, state: State) -> InterpolatedCursor:
     """The cursor at the start of a segment."""
     return InterpolatedCursor(
-        log_intensity=state.log_intensity.copy(),
-        variance=state.variance.copy(),
-        forward=segment.forward.copy(),
-        backward=segment.backward.copy(),
+        log_intensity=state.log_intensity.astype(np.float64),
+        variance=state.variance.astype(np.float64),
+        forward=segment.forward.astype(np.float64),
+        backward=segment.backward.astype(np.float64),
         since=np.full(state.newest.shape, segment.start, np.int64),
-        newest=state.newest.copy(),
+        newest=state.newest.astype(np.int64),
     )
 
 

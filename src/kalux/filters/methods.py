@@ -7,17 +7,20 @@ follows from the frames at both ends and the events in between; a memory value c
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Final, NamedTuple, Protocol
 
+import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation import bridge, deblur, interpolation
 from kalux.augmentation.bridge import BridgeNoise, Latent, Thresholds
-from kalux.augmentation.deblur import ExposureIntegrals, between, count_events
+from kalux.augmentation.deblur import ExposureIntegrals, all_between, count_chunks
 from kalux.events import EventArray
 from kalux.filters import akf, complementary
 from kalux.filters.akf import State
+from kalux.filters.common import make_clock
 from kalux.frames import Frame
 from kalux.models.camera import (
     Camera,
@@ -30,24 +33,30 @@ from kalux.models.camera import (
 from kalux.settings import Settings
 
 Array = NDArray[np.float64]
+Floats = NDArray[np.floating[Any]]
+
+Chunks = Sequence[EventArray]
+"""Events in time order, in a few arrays."""
 
 FAR_FUTURE: Final = 1 << 61
 """End of a segment that has no next frame, us."""
 
 
 class Shot(NamedTuple):
-    """A frame as the filters see it.
+    """A frame as the filters see it: what each of its levels says, so that functions of it are taken once per level.
 
     Attributes
     ----------
     start, middle, end
         Of the exposure, us.
-    intensity
-        (H, W) I of equation (3) at the reference exposure; 1 = a saturated pixel there.
-    weight
-        (H, W) f^w of its response.
-    clipped
-        (H, W) bool: saturated or masked, so that the value is no measurement.
+    levels
+        (H, W) whole numbers: which level a pixel has. Frames of floating point have one per pixel.
+    level_intensity
+        (N,) I of equation (3) at the reference exposure; 1 = a saturated pixel there.
+    level_weight
+        (N,) f^w of the response.
+    level_clipped
+        (N,) bool: saturated, so that the value is no measurement.
     white
         Intensity of a saturated pixel of this frame: the reference exposure over the frame's own.
     """
@@ -55,43 +64,52 @@ class Shot(NamedTuple):
     start: int
     middle: int
     end: int
-    intensity: Array
-    weight: Array
-    clipped: NDArray[np.bool_]
+    levels: NDArray[np.integer[Any]]
+    level_intensity: Array
+    level_weight: Array
+    level_clipped: NDArray[np.bool_]
     white: float
+
+    @property
+    def intensity(self) -> Array:
+        """(H, W) I."""
+        intensity: Array = self.level_intensity[self.levels]
+        return intensity
+
+    @property
+    def weight(self) -> Array:
+        """(H, W) f^w."""
+        weight: Array = self.level_weight[self.levels]
+        return weight
+
+    @property
+    def clipped(self) -> NDArray[np.bool_]:
+        """(H, W) bool."""
+        clipped: NDArray[np.bool_] = self.level_clipped[self.levels]
+        return clipped
 
 
 def take_shot(frame: Frame, camera: Camera, reference_exposure: float) -> Shot:
     """Invert the response (3), scale to the reference exposure, weigh (5) and mark what is clipped."""
     ratio = reference_exposure / frame.exposure
-    intensity, weight, clipped = _per_level(frame, camera, ratio)
+    levels: NDArray[np.integer[Any]]
+    if frame.image.dtype.kind == "f":
+        levels = np.arange(frame.image.size, dtype=np.int32).reshape(frame.image.shape)
+        response = frame.normalised().ravel()
+    else:
+        levels = frame.image.copy()  # the caller's memory may be filled again
+        values = np.arange(int(levels.max()) + 1, dtype=levels.dtype)
+        response = Frame(values, 0, 1, frame.white).normalised()
     return Shot(
         start=frame.exposure_start,
         middle=frame.middle,
         end=frame.exposure_end,
-        intensity=intensity,
-        weight=weight,
-        clipped=clipped,
+        levels=levels,
+        level_intensity=inverse_response(camera, response, ratio),
+        level_weight=camera.weight(np.clip(response, 0.0, 1.0)),
+        level_clipped=response >= camera.saturation,
         white=ratio,
     )
-
-
-def _per_level(frame: Frame, camera: Camera, ratio: float) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """I, f^w and clipped of every pixel; of integer images once per level, which is far quicker."""
-    if frame.image.dtype.kind == "f":
-        response = frame.normalised()
-    else:
-        levels = np.arange(int(frame.image.max()) + 1, dtype=frame.image.dtype)
-        response = Frame(levels, 0, 1, frame.white).normalised()
-    values = (
-        inverse_response(camera, response, ratio),
-        camera.weight(np.clip(response, 0.0, 1.0)),
-        response >= camera.saturation,
-    )
-    if frame.image.dtype.kind == "f":
-        return values
-    intensity, weight, clipped = (table[frame.image] for table in values)
-    return intensity, weight, clipped
 
 
 class Segment(Protocol):
@@ -117,12 +135,10 @@ class Method(Protocol):
     def needed_until(self, shot: Shot) -> int:
         """Events up to this time, us, are needed before the segment that ends at the frame is final."""
 
-    def start(self, shot: Shot, events: EventArray) -> tuple[Any, Segment | None, State]:
+    def start(self, shot: Shot, events: Chunks) -> tuple[Any, Segment | None, State]:
         """From the first frame: memory, the segment before its node if there is one, and the first state."""
 
-    def segment(
-        self, memory: Any, shot: Shot, following: Shot | None, events: EventArray
-    ) -> tuple[Segment, Any]:
+    def segment(self, memory: Any, shot: Shot, following: Shot | None, events: Chunks) -> tuple[Segment, Any]:
         """The segment from a frame to the next (None: not known, or none comes), and the memory after it.
 
         ``events`` are those after the frame's node, as far as known.
@@ -134,11 +150,11 @@ class Method(Protocol):
     def advance(self, segment: Any, cursor: Any, events: EventArray) -> None:
         """Take the cursor over events, in place."""
 
-    def read(self, segment: Any, cursor: Any, t: int) -> tuple[Array, Array]:
+    def read(self, segment: Any, cursor: Any, t: int) -> tuple[Floats, Floats]:
         """L and P at ``t``; P is infinite where the method has none."""
 
-    def newest(self, cursor: Any) -> NDArray[np.int64]:
-        """The newest event of each pixel, us."""
+    def end(self, segment: Any, cursor: Any) -> State:
+        """The state at the end of the segment."""
 
 
 def make_method(
@@ -160,14 +176,19 @@ class _Common:
         self.on, self.off = thresholds
         self.offset = settings.camera.log_offset
 
-    def integrals(self, shot: Shot, events: EventArray, step_on: Array, step_off: Array) -> ExposureIntegrals:
+    def integrals(self, shot: Shot, events: Chunks, step_on: Floats, step_off: Floats) -> ExposureIntegrals:
         """EDI over the frame's exposure, or nothing moving where deblurring is off."""
         if not self.settings.filter.deblur:
             return deblur.still_exposure(self.shape)
         return deblur.integrate_exposure(events, shot.start, shot.end, step_on, step_off)
 
     def log_frame(self, shot: Shot) -> Array:
-        return log_intensity(shot.intensity, self.offset)
+        log_frame: Array = log_intensity(shot.level_intensity, self.offset)[shot.levels]
+        return log_frame
+
+    def counts(self, events: Chunks, start: int, end: int) -> tuple[Floats, Floats]:
+        """Number of on and off events of every pixel with start < t <= end."""
+        return count_chunks(all_between(events, start, end), self.shape)
 
 
 class BridgeMemory(NamedTuple):
@@ -179,8 +200,8 @@ class BridgeMemory(NamedTuple):
     latent: Latent
     thresholds: Thresholds
     interval: float
-    on: Array
-    off: Array
+    on: Floats
+    off: Floats
 
 
 class BridgedFrames(_Common):
@@ -205,42 +226,44 @@ class BridgedFrames(_Common):
         events, c2 = self.settings.events, self.on * self.off
         return BridgeNoise(self.on, self.off, events.step_variance * c2, events.quantisation_variance * c2)
 
-    def latent(self, shot: Shot, events: EventArray, thresholds: Thresholds) -> Latent:
+    def latent(self, shot: Shot, events: Chunks, thresholds: Thresholds) -> Latent:
         """The frame without blur at the middle of its exposure, and its variance (K3)."""
         integrals = self.integrals(shot, events, self.on * thresholds.on, self.off * thresholds.off)
-        log_frame = self.log_frame(shot)
-        r_bar = covariance(shot.weight, (self.settings.camera.frame_noise * shot.white) ** 2, 1e-6)
-        variance = log_covariance(shot.intensity, r_bar, self.offset)
-        variance = variance + self.settings.events.deblur_variance * self.on * self.off * integrals.events
-        white = np.log(self.settings.camera.saturation * shot.white + self.offset)
-        clipped = shot.clipped | (deblur.latent_peak(log_frame, integrals) >= white)
-        return Latent(
-            deblur.latent_middle(log_frame, integrals), np.where(clipped, bridge.UNMEASURED, variance)
+        r_bar = covariance(shot.level_weight, (self.settings.camera.frame_noise * shot.white) ** 2, 1e-6)
+        level_variance = log_covariance(shot.level_intensity, r_bar, self.offset)
+        return latent_frame(
+            shot.levels,
+            log_intensity(shot.level_intensity, self.offset),
+            np.where(shot.level_clipped, bridge.UNMEASURED, level_variance),
+            integrals,
+            white=float(np.log(self.settings.camera.saturation * shot.white + self.offset)),
+            event_variance=self.settings.events.deblur_variance * self.on * self.off,
         )
 
-    def start(self, shot: Shot, events: EventArray) -> tuple[BridgeMemory, Segment | None, State]:
-        thresholds = bridge.nominal_thresholds(self.shape, self.settings.events.threshold_spread)
+    def start(self, shot: Shot, events: Chunks) -> tuple[BridgeMemory, Segment | None, State]:
+        thresholds = bridge.nominal_thresholds(self.shape, self.settings.events.threshold_spread, np.float32)
         latent = self.latent(shot, events, thresholds)
         begin = self.begin_time(shot)
-        newest = np.full(self.shape, shot.start, np.int64)
+        newest = make_clock(self.shape, begin - shot.start)
         lead_in = None
         if self.lookahead:
-            on, off = count_events(between(events, begin, shot.middle), self.shape)
+            on, off = self.counts(events, begin, shot.middle)
             memory = BridgeMemory(latent, thresholds, 0.0, on, off)
             value, variance = latent
             if shot.middle > begin:
                 lead_in = bridge.extend_backward(latent, on, off, thresholds, self.noise, begin, shot.middle)
-                value, variance = lead_in.augmented, lead_in.backward_variance
+                value = lead_in.augmented
+                variance = lead_in.backward_variance + lead_in.step_variance * lead_in.events
         else:
-            on, off = count_events(between(events, shot.middle, shot.end), self.shape)
+            on, off = self.counts(events, shot.middle, shot.end)
             memory = BridgeMemory(latent, thresholds, 0.0, on, off)
             value, variance = self._carried(memory)
         unmeasured = variance >= bridge.UNMEASURED
-        variance = np.where(unmeasured, self.settings.filter.initial_variance, variance)
+        variance = np.where(unmeasured, np.float32(self.settings.filter.initial_variance), variance)
         return memory, lead_in, State(value, variance, newest)
 
     def segment(
-        self, memory: BridgeMemory, shot: Shot, following: Shot | None, events: EventArray
+        self, memory: BridgeMemory, shot: Shot, following: Shot | None, events: Chunks
     ) -> tuple[Segment, BridgeMemory]:
         start = self.node(shot)
         if following is None:
@@ -248,14 +271,13 @@ class BridgedFrames(_Common):
             latent = memory.latent
             if not self.lookahead:
                 latent = self._carried(memory)
-            unbound = np.full(self.shape, -np.inf)
             return (
-                bridge.extend(latent, memory.thresholds, self.noise, start, FAR_FUTURE, seconds, unbound),
+                bridge.extend(latent, memory.thresholds, self.noise, start, FAR_FUTURE, seconds, None),
                 memory,
             )
         interval = (following.middle - shot.middle) * 1e-6
         second = self.latent(following, events, memory.thresholds)
-        on, off = count_events(between(events, start, following.middle), self.shape)
+        on, off = self.counts(events, start, following.middle)
         if self.lookahead:
             joined, learned = bridge.bridge(
                 memory.latent, second, on, off, memory.thresholds, self.noise, start, following.middle
@@ -271,7 +293,7 @@ class BridgedFrames(_Common):
             shot.middle,
             following.middle,
         )
-        tail = count_events(between(events, following.middle, following.end), self.shape)
+        tail = self.counts(events, following.middle, following.end)
         after = BridgeMemory(second, learned, interval, *tail)
         forward = bridge.extend(
             self._carried(memory),
@@ -280,7 +302,7 @@ class BridgedFrames(_Common):
             start,
             following.end,
             memory.interval or self._FIRST_INTERVAL,
-            bridge.lower_bound(self._carried(after)),
+            self._carried(after),
         )
         return forward, after
 
@@ -300,11 +322,55 @@ class BridgedFrames(_Common):
         noise = akf.BridgedNoise(settings.noise_rate, settings.step_variance, self.on * self.off)
         akf.advance_bridged(segment, cursor, events, noise)
 
-    def read(self, segment: Any, cursor: akf.BridgedCursor, t: int) -> tuple[Array, Array]:
+    def read(self, segment: Any, cursor: akf.BridgedCursor, t: int) -> tuple[Floats, Floats]:
         return akf.read_bridged(segment, cursor, t)
 
-    def newest(self, cursor: akf.BridgedCursor) -> NDArray[np.int64]:
-        return cursor.newest
+    def end(self, segment: Any, cursor: akf.BridgedCursor) -> State:
+        return akf.end_bridged(segment, cursor)
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _latent_frame(  # type: ignore[no-untyped-def]
+    levels, level_log, level_variance, integrals, white, event_variance, value, variance
+):
+    height, width = levels.shape
+    for row in range(height):
+        for column in range(width):
+            i = row, column
+            start = level_log[levels[i]] - integrals.log_mean[i]
+            value[i] = start + integrals.to_middle[i]
+            known = level_variance[levels[i]] + event_variance * integrals.events[i]
+            clipped = start + integrals.peak[i] >= white
+            variance[i] = bridge.UNMEASURED if clipped else min(known, bridge.UNMEASURED)
+
+
+def latent_frame(
+    levels: NDArray[np.integer[Any]],
+    level_log: Array,
+    level_variance: Array,
+    integrals: ExposureIntegrals,
+    *,
+    white: float,
+    event_variance: float,
+) -> Latent:
+    """A frame without blur at the middle of its exposure, and its variance (K3).
+
+    Parameters
+    ----------
+    levels
+        (H, W) the level of every pixel.
+    level_log, level_variance
+        (N,) log(I + I_0) of each level, and its variance; `UNMEASURED` where clipped.
+    integrals
+        EDI of the exposure.
+    white
+        Log intensity from which a pixel is clipped: one that reached it within the exposure was, for a part of it.
+    event_variance
+        What each event of the exposure adds to the variance.
+    """
+    value, variance = np.empty((2, *levels.shape), np.float32)
+    _latent_frame(levels, level_log, level_variance, integrals, white, event_variance, value, variance)
+    return Latent(value, variance)
 
 
 class InterpolationMemory(NamedTuple):
@@ -342,12 +408,12 @@ class InterpolatedFrames(_Common):
     def needed_until(self, shot: Shot) -> int:
         return shot.end
 
-    def nominal(self, events: EventArray) -> Array:
+    def nominal(self, events: Chunks) -> Array:
         """Sum of the nominal event steps, (H, W)."""
-        on, off = count_events(events, self.shape)
+        on, off = (count.astype(np.float64) for count in count_chunks(events, self.shape))
         return self.on * on - self.off * off
 
-    def exposure(self, shot: Shot, events: EventArray) -> ExposureIntegrals:
+    def exposure(self, shot: Shot, events: Chunks) -> ExposureIntegrals:
         steps = np.full(self.shape, self.on), np.full(self.shape, self.off)
         return self.integrals(shot, events, *steps)
 
@@ -360,7 +426,7 @@ class InterpolatedFrames(_Common):
         """L^F of equation (8), with its bias."""
         return super().log_frame(shot) - log_bias(shot.intensity, self.r_bar(shot), self.offset)
 
-    def start(self, shot: Shot, events: EventArray) -> tuple[InterpolationMemory, None, State]:
+    def start(self, shot: Shot, events: Chunks) -> tuple[InterpolationMemory, None, State]:
         integrals = self.exposure(shot, events)
         latent = deblur.latent_start(self.log_frame(shot), integrals)
         memory = InterpolationMemory(integrals, latent, np.ones(self.shape), None)
@@ -369,7 +435,7 @@ class InterpolatedFrames(_Common):
         return memory, None, State(value, variance, np.full(self.shape, self.node(shot), np.int64))
 
     def segment(
-        self, memory: InterpolationMemory, shot: Shot, following: Shot | None, events: EventArray
+        self, memory: InterpolationMemory, shot: Shot, following: Shot | None, events: Chunks
     ) -> tuple[Segment, InterpolationMemory]:
         if not self.lookahead:
             return self._causal(memory, shot, following, events)
@@ -379,11 +445,11 @@ class InterpolatedFrames(_Common):
             return segment, memory
         integrals = self.exposure(following, events)
         end_latent = deblur.latent_end(self.log_frame(following), integrals)
-        integral = self.nominal(between(events, shot.start, following.end))
+        integral = self.nominal(all_between(events, shot.start, following.end))
         scale = interpolation.threshold_scale(end_latent - start_latent, integral)  # (12)
         at_start = interpolation.backward(end_latent, scale, integral)  # (11)
         segment = self._segment(memory, shot, following, at_start, scale, following.start)
-        to_next = self.nominal(between(events, shot.start, following.start))
+        to_next = self.nominal(all_between(events, shot.start, following.start))
         forward = interpolation.forward(start_latent, scale, to_next)  # (10)
         return segment, InterpolationMemory(integrals, forward, scale, shot)
 
@@ -422,7 +488,7 @@ class InterpolatedFrames(_Common):
         )
 
     def _causal(
-        self, memory: InterpolationMemory, shot: Shot, following: Shot | None, events: EventArray
+        self, memory: InterpolationMemory, shot: Shot, following: Shot | None, events: Chunks
     ) -> tuple[Segment, InterpolationMemory]:
         value = deblur.latent_end(self.log_frame(shot), memory.integrals)
         end = FAR_FUTURE if following is None else following.end
@@ -433,7 +499,7 @@ class InterpolatedFrames(_Common):
         integrals = self.exposure(following, events)
         end_latent = deblur.latent_end(self.log_frame(following), integrals)
         start_latent = deblur.latent_start(self.log_frame(shot), memory.integrals)
-        integral = memory.integrals.to_end + self.nominal(between(events, shot.end, following.end))
+        integral = memory.integrals.to_end + self.nominal(all_between(events, shot.end, following.end))
         scale = interpolation.threshold_scale(end_latent - start_latent, integral)
         return segment, InterpolationMemory(integrals, end_latent, scale, shot)
 
@@ -457,8 +523,8 @@ class InterpolatedFrames(_Common):
     def read(self, segment: Any, cursor: akf.InterpolatedCursor, t: int) -> tuple[Array, Array]:
         return akf.read_interpolated(segment, cursor, t, self.noise)
 
-    def newest(self, cursor: akf.InterpolatedCursor) -> NDArray[np.int64]:
-        return cursor.newest
+    def end(self, segment: Any, cursor: akf.InterpolatedCursor) -> State:
+        return State(*self.read(segment, cursor, segment.end), cursor.newest)
 
 
 class HeldFrames(_Common):
@@ -472,19 +538,21 @@ class HeldFrames(_Common):
     def needed_until(self, shot: Shot) -> int:
         return shot.end
 
-    def start(self, shot: Shot, events: EventArray) -> tuple[None, None, State]:
-        newest = np.full(self.shape, self.node(shot), np.int64)
-        return None, None, State(self.log_frame(shot), np.full(self.shape, np.inf), newest)
+    def start(self, shot: Shot, events: Chunks) -> tuple[None, None, State]:
+        return None, None, self._state(self.frame(shot))
+
+    def frame(self, shot: Shot) -> Floats:
+        """log(I + I_0), (H, W) float32."""
+        log_frame: Floats = log_intensity(shot.level_intensity, self.offset).astype(np.float32)[shot.levels]
+        return log_frame
 
     def segment(
-        self, memory: None, shot: Shot, following: Shot | None, events: EventArray
+        self, memory: None, shot: Shot, following: Shot | None, events: Chunks
     ) -> tuple[Segment, None]:
         end = FAR_FUTURE if following is None else self.node(following)
         gain = 2 * np.pi * self.settings.filter.cutoff
-        return (
-            complementary.HeldSegment(self.node(shot), end, self.log_frame(shot), gain, self.on, self.off),
-            None,
-        )
+        held = complementary.HeldSegment(self.node(shot), end, self.frame(shot), gain, self.on, self.off)
+        return held, None
 
     def begin(self, segment: Any, state: State) -> complementary.Cursor:
         return complementary.begin(segment, state.log_intensity)
@@ -492,8 +560,12 @@ class HeldFrames(_Common):
     def advance(self, segment: Any, cursor: complementary.Cursor, events: EventArray) -> None:
         complementary.advance(segment, cursor, events)
 
-    def read(self, segment: Any, cursor: complementary.Cursor, t: int) -> tuple[Array, Array]:
-        return complementary.read(segment, cursor, t), np.full(self.shape, np.inf)
+    def read(self, segment: Any, cursor: complementary.Cursor, t: int) -> tuple[Floats, Floats]:
+        return complementary.read(segment, cursor, t), np.full(self.shape, np.inf, np.float32)
 
-    def newest(self, cursor: complementary.Cursor) -> NDArray[np.int64]:
-        return cursor.since
+    def end(self, segment: Any, cursor: complementary.Cursor) -> State:
+        return self._state(complementary.read(segment, cursor, segment.end))
+
+    def _state(self, log_intensity: Floats) -> State:
+        """It has neither a variance nor a memory of events."""
+        return State(log_intensity, np.empty(0), np.empty(0, np.int64))

@@ -1,11 +1,18 @@
 """Event noise, equations (1)-(2) of the paper, and kalux's own in units of the contrast threshold.
 
-Scalar functions, compiled by numba: the filter loops call them once per event. Times are in seconds here.
+Scalar functions, compiled by numba: the filter loops call them once per event. Times are in seconds here. They work
+in the type of their arguments; a plain 1.0 would make float64 of float32.
 """
 
 from __future__ import annotations
 
+from typing import Any, Final
+
 import numba as nb
+import numpy as np
+
+_ONE: Final = np.float32(1.0)
+_NEIGHBOURHOOD: Final = np.float32(9.0)
 
 
 @nb.njit(cache=True, inline="always")
@@ -50,21 +57,21 @@ def event_noise(
 
 
 @nb.njit(cache=True, inline="always")
-def signal_probability(noise_rate: float, since_any: float) -> float:
+def signal_probability(noise_rate: Any, since_any: Any) -> Any:
     """Probability that an event is signal, given the age of the newest event in its 3x3 pixels.
 
     Not in the paper (docs/equations.md, K5). Nine pixels together emit noise at 9 x ``noise_rate`` (Hz per
     pixel); a signal that repeats after ``since_any`` seconds has a rate of 1 / since_any. The probability is
     the share of the second in the sum of both.
     """
-    return 1.0 / (1.0 + 9.0 * noise_rate * since_any)
+    return _ONE / (_ONE + _NEIGHBOURHOOD * noise_rate * since_any)
 
 
 @nb.njit(cache=True, inline="always")
-def threshold_noise(step_variance: float, threshold2: float, signal: float) -> float:
+def threshold_noise(step_variance: Any, threshold2: Any, signal: Any) -> Any:
     """Q of one event in kalux's own model: what is not known of its step.
 
     ``step_variance`` is the variance of a real event's step in units of the squared threshold
     ``threshold2``; an event that is signal with probability ``signal`` adds the variance of a Bernoulli step.
     """
-    return threshold2 * (step_variance + signal * (1.0 - signal))
+    return threshold2 * (step_variance + signal * (_ONE - signal))

@@ -1,0 +1,169 @@
+"""What the compiled loops share: events as machine words, hints to the memory, and float32 elementary functions.
+
+The functions here are for numba's loops. They are branchless, so that loops over pixels become vector code, and
+they take and return float32: a literal number would turn float32 arithmetic into float64.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numba as nb
+import numpy as np
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.extending import intrinsic
+from numpy.typing import NDArray
+
+from kalux.events import EventArray
+
+MICROSECOND32: Final = np.float32(1e-6)
+"""Seconds."""
+
+ONE: Final = np.float32(1.0)
+
+AHEAD: Final = 48
+"""How many events ahead pixels are asked for: enough to cover a wait for memory, few enough to stay in the cache."""
+
+
+FUSED: Final = {"contract"}
+"""The one liberty that event loops take with arithmetic (numba's ``fastmath``): a product and a sum may be one
+instruction, which rounds once instead of twice."""
+
+
+def event_words(events: EventArray) -> NDArray[np.int64]:
+    """The same memory as (N, 2) int64: the time, and x, y and p in its lower 16, next 16 and next 8 bits."""
+    return np.ascontiguousarray(events).view(np.int64).reshape(-1, 2)
+
+
+@nb.njit(cache=True, inline="always")
+def event_column(word):  # type: ignore[no-untyped-def]
+    """x of an event's second word; unsigned, as all indices: numba need not look for negative ones."""
+    return np.uint64(word) & np.uint64(0xFFFF)
+
+
+@nb.njit(cache=True, inline="always")
+def event_row(word):  # type: ignore[no-untyped-def]
+    """y of an event's second word."""
+    return (np.uint64(word) >> np.uint64(16)) & np.uint64(0xFFFF)
+
+
+@nb.njit(cache=True, inline="always")
+def event_is_on(word):  # type: ignore[no-untyped-def]
+    """p of an event's second word; the three bytes above it are padding and may hold anything."""
+    return ((np.uint64(word) >> np.uint64(32)) & np.uint64(0xFF)) != np.uint64(0)
+
+
+def _prefetch(typing_context: Any, array: Any, index: Any) -> Any:
+    signature = types.void(array, index)
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        byte_pointer, i32 = ir.IntType(8).as_pointer(), ir.IntType(32)
+        data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
+        address = builder.bitcast(builder.gep(data, [arguments[1]]), byte_pointer)
+        function = cgutils.get_or_insert_function(  # type: ignore[no-untyped-call]
+            builder.module,
+            ir.FunctionType(ir.VoidType(), [byte_pointer, i32, i32, i32]),
+            "llvm.prefetch.p0i8",
+        )
+        builder.call(function, [address, i32(1), i32(3), i32(1)])  # to write, into all caches, data
+        return context.get_dummy_value()
+
+    return signature, generate
+
+
+prefetch: Any = intrinsic(_prefetch)
+"""Ask for the memory of ``array[index]``, 1-D, which will be written soon."""
+
+
+def _as_float_of(typing_context: Any, bits: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.bitcast(arguments[0], ir.FloatType())
+
+    return types.float32(types.int32), generate
+
+
+def _as_integer_of(typing_context: Any, value: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.bitcast(arguments[0], ir.IntType(32))
+
+    return types.int32(types.float32), generate
+
+
+_as_float: Any = intrinsic(_as_float_of)
+"""The float32 that has the bits of an int32."""
+
+_as_integer: Any = intrinsic(_as_integer_of)
+"""The int32 that has the bits of a float32."""
+
+
+_LOG2_E: Final = np.float32(1.4426950408889634)
+_LN2_HIGH: Final = np.float32(0.693359375)  # few bits, so that its small multiples are exact
+_LN2_LOW: Final = np.float32(-2.12194440e-4)
+_ROUNDING: Final = np.float32(1.5 * 2**23)  # added and taken away again, it rounds to a whole number
+_LEAST_EXPONENT, _LARGEST_EXPONENT = np.float32(-87.0), np.float32(88.0)
+_HALF: Final = np.float32(0.5)
+# Minimax polynomials of the Cephes library (S. Moshier, expf and logf).
+_EXP: Final = tuple(
+    np.float32(c)
+    for c in (
+        1.9875691500e-4,
+        1.3981999507e-3,
+        8.3334519073e-3,
+        4.1665795894e-2,
+        1.6666665459e-1,
+        5.0000001201e-1,
+    )
+)
+_LOG: Final = tuple(
+    np.float32(c)
+    for c in (
+        7.0376836292e-2,
+        -1.1514610310e-1,
+        1.1676998740e-1,
+        -1.2420140846e-1,
+        1.4249322787e-1,
+        -1.6668057665e-1,
+        2.0000714765e-1,
+        -2.4999993993e-1,
+        3.3333331174e-1,
+    )
+)
+_SQRT_HALF_BITS: Final = np.int32(0x3F3504F3)
+
+
+@nb.njit(cache=True, inline="always", error_model="numpy")
+def exponential(x):  # type: ignore[no-untyped-def]
+    """e^x in float32, to 2e-7 of itself; x is taken into [-87, 88]."""
+    x = _LEAST_EXPONENT if x < _LEAST_EXPONENT else x  # min and max would also look for NaN
+    x = _LARGEST_EXPONENT if x > _LARGEST_EXPONENT else x
+    shifted = x * _LOG2_E + _ROUNDING
+    whole = shifted - _ROUNDING
+    r = (x - whole * _LN2_HIGH) - whole * _LN2_LOW
+    p = _EXP[0]
+    p = p * r + _EXP[1]
+    p = p * r + _EXP[2]
+    p = p * r + _EXP[3]
+    p = p * r + _EXP[4]
+    p = p * r + _EXP[5]
+    return (p * r * r + r + ONE) * _as_float((np.int32(whole) + np.int32(127)) << np.int32(23))
+
+
+@nb.njit(cache=True, inline="always", error_model="numpy")
+def logarithm(x):  # type: ignore[no-untyped-def]
+    """log(x) of a normal positive float32, to 2e-7 of itself or 1e-7, whichever is larger; finite whatever x is."""
+    bits = _as_integer(x) - _SQRT_HALF_BITS
+    exponent = np.float32(bits >> np.int32(23))
+    m = _as_float((bits & np.int32(0x007FFFFF)) + _SQRT_HALF_BITS) - ONE
+    p = _LOG[0]
+    p = p * m + _LOG[1]
+    p = p * m + _LOG[2]
+    p = p * m + _LOG[3]
+    p = p * m + _LOG[4]
+    p = p * m + _LOG[5]
+    p = p * m + _LOG[6]
+    p = p * m + _LOG[7]
+    p = p * m + _LOG[8]
+    square = m * m
+    tail = exponent * _LN2_LOW + p * m * square
+    return (tail - _HALF * square) + m + exponent * _LN2_HIGH

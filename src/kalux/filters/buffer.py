@@ -1,0 +1,146 @@
+"""The events that the engine holds: added at the end, dropped at the start, each copied once."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, Final
+
+import numba as nb
+import numpy as np
+
+from kalux.augmentation.deblur import events_until
+from kalux.compiled import event_column, event_row, event_words
+from kalux.events import EVENT_DTYPE, EventArray
+
+_BLOCK: Final = 1 << 16
+"""Events that a block of memory holds at least: 1 MB, so that single events cost no allocation each."""
+
+_SPARE: Final = 1 << 20
+"""Largest block that is kept for reuse: fresh memory costs more than the copy into it."""
+
+
+class _Block:
+    """Events ``start`` to ``stop`` of some memory; what is behind them is free."""
+
+    def __init__(self, memory: EventArray) -> None:
+        self.memory, self.start, self.stop = memory, 0, 0
+
+    @property
+    def events(self) -> EventArray:
+        return self.memory[self.start : self.stop]
+
+
+class EventBuffer:
+    """Events in time order, numbered from 0 on as they were appended."""
+
+    def __init__(self) -> None:
+        self._blocks: list[_Block] = []
+        self._spare: EventArray | None = None
+        self._first = 0  # number of the first event held
+
+    def __len__(self) -> int:
+        return sum(block.stop - block.start for block in self._blocks)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickled without the free memory."""
+        blocks = []
+        for block in self._blocks:
+            blocks.append(_Block(block.events.copy()))
+            blocks[-1].stop = len(blocks[-1].memory)
+        return {"_blocks": blocks, "_spare": None, "_first": self._first}
+
+    @property
+    def first(self) -> int:
+        """Number of the first event held."""
+        return self._first
+
+    @property
+    def chunks(self) -> list[EventArray]:
+        """All events, in a few arrays."""
+        return [block.events for block in self._blocks]
+
+    def append(
+        self, events: EventArray, sensor_size: tuple[int, int], *, earliest: int | None, delay: int
+    ) -> bool:
+        """Copy events to the end, ``delay`` us earlier than stamped.
+
+        False, and nothing is appended, unless they are in time order, none is stamped before ``earliest`` (us), and all
+        lie inside the sensor, (height, width).
+        """
+        count = len(events)
+        if count == 0:
+            return True
+        if not self._blocks or len(self._blocks[-1].memory) - self._blocks[-1].stop < count:
+            memory, self._spare = self._spare, None
+            if memory is None or len(memory) < count:
+                memory = np.empty(max(count, _BLOCK), EVENT_DTYPE)
+            block = _Block(memory)
+        else:
+            block = self._blocks[-1]
+        height, width = (np.uint64(n) for n in sensor_size)
+        least = np.iinfo(np.int64).min if earliest is None else earliest
+        free = event_words(block.memory[block.stop : block.stop + count])
+        if not _copy_checked(event_words(events), free, least, delay, height, width):
+            return False
+        block.stop += count
+        if not (self._blocks and self._blocks[-1] is block):
+            self._blocks.append(block)
+        return True
+
+    def drop(self, until: int) -> None:
+        """Forget the events up to and at ``until`` (us)."""
+        while self._blocks:
+            block = self._blocks[0]
+            count = events_until(block.events, until)
+            block.start += count
+            self._first += count
+            if block.start < block.stop:
+                break
+            self._blocks.pop(0)
+            spare = 0 if self._spare is None else len(self._spare)
+            if spare < len(block.memory) <= _SPARE:
+                self._spare = block.memory
+        if self._blocks and 2 * (self._blocks[0].stop - self._blocks[0].start) < len(self._blocks[0].memory):
+            self._shrink(self._blocks[0])
+
+    def number(self, t: int) -> int:
+        """Number of the first event after the time ``t`` (us), one more than that of the last if there is none."""
+        number = self._first
+        for block in self._blocks:
+            count = events_until(block.events, t)
+            number += count
+            if count < block.stop - block.start:
+                break
+        return number
+
+    def after(self, number: int, until: int) -> Iterator[EventArray]:
+        """The events from ``number`` on up to and at the time ``until`` (us), in order, in a few arrays."""
+        first = self._first
+        for block in self._blocks:
+            count = block.stop - block.start
+            if number < first + count:
+                events = block.events[max(number - first, 0) :]
+                events = events[: events_until(events, until)]
+                if len(events) == 0:
+                    return
+                yield events
+            first += count
+
+    def _shrink(self, block: _Block) -> None:
+        """A small rest must not keep a large block in memory."""
+        if len(block.memory) > _SPARE:
+            rest = block.events.copy()
+            block.memory, block.start, block.stop = rest, 0, len(rest)
+
+
+@nb.njit(cache=True, nogil=True)
+def _copy_checked(words, copy, earliest, delay, height, width):  # type: ignore[no-untyped-def]
+    """Copy event words with their times moved; False if an event is out of order or outside the sensor."""
+    wrong = False
+    for i in range(len(words)):
+        t, word = words[i, 0], words[i, 1]
+        wrong |= (t < earliest) | (event_column(word) >= width) | (event_row(word) >= height)
+        earliest = t
+        copy[i, 0] = t - delay
+        copy[i, 1] = word
+    return not wrong

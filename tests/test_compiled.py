@@ -1,0 +1,61 @@
+"""Elementary functions in float32, and events as machine words."""
+
+from __future__ import annotations
+
+import numba as nb
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kalux.compiled import event_column, event_is_on, event_row, event_words, exponential, logarithm
+from kalux.events import EVENT_DTYPE
+
+
+@nb.njit(error_model="numpy")
+def over(function, values):
+    out = np.empty_like(values)
+    for i in range(len(values)):
+        out[i] = function(values[i])
+    return out
+
+
+def test_the_exponential_is_good_to_float32():
+    x = np.linspace(-86.9, 87.9, 1_000_001).astype(np.float32)
+    np.testing.assert_allclose(over(exponential, x), np.exp(x.astype(np.float64)), rtol=2e-7)
+
+
+def test_the_exponential_ends_in_finite_numbers():
+    out = over(exponential, np.array([-1e30, -100.0, 0.0, 100.0, 1e30], np.float32))
+    assert np.isfinite(out).all()
+    assert 0 < out[0] == out[1] < 1e-37
+    assert out[2] == 1.0
+    assert 1e38 < out[3] == out[4]
+
+
+def test_the_logarithm_is_good_to_float32():
+    x = np.exp(np.linspace(-87.0, 88.0, 1_000_001)).astype(np.float32)
+    np.testing.assert_allclose(over(logarithm, x), np.log(x.astype(np.float64)), rtol=2e-7, atol=1e-7)
+    near_one = np.linspace(0.7, 1.5, 100_001).astype(np.float32)
+    np.testing.assert_allclose(over(logarithm, near_one), np.log(near_one.astype(np.float64)), atol=6e-8)
+    assert over(logarithm, np.ones(1, np.float32))[0] == 0.0
+
+
+@given(
+    st.integers(-(2**62), 2**62),
+    st.integers(0, 65535),
+    st.integers(0, 65535),
+    st.booleans(),
+    st.binary(min_size=16, max_size=16),
+)
+def test_an_event_is_two_words_whatever_its_padding_holds(t, x, y, p, memory):
+    events = np.frombuffer(bytearray(memory), EVENT_DTYPE)
+    events["t"], events["x"], events["y"], events["p"] = t, x, y, p
+    words = event_words(events)
+    assert words[0, 0] == t
+    assert (event_column(words[0, 1]), event_row(words[0, 1]), event_is_on(words[0, 1])) == (x, y, p)
+
+
+def test_words_share_the_memory():
+    events = np.zeros(3, EVENT_DTYPE)
+    event_words(events[1:])[0, 0] = 7
+    assert events["t"].tolist() == [0, 7, 0]
