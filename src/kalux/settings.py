@@ -28,7 +28,8 @@ class CameraSettings:
     Attributes
     ----------
     response
-        ``"linear"`` (raw sensor values: DAVIS, machine vision), ``"srgb"`` or ``"gamma:EXPONENT"``.
+        ``"linear"`` (raw sensor values: DAVIS, machine vision), ``"srgb"``, ``"gamma:EXPONENT"``, or a measured
+        ``"curve:0 0.0012 ... 1"``: the irradiance at equally spaced response levels (`kalux calibrate response`).
     log_offset
         I_0 of equation (8); white = 1. Events are steps of log I, so it must be small; below the noise of a
         dark pixel it only magnifies that noise. 0.03 (docs/tuning.md). The paper's code: 1.
