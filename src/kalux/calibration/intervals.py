@@ -78,8 +78,8 @@ def intervals(
             yield Interval(
                 start=before.middle,
                 end=shot.middle,
-                change=log_intensity(shot.intensity, camera.log_offset)
-                - log_intensity(before.intensity, camera.log_offset),
+                change=log_intensity(shot.intensity, camera.offset)
+                - log_intensity(before.intensity, camera.offset),
                 level=(shot.intensity + before.intensity) / 2,
                 usable=usable & was_usable,
                 events=between(buffer, before.middle - margin, shot.middle + margin),

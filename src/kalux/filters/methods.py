@@ -158,7 +158,7 @@ class _Common:
     ) -> None:
         self.settings, self.lookahead, self.shape = settings, lookahead, shape
         self.on, self.off = thresholds
-        self.offset = settings.camera.log_offset
+        self.offset = settings.camera.offset
 
     def integrals(self, shot: Shot, events: EventArray, step_on: Array, step_off: Array) -> ExposureIntegrals:
         """EDI over the frame's exposure, or nothing moving where deblurring is off."""
@@ -203,7 +203,7 @@ class BridgedFrames(_Common):
     @property
     def noise(self) -> BridgeNoise:
         events, c2 = self.settings.events, self.on * self.off
-        return BridgeNoise(self.on, self.off, events.step_variance * c2, events.quantisation_variance * c2)
+        return BridgeNoise(self.on, self.off, events.step_noise * c2, events.quantisation_variance * c2)
 
     def latent(self, shot: Shot, events: EventArray, thresholds: Thresholds) -> Latent:
         """The frame without blur at the middle of its exposure, and its variance (K3)."""
@@ -297,7 +297,7 @@ class BridgedFrames(_Common):
 
     def advance(self, segment: Any, cursor: akf.BridgedCursor, events: EventArray) -> None:
         settings = self.settings.events
-        noise = akf.BridgedNoise(settings.noise_rate, settings.step_variance, self.on * self.off)
+        noise = akf.BridgedNoise(settings.noise_rate, settings.step_noise, self.on * self.off)
         akf.advance_bridged(segment, cursor, events, noise)
 
     def read(self, segment: Any, cursor: akf.BridgedCursor, t: int) -> tuple[Array, Array]:
