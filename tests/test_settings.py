@@ -184,14 +184,14 @@ def test_every_number_is_checked(group, name, value):
 
 
 def test_none_is_only_for_what_can_be_unknown():
-    with pytest.raises(SettingsError, match=r"camera\.log_offset needs a number"):
-        altered(DEFAULT, "camera", log_offset=None)
+    with pytest.raises(SettingsError, match=r"camera\.frame_noise needs a number"):
+        altered(DEFAULT, "camera", frame_noise=None)
 
 
 def test_from_dict_does_not_change_its_base():
     base = preset("default")
     from_dict({"camera": {"log_offset": 0.5}}, base)
-    assert base.camera.log_offset == 0.03
+    assert base.camera.log_offset is None
 
 
 def test_settings_errors_are_input_errors():

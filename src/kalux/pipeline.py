@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from kalux.calibration.contrast import ThresholdEstimate, estimate_thresholds
 from kalux.calibration.delay import DelayEstimate, estimate_delay
+from kalux.calibration.event_model import EventModel, estimate_event_model
 from kalux.errors import FrameError, InputError
 from kalux.events import EventArray
 from kalux.frames import Frame
@@ -36,13 +37,15 @@ class Plan:
     Attributes
     ----------
     settings
-        With thresholds and reference exposure filled in.
+        With thresholds, delay, I_0, step variance and reference exposure filled in.
     threshold_origin
         Whether the thresholds come from the settings, the recording, an estimate, or are assumed.
     estimate
         The fit, where there was one.
     delay_estimate
         The fit of the events' delay, where there was one.
+    event_model
+        The fit of I_0 and the variance of an event's step, where there was one.
     times
         (N,) int64 us, increasing: the images to make.
     lookahead
@@ -55,6 +58,7 @@ class Plan:
     threshold_origin: ThresholdOrigin
     estimate: ThresholdEstimate | None
     delay_estimate: DelayEstimate | None
+    event_model: EventModel | None
     times: NDArray[np.int64]
     lookahead: bool
     smooth: bool
@@ -89,9 +93,18 @@ def plan(
         chosen, camera=dataclasses.replace(chosen.camera, reference_exposure=reference)
     )
     chosen, delay = _with_delay(recording, chosen)
-    chosen, origin, estimate = _with_thresholds(recording, chosen)
-    wanted = _times(recording, exposures, rate_hz, times, at, chosen, lookahead)
-    return Plan(chosen, origin, estimate, delay, wanted, lookahead, smooth)
+    offset_known = chosen.camera.log_offset is not None
+    filled, origin, estimate = _with_thresholds(recording, chosen)
+    filled, model = _with_event_model(recording, filled)
+    if estimate is not None and not offset_known:  # it was made with another I_0
+        unfilled = dataclasses.replace(
+            filled.events,
+            threshold_on=chosen.events.threshold_on,
+            threshold_off=chosen.events.threshold_off,
+        )
+        filled, origin, estimate = _with_thresholds(recording, dataclasses.replace(filled, events=unfilled))
+    wanted = _times(recording, exposures, rate_hz, times, at, filled, lookahead)
+    return Plan(filled, origin, estimate, delay, model, wanted, lookahead, smooth)
 
 
 def reconstruct(
@@ -276,6 +289,36 @@ def _with_thresholds(
         threshold_off=events.threshold_off if events.threshold_off is not None else found[1],
     )
     return dataclasses.replace(settings, events=events), origin, estimate
+
+
+def _with_event_model(recording: Recording, settings: Settings) -> tuple[Settings, EventModel | None]:
+    """Fill in I_0 and the variance of an event's step: from the settings, else an estimate, else the usual."""
+    camera, events = settings.camera, settings.events
+    if camera.log_offset is not None and (events.step_variance is not None or not _uses_steps(settings)):
+        return settings, None
+    assert events.threshold_on is not None
+    assert events.threshold_off is not None
+    model = estimate_event_model(
+        recording,
+        camera,
+        (events.threshold_on, events.threshold_off),
+        delay=events.delay or 0,
+        threshold_spread=events.threshold_spread,
+        quantisation_variance=events.quantisation_variance,
+    )
+    if model is not None:
+        if camera.log_offset is None:
+            camera = dataclasses.replace(camera, log_offset=model.log_offset)
+        if events.step_variance is None:
+            events = dataclasses.replace(events, step_variance=model.step_variance)
+    # What could not be estimated is written down as it will be used.
+    camera = dataclasses.replace(camera, log_offset=camera.offset)
+    events = dataclasses.replace(events, step_variance=events.step_noise)
+    return dataclasses.replace(settings, camera=camera, events=events), model
+
+
+def _uses_steps(settings: Settings) -> bool:
+    return settings.filter.kind == "akf" and settings.filter.augmentation == "bridge"
 
 
 def _times(

@@ -329,7 +329,7 @@ class Reconstructor:
         return Image(
             t=estimate.t,
             intensity=intensity(
-                estimate.log_intensity, estimate.variance, self.settings.camera.log_offset, prior
+                estimate.log_intensity, estimate.variance, self.settings.camera.offset, prior
             ),
             variance=estimate.variance.astype(np.float32, copy=False),
             final=estimate.final,
@@ -337,7 +337,7 @@ class Reconstructor:
 
     def _white(self, progress: _Progress, t: int) -> float:
         """log(I + I_0) of the brightest level that frames show at ``t``: from one frame's to the next's."""
-        offset = self.settings.camera.log_offset
+        offset = self.settings.camera.offset
         white = float(np.log(self._shots[0].white + offset))
         if not (self.lookahead and progress.ready and progress.starts_frame):
             return white

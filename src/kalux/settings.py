@@ -20,6 +20,12 @@ AUTO: Final = "auto"
 
 SolutionName = Literal["exact", "printed"]
 
+UNKNOWN_LOG_OFFSET: Final = 0.03
+"""I_0 where it is not known: what real recordings of DAVIS sensors agree with best (docs/tuning.md)."""
+
+UNKNOWN_STEP_VARIANCE: Final = 0.2
+"""Variance of an event's step, c^2, where it is not known: the same recordings."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class CameraSettings:
@@ -28,10 +34,12 @@ class CameraSettings:
     Attributes
     ----------
     response
-        ``"linear"`` (raw sensor values: DAVIS, machine vision), ``"srgb"`` or ``"gamma:EXPONENT"``.
+        ``"linear"`` (raw sensor values: DAVIS, machine vision), ``"srgb"``, ``"gamma:EXPONENT"``, or a measured
+        ``"curve:0 0.0012 ... 1"``: the irradiance at equally spaced response levels (`kalux calibrate response`).
     log_offset
-        I_0 of equation (8); white = 1. Events are steps of log I, so it must be small; below the noise of a
-        dark pixel it only magnifies that noise. 0.03 (docs/tuning.md). The paper's code: 1.
+        I_0 of equation (8); white = 1. Events are steps of log I, so it must be small; below the dark current
+        of the event pixels it only magnifies noise. None: an estimate from the recording
+        (`kalux.calibration.event_model`), 0.03 where it cannot be told. The paper's code: 1.
     frame_noise
         sigma_im of equation (6) as the standard deviation of a well exposed pixel of one frame; white = 1.
         0.006 is what the paper's 7e5 1/s amounts to at 40 frames/s.
@@ -49,12 +57,17 @@ class CameraSettings:
     """
 
     response: str = "linear"
-    log_offset: float = 0.03
+    log_offset: float | None = None
     frame_noise: float = 0.006
     confidence: float = 7e5
     weight_floor: float = 0.09
     saturation: float = 0.98
     reference_exposure: int | None = None
+
+    @property
+    def offset(self) -> float:
+        """I_0, also where nobody has said or estimated it."""
+        return UNKNOWN_LOG_OFFSET if self.log_offset is None else self.log_offset
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,7 +86,8 @@ class EventSettings:
         sheets and the literature give 2 to 10 % (Lichtsteiner 2008: 2.1 % of contrast at c = 0.2), real
         recordings more.
     step_variance
-        Variance of one event's step in units of c^2. 0.2 (docs/tuning.md).
+        Variance of one event's step in units of c^2. None: an estimate from the recording
+        (`kalux.calibration.event_model`), 0.2 where it cannot be told (docs/tuning.md).
     quantisation_variance
         Variance, in c^2, of the change that events have not yet told at both ends of a frame interval: two
         uniform distributions one threshold wide, 2/12.
@@ -94,7 +108,7 @@ class EventSettings:
     threshold_off: float | None = None
     delay: int | None = None
     threshold_spread: float = 0.1
-    step_variance: float = 0.2
+    step_variance: float | None = None
     quantisation_variance: float = 1 / 6
     deblur_variance: float = 0.05
     noise_rate: float = 3.0
@@ -103,6 +117,11 @@ class EventSettings:
     sigma_iso2: float = 0.03
     sigma_ref2: float = 0.01
     refractory_bound: float = 0.01
+
+    @property
+    def step_noise(self) -> float:
+        """Variance of one event's step in units of c^2, also where nobody has said or estimated it."""
+        return UNKNOWN_STEP_VARIANCE if self.step_variance is None else self.step_variance
 
 
 @dataclass(frozen=True, kw_only=True)

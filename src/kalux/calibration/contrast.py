@@ -130,5 +130,5 @@ def _samples(
         on, off = count_events(inside, recording.sensor_size)
         chosen = interval.usable & (np.abs(on - off) >= 2)
         level = interval.level[chosen]
-        share = np.ones_like(level) if of_log_offset else level / (level + camera.log_offset)
+        share = np.ones_like(level) if of_log_offset else level / (level + camera.offset)
         yield interval.change[chosen], share * on[chosen], share * off[chosen]

@@ -35,6 +35,8 @@ class Interval(NamedTuple):
         (H, W) bool: well exposed at both ends.
     events
         Those between ``start`` and ``end``, and those of the margin before and after.
+    first, second
+        The frames at both ends.
     """
 
     start: int
@@ -43,6 +45,8 @@ class Interval(NamedTuple):
     level: Array
     usable: NDArray[np.bool_]
     events: EventArray
+    first: Shot
+    second: Shot
 
 
 def intervals(
@@ -74,11 +78,13 @@ def intervals(
             yield Interval(
                 start=before.middle,
                 end=shot.middle,
-                change=log_intensity(shot.intensity, camera.log_offset)
-                - log_intensity(before.intensity, camera.log_offset),
+                change=log_intensity(shot.intensity, camera.offset)
+                - log_intensity(before.intensity, camera.offset),
                 level=(shot.intensity + before.intensity) / 2,
                 usable=usable & was_usable,
                 events=between(buffer, before.middle - margin, shot.middle + margin),
+                first=before,
+                second=shot,
             )
         buffer = buffer[buffer["t"].searchsorted(shot.middle - margin, "right") :]
         previous = shot, usable

@@ -266,6 +266,8 @@ def decided(
         f"{contents.frames:,} frames, {contents.events:,} events",
         f"thresholds  on {events.threshold_on:.3f}, off {events.threshold_off:.3f} ({origin})",
         f"delay       events {(events.delay or 0) * 1e-3:g} ms late ({_delay_origin(made)})",
+        f"events      steps of log(I + {camera.offset:g}), variance {events.step_noise:g} c^2 each "
+        f"({_model_origin(made)})",
         f"exposure    {(camera.reference_exposure or 0) * 1e-3:g} ms makes a saturated pixel 1.0",
         f"filter      {made.settings.filter.kind}, preset {options.preset}"
         f"{'' if options.settings is None else f' changed by {options.settings}'}, {ahead}",
@@ -280,6 +282,12 @@ def _delay_origin(made: Plan) -> str:
     return (
         f"estimated: {found.apparent * 1e-3:.1f} ms explain the frames {100 * found.improvement:.0f} % better"
     )
+
+
+def _model_origin(made: Plan) -> str:
+    if made.event_model is None:
+        return "given, or not to be told from the recording"
+    return f"estimated from {made.event_model.samples:,} samples"
 
 
 def metadata(

@@ -81,12 +81,12 @@ def edi_video(recording: Recording, times: Times, *, settings: Settings | None =
     for frame, wanted in nearest_frames(recording.frames(), times):
         first = min(frame.exposure_start, int(wanted[0]))
         events = window.between(first, max(frame.exposure_end, int(wanted[-1])))
-        blurred = log_intensity(linear_frame(frame, reference, camera.response), camera.log_offset)
+        blurred = log_intensity(linear_frame(frame, reference, camera.response), camera.offset)
         integrals = integrate_exposure(events, frame.exposure_start, frame.exposure_end, on, off)
         sharp = latent_middle(blurred, integrals)
         for t in wanted.tolist():
             moved = sharp + _change(events, frame.middle, t, on, off)
-            yield np.maximum(np.exp(moved) - camera.log_offset, 0.0).astype(np.float32)
+            yield np.maximum(np.exp(moved) - camera.offset, 0.0).astype(np.float32)
 
 
 def filtered(

@@ -174,7 +174,7 @@ class _Common:
     ) -> None:
         self.settings, self.lookahead, self.shape = settings, lookahead, shape
         self.on, self.off = thresholds
-        self.offset = settings.camera.log_offset
+        self.offset = settings.camera.offset
 
     def integrals(self, shot: Shot, events: Chunks, step_on: Floats, step_off: Floats) -> ExposureIntegrals:
         """EDI over the frame's exposure, or nothing moving where deblurring is off."""
@@ -224,7 +224,7 @@ class BridgedFrames(_Common):
     @property
     def noise(self) -> BridgeNoise:
         events, c2 = self.settings.events, self.on * self.off
-        return BridgeNoise(self.on, self.off, events.step_variance * c2, events.quantisation_variance * c2)
+        return BridgeNoise(self.on, self.off, events.step_noise * c2, events.quantisation_variance * c2)
 
     def latent(self, shot: Shot, events: Chunks, thresholds: Thresholds) -> Latent:
         """The frame without blur at the middle of its exposure, and its variance (K3)."""
@@ -319,7 +319,7 @@ class BridgedFrames(_Common):
 
     def advance(self, segment: Any, cursor: akf.BridgedCursor, events: EventArray) -> None:
         settings = self.settings.events
-        noise = akf.BridgedNoise(settings.noise_rate, settings.step_variance, self.on * self.off)
+        noise = akf.BridgedNoise(settings.noise_rate, settings.step_noise, self.on * self.off)
         akf.advance_bridged(segment, cursor, events, noise)
 
     def read(self, segment: Any, cursor: akf.BridgedCursor, t: int) -> tuple[Floats, Floats]:

@@ -81,20 +81,51 @@ class Response:
         return cls(table, np.linspace(0.0, 1.0, len(table)))
 
     @classmethod
+    def curve(cls, irradiance: Any) -> Response:
+        """From the irradiance at equally spaced response levels, joined by a monotone cubic (PCHIP).
+
+        Parameters
+        ----------
+        irradiance
+            (n,) increasing from 0 to 1, e.g. 33 values of a measured inverse CRF.
+        """
+        from scipy.interpolate import PchipInterpolator  # slow to import, and rarely needed
+
+        knots = np.asarray(irradiance, dtype=np.float64).ravel()
+        if len(knots) < 2 or not np.isfinite(knots).all() or (np.diff(knots) <= 0).any():
+            raise SettingsError("response: a curve needs at least two increasing numbers, e.g. curve:0 0.2 1")
+        if (knots[0], knots[-1]) != (0.0, 1.0):
+            raise SettingsError(
+                f"response: the curve runs from {knots[0]:g} to {knots[-1]:g}; 0 to 1 is needed"
+            )
+        response = np.linspace(0.0, 1.0, _LEVELS)
+        table = PchipInterpolator(np.linspace(0.0, 1.0, len(knots)), knots)(response)
+        table[0], table[-1] = 0.0, 1.0
+        return cls(table, response)
+
+    @classmethod
     def named(cls, name: str) -> Response:
-        """``"linear"``, ``"srgb"`` or ``"gamma:2.2"``."""
+        """``"linear"``, ``"srgb"``, ``"gamma:2.2"``, or ``"curve:0 0.2 1"`` for `curve`."""
         if name == "linear":
             return cls.linear()
         if name == "srgb":
             return cls.srgb()
         kind, _, exponent = name.partition(":")
+        if kind == "curve":
+            try:
+                knots = [float(word) for word in exponent.split()]
+            except ValueError:
+                raise SettingsError(f"response: {name[:60]!r} holds something that is not a number") from None
+            return cls.curve(knots)
         try:
             value = float(exponent)
         except ValueError:
             kind = ""
         if kind == "gamma":
             return cls.gamma(value)
-        raise SettingsError(f"response: unknown response {name!r}; known are linear, srgb and gamma:EXPONENT")
+        raise SettingsError(
+            f"response: unknown response {name!r}; known are linear, srgb, gamma:EXPONENT and curve:NUMBERS"
+        )
 
     def __call__(self, irradiance: Array) -> Array:
         """CRF: response, 0 to 1, of an irradiance; clipped at 1."""

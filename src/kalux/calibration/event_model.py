@@ -1,0 +1,163 @@
+"""Where a recording's events become logarithmic, and how much one event's step varies: by maximum likelihood.
+
+Events are steps of log(I + I_d), with I_d the dark current of their pixels, seen by the frames' scale. The state is
+log(I + I_0), equation (8); it moves as the events say only if I_0 is near I_d. Too large, and steps in the dark are
+taken for larger ones than they are, so that pixels learn wrong thresholds there and carry them into highlights; too
+small, and the noise of dark frame pixels is magnified. What two successive frames and the events between them say of
+each other decides (docs/equations.md, K9).
+"""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux.augmentation.deblur import between, count_events
+from kalux.calibration.intervals import intervals
+from kalux.recording import Recording
+from kalux.settings import CameraSettings
+
+Array = NDArray[np.float64]
+
+LOG_OFFSETS: Final = (0.004, 0.008, 0.015, 0.03, 0.06)
+"""I_0 that are tried, white = 1. Less than a level of an 8-bit frame cannot be told; more than 0.06 is not dark."""
+
+STEP_VARIANCES: Final = (0.05, 0.1, 0.2, 0.4)
+"""Variances of an event's step that are tried, in units of c^2."""
+
+MAX_SAMPLES: Final = 100_000
+_MIN_SAMPLES: Final = 1_000
+_MAX_FRAMES: Final = 80
+_LEAST_NET: Final = 2  # as for the thresholds: a net count of one may be noise
+_DARKEST: Final = 0.01  # two to three levels of 8 bits: below, a frame's log is rounding
+_FREEDOM: Final = 4.0  # degrees of freedom of Student's t, whose tails take flicker and occlusions
+
+
+class EventModel(NamedTuple):
+    """What a recording says of its events.
+
+    Attributes
+    ----------
+    log_offset
+        I_0, white = 1.
+    step_variance
+        Variance of one event's step, in units of c^2.
+    samples
+        Pixels and frame intervals used.
+    """
+
+    log_offset: float
+    step_variance: float
+    samples: int
+
+
+class Samples(NamedTuple):
+    """Pixels of frame intervals: I before and after, and the on and off events between; all (N,)."""
+
+    before: Array
+    after: Array
+    on: Array
+    off: Array
+
+
+def estimate_event_model(
+    recording: Recording,
+    camera: CameraSettings,
+    thresholds: tuple[float, float],
+    *,
+    delay: int = 0,
+    threshold_spread: float = 0.1,
+    quantisation_variance: float = 1 / 6,
+) -> EventModel | None:
+    """I_0 and the variance of an event's step, from the first 80 frames.
+
+    Parameters
+    ----------
+    recording
+        With frames and exposures.
+    camera
+        Response, saturation, frame noise; its I_0 is not used.
+    thresholds
+        (on, off) contrast thresholds, log intensity.
+    delay
+        How much later than the frames' clock events are stamped, us.
+    threshold_spread, quantisation_variance
+        As in `kalux.settings.EventSettings`.
+
+    Returns None where fewer than 1000 pixels changed by two events between two frames that show them well enough.
+
+    Raises
+    ------
+    ExposureError
+        If the frames' exposures are not known.
+    """
+    samples = _samples(recording, camera, delay)
+    chosen = (np.abs(samples.on - samples.off) >= _LEAST_NET) & (
+        np.minimum(samples.before, samples.after) > _DARKEST
+    )
+    if np.count_nonzero(chosen) < _MIN_SAMPLES:
+        return None
+    signals = Samples(*(values[chosen] for values in samples))
+
+    def best(among: Samples, log_offsets: tuple[float, ...]) -> tuple[float, float]:
+        tried = [(i, q) for i in log_offsets for q in STEP_VARIANCES]
+        losses = [
+            negative_log_likelihood(
+                among, thresholds, i, q, camera.frame_noise, threshold_spread, quantisation_variance
+            )
+            for i, q in tried
+        ]
+        return tried[int(np.argmin(losses))]
+
+    # Single events, most of them noise where nothing moves, say much of the step and nothing of I_0.
+    log_offset, _ = best(signals, LOG_OFFSETS)
+    _, step_variance = best(samples, (log_offset,))
+    return EventModel(log_offset, step_variance, len(samples.on))
+
+
+def negative_log_likelihood(
+    samples: Samples,
+    thresholds: tuple[float, float],
+    log_offset: float,
+    step_variance: float,
+    frame_noise: float,
+    threshold_spread: float,
+    quantisation_variance: float,
+) -> float:
+    """Mean over the samples of -log p(I after | I before, events), up to a constant.
+
+    The mismatch between frames and events (docs/equations.md, K1) is Student's t with the variance that the bridge
+    takes it to have. The density is one of I, not of log(I + I_0), so that different I_0 can be compared.
+    """
+    on, off = thresholds
+    change = np.log(samples.after + log_offset) - np.log(samples.before + log_offset)
+    mismatch = change - (on * samples.on - off * samples.off)
+    variance = (
+        (frame_noise / (samples.before + log_offset)) ** 2
+        + (frame_noise / (samples.after + log_offset)) ** 2
+        + threshold_spread**2 * ((on * samples.on) ** 2 + (off * samples.off) ** 2)
+        + on * off * (step_variance * (samples.on + samples.off) + quantisation_variance)
+    )
+    tails = (_FREEDOM + 1) / 2 * np.log1p(mismatch**2 / (_FREEDOM * variance))
+    jacobian = np.log(samples.after + log_offset)
+    return float(np.mean(0.5 * np.log(variance) + tails + jacobian))
+
+
+def _samples(recording: Recording, camera: CameraSettings, delay: int) -> Samples:
+    """Pixels with events that no frame clips, interval by interval."""
+    found: list[Samples] = []
+    count = 0
+    for interval in intervals(recording, camera, margin=abs(delay), most_frames=_MAX_FRAMES):
+        inside = between(interval.events, interval.start + delay, interval.end + delay)
+        on, off = count_events(inside, recording.sensor_size)
+        first, second = interval.first, interval.second
+        chosen = ~first.clipped & ~second.clipped & (on + off >= 1)
+        found.append(Samples(first.intensity[chosen], second.intensity[chosen], on[chosen], off[chosen]))
+        count += len(found[-1].on)
+        if count >= MAX_SAMPLES:
+            break
+    if not found:
+        return Samples(*(np.empty(0) for _ in Samples._fields))
+    return Samples(*(np.concatenate(column) for column in zip(*found, strict=True)))

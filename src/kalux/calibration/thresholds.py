@@ -1,0 +1,520 @@
+"""Contrast thresholds in earnest: global and per pixel, with their spread and with what is not known of them.
+
+`kalux.calibration.contrast` is the quick estimate of a reconstruction. Here the change d of the deblurred log intensity
+between the middles of two exposures is explained by
+
+    d = c_on n_on - c_off n_off + h s
+
+with n the events between, and s the change of the sign of each pixel's latest event, halved (-1, 0, 1). After an ON
+event the intensity lies half a threshold above the reported level on average, after an OFF event half a threshold
+below, so that where the direction turns around one threshold is never reported: left out, this makes every small
+step look larger. h is free; (c_on + c_off) / 2 is what an ideal pixel has.
+
+Counts are wrong by noise events, lost events and what is not yet reported, and least squares would take that for a
+smaller threshold (attenuation). Neighbouring pixels see the same edges with errors of their own: their mean counts are
+instruments (two-stage least squares), for which no noise level needs to be known. Intervals with events that follow
+one another as fast as the pixel can are left out, since events may be lost there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import cv2
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux.augmentation.deblur import between, integrate_exposure, latent_middle, latent_peak
+from kalux.calibration.contrast import NORMAL_MAD, estimate_thresholds
+from kalux.calibration.intervals import Interval, intervals
+from kalux.calibration.values import Calibration
+from kalux.events import EVENT_DTYPE, EventArray
+from kalux.filters.methods import Shot
+from kalux.recording import Recording
+from kalux.settings import CameraSettings
+
+Array = NDArray[np.float64]
+
+MAX_FRAMES: Final = 1000
+"""Frames that are looked at for the thresholds of single pixels: some 500 events of a pixel that sees motion."""
+
+_GLOBAL_SAMPLES: Final = 400_000  # pixels for the global fit; its standard error is then below 0.5 %
+_SEARCH_FRAMES: Final = 40
+_SEARCHED: Final = (-4_000, 0, 3_000, 6_000, 10_000)  # delays, us, at which the trailing is measured
+_IN_TIME: Final = (0.7, 0.95, 1.15)
+"""h over the mean threshold where events are in time: 1 in theory, 0.79 to 1.02 on five simulated scenes. Between the
+outer values no delay is corrected, beyond them until the middle one is reached."""
+_MIN_SAMPLES: Final = 500
+_HUBER: Final = 1.345  # 95 % efficiency for normal residuals (Huber 1981)
+_WHITE: Final = 0.95  # of the response: the whole deblurred path lies below
+_CROWDED: Final = 3.0
+"""Intervals with events closer than this many times the smallest inter-event interval are left out. With 3, a
+refractory period of 200 us costs 4 % where edges pass at 50 thresholds per 10 ms, without it 8 %."""
+_EDGE: Final = 0.02  # of the most frequent inter-event interval: what is rarer and shorter is noise
+_EDGE_BINS: Final = np.logspace(1, 6, 51)  # us
+_TILES: Final = 8  # per side: blocks of the jackknife
+_EM_STEPS: Final = 60
+_LEAST_SPREAD: Final = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class ContrastCalibration:
+    """Contrast thresholds, log intensity, with standard errors (jackknife over 8 x 8 parts of the sensor).
+
+    Attributes
+    ----------
+    on, off, on_error, off_error
+        Mean thresholds, positive, and their standard errors.
+    spread_on, spread_off
+        Relative standard deviation between pixels, with what the fit cannot know taken out.
+    correlation
+        Of the ON and OFF thresholds of a pixel.
+    delay
+        How late the events are taken to be, us; given, or from the trailing.
+    trailing
+        h of the module's text.
+    residual
+        Robust standard deviation of the fit, log intensity.
+    step_variance
+        How much the variance of the fit grows per event, in units of c_on c_off.
+    shortest_interval
+        Shortest time between two events of a pixel that is not chance, us.
+    samples, intervals
+        Pixels of the global fit, and frame intervals that were looked at.
+    on_factor, off_factor, on_variance, off_variance
+        (H, W) thresholds of every pixel in units of ``on`` and ``off``, shrunk towards 1 as far as the pixel says
+        little, and the variance that is left.
+    """
+
+    on: float
+    off: float
+    on_error: float
+    off_error: float
+    spread_on: float
+    spread_off: float
+    correlation: float
+    delay: int
+    trailing: float
+    residual: float
+    step_variance: float
+    shortest_interval: int
+    samples: int
+    intervals: int
+    on_factor: Array
+    off_factor: Array
+    on_variance: Array
+    off_variance: Array
+
+    def calibration(self) -> Calibration:
+        """As settings with standard errors, and maps of the pixels."""
+        settings = {
+            "threshold_on": self.on,
+            "threshold_off": self.off,
+            "threshold_spread": float(np.hypot(self.spread_on, self.spread_off) / np.sqrt(2)),
+        }
+        errors = {"threshold_on": self.on_error, "threshold_off": self.off_error}
+        names = ("spread_on", "spread_off", "correlation", "trailing", "residual", "shortest_interval")
+        measured = {name: getattr(self, name) for name in (*names, "samples", "intervals")}
+        maps = {
+            "threshold_on": self.on_factor,
+            "threshold_off": self.off_factor,
+            "threshold_on_variance": self.on_variance,
+            "threshold_off_variance": self.off_variance,
+        }
+        finite = {name: value for name, value in errors.items() if np.isfinite(value)}
+        return Calibration({"events": settings}, finite, {**measured, "apparent_delay": self.delay}, maps)
+
+
+def calibrate_contrast(
+    recording: Recording, camera: CameraSettings, *, delay: int | None = None, refractory: int = 0
+) -> ContrastCalibration | None:
+    """Measure the contrast thresholds of a recording's sensor.
+
+    Parameters
+    ----------
+    recording
+        With frames and exposures, and motion before well exposed pixels; five frames are enough for the mean.
+    camera
+        Response and saturation.
+    delay
+        How late the events are, us. None: so that they trail the light by half a threshold, as those of an ideal
+        pixel do.
+    refractory
+        Refractory period, us, if it is known: what is lost in it is added to the events.
+
+    Returns
+    -------
+    None where too few pixels (500) change, or where events do not explain the changes.
+
+    Raises
+    ------
+    ExposureError
+        If the frames' exposures are not known.
+    """
+    first = estimate_thresholds(recording, camera, delay=delay or 0)
+    if first is None:
+        return None
+    view = _View((first.on, first.off), shortest_interval(recording), refractory)
+    if delay is None:
+        delay = _delay_of_trailing(recording, camera, view)
+    fit, data = None, None
+    for _ in range(2):  # the second time deblurred with the thresholds of the first
+        data = _gathered(_samples(recording, camera, view, (delay,), MAX_FRAMES), _GLOBAL_SAMPLES)
+        fit = _fit(data[0]) if data else None
+        if fit is None:
+            return None
+        view = view._replace(thresholds=(fit.on, fit.off))
+    assert fit is not None
+    assert data is not None
+    return _per_pixel(recording, camera, view, fit, data[0], delay)
+
+
+def shortest_interval(recording: Recording, most_events: int = 3_000_000) -> int:
+    """Lower edge of the times between two events of a pixel, us: no refractory period is longer.
+
+    Where their histogram over log time first reaches 2 % of its peak; below that are noise events, which follow the
+    others at any time. Of the first ``most_events``; 0 without events that follow one another.
+    """
+    last = np.full(recording.sensor_size, -1, np.int64)
+    histogram = np.zeros(len(_EDGE_BINS) - 1, np.int64)
+    count = 0
+    for chunk in recording.events():
+        histogram += np.histogram(_intervals_of(chunk["t"], chunk["x"], chunk["y"], last), _EDGE_BINS)[0]
+        count += len(chunk)
+        if count >= most_events:
+            break
+    if not histogram.any():
+        return 0
+    return round(float(_EDGE_BINS[int(np.argmax(histogram >= _EDGE * histogram.max()))]))
+
+
+@nb.njit(cache=True, nogil=True)
+def _intervals_of(t, x, y, last):  # type: ignore[no-untyped-def]
+    found = np.empty(len(t), np.int64)
+    n = 0
+    for i in range(len(t)):
+        before = last[y[i], x[i]]
+        if before >= 0:
+            found[n] = t[i] - before
+            n += 1
+        last[y[i], x[i]] = t[i]
+    return found[:n]
+
+
+# --- samples --------------------------------------------------------------------------------------------------
+
+
+class _View(NamedTuple):
+    """How to look at a recording: thresholds to deblur with, shortest inter-event interval and refractory, us."""
+
+    thresholds: tuple[float, float]
+    shortest: int
+    refractory: int
+
+
+class _Samples(NamedTuple):
+    """(N,) pixels: change, explaining values and their instruments (N, 3), index of the pixel."""
+
+    change: Array
+    explained: Array
+    instruments: Array
+    pixel: NDArray[np.int64]
+
+
+def _samples(
+    recording: Recording,
+    camera: CameraSettings,
+    view: _View,
+    delays: tuple[int, ...],
+    most_frames: int,
+) -> Iterator[tuple[_Samples, ...]]:
+    """The usable pixels of every frame interval, once for every delay."""
+    longest = max((frame.exposure for frame in recording.frames()), default=0)
+    margin = longest + max(abs(d) for d in delays)
+    histories = [_History(recording.sensor_size, view) for _ in delays]
+    for interval in intervals(recording, camera, margin=margin, most_frames=most_frames):
+        yield tuple(
+            _of_interval(interval, history, camera, view, d)
+            for history, d in zip(histories, delays, strict=True)
+        )
+
+
+class _History:
+    """What every pixel's latest event was, as the intervals pass."""
+
+    def __init__(self, shape: tuple[int, int], view: _View) -> None:
+        self._view, self._shape = view, shape
+        self._last = np.full(shape, -(1 << 60), np.int64)
+        self.sign = np.zeros(shape)
+        self.until: int | None = None
+
+    def counts(self, events: EventArray) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """On and off counts of events, and which pixels had some that follow too fast."""
+        on, off = np.zeros(self._shape), np.zeros(self._shape)
+        crowded = np.zeros(self._shape, np.bool_)
+        least = _CROWDED * max(self._view.shortest, self._view.refractory)
+        t, x, y, p = (events[name] for name in ("t", "x", "y", "p"))
+        _count(t, x, y, p, self._last, self.sign, least, float(self._view.refractory), on, off, crowded)
+        return on, off, crowded
+
+
+@nb.njit(cache=True, nogil=True)
+def _count(t, x, y, p, last, sign, least, refractory, on, off, crowded):  # type: ignore[no-untyped-def]
+    for i in range(len(t)):
+        row, column = y[i], x[i]
+        since = t[i] - last[row, column]
+        if since < least:
+            crowded[row, column] = True
+        # While the pixel was held in reset the light went on at the pace at which it then crossed the threshold.
+        weight = since / (since - refractory) if since > 1.5 * refractory else 1.0
+        if p[i]:
+            on[row, column] += weight
+            sign[row, column] = 1.0
+        else:
+            off[row, column] += weight
+            sign[row, column] = -1.0
+        last[row, column] = t[i]
+
+
+def _of_interval(
+    interval: Interval, history: _History, camera: CameraSettings, view: _View, delay: int
+) -> _Samples:
+    events = np.empty(len(interval.events), EVENT_DTYPE)
+    events[:] = interval.events
+    events["t"] -= delay
+    if history.until is None:
+        history.counts(between(events, -(1 << 60), interval.start))
+    before = history.sign.copy()
+    on, off, crowded = history.counts(between(events, interval.start, interval.end))
+    history.until = interval.end
+    turned = (history.sign - before) / 2.0
+    (first, first_good), (second, second_good) = (
+        _latent(shot, events, camera, view.thresholds) for shot in (interval.first, interval.second)
+    )
+    around = [_around(values) for values in (on, -off, turned)]
+    good = interval.usable & first_good & second_good & ~crowded & (_around(on + off) >= 1.0)
+    return _Samples(
+        (second - first)[good],
+        np.column_stack([values[good] for values in (on, -off, turned)]),
+        np.column_stack([values[good] for values in around]),
+        np.flatnonzero(good),
+    )
+
+
+def _latent(
+    shot: Shot, events: EventArray, camera: CameraSettings, thresholds: tuple[float, float]
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Log intensity of a frame without blur, and where the whole path of its exposure is well exposed."""
+    blurred = np.log(np.maximum(shot.intensity, 1e-6))
+    steps = (np.full(blurred.shape, c) for c in thresholds)
+    integrals = integrate_exposure(events, shot.start, shot.end, *steps)
+    good = latent_peak(blurred, integrals) < np.log(min(_WHITE, camera.saturation) * shot.white)
+    return latent_middle(blurred, integrals), good
+
+
+def _around(values: Array) -> Array:
+    """Mean of the eight neighbours."""
+    kernel = np.full((3, 3), 1 / 8)
+    kernel[1, 1] = 0.0
+    mean = cv2.filter2D(values, cv2.CV_64F, kernel, borderType=cv2.BORDER_REFLECT_101)
+    return np.asarray(mean, np.float64)
+
+
+def _gathered(parts: Iterator[tuple[_Samples, ...]], most: int) -> list[_Samples]:
+    """Samples joined, for every delay, until there are enough."""
+    kept: list[tuple[_Samples, ...]] = []
+    count = 0
+    for part in parts:
+        kept.append(part)
+        count += len(part[0].change)
+        if count >= most:
+            break
+    return [
+        _Samples(*(np.concatenate(c) for c in zip(*samples, strict=True)))
+        for samples in zip(*kept, strict=True)
+    ]
+
+
+# --- the global fit -------------------------------------------------------------------------------------------
+
+
+class _Fit(NamedTuple):
+    on: float
+    off: float
+    trailing: float
+    residual: float
+    weights: Array
+
+
+def _fit(data: _Samples) -> _Fit | None:
+    """Two-stage least squares with Huber's weights; None where it is not determined."""
+    if len(data.change) < _MIN_SAMPLES:
+        return None
+    weights = np.ones(len(data.change))
+    solution: Array = np.zeros(3)
+    scale = 0.0
+    for _ in range(40):
+        weighted = data.instruments * weights[:, None]
+        normal = weighted.T @ data.explained
+        if np.linalg.cond(normal) > 1e6:
+            return None
+        previous = solution
+        solution = np.linalg.solve(normal, weighted.T @ data.change).astype(np.float64)
+        residual = data.change - data.explained @ solution
+        scale = max(NORMAL_MAD * float(np.median(np.abs(residual))), 1e-9)
+        weights = np.minimum(1.0, _HUBER * scale / np.maximum(np.abs(residual), 1e-12))
+        if np.abs(solution - previous).max() < 1e-5:
+            break
+    on, off, trailing = (float(v) for v in solution)
+    return _Fit(on, off, trailing, scale, weights) if on > 0 and off > 0 else None
+
+
+def _delay_of_trailing(recording: Recording, camera: CameraSettings, view: _View) -> int:
+    """The delay, us, at which events trail the light by half a threshold; 0 where it cannot be told."""
+    parts = _samples(recording, camera, view, _SEARCHED, _SEARCH_FRAMES)
+    found = [_fit(data) for data in _gathered(parts, _GLOBAL_SAMPLES // 2)]
+    fits = [fit for fit in found if fit is not None]
+    if len(fits) < len(_SEARCHED):
+        return 0
+    # A longer delay always leaves less trailing; what noise makes otherwise is evened out.
+    trailing = np.array([2 * fit.trailing / (fit.on + fit.off) for fit in fits], np.float64)
+    ratio = np.minimum.accumulate(trailing)
+    low, wanted, high = _IN_TIME
+    if low <= ratio[_SEARCHED.index(0)] <= high or not ratio[-1] <= wanted <= ratio[0]:
+        return 0
+    return round(float(np.interp(wanted, ratio[::-1], _SEARCHED[::-1])))
+
+
+def _errors(data: _Samples, fit: _Fit, shape: tuple[int, int]) -> Array:
+    """Standard errors of the three parameters: jackknife over tiles of the sensor, weights kept."""
+    row, column = np.divmod(data.pixel, shape[1])
+    tile = (row * _TILES // shape[0]) * _TILES + column * _TILES // shape[1]
+    weighted = data.instruments * fit.weights[:, None]
+    size = _TILES**2
+    normal, right = np.zeros((size, 3, 3)), np.zeros((size, 3))
+    for i in range(3):
+        right[:, i] = np.bincount(tile, weighted[:, i] * data.change, size)
+        for j in range(3):
+            normal[:, i, j] = np.bincount(tile, weighted[:, i] * data.explained[:, j], size)
+    used = np.flatnonzero(np.abs(normal).sum(axis=(1, 2)) > 0)
+    without = [
+        np.linalg.solve(normal.sum(axis=0) - normal[k], right.sum(axis=0) - right[k])
+        for k in used
+        if np.linalg.cond(normal.sum(axis=0) - normal[k]) < 1e8
+    ]
+    if len(without) < 4:
+        return np.full(3, np.inf)
+    spread: Array = np.sqrt((len(without) - 1) * np.var(np.array(without), axis=0))
+    return spread
+
+
+# --- single pixels --------------------------------------------------------------------------------------------
+
+
+class _Variance(NamedTuple):
+    """Variance of the fit's residuals: ``still`` and what every event adds, log intensity^2."""
+
+    still: float
+    per_event: float
+
+
+def _residual_variance(data: _Samples, solution: Array) -> _Variance:
+    """By a robust variance for every number of events, and a line through these."""
+    events = np.abs(data.explained[:, :2]).sum(axis=1).round().astype(np.int64)
+    residual = data.change - data.explained @ solution
+    numbers, variances, sizes = [], [], []
+    for n in range(1, 9):
+        inside = np.abs(residual[events == n])
+        if len(inside) >= 100:
+            numbers.append(n)
+            variances.append((NORMAL_MAD * float(np.median(inside))) ** 2)
+            sizes.append(len(inside))
+    if len(numbers) < 2:
+        scale = NORMAL_MAD * float(np.median(np.abs(residual)))
+        return _Variance(max(scale**2, 1e-8), 0.0)
+    per_event, still = np.polyfit(numbers, variances, 1, w=np.sqrt(sizes))
+    per_event = max(float(per_event), 0.0)
+    return _Variance(max(float(still), 0.25 * min(variances), 1e-8), per_event)
+
+
+def _per_pixel(
+    recording: Recording, camera: CameraSettings, view: _View, fit: _Fit, data: _Samples, delay: int
+) -> ContrastCalibration:
+    # Deviations of single pixels are regressed on their own counts, so the mean they deviate from must be as
+    # attenuated as they are: that of least squares, not of the instruments.
+    weighted = data.explained * fit.weights[:, None]
+    plain: Array = np.linalg.solve(weighted.T @ data.explained, weighted.T @ data.change).astype(np.float64)
+    variance = _residual_variance(data, plain)
+    size = int(np.prod(recording.sensor_size))
+    normal: Array = np.zeros((size, 3))
+    right: Array = np.zeros((size, 2))
+    count = 0
+    for (part,) in _samples(recording, camera, view, (delay,), MAX_FRAMES):
+        count += 1
+        predicted = part.explained[:, :2] * plain[:2]  # by factor 1 of either threshold
+        residual = part.change - part.explained @ plain
+        spread = np.sqrt(variance.still + variance.per_event * np.abs(part.explained[:, :2]).sum(axis=1))
+        weight = np.minimum(1.0, 2 * _HUBER * spread / np.maximum(np.abs(residual), 1e-12)) / spread**2
+        for column, (i, j) in enumerate(((0, 0), (0, 1), (1, 1))):
+            normal[:, column] += np.bincount(part.pixel, weight * predicted[:, i] * predicted[:, j], size)
+        for i in range(2):
+            right[:, i] += np.bincount(part.pixel, weight * predicted[:, i] * residual, size)
+    _, covariance, offset, left = shrunk(normal, right)
+    errors = _errors(data, fit, recording.sensor_size)
+    shape = recording.sensor_size
+    spreads = np.sqrt(np.diag(covariance))
+    return ContrastCalibration(
+        on=fit.on * float(1 + covariance[0, 0]),  # the mean of 1 / c is what the instruments find
+        off=fit.off * float(1 + covariance[1, 1]),
+        on_error=float(errors[0]),
+        off_error=float(errors[1]),
+        spread_on=float(spreads[0]),
+        spread_off=float(spreads[1]),
+        correlation=float(covariance[0, 1] / max(spreads[0] * spreads[1], 1e-12)),
+        delay=delay,
+        trailing=fit.trailing,
+        residual=fit.residual,
+        step_variance=variance.per_event / (fit.on * fit.off),
+        shortest_interval=view.shortest,
+        samples=len(data.change),
+        intervals=count,
+        on_factor=np.clip(1 + offset[:, 0], 0.3, 3.0).reshape(shape),
+        off_factor=np.clip(1 + offset[:, 1], 0.3, 3.0).reshape(shape),
+        on_variance=left[:, 0].reshape(shape),
+        off_variance=left[:, 1].reshape(shape),
+    )
+
+
+def shrunk(normal: Array, right: Array) -> tuple[Array, Array, Array, Array]:
+    """Empirical Bayes of two values per pixel, with their covariance between pixels, by expectation maximisation.
+
+    Parameters
+    ----------
+    normal
+        (N, 3) normal equations of every pixel in units of its noise: xx, xy, yy.
+    right
+        (N, 2) their right sides.
+
+    Returns
+    -------
+    Mean (2,) and covariance (2, 2) of the pixels that say something; (N, 2) estimates of every pixel relative to that
+    mean, shrunk towards it; (N, 2) the variance that is left. A pixel that says nothing is the mean.
+    """
+    told = np.flatnonzero(normal[:, 0] + normal[:, 2] > 0)
+    mean, covariance = np.zeros(2), 0.01 * np.eye(2)
+    values, left = np.zeros((len(normal), 2)), np.zeros((len(normal), 2, 2))
+    information = np.stack([normal[:, [0, 1]], normal[:, [1, 2]]], axis=1)
+    for _ in range(_EM_STEPS):
+        prior = np.linalg.inv(covariance)
+        left = np.linalg.inv(information + prior)
+        values = np.einsum("nij,nj->ni", left, right + prior @ mean)
+        if len(told) < 10:
+            break
+        mean = values[told].mean(axis=0)
+        away = values[told] - mean
+        covariance = (away.T @ away) / len(told) + left[told].mean(axis=0)
+        covariance += _LEAST_SPREAD**2 * 1e-2 * np.eye(2)
+    return mean, covariance, values - mean, np.stack([left[:, 0, 0], left[:, 1, 1]], axis=1)

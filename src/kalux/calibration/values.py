@@ -1,0 +1,288 @@
+"""What calibrations find, as one kind of value: settings with standard errors, other quantities, maps of pixels.
+
+In a file a calibration is a small TOML text, which `kalux.settings.load` takes as well, and beside it an ``.npz`` with
+the maps, named with its checksum (docs/calibration.md).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import tomllib
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from io import BytesIO
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import tomli_w
+from numpy.typing import NDArray
+
+from kalux.errors import FormatError, InputError, SettingsError
+from kalux.models.pixels import PixelCalibration
+from kalux.settings import Settings, from_dict, preset
+
+VERSION: Final = 1
+"""Of the file format."""
+
+FIRST_LINE: Final = (
+    "# A calibration by kalux: docs/calibration.md. Can be given to --calibration and to --settings."
+)
+
+_MAPS: Final = ("threshold_on", "threshold_off", "threshold_on_variance", "threshold_off_variance")
+_FACTORS: Final = {"threshold_on": 1.0, "threshold_off": 1.0}
+
+UNITS: Final[Mapping[str, str]] = {
+    "threshold_on": "log intensity",
+    "threshold_off": "log intensity",
+    "threshold_spread": "relative standard deviation between pixels",
+    "spread_on": "relative standard deviation between pixels",
+    "spread_off": "relative standard deviation between pixels",
+    "correlation": "of a pixel's ON and OFF thresholds, -1 to 1",
+    "delay": "us",
+    "apparent_delay": "us",
+    "step_variance": "threshold^2 per event",
+    "noise_rate": "Hz per pixel",
+    "frame_noise": "standard deviation at half of white, white = 1",
+    "read_noise": "standard deviation in the dark, white = 1",
+    "shot_noise": "variance per intensity, white = 1",
+    "saturation": "of white, 0 to 1",
+    "black_level": "of white, 0 to 1",
+    "log_offset": "intensity, white = 1",
+    "response": "camera response function",
+    "trailing": "log intensity",
+    "residual": "log intensity",
+    "shortest_interval": "us",
+    "refractory_at_most": "us",
+    "residual_full_scale": "root mean square of images predicted from the merged radiance, share of full scale",
+    "left_out_full_scale": "root mean square of images predicted from the others, share of full scale",
+    "exposures": "s",
+}
+"""Units of every quantity that a calibration may hold; numbers of things have none."""
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """Measured values.
+
+    Attributes
+    ----------
+    settings
+        Settings by group and name, as in TOML, e.g. ``{"events": {"threshold_on": 0.21}}``.
+    errors
+        Standard errors, by name of a setting or of a measured quantity.
+    measured
+        Quantities that no setting takes, by name; units in `UNITS`.
+    maps
+        By name: (H, W) arrays. ``threshold_on``, ``threshold_off`` (factors of the settings') with
+        ``threshold_on_variance``, ``threshold_off_variance``; ``hot``, ``dead`` (bool); ``noise_rate`` (Hz).
+    provenance
+        What it was made from, and how.
+
+    Raises
+    ------
+    SettingsError
+        If a setting is unknown or out of its range.
+    """
+
+    settings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    errors: Mapping[str, float] = field(default_factory=dict)
+    measured: Mapping[str, Any] = field(default_factory=dict)
+    maps: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        from_dict(self.settings, preset("default"))
+
+    def apply(self, settings: Settings) -> Settings:
+        """The settings with what was measured in place of theirs."""
+        return from_dict(self.settings, settings)
+
+    @property
+    def pixels(self) -> PixelCalibration | None:
+        """What is known of single pixels; None without maps of thresholds or hot pixels."""
+        known = [name for name in (*_MAPS, "hot") if name in self.maps]
+        if not known:
+            return None
+        shape = self.maps[known[0]].shape
+        spread = float(self.settings.get("events", {}).get("threshold_spread", _prior_spread()))
+        filled = {
+            name: np.asarray(
+                self.maps.get(name, np.full(shape, _FACTORS.get(name, spread**2))), dtype=np.float64
+            )
+            for name in _MAPS
+        }
+        hot = np.asarray(self.maps.get("hot", np.zeros(shape)), dtype=np.bool_)
+        on, off, on_variance, off_variance = (filled[name] for name in _MAPS)
+        return PixelCalibration(on, off, on_variance, off_variance, hot)
+
+    def merged(self, other: Calibration) -> Calibration:
+        """Both; where both know something, the other wins."""
+        groups = {*self.settings, *other.settings}
+        return Calibration(
+            {g: {**self.settings.get(g, {}), **other.settings.get(g, {})} for g in sorted(groups)},
+            {**self.errors, **other.errors},
+            {**self.measured, **other.measured},
+            {**self.maps, **other.maps},
+            {**self.provenance, **other.provenance},
+        )
+
+
+def _prior_spread() -> float:
+    return preset("default").events.threshold_spread
+
+
+# --- files ----------------------------------------------------------------------------------------------------
+
+
+def to_files(calibration: Calibration, path: str | Path) -> dict[Path, bytes]:
+    """The files of a calibration, by path: the TOML text last, so that it never names maps that are not there."""
+    path = Path(path)
+    body: dict[str, Any] = {
+        "kalux_calibration": VERSION,
+        "provenance": dict(calibration.provenance),
+        "settings": {group: dict(values) for group, values in calibration.settings.items()},
+        "standard_errors": dict(calibration.errors),
+        "measured": dict(calibration.measured),
+    }
+    files: dict[Path, bytes] = {}
+    if calibration.maps:
+        maps = path.with_suffix(".npz")
+        files[maps] = _npz(calibration.maps)
+        body["maps"] = {
+            "file": maps.name,
+            "sha256": hashlib.sha256(files[maps]).hexdigest(),
+            "names": sorted(calibration.maps),
+        }
+    lines = [_with_unit(line) for line in tomli_w.dumps(body).splitlines()]
+    files[path] = "\n".join([FIRST_LINE, *lines, ""]).encode()
+    return files
+
+
+def _with_unit(line: str) -> str:
+    name, equals, _ = line.partition(" = ")
+    return f"{line}  # {UNITS[name]}" if equals and name in UNITS else line
+
+
+def _npz(maps: Mapping[str, NDArray[Any]]) -> bytes:
+    """As `numpy.savez_compressed`, but the same bytes every time: no time stamps."""
+    out = BytesIO()
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name in sorted(maps):
+            values = np.asarray(maps[name])
+            data = BytesIO()
+            np.save(data, values.astype(np.float32) if values.dtype.kind == "f" else values)
+            archive.writestr(zipfile.ZipInfo(f"{name}.npy"), data.getvalue(), zipfile.ZIP_DEFLATED)
+    return out.getvalue()
+
+
+def load_calibration(path: str | Path, *more: str | Path) -> Calibration:
+    """Read a calibration, or several that complete one another; of what several know the last is taken.
+
+    Parameters
+    ----------
+    path, more
+        Of the TOML files. Their maps lie beside them.
+
+    Raises
+    ------
+    InputError
+        If a file cannot be read.
+    FormatError
+        If it is no calibration, of a later version, or its maps are missing or others than it was written with.
+    SettingsError
+        If it holds a setting that is unknown or out of its range.
+    """
+    merged = Calibration()
+    for each in (path, *more):
+        merged = merged.merged(_load(Path(each)))
+    return merged
+
+
+def _load(path: Path) -> Calibration:
+    try:
+        body = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read: {error}") from error
+    except tomllib.TOMLDecodeError as error:
+        raise FormatError(f"{path}: not valid TOML: {error}") from error
+    version = body.get("kalux_calibration")
+    if not isinstance(version, int):
+        raise FormatError(f"{path}: not a calibration; kalux calibrate makes them")
+    if version > VERSION:
+        raise FormatError(
+            f"{path}: a calibration of version {version}, this kalux reads up to {VERSION}; update kalux"
+        )
+    tables = {
+        name: body.get(name, {}) for name in ("settings", "standard_errors", "measured", "provenance", "maps")
+    }
+    for name, table in tables.items():
+        if not isinstance(table, Mapping):
+            raise FormatError(f"{path}: {name} is not a table")
+    try:
+        return Calibration(
+            tables["settings"],
+            tables["standard_errors"],
+            tables["measured"],
+            _maps(path, tables["maps"]) if tables["maps"] else {},
+            tables["provenance"],
+        )
+    except SettingsError as error:
+        raise SettingsError(f"{path}: {error}") from None
+
+
+def _maps(path: Path, entry: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
+    name = entry.get("file")
+    if not isinstance(name, str) or Path(name).name != name:
+        raise FormatError(f"{path}: maps.file is {name!r}; the name of a file beside it is needed")
+    beside = path.with_name(name)
+    try:
+        data = beside.read_bytes()
+    except OSError as error:
+        raise FormatError(f"{path}: its maps {name} cannot be read: {error.strerror or error}") from error
+    if hashlib.sha256(data).hexdigest() != entry.get("sha256"):
+        raise FormatError(
+            f"{beside}: not the maps that {path.name} was written with (checksum); calibrate again"
+        )
+    with np.load(BytesIO(data), allow_pickle=False) as archive:
+        maps = {key: archive[key] for key in archive.files}
+    shapes = {values.shape for values in maps.values()}
+    if len(shapes) > 1:
+        raise FormatError(f"{beside}: maps of different sizes: {sorted(shapes)}")
+    return maps
+
+
+# --- text -----------------------------------------------------------------------------------------------------
+
+
+def describe_calibration(calibration: Calibration) -> list[tuple[str, str]]:
+    """Names and values with units and standard errors, for people."""
+    rows = []
+    values = [item for group in calibration.settings.values() for item in group.items()]
+    for name, value in [*values, *calibration.measured.items()]:
+        error = calibration.errors.get(name)
+        text = _number(value) + ("" if error is None else f" +- {_number(error)}")
+        unit = UNITS.get(name, "")
+        rows.append((name, f"{text}  ({unit})" if unit else text))
+    for name in sorted(calibration.maps):
+        rows.append((f"map {name}", _map_text(calibration.maps[name])))
+    return rows
+
+
+def _number(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, str) and len(value) > 40:
+        return value[:37] + "..."
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return ", ".join(_number(part) for part in value)
+    return str(value)
+
+
+def _map_text(values: NDArray[Any]) -> str:
+    size = "x".join(str(n) for n in values.shape[::-1])
+    if values.dtype.kind == "b":
+        return f"{size}: {np.count_nonzero(values):,} pixels"
+    low, middle, high = np.quantile(values, [0.05, 0.5, 0.95])
+    return f"{size}: median {middle:.3g}, 5 to 95 % from {low:.3g} to {high:.3g}"

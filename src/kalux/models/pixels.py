@@ -1,0 +1,70 @@
+"""What is known of single event pixels: their thresholds, and which of them are not to be believed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux.errors import InputError
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class PixelCalibration:
+    """A calibration of single pixels, as `kalux.Reconstructor` takes it.
+
+    Attributes
+    ----------
+    on, off
+        (H, W) thresholds of every pixel in units of the nominal ones, positive.
+    on_variance, off_variance
+        (H, W) what is not known of them, in the same units squared.
+    hot
+        (H, W) bool: pixels whose events say nothing and are left out.
+
+    Raises
+    ------
+    InputError
+        If the maps differ in size, are not finite, or factors are not positive.
+    """
+
+    on: Array
+    off: Array
+    on_variance: Array
+    off_variance: Array
+    hot: NDArray[np.bool_]
+
+    def __post_init__(self) -> None:
+        maps = {name: getattr(self, name) for name in ("on", "off", "on_variance", "off_variance", "hot")}
+        for name, values in maps.items():
+            if values.ndim != 2 or values.shape != self.on.shape:
+                raise InputError(f"pixel calibration: {name} is {values.shape}, on is {self.on.shape}")
+            if not np.isfinite(values).all():
+                raise InputError(f"pixel calibration: {name} is not finite")
+            if (values < 0).any() or (name in ("on", "off") and (values == 0).any()):
+                raise InputError(f"pixel calibration: {name} holds values that are not positive")
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(height, width)."""
+        height, width = self.on.shape
+        return height, width
+
+
+def require_size(pixels: PixelCalibration, sensor_size: tuple[int, int]) -> None:
+    """Check that a calibration is of a sensor of this (height, width).
+
+    Raises
+    ------
+    InputError
+        If it is not.
+    """
+    if pixels.shape != sensor_size:
+        (height, width), (rows, columns) = sensor_size, pixels.shape
+        raise InputError(
+            f"the calibration is of {columns}x{rows} pixels, the sensor has {width}x{height}; "
+            "calibrate with a recording of the same sensor and region"
+        )

@@ -1,0 +1,109 @@
+"""I_0 and the variance of an event's step, from recordings whose sensors are known."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from kalux import PRESETS, Recording
+from kalux.calibration import event_model
+from kalux.calibration.event_model import Samples, estimate_event_model, negative_log_likelihood
+from kalux.datasets import SensorSettings, pan, photograph_scene, simulate
+from kalux.pipeline import plan
+from kalux.settings import CameraSettings
+
+THRESHOLDS = (0.2, 0.2)
+
+
+def dark_scene(seed=0):
+    """A pan over texture from 0.005 to 1 of white."""
+    noise = np.random.default_rng(seed).standard_normal((40, 90))
+    for _ in range(3):
+        noise = (noise + np.roll(noise, 1, 0) + np.roll(noise, 1, 1)) / 3
+    share = (noise - noise.min()) / np.ptp(noise)
+    image = 0.005 * 200**share
+    return photograph_scene(image, pan(80), sensor_size=(36, 48), duration=600_000)
+
+
+def recorded(**sensor):
+    sensor = SensorSettings(threshold_on=0.2, threshold_off=0.2, exposure=2_000, **sensor)
+    return simulate(dark_scene(), sensor, seed=1).recording()
+
+
+@pytest.fixture(scope="module")
+def recordings():
+    return {offset: recorded(log_offset=offset) for offset in (0.004, 0.03, 0.06)}
+
+
+@pytest.mark.parametrize(("offset", "allowed"), [(0.004, (0.004, 0.008)), (0.03, (0.03,)), (0.06, (0.06,))])
+def test_the_offset_of_the_events_logarithm_is_found(recordings, offset, allowed):
+    found = estimate_event_model(recordings[offset], CameraSettings(), THRESHOLDS)
+    assert found.log_offset in allowed
+    assert found.samples > 5_000
+
+
+def test_noise_makes_steps_less_certain(recordings):
+    quiet = estimate_event_model(recordings[0.03], CameraSettings(), THRESHOLDS)
+    noisy = estimate_event_model(recorded(log_offset=0.03, noise_rate=20.0), CameraSettings(), THRESHOLDS)
+    assert quiet.step_variance == 0.05
+    assert noisy.step_variance >= 0.2
+
+
+def test_a_delay_is_taken_into_account(recordings):
+    events = next(iter(recordings[0.03].events())).copy()
+    events["t"] += 6_000
+    late = Recording.from_arrays(events, recordings[0.03].frames(), sensor_size=recordings[0.03].sensor_size)
+    assert len(events) == len(recordings[0.03].events())
+    known = estimate_event_model(late, CameraSettings(), THRESHOLDS, delay=6_000)
+    assert known == estimate_event_model(recordings[0.03], CameraSettings(), THRESHOLDS)
+
+
+def test_a_still_scene_says_nothing():
+    still = photograph_scene(np.full((40, 60), 0.5), pan(0), sensor_size=(36, 48), duration=300_000)
+    recording = simulate(still, SensorSettings(noise_rate=1.0), seed=0).recording()
+    assert estimate_event_model(recording, CameraSettings(), THRESHOLDS) is None
+
+
+def test_likelihood_compares_densities_of_the_intensity():
+    """Without events and with little noise in the frames, log(I + I_0) alone would favour a large I_0."""
+    rng = np.random.default_rng(0)
+    steps = rng.integers(-6, 7, 20_000)
+    before = np.exp(rng.uniform(np.log(0.02), np.log(0.9), 20_000))
+    after = (before + 0.03) * np.exp(0.2 * steps + 0.05 * rng.standard_normal(20_000)) - 0.03
+    kept = after > 0
+    samples = Samples(
+        before[kept], after[kept], np.maximum(steps, 0)[kept] * 1.0, np.maximum(-steps, 0)[kept] * 1.0
+    )
+    losses = [
+        negative_log_likelihood(samples, THRESHOLDS, offset, 0.05, 1e-3, 0.02, 1 / 6)
+        for offset in event_model.LOG_OFFSETS
+    ]
+    assert event_model.LOG_OFFSETS[int(np.argmin(losses))] == 0.03
+
+
+def test_a_plan_fills_in_what_is_not_given(recordings):
+    recording = recordings[0.06]
+    made = plan(recording, at="frames")
+    assert made.settings.camera.log_offset == made.event_model.log_offset == 0.06
+    assert made.settings.events.step_variance == made.event_model.step_variance
+    default = PRESETS["default"]
+    given = dataclasses.replace(
+        default,
+        camera=dataclasses.replace(default.camera, log_offset=0.02),
+        events=dataclasses.replace(default.events, step_variance=0.3),
+    )
+    kept = plan(recording, at="frames", settings=given)
+    assert kept.event_model is None
+    assert (kept.settings.camera.log_offset, kept.settings.events.step_variance) == (0.02, 0.3)
+
+
+def test_where_it_cannot_be_told_the_usual_is_written_down(recordings):
+    recording = recordings[0.03]
+    silent = Recording.from_arrays(
+        next(iter(recording.events()))[:0], recording.frames(), sensor_size=recording.sensor_size
+    )
+    made = plan(silent, at="frames")
+    assert made.event_model is None
+    assert (made.settings.camera.log_offset, made.settings.events.step_variance) == (0.03, 0.2)
