@@ -85,7 +85,7 @@ def edi(pixel, k, log_frame, on, off):
 def paper(pixel, settings, times, on, off):
     """L(t) and P(t) of one pixel, equations (6) to (21)."""
     c, ev, fl = settings.camera, settings.events, settings.filter
-    i0, count = c.log_offset, len(pixel.starts)
+    i0, count = c.offset, len(pixel.starts)
     r_bar = [w**2 / c.confidence / max(1.0, c.weight_floor) for w in pixel.white]  # (6), linear: f^w = 1
     log_frame = [
         np.log(i + i0) - r / (2 * (i + i0) ** 2)
@@ -184,7 +184,7 @@ def paper(pixel, settings, times, on, off):
 def bridged(pixel, settings, times, on, off):
     """L(t) and P(t) of one pixel, docs/equations.md, K1 to K5 and K7."""
     c, ev = settings.camera, settings.events
-    i0, count, c2 = c.log_offset, len(pixel.starts), on * off
+    i0, count, c2 = c.offset, len(pixel.starts), on * off
     scale_on, scale_off = 1.0, 1.0
     var_on = var_off = ev.threshold_spread**2
     learned = []
@@ -216,7 +216,7 @@ def bridged(pixel, settings, times, on, off):
         n_on, n_off = counts(a, b)
         mismatch = second[0] - first[0] - (on * scale_on * n_on - off * scale_off * n_off)
         total = first[1] + second[1] + var_on * (on * n_on) ** 2 + var_off * (off * n_off) ** 2
-        total += ev.step_variance * c2 * (n_on + n_off) + ev.quantisation_variance * c2
+        total += ev.step_noise * c2 * (n_on + n_off) + ev.quantisation_variance * c2
         intervals.append((a, b, first, second, scale_on, scale_off, var_on, var_off, mismatch / total))
         gain_on, gain_off = var_on * on * n_on / total, -var_off * off * n_off / total  # K2
         scale_on = min(max(scale_on + gain_on * mismatch, 0.3), 3.0)
@@ -237,7 +237,7 @@ def bridged(pixel, settings, times, on, off):
             return prior
         (t_on, t_off), (n_on, n_off) = counts(a, known_until), counts(a, b)
         shared = left[1] + v_on * on**2 * t_on * n_on + v_off * off**2 * t_off * n_off
-        shared += ev.step_variance * c2 * (t_on + t_off) + ev.quantisation_variance * c2 * (t - a) / (b - a)
+        shared += ev.step_noise * c2 * (t_on + t_off) + ev.quantisation_variance * c2 * (t - a) / (b - a)
         return prior + shared * gain
 
     def rate(interval, known_until):  # K4
@@ -246,11 +246,11 @@ def bridged(pixel, settings, times, on, off):
             # All of the last frame's information, spread over the last interval.
             spread = (pixel.middles[-1] - pixel.middles[-2]) * US if count > 1 else 0.04
             return (
-                1 / (left[1] + ev.step_variance * c2 * sum(counts(a, known_until))) + 1 / UNMEASURED
+                1 / (left[1] + ev.step_noise * c2 * sum(counts(a, known_until))) + 1 / UNMEASURED
             ) / spread
         forward = UNMEASURED if left is None else left[1]
-        forward += ev.step_variance * c2 * sum(counts(a, known_until))
-        backward = right[1] + ev.step_variance * c2 * sum(counts(known_until, b))
+        forward += ev.step_noise * c2 * sum(counts(a, known_until))
+        backward = right[1] + ev.step_noise * c2 * sum(counts(known_until, b))
         return 0.5 / ((b - a) * US) * (1 / forward + 1 / backward)
 
     value = augmented(intervals[0], begin, begin)
@@ -279,7 +279,7 @@ def bridged(pixel, settings, times, on, off):
             signal = 1 / (1 + 9 * ev.noise_rate * (t - near) * US)  # K5
             # Several events may share a time: this one alone moves L^A by its own step.
             step = own_step(intervals[index], polarity, on, off, ev, c2, counts)
-            q = c2 * (ev.step_variance + signal * (1 - signal))
+            q = c2 * (ev.step_noise + signal * (1 - signal))
             state = (value + signal * step, variance + q)
             at = t
 
@@ -301,19 +301,19 @@ def own_step(interval, polarity, on, off, ev, c2, counts):
         return nominal
     n_on, n_off = counts(a, b)
     shared = v_on * on**2 * n_on if polarity else v_off * off**2 * n_off
-    return nominal + gain * (shared + ev.step_variance * c2)
+    return nominal + gain * (shared + ev.step_noise * c2)
 
 
 def first_variance(interval, counts, ev, c2, settings):
     """P at the start: that of L^A, or the setting where the first frame is clipped."""
     a, b, _, right, *_ = interval
-    variance = right[1] + ev.step_variance * c2 * sum(counts(a, b))
+    variance = right[1] + ev.step_noise * c2 * sum(counts(a, b))
     return settings.filter.initial_variance if variance >= UNMEASURED else variance
 
 
 def complementary(pixel, settings, times, on, off):
     """L(t) of one pixel: dL/dt = e - alpha (L - L^F), frames held from the middle of their exposure."""
-    i0, alpha = settings.camera.log_offset, 2 * np.pi * settings.filter.cutoff
+    i0, alpha = settings.camera.offset, 2 * np.pi * settings.filter.cutoff
     frames = [np.log(i + i0) for i in pixel.intensity]
     out = []
     for t in times:
@@ -334,7 +334,7 @@ def complementary(pixel, settings, times, on, off):
 
 def intensity(log_intensity, variance, settings, white, stretch):
     """Read-out, K6."""
-    i0, scale2 = settings.camera.log_offset, settings.filter.highlight_scale**2
+    i0, scale2 = settings.camera.offset, settings.filter.highlight_scale**2
     top = np.log(white + i0)
     if scale2 > 0 and log_intensity > top:
         excess = (log_intensity - top) * scale2 / (scale2 + min(variance, 0.3))

@@ -76,12 +76,12 @@ def test_engine_agrees_with_the_oracle(name, data):
     for i, t in enumerate(times):
         image = engine.read(t)
         k = max([j for j, f in enumerate(frames) if engine_node(f, name) < t], default=-1)
-        white = white_at(t, k, frames, name, chosen.camera.log_offset)
+        white = white_at(t, k, frames, name, chosen.camera.offset)
         stretch = chosen.events.threshold_spread**2
         level = np.vectorize(lambda v, p: naive.intensity(v, p, chosen, white, stretch))(  # noqa: B023
             expected[i], np.nan_to_num(variance[i])
         )
-        offset = chosen.camera.log_offset
+        offset = chosen.camera.offset
         np.testing.assert_allclose(np.log(image.intensity + offset), np.log(level + offset), atol=1e-4)
         if name != "cf":
             np.testing.assert_allclose(image.variance, variance[i], rtol=1e-4)

@@ -280,8 +280,9 @@ def test_images_before_the_damage_are_returned(monkeypatch):
     """Events that run backwards late in a file: what came before is given, then the error with the place."""
     monkeypatch.setattr("kalux.recording.CHUNK_EVENTS", 10)
     stream = random_stream(6)
-    # The delay is given: to estimate it reads ahead, and would find the damage before the first image.
-    chosen = altered(PRESETS["default"], "events", delay=0)
+    # All is given: to estimate it reads ahead, and would find the damage before the first image.
+    chosen = altered(PRESETS["default"], "events", delay=0, step_variance=0.2)
+    chosen = altered(chosen, "camera", log_offset=0.03)
     good = list(reconstruct(recording(6), at="frames", settings=chosen))
     place = int(stream.events["t"].searchsorted(stream.frames[2].exposure_end)) + 12
     broken = stream.events.copy()

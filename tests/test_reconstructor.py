@@ -411,7 +411,7 @@ def test_one_frame_is_held(variant, lookahead):
 @pytest.mark.parametrize(("polarity", "step"), [(1, 0.25), (0, -0.2)])
 def test_one_frame_and_one_event(variant, lookahead, polarity, step):
     """A step of the threshold in log(I + I_0); a little less where a lonely event may be noise."""
-    offset = VARIANTS[variant].camera.log_offset
+    offset = VARIANTS[variant].camera.offset
     live = engine((1, 1), variant, lookahead)
     live.push_frame(frame(100, 0, 10_000))
     live.push_events(pixel_events([12_000], [polarity]))

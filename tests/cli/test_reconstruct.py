@@ -152,6 +152,7 @@ class TestWhatIsSaid:
             "recording",
             "thresholds",
             "delay",
+            "events",
             "exposure",
             "filter",
             "images",
