@@ -32,10 +32,14 @@ class Progress:
         How many events there will be, where only those are counted; 0: unknown.
     quiet
         Draw nothing.
+    unit
+        What is counted as ``images``, where that is something else.
     """
 
-    def __init__(self, title: str, *, images: int = 0, events: int = 0, quiet: bool = False) -> None:
-        self._title = title
+    def __init__(
+        self, title: str, *, images: int = 0, events: int = 0, quiet: bool = False, unit: str = "images"
+    ) -> None:
+        self._title, self._unit = title, unit
         self._total_images, self._total_events = images, events
         self.images = self.events = 0
         self._quiet = quiet
@@ -78,7 +82,9 @@ class Progress:
         self._draw()
 
     def _draw(self) -> None:
-        text = progress_text(self.images, self._total_images, self.events, self._total_events, self.seconds)
+        text = progress_text(
+            self.images, self._total_images, self.events, self._total_events, self.seconds, self._unit
+        )
         if self._bar is not None:
             done = self.images if self._total_images else self.events
             self._bar.update(self._bar.task_ids[0], completed=done, text=text)
@@ -87,14 +93,16 @@ class Progress:
             print(f"kalux: {self._title}: {text}", file=sys.stderr, flush=True)
 
 
-def progress_text(images: int, total_images: int, events: int, total_events: int, seconds: float) -> str:
+def progress_text(
+    images: int, total_images: int, events: int, total_events: int, seconds: float, unit: str = "images"
+) -> str:
     """Such as ``120/360 images, 85 images/s, 4.2M events/s, 0:03 left``."""
     seconds = max(seconds, 1e-3)
     parts = []
     if total_images:
-        parts.append(f"{images}/{total_images} images")
+        parts.append(f"{images}/{total_images} {unit}")
         if images:
-            parts.append(f"{short_number(images / seconds)} images/s")
+            parts.append(f"{short_number(images / seconds)} {unit}/s")
     else:
         parts.append(f"{short_number(events)} events")
     if events or not total_images:
