@@ -204,7 +204,7 @@ def _run(job: Job) -> Finished:
     record = {
         "layout": LAYOUT,
         "key": job.key,
-        "sequence": _described(job),
+        "sequence": described(job),
         "method": {
             "name": job.method,
             "label": method.label,
@@ -223,7 +223,8 @@ def _run(job: Job) -> Finished:
     )
 
 
-def _described(job: Job) -> dict[str, Any]:
+def described(job: Job) -> dict[str, Any]:
+    """The sequence of a job, as plain values."""
     sequence = job.sequence
     options = {
         k: str(v) if isinstance(v, Path) else v for k, v in dataclasses.asdict(sequence.options).items()

@@ -80,7 +80,7 @@ box-shadow:0 0 0 1px #000;pointer-events:none}
 .key{margin:.8rem 0}
 @media(max-width:600px){main,header{padding:0 14px}header{padding-top:22px}h1{font-size:1.4rem}
 body{font-size:15px}.pictures{--least:150px;gap:.6rem}th,td{padding:.25rem .4rem}
-th[scope=row]{white-space:normal;max-width:8.2rem;line-height:1.25}}
+th[scope=row]{white-space:normal;min-width:7.4rem;line-height:1.25}}
 @media print{.compare,fieldset{display:none}}
 """
 

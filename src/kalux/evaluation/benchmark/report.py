@@ -147,8 +147,8 @@ def _metric_notes(results: Results) -> str:
     return (
         '<p class="soft">MSE of linear intensity. 1 is white: a saturated pixel at the median exposure (ground truth), '
         "or the 99.5th percentile of all frames (held-out frames). SSIM of Wang et al., 11 × 11 Gaussian windows. "
-        "log-MSE of log(I + 0.02). Nothing is clipped. A dash: the method looks at the very frames it would be compared "
-        "with."
+        "log-MSE of log(I + 0.02). Nothing is clipped. A dash: the method looks at the very frames it would be "
+        "compared with."
         f"{quality if with_q else ''}</p>"
     )
 
@@ -295,8 +295,9 @@ def _camera(results: Results) -> str:
         '<section id="camera"><h2>The camera model in use (Figure 2 of the paper)</h2>'
         f'<ul class="legend">{"".join(legend)}</ul>'
         f'<div class="charts"><figure>{first}<figcaption>(a) Weighting function, equation (5). Where kalux’s default '
-        f"takes a pixel as clipped it has no weight.</figcaption></figure><figure>{second}<figcaption>(b) Covariance of the "
-        "frame’s noise, equation (6); it ends where a pixel counts as clipped, or is capped by the paper’s floor of "
+        "takes a pixel as clipped it has no weight.</figcaption></figure>"
+        f"<figure>{second}<figcaption>(b) Covariance of the frame’s noise, equation (6); it ends where a pixel counts "
+        "as clipped, or is capped by the paper’s floor of "
         "f<sup>w</sup>.</figcaption></figure></div></section>"
     )
 

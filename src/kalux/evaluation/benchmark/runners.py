@@ -131,7 +131,7 @@ def on_dask(jobs: Sequence[Job], address: str) -> Outcomes:
     futures: dict[Any, Job] = {}
     try:
         futures = {client.submit(run_job, job, pure=False): job for job in jobs}
-        for future in distributed.as_completed(futures):
+        for future in distributed.as_completed(futures, loop=client.loop):
             yield futures[future], _outcome(future)
             future.release()
     finally:

@@ -148,7 +148,7 @@ def gather(sets: Iterable[str | Path], options: Options | None = None) -> Benchm
     found: list[Sequence] = []
     titles, methods = [], []
     for given in sets:
-        path = Path(given).resolve()
+        path = Path(given).absolute()
         if path.suffix.lower() == ".toml":
             listed = load(path)
             titles.append(listed.title)
@@ -222,8 +222,8 @@ def _listed(where: str, folder: Path, entry: Any) -> Sequence:
     if "truth" in options:
         if "hold_out_frames" in options:
             raise InputError(f"{where}: truth and hold_out_frames exclude each other; give one")
-        options["truth"] = (folder / options["truth"]).resolve()
-    path = (folder / entry["path"]).resolve()
+        options["truth"] = (folder / options["truth"]).absolute()
+    path = (folder / entry["path"]).absolute()
     plain = _sequence(path, Options(**options))
     return dataclasses.replace(
         plain,

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.errors import FormatError, OutputError
-from kalux.evaluation.benchmark.jobs import Finished, Job
+from kalux.evaluation.benchmark.jobs import Finished, Job, described
 from kalux.writers.files import output_errors, uninterrupted, write_whole
 
 FOLDER: Final = "jobs"
@@ -58,14 +58,14 @@ class Store:
             write_whole(path, record.encode())
 
     def record(self, job: Job) -> dict[str, Any] | None:
-        """The record of a job, if it is done with this very key."""
+        """The record of a job, if it is done with this very key; its title and group may have changed since."""
         path = self.path(job)
         if not path.with_suffix(".npz").is_file():
             return None
         with contextlib.suppress(OSError, ValueError):
             found = json.loads(path.read_text(encoding="utf-8"))
             if isinstance(found, dict) and found.get("key") == job.key:
-                return found
+                return {**found, "sequence": described(job)}
         return None
 
     def pictures(self, job: Job) -> dict[str, NDArray[Any]]:
