@@ -60,7 +60,7 @@ figure{margin:0}
 .pictures img,.stage img{display:block;width:100%;height:auto;background:#000}
 img.small{image-rendering:pixelated}
 .pictures figcaption{padding-top:.2rem}
-.pictures figcaption b{color:var(--ink);font-weight:600}
+.pictures figcaption b{color:var(--ink);font-weight:600;display:block}
 fieldset{border:0;padding:0;margin:.8rem 0;display:flex;flex-wrap:wrap;gap:.3rem 1.1rem;align-items:center}
 legend{float:left;padding:0 .9rem 0 0;font-size:.9rem}
 label{font-size:.9rem}
