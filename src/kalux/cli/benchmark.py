@@ -144,10 +144,11 @@ def _work(plan: Plan, store: Store, jobs: list[Job], options: argparse.Namespace
     left = dict.fromkeys(jobs)
     if not jobs:
         return failed
-    title = "benchmark"
+    # Elsewhere than on a terminal, the line of every job is enough.
+    no_bar = options.quiet or not sys.stderr.isatty()
     try:
         with (
-            Progress(title, images=len(jobs), quiet=options.quiet, unit="jobs") as progress,
+            Progress("benchmark", images=len(jobs), quiet=no_bar, unit="jobs") as progress,
             contextlib.closing(_outcomes(jobs, options)) as outcomes,
         ):
             for job, outcome in outcomes:
@@ -158,7 +159,7 @@ def _work(plan: Plan, store: Store, jobs: list[Job], options: argparse.Namespace
                 del left[job]
                 progress.add(images=1)
                 if not options.quiet:
-                    _tell(len(jobs) - len(left), len(jobs), job, outcome)
+                    _tell(len(jobs) - len(left), len(jobs), progress.seconds, job, outcome)
     except KeyboardInterrupt as interrupt:
         interrupt.add_note(_interrupted(plan, list(left), options.out))
         raise
@@ -173,16 +174,15 @@ def _outcomes(jobs: list[Job], options: argparse.Namespace) -> Outcomes:
     return runners.in_processes(jobs, options.processes or len(os.sched_getaffinity(0)))
 
 
-def _tell(number: int, total: int, job: Job, outcome: Outcome) -> None:
+def _tell(number: int, total: int, seconds: float, job: Job, outcome: Outcome) -> None:
+    from kalux.cli.progress import clock
     from kalux.evaluation.benchmark.jobs import Failed
 
-    text = (
-        f"failed: {outcome.message}"
-        if isinstance(outcome, Failed)
-        else f"{outcome.record['seconds']['all']:.1f} s"
-    )
+    found = "failed" if isinstance(outcome, Failed) else f"{outcome.record['seconds']['all']:.1f} s"
+    rest = f", {clock(seconds / number * (total - number))} left" if number < total else ""
+    why = f": {outcome.message}" if isinstance(outcome, Failed) else ""
     with contextlib.suppress(OSError):
-        print(f"kalux: {number}/{total} {job.name}: {text}", file=sys.stderr, flush=True)
+        print(f"kalux: {number}/{total} {job.name}: {found}{rest}{why}", file=sys.stderr, flush=True)
 
 
 def _interrupted(plan: Plan, left: list[Job], out: Path) -> str:

@@ -78,3 +78,10 @@ def test_without_a_scheduler_the_address_is_named(two):
     pytest.importorskip("distributed")
     with pytest.raises(InputError, match="nowhere: no scheduler answers"):
         next(on_dask(two, "nowhere"))
+
+
+def test_a_cluster_that_gives_up_a_job_is_told():
+    class Future:
+        status = "cancelled"
+
+    assert "has given it up" in runners._outcome(Future()).message

@@ -141,6 +141,8 @@ def on_dask(jobs: Sequence[Job], address: str) -> Outcomes:
 
 
 def _outcome(future: Any) -> Outcome:
+    if future.status in ("cancelled", "lost"):
+        return Failed("the Dask scheduler has given it up, or has gone", is_bug=False)
     error = future.exception()
     if error is None:
         outcome: Outcome = future.result()
