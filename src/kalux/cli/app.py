@@ -6,13 +6,32 @@ import sys
 import traceback
 from collections.abc import Sequence
 
-from kalux.cli import convert, demo, evaluate, info, reconstruct, simulate
+from kalux.cli import (
+    benchmark,
+    convert,
+    demo,
+    evaluate,
+    info,
+    reconstruct,
+    simulate,
+)
 from kalux.cli.parser import Parser, UsageError, normalised
 from kalux.cli.signals import termination_as_interrupt
 from kalux.cli.terminal import close_output, error_line
 from kalux.errors import InternalError, KaluxError
 
 DONE, BUG, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+
+COMMANDS = (
+    info,
+    reconstruct,
+    convert,
+    evaluate,
+    benchmark,
+    simulate,
+    demo,
+)
+"""The modules of the commands, in the order of the help."""
 
 _DESCRIPTION = """\
 HDR video with per-pixel uncertainty from cameras that give events and frames.
@@ -22,6 +41,7 @@ commands:
   reconstruct  make images or a video from a recording
   convert      copy a recording of any format into one kalux HDF5 file
   evaluate     compare methods with ground truth, or with frames held out
+  benchmark    the same for many recordings, with a report
   simulate     make a recording with ground truth from an HDR photograph, images or a video
   demo         simulate a scene, reconstruct it, and compare with the truth
 
@@ -98,6 +118,6 @@ def make_parser() -> Parser:
     parser = Parser(prog="kalux", description=_DESCRIPTION, epilog=_EXAMPLES, usage="kalux COMMAND ...")
     parser.add_version()
     commands = parser.add_subparsers(dest="command", prog="kalux", parser_class=Parser)
-    for command in (info, reconstruct, convert, evaluate, simulate, demo):
+    for command in COMMANDS:
         command.add_command(commands)
     return parser

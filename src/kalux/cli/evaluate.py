@@ -7,7 +7,6 @@ import csv
 import dataclasses
 import io
 import json
-import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -269,6 +268,7 @@ def as_csv(path: str, protocol: str, found: list[Scores], consistent: list[BlurC
 def as_json(path: str, protocol: str, found: list[Scores], consistent: list[BlurConsistency | None]) -> str:
     """The same, and the scores of every image; infinite values (PSNR of equal images) as null."""
     import kalux
+    from kalux.evaluation.scores import finite_or_none
 
     rows = []
     for scores, consistency in zip(found, consistent, strict=True):
@@ -276,7 +276,7 @@ def as_json(path: str, protocol: str, found: list[Scores], consistent: list[Blur
         row["adjustments"] = scores.adjustments()
         row["per_image"] = [dataclasses.asdict(image) for image in scores.images]
         rows.append(row)
-    return json.dumps(_finite({"kalux": kalux.__version__, "methods": rows}), indent=1) + "\n"
+    return json.dumps(finite_or_none({"kalux": kalux.__version__, "methods": rows}), indent=1) + "\n"
 
 
 def _row(path: str, protocol: str, scores: Scores, consistency: BlurConsistency | None) -> dict[str, Any]:
@@ -293,11 +293,3 @@ def _row(path: str, protocol: str, scores: Scores, consistency: BlurConsistency 
         "clipped": scores.clipped,
         "negative": scores.negative,
     }
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _finite(part) for key, part in value.items()}
-    if isinstance(value, list):
-        return [_finite(part) for part in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

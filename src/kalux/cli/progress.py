@@ -33,7 +33,7 @@ class Progress:
     quiet
         Draw nothing.
     unit
-        What is counted as images.
+        What is counted as ``images``, where that is something else.
     """
 
     def __init__(

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain, pairwise
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,21 @@ Image = NDArray[np.float32]
 Times = NDArray[np.int64]
 
 
+class Estimated(NamedTuple):
+    """An image, and how sure a method is of it.
+
+    Attributes
+    ----------
+    intensity
+        (H, W), linear.
+    variance
+        (H, W), of log(intensity + I_0) with the method's own I_0; None: the method does not say.
+    """
+
+    intensity: Image
+    variance: Image | None
+
+
 @dataclass(frozen=True)
 class Method:
     """A way to make images.
@@ -42,11 +57,27 @@ class Method:
         From a recording and ascending times (N,) int64, us, to N images.
     needs_held_out
         Whether it looks at the frames before and after, which would be unfair where they are not held out.
+    estimates
+        As ``images``, with the variance of every image; None: the method has none.
+    log_offset
+        I_0 of these variances.
+    settings
+        Of `kalux.reconstruct`, where that makes the images.
     """
 
     label: str
     images: Callable[[Recording, Times], Iterable[Image]]
     needs_held_out: bool = False
+    estimates: Callable[[Recording, Times], Iterable[Estimated]] | None = None
+    log_offset: float = 0.0
+    settings: Settings | None = None
+
+    def estimated(self, recording: Recording, times: Times) -> Iterator[Estimated]:
+        """The images at ascending times (us), with their variances where the method has them."""
+        if self.estimates is not None:
+            yield from self.estimates(recording, times)
+        else:
+            yield from (Estimated(image, None) for image in self.images(recording, times))
 
 
 def hold_last_frame(recording: Recording, times: Times, *, response: str = "linear") -> Iterator[Image]:
@@ -97,6 +128,14 @@ def filtered(
         yield image.intensity
 
 
+def filtered_estimates(
+    recording: Recording, times: Times, *, settings: Settings, smooth: bool = False
+) -> Iterator[Estimated]:
+    """As `filtered`, with the variances."""
+    for image in reconstruct(recording, times=times, settings=settings, smooth=smooth):
+        yield Estimated(image.intensity, image.variance)
+
+
 _FILTERS: Final = {
     "cf": "CF",
     "iccv2021": "AKF iccv2021",
@@ -122,7 +161,14 @@ def methods(response: str = "linear") -> dict[str, Method]:
 
 def filter_method(label: str, settings: Settings, *, smooth: bool = False) -> Method:
     """`kalux.reconstruct` with these settings as a method."""
-    return Method(label, partial(filtered, settings=settings, smooth=smooth))
+    with_variance = partial(filtered_estimates, settings=settings, smooth=smooth)
+    return Method(
+        label,
+        partial(filtered, settings=settings, smooth=smooth),
+        estimates=None if settings.filter.kind == "cf" else with_variance,
+        log_offset=settings.camera.log_offset,
+        settings=settings,
+    )
 
 
 def chosen_methods(

@@ -22,6 +22,7 @@ from kalux.evaluation.pairs import Array
 from kalux.evaluation.scores import Pair, Scores, score
 from kalux.frames import Frame
 from kalux.recording import Recording
+from kalux.settings import CameraSettings
 
 READS: Final = 5
 """Reads across the exposure of a held-out frame."""
@@ -163,7 +164,7 @@ def evaluate_held_out(
         Whatever the method or the metrics say.
     """
     return score(
-        _pairs(held, method, clip),
+        held_out_pairs(held, method, clip=clip),
         method=method.label,
         protocol=held.described(),
         data_range=1.0,
@@ -174,14 +175,25 @@ def evaluate_held_out(
     )
 
 
-def _pairs(held: HeldOut, method: Method, clip: bool) -> Iterator[Pair]:
-    images = means_of(method.images(held.kept, held.times.ravel()), held.times.shape[1])
+def held_out_pairs(held: HeldOut, method: Method, *, clip: bool = False) -> Iterator[Pair]:
+    """A method's images with the frames that were held out; ``clip`` as in `evaluate_held_out`.
+
+    The variance of the mean of the reads of an exposure is taken as the mean of theirs: reads a few milliseconds apart
+    share their errors.
+    """
+    estimates = method.estimated(held.kept, held.times.ravel())
+    read = (np.stack([part for part in estimate if part is not None]) for estimate in estimates)
     chosen = {*held.compared.tolist()}
     frames = (frame for i, frame in enumerate(held.whole.frames()) if i in chosen)
-    for frame, image in zip(frames, images, strict=True):
-        if clip:
-            image = clipped_as(image, frame, held.reference_exposure)
-        yield Pair(frame.middle, image, linear_frame(frame, held.reference_exposure, held.response))
+    for frame, means in zip(frames, means_of(read, held.times.shape[1]), strict=True):
+        image = clipped_as(means[0], frame, held.reference_exposure) if clip else means[0]
+        yield Pair(
+            frame.middle,
+            image,
+            linear_frame(frame, held.reference_exposure, held.response),
+            variance=means[1] if len(means) == 2 else None,
+            clipped=frame.normalised() >= CameraSettings().saturation,
+        )
 
 
 def clipped_as(image: Array, frame: Frame, reference: int) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
@@ -137,12 +138,18 @@ class Pair(NamedTuple):
         (H, W) linear intensity.
     mask
         (H, W) bool, True = compared; None: all.
+    variance
+        (H, W), what the method says of its log(intensity + I_0); None: nothing.
+    clipped
+        (H, W) bool, True where the reference itself is clipped; None: nowhere.
     """
 
     t: int
     test: NDArray[Any]
     reference: NDArray[Any]
     mask: NDArray[np.bool_] | None = None
+    variance: NDArray[Any] | None = None
+    clipped: NDArray[np.bool_] | None = None
 
 
 def score(
@@ -166,7 +173,7 @@ def score(
         If scikit-image is not installed.
     """
     images, negative = [], 0
-    for t, test, reference, mask in pairs:
+    for t, test, reference, mask, *_ in pairs:
         test, reference = np.asarray(test) / scale, np.asarray(reference) / scale
         try:
             images.append(score_image(t, test, reference, data_range, mask=mask, hdr_vdp=hdr_vdp))
@@ -208,6 +215,15 @@ def _quality(test: NDArray[np.float64], reference: NDArray[np.float64], mask: An
         reference = np.where(mask, reference, 0.0)
         test = np.where(mask, test, reference)
     return hdrvdp(DISPLAY_LUMINANCE * test, DISPLAY_LUMINANCE * reference).Q
+
+
+def finite_or_none(value: Any) -> Any:
+    """Plain values for JSON, which has no infinity (PSNR of equal images) and no NaN: those are None."""
+    if isinstance(value, dict):
+        return {key: finite_or_none(part) for key, part in value.items()}
+    if isinstance(value, list):
+        return [finite_or_none(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def require_dependencies() -> None:

@@ -131,21 +131,21 @@ def evaluate_truth(
     KaluxError
         Whatever the method or the metrics say.
     """
-
-    def pairs() -> Iterator[Pair]:
-        made = method.images(recording, reference.times)
-        for i, image in enumerate(made):
-            mask = None if reference.masks is None else reference.masks[i]
-            yield Pair(int(reference.times[i]), image, reference.images[i], mask)
-
     return score(
-        pairs(),
+        truth_pairs(recording, reference, method),
         method=method.label,
         protocol=reference.described(),
         data_range=reference.data_range,
         hdr_vdp=hdr_vdp,
         on_image=on_image,
     )
+
+
+def truth_pairs(recording: Recording, reference: Reference, method: Method) -> Iterator[Pair]:
+    """A method's images with the reference images, and with its variances where it has them."""
+    for i, (image, variance) in enumerate(method.estimated(recording, reference.times)):
+        mask = None if reference.masks is None else reference.masks[i]
+        yield Pair(int(reference.times[i]), image, reference.images[i], mask, variance)
 
 
 def load_truth(path: Path) -> tuple[GroundTruth, NDArray[np.bool_] | None]:

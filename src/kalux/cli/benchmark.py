@@ -1,0 +1,246 @@
+"""``kalux benchmark``: many sequences by many methods, one table and one report."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from kalux.cli.parser import Parser, UsageError, whole
+from kalux.cli.terminal import error_line, say
+
+if TYPE_CHECKING:
+    from kalux.evaluation.benchmark.jobs import Job, Outcome
+    from kalux.evaluation.benchmark.results import Plan, Results
+    from kalux.evaluation.benchmark.runners import Outcomes
+    from kalux.evaluation.benchmark.store import Store
+
+_DESCRIPTION = """\
+Compare methods on many recordings: each with its ground truth or, where it has none, with frames held out.
+Writes results.csv, results.json and report.html to the folder OUT. Run again after an interrupt or an error,
+the same command does only what is missing. Needs the extra kalux[evaluation].
+
+SET is a recording, a folder with recordings, or a TOML file that lists sequences (docs/benchmark.md).
+methods: as of kalux evaluate; without --methods hold, mean (where frames are held out), edi, cf, iccv2021,
+default, smooth."""
+
+_EXAMPLES = """\
+examples:
+  kalux benchmark recordings/ -o results
+  kalux benchmark pan.mat night_drive.aedat4 --methods hold,cf,default --hdrvdp -o results
+  kalux benchmark paper.toml --hdrvdp --processes 8 -o results
+  kalux benchmark paper.toml --dask tcp://10.0.0.5:8786 -o results
+
+a TOML file:
+  title = "My sequences"
+  [[sequence]]
+  path = "slider_depth"                # relative to the file
+  exposure = 10000                     # us; also: name, title, group, stamp, response
+  [[sequence]]
+  path = "pan.mat"
+  truth = "pan_hdr.npz"                # or hold_out_frames = 2"""
+
+CSV, JSON, REPORT = "results.csv", "results.json", "report.html"
+_LISTED: Final = 6
+
+
+def add_command(commands: Any) -> None:
+    """Add ``benchmark`` to the parser."""
+    parser: Parser = commands.add_parser(
+        "benchmark",
+        description=_DESCRIPTION,
+        epilog=_EXAMPLES,
+        usage="kalux benchmark SET... -o OUT [flags]",
+    )
+    group = parser.add_argument_group("sequences")
+    group.add_argument("sets", nargs="+", metavar="SET", help="recordings, folders of them, TOML files")
+    group.add_argument(
+        "--exposure", type=whole, metavar="US", help="exposure time, us, of recordings that store none"
+    )
+    group.add_argument(
+        "--stamp",
+        choices=("start", "middle", "end"),
+        help="with --exposure: what a frame's time stamp marks (default start)",
+    )
+    group.add_argument("--response", default="linear", help="of the cameras: linear, srgb or gamma:EXPONENT")
+    group.add_argument(
+        "--hold-out-frames",
+        type=whole,
+        metavar="N",
+        help="hold out every N-th frame even where there is truth",
+    )
+    group = parser.add_argument_group("what is computed")
+    group.add_argument("--methods", metavar="A,B", help="names, in this order, with commas")
+    group.add_argument("--hdrvdp", action="store_true", help="HDR-VDP's Q as well, 0.2 s per VGA image")
+    group = parser.add_argument_group("where")
+    one = group.add_mutually_exclusive_group()
+    one.add_argument(
+        "--processes", type=whole, metavar="N", help="of this machine (default: as many as it has cores)"
+    )
+    one.add_argument(
+        "--dask", metavar="ADDRESS", help="scheduler of a Dask cluster whose workers see the recordings"
+    )
+    group = parser.add_argument_group("output")
+    group.add_argument("-o", "--out", type=Path, required=True, metavar="OUT", help="folder")
+    group.add_argument("--overwrite", action="store_true", help="run all again, also what is done")
+    group.add_argument("--quiet", action="store_true", help="no progress")
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace, command: list[str]) -> None:
+    """Run the command."""
+    from kalux.evaluation.benchmark import store as stores
+    from kalux.evaluation.benchmark.results import Results, make_plan
+    from kalux.evaluation.benchmark.sequences import Options, gather
+    from kalux.evaluation.scores import require_dependencies
+
+    if options.stamp is not None and options.exposure is None:
+        raise UsageError("--stamp says what a frame's time marks for --exposure; give --exposure, too")
+    if options.processes is not None and options.processes < 1:
+        raise UsageError(f"--processes {options.processes}: at least 1 is needed")
+    require_dependencies()
+    common = Options(
+        exposure=options.exposure,
+        stamp=options.stamp or "start",
+        response=options.response,
+        hold_out_frames=options.hold_out_frames,
+    )
+    names = None if options.methods is None else [n.strip() for n in options.methods.split(",") if n.strip()]
+    plan = make_plan(gather(options.sets, common), names, hdr_vdp=options.hdrvdp)
+    stores.prepare(options.out)
+    store = stores.Store(options.out)
+    records = (
+        {} if options.overwrite else {job: r for job in plan.jobs if (r := store.record(job)) is not None}
+    )
+    missing = [job for job in plan.jobs if job not in records]
+    if records and not options.quiet:
+        error_line(f"{len(records)} of {len(plan.jobs)} jobs are done already, in {options.out}")
+    failed = _work(plan, store, missing, options)
+    done = {
+        job: record for job in plan.jobs if (record := store.record(job)) is not None and job not in failed
+    }
+    results = Results(
+        plan,
+        {(job.sequence.name, job.method): record for job, record in done.items()},
+        {**plan.failures, **{(job.sequence.name, job.method): outcome for job, outcome in failed.items()}},
+    )
+    _write(options.out, results, store)
+    for line in table(results):
+        say(line)
+    say(f"wrote {options.out / CSV}, {options.out / JSON}, {options.out / REPORT}")
+    _raise_failures(results, options.out)
+
+
+def _work(plan: Plan, store: Store, jobs: list[Job], options: argparse.Namespace) -> dict[Job, Any]:
+    """Run jobs and keep what they find; returns the failures."""
+    from kalux.cli.progress import Progress
+    from kalux.evaluation.benchmark.jobs import Failed
+
+    failed: dict[Job, Failed] = {}
+    left = dict.fromkeys(jobs)
+    if not jobs:
+        return failed
+    # Elsewhere than on a terminal, the line of every job is enough.
+    no_bar = options.quiet or not sys.stderr.isatty()
+    try:
+        with (
+            Progress("benchmark", images=len(jobs), quiet=no_bar, unit="jobs") as progress,
+            contextlib.closing(_outcomes(jobs, options)) as outcomes,
+        ):
+            for job, outcome in outcomes:
+                if isinstance(outcome, Failed):
+                    failed[job] = outcome
+                else:
+                    store.save(job, outcome)
+                del left[job]
+                progress.add(images=1)
+                if not options.quiet:
+                    _tell(len(jobs) - len(left), len(jobs), progress.seconds, job, outcome)
+    except KeyboardInterrupt as interrupt:
+        interrupt.add_note(_interrupted(plan, list(left), options.out))
+        raise
+    return failed
+
+
+def _outcomes(jobs: list[Job], options: argparse.Namespace) -> Outcomes:
+    from kalux.evaluation.benchmark import runners
+
+    if options.dask is not None:
+        return runners.on_dask(jobs, options.dask)
+    return runners.in_processes(jobs, options.processes or len(os.sched_getaffinity(0)))
+
+
+def _tell(number: int, total: int, seconds: float, job: Job, outcome: Outcome) -> None:
+    from kalux.cli.progress import clock
+    from kalux.evaluation.benchmark.jobs import Failed
+
+    found = "failed" if isinstance(outcome, Failed) else f"{outcome.record['seconds']['all']:.1f} s"
+    rest = f", {clock(seconds / number * (total - number))} left" if number < total else ""
+    why = f": {outcome.message}" if isinstance(outcome, Failed) else ""
+    with contextlib.suppress(OSError):
+        print(f"kalux: {number}/{total} {job.name}: {found}{rest}{why}", file=sys.stderr, flush=True)
+
+
+def _interrupted(plan: Plan, left: list[Job], out: Path) -> str:
+    done = len(plan.jobs) - len(left)
+    return (
+        f"{done} of {len(plan.jobs)} jobs are finished and kept in {out}; missing: "
+        f"{_some(job.name for job in left)}; the same command goes on from here"
+    )
+
+
+def _some(names: Iterable[str]) -> str:
+    listed = list(names)
+    more = len(listed) - _LISTED
+    return ", ".join(listed[:_LISTED]) + (f" and {more} more" if more > 0 else "")
+
+
+def _write(out: Path, results: Results, store: Store) -> None:
+    from kalux.evaluation.benchmark.report import make_report
+    from kalux.evaluation.benchmark.results import as_csv, as_json
+    from kalux.writers.files import output_errors, write_whole
+
+    for name, text in (
+        (CSV, as_csv(results)),
+        (JSON, as_json(results)),
+        (REPORT, make_report(results, store)),
+    ):
+        with output_errors(out / name):
+            write_whole(out / name, text.encode())
+
+
+def _raise_failures(results: Results, out: Path) -> None:
+    """Raise what failed, if anything did, as one line."""
+    from kalux.errors import InputError, InternalError
+
+    if not results.failures:
+        return
+    total = len(results.plan.jobs) + len(results.plan.failures)
+    first = next(iter(results.failures.items()))
+    text = (
+        f"{len(results.failures)} of {total} jobs failed: {_some('/'.join(n) for n in results.failures)}; the others "
+        f"are in {out}, the same command tries again. {'/'.join(first[0])}: {first[1].message}"
+    )
+    raise (InternalError if any(f.is_bug for f in results.failures.values()) else InputError)(text)
+
+
+def table(results: Results) -> list[str]:
+    """A row per sequence and method, as of ``kalux evaluate``."""
+    from kalux.evaluation.benchmark.results import PSNR
+
+    metrics = [*results.shown(), PSNR]
+    wide = max([len(s.name) for s in results.plan.sequences] + [8])
+    heads = [f"{m.label} {m.unit}".replace("×", "x").replace("x ", "x").strip() for m in metrics]
+    lines = [f"{'sequence':<{wide}}  {'method':<24}" + "".join(f"{head:>15}" for head in heads)]
+    for sequence in results.plan.sequences:
+        for name in results.of_sequence(sequence):
+            values = (metric.shown(results.mean(sequence, name, metric.name)) for metric in metrics)
+            lines.append(
+                f"{sequence.name:<{wide}}  {results.label(name):<24}"
+                + "".join(f"{value:>15}" for value in values)
+            )
+    return lines

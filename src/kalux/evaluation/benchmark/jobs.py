@@ -1,0 +1,417 @@
+"""A job: one method on one sequence. It is small, can be sent anywhere, and its outcome is plain values and arrays."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import importlib.metadata
+import json
+import platform
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+import kalux
+from kalux.errors import InputError, KaluxError
+from kalux.evaluation.baselines import Method, chosen_methods, frames_around
+from kalux.evaluation.benchmark.calibration import Calibrations
+from kalux.evaluation.benchmark.sequences import EVERY, Sequence, files_under
+from kalux.evaluation.exposures import linear_frame, reference_exposure
+from kalux.evaluation.held_out import held_out_pairs, hold_out_frames
+from kalux.evaluation.scores import Pair, Scores, finite_or_none, score
+from kalux.evaluation.truth import load_truth, prepare_reference, truth_pairs
+from kalux.models.camera import Camera, Response
+from kalux.recording import Recording
+from kalux.settings import to_dict
+
+LAYOUT: Final = 1
+"""Of the files of jobs; part of every key, so that others are not taken for one's own."""
+
+MOMENTS: Final = 3
+"""Times of a sequence at which pictures are kept."""
+
+GROUPS: Final = {False: "Ground truth", True: "Held-out frames"}
+
+_LIBRARIES: Final = ("numpy", "scipy", "numba", "scikit-image", "opencv-python-headless")
+
+
+@dataclass(frozen=True)
+class Job:
+    """One method on one sequence.
+
+    Attributes
+    ----------
+    sequence
+        The sequence.
+    method
+        Name, as `kalux.evaluation.baselines.chosen_methods` takes it.
+    held_out
+        Whether frames are held out; else it is compared with ground truth.
+    hdr_vdp
+        Whether Q is computed.
+    key
+        Digest of all that the scores depend on, from `make_job`.
+    version
+        Of the kalux that made the job; another one refuses to run it.
+    """
+
+    sequence: Sequence
+    method: str
+    held_out: bool
+    hdr_vdp: bool
+    key: str
+    version: str
+
+    @property
+    def name(self) -> str:
+        """Sequence and method, for messages."""
+        return f"{self.sequence.name}/{self.method}"
+
+
+@dataclass(frozen=True, eq=False)
+class Finished:
+    """The outcome of a job.
+
+    Attributes
+    ----------
+    record
+        Plain values for JSON; docs/benchmark.md lists them.
+    pictures
+        ``times`` (K,) us, ``frame``, ``reference``, ``test`` and maybe ``variance`` (K, H, W) float32.
+    """
+
+    record: dict[str, Any]
+    pictures: dict[str, NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class Failed:
+    """A job that could not be done.
+
+    Attributes
+    ----------
+    message
+        One line.
+    is_bug
+        Whether the error is kalux's own.
+    """
+
+    message: str
+    is_bug: bool
+
+
+Outcome = Finished | Failed
+
+
+def uses_held_out(sequence: Sequence) -> bool:
+    """Whether a sequence is compared with held-out frames: it says so, or has no ground truth.
+
+    Raises
+    ------
+    KaluxError
+        If the recording cannot be opened.
+    """
+    if sequence.options.hold_out_frames is not None:
+        return True
+    return sequence.truth_file() is None and sequence.open().source.ground_truth is None
+
+
+def make_job(sequence: Sequence, method: str, *, held_out: bool, hdr_vdp: bool) -> Job:
+    """A job with its key.
+
+    The key is a digest of: path, size and time of change of every file of the sequence, and of the file in a method's
+    name; the sequence's options; the method's name and settings; whether Q is computed; the version of kalux.
+
+    Raises
+    ------
+    InputError
+        If there is no such method.
+    """
+    chosen = _method(method, sequence, held_out)
+    named = Path(method.partition(":")[2]) if ":" in method else None
+    parts = {
+        "layout": LAYOUT,
+        "kalux": kalux.__version__,
+        "files": [_identity(path) for path in sequence.files()],
+        "options": {k: str(v) for k, v in dataclasses.asdict(sequence.options).items()},
+        "held_out": held_out,
+        "method": method,
+        "method_files": []
+        if named is None or not named.exists()
+        else list(map(_identity, files_under(named))),
+        "settings": None if chosen.settings is None else to_dict(chosen.settings),
+        "hdr_vdp": hdr_vdp,
+    }
+    digest = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+    return Job(sequence, method, held_out, hdr_vdp, digest, kalux.__version__)
+
+
+def _identity(path: Path) -> tuple[str, int, int]:
+    try:
+        status = path.stat()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+    return str(path.absolute()), status.st_size, status.st_mtime_ns
+
+
+def _method(name: str, sequence: Sequence, held_out: bool) -> Method:
+    return chosen_methods([name], response=sequence.options.response, held_out=held_out)[0]
+
+
+def run_job(job: Job) -> Outcome:
+    """Do a job. Whatever goes wrong is an outcome, too."""
+    try:
+        if job.version != kalux.__version__:
+            raise InputError(
+                f"the job is for kalux {job.version}, this is {kalux.__version__}; install the same"
+            )
+        return _run(job)
+    except KaluxError as error:
+        return Failed(" ".join(str(error).split()), is_bug=False)
+    except Exception as error:
+        text = " ".join(f"{type(error).__name__} inside kalux: {error}".split())
+        return Failed(text, is_bug=not isinstance(error, (MemoryError, OSError)))
+
+
+def _run(job: Job) -> Finished:
+    started = time.perf_counter()
+    recording = job.sequence.open()
+    method = _method(job.method, job.sequence, job.held_out)
+    comparison = _comparison(job, recording)
+    calibrations = Calibrations(method.log_offset)
+    pictures = Pictures(moments(comparison.images))
+    clock = Clock()
+
+    def watched() -> Iterator[Pair]:
+        for i, pair in enumerate(clock.timed(comparison.pairs(method))):
+            calibrations.add(pair)
+            pictures.add(i, pair)
+            yield pair
+
+    scores = score(
+        watched(),
+        method=method.label,
+        protocol=comparison.described,
+        data_range=comparison.data_range,
+        scale=comparison.scale,
+        hdr_vdp=job.hdr_vdp,
+    )
+    record = {
+        "layout": LAYOUT,
+        "key": job.key,
+        "sequence": described(job),
+        "method": {
+            "name": job.method,
+            "label": method.label,
+            "settings": None if method.settings is None else to_dict(method.settings),
+        },
+        "scores": _scored(scores),
+        "calibration": calibrations.found(),
+        "camera": camera_curves(recording, method),
+        "seconds": {"images": clock.seconds, "all": time.perf_counter() - started},
+        "versions": versions(),
+    }
+    inputs = comparison.given
+    return Finished(
+        finite_or_none(record),
+        pictures.arrays(inputs, reference_exposure(inputs), job.sequence.options.response),
+    )
+
+
+def described(job: Job) -> dict[str, Any]:
+    """The sequence of a job, as plain values."""
+    sequence = job.sequence
+    options = {
+        k: str(v) if isinstance(v, Path) else v for k, v in dataclasses.asdict(sequence.options).items()
+    }
+    return {
+        "name": sequence.name,
+        "title": sequence.title,
+        "group": sequence.group or GROUPS[job.held_out],
+        "path": str(sequence.path),
+        "files": [str(path) for path in sequence.files()]
+        if len(sequence.files()) < 10
+        else [str(sequence.path)],
+        "held_out": job.held_out,
+        **options,
+    }
+
+
+def _scored(scores: Scores) -> dict[str, Any]:
+    return {
+        "protocol": scores.protocol,
+        "adjustments": scores.adjustments(),
+        "data_range": scores.data_range,
+        "scale": scores.scale,
+        "negative": scores.negative,
+        "pixels": scores.pixels,
+        "means": scores.means(),
+        "per_image": [dataclasses.asdict(image) for image in scores.images],
+    }
+
+
+def versions() -> dict[str, str]:
+    """Of Python, kalux, and the libraries that numbers can depend on."""
+    found = {"python": platform.python_version(), "kalux": kalux.__version__}
+    for name in _LIBRARIES:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+# What is compared with what.
+
+
+@dataclass(frozen=True, eq=False)
+class _Comparison:
+    """Images with their references: of `kalux.evaluation.truth` or `kalux.evaluation.held_out`.
+
+    Attributes
+    ----------
+    given
+        The recording as methods see it.
+    images
+        How many are compared.
+    """
+
+    described: str
+    given: Recording
+    images: int
+    data_range: float
+    scale: float
+    pairs: Callable[[Method], Iterator[Pair]]
+
+
+def _comparison(job: Job, recording: Recording) -> _Comparison:
+    options = job.sequence.options
+    if job.held_out:
+        held = hold_out_frames(recording, options.hold_out_frames or EVERY, response=options.response)
+        return _Comparison(
+            held.described(),
+            held.kept,
+            len(held.compared),
+            1.0,
+            held.scale,
+            lambda m: held_out_pairs(held, m),
+        )
+    path = job.sequence.truth_file()
+    truth, mask = (recording.ground_truth(), None) if path is None else load_truth(path)
+    if truth is None:
+        raise InputError(f"{recording.source.path}: its ground truth has gone; start again")
+    reference = prepare_reference(recording, truth, mask)
+    return _Comparison(
+        reference.described(),
+        recording,
+        len(reference.times),
+        reference.data_range,
+        1.0,
+        lambda m: truth_pairs(recording, reference, m),
+    )
+
+
+class Clock:
+    """Times an iterator, not what is done between its items."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+
+    def timed(self, pairs: Iterator[Pair]) -> Iterator[Pair]:
+        """The same items."""
+        while True:
+            start = time.perf_counter()
+            pair = next(pairs, None)
+            self.seconds += time.perf_counter() - start
+            if pair is None:
+                return
+            yield pair
+
+
+# Pictures.
+
+
+def moments(images: int) -> list[int]:
+    """Numbers of the images that are shown: the middles of equal parts of the sequence."""
+    return sorted({images * (2 * k + 1) // (2 * MOMENTS) for k in range(MOMENTS)})
+
+
+class Pictures:
+    """Keeps some of the pairs for the report.
+
+    Parameters
+    ----------
+    chosen
+        Their numbers.
+    """
+
+    def __init__(self, chosen: list[int]) -> None:
+        self._chosen = {*chosen}
+        self._kept: list[Pair] = []
+
+    def add(self, number: int, pair: Pair) -> None:
+        """Keep the pair if it is one of the chosen."""
+        if number in self._chosen:
+            self._kept.append(pair)
+
+    def arrays(self, given: Recording, reference: int, response: str) -> dict[str, NDArray[Any]]:
+        """As in `Finished.pictures`; ``frame`` is the last frame that the method was given."""
+        times = np.array([pair.t for pair in self._kept], np.int64)
+        frames = [before or after for before, after, _ in frames_around(given.frames(), times)]
+        found = {
+            "frame": [linear_frame(f, reference, response) for f in frames if f is not None],
+            "reference": [_masked(pair.reference, pair) for pair in self._kept],
+            "test": [pair.test for pair in self._kept],
+        }
+        if all(pair.variance is not None for pair in self._kept):
+            found["variance"] = [np.asarray(pair.variance) for pair in self._kept]
+        return {"times": times, **{name: np.stack(a).astype(np.float32) for name, a in found.items()}}
+
+
+def _masked(image: NDArray[Any], pair: Pair) -> NDArray[Any]:
+    """NaN where nothing is compared."""
+    return np.asarray(image, np.float64) if pair.mask is None else np.where(pair.mask, image, np.nan)
+
+
+# The camera model, for Figure 2.
+
+
+def camera_curves(recording: Recording, method: Method) -> dict[str, Any] | None:
+    """f^w (5) and R_bar (6) for sigma_im^2 = 1 over the camera's response, as the method uses them.
+
+    Returns
+    -------
+    ``source`` (the response's name, or that it is the recording's own table), ``response``, ``weight`` and
+    ``covariance``, lists of equal length, with None where a pixel counts as clipped and has no weight at all. None for
+    a method without a model of the camera's noise.
+    """
+    settings = method.settings
+    if settings is None or settings.filter.kind == "cf":
+        return None
+    camera_settings = settings.camera
+    response = Response.named(camera_settings.response)
+    table = recording.source.inverse_covariance
+    saturation = camera_settings.saturation
+    camera = (
+        Camera(response, None, saturation)
+        if table is None
+        else Camera.from_inverse_covariance(table, response, saturation)
+    )
+    levels = np.linspace(0.0, 1.0, 256)
+    weight = camera.weight(levels)
+    if settings.filter.augmentation == "paper":
+        usable, floor = np.ones(len(levels), bool), camera_settings.weight_floor
+    else:
+        usable, floor = levels < saturation, 1e-6
+    r_bar = np.maximum(weight, floor) ** -1
+    return {
+        "source": f"response {camera_settings.response}" if table is None else "table of the recording (f_Q)",
+        "response": levels.round(5).tolist(),
+        "weight": [float(w) if u else 0.0 for w, u in zip(weight, usable, strict=True)],
+        "covariance": [float(r) if u else None for r, u in zip(r_bar, usable, strict=True)],
+    }

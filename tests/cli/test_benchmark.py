@@ -1,0 +1,176 @@
+"""``kalux benchmark``: resumes, tells what failed and what is missing, writes its files."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import shutil
+import signal
+import time
+
+import pytest
+
+from kalux.evaluation.benchmark import jobs, runners
+
+FILES = ("results.csv", "results.json", "report.html")
+
+
+@pytest.fixture
+def ran(monkeypatch):
+    """Jobs are run in this process; the names of those that are."""
+    names = []
+
+    def in_this(jobs, processes):
+        for job, outcome in runners.here(jobs):
+            names.append(job.name)
+            yield job, outcome
+
+    monkeypatch.setattr(runners, "in_processes", in_this)
+    return names
+
+
+@pytest.fixture
+def folder(tmp_path, recording):
+    """A folder with two recordings."""
+    folder = tmp_path / "set"
+    folder.mkdir()
+    for name in ("a.h5", "b.h5"):
+        shutil.copy(recording, folder / name)
+    return folder
+
+
+def test_it_writes_a_table_and_a_report_and_does_nothing_twice(cli, ran, folder, tmp_path):
+    out = tmp_path / "out"
+    arguments = ("benchmark", folder, "--methods", "hold,cf", "-o", out)
+    first = cli(*arguments)
+    assert first.code == 0, first.err
+    assert ran == ["a/hold", "a/cf", "b/hold", "b/cf"]
+    assert "4/4 b/cf" in first.err
+    rows = [line.split() for line in first.out.splitlines()]
+    assert [row[0] for row in rows[1:5]] == ["a", "a", "b", "b"]
+    contents = [(out / name).read_bytes() for name in FILES]
+    assert all(contents)
+    again = cli(*arguments)
+    assert len(ran) == 4
+    assert "4 of 4 jobs are done already" in again.err
+    assert again.out == first.out
+    assert [(out / name).read_bytes() for name in FILES] == contents
+    more = cli("benchmark", folder, "--methods", "hold,mean,cf", "-o", out, "--quiet")
+    assert ran[4:] == ["a/mean", "b/mean"]
+    assert more.err == ""
+    cli(*arguments, "--overwrite")
+    assert ran[6:] == ["a/hold", "a/cf", "b/hold", "b/cf"]
+
+
+def test_what_has_changed_is_done_again(cli, ran, folder, tmp_path):
+    arguments = ("benchmark", folder, "--methods", "hold", "-o", tmp_path / "out")
+    cli(*arguments)
+    os.utime(folder / "b.h5", ns=(5, 5))
+    cli(*arguments)
+    assert ran == ["a/hold", "b/hold", "b/hold"]
+
+
+def test_a_failed_job_is_told_and_tried_again_and_the_others_are_done(cli, ran, folder, tmp_path):
+    good = (folder / "b.h5").read_bytes()
+    (folder / "b.h5").write_bytes(good[: len(good) // 2])
+    out = tmp_path / "out"
+    arguments = ("benchmark", folder / "a.h5", folder / "b.h5", "--methods", "hold,cf", "-o", out)
+    found = cli(*arguments, "--quiet")
+    assert found.code == 2
+    assert "2 of 4 jobs failed: b/hold, b/cf" in found.error
+    assert "b.h5" in found.error
+    assert {row["sequence"] for row in csv.DictReader((out / "results.csv").open())} == {"a"}
+    assert len(json.loads((out / "results.json").read_text())["failures"]) == 2
+    assert "failed" in (out / "report.html").read_text()
+    (folder / "b.h5").write_bytes(good)
+    assert cli(*arguments).code == 0
+    assert ran[-2:] == ["b/hold", "b/cf"]
+    assert json.loads((out / "results.json").read_text())["failures"] == []
+
+
+def test_an_error_of_kalux_itself_is_one(cli, ran, folder, tmp_path, monkeypatch):
+    def broken(job):
+        raise ZeroDivisionError("oh")
+
+    monkeypatch.setattr(jobs, "_run", broken)
+    found = cli("benchmark", folder / "a.h5", "--methods", "hold", "-o", tmp_path / "out")
+    assert found.code == 1
+    assert "a/hold: ZeroDivisionError inside kalux: oh" in found.err
+
+
+def test_an_interrupt_keeps_what_is_done_and_says_what_is_missing(cli, ran, folder, tmp_path, monkeypatch):
+    def interrupted(given, processes):
+        for number, done in enumerate(runners.here(given)):
+            if number == 2:
+                raise KeyboardInterrupt
+            yield done
+
+    out = tmp_path / "out"
+    arguments = ("benchmark", folder, "--methods", "hold,cf", "-o", out)
+    with monkeypatch.context() as patch:
+        patch.setattr(runners, "in_processes", interrupted)
+        found = cli(*arguments)
+    assert found.code == 130
+    assert "2 of 4 jobs are finished and kept" in found.err
+    assert "missing: b/hold, b/cf; the same command goes on" in found.err
+    assert not (out / "results.csv").exists()
+    assert cli(*arguments).code == 0
+    assert ran == ["b/hold", "b/cf"]
+
+
+def test_ctrl_c_ends_the_processes_and_leaves_whole_files(start_cli, folder, tmp_path):
+    out = tmp_path / "out"
+    names = "hold,mean,edi,cf,iccv2021,default,smooth"
+    running = start_cli(
+        "benchmark", folder, "--methods", names, "-o", out, "--processes", "1", start_new_session=True
+    )
+    deadline = time.monotonic() + 90
+    while not list(out.glob("jobs/*/*.json")) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    os.killpg(running.pid, signal.SIGINT)
+    _, err = running.communicate(timeout=30)
+    assert running.returncode == 130, err
+    assert "jobs are finished and kept in" in err
+    assert "Traceback" not in err
+    for path in out.glob("jobs/*/*.json"):
+        assert json.loads(path.read_text())["key"]
+
+
+def test_a_toml_file_says_it_all(cli, ran, folder, tmp_path):
+    path = folder / "bench.toml"
+    path.write_text('title = "Mine"\nmethods = ["hold"]\n[[sequence]]\npath = "a.h5"\nname = "pan"\n')
+    out = tmp_path / "out"
+    assert cli("benchmark", path, "-o", out).code == 0
+    assert ran == ["pan/hold"]
+    assert "<h1>Mine</h1>" in (out / "report.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["--methods", "e3vid"], "no method 'e3vid'"),
+        (["--processes", "0"], "at least 1"),
+        (["--stamp", "end"], "give --exposure, too"),
+        (["--processes", "2", "--dask", "tcp://x"], "not allowed with"),
+        (["missing.h5"], "missing.h5"),
+    ],
+)
+def test_errors_are_one_line_and_come_before_the_work(cli, ran, recording, tmp_path, arguments, told):
+    found = cli("benchmark", recording, "-o", tmp_path / "out", *arguments)
+    assert found.code == 2
+    assert told in found.err
+    assert ran == []
+
+
+def test_a_folder_of_something_else_is_left_alone(cli, recording, tmp_path):
+    (tmp_path / "mine.txt").write_text("mine")
+    assert "not of a benchmark" in cli("benchmark", recording, "-o", tmp_path).error
+    assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def test_without_dask_the_extra_is_named(cli, recording, tmp_path, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "distributed", None)
+    found = cli("benchmark", recording, "-o", tmp_path / "out", "--dask", "tcp://x", "--methods", "hold")
+    assert found.code == 2
+    assert "kalux[dask]" in found.error

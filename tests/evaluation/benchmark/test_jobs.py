@@ -1,0 +1,119 @@
+"""Jobs: the numbers of the library, keys that change when they must, errors as outcomes."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+
+import numpy as np
+import pytest
+
+import kalux
+from kalux.errors import InputError
+from kalux.evaluation.baselines import methods
+from kalux.evaluation.benchmark import jobs
+from kalux.evaluation.benchmark.jobs import Failed, make_job, moments, run_job, uses_held_out
+from kalux.evaluation.benchmark.sequences import Options
+from kalux.evaluation.held_out import evaluate_held_out, hold_out_frames
+from kalux.evaluation.truth import evaluate_truth, load_truth, prepare_reference
+
+
+def test_the_numbers_are_those_of_the_library(small_set):
+    recording = kalux.open(small_set.with_truth.path)
+    reference = prepare_reference(recording, *load_truth(small_set.folder / "a_gt.npz"))
+    for held_out in (False, True):
+        done = run_job(small_set.job("default", held_out=held_out, hdr_vdp=True))
+        expected = (
+            evaluate_held_out(hold_out_frames(recording), methods()["default"], hdr_vdp=True)
+            if held_out
+            else evaluate_truth(recording, reference, methods()["default"], hdr_vdp=True)
+        )
+        scores = done.record["scores"]
+        assert scores["means"] == expected.means()
+        assert scores["per_image"] == [dataclasses.asdict(image) for image in expected.images]
+        assert (scores["protocol"], scores["pixels"]) == (expected.protocol, expected.pixels)
+
+
+def test_pictures_are_of_the_middles_of_three_parts(small_set):
+    done = run_job(small_set.job("default", held_out=False))
+    truth, _ = load_truth(small_set.folder / "a_gt.npz")
+    times = done.pictures["times"]
+    assert set(times) <= set(truth.times)
+    shapes = {name: a.shape for name, a in done.pictures.items() if name != "times"}
+    assert shapes == dict.fromkeys(("frame", "reference", "test", "variance"), (3, 32, 40))
+    k = [int(np.flatnonzero(truth.times == t)[0]) for t in times]
+    assert np.array_equal(done.pictures["reference"], truth.images[k])
+    image, *_ = kalux.reconstruct(kalux.open(small_set.with_truth.path), times=times[:1])
+    assert np.array_equal(done.pictures["test"][0], image.intensity)
+    assert np.array_equal(done.pictures["variance"][0], image.variance)
+    assert (moments(9), moments(1), moments(2)) == ([1, 4, 7], [0], [0, 1])
+
+
+def test_what_only_some_methods_have_is_none_for_others(small_set):
+    hold, cf, paper, default = (
+        run_job(small_set.job(n)).record for n in ("hold", "cf", "iccv2021", "default")
+    )
+    assert hold["calibration"] is cf["calibration"] is hold["camera"] is cf["camera"] is None
+    assert default["calibration"]["log_offset"] == 0.03
+    assert paper["calibration"]["log_offset"] == 1.0
+    assert default["camera"]["covariance"][-1] is None
+    assert paper["camera"]["covariance"][-1] == 1.0  # linear: f^w is 1 up to white
+
+
+def test_held_out_calibration_leaves_clipped_frames_out(small_set, simulation):
+    all_pixels = run_job(small_set.job("default")).record
+    held = hold_out_frames(kalux.open(small_set.without.path))
+    frames = list(simulation.frames)
+    clipped = sum(int((frames[i].normalised() >= 0.98).sum()) for i in held.compared)
+    assert clipped > 0
+    assert all_pixels["calibration"]["all"]["pixels"] == all_pixels["scores"]["pixels"] - clipped
+
+
+def test_the_key_is_of_all_that_scores_depend_on(small_set, monkeypatch):
+    path = small_set.without.path
+    first = small_set.job("hold").key
+    assert small_set.job("hold").key == first
+    others = {small_set.job("cf").key, small_set.job("hold", hdr_vdp=True).key}
+    options = Options(hold_out_frames=3)
+    other = dataclasses.replace(small_set.without, options=options)
+    others.add(make_job(other, "hold", held_out=True, hdr_vdp=False).key)
+    os.utime(path, ns=(1, 1))
+    others.add(small_set.job("hold").key)
+    monkeypatch.setattr(kalux, "__version__", "9.9")
+    others.add(small_set.job("hold").key)
+    assert len(others - {first}) == 5
+
+
+def test_a_title_is_not_part_of_the_key(small_set):
+    renamed = dataclasses.replace(small_set.without, title="other", group="other")
+    assert make_job(renamed, "hold", held_out=True, hdr_vdp=False).key == small_set.job("hold").key
+
+
+def test_held_out_frames_are_used_where_there_is_no_truth(small_set):
+    assert uses_held_out(small_set.without)
+    assert not uses_held_out(small_set.with_truth)
+    options = Options(hold_out_frames=2)
+    assert uses_held_out(dataclasses.replace(small_set.with_truth, options=options))
+
+
+def test_whatever_goes_wrong_is_an_outcome_of_one_line(small_set, monkeypatch):
+    job = small_set.job("hold")
+    assert run_job(dataclasses.replace(job, version="0.0")) == Failed(
+        f"the job is for kalux 0.0, this is {kalux.__version__}; install the same", is_bug=False
+    )
+    few = dataclasses.replace(small_set.without, options=Options(hold_out_frames=99))
+    assert "too few" in run_job(make_job(few, "hold", held_out=True, hdr_vdp=False)).message
+    small_set.without.path.write_bytes(b"x")
+    assert not run_job(job).is_bug
+
+    def broken(*unused, **options):
+        raise ZeroDivisionError("one\ntwo")
+
+    monkeypatch.setattr(jobs, "_run", broken)
+    assert run_job(job) == Failed("ZeroDivisionError inside kalux: one two", is_bug=True)
+
+
+def test_a_missing_recording_is_named(small_set):
+    missing = dataclasses.replace(small_set.without, path=small_set.folder / "none.h5")
+    with pytest.raises(InputError, match=r"none\.h5"):
+        make_job(missing, "hold", held_out=True, hdr_vdp=False)

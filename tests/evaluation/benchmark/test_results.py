@@ -1,0 +1,92 @@
+"""Results: which jobs, means, the best, tidy tables."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+
+import pytest
+
+from kalux.errors import InputError
+from kalux.evaluation.benchmark.jobs import run_job
+from kalux.evaluation.benchmark.results import PSNR, SHOWN, Results, as_csv, as_json, make_plan
+from kalux.evaluation.benchmark.sequences import Benchmark
+
+
+def planned(small_set, methods=None, sequences=None):
+    benchmark = Benchmark("Title", sequences or (small_set.with_truth, small_set.without))
+    return make_plan(benchmark, methods)
+
+
+@pytest.fixture(scope="module")
+def results(lasting_set):
+    plan = planned(lasting_set, ["hold", "mean", "default"])
+    records = {(job.sequence.name, job.method): run_job(job).record for job in plan.jobs}
+    return Results(plan, records, {})
+
+
+def test_the_neighbours_are_compared_only_where_frames_are_held_out(small_set):
+    plan = planned(small_set)
+    assert plan.methods == ("hold", "mean", "edi", "cf", "iccv2021", "default", "smooth")
+    assert [job.method for job in plan.jobs if job.sequence.name == "a"] == [
+        name for name in plan.methods if name != "mean"
+    ]
+    assert [job.held_out for job in plan.jobs] == [False] * 6 + [True] * 7
+    assert "mean" in [job.method for job in plan.jobs if job.sequence.name == "b"]
+
+
+def test_a_sequence_that_cannot_be_opened_fails_alone(small_set):
+    small_set.without.path.write_bytes(b"no recording")
+    plan = planned(small_set, ["hold", "cf"])
+    assert [job.name for job in plan.jobs] == ["a/hold", "a/cf"]
+    assert set(plan.failures) == {("b", "hold"), ("b", "cf")}
+    assert "not a recording" in plan.failures["b", "hold"].message
+
+
+def test_an_unknown_method_is_refused_at_once(small_set):
+    with pytest.raises(InputError, match="no method 'e3vid'"):
+        planned(small_set, ["hold", "e3vid"])
+
+
+def test_methods_given_win_over_those_of_the_file_and_none_is_run_twice(small_set):
+    benchmark = Benchmark("", (small_set.without,), ("cf",))
+    assert make_plan(benchmark).methods == ("cf",)
+    assert make_plan(benchmark, ["hold", "mean", "hold"]).methods == ("hold", "mean")
+
+
+def test_csv_is_tidy_and_holds_the_means(results):
+    rows = list(csv.DictReader(io.StringIO(as_csv(results))))
+    values = {(r["sequence"], r["method"], r["metric"]): r["value"] for r in rows}
+    assert len(values) == len(rows)
+    for key, record in results.records.items():
+        assert float(values[*key, "mse"]) == record["scores"]["means"]["mse"]
+        assert ((*key, "rms_z") in values) == (key[1] == "default")
+        assert (*key, "q") not in values
+    assert {metric for *_, metric in values} == {
+        *("mse", "psnr", "ssim", "log_mse", "one_sigma", "rms_z", "seconds")
+    }
+
+
+def test_json_holds_the_records_and_is_valid(results):
+    whole = json.loads(as_json(results), parse_constant=pytest.fail)
+    assert [job["method"]["name"] for job in whole["jobs"]] == ["hold", "default", "hold", "mean", "default"]
+    assert whole["jobs"][0] == results.records["a", "hold"]
+    assert whole["sequences"] == ["a", "b"]
+
+
+def test_means_of_groups_need_all_sequences(results, lasting_set):
+    both = [lasting_set.with_truth, lasting_set.without]
+    values = [results.mean(sequence, "hold", "mse") for sequence in both]
+    assert results.group_mean(both, "hold", "mse") == pytest.approx(sum(values) / 2)
+    assert results.group_mean(both, "mean", "mse") is None
+    assert [[s.name for s in group] for group in results.groups().values()] == [["a"], ["b"]]
+
+
+def test_the_best_is_by_what_is_shown():
+    error, similarity = SHOWN[0], SHOWN[1]
+    best = Results.best
+    assert best(None, error, {"a": 0.0100001, "b": 0.01, "c": 0.02, "d": None}) == {"a", "b"}
+    assert best(None, similarity, {"a": 0.9, "b": 0.95}) == {"b"}
+    assert best(None, error, {"a": 0.1, "b": None}) == set()
+    assert (error.shown(0.0123456), error.shown(None), PSNR.shown(30.123)) == ("1.235", "–", "30.12")
