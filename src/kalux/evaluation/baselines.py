@@ -42,11 +42,14 @@ class Method:
         From a recording and ascending times (N,) int64, us, to N images.
     needs_held_out
         Whether it looks at the frames before and after, which would be unfair where they are not held out.
+    notes
+        What a reader of its scores has to know.
     """
 
     label: str
     images: Callable[[Recording, Times], Iterable[Image]]
     needs_held_out: bool = False
+    notes: tuple[str, ...] = ()
 
 
 def hold_last_frame(recording: Recording, times: Times, *, response: str = "linear") -> Iterator[Image]:
@@ -133,7 +136,8 @@ def chosen_methods(
     Parameters
     ----------
     names
-        Of `methods`. Default: all that can be compared, without `OPTIONAL`.
+        Of `methods`, or a text as in `kalux.evaluation.specs`: a network with its weights, a folder of images. Default:
+        all of `methods` that can be compared, without `OPTIONAL`.
     response
         Of the camera, as in `kalux.settings.CameraSettings`.
     held_out
@@ -142,21 +146,27 @@ def chosen_methods(
     Raises
     ------
     InputError
-        If a name is unknown, or the method needs frames to be held out.
+        If a name is unknown, the method needs frames to be held out, or its weights or images are missing.
+    MissingDependencyError
+        If the method is a network, and PyTorch is not installed.
     """
+    # These methods are of the kind that this module defines, so it can be imported only now.
+    from kalux.evaluation.specs import FORMS, outside_method
+
     known = methods(response)
     if names is None:
         names = [n for n, m in known.items() if n not in OPTIONAL and (held_out or not m.needs_held_out)]
     chosen = []
     for name in names:
-        if name not in known:
-            raise InputError(f"there is no method {name!r}; known are {', '.join(known)}")
-        if known[name].needs_held_out and not held_out:
+        method = known.get(name) or outside_method(name, response=response)
+        if method is None:
+            raise InputError(f"there is no method {name!r}; known are {', '.join(known)}, and {FORMS}")
+        if method.needs_held_out and not held_out:
             raise InputError(
                 f"method {name!r} looks at the frames around an image, which is a comparison only where frames "
                 "are held out"
             )
-        chosen.append(known[name])
+        chosen.append(method)
     if not chosen:
         raise InputError(f"no method is given; known are {', '.join(known)}")
     return chosen

@@ -165,6 +165,7 @@ def evaluate_held_out(
     return score(
         _pairs(held, method, clip),
         method=method.label,
+        notes=method.notes,
         protocol=held.described(),
         data_range=1.0,
         scale=held.scale,

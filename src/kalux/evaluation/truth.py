@@ -141,6 +141,7 @@ def evaluate_truth(
     return score(
         pairs(),
         method=method.label,
+        notes=method.notes,
         protocol=reference.described(),
         data_range=reference.data_range,
         hdr_vdp=hdr_vdp,
