@@ -86,7 +86,9 @@ def test_clipping_is_asked_for_and_told(cli, recording):
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        (["--methods", "e2vid"], "no method 'e2vid'"),
+        (["--methods", "e3vid"], "no method 'e3vid'"),
+        (["--methods", "hold,e2vid"], "method 'e2vid' needs its weights: e2vid:FILE"),
+        (["--methods", "mine=nowhere"], "not a folder of images"),
         (["--truth"], "has no ground truth; give --truth FILE.npz"),
         (["--truth", "missing.npz"], "missing.npz: cannot be read"),
         (["--truth", "x.npz", "--clip"], "--clip is for held-out frames"),

@@ -22,7 +22,7 @@ from typing import Any, Final
 from kalux.errors import InputError, MissingDependencyError
 from kalux.evaluation import folder_method
 from kalux.evaluation.baselines import Image, Method, Times
-from kalux.evaluation.learned.catalogue import NETWORKS, checksum
+from kalux.evaluation.learned.catalogue import NETWORKS, checksums
 from kalux.recording import Recording
 
 FORMS: Final = "NETWORK:WEIGHTS (" + ", ".join(NETWORKS) + "), NAME=FOLDER or folder:FOLDER of images"
@@ -80,24 +80,31 @@ def _read_options(spec: str, text: str | None, known: dict[str, str]) -> dict[st
 def _network(
     spec: str, name: str, path: Path, response: str, *, window: int | None = None, scaled: bool = False
 ) -> Method:
-    published, digest = NETWORKS[name], checksum(name, path)
+    published, found = NETWORKS[name], checksums(name, path)
+    others = [other for other, entry in NETWORKS.items() if entry.blob == found.blob and other != name]
+    if others:
+        raise InputError(
+            f"{path}: these are the weights of {NETWORKS[others[0]].label}; give {others[0]}:{path}"
+        )
     if importlib.util.find_spec("torch") is None:
         raise MissingDependencyError(f"method {spec!r} needs PyTorch; pip install 'kalux[learned]'")
     from kalux.evaluation.learned import weights
 
     weights.load_network(name, path)
-    known = "as published" if digest in published.checksums else "not known to be as published"
+    known = (
+        "as EVREAL distributes them" if found.blob == published.blob else "not those that EVREAL distributes"
+    )
     windows = "from frame to frame" if window is None else f"of {window} us"
     stretched = (
-        "; 1st to 99th percentile of each image stretched to 0 to 1" if published.tone == "robust" else ""
+        ", 1st to 99th percentile of each image stretched to 0 to 1" if published.tone == "robust" else ""
     )
-    scale = "gain and offset fitted to the given frames" if scaled else "not scaled to frames"
+    scale = "then gain and offset fitted to the given frames" if scaled else "not scaled to frames"
     return Method(
         f"{published.label}, scaled" if scaled else published.label,
         partial(_network_images, name=name, path=path, window=window, scaled=scaled, response=response),
         notes=(
-            f"events only, windows {windows}; relative intensity, clipped to 0 to 1, {scale}{stretched}",
-            f"weights {path.name}, SHA-256 {digest[:16]}, {known}",
+            f"events only, windows {windows}; relative intensity{stretched}, clipped to 0 to 1, {scale}",
+            f"weights {path.name}, SHA-256 {found.sha256[:16]}, {known}",
         ),
     )
 

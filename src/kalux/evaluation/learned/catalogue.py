@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final, Literal, NamedTuple
 
 from kalux.errors import InputError
 
-Architecture = Literal["fire", "unet"]
+Architecture = Literal["fire", "unet", "dynamic unet"]
 Activation = Literal["none", "sigmoid"]
 Tone = Literal["none", "robust"]
 
@@ -32,8 +33,8 @@ class Published:
         What is done to the image: nothing, or its 1st and 99th percentiles become 0 and 1.
     home
         Where the authors publish the weights.
-    checksums
-        SHA-256 of published weights that are known; others are used too, and the result says so.
+    blob
+        Git's name (SHA-1) of the weights that EVREAL distributes: others are used too, and the result says so.
     """
 
     label: str
@@ -42,7 +43,7 @@ class Published:
     activation: Activation
     tone: Tone
     home: str
-    checksums: frozenset[str] = frozenset()
+    blob: str
 
 
 _ECNN: Final = "https://github.com/TimoStoff/event_cnn_minimal"
@@ -55,6 +56,7 @@ NETWORKS: Final = {
         activation="sigmoid",
         tone="robust",
         home="https://github.com/uzh-rpg/rpg_e2vid (E2VID_lightweight.pth.tar)",
+        blob="21b384198806a89c7b8426522e4b439f49def5c1",
     ),
     "e2vid+": Published(
         "E2VID+",
@@ -63,6 +65,7 @@ NETWORKS: Final = {
         activation="none",
         tone="none",
         home=f"{_ECNN} (reconstruction model)",
+        blob="787f90c7eea3222e5287cd2e5eb7ef2d342b22ae",
     ),
     "firenet": Published(
         "FireNet",
@@ -71,7 +74,7 @@ NETWORKS: Final = {
         activation="none",
         tone="none",
         home="https://github.com/cedric-scheerlinck/rpg_e2vid/tree/cedric/firenet (firenet_1000.pth.tar)",
-        checksums=frozenset({"a64af3191a00e9f01cd47d086d9a88c35ff1e63756566ca44b4ff02301ca696e"}),
+        blob="b7c5d3a31c6571c7d58c362c277fc2d044d6fa45",
     ),
     "firenet+": Published(
         "FireNet+",
@@ -80,41 +83,52 @@ NETWORKS: Final = {
         activation="none",
         tone="none",
         home=f"{_ECNN} (FireNet+ model)",
-        checksums=frozenset({"76122a81cf6313d84036509f388f150127482bcd977d46e8de650b7f841239f8"}),
+        blob="353522b00dd5dabc610971dedd3ecddcbb07bd4e",
     ),
     "hypere2vid": Published(
         "HyperE2VID",
-        "unet",
+        "dynamic unet",
         normalised=False,
         activation="none",
         tone="none",
         home="https://github.com/ercanburak/HyperE2VID",
+        blob="b69afbf1eee9070cbb335f1ea50614ad0be9a0df",
     ),
 }
 """By the name that a method is chosen with.
 
 Input, normalisation and tone as in EVREAL (Ercan et al., CVPRW 2023, ``config/method``; MIT), which runs all five with
-their authors' settings: the voxel grid of E2VID and FireNet is normalised, those of the later three, which were trained
-on unscaled ones, is not; only E2VID's image is stretched. The checksums are those of the files that EVREAL distributes.
+their authors' settings: the voxel grid of E2VID and FireNet is normalised, that of the later three, which were trained
+on unscaled ones, is not; only E2VID's image is stretched.
 """
 
 
-def checksum(name: str, path: Path) -> str:
-    """SHA-256 of the weights.
+class Checksums(NamedTuple):
+    """Of a file: SHA-256, and SHA-1 with git's header, which is how a repository names it."""
+
+    sha256: str
+    blob: str
+
+
+def checksums(name: str, path: Path) -> Checksums:
+    """Checksums of the weights.
 
     Raises
     ------
     InputError
         If there is no such file; says where the authors publish it.
     """
-    digest = hashlib.sha256()
+    published = NETWORKS[name]
     try:
         with path.open("rb") as file:
+            size = os.fstat(file.fileno()).st_size
+            sha256, blob = hashlib.sha256(), hashlib.sha1(b"blob %d\0" % size, usedforsecurity=False)
             while block := file.read(1 << 20):
-                digest.update(block)
+                sha256.update(block)
+                blob.update(block)
     except OSError as error:
         raise InputError(
-            f"{path}: the weights of {NETWORKS[name].label} cannot be read: {error.strerror}; the authors publish "
-            f"them at {NETWORKS[name].home}"
+            f"{path}: the weights of {published.label} cannot be read: {error.strerror}; the authors publish them at "
+            f"{published.home}"
         ) from error
-    return digest.hexdigest()
+    return Checksums(sha256.hexdigest(), blob.hexdigest())

@@ -43,10 +43,16 @@ _FIRE_NAMES: Final = {
     "net.resblocks.1.": "R2.",
     "net.pred.": "pred.",
 }
-"""FireNet's first release names the parts of the same network otherwise than FireNet+."""
-
 _UNET_NAMES: Final = {"unetrecurrent.": "", "unetflow.": ""}
-"""The second where the network predicts optical flow beside the image."""
+_NAMES: Final[Mapping[str, Mapping[str, str]]] = {
+    "e2vid": _UNET_NAMES,
+    "e2vid+": _UNET_NAMES,
+    "firenet": _FIRE_NAMES,
+    "firenet+": {"": ""},
+    "hypere2vid": _UNET_NAMES,
+}
+"""How the published names of each network's tensors begin, and how ours do. FireNet's first release names the parts of
+the same network otherwise than FireNet+; ``unetflow`` predicts optical flow beside the image."""
 
 _NAMED: Final = 4
 """Tensors that an error names before it only counts."""
@@ -86,18 +92,23 @@ def load_network(name: str, path: Path) -> Network:
     """
     published = NETWORKS[name]
     tensors, config = read_checkpoint(path)
-    names = _FIRE_NAMES if published.architecture == "fire" else _UNET_NAMES
-    tensors = {_renamed(key, names): value for key, value in tensors.items()}
     try:
-        network = _build(published, tensors, config)
-    except (KeyError, IndexError) as error:
-        raise FormatError(
-            f"{path}: not the weights of {published.label}: has no fitting tensor {error}; {_where(published)}"
-        ) from error
-    problems = differences(network.state_dict(), tensors)
+        tensors = {_renamed(key, _NAMES[name]): value for key, value in tensors.items()}
+        # Without memory for its own tensors, and without drawing random ones.
+        with torch.device("meta"):
+            network = _build(published, tensors, config)
+        problems = differences(network.state_dict(), tensors)
+    except (LookupError, ValueError, RuntimeError) as error:
+        problems = f"no network has such tensors ({str(error).splitlines()[0]})"
     if problems:
-        raise FormatError(f"{path}: not the weights of {published.label}: {problems}; {_where(published)}")
-    network.load_state_dict(tensors, strict=True)
+        raise FormatError(
+            f"{path}: not the weights of {published.label}: {problems}; the authors publish them at {published.home}"
+        )
+    network.load_state_dict(
+        {key: value.float() if value.is_floating_point() else value for key, value in tensors.items()},
+        strict=True,
+        assign=True,
+    )
     network.eval()
     return network
 
@@ -163,22 +174,21 @@ def _some(names: list[str]) -> str:
     return ", ".join(islice(names, _NAMED)) + (f" and {more} more" if more > 0 else "")
 
 
-def _where(published: Published) -> str:
-    return f"the authors publish them at {published.home}"
-
-
 def _renamed(name: str, prefixes: Mapping[str, str]) -> str:
-    for prefix, following in prefixes.items():
+    for prefix, ours in prefixes.items():
         if name.startswith(prefix):
-            return following + name.removeprefix(prefix)
-    return name
+            return ours + name.removeprefix(prefix)
+    raise LookupError(f"unexpected: {name}")
 
 
 def _build(published: Published, tensors: Tensors, config: Mapping[str, Any]) -> Network:
     """The network with the sizes that the tensors have."""
     if published.architecture == "fire":
         return FireNet(fire_design(tensors))
-    return RecurrentUNet(unet_design(tensors), _activation(config, published.activation))
+    design = unet_design(tensors)
+    if (design.dynamic is None) != (published.architecture == "unet"):
+        raise LookupError(f"the first decoder is {'not ' if design.dynamic is None else ''}dynamic")
+    return RecurrentUNet(design, _activation(config, published.activation))
 
 
 def fire_design(tensors: Tensors) -> FireNetDesign:
