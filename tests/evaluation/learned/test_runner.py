@@ -95,6 +95,20 @@ def test_chunks_do_not_matter(weights):
     assert np.array_equal(found[0], found[1])
 
 
+def test_threads_do_not_matter_and_stay_as_they_were(weights):
+    simulation, path = moving_blocks(size=(64, 80)), weights("e2vid")
+    found, before = [], torch.get_num_threads()
+    try:
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            times = simulation.truth_times()[:3]
+            found.append(list(images(simulation.recording(), times, name="e2vid", path=path)))
+            assert torch.get_num_threads() == threads
+    finally:
+        torch.set_num_threads(before)
+    assert np.array_equal(found[0], found[1])
+
+
 def test_a_read_between_frames_sees_the_events_until_then_and_at_least_a_third_of_a_window(weights):
     recording, path = (
         recording_of([1000, 1300, 1600, 1900], [990, 1150, 1399, 1401, 1550]),

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import chain, count, pairwise
 from pathlib import Path
 from typing import Any, Final
@@ -132,10 +133,21 @@ def step(network: Network, grid: NDArray[np.float32], state: Any) -> tuple[NDArr
     top, bottom = _margins(height, network.multiple)
     left, right = _margins(width, network.multiple)
     padded = np.pad(grid, ((0, 0), (top, bottom), (left, right)))
-    with torch.inference_mode():
+    with torch.inference_mode(), _one_thread():
         image, following = network(torch.from_numpy(padded)[None], state)
     found: NDArray[np.float32] = image[0, 0, top : top + height, left : left + width].numpy()
     return found, following
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """PyTorch sums in another order with another number of threads, and images would depend on the machine's load."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def _margins(size: int, multiple: int) -> tuple[int, int]:
