@@ -137,7 +137,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
 
 
 def foreign_classes(path: Path) -> set[str]:
-    """Full names of all that a checkpoint's pickle names outside of PyTorch, found without executing it."""
+    """Full names of all that a checkpoint names outside of PyTorch and `collections`, found without executing it."""
     if zipfile.is_zipfile(path):
         with zipfile.ZipFile(path) as archive:
             member = next(n for n in [*archive.namelist(), "data.pkl"] if n.endswith("data.pkl"))
@@ -153,7 +153,7 @@ def _foreign(file: Any, pickles: int) -> set[str]:
         for opcode, argument, _ in pickletools.genops(file):
             if opcode.name == "GLOBAL":
                 found.add(str(argument).replace(" ", "."))
-    return {name for name in found if not name.startswith("torch.")}
+    return {name for name in found if not name.startswith(("torch.", "collections."))}
 
 
 def differences(expected: Tensors, found: Tensors) -> str:
