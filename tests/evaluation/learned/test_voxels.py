@@ -13,7 +13,7 @@ from builders import events, random_stream
 
 
 def naive_grid(rows, size, bins):
-    """Bilinear in time, event by event and bin by bin (Zhu et al., CVPR 2019, equations 1 and 2)."""
+    """Linear in time, event by event and bin by bin."""
     grid = np.zeros((bins, *size))
     first, last = rows["t"][0], rows["t"][-1]
     for t, x, y, p in rows.tolist():
