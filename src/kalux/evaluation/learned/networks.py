@@ -1,10 +1,10 @@
 """The networks, in PyTorch. A network is a pure function: (voxel grid, state) to (image, following state).
 
 `FireNet` is that of Scheerlinck et al., "Fast Image Reconstruction with an Event Camera" (WACV 2020); `RecurrentUNet`
-that of Rebecq et al., "High Speed and High Dynamic Range Video with an Event Camera" (T-PAMI 2021); Stoffregen et al.,
-"Reducing the Sim-to-Real Gap for Event Cameras" (ECCV 2020), train both anew as FireNet+ and E2VID+ (ECNN). Ercan et
-al., "HyperE2VID" (TIP 2024), replace the first decoder by `DynamicDecoder`. The names of the attributes are those of the
-published tensors.
+that of Rebecq et al., "High Speed and High Dynamic Range Video with an Event Camera" (T-PAMI 2021); Stoffregen et
+al., "Reducing the Sim-to-Real Gap for Event Cameras" (ECCV 2020), train both anew as FireNet+ and E2VID+ (ECNN).
+Ercan et al., "HyperE2VID" (TIP 2024), replace the first decoder by `DynamicDecoder`. The names of the attributes are
+those of the published tensors.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Events as the networks see them: a voxel grid of signed counts, linear between bins of time.
 
-As in Rebecq et al., "High Speed and High Dynamic Range Video with an Event Camera" (T-PAMI 2021): the times of the first
-and the last event of the window are the first and the last bin.
+As in Rebecq et al., "High Speed and High Dynamic Range Video with an Event Camera" (T-PAMI 2021): the times of the
+first and the last event of the window are the first and the last bin.
 """
 
 from __future__ import annotations
