@@ -83,10 +83,25 @@ def test_clipping_is_asked_for_and_told(cli, recording):
     assert "all: the reconstruction clipped" in cli("evaluate", recording, "--methods", "hold", "--clip").out
 
 
+def test_a_folder_of_images_is_compared_and_what_it_says_is_its_own(cli, with_truth, simulation, tmp_path):
+    truth, lines = simulation.truth(), ["t_us,file"]
+    for t, image in zip(truth.times.tolist(), truth.images, strict=True):
+        np.save(tmp_path / f"{t}.npy", image)
+        lines.append(f"{t},{t}.npy")
+    (tmp_path / "timestamps.csv").write_text("\n".join(lines))
+    found = cli("evaluate", with_truth, "--methods", f"theirs={tmp_path},hold")
+    assert labels(found.out)[:2] == ["theirs", "hold the last frame"]
+    assert found.out.splitlines()[2].split()[1:4] == ["0.000", "inf", "1.000"]
+    assert f"\ntheirs: {len(truth.times)} images of " in found.out
+    assert "all: " not in found.out
+
+
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        (["--methods", "e2vid"], "no method 'e2vid'"),
+        (["--methods", "e3vid"], "no method 'e3vid'"),
+        (["--methods", "hold,e2vid"], "method 'e2vid' needs its weights: e2vid:FILE"),
+        (["--methods", "mine=nowhere"], "not a folder of images"),
         (["--truth"], "has no ground truth; give --truth FILE.npz"),
         (["--truth", "missing.npz"], "missing.npz: cannot be read"),
         (["--truth", "x.npz", "--clip"], "--clip is for held-out frames"),

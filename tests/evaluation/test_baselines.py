@@ -108,8 +108,8 @@ def test_choice_by_name():
     assert [m.label for m in chosen_methods(["cf", "hold"])] == ["CF", "hold the last frame"]
     assert "mean of the neighbours" not in [m.label for m in chosen_methods()]
     assert "mean of the neighbours" in [m.label for m in chosen_methods(held_out=True)]
-    with pytest.raises(InputError, match=r"no method 'e2vid'; known are hold"):
-        chosen_methods(["e2vid"])
+    with pytest.raises(InputError, match=r"no method 'e3vid'; known are hold.*NETWORK:WEIGHTS"):
+        chosen_methods(["e3vid"])
     with pytest.raises(InputError, match="held out"):
         chosen_methods(["mean"])
     with pytest.raises(InputError, match="no method is given"):

@@ -28,13 +28,16 @@ that were held out from them. Needs the extra kalux[evaluation].
 
 methods: hold (the last frame), mean (of the frames around; held-out frames only), edi (nearest frame,
 deblurred and moved by events), cf, iccv2021, iccv2021-flir, default, smooth (default, both ways in time).
-Without --methods all but iccv2021-flir."""
+Without --methods all but iccv2021-flir. Networks, with their weights (need the extra kalux[learned]):
+e2vid:FILE, e2vid+:FILE, firenet:FILE, firenet+:FILE, hypere2vid:FILE. Any other method: NAME=FOLDER of images
+with a timestamps.csv."""
 
 _EXAMPLES = """\
 examples:
   kalux evaluate night_drive.aedat4
   kalux evaluate pan.mat --truth pan_gt.npz --hdrvdp -o scores.csv
-  kalux evaluate slider_depth --exposure 10000 --hold-out-frames 4 --methods hold,cf,default"""
+  kalux evaluate slider_depth --exposure 10000 --hold-out-frames 4 --methods hold,cf,default
+  kalux evaluate night_drive.aedat4 --methods default,firenet:firenet_1000.pth.tar,mine=results/night"""
 
 _SUFFIXES: Final = (".csv", ".json")
 _OWN: Final = Path()  # --truth without a file
@@ -221,14 +224,12 @@ def table_row(scores: Scores, consistency: BlurConsistency | None) -> str:
 def notes(found: list[Scores]) -> list[str]:
     """How many pixels, and what was done to images before they were compared."""
     first = found[0]
-    lines = [
-        f"{len(first.images):,} images, {first.pixels:,} pixels compared; data range {first.data_range:.4g}"
+    everywhere = [text for text in first.adjustments() if all(text in s.adjustments() for s in found)]
+    return [
+        f"{len(first.images):,} images, {first.pixels:,} pixels compared; data range {first.data_range:.4g}",
+        *(f"all: {text}" for text in everywhere),
+        *(f"{s.method}: {text}" for s in found for text in s.adjustments() if text not in everywhere),
     ]
-    for scores in found:
-        lines += [
-            f"{scores.method}: {text}" for text in scores.adjustments() if text not in first.adjustments()
-        ]
-    return lines[:1] + [f"all: {text}" for text in first.adjustments()] + lines[1:]
 
 
 # Write.

@@ -63,6 +63,8 @@ class Method:
         I_0 of these variances.
     settings
         Of `kalux.reconstruct`, where that makes the images.
+    notes
+        What a reader of its scores has to know.
     """
 
     label: str
@@ -71,6 +73,7 @@ class Method:
     estimates: Callable[[Recording, Times], Iterable[Estimated]] | None = None
     log_offset: float = 0.0
     settings: Settings | None = None
+    notes: tuple[str, ...] = ()
 
     def estimated(self, recording: Recording, times: Times) -> Iterator[Estimated]:
         """The images at ascending times (us), with their variances where the method has them."""
@@ -179,7 +182,8 @@ def chosen_methods(
     Parameters
     ----------
     names
-        Of `methods`. Default: all that can be compared, without `OPTIONAL`.
+        Of `methods`, or a text as in `kalux.evaluation.specs`: a network with its weights, a folder of images. Default:
+        all of `methods` that can be compared, without `OPTIONAL`.
     response
         Of the camera, as in `kalux.settings.CameraSettings`.
     held_out
@@ -188,21 +192,27 @@ def chosen_methods(
     Raises
     ------
     InputError
-        If a name is unknown, or the method needs frames to be held out.
+        If a name is unknown, the method needs frames to be held out, or its weights or images are missing.
+    MissingDependencyError
+        If the method is a network, and PyTorch is not installed.
     """
+    # These methods are of the kind that this module defines, so it can be imported only now.
+    from kalux.evaluation.specs import FORMS, outside_method
+
     known = methods(response)
     if names is None:
         names = [n for n, m in known.items() if n not in OPTIONAL and (held_out or not m.needs_held_out)]
     chosen = []
     for name in names:
-        if name not in known:
-            raise InputError(f"there is no method {name!r}; known are {', '.join(known)}")
-        if known[name].needs_held_out and not held_out:
+        method = known.get(name) or outside_method(name, response=response)
+        if method is None:
+            raise InputError(f"there is no method {name!r}; known are {', '.join(known)}, and {FORMS}")
+        if method.needs_held_out and not held_out:
             raise InputError(
                 f"method {name!r} looks at the frames around an image, which is a comparison only where frames "
                 "are held out"
             )
-        chosen.append(known[name])
+        chosen.append(method)
     if not chosen:
         raise InputError(f"no method is given; known are {', '.join(known)}")
     return chosen

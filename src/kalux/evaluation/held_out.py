@@ -166,6 +166,7 @@ def evaluate_held_out(
     return score(
         held_out_pairs(held, method, clip=clip),
         method=method.label,
+        notes=method.notes,
         protocol=held.described(),
         data_range=1.0,
         scale=held.scale,

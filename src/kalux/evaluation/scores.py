@@ -68,6 +68,8 @@ class Scores:
         Whether the images were clipped as the camera clips before they were compared.
     negative
         How many compared values of the method's images are below 0. They count as 0 in log-MSE and HDR-VDP.
+    notes
+        Of the method.
     """
 
     method: str
@@ -77,6 +79,7 @@ class Scores:
     scale: float
     clipped: bool
     negative: int
+    notes: tuple[str, ...] = ()
 
     @property
     def pixels(self) -> int:
@@ -113,7 +116,7 @@ class Scores:
         return {name: getattr(self, name) for name in METRICS}
 
     def adjustments(self) -> list[str]:
-        """What was done to the images, in words; empty: nothing."""
+        """What was done to the images, and what else the method says of itself, in words; empty: nothing."""
         done = []
         if self.scale != 1.0:
             done.append(f"intensities divided by {self.scale:.4g}")
@@ -121,7 +124,7 @@ class Scores:
             done.append("the reconstruction clipped where the camera clips")
         if self.negative:
             done.append(f"{self.negative} negative values taken as 0 in log-MSE and HDR-VDP")
-        return done
+        return [*done, *self.notes]
 
     def _mean(self, name: str) -> float:
         return float(np.mean([getattr(image, name) for image in self.images]))
@@ -160,6 +163,7 @@ def score(
     data_range: float,
     scale: float = 1.0,
     clipped: bool = False,
+    notes: tuple[str, ...] = (),
     hdr_vdp: bool = False,
     on_image: Callable[[], None] = lambda: None,
 ) -> Scores:
@@ -183,7 +187,7 @@ def score(
         on_image()
     if not images:
         raise InputError(f"{method}: no images to compare")
-    return Scores(method, protocol, tuple(images), data_range, scale, clipped, negative)
+    return Scores(method, protocol, tuple(images), data_range, scale, clipped, negative, notes)
 
 
 def score_image(

@@ -134,6 +134,7 @@ def evaluate_truth(
     return score(
         truth_pairs(recording, reference, method),
         method=method.label,
+        notes=method.notes,
         protocol=reference.described(),
         data_range=reference.data_range,
         hdr_vdp=hdr_vdp,

@@ -38,7 +38,7 @@ _WANTED: Final = (
 _ABOUT_FRAMES: Final = re.compile(r"\b(frames?|images?)\b")
 
 
-class _Listed(NamedTuple):
+class Listed(NamedTuple):
     """An image file and its exposure, us; start and end are both the stamp where that is all that is known."""
 
     file: Path
@@ -129,7 +129,7 @@ def _images(frames: Path, start: int | None, rate_hz: float | None) -> Source:
         if path.stat().st_size > _LARGEST_LIST:
             raise FormatError(f"{path}: is too large for a list of images; {_WANTED} is needed")
         text = path.read_text("utf-8-sig")
-        read = _read_ijrr if path.suffix.lower() == ".txt" else _read_csv
+        read = _read_ijrr if path.suffix.lower() == ".txt" else read_image_list
         listed, exposure_known = read(path, text)
     if not listed:
         raise FormatError(f"{path}: lists no images; {_WANTED} is needed")
@@ -162,7 +162,14 @@ def _list_file(folder: Path) -> Path:
     return others[0]
 
 
-def _read_csv(path: Path, text: str) -> tuple[list[_Listed], bool]:
+def read_image_list(path: Path, text: str) -> tuple[list[Listed], bool]:
+    """The images that a CSV lists, and whether it states their exposures.
+
+    Raises
+    ------
+    FormatError
+        If it has no column of times, or a line cannot be read.
+    """
     lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
     if not lines or "\0" in text:
         raise FormatError(f"{path}: is empty, or no text; {_WANTED} is needed")
@@ -193,11 +200,11 @@ def _read_csv(path: Path, text: str) -> tuple[list[_Listed], bool]:
     for (number, row), file in zip(rows, files, strict=True):
         stamp = _microseconds(path, number, row[time[0]], time[1])
         length = 0 if exposure is None else _microseconds(path, number, row[exposure[0]], exposure[1])
-        listed.append(_Listed(file, stamp, stamp + length))
+        listed.append(Listed(file, stamp, stamp + length))
     return listed, exposure is not None
 
 
-def _read_ijrr(path: Path, text: str) -> tuple[list[_Listed], bool]:
+def _read_ijrr(path: Path, text: str) -> tuple[list[Listed], bool]:
     listed = []
     for number, line in enumerate(text.splitlines(), 1):
         fields = line.split(maxsplit=1)
@@ -206,7 +213,7 @@ def _read_ijrr(path: Path, text: str) -> tuple[list[_Listed], bool]:
         if len(fields) != 2:
             raise FormatError(f"{path}: line {number}: {line[:60]!r} is not 't file' with t in seconds")
         stamp = _microseconds(path, number, fields[0], "s")
-        listed.append(_Listed(path.parent / fields[1].strip(), stamp, stamp))
+        listed.append(Listed(path.parent / fields[1].strip(), stamp, stamp))
     return listed, False
 
 

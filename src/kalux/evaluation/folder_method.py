@@ -1,0 +1,152 @@
+"""Any other method, as a folder of its images with their times.
+
+The folder is as `kalux reconstruct` writes one: `timestamps.csv` with a time and a file per image. EXR (channel ``Y``)
+and NPY ((H, W), or (2, H, W) with the intensity first) hold linear intensity, 1 = white; PNG and other 8 and 16-bit
+images are taken as they are, 0 to 1, without undoing any tone curve.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux.errors import FormatError, FrameError, InputError
+from kalux.evaluation.baselines import Image, Times
+from kalux.readers.images import grey_image
+from kalux.readers.joined import read_image_list
+from kalux.readers.source import reading
+from kalux.recording import Recording
+
+LISTING: Final = "timestamps.csv"
+
+TOLERANCE: Final = 1000
+"""us from a wanted time to that of the image for it: as EVREAL, 1 ms."""
+
+
+def images(
+    recording: Recording, times: Times, *, folder: Path, tolerance: int = TOLERANCE
+) -> Iterator[Image]:
+    """The folder's image nearest to each time.
+
+    Parameters
+    ----------
+    recording
+        Whose sensor the images have.
+    times
+        (N,) int64 us.
+    folder
+        With `timestamps.csv`.
+    tolerance
+        us that an image may be away from the time it is taken for.
+
+    Raises
+    ------
+    InputError
+        If there is no image near enough to some time; before the first is read.
+    FormatError
+        If the list or an image cannot be read.
+    FrameError
+        If an image has not the size of the sensor.
+    """
+    stamps, files = listed(folder)
+    nearest = _nearest(stamps, times)
+    distance = np.abs(stamps[nearest] - times)
+    lacking = np.flatnonzero(distance > tolerance)
+    if len(lacking):
+        worst = lacking[0]
+        raise InputError(
+            f"{folder}: no image within {tolerance} us of {len(lacking)} of {len(times)} times, the first is "
+            f"{times[worst]} us (nearest: {stamps[nearest[worst]]} us); make images at these times, or allow more: "
+            "NAME=FOLDER?tolerance=US"
+        )
+    held, image = -1, np.empty(0, np.float32)
+    for index in nearest.tolist():
+        if index != held:
+            held, image = index, _load(folder, files[index], recording.sensor_size)
+        yield image
+
+
+def listed(folder: Path) -> tuple[Times, list[Path]]:
+    """Times, us, ascending, and files of a folder's list.
+
+    Raises
+    ------
+    InputError
+        If there is no folder of this name, or it has no list.
+    FormatError
+        If the list cannot be read, is empty, or names a file that is not there.
+    """
+    listing = folder / LISTING
+    if not listing.is_file():
+        raise InputError(
+            f"{folder}: not a folder of images with a {LISTING}; it needs one with a line per image and the columns "
+            "t_us and file"
+        )
+    with reading(listing, UnicodeError):
+        rows, _ = read_image_list(listing, listing.read_text("utf-8-sig"))
+    if not rows:
+        raise FormatError(f"{listing}: lists no images")
+    rows.sort(key=lambda row: row.start)
+    absent = [row.file for row in rows if not row.file.is_file()]
+    if absent:
+        raise FormatError(
+            f"{listing}: {len(absent)} of {len(rows)} images are missing, the first is {absent[0]}"
+        )
+    return np.array([row.start for row in rows], np.int64), [row.file for row in rows]
+
+
+def _nearest(stamps: Times, times: Times) -> NDArray[np.int64]:
+    after = np.searchsorted(stamps, times).clip(0, len(stamps) - 1)
+    before = (after - 1).clip(0)
+    closer = np.abs(stamps[before] - times) <= np.abs(stamps[after] - times)
+    return np.where(closer, before, after)
+
+
+def _load(folder: Path, file: Path, sensor_size: tuple[int, int]) -> Image:
+    with reading(file):
+        data = file.read_bytes()
+    decode = {".exr": _exr, ".npy": _npy}.get(file.suffix.lower(), _display)
+    image = decode(folder, file, data)
+    if image.shape != sensor_size:
+        raise FrameError(
+            f"{file}: has {_size(image.shape)} pixels, but the sensor {_size(sensor_size)}; an image has a value for "
+            "each pixel of the sensor"
+        )
+    return image.astype(np.float32)
+
+
+def _size(shape: tuple[int, ...]) -> str:
+    return "x".join(str(length) for length in reversed(shape))
+
+
+def _display(folder: Path, file: Path, data: bytes) -> NDArray[Any]:
+    image = grey_image(folder, file.name, data)
+    return image / np.iinfo(image.dtype).max
+
+
+def _npy(folder: Path, file: Path, data: bytes) -> NDArray[Any]:
+    try:
+        image: NDArray[Any] = np.load(io.BytesIO(data), allow_pickle=False)
+    except (ValueError, EOFError, OSError) as error:
+        raise FormatError(f"{file}: not an .npy file of plain numbers, or damaged") from error
+    if image.dtype.kind not in "fiu":
+        raise FormatError(f"{file}: holds {image.dtype}; linear intensity is needed")
+    return image[0] if image.ndim == 3 and len(image) == 2 else image
+
+
+def _exr(folder: Path, file: Path, data: bytes) -> NDArray[Any]:
+    import OpenEXR
+
+    try:
+        channels = OpenEXR.File(io.BytesIO(data), separate_channels=True).channels()
+    except (RuntimeError, ValueError, TypeError) as error:
+        raise FormatError(f"{file}: not an OpenEXR image, or damaged") from error
+    if "Y" not in channels:
+        raise FormatError(f"{file}: has the channels {', '.join(channels)[:80]}; Y, the intensity, is needed")
+    image: NDArray[Any] = channels["Y"].pixels
+    return image

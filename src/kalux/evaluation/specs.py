@@ -1,0 +1,125 @@
+"""Methods from outside, by a text that any process can read: networks with their weights, folders of images.
+
+::
+
+    firenet:weights.pth                  a network of `kalux.evaluation.learned`, windows of events from frame to frame
+    firenet:weights.pth?window=40000     windows of 40 ms
+    firenet:weights.pth?scaled           gain and offset fitted to the recording's frames
+    theirs=results/run3                  a folder of images with timestamps.csv; in tables it is "theirs"
+    folder:results/run3                  the same, in tables it is "run3"
+    theirs=results/run3?tolerance=5000   an image serves times up to 5 ms away
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+from kalux.errors import InputError, MissingDependencyError
+from kalux.evaluation import folder_method
+from kalux.evaluation.baselines import Image, Method, Times
+from kalux.evaluation.learned.catalogue import NETWORKS, checksums
+from kalux.recording import Recording
+
+FORMS: Final = "NETWORK:WEIGHTS (" + ", ".join(NETWORKS) + "), NAME=FOLDER or folder:FOLDER of images"
+"""For messages."""
+
+_OPTION: Final = r"[a-z]+(?:=\d+)?"
+_SPEC: Final = re.compile(
+    rf"(?P<name>[^:=?]+)(?P<kind>[:=])(?P<path>.+?)(?:\?(?P<options>{_OPTION}(?:&{_OPTION})*))?"
+)
+
+
+def outside_method(spec: str, *, response: str = "linear") -> Method | None:
+    """The method that a text names; None if it has no such form. ``response`` is the camera's, for ``?scaled``.
+
+    Raises
+    ------
+    InputError
+        If weights or images are missing, or the option is unknown.
+    FormatError
+        If the weights do not fit the network, or the folder's list cannot be read.
+    MissingDependencyError
+        If the method is a network, and PyTorch is not installed.
+    """
+    if spec in NETWORKS:
+        raise InputError(
+            f"method {spec!r} needs its weights: {spec}:FILE; the authors publish them at {NETWORKS[spec].home}"
+        )
+    match = _SPEC.fullmatch(spec)
+    if match is None:
+        return None
+    name, path = match["name"].strip(), Path(match["path"])
+    options = match["options"]
+    if match["kind"] == ":" and name in NETWORKS:
+        return _network(
+            spec, name, path, response, **_read_options(spec, options, {"window": "=US", "scaled": ""})
+        )
+    if match["kind"] == "=":
+        return _folder(name, path, **_read_options(spec, options, {"tolerance": "=US"}))
+    if name == "folder":
+        return _folder(path.resolve().name, path, **_read_options(spec, options, {"tolerance": "=US"}))
+    return None
+
+
+def _read_options(spec: str, text: str | None, known: dict[str, str]) -> dict[str, Any]:
+    options: dict[str, Any] = {}
+    for part in text.split("&") if text else []:
+        key, equals, value = part.partition("=")
+        if key not in known or bool(equals) != bool(known[key]) or (equals and int(value) < 1):
+            forms = ", ".join(f"?{name}{form}" for name, form in known.items())
+            raise InputError(f"method {spec!r}: the options here are {forms}; US is at least 1")
+        options[key] = int(value) if equals else True
+    return options
+
+
+def _network(
+    spec: str, name: str, path: Path, response: str, *, window: int | None = None, scaled: bool = False
+) -> Method:
+    published, found = NETWORKS[name], checksums(name, path)
+    others = [other for other, entry in NETWORKS.items() if entry.blob == found.blob and other != name]
+    if others:
+        raise InputError(
+            f"{path}: these are the weights of {NETWORKS[others[0]].label}; give {others[0]}:{path}"
+        )
+    if importlib.util.find_spec("torch") is None:
+        raise MissingDependencyError(f"method {spec!r} needs PyTorch; pip install 'kalux[learned]'")
+    from kalux.evaluation.learned import weights
+
+    weights.load_network(name, path)
+    known = (
+        "as EVREAL distributes them" if found.blob == published.blob else "not those that EVREAL distributes"
+    )
+    windows = "from frame to frame" if window is None else f"of {window} us"
+    stretched = (
+        ", 1st to 99th percentile of each image stretched to 0 to 1" if published.tone == "robust" else ""
+    )
+    scale = "then gain and offset fitted to the given frames" if scaled else "not scaled to frames"
+    return Method(
+        f"{published.label}, scaled" if scaled else published.label,
+        partial(_network_images, name=name, path=path, window=window, scaled=scaled, response=response),
+        notes=(
+            f"events only, windows {windows}; relative intensity{stretched}, clipped to 0 to 1, {scale}",
+            f"weights {path.name}, SHA-256 {found.sha256[:16]}, {known}",
+        ),
+    )
+
+
+def _network_images(recording: Recording, times: Times, **chosen: Any) -> Iterator[Image]:
+    from kalux.evaluation.learned import runner
+
+    return runner.images(recording, times, **chosen)
+
+
+def _folder(label: str, folder: Path, tolerance: int = folder_method.TOLERANCE) -> Method:
+    _, files = folder_method.listed(folder)
+    linear = all(file.suffix.lower() in (".exr", ".npy") for file in files)
+    taken = "linear" if linear else "display values 0 to 1 taken as intensity"
+    images = partial(folder_method.images, folder=folder, tolerance=tolerance)
+    return Method(
+        label, images, notes=(f"{len(files)} images of {folder}, {taken}; up to {tolerance} us away",)
+    )
