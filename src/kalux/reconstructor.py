@@ -47,8 +47,10 @@ class Image:
     intensity
         float32 (H, W), linear: 1.0 = a saturated frame pixel at the reference exposure; more in highlights.
     variance
-        float32 (H, W), P: the variance of the log intensity (20); infinite for the complementary filter, which
-        knows none.
+        float32 (H, W), P: the variance of log(intensity + log_offset) (20); infinite for the complementary filter,
+        which knows none.
+    log_offset
+        I_0 of equation (8).
     final
         Whether more data can no longer change it. With lookahead an image is final one frame later.
     """
@@ -56,6 +58,7 @@ class Image:
     t: int
     intensity: NDArray[np.float32]
     variance: NDArray[np.float32]
+    log_offset: float
     final: bool
 
 
@@ -332,6 +335,7 @@ class Reconstructor:
                 estimate.log_intensity, estimate.variance, self.settings.camera.offset, prior
             ),
             variance=estimate.variance.astype(np.float32, copy=False),
+            log_offset=self.settings.camera.offset,
             final=estimate.final,
         )
 

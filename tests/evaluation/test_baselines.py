@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from kalux import Frame, Recording, reconstruct
+from kalux.datasets import SensorSettings
 from kalux.errors import InputError
 from kalux.evaluation.baselines import (
     EventWindow,
@@ -86,7 +87,8 @@ def test_every_method_gives_one_image_per_time_near_the_truth(name):
 
 
 def test_events_make_images_better_than_held_frames():
-    simulation = moving_blocks()
+    sensor = SensorSettings(threshold_mismatch=0.1, noise_rate=1.0)
+    simulation = moving_blocks(sensor=sensor)
     recording, times, truth = simulation.recording(), simulation.truth_times(), simulation.truth().images
     error = {
         name: np.mean((np.stack(list(methods()[name].images(recording, times))) - truth) ** 2)

@@ -38,11 +38,14 @@ class Estimated(NamedTuple):
     intensity
         (H, W), linear.
     variance
-        (H, W), of log(intensity + I_0) with the method's own I_0; None: the method does not say.
+        (H, W), of log(intensity + log_offset); None: the method does not say.
+    log_offset
+        I_0.
     """
 
     intensity: Image
     variance: Image | None
+    log_offset: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -59,8 +62,6 @@ class Method:
         Whether it looks at the frames before and after, which would be unfair where they are not held out.
     estimates
         As ``images``, with the variance of every image; None: the method has none.
-    log_offset
-        I_0 of these variances.
     settings
         Of `kalux.reconstruct`, where that makes the images.
     notes
@@ -71,7 +72,6 @@ class Method:
     images: Callable[[Recording, Times], Iterable[Image]]
     needs_held_out: bool = False
     estimates: Callable[[Recording, Times], Iterable[Estimated]] | None = None
-    log_offset: float = 0.0
     settings: Settings | None = None
     notes: tuple[str, ...] = ()
 
@@ -136,7 +136,7 @@ def filtered_estimates(
 ) -> Iterator[Estimated]:
     """As `filtered`, with the variances."""
     for image in reconstruct(recording, times=times, settings=settings, smooth=smooth):
-        yield Estimated(image.intensity, image.variance)
+        yield Estimated(image.intensity, image.variance, image.log_offset)
 
 
 _FILTERS: Final = {
@@ -169,7 +169,6 @@ def filter_method(label: str, settings: Settings, *, smooth: bool = False) -> Me
         label,
         partial(filtered, settings=settings, smooth=smooth),
         estimates=None if settings.filter.kind == "cf" else with_variance,
-        log_offset=settings.camera.log_offset,
         settings=settings,
     )
 

@@ -182,11 +182,17 @@ def held_out_pairs(held: HeldOut, method: Method, *, clip: bool = False) -> Iter
     The variance of the mean of the reads of an exposure is taken as the mean of theirs: reads a few milliseconds apart
     share their errors.
     """
-    estimates = method.estimated(held.kept, held.times.ravel())
-    read = (np.stack([part for part in estimate if part is not None]) for estimate in estimates)
+    offset = 0.0
+
+    def read() -> Iterator[NDArray[np.float32]]:
+        nonlocal offset
+        for made in method.estimated(held.kept, held.times.ravel()):
+            offset = made.log_offset
+            yield np.stack([part for part in (made.intensity, made.variance) if part is not None])
+
     chosen = {*held.compared.tolist()}
     frames = (frame for i, frame in enumerate(held.whole.frames()) if i in chosen)
-    for frame, means in zip(frames, means_of(read, held.times.shape[1]), strict=True):
+    for frame, means in zip(frames, means_of(read(), held.times.shape[1]), strict=True):
         image = clipped_as(means[0], frame, held.reference_exposure) if clip else means[0]
         yield Pair(
             frame.middle,
@@ -194,6 +200,7 @@ def held_out_pairs(held: HeldOut, method: Method, *, clip: bool = False) -> Iter
             linear_frame(frame, held.reference_exposure, held.response),
             variance=means[1] if len(means) == 2 else None,
             clipped=frame.normalised() >= CameraSettings().saturation,
+            log_offset=offset,
         )
 
 

@@ -142,9 +142,11 @@ class Pair(NamedTuple):
     mask
         (H, W) bool, True = compared; None: all.
     variance
-        (H, W), what the method says of its log(intensity + I_0); None: nothing.
+        (H, W), what the method says of its log(intensity + log_offset); None: nothing.
     clipped
         (H, W) bool, True where the reference itself is clipped; None: nowhere.
+    log_offset
+        I_0 of the variance.
     """
 
     t: int
@@ -153,6 +155,7 @@ class Pair(NamedTuple):
     mask: NDArray[np.bool_] | None = None
     variance: NDArray[Any] | None = None
     clipped: NDArray[np.bool_] | None = None
+    log_offset: float = 0.0
 
 
 def score(

@@ -144,9 +144,16 @@ def evaluate_truth(
 
 def truth_pairs(recording: Recording, reference: Reference, method: Method) -> Iterator[Pair]:
     """A method's images with the reference images, and with its variances where it has them."""
-    for i, (image, variance) in enumerate(method.estimated(recording, reference.times)):
+    for i, made in enumerate(method.estimated(recording, reference.times)):
         mask = None if reference.masks is None else reference.masks[i]
-        yield Pair(int(reference.times[i]), image, reference.images[i], mask, variance)
+        yield Pair(
+            int(reference.times[i]),
+            made.intensity,
+            reference.images[i],
+            mask,
+            made.variance,
+            log_offset=made.log_offset,
+        )
 
 
 def load_truth(path: Path) -> tuple[GroundTruth, NDArray[np.bool_] | None]:

@@ -70,8 +70,8 @@ def test_masked_pixels_and_clipped_references_do_not_count_and_highlights_are_to
     mask, clipped = np.ones((4, 5), bool), np.zeros((4, 5), bool)
     mask[0], clipped[1] = False, True
     test[0] = np.nan
-    collected = Calibrations(OFFSET)
-    collected.add(Pair(0, test, reference, mask, variance, clipped))
+    collected = Calibrations()
+    collected.add(Pair(0, test, reference, mask, variance, clipped, OFFSET))
     got = collected.found()
     assert got["log_offset"] == OFFSET
     assert got["all"]["pixels"] == 10
@@ -81,6 +81,6 @@ def test_masked_pixels_and_clipped_references_do_not_count_and_highlights_are_to
 
 
 def test_a_method_without_variances_has_no_calibration():
-    collected = Calibrations(0.0)
+    collected = Calibrations()
     collected.add(Pair(0, np.ones((2, 2)), np.ones((2, 2))))
     assert collected.found() is None

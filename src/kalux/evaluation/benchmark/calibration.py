@@ -108,20 +108,22 @@ class Calibration:
 class Calibrations:
     """`Calibration` of all pixels of a comparison, and of those up to and beyond white.
 
-    Parameters
-    ----------
-    log_offset
-        I_0 of the method.
+    All images that are added have the same I_0.
     """
 
-    def __init__(self, log_offset: float) -> None:
-        self._log_offset = log_offset
-        self._parts = {name: Calibration(log_offset) for name in ("all", "up_to_white", "beyond_white")}
+    def __init__(self) -> None:
+        self._log_offset = 0.0
+        self._parts: dict[str, Calibration] = {}
 
     def add(self, pair: Pair) -> None:
         """Add an image; pixels whose reference is itself clipped are left out, others are all in."""
         if pair.variance is None:
             return
+        if not self._parts:
+            self._log_offset = pair.log_offset
+            self._parts = {
+                name: Calibration(pair.log_offset) for name in ("all", "up_to_white", "beyond_white")
+            }
         counted = np.ones(np.shape(pair.test), bool) if pair.mask is None else pair.mask
         if pair.clipped is not None:
             counted = counted & ~pair.clipped
@@ -132,7 +134,7 @@ class Calibrations:
     def found(self) -> dict[str, Any] | None:
         """``log_offset``, and for each part what `Calibration.found` says; None: no pixel has a variance."""
         parts = {name: part.found() for name, part in self._parts.items()}
-        return None if parts["all"] is None else {"log_offset": self._log_offset, **parts}
+        return None if parts.get("all") is None else {"log_offset": self._log_offset, **parts}
 
 
 def _log(intensity: NDArray[Any], offset: float) -> NDArray[np.float64]:

@@ -183,7 +183,7 @@ def _run(job: Job) -> Finished:
     recording = job.sequence.open()
     method = _method(job.method, job.sequence, job.held_out)
     comparison = _comparison(job, recording)
-    calibrations = Calibrations(method.log_offset)
+    calibrations = Calibrations()
     pictures = Pictures(moments(comparison.images))
     clock = Clock()
 
