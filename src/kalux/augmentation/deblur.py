@@ -54,6 +54,8 @@ EXPOSURE_PIXEL: Final = np.dtype(
 )
 """What a pixel remembers within an exposure: 32 bytes, half a cache line, fetched and stored at once."""
 
+_LARGEST: Final = np.float32(1e37)
+
 
 class ExposureIntegrals(NamedTuple):
     """What the events of one exposure say, per pixel; all (H, W) float32, log intensity.
@@ -95,15 +97,24 @@ def integrate_exposure(
     step_on, step_off
         (H, W) positive log-intensity steps of an event of either polarity.
     """
+    chunks = [events] if isinstance(events, np.ndarray) else events
+    pixels = expose(chunks, start, end, step_on, step_off)
+    integrals = ExposureIntegrals(*np.empty((5, *step_on.shape), np.float32))
+    _finish_exposure(pixels.reshape(-1), end - start, *integrals)
+    return integrals
+
+
+def expose(
+    chunks: Sequence[EventArray], start: int, end: int, step_on: Floats, step_off: Floats
+) -> NDArray[np.void]:
+    """What every pixel remembers of an exposure, (H, W) of `EXPOSURE_PIXEL`. Parameters of `integrate_exposure`."""
     height, width = step_on.shape
     pixels = np.empty(height * width, EXPOSURE_PIXEL)
     _begin_exposure(pixels, step_on, step_off)
-    for chunk in [events] if isinstance(events, np.ndarray) else events:
+    for chunk in chunks:
         inside = between(chunk, start, end)
         _integrate(event_words(inside), pixels, np.uint64(width), start, (start + end) // 2)
-    integrals = ExposureIntegrals(*np.empty((5, height, width), np.float32))
-    _finish_exposure(pixels, end - start, *integrals)
-    return integrals
+    return pixels.reshape(height, width)
 
 
 def still_exposure(shape: tuple[int, int]) -> ExposureIntegrals:
@@ -202,6 +213,13 @@ def _integrate(words, pixels, width, start, middle):  # type: ignore[no-untyped-
             pixel.at_middle = level
 
 
+@nb.njit(cache=True, inline="always", error_model="numpy")
+def mean_level(pixel, duration):  # type: ignore[no-untyped-def]
+    """Mean of the level of an `EXPOSURE_PIXEL` over its exposure of ``duration`` us; finite also of a broken pixel."""
+    mean = (pixel.integral + pixel.level * (duration - pixel.since)) / duration
+    return mean if mean < _LARGEST else _LARGEST
+
+
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _finish_exposure(pixels, exposure, log_mean, to_middle, to_end, peak, events):  # type: ignore[no-untyped-def]
     height, width = events.shape
@@ -211,13 +229,13 @@ def _finish_exposure(pixels, exposure, log_mean, to_middle, to_end, peak, events
             i = row * width + column
             prefetch(pixels, min(i + AHEAD, len(pixels) - 1))
             pixel = pixels[i]
-            log_mean[row, column] = pixel.integral + pixel.level * (duration - pixel.since)
+            log_mean[row, column] = mean_level(pixel, duration)
             to_middle[row, column] = pixel.at_middle
             to_end[row, column] = pixel.level
             peak[row, column] = pixel.peak
             events[row, column] = pixel.events
         for column in range(width):
-            log_mean[row, column] = logarithm(log_mean[row, column] / duration)
+            log_mean[row, column] = logarithm(log_mean[row, column])
         for plane in (to_middle, to_end, peak):
             for column in range(width):
                 plane[row, column] = logarithm(plane[row, column])

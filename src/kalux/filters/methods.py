@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from kalux.augmentation import bridge, deblur, interpolation
 from kalux.augmentation.bridge import BridgeNoise, Latent, Thresholds
-from kalux.augmentation.deblur import ExposureIntegrals, all_between, count_chunks
+from kalux.augmentation.deblur import ExposureIntegrals, all_between, count_chunks, mean_level
+from kalux.compiled import AHEAD, logarithm, prefetch
 from kalux.events import EventArray
 from kalux.filters import akf, complementary
 from kalux.filters.akf import State
@@ -176,12 +177,6 @@ class _Common:
         self.on, self.off = thresholds
         self.offset = settings.camera.offset
 
-    def integrals(self, shot: Shot, events: Chunks, step_on: Floats, step_off: Floats) -> ExposureIntegrals:
-        """EDI over the frame's exposure, or nothing moving where deblurring is off."""
-        if not self.settings.filter.deblur:
-            return deblur.still_exposure(self.shape)
-        return deblur.integrate_exposure(events, shot.start, shot.end, step_on, step_off)
-
     def log_frame(self, shot: Shot) -> Array:
         log_frame: Array = log_intensity(shot.level_intensity, self.offset)[shot.levels]
         return log_frame
@@ -228,14 +223,21 @@ class BridgedFrames(_Common):
 
     def latent(self, shot: Shot, events: Chunks, thresholds: Thresholds) -> Latent:
         """The frame without blur at the middle of its exposure, and its variance (K3)."""
-        integrals = self.integrals(shot, events, self.on * thresholds.on, self.off * thresholds.off)
+        pixels = deblur.expose(
+            events if self.settings.filter.deblur else (),
+            shot.start,
+            shot.end,
+            np.float32(self.on) * thresholds.on,
+            np.float32(self.off) * thresholds.off,
+        )
         r_bar = covariance(shot.level_weight, (self.settings.camera.frame_noise * shot.white) ** 2, 1e-6)
         level_variance = log_covariance(shot.level_intensity, r_bar, self.offset)
         return latent_frame(
             shot.levels,
             log_intensity(shot.level_intensity, self.offset),
             np.where(shot.level_clipped, bridge.UNMEASURED, level_variance),
-            integrals,
+            pixels,
+            duration=shot.end - shot.start,
             white=float(np.log(self.settings.camera.saturation * shot.white + self.offset)),
             event_variance=self.settings.events.deblur_variance * self.on * self.off,
         )
@@ -329,27 +331,13 @@ class BridgedFrames(_Common):
         return akf.end_bridged(segment, cursor)
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
-def _latent_frame(  # type: ignore[no-untyped-def]
-    levels, level_log, level_variance, integrals, white, event_variance, value, variance
-):
-    height, width = levels.shape
-    for row in range(height):
-        for column in range(width):
-            i = row, column
-            start = level_log[levels[i]] - integrals.log_mean[i]
-            value[i] = start + integrals.to_middle[i]
-            known = level_variance[levels[i]] + event_variance * integrals.events[i]
-            clipped = start + integrals.peak[i] >= white
-            variance[i] = bridge.UNMEASURED if clipped else min(known, bridge.UNMEASURED)
-
-
 def latent_frame(
     levels: NDArray[np.integer[Any]],
     level_log: Array,
     level_variance: Array,
-    integrals: ExposureIntegrals,
+    pixels: NDArray[np.void],
     *,
+    duration: int,
     white: float,
     event_variance: float,
 ) -> Latent:
@@ -361,16 +349,49 @@ def latent_frame(
         (H, W) the level of every pixel.
     level_log, level_variance
         (N,) log(I + I_0) of each level, and its variance; `UNMEASURED` where clipped.
-    integrals
-        EDI of the exposure.
+    pixels
+        (H, W) EDI of the exposure, from `deblur.expose`.
+    duration
+        Of the exposure, us.
     white
         Log intensity from which a pixel is clipped: one that reached it within the exposure was, for a part of it.
     event_variance
         What each event of the exposure adds to the variance.
     """
     value, variance = np.empty((2, *levels.shape), np.float32)
-    _latent_frame(levels, level_log, level_variance, integrals, white, event_variance, value, variance)
+    scalars = np.float32(duration), np.float32(white), np.float32(event_variance)
+    tables = level_log.astype(np.float32), level_variance.astype(np.float32)
+    _latent_frame(levels, *tables, pixels.reshape(-1), *scalars, value, variance)
     return Latent(value, variance)
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _latent_frame(  # type: ignore[no-untyped-def]
+    levels, level_log, level_variance, pixels, duration, white, event_variance, value, variance
+):
+    unmeasured = np.float32(bridge.UNMEASURED)
+    height, width = levels.shape
+    # L^D at the middle, and at its peak, over log(B + I_0): their logarithms go over a row at a time.
+    middle, peak = np.empty(width, np.float32), np.empty(width, np.float32)
+    for row in range(height):
+        for column in range(width):
+            i = row * width + column
+            prefetch(pixels, min(i + AHEAD, len(pixels) - 1))
+            pixel = pixels[i]
+            mean = mean_level(pixel, duration)
+            middle[column] = pixel.at_middle / mean
+            peak[column] = pixel.peak / mean
+            variance[row, column] = event_variance * pixel.events
+        for column in range(width):
+            middle[column] = logarithm(middle[column])
+            peak[column] = logarithm(peak[column])
+        for column in range(width):
+            level = levels[row, column]
+            log_frame = level_log[level]
+            known = level_variance[level] + variance[row, column]
+            value[row, column] = log_frame + middle[column]
+            clipped = log_frame + peak[column] >= white or known >= unmeasured
+            variance[row, column] = unmeasured if clipped else known
 
 
 class InterpolationMemory(NamedTuple):
@@ -414,8 +435,10 @@ class InterpolatedFrames(_Common):
         return self.on * on - self.off * off
 
     def exposure(self, shot: Shot, events: Chunks) -> ExposureIntegrals:
+        if not self.settings.filter.deblur:
+            return deblur.still_exposure(self.shape)
         steps = np.full(self.shape, self.on), np.full(self.shape, self.off)
-        return self.integrals(shot, events, *steps)
+        return deblur.integrate_exposure(events, shot.start, shot.end, *steps)
 
     def r_bar(self, shot: Shot) -> Array:
         """R_bar (6); scaling the intensity by the exposure scales its noise with it."""
