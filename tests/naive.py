@@ -182,7 +182,7 @@ def paper(pixel, settings, times, on, off):
 
 
 def bridged(pixel, settings, times, on, off):
-    """L(t) and P(t) of one pixel, docs/equations.md, K1 to K5 and K7."""
+    """L(t) and P(t) of one pixel, docs/equations.md, K1 to K5, K7 and K10."""
     c, ev = settings.camera, settings.events
     i0, count, c2 = c.offset, len(pixel.starts), on * off
     scale_on, scale_off = 1.0, 1.0
@@ -228,6 +228,21 @@ def bridged(pixel, settings, times, on, off):
     last = (pixel.middles[-1], None, first, None, scale_on, scale_off, var_on, var_off, 0.0)
     intervals.append(last)
 
+    def drift():  # K10: what the thresholds add to the variance at the end of every interval
+        far_on = far_off = 0
+        yield 0.0
+        for a, b, _, right, _, _, v_on, v_off, _ in intervals[1:-1]:
+            n_on, n_off = counts(a, b)
+            if right[1] < UNMEASURED:
+                far_on = far_off = 0
+                yield 0.0
+                continue
+            before = v_on * (on * far_on) ** 2 + v_off * (off * far_off) ** 2
+            far_on, far_off = far_on + n_on, far_off + n_off
+            yield v_on * (on * far_on) ** 2 + v_off * (off * far_off) ** 2 - before
+
+    drifts = list(drift())
+
     def augmented(interval, t, known_until):  # K1: posterior mean of the level at t, given both frames
         a, b, left, right, s_on, s_off, v_on, v_off, gain = interval
         if left is None:
@@ -266,10 +281,20 @@ def bridged(pixel, settings, times, on, off):
         deviation = (value - augmented(interval, at, at)) / variance / information  # (17)
         return augmented(interval, t, at) + deviation, 1 / information
 
-    def bounded(t):  # K7
+    def bounded(t):  # K7 and K10
         value, variance = predict(t)
         _, b, _, right, *_ = intervals[index]
-        return (max(value, right[0]) if t == b and right[1] >= UNMEASURED else value), variance
+        if t != b:
+            return value, variance
+        return (max(value, right[0]) if right[1] >= UNMEASURED else value), variance + drifts[index]
+
+    def raised(value):  # K7: what events take below the next frame's bound was too low all the time
+        a, b, left, right, *_ = intervals[index]
+        if right is None or left[1] < UNMEASURED or right[1] < UNMEASURED:
+            return value
+        n_on, n_off = counts(a, b)
+        up, down = (own_step(intervals[index], p, on, off, ev, c2, counts) for p in (True, False))
+        return max(value, right[0] - (n_on * up + n_off * down))
 
     def step_to(limit):
         nonlocal state, at
@@ -288,6 +313,7 @@ def bridged(pixel, settings, times, on, off):
             step_to(intervals[index][1])
             state, at = bounded(intervals[index][1]), intervals[index][1]
             index += 1
+            state = (raised(state[0]), state[1])
         step_to(t)
         out.append(bounded(t))
     return np.array(out)
@@ -332,18 +358,61 @@ def complementary(pixel, settings, times, on, off):
     return np.array(out)
 
 
+def hidden(pixel, settings, t, on, off):
+    """K11: (the variance of what no event has told, whether the pixel moves)."""
+    middles, first = pixel.middles, pixel.starts[0]
+    k = sum(m < t for m in middles) - 1  # segments end where the next one's frame is read
+    start, end = first, middles[0]
+    still_since = first
+    if k >= 0:
+        start = middles[k]
+        end = middles[k + 1] if k + 1 < len(middles) else None
+        seconds = 0.04e6
+        if k > 0:
+            seconds = middles[k] - middles[k - 1]
+        still_since = max(start - round(seconds), first)
+    newest = max([q for q, *_ in pixel.events if q <= t], default=first)
+    share = 0.5 if k < 0 or end is None else (t - start) / (end - start)
+    moving = newest > still_since
+    at, half = (0.02, 0.12) if moving else (0.005, 0.04)
+    return on * off * (at + half * 4 * share * (1 - share)), moving
+
+
+def regularised(level, variance, moving, difference):
+    """K12, of whole images."""
+    out = level.copy()
+    height, width = level.shape
+    for row, column in zip(*np.nonzero(moving), strict=True):
+        total, weights = level[row, column] / variance[row, column], 1 / variance[row, column]
+        for i in range(max(row - 1, 0), min(row + 2, height)):
+            for j in range(max(column - 1, 0), min(column + 2, width)):
+                if (i, j) == (row, column):
+                    continue
+                own = variance[i, j] + difference**2 * ((i - row) ** 2 + (j - column) ** 2)
+                both = variance[row, column] + own
+                excess = level[i, j] - level[row, column]
+                weight = (1 + excess**2 / (4 * both)) ** -2 / own
+                total, weights = total + weight * level[i, j], weights + weight
+        out[row, column] = total / weights
+    return out
+
+
 def intensity(log_intensity, variance, settings, white, stretch):
     """Read-out, K6."""
     i0, scale2 = settings.camera.offset, settings.filter.highlight_scale**2
     top = np.log(white + i0)
     if scale2 > 0 and log_intensity > top:
-        excess = (log_intensity - top) * scale2 / (scale2 + min(variance, 0.3))
-        log_intensity = top + (lambertw(stretch * excess).real / stretch if stretch > 0 else excess)
+        trust = scale2 / (scale2 + variance)
+        believed, left = (log_intensity - top) * trust, variance * trust
+        if stretch > 0:
+            w = lambertw(stretch * believed).real
+            believed, left = w / stretch, left * (np.exp(-w) / (1 + w)) ** 2
+        log_intensity = top + believed + min(left, believed * np.sqrt(left)) / 2
     return max(np.exp(log_intensity) - i0, 0.0)
 
 
 def reconstruct(events, frames, sensor_size, settings, times):
-    """L and P at ``times``, two (T, H, W) arrays."""
+    """L, P, hidden variance (K11) and whether pixels move at ``times``, four (T, H, W) arrays."""
     kind = settings.filter.kind
     if kind == "cf":
         method, begin = complementary, (frames[0].exposure_start + frames[0].exposure_end) // 2
@@ -351,7 +420,8 @@ def reconstruct(events, frames, sensor_size, settings, times):
         method = bridged if settings.filter.augmentation == "bridge" else paper
         begin = frames[0].exposure_start
     on, off = settings.events.threshold_on, settings.events.threshold_off
-    out = np.empty((2, len(times), *sensor_size))
+    out = np.empty((4, len(times), *sensor_size))
     for (row, column), pixel in pixels(events, frames, sensor_size, settings, begin).items():
-        out[:, :, row, column] = method(pixel, settings, times, on, off).T
-    return out[0], out[1]
+        out[:2, :, row, column] = method(pixel, settings, times, on, off).T
+        out[2:, :, row, column] = np.transpose([hidden(pixel, settings, t, on, off) for t in times])
+    return out[0], out[1], out[2], out[3].astype(bool)

@@ -20,7 +20,7 @@ from kalux.events import as_events, check_events
 from kalux.filters.akf import State
 from kalux.filters.buffer import EventBuffer
 from kalux.filters.methods import Method, Segment, Shot, make_method, take_shot
-from kalux.filters.readout import HighlightPrior, intensity
+from kalux.filters.readout import HighlightPrior, intensity, regularised, total_variance
 from kalux.frames import Frame, check_frame
 from kalux.models.camera import Camera, Response
 from kalux.settings import Settings
@@ -76,6 +76,10 @@ class Estimate:
         log(1 + I_0) of the brightest level that frames show there.
     final
         As of `Image`.
+    moving
+        (H, W) bool: pixels with an event in this frame interval or the one before; None: not told.
+    between
+        0 at a frame, 1 half-way between two or where no next one is known.
     """
 
     t: int
@@ -83,6 +87,8 @@ class Estimate:
     variance: NDArray[np.floating[Any]]
     white: float
     final: bool
+    moving: NDArray[np.bool_] | None = None
+    between: float = 0.0
 
 
 class _Progress:
@@ -318,10 +324,18 @@ class Reconstructor:
         log_intensity, variance = self._method.read(progress.segment, progress.cursor, t)
         final_until = self.final_until
         final = final_until is not None and t <= final_until
-        return Estimate(t, log_intensity, variance, self._white(progress, t), final)
+        return Estimate(
+            t,
+            log_intensity,
+            variance,
+            self._white(progress, t),
+            final,
+            self._method.moving(progress.segment, progress.cursor),
+            _between(progress, t),
+        )
 
     def image(self, estimate: Estimate) -> Image:
-        """The image of an estimate: its intensity, with highlights as far as they are believed (K6)."""
+        """The image of an estimate: highlights as far as they are believed (K6), with what neighbours know (K12)."""
         # The prior needs a variance, which the complementary filter has not.
         scale = self.settings.filter.highlight_scale if self.settings.filter.kind == "akf" else 0.0
         events = self.settings.events
@@ -329,12 +343,16 @@ class Reconstructor:
         prior = HighlightPrior(
             white=estimate.white, scale2=scale**2, stretch=spread**2 / scale if scale > 0 else 0.0
         )
+        moving, neighbours = estimate.moving, self.settings.filter.neighbours
+        on, off = self.thresholds
+        variance = total_variance(estimate.variance, moving, estimate.between, on * off)
+        log_intensity = estimate.log_intensity
+        if moving is not None and neighbours > 0:
+            log_intensity = regularised(log_intensity, variance, moving, neighbours)
         return Image(
             t=estimate.t,
-            intensity=intensity(
-                estimate.log_intensity, estimate.variance, self.settings.camera.offset, prior
-            ),
-            variance=estimate.variance.astype(np.float32, copy=False),
+            intensity=intensity(log_intensity, variance, self.settings.camera.offset, prior),
+            variance=variance,
             log_offset=self.settings.camera.offset,
             final=estimate.final,
         )
@@ -455,6 +473,15 @@ class Reconstructor:
             self._method.advance(progress.segment, progress.cursor, events)
             progress.latest = int(events["t"][-1])
         progress.taken = self._events.number(t)
+
+
+def _between(progress: _Progress, t: int) -> float:
+    """4 s (1 - s) at the share s of the way from one frame to the next; 1 where there is only one of them."""
+    segment = progress.segment
+    if not (progress.ready and progress.starts_frame):
+        return 1.0
+    share = (t - segment.start) / (segment.end - segment.start)
+    return 4.0 * share * (1.0 - share)
 
 
 def _with_spread(settings: Settings, least: float) -> Settings:

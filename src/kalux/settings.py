@@ -144,7 +144,10 @@ class FilterSettings:
         the released code). 1.0: a clipped pixel is white or up to a few times brighter.
     highlight_scale
         Standard deviation, in log intensity, of how far scenes go beyond white: what is not known of a
-        highlight is drawn towards white by it. 0 turns it off. 1.0: highlights up to e times white are usual.
+        highlight is drawn towards white by it. 0 turns it off. 1.5 (docs/tuning.md).
+    neighbours
+        Standard deviation, in log intensity, by which neighbouring pixels of a surface differ: moving pixels are
+        given what their eight neighbours know (docs/equations.md, K12). 0 turns it off. 0.3 (docs/tuning.md).
     cutoff
         Of the complementary filter, Hz. 1.0 (Scheerlinck 2018 uses 2 pi rad/s).
     """
@@ -154,7 +157,8 @@ class FilterSettings:
     solution: SolutionName = "exact"
     deblur: bool = True
     initial_variance: float = 1.0
-    highlight_scale: float = 1.0
+    highlight_scale: float = 1.5
+    neighbours: float = 0.3
     cutoff: float = 1.0
 
 
@@ -302,7 +306,11 @@ _PAPER: Final = Settings(
     camera=CameraSettings(log_offset=1.0),
     events=EventSettings(delay=0),
     filter=FilterSettings(
-        augmentation="paper", solution="printed", initial_variance=0.09, highlight_scale=0.0
+        augmentation="paper",
+        solution="printed",
+        initial_variance=0.09,
+        highlight_scale=0.0,
+        neighbours=0.0,
     ),
 )
 
@@ -310,7 +318,7 @@ PRESETS: Final[Mapping[str, Settings]] = {
     "default": Settings(),
     "iccv2021": _PAPER,
     "iccv2021-flir": dataclasses.replace(_PAPER, camera=dataclasses.replace(_PAPER.camera, confidence=7e7)),
-    "cf": Settings(filter=FilterSettings(kind="cf", deblur=False, highlight_scale=0.0)),
+    "cf": Settings(filter=FilterSettings(kind="cf", deblur=False, highlight_scale=0.0, neighbours=0.0)),
 }
 """``default``: best on ground truth. ``iccv2021``: the paper to the letter with the confidence of its DAVIS,
 ``iccv2021-flir`` of its FLIR. ``cf``: the complementary filter."""

@@ -230,7 +230,13 @@ def combine(forward: Estimate, backward: Estimate | None) -> Estimate:
         variance=np.minimum(forward.variance, backward.variance),
         white=forward.white,
         final=forward.final,
+        moving=_either(forward.moving, backward.moving),
+        between=forward.between,
     )
+
+
+def _either(first: NDArray[np.bool_] | None, second: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
+    return None if first is None or second is None else first | second
 
 
 def reversed_settings(settings: Settings) -> Settings:

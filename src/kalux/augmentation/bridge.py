@@ -63,7 +63,9 @@ class BridgedSegment(NamedTuple):
     the way to the end to the way from the start. The covariance of L^A as a measurement is
     R = 1 / (rate (1/forward + 1/backward)), ``rate`` in 1/s, where ``forward`` is ``forward_variance`` and
     ``step_variance`` for each event since the start, and ``backward`` is ``backward_variance`` and ``step_variance``
-    for each of the ``events`` still to come. At ``end`` the pixel obeys the frame ``bound`` (`lift`).
+    for each of the ``events`` still to come. At ``start`` the level is ``floor`` or more (`floor_before`; None: no
+    bound). At ``end`` the pixel obeys the frame ``bound`` (`lift`), and its variance grows by ``drift``, what its
+    thresholds may have been wrong by (`drift`; None: nothing). Pixels without an event after ``still_since`` are still.
     """
 
     start: int
@@ -78,6 +80,34 @@ class BridgedSegment(NamedTuple):
     step_variance: float
     rate: float
     bound: Latent | None
+    drift: Array | None = None
+    still_since: int = 0
+    floor: Array | None = None
+
+
+def drift(
+    thresholds: Thresholds, noise: BridgeNoise, far_on: Array, far_off: Array, on: Array, off: Array
+) -> Array:
+    """By how much events add to the variance of a pixel that no frame measures (docs/equations.md, K10).
+
+    A threshold that is wrong is wrong for all events alike: after N of them the level is off by N times the error, and
+    the variance is N^2 times the threshold's. ``far_on`` and ``far_off`` events have come since a frame last measured
+    the pixel, ``on`` and ``off`` come now.
+    """
+    of_on = thresholds.on_variance * noise.threshold_on**2 * on * (2 * far_on + on)
+    of_off = thresholds.off_variance * noise.threshold_off**2 * off * (2 * far_off + off)
+    grown: Array = of_on + of_off
+    return grown
+
+
+def floor_before(second: Latent, net: Array, unmeasured: NDArray[np.bool_]) -> Array:
+    """What a clipped frame says of the level one interval earlier (K7), where no frame measured that; -inf elsewhere.
+
+    What is not known of such a pixel is a constant: if events lead from it to less than the next frame's bound, it was
+    too low all the time. ``net`` is what events add to the level between the frames.
+    """
+    bound = unmeasured & (second.variance >= UNMEASURED)
+    return np.where(bound, second.value - net, np.float32(-np.inf))
 
 
 def lift(log_intensity: Array, frame: Latent) -> None:

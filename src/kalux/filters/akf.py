@@ -167,7 +167,10 @@ def begin_bridged(segment: BridgedSegment, state: State) -> BridgedCursor:
     """The cursor at the start of a segment: L stays, L^A is the segment's. The clock's origin is the start."""
     clock: Clock = state.newest.astype(np.int32)
     pixels = np.empty(clock.shape, BRIDGED_PIXEL)
-    _begin_bridged(segment, state.log_intensity, state.variance, pixels)
+    level = state.log_intensity
+    if segment.floor is not None:
+        level = np.maximum(level, segment.floor)  # K7
+    _begin_bridged(segment, level, state.variance, pixels)
     return BridgedCursor(pixels, clock, segment.start)
 
 
@@ -195,9 +198,19 @@ def read_bridged(segment: BridgedSegment, cursor: BridgedCursor, t: int) -> tupl
     since_start = np.float32((t - segment.start) * 1e-6)
     pixels, clock = cursor.pixels.reshape(-1), cursor.clock.reshape(-1)
     _read_bridged(segment, pixels, clock, within, beyond, since_start, log_intensity, variance)
-    if t == segment.end and segment.bound is not None:
-        lift(log_intensity, segment.bound)  # K7
+    if t == segment.end:
+        if segment.bound is not None:
+            lift(log_intensity, segment.bound)  # K7
+        if segment.drift is not None:
+            variance += segment.drift  # K10
     return log_intensity, variance
+
+
+def moving_bridged(segment: BridgedSegment, cursor: BridgedCursor) -> NDArray[np.bool_]:
+    """(H, W): pixels with an event since ``segment.still_since``."""
+    inside = cursor.clock[1:-1, 1:-1]
+    moving: NDArray[np.bool_] = inside > np.int32(max(segment.still_since - cursor.origin, -EPOCH))
+    return moving
 
 
 def end_bridged(segment: BridgedSegment, cursor: BridgedCursor) -> State:

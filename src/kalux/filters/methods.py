@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation import bridge, deblur, interpolation
-from kalux.augmentation.bridge import BridgeNoise, Latent, Thresholds
+from kalux.augmentation.bridge import BridgedSegment, BridgeNoise, Latent, Thresholds
 from kalux.augmentation.deblur import ExposureIntegrals, all_between, count_chunks, mean_level
 from kalux.compiled import AHEAD, logarithm, prefetch
 from kalux.events import EventArray
@@ -157,6 +157,9 @@ class Method(Protocol):
     def end(self, segment: Any, cursor: Any) -> State:
         """The state at the end of the segment."""
 
+    def moving(self, segment: Any, cursor: Any) -> NDArray[np.bool_] | None:
+        """(H, W): pixels with an event in this frame interval or the one before; None: the method does not tell."""
+
 
 def make_method(
     settings: Settings, thresholds: tuple[float, float], lookahead: bool, shape: tuple[int, int]
@@ -177,6 +180,9 @@ class _Common:
         self.on, self.off = thresholds
         self.offset = settings.camera.offset
 
+    def moving(self, segment: Any, cursor: Any) -> NDArray[np.bool_] | None:
+        return None
+
     def log_frame(self, shot: Shot) -> Array:
         log_frame: Array = log_intensity(shot.level_intensity, self.offset)[shot.levels]
         return log_frame
@@ -189,7 +195,9 @@ class _Common:
 class BridgeMemory(NamedTuple):
     """The latest frame, deblurred; the pixels' thresholds; the frame interval in s (0: not known yet).
 
-    In causal mode also the counts of events between the middle and the end of the latest exposure.
+    In causal mode also the counts of events between the middle and the end of the latest exposure. Of pixels that the
+    latest frames did not measure, the counts since one did (to the latest node); 0 elsewhere. ``since`` is the start of
+    the first exposure, us.
     """
 
     latent: Latent
@@ -197,6 +205,9 @@ class BridgeMemory(NamedTuple):
     interval: float
     on: Floats
     off: Floats
+    far_on: Floats
+    far_off: Floats
+    since: int
 
 
 class BridgedFrames(_Common):
@@ -248,17 +259,19 @@ class BridgedFrames(_Common):
         begin = self.begin_time(shot)
         newest = make_clock(self.shape, begin - shot.start)
         lead_in = None
+        far = np.zeros(self.shape, np.float32)
         if self.lookahead:
             on, off = self.counts(events, begin, shot.middle)
-            memory = BridgeMemory(latent, thresholds, 0.0, on, off)
+            memory = BridgeMemory(latent, thresholds, 0.0, on, off, far, far, shot.start)
             value, variance = latent
             if shot.middle > begin:
                 lead_in = bridge.extend_backward(latent, on, off, thresholds, self.noise, begin, shot.middle)
+                lead_in = lead_in._replace(still_since=shot.start)
                 value = lead_in.augmented
                 variance = lead_in.backward_variance + lead_in.step_variance * lead_in.events
         else:
             on, off = self.counts(events, shot.middle, shot.end)
-            memory = BridgeMemory(latent, thresholds, 0.0, on, off)
+            memory = BridgeMemory(latent, thresholds, 0.0, on, off, far, far, shot.start)
             value, variance = self._carried(memory)
         unmeasured = variance >= bridge.UNMEASURED
         variance = np.where(unmeasured, np.float32(self.settings.filter.initial_variance), variance)
@@ -273,10 +286,8 @@ class BridgedFrames(_Common):
             latent = memory.latent
             if not self.lookahead:
                 latent = self._carried(memory)
-            return (
-                bridge.extend(latent, memory.thresholds, self.noise, start, FAR_FUTURE, seconds, None),
-                memory,
-            )
+            alone = bridge.extend(latent, memory.thresholds, self.noise, start, FAR_FUTURE, seconds, None)
+            return alone._replace(still_since=_still_since(memory, start, seconds)), memory
         interval = (following.middle - shot.middle) * 1e-6
         second = self.latent(following, events, memory.thresholds)
         on, off = self.counts(events, start, following.middle)
@@ -284,7 +295,11 @@ class BridgedFrames(_Common):
             joined, learned = bridge.bridge(
                 memory.latent, second, on, off, memory.thresholds, self.noise, start, following.middle
             )
-            return joined, BridgeMemory(second, learned, interval, on, off)
+            net = joined.step_on * on - joined.step_off * off
+            unmeasured = memory.latent.variance >= bridge.UNMEASURED
+            joined = joined._replace(floor=bridge.floor_before(second, net, unmeasured))
+            joined, far_on, far_off = self._drifting(joined, memory, second, on, off)
+            return joined, BridgeMemory(second, learned, interval, on, off, far_on, far_off, memory.since)
         _, learned = bridge.bridge(
             memory.latent,
             second,
@@ -296,7 +311,7 @@ class BridgedFrames(_Common):
             following.middle,
         )
         tail = self.counts(events, following.middle, following.end)
-        after = BridgeMemory(second, learned, interval, *tail)
+        after = BridgeMemory(second, learned, interval, *tail, memory.far_on, memory.far_off, memory.since)
         forward = bridge.extend(
             self._carried(memory),
             memory.thresholds,
@@ -306,7 +321,24 @@ class BridgedFrames(_Common):
             memory.interval or self._FIRST_INTERVAL,
             self._carried(after),
         )
-        return forward, after
+        forward, far_on, far_off = self._drifting(forward, memory, second, on + tail[0], off + tail[1])
+        return forward, after._replace(far_on=far_on, far_off=far_off)
+
+    def _drifting(
+        self, segment: BridgedSegment, memory: BridgeMemory, second: Latent, on: Floats, off: Floats
+    ) -> tuple[BridgedSegment, Floats, Floats]:
+        """The segment with what its pixels may drift (K10), and the counts since they were measured, at its end."""
+        unmeasured = second.variance >= bridge.UNMEASURED
+        grown = bridge.drift(memory.thresholds, self.noise, memory.far_on, memory.far_off, on, off)
+        segment = segment._replace(
+            drift=np.where(unmeasured, grown, np.float32(0.0)),
+            still_since=_still_since(memory, segment.start, memory.interval or self._FIRST_INTERVAL),
+        )
+        far_on, far_off = (
+            np.where(unmeasured, far + now, np.float32(0.0))
+            for far, now in ((memory.far_on, on), (memory.far_off, off))
+        )
+        return segment, far_on, far_off
 
     def _carried(self, memory: BridgeMemory) -> Latent:
         """The latest frame from the middle to the end of its exposure, with the events between (10)."""
@@ -329,6 +361,14 @@ class BridgedFrames(_Common):
 
     def end(self, segment: Any, cursor: akf.BridgedCursor) -> State:
         return akf.end_bridged(segment, cursor)
+
+    def moving(self, segment: Any, cursor: akf.BridgedCursor) -> NDArray[np.bool_]:
+        return akf.moving_bridged(segment, cursor)
+
+
+def _still_since(memory: BridgeMemory, start: int, seconds: float) -> int:
+    """One frame interval before a segment, but not before the first exposure, us."""
+    return max(start - round(seconds * 1e6), memory.since)
 
 
 def latent_frame(

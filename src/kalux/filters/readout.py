@@ -1,4 +1,4 @@
-"""From the state to an intensity: I = exp(L) - I_0, with what is known of highlights."""
+"""From the state to an intensity: I = exp(L) - I_0, with what is known of highlights and of neighbours."""
 
 from __future__ import annotations
 
@@ -13,9 +13,13 @@ from kalux.compiled import ONE, exponential, logarithm
 Array = NDArray[np.floating[Any]]
 
 
-MOST_VARIANCE: Final = 0.3
-"""Largest variance that an excess is shrunk for. A pixel that was never seen below white has the variance of its
-start, white, which is the prior itself: what events add to it must not be shrunk for it a second time."""
+HIDDEN_MOVING: Final = (0.02, 0.12)
+"""Variance, in c^2, of what a pixel does between its events, at a frame and in addition half-way between two frames,
+where events have come of late: that of mid-exposure frames and of times half-way between on eleven simulated scenes
+(docs/equations.md, K11)."""
+
+HIDDEN_STILL: Final = (0.005, 0.04)
+"""The same where no event has come of late."""
 
 _BLOCK: Final = 256
 """Pixels that are looked at together: the highlights of a block are brought together, so that they go through vector
@@ -46,13 +50,19 @@ def believed_highlight(excess, variance, scale2, stretch):  # type: ignore[no-un
 
     Additive noise: a normal prior of variance ``scale2`` shrinks the excess. Unknown scale of the events: with
     a log-normal scale and an exponential prior the mode solves d exp(stretch d) = excess, i.e.
-    d = W(stretch excess) / stretch with Lambert's W.
+    d = W(stretch excess) / stretch with Lambert's W. What is returned is the log of the mean intensity, half the
+    variance that is left above the mean of the log, but no more than a part of d: at white nothing is added.
     """
     scale2, stretch = np.float32(scale2), np.float32(stretch)
-    shrunk = np.float32(excess) * (scale2 / (scale2 + np.float32(variance)))
-    if stretch == np.float32(0.0):
-        return shrunk
-    return lambert_w(stretch * shrunk) / stretch
+    trust = scale2 / (scale2 + np.float32(variance))
+    believed = np.float32(excess) * trust
+    left = np.float32(variance) * trust
+    if stretch != np.float32(0.0):
+        w = lambert_w(stretch * believed)
+        believed = w / stretch
+        slope = exponential(-w) / (ONE + w)  # of d in the shrunk excess
+        left *= slope * slope
+    return believed + np.float32(0.5) * min(left, believed * np.sqrt(left))
 
 
 @nb.njit(cache=True, inline="always", error_model="numpy")
@@ -96,7 +106,7 @@ def intensity(
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _intensity(log_intensity, variance, log_offset, prior, out):  # type: ignore[no-untyped-def]
-    zero, most_variance = np.float32(0.0), np.float32(MOST_VARIANCE)
+    zero = np.float32(0.0)
     white, scale2, stretch = np.float32(prior.white), np.float32(prior.scale2), np.float32(prior.stretch)
     places = np.empty(_BLOCK, np.int64)
     excess, doubt = np.empty(_BLOCK, np.float32), np.empty(_BLOCK, np.float32)
@@ -116,9 +126,90 @@ def _intensity(log_intensity, variance, log_offset, prior, out):  # type: ignore
             count += int(np.float32(logs[i]) > white)
         for k in range(highlights):
             excess[k] = np.float32(logs[places[k]]) - white
-            doubt[k] = min(np.float32(variances[places[k]]), most_variance)
+            doubt[k] = np.float32(variances[places[k]])
         for k in range(highlights):
             believed = white + believed_highlight(excess[k], doubt[k], scale2, stretch)
             excess[k] = max(exponential(believed) - log_offset, zero)
         for k in range(highlights):
             block[places[k]] = excess[k]
+
+
+def total_variance(
+    variance: Array, moving: NDArray[np.bool_] | None, between: float, threshold2: float
+) -> NDArray[np.float32]:
+    """P and the variance of what no event has told yet (docs/equations.md, K11), (H, W) float32.
+
+    Parameters
+    ----------
+    variance
+        (H, W) P.
+    moving
+        (H, W): pixels with an event of late; None: P as it is.
+    between
+        0 at a frame, 1 half-way between two.
+    threshold2
+        c^2.
+    """
+    if moving is None:
+        return variance.astype(np.float32, copy=False)
+    still, move = (
+        np.float32(threshold2 * (at + between * half)) for at, half in (HIDDEN_STILL, HIDDEN_MOVING)
+    )
+    return variance.astype(np.float32, copy=False) + np.where(moving, move, still)
+
+
+def regularised(
+    log_intensity: Array, variance: NDArray[np.float32], moving: NDArray[np.bool_], difference: float
+) -> NDArray[np.float32]:
+    """L with what neighbours know (docs/equations.md, K12), (H, W) float32; still pixels are as they were.
+
+    The mean of a pixel and its eight neighbours, weighted by the information that each has about it: a neighbour at
+    distance d differs by a normal amount of variance ``difference``^2 d^2, unless there is an edge between, which a
+    difference beyond what both variances explain tells.
+
+    Parameters
+    ----------
+    log_intensity, variance
+        (H, W) L, and its variance.
+    moving
+        (H, W): pixels that are changed.
+    difference
+        Standard deviation of the difference of L between neighbours where there is no edge.
+    """
+    out = log_intensity.astype(np.float32)
+    _regularise(log_intensity, variance, moving, np.float32(difference * difference), out)
+    return out
+
+
+@nb.njit(cache=True, inline="always")
+def neighbour_weight(excess, variance, neighbour_variance, allowed):  # type: ignore[no-untyped-def]
+    """Information that a neighbour has about a pixel; ``excess`` is the difference of their L.
+
+    1 / (P' + s^2) (1 + excess^2 / (4 v))^-2 with v = P + P' + s^2: near exp(-excess^2 / (2 v)), with one division.
+    """
+    own = neighbour_variance + allowed
+    both = variance + own
+    edge = both + np.float32(0.25) * excess * excess
+    return both * both / (own * edge * edge)
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _regularise(log_intensity, variance, moving, allowed, out):  # type: ignore[no-untyped-def]
+    height, width = log_intensity.shape
+    for row in range(height):
+        for column in range(width):
+            if not moving[row, column]:
+                continue
+            value, own = np.float32(log_intensity[row, column]), variance[row, column]
+            information = ONE / own
+            deviation = np.float32(0.0)
+            for i in range(max(row - 1, 0), min(row + 2, height)):
+                for j in range(max(column - 1, 0), min(column + 2, width)):
+                    if i == row and j == column:
+                        continue
+                    distance2 = np.float32((i - row) * (i - row) + (j - column) * (j - column))
+                    excess = np.float32(log_intensity[i, j]) - value
+                    weight = neighbour_weight(excess, own, variance[i, j], allowed * distance2)
+                    deviation += weight * excess
+                    information += weight
+            out[row, column] = value + deviation / information
