@@ -15,13 +15,21 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.errors import InputError
+from kalux.errors import InputError, SettingsError
 from kalux.events import EVENT_DTYPE, EventArray, as_events, check_events
 from kalux.filters.akf import State
 from kalux.filters.methods import Method, Segment, Shot, make_method, take_shot
 from kalux.filters.readout import HighlightPrior, intensity
 from kalux.frames import Frame, check_frame
-from kalux.models.camera import Camera, Response
+from kalux.models.camera import Camera
+from kalux.models.colour import (
+    Gains,
+    calm_highlights,
+    demosaic,
+    joined_chromaticity,
+    luminance,
+    white_balance,
+)
 from kalux.settings import Settings
 from kalux.settings import preset as named_preset
 
@@ -50,12 +58,22 @@ class Image:
         knows none.
     final
         Whether more data can no longer change it. With lookahead an image is final one frame later.
+    colour
+        float32 (H, W, 3), linear red, green, blue with the scale of ``intensity``, which of a Bayer sensor holds each
+        pixel's own channel before white balance, and of frames in RGB the luminance. None: the frames are grey.
     """
 
     t: int
     intensity: NDArray[np.float32]
     variance: NDArray[np.float32]
     final: bool
+    colour: NDArray[np.float32] | None = None
+
+    def grey(self) -> Image:
+        """The same image without colours: its intensity is the luminance of ``colour``."""
+        if self.colour is None:
+            return self
+        return dataclasses.replace(self, intensity=luminance(self.colour), colour=None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +90,8 @@ class Estimate:
         log(1 + I_0) of the brightest level that frames show there.
     final
         As of `Image`.
+    chroma
+        Of frames in RGB: float32 (H, W, 3), the ratios of the channels to the luminance; else None.
     """
 
     t: int
@@ -79,6 +99,7 @@ class Estimate:
     variance: NDArray[np.float64]
     white: float
     final: bool
+    chroma: NDArray[np.float32] | None = None
 
 
 class _Progress:
@@ -151,12 +172,12 @@ class Reconstructor:
         )
         self._delay = chosen.delay or 0
         camera = self.settings.camera
-        response = Response.named(camera.response)
-        self._camera = (
-            Camera(response, None, camera.saturation)
-            if inverse_covariance is None
-            else Camera.from_inverse_covariance(inverse_covariance, response, camera.saturation)
-        )
+        self._camera = Camera.named(camera.response, camera.saturation)
+        if inverse_covariance is not None:
+            self._camera = Camera.from_inverse_covariance(
+                inverse_covariance, self._camera.response, camera.saturation
+            )
+        self._gains = white_balance(camera.white_balance)
         self._reference = camera.reference_exposure or reference_exposure
         used = _with_spread(self.settings, _UNKNOWN_SPREAD) if unknown else self.settings
         self._method: Method = make_method(used, self.thresholds, lookahead, self.sensor_size)
@@ -187,9 +208,20 @@ class Reconstructor:
         self._require_open()
         check_frame(frame, self.sensor_size, index=self._frame_count, previous=self._last_frame)
         self._reference = self._reference or frame.exposure
-        self._shots.append(take_shot(frame, self._camera, self._reference))
+        self._shots.append(take_shot(frame, self._camera, self._reference, self._gains_of(frame)))
         self._last_frame = frame
         self._frame_count += 1
+
+    def _gains_of(self, frame: Frame) -> Gains:
+        """The white balance, which grey frames do not need."""
+        if frame.colours == "grey":
+            return (1.0, 1.0, 1.0)
+        if self._gains is None:
+            raise SettingsError(
+                "white_balance: grey-world is measured by kalux.reconstruct over a recording; a live stream needs "
+                "as-recorded or gains, e.g. 1.8;1;1.4"
+            )
+        return self._gains
 
     def push_events(self, events: Any) -> None:
         """Add the next events, in any layout that `as_events` takes: times in us, 0-based coordinates.
@@ -318,7 +350,9 @@ class Reconstructor:
         log_intensity, variance = self._method.read(progress.segment, progress.cursor, t)
         final_until = self.final_until
         final = final_until is not None and t <= final_until
-        return Estimate(t, log_intensity, variance, self._white(progress, t), final)
+        return Estimate(
+            t, log_intensity, variance, self._white(progress, t), final, self._chroma(progress, t)
+        )
 
     def image(self, estimate: Estimate) -> Image:
         """The image of an estimate: its intensity, with highlights as far as they are believed (K6)."""
@@ -329,7 +363,7 @@ class Reconstructor:
         prior = HighlightPrior(
             white=estimate.white, scale2=scale**2, stretch=spread**2 / scale if scale > 0 else 0.0
         )
-        return Image(
+        image = Image(
             t=estimate.t,
             intensity=intensity(
                 estimate.log_intensity, estimate.variance, self.settings.camera.log_offset, prior
@@ -337,6 +371,48 @@ class Reconstructor:
             variance=estimate.variance.astype(np.float32),
             final=estimate.final,
         )
+        return (
+            image
+            if self._colours == "grey"
+            else dataclasses.replace(image, colour=self._coloured(image, estimate))
+        )
+
+    @property
+    def _colours(self) -> str:
+        return "grey" if self._last_frame is None else self._last_frame.colours
+
+    def _coloured(self, image: Image, estimate: Estimate) -> NDArray[np.float32]:
+        """The image's colours: the mosaic's, or those that the frames lend to the luminance."""
+        if estimate.chroma is not None:
+            return estimate.chroma * image.intensity[..., None]
+        assert self._last_frame is not None
+        assert self._last_frame.mosaic is not None
+        colour = demosaic(
+            image.intensity,
+            self._last_frame.mosaic,
+            self.settings.camera.log_offset,
+            self._gains_of(self._last_frame),
+        )
+        return calm_highlights(colour, image.variance)
+
+    def _chroma(self, progress: _Progress, t: int) -> NDArray[np.float32] | None:
+        """What RGB frames say of the chromaticity at ``t``: those before and after, by their distance in time."""
+        first = self._shots[0]
+        if first.chroma is None:
+            return None
+        fraction = 0.0
+        shots = [first]
+        if self.lookahead and progress.ready and progress.starts_frame:
+            second = self._shots[1]
+            shots.append(second)
+            fraction = min(max((t - first.middle) / (second.middle - first.middle), 0.0), 1.0)
+        weights = (1.0 - fraction, fraction)
+        parts = [
+            (weight, shot.chroma, shot.chroma_weight)
+            for weight, shot in zip(weights, shots, strict=False)
+            if shot.chroma is not None and shot.chroma_weight is not None
+        ]
+        return joined_chromaticity(parts)
 
     def _white(self, progress: _Progress, t: int) -> float:
         """log(I + I_0) of the brightest level that frames show at ``t``: from one frame's to the next's."""

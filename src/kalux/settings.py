@@ -28,7 +28,8 @@ class CameraSettings:
     Attributes
     ----------
     response
-        ``"linear"`` (raw sensor values: DAVIS, machine vision), ``"srgb"`` or ``"gamma:EXPONENT"``.
+        ``"linear"`` (raw sensor values: DAVIS, machine vision), ``"srgb"`` or ``"gamma:EXPONENT"``. Three with ";"
+        between them are those of red, green and blue.
     log_offset
         I_0 of equation (8); white = 1. Events are steps of log I, so it must be small; below the noise of a
         dark pixel it only magnifies that noise. 0.03 (docs/tuning.md). The paper's code: 1.
@@ -46,6 +47,10 @@ class CameraSettings:
         fixed pattern noise at the top.
     reference_exposure
         Exposure time, us, at which a saturated pixel has intensity 1; None: the recording's median.
+    white_balance
+        Of recordings in colour: ``"as-recorded"``, ``"grey-world"`` (gains that make the mean of well exposed pixels
+        grey; one set for a recording), or gains of red, green and blue, ``"1.8;1;1.4"``. As recorded: what is grey is
+        not in the recording, and RGB frames are balanced already.
     """
 
     response: str = "linear"
@@ -55,6 +60,7 @@ class CameraSettings:
     weight_floor: float = 0.09
     saturation: float = 0.98
     reference_exposure: int | None = None
+    white_balance: str = "as-recorded"
 
 
 @dataclass(frozen=True, kw_only=True)

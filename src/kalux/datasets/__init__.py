@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from kalux.datasets.colour import ColourScene, colour_photograph, simulate_colour
 from kalux.datasets.scenes import (
     Motion,
     Pose,
@@ -24,12 +25,14 @@ from kalux.datasets.simulate import DEMO_SENSOR, Sampling, SensorSettings, Simul
 
 __all__ = [
     "DEMO_SENSOR",
+    "ColourScene",
     "Motion",
     "Pose",
     "Sampling",
     "Scene",
     "SensorSettings",
     "Simulation",
+    "colour_photograph",
     "combine",
     "demo_scene",
     "dolly",
@@ -41,6 +44,7 @@ __all__ = [
     "photograph_scene",
     "shake",
     "simulate",
+    "simulate_colour",
     "spin",
     "static",
     "still",

@@ -7,6 +7,7 @@ follows from the frames at both ends and the events in between; a memory value c
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
@@ -15,10 +16,12 @@ from numpy.typing import NDArray
 from kalux.augmentation import bridge, deblur, interpolation
 from kalux.augmentation.bridge import BridgeNoise, Latent, Thresholds
 from kalux.augmentation.deblur import ExposureIntegrals, between, count_events
+from kalux.errors import SettingsError
 from kalux.events import EventArray
 from kalux.filters import akf, complementary
 from kalux.filters.akf import State
 from kalux.frames import Frame
+from kalux.models import colour
 from kalux.models.camera import (
     Camera,
     covariance,
@@ -50,6 +53,9 @@ class Shot(NamedTuple):
         (H, W) bool: saturated or masked, so that the value is no measurement.
     white
         Intensity of a saturated pixel of this frame: the reference exposure over the frame's own.
+    chroma, chroma_weight
+        Of a frame in RGB: (H, W, 3) float32 ratio of each channel to the luminance, and (H, W) how reliable it is, 0
+        where a channel is clipped to 1; else None.
     """
 
     start: int
@@ -59,12 +65,34 @@ class Shot(NamedTuple):
     weight: Array
     clipped: NDArray[np.bool_]
     white: float
+    chroma: NDArray[np.float32] | None = None
+    chroma_weight: NDArray[np.float32] | None = None
 
 
-def take_shot(frame: Frame, camera: Camera, reference_exposure: float) -> Shot:
-    """Invert the response (3), scale to the reference exposure, weigh (5) and mark what is clipped."""
+_CLIPPED_SHARE: Final = 0.2
+"""A clipped channel with a smaller share of the luminance (the blue of a sky) is an error of that share where it is
+twice as bright as it can show: as little as a few events are off."""
+
+_CHROMA_FLOOR: Final = 0.006
+"""Noise of a pixel, white = 1, below which a ratio of channels says nothing; `CameraSettings.frame_noise`'s default."""
+
+
+def take_shot(
+    frame: Frame, camera: Camera, reference_exposure: float, gains: colour.Gains = (1.0, 1.0, 1.0)
+) -> Shot:
+    """Invert the response (3), scale to the reference exposure, weigh (5) and mark what is clipped.
+
+    ``gains`` is the white balance of frames in RGB, of which the luminance is taken; mosaics are filtered as recorded.
+
+    Raises
+    ------
+    SettingsError
+        If the camera has a response per colour and the frame is grey.
+    """
     ratio = reference_exposure / frame.exposure
-    intensity, weight, clipped = _per_level(frame, camera, ratio)
+    if frame.image.ndim == 3:
+        return _colour_shot(frame, camera, ratio, gains)
+    intensity, weight, clipped = _mosaic(frame, camera, ratio)
     return Shot(
         start=frame.exposure_start,
         middle=frame.middle,
@@ -76,12 +104,62 @@ def take_shot(frame: Frame, camera: Camera, reference_exposure: float) -> Shot:
     )
 
 
-def _per_level(frame: Frame, camera: Camera, ratio: float) -> tuple[Array, Array, NDArray[np.bool_]]:
+_Levels = tuple[Array, Array, NDArray[np.bool_]]
+
+
+def _mosaic(frame: Frame, camera: Camera, ratio: float) -> _Levels:
+    """I, f^w and clipped of every pixel, by its own channel's response."""
+    if camera.colours is None:
+        return _per_level(frame, camera, ratio)
+    if frame.mosaic is None:
+        raise SettingsError("response: three responses are for frames in colour or mosaics; these are grey")
+    shape = frame.image.shape
+    values: _Levels = (np.empty(shape), np.empty(shape), np.empty(shape, np.bool_))
+    for row, column in np.ndindex(2, 2):
+        part = np.s_[row::2, column::2]
+        own = camera.of_channel("RGB".index(frame.mosaic[2 * row + column]))
+        found = _per_level(dataclasses.replace(frame, image=frame.image[part]), own, ratio)
+        for whole, piece in zip(values, found, strict=True):
+            whole[part] = piece
+    return values
+
+
+def _colour_shot(frame: Frame, camera: Camera, ratio: float, gains: colour.Gains) -> Shot:
+    """The luminance of an RGB frame, and its chromaticity (docs/colour.md).
+
+    Errors of the channels are taken as common to them, as demosaicing and compression make them: standard deviations
+    add. A pixel is clipped where clipped channels carry more than `_CLIPPED_SHARE` of the luminance.
+    """
+    parts = [
+        _per_level(dataclasses.replace(frame, image=frame.image[..., c]), camera.of_channel(c), ratio)
+        for c in range(3)
+    ]
+    rgb = np.stack([gain * part[0] for gain, part in zip(gains, parts, strict=True)], axis=-1)
+    y = colour.luminance(rgb)
+    shares = [w * g for w, g in zip(colour.LUMINANCE, gains, strict=True)]
+    spread = sum(s / np.sqrt(np.maximum(part[1], 1e-6)) for s, part in zip(shares, parts, strict=True))
+    of_clipped = sum(s * part[0] * part[2] for s, part in zip(shares, parts, strict=True))
+    brightest = np.max(frame.image, axis=-1) / frame.white_value
+    room = max(camera.saturation - colour.RELIABLE, 1e-6)
+    return Shot(
+        start=frame.exposure_start,
+        middle=frame.middle,
+        end=frame.exposure_end,
+        intensity=y,
+        weight=1 / np.square(spread),
+        clipped=of_clipped > _CLIPPED_SHARE * np.maximum(y, 0),
+        white=ratio,
+        chroma=colour.chromaticity(rgb, _CHROMA_FLOOR * ratio),
+        chroma_weight=np.clip((camera.saturation - brightest) / room, 0, 1).astype(np.float32),
+    )
+
+
+def _per_level(frame: Frame, camera: Camera, ratio: float) -> _Levels:
     """I, f^w and clipped of every pixel; of integer images once per level, which is far quicker."""
     if frame.image.dtype.kind == "f":
         response = frame.normalised()
     else:
-        levels = np.arange(int(frame.image.max()) + 1, dtype=frame.image.dtype)
+        levels = np.arange(int(frame.image.max(initial=0)) + 1, dtype=frame.image.dtype)
         response = Frame(levels, 0, 1, frame.white).normalised()
     values = (
         inverse_response(camera, response, ratio),
