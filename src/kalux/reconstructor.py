@@ -385,15 +385,14 @@ class Reconstructor:
         """The image's colours: the mosaic's, or those that the frames lend to the luminance."""
         if estimate.chroma is not None:
             return estimate.chroma * image.intensity[..., None]
-        assert self._last_frame is not None
-        assert self._last_frame.mosaic is not None
-        colour = demosaic(
-            image.intensity,
-            self._last_frame.mosaic,
-            self.settings.camera.log_offset,
-            self._gains_of(self._last_frame),
-        )
-        return calm_highlights(colour, image.variance)
+        frame = self._last_frame
+        assert frame is not None
+        assert frame.mosaic is not None
+        gains = self._gains_of(frame)
+        colour = demosaic(image.intensity, frame.mosaic, self.settings.camera.log_offset, gains)
+        # The complementary filter knows no variance: its highlights are taken as any are that were never seen.
+        variance = np.minimum(image.variance, np.float32(self.settings.filter.initial_variance))
+        return calm_highlights(colour, variance, gains)
 
     def _chroma(self, progress: _Progress, t: int) -> NDArray[np.float32] | None:
         """What RGB frames say of the chromaticity at ``t``: those before and after, by their distance in time."""

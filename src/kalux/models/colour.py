@@ -28,11 +28,11 @@ EDGE: Final = 0.01
 """Squared log-intensity difference below which `demosaic` follows no edge: that of estimates' noise, 0.1. 1e-4 to 1e-2
 measure alike without noise, and 1e-2 is best with it (docs/colour.md)."""
 
-DOUBT: Final = 3.0
-"""How soon an uncertain highlight loses its colour; least errors of stained glass (docs/colour.md)."""
+DOUBT: Final = 6.0
+"""How soon an uncertain highlight loses its colour: least errors of stained glass are at 3 to 10 (docs/colour.md)."""
 
 RELIABLE: Final = 0.9
-"""Response up to which a frame's chromaticity counts in full; from there to saturation less and less."""
+"""Response up to which colours count in full; from there to saturation less and less."""
 
 _NEUTRAL: Final = 1e-3
 """Weight of neutral grey among the frames' chromaticities: it decides only where no frame has one."""
@@ -184,12 +184,13 @@ def _demosaic(padded, pattern, edge, out):  # type: ignore[no-untyped-def]
             out[y, x, 2 - beside] = g + half * across
 
 
-def calm_highlights(colour: Float32, variance: Float32) -> Float32:
+def calm_highlights(colour: Float32, variance: Float32, gains: Gains = (1.0, 1.0, 1.0)) -> Float32:
     """Draw the colour of highlights towards neutral where it is not known.
 
-    Beyond white each channel of a Bayer sensor is its own extrapolation by events, and an error of one is a colour.
-    Where a channel exceeds 1, the ratios to the luminance are raised to a power that falls from 1, at white, to
-    1 / (1 + `DOUBT` P), from e times white on. The luminance stays.
+    Beyond white each channel of a Bayer sensor is its own extrapolation by events, and an error of one is a colour; at
+    white, where all are clipped, the white balance is. Where a channel, before its gain, is as bright as white, the
+    ratios to the luminance are raised to the power 1 / (1 + `DOUBT` P), and less so from `RELIABLE` of white on. The
+    luminance stays. P is small where frames or events of a time below white tell the channel.
 
     Parameters
     ----------
@@ -197,22 +198,25 @@ def calm_highlights(colour: Float32, variance: Float32) -> Float32:
         (H, W, 3) linear, white balanced.
     variance
         (H, W) P of the log intensity.
+    gains
+        The white balance that ``colour`` has.
     """
     out = colour.copy()
-    _calm(out, variance)
+    _calm(out, variance, np.array(gains, np.float32))
     return out
 
 
 @nb.njit(cache=True, nogil=True)
-def _calm(colour, variance):  # type: ignore[no-untyped-def]
+def _calm(colour, variance, gains):  # type: ignore[no-untyped-def]
     for y in range(colour.shape[0]):
         for x in range(colour.shape[1]):
             red, green, blue = colour[y, x, 0], colour[y, x, 1], colour[y, x, 2]
-            brightest = max(red, green, blue)
-            if brightest <= 1.0:
+            brightest = max(red / gains[0], green / gains[1], blue / gains[2])
+            if brightest <= RELIABLE:
                 continue
-            power = 1.0 / (1.0 + min(np.log(brightest), 1.0) * DOUBT * variance[y, x])
-            least = 1e-6 * brightest
+            share = min((brightest - RELIABLE) / (1.0 - RELIABLE), 1.0)
+            power = 1.0 / (1.0 + share * DOUBT * variance[y, x])
+            least = 1e-6 * max(red, green, blue)
             red_, green_, blue_ = (
                 max(red, least) ** power,
                 max(green, least) ** power,
