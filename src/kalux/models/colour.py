@@ -28,8 +28,8 @@ EDGE: Final = 0.01
 """Squared log-intensity difference below which `demosaic` follows no edge: that of estimates' noise, 0.1. 1e-4 to 1e-2
 measure alike without noise, and 1e-2 is best with it (docs/colour.md)."""
 
-DOUBT: Final = 6.0
-"""How soon an uncertain highlight loses its colour: least errors of stained glass are at 3 to 10 (docs/colour.md)."""
+DOUBT: Final = 3.0
+"""How soon an uncertain highlight loses its colour: least errors of stained glass are at 2 to 6 (docs/colour.md)."""
 
 RELIABLE: Final = 0.9
 """Response up to which colours count in full; from there to saturation less and less."""
