@@ -197,6 +197,11 @@ def test_damage_gives_clear_errors(path):
     assert_only_clear_errors(path, damaged(header() + b"".join(parts), 200, header=400))
 
 
+def test_damage_of_colours_gives_clear_errors(path):
+    frames = [frame(f, 0b0010111) for f in colour_frames(dtype=np.uint16)]
+    assert_only_clear_errors(path, damaged(header() + b"".join(frames), 200, header=400))
+
+
 def test_tonic_reads_the_same_events(path):
     events = small_events()
     write(path, polarity(events[:200]), polarity(events[200:]))

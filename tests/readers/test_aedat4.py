@@ -261,6 +261,11 @@ def test_damage_gives_clear_errors(path, compression):
     assert_only_clear_errors(path, damaged(small_file(compression=compression), 300, header=700))
 
 
+def test_damage_of_colours_gives_clear_errors(path):
+    packets = [(1, colour_packet(frame, 24)) for frame in colour_frames()]
+    assert_only_clear_errors(path, damaged(aedat4_file(packets, camera="DAVIS346_1"), 300, header=700))
+
+
 # Real files
 
 

@@ -222,6 +222,11 @@ def test_damage_gives_clear_errors(path):
     assert_only_clear_errors(path, damaged(path.read_bytes(), 300))
 
 
+def test_damage_of_colours_gives_clear_errors(path, tmp_path):
+    write(path, frames=colour_frames(), mosaic="RGGB")
+    assert_only_clear_errors(tmp_path / "damaged.h5", damaged(path.read_bytes(), 60))
+
+
 def test_a_real_recording_comes_back(shared_data, path):
     source = readers.read(shared_data / "newton_davis346.aedat4")
     hdf5.write(path, sensor_size=source.sensor_size, events=source.events(), frames=source.frames())

@@ -657,6 +657,14 @@ def test_damage_gives_clear_errors(tmp_path, container):
     assert_only_clear_errors(copy, damaged(whole, 150, header=4200))
 
 
+@pytest.mark.parametrize("encoding", ["bgra8", "bayer_gbrg8"])
+def test_damage_of_colours_gives_clear_errors(tmp_path, encoding):
+    path = tmp_path / "recording.bag"
+    picture = np.zeros((*SIZE, 4) if encoding == "bgra8" else SIZE, np.uint8)
+    write_bag1(path, image_messages([picture] * 4, encoding))
+    assert_only_clear_errors(tmp_path / "damaged.bag", damaged(path.read_bytes(), 100, header=4200))
+
+
 @pytest.mark.parametrize("container", ["bag", "mcap"])
 @pytest.mark.parametrize("share", [0.01, 0.5, 0.99])
 def test_a_file_cut_short_is_refused(tmp_path, container, share):
