@@ -9,7 +9,16 @@ from typing import NamedTuple
 import numpy as np
 
 from kalux import EVENT_DTYPE, PRESETS, Frame, Recording, Settings
-from kalux.datasets import SensorSettings, Simulation, pan, photograph_scene, simulate
+from kalux.datasets import (
+    ColourScene,
+    SensorSettings,
+    Simulation,
+    colour_photograph,
+    pan,
+    photograph_scene,
+    simulate,
+    simulate_colour,
+)
 from kalux.events import make_events
 
 
@@ -98,6 +107,21 @@ def moving_blocks(
     """A camera that pans over `blocks`, ``speed`` in pixels/s; what is more than 1 saturates."""
     scene = photograph_scene(blocks(low, high), pan(speed), sensor_size=size, duration=duration)
     return simulate(scene, sensor, exposures=exposures)
+
+
+@lru_cache(maxsize=4)
+def colour_blocks(
+    mosaic: str | None = None,
+    *,
+    high: float = 0.6,
+    sensor: SensorSettings | None = None,
+    size: tuple[int, int] = (40, 48),
+    duration: int = 400_000,
+) -> tuple[ColourScene, Simulation]:
+    """A camera that pans over rectangles of many colours, and what a sensor with or without a mosaic records of it."""
+    painted = np.stack([blocks(0.02, high, seed=seed) for seed in range(3)], axis=-1).astype(np.float32)
+    scene = colour_photograph(painted, pan(60.0, 20.0), sensor_size=size, duration=duration)
+    return scene, simulate_colour(scene, sensor or SensorSettings(), mosaic=mosaic)
 
 
 def unlabelled(simulation: Simulation) -> Recording:

@@ -35,6 +35,16 @@ def small_frames(count: int = 4, seed: int = 0) -> list[Frame]:
     ]
 
 
+def colour_frames(count: int = 4, seed: int = 0, dtype: type = np.uint8) -> list[Frame]:
+    """RGB, of which no two channels are alike."""
+    rng = np.random.default_rng(seed)
+    top = np.iinfo(dtype).max
+    return [
+        Frame(rng.integers(0, top, (*SIZE, 3), dtype, endpoint=True), 20_000 * i, 20_000 * i + 3_000 + i)
+        for i in range(count)
+    ]
+
+
 def all_events(source) -> np.ndarray:
     return np.concatenate([np.empty(0, EVENT_DTYPE), *source.events()])
 

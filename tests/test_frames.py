@@ -9,8 +9,8 @@ from kalux.errors import ExposureError, FrameError
 from kalux.frames import Frame, check_frame, place_exposure
 
 
-def frame(start=100, end=200, dtype=np.uint8, shape=(3, 4), white=None):
-    return Frame(np.ones(shape, dtype), start, end, white)
+def frame(start=100, end=200, dtype=np.uint8, shape=(3, 4), white=None, mosaic=None):
+    return Frame(np.ones(shape, dtype), start, end, white, mosaic)
 
 
 @pytest.mark.parametrize(
@@ -41,6 +41,17 @@ def test_place_exposure(stamp, start):
     assert (placed.exposure_start, placed.exposure_end) == (start, start + 11)
 
 
+def test_placing_an_exposure_keeps_the_rest():
+    placed = place_exposure(frame(100, 100, np.uint16, white=1023, mosaic="GBRG"), 11, "start")
+    assert (placed.white, placed.mosaic) == (1023, "GBRG")
+
+
+def test_colours():
+    assert frame().colours == "grey"
+    assert frame(shape=(3, 4, 3)).colours == "RGB"
+    assert frame(mosaic="BGGR").colours == "BGGR"
+
+
 def check(one, **options):
     check_frame(one, (3, 4), where="here", index=7, **options)
 
@@ -50,6 +61,8 @@ def test_good_frames_pass():
     check(frame(100, 100), exposure_known=False, previous=frame(50, 50))
     for dtype in (np.uint16, np.float32, np.float64):
         check(frame(dtype=dtype))
+        check(frame(dtype=dtype, shape=(3, 4, 3)))
+    check(frame(mosaic="RGGB"), previous=frame(0, 100, mosaic="RGGB"))
 
 
 def not_finite():
@@ -62,7 +75,16 @@ def not_finite():
     ("one", "options", "kind", "message"),
     [
         (frame(shape=(4, 3)), {}, FrameError, "frame 7 is 3x4 pixels, the sensor is 4x3"),
-        (frame(shape=(3, 4, 3)), {}, FrameError, "must be grey"),
+        (frame(shape=(3, 4, 2)), {}, FrameError, "frame 7 is 4x3x2 pixels.*must be grey or RGB"),
+        (frame(mosaic="RGBG"), {}, FrameError, "mosaic 'RGBG'; known are RGGB, BGGR, GRBG, GBRG"),
+        (frame(shape=(3, 4, 3), mosaic="RGGB"), {}, FrameError, "a mosaic is"),
+        (
+            frame(mosaic="RGGB"),
+            {"previous": frame(0, 50)},
+            FrameError,
+            "frame 7 is RGGB, those before it are grey",
+        ),
+        (frame(shape=(3, 4, 3)), {"previous": frame(0, 50)}, FrameError, "is RGB, those before it are grey"),
         (frame(dtype=np.int16), {}, FrameError, "dtype int16"),
         (not_finite(), {}, FrameError, "not finite .* at x=2, y=1"),
         (frame(100, 100), {}, ExposureError, "exposure of 0 us"),

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kalux import recording
-from kalux.events import make_events
+from kalux.events import EVENT_DTYPE, make_events
 from kalux.frames import Frame
 from kalux.info import describe, format_description, summarise_events, summarise_frames
 from kalux.readers import GroundTruth, hdf5
@@ -88,6 +88,22 @@ def test_a_whole_recording():
     ):
         assert part in text
     assert not text.endswith("\n")
+
+
+@pytest.mark.parametrize(
+    ("mosaic", "image", "said"),
+    [
+        (None, np.zeros((4, 6), np.uint8), None),
+        (None, np.zeros((4, 6, 3), np.uint8), "RGB frames; events are taken as those of a sensor without"),
+        ("RGGB", np.zeros((4, 6), np.uint8), "Bayer mosaic RGGB"),
+        ("RGGB", np.zeros((4, 6, 3), np.uint8), "Bayer mosaic RGGB, stored as RGB that was made of it"),
+    ],
+)
+def test_colours_are_said(mosaic, image, said):
+    made = Recording.from_arrays(np.empty(0, EVENT_DTYPE), [Frame(image, 0, 10)], sensor_size=(4, 6))
+    text = format_description(describe(Recording(made.source, mosaic=mosaic)))
+    lines = [line.split(maxsplit=1)[1] for line in text.splitlines() if line.split()[0] == "colour"]
+    assert [line.startswith(said) for line in lines] == ([True] if said else [])
 
 
 def test_streams_that_do_not_overlap():

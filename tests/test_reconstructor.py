@@ -654,7 +654,11 @@ BAD_FRAMES = {
     "nan": (frame([[1.0, np.nan]], 9_000, 9_500, dtype=np.float32), FrameError, "frame 1 .* x=1, y=0"),
     "infinite": (frame([[np.inf, 1.0]], 9_000, 9_500, dtype=np.float64), FrameError, "frame 1 .* x=0, y=0"),
     "wrong size": (frame([[1], [2]], 9_000, 9_500), FrameError, "frame 1 is 1x2 pixels, the sensor is 2x1"),
-    "colour": (frame(np.ones((1, 2, 3)), 9_000, 9_500), FrameError, "frame 1 .* must be grey"),
+    "colour": (
+        frame(np.ones((1, 2, 3)), 9_000, 9_500),
+        FrameError,
+        "frame 1 is RGB, those before it are grey",
+    ),
     "wrong type": (frame([[1, 2]], 9_000, 9_500, dtype=np.int32), FrameError, "frame 1 has dtype int32"),
     "earlier": (frame([[1, 2]], 0, 1_000), FrameError, "frame 1 starts at 0 us, not after"),
     "overlap": (frame([[1, 2]], 1_999, 3_000), ExposureError, "frame 1 starts at 1999 us"),

@@ -1,4 +1,4 @@
-"""Tone mapping: from linear intensity, far above 1 in highlights, to a picture in 0 to 1.
+"""Tone mapping: from linear intensity or colour, far above 1 in highlights, to a picture in 0 to 1.
 
 For looking only. Nothing here feeds a metric, a float output (EXR, npy) or the reconstruction.
 
@@ -6,6 +6,9 @@ A mapping is done in two steps. `measure` takes the statistics of one image that
 log average, local histograms) as a small array of numbers; `apply` maps an image with given statistics.
 `tone_map` does both for one image. For a video, where fresh statistics in every image would flicker,
 `tone_map_next` carries them on in a `ToneState`, smoothed over time.
+
+Of an image in colour the luminance is mapped, exactly as if it were a grey image; the picture has its chromaticity
+on an sRGB display, and goes towards white where the display has no such colour as bright.
 """
 
 from __future__ import annotations
@@ -18,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.errors import InputError, SettingsError
+from kalux.models.colour import luminance
 
 Float32 = NDArray[np.float32]
 Statistics = NDArray[np.float64]
@@ -282,25 +286,32 @@ def settings_table(settings: DisplaySettings) -> dict[str, Any]:
     return {"curve": name, name: curve, **encoding}
 
 
+def colour_of(image: object) -> Float32 | None:
+    """The attribute ``colour`` of an image, (height, width, 3) linear RGB, or None where it has none."""
+    colour: Float32 | None = getattr(image, "colour", None)
+    return colour
+
+
 def tone_map(intensity: NDArray[Any], settings: DisplaySettings | None = None) -> Float32:
     """Map one image by its own statistics.
 
     Parameters
     ----------
     intensity
-        (height, width), linear, 1.0 = a saturated frame pixel. Values below 0 count as 0, above 1e30 as 1e30.
+        (height, width), or (height, width, 3) RGB, linear, 1.0 = a saturated frame pixel. Values below 0 count as 0,
+        above 1e30 as 1e30.
     settings
         Default: ``DisplaySettings()``.
 
     Returns
     -------
     ndarray
-        (height, width) float32, 0 to 1.
+        float32 of the same shape, 0 to 1.
 
     Raises
     ------
     InputError
-        The intensity is not two-dimensional, is empty, or is not finite.
+        The intensity is of another shape, is empty, or is not finite.
     """
     settings = settings or DisplaySettings()
     checked = _checked(intensity)
@@ -319,7 +330,8 @@ def tone_map_next(
     Parameters
     ----------
     image
-        With ``t``, us, and ``intensity``, (height, width), linear.
+        With ``t``, us, and ``intensity``, (height, width), linear; or with ``colour``, (height, width, 3), which is
+        then shown.
     settings
         Default: ``DisplaySettings()``.
     state
@@ -328,7 +340,7 @@ def tone_map_next(
     Returns
     -------
     mapped : ndarray
-        (height, width) float32, 0 to 1.
+        (height, width) or (height, width, 3) float32, 0 to 1.
     state : ToneState
         For the next image.
 
@@ -338,7 +350,8 @@ def tone_map_next(
         The intensity is not two-dimensional, is empty, or is not finite; or the state is of other settings.
     """
     settings = settings or DisplaySettings()
-    intensity = _checked(image.intensity)
+    colour = colour_of(image)
+    intensity = _checked(image.intensity if colour is None else colour)
     statistics = _measure(intensity, settings.curve)
     if state is not None:
         statistics = _smoothed(state, statistics, image.t, settings.smoothing)
@@ -364,7 +377,7 @@ def apply(intensity: NDArray[Any], settings: DisplaySettings, statistics: Statis
     Parameters
     ----------
     intensity
-        (height, width), linear.
+        (height, width), or (height, width, 3) RGB, linear.
     settings
         Of which ``smoothing`` is not used.
     statistics
@@ -373,13 +386,12 @@ def apply(intensity: NDArray[Any], settings: DisplaySettings, statistics: Statis
     Returns
     -------
     ndarray
-        (height, width) float32, 0 to 1.
+        float32 of the same shape, 0 to 1.
 
     Raises
     ------
     InputError
-        The intensity is not two-dimensional, is empty, or is not finite; or the statistics are of another
-        curve.
+        The intensity is of another shape, is empty, or is not finite; or the statistics are of another curve.
     """
     return _apply(_checked(intensity), settings, statistics)
 
@@ -400,6 +412,28 @@ def encode_srgb(linear: Float32) -> Float32:
     return np.where(linear <= 0.0031308, 12.92 * linear, curved).astype(np.float32)
 
 
+def decode_srgb(encoded: Float32) -> Float32:
+    """The inverse of `encode_srgb`."""
+    curved = np.power((encoded + np.float32(0.055)) / np.float32(1.055), np.float32(2.4))
+    return np.where(encoded <= 0.04045, encoded / np.float32(12.92), curved).astype(np.float32)
+
+
+def _in_colour(colour: Float32, y: Float32, grey: Float32) -> Float32:
+    """The picture that has the luminance of ``grey`` on an sRGB display, and the chromaticity of ``colour``.
+
+    Where a channel would exceed 1, all are drawn towards grey of that luminance, which at its brightest is white.
+    """
+    light = decode_srgb(grey)
+    ratio = light / np.maximum(y, np.float32(1e-12))
+    wanted = colour * ratio[..., None]
+    # Black has no chromaticity, but may be mapped to something brighter.
+    wanted = np.where((y > 1e-12)[..., None], wanted, light[..., None])
+    excess = wanted.max(axis=-1) - light
+    saturation = np.minimum(np.float32(1), (1 - light) / np.maximum(excess, np.float32(1e-12)))
+    shown = light[..., None] + saturation[..., None] * (wanted - light[..., None])
+    return encode_srgb(np.clip(shown, 0, 1))
+
+
 def _to_integer(mapped: NDArray[Any], top: int) -> Float32:
     scaled = np.clip(np.asarray(mapped, np.float32), 0, 1) * np.float32(top)
     rounded: Float32 = np.rint(scaled, out=scaled)
@@ -417,10 +451,12 @@ def _require_percentile(name: str, value: float) -> None:
 
 def _checked(intensity: NDArray[Any]) -> Float32:
     checked = np.asarray(intensity, np.float32)
-    if checked.ndim != 2 or checked.size == 0:
-        raise InputError(f"display: the intensity has shape {checked.shape}; (height, width) is needed")
+    if (checked.ndim != 2 and checked.shape[2:] != (3,)) or checked.size == 0:
+        raise InputError(
+            f"display: the intensity has shape {checked.shape}; (height, width) or (height, width, 3) is needed"
+        )
     if not np.isfinite(checked).all():
-        y, x = (int(i[0]) for i in np.nonzero(~np.isfinite(checked)))
+        y, x = (int(i[0]) for i in np.nonzero(~np.isfinite(checked))[:2])
         raise InputError(f"display: the intensity at x={x}, y={y} is not finite (NaN or infinite)")
     return np.clip(checked, np.float32(0), np.float32(LARGEST))
 
@@ -440,6 +476,8 @@ def _sampled(intensity: Float32) -> Float32:
 
 
 def _measure(intensity: Float32, curve: Curve) -> Statistics:
+    if intensity.ndim == 3:
+        intensity = luminance(intensity)
     match curve:
         case Linear():
             return np.empty(0)
@@ -456,6 +494,9 @@ def _measure(intensity: Float32, curve: Curve) -> Statistics:
 
 
 def _apply(intensity: Float32, settings: DisplaySettings, statistics: Statistics) -> Float32:
+    if intensity.ndim == 3:
+        y = luminance(intensity)
+        return _in_colour(intensity, y, _apply(y, settings, statistics))
     mapped = _curved(intensity, settings.curve, statistics)
     return _encoded(np.clip(mapped, 0, 1, out=mapped), settings)
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Final, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,27 +14,41 @@ from kalux.errors import ExposureError, FrameError
 Stamp = Literal["start", "middle", "end"]
 """Which moment of the exposure a frame's single time stamp marks."""
 
+Mosaic = Literal["RGGB", "BGGR", "GRBG", "GBRG"]
+"""A Bayer pattern: the colours of the upper left 2x2 pixels, by rows."""
+
+MOSAICS: Final[tuple[Mosaic, ...]] = get_args(Mosaic)
+
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One grey image and its exposure.
+    """One image and its exposure.
 
     Attributes
     ----------
     image
-        (height, width), uint8, uint16, float32 or float64: the raw camera response I^F.
+        The raw camera response I^F, uint8, uint16, float32 or float64: (height, width), grey or a Bayer mosaic; or
+        (height, width, 3), red, green, blue of a camera whose events see all colours.
     exposure_start, exposure_end
         First and last moment of the exposure, int microseconds, in the clock of the events. Equal where a
         recording stores only one stamp per frame (see `Recording.exposure_known`).
     white
         The value of a saturated pixel. Default: 255 for uint8, 65535 for uint16, 1.0 for floats. Sensors
         of 10 or 12 bits stored in uint16 need it (1023, 4095).
+    mosaic
+        Of a Bayer sensor, whose pixels each see one colour in frames and events alike: its pattern. None: no mosaic.
     """
 
     image: NDArray[Any]
     exposure_start: int
     exposure_end: int
     white: float | None = None
+    mosaic: Mosaic | None = None
+
+    @property
+    def colours(self) -> str:
+        """``"grey"``, ``"RGB"``, or the pattern of the mosaic."""
+        return self.mosaic or ("RGB" if self.image.ndim == 3 else "grey")
 
     @property
     def exposure(self) -> int:
@@ -73,7 +88,7 @@ def place_exposure(frame: Frame, exposure: int, stamp: Stamp) -> Frame:
     """
     before = {"start": 0, "middle": exposure // 2, "end": exposure}[stamp]
     start = frame.exposure_start - before
-    return Frame(frame.image, start, start + exposure, frame.white)
+    return dataclasses.replace(frame, exposure_start=start, exposure_end=start + exposure)
 
 
 def check_frame(
@@ -90,23 +105,24 @@ def check_frame(
     Raises
     ------
     FrameError
-        Wrong size or dtype, not finite, or out of order.
+        Wrong size, colours or dtype, not finite, or out of order.
     ExposureError
         An exposure that is empty, or that begins before the previous one has ended.
     """
     image = frame.image
-    if image.shape != sensor_size:
-        size = "x".join(str(n) for n in image.shape[::-1])
+    if image.shape not in (sensor_size, (*sensor_size, 3)):
+        size = "x".join(str(n) for n in (*image.shape[:2][::-1], *image.shape[2:]))
         raise FrameError(
             f"{where}: frame {index} is {size} pixels, the sensor is {sensor_size[1]}x{sensor_size[0]}; "
-            "frames must be grey and have the size of the sensor"
+            "frames must be grey or RGB and have the size of the sensor"
         )
+    _check_colours(frame, where, index, previous)
     if image.dtype not in (np.uint8, np.uint16, np.float32, np.float64):
         raise FrameError(
             f"{where}: frame {index} has dtype {image.dtype}; uint8, uint16, float32 or float64 is needed"
         )
     if image.dtype.kind == "f" and not np.isfinite(image).all():
-        y, x = (int(i[0]) for i in np.nonzero(~np.isfinite(image)))
+        y, x = (int(i[0]) for i in np.nonzero(~np.isfinite(image))[:2])
         raise FrameError(f"{where}: frame {index} is not finite (NaN or infinite) at x={x}, y={y}")
     if exposure_known and frame.exposure <= 0:
         raise ExposureError(
@@ -122,4 +138,20 @@ def check_frame(
         raise ExposureError(
             f"{where}: the exposure of frame {index} starts at {frame.exposure_start} us, before that of the "
             f"previous frame has ended ({previous.exposure_end} us); is the exposure time too long?"
+        )
+
+
+def _check_colours(frame: Frame, where: str, index: int, previous: Frame | None) -> None:
+    if frame.mosaic is not None:
+        if frame.mosaic not in MOSAICS:
+            raise FrameError(
+                f"{where}: frame {index} has the mosaic {frame.mosaic!r}; known are {', '.join(MOSAICS)}"
+            )
+        if frame.image.ndim != 2 or min(frame.image.shape) < 2:
+            raise FrameError(
+                f"{where}: frame {index} has the shape {frame.image.shape}; a mosaic is (height, width), at least 2x2"
+            )
+    if previous is not None and frame.colours != previous.colours:
+        raise FrameError(
+            f"{where}: frame {index} is {frame.colours}, those before it are {previous.colours}; all must be alike"
         )

@@ -109,6 +109,10 @@ class Description:
         Whether reference images come with the recording.
     missing
         What the recording lacks, one sentence each.
+    colours
+        Of the frames: ``"grey"``, ``"RGB"``, or the pattern of a mosaic; None without frames.
+    stored_in_rgb
+        Whether a mosaic is stored as RGB that was made of it.
     """
 
     path: str
@@ -122,6 +126,8 @@ class Description:
     estimated_threshold: tuple[float, float] | None
     has_ground_truth: bool
     missing: tuple[str, ...]
+    colours: str | None = None
+    stored_in_rgb: bool = False
 
 
 def describe(recording: Recording, *, estimated_threshold: tuple[float, float] | None = None) -> Description:
@@ -140,6 +146,8 @@ def describe(recording: Recording, *, estimated_threshold: tuple[float, float] |
         If the recording is damaged or its contents are not usable, whatever `Recording` checks.
     """
     source = recording.source
+    first = next(iter(recording.stamped_frames()), None)
+    stored = next(iter(recording.stored_frames()), None)
     events = summarise_events(recording.events())
     frames = summarise_frames(recording.stamped_frames(), exposure_known=recording.exposure_known)
     return Description(
@@ -154,6 +162,8 @@ def describe(recording: Recording, *, estimated_threshold: tuple[float, float] |
         estimated_threshold=estimated_threshold,
         has_ground_truth=source.ground_truth is not None,
         missing=source.missing,
+        colours=None if first is None else first.colours,
+        stored_in_rgb=stored is not None and stored.image.ndim == 3 and recording.mosaic is not None,
     )
 
 
@@ -239,6 +249,7 @@ def format_description(description: Description) -> str:
         ("sensor", f"{width} x {height} pixels"),
         *_event_rows(description.events),
         *_frame_rows(description.frames, description.exposure_known),
+        *_colour_rows(description),
     ]
     if description.overlap is not None:
         overlap = "none: events and frames do not overlap in time" if not description.overlap else None
@@ -284,6 +295,15 @@ def _frame_rows(frames: FrameSummary, exposure_known: bool) -> list[tuple[str, s
     )
     rows.append(("exposure", _exposure_text(frames) if exposure_known else "unknown"))
     return rows
+
+
+def _colour_rows(description: Description) -> list[tuple[str, str]]:
+    if description.colours in (None, "grey"):
+        return []
+    if description.colours == "RGB":
+        return [("colour", "RGB frames; events are taken as those of a sensor without colour filters")]
+    stored = ", stored as RGB that was made of it" if description.stored_in_rgb else ""
+    return [("colour", f"Bayer mosaic {description.colours}{stored}")]
 
 
 def _exposure_text(frames: FrameSummary) -> str:

@@ -15,9 +15,11 @@ from numpy.typing import NDArray
 from kalux.calibration.contrast import ThresholdEstimate, estimate_thresholds
 from kalux.calibration.delay import DelayEstimate, estimate_delay
 from kalux.calibration.event_model import EventModel, estimate_event_model
+from kalux.calibration.white_balance import grey_world
 from kalux.errors import FrameError, InputError
 from kalux.events import EventArray
 from kalux.frames import Frame
+from kalux.models.colour import white_balance
 from kalux.reconstructor import Estimate, Image, Reconstructor
 from kalux.recording import Recording
 from kalux.settings import Settings
@@ -37,7 +39,7 @@ class Plan:
     Attributes
     ----------
     settings
-        With thresholds, delay, I_0, step variance and reference exposure filled in.
+        With thresholds, delay, I_0, step variance, reference exposure and white balance filled in.
     threshold_origin
         Whether the thresholds come from the settings, the recording, an estimate, or are assumed.
     estimate
@@ -92,6 +94,7 @@ def plan(
     chosen = dataclasses.replace(
         chosen, camera=dataclasses.replace(chosen.camera, reference_exposure=reference)
     )
+    chosen = _with_white_balance(recording, chosen)
     chosen, delay = _with_delay(recording, chosen)
     offset_known = chosen.camera.log_offset is not None
     filled, origin, estimate = _with_thresholds(recording, chosen)
@@ -255,6 +258,15 @@ def _exposures(recording: Recording) -> NDArray[np.int64]:
     if not exposures:
         raise FrameError(f"{recording.source.path}: no frames; kalux needs frames as well as events")
     return np.array(exposures, np.int64)
+
+
+def _with_white_balance(recording: Recording, settings: Settings) -> Settings:
+    """Measure the gains of a white balance that has none, where frames are in colour."""
+    first = next(iter(recording.frames()))
+    if first.colours == "grey" or white_balance(settings.camera.white_balance) is not None:
+        return settings
+    gains = ";".join(f"{gain:.4f}" for gain in grey_world(recording, settings.camera))
+    return dataclasses.replace(settings, camera=dataclasses.replace(settings.camera, white_balance=gains))
 
 
 def _with_delay(recording: Recording, settings: Settings) -> tuple[Settings, DelayEstimate | None]:

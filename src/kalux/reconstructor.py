@@ -15,14 +15,22 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.errors import InputError
+from kalux.errors import InputError, SettingsError
 from kalux.events import as_events, check_events
 from kalux.filters.akf import State
 from kalux.filters.buffer import EventBuffer
 from kalux.filters.methods import Method, Segment, Shot, make_method, take_shot
 from kalux.filters.readout import HighlightPrior, intensity, regularised, total_variance
 from kalux.frames import Frame, check_frame
-from kalux.models.camera import Camera, Response
+from kalux.models.camera import Camera
+from kalux.models.colour import (
+    Gains,
+    calm_highlights,
+    demosaic,
+    joined_chromaticity,
+    luminance,
+    white_balance,
+)
 from kalux.settings import Settings
 from kalux.settings import preset as named_preset
 
@@ -53,6 +61,9 @@ class Image:
         I_0 of equation (8).
     final
         Whether more data can no longer change it. With lookahead an image is final one frame later.
+    colour
+        float32 (H, W, 3), linear red, green, blue with the scale of ``intensity``, which of a Bayer sensor holds each
+        pixel's own channel before white balance, and of frames in RGB the luminance. None: the frames are grey.
     """
 
     t: int
@@ -60,6 +71,13 @@ class Image:
     variance: NDArray[np.float32]
     log_offset: float
     final: bool
+    colour: NDArray[np.float32] | None = None
+
+    def grey(self) -> Image:
+        """The same image without colours: its intensity is the luminance of ``colour``."""
+        if self.colour is None:
+            return self
+        return dataclasses.replace(self, intensity=luminance(self.colour), colour=None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +98,8 @@ class Estimate:
         (H, W) bool: pixels with an event in this frame interval or the one before; None: not told.
     between
         0 at a frame, 1 half-way between two or where no next one is known.
+    chroma
+        Of frames in RGB: float32 (H, W, 3), the ratios of the channels to the luminance; else None.
     """
 
     t: int
@@ -89,6 +109,7 @@ class Estimate:
     final: bool
     moving: NDArray[np.bool_] | None = None
     between: float = 0.0
+    chroma: NDArray[np.float32] | None = None
 
 
 class _Progress:
@@ -161,12 +182,12 @@ class Reconstructor:
         )
         self._delay = chosen.delay or 0
         camera = self.settings.camera
-        response = Response.named(camera.response)
-        self._camera = (
-            Camera(response, None, camera.saturation)
-            if inverse_covariance is None
-            else Camera.from_inverse_covariance(inverse_covariance, response, camera.saturation)
-        )
+        self._camera = Camera.named(camera.response, camera.saturation)
+        if inverse_covariance is not None:
+            self._camera = Camera.from_inverse_covariance(
+                inverse_covariance, self._camera.response, camera.saturation
+            )
+        self._gains = white_balance(camera.white_balance)
         self._reference = camera.reference_exposure or reference_exposure
         used = _with_spread(self.settings, _UNKNOWN_SPREAD) if unknown else self.settings
         self._method: Method = make_method(used, self.thresholds, lookahead, self.sensor_size)
@@ -197,9 +218,20 @@ class Reconstructor:
         self._require_open()
         check_frame(frame, self.sensor_size, index=self._frame_count, previous=self._last_frame)
         self._reference = self._reference or frame.exposure
-        self._shots.append(take_shot(frame, self._camera, self._reference))
+        self._shots.append(take_shot(frame, self._camera, self._reference, self._gains_of(frame)))
         self._last_frame = frame
         self._frame_count += 1
+
+    def _gains_of(self, frame: Frame) -> Gains:
+        """The white balance, which grey frames do not need."""
+        if frame.colours == "grey":
+            return (1.0, 1.0, 1.0)
+        if self._gains is None:
+            raise SettingsError(
+                "white_balance: grey-world is measured by kalux.reconstruct over a recording; a live stream needs "
+                "as-recorded or gains, e.g. 1.8;1;1.4"
+            )
+        return self._gains
 
     def push_events(self, events: Any) -> None:
         """Add the next events, in any layout that `as_events` takes: times in us, 0-based coordinates.
@@ -332,6 +364,7 @@ class Reconstructor:
             final,
             self._method.moving(progress.segment, progress.cursor),
             _between(progress, t),
+            self._chroma(progress, t),
         )
 
     def image(self, estimate: Estimate) -> Image:
@@ -348,14 +381,57 @@ class Reconstructor:
         variance = total_variance(estimate.variance, moving, estimate.between, on * off)
         log_intensity = estimate.log_intensity
         if moving is not None and neighbours > 0:
-            log_intensity = regularised(log_intensity, variance, moving, neighbours)
-        return Image(
+            mosaic = self._last_frame is not None and self._last_frame.mosaic is not None
+            pitch = 2 if mosaic else 1  # neighbours of the same colour
+            log_intensity = regularised(log_intensity, variance, moving, neighbours, pitch)
+        image = Image(
             t=estimate.t,
             intensity=intensity(log_intensity, variance, self.settings.camera.offset, prior),
             variance=variance,
             log_offset=self.settings.camera.offset,
             final=estimate.final,
         )
+        return (
+            image
+            if self._colours == "grey"
+            else dataclasses.replace(image, colour=self._coloured(image, estimate))
+        )
+
+    @property
+    def _colours(self) -> str:
+        return "grey" if self._last_frame is None else self._last_frame.colours
+
+    def _coloured(self, image: Image, estimate: Estimate) -> NDArray[np.float32]:
+        """The image's colours: the mosaic's, or those that the frames lend to the luminance."""
+        if estimate.chroma is not None:
+            return estimate.chroma * image.intensity[..., None]
+        frame = self._last_frame
+        assert frame is not None
+        assert frame.mosaic is not None
+        gains = self._gains_of(frame)
+        colour = demosaic(image.intensity, frame.mosaic, self.settings.camera.offset, gains)
+        # The complementary filter knows no variance: its highlights are taken as any are that were never seen.
+        variance = np.minimum(image.variance, np.float32(self.settings.filter.initial_variance))
+        return calm_highlights(colour, variance, gains)
+
+    def _chroma(self, progress: _Progress, t: int) -> NDArray[np.float32] | None:
+        """What RGB frames say of the chromaticity at ``t``: those before and after, by their distance in time."""
+        first = self._shots[0]
+        if first.chroma is None:
+            return None
+        fraction = 0.0
+        shots = [first]
+        if self.lookahead and progress.ready and progress.starts_frame:
+            second = self._shots[1]
+            shots.append(second)
+            fraction = min(max((t - first.middle) / (second.middle - first.middle), 0.0), 1.0)
+        weights = (1.0 - fraction, fraction)
+        parts = [
+            (weight, shot.chroma, shot.chroma_weight)
+            for weight, shot in zip(weights, shots, strict=False)
+            if shot.chroma is not None and shot.chroma_weight is not None
+        ]
+        return joined_chromaticity(parts)
 
     def _white(self, progress: _Progress, t: int) -> float:
         """log(I + I_0) of the brightest level that frames show at ``t``: from one frame's to the next's."""

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,8 @@ from numpy.typing import NDArray
 from kalux import readers
 from kalux.errors import ExposureError, InputError
 from kalux.events import EventArray, as_events, check_events
-from kalux.frames import Frame, Stamp, check_frame, place_exposure
+from kalux.frames import MOSAICS, Frame, Mosaic, Stamp, check_frame, place_exposure
+from kalux.models.colour import sample_mosaic
 from kalux.readers import CHUNK_EVENTS, GroundTruth, Source, joined
 
 
@@ -56,14 +58,26 @@ class Recording:
         (height, width), pixels.
     exposure_known
         Whether every frame has an exposure interval, from the file or from ``exposure``.
+    mosaic
+        The Bayer pattern of the sensor, from the file or as given; None: it has none, or none is known.
     """
 
-    def __init__(self, source: Source, *, exposure: int | None = None, stamp: Stamp = "start") -> None:
+    def __init__(
+        self,
+        source: Source,
+        *,
+        exposure: int | None = None,
+        stamp: Stamp = "start",
+        mosaic: Mosaic | Literal["none"] | None = None,
+    ) -> None:
         if exposure is not None and exposure <= 0:
             raise ExposureError(f"exposure is {exposure} us; it must be positive")
         if stamp not in ("start", "middle", "end"):
             raise InputError(f"stamp is {stamp!r}; it must be 'start', 'middle' or 'end'")
+        if mosaic not in (None, "none", *MOSAICS):
+            raise InputError(f"mosaic is {mosaic!r}; it must be one of {', '.join(MOSAICS)}, or 'none'")
         self.source = source
+        self.mosaic: Mosaic | None = source.mosaic if mosaic is None else None if mosaic == "none" else mosaic
         self.sensor_size = source.sensor_size
         self.exposure_known = source.exposure_known or exposure is not None
         self._exposure = exposure
@@ -128,6 +142,7 @@ class Recording:
                 contrast_threshold=contrast_threshold,
                 inverse_covariance=inverse_covariance,
                 ground_truth=None if ground_truth is None else lambda: ground_truth,
+                mosaic=frame_list[0].mosaic if frame_list else None,
             )
         )
         for _ in recording.events():
@@ -168,6 +183,10 @@ class Recording:
         """The frames even where their exposure is unknown: start and end then both hold the stamp."""
         return FrameStream(self._checked_frames, self.source.count_frames)
 
+    def stored_frames(self) -> FrameStream:
+        """As `stamped_frames`, but RGB that was made of a mosaic stays RGB: for a copy without loss."""
+        return FrameStream(lambda: self._checked_frames(as_stored=True), self.source.count_frames)
+
     def _checked_events(self) -> Iterator[EventArray]:
         count, previous_t = 0, None
         for chunk in self.source.events():
@@ -183,11 +202,13 @@ class Recording:
                 previous_t = int(chunk["t"][-1])
                 yield chunk
 
-    def _checked_frames(self) -> Iterator[Frame]:
+    def _checked_frames(self, *, as_stored: bool = False) -> Iterator[Frame]:
         previous = None
         for index, frame in enumerate(self.source.frames()):
             if self._exposure is not None:
                 frame = place_exposure(frame, self._exposure, self._stamp)
+            if not as_stored:
+                frame = _with_mosaic(frame, self.mosaic)
             check_frame(
                 frame,
                 self.sensor_size,
@@ -200,6 +221,16 @@ class Recording:
             yield frame
 
 
+def _with_mosaic(frame: Frame, mosaic: Mosaic | None) -> Frame:
+    """The frame as a mosaic, of RGB every pixel's own channel; or without one."""
+    if mosaic == frame.mosaic:
+        return frame
+    image = frame.image
+    if mosaic is not None and image.ndim == 3:
+        image = sample_mosaic(image, mosaic)
+    return dataclasses.replace(frame, image=image, mosaic=mosaic)
+
+
 def open(
     path: str | Path,
     *,
@@ -209,6 +240,7 @@ def open(
     frames_start: int | None = None,
     frames_rate: float | None = None,
     replace_frames: bool = False,
+    mosaic: Mosaic | Literal["none"] | None = None,
 ) -> Recording:
     """Open a recording of any known format, recognised by its content.
 
@@ -223,11 +255,14 @@ def open(
         With ``exposure``: whether a frame's time stamp (or stored exposure start) is the start, the middle or
         the end of its exposure.
     frames
-        Frames from elsewhere: a folder of grey images with their times, or a video; see ``docs/formats.md``.
+        Frames from elsewhere: a folder of images with their times, or a video; see ``docs/formats.md``.
     frames_start, frames_rate
         For a video: time of its first frame, us, in the clock of the events; frames per second.
     replace_frames
         Whether ``frames`` may replace frames that the recording has itself.
+    mosaic
+        The Bayer pattern of the sensor, ``"RGGB"``, ``"BGGR"``, ``"GRBG"`` or ``"GBRG"``, where the recording does not
+        state it or is wrong; ``"none"``: it has none. Frames in RGB then give every pixel its own channel back.
 
     Raises
     ------
@@ -245,4 +280,4 @@ def open(
         raise InputError(
             "frames_start, frames_rate and replace_frames say what to do with frames; give frames"
         )
-    return Recording(source, exposure=exposure, stamp=stamp)
+    return Recording(source, exposure=exposure, stamp=stamp, mosaic=mosaic)

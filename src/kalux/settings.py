@@ -36,6 +36,7 @@ class CameraSettings:
     response
         ``"linear"`` (raw sensor values: DAVIS, machine vision), ``"srgb"``, ``"gamma:EXPONENT"``, or a measured
         ``"curve:0 0.0012 ... 1"``: the irradiance at equally spaced response levels (`kalux calibrate response`).
+        Three with ";" between them are those of red, green and blue.
     log_offset
         I_0 of equation (8); white = 1. Events are steps of log I, so it must be small; below the dark current
         of the event pixels it only magnifies noise. None: an estimate from the recording
@@ -54,6 +55,10 @@ class CameraSettings:
         fixed pattern noise at the top.
     reference_exposure
         Exposure time, us, at which a saturated pixel has intensity 1; None: the recording's median.
+    white_balance
+        Of recordings in colour: ``"as-recorded"``, ``"grey-world"`` (gains that make the mean of well exposed pixels
+        grey; one set for a recording), or gains of red, green and blue, ``"1.8;1;1.4"``. As recorded: what is grey is
+        not in the recording, and RGB frames are balanced already.
     """
 
     response: str = "linear"
@@ -63,6 +68,7 @@ class CameraSettings:
     weight_floor: float = 0.09
     saturation: float = 0.98
     reference_exposure: int | None = None
+    white_balance: str = "as-recorded"
 
     @property
     def offset(self) -> float:

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from kalux.errors import OutputError
 from kalux.events import EVENT_DTYPE, EventArray
-from kalux.frames import Frame
+from kalux.frames import Frame, Mosaic
 from kalux.reconstructor import Estimate, Reconstructor
 from kalux.recording import Recording
 from kalux.settings import Settings
@@ -56,7 +56,7 @@ class Spill:
     def __init__(self, recording: Recording, folder: Path) -> None:
         self._folder = folder
         self._events = folder / "events.bin"
-        self._exposures: list[tuple[int, int, float | None]] = []
+        self._exposures: list[tuple[int, int, float | None, Mosaic | None]] = []
         self.count = 0
         try:
             with self._events.open("wb") as file:
@@ -65,7 +65,7 @@ class Spill:
                     self.count += len(chunk)
             for index, frame in enumerate(recording.frames()):
                 np.save(self._frame_path(index), frame.image)
-                self._exposures.append((frame.exposure_start, frame.exposure_end, frame.white))
+                self._exposures.append((frame.exposure_start, frame.exposure_end, frame.white, frame.mosaic))
         except OSError as error:
             raise OutputError(
                 f"{folder}: the recording cannot be spilled for the backward pass: {error.strerror or error}"
@@ -83,8 +83,8 @@ class Spill:
     def reversed_frame(self, index: int) -> Frame:
         """The frame ``index`` of the reversed recording."""
         forward = len(self) - 1 - index
-        start, end, white = self._exposures[forward]
-        return Frame(np.load(self._frame_path(forward)), -end, -start, white)
+        start, end, white, mosaic = self._exposures[forward]
+        return Frame(np.load(self._frame_path(forward)), -end, -start, white, mosaic)
 
     def reversed_events(self, first: int) -> EventArray:
         """A block of the reversed recording's events, from its event ``first`` on; empty at the end."""
@@ -203,7 +203,7 @@ class Backward:
             if t in self._current:
                 continue
             backward.reach(self._spill, -t)
-            self._current[t] = backward.engine.estimate(-t)
+            self._current[t] = dataclasses.replace(backward.engine.estimate(-t), chroma=None)
         self._state_path(self._next_window).unlink()
         self._next_window += 1
 
@@ -232,6 +232,7 @@ def combine(forward: Estimate, backward: Estimate | None) -> Estimate:
         final=forward.final,
         moving=_either(forward.moving, backward.moving),
         between=forward.between,
+        chroma=forward.chroma,
     )
 
 

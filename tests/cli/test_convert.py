@@ -15,6 +15,7 @@ import kalux
 from kalux import readers
 from kalux.cli.signals import interrupts_held
 from kalux.frames import Frame
+from kalux.models.colour import sample_mosaic
 from kalux.readers import GroundTruth
 
 
@@ -67,6 +68,22 @@ def test_everything_is_copied(cli, write_recording, simulation, tmp_path):
     copy = kalux.open(tmp_path / "copy.h5")
     assert_same(copy, kalux.open(path))
     assert next(iter(copy.frames())).white_value == 300
+
+
+def test_rgb_that_was_made_of_a_mosaic_is_copied_as_it_is(cli, write_recording, simulation, tmp_path):
+    """The pattern that is given goes into the copy, which then opens as a mosaic."""
+    rng = np.random.default_rng(0)
+    frames = [
+        dataclasses.replace(f, image=rng.integers(0, 256, (*f.image.shape, 3), np.uint8))
+        for f in simulation.frames
+    ]
+    path = write_recording(tmp_path / "rec.h5", frames=frames)
+    assert cli("convert", path, tmp_path / "copy.h5", "--bayer", "gbrg").code == 0
+    copy = kalux.open(tmp_path / "copy.h5")
+    assert copy.mosaic == "GBRG"
+    for stored, mosaic, frame in zip(copy.stored_frames(), copy.frames(), frames, strict=True):
+        assert np.array_equal(stored.image, frame.image)
+        assert np.array_equal(mosaic.image, sample_mosaic(frame.image, "GBRG"))
 
 
 def test_exposures_that_are_given_are_put_in(cli, damaged, tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import errno
 import os
 import signal
@@ -10,10 +11,13 @@ import time
 import tomllib
 
 import av
+import cv2
 import numpy as np
 import pytest
 
 import kalux
+from kalux.datasets import SensorSettings, colour_photograph, pan, simulate_colour
+from kalux.models.colour import luminance
 from kalux.writers import folder
 
 
@@ -24,6 +28,84 @@ def times_in(path):
 
 def images_in(path):
     return [np.load(file) for file in sorted(path.glob("*.npy"))]
+
+
+@pytest.fixture(scope="module")
+def coloured(tmp_path_factory, write_recording):
+    """A recording of a sensor with a mosaic, which does not say so: its pattern is GRBG."""
+    painted = np.random.default_rng(0).uniform(0.05, 1.2, (8, 10, 3)).repeat(12, 0).repeat(12, 1)
+    scene = colour_photograph(painted, pan(60.0), sensor_size=(32, 40), duration=400_000)
+    made = simulate_colour(scene, SensorSettings(), mosaic="GRBG")
+    frames = [dataclasses.replace(frame, mosaic=None) for frame in made.frames]
+    path = tmp_path_factory.mktemp("coloured") / "rec.h5"
+    return write_recording(path, events=[made.events], frames=frames)
+
+
+class TestColour:
+    def test_a_pattern_makes_colours(self, cli, coloured, tmp_path):
+        found = cli(
+            "reconstruct",
+            coloured,
+            "-o",
+            tmp_path / "o",
+            "--format",
+            "npy",
+            "--at",
+            "frames",
+            "--bayer",
+            "grbg",
+        )
+        assert found.code == 0, found.err
+        assert "Bayer mosaic GRBG, demosaiced after the filter; white balance as-recorded" in found.out
+        expected = kalux.reconstruct(kalux.open(coloured, mosaic="GRBG"), at="frames")
+        for read, image in zip(images_in(tmp_path / "o"), expected, strict=True):
+            np.testing.assert_array_equal(read, [*np.moveaxis(image.colour, 2, 0), image.variance])
+        assert tomllib.loads((tmp_path / "o/kalux.toml").read_text())["input"]["bayer"] == "GRBG"
+
+    def test_grey_is_the_luminance(self, cli, coloured, tmp_path):
+        flags = ("--format", "npy", "--at", "frames", "--bayer", "GRBG")
+        assert cli("reconstruct", coloured, "-o", tmp_path / "c", *flags).code == 0
+        assert cli("reconstruct", coloured, "-o", tmp_path / "g", *flags, "--grey").code == 0
+        for colour, grey in zip(images_in(tmp_path / "c"), images_in(tmp_path / "g"), strict=True):
+            assert grey.shape == (2, 32, 40)
+            np.testing.assert_array_equal(grey[0], luminance(np.moveaxis(colour[:3], 0, 2)))
+
+    @pytest.mark.parametrize("name", ["v.mp4", "pictures"])
+    def test_videos_and_pictures_are_in_colour(self, cli, coloured, tmp_path, name):
+        out = tmp_path / name
+        assert cli("reconstruct", coloured, "-o", out, "--rate", 50, "--bayer", "GRBG").code == 0
+        if out.suffix:
+            with av.open(str(out)) as video:
+                picture = next(video.decode(video=0)).to_ndarray(format="rgb24")
+        else:
+            picture = cv2.imread(str(out / "000000.png"), cv2.IMREAD_UNCHANGED)
+            assert picture.dtype == np.uint16
+        assert picture.shape == (32, 40, 3)
+        assert np.ptp(picture.astype(float), axis=-1).mean() > 0.05 * np.iinfo(picture.dtype).max
+
+    def test_the_gains_that_were_measured_are_written_down(self, cli, coloured, tmp_path):
+        flags = ("--at", "frames", "--bayer", "GRBG", "--camera.white-balance", "grey-world")
+        assert cli("reconstruct", coloured, "-o", tmp_path / "o", *flags).code == 0
+        written = tomllib.loads((tmp_path / "o/kalux.toml").read_text())["settings"]["camera"][
+            "white_balance"
+        ]
+        assert len(written.split(";")) == 3
+        again = ("--settings", tmp_path / "o/kalux.toml", "--at", "frames", "--bayer", "GRBG")
+        assert cli("reconstruct", coloured, "-o", tmp_path / "again", *again).code == 0
+        for file in (tmp_path / "o").glob("*.png"):
+            assert file.read_bytes() == (tmp_path / "again" / file.name).read_bytes()
+
+    def test_an_unknown_pattern_is_one_line(self, cli, coloured, tmp_path):
+        found = cli("reconstruct", coloured, "-o", tmp_path / "o", "--bayer", "RGBG")
+        assert found.code == 2
+        assert "RGBG" in found.error
+        assert "RGGB" in found.error
+
+    def test_info_and_evaluate_know_it(self, cli, coloured):
+        found = cli("info", coloured, "--bayer", "grbg", "--no-estimate")
+        assert "Bayer mosaic GRBG" in found.out
+        assert "Bayer" not in cli("info", coloured, "--no-estimate").out
+        assert cli("evaluate", coloured, "--bayer", "grbg", "--methods", "hold,default", "--quiet").code == 0
 
 
 class TestOutput:

@@ -168,6 +168,23 @@ def test_weight_is_certainty_after_inverse(response, level):
     np.testing.assert_array_equal(response.weight(value), response.certainty(response.inverse(value)))
 
 
+def test_colours_may_have_a_response_each():
+    camera = Camera.named("linear; gamma:2 ;srgb", 0.9)
+    assert camera.saturation == 0.9
+    level = np.array([0.25, 0.5])
+    for channel, name in enumerate(("linear", "gamma:2", "srgb")):
+        own = camera.of_channel(channel)
+        assert own.colours is None
+        np.testing.assert_array_equal(own.response.inverse(level), Response.named(name).inverse(level))
+    assert Camera.named("srgb", 0.9).of_channel(2).colours is None
+
+
+@pytest.mark.parametrize("text", ["linear;srgb", "linear;srgb;linear;srgb", ";;", "linear;srgb;no"])
+def test_responses_per_colour_that_are_none(text):
+    with pytest.raises(SettingsError, match="response"):
+        Camera.named(text, 0.98)
+
+
 def test_linear_camera_weighs_all_levels_alike():
     level = np.arange(256) / 255
     np.testing.assert_allclose(Camera(Response.linear()).weight(level), 1.0, rtol=1e-9)

@@ -234,7 +234,6 @@ def test_an_event_may_begin_with_the_byte_of_a_header_line(path):
     [
         (None, "does not say which sensor"),
         ("ch.unizh.ini.jaer.chip.retina.DVS128", "sensor DVS128 cannot be read"),
-        ("eu.seebetter.ini.chips.davis.Davis346redColor", "colour pixels"),
         ("eu.seebetter.ini.chips.davis.DavisRGBW640", "colour pixels"),
     ],
 )
@@ -250,6 +249,22 @@ def test_other_sensors_are_known(path, chip, size):
     source = write(path, event_words(small_events(), size), head=header(chip))
     assert source.sensor_size == size
     assert np.array_equal(all_events(source), small_events())
+
+
+@pytest.mark.parametrize(
+    ("chip", "mosaic"),
+    [
+        ("Davis346redColor", "RGGB"),
+        ("Davis346BColor", "RGGB"),
+        ("Davis640Color", "RGGB"),
+        ("Davis128Color", "GRBG"),
+        ("DAVIS346blue", None),
+    ],
+)
+def test_sensors_in_colour_are_known_by_their_name(path, chip, mosaic):
+    """The patterns of jAER begin at the lower left pixel; here rows are counted from the top."""
+    events = event_words(small_events(), (100, 100))
+    assert write(path, events, head=header(f"eu.seebetter.ini.chips.davis.{chip}")).mosaic == mosaic
 
 
 def test_an_event_outside_the_sensor_is_refused(path):

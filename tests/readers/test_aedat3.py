@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import struct
 
 import numpy as np
@@ -12,10 +13,12 @@ from kalux.errors import FormatError
 from kalux.events import make_events
 from kalux.frames import Frame
 from kalux.readers import CHUNK_EVENTS
+from kalux.recording import Recording
 from recordings import (
     SIZE,
     all_events,
     assert_only_clear_errors,
+    colour_frames,
     damaged,
     same_frames,
     small_events,
@@ -52,7 +55,7 @@ def polarity(events, valid=True, **more):
 
 
 def frame(stored, info=0b11, **more):
-    height, width = stored.image.shape
+    height, width = stored.image.shape[:2]
     begin, end = stored.exposure_start, stored.exposure_end
     head = struct.pack("<I8i", info, begin - 5, end + 900, begin, end, width, height, 0, 0)
     body = head + stored.image.astype("<u2").tobytes()
@@ -90,6 +93,29 @@ def test_reads_what_was_written(path):
         assert np.array_equal(all_events(source), events)
         assert same_frames(source.frames(), frames)
     assert (source.count_events(), source.count_frames()) == (len(events), len(frames))
+
+
+@pytest.mark.parametrize(
+    ("number", "mosaic"), [(1, "RGGB"), (2, "GRBG"), (3, "GBRG"), (4, "BGGR"), (0, None)]
+)
+def test_colour_filters_are_those_of_libcaer(path, number, mosaic):
+    """libcaer's RGBG, GRGB, GBGR, BGRG name the upper left pixels by columns of its frame_utils.c."""
+    frames = wide(small_frames())
+    source = write(path, *(frame(f, 0b11 | number << 4) for f in frames))
+    assert source.mosaic == mosaic
+    assert same_frames(source.frames(), frames)
+    assert {f.mosaic for f in Recording(source).frames()} == {mosaic}
+
+
+@pytest.mark.parametrize("channels", [3, 4])
+def test_frames_in_rgb(path, channels):
+    frames = colour_frames(dtype=np.uint16)
+    stored = [
+        dataclasses.replace(f, image=np.dstack([f.image, f.image[..., :1]])[..., :channels]) for f in frames
+    ]
+    source = write(path, *(frame(f, 1 | channels << 1) for f in stored))
+    assert source.sensor_size == SIZE
+    assert same_frames(source.frames(), frames)
 
 
 def test_how_packets_are_cut_makes_no_difference(path):
@@ -155,8 +181,8 @@ def test_one_source_is_read_that_with_frames(path):
         (header() + polarity(small_events()) + b"\1\0", "within the header of a packet"),
         (header() + packet(1, bytes(9), 1, 9), "9 bytes instead of 8"),
         (header() + packet(-3, b"", 0, 8), "makes no sense"),
-        (header() + frame(wide(small_frames())[0], 0b111), "in colour"),
-        (header() + frame(wide(small_frames())[0], 0b10011), "in colour"),
+        (header() + frame(wide(small_frames())[0], 0b1010011), "colour filter that is no Bayer mosaic"),
+        (header() + frame(wide(small_frames())[0], 0b101), "makes no sense"),  # of two channels
     ],
 )
 def test_what_cannot_be_read_is_said(path, data, message):
@@ -169,6 +195,11 @@ def test_damage_gives_clear_errors(path):
     events, frames = small_events(), wide(small_frames())
     parts = [polarity(events[:200]), OTHERS, *map(frame, frames), polarity(events[200:])]
     assert_only_clear_errors(path, damaged(header() + b"".join(parts), 200, header=400))
+
+
+def test_damage_of_colours_gives_clear_errors(path):
+    frames = [frame(f, 0b0010111) for f in colour_frames(dtype=np.uint16)]
+    assert_only_clear_errors(path, damaged(header() + b"".join(frames), 200, header=400))
 
 
 def test_tonic_reads_the_same_events(path):

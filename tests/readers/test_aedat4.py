@@ -4,19 +4,24 @@ from __future__ import annotations
 
 import struct
 
+import cv2
 import lz4.frame
 import numpy as np
 import pytest
 import zstandard
 
+import kalux
 from kalux import readers
 from kalux.errors import FormatError
+from kalux.events import make_events
 from kalux.frames import Frame
+from kalux.models.colour import sample_mosaic
 from kalux.readers import CHUNK_EVENTS, aedat4
 from recordings import (
     SIZE,
     all_events,
     assert_only_clear_errors,
+    colour_frames,
     damaged,
     same_frames,
     small_events,
@@ -54,7 +59,7 @@ def event_packet(events):
 
 
 def frame_packet(frame, *, kind=0, exposure="both"):
-    height, width = frame.image.shape
+    height, width = frame.image.shape[:2]
     fields = {0: ("<q", frame.exposure_start), 1: ("<q", 0), 2: ("<q", 0)}
     if exposure == "both":
         fields |= {3: ("<q", frame.exposure_start), 4: ("<q", frame.exposure_end)}
@@ -65,11 +70,21 @@ def frame_packet(frame, *, kind=0, exposure="both"):
     return flatbuffer("FRME", fields)
 
 
-def aedat4_file(packets, *, streams=(("EVTS", SIZE), ("FRME", SIZE)), compression=0, closed=True):
+def colour_packet(frame, kind):
+    bgr = frame.image[..., ::-1]
+    stored = np.dstack([bgr, bgr[..., 0]]) if kind in (24, 26) else bgr
+    flat = Frame(np.ascontiguousarray(stored), frame.exposure_start, frame.exposure_end)
+    return frame_packet(flat, kind=kind)
+
+
+def aedat4_file(
+    packets, *, streams=(("EVTS", SIZE), ("FRME", SIZE)), compression=0, closed=True, camera="Unknown"
+):
     """A file of (stream, packet) pairs."""
     nodes = "".join(
         f'<node name="{i}"><attr key="typeIdentifier" type="string">{kind}</attr><node name="info">'
-        f'<attr key="sizeX" type="int">{width}</attr><attr key="sizeY" type="int">{height}</attr></node></node>'
+        f'<attr key="sizeX" type="int">{width}</attr><attr key="sizeY" type="int">{height}</attr>'
+        f'<attr key="source" type="string">{camera}</attr></node></node>'
         for i, (kind, (height, width)) in enumerate(streams)
     )
     info = f'<dv version="2.0"><node name="outInfo">{nodes}</node></dv>'.encode()
@@ -179,11 +194,40 @@ def test_16_bit_frames(path):
     assert np.array_equal(frame.image, image)
 
 
-def test_colour_is_refused(path):
-    image = np.zeros((SIZE[0], SIZE[1] * 3), np.uint8)
-    packet = frame_packet(Frame(image, 5, 9), kind=16)
-    path.write_bytes(aedat4_file([(1, packet)]))
-    with pytest.raises(FormatError, match=r"in colour \(BGR\)"):
+@pytest.mark.parametrize(
+    ("kind", "dtype"), [(16, np.uint8), (24, np.uint8), (18, np.uint16), (26, np.uint16)]
+)
+def test_frames_in_colour_are_stored_as_bgr(path, kind, dtype):
+    frames = colour_frames(dtype=dtype)
+    packets = [(1, colour_packet(frame, kind)) for frame in frames]
+    path.write_bytes(aedat4_file(packets))
+    source = readers.read(path)
+    assert same_frames(source.frames(), frames)
+    assert source.mosaic is None
+
+
+def test_colours_of_a_davis_are_those_of_its_mosaic(path):
+    """Events of a colour DAVIS see the colour of their pixel, so frames get each pixel's own channel back."""
+    frames = colour_frames()
+    path.write_bytes(
+        aedat4_file([(1, colour_packet(frame, 16)) for frame in frames], camera="DAVIS346_00000002")
+    )
+    recording = kalux.open(path)
+    assert recording.mosaic == "RGGB"
+    assert any("Bayer mosaic" in text and "--bayer none" in text for text in recording.source.missing)
+    for frame, rgb in zip(recording.frames(), frames, strict=True):
+        assert frame.mosaic == "RGGB"
+        assert np.array_equal(frame.image[::2, ::2], rgb.image[::2, ::2, 0])
+        assert np.array_equal(frame.image[::2, 1::2], rgb.image[::2, 1::2, 1])
+        assert np.array_equal(frame.image[1::2, ::2], rgb.image[1::2, ::2, 1])
+        assert np.array_equal(frame.image[1::2, 1::2], rgb.image[1::2, 1::2, 2])
+    assert same_frames(recording.stored_frames(), frames)
+    assert same_frames(kalux.open(path, mosaic="none").frames(), frames)
+
+
+def test_unknown_pixel_types_are_refused(path):
+    path.write_bytes(aedat4_file([(1, frame_packet(small_frames()[0], kind=5))]))
+    with pytest.raises(FormatError, match="unknown pixel type 5"):
         list(readers.read(path).frames())
 
 
@@ -215,6 +259,11 @@ def test_a_file_cut_between_packets_is_refused(path):
 @pytest.mark.parametrize("compression", [0, 1, 3])
 def test_damage_gives_clear_errors(path, compression):
     assert_only_clear_errors(path, damaged(small_file(compression=compression), 300, header=700))
+
+
+def test_damage_of_colours_gives_clear_errors(path):
+    packets = [(1, colour_packet(frame, 24)) for frame in colour_frames()]
+    assert_only_clear_errors(path, damaged(aedat4_file(packets, camera="DAVIS346_1"), 300, header=700))
 
 
 # Real files
@@ -260,6 +309,20 @@ def test_agrees_with_dv_processing(shared_data, name):
     for frame, image in zip(source.frames(), images, strict=True):
         assert np.array_equal(frame.image, image.image)
         assert frame.exposure == image.exposure.total_seconds() * 1e6
+
+
+def test_a_real_photograph_as_a_colour_davis_stores_it(shared_data, path):
+    """A real payload, our writer: no recording of a colour DAVIS could be had."""
+    picture = cv2.imread(str(shared_data / "hdr" / "Oxford_Church.hdr"), cv2.IMREAD_UNCHANGED)[..., ::-1]
+    raw = sample_mosaic(np.rint(255 * np.clip(4 * picture[300:560, 300:646], 0, 1)).astype(np.uint8), "RGGB")
+    stored = Frame(cv2.cvtColor(raw, cv2.COLOR_BayerBG2RGB), 1_000, 9_000)
+    events = make_events([0, 5_000], [3, 345], [259, 2], [1, 0])
+    streams = (("EVTS", (260, 346)), ("FRME", (260, 346)))
+    packets = [(0, event_packet(events)), (1, colour_packet(stored, 16))]
+    path.write_bytes(aedat4_file(packets, streams=streams, compression=1, camera="DAVIS346_00000499"))
+    frame = next(iter(kalux.open(path).frames()))
+    # OpenCV leaves measured values as they are, but for the outermost rows and columns, which it repeats.
+    assert np.array_equal(frame.image[1:-1, 1:-1], raw[1:-1, 1:-1])
 
 
 @pytest.mark.parametrize("share", [0.001, 0.1, 0.5, 0.9, 0.99])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import resource
 
 import h5py
@@ -19,6 +20,7 @@ from recordings import (
     SIZE,
     all_events,
     assert_only_clear_errors,
+    colour_frames,
     damaged,
     same_frames,
     small_events,
@@ -91,6 +93,31 @@ def test_frames_keep_type_and_white(path, dtype, white):
     ]
     write(path, frames=frames)
     assert same_frames(readers.read(path).frames(), frames)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_frames_in_rgb(path, dtype):
+    frames = colour_frames(dtype=dtype)
+    write(path, frames=frames)
+    source = readers.read(path)
+    assert same_frames(source.frames(), frames)
+    assert source.mosaic is None
+
+
+def test_a_mosaic_is_that_of_the_frames_or_as_given(path):
+    frames = [dataclasses.replace(frame, mosaic="GRBG") for frame in small_frames()]
+    write(path, frames=frames)
+    assert readers.read(path).mosaic == "GRBG"
+    write(path, frames=colour_frames(), mosaic="BGGR")  # RGB that was made of it
+    assert readers.read(path).mosaic == "BGGR"
+
+
+def test_an_unknown_mosaic_is_refused(path):
+    write(path, frames=small_frames(), mosaic="RGGB")
+    with h5py.File(path, "r+") as file:
+        file["frames"].attrs["mosaic"] = np.bytes_("RGBG")
+    with pytest.raises(FormatError, match="states the mosaic 'RGBG'"):
+        readers.read(path)
 
 
 def test_nothing_but_a_sensor(path):
@@ -193,6 +220,11 @@ def test_a_file_cut_short_is_refused(path):
 def test_damage_gives_clear_errors(path):
     write(path)
     assert_only_clear_errors(path, damaged(path.read_bytes(), 300))
+
+
+def test_damage_of_colours_gives_clear_errors(path, tmp_path):
+    write(path, frames=colour_frames(), mosaic="RGGB")
+    assert_only_clear_errors(tmp_path / "damaged.h5", damaged(path.read_bytes(), 60))
 
 
 def test_a_real_recording_comes_back(shared_data, path):

@@ -14,7 +14,7 @@ import pytest
 from kalux import readers
 from kalux.errors import FormatError
 from kalux.readers import hdf5_layout
-from recordings import SIZE, all_events, complaint, damaged, small_events, small_frames
+from recordings import SIZE, all_events, colour_frames, complaint, damaged, small_events, small_frames
 
 STARTS = [frame.exposure_start for frame in small_frames()]
 
@@ -280,12 +280,13 @@ class TestDsec:
         source = readers.read(tmp_path)
         assert (source.count_frames(), source.missing) == (0, ("There are no images.",))
 
-    def test_colour_is_refused_with_what_to_do(self, tmp_path):
+    def test_images_in_colour(self, tmp_path):
         folder = write_dsec_folder(tmp_path / "s", small_events(), small_frames(), SIZE)
         colour = np.random.default_rng(0).integers(0, 256, (*SIZE, 3), np.uint8)
         cv2.imwrite(str(folder / "images/left/rectified/000000.png"), colour)
-        with pytest.raises(FormatError, match=r"in colour, which kalux does not read yet; .*--frames FOLDER"):
-            readers.read(folder)
+        frames = list(readers.read(folder).frames())
+        assert np.array_equal(frames[0].image, colour[..., ::-1])
+        assert {frame.image.shape for frame in frames} == {(*SIZE, 3)}
 
     def test_images_of_another_size_are_refused(self, tmp_path):
         folder = write_dsec_folder(tmp_path / "s", small_events(), small_frames(), (31, 40))
@@ -344,14 +345,19 @@ class TestHqf:
         with pytest.raises(FormatError, match="not finite"):
             all_events(readers.read(path))
 
-    def test_colour_is_refused(self, tmp_path):
-        path = write(tmp_path, "hqf")
+    def test_images_in_colour_are_stored_as_bgr(self, tmp_path):
+        """The packager of event_utils writes what cv_bridge gives as "bgr8"."""
+        path = write(tmp_path, "hqf", frames=[])
+        frames = colour_frames()
         with h5py.File(path, "r+") as file:
-            del file["images/image000000000"]
-            image = file.create_dataset("images/image000000000", data=np.zeros((*SIZE, 3), np.uint8))
-            image.attrs["timestamp"] = 0.0
-        with pytest.raises(FormatError, match="in colour"):
-            readers.read(path)
+            for index, frame in enumerate(frames):
+                image = file.create_dataset(f"images/image{index:09d}", data=frame.image[..., ::-1])
+                image.attrs["timestamp"] = frame.exposure_start * 1e-6
+                image.attrs["type"] = "color_bgr"
+        source = readers.read(path)
+        assert source.sensor_size == SIZE
+        for found, frame in zip(source.frames(), frames, strict=True):
+            assert np.array_equal(found.image, frame.image)
 
 
 class TestMvsec:

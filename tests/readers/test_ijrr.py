@@ -203,9 +203,20 @@ def test_images_in_colour(folder):
     grey = small_frames()[0].image
     cv2.imwrite(str(name), np.dstack([grey] * 3))  # grey, saved as colour
     assert np.array_equal(next(readers.read(folder).frames()).image, grey)
-    cv2.imwrite(str(name), np.dstack([grey, grey, 255 - grey]))
-    with pytest.raises(FormatError, match="in colour"):
-        readers.read(folder)
+    cv2.imwrite(str(name), np.dstack([255 - grey, grey, grey // 2]))  # blue, green, red
+    frames = list(readers.read(folder).frames())
+    assert np.array_equal(frames[0].image, np.dstack([grey // 2, grey, 255 - grey]))
+    assert {frame.image.shape for frame in frames} == {(*SIZE, 3)}  # also those that are grey
+
+
+def test_an_image_in_colour_among_grey_ones_is_refused(folder):
+    """Whether a recording is in colour is told from its first, its middle and its last image."""
+    grey = small_frames()[1].image
+    cv2.imwrite(str(folder / "images" / "frame_00000001.png"), np.dstack([grey, grey, 255 - grey]))
+    with pytest.raises(
+        FormatError, match=r"frame_00000001\.png' is in colour, but the images before it are grey"
+    ):
+        list(readers.read(folder).frames())
 
 
 def test_16_bit_images(folder):

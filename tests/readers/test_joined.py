@@ -196,13 +196,13 @@ class TestBadLists:
         with pytest.raises(FormatError, match="has 2 CSV files"):
             kalux.open(events_only, frames=folder)
 
-    def test_colour(self, events_only, tmp_path):
+    def test_images_in_colour_are_not_among_them(self, events_only, tmp_path):
         folder = tmp_path / "images"
         colour = np.random.default_rng(0).integers(0, 256, (*SIZE, 3), np.uint8)
         write_images(folder, [Frame(colour, 0, 1)])
         (folder / "frames.csv").write_text("t_us\n0\n")
-        with pytest.raises(FormatError, match="in colour"):
-            kalux.open(events_only, frames=folder)
+        frame = next(iter(kalux.open(events_only, frames=folder, exposure=100).frames()))
+        assert np.array_equal(frame.image, colour[..., ::-1])  # `write_images` leaves OpenCV's order
 
     def test_nothing_there(self, events_only, tmp_path):
         with pytest.raises(InputError, match="no such file"):
@@ -274,6 +274,22 @@ class TestVideo:
         rec = kalux.open(events_only, frames=video, frames_start=0, frames_rate=30)
         means = [frame.image.mean() for frame in rec.stamped_frames()]
         assert means == pytest.approx([0, 100, 255], abs=3)
+
+    def test_a_video_in_colour(self, events_only, tmp_path):
+        """Its first picture may be black; red is red."""
+        pictures = [np.zeros((*SIZE, 3), np.uint8) for _ in range(3)]
+        pictures[1][:] = (200, 40, 20)
+        with av.open(str(tmp_path / "v.mp4"), "w") as container:
+            stream = container.add_stream("h264", 25)
+            stream.height, stream.width, stream.pix_fmt = *SIZE, "yuv420p"
+            for picture in pictures:
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+            container.mux(stream.encode())
+        rec = kalux.open(events_only, frames=tmp_path / "v.mp4", frames_start=0, frames_rate=30)
+        means = [frame.image.mean(axis=(0, 1)) for frame in rec.stamped_frames()]
+        assert means[0] == pytest.approx([0, 0, 0], abs=3)
+        assert means[1] == pytest.approx([200, 40, 20], abs=4)
+        assert any("colours of a video" in text for text in rec.source.missing)
 
     @pytest.mark.parametrize("given", [{}, {"frames_start": 0}, {"frames_rate": 30.0}])
     def test_start_and_rate_are_needed(self, events_only, tmp_path, given):

@@ -8,6 +8,7 @@ that of a real recording. Bags with event packets are real ones.
 from __future__ import annotations
 
 import builtins
+import dataclasses
 import struct
 import tracemalloc
 
@@ -15,10 +16,12 @@ import cv2
 import numpy as np
 import pytest
 
+import kalux
 from kalux import readers
 from kalux.errors import EventError, FormatError, InputError, MissingDependencyError
 from kalux.events import make_events
 from kalux.frames import Frame
+from kalux.models.colour import sample_mosaic
 from kalux.readers import CHUNK_EVENTS, ros_bags
 from kalux.readers.streams import rechunk
 from kalux.recording import Recording
@@ -26,6 +29,7 @@ from recordings import (
     SIZE,
     all_events,
     assert_only_clear_errors,
+    colour_frames,
     complaint,
     damaged,
     same_frames,
@@ -334,17 +338,101 @@ def test_late_images_are_put_in_order(tmp_path):
     assert middles == sorted(middles)
 
 
-@pytest.mark.parametrize("encoding", ["bgr8", "bayer_rggb8"])
-def test_colour_is_refused_but_events_can_be_had(tmp_path, encoding):
+def image_messages(images, encoding, topic="/dvs/image_raw"):
+    """Events and exposures of the DAVIS driver with these images, each flattened to rows."""
+    others = [m for m in davis_messages(False) if "image" not in m[1]]
+    pictures = [picture.reshape(len(picture), -1) for picture in images]
+    frames = zip(small_frames(), pictures, strict=True)
+    return others + [
+        (
+            EPOCH + 1000 * frame.exposure_end + 4_000_000,
+            topic,
+            "sensor_msgs/msg/Image",
+            widened(image(picture, EPOCH + 1000 * frame.middle, False, encoding), SIZE[1]),
+        )
+        for frame, picture in frames
+    ]
+
+
+def widened(message, width):
+    """The message with another width: `image` takes that of the flattened rows."""
+    at = message.index(struct.pack("<I", SIZE[0])) + 4
+    return message[:at] + struct.pack("<I", width) + message[at + 4 :]
+
+
+@pytest.mark.parametrize(
+    ("encoding", "order", "dtype"),
+    [
+        ("rgb8", "rgb", "u1"),
+        ("bgr8", "bgr", "u1"),
+        ("rgba8", "rgba", "u1"),
+        ("bgra16", "bgra", "<u2"),
+        ("rgb16", "rgb", "<u2"),
+    ],
+)
+def test_images_in_colour(tmp_path, encoding, order, dtype):
     path = tmp_path / "recording.bag"
-    messages = [m for m in davis_messages(False) if "image" not in m[1]]
-    colour = image(np.zeros((30, 40 * 3), np.uint8), EPOCH, False, encoding)
-    write_bag1(path, [*messages, (EPOCH, "/dvs/image_raw", "sensor_msgs/msg/Image", colour)])
-    with pytest.raises(FormatError, match=rf"{encoding}.*colour is not supported yet"):
+    frames = colour_frames(dtype=np.dtype(dtype).type)
+    stored = [np.stack([f.image[..., "rgba".index(c) % 3] for c in order], axis=-1) for f in frames]
+    write_bag1(path, image_messages(stored, encoding, "/dvs/image_color"))
+    source = readers.read(path)
+    assert (source.sensor_size, source.mosaic) == (SIZE, None)
+    assert same_frames(source.frames(), shifted_frames(frames))
+
+
+@pytest.mark.parametrize("mosaic", ["rggb", "bggr", "gbrg", "grbg"])
+@pytest.mark.parametrize("bits", [8, 16])
+def test_raw_mosaics_say_their_pattern(tmp_path, mosaic, bits):
+    path = tmp_path / "recording.bag"
+    frames = [dataclasses.replace(f, image=f.image.astype(f"u{bits // 8}")) for f in small_frames()]
+    write_bag1(path, image_messages([f.image for f in frames], f"bayer_{mosaic}{bits}"))
+    recording = kalux.open(path)
+    assert recording.mosaic == mosaic.upper()
+    assert [f.mosaic for f in recording.frames()] == [mosaic.upper()] * 4
+    assert same_frames(recording.frames(), shifted_frames(frames))
+
+
+def test_colour_made_of_a_mosaic_gives_pixels_their_channel_back(tmp_path):
+    """As in CED: /dvs/image_color was demosaiced, its events see the colours of a DAVIS346; the bag does not say so."""
+    path = tmp_path / "recording.bag"
+    frames = colour_frames()
+    write_bag1(path, image_messages([f.image for f in frames], "rgb8", "/dvs/image_color"))
+    image_of = next(iter(kalux.open(path, mosaic="RGGB").frames())).image
+    assert np.array_equal(image_of, sample_mosaic(frames[0].image, "RGGB"))
+
+
+def test_unknown_encodings_are_refused_but_events_can_be_had(tmp_path):
+    path = tmp_path / "recording.bag"
+    write_bag1(path, image_messages([f.image for f in small_frames()], "yuv422"))
+    with pytest.raises(FormatError, match=r"'yuv422'; known are mono8.*bayer_rggb8.*frames="):
         readers.read(path)
     source = readers.read(f"{path}?frames=")
     assert source.count_frames() == 0
     assert np.array_equal(all_events(source), shifted(small_events()))
+
+
+def test_compressed_images_in_colour(tmp_path):
+    """The first may be black, and is in colour like the others."""
+    path = tmp_path / "recording.bag"
+    frames = colour_frames()
+    frames[0] = dataclasses.replace(frames[0], image=np.zeros_like(frames[0].image))
+    messages = []
+    for frame in frames:
+        png = cv2.imencode(".png", frame.image[..., ::-1])[1].tobytes()
+        data = bytes(Body(False).header(EPOCH + 1000 * frame.middle).text("png").blob(png).data)
+        messages.append(
+            (EPOCH + 1000 * frame.middle, "/c/compressed", "sensor_msgs/msg/CompressedImage", data)
+        )
+    write_bag1(path, messages)
+    for found, frame in zip(readers.read(path).frames(), frames, strict=True):
+        assert np.array_equal(found.image, frame.image)
+
+
+def test_drawings_of_events_alone_are_no_frames_unless_asked_for(tmp_path):
+    path = tmp_path / "recording.bag"
+    write_bag1(path, image_messages([f.image for f in colour_frames()], "bgr8", "/dvs_rendering"))
+    assert readers.read(path).count_frames() == 0
+    assert readers.read(f"{path}?frames=/dvs_rendering").count_frames() == 4
 
 
 def test_colour_drawings_of_events_do_not_stand_in_the_way(tmp_path):
@@ -567,6 +655,14 @@ def test_damage_gives_clear_errors(tmp_path, container):
     whole = file.read_bytes()
     copy = tmp_path / f"damaged.{container}"
     assert_only_clear_errors(copy, damaged(whole, 150, header=4200))
+
+
+@pytest.mark.parametrize("encoding", ["bgra8", "bayer_gbrg8"])
+def test_damage_of_colours_gives_clear_errors(tmp_path, encoding):
+    path = tmp_path / "recording.bag"
+    picture = np.zeros((*SIZE, 4) if encoding == "bgra8" else SIZE, np.uint8)
+    write_bag1(path, image_messages([picture] * 4, encoding))
+    assert_only_clear_errors(tmp_path / "damaged.bag", damaged(path.read_bytes(), 100, header=4200))
 
 
 @pytest.mark.parametrize("container", ["bag", "mcap"])

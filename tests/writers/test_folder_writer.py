@@ -19,7 +19,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from kalux.display import DisplaySettings, Linear, tone_map_next
+from kalux.display import DisplaySettings, Linear, tone_map, tone_map_next
 from kalux.errors import InputError, InternalError, OutputError, SettingsError
 from kalux.writers import files, open_writer
 from kalux.writers.files import uninterrupted
@@ -31,6 +31,11 @@ class Image:
     t: int
     intensity: np.ndarray
     variance: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ColourImage(Image):
+    colour: np.ndarray
 
 
 def make_image(index: int, shape: tuple[int, int] = (13, 17), top: float = 40.0) -> Image:
@@ -110,6 +115,58 @@ def test_npy_is_exact(tmp_path):
     read = np.load(tmp_path / "o/000000.npy")
     assert read.dtype == np.float32
     np.testing.assert_array_equal(read, [image.intensity[:, ::2], image.variance[:, ::2]])
+
+
+class TestColour:
+    image = ColourImage(
+        7,
+        np.ones((5, 6), np.float32),
+        np.full((5, 6), 0.5, np.float32),
+        np.random.default_rng(0).uniform(0, 3, (5, 6, 3)).astype(np.float32),
+    )
+
+    def test_exr_has_red_green_blue_and_variance(self, tmp_path):
+        with open_writer(tmp_path / "o", format="exr") as writer:
+            writer.write(self.image)
+        # Channels one by one; OpenEXR would join them to one array.
+        channels = OpenEXR.File(str(tmp_path / "o/000000.exr"), separate_channels=True).channels()
+        assert set(channels) == {"R", "G", "B", "variance"}
+        for index, name in enumerate("RGB"):
+            np.testing.assert_array_equal(channels[name].pixels, self.image.colour[..., index])
+        np.testing.assert_array_equal(channels["variance"].pixels, self.image.variance)
+
+    def test_npy_has_red_green_blue_and_variance(self, tmp_path):
+        with open_writer(tmp_path / "o", format="npy") as writer:
+            writer.write(self.image)
+        read = np.load(tmp_path / "o/000000.npy")
+        np.testing.assert_array_equal(read, [*np.moveaxis(self.image.colour, 2, 0), self.image.variance])
+
+    @pytest.mark.parametrize(("bits", "top"), [(8, 255), (16, 65535)])
+    def test_png_is_in_colour(self, tmp_path, bits, top):
+        with open_writer(tmp_path / "o", format="png", png_bits=bits) as writer:
+            writer.write(self.image)
+        read = cv2.imread(str(tmp_path / "o/000000.png"), cv2.IMREAD_UNCHANGED)
+        np.testing.assert_allclose(read[..., ::-1] / top, tone_map(self.image.colour), atol=0.51 / top)
+
+    def test_what_does_not_fit_is_refused(self, tmp_path):
+        with open_writer(tmp_path / "a", format="npy") as writer:
+            writer.write(self.image)
+            with pytest.raises(InputError, match="image 1: is grey, those before it are not"):
+                writer.write(Image(8, self.image.intensity, self.image.variance))
+        flat = dataclasses.replace(self.image, colour=self.image.colour[..., :2])
+        with (
+            open_writer(tmp_path / "b", format="npy") as writer,
+            pytest.raises(InputError, match="the colour is"),
+        ):
+            writer.write(flat)
+        bad = dataclasses.replace(
+            self.image, colour=np.where(self.image.colour > 2.9, np.nan, self.image.colour)
+        )
+        with (
+            open_writer(tmp_path / "c", format="npy") as writer,
+            pytest.raises(InternalError, match=r"the colour at x=.* is not finite"),
+        ):
+            writer.write(bad)
 
 
 def test_the_list_and_the_settings_grow_with_the_images(tmp_path):

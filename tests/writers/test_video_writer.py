@@ -11,12 +11,13 @@ import time
 import tomllib
 from fractions import Fraction
 from pathlib import Path
+from types import SimpleNamespace
 
 import av
 import numpy as np
 import pytest
 
-from kalux.display import DisplaySettings, Linear
+from kalux.display import DisplaySettings, Linear, tone_map
 from kalux.errors import InputError, OutputError, SettingsError
 from kalux.writers import VideoSettings, open_writer, video
 from kalux.writers.video import video_frame
@@ -119,6 +120,42 @@ def test_a_frame_is_the_limited_range():
     frame = video_frame(np.array([[0.0, 1.0], [0.5, 0.25]], np.float32))
     np.testing.assert_array_equal(luma(frame), [[16, 235], [126, 71]])
     np.testing.assert_array_equal(np.frombuffer(frame.planes[1], np.uint8)[0], 128)
+
+
+def test_colours_are_those_of_bt_709(tmp_path):
+    """Decoded by FFmpeg with what the file says of itself: bars of the primaries, and a ramp, come back."""
+    bars = np.zeros((48, 96, 3), np.float32)
+    for index, colour in enumerate(
+        [(0.8, 0, 0), (0, 0.8, 0), (0, 0, 0.8), (0.6, 0.6, 0.1), (0.3, 0.5, 0.7), (0.5, 0.5, 0.5)]
+    ):
+        bars[:, 16 * index : 16 * index + 16] = colour
+    image = SimpleNamespace(t=0, intensity=bars[..., 0], variance=np.ones((48, 96), np.float32), colour=bars)
+    with open_writer(tmp_path / "v.mp4", display=LINEAR, video=VideoSettings(crf=1)) as writer:
+        writer.write(image)
+    with av.open(str(tmp_path / "v.mp4")) as container:
+        context = container.streams.video[0].codec_context
+        assert (context.colorspace, context.color_primaries, context.color_trc, context.color_range) == (
+            1,
+            1,
+            1,
+            1,
+        )
+        frame = next(container.decode(video=0))
+        assert frame.colorspace == 1
+        rgb = frame.reformat(format="rgb24", src_colorspace=1, dst_colorspace=1).to_ndarray() / 255
+    expected = tone_map(bars, LINEAR)
+    inside = np.abs(np.arange(96) % 16 - 7.5) < 5  # chroma is at half the size
+    np.testing.assert_allclose(rgb[:, inside], expected[:, inside], atol=0.02)
+
+
+def test_chroma_lies_on_even_columns_between_rows():
+    picture = np.zeros((2, 6, 3), np.float32)
+    picture[:, 2, 0] = 1.0  # one red column
+    cr = np.frombuffer(video_frame(picture).planes[2], np.uint8)[:3].astype(int) - 128
+    np.testing.assert_allclose(cr, [0, 112 / 2, 0], atol=1)
+    picture = np.roll(picture, 1, axis=1)
+    cr = np.frombuffer(video_frame(picture).planes[2], np.uint8)[:3].astype(int) - 128
+    np.testing.assert_allclose(cr, [0, 112 / 4, 112 / 4], atol=1)
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from kalux.augmentation.deblur import between
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.filters.methods import Shot, take_shot
-from kalux.models.camera import Camera, Response, log_intensity
+from kalux.models.camera import Camera, log_intensity
 from kalux.recording import Recording
 from kalux.settings import CameraSettings
 
@@ -53,7 +53,7 @@ def intervals(
     recording: Recording, camera: CameraSettings, *, margin: int, most_frames: int
 ) -> Iterator[Interval]:
     """The intervals between the first ``most_frames`` frames, with the events up to ``margin`` us around each."""
-    model = Camera(Response.named(camera.response), None, camera.saturation)
+    model = Camera.named(camera.response, camera.saturation)
     low, high = _WELL_EXPOSED
     chunks = iter(recording.events())
     buffer: EventArray = np.empty(0, EVENT_DTYPE)
@@ -65,7 +65,8 @@ def intervals(
         reference = reference or float(frame.exposure)
         shot = take_shot(frame, model, reference)
         response = frame.normalised()
-        usable = (response > low) & (response < high)
+        inside = (response > low) & (response < high)
+        usable = np.asarray(inside.all(axis=-1) if inside.ndim == 3 else inside, np.bool_)
         while len(buffer) == 0 or buffer["t"][-1] <= shot.middle + margin:
             chunk = next(chunks, None)
             if chunk is None:

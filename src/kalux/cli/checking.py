@@ -20,6 +20,8 @@ class Contents(NamedTuple):
         Start of the first exposure and end of the last, us.
     events_between
         The events from start to end.
+    colours
+        As of `kalux.Frame`: ``"grey"``, ``"RGB"`` or the pattern of a mosaic.
     """
 
     frames: int
@@ -27,6 +29,7 @@ class Contents(NamedTuple):
     start: int
     end: int
     events_between: int
+    colours: str
 
     @property
     def seconds(self) -> float:
@@ -59,7 +62,10 @@ def check_recording(recording: Recording, on_events: Callable[[int], None]) -> C
     InputError
         Whatever is wrong with the recording, or it has no frames.
     """
-    exposures = [(frame.exposure_start, frame.exposure_end) for frame in recording.frames()]
+    exposures, colours = [], "grey"
+    for frame in recording.frames():
+        exposures.append((frame.exposure_start, frame.exposure_end))
+        colours = frame.colours
     if not exposures:
         raise FrameError(f"{recording.source.path}: no frames; kalux needs frames as well as events")
     start, end = exposures[0][0], exposures[-1][1]
@@ -68,4 +74,4 @@ def check_recording(recording: Recording, on_events: Callable[[int], None]) -> C
         count += len(chunk)
         between += int(chunk["t"].searchsorted(end, "right") - chunk["t"].searchsorted(start))
         on_events(len(chunk))
-    return Contents(len(exposures), count, start, end, between)
+    return Contents(len(exposures), count, start, end, between, colours)

@@ -107,11 +107,12 @@ def write_copy(recording: Recording, out: Path, progress: Any) -> None:
             out,
             sensor_size=recording.sensor_size,
             events=_counted(recording.events(), lambda chunk: progress.add(events=len(chunk)), let_through),
-            frames=_counted(recording.stamped_frames(), lambda _: progress.add(images=1), let_through),
+            frames=_counted(recording.stored_frames(), lambda _: progress.add(images=1), let_through),
             exposure_known=recording.exposure_known,
             contrast_threshold=recording.contrast_threshold,
             inverse_covariance=recording.source.inverse_covariance,
             ground_truth=recording.ground_truth(),
+            mosaic=recording.mosaic,
         )
 
 

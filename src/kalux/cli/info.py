@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from kalux.cli.parser import Parser, UsageError, number, whole
 from kalux.cli.terminal import say
+from kalux.frames import MOSAICS
 
 if TYPE_CHECKING:
     from kalux.calibration.delay import DelayEstimate
@@ -65,6 +66,17 @@ def add_recording(parser: Parser) -> None:
     group.add_argument(
         "--replace-frames", action="store_true", help="--frames instead of the recording's own"
     )
+    group.add_argument(
+        "--bayer",
+        type=_pattern,
+        choices=(*MOSAICS, "none"),
+        metavar="PATTERN",
+        help=f"the sensor's Bayer pattern, where the recording does not state it: {', '.join(MOSAICS)}, none",
+    )
+
+
+def _pattern(text: str) -> str:
+    return "none" if text.lower() == "none" else text.upper()
 
 
 def open_recording(options: argparse.Namespace) -> Recording:
@@ -87,6 +99,7 @@ def open_recording(options: argparse.Namespace) -> Recording:
         frames_start=options.frames_start,
         frames_rate=options.frames_rate,
         replace_frames=options.replace_frames,
+        mosaic=options.bayer,
     )
 
 

@@ -99,6 +99,7 @@ def _add_output(parser: Parser) -> None:
         choices=FOLDER_FORMATS,
         help="of a folder: png is a picture (default), exr and npy hold linear intensity and variance",
     )
+    group.add_argument("--grey", action="store_true", help="of a recording in colour, the luminance alone")
     group.add_argument("--overwrite", action="store_true", help="replace a former output of kalux")
     group.add_argument("--quiet", action="store_true", help="print warnings and errors only")
 
@@ -261,6 +262,7 @@ def decided(
     if options.at is not None:
         spacing = "at the frames"
     ahead = "both ways in time" if made.smooth else "one frame ahead" if made.lookahead else "causal"
+    colours = [] if contents.colours == "grey" else [f"colour      {_colour_line(contents, made, options)}"]
     return [
         f"recording   {source.path}: {source.format}, {width}x{height} pixels, {contents.seconds:.3f} s, "
         f"{contents.frames:,} frames, {contents.events:,} events",
@@ -268,11 +270,21 @@ def decided(
         f"delay       events {(events.delay or 0) * 1e-3:g} ms late ({_delay_origin(made)})",
         f"events      steps of log(I + {camera.offset:g}), variance {events.step_noise:g} c^2 each "
         f"({_model_origin(made)})",
+        *colours,
         f"exposure    {(camera.reference_exposure or 0) * 1e-3:g} ms makes a saturated pixel 1.0",
         f"filter      {made.settings.filter.kind}, preset {options.preset}"
         f"{'' if options.settings is None else f' changed by {options.settings}'}, {ahead}",
         f"images      {len(made.times):,} {spacing}, {begin:.3f} to {end:.3f} s -> {output.path} ({output.format})",
     ]
+
+
+def _colour_line(contents: Contents, made: Plan, options: argparse.Namespace) -> str:
+    what = (
+        "RGB frames: luminance filtered, chromaticity of the frames"
+        if contents.colours == "RGB"
+        else f"Bayer mosaic {contents.colours}, demosaiced after the filter"
+    )
+    return f"{what}; white balance {made.settings.camera.white_balance}{', written in grey' if options.grey else ''}"
 
 
 def _delay_origin(made: Plan) -> str:
@@ -311,6 +323,7 @@ def metadata(
             "frames": options.frames,
             "frames_start": options.frames_start,
             "frames_rate": options.frames_rate,
+            "bayer": options.bayer,
         },
         "images_wanted": {
             "count": len(made.times),
@@ -348,7 +361,7 @@ def write_images(
                 first = next(images, None)
             with progress:
                 for image in itertools.chain([] if first is None else [first], images):
-                    writer.write(image)
+                    writer.write(image.grey() if options.grey else image)
                     progress.add(images=1)
     except (KeyboardInterrupt, InputError) as error:
         error.add_note(_what_is_left(writer, output))

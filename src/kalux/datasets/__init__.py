@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from kalux.datasets.colour import ColourScene, colour_photograph, simulate_colour
 from kalux.datasets.motion import Motion, Pose, combine, dolly, handheld, pan, shake, spin, still
 from kalux.datasets.room import demo_scene
 from kalux.datasets.scenes import Scene, linear_ramp, log_ramp, moving_edge, photograph_scene, static
@@ -11,6 +12,7 @@ from kalux.datasets.simulate import Simulation, simulate
 __all__ = [
     "DEMO_SENSOR",
     "PRESETS",
+    "ColourScene",
     "Motion",
     "Pose",
     "Sampling",
@@ -18,6 +20,7 @@ __all__ = [
     "SensorPreset",
     "SensorSettings",
     "Simulation",
+    "colour_photograph",
     "combine",
     "demo_scene",
     "dolly",
@@ -30,6 +33,7 @@ __all__ = [
     "sensor_preset",
     "shake",
     "simulate",
+    "simulate_colour",
     "spin",
     "static",
     "still",

@@ -10,9 +10,11 @@ from numpy.typing import NDArray
 
 from kalux.errors import FrameError
 from kalux.evaluation.pairs import Array
+from kalux.filters.methods import take_shot
 from kalux.frames import Frame
-from kalux.models.camera import Camera, Response, inverse_response
+from kalux.models.camera import Camera
 from kalux.recording import Recording
+from kalux.settings import CameraSettings
 
 
 def reference_exposure(recording: Recording) -> int:
@@ -32,10 +34,10 @@ def reference_exposure(recording: Recording) -> int:
 def linear_frame(frame: Frame, reference: int, response: str = "linear") -> Array:
     """A frame's intensity, 1 = a saturated pixel at the reference exposure (us): (H, W) float64.
 
-    ``response`` is the camera's, named as in `kalux.settings.CameraSettings`.
+    Of a mosaic each pixel's own channel, of RGB the luminance: what images have as their intensity. ``response`` is the
+    camera's, named as in `kalux.settings.CameraSettings`.
     """
-    camera = Camera(Response.named(response))
-    return inverse_response(camera, frame.normalised(), reference / frame.exposure)
+    return take_shot(frame, Camera.named(response, CameraSettings().saturation), reference).intensity
 
 
 def exposure_times(frame: Frame, reads: int) -> NDArray[np.int64]:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from kalux.errors import FormatError, FrameError, InputError
 from kalux.evaluation.baselines import Image, Times
-from kalux.readers.images import grey_image
+from kalux.readers.images import read_image
 from kalux.readers.joined import read_image_list
 from kalux.readers.source import reading
 from kalux.recording import Recording
@@ -125,8 +125,9 @@ def _size(shape: tuple[int, ...]) -> str:
 
 
 def _display(folder: Path, file: Path, data: bytes) -> NDArray[Any]:
-    image = grey_image(folder, file.name, data)
-    return image / np.iinfo(image.dtype).max
+    image = read_image(folder, file.name, data, colour=False)
+    displayed: NDArray[Any] = image / np.iinfo(image.dtype).max
+    return displayed
 
 
 def _npy(folder: Path, file: Path, data: bytes) -> NDArray[Any]:

@@ -131,6 +131,7 @@ def without_frames(recording: Recording, every: int) -> Recording:
             count_frames=lambda: sum(1 for _ in frames()),
             exposure_known=True,
             ground_truth=None,
+            mosaic=recording.mosaic,
         )
     )
 

@@ -159,7 +159,11 @@ def total_variance(
 
 
 def regularised(
-    log_intensity: Array, variance: NDArray[np.float32], moving: NDArray[np.bool_], difference: float
+    log_intensity: Array,
+    variance: NDArray[np.float32],
+    moving: NDArray[np.bool_],
+    difference: float,
+    pitch: int = 1,
 ) -> NDArray[np.float32]:
     """L with what neighbours know (docs/equations.md, K12), (H, W) float32; still pixels are as they were.
 
@@ -174,10 +178,12 @@ def regularised(
     moving
         (H, W): pixels that are changed.
     difference
-        Standard deviation of the difference of L between neighbours where there is no edge.
+        Standard deviation of the difference of L between pixels one apart where there is no edge.
+    pitch
+        Distance of the neighbours: 2 in a Bayer mosaic, whose pixels repeat their colours.
     """
     out = log_intensity.astype(np.float32)
-    _regularise(log_intensity, variance, moving, np.float32(difference * difference), out)
+    _regularise(log_intensity, variance, moving, np.float32(difference * difference), pitch, out)
     return out
 
 
@@ -194,7 +200,7 @@ def neighbour_weight(excess, variance, neighbour_variance, allowed):  # type: ig
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _regularise(log_intensity, variance, moving, allowed, out):  # type: ignore[no-untyped-def]
+def _regularise(log_intensity, variance, moving, allowed, pitch, out):  # type: ignore[no-untyped-def]
     height, width = log_intensity.shape
     for row in range(height):
         for column in range(width):
@@ -203,9 +209,9 @@ def _regularise(log_intensity, variance, moving, allowed, out):  # type: ignore[
             value, own = np.float32(log_intensity[row, column]), variance[row, column]
             information = ONE / own
             deviation = np.float32(0.0)
-            for i in range(max(row - 1, 0), min(row + 2, height)):
-                for j in range(max(column - 1, 0), min(column + 2, width)):
-                    if i == row and j == column:
+            for i in range(row - pitch, row + pitch + 1, pitch):
+                for j in range(column - pitch, column + pitch + 1, pitch):
+                    if (i == row and j == column) or i < 0 or j < 0 or i >= height or j >= width:
                         continue
                     distance2 = np.float32((i - row) * (i - row) + (j - column) * (j - column))
                     excess = np.float32(log_intensity[i, j]) - value

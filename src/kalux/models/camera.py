@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Final
 
@@ -152,6 +152,22 @@ class Response:
         return self.certainty(self.inverse(response))
 
 
+def named_responses(text: str) -> tuple[Response, ...]:
+    """The responses of a setting, each as in `Response.named`: one, or those of red, green and blue between ";".
+
+    Raises
+    ------
+    SettingsError
+        If one is unknown, or there are two or more than three.
+    """
+    names = [name.strip() for name in text.split(";")]
+    if len(names) not in (1, 3):
+        raise SettingsError(
+            f"response: {text!r} has {len(names)} parts; one response, or three (red;green;blue), are needed"
+        )
+    return tuple(Response.named(name) for name in names)
+
+
 @dataclass(frozen=True, eq=False)
 class Camera:
     """Everything that is known of the frame camera.
@@ -165,11 +181,26 @@ class Camera:
         it from the response, equation (5).
     saturation
         Response, 0 to 1, from which a pixel counts as clipped.
+    colours
+        CRF of red, green and blue pixels, where they differ; ``response`` is then that of green.
     """
 
     response: Response
     weight_table: Array | None = None
     saturation: float = 0.98
+    colours: tuple[Response, ...] | None = None
+
+    @classmethod
+    def named(cls, response: str, saturation: float) -> Camera:
+        """From settings; see `named_responses`."""
+        found = named_responses(response)
+        return cls(found[len(found) // 2], None, saturation, found if len(found) > 1 else None)
+
+    def of_channel(self, channel: int) -> Camera:
+        """The camera of the red (0), green (1) or blue (2) pixels."""
+        if self.colours is None:
+            return self
+        return replace(self, response=self.colours[channel], colours=None)
 
     @classmethod
     def from_inverse_covariance(cls, f_Q: Any, response: Response, saturation: float) -> Camera:

@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 
 from kalux.errors import FormatError
 from kalux.events import EventArray
-from kalux.frames import Frame
+from kalux.frames import Frame, Mosaic
 from kalux.readers import evt
 from kalux.readers.source import Source, TriggerArray, reading
 
@@ -45,6 +45,14 @@ _BLOCK_WORDS: Final = 1 << 16
 _LONGEST_LINE: Final = 1 << 16
 _LARGEST_HEADER: Final = 1 << 24
 _WHITE: Final = 1023  # the converter has 10 bits
+# Names of sensors of jAER with a Bayer mosaic, after "davis" and the size, and the mosaic seen from above: jAER's lists
+# go from the lower left pixel to the right and round, and rows are counted from the bottom.
+_MOSAICS: Final[dict[str, Mosaic]] = {
+    "128color": "GRBG",
+    "346bcolor": "RGGB",
+    "346redcolor": "RGGB",
+    "640color": "RGGB",
+}
 _SIZES: Final = {"128": (128, 128), "240": (180, 240), "346": (260, 346), "640": (480, 640)}
 
 _NO_FRAMES: Final = "The file has no complete frames."
@@ -86,7 +94,7 @@ def recognises(path: Path) -> bool:
 
 
 def read(path: Path) -> Source:
-    """Open an AEDAT 2.0 file of a DAVIS with 128x128, 240x180, 346x260 or 640x480 grey pixels.
+    """Open an AEDAT 2.0 file of a DAVIS with 128x128, 240x180, 346x260 or 640x480 pixels, grey or of a Bayer mosaic.
 
     It is read through once. Frames are uint16, white is 1023.
 
@@ -118,6 +126,7 @@ def read(path: Path) -> Source:
         count_frames=lambda: survey.frames,
         triggers=words.triggers,
         missing=_missing(survey, header, rolling),
+        mosaic=_mosaic(header.chip),
     )
 
 
@@ -211,6 +220,10 @@ def _rolling(chip: str, shutters: dict[str, bool]) -> bool | None:
     return said.pop() if len(said) == 1 else None
 
 
+def _mosaic(chip: str) -> Mosaic | None:
+    return _MOSAICS.get(chip.lower().removeprefix("davis"))
+
+
 def _sensor_size(path: Path, chip: str) -> tuple[int, int]:
     if not chip:
         raise FormatError(
@@ -218,8 +231,10 @@ def _sensor_size(path: Path, chip: str) -> tuple[int, int]:
             "'# AEChip: eu.seebetter.ini.chips.davis.DAVIS240C'"
         )
     name = chip.lower()
-    if re.search(r"colou?r|rgb|cdavis", name):
-        raise FormatError(f"{path}: the sensor {chip[:40]} has colour pixels, which kalux does not read")
+    if _mosaic(chip) is None and re.search(r"colou?r|rgb|cdavis", name):
+        raise FormatError(
+            f"{path}: the sensor {chip[:40]} has colour pixels in no known Bayer mosaic; kalux does not read them"
+        )
     model = re.match(r"davi(?:s)?(\d{3})", name)
     if model is None or model[1] not in _SIZES:
         raise FormatError(

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from kalux.errors import FormatError
 from kalux.events import EVENT_DTYPE, EventArray
-from kalux.frames import Frame
+from kalux.frames import Frame, Mosaic
 from kalux.readers.source import SIZE_UNKNOWN, Source, reading, smallest_size
 from kalux.readers.streams import in_order, rechunk
 
@@ -44,6 +44,8 @@ _SIZES: Final = {
     "DAVIS346": (260, 346),
     "DAVIS640": (480, 640),
 }
+# The colour filters of libcaer's frame.h by its numbers, and what their names mean: the pixels of 2x2, by rows.
+_FILTERS: Final[dict[int, Mosaic]] = {1: "RGGB", 2: "GRBG", 3: "GBRG", 4: "BGGR"}
 _NO_EVENTS: Final = "The file has no events."
 _NO_FRAMES: Final = "The file has no frames."
 
@@ -101,6 +103,14 @@ class _Packets:
                 frame for packet in self.of(source, _FRAME) for frame in _frames(str(self.path), file, packet)
             )
 
+    def mosaic(self, source: int) -> Mosaic | None:
+        """The colour filter of the first frame."""
+        with reading(self.path, _Damage), self.path.open("rb") as file:
+            for packet in self.of(source, _FRAME):
+                for _, info in _frame_headers(file, packet):
+                    return _FILTERS.get(info >> 4 & 0xF)
+        return None
+
 
 def recognises(path: Path) -> bool:
     """Whether the file begins like AEDAT 3."""
@@ -111,13 +121,13 @@ def recognises(path: Path) -> bool:
 
 
 def read(path: Path) -> Source:
-    """Open an AEDAT 3.1 file: the polarity events and the grey frames of one source.
+    """Open an AEDAT 3.1 file: the polarity events and the frames of one source.
 
     Raises
     ------
     FormatError
         If it is of another version or compressed, cut short or damaged, holds neither events nor frames, or
-        its frames are in colour.
+        its frames have a colour filter with white.
     InputError
         If it cannot be read.
     """
@@ -163,6 +173,7 @@ def read(path: Path) -> Source:
         + ((f"The file has {len(others) + 1} sources; only source {source} is read.",) if others else ())
         + (() if size else (SIZE_UNKNOWN,)),
         sensor_size_known=size is not None,
+        mosaic=None if first is None else packets.mosaic(source),
     )
 
 
@@ -246,21 +257,36 @@ def _unpacked(data: NDArray[np.uint32], t: NDArray[np.int32], overflow: int) -> 
     return events
 
 
-def _frames(where: str, file: BinaryIO, packet: _Packet) -> Iterator[Frame]:
-    """The valid frames of a packet."""
+def _frame_headers(file: BinaryIO, packet: _Packet) -> Iterator[tuple[int, int]]:
+    """Place and first word of the valid frames of a packet."""
     for index in range(packet.length):
         start = packet.start + index * packet.size
         file.seek(start)
-        info, _, _, begin, end, width, height, _, _ = _FRAME_HEADER.unpack(file.read(_FRAME_HEADER.size))
-        if not info & 1:
-            continue
-        if (info >> 1 & 7) != 1 or info >> 4 & 0xF:
+        info = int.from_bytes(file.read(4), "little")
+        if info & 1:
+            yield start, info
+
+
+def _frames(where: str, file: BinaryIO, packet: _Packet) -> Iterator[Frame]:
+    """The valid frames of a packet, colours in the order red, green, blue."""
+    for start, info in _frame_headers(file, packet):
+        file.seek(start)
+        _, _, _, begin, end, width, height, _, _ = _FRAME_HEADER.unpack(file.read(_FRAME_HEADER.size))
+        channels, colour_filter = info >> 1 & 7, info >> 4 & 0xF
+        if colour_filter and colour_filter not in _FILTERS:
             raise FormatError(
-                f"{where}: its frames are in colour, which kalux does not read yet; record or convert to grey frames"
+                f"{where}: its frames have a colour filter that is no Bayer mosaic (number {colour_filter}); "
+                "record or convert to grey frames"
             )
-        pixels = width * height
-        if min(width, height) <= 0 or min(begin, end) < 0 or _FRAME_HEADER.size + 2 * pixels > packet.size:
+        values = width * height * channels
+        if (
+            min(width, height) <= 0
+            or channels not in (1, 3, 4)
+            or min(begin, end) < 0
+            or _FRAME_HEADER.size + 2 * values > packet.size
+        ):
             raise _Damage(f"the frame at byte {start} makes no sense")
-        image = np.fromfile(file, "<u2", pixels).reshape(height, width)
+        image = np.fromfile(file, "<u2", values)
+        image = image.reshape((height, width) if channels == 1 else (height, width, channels))
         past = packet.overflow << 31
-        yield Frame(image, begin + past, end + past)
+        yield Frame(np.ascontiguousarray(image[..., :3]) if channels > 1 else image, begin + past, end + past)

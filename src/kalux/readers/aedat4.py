@@ -7,6 +7,7 @@ https://docs.inivation.com/software/software-advanced-usage/file-formats/aedat-4
 
 from __future__ import annotations
 
+import dataclasses
 import struct
 import xml.etree.ElementTree as ElementTree
 from array import array
@@ -23,16 +24,27 @@ import zstandard
 
 from kalux.errors import FormatError
 from kalux.events import EVENT_DTYPE, EventArray
-from kalux.frames import Frame
+from kalux.frames import Frame, Mosaic
 from kalux.readers.source import Source, one_line, reading
 from kalux.readers.streams import in_order, rechunk
 
 T = TypeVar("T")
 _MAGIC: Final = b"#!AER-DAT4.0\r\n"
 _PACKET_HEADER: Final = struct.Struct("<ii")  # stream, size in bytes
-# OpenCV's numbers for 8 and 16 bits, one channel
-_GREY_DTYPES: Final[dict[int, np.dtype[Any]]] = {0: np.dtype("u1"), 2: np.dtype("<u2")}
-_COLOUR: Final = {16: "BGR", 24: "BGRA", 18: "16-bit BGR", 26: "16-bit BGRA"}
+# OpenCV's numbers of pixel types: 8 or 16 bits, one channel, BGR or BGRA
+_PIXELS: Final[dict[int, tuple[np.dtype[Any], int]]] = {
+    0: (np.dtype("u1"), 1),
+    2: (np.dtype("<u2"), 1),
+    16: (np.dtype("u1"), 3),
+    18: (np.dtype("<u2"), 3),
+    24: (np.dtype("u1"), 4),
+    26: (np.dtype("<u2"), 4),
+}
+_DAVIS_FILTER: Final[Mosaic] = "RGGB"
+_DEMOSAICED: Final = (
+    f"The frames were made RGB from the Bayer mosaic of a DAVIS, taken as {_DAVIS_FILTER}; every pixel gets its own "
+    "channel back (--bayer none: luminance and chromaticity)."
+)
 # Whatever a wrong offset, size or compressed byte can lead to.
 _DAMAGE: Final = (
     struct.error,
@@ -50,6 +62,7 @@ class _Stream:
     number: int
     kind: str  # EVTS, FRME, IMUS, TRIG
     size: tuple[int, int]  # height, width
+    camera: str
 
 
 @dataclass(frozen=True)
@@ -94,12 +107,12 @@ def read(path: Path) -> Source:
     """Open an AEDAT 4 file.
 
     The first event stream and the first frame stream of equal size are read. Frames may be 8 or 16 bits,
-    grey. Times are absolute, us.
+    grey or in colour; those in colour of a DAVIS come from a Bayer sensor. Times are absolute, us.
 
     Raises
     ------
     FormatError
-        If the file is cut short or damaged, has no event or frame stream, or its frames are in colour.
+        If the file is cut short or damaged, or has no event or frame stream.
     InputError
         If it cannot be read.
     """
@@ -121,6 +134,10 @@ def read(path: Path) -> Source:
     if first is not None and first.exposure <= 0:
         exposure_known = False
         missing += ("The exposure times of the frames are not recorded.",)
+    # Only those cameras have colour filters over pixels of events and frames alike.
+    is_colour_davis = first is not None and first.image.ndim == 3 and "DAVIS" in frames.camera.upper()  # type: ignore[union-attr]
+    if is_colour_davis:
+        missing += (_DEMOSAICED,)
 
     def read_events() -> Iterator[EventArray]:
         return iter(()) if events is None else rechunk(container.read(events, _events))
@@ -145,6 +162,7 @@ def read(path: Path) -> Source:
         count_frames=lambda: 0 if frames is None else len(container.packets[frames.number]) // 2,
         exposure_known=exposure_known,
         missing=missing,
+        mosaic=_DAVIS_FILTER if is_colour_davis else None,
     )
 
 
@@ -170,7 +188,7 @@ def _others(name: str, chosen: _Stream | None, streams: list[_Stream]) -> tuple[
 
 
 def _stamp_only(frame: Frame) -> Frame:
-    return Frame(frame.image, frame.exposure_start, frame.exposure_start, frame.white)
+    return dataclasses.replace(frame, exposure_end=frame.exposure_start)
 
 
 # The contents of packets
@@ -196,21 +214,20 @@ def _stored_frames(container: _Container, stream: _Stream) -> Iterator[Frame]:
 
 def _frame(table: _Table, where: str) -> Frame:
     kind = table.scalar(5, "<b", 0)
-    if kind in _COLOUR:
+    if kind not in _PIXELS:
         raise FormatError(
-            f"{where}: its frames are in colour ({_COLOUR[kind]}), which kalux does not read yet; "
-            "record or convert to grey frames"
-        )
-    if kind not in _GREY_DTYPES:
-        raise FormatError(
-            f"{where}: its frames have the unknown pixel type {kind}; 8-bit or 16-bit grey is needed"
+            f"{where}: its frames have the unknown pixel type {kind}; 8 or 16 bits, grey or BGR, are needed"
         )
     width, height = table.scalar(6, "<h", 0), table.scalar(7, "<h", 0)
-    dtype = _GREY_DTYPES[kind]
+    dtype, channels = _PIXELS[kind]
     start, size = table.vector(10)
-    if width <= 0 or height <= 0 or size != width * height * dtype.itemsize:
+    if width <= 0 or height <= 0 or size != width * height * channels * dtype.itemsize:
         raise ValueError(f"{size} bytes of pixels for {width}x{height}")
-    image = np.frombuffer(table.data, dtype, width * height, start).reshape(height, width).copy()
+    image = np.frombuffer(table.data, dtype, width * height * channels, start)
+    if channels == 1:
+        image = image.reshape(height, width).copy()
+    else:
+        image = np.ascontiguousarray(image.reshape(height, width, channels)[..., 2::-1])
     stamp = table.scalar(0, "<q", 0)
     exposure_start = table.scalar(3, "<q", 0) or stamp
     exposure_end = table.scalar(4, "<q", 0) or exposure_start + table.scalar(11, "<q", 0)
@@ -255,7 +272,8 @@ def _streams(info: str) -> Iterator[_Stream]:
         )
         if kind in _NAMES and (width <= 0 or height <= 0):
             raise ValueError(f"the {_NAMES[kind]} stream has no size")
-        yield _Stream(int(node.attrib["name"]), kind, (height, width))
+        camera = node.findtext("./node[@name='info']/attr[@key='source']", "")
+        yield _Stream(int(node.attrib["name"]), kind, (height, width), camera)
 
 
 def _packets(path: Path, file: BinaryIO, position: int, end: int) -> dict[int, array[int]]:

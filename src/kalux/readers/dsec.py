@@ -8,7 +8,7 @@
     images/timestamps.txt                    mean of the exposures' middles, left and right, us
 
 Written from https://dsec.ifi.uzh.ch/data-format/ and the layout in https://github.com/uzh-rpg/DSEC. The published
-images are in colour and of another camera; they are refused with what to do. Grey ones of the sensor's size are read.
+images are of another camera and size; they are refused with what to do. Images of the sensor's size are read.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from kalux.errors import FormatError
 from kalux.events import EventArray
 from kalux.frames import Frame
 from kalux.readers import hdf5_layout
-from kalux.readers.images import SUFFIXES, grey_image
+from kalux.readers.images import SUFFIXES, in_colour, read_image
 from kalux.readers.source import Source, reading
 
 _COLUMNS: Final = ("events/t", "events/x", "events/y", "events/p")
@@ -37,7 +37,7 @@ _EXPOSURES_PATTERN: Final = "*image_exposure_timestamps_left.txt"
 _STAMPS: Final = ("images/timestamps.txt",)
 _STAMPS_PATTERN: Final = "*image_timestamps.txt"
 _HINT: Final = (
-    "give its events.h5 as the recording and join grey images of the events' pixels to it (--frames FOLDER)"
+    "give its events.h5 as the recording and join images of the events' pixels to it (--frames FOLDER)"
 )
 
 
@@ -48,6 +48,7 @@ class _Images(NamedTuple):
     times: tuple[tuple[int, int], ...] = ()
     exposure_known: bool = True
     missing: tuple[str, ...] = ("There are no images.",)
+    colour: bool = False
 
 
 def recognises(path: Path) -> bool:
@@ -66,7 +67,7 @@ def read(path: Path) -> Source:
     Raises
     ------
     FormatError
-        If a file is damaged, times and images differ in number, or images are in colour.
+        If a file is damaged, times and images differ in number, or images have another size than the sensor.
     InputError
         If a file cannot be read.
     """
@@ -152,7 +153,8 @@ def _find_images(folder: Path) -> _Images:
             f"{folder}: has {len(files)} images, but {len(times)} lines in {(exposures or stamps)!s}; "
             "copy or download it again"
         )
-    return _Images(files, times, exposures is not None, missing)
+    colour = in_colour(folder, files, lambda file: (file.name, _bytes(folder, file)))
+    return _Images(files, times, exposures is not None, missing, colour)
 
 
 def _read_times(path: Path, columns: int) -> Iterator[tuple[int, ...]]:
@@ -169,19 +171,22 @@ def _read_times(path: Path, columns: int) -> Iterator[tuple[int, ...]]:
 
 
 def _check_first(path: Path, images: _Images, size: tuple[int, int]) -> None:
-    shape = _load(path, images.files[0]).shape
+    shape = _load(path, images.files[0], images.colour).shape[:2]
     if shape != size:
         raise FormatError(
             f"{path}: its images have {shape[1]}x{shape[0]} pixels, its events {size[1]}x{size[0]}; {_HINT}"
         )
 
 
-def _load(path: Path, file: Path) -> NDArray[Any]:
+def _load(path: Path, file: Path, colour: bool) -> NDArray[Any]:
+    return read_image(path, file.name, _bytes(path, file), colour=colour)
+
+
+def _bytes(path: Path, file: Path) -> bytes:
     with reading(path):
-        data = file.read_bytes()
-    return grey_image(path, file.name, data, hint=_HINT)
+        return file.read_bytes()
 
 
 def _frames(path: Path, images: _Images) -> Iterator[Frame]:
     for file, (start, end) in zip(images.files, images.times, strict=True):
-        yield Frame(_load(path, file), start, end)
+        yield Frame(_load(path, file, images.colour), start, end)

@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 
 from kalux.errors import FormatError, FrameError, OutputError
 from kalux.events import EVENT_DTYPE, EventArray
-from kalux.frames import Frame
+from kalux.frames import MOSAICS, Frame, Mosaic
 from kalux.readers.source import CHUNK_EVENTS, GroundTruth, Source, one_line, reading
 
 T = TypeVar("T")
 MAJOR_VERSION: Final = 1
 """Files with a greater major version are refused; a minor version only adds."""
 
-_VERSION: Final = f"{MAJOR_VERSION}.0"
+_VERSION: Final = f"{MAJOR_VERSION}.1"
 _SIGNATURE: Final = b"\x89HDF\r\n\x1a\n"
 _EVENTS_PER_CHUNK: Final = 1 << 17
 _COLUMNS: Final = ("t", "x", "y", "p")
@@ -59,6 +59,7 @@ def read(path: Path) -> Source:
         frame_count = _common_length(path, file, "frames", ("image", "exposure_start", "exposure_end"))
         exposure_known = bool(file["frames"].attrs["exposure_known"])
         height, width = (int(n) for n in file.attrs["sensor_size"])
+        mosaic = _mosaic(path, file["frames"].attrs.get("mosaic"))
         threshold = file.attrs.get("contrast_threshold")
         inverse_covariance = file["inverse_covariance"][...] if "inverse_covariance" in file else None
         has_ground_truth = "ground_truth" in file
@@ -83,6 +84,16 @@ def read(path: Path) -> Source:
         inverse_covariance=inverse_covariance,
         ground_truth=(lambda: _ground_truth(path)) if has_ground_truth else None,
         missing=missing,
+        mosaic=mosaic,
+    )
+
+
+def _mosaic(path: Path, value: Any) -> Mosaic | None:
+    name = None if value is None else _text(value)
+    if name is None or name in MOSAICS:
+        return name
+    raise FormatError(
+        f"{path}: states the mosaic {name[:20]!r}; known are {', '.join(MOSAICS)}; write it again"
     )
 
 
@@ -169,6 +180,7 @@ def write(
     contrast_threshold: tuple[float, float] | None = None,
     inverse_covariance: NDArray[np.float64] | None = None,
     ground_truth: GroundTruth | TruthStream | None = None,
+    mosaic: Mosaic | None = None,
 ) -> None:
     """Write a recording, chunk by chunk, in bounded memory.
 
@@ -183,7 +195,7 @@ def write(
     events
         Chunks of `EVENT_DTYPE` in time order, of any length.
     frames
-        In time order, of one dtype, size and white value.
+        In time order, of one dtype, shape and white value.
     exposure_known
         Whether the frames carry their exposure, or only a stamp (start and end equal).
     contrast_threshold
@@ -192,6 +204,8 @@ def write(
         (256,) 1 / R_bar per 8-bit value, 1/s.
     ground_truth
         Reference images, or a stream of them.
+    mosaic
+        The sensor's Bayer pattern. Default: that of the frames.
 
     Raises
     ------
@@ -220,7 +234,9 @@ def write(
                         file.create_group("ground_truth"), ground_truth.times, images, sensor_size
                     )
                 _write_events(file.create_group("events"), sink.checked(events))
-                _write_frames(file.create_group("frames"), sink.checked(frames), sensor_size, exposure_known)
+                _write_frames(
+                    file.create_group("frames"), sink.checked(frames), sensor_size, exposure_known, mosaic
+                )
             sink.check()
         os.replace(partial, path)
     except OSError as error:
@@ -315,7 +331,11 @@ def _aligned(chunks: Iterable[EventArray]) -> Iterator[EventArray]:
 
 
 def _write_frames(
-    group: Any, frames: Iterable[Frame], sensor_size: tuple[int, int], exposure_known: bool
+    group: Any,
+    frames: Iterable[Frame],
+    sensor_size: tuple[int, int],
+    exposure_known: bool,
+    mosaic: Mosaic | None,
 ) -> None:
     group.attrs["exposure_known"] = exposure_known
     images = None
@@ -327,13 +347,10 @@ def _write_frames(
             first = frame
             if frame.white is not None:
                 group.attrs["white"] = frame.white
-        if (frame.image.shape, frame.image.dtype, frame.white) != (
-            first.image.shape,
-            first.image.dtype,
-            first.white,
-        ):
+            mosaic = mosaic or frame.mosaic
+        if _kind(frame) != _kind(first):
             raise FrameError(
-                f"frame {index} has another size, dtype or white value than frame 0; the file holds one of each"
+                f"frame {index} has another size, dtype, mosaic or white value than frame 0; the file holds one of each"
             )
         images.resize(index + 1, axis=0)
         images[index] = frame.image
@@ -341,8 +358,14 @@ def _write_frames(
         ends.append(frame.exposure_end)
     if images is None:
         _create_images(group, sensor_size, np.dtype(np.uint8))
+    if mosaic is not None:
+        group.attrs["mosaic"] = np.bytes_(mosaic)
     group["exposure_start"] = np.array(starts, np.int64)
     group["exposure_end"] = np.array(ends, np.int64)
+
+
+def _kind(frame: Frame) -> tuple[Any, ...]:
+    return frame.image.shape, frame.image.dtype, frame.white, frame.mosaic
 
 
 def _create_images(group: Any, size: tuple[int, ...], dtype: np.dtype[Any]) -> Any:

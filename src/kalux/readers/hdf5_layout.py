@@ -160,22 +160,22 @@ def microseconds(path: Path, seconds: NDArray[Any]) -> NDArray[np.int64]:
     return scaled.astype(np.int64)
 
 
-def size_of(path: Path, shape: tuple[int, ...]) -> tuple[int, int]:
-    """(height, width) of a grey image's shape.
+def size_of(path: Path, shape: tuple[int, ...], *, grey: bool = False) -> tuple[int, int]:
+    """(height, width) of an image's shape.
 
     Raises
     ------
     FormatError
-        If it is in colour, or no image.
+        If it is no image, or in colour where a layout has none (``grey``).
     """
-    if len(shape) == 3 and shape[2] in (3, 4):
-        raise FormatError(f"{path}: its images are in colour, which kalux does not read yet; {JOIN_GREY}")
-    if len(shape) == 3 and shape[2] == 1:
+    if grey and len(shape) == 3 and shape[2] in (3, 4):
+        raise FormatError(f"{path}: its images are in colour, which this layout has not; {JOIN_FRAMES}")
+    if len(shape) == 3 and shape[2] in (1, 3, 4):
         shape = shape[:2]
     if len(shape) != 2 or not 0 < shape[0] * shape[1] <= LARGEST_IMAGE:
         raise FormatError(f"{path}: its images have the shape {shape}; (height, width) is needed")
     return int(shape[0]), int(shape[1])
 
 
-JOIN_GREY: Final = "join grey images of the events' pixels instead (--frames FOLDER --replace-frames)"
-"""What to do about images in colour."""
+JOIN_FRAMES: Final = "join images of the events' pixels instead (--frames FOLDER --replace-frames)"
+"""What to do about images of an unknown order of colours."""

@@ -37,7 +37,7 @@ def read(path: Path) -> Source:
     Raises
     ------
     FormatError
-        If it is damaged, or its images are in colour.
+        If it is damaged.
     InputError
         If it cannot be read.
     """
@@ -99,4 +99,7 @@ def _frames(path: Path, names: list[str], stamps: list[int], size: tuple[int, in
             if hdf5_layout.size_of(path, image.shape) != size:
                 raise FormatError(f"{path}: {name} has the shape {image.shape}, the first image {size}")
             hdf5_layout.check_dataset(path, image)
-            yield Frame(np.ascontiguousarray(image[...].reshape(size)), stamp, stamp)
+            pixels = image[...]
+            # Stored as "color_bgr".
+            pixels = pixels[..., 2::-1] if pixels.size != size[0] * size[1] else pixels.reshape(size)
+            yield Frame(np.ascontiguousarray(pixels), stamp, stamp)

@@ -23,7 +23,7 @@ from kalux.errors import FormatError
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.frames import Frame
 from kalux.readers.characters import DOT, FIVE, NEWLINE, NINE, ONE, SPACE, ZERO, skip_blanks
-from kalux.readers.images import grey_image
+from kalux.readers.images import in_colour, read_image
 from kalux.readers.source import SIZE_UNKNOWN, Source, reading
 
 _EVENTS: Final = "events.txt"
@@ -71,7 +71,7 @@ def read(path: Path) -> Source:
     Raises
     ------
     FormatError
-        If a line cannot be read (named by its number), or an image is missing, damaged or in colour.
+        If a line cannot be read (named by its number), or an image is missing, damaged, or in colour among grey ones.
     InputError
         If a file cannot be read.
     """
@@ -81,8 +81,10 @@ def read(path: Path) -> Source:
             raise FormatError(f"{path}: has no {_EVENTS}; give the folder or zip that contains it")
         declared_size = _check_beginning(path, root)
         images, missing = _image_list(path, root)
+    colour = False
     if images:
-        size = _load(path, root, images[0][1]).shape
+        colour = in_colour(path, [name for _, name in images], lambda name: (name, _bytes(path, root, name)))
+        size = _load(path, root, images[0][1], colour).shape
         sensor_size = (int(size[0]), int(size[1]))
         missing += ("The exposure times of the frames are not recorded.",)
     elif declared_size is not None:
@@ -98,7 +100,7 @@ def read(path: Path) -> Source:
     def read_frames() -> Iterator[Frame]:
         place = _root_again(path)
         for stamp, name in images:
-            yield Frame(_load(path, place, name), stamp, stamp)
+            yield Frame(_load(path, place, name, colour), stamp, stamp)
 
     return Source(
         path=path,
@@ -368,7 +370,10 @@ def _microseconds(seconds: str) -> int:
     return int((Decimal(seconds) * 1_000_000).to_integral_value(ROUND_HALF_UP))
 
 
-def _load(path: Path, root: _Place, name: str) -> NDArray[Any]:
+def _load(path: Path, root: _Place, name: str, colour: bool) -> NDArray[Any]:
+    return read_image(path, name, _bytes(path, root, name), colour=colour)
+
+
+def _bytes(path: Path, root: _Place, name: str) -> bytes:
     with reading(path, *_DAMAGE):
-        data = (root / name).read_bytes()
-    return grey_image(path, name, data)
+        return (root / name).read_bytes()

@@ -1,10 +1,11 @@
-"""Image files of frames: whole, grey, 8 or 16 bits."""
+"""Image files of frames: whole, grey or in colour, 8 or 16 bits."""
 
 from __future__ import annotations
 
 import zlib
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import cv2
 import numpy as np
@@ -19,9 +20,10 @@ _PNG_SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
 _JPEG_START, _JPEG_END = b"\xff\xd8\xff", b"\xff\xd9"
 
 
-def grey_image(
-    path: Path, name: str, data: bytes, *, hint: str = "convert the images to grey"
-) -> NDArray[Any]:
+T = TypeVar("T")
+
+
+def read_image(path: Path, name: str, data: bytes, *, colour: bool) -> NDArray[Any]:
     """Decode an image file.
 
     Parameters
@@ -30,19 +32,52 @@ def grey_image(
         The recording and the file in it, for messages.
     data
         The file.
-    hint
-        What to do about an image in colour.
+    colour
+        Whether the frames are in colour; grey images that are stored in colour count as grey otherwise.
 
     Returns
     -------
     numpy.ndarray
-        (height, width), uint8 or uint16.
+        (height, width), or (height, width, 3), red, green, blue; uint8 or uint16.
 
     Raises
     ------
     FormatError
-        If it is damaged, no image, or in colour.
+        If it is damaged, no image, or in colour where frames are grey.
     """
+    image = _decoded(path, name, data)
+    if colour:
+        return np.ascontiguousarray(image[..., 2::-1]) if image.ndim == 3 else np.stack([image] * 3, axis=-1)
+    if image.ndim == 3:
+        if not _is_grey(image):
+            raise FormatError(
+                f"{path}: {name!r} is in colour, but the images before it are grey; convert all to one of both"
+            )
+        image = np.ascontiguousarray(image[..., 0])
+    return image
+
+
+def in_colour(path: Path, images: Sequence[T], load: Callable[[T], tuple[str, bytes]]) -> bool:
+    """Whether any of the first, the middle and the last image is in colour: one alone may be black.
+
+    ``load`` gives an image's name and file.
+
+    Raises
+    ------
+    FormatError
+        If one is damaged or no image.
+    """
+    places = {0, len(images) // 2, len(images) - 1} if images else set()
+    samples = (load(images[place]) for place in sorted(places))
+    return any(not _is_grey(_decoded(path, name, data)) for name, data in samples)
+
+
+def _is_grey(image: NDArray[Any]) -> bool:
+    return image.ndim == 2 or bool((image[..., :3] == image[..., :1]).all())
+
+
+def _decoded(path: Path, name: str, data: bytes) -> NDArray[Any]:
+    """The image as stored: (H, W), or (H, W, 3 or 4) in the order blue, green, red."""
     image = None
     if _is_whole(data):
         try:
@@ -51,11 +86,7 @@ def grey_image(
             image = None
     if image is None:
         raise FormatError(f"{path}: {name!r} is not an image, or damaged; copy or download it again")
-    if image.ndim == 3:
-        if not (image[..., :3] == image[..., :1]).all():
-            raise FormatError(f"{path}: {name!r} is in colour, which kalux does not read yet; {hint}")
-        image = np.ascontiguousarray(image[..., 0])
-    return image
+    return np.asarray(image)
 
 
 def _is_whole(data: bytes) -> bool:

@@ -13,6 +13,7 @@ import re
 from collections.abc import Iterator
 from decimal import ROUND_HALF_UP, Decimal
 from functools import cache
+from itertools import islice
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -22,7 +23,7 @@ from numpy.typing import NDArray
 from kalux.errors import FormatError, FrameError, InputError
 from kalux.frames import Frame
 from kalux.readers.columns import ALIASES, find_name, find_time
-from kalux.readers.images import SUFFIXES, grey_image
+from kalux.readers.images import SUFFIXES, in_colour, read_image
 from kalux.readers.source import SIZE_UNKNOWN, Source, reading
 
 _LISTS: Final = ("frames.csv", "timestamps.csv", "images.txt")
@@ -35,6 +36,8 @@ _WANTED: Final = (
     "a CSV named frames.csv with a line per image and the columns timestamp_us, perhaps exposure_us and file, or the "
     "images.txt of the IJRR layout"
 )
+_FIRST_PICTURES: Final = 10  # of a video, which tell whether it is in colour
+_GREY_ROUNDING: Final = 0.03
 _ABOUT_FRAMES: Final = re.compile(r"\b(frames?|images?)\b")
 
 
@@ -54,8 +57,7 @@ def join(source: Source, frames: Path, *, start: int | None, rate_hz: float | No
     source
         The recording; its events stay as they are.
     frames
-        A folder of grey images with `frames.csv`, `timestamps.csv` or `images.txt` (or that file itself); or a video,
-        of which the luma is taken.
+        A folder of images with `frames.csv`, `timestamps.csv` or `images.txt` (or that file itself); or a video.
     start, rate_hz
         For a video: the time of the first frame, us, in the clock of the events, and frames per second.
     replace
@@ -138,12 +140,13 @@ def _images(frames: Path, start: int | None, rate_hz: float | None) -> Source:
         raise FormatError(
             f"{path}: {len(absent)} of {len(listed)} images are missing, the first is {absent[0]}"
         )
-    first = _load(frames, listed[0].file)
+    colour = in_colour(frames, [image.file for image in listed], lambda file: (file.name, _bytes(file)))
+    first = _load(frames, listed[0].file, colour)
     return _frames_only(
         frames,
         "images",
-        sensor_size=first.shape,
-        frames=lambda: (Frame(_load(frames, image.file), image.start, image.end) for image in listed),
+        sensor_size=first.shape[:2],
+        frames=lambda: (Frame(_load(frames, image.file, colour), image.start, image.end) for image in listed),
         count_frames=lambda: len(listed),
         exposure_known=exposure_known,
         missing=() if exposure_known else ("The exposure times of the frames are not recorded.",),
@@ -234,10 +237,13 @@ def _microseconds(path: Path, number: int, text: str, unit: str | None) -> int:
     return int((Decimal(text) * _PER_UNIT[unit or "us"]).to_integral_value(ROUND_HALF_UP))
 
 
-def _load(frames: Path, file: Path) -> NDArray[Any]:
+def _load(frames: Path, file: Path, colour: bool) -> NDArray[Any]:
+    return read_image(frames, file.name, _bytes(file), colour=colour)
+
+
+def _bytes(file: Path) -> bytes:
     with reading(file):
-        data = file.read_bytes()
-    return grey_image(frames, file.name, data)
+        return file.read_bytes()
 
 
 # Video
@@ -251,35 +257,45 @@ def _video(path: Path, start: int | None, rate_hz: float | None) -> Source:
         )
     if not 0 < rate_hz < 1e6:  # also refuses NaN
         raise InputError(f"{path}: the rate of the frames is {rate_hz} Hz; it must be between 0 and 1 MHz")
-    first = next(_pictures(path), None)
+    beginning = list(islice(_pictures(path, colour=True), _FIRST_PICTURES))
+    colour = any(map(_has_colour, beginning))
+    first = next(iter(beginning), None)
     if first is None:
         raise FormatError(f"{path}: has no picture that can be decoded; copy or download it again")
 
     @cache
     def count_frames() -> int:
-        return sum(1 for _ in _pictures(path))
+        return sum(1 for _ in _pictures(path, colour=False))
 
     def read_frames() -> Iterator[Frame]:
-        for index, image in enumerate(_pictures(path)):
+        for index, image in enumerate(_pictures(path, colour=colour)):
             stamp = start + round(index * 1e6 / rate_hz)
             yield Frame(image, stamp, stamp)
 
     return _frames_only(
         path,
         "video",
-        sensor_size=first.shape,
+        sensor_size=first.shape[:2],
         frames=read_frames,
         count_frames=count_frames,
         exposure_known=False,
         missing=(
             "The exposure times of the frames are not recorded.",
-            "The frames are the luma of a video, with whatever its encoder did to them.",
+            f"The frames are the {'colours' if colour else 'luma'} of a video, with whatever its encoder did to them.",
         ),
     )
 
 
-def _pictures(path: Path) -> Iterator[NDArray[Any]]:
-    """The luma of each picture, uint8, or uint16 where it has more than 8 bits."""
+def _has_colour(picture: NDArray[Any]) -> bool:
+    """Whether channels differ by more than the rounding of a grey picture in YUV."""
+    if picture.ndim == 2:
+        return False
+    apart = picture.max(axis=-1).astype(np.int64) - picture.min(axis=-1)
+    return bool(apart.max() > np.iinfo(picture.dtype).max * _GREY_ROUNDING)
+
+
+def _pictures(path: Path, *, colour: bool) -> Iterator[NDArray[Any]]:
+    """Each picture, uint8, or uint16 where it has more than 8 bits: red, green, blue if it has colours, or the luma."""
     import av
 
     with reading(path, av.FFmpegError, ValueError, IndexError), av.open(str(path)) as container:
@@ -289,7 +305,11 @@ def _pictures(path: Path) -> Iterator[NDArray[Any]]:
         count = 0
         for picture in container.decode(stream):
             deep = picture.format.components[0].bits > 8
-            yield np.ascontiguousarray(picture.to_ndarray(format="gray16le" if deep else "gray"))
+            if colour and len(picture.format.components) >= 3:
+                wanted = "rgb48le" if deep else "rgb24"
+            else:
+                wanted = "gray16le" if deep else "gray"
+            yield np.ascontiguousarray(picture.to_ndarray(format=wanted))
             count += 1
         if count < stream.frames:
             raise FormatError(

@@ -79,7 +79,7 @@ def read(path: Path) -> Source:
 
 def _images(path: Path, file: Any) -> tuple[NDArray[np.int64], tuple[int, int]]:
     images = file[_IMAGES]
-    size = hdf5_layout.size_of(path, images.shape[1:])
+    size = hdf5_layout.size_of(path, images.shape[1:], grey=True)
     if file[_STAMPS].shape != images.shape[:1]:
         raise FormatError(
             f"{path}: has {images.shape[0]} images for {file[_STAMPS].shape[0]} times; copy or download it again"

@@ -9,8 +9,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
+from itertools import islice
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 from urllib.parse import parse_qsl
 
 import numpy as np
@@ -18,19 +19,41 @@ from numpy.typing import NDArray
 
 from kalux.errors import FormatError, InputError
 from kalux.events import EventArray
-from kalux.frames import Frame
+from kalux.frames import MOSAICS, Frame, Mosaic
 from kalux.readers import event_packet
 from kalux.readers.event_packet import EVENT_ARRAYS, EVENT_PACKETS, EventTopic, Message
-from kalux.readers.images import grey_image
+from kalux.readers.images import in_colour, read_image
 from kalux.readers.ros_bags import BAG_MAGIC, DAMAGE, Bag, Topic, container, open_bag, parts
 from kalux.readers.source import Source, TriggerArray, reading
 from kalux.readers.streams import in_order
 
+
+class _Encoding(NamedTuple):
+    """``dtype`` without byte order; ``order`` of colours, none for grey; ``mosaic``."""
+
+    dtype: str
+    order: str = ""
+    mosaic: Mosaic | None = None
+
+
+_ORDERS: Final = ("rgb", "bgr", "rgba", "bgra")
+_DRAWING: Final = "render"  # in the name of a topic: a drawing of the events, as of dvs_renderer
 _IMAGE: Final = "sensor_msgs/Image"
 _COMPRESSED: Final = "sensor_msgs/CompressedImage"
 _EXPOSURE: Final = "std_msgs/Int32"
-_GREY: Final = {"mono8": "u1", "8UC1": "u1", "mono16": "u2", "16UC1": "u2"}
+_ENCODINGS: Final = {
+    **{name: _Encoding("u1") for name in ("mono8", "8UC1")},
+    **{name: _Encoding("u2") for name in ("mono16", "16UC1")},
+    **{f"bayer_{name.lower()}8": _Encoding("u1", mosaic=name) for name in MOSAICS},
+    **{f"bayer_{name.lower()}16": _Encoding("u2", mosaic=name) for name in MOSAICS},
+    **{
+        f"{order}{bits}": _Encoding(kind, order)
+        for order in _ORDERS
+        for bits, kind in ((8, "u1"), (16, "u2"))
+    },
+}
 _CHOICES: Final = ("events", "frames", "exposure")
+_FIRST_IMAGES: Final = 10
 _NO_EXPOSURE: Final = "The exposure times of the frames are not recorded."
 
 
@@ -106,11 +129,13 @@ class _Events:
 
 @dataclass(frozen=True)
 class _Images:
-    """``fault``: why the images cannot be read, if so."""
+    """``fault``: why the images cannot be read, if so; ``colour``: whether they are RGB; ``mosaic``: of the sensor."""
 
     topic: Topic
     size: tuple[int, int]
     fault: FormatError | None
+    colour: bool = False
+    mosaic: Mosaic | None = None
 
 
 def _choose(path: Path, bag: Bag, chosen: dict[str, str]) -> tuple[_Events | None, _Images | None]:
@@ -139,9 +164,14 @@ def _choose(path: Path, bag: Bag, chosen: dict[str, str]) -> tuple[_Events | Non
         raise FormatError(f"{path}: holds neither events nor images, but {held[:200]}")
     # Images that cannot be read, such as coloured drawings of the events, do not stand in the way of others.
     readable = [images for images in image_topics if images.fault is None]
-    if image_topics and not readable:
-        assert image_topics[0].fault is not None
-        raise image_topics[0].fault
+    if not chosen.get("frames"):
+        # Nor do those in colour: a driver's own images are grey or raw, and drawings of the events are in colour.
+        readable = [images for images in readable if not images.colour] or [
+            images for images in readable if _DRAWING not in images.topic.name
+        ]
+    faults = [images.fault for images in image_topics if images.fault is not None]
+    if faults and not readable:
+        raise faults[0]
     if not readable and len(event_topics) == 1:
         return event_topics[0], None
     if not event_topics and len(readable) == 1:
@@ -188,55 +218,77 @@ def _open_images(path: Path, bag: Bag, topic: Topic) -> _Images | None:
     with _decoding(path, topic):
         if topic.kind == _COMPRESSED:
             try:
-                size = _compressed_image(path, topic, message)[1].shape
+                colour = _compressed_in_colour(path, bag, topic)
+                size = _compressed_image(path, topic, message, colour)[1].shape
             except FormatError as fault:
                 return _Images(topic, (0, 0), fault)
-            return _Images(topic, (size[0], size[1]), None)
+            return _Images(topic, (size[0], size[1]), None, colour)
         message.stamp()
         height, width = message.numbers("II")
         encoding = message.text()
-    return _Images(topic, (height, width), None if encoding in _GREY else _not_grey(path, topic, encoding))
+    if encoding not in _ENCODINGS:
+        return _Images(topic, (height, width), _unknown_encoding(path, topic, encoding))
+    found = _ENCODINGS[encoding]
+    return _Images(topic, (height, width), None, bool(found.order), found.mosaic)
 
 
 def _decoding(path: Path, topic: Topic) -> Any:
     return reading(Path(f"{path}: topic {topic.name!r}"), *DAMAGE)
 
 
-def _not_grey(path: Path, topic: Topic, encoding: str) -> FormatError:
+def _unknown_encoding(path: Path, topic: Topic, encoding: str) -> FormatError:
     return FormatError(
-        f"{path}: topic {topic.name!r}: its images are {encoding[:40]!r}; colour is not supported yet, only "
-        f"{', '.join(_GREY)} ('{path.name}?frames=' reads the events alone)"
+        f"{path}: topic {topic.name!r}: its images are {encoding[:40]!r}; known are {', '.join(_ENCODINGS)} "
+        f"('{path.name}?frames=' reads the events alone)"
     )
 
 
 # Images
 
 
-def _image(path: Path, topic: Topic, message: Message) -> tuple[int, NDArray[Any]]:
+def _image(path: Path, topic: Topic, message: Message, colour: bool) -> tuple[int, NDArray[Any]]:
     """(stamp in us, image)."""
     if topic.kind == _COMPRESSED:
-        return _compressed_image(path, topic, message)
+        return _compressed_image(path, topic, message, colour)
     stamp = message.stamp() // 1000
     height, width = message.numbers("II")
     encoding = message.text()
-    if encoding not in _GREY:
-        raise _not_grey(path, topic, encoding)
-    dtype = np.dtype(_GREY[encoding]).newbyteorder(">" if message.number("B") else "<")
+    if encoding not in _ENCODINGS:
+        raise _unknown_encoding(path, topic, encoding)
+    found = _ENCODINGS[encoding]
+    dtype = np.dtype(found.dtype).newbyteorder(">" if message.number("B") else "<")
+    values = width * max(len(found.order), 1)
     step = message.number("I")
     start, length = message.sequence()
-    if step < width * dtype.itemsize or length < height * step or step == 0:
+    if step < values * dtype.itemsize or length < height * step or step == 0:
         raise ValueError(f"{length} bytes in rows of {step} for {width}x{height} pixels of {encoding}")
     rows = np.frombuffer(message.data, np.uint8, height * step, start).reshape(height, step)
-    pixels = np.ascontiguousarray(rows[:, : width * dtype.itemsize]).view(dtype)
-    return stamp, pixels.astype(dtype.newbyteorder("="))
+    pixels = (
+        np.ascontiguousarray(rows[:, : values * dtype.itemsize]).view(dtype).astype(dtype.newbyteorder("="))
+    )
+    if found.order:
+        pixels = pixels.reshape(height, width, len(found.order))
+        pixels = np.ascontiguousarray(pixels[..., [found.order.index(c) for c in "rgb"]])
+    return stamp, pixels
 
 
-def _compressed_image(path: Path, topic: Topic, message: Message) -> tuple[int, NDArray[Any]]:
+def _compressed(message: Message) -> tuple[int, bytes]:
+    """(stamp in us, file)."""
     stamp = message.stamp() // 1000
     message.text()  # what the data say better
     start, length = message.sequence()
-    hint = f"colour is not supported yet ('{path.name}?frames=' reads the events alone)"
-    return stamp, grey_image(path, topic.name, message.data[start : start + length], hint=hint)
+    return stamp, message.data[start : start + length]
+
+
+def _compressed_in_colour(path: Path, bag: Bag, topic: Topic) -> bool:
+    """Whether any of the first images is in colour: one alone may be black."""
+    first = [_compressed(message)[1] for message in islice(_messages(bag, topic), _FIRST_IMAGES)]
+    return in_colour(path, first, lambda data: (topic.name, data))
+
+
+def _compressed_image(path: Path, topic: Topic, message: Message, colour: bool) -> tuple[int, NDArray[Any]]:
+    stamp, data = _compressed(message)
+    return stamp, read_image(path, topic.name, data, colour=colour)
 
 
 # Exposure times
@@ -299,7 +351,7 @@ def _source(
                 yield from events.content.triggers()
 
     def read_frames() -> Iterator[Frame]:
-        return iter(()) if images is None else in_order(_frames(path, bag, images.topic, exposures))
+        return iter(()) if images is None else in_order(_frames(path, bag, images, exposures))
 
     @cache
     def count_events() -> int:
@@ -328,13 +380,15 @@ def _source(
         exposure_known=images is None or exposures is not None,
         triggers=None if events is None or events.content.triggers is None else read_triggers,
         missing=missing,
+        mosaic=None if images is None else images.mosaic,
     )
 
 
-def _frames(path: Path, bag: Bag, topic: Topic, exposures: _Exposures | None) -> Iterator[Frame]:
+def _frames(path: Path, bag: Bag, images: _Images, exposures: _Exposures | None) -> Iterator[Frame]:
+    topic = images.topic
     with _decoding(path, topic):
         for record in bag.records(topic):
-            stamp, image = _image(path, topic, Message(record.data, topic.cdr))
+            stamp, image = _image(path, topic, Message(record.data, topic.cdr), images.colour)
             if exposures is None:
                 yield Frame(image, stamp, stamp)
                 continue

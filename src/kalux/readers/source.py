@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from kalux.errors import FormatError, InputError, KaluxError
 from kalux.events import EventArray
-from kalux.frames import Frame
+from kalux.frames import Frame, Mosaic
 
 CHUNK_EVENTS: Final = 1 << 20
 """Events in a chunk, at most, where a format leaves the choice to the reader: 16 MiB."""
@@ -75,6 +75,9 @@ class Source:
         What the recording lacks, one sentence each, for the user.
     sensor_size_known
         Whether the recording states its sensor size; otherwise it is the smallest that holds all events.
+    mosaic
+        The Bayer pattern of the sensor, if the recording states one. Frames are given as stored all the same: a mosaic,
+        or RGB that was made of it.
     """
 
     path: Path
@@ -91,6 +94,7 @@ class Source:
     triggers: Callable[[], Iterator[TriggerArray]] | None = None
     missing: tuple[str, ...] = field(default=())
     sensor_size_known: bool = True
+    mosaic: Mosaic | None = None
 
 
 SIZE_UNKNOWN: Final = "The sensor size is not recorded; the smallest that holds all events is taken."

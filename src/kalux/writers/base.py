@@ -10,12 +10,13 @@ from typing import Any, Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.display import colour_of
 from kalux.errors import InputError, InternalError, KaluxError, OutputError
 from kalux.writers.files import uninterrupted
 
 
 class ImageLike(Protocol):
-    """An image that can be written."""
+    """An image that can be written; in colour where it has a ``colour``, (height, width, 3) linear RGB."""
 
     @property
     def t(self) -> int:
@@ -42,6 +43,7 @@ class Writer(ABC):
         self._times: tuple[int, int] | None = None
         self._images = 0
         self._shape: tuple[int, ...] | None = None
+        self._in_colour: bool | None = None
         self._failed = False
         self._closed = False
 
@@ -68,12 +70,13 @@ class Writer(ABC):
             state = "closed" if self._closed else "unusable after an error"
             raise OutputError(f"{self.path}: cannot write an image, the writer is {state}")
         try:
-            check_image(image, self._images, self._shape)
+            check_image(image, self._images, self._shape, self._in_colour)
             with uninterrupted():
                 self._write(image)
                 first = self._times[0] if self._times else int(image.t)
                 self._times = first, int(image.t)
                 self._shape = image.intensity.shape
+                self._in_colour = colour_of(image) is not None
                 self._images += 1
                 self._written()
         except BaseException:
@@ -134,16 +137,26 @@ class Writer(ABC):
         """Finish the files. Called once."""
 
 
-def check_image(image: ImageLike, index: int, shape: tuple[int, ...] | None) -> None:
-    """Check the type, the size and the values of an image; ``shape`` is that of the images before it.
+def check_image(
+    image: ImageLike, index: int, shape: tuple[int, ...] | None, in_colour: bool | None = None
+) -> None:
+    """Check type, size and values of an image; ``shape`` and ``in_colour`` are those of the images before it.
 
     Raises
     ------
     InputError
-        Wrong dtype or size.
+        Wrong dtype or size, or grey among colours.
     InternalError
-        An intensity is not finite, or a variance is NaN.
+        An intensity or a colour is not finite, or a variance is NaN.
     """
+    colour = colour_of(image)
+    if in_colour is not None and in_colour != (colour is not None):
+        raise InputError(f"image {index}: is {'grey' if in_colour else 'in colour'}, those before it are not")
+    if colour is not None and (colour.dtype != np.float32 or colour.shape != (*image.intensity.shape, 3)):
+        raise InputError(
+            f"image {index}: the colour is {colour.dtype} of shape {colour.shape}; "
+            f"float32 of shape {(*image.intensity.shape, 3)} is needed"
+        )
     for name, values in (("intensity", image.intensity), ("variance", image.variance)):
         if values.dtype != np.float32 or values.ndim != 2 or values.size == 0:
             raise InputError(
@@ -155,12 +168,14 @@ def check_image(image: ImageLike, index: int, shape: tuple[int, ...] | None) -> 
             found = " x ".join(str(n) for n in values.shape)
             raise InputError(f"image {index}: the {name} is {found} (height x width), {wanted} is needed")
     _refuse(~np.isfinite(image.intensity), "intensity", "not finite", image.t, index)
+    if colour is not None:
+        _refuse(~np.isfinite(colour), "colour", "not finite", image.t, index)
     _refuse(np.isnan(image.variance), "variance", "NaN", image.t, index)
 
 
 def _refuse(bad: NDArray[Any], name: str, what: str, t: int, index: int) -> None:
     if bad.any():
-        y, x = (int(i[0]) for i in np.nonzero(bad))
+        y, x = (int(i[0]) for i in np.nonzero(bad)[:2])
         raise InternalError(
             f"image {index} at {t} us: the {name} at x={x}, y={y} is {what}, so it is not written; "
             "this is an error in kalux, please report it"

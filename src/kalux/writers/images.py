@@ -11,7 +11,7 @@ import numpy as np
 import OpenEXR
 from numpy.typing import NDArray
 
-from kalux.display import DisplaySettings, ToneState, to_uint8, to_uint16, tone_map_next
+from kalux.display import DisplaySettings, ToneState, colour_of, to_uint8, to_uint16, tone_map_next
 from kalux.writers.base import ImageLike
 
 Encode = Callable[[ImageLike, ToneState | None], tuple[bytes, ToneState | None]]
@@ -19,7 +19,7 @@ Encode = Callable[[ImageLike, ToneState | None], tuple[bytes, ToneState | None]]
 
 
 def encode_png(display: DisplaySettings, bits: Literal[8, 16]) -> Encode:
-    """Grey PNGs of the display-mapped intensity, 0 to 1 as 0 to 65535 (or 255), rounded to nearest."""
+    """PNGs of the display-mapped intensity or colour, 0 to 1 as 0 to 65535 (or 255), rounded to nearest."""
     quantise: Callable[[NDArray[Any]], NDArray[Any]] = to_uint16 if bits == 16 else to_uint8
 
     def encode(image: ImageLike, state: ToneState | None) -> tuple[bytes, ToneState | None]:
@@ -30,32 +30,37 @@ def encode_png(display: DisplaySettings, bits: Literal[8, 16]) -> Encode:
 
 
 def encode_exr(image: ImageLike, state: ToneState | None) -> tuple[bytes, ToneState | None]:
-    """OpenEXR, 32-bit float, ZIP: channel Y the intensity, channel ``variance``; attribute ``t_us``."""
+    """OpenEXR, 32-bit float, ZIP: the intensity as Y, or the colour as R, G, B; ``variance``; attribute ``t_us``."""
     header = {
         "compression": OpenEXR.ZIP_COMPRESSION,
         "type": OpenEXR.scanlineimage,
         "t_us": str(int(image.t)),
     }
-    channels = {
-        "Y": np.ascontiguousarray(image.intensity),
-        "variance": np.ascontiguousarray(image.variance),
-    }
+    colour = colour_of(image)
+    values = (
+        {"Y": image.intensity} if colour is None else dict(zip("RGB", np.moveaxis(colour, 2, 0), strict=True))
+    )
+    channels = {name: np.ascontiguousarray(v) for name, v in {**values, "variance": image.variance}.items()}
     file = io.BytesIO()
     OpenEXR.File(header, channels).write(file)
     return file.getvalue(), state
 
 
 def encode_npy(image: ImageLike, state: ToneState | None) -> tuple[bytes, ToneState | None]:
-    """NumPy's format, float32 (2, height, width): the intensity and the variance."""
+    """NumPy's format, float32 (2, height, width): intensity, variance; or (4, ...): red, green, blue, variance."""
+    colour = colour_of(image)
+    values = [image.intensity] if colour is None else list(np.moveaxis(colour, 2, 0))
     file = io.BytesIO()
-    np.save(file, np.stack([image.intensity, image.variance]), allow_pickle=False)
+    np.save(file, np.stack([*values, image.variance]), allow_pickle=False)
     return file.getvalue(), state
 
 
 def png_bytes(picture: NDArray[Any]) -> bytes:
-    """A grey uint8 or uint16 picture as PNG."""
+    """A grey or RGB uint8 or uint16 picture as PNG."""
+    if picture.ndim == 3:
+        picture = np.ascontiguousarray(picture[..., ::-1])  # OpenCV's order
     # Without parameters OpenCV takes its fastest way. Asking for a level, even for 1, leaves that way and
     # takes two to three times as long, for files of about the same size.
     done, encoded = cv2.imencode(".png", picture)
-    assert done, "OpenCV encodes every grey uint8 or uint16 picture"
+    assert done, "OpenCV encodes every uint8 or uint16 picture"
     return encoded.tobytes()

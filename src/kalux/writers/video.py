@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 
 from kalux.display import DisplaySettings, Float32, ToneState, tone_map_next
 from kalux.errors import InputError, MissingDependencyError, OutputError, SettingsError
+from kalux.models.colour import luminance
 from kalux.writers.base import ImageLike, Writer
 from kalux.writers.files import output_errors, remove_quietly, temporary_path
 from kalux.writers.settings_file import SettingsFile, require_ours
@@ -33,6 +35,7 @@ PRESETS = (
     "slower",
     "veryslow",
 )
+_BT709 = 1
 MICROSECOND = Fraction(1, 1_000_000)
 
 
@@ -253,28 +256,53 @@ def open_container(
     stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
     stream.time_base = ticks.time_base
     stream.codec_context.time_base = ticks.time_base
-    stream.codec_context.color_range = 1  # limited, 16 to 235, which every player takes
+    _tag_colours(stream.codec_context)
     stream.options = {"crf": f"{video.crf:g}", "preset": video.preset}
     return container, stream
 
 
+def _tag_colours(target: Any) -> None:
+    """Say what the numbers mean: BT.709 in the limited range, 16 to 235, which every player takes."""
+    target.color_range = 1
+    target.color_primaries = target.color_trc = target.colorspace = _BT709
+
+
 def video_frame(mapped: Float32) -> av.VideoFrame:
-    """A grey frame, yuv420p in the limited range, from values 0 to 1; odd sizes are padded.
+    """A frame, yuv420p of BT.709 in the limited range, from values 0 to 1; odd sizes are padded.
 
     Parameters
     ----------
     mapped
-        (height, width). Where a size is odd, the last row or column is repeated.
+        (height, width) or (height, width, 3). Where a size is odd, the last row or column is repeated.
     """
-    height, width = mapped.shape
-    padded = np.pad(mapped, ((0, height % 2), (0, width % 2)), mode="edge")
+    height, width = mapped.shape[:2]
+    padding = [(0, height % 2), (0, width % 2), (0, 0)][: mapped.ndim]
+    padded = np.pad(mapped, padding, mode="edge")
     frame = av.VideoFrame(padded.shape[1], padded.shape[0], "yuv420p")
-    luma = np.rint(16 + 219 * padded).astype(np.uint8)
-    neutral = np.full((luma.shape[0] // 2, luma.shape[1] // 2), 128, np.uint8)
-    for plane, values in zip(frame.planes, (luma, neutral, neutral), strict=True):
+    luma = padded if padded.ndim == 2 else luminance(padded)
+    planes = [np.rint(16 + 219 * luma).astype(np.uint8), *_chroma_planes(padded, luma)]
+    for plane, values in zip(frame.planes, planes, strict=True):
         plane.update(_plane_bytes(values, plane.line_size, plane.buffer_size))
     frame.color_range = 1
+    frame.colorspace = _BT709
     return frame
+
+
+def _chroma_planes(picture: Float32, luma: Float32) -> list[NDArray[np.uint8]]:
+    """Cb and Cr of BT.709 at half the size: 128 of a grey picture.
+
+    Samples lie on even columns, between two rows, as H.264 has them by default: weights 1 2 1 along rows.
+    """
+    if picture.ndim == 2:
+        return [np.full((luma.shape[0] // 2, luma.shape[1] // 2), 128, np.uint8)] * 2
+    planes = []
+    for channel, largest in ((2, 1.8556), (0, 1.5748)):  # 2 (1 - 0.0722), 2 (1 - 0.2126)
+        difference = (picture[..., channel] - luma) / np.float32(largest)
+        rows = (difference[::2] + difference[1::2]) / 2
+        before = np.concatenate([rows[:, :1], rows[:, 1:-1:2]], axis=1)
+        halved = (before + 2 * rows[:, ::2] + rows[:, 1::2]) / 4
+        planes.append(np.rint(128 + 224 * halved).astype(np.uint8))
+    return planes
 
 
 def frames_of(path: Path) -> int:
