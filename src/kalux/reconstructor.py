@@ -97,7 +97,7 @@ class Estimate:
     moving
         (H, W) bool: pixels with an event in this frame interval or the one before; None: not told.
     between
-        0 at a frame, 1 half-way between two or where no next one is known.
+        0 at a frame, 1 half-way between two, and where the next one is not known or not used.
     chroma
         Of frames in RGB: float32 (H, W, 3), the ratios of the channels to the luminance; else None.
     """
@@ -363,7 +363,7 @@ class Reconstructor:
             self._white(progress, t),
             final,
             self._method.moving(progress.segment, progress.cursor),
-            _between(progress, t),
+            _between(progress, t) if self.lookahead else 1.0,
             self._chroma(progress, t),
         )
 
