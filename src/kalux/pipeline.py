@@ -19,7 +19,7 @@ from kalux.events import EventArray
 from kalux.frames import Frame
 from kalux.reconstructor import Estimate, Image, Reconstructor
 from kalux.recording import Recording
-from kalux.settings import Settings
+from kalux.settings import Settings, chosen_response
 from kalux.settings import preset as named_preset
 from kalux.smoothing import Backward, combine, reversed_settings
 
@@ -85,8 +85,9 @@ def plan(
         )
     exposures = _exposures(recording)
     reference = chosen.camera.reference_exposure or round(float(np.median(exposures[:, 1] - exposures[:, 0])))
+    response = chosen_response(chosen.camera.response, recording.response)
     chosen = dataclasses.replace(
-        chosen, camera=dataclasses.replace(chosen.camera, reference_exposure=reference)
+        chosen, camera=dataclasses.replace(chosen.camera, reference_exposure=reference, response=response)
     )
     chosen, delay = _with_delay(recording, chosen)
     chosen, origin, estimate = _with_thresholds(recording, chosen)

@@ -21,6 +21,11 @@ AUTO: Final = "auto"
 SolutionName = Literal["exact", "printed"]
 
 
+def chosen_response(setting: str, stated: str | None) -> str:
+    """The camera's response that a setting names, or, where that is ``"auto"``, the recording states."""
+    return (stated or "linear") if setting == AUTO else setting
+
+
 @dataclass(frozen=True, kw_only=True)
 class CameraSettings:
     """The frame camera, equations (3)-(9).
@@ -28,7 +33,8 @@ class CameraSettings:
     Attributes
     ----------
     response
-        ``"linear"`` (raw sensor values: DAVIS, machine vision), ``"srgb"`` or ``"gamma:EXPONENT"``.
+        ``"linear"`` (raw sensor values: DAVIS, machine vision), ``"srgb"``, ``"gamma:EXPONENT"`` or
+        ``"s-curve:BLACK"``; ``"auto"``: what the recording states, else linear.
     log_offset
         I_0 of equation (8); white = 1. Events are steps of log I, so it must be small; below the noise of a
         dark pixel it only magnifies that noise. 0.03 (docs/tuning.md). The paper's code: 1.
@@ -48,7 +54,7 @@ class CameraSettings:
         Exposure time, us, at which a saturated pixel has intensity 1; None: the recording's median.
     """
 
-    response: str = "linear"
+    response: str = AUTO
     log_offset: float = 0.03
     frame_noise: float = 0.006
     confidence: float = 7e5

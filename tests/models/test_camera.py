@@ -95,7 +95,7 @@ def test_named_responses(name, same):
 
 @pytest.mark.parametrize("name", ["", "lin", "gamma", "gamma:", "gamma:two", "srgb:2", "LINEAR"])
 def test_unknown_names_say_what_is_known(name):
-    with pytest.raises(SettingsError, match="known are linear, srgb and gamma:EXPONENT"):
+    with pytest.raises(SettingsError, match="known are linear, srgb, gamma:EXPONENT and s-curve:BLACK"):
         Response.named(name)
 
 

@@ -112,6 +112,7 @@ def write_copy(recording: Recording, out: Path, progress: Any) -> None:
             contrast_threshold=recording.contrast_threshold,
             inverse_covariance=recording.source.inverse_covariance,
             ground_truth=recording.ground_truth(),
+            response=recording.response,
         )
 
 

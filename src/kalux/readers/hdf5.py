@@ -22,7 +22,7 @@ T = TypeVar("T")
 MAJOR_VERSION: Final = 1
 """Files with a greater major version are refused; a minor version only adds."""
 
-_VERSION: Final = f"{MAJOR_VERSION}.0"
+_VERSION: Final = f"{MAJOR_VERSION}.1"
 _SIGNATURE: Final = b"\x89HDF\r\n\x1a\n"
 _EVENTS_PER_CHUNK: Final = 1 << 17
 _COLUMNS: Final = ("t", "x", "y", "p")
@@ -62,6 +62,7 @@ def read(path: Path) -> Source:
         threshold = file.attrs.get("contrast_threshold")
         inverse_covariance = file["inverse_covariance"][...] if "inverse_covariance" in file else None
         has_ground_truth = "ground_truth" in file
+        response = _text(file["frames"].attrs["response"]) if "response" in file["frames"].attrs else None
         contrast_threshold = None if threshold is None else (float(threshold[0]), float(threshold[1]))
     missing: tuple[str, ...] = ()
     if not event_count:
@@ -82,6 +83,7 @@ def read(path: Path) -> Source:
         contrast_threshold=contrast_threshold,
         inverse_covariance=inverse_covariance,
         ground_truth=(lambda: _ground_truth(path)) if has_ground_truth else None,
+        response=response,
         missing=missing,
     )
 
@@ -137,11 +139,16 @@ def _ground_truth(path: Path) -> GroundTruth:
     with reading(path, *_DAMAGE), h5py.File(path, "r") as file:
         group = file["ground_truth"]
         times, images = group["times"][...].astype(np.int64), group["images"][...].astype(np.float32)
+        masks = group["masks"][...].astype(bool) if "masks" in group else None
     if images.ndim != 3 or len(times) != len(images):
         raise FormatError(
             f"{path}: ground truth has {len(times)} times for {images.shape} images; write it again"
         )
-    return GroundTruth(times, images)
+    if masks is not None and masks.shape != images.shape:
+        raise FormatError(
+            f"{path}: ground truth has {masks.shape} masks for {images.shape} images; write it again"
+        )
+    return GroundTruth(times, images, masks)
 
 
 def write(
@@ -154,6 +161,7 @@ def write(
     contrast_threshold: tuple[float, float] | None = None,
     inverse_covariance: NDArray[np.float64] | None = None,
     ground_truth: GroundTruth | None = None,
+    response: str | None = None,
 ) -> None:
     """Write a recording, chunk by chunk, in bounded memory.
 
@@ -177,6 +185,8 @@ def write(
         (256,) 1 / R_bar per 8-bit value, 1/s.
     ground_truth
         Reference images.
+    response
+        Of the frame camera, named as in `kalux.settings.CameraSettings`.
 
     Raises
     ------
@@ -201,8 +211,12 @@ def write(
                     file["inverse_covariance"] = np.asarray(inverse_covariance, np.float64)
                 if ground_truth is not None:
                     _write_ground_truth(file.create_group("ground_truth"), ground_truth)
+                    if ground_truth.masks is not None:
+                        _write_masks(file["ground_truth"], ground_truth.masks)
                 _write_events(file.create_group("events"), sink.checked(events))
-                _write_frames(file.create_group("frames"), sink.checked(frames), sensor_size, exposure_known)
+                if response is not None:
+                    file.create_group("frames").attrs["response"] = np.bytes_(response)
+                _write_frames(file.require_group("frames"), sink.checked(frames), sensor_size, exposure_known)
             sink.check()
         os.replace(partial, path)
     except OSError as error:
@@ -338,4 +352,10 @@ def _write_ground_truth(group: Any, ground_truth: GroundTruth) -> None:
     group["times"] = np.asarray(ground_truth.times, np.int64)
     group.create_dataset(
         "images", data=images, maxshape=(None, *images.shape[1:]), chunks=(1, *images.shape[1:]), **_packing()
+    )
+
+
+def _write_masks(group: Any, masks: NDArray[np.bool_]) -> None:
+    group.create_dataset(
+        "masks", data=masks, maxshape=(None, *masks.shape[1:]), chunks=(1, *masks.shape[1:]), **_packing()
     )
