@@ -6,7 +6,7 @@ import sys
 import traceback
 from collections.abc import Sequence
 
-from kalux.cli import ahdr, convert, demo, evaluate, hdr_reference, info, reconstruct
+from kalux.cli import ahdr, convert, datasets, demo, evaluate, hdr_reference, info, reconstruct
 from kalux.cli.parser import Parser, UsageError, normalised
 from kalux.cli.signals import termination_as_interrupt
 from kalux.cli.terminal import close_output, error_line
@@ -25,6 +25,7 @@ commands:
   demo         simulate a scene, reconstruct it, and compare with the truth
   ahdr         a recording with frames clipped on purpose, the originals as truth
   hdr-reference  radiance from bracketed exposures, and ground truth from it
+  datasets     published sets: licence, page, layout; checks a folder
 
 kalux COMMAND --help says more."""
 
@@ -99,6 +100,6 @@ def make_parser() -> Parser:
     parser = Parser(prog="kalux", description=_DESCRIPTION, epilog=_EXAMPLES, usage="kalux COMMAND ...")
     parser.add_version()
     commands = parser.add_subparsers(dest="command", prog="kalux", parser_class=Parser)
-    for command in (info, reconstruct, convert, evaluate, demo, ahdr, hdr_reference):
+    for command in (info, reconstruct, convert, evaluate, demo, ahdr, hdr_reference, datasets):
         command.add_command(commands)
     return parser
