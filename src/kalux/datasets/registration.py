@@ -39,6 +39,7 @@ _INLIER_DISTANCE: Final = 2.0  # pixels of the fixed image: SIFT in noisy, blurr
 _WORK_WIDTH: Final = 640  # smaller images are enlarged for SIFT, which finds little in 240 x 180
 _MOST_FEATURES: Final = 6000
 _ITERATIONS: Final = 20
+_UNSMOOTHED: Final = 1.2  # pixels per pixel: bilinear sampling alone smooths as much
 _CONVERGED: Final = 0.002  # pixels
 _LEAP: Final = 5.0  # pixels: a step that is no refinement any more
 _HUBER: Final = 1.345  # standard deviations; 95 % efficient for Gaussian errors
@@ -160,7 +161,7 @@ def warped(image: NDArray[Any], matrix: Array, size: tuple[int, int]) -> Image:
 def as_seen(image: NDArray[Any], shrink: float) -> Image:
     """An image as pixels ``shrink`` times as large would see it, not resampled: float32."""
     smooth = np.ascontiguousarray(image, np.float32)
-    if shrink <= 1.2:
+    if shrink <= _UNSMOOTHED:
         return smooth
     # A box of the fixed image's pixel has the variance shrink^2 / 12; one moving pixel is there already.
     sigma = float(np.sqrt((shrink**2 - 1) / 12))
@@ -190,7 +191,7 @@ def warped_mask(mask: Mask, matrix: Array, size: tuple[int, int]) -> Mask:
 
 def eroded(mask: Mask, shrink: float) -> Image:
     """1 where pixels ``shrink`` times as large see only what is valid, else 0: float32."""
-    reach = max(int(np.ceil(shrink)), 1)
+    reach = 1 if shrink <= _UNSMOOTHED else int(np.ceil(shrink))
     kernel = np.ones((2 * reach - 1, 2 * reach - 1), np.uint8)
     return 1.0 - np.asarray(cv2.dilate((~mask).astype(np.uint8), kernel), np.float32)
 
@@ -385,9 +386,8 @@ def register_frames(
     for placed in found:
         if placed.matrix is not None and not placed.failure:
             mask = warped_mask(valid, placed.matrix, size)
-            if blur > 0:
-                mask = _shrunk(mask, int(np.ceil(3 * blur)))
-            image = _blurred(warped(np.where(valid, luminance, 0.0), placed.matrix, size), blur)
+            image = warped(np.where(valid, luminance, 0.0), placed.matrix, size)
+            image = _blurred(np.nan_to_num(image), mask, blur)
             images.append(np.where(mask, scale * image, 0.0).astype(np.float32))
             masks.append(mask)
             times.append(placed.time)
@@ -395,14 +395,13 @@ def register_frames(
     return RegisteredTruth(found, scale, truth, np.stack(masks))
 
 
-def _blurred(image: Image, sigma: float) -> Image:
-    whole = np.nan_to_num(image)
-    return np.asarray(cv2.GaussianBlur(whole, (0, 0), sigma), np.float32) if sigma > 0 else whole
-
-
-def _shrunk(mask: Mask, by: int) -> Mask:
-    kernel = np.ones((2 * by + 1, 2 * by + 1), np.uint8)
-    return ~np.asarray(cv2.dilate((~mask).astype(np.uint8), kernel, borderType=cv2.BORDER_REPLICATE), bool)
+def _blurred(image: Image, mask: Mask, sigma: float) -> Image:
+    """An image blurred, of its valid pixels only."""
+    if sigma <= 0:
+        return image
+    weight = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), sigma)
+    total = cv2.GaussianBlur(np.where(mask, image, 0).astype(np.float32), (0, 0), sigma)
+    return np.asarray(total / np.maximum(weight, 1e-6), np.float32)
 
 
 def _median_exposure(recording: Recording) -> int:
