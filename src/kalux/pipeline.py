@@ -22,7 +22,7 @@ from kalux.frames import Frame
 from kalux.models.colour import white_balance
 from kalux.reconstructor import Estimate, Image, Reconstructor
 from kalux.recording import Recording
-from kalux.settings import Settings
+from kalux.settings import Settings, chosen_response
 from kalux.settings import preset as named_preset
 from kalux.smoothing import Backward, combine, reversed_settings
 
@@ -91,8 +91,9 @@ def plan(
         )
     exposures = _exposures(recording)
     reference = chosen.camera.reference_exposure or round(float(np.median(exposures[:, 1] - exposures[:, 0])))
+    response = chosen_response(chosen.camera.response, recording.response)
     chosen = dataclasses.replace(
-        chosen, camera=dataclasses.replace(chosen.camera, reference_exposure=reference)
+        chosen, camera=dataclasses.replace(chosen.camera, reference_exposure=reference, response=response)
     )
     chosen = _with_white_balance(recording, chosen)
     chosen, delay = _with_delay(recording, chosen)

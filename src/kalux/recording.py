@@ -156,6 +156,11 @@ class Recording:
         """(on, off) thresholds in log intensity that the recording states, or None."""
         return self.source.contrast_threshold
 
+    @property
+    def response(self) -> str | None:
+        """The frame camera's response that the recording states, as in `kalux.settings.CameraSettings`, or None."""
+        return self.source.response
+
     def ground_truth(self) -> GroundTruth | None:
         """Reference images that came with the recording, or None."""
         return None if self.source.ground_truth is None else self.source.ground_truth()

@@ -27,6 +27,11 @@ UNKNOWN_STEP_VARIANCE: Final = 0.2
 """Variance of an event's step, c^2, where it is not known: the same recordings."""
 
 
+def chosen_response(setting: str, stated: str | None) -> str:
+    """The camera's response that a setting names, or, where that is ``"auto"``, the recording states."""
+    return (stated or "linear") if setting == AUTO else setting
+
+
 @dataclass(frozen=True, kw_only=True)
 class CameraSettings:
     """The frame camera, equations (3)-(9).
@@ -34,9 +39,10 @@ class CameraSettings:
     Attributes
     ----------
     response
-        ``"linear"`` (raw sensor values: DAVIS, machine vision), ``"srgb"``, ``"gamma:EXPONENT"``, or a measured
-        ``"curve:0 0.0012 ... 1"``: the irradiance at equally spaced response levels (`kalux calibrate response`).
-        Three with ";" between them are those of red, green and blue.
+        ``"linear"`` (raw sensor values: DAVIS, machine vision), ``"srgb"``, ``"gamma:EXPONENT"``, ``"s-curve:BLACK"``,
+        or a measured ``"curve:0 0.0012 ... 1"``: the irradiance at equally spaced response levels
+        (`kalux calibrate response`). Three with ";" between them are those of red, green and blue. ``"auto"``: what
+        the recording states, else linear.
     log_offset
         I_0 of equation (8); white = 1. Events are steps of log I, so it must be small; below the dark current
         of the event pixels it only magnifies noise. None: an estimate from the recording
@@ -61,7 +67,7 @@ class CameraSettings:
         not in the recording, and RGB frames are balanced already.
     """
 
-    response: str = "linear"
+    response: str = AUTO
     log_offset: float | None = None
     frame_noise: float = 0.006
     confidence: float = 7e5

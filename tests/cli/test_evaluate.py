@@ -50,6 +50,16 @@ def test_truth_from_a_file_is_that_of_the_recording(cli, recording, with_truth, 
     assert from_file.splitlines()[1:] == own.splitlines()[1:]
 
 
+def test_truth_beside_the_recording_is_found_and_told(cli, write_recording, simulation, tmp_path):
+    truth = simulation.truth()
+    path = write_recording(tmp_path / "pan.h5")
+    np.savez(tmp_path / "pan_gt.npz", times_us=truth.times, gt=truth.images)
+    found = cli("evaluate", path, "--methods", "hold").out
+    assert f"ground truth of {tmp_path / 'pan_gt.npz'}: " in found
+    assert cli("evaluate", path, "--truth", "--methods", "hold").out == found
+    assert "held-out" in cli("evaluate", path, "--hold-out-frames", "3", "--methods", "hold").out
+
+
 def test_the_numbers_are_those_of_the_library_in_table_and_files(cli, recording, tmp_path):
     table, whole = tmp_path / "s.csv", tmp_path / "s.json"
     arguments = ("evaluate", recording, "--methods", "hold,cf", "--hdrvdp", "--blur-consistency", "--quiet")

@@ -234,3 +234,20 @@ def test_a_real_recording_comes_back(shared_data, path):
     assert copy.count_events() == 319_512
     assert np.array_equal(all_events(copy), all_events(source))
     assert same_frames(copy.frames(), source.frames())
+
+
+def test_masks_of_the_truth_and_the_response(tmp_path):
+    rng = np.random.default_rng(0)
+    images = rng.random((2, *SIZE)).astype(np.float32)
+    truth = GroundTruth(np.array([5, 9]), images, images > 0.5)
+    hdf5.write(
+        tmp_path / "a.h5",
+        sensor_size=SIZE,
+        events=[small_events()],
+        frames=small_frames(),
+        ground_truth=truth,
+        response="gamma:2.2",
+    )
+    found = hdf5.read(tmp_path / "a.h5")
+    assert found.response == "gamma:2.2"
+    assert np.array_equal(found.ground_truth().masks, truth.masks)

@@ -13,7 +13,7 @@ from kalux.events import EVENT_DTYPE, EventArray
 from kalux.filters.methods import Shot, take_shot
 from kalux.models.camera import Camera, log_intensity
 from kalux.recording import Recording
-from kalux.settings import CameraSettings
+from kalux.settings import CameraSettings, chosen_response
 
 Array = NDArray[np.float64]
 
@@ -53,7 +53,8 @@ def intervals(
     recording: Recording, camera: CameraSettings, *, margin: int, most_frames: int
 ) -> Iterator[Interval]:
     """The intervals between the first ``most_frames`` frames, with the events up to ``margin`` us around each."""
-    model = Camera.named(camera.response, camera.saturation)
+    response = chosen_response(camera.response, recording.response)
+    model = Camera.named(response, camera.saturation)
     low, high = _WELL_EXPOSED
     chunks = iter(recording.events())
     buffer: EventArray = np.empty(0, EVENT_DTYPE)
@@ -64,8 +65,8 @@ def intervals(
             return
         reference = reference or float(frame.exposure)
         shot = take_shot(frame, model, reference)
-        response = frame.normalised()
-        inside = (response > low) & (response < high)
+        level = frame.normalised()
+        inside = (level > low) & (level < high)
         usable = np.asarray(inside.all(axis=-1) if inside.ndim == 3 else inside, np.bool_)
         while len(buffer) == 0 or buffer["t"][-1] <= shot.middle + margin:
             chunk = next(chunks, None)

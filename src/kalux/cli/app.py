@@ -7,10 +7,13 @@ import traceback
 from collections.abc import Sequence
 
 from kalux.cli import (
+    ahdr,
     benchmark,
     convert,
+    datasets,
     demo,
     evaluate,
+    hdr_reference,
     info,
     reconstruct,
     simulate,
@@ -30,6 +33,9 @@ COMMANDS = (
     benchmark,
     simulate,
     demo,
+    ahdr,
+    hdr_reference,
+    datasets,
 )
 """The modules of the commands, in the order of the help."""
 
@@ -44,6 +50,9 @@ commands:
   benchmark    the same for many recordings, with a report
   simulate     make a recording with ground truth from an HDR photograph, images or a video
   demo         simulate a scene, reconstruct it, and compare with the truth
+  ahdr         a recording with frames clipped on purpose, the originals as truth
+  hdr-reference  radiance from bracketed exposures, and ground truth from it
+  datasets     published sets: licence, page, layout; checks a folder
 
 kalux COMMAND --help says more."""
 

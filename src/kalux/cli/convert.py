@@ -113,6 +113,7 @@ def write_copy(recording: Recording, out: Path, progress: Any) -> None:
             inverse_covariance=recording.source.inverse_covariance,
             ground_truth=recording.ground_truth(),
             mosaic=recording.mosaic,
+            response=recording.response,
         )
 
 

@@ -63,7 +63,11 @@ def add_command(commands: Any) -> None:
         help="the recording's ground truth, or that of an .npz with times (us) and images, maybe mask",
     )
     group.add_argument("--clip", action="store_true", help="held-out: clip images where the camera clips")
-    group.add_argument("--response", default="linear", help="of the camera: linear, srgb or gamma:EXPONENT")
+    group.add_argument(
+        "--response",
+        default="auto",
+        help="of the camera: linear, srgb, gamma:EXPONENT (default: what the recording states, else linear)",
+    )
     group = parser.add_argument_group("what is computed")
     group.add_argument("--methods", metavar="A,B", help="names, in this order, with commas")
     group.add_argument("--hdrvdp", action="store_true", help="HDR-VDP's Q as well, 0.2 s per VGA image")
@@ -137,7 +141,7 @@ class Protocol:
         self._score: Callable[[Method, Callable[[], None]], Scores]
         reference = None
         if options.hold_out_frames is None:
-            reference = _reference(recording, options)
+            reference, origin = _reference(recording, options)
         if reference is None:
             every = 2 if options.hold_out_frames is None else options.hold_out_frames
             held = held_out.hold_out_frames(recording, every, response=options.response)
@@ -146,7 +150,7 @@ class Protocol:
                 held, method, clip=options.clip, hdr_vdp=options.hdrvdp, on_image=count
             )
         else:
-            self.described, self._images = reference.described(), len(reference.times)
+            self.described, self._images = reference.described(origin), len(reference.times)
             self._score = lambda method, count: truth.evaluate_truth(
                 recording, reference, method, hdr_vdp=options.hdrvdp, on_image=count
             )
@@ -178,12 +182,16 @@ class Protocol:
             )
 
 
-def _reference(recording: Recording, options: argparse.Namespace) -> Any:
-    """The ground truth that is asked for, or there; None: none."""
-    from kalux.evaluation.truth import load_truth, prepare_reference
+def _reference(recording: Recording, options: argparse.Namespace) -> tuple[Any, str]:
+    """The ground truth that is asked for, or there, and where it was found; None: none."""
+    from kalux.evaluation.truth import load_truth, prepare_reference, truth_beside
 
     if options.truth is None or options.truth == _OWN:
-        images, mask = recording.ground_truth(), None
+        images = recording.ground_truth()
+        mask = None if images is None else images.masks
+        beside = truth_beside(recording.source.path)
+        if images is None and beside.is_file():
+            images, mask = load_truth(beside)
         if images is None and options.truth == _OWN:
             raise UsageError(
                 f"{recording.source.path}: has no ground truth; give --truth FILE.npz, or --hold-out-frames 2"
@@ -191,10 +199,15 @@ def _reference(recording: Recording, options: argparse.Namespace) -> Any:
     else:
         images, mask = load_truth(options.truth)
     if images is None:
-        return None
+        return None, ""
+    origin = ""
+    if options.truth not in (None, _OWN):
+        origin = f" of {options.truth}"
+    elif recording.source.ground_truth is None:
+        origin = f" of {beside}"
     if options.clip:
         raise UsageError("--clip is for held-out frames, the recording has ground truth; --hold-out-frames 2")
-    return prepare_reference(recording, images, mask)
+    return prepare_reference(recording, images, mask), origin
 
 
 # Say.

@@ -24,7 +24,7 @@ from kalux.frames import Frame
 from kalux.models.camera import log_intensity
 from kalux.pipeline import plan, reconstruct
 from kalux.recording import Recording
-from kalux.settings import PRESETS, Settings
+from kalux.settings import AUTO, PRESETS, Settings, chosen_response
 
 Image = NDArray[np.float32]
 Times = NDArray[np.int64]
@@ -83,18 +83,20 @@ class Method:
             yield from (Estimated(image, None) for image in self.images(recording, times))
 
 
-def hold_last_frame(recording: Recording, times: Times, *, response: str = "linear") -> Iterator[Image]:
+def hold_last_frame(recording: Recording, times: Times, *, response: str = AUTO) -> Iterator[Image]:
     """The last frame whose exposure's middle has passed; before the first, the first."""
     reference = reference_exposure(recording)
+    response = chosen_response(response, recording.response)
     for before, after, _ in frames_around(recording.frames(), times):
         held = before or after
         assert held is not None
         yield linear_frame(held, reference, response).astype(np.float32)
 
 
-def mean_of_neighbours(recording: Recording, times: Times, *, response: str = "linear") -> Iterator[Image]:
+def mean_of_neighbours(recording: Recording, times: Times, *, response: str = AUTO) -> Iterator[Image]:
     """The mean of the frames before and after, each by the middle of its exposure."""
     reference = reference_exposure(recording)
+    response = chosen_response(response, recording.response)
     for before, after, _ in frames_around(recording.frames(), times):
         pair = [linear_frame(frame, reference, response) for frame in (before, after) if frame is not None]
         yield np.mean(pair, axis=0).astype(np.float32)
@@ -150,7 +152,7 @@ OPTIONAL: Final = ("iccv2021-flir",)
 """Not among those that are compared if nothing is said: for one camera only."""
 
 
-def methods(response: str = "linear") -> dict[str, Method]:
+def methods(response: str = AUTO) -> dict[str, Method]:
     """All methods by name; ``response`` is the camera's, as in `kalux.settings.CameraSettings`."""
     presets = {name: _with_response(PRESETS[name], response) for name in _FILTERS}
     return {
@@ -174,7 +176,7 @@ def filter_method(label: str, settings: Settings, *, smooth: bool = False) -> Me
 
 
 def chosen_methods(
-    names: Iterable[str] | None = None, *, response: str = "linear", held_out: bool = False
+    names: Iterable[str] | None = None, *, response: str = AUTO, held_out: bool = False
 ) -> list[Method]:
     """Methods by name, in that order.
 

@@ -18,7 +18,7 @@ from kalux.evaluation.exposures import exposure_times, linear_frame, means_of, r
 from kalux.evaluation.metrics import psnr
 from kalux.frames import Frame
 from kalux.recording import Recording
-from kalux.settings import CameraSettings
+from kalux.settings import AUTO, CameraSettings, chosen_response
 
 READS: Final = 9
 """Reads across an exposure."""
@@ -62,7 +62,7 @@ def blur_consistency(
     method: Method,
     *,
     reads: int = READS,
-    response: str = "linear",
+    response: str = AUTO,
     on_image: Callable[[], None] = lambda: None,
 ) -> BlurConsistency:
     """Integrate a method's images over every exposure but the first and the last, and compare them with the frames.
@@ -90,6 +90,7 @@ def blur_consistency(
     if reads < 2:
         raise InputError(f"blur consistency: reads are {reads}; at least 2 are needed")
     reference = reference_exposure(recording)
+    response = chosen_response(response, recording.response)
     inner = [exposure_times(frame, reads) for frame in recording.frames()][1:-1]
     if not inner:
         raise FrameError(f"{recording.source.path}: blur consistency needs at least three frames")

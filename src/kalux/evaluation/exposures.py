@@ -31,7 +31,7 @@ def reference_exposure(recording: Recording) -> int:
     return round(float(np.median(exposures)))
 
 
-def linear_frame(frame: Frame, reference: int, response: str = "linear") -> Array:
+def linear_frame(frame: Frame, reference: int, response: str) -> Array:
     """A frame's intensity, 1 = a saturated pixel at the reference exposure (us): (H, W) float64.
 
     Of a mosaic each pixel's own channel, of RGB the luminance: what images have as their intensity. ``response`` is the

@@ -22,7 +22,7 @@ from kalux.evaluation.pairs import Array
 from kalux.evaluation.scores import Pair, Scores, score
 from kalux.frames import Frame
 from kalux.recording import Recording
-from kalux.settings import CameraSettings
+from kalux.settings import AUTO, CameraSettings, chosen_response
 
 READS: Final = 5
 """Reads across the exposure of a held-out frame."""
@@ -75,7 +75,7 @@ class HeldOut:
 
 
 def hold_out_frames(
-    recording: Recording, every: int = 2, *, reads: int = READS, response: str = "linear"
+    recording: Recording, every: int = 2, *, reads: int = READS, response: str = AUTO
 ) -> HeldOut:
     """Hold out every ``every``-th frame (numbers every - 1, 2 every - 1 ..., from 0).
 
@@ -108,6 +108,7 @@ def hold_out_frames(
             f"a frame that is compared needs {MARGIN} before and {MARGIN} after it"
         )
     kept = without_frames(recording, every)
+    response = chosen_response(response, recording.response)
     reference = reference_exposure(kept)
     chosen = {*compared.tolist()}
     times = [exposure_times(f, reads) for i, f in enumerate(recording.frames()) if i in chosen]

@@ -42,11 +42,11 @@ class Reference:
     left_out: int
     data_range: float
 
-    def described(self) -> str:
-        """The protocol in words."""
-        said = f"ground truth: {len(self.times)} images"
+    def described(self, origin: str = "") -> str:
+        """The protocol in words; ``origin``, such as " of FILE", says whose truth it is."""
+        said = f"ground truth{origin}: {len(self.times)} images"
         if self.masks is not None:
-            said += ", unregistered pixels not compared"
+            said += ", masked pixels not compared"
         if self.left_out:
             said += f"; {self.left_out} more lie before the first or after the last frame"
         return said
@@ -65,6 +65,7 @@ def prepare_reference(
         Reference images, in any order.
     mask
         (T, H, W) or (H, W) bool, True = compared; where it is False an image may hold anything, NaN included.
+        Default: that of the truth.
 
     Raises
     ------
@@ -80,7 +81,8 @@ def prepare_reference(
             f"ground truth: images {images.shape} at {len(times)} times for a sensor of {recording.sensor_size}; "
             "(T, height, width) at T times is needed"
         )
-    masks = None if mask is None else _masks(mask, images.shape)
+    given = truth.masks if mask is None else mask
+    masks = None if given is None else _masks(given, images.shape)
     first, last = _span(recording)
     order = np.argsort(times, kind="stable")
     chosen = order[(times[order] >= first) & (times[order] <= last)]
@@ -154,6 +156,12 @@ def truth_pairs(recording: Recording, reference: Reference, method: Method) -> I
             made.variance,
             log_offset=made.log_offset,
         )
+
+
+def truth_beside(path: Path) -> Path:
+    """Where the ground truth of a recording lies, if it has any: ``X_gt.npz`` beside ``X.mat`` or the folder ``X``."""
+    name = path.name if path.is_dir() else path.stem
+    return path.with_name(f"{name}_gt.npz")
 
 
 def load_truth(path: Path) -> tuple[GroundTruth, NDArray[np.bool_] | None]:

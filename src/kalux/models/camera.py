@@ -104,9 +104,33 @@ class Response:
         return cls(table, response)
 
     @classmethod
+    def s_curve(cls, black: float) -> Response:
+        """A smooth S: black up to the irradiance ``black``, then 3 u^2 - 2 u^3 of u = 0 to 1, up to white.
+
+        What is black rises by a quarter of an 8-bit level, since a response must increase.
+
+        Parameters
+        ----------
+        black
+            0 to less than 1.
+        """
+        if not (np.isfinite(black) and 0 <= black < 1):
+            raise SettingsError(f"response: an s-curve is black up to {black}; 0 to less than 1 is needed")
+        # Dense where the curve is flat, so that its inverse is as precise there as elsewhere.
+        u = (1.0 - np.cos(np.linspace(0.0, np.pi, 16 * _LEVELS))) / 2.0
+        toe = 0.25 / 255 if black > 0 else 0.0
+        irradiance, response = black + (1.0 - black) * u, toe + (1.0 - toe) * u**2 * (3.0 - 2.0 * u)
+        rising = np.concatenate([[True], np.diff(response) > 0])
+        irradiance, response = irradiance[rising], response[rising]
+        if black > 0:
+            irradiance, response = np.append(0.0, irradiance), np.append(0.0, response)
+        irradiance[-1] = response[-1] = 1.0
+        return cls(irradiance, response)
+
+    @classmethod
     def named(cls, name: str) -> Response:
-        """``"linear"``, ``"srgb"``, ``"gamma:2.2"``, or ``"curve:0 0.2 1"`` for `curve`."""
-        if name == "linear":
+        """``"linear"`` or ``"auto"``, ``"srgb"``, ``"gamma:2.2"``, ``"s-curve:0.4"``, or ``"curve:0 0.2 1"``."""
+        if name in ("linear", "auto"):
             return cls.linear()
         if name == "srgb":
             return cls.srgb()
@@ -123,8 +147,11 @@ class Response:
             kind = ""
         if kind == "gamma":
             return cls.gamma(value)
+        if kind == "s-curve":
+            return cls.s_curve(value)
         raise SettingsError(
-            f"response: unknown response {name!r}; known are linear, srgb, gamma:EXPONENT and curve:NUMBERS"
+            f"response: unknown response {name!r}; known are linear, srgb, gamma:EXPONENT, s-curve:BLACK and "
+            "curve:NUMBERS"
         )
 
     def __call__(self, irradiance: Array) -> Array:

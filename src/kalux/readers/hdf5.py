@@ -63,6 +63,7 @@ def read(path: Path) -> Source:
         threshold = file.attrs.get("contrast_threshold")
         inverse_covariance = file["inverse_covariance"][...] if "inverse_covariance" in file else None
         has_ground_truth = "ground_truth" in file
+        response = _text(file["frames"].attrs["response"]) if "response" in file["frames"].attrs else None
         contrast_threshold = None if threshold is None else (float(threshold[0]), float(threshold[1]))
     missing: tuple[str, ...] = ()
     if not event_count:
@@ -83,6 +84,7 @@ def read(path: Path) -> Source:
         contrast_threshold=contrast_threshold,
         inverse_covariance=inverse_covariance,
         ground_truth=(lambda: _ground_truth(path)) if has_ground_truth else None,
+        response=response,
         missing=missing,
         mosaic=mosaic,
     )
@@ -148,11 +150,16 @@ def _ground_truth(path: Path) -> GroundTruth:
     with reading(path, *_DAMAGE), h5py.File(path, "r") as file:
         group = file["ground_truth"]
         times, images = group["times"][...].astype(np.int64), group["images"][...].astype(np.float32)
+        masks = group["masks"][...].astype(bool) if "masks" in group else None
     if images.ndim != 3 or len(times) != len(images):
         raise FormatError(
             f"{path}: ground truth has {len(times)} times for {images.shape} images; write it again"
         )
-    return GroundTruth(times, images)
+    if masks is not None and masks.shape != images.shape:
+        raise FormatError(
+            f"{path}: ground truth has {masks.shape} masks for {images.shape} images; write it again"
+        )
+    return GroundTruth(times, images, masks)
 
 
 class TruthStream(NamedTuple):
@@ -181,6 +188,7 @@ def write(
     inverse_covariance: NDArray[np.float64] | None = None,
     ground_truth: GroundTruth | TruthStream | None = None,
     mosaic: Mosaic | None = None,
+    response: str | None = None,
 ) -> None:
     """Write a recording, chunk by chunk, in bounded memory.
 
@@ -206,6 +214,8 @@ def write(
         Reference images, or a stream of them.
     mosaic
         The sensor's Bayer pattern. Default: that of the frames.
+    response
+        Of the frame camera, named as in `kalux.settings.CameraSettings`.
 
     Raises
     ------
@@ -230,12 +240,15 @@ def write(
                     file["inverse_covariance"] = np.asarray(inverse_covariance, np.float64)
                 if ground_truth is not None:
                     images = sink.checked(iter(ground_truth.images))
-                    _write_ground_truth(
-                        file.create_group("ground_truth"), ground_truth.times, images, sensor_size
-                    )
+                    group = file.create_group("ground_truth")
+                    _write_ground_truth(group, ground_truth.times, images, sensor_size)
+                    if isinstance(ground_truth, GroundTruth) and ground_truth.masks is not None:
+                        _write_masks(group, ground_truth.masks)
                 _write_events(file.create_group("events"), sink.checked(events))
+                if response is not None:
+                    file.create_group("frames").attrs["response"] = np.bytes_(response)
                 _write_frames(
-                    file.create_group("frames"), sink.checked(frames), sensor_size, exposure_known, mosaic
+                    file.require_group("frames"), sink.checked(frames), sensor_size, exposure_known, mosaic
                 )
             sink.check()
         os.replace(partial, path)
@@ -388,3 +401,9 @@ def _write_ground_truth(
     )
     for index, image in enumerate(images):
         stored[index] = image
+
+
+def _write_masks(group: Any, masks: NDArray[np.bool_]) -> None:
+    group.create_dataset(
+        "masks", data=masks, maxshape=(None, *masks.shape[1:]), chunks=(1, *masks.shape[1:]), **_packing()
+    )

@@ -210,10 +210,12 @@ def _ground_truth(
         )
 
     def load() -> GroundTruth:
-        images = [
-            _mean_of_channels(image) / np.float32(_WHITE) for image in variables.images("HDR_mat", count)
-        ]
-        return GroundTruth(times, np.stack(images))
+        images, masks = [], []
+        for image in variables.images("HDR_mat", count):
+            grey = _mean_of_channels(image)
+            images.append(grey / np.float32(_WHITE))
+            masks.append(grey > 0)
+        return GroundTruth(times, np.stack(images), None if np.all(masks) else np.stack(masks))
 
     return load
 

@@ -36,10 +36,13 @@ class GroundTruth:
         (T,) int64, us.
     images
         (T, height, width) float32, linear, 1.0 = a saturated frame pixel.
+    masks
+        (T, height, width) bool, True where an image is the truth, if that is not everywhere.
     """
 
     times: NDArray[np.int64]
     images: NDArray[np.float32]
+    masks: NDArray[np.bool_] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,6 +72,8 @@ class Source:
         (256,) the released datasets' ``f_Q``: 1 / R_bar for each 8-bit value, 1/s; None if absent.
     ground_truth
         Called for the reference images; None if there are none.
+    response
+        The frame camera's response, named as in `kalux.settings.CameraSettings`, if the recording states it.
     triggers
         Called for a fresh iterator over bounded chunks of `TRIGGER_DTYPE`; None where the format has none.
     missing
@@ -91,6 +96,7 @@ class Source:
     contrast_threshold: tuple[float, float] | None = None
     inverse_covariance: NDArray[np.float64] | None = None
     ground_truth: Callable[[], GroundTruth] | None = None
+    response: str | None = None
     triggers: Callable[[], Iterator[TriggerArray]] | None = None
     missing: tuple[str, ...] = field(default=())
     sensor_size_known: bool = True

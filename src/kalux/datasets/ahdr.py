@@ -1,0 +1,161 @@
+"""Artificial HDR recordings: real frames, clipped by an artificial camera, with the originals as their truth.
+
+The protocol of the paper's AHDR data (section 5): an artificial camera response takes the dark and the bright end off
+every frame, and what was there is what a reconstruction must find in the events. The authors publish five curves, cut
+at 30, 50, 80, 100 and 115. Those files are not needed here: a cut of c makes levels below c black and those above
+255 - c white (of cut 100 the paper says, "higher than 160 or lower than 100"), with a smooth S in between
+(`kalux.models.camera.Response.s_curve`).
+
+What makes the comparison fair: the artificial response is written into the recording, so that every method inverts it;
+1 is the white of the artificial camera, and the truth goes beyond it. What it cannot tell: frames and truth share the
+noise and the blur of the originals, so that the clipped frame itself is perfect where it is not clipped. Held-out
+frames (``every``) do not have that flaw.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux.errors import FrameError, InputError
+from kalux.frames import Frame
+from kalux.models.camera import Camera, Response, inverse_response
+from kalux.readers import GroundTruth
+from kalux.recording import Recording
+from kalux.settings import CameraSettings, chosen_response
+
+CUTS: Final = (30, 50, 80, 100, 115)
+"""Those of the published data, of 255."""
+
+
+@dataclass(frozen=True)
+class ArtificialCamera:
+    """What an artificial camera sees of the intensity of a real one's frame.
+
+    Attributes
+    ----------
+    low, high
+        Intensities, 0 to 1 = a saturated pixel of the real camera, up to which it sees black and from which it sees
+        white.
+
+    Raises
+    ------
+    InputError
+        If they are not in order within 0 to 1.
+    """
+
+    low: float
+    high: float
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.low < self.high <= 1:
+            raise InputError(
+                f"artificial camera: black up to {self.low:g} and white from {self.high:g}; 0 <= black < white <= 1 "
+                "is needed"
+            )
+
+    @classmethod
+    def with_cut(cls, cut: float) -> ArtificialCamera:
+        """Both ends cut by as much, of 255: less than 127.5."""
+        if not 0 <= cut < 127.5:
+            raise InputError(
+                f"artificial camera: a cut of {cut:g} leaves nothing; 0 to less than 127.5 is possible"
+            )
+        return cls(cut / 255, 1 - cut / 255)
+
+    @property
+    def response(self) -> str:
+        """Its response, as in `kalux.settings.CameraSettings`: irradiance 1 is its white."""
+        return f"s-curve:{self.low / self.high!r}"
+
+
+def artificial_hdr(
+    recording: Recording,
+    camera: ArtificialCamera,
+    *,
+    response: str = "auto",
+    black: float = 0.0,
+    every: int | None = None,
+) -> Recording:
+    """A recording as an artificial camera would have made it, with the original frames as ground truth.
+
+    Events are untouched. Frames keep their exposures, and have 8 bits. The truth is at the middle of exposures, 1 = the
+    white of the artificial camera at the recording's median exposure; masked where the original was saturated itself.
+
+    Parameters
+    ----------
+    recording
+        With known exposures.
+    camera
+        The artificial one.
+    response
+        Of the real one, as in `kalux.settings.CameraSettings`.
+    black
+        Response, 0 to 1, that is black in the original frames (14 of 255 in the authors' data).
+    every
+        Leave out every ``every``-th frame (numbers every - 1, 2 every - 1 ..., from 0); the truth is then those
+        frames alone. At least 2. None: all frames are kept, and all are truth.
+
+    Raises
+    ------
+    InputError
+        If ``every`` or ``black`` is out of its range.
+    FrameError
+        If there are too few frames, or all are black.
+    """
+    if every is not None and every < 2:
+        raise InputError(f"artificial HDR: every is {every}; at least 2 is needed")
+    if not 0 <= black < 1:
+        raise InputError(f"artificial HDR: black is {black}; 0 to less than 1 is possible")
+    real = Camera(Response.named(chosen_response(response, recording.response)))
+    artificial = Response.named(camera.response)
+    kept = [f.exposure for i, f in enumerate(recording.frames()) if every is None or i % every != every - 1]
+    if len(kept) < 2:
+        raise FrameError(f"{recording.source.path}: {len(kept)} frames are too few for artificial HDR")
+
+    def frames() -> Iterator[Frame]:
+        for index, frame in enumerate(recording.frames()):
+            if every is None or index % every != every - 1:
+                intensity = _intensity(frame, real, black, 1.0)
+                level = artificial(np.minimum(intensity / camera.high, 1.0))
+                levels = np.rint(255 * level).astype(np.uint8)
+                yield Frame(levels, frame.exposure_start, frame.exposure_end)
+
+    reference = round(float(np.median(kept)))
+
+    def truth() -> GroundTruth:
+        times, images, masks = [], [], []
+        for index, frame in enumerate(recording.frames()):
+            if every is None or index % every == every - 1:
+                image = _intensity(frame, real, black, reference / frame.exposure) / camera.high
+                times.append(frame.middle)
+                images.append(np.maximum(image, 0.0).astype(np.float32))
+                masks.append(frame.normalised() < CameraSettings().saturation)
+        whole = np.stack(masks)
+        return GroundTruth(np.array(times, np.int64), np.stack(images), None if whole.all() else whole)
+
+    if recording.source.count_frames() and not any(f.image.any() for f in recording.frames()):
+        raise FrameError(f"{recording.source.path}: all frames are black; there is nothing to cut")
+    return Recording(
+        dataclasses.replace(
+            recording.source,
+            events=lambda: iter(recording.events()),
+            frames=frames,
+            count_frames=lambda: len(kept),
+            exposure_known=True,
+            inverse_covariance=None,  # of the real camera
+            ground_truth=truth,
+            response=camera.response,
+        )
+    )
+
+
+def _intensity(frame: Frame, camera: Camera, black: float, exposure_ratio: float) -> NDArray[np.float64]:
+    """Intensity of a frame, its black taken off, 1 = saturated."""
+    level = (frame.normalised() - black) / (1.0 - black)
+    return inverse_response(camera, level, exposure_ratio)

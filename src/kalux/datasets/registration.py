@@ -1,0 +1,498 @@
+"""Registration of images of a static, distant scene: features and a homography, refined on the intensities.
+
+As in section 5 of the paper, with SIFT [1]_ (whose patent has expired) in place of SURF, and MAGSAC++ [2]_ for the
+homography. Features place an image to about a third of a pixel; the Lucas-Kanade refinement [3]_ on the log
+intensities, which a difference in exposure only shifts, to a few hundredths.
+
+References
+----------
+.. [1] D. Lowe, "Distinctive Image Features from Scale-Invariant Keypoints", IJCV 60(2), 2004.
+.. [2] D. Barath et al., "MAGSAC++, a Fast, Reliable and Accurate Robust Estimator", CVPR 2020.
+.. [3] S. Baker, I. Matthews, "Lucas-Kanade 20 Years On: A Unifying Framework", IJCV 56(3), 2004.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux.errors import InputError
+from kalux.frames import Frame
+from kalux.models.camera import Camera, Response, inverse_response
+from kalux.readers import GroundTruth
+from kalux.recording import Recording
+
+Array = NDArray[np.float64]
+Image = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+LEAST_INLIERS: Final = 15
+"""Matches that agree on a homography, at least: its four points must be many times overdetermined."""
+
+_RATIO: Final = 0.8  # of the distances of the best and the second best match (Lowe)
+_INLIER_DISTANCE: Final = 2.0  # pixels of the fixed image: SIFT in noisy, blurry frames
+_WORK_WIDTH: Final = 640  # smaller images are enlarged for SIFT, which finds little in 240 x 180
+_MOST_FEATURES: Final = 6000
+_ITERATIONS: Final = 20
+_UNSMOOTHED: Final = 1.2  # pixels per pixel: bilinear sampling alone smooths as much
+_CONVERGED: Final = 0.002  # pixels
+_LEAP: Final = 5.0  # pixels: a step that is no refinement any more
+_HUBER: Final = 1.345  # standard deviations; 95 % efficient for Gaussian errors
+
+
+@dataclass(frozen=True, eq=False)
+class Match:
+    """A homography from features.
+
+    Attributes
+    ----------
+    matrix
+        (3, 3) float64: from (x, y, 1) in the fixed image to the same point in the moving one, up to a factor.
+        Pixel centres are whole numbers. None: no homography was found.
+    matches, inliers
+        How many features look alike, and how many of them agree with the homography.
+    """
+
+    matrix: Array | None
+    matches: int
+    inliers: int
+
+
+def tone_compressed(log_intensity: NDArray[Any], low: float, high: float) -> NDArray[np.uint8]:
+    """A log intensity as a picture: ``low`` is 0, ``high`` is 255."""
+    share = (log_intensity - low) / max(high - low, 1e-6)
+    return np.asarray(np.rint(255 * np.clip(share, 0.0, 1.0)), np.uint8)
+
+
+class Features(NamedTuple):
+    """SIFT features of a picture: its (height, width), positions (N, 2) in its pixels, and descriptors (N, 128)."""
+
+    size: tuple[int, int]
+    points: Array
+    descriptors: Any
+
+
+def match_features(fixed: Features, moving: Features) -> Match:
+    """The homography on which most features of two pictures, of any two sizes, agree."""
+    points, moving_points = fixed.points, moving.points
+    if min(len(points), len(moving_points)) < 4:
+        return Match(None, 0, 0)
+    pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(fixed.descriptors, moving.descriptors, k=2)
+    good = [p[0] for p in pairs if len(p) == 2 and p[0].distance < _RATIO * p[1].distance]
+    if len(good) < 4:
+        return Match(None, len(good), 0)
+    source = np.array([points[m.queryIdx] for m in good])
+    target = np.array([moving_points[m.trainIdx] for m in good])
+    # From the moving to the fixed image, so that the inlier distance is in pixels of the fixed one.
+    found, inliers = cv2.findHomography(target, source, cv2.USAC_MAGSAC, _INLIER_DISTANCE, None, 5000, 0.9999)
+    if found is None or not np.isfinite(found).all() or abs(np.linalg.det(found)) < 1e-12:
+        return Match(None, len(good), 0)
+    matrix: Array = np.asarray(np.linalg.inv(found), np.float64)
+    count = int(np.count_nonzero(inliers))
+    if count < LEAST_INLIERS or not is_plausible(matrix, fixed.size):
+        return Match(None, len(good), count)
+    return Match(matrix / matrix[2, 2], len(good), count)
+
+
+def find_features(picture: NDArray[np.uint8], mask: Mask) -> Features:
+    """SIFT features of an (H, W) picture, where the mask is True."""
+    size = (picture.shape[0], picture.shape[1])
+    scale = max(_WORK_WIDTH / size[1], 1.0)
+    allowed = mask.astype(np.uint8)
+    if scale > 1.0:
+        larger = (round(size[1] * scale), round(size[0] * scale))
+        picture = np.asarray(cv2.resize(picture, larger, interpolation=cv2.INTER_CUBIC), np.uint8)
+        allowed = np.asarray(cv2.resize(allowed, larger, interpolation=cv2.INTER_NEAREST), np.uint8)
+    # A low threshold: the ratio test and the homography judge the features, not their contrast.
+    sift = cv2.SIFT.create(_MOST_FEATURES, contrastThreshold=0.02)
+    keypoints, descriptors = sift.detectAndCompute(picture, allowed)
+    points = np.array([k.pt for k in keypoints], np.float64).reshape(-1, 2)
+    return Features(size, (points + 0.5) / scale - 0.5, descriptors)
+
+
+def is_plausible(matrix: Array, size: tuple[int, int]) -> bool:
+    """Whether a homography keeps the corners of a (height, width) image convex, in order, and of a likely size."""
+    corners = transformed(matrix, corners_of(size))
+    if not np.isfinite(corners).all():
+        return False
+    edges = np.roll(corners, -1, axis=0) - corners
+    following = np.roll(edges, -1, axis=0)
+    turns = edges[:, 0] * following[:, 1] - edges[:, 1] * following[:, 0]
+    area = 0.5 * abs(
+        np.sum(corners[:, 0] * np.roll(corners[:, 1], -1) - corners[:, 1] * np.roll(corners[:, 0], -1))
+    )
+    share = area / (size[0] * size[1])
+    return bool((turns > 0).all() and 1e-2 < share < 1e4)
+
+
+def corners_of(size: tuple[int, int]) -> Array:
+    """(4, 2): x and y of the corners of a (height, width) image, clockwise."""
+    height, width = size
+    return np.array([[0, 0], [width - 1, 0], [width - 1, height - 1], [0, height - 1]], np.float64)
+
+
+def transformed(matrix: Array, points: Array) -> Array:
+    """Points (N, 2) under a homography; infinite where they go to infinity."""
+    homogeneous = points @ matrix[:, :2].T + matrix[:, 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(homogeneous[:, :2] / homogeneous[:, 2:], np.float64)
+
+
+def displacement(first: Array, second: Array, size: tuple[int, int]) -> float:
+    """Largest distance, pixels, between where two homographies send the corners of a (height, width) image."""
+    corners = corners_of(size)
+    apart = transformed(first, corners) - transformed(second, corners)
+    return float(np.sqrt((apart**2).sum(axis=1)).max())
+
+
+def warped(image: NDArray[Any], matrix: Array, size: tuple[int, int]) -> Image:
+    """The moving image seen in the fixed one's pixels: (height, width) or (height, width, C) float32.
+
+    Where it is shown smaller than it is, it is smoothed first, as the larger pixels would. NaN beyond its edges.
+    """
+    return resampled(as_seen(image, _scale_at_middle(matrix, size)), matrix, size, np.nan)
+
+
+def as_seen(image: NDArray[Any], shrink: float) -> Image:
+    """An image as pixels ``shrink`` times as large would see it, not resampled: float32."""
+    smooth = np.ascontiguousarray(image, np.float32)
+    if shrink <= _UNSMOOTHED:
+        return smooth
+    # A box of the fixed image's pixel has the variance shrink^2 / 12; one moving pixel is there already.
+    sigma = float(np.sqrt((shrink**2 - 1) / 12))
+    return np.asarray(cv2.GaussianBlur(smooth, (0, 0), sigma, borderType=cv2.BORDER_REFLECT_101), np.float32)
+
+
+def resampled(image: Image, matrix: Array, size: tuple[int, int], outside: float) -> Image:
+    """The moving image's values at the fixed one's pixels, bilinear; ``outside`` beyond its edges."""
+    return np.asarray(
+        cv2.warpPerspective(
+            image,
+            matrix,
+            (size[1], size[0]),
+            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+            borderMode=cv2.BORDER_CONSTANT,
+            borderValue=(outside,) * 4,
+        ),
+        np.float32,
+    )
+
+
+def warped_mask(mask: Mask, matrix: Array, size: tuple[int, int]) -> Mask:
+    """Where all that a pixel of the fixed image sees of the moving one is valid: (height, width) bool."""
+    valid = eroded(mask, _scale_at_middle(matrix, size))
+    return np.asarray(resampled(valid, matrix, size, 0.0) > 0.999)
+
+
+def eroded(mask: Mask, shrink: float) -> Image:
+    """1 where pixels ``shrink`` times as large see only what is valid, else 0: float32."""
+    reach = 1 if shrink <= _UNSMOOTHED else int(np.ceil(shrink))
+    kernel = np.ones((2 * reach - 1, 2 * reach - 1), np.uint8)
+    return 1.0 - np.asarray(cv2.dilate((~mask).astype(np.uint8), kernel), np.float32)
+
+
+def _scale_at_middle(matrix: Array, size: tuple[int, int]) -> float:
+    """Pixels of the moving image per pixel of the fixed one."""
+    x, y = (size[1] - 1) / 2, (size[0] - 1) / 2
+    square = np.array([[x, y], [x + 1, y], [x, y + 1]])
+    a, b, c = transformed(matrix, square)
+    u, v = b - a, c - a
+    return float(np.sqrt(abs(u[0] * v[1] - u[1] * v[0])))
+
+
+def refined(
+    fixed: NDArray[Any], moving: NDArray[Any], fixed_mask: Mask, moving_mask: Mask, matrix: Array
+) -> tuple[Array, float]:
+    """A homography, improved so that the moving image equals the fixed one up to a constant.
+
+    Parameters
+    ----------
+    fixed, moving
+        (H, W) log intensities, of any two sizes.
+    fixed_mask, moving_mask
+        bool, True where they are measured.
+    matrix
+        Within a pixel or so.
+
+    Returns
+    -------
+    The matrix, and the robust standard deviation of what is left, log intensity (infinite without overlap).
+    """
+    size = (fixed.shape[0], fixed.shape[1])
+    target = np.asarray(cv2.GaussianBlur(np.asarray(fixed, np.float32), (0, 0), 0.8), np.float64)
+    shrink = _scale_at_middle(matrix, size)
+    filled = np.where(moving_mask, moving, np.median(moving[moving_mask]) if moving_mask.any() else 0.0)
+    # As smooth as the target: its 0.8 pixels, in pixels of the moving image, and what its pixels smooth.
+    source = np.asarray(cv2.GaussianBlur(as_seen(filled, shrink), (0, 0), 0.8 * shrink), np.float32)
+    valid = eroded(moving_mask, shrink)
+    # Around the middle and to about 1, so that the eight parameters are of one size.
+    centre = np.array([[2 / size[1], 0, -1 + 1 / size[1]], [0, 2 / size[1], -size[0] / size[1]], [0, 0, 1]])
+    rows, columns = np.mgrid[: size[0], : size[1]]
+    x, y = centre[0, 0] * columns + centre[0, 2], centre[1, 1] * rows + centre[1, 2]
+    current, deviation = matrix, np.inf
+    for _ in range(_ITERATIONS):
+        image = resampled(source, current, size, 0.0).astype(np.float64)
+        inside = fixed_mask & (resampled(valid, current, size, 0.0) > 0.999)
+        if np.count_nonzero(inside) < 50 * 8:
+            return current, np.inf
+        gy, gx = np.gradient(image)
+        gx, gy = gx / centre[0, 0], gy / centre[1, 1]
+        inside[0], inside[-1], inside[:, 0], inside[:, -1] = False, False, False, False
+        slope = x * gx + y * gy
+        columns_of = (gx * x, gx * y, gx, gy * x, gy * y, gy, -slope * x, -slope * y, np.ones(size))
+        jacobian = np.stack([column[inside] for column in columns_of], axis=1)
+        residual = (target - image)[inside]
+        offset = np.median(residual)
+        deviation = 1.4826 * float(np.median(np.abs(residual - offset))) + 1e-9
+        weight = np.minimum(1.0, _HUBER * deviation / np.maximum(np.abs(residual - offset), 1e-12))
+        normal = jacobian.T @ (weight[:, None] * jacobian)
+        step = np.linalg.lstsq(normal, jacobian.T @ (weight * residual), rcond=1e-10)[0]
+        update = np.eye(3) + np.append(step[:8], 0.0).reshape(3, 3)
+        following = current @ np.linalg.inv(centre) @ update @ centre
+        following = following / following[2, 2]
+        moved = displacement(following, current, size) / shrink
+        if not is_plausible(following, size) or moved > _LEAP:
+            return current, deviation
+        current = following
+        if moved < _CONVERGED:
+            break
+    return current, deviation
+
+
+# --- a reference, registered to every frame of a recording --------------------------------------------------
+
+
+class RegisteredFrame(NamedTuple):
+    """What became of a frame.
+
+    Attributes
+    ----------
+    number, time
+        Of the frame: from 0, and the middle of its exposure, us.
+    matrix
+        (3, 3), from the frame's pixels to the reference's; None: it could not be registered.
+    inliers
+        Features that agree.
+    deviation
+        Robust standard deviation between frame and reference, log intensity, where the frame is well exposed.
+    scale
+        What the reference must be multiplied by, so that 1 is a saturated pixel at the recording's median exposure.
+    failure
+        Why it is left out; empty if it is not.
+    """
+
+    number: int
+    time: int
+    matrix: Array | None
+    inliers: int
+    deviation: float
+    scale: float
+    failure: str
+
+
+@dataclass(frozen=True, eq=False)
+class RegisteredTruth:
+    """A reference image in the pixels of the frames that it could be registered to.
+
+    Attributes
+    ----------
+    frames
+        All frames of the recording, also those that are left out.
+    scale
+        The one that the truth has: the median of the frames'.
+    truth
+        An image at the middle of every registered frame's exposure; linear, 1 = a saturated pixel at the median
+        exposure; 0 where it is not valid.
+    masks
+        (T, H, W) bool: where it is valid.
+    """
+
+    frames: list[RegisteredFrame]
+    scale: float
+    truth: GroundTruth
+    masks: NDArray[np.bool_]
+
+
+_LOG_OFFSET: Final = 0.02  # white = 1; the noise of dark pixels must not be magnified by the logarithm
+_EXPOSED: Final = (0.03, 0.96)  # of the frame's response
+_LEAST_CORRELATION: Final = (
+    0.7  # of log intensities: blur and noise lower it to about 0.9, a wrong place below 0.5
+)
+_LEAST_MEASURED: Final = 0.02  # share of the frame's pixels that must be comparable
+_SCALE_TOLERANCE: Final = 0.15  # relative; more is another exposure or another light
+
+
+def register_frames(
+    luminance: NDArray[Any],
+    valid: Mask,
+    recording: Recording,
+    *,
+    response: str = "linear",
+    blur: float = 0.0,
+    on_frame: Callable[[], None] = lambda: None,
+) -> RegisteredTruth:
+    """Register a reference image to every frame, as in section 5 of the paper.
+
+    The scene must be static and far away, or the camera only rotate: then a homography says it all.
+
+    Parameters
+    ----------
+    luminance
+        (H, W) linear, any scale: of any size, but showing all that the frames show.
+    valid
+        (H, W) bool.
+    recording
+        With known exposures.
+    response
+        Of its frame camera, as in `kalux.settings.CameraSettings`.
+    blur
+        Standard deviation, pixels of the frame, by which the frames' lens blurs more than the reference's; the size
+        of the frame's pixels is accounted for without it.
+    on_frame
+        Called after every frame.
+
+    Raises
+    ------
+    InputError
+        If no frame can be registered.
+    """
+    camera = Camera(Response.named(response))
+    exposure = _median_exposure(recording)
+    found: list[RegisteredFrame] = []
+    features: Features | None = None
+    for index, frame in enumerate(recording.frames()):
+        known = [f.scale for f in found if not f.failure]
+        if features is None or len(known) in (0, 1):  # once more when the scale is known
+            features = _reference_features(luminance, valid, frame, camera, exposure, known)
+        guess = float(np.median(known)) if known else None
+        found.append(_register(luminance, valid, features, frame, index, camera, exposure, guess))
+        on_frame()
+    scales = [f.scale for f in found if not f.failure]
+    if not scales:
+        reasons = {f.failure for f in found}
+        raise InputError(
+            f"{recording.source.path}: the reference cannot be registered to any of {len(found)} frames "
+            f"({'; '.join(sorted(reasons)[:3])}); do they show the same scene?"
+        )
+    scale = float(np.median(scales))
+    found = [_checked_scale(f, scale) for f in found]
+    size = recording.sensor_size
+    images, masks, times = [], [], []
+    for placed in found:
+        if placed.matrix is not None and not placed.failure:
+            mask = warped_mask(valid, placed.matrix, size)
+            image = warped(np.where(valid, luminance, 0.0), placed.matrix, size)
+            image = _blurred(np.nan_to_num(image), mask, blur)
+            images.append(np.where(mask, scale * image, 0.0).astype(np.float32))
+            masks.append(mask)
+            times.append(placed.time)
+    truth = GroundTruth(np.array(times, np.int64), np.stack(images))
+    return RegisteredTruth(found, scale, truth, np.stack(masks))
+
+
+def _blurred(image: Image, mask: Mask, sigma: float) -> Image:
+    """An image blurred, of its valid pixels only."""
+    if sigma <= 0:
+        return image
+    weight = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), sigma)
+    total = cv2.GaussianBlur(np.where(mask, image, 0).astype(np.float32), (0, 0), sigma)
+    return np.asarray(total / np.maximum(weight, 1e-6), np.float32)
+
+
+def _median_exposure(recording: Recording) -> int:
+    exposures = [frame.exposure for frame in recording.frames()]
+    if not exposures:
+        raise InputError(f"{recording.source.path}: no frames to register a reference to")
+    return round(float(np.median(exposures)))
+
+
+def _register(
+    luminance: NDArray[Any],
+    valid: Mask,
+    features: Features,
+    frame: Frame,
+    index: int,
+    camera: Camera,
+    exposure: int,
+    guess: float | None,
+) -> RegisteredFrame:
+    size = (frame.image.shape[0], frame.image.shape[1])
+    level = frame.normalised()
+    intensity = inverse_response(camera, level, exposure / frame.exposure)
+    exposed = (level > _EXPOSED[0]) & (level < _EXPOSED[1])
+
+    def failed(why: str, inliers: int = 0) -> RegisteredFrame:
+        return RegisteredFrame(index, frame.middle, None, inliers, np.inf, np.nan, why)
+
+    if exposed.mean() < _LEAST_MEASURED:
+        return failed(f"{100 * exposed.mean():.1f} % of its pixels are exposed well")
+    scale = guess or _guessed_scale(luminance, valid, intensity)
+    seen = np.log(np.maximum(intensity, 0.0) + _LOG_OFFSET)
+    picture = tone_compressed(seen, *_tone_range(seen))
+    match = match_features(find_features(picture, np.ones(size, bool)), features)
+    if match.matrix is None:
+        return failed(f"{match.inliers} of {match.matches} common features agree", match.inliers)
+    matrix, deviation = match.matrix, np.inf
+    for _ in range(2):  # the logarithm has an offset, so the scale must be right for the refinement to be
+        scale = _fitted_scale(luminance, valid, intensity, exposed, matrix) or scale
+        relative = np.log(scale * luminance + _LOG_OFFSET)
+        matrix, deviation = refined(seen, relative, exposed, valid, matrix)
+    scale = _fitted_scale(luminance, valid, intensity, exposed, matrix) or 0.0
+    compared = exposed & warped_mask(valid, matrix, size)
+    if not scale or compared.mean() < _LEAST_MEASURED:
+        return failed("too little of it is both exposed well and in the reference", match.inliers)
+    placed = np.log(scale * np.nan_to_num(warped(luminance, matrix, size)) + _LOG_OFFSET)
+    correlation = float(np.corrcoef(placed[compared], seen[compared])[0, 1])
+    if not correlation >= _LEAST_CORRELATION:
+        return failed(f"correlates by {correlation:.2f} with the reference", match.inliers)
+    return RegisteredFrame(index, frame.middle, matrix, match.inliers, deviation, scale, "")
+
+
+def _reference_features(
+    luminance: NDArray[Any],
+    valid: Mask,
+    frame: Frame,
+    camera: Camera,
+    exposure: int,
+    known_scales: list[float],
+) -> Features:
+    """Features of the reference, shown with the tones of a frame."""
+    intensity = inverse_response(camera, frame.normalised(), exposure / frame.exposure)
+    scale = known_scales[0] if known_scales else _guessed_scale(luminance, valid, intensity)
+    seen = np.log(np.maximum(intensity, 0.0) + _LOG_OFFSET)
+    return find_features(tone_compressed(np.log(scale * luminance + _LOG_OFFSET), *_tone_range(seen)), valid)
+
+
+def _guessed_scale(luminance: NDArray[Any], valid: Mask, intensity: Array) -> float:
+    """Until it is known from a frame: both show the same scene, so their medians are alike."""
+    return float(max(np.median(intensity), 1e-3) / max(np.median(luminance[valid]), 1e-12))
+
+
+def _tone_range(seen: Array) -> tuple[float, float]:
+    low, high = np.percentile(seen, (1, 99.5))
+    return float(low), float(high)
+
+
+def _fitted_scale(
+    luminance: NDArray[Any], valid: Mask, intensity: Array, exposed: Mask, matrix: Array
+) -> float | None:
+    """Median ratio of the frame's intensity to the reference's, where both are measured and not dark."""
+    size = (intensity.shape[0], intensity.shape[1])
+    image = np.nan_to_num(warped(luminance, matrix, size).astype(np.float64))
+    compared = exposed & warped_mask(valid, matrix, size) & (image > 0)
+    if np.count_nonzero(compared) < 100:
+        return None
+    # The brighter half: noise and black level matter least there.
+    compared &= intensity >= np.median(intensity[compared])
+    return float(np.median(intensity[compared] / image[compared]))
+
+
+def _checked_scale(frame: RegisteredFrame, scale: float) -> RegisteredFrame:
+    if frame.failure or abs(frame.scale / scale - 1) <= _SCALE_TOLERANCE:
+        return frame
+    return frame._replace(failure=f"{frame.scale / scale:.2f} times as bright as the other frames")

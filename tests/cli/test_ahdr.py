@@ -1,0 +1,51 @@
+"""``kalux ahdr``: a file that ``kalux evaluate`` finds the truth in; errors."""
+
+from __future__ import annotations
+
+import pytest
+
+import kalux
+
+
+def test_from_a_recording_to_scores(cli, recording, tmp_path):
+    out = tmp_path / "a.h5"
+    made = cli("ahdr", recording, "-o", out, "--cut-low", 10, "--cut-high", 80)
+    assert made.code == 0, made.err
+    assert "black up to 10 and white from 80 of 255" in made.out
+    assert made.err == ""
+    found = cli("evaluate", out, "--methods", "hold,default")
+    assert found.out.splitlines()[0].startswith(f"{out}: ground truth: ")
+    held, default = (float(line[26:].split()[0]) for line in found.out.splitlines()[2:4])
+    assert default < held
+    assert "s-curve" in kalux.open(out).response
+
+
+def test_held_out_frames(cli, recording, tmp_path):
+    out = tmp_path / "a.h5"
+    assert "4 of truth" in cli("ahdr", recording, "-o", out, "--cut", 60, "--hold-out-frames", "3").out
+    assert len(kalux.open(out).frames()) == 8
+
+
+def test_a_cut_that_leaves_no_highlights_is_told(cli, recording, tmp_path):
+    found = cli("ahdr", recording, "-o", tmp_path / "a.h5", "--cut", 0, "--response", "gamma:0.2")
+    assert found.code == 0
+    assert ("no pixel of any frame is white" in found.err) == ("0.0 % of pixels white" in found.out)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["-o", "x.mat"], "ends in .h5"),
+        (["-o", "x.h5", "--cut", "128"], "leaves nothing"),
+        (["-o", "x.h5", "--cut", "30", "--cut-low", "3"], "--cut-low and --cut-high"),
+        (["-o", "x.h5", "--cut-low", "90", "--cut-high", "80"], "black < white"),
+        (["-o", "x.h5", "--hold-out-frames", "1"], "at least 2"),
+        (["-o", "x.h5", "--response", "film"], "unknown response"),
+    ],
+)
+def test_errors_are_one_line(cli, recording, tmp_path, monkeypatch, arguments, told):
+    monkeypatch.chdir(tmp_path)
+    found = cli("ahdr", recording, *arguments)
+    assert found.code == 2
+    assert told in found.error
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,116 @@
+"""Artificial HDR: what the artificial camera sees, the truth in its units, frames held out."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import kalux
+from kalux.datasets.ahdr import CUTS, ArtificialCamera, artificial_hdr
+from kalux.errors import FrameError, InputError, SettingsError
+from kalux.evaluation.baselines import methods
+from kalux.evaluation.truth import evaluate_truth, prepare_reference
+from kalux.models.camera import Response
+from kalux.readers import hdf5
+
+from builders import frame, moving_blocks
+
+LEVELS = np.arange(256, dtype=np.uint8).reshape(16, 16)
+
+
+def recording_of(images, exposures=None):
+    exposures = exposures or [1000] * len(images)
+    frames = [
+        frame(i, 10_000 * k, 10_000 * k + e) for k, (i, e) in enumerate(zip(images, exposures, strict=True))
+    ]
+    return kalux.Recording.from_arrays(np.empty(0, kalux.EVENT_DTYPE), frames, sensor_size=images[0].shape)
+
+
+@pytest.mark.parametrize("cut", CUTS)
+def test_ends_are_cut_and_the_rest_is_what_it_was(cut):
+    """Below the cut black, above 255 - cut white; between, the stated response gives back the original."""
+    found = artificial_hdr(recording_of([LEVELS] * 3), ArtificialCamera.with_cut(cut))
+    image = next(iter(found.frames())).image
+    assert (image[cut >= LEVELS] == 0).all()
+    assert (image[255 - cut <= LEVELS] == 255).all()
+    assert (np.diff(image.ravel().astype(int)) >= 0).all()
+    inner = (image > 10) & (image < 245)
+    back = Response.named(found.response).inverse(image / 255.0)[inner] * (255 - cut)
+    assert np.abs(back - LEVELS[inner]).max() < 0.7
+    assert inner.sum() > 0.6 * (255 - 2 * cut)
+
+
+def test_the_truth_is_the_original_in_units_of_artificial_white():
+    exposures = [1000, 2000, 1000]
+    camera = ArtificialCamera(20 / 255, 100 / 255)
+    truth = artificial_hdr(recording_of([LEVELS] * 3, exposures), camera).ground_truth()
+    assert truth.times.tolist() == [500, 11_000, 20_500]
+    for image, exposure in zip(truth.images, exposures, strict=True):
+        assert np.allclose(image, LEVELS / 100 * (1000 / exposure), rtol=1e-5)
+    assert np.array_equal(truth.masks[0], LEVELS / 255 < 0.98)
+
+
+def test_black_and_the_real_response_are_taken_off():
+    camera = ArtificialCamera(0.1, 0.5)
+    found = artificial_hdr(recording_of([LEVELS] * 2), camera, response="gamma:2", black=14 / 255)
+    expected = np.maximum((LEVELS - 14.0) / 241, 0) ** 2 / 0.5
+    assert np.allclose(found.ground_truth().images[0], expected, atol=2e-3)
+
+
+def test_held_out_frames_are_the_truth_alone():
+    found = artificial_hdr(recording_of([LEVELS] * 7), ArtificialCamera.with_cut(50), every=3)
+    assert [f.exposure_start for f in found.frames()] == [0, 10_000, 30_000, 40_000, 60_000]
+    assert len(found.frames()) == 5
+    assert found.ground_truth().times.tolist() == [20_500, 50_500]
+
+
+@pytest.fixture(scope="module")
+def simulation():
+    return moving_blocks(high=0.9)
+
+
+def test_a_recording_is_evaluated_as_it_is_written(simulation, tmp_path):
+    """The response is in the file: the defaults reconstruct and compare in the right units."""
+    found = artificial_hdr(simulation.recording(), ArtificialCamera(0.02, 0.3))
+    truth = found.ground_truth()
+    assert truth.images.max() > 2
+    hdf5.write(
+        tmp_path / "a.h5",
+        sensor_size=found.sensor_size,
+        events=found.events(),
+        frames=found.frames(),
+        contrast_threshold=found.contrast_threshold,
+        ground_truth=truth,
+        response=found.response,
+    )
+    again = kalux.open(tmp_path / "a.h5")
+    assert again.response == found.response == "s-curve:0.06666666666666667"
+    reference = prepare_reference(again, again.ground_truth())
+    scores = {name: evaluate_truth(again, reference, methods()[name]) for name in ("hold", "default")}
+    linear = evaluate_truth(again, reference, methods("linear")["default"])
+    assert scores["default"].mse < 0.5 * scores["hold"].mse
+    assert scores["default"].log_mse < 0.5 * linear.log_mse
+
+
+def test_held_frames_are_perfect_where_they_are_not_clipped(simulation):
+    found = artificial_hdr(simulation.recording(), ArtificialCamera(0.0, 1.0))
+    scores = evaluate_truth(found, prepare_reference(found, found.ground_truth()), methods()["hold"])
+    assert scores.mse < 2e-4  # its S is flat at both ends: quantisation
+
+
+def test_what_cannot_be():
+    recording = recording_of([LEVELS] * 3)
+    for bad in (lambda: ArtificialCamera.with_cut(128), lambda: ArtificialCamera(0.5, 0.4)):
+        with pytest.raises(InputError, match="artificial camera"):
+            bad()
+    camera = ArtificialCamera.with_cut(30)
+    with pytest.raises(InputError, match="every is 1"):
+        artificial_hdr(recording, camera, every=1)
+    with pytest.raises(InputError, match="black is 1"):
+        artificial_hdr(recording, camera, black=1.0)
+    with pytest.raises(FrameError, match="too few"):
+        artificial_hdr(recording_of([LEVELS]), camera)
+    with pytest.raises(FrameError, match="black"):
+        artificial_hdr(recording_of([LEVELS * 0] * 3), camera)
+    with pytest.raises(SettingsError, match="s-curve is black up to 1"):
+        Response.s_curve(1.0)

@@ -1,0 +1,161 @@
+"""Registration: known homographies and radiance of simulated recordings, frames that cannot be registered."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import cv2
+import numpy as np
+import pytest
+
+import kalux
+from kalux.datasets import SensorSettings, combine, handheld, pan, photograph_scene, simulate, spin
+from kalux.datasets.registration import (
+    displacement,
+    find_features,
+    is_plausible,
+    match_features,
+    refined,
+    register_frames,
+    resampled,
+    tone_compressed,
+    transformed,
+    warped,
+    warped_mask,
+)
+from kalux.datasets.scenes import camera_matrix
+from kalux.errors import InputError
+
+from builders import blocks
+
+SIZE = (100, 130)
+SCALE = 1.15  # below what is smoothed for the pixels' size, so that the truth is sampled as the scene is
+BLUR = 0.5
+MOTION = combine(pan(60.0, 20.0), handheld(3), spin(0.1))
+
+
+@pytest.fixture(scope="module")
+def photograph():
+    fine = blocks(0.02, 6.0, shape=(260, 340), count=900)
+    return cv2.GaussianBlur(fine, (0, 0), 0.8).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def simulation(photograph):
+    """Frames with noise and blur; hardly any events, which take the time."""
+    scene = photograph_scene(photograph, MOTION, sensor_size=SIZE, duration=700_000, scale=SCALE, blur=BLUR)
+    sensor = SensorSettings(
+        threshold_on=9, threshold_off=9, frame_rate=10.0, exposure=8_000, read_noise=0.005, full_well=20_000
+    )
+    return simulate(scene, sensor)
+
+
+@pytest.fixture(scope="module")
+def registered(simulation, photograph):
+    unit = 7.3  # of the reference, which is not the frames'
+    everywhere = np.ones(photograph.shape, bool)
+    return register_frames(unit * photograph, everywhere, simulation.recording(), blur=BLUR), unit
+
+
+def true_matrix(photograph, t):
+    centre = ((photograph.shape[1] - 1) / 2, (photograph.shape[0] - 1) / 2)
+    return np.vstack([camera_matrix(MOTION(t), SIZE, SCALE, centre), [0, 0, 1]])
+
+
+def test_frames_are_placed_to_a_tenth_of_a_pixel(registered, photograph):
+    found, _ = registered
+    assert [frame.failure for frame in found.frames] == [""] * 7
+    for frame in found.frames:
+        apart = displacement(frame.matrix, true_matrix(photograph, frame.time), SIZE) / SCALE
+        assert apart < 0.5, frame  # at the worst corner
+        middle = np.array([[SIZE[1] / 2, SIZE[0] / 2]])
+        truth = transformed(true_matrix(photograph, frame.time), middle)
+        assert np.abs(transformed(frame.matrix, middle) - truth).max() / SCALE < 0.1
+
+
+def test_the_truth_is_the_scene(registered, simulation):
+    found, unit = registered
+    assert found.scale * unit == pytest.approx(1.0, abs=0.01)
+    truth = simulation.truth(found.truth.times).images
+    assert found.truth.times.tolist() == [frame.middle for frame in simulation.frames]
+    off = np.log((found.truth.images + 0.02) / (truth + 0.02))[found.masks]
+    assert 1.4826 * np.median(np.abs(off)) < 0.03
+    assert found.masks.mean() > 0.8
+    assert (found.truth.images[~found.masks] == 0).all()
+    assert found.truth.images.max() > 2.0
+
+
+def test_what_is_not_valid_stays_so(simulation, photograph):
+    valid = np.ones(photograph.shape, bool)
+    valid[:, 150:160] = False
+    changed = np.where(valid, photograph, 1e6)
+    found = register_frames(changed, valid, simulation.recording())
+    for frame, image, mask in zip(found.frames, found.truth.images, found.masks, strict=True):
+        seen = warped_mask(valid, frame.matrix, SIZE)
+        assert not mask[~seen].any()
+        assert image.max() < 100
+
+
+def test_frames_that_show_something_else_are_left_out_and_told(simulation, photograph):
+    frames = list(simulation.frames)
+    rng = np.random.default_rng(0)
+    other = cv2.GaussianBlur(rng.integers(0, 256, SIZE).astype(np.uint8), (0, 0), 1.5)
+    frames[2] = dataclasses.replace(frames[2], image=other)
+    frames[4] = dataclasses.replace(frames[4], image=np.zeros(SIZE, np.uint8))
+    frames[5] = dataclasses.replace(frames[5], image=(frames[5].image // 2).astype(np.uint8))
+    recording = kalux.Recording.from_arrays(simulation.events, frames, sensor_size=SIZE)
+    found = register_frames(photograph, np.ones(photograph.shape, bool), recording)
+    failures = {frame.number: frame.failure for frame in found.frames if frame.failure}
+    assert set(failures) == {2, 4, 5}
+    assert "exposed well" in failures[4]
+    assert "as bright" in failures[5]
+    assert len(found.truth.times) == len(found.masks) == 4
+
+
+def test_another_scene_is_an_error(simulation):
+    other = blocks(0.02, 6.0, shape=(260, 340), seed=5)
+    with pytest.raises(InputError, match="cannot be registered to any of 7 frames"):
+        register_frames(other, np.ones(other.shape, bool), simulation.recording())
+
+
+def test_a_perspective_is_found(photograph):
+    truth = np.array([[1.9, 0.06, 20.0], [-0.04, 1.95, 15.0], [2e-4, -1e-4, 1.0]])
+    log = np.log(photograph + 0.02)
+    fixed = np.log(warped(photograph, truth, SIZE) + 0.02)
+    mask, everywhere = np.isfinite(fixed), np.ones(log.shape, bool)
+    fixed = np.where(mask, fixed, 0)
+    low, high = np.percentile(log, (1, 99))
+    pictures = [tone_compressed(image, low, high) for image in (fixed, log)]
+    match = match_features(find_features(pictures[0], mask), find_features(pictures[1], everywhere))
+    assert displacement(match.matrix, truth, SIZE) < 3.0
+    better, deviation = refined(fixed + 0.4, log, mask, everywhere, match.matrix)
+    assert displacement(better, truth, SIZE) < 0.2
+    assert deviation < 0.02
+
+
+def test_pictures_without_features_do_not_match():
+    blank, mask = np.full(SIZE, 80, np.uint8), np.ones(SIZE, bool)
+    match = match_features(find_features(blank, mask), find_features(blank, mask))
+    assert (match.matrix, match.inliers) == (None, 0)
+
+
+def test_a_larger_image_is_smoothed_before_it_is_made_smaller():
+    fine = np.indices((300, 300)).sum(axis=0) % 2 * 1.0  # a chess board of pixels
+    shrink = np.diag([3.0, 3.0, 1.0])
+    seen = warped(fine, shrink, (90, 90))[5:-5, 5:-5]
+    assert np.abs(seen - 0.5).max() < 0.05
+    assert np.isnan(warped(fine, shrink, (120, 120))[-1, -1])
+    assert np.ptp(resampled(fine.astype(np.float32), shrink, (90, 90), 0.0)) == 1.0
+
+
+@pytest.mark.parametrize(
+    ("matrix", "plausible"),
+    [
+        (np.eye(3), True),
+        (np.diag([-1.0, 1.0, 1.0]), False),  # mirrored
+        (np.diag([1e-3, 1e-3, 1.0]), False),
+        (np.array([[1, 0, 0], [0, 1, 0], [-0.02, 0, 1.0]]), False),  # through infinity
+    ],
+)
+def test_plausible_homographies(matrix, plausible):
+    assert is_plausible(matrix, SIZE) == plausible
