@@ -36,11 +36,11 @@ RATE = 15_000_000  # events/s
 FRAME, EXPOSURE = 40_000, 10_000  # us
 THRESHOLD = 0.2
 LIMITS = {
-    "filter / literal in numba": 8.0,
-    "filter / storing only": 0.15,
+    "filter / literal in numba": 4.0,
+    "filter / storing only": 0.14,
     "filter / plain Python": 500.0,
     "complementary / filter": 1.0,
-    "EDI / literal in numba": 8.0,
+    "EDI / literal in numba": 3.0,
 }
 """Ratios of million events/s at 640x480 that `--check` asks for."""
 

@@ -320,7 +320,7 @@ class Watched(Reconstructor):
         self._look()
 
     def _look(self):
-        Watched.most_events = max(Watched.most_events, sum(len(chunk) for chunk in self._chunks))
+        Watched.most_events = max(Watched.most_events, len(self._events))
         Watched.most_frames = max(Watched.most_frames, len(self._shots))
 
 
