@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -28,12 +28,17 @@ class Frame:
     white
         The value of a saturated pixel. Default: 255 for uint8, 65535 for uint16, 1.0 for floats. Sensors
         of 10 or 12 bits stored in uint16 need it (1023, 4095).
+    valid
+        (height, width) bool: False where the frame says nothing, e.g. outside the view of a second camera. The
+        value of such a pixel is no measurement, not even of brightness beyond white; it should be a guess,
+        because the first frame's is where the filter starts. None: all pixels are measured.
     """
 
     image: NDArray[Any]
     exposure_start: int
     exposure_end: int
     white: float | None = None
+    valid: NDArray[np.bool_] | None = None
 
     @property
     def exposure(self) -> int:
@@ -73,7 +78,7 @@ def place_exposure(frame: Frame, exposure: int, stamp: Stamp) -> Frame:
     """
     before = {"start": 0, "middle": exposure // 2, "end": exposure}[stamp]
     start = frame.exposure_start - before
-    return Frame(frame.image, start, start + exposure, frame.white)
+    return replace(frame, exposure_start=start, exposure_end=start + exposure)
 
 
 def check_frame(
@@ -108,6 +113,12 @@ def check_frame(
     if image.dtype.kind == "f" and not np.isfinite(image).all():
         y, x = (int(i[0]) for i in np.nonzero(~np.isfinite(image)))
         raise FrameError(f"{where}: frame {index} is not finite (NaN or infinite) at x={x}, y={y}")
+    valid = frame.valid
+    if valid is not None and (valid.shape != sensor_size or valid.dtype != bool):
+        raise FrameError(
+            f"{where}: frame {index} has a mask of valid pixels of {valid.dtype} {valid.shape}; "
+            f"bool {sensor_size} is needed"
+        )
     if exposure_known and frame.exposure <= 0:
         raise ExposureError(
             f"{where}: frame {index} has an exposure of {frame.exposure} us; give the real exposure time "

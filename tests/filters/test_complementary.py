@@ -18,7 +18,7 @@ ON, OFF = 0.3, 0.2
 
 
 def held(log_frame=0.0, gain=6.0, start=1000, shape=(1, 1)):
-    return HeldSegment(start, 10**9, np.full(shape, float(log_frame)), gain, ON, OFF)
+    return HeldSegment(start, 10**9, np.full(shape, float(log_frame)), np.full(shape, gain), ON, OFF)
 
 
 def solved(value, target, gain, times, polarities, start, t):

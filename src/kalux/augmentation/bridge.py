@@ -22,15 +22,18 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 UNMEASURED: Final = 1e12
-"""Variance of a clipped or masked pixel. 1/R is then 1e-12, which a double cannot tell from 0 beside any
+"""Variance of a clipped pixel. 1/R is then 1e-12, which a double cannot tell from 0 beside any
 information in use (1e-2 and more), and the formulas need no special case."""
+
+UNSEEN: Final = 1e13
+"""Variance of a pixel of which the frame says nothing (`Frame.valid`): as little weight, and no bound."""
 
 _SCALE_BOUNDS: Final = (0.3, 3.0)
 _SCALE_DRIFT: Final = 1e-5  # variance per frame: a calibration never becomes certain, temperatures drift
 
 
 class Latent(NamedTuple):
-    """A deblurred frame at one moment: (H, W) log intensity and its variance (`UNMEASURED` where clipped)."""
+    """A deblurred frame at one moment: (H, W) log intensity and its variance (`UNMEASURED` if clipped, `UNSEEN` if masked)."""
 
     value: Array
     variance: Array
@@ -83,7 +86,8 @@ def lower_bound(frame: Latent) -> Array:
     A frame integrates: where its value is clipped, the mean over the exposure was at least the value, and the
     latent value computed from it is a bound for every moment.
     """
-    return np.where(frame.variance >= UNMEASURED, frame.value, -np.inf)
+    clipped = (frame.variance >= UNMEASURED) & (frame.variance < UNSEEN)
+    return np.where(clipped, frame.value, -np.inf)
 
 
 def nominal_thresholds(shape: tuple[int, int], spread: float) -> Thresholds:

@@ -113,7 +113,7 @@ def blur_consistency(
 
 
 def valid_pixels(frame: Frame) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-    """Where a frame is neither clipped nor black: (H, W) bool."""
+    """Where a frame is measured, and neither clipped nor black: (H, W) bool."""
     values = frame.normalised()
     valid = (values > 0) & (values < CameraSettings().saturation)
-    return np.asarray(valid, np.bool_)
+    return np.asarray(valid if frame.valid is None else valid & frame.valid, np.bool_)

@@ -181,7 +181,8 @@ def _pairs(held: HeldOut, method: Method, clip: bool) -> Iterator[Pair]:
     for frame, image in zip(frames, images, strict=True):
         if clip:
             image = clipped_as(image, frame, held.reference_exposure)
-        yield Pair(frame.middle, image, linear_frame(frame, held.reference_exposure, held.response))
+        truth = linear_frame(frame, held.reference_exposure, held.response)
+        yield Pair(frame.middle, image, truth, frame.valid)
 
 
 def clipped_as(image: Array, frame: Frame, reference: int) -> Array:
@@ -193,7 +194,8 @@ def intensity_percentile(recording: Recording, percent: float, reference: int, r
     """A percentile of the intensities of all frames, in little memory: frames repeat their values."""
     values, counts = np.empty(0), np.empty(0, np.int64)
     for frame in recording.frames():
-        found, number = np.unique(linear_frame(frame, reference, response), return_counts=True)
+        linear = linear_frame(frame, reference, response)
+        found, number = np.unique(linear if frame.valid is None else linear[frame.valid], return_counts=True)
         values, index = np.unique(np.concatenate([values, found]), return_inverse=True)
         counts = np.bincount(index, np.concatenate([counts, number])).astype(np.int64)
     return percentile_of_counts(values, counts, percent)

@@ -20,12 +20,12 @@ Times = NDArray[np.int64]
 
 
 class HeldSegment(NamedTuple):
-    """A frame that is held: times in us, log(I + I_0) as (H, W), the gain in 1/s, nominal thresholds."""
+    """A frame that is held: times in us, (H, W) log(I + I_0) and gain in 1/s (0: no frame), nominal thresholds."""
 
     start: int
     end: int
     log_frame: Array
-    gain: float
+    gain: Array
     step_on: float
     step_off: float
 
@@ -59,7 +59,7 @@ def _advance(segment, cursor, t, x, y, p):  # type: ignore[no-untyped-def]
     for i in range(len(t)):
         row, column = y[i], x[i]
         frame = segment.log_frame[row, column]
-        decay = np.exp(-segment.gain * (t[i] - cursor.since[row, column]) * MICROSECOND)
+        decay = np.exp(-segment.gain[row, column] * (t[i] - cursor.since[row, column]) * MICROSECOND)
         value = frame + (cursor.log_intensity[row, column] - frame) * decay
         cursor.log_intensity[row, column] = value + (segment.step_on if p[i] else -segment.step_off)
         cursor.since[row, column] = t[i]

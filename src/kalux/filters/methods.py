@@ -47,9 +47,11 @@ class Shot(NamedTuple):
     weight
         (H, W) f^w of its response.
     clipped
-        (H, W) bool: saturated or masked, so that the value is no measurement.
+        (H, W) bool: saturated, so that the value is no measurement.
     white
         Intensity of a saturated pixel of this frame: the reference exposure over the frame's own.
+    valid
+        (H, W) bool: where the frame says anything at all; None: everywhere.
     """
 
     start: int
@@ -59,6 +61,7 @@ class Shot(NamedTuple):
     weight: Array
     clipped: NDArray[np.bool_]
     white: float
+    valid: NDArray[np.bool_] | None = None
 
 
 def take_shot(frame: Frame, camera: Camera, reference_exposure: float) -> Shot:
@@ -73,6 +76,7 @@ def take_shot(frame: Frame, camera: Camera, reference_exposure: float) -> Shot:
         weight=weight,
         clipped=clipped,
         white=ratio,
+        valid=frame.valid,
     )
 
 
@@ -169,6 +173,15 @@ class _Common:
     def log_frame(self, shot: Shot) -> Array:
         return log_intensity(shot.intensity, self.offset)
 
+    def unseen(self, shot: Shot) -> NDArray[np.bool_]:
+        """(H, W) bool: where the frame says nothing."""
+        return np.zeros(self.shape, bool) if shot.valid is None else ~shot.valid
+
+    def unseen_variance(self, shot: Shot) -> float:
+        """P of a pixel of which the first frame says nothing: it is distributed as the others are."""
+        seen = self.log_frame(shot)[shot.valid]
+        return max(self.settings.filter.initial_variance, float(np.var(seen)) if seen.size else 0.0)
+
 
 class BridgeMemory(NamedTuple):
     """The latest frame, deblurred; the pixels' thresholds; the frame interval in s (0: not known yet).
@@ -214,9 +227,10 @@ class BridgedFrames(_Common):
         variance = variance + self.settings.events.deblur_variance * self.on * self.off * integrals.events
         white = np.log(self.settings.camera.saturation * shot.white + self.offset)
         clipped = shot.clipped | (deblur.latent_peak(log_frame, integrals) >= white)
-        return Latent(
-            deblur.latent_middle(log_frame, integrals), np.where(clipped, bridge.UNMEASURED, variance)
-        )
+        variance = np.where(clipped, bridge.UNMEASURED, variance)
+        if shot.valid is not None:
+            variance[~shot.valid] = bridge.UNSEEN
+        return Latent(deblur.latent_middle(log_frame, integrals), variance)
 
     def start(self, shot: Shot, events: EventArray) -> tuple[BridgeMemory, Segment | None, State]:
         thresholds = bridge.nominal_thresholds(self.shape, self.settings.events.threshold_spread)
@@ -237,6 +251,8 @@ class BridgedFrames(_Common):
             value, variance = self._carried(memory)
         unmeasured = variance >= bridge.UNMEASURED
         variance = np.where(unmeasured, self.settings.filter.initial_variance, variance)
+        if shot.valid is not None:
+            variance[~shot.valid] = self.unseen_variance(shot)
         return memory, lead_in, State(value, variance, newest)
 
     def segment(
@@ -334,6 +350,8 @@ class InterpolatedFrames(_Common):
     Causal mode goes from the end of one exposure to the end of the next with L^{A-} and the previous c_p.
     """
 
+    _UNSEEN: Final = 1e6  # R_bar: worth nothing beside P, and integrals of 1/R over a linear R (7) stay exact
+
     def node(self, shot: Shot) -> int:
         return shot.start if self.lookahead else shot.end
 
@@ -356,6 +374,11 @@ class InterpolatedFrames(_Common):
         camera = self.settings.camera
         return covariance(shot.weight, shot.white**2 / camera.confidence, camera.weight_floor)
 
+    def measured_r_bar(self, shot: Shot) -> Array:
+        """R_bar as a measurement: without weight where the frame says nothing."""
+        r_bar = self.r_bar(shot)
+        return r_bar if shot.valid is None else np.where(shot.valid, r_bar, self._UNSEEN)
+
     def log_frame(self, shot: Shot) -> Array:
         """L^F of equation (8), with its bias."""
         return super().log_frame(shot) - log_bias(shot.intensity, self.r_bar(shot), self.offset)
@@ -366,6 +389,8 @@ class InterpolatedFrames(_Common):
         memory = InterpolationMemory(integrals, latent, np.ones(self.shape), None)
         value = latent if self.lookahead else deblur.latent_end(self.log_frame(shot), integrals)
         variance = np.full(self.shape, self.settings.filter.initial_variance)
+        if shot.valid is not None:
+            variance[~shot.valid] = self.unseen_variance(shot)
         return memory, None, State(value, variance, np.full(self.shape, self.node(shot), np.int64))
 
     def segment(
@@ -374,6 +399,9 @@ class InterpolatedFrames(_Common):
         if not self.lookahead:
             return self._causal(memory, shot, following, events)
         start_latent = deblur.latent_start(self.log_frame(shot), memory.integrals)
+        # (17) as printed follows L^A wherever that goes, so that L^A must not go to values that are no measurements.
+        unseen = self.unseen(shot)
+        start_latent[unseen] = memory.forward[unseen]
         if following is None:
             segment = self._segment(memory, shot, None, start_latent, memory.scale, FAR_FUTURE)
             return segment, memory
@@ -381,7 +409,12 @@ class InterpolatedFrames(_Common):
         end_latent = deblur.latent_end(self.log_frame(following), integrals)
         integral = self.nominal(between(events, shot.start, following.end))
         scale = interpolation.threshold_scale(end_latent - start_latent, integral)  # (12)
+        unseen_next = self.unseen(following)
+        scale[unseen | unseen_next] = 1.0
+        end_latent[unseen_next] = (start_latent + integral)[unseen_next]
         at_start = interpolation.backward(end_latent, scale, integral)  # (11)
+        start_latent[unseen] = at_start[unseen]
+        memory = memory._replace(forward=np.where(unseen, at_start, memory.forward))
         segment = self._segment(memory, shot, following, at_start, scale, following.start)
         to_next = self.nominal(between(events, shot.start, following.start))
         forward = interpolation.forward(start_latent, scale, to_next)  # (10)
@@ -398,9 +431,9 @@ class InterpolatedFrames(_Common):
     ) -> interpolation.InterpolatedSegment:
         # At the first frame nothing comes before: L^{A-} and c_p are those of the interval after it.
         previous = memory.previous
-        here = self.r_bar(shot)
-        after = here if following is None else self.r_bar(following)
-        before = here if previous is None else self.r_bar(previous)
+        here = self.measured_r_bar(shot)
+        after = here if following is None else self.measured_r_bar(following)
+        before = here if previous is None else self.measured_r_bar(previous)
         at = shot if previous is None else previous
         return interpolation.InterpolatedSegment(
             start=self.node(shot),
@@ -435,6 +468,7 @@ class InterpolatedFrames(_Common):
         start_latent = deblur.latent_start(self.log_frame(shot), memory.integrals)
         integral = memory.integrals.to_end + self.nominal(between(events, shot.end, following.end))
         scale = interpolation.threshold_scale(end_latent - start_latent, integral)
+        scale[self.unseen(shot) | self.unseen(following)] = 1.0
         return segment, InterpolationMemory(integrals, end_latent, scale, shot)
 
     @property
@@ -480,7 +514,9 @@ class HeldFrames(_Common):
         self, memory: None, shot: Shot, following: Shot | None, events: EventArray
     ) -> tuple[Segment, None]:
         end = FAR_FUTURE if following is None else self.node(following)
-        gain = 2 * np.pi * self.settings.filter.cutoff
+        gain = np.full(self.shape, 2 * np.pi * self.settings.filter.cutoff)
+        if shot.valid is not None:
+            gain[~shot.valid] = 0.0
         return (
             complementary.HeldSegment(self.node(shot), end, self.log_frame(shot), gain, self.on, self.off),
             None,

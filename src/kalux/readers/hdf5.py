@@ -22,7 +22,7 @@ T = TypeVar("T")
 MAJOR_VERSION: Final = 1
 """Files with a greater major version are refused; a minor version only adds."""
 
-_VERSION: Final = f"{MAJOR_VERSION}.0"
+_VERSION: Final = f"{MAJOR_VERSION}.1"
 _SIGNATURE: Final = b"\x89HDF\r\n\x1a\n"
 _EVENTS_PER_CHUNK: Final = 1 << 17
 _COLUMNS: Final = ("t", "x", "y", "p")
@@ -56,7 +56,7 @@ def read(path: Path) -> Source:
     with reading(path, *_DAMAGE), h5py.File(path, "r") as file:
         _check_version(path, _text(file.attrs.get("version", "")))
         event_count = _common_length(path, file, "events", _COLUMNS)
-        frame_count = _common_length(path, file, "frames", ("image", "exposure_start", "exposure_end"))
+        frame_count = _common_length(path, file, "frames", _frame_columns(file))
         exposure_known = bool(file["frames"].attrs["exposure_known"])
         height, width = (int(n) for n in file.attrs["sensor_size"])
         threshold = file.attrs.get("contrast_threshold")
@@ -84,6 +84,11 @@ def read(path: Path) -> Source:
         ground_truth=(lambda: _ground_truth(path)) if has_ground_truth else None,
         missing=missing,
     )
+
+
+def _frame_columns(file: Any) -> tuple[str, ...]:
+    columns = ("image", "exposure_start", "exposure_end")
+    return (*columns, "valid") if "valid" in file["frames"] else columns
 
 
 def _text(value: Any) -> str:
@@ -129,8 +134,10 @@ def _frames(path: Path) -> Iterator[Frame]:
         group = file["frames"]
         white = float(group.attrs["white"]) if "white" in group.attrs else None
         starts, ends = group["exposure_start"][...], group["exposure_end"][...]
+        masks = group.get("valid")
         for index, (start, end) in enumerate(zip(starts, ends, strict=True)):
-            yield Frame(group["image"][index], int(start), int(end), white)
+            valid = None if masks is None else masks[index].astype(bool)
+            yield Frame(group["image"][index], int(start), int(end), white, valid)
 
 
 def _ground_truth(path: Path) -> GroundTruth:
@@ -300,7 +307,7 @@ def _write_frames(
     group: Any, frames: Iterable[Frame], sensor_size: tuple[int, int], exposure_known: bool
 ) -> None:
     group.attrs["exposure_known"] = exposure_known
-    images = None
+    images = masks = None
     starts: list[int] = []
     ends: list[int] = []
     for index, frame in enumerate(frames):
@@ -319,17 +326,26 @@ def _write_frames(
             )
         images.resize(index + 1, axis=0)
         images[index] = frame.image
+        if frame.valid is not None:
+            if masks is None:  # of frames without a mask all pixels are valid
+                masks = _create_images(group, frame.valid.shape, np.dtype(bool), "valid", fill=True)
+            masks.resize(index + 1, axis=0)
+            masks[index] = frame.valid
         starts.append(frame.exposure_start)
         ends.append(frame.exposure_end)
     if images is None:
         _create_images(group, sensor_size, np.dtype(np.uint8))
+    if masks is not None:
+        masks.resize(len(starts), axis=0)
     group["exposure_start"] = np.array(starts, np.int64)
     group["exposure_end"] = np.array(ends, np.int64)
 
 
-def _create_images(group: Any, size: tuple[int, ...], dtype: np.dtype[Any]) -> Any:
+def _create_images(
+    group: Any, size: tuple[int, ...], dtype: np.dtype[Any], name: str = "image", *, fill: bool = False
+) -> Any:
     return group.create_dataset(
-        "image", (0, *size), dtype, maxshape=(None, *size), chunks=(1, *size), **_packing()
+        name, (0, *size), dtype, maxshape=(None, *size), chunks=(1, *size), fillvalue=fill, **_packing()
     )
 
 
