@@ -33,7 +33,10 @@ _SCALE_DRIFT: Final = 1e-5  # variance per frame: a calibration never becomes ce
 
 
 class Latent(NamedTuple):
-    """A deblurred frame at one moment: (H, W) log intensity and its variance (`UNMEASURED` if clipped, `UNSEEN` if masked)."""
+    """A deblurred frame at one moment: (H, W) log intensity and its variance.
+
+    The variance is `UNMEASURED` where the frame is clipped, `UNSEEN` where it is masked.
+    """
 
     value: Array
     variance: Array
