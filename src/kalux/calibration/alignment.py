@@ -250,7 +250,9 @@ def align(
     for blur in blurs:
         for _ in range(_STEPS):
             normal = _normal_equations(shots, events, _with(begin, parameters), parameters, blur, spread)
-            step = _solve(normal.matrices.sum(axis=0), normal.vectors.sum(axis=0), free_homography, free_offset)
+            step = _solve(
+                normal.matrices.sum(axis=0), normal.vectors.sum(axis=0), free_homography, free_offset
+            )
             last, parameters = parameters, _stepped(parameters, step, begin.events.sensor_size)
             moved = _distance(_with(begin, last), _with(begin, parameters)) if free_homography else 0.0
             if moved < _CLOSE and abs(parameters.offset - last.offset) < _CLOSE * 1_000:
@@ -318,13 +320,9 @@ def _normal_equations(
         change = _blurred((following[0] - warped[0]) * (warped[2] & following[2]), blur)
         share = (following[1] + warped[1]) / 2
         first, last = place[k], place[k + 1]
-        counts = [
-            _blurred((level[last[1]] - level[first[1]]) * share, blur) for level in (on, off)
-        ]
+        counts = [_blurred((level[last[1]] - level[first[1]]) * share, blur) for level in (on, off)]
         slopes = [
-            _blurred(
-                ((level[last[2]] - level[first[2]]) - (level[last[0]] - level[first[0]])) * share, blur
-            )
+            _blurred(((level[last[2]] - level[first[2]]) - (level[last[0]] - level[first[0]])) * share, blur)
             / (2 * _HALF_STEP)
             for level in (on, off)
         ]

@@ -75,7 +75,9 @@ class Board:
             raise InputError(f"board: the squares are {self.square} m wide; a positive width is needed")
         if self.dictionary is not None:
             if not hasattr(cv2.aruco, f"DICT_{self.dictionary}"):
-                raise InputError(f"board: OpenCV has no ArUco dictionary DICT_{self.dictionary}; e.g. 5X5_100")
+                raise InputError(
+                    f"board: OpenCV has no ArUco dictionary DICT_{self.dictionary}; e.g. 5X5_100"
+                )
             if self.marker is None or not 0 < self.marker < self.square:
                 raise InputError("board: a ChArUco board needs markers smaller than its squares")
 
@@ -157,9 +159,7 @@ def _find_charuco(board: Board, picture: Picture) -> Corners | None:
     if ids is None or len(ids) < 6:
         return None
     order = np.argsort(ids.ravel())
-    return Corners(
-        ids.ravel()[order].astype(np.int64), np.asarray(corners, np.float64).reshape(-1, 2)[order]
-    )
+    return Corners(ids.ravel()[order].astype(np.int64), np.asarray(corners, np.float64).reshape(-1, 2)[order])
 
 
 # --- views ------------------------------------------------------------------------------------------------

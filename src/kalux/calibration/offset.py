@@ -125,8 +125,10 @@ def frame_changes(
         if registration is None:
             scale = max(1, frame.image.shape[1] // 160)
             size = (frame.image.shape[1] // scale, frame.image.shape[0] // scale)
-            now = (cv2.resize(log, size, interpolation=cv2.INTER_AREA),
-                   cv2.resize(good, size, interpolation=cv2.INTER_AREA))
+            now = (
+                cv2.resize(log, size, interpolation=cv2.INTER_AREA),
+                cv2.resize(good, size, interpolation=cv2.INTER_AREA),
+            )
         else:
             now = registration.resampled(log), registration.resampled(good) * registration.maps.inside
         if before is not None:
@@ -140,7 +142,9 @@ def frame_changes(
         before = now
         middles.append(frame.middle)
     if len(middles) < _LEAST_FRAMES:
-        raise InputError(f"offset: {len(middles)} frames are too few; {_LEAST_FRAMES} at least, fifty are good")
+        raise InputError(
+            f"offset: {len(middles)} frames are too few; {_LEAST_FRAMES} at least, fifty are good"
+        )
     return Changes(np.array(middles, np.int64), np.array(rows), registration is not None)
 
 
@@ -204,7 +208,9 @@ def correlate(
     curve[:] = _correlation(found.sum(axis=1))
     best = int(np.argmax(curve))
     if not curve[best] > 0:
-        raise InputError("offset: nothing in the frames changes as the events say; do both see the same scene?")
+        raise InputError(
+            "offset: nothing in the frames changes as the events say; do both see the same scene?"
+        )
     interval = float(np.median(np.diff(middles)))
     away = np.abs(grid - grid[best]) > 1.5 * interval
     other = float(curve[away].max()) if away.any() else 0.0

@@ -107,18 +107,24 @@ class Registration:
         source = np.asarray(image, np.float32)
         if sigma < 0.1:
             return source
-        return np.asarray(cv2.GaussianBlur(source, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE), np.float32)
+        return np.asarray(
+            cv2.GaussianBlur(source, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE), np.float32
+        )
 
     def sampled(self, filtered: NDArray[np.float32]) -> NDArray[np.float32]:
         """A filtered image at the event camera's pixels, (H, W) or (H, W, channels) float32."""
         x, y, _ = self.maps
-        return np.asarray(cv2.remap(filtered, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32)
+        return np.asarray(
+            cv2.remap(filtered, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32
+        )
 
     def resampled(self, image: NDArray[Any]) -> NDArray[np.float32]:
         """An image (H', W') or (H', W', channels) of the frame camera at the event camera's pixels, float32."""
         return self.sampled(self.filtered(image))
 
-    def frame(self, frame: Frame, *, index: int = 0, saturation: float = CameraSettings().saturation) -> Frame:
+    def frame(
+        self, frame: Frame, *, index: int = 0, saturation: float = CameraSettings().saturation
+    ) -> Frame:
         """A frame in the event camera's pixels, with the mask of those that are measured.
 
         Integer images become uint16 with white at 65535, because the mean of several pixels has more levels than they;
@@ -137,7 +143,9 @@ class Registration:
                 f"{self.frames.sensor_size[0]}; the rig must be calibrated with frames of the same size"
             )
         if getattr(frame, "mosaic", None) is not None:
-            raise FrameError(f"frame {index} is a raw mosaic, which cannot be resampled; demosaic the frames first")
+            raise FrameError(
+                f"frame {index} is a raw mosaic, which cannot be resampled; demosaic the frames first"
+            )
         response = frame.normalised()
         values = self.resampled(response)
         clipped = response >= saturation

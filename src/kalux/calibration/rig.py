@@ -214,7 +214,9 @@ def load_rig(path: Path) -> Rig:
     if not isinstance(version, int):
         raise FormatError(f"{path}: not a rig file (kalux_rig is missing); kalux calibrate rig makes one")
     if version > VERSION:
-        raise FormatError(f"{path}: a rig file of version {version}, this kalux reads {VERSION}; update kalux")
+        raise FormatError(
+            f"{path}: a rig file of version {version}, this kalux reads {VERSION}; update kalux"
+        )
     try:
         return Rig(
             events=_lens(table["events"]),

@@ -44,7 +44,11 @@ class TriggeredExposures(NamedTuple):
 
 
 def exposures(
-    chunks: Iterable[TriggerArray], *, edge: Edge = "both", exposure: int | None = None, input_id: int | None = None
+    chunks: Iterable[TriggerArray],
+    *,
+    edge: Edge = "both",
+    exposure: int | None = None,
+    input_id: int | None = None,
 ) -> tuple[Times, Times, tuple[str, ...]]:
     """Exposures (starts, ends, notes), us, from edges.
 
@@ -76,7 +80,11 @@ def exposures(
     if not len(edges):
         raise ExposureError(
             "triggers: the recording has no edges on "
-            + ("its trigger inputs" if input_id is None else f"input {input_id} (there are some on {ids.tolist()})")
+            + (
+                "its trigger inputs"
+                if input_id is None
+                else f"input {input_id} (there are some on {ids.tolist()})"
+            )
             + "; is the wire connected, and the input enabled when recording?"
         )
     rising, times = edges["rising"], edges["t"].astype(np.int64)
@@ -111,7 +119,13 @@ def exposures(
 
 
 def match(
-    starts: Times, ends: Times, stamps: Times | None, count: int, *, skip_triggers: int = 0, skip_frames: int = 0
+    starts: Times,
+    ends: Times,
+    stamps: Times | None,
+    count: int,
+    *,
+    skip_triggers: int = 0,
+    skip_frames: int = 0,
 ) -> TriggeredExposures:
     """Which frame each exposure is of.
 
@@ -155,11 +169,11 @@ def match(
     else:
         shift = _best_shift(starts, None if stamps is None else stamps[skip_frames:], missing, said)
     many = "exposures" if missing > 0 else "frames"
-    note = (
-        f"there are {said}: {shift} {many} at the beginning and {abs(missing) - shift} at the end are left out"
-    )
+    note = f"there are {said}: {shift} {many} at the beginning and {abs(missing) - shift} at the end are left out"
     if missing > 0:
-        return TriggeredExposures(starts[shift : shift + frames], ends[shift : shift + frames], skip_frames, (note,))
+        return TriggeredExposures(
+            starts[shift : shift + frames], ends[shift : shift + frames], skip_frames, (note,)
+        )
     return TriggeredExposures(starts, ends, skip_frames + shift, (note,))
 
 

@@ -82,7 +82,9 @@ def patchwork(shape: tuple[int, int], seed: int = 0) -> Image:
         x, y = int(rng.integers(-20, width)), int(rng.integers(-20, height))
         value = float(np.exp(rng.uniform(np.log(0.03), np.log(0.75))))
         corners = np.array([[x, y], [x + w, y], [x + w, y + h], [x, y + h]], np.float64)
-        turned = cv2.transform(corners[None], cv2.getRotationMatrix2D((x + w / 2, y + h / 2), rng.uniform(-12, 12), 1))
+        turned = cv2.transform(
+            corners[None], cv2.getRotationMatrix2D((x + w / 2, y + h / 2), rng.uniform(-12, 12), 1)
+        )
         mask = np.zeros(shape, np.uint8)
         cv2.fillPoly(mask, [np.rint(turned * 16).astype(np.int32)], 255, cv2.LINE_AA, 4)
         share = mask.astype(np.float32) / 255
