@@ -303,7 +303,7 @@ def _normal_equations(
     place = np.empty(len(order), np.int64)
     place[order] = np.arange(len(order))
     on, off = levels(inside, size, times.ravel()[order], spread=spread)
-    place = place.reshape(count, 3)
+    places = place.reshape(count, 3)
     coordinates = _coordinates(registration)
     margin = int(np.ceil(2 * blur)) * 2 + 1
     kernel = np.ones((margin, margin), np.uint8)
@@ -319,7 +319,7 @@ def _normal_equations(
         good = cv2.erode(good, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0).astype(bool)
         change = _blurred((following[0] - warped[0]) * (warped[2] & following[2]), blur)
         share = (following[1] + warped[1]) / 2
-        first, last = place[k], place[k + 1]
+        first, last = places[k], places[k + 1]
         counts = [_blurred((level[last[1]] - level[first[1]]) * share, blur) for level in (on, off)]
         slopes = [
             _blurred(((level[last[2]] - level[first[2]]) - (level[last[0]] - level[first[0]])) * share, blur)
@@ -330,13 +330,14 @@ def _normal_equations(
         good &= lattice
         if not good.any():
             continue
-        gy, gx = np.gradient(change)
+        gy, gx = (np.asarray(g, np.float32) for g in np.gradient(change))
         residual = (change - now.on * counts[0] + now.off * counts[1])[good]
-        jacobian = np.column_stack(
+        by_offset = np.asarray(now.on * slopes[0] - now.off * slopes[1], np.float32)
+        jacobian: Floats = np.column_stack(
             [
                 -counts[0][good],
                 counts[1][good],
-                -(now.on * slopes[0] - now.off * slopes[1])[good],
+                -by_offset[good],
                 _homography_columns(gx[good], gy[good], coordinates[good]),
             ]
         )

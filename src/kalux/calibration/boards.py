@@ -2,8 +2,8 @@
 
 Where a screen switches a board on and off, its white squares make events at every switch and its black ones none: an
 image of the number of events in some time shows the board. The number grows with the logarithm of the brightness; it is
-exponentiated, or white squares would look too large (corners, which a turn by 180 degrees leaves as they are, would stay
-where they are even so). The rig is held
+exponentiated, or white squares would look too large (corners, symmetric under a turn by 180 degrees, would stay where
+they are even so). The rig is held
 still before the board, moved, held still again: in every pause both cameras see the board in one pose, and no common
 clock finer than a pause is needed.
 """
@@ -30,7 +30,7 @@ LEAST_VIEWS: Final = 6
 """Below it focal length and pose cannot be told apart reliably; 15 to 30 are recommended."""
 
 _STILL: Final = 0.7
-"""Pixels that corners may move between two frames of a view. A blinking board gives no better event image if it moves."""
+"""Pixels that corners may move between two frames of a view. Event images of a moving board are smeared."""
 
 _CONTRAST: Final = 10.0
 """Brightness of the board's white over that of its black, about, which is what the most events of a pixel stand for."""
@@ -138,11 +138,10 @@ class RigCalibration(NamedTuple):
 
 
 def _find_squares(board: Board, picture: Picture) -> Corners | None:
-    # What is not found at once may be found by a longer search, small squares in a larger picture.
-    for scale, flags in ((1, cv2.CALIB_CB_ACCURACY), (2, cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_EXHAUSTIVE)):
-        if scale > 1 and picture.shape[1] >= 500:
-            return None
-        large = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+    # Small squares are found better in a larger picture, and some boards only by a longer search.
+    scale = 2 if picture.shape[1] < 500 else 1
+    large = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+    for flags in (cv2.CALIB_CB_ACCURACY, cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_EXHAUSTIVE):
         found, corners = cv2.findChessboardCornersSB(large, (board.columns, board.rows), flags=flags)
         if found:  # half a pixel lies between the corners of both pictures and the centres of their pixels
             pixels = (np.asarray(corners, np.float64).reshape(-1, 2) + 0.5) / scale - 0.5
@@ -289,7 +288,8 @@ def calibrate_rig(
 ) -> RigCalibration:
     """Intrinsics of both cameras (k1, k2, p1, p2; k3 = 0, which boards seldom determine) and their pose.
 
-    Each camera by itself first (Zhang 2000), then the pose with the lenses fixed. Views with more than three times the
+    Each camera by itself first (Zhang 2000), then all together, by which the frames, whose corners are sharper, make the
+    event camera's lens better known. Views with more than three times the
     median error are dropped, and all is done again.
 
     Parameters
@@ -320,7 +320,7 @@ def calibrate_rig(
             break
         kept = [view for view, ok in zip(kept, good, strict=True) if ok]
         _require(kept)
-    rotation, translation, rms = _pose(board, kept, lenses)
+    joint, rotation, translation, rms = _joint(board, kept, lenses)
     about = {
         "views": len(kept),
         "rms_events_px": _rms(errors[0]),
@@ -331,7 +331,7 @@ def calibrate_rig(
         "board": f"{board.columns}x{board.rows} inner corners, squares of {1e3 * board.square:g} mm",
     }
     return RigCalibration(
-        Rig(lenses[0], lenses[1], rotation, translation, about), tuple(kept), len(found) - len(kept)
+        Rig(joint[0], joint[1], rotation, translation, about), tuple(kept), len(found) - len(kept)
     )
 
 
@@ -367,8 +367,10 @@ def _lens(board: Board, views: list[View], size: tuple[int, int], camera: int) -
     return lens, np.asarray(errors, np.float64).ravel()
 
 
-def _pose(board: Board, views: list[View], lenses: tuple[Lens, ...]) -> tuple[Array, Array, float]:
-    """Rotation, translation and rms error in pixels, with the lenses fixed."""
+def _joint(
+    board: Board, views: list[View], lenses: tuple[Lens, ...]
+) -> tuple[tuple[Lens, Lens], Array, Array, float]:
+    """Both lenses, rotation, translation and rms error in pixels, from first guesses of the lenses."""
     world = board.points()
     shared = [np.intersect1d(view.events.ids, view.frames.ids) for view in views]
     pairs = [_common(view.events, view.frames) for view in views]
@@ -381,10 +383,17 @@ def _pose(board: Board, views: list[View], lenses: tuple[Lens, ...]) -> tuple[Ar
         lenses[1].matrix.copy(),
         lenses[1].distortion.copy(),
         lenses[0].sensor_size[::-1],
-        flags=cv2.CALIB_FIX_INTRINSIC,
+        flags=cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_K3,
+        criteria=(cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-9),
     )
-    rotation, translation = found[5], found[6]
-    return np.asarray(rotation, np.float64), np.asarray(translation, np.float64).ravel(), float(found[0])
+    rms, *intrinsics = found[:5]
+    rotation, translation = found[5:7]
+    both = [
+        Lens(lens.sensor_size, np.asarray(matrix, np.float64), np.asarray(distortion, np.float64).ravel()[:5])
+        for lens, matrix, distortion in zip(lenses, intrinsics[::2], intrinsics[1::2], strict=True)
+    ]
+    pose = np.asarray(rotation, np.float64), np.asarray(translation, np.float64).ravel()
+    return (both[0], both[1]), *pose, float(rms)
 
 
 def coverage(corners: Iterable[Array], size: tuple[int, int], cells: tuple[int, int] = (6, 8)) -> float:

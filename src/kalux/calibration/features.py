@@ -1,8 +1,8 @@
 """The homography between two cameras without any calibration, by features that both see.
 
 An event camera has no image, but what it says between two moments is what changes from one frame to another: both are
-pictures of the same change of the log intensity, with sign. SIFT finds its features in these (Lowe 2004), several pairs of
-frames give matches, and MAGSAC (Barath et al. 2019) the homography most of them agree with.
+pictures of the same change of the log intensity, with sign. SIFT finds its features in these (Lowe 2004), several pairs
+of frames give matches, and MAGSAC (Barath et al. 2019) the homography most of them agree with.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def match_cameras(
     net = on - off
     activity = [float(np.abs(b - a).sum()) for a, b in zip(shots.log[:-1], shots.log[1:], strict=True)]
     chosen = np.sort(np.argsort(activity)[::-1][:_PAIRS])
-    sift = cv2.SIFT_create(nfeatures=3000, contrastThreshold=0.01)
+    sift = cv2.SIFT.create(nfeatures=3000, contrastThreshold=0.01)
     matcher = cv2.BFMatcher(cv2.NORM_L2)
     # Frames are shrunk to about the event camera's pixels: their finer detail has no counterpart.
     shrink = min(1.0, 1.3 * size[1] / frames_lens.sensor_size[1])
@@ -95,8 +95,8 @@ def match_cameras(
 
 def _no_match(matches: int, agree: int) -> InputError:
     return InputError(
-        f"registration: {agree} of {matches} features agree, {_LEAST} are needed; record a textured scene while the rig "
-        "moves, see to it that the frames' times are right, or calibrate the rig (kalux calibrate rig)"
+        f"registration: {agree} of {matches} features agree, {_LEAST} are needed; record a textured scene while the "
+        "rig moves, see to it that the frames' times are right, or calibrate the rig (kalux calibrate rig)"
     )
 
 

@@ -8,7 +8,7 @@ pixel by pixel.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -31,7 +31,7 @@ MARGIN: Final = 300_000
 """us of events before and after the frames that are aligned: longer than any step is spread over."""
 
 SURE: Final = 1.15
-"""Least height of the peak of the correlation over the next one: below it the offset may be another, e.g. a period more."""
+"""Least height of the peak of the correlation over the next one: below it the offset may be a period more or less."""
 
 _BIN: Final = 1_000  # us
 _CELLS: Final = (12, 16)
@@ -81,8 +81,8 @@ class OffsetEstimate(NamedTuple):
     offset, standard_error
         us, to be added to the frames' times; of the fine fit where there is one.
     apparent
-        us: the offset at which whole event steps explain the frames best. It includes the half threshold by which events
-        trail the light, as the delay that `kalux.reconstruct` corrects does. None without a fine fit.
+        us: the offset at which whole event steps explain the frames best. It includes the half threshold by which
+        events trail the light, as the delay that `kalux.reconstruct` corrects does. None without a fine fit.
     coarse
         The search over seconds.
     fine
@@ -116,12 +116,12 @@ def frame_changes(
     """
     middles: list[int] = []
     rows: list[Array] = []
-    before: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None
+    before: tuple[NDArray[Any], NDArray[Any]] | None = None
     for index, frame in enumerate(frames):
         if index == _COARSE_FRAMES:
             break
-        shot = _one(frame, camera)
-        log, good = shot
+        log, good = _one(frame, camera)
+        now: tuple[NDArray[Any], NDArray[Any]]
         if registration is None:
             scale = max(1, frame.image.shape[1] // 160)
             size = (frame.image.shape[1] // scale, frame.image.shape[0] // scale)
@@ -130,7 +130,8 @@ def frame_changes(
                 cv2.resize(good, size, interpolation=cv2.INTER_AREA),
             )
         else:
-            now = registration.resampled(log), registration.resampled(good) * registration.maps.inside
+            inside = registration.maps.inside.astype(np.float32)
+            now = registration.resampled(log), registration.resampled(good) * inside
         if before is not None:
             both = (now[1] > 0.98) & (before[1] > 0.98)
             change = np.where(both, now[0] - before[0], 0.0)
@@ -216,7 +217,7 @@ def correlate(
     other = float(curve[away].max()) if away.any() else 0.0
     near = slice(max(best - 40, 0), best + 41)
     left_out = _correlation(found[near].sum(axis=1, keepdims=True) - found[near])
-    peaks = [_peak(grid[near], left_out[:, k], interval) for k in range(left_out.shape[1])]
+    peaks = np.array([_peak(grid[near], left_out[:, k], interval) for k in range(left_out.shape[1])])
     n = len(peaks)
     error = float(np.sqrt((n - 1) / n * np.sum((peaks - np.mean(peaks)) ** 2)))
     return Correlation(

@@ -48,7 +48,7 @@ def correlation_plot(
     ratio = "no other peak" if np.isinf(found.ratio) else f"{found.ratio:.2f} times the next peak"
     kind = "registered cells, signed" if found.per_pixel else "activity of the whole image"
     _write(picture, f"correlation {found.peak:.2f}, {ratio}; {kind}", 16, 54, 0.5)
-    x = found.grid * 1e-3
+    x: NDArray[np.float64] = found.grid.astype(np.float64) * 1e-3
     near = np.abs(x - found.offset * 1e-3) <= 80
     for left, xs, ys, title in (
         (0, x, found.curve, "whole range, ms"),

@@ -27,6 +27,8 @@ _APERTURE: Final = 0.4
 """Sigma of a pixel's aperture, in its own pixels. What a pixel of the frame lacks of one of the event camera is blurred
 in before it is resampled, so that fine detail does not alias."""
 
+_EDGE: Final = 0.01  # pixels that count as inside beyond the outermost centres: rounding
+
 _PART: Final = 0.02
 """Share of clipped frame pixels from which a resampled one is no measurement; from 1 less it, it is clipped."""
 
@@ -67,11 +69,13 @@ class Registration:
         x, y = self.places(self._undistorted).T.reshape(2, height, width)
         rows, columns = self.frames.sensor_size
         with np.errstate(invalid="ignore"):
-            inside = (x >= 0) & (x <= columns - 1) & (y >= 0) & (y <= rows - 1)
+            inside = (x >= -_EDGE) & (x <= columns - 1 + _EDGE) & (y >= -_EDGE) & (y <= rows - 1 + _EDGE)
         # A pixel outside shows the nearest that is inside: a guess, for the filter to start with.
-        x = np.clip(np.nan_to_num(x), 0, columns - 1).astype(np.float32)
-        y = np.clip(np.nan_to_num(y), 0, rows - 1).astype(np.float32)
-        return Maps(x, y, inside)
+        return Maps(
+            np.clip(np.nan_to_num(x), 0, columns - 1).astype(np.float32),
+            np.clip(np.nan_to_num(y), 0, rows - 1).astype(np.float32),
+            inside,
+        )
 
     @property
     def _undistorted(self) -> Array:
@@ -148,9 +152,9 @@ class Registration:
             )
         response = frame.normalised()
         values = self.resampled(response)
-        clipped = response >= saturation
+        clipped = np.asarray(response >= saturation)
         if clipped.ndim == 3:
-            clipped = clipped.any(axis=2)
+            clipped = np.asarray(clipped.any(axis=2))
         share = self.resampled(clipped)
         valid = self.maps.inside & ((share < _PART) | (share > 1 - _PART))
         if frame.valid is not None:
@@ -163,7 +167,7 @@ class Registration:
 
 
 def undistortion_maps(lens: Lens) -> Maps:
-    """For a picture without distortion, with the lens's own camera matrix: where each of its pixels lies in the image."""
+    """For a picture without distortion, with the lens's camera matrix: where each of its pixels lies in the image."""
     pinhole = Lens(lens.sensor_size, lens.matrix, np.zeros(5))
     straight = Registration(pinhole, lens, np.eye(3))
     return straight.maps

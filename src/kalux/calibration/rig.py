@@ -1,8 +1,8 @@
 """Two cameras side by side: their lenses, the pose between them, and the TOML file that holds both.
 
 Coordinates are those of OpenCV: x right, y down, z forward, pixel centres at whole numbers. A lens maps the normalised
-point (X/Z, Y/Z) to a pixel through five coefficients of distortion (k1, k2, p1, p2, k3; Brown 1971) and a camera matrix;
-the pose takes a point from the event camera to the frame camera, X_frames = R X_events + t.
+point (X/Z, Y/Z) to a pixel through five coefficients of distortion (k1, k2, p1, p2, k3; Brown 1971) and a camera
+matrix; the pose takes a point from the event camera to the frame camera, X_frames = R X_events + t.
 """
 
 from __future__ import annotations
@@ -169,8 +169,8 @@ class Rig:
         pose = self.rotation.copy()
         if distance is not None:
             pose[:, 2] += self.translation / distance
-        h: Array = self.frames.matrix @ pose @ np.linalg.inv(self.events.matrix)
-        return h / h[2, 2]
+        h = self.frames.matrix @ pose @ np.linalg.inv(self.events.matrix)
+        return np.asarray(h / h[2, 2], np.float64)
 
 
 def rig_toml(rig: Rig) -> str:

@@ -1,6 +1,6 @@
 """Exposures from hardware triggers: what a frame camera tells an event camera by wire, in the event camera's clock.
 
-A camera's exposure output is high while it exposes: its rising edge is the start of an exposure, its falling edge the end.
+A camera's exposure output is high while it exposes: its rising edge is the start, its falling edge the end.
 Where one edge only is recorded (a pulse, a strobe), the exposure time is given.
 """
 
@@ -112,7 +112,7 @@ def exposures(
     wrong = np.flatnonzero(rising != (np.arange(len(rising)) % 2 == 0))
     if len(wrong):
         raise ExposureError(
-            f"triggers: at {times[wrong[0]]} us two edges of one kind follow each other, so that they cannot be paired; "
+            f"triggers: at {times[wrong[0]]} us two edges of one kind follow each other, and cannot be paired; "
             "is an edge lost, or the input noisy? One edge (--trigger-edge rising) and an exposure time may do"
         )
     return times[::2], times[1::2], tuple(notes)
@@ -129,7 +129,7 @@ def match(
 ) -> TriggeredExposures:
     """Which frame each exposure is of.
 
-    Where the numbers differ by one or two, some are missing at the beginning or the end; where they are follows from the
+    Where the numbers differ by one or two, some are missing at the beginning or the end; where follows from the
     intervals between the frames' own stamps, if these vary enough.
 
     Parameters
@@ -180,8 +180,8 @@ def match(
 def _best_shift(starts: Times, stamps: Times | None, missing: int, said: str) -> int:
     """How many of the longer sequence to leave out at the beginning."""
     unsure = ExposureError(
-        f"triggers: there are {said}, and the frames' own times do not tell whether the first or the last is missing; say "
-        "it with --skip-triggers N or --skip-frames N (0 or more; the rest is missing at the end)"
+        f"triggers: there are {said}, and the frames' own times do not tell whether the first or the last is missing; "
+        "say it with --skip-triggers N or --skip-frames N (0 or more; the rest is missing at the end)"
     )
     if stamps is None or min(len(starts), len(stamps)) < 4:
         raise unsure

@@ -201,9 +201,9 @@ def register(
         coarse = correlate(changes, events(), events_size, centre=centre, reach=reach)
         if not coarse.sure:
             raise InputError(
-                f"register: the frames' clock cannot be told from the recording: the correlation is {coarse.peak:.2f} at "
-                f"{coarse.offset * 1e-3:.1f} ms, {coarse.ratio:.2f} times the next peak ({SURE} is needed); shake the rig "
-                "unevenly, narrow the search (--range), or give --offset"
+                "register: the frames' clock cannot be told from the recording: the correlation is "
+                f"{coarse.peak:.2f} at {coarse.offset * 1e-3:.1f} ms, {coarse.ratio:.2f} times the next "
+                f"peak ({SURE} is needed); shake the rig unevenly, narrow the search (--range), or give --offset"
             )
     begin = offset if coarse is None else coarse.offset
     assert begin is not None

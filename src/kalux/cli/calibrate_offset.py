@@ -75,8 +75,8 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     found = estimate_offset(recording.stamped_frames, recording.events, same, centre=centre, reach=reach)
     if not found.coarse.sure:
         warn(
-            f"the correlation is {found.coarse.peak:.2f}, {found.coarse.ratio:.2f} times the next peak: the offset may be "
-            "another; look at --plot, or narrow --range"
+            f"the correlation is {found.coarse.peak:.2f}, {found.coarse.ratio:.2f} times the next peak: the offset "
+            "may be another; look at --plot, or narrow --range"
         )
     if not recording.exposure_known:
         warn("exposures are unknown: the offset is from the frames' stamps to the middle of their exposures")

@@ -203,8 +203,8 @@ def described(found: Registered, by_trigger: bool) -> Iterator[str]:
         yield f"features    {found.matched.inliers} of {found.matched.matches} matches agree with the homography"
     if found.coarse is not None:
         yield (
-            f"offset      {found.offset * 1e-3:.2f} ms, standard error {found.standard_error * 1e-3:.2f} ms, added to the "
-            f"frames' times; correlation {found.coarse.peak:.2f}, {found.coarse.ratio:.2f} times the next peak"
+            f"offset      {found.offset * 1e-3:.2f} ms, standard error {found.standard_error * 1e-3:.2f} ms, added to "
+            f"the frames' times; correlation {found.coarse.peak:.2f}, {found.coarse.ratio:.2f} times the next peak"
         )
     else:
         yield f"offset      {found.offset * 1e-3:.2f} ms, " + ("by trigger" if by_trigger else "as given")

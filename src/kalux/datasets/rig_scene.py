@@ -107,8 +107,8 @@ def distant_scenes(
     picture
         (H, W) radiance, ``fine`` of its pixels to a pixel of the event camera at the image's centre.
     motion
-        Of the rig, about the event camera: x and y as the pixels by which its centre looks right and down, and the angle
-        about its axis. Zooms are ignored.
+        Of the rig, about the event camera: x and y as the pixels by which its centre looks right and down, and the
+        angle about its axis. Zooms are ignored.
     distance
         Of the picture from the event camera, m; it stands square to the camera's axis at rest.
     duration
