@@ -10,9 +10,9 @@ from kalux.calibration.alignment import align, levels, take_shots
 from kalux.calibration.registration import Registration
 from kalux.errors import InputError
 from kalux.settings import CameraSettings
+from rigs import DISTANCE, OFFSET, distant_recording, misplaced, small_rig
 
 from builders import events, frame, pixel_events
-from rigs import DISTANCE, OFFSET, distant_recording, misplaced, small_rig
 
 CAMERA = CameraSettings()
 
@@ -30,7 +30,7 @@ def test_whole_steps_are_counts():
 
 
 def test_a_step_is_spread_over_the_shorter_of_the_times_around_it():
-    """Events at 1, 2 and 5 ms: the second gathered for 1 ms (since the first), the third for 3 ms (nothing comes after)."""
+    """Events at 1, 2 and 5 ms: the second gathered for 1 ms, since the first, the third for 3 ms."""
     array = pixel_events([1000, 2000, 5000], [1, 1, 0])
     on, off = at(array, [0, 500, 1000, 1500, 2000, 3500, 5000])
     # Nothing comes before the first event: it gathered as long as the second.

@@ -19,9 +19,9 @@ from kalux.calibration.boards import (
 )
 from kalux.calibration.registration import Registration
 from kalux.errors import InputError
+from rigs import DISTANCE, SQUARE, board_recording, misplaced, small_rig
 
 from builders import events
-from rigs import DISTANCE, SQUARE, board_recording, misplaced, small_rig
 
 BOARD = Board(6, 5, SQUARE)
 SIZES = {"events_size": (120, 160), "frames_size": (240, 320)}
@@ -110,7 +110,7 @@ def test_a_charuco_board_is_found_even_in_part():
     np.testing.assert_allclose(np.diff(whole.pixels[:6], axis=0), [[80, 0]] * 5, atol=0.5)
     part = board.find(np.pad(drawn, 30, constant_values=255)[:, 160:])
     assert 6 <= len(part.ids) < 24
-    np.testing.assert_allclose(part.pixels + [160, 0], whole.pixels[part.ids], atol=0.5)
+    np.testing.assert_allclose(part.pixels + np.array([160, 0]), whole.pixels[part.ids], atol=0.5)
     assert board.find(np.zeros((100, 100), np.uint8)) is None
 
 

@@ -13,9 +13,9 @@ from kalux.calibration.registration import Registration
 from kalux.calibration.rig import Lens
 from kalux.errors import InputError
 from kalux.settings import CameraSettings
+from rigs import DISTANCE, OFFSET, distant_recording, small_rig
 
 from builders import frame, pixel_events
-from rigs import DISTANCE, OFFSET, distant_recording, small_rig
 
 CAMERA = CameraSettings()
 TRUTH = Registration.of_rig(small_rig(), DISTANCE)

@@ -11,7 +11,6 @@ from kalux.calibration.registration import Registration, require_overlap, undist
 from kalux.calibration.rig import Lens
 from kalux.datasets.rig_scene import example_rig
 from kalux.errors import FrameError, InputError
-
 from rigs import DISTANCE, SENSOR, distant_recording, small_rig
 
 SIZE = (30, 40)

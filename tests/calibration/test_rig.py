@@ -36,7 +36,7 @@ def test_the_lens_is_that_of_opencv(rig, name):
 @pytest.mark.parametrize("name", ["events", "frames"])
 def test_pixels_and_rays_are_inverse(rig, name):
     lens = getattr(rig, name)
-    rays = lens.rays()
+    rays = lens.rays
     assert np.isfinite(rays).all()
     np.testing.assert_allclose(lens.pixels(rays), grid(lens), atol=1e-3)
 
@@ -53,7 +53,7 @@ def test_where_the_lens_folds_back_there_is_nothing():
 
 @pytest.mark.parametrize("distance", [2.0, 20.0, None])
 def test_the_homography_takes_points_of_the_plane_where_the_cameras_see_them(rig, distance):
-    rays = rig.events.rays()[::97]
+    rays = rig.events.rays[::97]
     depth = 1e9 if distance is None else distance
     points = np.column_stack([rays, np.ones(len(rays))]) * depth @ rig.rotation.T + rig.translation
     expected = points[:, :2] / points[:, 2:] @ rig.frames.matrix[:2, :2].T + rig.frames.matrix[:2, 2]

@@ -95,7 +95,7 @@ def test_a_missing_one_is_found_by_the_intervals(at, many):
 def test_even_intervals_do_not_tell():
     starts = np.arange(10) * 33_333
     for stamps in (None, np.arange(9) * 33_333):
-        with pytest.raises(ExposureError, match="10 trigger exposures and 9 frames.*--skip-triggers"):
+        with pytest.raises(ExposureError, match=r"10 trigger exposures and 9 frames.*--skip-triggers"):
             match(starts, starts + 9, stamps, 9)
     found = match(starts, starts + 9, None, 9, skip_triggers=1)
     np.testing.assert_array_equal(found.starts, starts[1:])

@@ -16,7 +16,6 @@ from kalux.datasets.simulate import simulate_frames
 from kalux.errors import ExposureError, InputError
 from kalux.readers import hdf5
 from kalux.readers.source import TRIGGER_DTYPE
-
 from rigs import DISTANCE, OFFSET, SENSOR, distant_recording, misplaced, small_rig
 
 SIZES = {"events_size": (120, 160), "frames_size": (240, 320)}
@@ -102,7 +101,7 @@ def test_what_does_not_fit(options, told):
 def test_a_still_scene_tells_no_offset():
     seen = distant_recording()
     still = [dataclasses.replace(f, image=seen.frames[0].image) for f in seen.frames]
-    with pytest.raises(InputError, match="offset|cannot be told"):
+    with pytest.raises(InputError, match=r"offset|cannot be told"):
         register(lambda: still, lambda: [seen.events], rig=small_rig(), reach=200_000, **SIZES)
 
 

@@ -288,9 +288,9 @@ def calibrate_rig(
 ) -> RigCalibration:
     """Intrinsics of both cameras (k1, k2, p1, p2; k3 = 0, which boards seldom determine) and their pose.
 
-    Each camera by itself first (Zhang 2000), then all together, by which the frames, whose corners are sharper, make the
-    event camera's lens better known. Views with more than three times the
-    median error are dropped, and all is done again.
+    Each camera by itself first (Zhang 2000), then all together, by which the frames, whose corners are sharper, make
+    the event camera's lens better known. Views with more than three times the median error are dropped, and all is
+    done again.
 
     Parameters
     ----------

@@ -320,8 +320,6 @@ def estimate_offset(
     changes = frame_changes(frames(), registration, camera)
     coarse = correlate(changes, events(), registration.events.sensor_size, centre=centre, reach=reach)
     shots, inside = aligned_stretch(frames, events, changes, coarse.offset, camera)
-    fine, whole = (
-        align(shots, inside, registration, offset=coarse.offset, free_homography=False, spread=spread)
-        for spread in (True, False)
-    )
+    fine = align(shots, inside, registration, offset=coarse.offset, free_homography=False)
+    whole = align(shots, inside, registration, offset=fine.offset, free_homography=False, spread=False)
     return OffsetEstimate(fine.offset, fine.standard_error, whole.offset, coarse, fine)

@@ -80,7 +80,7 @@ class Registration:
     @property
     def _undistorted(self) -> Array:
         """Undistorted pixels of the event camera, (H * W, 2)."""
-        rays = self.events.rays()
+        rays = self.events.rays
         return rays @ self.events.matrix[:2, :2].T + self.events.matrix[:2, 2]
 
     def places(self, undistorted: Array) -> Array:

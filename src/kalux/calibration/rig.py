@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import tomllib
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
 
@@ -98,6 +99,7 @@ class Lens:
         points[~(off < _CONVERGED)] = np.nan
         return points
 
+    @cached_property
     def rays(self) -> Array:
         """Normalised points of all pixels, (height * width, 2), row by row."""
         height, width = self.sensor_size

@@ -121,7 +121,7 @@ def distant_scenes(
     def scene(lens: Lens, turn: Array, position: Array, name: str) -> Scene:
         blurred = _blurred(canvas, _APERTURE * fine * focal / float(lens.matrix[0, 0]))
         height, width = lens.sensor_size
-        rays = lens.rays().reshape(height, width, 2)
+        rays = lens.rays.reshape(height, width, 2)
 
         def radiance(t: float) -> Image:
             pose = motion(t)
