@@ -37,6 +37,7 @@ _BIN: Final = 1_000  # us
 _CELLS: Final = (12, 16)
 _COARSE_FRAMES: Final = 400
 _LEAST_FRAMES: Final = 6
+_LARGEST: Final = 30_000_000  # pixels of all frames that are aligned together: some 700 MB
 _LEAST_CORRELATION: Final = 0.25
 
 
@@ -280,11 +281,18 @@ def aligned_stretch(
     frames: Callable[[], Iterable[Frame]],
     events: Callable[[], Iterable[EventArray]],
     changes: Changes,
+    sensor_size: tuple[int, int],
     offset: float,
     camera: CameraSettings,
 ) -> tuple[Shots, EventArray]:
-    """The frames of the busiest stretch, and its events."""
-    shots = take_shots(some_frames(frames(), busiest(changes)), camera)
+    """The frames of the busiest stretch, fewer of large ones, and its events.
+
+    ``sensor_size`` is the event camera's (height, width), ``offset`` us.
+    """
+    first = next(iter(frames()))
+    most = _LARGEST // max(first.image[..., 0].size if first.image.ndim == 3 else first.image.size, 1)
+    most = int(np.clip(min(most, _LARGEST // (2 * sensor_size[0] * sensor_size[1])), 8, MOST_FRAMES))
+    shots = take_shots(some_frames(frames(), busiest(changes, most)), camera)
     begin, end = int(shots.middles[0]) + offset - MARGIN, int(shots.middles[-1]) + offset + MARGIN
     return shots, some_events(events(), begin, end)
 
@@ -319,7 +327,9 @@ def estimate_offset(
     camera = camera if camera is not None else CameraSettings()
     changes = frame_changes(frames(), registration, camera)
     coarse = correlate(changes, events(), registration.events.sensor_size, centre=centre, reach=reach)
-    shots, inside = aligned_stretch(frames, events, changes, coarse.offset, camera)
+    shots, inside = aligned_stretch(
+        frames, events, changes, registration.events.sensor_size, coarse.offset, camera
+    )
     fine = align(shots, inside, registration, offset=coarse.offset, free_homography=False)
     whole = align(shots, inside, registration, offset=fine.offset, free_homography=False, spread=False)
     return OffsetEstimate(fine.offset, fine.standard_error, whole.offset, coarse, fine)

@@ -207,7 +207,7 @@ def register(
             )
     begin = offset if coarse is None else coarse.offset
     assert begin is not None
-    shots, inside = aligned_stretch(frames, events, changes, begin, camera)
+    shots, inside = aligned_stretch(frames, events, changes, events_size, begin, camera)
     matched = match_cameras(shots, inside, *lenses, begin) if first is None else None
     guess = first if matched is None else matched.registration
     assert guess is not None

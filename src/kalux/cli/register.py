@@ -126,10 +126,13 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
         offset = read_offset(options.offset)
     elif timing != "auto":
         offset = 0.0
+    size = events.sensor_size
+    if rig is not None and not events.source.sensor_size_known:
+        size = rig.events.sensor_size  # of which the recording knows no more than which pixels had events
     found = register(
         frames,
         events.events,
-        events_size=events.sensor_size,
+        events_size=size,
         frames_size=other.sensor_size,
         rig=rig,
         distance=options.distance,
@@ -144,7 +147,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
             say(line)
     if not exposure_known:
         warn("the frames have no exposure times; --exposure and --stamp would put them in")
-    _write(options, events, lambda: found.frames(frames()), exposure_known)
+    _write(options, events, size, lambda: found.frames(frames()), exposure_known)
     if options.plot is not None and found.coarse is not None:
         from kalux.calibration.pictures import correlation_plot
 
@@ -219,6 +222,7 @@ def described(found: Registered, by_trigger: bool) -> Iterator[str]:
 def _write(
     options: argparse.Namespace,
     events: Recording,
+    size: tuple[int, int],
     frames: Callable[[], Iterable[Frame]],
     exposure_known: bool,
 ) -> None:
@@ -236,7 +240,7 @@ def _write(
 
         hdf5.write(
             options.out,
-            sensor_size=events.sensor_size,
+            sensor_size=size,
             events=counted(events.events(), lambda chunk: progress.add(events=len(chunk))),
             frames=counted(frames(), lambda _: progress.add(images=1)),
             exposure_known=exposure_known,
