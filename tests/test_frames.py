@@ -96,3 +96,17 @@ def not_finite():
 def test_bad_frames_are_named(one, options, kind, message):
     with pytest.raises(kind, match="here.*" + message):
         check(one, **options)
+
+
+@pytest.mark.parametrize("valid", [np.ones((3, 5), bool), np.ones((3, 4), np.uint8)])
+def test_a_mask_of_another_size_or_type_is_refused(valid):
+    masked = Frame(np.ones((3, 4), np.uint8), 100, 200, valid=valid)
+    with pytest.raises(FrameError, match=r"mask of valid pixels of .*bool \(3, 4\) is needed"):
+        check_frame(masked, (3, 4))
+
+
+def test_a_placed_exposure_keeps_the_mask():
+    mask = np.eye(3, 4, dtype=bool)
+    masked = Frame(np.ones((3, 4), np.uint8), 100, 100, valid=mask)
+    assert place_exposure(masked, 10, "start").valid is mask
+    check_frame(masked, (3, 4), exposure_known=False)

@@ -146,6 +146,20 @@ def test_the_spilled_recording_is_the_recording_reversed(tmp_path):
     assert len(spill.reversed_events(spill.count)) == 0
 
 
+def test_the_spill_keeps_masks(tmp_path):
+    mask = np.arange(48).reshape(SIZE) % 3 == 0
+    whole = recording()
+    frames = [
+        dataclasses.replace(frame, valid=mask if i == 1 else None) for i, frame in enumerate(whole.frames())
+    ]
+    spill = Spill(
+        Recording.from_arrays(make_events(*[np.empty(0, int)] * 4), frames, sensor_size=SIZE), tmp_path
+    )
+    found = [spill.reversed_frame(i).valid for i in range(len(spill))]
+    assert [valid is None for valid in found] == [True, True, True, False, True]
+    np.testing.assert_array_equal(found[3], mask)
+
+
 def test_thresholds_change_sides():
     settings = PRESETS["default"]
     events = dataclasses.replace(settings.events, threshold_on=0.1, threshold_off=0.3)

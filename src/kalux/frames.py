@@ -37,6 +37,10 @@ class Frame:
         of 10 or 12 bits stored in uint16 need it (1023, 4095).
     mosaic
         Of a Bayer sensor, whose pixels each see one colour in frames and events alike: its pattern. None: no mosaic.
+    valid
+        (height, width) bool: False where the frame says nothing, e.g. outside the view of a second camera. The
+        value of such a pixel is no measurement, not even of brightness beyond white; it should be a guess,
+        because the first frame's is where the filter starts. None: all pixels are measured.
     """
 
     image: NDArray[Any]
@@ -44,6 +48,7 @@ class Frame:
     exposure_end: int
     white: float | None = None
     mosaic: Mosaic | None = None
+    valid: NDArray[np.bool_] | None = None
 
     @property
     def colours(self) -> str:
@@ -124,6 +129,12 @@ def check_frame(
     if image.dtype.kind == "f" and not np.isfinite(image).all():
         y, x = (int(i[0]) for i in np.nonzero(~np.isfinite(image))[:2])
         raise FrameError(f"{where}: frame {index} is not finite (NaN or infinite) at x={x}, y={y}")
+    valid = frame.valid
+    if valid is not None and (valid.shape != sensor_size or valid.dtype != bool):
+        raise FrameError(
+            f"{where}: frame {index} has a mask of valid pixels of {valid.dtype} {valid.shape}; "
+            f"bool {sensor_size} is needed"
+        )
     if exposure_known and frame.exposure <= 0:
         raise ExposureError(
             f"{where}: frame {index} has an exposure of {frame.exposure} us; give the real exposure time "

@@ -210,9 +210,10 @@ def summarise_frames(frames: Iterable[Frame], *, exposure_known: bool = True) ->
         starts.append(frame.exposure_start)
         exposures.append(frame.exposure)
         last = frame.exposure_end
-        pixels += frame.image.size
-        saturated += int(np.count_nonzero(frame.image >= _SATURATED * frame.white_value))
-        near_black += int(np.count_nonzero(frame.image <= _NEAR_BLACK * frame.white_value))
+        image = frame.image if frame.valid is None else frame.image[frame.valid]
+        pixels += image.size
+        saturated += int(np.count_nonzero(image >= _SATURATED * frame.white_value))
+        near_black += int(np.count_nonzero(image <= _NEAR_BLACK * frame.white_value))
     if last is None:
         return FrameSummary(0)
     intervals = np.diff(np.array(starts, np.float64))
@@ -225,8 +226,8 @@ def summarise_frames(frames: Iterable[Frame], *, exposure_known: bool = True) ->
         exposure_min=min(exposures) if exposure_known else None,
         exposure_median=float(np.median(exposures)) if exposure_known else None,
         exposure_max=max(exposures) if exposure_known else None,
-        saturated_share=saturated / pixels,
-        near_black_share=near_black / pixels,
+        saturated_share=saturated / max(pixels, 1),
+        near_black_share=near_black / max(pixels, 1),
         gap_count=int(np.count_nonzero(intervals > _LARGE_GAP * median_interval)) if median_interval else 0,
         largest_gap=int(intervals.max()) if len(intervals) else None,
     )

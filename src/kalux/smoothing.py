@@ -56,7 +56,7 @@ class Spill:
     def __init__(self, recording: Recording, folder: Path) -> None:
         self._folder = folder
         self._events = folder / "events.bin"
-        self._exposures: list[tuple[int, int, float | None, Mosaic | None]] = []
+        self._exposures: list[tuple[int, int, float | None, Mosaic | None, bool]] = []
         self.count = 0
         try:
             with self._events.open("wb") as file:
@@ -65,7 +65,17 @@ class Spill:
                     self.count += len(chunk)
             for index, frame in enumerate(recording.frames()):
                 np.save(self._frame_path(index), frame.image)
-                self._exposures.append((frame.exposure_start, frame.exposure_end, frame.white, frame.mosaic))
+                if frame.valid is not None:
+                    np.save(self._mask_path(index), frame.valid)
+                self._exposures.append(
+                    (
+                        frame.exposure_start,
+                        frame.exposure_end,
+                        frame.white,
+                        frame.mosaic,
+                        frame.valid is not None,
+                    )
+                )
         except OSError as error:
             raise OutputError(
                 f"{folder}: the recording cannot be spilled for the backward pass: {error.strerror or error}"
@@ -83,8 +93,9 @@ class Spill:
     def reversed_frame(self, index: int) -> Frame:
         """The frame ``index`` of the reversed recording."""
         forward = len(self) - 1 - index
-        start, end, white, mosaic = self._exposures[forward]
-        return Frame(np.load(self._frame_path(forward)), -end, -start, white, mosaic)
+        start, end, white, mosaic, masked = self._exposures[forward]
+        valid = np.load(self._mask_path(forward)) if masked else None
+        return Frame(np.load(self._frame_path(forward)), -end, -start, white, mosaic, valid)
 
     def reversed_events(self, first: int) -> EventArray:
         """A block of the reversed recording's events, from its event ``first`` on; empty at the end."""
@@ -101,6 +112,9 @@ class Spill:
 
     def _frame_path(self, index: int) -> Path:
         return self._folder / f"frame_{index:06d}.npy"
+
+    def _mask_path(self, index: int) -> Path:
+        return self._folder / f"valid_{index:06d}.npy"
 
 
 class BackwardPass:

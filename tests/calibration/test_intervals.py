@@ -49,3 +49,12 @@ def test_change_level_and_what_is_usable():
 
 def test_no_more_frames_than_asked_for():
     assert len(list(intervals(recording(random_stream(4), 50), CAMERA, margin=0, most_frames=2))) == 1
+
+
+def test_pixels_that_are_not_valid_are_not_usable():
+    frames = [frame([[51, 60, 70]], 0, 10_000), frame([[102, 100, 100]], 40_000, 50_000)]
+    masks = np.array([[True, True, False]]), np.array([[True, False, True]])
+    masked = [dataclasses.replace(f, valid=m) for f, m in zip(frames, masks, strict=True)]
+    rec = Recording.from_arrays(pixel_events([20_000], [1]), masked, sensor_size=(1, 3))
+    (interval,) = intervals(rec, CAMERA, margin=0, most_frames=2)
+    assert interval.usable.tolist() == [[True, False, False]]

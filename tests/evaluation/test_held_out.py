@@ -73,6 +73,23 @@ def test_scores_by_hand():
     assert scores.adjustments() == ["intensities divided by 0.8"]
 
 
+def test_pixels_that_are_not_valid_do_not_count():
+    """The frames are 100 where they are valid, and 255, which no method is punished for, elsewhere."""
+    mask = np.zeros((12, 16), bool)
+    mask[:, :12] = True
+    image = np.where(mask, 100, 255).astype(np.uint8)
+    frames = [kalux.Frame(image, 100 * i, 100 * i + 10, valid=mask) for i in range(9)]
+    recording = Recording.from_arrays(
+        pixel_events([], []), frames, sensor_size=(12, 16), contrast_threshold=0.2
+    )
+    held = hold_out_frames(recording)
+    assert held.scale == pytest.approx(100 / 255)
+    scores = evaluate_held_out(held, constant(100 / 255))
+    assert scores.mse == pytest.approx(0, abs=1e-12)
+    assert scores.images[0].pixels == mask.sum()
+    np.testing.assert_array_equal(valid_pixels(frames[0]), mask)
+
+
 def test_nothing_is_clipped_unless_asked_for():
     held = hold_out_frames(still([255] * 8))
     assert evaluate_held_out(held, constant(3.0)).mse == pytest.approx(4.0)

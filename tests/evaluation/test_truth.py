@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -80,6 +82,20 @@ def test_masked_pixels_may_hold_anything(simulation, recording):
     assert hold.mse != whole.mse
     right = evaluate_truth(recording, reference, perfect(simulation), hdr_vdp=True)
     assert (right.mse, right.q) == (0, pytest.approx(10))
+
+
+def test_pixels_that_no_frame_sees_are_not_compared(simulation):
+    """A pixel that one frame sees is: what events carry is the method's to know."""
+    masks = np.ones((len(simulation.frames), 32, 40), bool)
+    masks[:, :, 30:] = False
+    masks[2, :, 30:35] = True
+    frames = [dataclasses.replace(f, valid=m) for f, m in zip(simulation.frames, masks, strict=True)]
+    recording = kalux.Recording.from_arrays(simulation.events, frames, sensor_size=(32, 40))
+    reference = prepare_reference(recording, simulation.truth())
+    assert reference.masks.sum() == len(reference.times) * 32 * 35
+    assert not reference.masks[:, :, 35:].any()
+    assert "that no frame sees" in reference.described()
+    assert evaluate_truth(recording, reference, perfect(simulation)).mse == 0
 
 
 def test_what_does_not_fit_is_refused(simulation, recording):

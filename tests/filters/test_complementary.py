@@ -19,7 +19,8 @@ ON, OFF = 0.3, 0.2
 
 
 def held(log_frame=0.0, gain=6.0, start=1000, shape=(1, 1)):
-    return HeldSegment(start, 10**9, np.full(shape, log_frame, np.float32), gain, ON, OFF)
+    frame, gains = np.full(shape, log_frame, np.float32), np.full(shape, gain, np.float32)
+    return HeldSegment(start, 10**9, frame, gains, ON, OFF)
 
 
 def solved(value, target, gain, times, polarities, start, t):

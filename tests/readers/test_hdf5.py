@@ -27,6 +27,8 @@ from recordings import (
     small_frames,
 )
 
+MASK = np.random.default_rng(1).random(SIZE) < 0.5
+
 REFERENCE = GroundTruth(
     np.array([10, 20, 30]), np.random.default_rng(0).uniform(0, 9, (3, *SIZE)).astype(np.float32)
 )
@@ -251,3 +253,29 @@ def test_masks_of_the_truth_and_the_response(tmp_path):
     found = hdf5.read(tmp_path / "a.h5")
     assert found.response == "gamma:2.2"
     assert np.array_equal(found.ground_truth().masks, truth.masks)
+
+
+@pytest.mark.parametrize("masked", [(0, 1, 2, 3), (0,), (2,), (3,), ()])
+def test_masks_of_valid_pixels_come_back(path, masked):
+    """Where one frame has a mask, all have one; those without are valid everywhere."""
+    frames = [
+        dataclasses.replace(frame, valid=MASK if i in masked else None)
+        for i, frame in enumerate(small_frames())
+    ]
+    write(path, frames=frames)
+    back = list(readers.read(path).frames())
+    assert same_frames(frames, back)
+    for i, frame in enumerate(back):
+        if not masked:
+            assert frame.valid is None
+        else:
+            assert frame.valid.dtype == bool
+            np.testing.assert_array_equal(frame.valid, MASK if i in masked else np.ones(SIZE, bool))
+
+
+def test_masks_of_another_number_are_refused(path):
+    write(path, frames=[dataclasses.replace(frame, valid=MASK) for frame in small_frames()])
+    with h5py.File(path, "r+") as file:
+        file["frames/valid"].resize(3, axis=0)
+    with pytest.raises(FormatError, match="different lengths"):
+        readers.read(path)

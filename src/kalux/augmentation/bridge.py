@@ -23,15 +23,21 @@ from numpy.typing import NDArray
 Array = NDArray[np.floating[Any]]
 
 UNMEASURED: Final = 2.0**40
-"""Variance of a clipped or masked pixel, a number that float32 holds too. 1/R is then 1e-12, which cannot be told
+"""Variance of a clipped pixel, a number that float32 holds too. 1/R is then 1e-12, which cannot be told
 from 0 beside any information in use (1e-2 and more), and the formulas need no special case."""
+
+UNSEEN: Final = 2.0**41
+"""Variance of a pixel of which the frame says nothing (`Frame.valid`): as little weight, and no bound."""
 
 _SCALE_BOUNDS: Final = (0.3, 3.0)
 _SCALE_DRIFT: Final = 1e-5  # variance per frame: a calibration never becomes certain, temperatures drift
 
 
 class Latent(NamedTuple):
-    """A deblurred frame at one moment: (H, W) log intensity and its variance (`UNMEASURED` where clipped)."""
+    """A deblurred frame at one moment: (H, W) log intensity and its variance.
+
+    The variance is `UNMEASURED` where the frame is clipped, `UNSEEN` where it is masked.
+    """
 
     value: Array
     variance: Array
@@ -106,7 +112,7 @@ def floor_before(second: Latent, net: Array, unmeasured: NDArray[np.bool_]) -> A
     What is not known of such a pixel is a constant: if events lead from it to less than the next frame's bound, it was
     too low all the time. ``net`` is what events add to the level between the frames.
     """
-    bound = unmeasured & (second.variance >= UNMEASURED)
+    bound = unmeasured & (second.variance >= UNMEASURED) & (second.variance < UNSEEN)
     return np.where(bound, second.value - net, np.float32(-np.inf))
 
 
@@ -122,7 +128,7 @@ def lift(log_intensity: Array, frame: Latent) -> None:
 @nb.njit(cache=True, nogil=True)
 def _lift(log_intensity, value, variance):  # type: ignore[no-untyped-def]
     for i in range(len(value)):
-        if variance[i] >= UNMEASURED and value[i] > log_intensity[i]:
+        if UNMEASURED <= variance[i] < UNSEEN and value[i] > log_intensity[i]:
             log_intensity[i] = value[i]
 
 

@@ -32,7 +32,7 @@ class Interval(NamedTuple):
     level
         (H, W) mean of I at both ends.
     usable
-        (H, W) bool: well exposed at both ends.
+        (H, W) bool: valid and well exposed at both ends.
     events
         Those between ``start`` and ``end``, and those of the margin before and after.
     first, second
@@ -68,6 +68,8 @@ def intervals(
         level = frame.normalised()
         inside = (level > low) & (level < high)
         usable = np.asarray(inside.all(axis=-1) if inside.ndim == 3 else inside, np.bool_)
+        if frame.valid is not None:
+            usable &= frame.valid
         while len(buffer) == 0 or buffer["t"][-1] <= shot.middle + margin:
             chunk = next(chunks, None)
             if chunk is None:

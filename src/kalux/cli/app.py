@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from kalux.cli import (
     ahdr,
     benchmark,
+    calibrate,
     convert,
     datasets,
     demo,
@@ -16,6 +17,7 @@ from kalux.cli import (
     hdr_reference,
     info,
     reconstruct,
+    register,
     simulate,
 )
 from kalux.cli.parser import Parser, UsageError, normalised
@@ -29,6 +31,8 @@ COMMANDS = (
     info,
     reconstruct,
     convert,
+    register,
+    calibrate,
     evaluate,
     benchmark,
     simulate,
@@ -46,6 +50,8 @@ commands:
   info         what is in a recording, and what kalux would use of it
   reconstruct  make images or a video from a recording
   convert      copy a recording of any format into one kalux HDF5 file
+  register     make one recording of an event camera's events and another camera's frames
+  calibrate    measure what cameras are like: two-camera rigs, clock offsets
   evaluate     compare methods with ground truth, or with frames held out
   benchmark    the same for many recordings, with a report
   simulate     make a recording with ground truth from an HDR photograph, images or a video

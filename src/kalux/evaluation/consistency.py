@@ -114,7 +114,8 @@ def blur_consistency(
 
 
 def valid_pixels(frame: Frame) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-    """Where a frame is neither clipped nor black, in any of its channels: (H, W) bool."""
+    """Where a frame is measured, and neither clipped nor black in any of its channels: (H, W) bool."""
     values = frame.normalised()
-    valid = (values > 0) & (values < CameraSettings().saturation)
-    return np.asarray(valid.all(axis=-1) if valid.ndim == 3 else valid, np.bool_)
+    inside = (values > 0) & (values < CameraSettings().saturation)
+    valid = inside.all(axis=-1) if inside.ndim == 3 else inside
+    return np.asarray(valid if frame.valid is None else valid & frame.valid, np.bool_)

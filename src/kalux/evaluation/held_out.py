@@ -200,6 +200,7 @@ def held_out_pairs(held: HeldOut, method: Method, *, clip: bool = False) -> Iter
             frame.middle,
             image,
             linear_frame(frame, held.reference_exposure, held.response),
+            frame.valid,
             variance=means[1] if len(means) == 2 else None,
             clipped=frame.normalised() >= CameraSettings().saturation,
             log_offset=offset,
@@ -215,7 +216,8 @@ def intensity_percentile(recording: Recording, percent: float, reference: int, r
     """A percentile of the intensities of all frames, in little memory: frames repeat their values."""
     values, counts = np.empty(0), np.empty(0, np.int64)
     for frame in recording.frames():
-        found, number = np.unique(linear_frame(frame, reference, response), return_counts=True)
+        linear = linear_frame(frame, reference, response)
+        found, number = np.unique(linear if frame.valid is None else linear[frame.valid], return_counts=True)
         values, index = np.unique(np.concatenate([values, found]), return_inverse=True)
         counts = np.bincount(index, np.concatenate([counts, number])).astype(np.int64)
     return percentile_of_counts(values, counts, percent)

@@ -46,7 +46,7 @@ class Reference:
         """The protocol in words; ``origin``, such as " of FILE", says whose truth it is."""
         said = f"ground truth{origin}: {len(self.times)} images"
         if self.masks is not None:
-            said += ", masked pixels not compared"
+            said += ", masked pixels and those that no frame sees not compared"
         if self.left_out:
             said += f"; {self.left_out} more lie before the first or after the last frame"
         return said
@@ -65,7 +65,7 @@ def prepare_reference(
         Reference images, in any order.
     mask
         (T, H, W) or (H, W) bool, True = compared; where it is False an image may hold anything, NaN included.
-        Default: that of the truth.
+        Default: that of the truth. Pixels that no frame sees (`Frame.valid`) are not compared either.
 
     Raises
     ------
@@ -83,7 +83,9 @@ def prepare_reference(
         )
     given = truth.masks if mask is None else mask
     masks = None if given is None else _masks(given, images.shape)
-    first, last = _span(recording)
+    first, last, seen = _frames_span(recording)
+    if not seen.all():
+        masks = np.broadcast_to(seen, images.shape) if masks is None else masks & seen
     order = np.argsort(times, kind="stable")
     chosen = order[(times[order] >= first) & (times[order] <= last)]
     if len(chosen) == 0:
@@ -212,9 +214,13 @@ def _masks(mask: NDArray[np.bool_], shape: tuple[int, ...]) -> NDArray[np.bool_]
     return np.broadcast_to(given, shape)
 
 
-def _span(recording: Recording) -> tuple[int, int]:
-    """Middle of the first exposure, where every method can begin, and end of the last, us."""
-    frames = [(frame.middle, frame.exposure_end) for frame in recording.frames()]
-    if not frames:
+def _frames_span(recording: Recording) -> tuple[int, int, NDArray[np.bool_]]:
+    """Middle of the first exposure, where every method can begin, and end of the last, us; which pixels frames see."""
+    seen = np.zeros(recording.sensor_size, bool)
+    spans = []
+    for frame in recording.frames():
+        spans.append((frame.middle, frame.exposure_end))
+        seen |= True if frame.valid is None else frame.valid
+    if not spans:
         raise FrameError(f"{recording.source.path}: no frames; an evaluation needs frames")
-    return frames[0][0], frames[-1][1]
+    return spans[0][0], spans[-1][1], seen

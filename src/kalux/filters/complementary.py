@@ -34,6 +34,7 @@ HELD_PIXEL: Final = np.dtype(
     [
         ("deviation", "f4"),  # L - L^F after the pixel's latest event, or at the origin
         ("since", "i4"),  # time of that event, us after the origin, or 0
+        ("gain", "f4"),  # 1/s
     ],
     align=True,
 )
@@ -41,12 +42,12 @@ HELD_PIXEL: Final = np.dtype(
 
 
 class HeldSegment(NamedTuple):
-    """A frame that is held: times in us, log(I + I_0) as (H, W), the gain in 1/s, nominal thresholds."""
+    """A frame that is held: times in us, (H, W) log(I + I_0) and gain in 1/s (0: no frame), nominal thresholds."""
 
     start: int
     end: int
     log_frame: Array
-    gain: float
+    gain: Array
     step_on: float
     step_off: float
 
@@ -62,7 +63,6 @@ class Cursor:
 class _Scalars(NamedTuple):
     """Of the segment, float32."""
 
-    gain: np.float32
     step_on: np.float32
     step_off: np.float32
 
@@ -71,6 +71,7 @@ def begin(segment: HeldSegment, log_intensity: Array) -> Cursor:
     """The cursor at the start of a segment."""
     pixels = np.zeros(log_intensity.shape, HELD_PIXEL)
     pixels["deviation"] = log_intensity - segment.log_frame
+    pixels["gain"] = segment.gain
     return Cursor(pixels, segment.start)
 
 
@@ -84,7 +85,7 @@ def advance(segment: HeldSegment, cursor: Cursor, events: EventArray) -> None:
         events = events[count:]
         if len(events):
             epochs = (int(events["t"][0]) - 1 - segment.start) // EPOCH
-            _move_origin(pixels, segment.start + epochs * EPOCH - cursor.origin, scalars.gain)
+            _move_origin(pixels, segment.start + epochs * EPOCH - cursor.origin)
             cursor.origin = segment.start + epochs * EPOCH
 
 
@@ -93,14 +94,13 @@ def read(segment: HeldSegment, cursor: Cursor, t: int) -> Array:
     log_intensity = np.empty(cursor.pixels.shape, np.float32)
     within = min(t - cursor.origin, EPOCH)
     beyond = np.float32((t - cursor.origin - within) * 1e-6)
-    gain = np.float32(segment.gain)
     frame = segment.log_frame.reshape(-1)
-    _read(frame, cursor.pixels.reshape(-1), within, beyond, gain, log_intensity.reshape(-1))
+    _read(frame, cursor.pixels.reshape(-1), within, beyond, log_intensity.reshape(-1))
     return log_intensity
 
 
 def _scalars(segment: HeldSegment) -> _Scalars:
-    return _Scalars(np.float32(segment.gain), np.float32(segment.step_on), np.float32(segment.step_off))
+    return _Scalars(np.float32(segment.step_on), np.float32(segment.step_off))
 
 
 @nb.njit(cache=True, inline="always")
@@ -120,21 +120,21 @@ def _advance(words, pixels, width, origin, scalars):  # type: ignore[no-untyped-
         now = np.int32(words[i, 0] - origin)
         seconds = np.float32(np.int32(now - pixel.since)) * MICROSECOND32
         step = scalars.step_on if event_is_on(word) else -scalars.step_off
-        pixel.deviation = decayed(pixel.deviation, scalars.gain, seconds) + step
+        pixel.deviation = decayed(pixel.deviation, pixel.gain, seconds) + step
         pixel.since = now
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _read(log_frame, pixels, now, beyond, gain, log_intensity):  # type: ignore[no-untyped-def]
+def _read(log_frame, pixels, now, beyond, log_intensity):  # type: ignore[no-untyped-def]
     for i in range(len(pixels)):
         seconds = np.float32(np.int32(now - pixels[i].since)) * MICROSECOND32 + beyond
-        log_intensity[i] = log_frame[i] + decayed(pixels[i].deviation, gain, seconds)
+        log_intensity[i] = log_frame[i] + decayed(pixels[i].deviation, pixels[i].gain, seconds)
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _move_origin(pixels, span, gain):  # type: ignore[no-untyped-def]
+def _move_origin(pixels, span):  # type: ignore[no-untyped-def]
     """Predict every pixel at an origin ``span`` us later, so that times do not overflow."""
     for i in range(len(pixels)):
         pixel = pixels[i]
-        pixel.deviation = decayed(pixel.deviation, gain, np.float32(span - pixel.since) * MICROSECOND32)
+        pixel.deviation = decayed(pixel.deviation, pixel.gain, np.float32(span - pixel.since) * MICROSECOND32)
         pixel.since = np.int32(0)

@@ -66,6 +66,8 @@ class Shot(NamedTuple):
     chroma, chroma_weight
         Of a frame in RGB: (H, W, 3) float32 ratio of each channel to the luminance, and (H, W) how reliable it is, 0
         where a channel is clipped to 1; else None.
+    valid
+        (H, W) bool: where the frame says anything at all; None: everywhere.
     """
 
     start: int
@@ -78,6 +80,7 @@ class Shot(NamedTuple):
     white: float
     chroma: NDArray[np.float32] | None = None
     chroma_weight: NDArray[np.float32] | None = None
+    valid: NDArray[np.bool_] | None = None
 
     @property
     def intensity(self) -> Array:
@@ -131,6 +134,7 @@ def take_shot(
         level_weight=weight,
         level_clipped=response >= camera.saturation,
         white=ratio,
+        valid=frame.valid,
     )
 
 
@@ -195,6 +199,7 @@ def _colour_shot(frame: Frame, camera: Camera, ratio: float, gains: colour.Gains
         white=ratio,
         chroma=colour.chromaticity(rgb, _CHROMA_FLOOR * ratio),
         chroma_weight=np.clip((camera.saturation - brightest) / room, 0, 1).astype(np.float32),
+        valid=frame.valid,
     )
 
 
@@ -285,6 +290,15 @@ class _Common:
         """Number of on and off events of every pixel with start < t <= end."""
         return count_chunks(all_between(events, start, end), self.shape)
 
+    def unseen(self, shot: Shot) -> NDArray[np.bool_]:
+        """(H, W) bool: where the frame says nothing."""
+        return np.zeros(self.shape, bool) if shot.valid is None else ~shot.valid
+
+    def unseen_variance(self, shot: Shot) -> float:
+        """P of a pixel of which the first frame says nothing: it is distributed as the others are."""
+        seen = self.log_frame(shot)[shot.valid]
+        return max(self.settings.filter.initial_variance, float(np.var(seen)) if seen.size else 0.0)
+
 
 class BridgeMemory(NamedTuple):
     """The latest frame, deblurred; the pixels' thresholds; the frame interval in s (0: not known yet).
@@ -337,7 +351,7 @@ class BridgedFrames(_Common):
         )
         r_bar = covariance(shot.level_weight, (self.settings.camera.frame_noise * shot.white) ** 2, 1e-6)
         level_variance = log_covariance(shot.level_intensity, r_bar, self.offset)
-        return latent_frame(
+        latent = latent_frame(
             shot.levels,
             log_intensity(shot.level_intensity, self.offset),
             np.where(shot.level_clipped, bridge.UNMEASURED, level_variance),
@@ -346,6 +360,9 @@ class BridgedFrames(_Common):
             white=float(np.log(self.settings.camera.saturation * shot.white + self.offset)),
             event_variance=self.settings.events.deblur_variance * self.on * self.off,
         )
+        if shot.valid is not None:
+            latent.variance[~shot.valid] = bridge.UNSEEN
+        return latent
 
     def start(self, shot: Shot, events: Chunks) -> tuple[BridgeMemory, Segment | None, State]:
         thresholds = bridge.nominal_thresholds(self.shape, self.settings.events.threshold_spread, np.float32)
@@ -369,6 +386,8 @@ class BridgedFrames(_Common):
             value, variance = self._carried(memory)
         unmeasured = variance >= bridge.UNMEASURED
         variance = np.where(unmeasured, np.float32(self.settings.filter.initial_variance), variance)
+        if shot.valid is not None:
+            variance[~shot.valid] = self.unseen_variance(shot)
         return memory, lead_in, State(value, variance, newest)
 
     def segment(
@@ -555,6 +574,8 @@ class InterpolatedFrames(_Common):
     Causal mode goes from the end of one exposure to the end of the next with L^{A-} and the previous c_p.
     """
 
+    _UNSEEN: Final = 1e6  # R_bar: worth nothing beside P, and integrals of 1/R over a linear R (7) stay exact
+
     def node(self, shot: Shot) -> int:
         return shot.start if self.lookahead else shot.end
 
@@ -579,6 +600,11 @@ class InterpolatedFrames(_Common):
         camera = self.settings.camera
         return covariance(shot.weight, shot.white**2 / camera.confidence, camera.weight_floor)
 
+    def measured_r_bar(self, shot: Shot) -> Array:
+        """R_bar as a measurement: without weight where the frame says nothing."""
+        r_bar = self.r_bar(shot)
+        return r_bar if shot.valid is None else np.where(shot.valid, r_bar, self._UNSEEN)
+
     def log_frame(self, shot: Shot) -> Array:
         """L^F of equation (8), with its bias."""
         return super().log_frame(shot) - log_bias(shot.intensity, self.r_bar(shot), self.offset)
@@ -589,6 +615,8 @@ class InterpolatedFrames(_Common):
         memory = InterpolationMemory(integrals, latent, np.ones(self.shape), None)
         value = latent if self.lookahead else deblur.latent_end(self.log_frame(shot), integrals)
         variance = np.full(self.shape, self.settings.filter.initial_variance)
+        if shot.valid is not None:
+            variance[~shot.valid] = self.unseen_variance(shot)
         return memory, None, State(value, variance, np.full(self.shape, self.node(shot), np.int64))
 
     def segment(
@@ -597,6 +625,9 @@ class InterpolatedFrames(_Common):
         if not self.lookahead:
             return self._causal(memory, shot, following, events)
         start_latent = deblur.latent_start(self.log_frame(shot), memory.integrals)
+        # (17) as printed follows L^A wherever that goes, so that L^A must not go to values that are no measurements.
+        unseen = self.unseen(shot)
+        start_latent[unseen] = memory.forward[unseen]
         if following is None:
             segment = self._segment(memory, shot, None, start_latent, memory.scale, FAR_FUTURE)
             return segment, memory
@@ -604,7 +635,12 @@ class InterpolatedFrames(_Common):
         end_latent = deblur.latent_end(self.log_frame(following), integrals)
         integral = self.nominal(all_between(events, shot.start, following.end))
         scale = interpolation.threshold_scale(end_latent - start_latent, integral)  # (12)
+        unseen_next = self.unseen(following)
+        scale[unseen | unseen_next] = 1.0
+        end_latent[unseen_next] = (start_latent + integral)[unseen_next]
         at_start = interpolation.backward(end_latent, scale, integral)  # (11)
+        start_latent[unseen] = at_start[unseen]
+        memory = memory._replace(forward=np.where(unseen, at_start, memory.forward))
         segment = self._segment(memory, shot, following, at_start, scale, following.start)
         to_next = self.nominal(all_between(events, shot.start, following.start))
         forward = interpolation.forward(start_latent, scale, to_next)  # (10)
@@ -621,9 +657,9 @@ class InterpolatedFrames(_Common):
     ) -> interpolation.InterpolatedSegment:
         # At the first frame nothing comes before: L^{A-} and c_p are those of the interval after it.
         previous = memory.previous
-        here = self.r_bar(shot)
-        after = here if following is None else self.r_bar(following)
-        before = here if previous is None else self.r_bar(previous)
+        here = self.measured_r_bar(shot)
+        after = here if following is None else self.measured_r_bar(following)
+        before = here if previous is None else self.measured_r_bar(previous)
         at = shot if previous is None else previous
         return interpolation.InterpolatedSegment(
             start=self.node(shot),
@@ -658,6 +694,7 @@ class InterpolatedFrames(_Common):
         start_latent = deblur.latent_start(self.log_frame(shot), memory.integrals)
         integral = memory.integrals.to_end + self.nominal(all_between(events, shot.end, following.end))
         scale = interpolation.threshold_scale(end_latent - start_latent, integral)
+        scale[self.unseen(shot) | self.unseen(following)] = 1.0
         return segment, InterpolationMemory(integrals, end_latent, scale, shot)
 
     @property
@@ -707,7 +744,9 @@ class HeldFrames(_Common):
         self, memory: None, shot: Shot, following: Shot | None, events: Chunks
     ) -> tuple[Segment, None]:
         end = FAR_FUTURE if following is None else self.node(following)
-        gain = 2 * np.pi * self.settings.filter.cutoff
+        gain = np.full(self.shape, 2 * np.pi * self.settings.filter.cutoff, np.float32)
+        if shot.valid is not None:
+            gain[~shot.valid] = 0.0
         held = complementary.HeldSegment(self.node(shot), end, self.frame(shot), gain, self.on, self.off)
         return held, None
 

@@ -25,7 +25,7 @@ import zstandard
 from kalux.errors import FormatError
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.frames import Frame, Mosaic
-from kalux.readers.source import Source, one_line, reading
+from kalux.readers.source import TRIGGER_DTYPE, Source, TriggerArray, one_line, reading
 from kalux.readers.streams import in_order, rechunk
 
 T = TypeVar("T")
@@ -92,7 +92,9 @@ class _Container:
                 yield content
 
 
-_NAMES: Final = {"EVTS": "event", "FRME": "frame"}
+_NAMES: Final = {"EVTS": "event", "FRME": "frame", "TRIG": "trigger"}
+# Numbers of dv::TriggerType for edges of the external input; others are of the generator and of the sensor itself.
+_EDGES: Final = {1: True, 2: False}
 
 
 def recognises(path: Path) -> bool:
@@ -107,7 +109,8 @@ def read(path: Path) -> Source:
     """Open an AEDAT 4 file.
 
     The first event stream and the first frame stream of equal size are read. Frames may be 8 or 16 bits,
-    grey or in colour; those in colour of a DAVIS come from a Bayer sensor. Times are absolute, us.
+    grey or in colour; those in colour of a DAVIS come from a Bayer sensor. Times are absolute, us. Edges on the
+    external input are in ``triggers``, input 0.
 
     Raises
     ------
@@ -148,6 +151,12 @@ def read(path: Path) -> Source:
         ordered = in_order(_stored_frames(container, frames))
         return ordered if exposure_known else map(_stamp_only, ordered)
 
+    triggers = [s for s in container.streams if s.kind == "TRIG"]
+
+    def read_triggers() -> Iterator[TriggerArray]:
+        for stream in triggers[:1]:
+            yield from container.read(stream, _edges)
+
     @cache
     def count_events() -> int:
         return 0 if events is None else sum(container.read(events, _event_count))
@@ -161,6 +170,7 @@ def read(path: Path) -> Source:
         count_events=count_events,
         count_frames=lambda: 0 if frames is None else len(container.packets[frames.number]) // 2,
         exposure_known=exposure_known,
+        triggers=read_triggers if triggers else None,
         missing=missing,
         mosaic=_DAVIS_FILTER if is_colour_davis else None,
     )
@@ -201,6 +211,19 @@ def _events(table: _Table) -> EventArray:
     if count and events["p"].view("u1").max() > 1:
         raise ValueError("polarity is neither 0 nor 1")
     return events
+
+
+def _edges(table: _Table) -> TriggerArray:
+    found = [(t, 0, _EDGES[kind]) for t, kind in trigger_types(table) if kind in _EDGES]
+    return np.array(found, TRIGGER_DTYPE)
+
+
+def trigger_types(table: _Table) -> Iterator[tuple[int, int]]:
+    """Time (us) and dv::TriggerType of every trigger of a packet."""
+    start, count = table.vector(0)
+    for place in range(start, start + 4 * count, 4):
+        trigger = _Table(table.data, place + _unpack("<I", table.data, place))
+        yield trigger.scalar(0, "<q", 0), trigger.scalar(1, "<b", 0)
 
 
 def _event_count(table: _Table) -> int:
@@ -270,7 +293,7 @@ def _streams(info: str) -> Iterator[_Stream]:
         width, height = (
             int(node.findtext(f"./node[@name='info']/attr[@key='{key}']", "0")) for key in ("sizeX", "sizeY")
         )
-        if kind in _NAMES and (width <= 0 or height <= 0):
+        if kind in ("EVTS", "FRME") and (width <= 0 or height <= 0):
             raise ValueError(f"the {_NAMES[kind]} stream has no size")
         camera = node.findtext("./node[@name='info']/attr[@key='source']", "")
         yield _Stream(int(node.attrib["name"]), kind, (height, width), camera)

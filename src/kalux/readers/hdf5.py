@@ -56,7 +56,7 @@ def read(path: Path) -> Source:
     with reading(path, *_DAMAGE), h5py.File(path, "r") as file:
         _check_version(path, _text(file.attrs.get("version", "")))
         event_count = _common_length(path, file, "events", _COLUMNS)
-        frame_count = _common_length(path, file, "frames", ("image", "exposure_start", "exposure_end"))
+        frame_count = _common_length(path, file, "frames", _frame_columns(file))
         exposure_known = bool(file["frames"].attrs["exposure_known"])
         height, width = (int(n) for n in file.attrs["sensor_size"])
         mosaic = _mosaic(path, file["frames"].attrs.get("mosaic"))
@@ -97,6 +97,11 @@ def _mosaic(path: Path, value: Any) -> Mosaic | None:
     raise FormatError(
         f"{path}: states the mosaic {name[:20]!r}; known are {', '.join(MOSAICS)}; write it again"
     )
+
+
+def _frame_columns(file: Any) -> tuple[str, ...]:
+    columns = ("image", "exposure_start", "exposure_end")
+    return (*columns, "valid") if "valid" in file["frames"] else columns
 
 
 def _text(value: Any) -> str:
@@ -142,8 +147,10 @@ def _frames(path: Path) -> Iterator[Frame]:
         group = file["frames"]
         white = float(group.attrs["white"]) if "white" in group.attrs else None
         starts, ends = group["exposure_start"][...], group["exposure_end"][...]
+        masks = group.get("valid")
         for index, (start, end) in enumerate(zip(starts, ends, strict=True)):
-            yield Frame(group["image"][index], int(start), int(end), white)
+            valid = None if masks is None else masks[index].astype(bool)
+            yield Frame(group["image"][index], int(start), int(end), white, valid=valid)
 
 
 def _ground_truth(path: Path) -> GroundTruth:
@@ -351,7 +358,7 @@ def _write_frames(
     mosaic: Mosaic | None,
 ) -> None:
     group.attrs["exposure_known"] = exposure_known
-    images = None
+    images = masks = None
     starts: list[int] = []
     ends: list[int] = []
     for index, frame in enumerate(frames):
@@ -367,12 +374,19 @@ def _write_frames(
             )
         images.resize(index + 1, axis=0)
         images[index] = frame.image
+        if frame.valid is not None:
+            if masks is None:  # of frames without a mask all pixels are valid
+                masks = _create_images(group, frame.valid.shape, np.dtype(bool), "valid", fill=True)
+            masks.resize(index + 1, axis=0)
+            masks[index] = frame.valid
         starts.append(frame.exposure_start)
         ends.append(frame.exposure_end)
     if images is None:
         _create_images(group, sensor_size, np.dtype(np.uint8))
     if mosaic is not None:
         group.attrs["mosaic"] = np.bytes_(mosaic)
+    if masks is not None:
+        masks.resize(len(starts), axis=0)
     group["exposure_start"] = np.array(starts, np.int64)
     group["exposure_end"] = np.array(ends, np.int64)
 
@@ -381,9 +395,11 @@ def _kind(frame: Frame) -> tuple[Any, ...]:
     return frame.image.shape, frame.image.dtype, frame.white, frame.mosaic
 
 
-def _create_images(group: Any, size: tuple[int, ...], dtype: np.dtype[Any]) -> Any:
+def _create_images(
+    group: Any, size: tuple[int, ...], dtype: np.dtype[Any], name: str = "image", *, fill: bool = False
+) -> Any:
     return group.create_dataset(
-        "image", (0, *size), dtype, maxshape=(None, *size), chunks=(1, *size), **_packing()
+        name, (0, *size), dtype, maxshape=(None, *size), chunks=(1, *size), fillvalue=fill, **_packing()
     )
 
 

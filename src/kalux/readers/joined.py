@@ -79,7 +79,7 @@ def join(source: Source, frames: Path, *, start: int | None, rate_hz: float | No
             f"{source.path}: has {source.count_frames()} frames of its own; leave --frames out, or replace them with "
             "--replace-frames (replace_frames=True)"
         )
-    joined = _images(frames, start, rate_hz) if _is_list(frames) else _video(frames, start, rate_hz)
+    joined = open_frames(frames, start=start, rate_hz=rate_hz)
     size = _joint_size(source, frames, joined)
     kept = (text for text in source.missing if not _ABOUT_FRAMES.search(text))
     adopted = not source.sensor_size_known
@@ -94,6 +94,13 @@ def join(source: Source, frames: Path, *, start: int | None, rate_hz: float | No
         ground_truth=source.ground_truth,
         missing=(*(text for text in kept if not (adopted and text == SIZE_UNKNOWN)), *joined.missing),
     )
+
+
+def open_frames(frames: Path, *, start: int | None, rate_hz: float | None) -> Source:
+    """Frames alone, of any size, as a recording without events; arguments and errors as of `join`."""
+    if not frames.exists():
+        raise InputError(f"{frames}: no such file or folder")
+    return _images(frames, start, rate_hz) if _is_list(frames) else _video(frames, start, rate_hz)
 
 
 def _joint_size(source: Source, frames: Path, joined: Source) -> tuple[int, int]:

@@ -1,0 +1,433 @@
+"""Frames against events, in space and in time: what changes between two frames is what the events between them say.
+
+For every two successive frames, warped into the event camera's pixels, the change of the log intensity is modelled as
+
+    log I_{k+1} - log I_k = s (c_on N_on - c_off N_off),    s = I / (I + I_0),
+
+with N the number of events between tau_k + d and tau_{k+1} + d, d the offset of the frames' clock. Least squares, with
+Huber's weights, over all pixels and intervals, in the thresholds, the offset d and, where it is free, the homography
+between the cameras: Gauss and Newton's iteration, first blurred, then sharp.
+
+An event comes when a whole threshold has gathered, so that counts trail the light by half a threshold: a delay that
+depends on the speed, 1 to 7 ms. Here a step is spread over the time in which it gathered (`levels`), which takes the
+trail away: the offset is that of the clocks, to the pixels' own latency. The mean delay with whole steps, as in
+`kalux.calibration.delay`, is reported as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any, Final, NamedTuple
+
+import cv2
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux.augmentation.deblur import between
+from kalux.calibration.contrast import NORMAL_MAD
+from kalux.calibration.registration import Registration
+from kalux.errors import InputError
+from kalux.events import EventArray
+from kalux.frames import Frame
+from kalux.models.camera import Response
+from kalux.settings import CameraSettings
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+
+MOST_FRAMES: Final = 24
+"""Frames that are looked at together; at 25 Hz that is 1 s."""
+
+_BLURS: Final = (4.0, 2.0, 1.0, 1.0)
+"""Sigmas, event camera's pixels, in the order they are used; each for a few steps."""
+
+_STEPS: Final = 6
+_CLOSE: Final = 0.01  # pixels, and ms: steps below it end a round
+_MOST_SAMPLES: Final = 200_000  # neighbouring pixels, blurred, say the same
+_HALF_STEP: Final = 1_000  # us, of the derivative by the offset
+_HUBER: Final = 1.345
+_WELL_EXPOSED: Final = (0.03, 0.95)
+_SPREAD: Final = 200_000
+"""us: a step is spread over no longer than this: what is older than that has mostly been still."""
+
+
+class Shots(NamedTuple):
+    """Frames to align: middles in their own clock (K,) us, and in their own pixels log(I + I_0), I / (I + I_0) and
+    what is well exposed, (K, H', W') each."""
+
+    middles: NDArray[np.int64]
+    log: Floats
+    share: Floats
+    usable: NDArray[np.bool_]
+
+
+class Alignment(NamedTuple):
+    """What was found.
+
+    Attributes
+    ----------
+    registration
+        As given, or with a better homography.
+    offset
+        us, to be added to the frames' times.
+    standard_error
+        us, of the offset, by leaving out one interval at a time.
+    thresholds
+        (on, off), log intensity, as fitted.
+    explained
+        Share of the changes' variance (of their Huber-weighted squares) that the events explain, 0 to 1.
+    intervals, samples
+        How many were used.
+    moved
+        Mean distance, event camera's pixels, by which the homography was moved.
+    """
+
+    registration: Registration
+    offset: float
+    standard_error: float
+    thresholds: tuple[float, float]
+    explained: float
+    intervals: int
+    samples: int
+    moved: float
+
+
+def take_shots(frames: Iterable[Frame], camera: CameraSettings) -> Shots:
+    """Logarithms of frames, scaled to the first one's exposure where exposures are known."""
+    response = Response.named(camera.response)
+    middles, logs, shares, usable = [], [], [], []
+    reference = 0
+    for frame in frames:
+        values = frame.normalised()
+        grey = values if values.ndim == 2 else values.mean(axis=2)
+        low, high = _WELL_EXPOSED
+        good = (grey > low) & (grey < high)
+        if frame.valid is not None:
+            good &= frame.valid
+        linear = np.maximum(response.inverse(grey), 0.0)
+        if frame.exposure > 0:
+            reference = reference or frame.exposure
+            linear = linear * (reference / frame.exposure)
+        middles.append(frame.middle)
+        logs.append(np.log(linear + camera.offset).astype(np.float32))
+        shares.append((linear / (linear + camera.offset)).astype(np.float32))
+        usable.append(good)
+    if len(middles) < 3:
+        raise InputError(f"alignment: {len(middles)} frames are too few; three at least, thirty are good")
+    return Shots(np.array(middles, np.int64), np.stack(logs), np.stack(shares), np.stack(usable))
+
+
+# --- events as levels --------------------------------------------------------------------------------------
+
+
+def levels(
+    events: EventArray, sensor_size: tuple[int, int], times: NDArray[np.int64], *, spread: bool = True
+) -> tuple[Floats, Floats]:
+    """Number of on and off events of each pixel before each of some times.
+
+    Parameters
+    ----------
+    events
+        Time-ordered, from before the first time on.
+    times
+        (Q,) us, ascending.
+    spread
+        Whether an event's step is spread evenly over the time before it: over the time since the pixel's event before
+        or until the one after it, whichever is shorter, because the first event after a pause tells of a change that
+        has just begun.
+
+    Returns
+    -------
+    Two (Q, height, width) float32, from any common origin per pixel.
+    """
+    on = np.zeros((len(times), *sensor_size), np.float32)
+    off = np.zeros_like(on)
+    _levels(events["t"], events["x"], events["y"], events["p"], times, spread, _SPREAD, on, off)
+    return on, off
+
+
+@nb.njit(cache=True, nogil=True)
+def _levels(t, x, y, p, times, spread, longest, on, off):  # type: ignore[no-untyped-def]
+    queries, height, width = on.shape
+    # Of every pixel: the event that waits for the one after it, the one before it, and the next time to be told.
+    waiting = np.full((height, width), -1, np.int64)
+    before = np.full((height, width), -(1 << 60), np.int64)
+    upcoming = np.zeros((height, width), np.int64)
+    level = np.zeros((2, height, width), np.float32)
+    for i in range(len(t) + height * width):
+        if i < len(t):
+            row, column, now = y[i], x[i], t[i]
+        else:  # the last events have none after them
+            row, column, now = (i - len(t)) // width, (i - len(t)) % width, 1 << 60
+        w = waiting[row, column]
+        k = upcoming[row, column]
+        if w >= 0:
+            here = t[w]
+            length = min(here - before[row, column], now - here, longest) if spread else 0
+            which = 0 if p[w] else 1
+            while k < queries and times[k] <= here:
+                part = np.float32(0.0)
+                if times[k] > here - length:
+                    part = np.float32(1.0 - (here - times[k]) / length)
+                on[k, row, column] = level[0, row, column] + (part if which == 0 else np.float32(0.0))
+                off[k, row, column] = level[1, row, column] + (part if which == 1 else np.float32(0.0))
+                k += 1
+            level[which, row, column] += np.float32(1.0)
+            before[row, column] = here
+        if i < len(t):
+            waiting[row, column] = i
+        else:
+            while k < queries:
+                on[k, row, column] = level[0, row, column]
+                off[k, row, column] = level[1, row, column]
+                k += 1
+        upcoming[row, column] = k
+
+
+# --- the fit ----------------------------------------------------------------------------------------------
+
+
+class _Parameters(NamedTuple):
+    on: float
+    off: float
+    offset: float
+    homography: Array
+
+
+class _Normal(NamedTuple):
+    """Normal equations of each interval: (K-1, n, n), (K-1, n); squares before and after, weighted; samples."""
+
+    matrices: Array
+    vectors: Array
+    before: float
+    after: float
+    samples: int
+
+
+def align(
+    shots: Shots,
+    events: EventArray,
+    registration: Registration,
+    *,
+    offset: float,
+    free_homography: bool,
+    free_offset: bool = True,
+    spread: bool = True,
+) -> Alignment:
+    """Fit thresholds, the offset and the homography, from a first guess of both.
+
+    Parameters
+    ----------
+    shots
+        From `take_shots`.
+    events
+        All of the time of the frames, and a margin of 50 ms at least before and after.
+    registration
+        First guess. Right to some pixels, or exact where the homography is not free.
+    offset
+        First guess, us; right to half a frame interval.
+    free_homography, free_offset
+        What is fitted besides the thresholds. Where the cameras move evenly in one direction, an offset cannot be told
+        from a shift: shake them.
+    spread
+        See `levels`.
+
+    Raises
+    ------
+    InputError
+        If too little changes, or the fit does not end near its beginning.
+    """
+    begin = registration
+    parameters = _Parameters(0.2, 0.2, offset, registration.homography)
+    blurs = _BLURS if free_homography else _BLURS[1:]
+    shots = shots._replace(
+        log=np.stack([begin.filtered(image) for image in shots.log]),
+        share=np.stack([begin.filtered(image) for image in shots.share]),
+        usable=np.stack([begin.filtered(image) for image in shots.usable]) > 0.98,
+    )
+    normal: _Normal | None = None
+    for blur in blurs:
+        for _ in range(_STEPS):
+            normal = _normal_equations(shots, events, _with(begin, parameters), parameters, blur, spread)
+            step = _solve(
+                normal.matrices.sum(axis=0), normal.vectors.sum(axis=0), free_homography, free_offset
+            )
+            last, parameters = parameters, _stepped(parameters, step, begin.events.sensor_size)
+            moved = _distance(_with(begin, last), _with(begin, parameters)) if free_homography else 0.0
+            if moved < _CLOSE and abs(parameters.offset - last.offset) < _CLOSE * 1_000:
+                break
+    assert normal is not None
+    found = _with(begin, parameters)
+    least = np.ptp(shots.middles) / (len(shots.middles) - 1)
+    if abs(parameters.offset - offset) > least or min(parameters.on, parameters.off) <= 0:
+        raise InputError(
+            "alignment: the events do not explain how the frames change near the offset and the registration that it "
+            f"began with ({offset * 1e-3:.1f} ms; now at {parameters.offset * 1e-3:.1f} ms, thresholds "
+            f"{parameters.on:.2f} and {parameters.off:.2f}); do both see the same moving scene?"
+        )
+    return Alignment(
+        registration=found,
+        offset=parameters.offset,
+        standard_error=_jackknife(normal, free_homography) if free_offset else 0.0,
+        thresholds=(parameters.on, parameters.off),
+        explained=1.0 - normal.after / normal.before,
+        intervals=len(normal.matrices),
+        samples=normal.samples,
+        moved=_distance(begin, found),
+    )
+
+
+def _with(registration: Registration, parameters: _Parameters) -> Registration:
+    return Registration(registration.events, registration.frames, parameters.homography)
+
+
+def _distance(one: Registration, other: Registration) -> float:
+    """Mean distance between where both take the overlap's pixels, event camera's pixels."""
+    a, b = one.maps, other.maps
+    both = a.inside & b.inside
+    if not both.any():
+        return float("inf")
+    return float(np.hypot(a.x - b.x, a.y - b.y)[both].mean() / other.scale)
+
+
+def _normal_equations(
+    shots: Shots, events: EventArray, registration: Registration, now: _Parameters, blur: float, spread: bool
+) -> _Normal:
+    size = registration.events.sensor_size
+    count = len(shots.middles)
+    times = np.rint(shots.middles[:, None] + now.offset + np.array([-1, 0, 1]) * _HALF_STEP).astype(np.int64)
+    inside = between(events, int(times[0, 0]) - _SPREAD, int(times[-1, -1]) + _SPREAD)
+    # Frames closer than the half steps would put the times out of order.
+    order = np.argsort(times.ravel(), kind="stable")
+    place = np.empty(len(order), np.int64)
+    place[order] = np.arange(len(order))
+    on, off = levels(inside, size, times.ravel()[order], spread=spread)
+    places = place.reshape(count, 3)
+    coordinates = _coordinates(registration)
+    margin = int(np.ceil(2 * blur)) * 2 + 1
+    kernel = np.ones((margin, margin), np.uint8)
+    warped = _warp(shots, registration, 0)
+    stride = max(int(np.sqrt(size[0] * size[1] * (count - 1) / _MOST_SAMPLES)), 1)
+    lattice = np.zeros(size, bool)
+    lattice[stride // 2 :: stride, stride // 2 :: stride] = True
+    rows: list[tuple[Floats, Floats, Floats]] = []
+    for k in range(count - 1):
+        following = _warp(shots, registration, k + 1)
+        good = (warped[2] & following[2]).astype(np.uint8)
+        good[0], good[-1], good[:, 0], good[:, -1] = 0, 0, 0, 0
+        good = cv2.erode(good, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0).astype(bool)
+        change = _blurred((following[0] - warped[0]) * (warped[2] & following[2]), blur)
+        share = (following[1] + warped[1]) / 2
+        first, last = places[k], places[k + 1]
+        counts = [_blurred((level[last[1]] - level[first[1]]) * share, blur) for level in (on, off)]
+        slopes = [
+            _blurred(((level[last[2]] - level[first[2]]) - (level[last[0]] - level[first[0]])) * share, blur)
+            / (2 * _HALF_STEP)
+            for level in (on, off)
+        ]
+        warped = following
+        good &= lattice
+        if not good.any():
+            continue
+        gy, gx = (np.asarray(g, np.float32) for g in np.gradient(change))
+        residual = (change - now.on * counts[0] + now.off * counts[1])[good]
+        by_offset = np.asarray(now.on * slopes[0] - now.off * slopes[1], np.float32)
+        jacobian: Floats = np.column_stack(
+            [
+                -counts[0][good],
+                counts[1][good],
+                -by_offset[good],
+                _homography_columns(gx[good], gy[good], coordinates[good]),
+            ]
+        )
+        rows.append((residual, jacobian, change[good]))
+    if not rows or sum(len(r) for r, _, _ in rows) < 500:
+        raise InputError(
+            "alignment: less than 500 well exposed pixels are in both cameras' view; is the registration right?"
+        )
+    everything = np.concatenate([r for r, _, _ in rows])
+    scale = max(NORMAL_MAD * float(np.median(np.abs(everything))), 1e-6)
+    matrices, vectors, before, after = [], [], 0.0, 0.0
+    for residual, jacobian, change in rows:
+        weight = np.minimum(1.0, _HUBER * scale / np.maximum(np.abs(residual), 1e-12))
+        weighted = jacobian * weight[:, None]
+        matrices.append(weighted.T @ jacobian)
+        vectors.append(weighted.T @ residual)
+        before += float((weight * change**2).sum())
+        after += float((weight * residual**2).sum())
+    return _Normal(
+        np.array(matrices, np.float64), np.array(vectors, np.float64), before, after, len(everything)
+    )
+
+
+def _warp(shots: Shots, registration: Registration, k: int) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    usable = registration.sampled(shots.usable[k].astype(np.float32)) > 0.98
+    return (
+        registration.sampled(shots.log[k]),
+        registration.sampled(shots.share[k]),
+        usable & registration.maps.inside,
+    )
+
+
+def _blurred(image: NDArray[Any], sigma: float) -> Floats:
+    return np.asarray(cv2.GaussianBlur(np.asarray(image, np.float32), (0, 0), sigma), np.float32)
+
+
+def _scaling(size: tuple[int, int]) -> Array:
+    """(3, 3), from pixels to coordinates of about -1 to 1."""
+    height, width = size
+    return np.array([[2 / width, 0, -1], [0, 2 / width, -height / width], [0, 0, 1]])
+
+
+def _coordinates(registration: Registration) -> Floats:
+    """(H, W, 2): the undistorted pixels of the event camera, scaled."""
+    height, width = registration.events.sensor_size
+    points = np.column_stack([registration._undistorted, np.ones(height * width)])
+    scaled = points @ _scaling((height, width)).T
+    return np.nan_to_num(scaled[:, :2]).reshape(height, width, 2).astype(np.float32)
+
+
+def _homography_columns(gx: Floats, gy: Floats, at: Floats) -> Floats:
+    """Derivatives of a warped image by the eight parameters of a small homography applied before it, (N, 8)."""
+    x, y = at.T
+    along = gx * x + gy * y
+    return np.column_stack([gx * x, gx * y, gx, gy * x, gy * y, gy, -along * x, -along * y])
+
+
+def _solve(matrix: Array, vector: Array, free_homography: bool, free_offset: bool) -> Array:
+    """The step of all parameters, (11,); 0 for those that are not free."""
+    free = np.array([True, True, free_offset] + [free_homography] * 8)
+    scale = np.sqrt(np.maximum(np.diag(matrix), 1e-30))
+    scaled = (matrix / scale / scale[:, None])[np.ix_(free, free)] + 1e-6 * np.eye(int(free.sum()))
+    step = np.zeros(len(vector))
+    step[free] = -np.linalg.solve(scaled, (vector / scale)[free])
+    out: Array = step / scale
+    return out
+
+
+def _stepped(now: _Parameters, step: Array, size: tuple[int, int]) -> _Parameters:
+    # The derivative by a small homography is by scaled coordinates; the image's gradient is by pixels.
+    small = np.eye(3)
+    small.ravel()[:8] += step[3:] * 2 / size[1]
+    scaling = _scaling(size)
+    homography = now.homography @ np.linalg.inv(scaling) @ small @ scaling
+    return _Parameters(
+        now.on + float(step[0]),
+        now.off + float(step[1]),
+        now.offset + float(np.clip(step[2], -10_000, 10_000)),
+        homography / homography[2, 2],
+    )
+
+
+def _jackknife(normal: _Normal, free_homography: bool) -> float:
+    """Standard error of the offset, us: the spread of what is found without one interval at a time."""
+    matrix, vector = normal.matrices.sum(axis=0), normal.vectors.sum(axis=0)
+    count = len(normal.matrices)
+    if count < 3:
+        return float("inf")
+    found = [
+        _solve(matrix - m, vector - v, free_homography, True)[2]
+        for m, v in zip(normal.matrices, normal.vectors, strict=True)
+    ]
+    return float(np.sqrt((count - 1) / count * np.sum((found - np.mean(found)) ** 2)))

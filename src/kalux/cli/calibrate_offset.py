@@ -1,0 +1,136 @@
+"""``kalux calibrate offset``: the offset between the clocks of frames and events."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from kalux.cli.calibrate_rig import write_picture, write_text
+from kalux.cli.info import add_recording, open_recording
+from kalux.cli.parser import Parser, UsageError, number
+from kalux.cli.terminal import say, warn
+
+_DESCRIPTION = """\
+Estimate what has to be added to the frames' times to have those of the events, where no trigger tells it: by
+correlation over seconds, then by a fit pixel by pixel. Frames and events must have the same pixels; for two
+cameras, kalux register finds the offset on the way."""
+
+_EXAMPLES = """\
+examples:
+  kalux calibrate offset night_drive.aedat4 --plot offset.png
+  kalux calibrate offset events.raw --frames registered/ -o offset.toml"""
+
+
+def add_command(subparsers: Any) -> None:
+    """Add ``offset`` to the parser of ``kalux calibrate``."""
+    parser: Parser = subparsers.add_parser(
+        "offset", description=_DESCRIPTION, epilog=_EXAMPLES, usage="kalux calibrate offset REC [flags]"
+    )
+    add_recording(parser)
+    add_range(parser.add_argument_group("search"))
+    group = parser.add_argument_group("output")
+    group.add_argument(
+        "-o", "--out", type=Path, metavar="OFFSET.toml", help="a file for kalux register --offset"
+    )
+    group.add_argument("--plot", type=Path, metavar="FILE.png", help="the correlation over the offset")
+    group.add_argument("--overwrite", action="store_true", help="replace files that are there")
+    parser.set_defaults(run=run)
+
+
+def add_range(group: Any) -> None:
+    """Add how far the search for an offset goes."""
+    group.add_argument(
+        "--range", type=number, default=2.0, metavar="S", help="how far the clocks may be apart, s (2)"
+    )
+    group.add_argument(
+        "--around", type=number, default=0.0, metavar="MS", help="middle of that range, ms (0)"
+    )
+
+
+def checked_range(options: argparse.Namespace) -> tuple[float, int]:
+    """Middle and reach, us."""
+    if not 0.01 <= options.range <= 600:
+        raise UsageError(f"--range is {options.range:g} s; 0.01 to 600 is possible")
+    return options.around * 1e3, round(options.range * 1e6)
+
+
+def run(options: argparse.Namespace, command: list[str]) -> None:
+    """Run the command."""
+    import numpy as np
+
+    from kalux.calibration.offset import estimate_offset
+    from kalux.calibration.pictures import correlation_plot
+    from kalux.calibration.registration import Registration
+    from kalux.calibration.rig import Lens
+    from kalux.cli.output import check_file
+
+    centre, reach = checked_range(options)
+    for path in (options.out, options.plot):
+        if path is not None:
+            check_file(path, overwrite=options.overwrite)
+    recording = open_recording(options)
+    lens = Lens.pinhole(recording.sensor_size)
+    same = Registration(lens, lens, np.eye(3))
+    found = estimate_offset(recording.stamped_frames, recording.events, same, centre=centre, reach=reach)
+    if not found.coarse.sure:
+        warn(
+            f"the correlation is {found.coarse.peak:.2f}, {found.coarse.ratio:.2f} times the next peak: the offset "
+            "may be another; look at --plot, or narrow --range"
+        )
+    if not recording.exposure_known:
+        warn("exposures are unknown: the offset is from the frames' stamps to the middle of their exposures")
+    say(
+        f"offset {found.offset * 1e-3:.2f} ms, standard error {found.standard_error * 1e-3:.2f} ms: "
+        "to be added to the frames' times"
+    )
+    if found.apparent is not None:
+        say(
+            f"with events taken as whole steps, half a threshold late as they come: {found.apparent * 1e-3:.2f} ms"
+        )
+    say(f"correlation {found.coarse.peak:.2f}, {found.coarse.ratio:.2f} times the next peak")
+    if options.plot is not None:
+        write_picture(
+            options.plot,
+            correlation_plot(found.coarse, offset=found.offset, standard_error=found.standard_error),
+        )
+    if options.out is not None:
+        write_text(options.out, offset_toml(found))
+
+
+def offset_toml(found: Any) -> str:
+    """An offset as the text of its file."""
+    import tomli_w
+
+    described = {
+        "kalux_offset": 1,
+        "offset_us": round(found.offset),
+        "standard_error_us": round(found.standard_error, 1),
+        "correlation": round(found.coarse.peak, 4),
+    }
+    if found.coarse.ratio < float("inf"):
+        described["over_next_peak"] = round(found.coarse.ratio, 3)
+    return tomli_w.dumps(described)
+
+
+def read_offset(text: str) -> float:
+    """us, from a number or the name of an offset file.
+
+    Raises
+    ------
+    UsageError
+        If it is neither.
+    """
+    import tomllib
+
+    try:
+        return float(text)
+    except ValueError:
+        pass
+    try:
+        table = tomllib.loads(Path(text).read_text("utf-8"))
+        return float(table["offset_us"])
+    except OSError as error:
+        raise UsageError(f"--offset {text}: neither a number of us nor a file: {error.strerror}") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise UsageError(f"--offset {text}: not an offset file of kalux calibrate offset") from error

@@ -1,0 +1,261 @@
+"""``kalux register``: events of one camera and frames of another, as one recording."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from kalux.cli.calibrate_offset import add_range, checked_range, read_offset
+from kalux.cli.calibrate_rig import add_frames, write_picture
+from kalux.cli.parser import Parser, UsageError, number, whole
+from kalux.cli.terminal import say, warn
+
+if TYPE_CHECKING:
+    from kalux.calibration.two_cameras import Registered
+    from kalux.frames import Frame
+    from kalux.recording import Recording
+
+T = TypeVar("T")
+
+_DESCRIPTION = """\
+Make one recording of an event camera's events and another camera's frames: the frames are undistorted, warped
+into the event camera's pixels, and put into its clock. Pixels that the frames do not see are marked, and
+reconstruct gives them no frame information. For scenes that are far away against the distance between the
+cameras; docs/rig.md goes through all of it."""
+
+_EXAMPLES = """\
+examples:
+  kalux register drive.raw --frames drive_frames/ --rig rig.toml --timing triggers -o drive.h5
+  kalux register drive.raw --frames drive_frames/ --rig rig.toml --distance 20 -o drive.h5 --overlay overlay.png
+  kalux register drive.raw --frames drive.mp4 --frames-start 0 --frames-rate 30 --exposure 8000 -o drive.h5"""
+
+
+def add_command(commands: Any) -> None:
+    """Add ``register`` to the parser."""
+    parser: Parser = commands.add_parser(
+        "register",
+        description=_DESCRIPTION,
+        epilog=_EXAMPLES,
+        usage="kalux register EVENTS --frames FRAMES -o OUT.h5 [flags]",
+    )
+    group = parser.add_argument_group("recording")
+    group.add_argument("events", metavar="EVENTS", type=Path, help="recording of the event camera")
+    add_frames(group, positional=False)
+    group.add_argument("--exposure", type=whole, metavar="US", help="exposure time of all frames, us")
+    group.add_argument(
+        "--stamp",
+        choices=("start", "middle", "end"),
+        help="with --exposure: what a frame's time marks (start)",
+    )
+    group.add_argument(
+        "--response",
+        default="linear",
+        metavar="NAME",
+        help="of the frames: linear, srgb or gamma:2.2 (linear)",
+    )
+    group = parser.add_argument_group("space")
+    group.add_argument("--rig", type=Path, metavar="RIG.toml", help="calibration of both cameras")
+    group.add_argument(
+        "--distance", type=number, metavar="M", help="of the scene, m; with --rig (default: infinitely far)"
+    )
+    group.add_argument(
+        "--homography",
+        choices=("rig", "refine", "auto"),
+        help="rig: as calibrated; refine: from there to where frames and events agree (default with --rig); "
+        "auto: from features (default without)",
+    )
+    group = parser.add_argument_group("time")
+    group.add_argument(
+        "--timing",
+        choices=("auto", "triggers", "same"),
+        help="auto: the offset is estimated (default); triggers: exposures from the trigger input; same: one clock",
+    )
+    group.add_argument("--offset", metavar="US|FILE", help="to be added to the frames' times, if it is known")
+    add_range(group)
+    group.add_argument(
+        "--trigger-edge",
+        choices=("both", "rising", "falling"),
+        help="both: from rising to falling (default); else where exposures start, with --exposure",
+    )
+    group.add_argument("--trigger-input", type=whole, metavar="ID", help="where several inputs have edges")
+    group.add_argument(
+        "--skip-triggers", type=whole, metavar="N", help="exposures to leave out at the beginning"
+    )
+    group.add_argument("--skip-frames", type=whole, metavar="N", help="frames to leave out at the beginning")
+    group = parser.add_argument_group("output")
+    group.add_argument("-o", "--out", required=True, type=Path, metavar="OUT.h5", help="a kalux HDF5 file")
+    group.add_argument(
+        "--overlay", type=Path, metavar="FILE.png", help="a frame with the events on it, to look at"
+    )
+    group.add_argument("--plot", type=Path, metavar="FILE.png", help="the correlation over the offset")
+    group.add_argument("--overwrite", action="store_true", help="replace files that are there")
+    group.add_argument("--quiet", action="store_true", help="print warnings and errors only")
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace, command: list[str]) -> None:
+    """Run the command."""
+    import kalux
+    from kalux.calibration.rig import load_rig
+    from kalux.calibration.two_cameras import open_frames, register
+    from kalux.cli.convert import check_name
+    from kalux.cli.output import check_file
+    from kalux.settings import CameraSettings
+
+    timing = _timing(options)
+    centre, reach = checked_range(options)
+    check_name(options.out, options.events)
+    for path in (options.out, options.overlay, options.plot):
+        if path is not None:
+            check_file(path, overwrite=options.overwrite)
+    rig = None if options.rig is None else load_rig(options.rig)
+    events = kalux.open(options.events)
+    by_trigger = timing == "triggers"
+    other = open_frames(
+        options.frames,
+        start=options.frames_start,
+        rate_hz=options.frames_rate,
+        exposure=None if by_trigger else options.exposure,
+        stamp=options.stamp or "start",
+    )
+    frames, exposure_known = _timed_frames(options, events, other, by_trigger)
+    offset = None
+    if options.offset is not None:
+        offset = read_offset(options.offset)
+    elif timing != "auto":
+        offset = 0.0
+    size = events.sensor_size
+    if rig is not None and not events.source.sensor_size_known:
+        size = rig.events.sensor_size  # of which the recording knows no more than which pixels had events
+    found = register(
+        frames,
+        events.events,
+        events_size=size,
+        frames_size=other.sensor_size,
+        rig=rig,
+        distance=options.distance,
+        homography=options.homography,
+        offset=offset,
+        centre=centre,
+        reach=reach,
+        camera=CameraSettings(response=options.response),
+    )
+    if not options.quiet:
+        for line in described(found, by_trigger):
+            say(line)
+    if not exposure_known:
+        warn("the frames have no exposure times; --exposure and --stamp would put them in")
+    _write(options, events, size, lambda: found.frames(frames()), exposure_known)
+    if options.plot is not None and found.coarse is not None:
+        from kalux.calibration.pictures import correlation_plot
+
+        picture = correlation_plot(found.coarse, offset=found.offset, standard_error=found.standard_error)
+        write_picture(options.plot, picture)
+    if options.overlay is not None:
+        write_picture(options.overlay, _overlay(found, frames, events))
+
+
+def _timing(options: argparse.Namespace) -> str:
+    timing = str(options.timing or "auto")
+    if options.offset is not None and options.timing is not None:
+        raise UsageError("--offset says what the frames' clock is; leave --timing out")
+    if timing != "triggers":
+        for name in ("trigger_edge", "trigger_input", "skip_triggers", "skip_frames"):
+            if getattr(options, name) is not None:
+                raise UsageError(f"--{name.replace('_', '-')} is for --timing triggers")
+        if options.stamp is not None and options.exposure is None:
+            raise UsageError("--stamp says what a frame's time marks for --exposure; give --exposure, too")
+    elif options.stamp is not None:
+        raise UsageError(
+            "--stamp is for frames with times of their own; --trigger-edge says what triggers mark"
+        )
+    return timing
+
+
+def _timed_frames(
+    options: argparse.Namespace, events: Recording, other: Recording, by_trigger: bool
+) -> tuple[Callable[[], Iterable[Frame]], bool]:
+    if not by_trigger:
+        return other.stamped_frames, other.exposure_known
+    from kalux.calibration.two_cameras import triggered
+
+    frames, notes = triggered(
+        events,
+        other,
+        edge=options.trigger_edge or "both",
+        exposure=options.exposure,
+        input_id=options.trigger_input,
+        skip_triggers=options.skip_triggers or 0,
+        skip_frames=options.skip_frames or 0,
+    )
+    for note in notes:
+        warn(f"triggers: {note}")
+    return frames, True
+
+
+def described(found: Registered, by_trigger: bool) -> Iterator[str]:
+    """What was found, a line each."""
+    registration = found.registration
+    yield (
+        f"overlap     {100 * registration.overlap:.0f} % of the event camera's pixels lie in the frames; "
+        f"{registration.scale:.2f} frame pixels to one of its own"
+    )
+    if found.matched is not None:
+        yield f"features    {found.matched.inliers} of {found.matched.matches} matches agree with the homography"
+    if found.coarse is not None:
+        yield (
+            f"offset      {found.offset * 1e-3:.2f} ms, standard error {found.standard_error * 1e-3:.2f} ms, added to "
+            f"the frames' times; correlation {found.coarse.peak:.2f}, {found.coarse.ratio:.2f} times the next peak"
+        )
+    else:
+        yield f"offset      {found.offset * 1e-3:.2f} ms, " + ("by trigger" if by_trigger else "as given")
+    if found.alignment is not None:
+        fit = found.alignment
+        yield (
+            f"fit         events explain {100 * fit.explained:.0f} % of what changes between frames, thresholds "
+            f"{fit.thresholds[0]:.2f} and {fit.thresholds[1]:.2f}; moved by {fit.moved:.2f} pixels"
+        )
+
+
+def _write(
+    options: argparse.Namespace,
+    events: Recording,
+    size: tuple[int, int],
+    frames: Callable[[], Iterable[Frame]],
+    exposure_known: bool,
+) -> None:
+    from kalux.cli.progress import Progress
+    from kalux.cli.signals import interrupts_held
+    from kalux.readers import hdf5
+
+    with Progress("registering", quiet=options.quiet) as progress, interrupts_held() as let_through:
+
+        def counted(items: Iterable[T], count: Callable[[T], None]) -> Iterator[T]:
+            for item in items:
+                let_through()
+                yield item
+                count(item)
+
+        hdf5.write(
+            options.out,
+            sensor_size=size,
+            events=counted(events.events(), lambda chunk: progress.add(events=len(chunk))),
+            frames=counted(frames(), lambda _: progress.add(images=1)),
+            exposure_known=exposure_known,
+            contrast_threshold=events.contrast_threshold,
+        )
+    if not options.quiet:
+        say(f"wrote {progress.events:,} events and {progress.images:,} frames to {options.out}")
+
+
+def _overlay(found: Registered, frames: Callable[[], Iterable[Frame]], events: Recording) -> Any:
+    """The frame in the middle of the recording, with the events of 5 ms before and after its middle."""
+    from kalux.calibration.offset import some_events, some_frames
+    from kalux.calibration.pictures import overlay
+
+    count = sum(1 for _ in frames())
+    middle = count // 2
+    frame = next(found.frames(some_frames(frames(), slice(middle, middle + 1))))
+    return overlay(frame, some_events(events.events(), frame.middle - 5_000, frame.middle + 5_000))

@@ -1,0 +1,136 @@
+"""``kalux register``, ``kalux calibrate rig`` and ``kalux calibrate offset``."""
+
+from __future__ import annotations
+
+import tomllib
+
+import cv2
+import numpy as np
+import pytest
+
+import kalux
+from kalux.calibration.registration import Registration
+from kalux.calibration.rig import load_rig, rig_toml
+from kalux.readers import hdf5
+from rigs import DISTANCE, OFFSET, board_recording, distant_recording, misplaced, small_rig
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("rig")
+    for name, seen in (("scene", distant_recording()), ("board", board_recording())):
+        hdf5.write(folder / f"{name}.h5", sensor_size=(120, 160), events=[seen.events], frames=[])
+        hdf5.write(folder / f"{name}_frames.h5", sensor_size=(240, 320), events=[], frames=seen.frames)
+    (folder / "true.toml").write_text(rig_toml(small_rig()))
+    return folder
+
+
+def test_from_the_board_to_the_reconstruction(cli, files, tmp_path):
+    board = (files / "board.h5", files / "board_frames.h5", "--board", "6x5", "--square", "40")
+    rig_file, sheet = tmp_path / "rig.toml", tmp_path / "sheet.png"
+    done = cli("calibrate", "rig", *board, "-o", rig_file, "--window", 300, "--sheet", sheet)
+    assert done.code == 0, done.err
+    assert "used, 0 dropped" in done.out
+    assert cv2.imread(str(sheet)).shape[2] == 3
+    assert load_rig(rig_file).baseline == pytest.approx(0.04, abs=0.003)
+
+    out, overlay, plot = tmp_path / "both.h5", tmp_path / "overlay.png", tmp_path / "offset.png"
+    scene = (files / "scene.h5", "--frames", files / "scene_frames.h5", "--rig", rig_file, "--range", 0.3)
+    done = cli("register", *scene, "-o", out, "--overlay", overlay, "--plot", plot)
+    assert done.code == 0, done.err
+    assert f"offset      {OFFSET / 1000:.1f}"[:14] in done.out
+    assert cv2.imread(str(overlay)).shape == (240, 320, 3)
+    assert cv2.imread(str(plot)) is not None
+    recording = kalux.open(out)
+    frames = list(recording.frames())
+    assert len(frames) == len(distant_recording().frames)
+    assert abs(frames[0].exposure_start - distant_recording().frames[0].exposure_start - OFFSET) < 300
+    assert all(f.valid is not None and 0.8 < f.valid.mean() < 1 for f in frames)
+    assert len(recording.events()) == len(distant_recording().events)
+
+    done = cli("calibrate", "offset", out, "--range", "0.2", "-o", tmp_path / "offset.toml")
+    assert done.code == 0, done.err
+    assert (
+        abs(tomllib.loads((tmp_path / "offset.toml").read_text())["offset_us"]) < 500
+    )  # nothing is left of it
+
+
+def test_an_offset_file_is_taken(cli, files, tmp_path):
+    (tmp_path / "offset.toml").write_text(f"kalux_offset = 1\noffset_us = {OFFSET}\n")
+    for offset in (tmp_path / "offset.toml", OFFSET):
+        out = tmp_path / "both.h5"
+        done = cli(
+            "register", files / "scene.h5", "--frames", files / "scene_frames.h5", "--rig", files / "true.toml",
+            "--homography", "rig", "--distance", DISTANCE, "--offset", offset, "-o", out, "--overwrite", "--quiet",
+        )  # fmt: skip
+        assert (done.code, done.out) == (0, "")
+        frame = next(iter(kalux.open(out).frames()))
+        expected = Registration.of_rig(small_rig(), DISTANCE).frame(distant_recording().frames[0])
+        np.testing.assert_array_equal(frame.image, expected.image)
+        np.testing.assert_array_equal(frame.valid, expected.valid)
+        assert frame.exposure_start == distant_recording().frames[0].exposure_start + OFFSET
+    assert (
+        misplaced(Registration.of_rig(small_rig()), Registration.of_rig(small_rig(), DISTANCE)).mean() > 0.2
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["--stamp", "start"], "give --exposure, too"),
+        (["--trigger-edge", "rising"], "--trigger-edge is for --timing triggers"),
+        (["--timing", "triggers"], "has no trigger events"),
+        (["--timing", "triggers", "--stamp", "end"], "--stamp is for frames with times of their own"),
+        (["--timing", "same", "--offset", "5"], "leave --timing out"),
+        (["--offset", "later"], "neither a number of us nor a file"),
+        (["--range", "0"], "--range is 0 s"),
+        (["--distance", "20"], "without a rig file"),
+        (["--rig", "none.toml"], "none.toml: cannot be read"),
+    ],
+)
+def test_usage(cli, files, tmp_path, arguments, told):
+    out = tmp_path / "both.h5"
+    done = cli("register", files / "scene.h5", "--frames", files / "scene_frames.h5", "-o", out, *arguments)
+    assert done.code == 2
+    assert told in done.error
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["--board", "nine"], "COLUMNSxROWS"),
+        (["--board", "6x5", "--window", "0"], "--window is 0 ms"),
+        (["--board", "9x8"], "in 0 places only"),
+    ],
+)
+def test_usage_of_calibrate_rig(cli, files, tmp_path, arguments, told):
+    out = tmp_path / "rig.toml"
+    done = cli(
+        "calibrate",
+        "rig",
+        files / "scene.h5",
+        files / "scene_frames.h5",
+        "--square",
+        "40",
+        "-o",
+        out,
+        *arguments,
+    )
+    assert done.code == 2
+    assert told in done.error
+    assert not out.exists()
+
+
+def test_calibrate_needs_to_know_what(cli):
+    done = cli("calibrate")
+    assert done.code == 2
+    assert "still needed: what" in done.error
+
+
+def test_nothing_is_overwritten(cli, files, tmp_path):
+    out = tmp_path / "both.h5"
+    out.write_text("mine")
+    done = cli("register", files / "scene.h5", "--frames", files / "scene_frames.h5", "-o", out)
+    assert done.code == 2
+    assert out.read_text() == "mine"

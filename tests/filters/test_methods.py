@@ -1,0 +1,124 @@
+"""Frames that say nothing of some pixels (`Frame.valid`), in every method."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from kalux import Frame, Reconstructor
+from kalux.augmentation.bridge import UNMEASURED, UNSEEN, Latent, floor_before, lift
+
+from builders import VARIANTS, altered, events, random_stream
+
+THRESHOLD = 0.2
+MODES = pytest.mark.parametrize("lookahead", [True, False], ids=["lookahead", "causal"])
+ALL = pytest.mark.parametrize("variant", list(VARIANTS))
+
+
+def images(stream, frames, variant, lookahead):
+    engine = Reconstructor(
+        stream.sensor_size,
+        settings=VARIANTS[variant],
+        lookahead=lookahead,
+        contrast_threshold=THRESHOLD,
+    )
+    for frame in frames:
+        engine.push_frame(frame)
+    engine.push_events(stream.events)
+    engine.finish()
+    begin = engine.begin_time
+    return [engine.read(t) for t in np.linspace(begin, frames[-1].exposure_end, 9).astype(int).tolist()]
+
+
+def same(one, other):
+    for a, b in zip(one, other, strict=True):
+        np.testing.assert_array_equal(a.intensity, b.intensity)
+        np.testing.assert_array_equal(a.variance, b.variance)
+
+
+def masked(frames, masks, values=None):
+    """The frames with masks, and with other values where these are False."""
+    out = []
+    for frame, mask in zip(frames, masks, strict=True):
+        image = frame.image if values is None else np.where(mask, frame.image, np.uint8(values))
+        out.append(dataclasses.replace(frame, image=image, valid=mask))
+    return out
+
+
+@ALL
+@MODES
+def test_a_mask_of_valid_pixels_only_changes_nothing(variant, lookahead):
+    stream = random_stream(1)
+    masks = [np.ones(stream.sensor_size, bool)] * len(stream.frames)
+    same(
+        images(stream, stream.frames, variant, lookahead),
+        images(stream, masked(stream.frames, masks), variant, lookahead),
+    )
+
+
+@ALL
+@MODES
+@pytest.mark.parametrize("seed", range(3))
+def test_values_that_are_not_valid_have_no_weight(variant, lookahead, seed):
+    """Black, grey or saturated: after the first frame, which starts the filter, they leave the images as they are."""
+    stream = random_stream(seed)
+    rng = np.random.default_rng(seed)
+    masks = [rng.random(stream.sensor_size) < 0.6 for _ in stream.frames]
+    masks[0][:] = True
+    made = [
+        images(stream, masked(stream.frames, masks, value), variant, lookahead) for value in (0, 100, 255)
+    ]
+    for other in made[1:]:
+        for a, b in zip(made[0], other, strict=True):
+            np.testing.assert_allclose(a.intensity, b.intensity, rtol=1e-5, atol=1e-6)
+            np.testing.assert_allclose(a.variance, b.variance, rtol=1e-4)
+
+
+@ALL
+@MODES
+def test_pixels_that_are_never_valid_follow_their_events(variant, lookahead):
+    settings = altered(VARIANTS[variant], "events", noise_rate=0.0)
+    settings = altered(settings, "filter", highlight_scale=0.0, neighbours=0.0)
+    frames = [
+        Frame(np.full((1, 2), 100, np.uint8), t, t + 10_000, valid=np.array([[True, False]]))
+        for t in (0, 40_000, 80_000)
+    ]
+    engine = Reconstructor((1, 2), settings=settings, lookahead=lookahead, contrast_threshold=THRESHOLD)
+    for frame in frames:
+        engine.push_frame(frame)
+    engine.push_events(events((20_000, 1, 0, 1), (30_000, 1, 0, 1), (60_000, 1, 0, 0), (70_000, 1, 0, 1)))
+    engine.finish()
+    offset = settings.camera.offset
+    estimates = [engine.estimate(t) for t in (15_000, 35_000, 85_000)]
+    read = [engine.image(estimate) for estimate in estimates]
+    log = [np.log(image.intensity[0, 1] + offset) for image in read]
+    np.testing.assert_allclose(np.diff(log), [2 * THRESHOLD, 0.0], atol=1e-4)
+    assert log[0] == pytest.approx(np.log(100 / 255 + offset), abs=2e-2)
+    if settings.filter.kind == "akf":
+        variances = [estimate.variance[0, 1] for estimate in estimates]
+        assert variances[0] >= settings.filter.initial_variance * 0.999
+        assert variances == sorted(variances)
+        assert estimates[-1].variance[0, 0] < 0.5 * variances[-1]
+
+
+def test_unseen_pixels_start_with_the_variance_of_the_others():
+    image = np.array([[1, 250, 100]], np.uint8)
+    frames = [Frame(image, t, t + 10_000, valid=np.array([[True, True, False]])) for t in (0, 40_000)]
+    engine = Reconstructor((1, 3), contrast_threshold=THRESHOLD)
+    for frame in frames:
+        engine.push_frame(frame)
+    engine.finish()
+    logs = np.log(image[0, :2] / 255 + engine.settings.camera.offset)
+    assert engine.estimate(20_000).variance[0, 2] == pytest.approx(np.var(logs), rel=1e-5)
+    assert np.var(logs) > 1.5  # more than initial_variance
+
+
+def test_a_masked_pixel_is_no_bound():
+    frame = Latent(np.zeros((1, 3)), np.array([[0.1, UNMEASURED, UNSEEN]]))
+    level = np.full((1, 3), -1.0)
+    lift(level, frame)
+    np.testing.assert_array_equal(level, [[-1.0, 0.0, -1.0]])
+    floor = floor_before(frame, np.full((1, 3), 0.5), np.ones((1, 3), bool))
+    np.testing.assert_array_equal(floor, [[-np.inf, -0.5, -np.inf]])
