@@ -14,16 +14,18 @@ from numpy.typing import NDArray
 
 from kalux.calibration.contrast import ThresholdEstimate, estimate_thresholds
 from kalux.calibration.delay import DelayEstimate, estimate_delay
+from kalux.calibration.values import Calibration
 from kalux.errors import FrameError, InputError
 from kalux.events import EventArray
 from kalux.frames import Frame
+from kalux.models.pixels import PixelCalibration, require_size
 from kalux.reconstructor import Estimate, Image, Reconstructor
 from kalux.recording import Recording
 from kalux.settings import Settings
 from kalux.settings import preset as named_preset
 from kalux.smoothing import Backward, combine, reversed_settings
 
-ThresholdOrigin = Literal["settings", "recording", "estimate", "assumed"]
+ThresholdOrigin = Literal["settings", "recording", "calibration", "estimate", "assumed"]
 
 _ASSUMED_THRESHOLD: Final = 0.2
 """Where nothing moves enough to estimate the thresholds they hardly matter: a usual setting of DVS sensors."""
@@ -38,7 +40,7 @@ class Plan:
     settings
         With thresholds and reference exposure filled in.
     threshold_origin
-        Whether the thresholds come from the settings, the recording, an estimate, or are assumed.
+        Whether the thresholds come from the settings, the recording, a calibration, an estimate, or are assumed.
     estimate
         The fit, where there was one.
     delay_estimate
@@ -49,6 +51,8 @@ class Plan:
         Whether images use the frame after them.
     smooth
         Whether images use all of the recording after them.
+    pixels
+        What a calibration says of single pixels.
     """
 
     settings: Settings
@@ -58,6 +62,7 @@ class Plan:
     times: NDArray[np.int64]
     lookahead: bool
     smooth: bool
+    pixels: PixelCalibration | None = None
 
 
 def plan(
@@ -68,11 +73,13 @@ def plan(
     at: Literal["frames"] | None = None,
     preset: str = "default",
     settings: Settings | None = None,
+    calibration: Calibration | None = None,
     lookahead: bool = True,
     smooth: bool = False,
 ) -> Plan:
     """Decide what a reconstruction will do. See `reconstruct` for the parameters and errors."""
-    chosen = settings if settings is not None else named_preset(preset)
+    known = Calibration() if calibration is None else calibration
+    chosen = settings if settings is not None else known.apply(named_preset(preset))
     if sum(choice is not None for choice in (rate_hz, times, at)) != 1:
         raise InputError("reconstruct: give exactly one of rate_hz, times and at")
     if smooth and not lookahead:
@@ -90,8 +97,12 @@ def plan(
     )
     chosen, delay = _with_delay(recording, chosen)
     chosen, origin, estimate = _with_thresholds(recording, chosen)
+    if origin == "settings" and _are_calibrated(chosen, known):
+        origin = "calibration"
     wanted = _times(recording, exposures, rate_hz, times, at, chosen, lookahead)
-    return Plan(chosen, origin, estimate, delay, wanted, lookahead, smooth)
+    if known.pixels is not None:
+        require_size(known.pixels, recording.sensor_size)
+    return Plan(chosen, origin, estimate, delay, wanted, lookahead, smooth, known.pixels)
 
 
 def reconstruct(
@@ -102,6 +113,7 @@ def reconstruct(
     at: Literal["frames"] | None = None,
     preset: str = "default",
     settings: Settings | None = None,
+    calibration: Calibration | None = None,
     lookahead: bool = True,
     smooth: bool = False,
 ) -> Iterator[Image]:
@@ -119,6 +131,9 @@ def reconstruct(
         ``"frames"``: one image at the middle of each exposure.
     preset, settings
         Name of a preset, or whole `Settings`, which win.
+    calibration
+        From `kalux.load_calibration`: what was measured replaces the preset's settings (not those of ``settings``), and
+        what is known of single pixels is used.
     lookahead
         Whether an image uses the frame after it too; False is what a robot would see.
     smooth
@@ -143,6 +158,7 @@ def reconstruct(
             at=at,
             preset=preset,
             settings=settings,
+            calibration=calibration,
             lookahead=lookahead,
             smooth=smooth,
         ),
@@ -181,8 +197,9 @@ def _engine(recording: Recording, plan: Plan, settings: Settings) -> Reconstruct
         recording.sensor_size,
         settings=settings,
         lookahead=plan.lookahead,
-        threshold_is_estimate=plan.threshold_origin in ("estimate", "assumed"),
+        threshold_is_estimate=plan.threshold_origin in ("calibration", "estimate", "assumed"),
         inverse_covariance=recording.source.inverse_covariance,
+        pixels=plan.pixels,
     )
 
 
@@ -242,6 +259,13 @@ def _exposures(recording: Recording) -> NDArray[np.int64]:
     if not exposures:
         raise FrameError(f"{recording.source.path}: no frames; kalux needs frames as well as events")
     return np.array(exposures, np.int64)
+
+
+def _are_calibrated(settings: Settings, calibration: Calibration) -> bool:
+    """Whether the thresholds are those of the calibration."""
+    found = calibration.settings.get("events", {})
+    names = ("threshold_on", "threshold_off")
+    return all(name in found and found[name] == getattr(settings.events, name) for name in names)
 
 
 def _with_delay(recording: Recording, settings: Settings) -> tuple[Settings, DelayEstimate | None]:

@@ -22,6 +22,7 @@ from kalux.filters.methods import Method, Segment, Shot, make_method, take_shot
 from kalux.filters.readout import HighlightPrior, intensity
 from kalux.frames import Frame, check_frame
 from kalux.models.camera import Camera, Response
+from kalux.models.pixels import PixelCalibration, require_size
 from kalux.settings import Settings
 from kalux.settings import preset as named_preset
 
@@ -116,11 +117,16 @@ class Reconstructor:
         Exposure time, us, at which a saturated pixel is 1.0; default: that of the first frame. Settings win.
     inverse_covariance
         A released ``f_Q``: 1 / R_bar for each level of the response, its shape used as f^w (5).
+    pixels
+        What is known of single pixels, from a calibration: priors of their thresholds, and hot ones, whose events
+        are left out.
 
     Raises
     ------
     SettingsError
         If a setting or preset is unknown or out of range.
+    InputError
+        If ``pixels`` are of a sensor of another size.
     """
 
     def __init__(
@@ -134,6 +140,7 @@ class Reconstructor:
         threshold_is_estimate: bool = False,
         reference_exposure: int | None = None,
         inverse_covariance: NDArray[np.float64] | None = None,
+        pixels: PixelCalibration | None = None,
     ) -> None:
         height, width = (int(n) for n in sensor_size)
         if height <= 0 or width <= 0:
@@ -159,7 +166,10 @@ class Reconstructor:
         )
         self._reference = camera.reference_exposure or reference_exposure
         used = _with_spread(self.settings, _UNKNOWN_SPREAD) if unknown else self.settings
-        self._method: Method = make_method(used, self.thresholds, lookahead, self.sensor_size)
+        if pixels is not None:
+            require_size(pixels, self.sensor_size)
+        self._ignored = pixels.hot if pixels is not None and pixels.hot.any() else None
+        self._method: Method = make_method(used, self.thresholds, lookahead, self.sensor_size, pixels)
         self._shots: list[Shot] = []  # from the current segment's frame on
         self._chunks: list[EventArray] = []  # events after the current segment's start
         self._state: State | None = None  # at the current segment's start
@@ -213,6 +223,8 @@ class Reconstructor:
         self.advance(self._last_event - 1)  # more events may carry the last one's time
         if self._needed_from is not None:
             array = array[array["t"].searchsorted(self._needed_from + self._delay, "right") :]
+        if self._ignored is not None:
+            array = array[~self._ignored[array["y"], array["x"]]]
         if array.base is not None or array is events:
             array = array.copy()  # drivers fill the same buffer again
         array["t"] -= self._delay

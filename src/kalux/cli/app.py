@@ -6,7 +6,7 @@ import sys
 import traceback
 from collections.abc import Sequence
 
-from kalux.cli import convert, demo, evaluate, info, reconstruct
+from kalux.cli import calibrate, convert, demo, evaluate, info, reconstruct
 from kalux.cli.parser import Parser, UsageError, normalised
 from kalux.cli.signals import termination_as_interrupt
 from kalux.cli.terminal import close_output, error_line
@@ -21,6 +21,7 @@ commands:
   info         what is in a recording, and what kalux would use of it
   reconstruct  make images or a video from a recording
   convert      copy a recording of any format into one kalux HDF5 file
+  calibrate    measure thresholds, noise and the camera's response
   evaluate     compare methods with ground truth, or with frames held out
   demo         simulate a scene, reconstruct it, and compare with the truth
 
@@ -97,6 +98,6 @@ def make_parser() -> Parser:
     parser = Parser(prog="kalux", description=_DESCRIPTION, epilog=_EXAMPLES, usage="kalux COMMAND ...")
     parser.add_version()
     commands = parser.add_subparsers(dest="command", prog="kalux", parser_class=Parser)
-    for command in (info, reconstruct, convert, evaluate, demo):
+    for command in (info, reconstruct, convert, calibrate, evaluate, demo):
         command.add_command(commands)
     return parser
