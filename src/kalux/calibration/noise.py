@@ -38,6 +38,8 @@ _HOT_LEAST: Final = 5  # events
 _DEAD_EXPECTED: Final = 25.0  # events of the neighbours' median, of a pixel that says nothing
 _BINS: Final = 32  # of the response, for the photon transfer curve
 _BIN_LEAST: Final = 200  # pixels
+_BELIEVED: Final = 0.3
+"""Largest relative standard error of the frame noise with which it is taken as a setting."""
 _PILE: Final = 4.0  # times as many pixels as in the levels beside it
 
 
@@ -139,8 +141,9 @@ class NoiseCalibration:
         if self.refractory_at_most is not None:
             measured["refractory_at_most"] = self.refractory_at_most
         if self.frames is not None:
-            camera["frame_noise"] = self.frames.at_half
-            errors["frame_noise"] = self.frames.error
+            if self.frames.error < _BELIEVED * self.frames.at_half:
+                camera["frame_noise"] = self.frames.at_half
+                errors["frame_noise"] = self.frames.error
             measured |= {"read_noise": self.frames.read, "shot_noise": self.frames.shot}
         if self.levels.saturation is not None:
             measured["white_level"] = self.levels.saturation

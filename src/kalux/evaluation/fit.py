@@ -5,9 +5,9 @@ Every second frame is held out. A setting is judged by the mean negative log pre
     -log p(B),  log(B + I_0) ~ Normal(L, P + R),
 
 with L and P the filter's estimate and its own variance, and R that of the frame (9): a filter that claims too small a
-variance pays for it, as does one that knows too little. The density is that of the intensity B itself, so that different
-I_0 can be compared; a clipped pixel counts with the probability of being at least white. One pixel in a hundred is
-granted ten times the standard deviation, or a few flickering pixels would decide.
+variance pays for it, as does one that knows too little. The density is that of the intensity B itself, so that
+different I_0 can be compared; a clipped pixel counts with the probability of being at least white. One pixel in a
+hundred is granted ten times the standard deviation, or a few flickering pixels would decide.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ class Fit:
     def described(self) -> str:
         """In words."""
         changes = ", ".join(
-            f"{name} x {factor:.3g}" for name, factor in self.factors.items() if factor != 1.0
+            f"{name} x {factor:.3g}" for name, factor in self.factors.items() if abs(factor - 1.0) > 1e-9
         )
         return (
             f"fit: {self.evaluations} reconstructions; negative log likelihood per held-out pixel "
@@ -231,7 +231,7 @@ def score_settings(held: HeldOut, settings: Settings, calibration: Calibration |
     camera = Camera(Response.named(settings.camera.response), None, settings.camera.saturation)
     for frame in frames:
         group = [next(images) for _ in range(reads)]
-        mean = np.mean([image.intensity for image in group], axis=0, dtype=np.float64)
+        mean: Array = np.stack([image.intensity for image in group]).mean(axis=0, dtype=np.float64)
         variance = group[reads // 2].variance.astype(np.float64)
         ratio = held.reference_exposure / frame.exposure
         nll += float(_negative_log_density(mean, variance, frame, camera, settings, ratio).sum())
@@ -259,4 +259,4 @@ def _negative_log_density(
     above = np.logaddexp(
         np.log(1 - _OUTLIERS) + log_ndtr(-away), np.log(_OUTLIERS) + log_ndtr(-away / _OUTLIER_SCALE)
     )
-    return -np.where(response >= camera.saturation, above, density)
+    return np.asarray(-np.where(response >= camera.saturation, above, density), np.float64)
