@@ -355,7 +355,7 @@ def shrunk_rates(counts: Array, quiet: Array, rate: float, hot: NDArray[np.bool_
     rate
         The typical one, Hz.
     hot
-        Pixels that are not to widen the prior.
+        Pixels that neither widen the prior nor are shrunk.
     """
     good = ~hot & (quiet > 0)
     expected = rate * quiet[good]
@@ -363,7 +363,8 @@ def shrunk_rates(counts: Array, quiet: Array, rate: float, hot: NDArray[np.bool_
         return np.full(counts.shape, rate)
     extra = ((counts[good] - expected) ** 2 - expected).sum() / max((expected**2).sum(), 1e-12)
     shape = 1.0 / min(max(float(extra), 1e-3), 10.0)
-    return np.asarray((counts + shape) / (quiet + shape / rate), np.float64)
+    rates = (counts + shape) / (quiet + shape / rate)
+    return np.asarray(np.where(hot & (quiet > 0), counts / np.maximum(quiet, 1e-9), rates), np.float64)
 
 
 def _dead_pixels(total: NDArray[np.int64]) -> NDArray[np.bool_]:

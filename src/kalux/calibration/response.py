@@ -146,7 +146,12 @@ def calibrate_response(
         _require_pixels(strip)
         methods: tuple[MethodName, ...] = ("debevec", "robertson")
         some = np.ascontiguousarray(strip[..., flat[:: max(1, len(flat) // _MOST_PIXELS)]])
-        found = sorted((_fitted(method, some, times) for method in methods), key=lambda fit: fit.residual)
+        fitted = [fit for method in methods if (fit := _fitted(method, some, times)) is not None]
+        if not fitted:
+            raise InputError(
+                "response: no curve fits the images; do they show one still scene, with these times?"
+            )
+        found = sorted(fitted, key=lambda fit: fit.residual)
         fits.append(tuple(found))
         best = Response.curve(found[0].knots)
         residuals.append(prediction_residuals(best, strip, times, leave_out=False))
@@ -227,8 +232,8 @@ def _flat_pixels(images: ImageArray) -> NDArray[np.int64]:
     return np.flatnonzero(steepest.ravel() <= np.median(steepest))
 
 
-def _fitted(method: MethodName, strip: ImageArray, times: Array) -> ResponseFit:
-    """One method's curve; ``strip`` (K, H, W) uint8."""
+def _fitted(method: MethodName, strip: ImageArray, times: Array) -> ResponseFit | None:
+    """One method's curve; ``strip`` (K, H, W) uint8. None where it diverges."""
     if method == "debevec":
         table = _debevec(strip, times)
     else:
@@ -237,6 +242,8 @@ def _fitted(method: MethodName, strip: ImageArray, times: Array) -> ResponseFit:
         table = np.asarray(calibrator.process(images, times.astype(np.float32)), np.float64).reshape(
             _LEVELS, -1
         )[:, 0]
+    if np.count_nonzero(np.isfinite(table) & (table > 0)) < _LEVELS // 2:
+        return None
     knots = smooth_knots(table, _level_counts(strip))
     response = Response.curve(knots)
     residual = float(np.sqrt(np.mean(prediction_residuals(response, strip, times) ** 2)))
