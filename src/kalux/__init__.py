@@ -1,5 +1,6 @@
 """kalux: HDR video with per-pixel uncertainty from hybrid event cameras."""
 
+from kalux.calibration.values import Calibration, load_calibration
 from kalux.errors import KaluxError
 from kalux.events import EVENT_DTYPE, as_events
 from kalux.frames import Frame
@@ -13,6 +14,7 @@ __version__ = "0.1.0"
 __all__ = [
     "EVENT_DTYPE",
     "PRESETS",
+    "Calibration",
     "Frame",
     "Image",
     "KaluxError",
@@ -20,6 +22,7 @@ __all__ = [
     "Recording",
     "Settings",
     "as_events",
+    "load_calibration",
     "open",
     "preset",
     "reconstruct",

@@ -15,18 +15,20 @@ from numpy.typing import NDArray
 from kalux.calibration.contrast import ThresholdEstimate, estimate_thresholds
 from kalux.calibration.delay import DelayEstimate, estimate_delay
 from kalux.calibration.event_model import EventModel, estimate_event_model
+from kalux.calibration.values import Calibration
 from kalux.calibration.white_balance import grey_world
 from kalux.errors import FrameError, InputError
 from kalux.events import EventArray
 from kalux.frames import Frame
 from kalux.models.colour import white_balance
+from kalux.models.pixels import PixelCalibration, require_size
 from kalux.reconstructor import Estimate, Image, Reconstructor
 from kalux.recording import Recording
 from kalux.settings import Settings, chosen_response
 from kalux.settings import preset as named_preset
 from kalux.smoothing import Backward, combine, reversed_settings
 
-ThresholdOrigin = Literal["settings", "recording", "estimate", "assumed"]
+ThresholdOrigin = Literal["settings", "recording", "calibration", "estimate", "assumed"]
 
 _ASSUMED_THRESHOLD: Final = 0.2
 """Where nothing moves enough to estimate the thresholds they hardly matter: a usual setting of DVS sensors."""
@@ -41,7 +43,7 @@ class Plan:
     settings
         With thresholds, delay, I_0, step variance, reference exposure and white balance filled in.
     threshold_origin
-        Whether the thresholds come from the settings, the recording, an estimate, or are assumed.
+        Whether the thresholds come from the settings, the recording, a calibration, an estimate, or are assumed.
     estimate
         The fit, where there was one.
     delay_estimate
@@ -54,6 +56,8 @@ class Plan:
         Whether images use the frame after them.
     smooth
         Whether images use all of the recording after them.
+    pixels
+        What a calibration says of single pixels.
     """
 
     settings: Settings
@@ -64,6 +68,7 @@ class Plan:
     times: NDArray[np.int64]
     lookahead: bool
     smooth: bool
+    pixels: PixelCalibration | None = None
 
 
 def plan(
@@ -74,11 +79,13 @@ def plan(
     at: Literal["frames"] | None = None,
     preset: str = "default",
     settings: Settings | None = None,
+    calibration: Calibration | None = None,
     lookahead: bool = True,
     smooth: bool = False,
 ) -> Plan:
     """Decide what a reconstruction will do. See `reconstruct` for the parameters and errors."""
-    chosen = settings if settings is not None else named_preset(preset)
+    known = Calibration() if calibration is None else calibration
+    chosen = settings if settings is not None else known.apply(named_preset(preset))
     if sum(choice is not None for choice in (rate_hz, times, at)) != 1:
         raise InputError("reconstruct: give exactly one of rate_hz, times and at")
     if smooth and not lookahead:
@@ -107,8 +114,12 @@ def plan(
             threshold_off=chosen.events.threshold_off,
         )
         filled, origin, estimate = _with_thresholds(recording, dataclasses.replace(filled, events=unfilled))
+    if origin == "settings" and _are_calibrated(filled, known):
+        origin = "calibration"
     wanted = _times(recording, exposures, rate_hz, times, at, filled, lookahead)
-    return Plan(filled, origin, estimate, delay, model, wanted, lookahead, smooth)
+    if known.pixels is not None:
+        require_size(known.pixels, recording.sensor_size)
+    return Plan(filled, origin, estimate, delay, model, wanted, lookahead, smooth, known.pixels)
 
 
 def reconstruct(
@@ -119,6 +130,7 @@ def reconstruct(
     at: Literal["frames"] | None = None,
     preset: str = "default",
     settings: Settings | None = None,
+    calibration: Calibration | None = None,
     lookahead: bool = True,
     smooth: bool = False,
 ) -> Iterator[Image]:
@@ -136,6 +148,9 @@ def reconstruct(
         ``"frames"``: one image at the middle of each exposure.
     preset, settings
         Name of a preset, or whole `Settings`, which win.
+    calibration
+        From `kalux.load_calibration`: what was measured replaces the preset's settings (not those of ``settings``), and
+        what is known of single pixels is used.
     lookahead
         Whether an image uses the frame after it too; False is what a robot would see.
     smooth
@@ -160,6 +175,7 @@ def reconstruct(
             at=at,
             preset=preset,
             settings=settings,
+            calibration=calibration,
             lookahead=lookahead,
             smooth=smooth,
         ),
@@ -198,8 +214,9 @@ def _engine(recording: Recording, plan: Plan, settings: Settings) -> Reconstruct
         recording.sensor_size,
         settings=settings,
         lookahead=plan.lookahead,
-        threshold_is_estimate=plan.threshold_origin in ("estimate", "assumed"),
+        threshold_is_estimate=plan.threshold_origin in ("calibration", "estimate", "assumed"),
         inverse_covariance=recording.source.inverse_covariance,
+        pixels=plan.pixels,
     )
 
 
@@ -268,6 +285,13 @@ def _with_white_balance(recording: Recording, settings: Settings) -> Settings:
         return settings
     gains = ";".join(f"{gain:.4f}" for gain in grey_world(recording, settings.camera))
     return dataclasses.replace(settings, camera=dataclasses.replace(settings.camera, white_balance=gains))
+
+
+def _are_calibrated(settings: Settings, calibration: Calibration) -> bool:
+    """Whether the thresholds are those of the calibration."""
+    found = calibration.settings.get("events", {})
+    names = ("threshold_on", "threshold_off")
+    return all(name in found and found[name] == getattr(settings.events, name) for name in names)
 
 
 def _with_delay(recording: Recording, settings: Settings) -> tuple[Settings, DelayEstimate | None]:

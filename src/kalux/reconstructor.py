@@ -31,6 +31,7 @@ from kalux.models.colour import (
     luminance,
     white_balance,
 )
+from kalux.models.pixels import PixelCalibration, require_size
 from kalux.settings import Settings
 from kalux.settings import preset as named_preset
 
@@ -147,11 +148,16 @@ class Reconstructor:
         Exposure time, us, at which a saturated pixel is 1.0; default: that of the first frame. Settings win.
     inverse_covariance
         A released ``f_Q``: 1 / R_bar for each level of the response, its shape used as f^w (5).
+    pixels
+        What is known of single pixels, from a calibration: priors of their thresholds, and hot ones, whose events
+        are left out.
 
     Raises
     ------
     SettingsError
         If a setting or preset is unknown or out of range.
+    InputError
+        If ``pixels`` are of a sensor of another size.
     """
 
     def __init__(
@@ -165,6 +171,7 @@ class Reconstructor:
         threshold_is_estimate: bool = False,
         reference_exposure: int | None = None,
         inverse_covariance: NDArray[np.float64] | None = None,
+        pixels: PixelCalibration | None = None,
     ) -> None:
         height, width = (int(n) for n in sensor_size)
         if height <= 0 or width <= 0:
@@ -190,7 +197,10 @@ class Reconstructor:
         self._gains = white_balance(camera.white_balance)
         self._reference = camera.reference_exposure or reference_exposure
         used = _with_spread(self.settings, _UNKNOWN_SPREAD) if unknown else self.settings
-        self._method: Method = make_method(used, self.thresholds, lookahead, self.sensor_size)
+        if pixels is not None:
+            require_size(pixels, self.sensor_size)
+        self._ignored = pixels.hot if pixels is not None and pixels.hot.any() else None
+        self._method: Method = make_method(used, self.thresholds, lookahead, self.sensor_size, pixels)
         self._shots: list[Shot] = []  # from the current segment's frame on
         self._events = EventBuffer()  # those after the current segment's start
         self._state: State | None = None  # at the current segment's start
@@ -247,7 +257,11 @@ class Reconstructor:
         if self._complete_until is not None:
             earliest = self._complete_until + 1 + self._delay
             previous = earliest if previous is None else max(previous, earliest)
-        if not self._events.append(array, self.sensor_size, earliest=previous, delay=self._delay):
+        kept = array
+        if self._ignored is not None:
+            check_events(array, self.sensor_size, first_index=self._event_count, previous_t=previous)
+            kept = array[~self._ignored[array["y"], array["x"]]]
+        if not self._events.append(kept, self.sensor_size, earliest=previous, delay=self._delay):
             check_events(array, self.sensor_size, first_index=self._event_count, previous_t=previous)
         if len(array) == 0:
             return

@@ -257,3 +257,40 @@ def test_bias_against_a_sampled_logarithm():
     variance = log_covariance(np.array([0.3]), np.array([0.02**2]), 0.1)[0]
     assert np.log(0.4) - sampled.mean() == pytest.approx(bias, rel=0.1)
     assert sampled.var() == pytest.approx(variance, rel=0.02)
+
+
+# --- measured curves --------------------------------------------------------------------------------------
+
+
+def test_a_curve_goes_through_its_knots_and_back():
+    curve = Response.named("curve:0 0.02 0.1 0.3 1")
+    level = np.linspace(0, 1, 5)
+    np.testing.assert_allclose(curve.inverse(level), [0, 0.02, 0.1, 0.3, 1], atol=2e-3)
+    fine = np.linspace(0, 1, 101)
+    np.testing.assert_allclose(curve(curve.inverse(fine)), fine, atol=1e-9)
+    assert (np.diff(curve.inverse(fine)) > 0).all()
+
+
+def test_the_certainty_of_a_curve_is_its_slope():
+    """Knots of a square root: f^c falls as 1 / sqrt(I), and f^w as 1 / response."""
+    knots = " ".join(str(v) for v in np.linspace(0, 1, 33) ** 2)
+    curve = Response.named(f"curve:{knots}")
+    ratio = curve.weight(np.array([0.25])) / curve.weight(np.array([0.5]))
+    assert ratio[0] == pytest.approx(2.0, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("curve:", "at least two increasing"),
+        ("curve:0", "at least two increasing"),
+        ("curve:0 0.5 0.4 1", "at least two increasing"),
+        ("curve:0 0.5 nan 1", "at least two increasing"),
+        ("curve:0 0.5 2", "0 to 1 is needed"),
+        ("curve:0.1 0.5 1", "0 to 1 is needed"),
+        ("curve:0 half 1", "not a number"),
+    ],
+)
+def test_curves_that_are_none(name, message):
+    with pytest.raises(SettingsError, match=message):
+        Response.named(name)

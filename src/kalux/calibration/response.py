@@ -31,9 +31,10 @@ KNOTS: Final = 33
 """Of the curve: every eighth level of 8 bits. Finer steps of a measured curve are noise."""
 
 _LEVELS: Final = 256
-_GREY_SAMPLES: Final = 400  # pixels of Debevec's least squares, which has 256 unknowns besides
-_SMOOTHNESS: Final = 20.0  # Debevec's lambda: 10 to 100 in the paper
+_GREY_SAMPLES: Final = 1_600  # pixels of Debevec's least squares, which has 256 unknowns besides
+_SMOOTHNESS: Final = 60.0  # Debevec's lambda
 _TRUSTED: Final = (4 / 255, 250 / 255)  # of the response: beyond, images say only that it is dark or clipped
+_WIDTH: Final = 1.5  # of the smoothing, in knots
 _LEAST_PIXELS: Final = 500
 _MOST_PIXELS: Final = 40_000  # that the curve is fitted to; it is judged by all
 
@@ -135,16 +136,22 @@ def calibrate_response(
     times = times[order]
     stack = aligned(np.stack([np.atleast_3d(images[i]) for i in order]))  # (K, H, W, C)
     if per_channel:
-        channels = [stack[..., c : c + 1] for c in range(stack.shape[-1])]
+        channels = [stack[..., c] for c in range(stack.shape[-1])]
     else:
-        channels = [np.concatenate([stack[..., c : c + 1] for c in range(stack.shape[-1])], axis=2)]
+        channels = [np.concatenate([stack[..., c] for c in range(stack.shape[-1])], axis=2)]
     fits, residuals, left_out = [], [], []
     for channel in channels:
-        strip = channel[..., 0].reshape(len(times), 1, -1)
+        flat = _flat_pixels(channel)
+        strip = channel.reshape(len(times), 1, -1)
         _require_pixels(strip)
         methods: tuple[MethodName, ...] = ("debevec", "robertson")
-        some = np.ascontiguousarray(strip[..., :: max(1, strip.shape[-1] // _MOST_PIXELS)])
-        found = sorted((_fitted(method, some, times) for method in methods), key=lambda fit: fit.residual)
+        some = np.ascontiguousarray(strip[..., flat[:: max(1, len(flat) // _MOST_PIXELS)]])
+        fitted = [fit for method in methods if (fit := _fitted(method, some, times)) is not None]
+        if not fitted:
+            raise InputError(
+                "response: no curve fits the images; do they show one still scene, with these times?"
+            )
+        found = sorted(fitted, key=lambda fit: fit.residual)
         fits.append(tuple(found))
         best = Response.curve(found[0].knots)
         residuals.append(prediction_residuals(best, strip, times, leave_out=False))
@@ -216,8 +223,17 @@ def _require_pixels(strip: ImageArray) -> None:
         )
 
 
-def _fitted(method: MethodName, strip: ImageArray, times: Array) -> ResponseFit:
-    """One method's curve; ``strip`` (K, H, W) uint8."""
+def _flat_pixels(images: ImageArray) -> NDArray[np.int64]:
+    """Indices of the half of the pixels (H, W) whose neighbours differ least: the others move with the camera."""
+    if min(images.shape[1:]) < 3:
+        return np.arange(images[0].size)
+    kernel = np.ones((3, 3), np.uint8)
+    steepest = np.max([cv2.morphologyEx(image, cv2.MORPH_GRADIENT, kernel) for image in images], axis=0)
+    return np.flatnonzero(steepest.ravel() <= np.median(steepest))
+
+
+def _fitted(method: MethodName, strip: ImageArray, times: Array) -> ResponseFit | None:
+    """One method's curve; ``strip`` (K, H, W) uint8. None where it diverges."""
     if method == "debevec":
         table = _debevec(strip, times)
     else:
@@ -226,6 +242,8 @@ def _fitted(method: MethodName, strip: ImageArray, times: Array) -> ResponseFit:
         table = np.asarray(calibrator.process(images, times.astype(np.float32)), np.float64).reshape(
             _LEVELS, -1
         )[:, 0]
+    if np.count_nonzero(np.isfinite(table) & (table > 0)) < _LEVELS // 2:
+        return None
     knots = smooth_knots(table, _level_counts(strip))
     response = Response.curve(knots)
     residual = float(np.sqrt(np.mean(prediction_residuals(response, strip, times) ** 2)))
@@ -276,7 +294,7 @@ def smooth_knots(table: Array, counts: Array) -> Array:
     rising = isotonic_regression(table[inside], weights=weights[inside]).x
     knots_at = np.linspace(0.0, 1.0, KNOTS)
     width = 1.0 / (KNOTS - 1)
-    kernel = np.exp(-0.5 * ((knots_at[:, None] - level[inside]) / (0.5 * width)) ** 2) * weights[inside]
+    kernel = np.exp(-0.5 * ((knots_at[:, None] - level[inside]) / (_WIDTH * width)) ** 2) * weights[inside]
     values = np.array(
         [_local_line(k, level[inside], rising, w) for k, w in zip(knots_at, kernel, strict=True)]
     )
@@ -343,7 +361,7 @@ def read_exposure(path: str | Path) -> float:
         from PIL import Image, UnidentifiedImageError
     except ImportError as error:
         raise MissingDependencyError(
-            "exposure times of photographs are read by Pillow; pip install 'kalux[photographs]', or give --times"
+            "exposure times of photographs are read by Pillow; pip install 'kalux[hdr]', or give --times"
         ) from error
     try:
         with Image.open(path) as image:

@@ -125,7 +125,7 @@ class ContrastCalibration:
             "threshold_off_variance": self.off_variance,
         }
         finite = {name: value for name, value in errors.items() if np.isfinite(value)}
-        return Calibration({"events": settings}, finite, {**measured, "apparent_delay": self.delay}, maps)
+        return Calibration({"events": settings}, finite, {**measured, "trailing_delay": self.delay}, maps)
 
 
 def calibrate_contrast(

@@ -42,13 +42,16 @@ UNITS: Final[Mapping[str, str]] = {
     "correlation": "of a pixel's ON and OFF thresholds, -1 to 1",
     "delay": "us",
     "apparent_delay": "us",
+    "trailing_delay": "us",
     "step_variance": "threshold^2 per event",
     "noise_rate": "Hz per pixel",
     "frame_noise": "standard deviation at half of white, white = 1",
     "read_noise": "standard deviation in the dark, white = 1",
     "shot_noise": "variance per intensity, white = 1",
     "saturation": "of white, 0 to 1",
-    "black_level": "of white, 0 to 1",
+    "black_level": "of white, 0 to 1: below, pixels pile up",
+    "white_level": "of white, 0 to 1: above, pixels pile up",
+    "quiet_share": "of the sensor's time",
     "log_offset": "intensity, white = 1",
     "response": "camera response function",
     "trailing": "log intensity",
@@ -118,11 +121,12 @@ class Calibration:
         return PixelCalibration(on, off, on_variance, off_variance, hot)
 
     def merged(self, other: Calibration) -> Calibration:
-        """Both; where both know something, the other wins."""
+        """Both; where both know something, the other wins, and its standard error, if any, with it."""
         groups = {*self.settings, *other.settings}
+        replaced = {name for values in (*other.settings.values(), other.measured) for name in values}
         return Calibration(
             {g: {**self.settings.get(g, {}), **other.settings.get(g, {})} for g in sorted(groups)},
-            {**self.errors, **other.errors},
+            {**{n: e for n, e in self.errors.items() if n not in replaced}, **other.errors},
             {**self.measured, **other.measured},
             {**self.maps, **other.maps},
             {**self.provenance, **other.provenance},

@@ -51,7 +51,7 @@ commands:
   reconstruct  make images or a video from a recording
   convert      copy a recording of any format into one kalux HDF5 file
   register     make one recording of an event camera's events and another camera's frames
-  calibrate    measure what cameras are like: two-camera rigs, clock offsets
+  calibrate    measure cameras: thresholds, noise, response, two-camera rigs, clock offsets
   evaluate     compare methods with ground truth, or with frames held out
   benchmark    the same for many recordings, with a report
   simulate     make a recording with ground truth from an HDR photograph, images or a video

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from kalux.cli.calibrations import add_calibration, given_calibration
 from kalux.cli.checking import check_recording
 from kalux.cli.info import add_recording, open_recording
 from kalux.cli.parser import Parser, UsageError, whole
@@ -68,6 +69,7 @@ def add_command(commands: Any) -> None:
         default="auto",
         help="of the camera: linear, srgb, gamma:EXPONENT (default: what the recording states, else linear)",
     )
+    add_calibration(group)
     group = parser.add_argument_group("what is computed")
     group.add_argument("--methods", metavar="A,B", help="names, in this order, with commas")
     group.add_argument("--hdrvdp", action="store_true", help="HDR-VDP's Q as well, 0.2 s per VGA image")
@@ -139,6 +141,9 @@ class Protocol:
 
         self._recording, self._options = recording, options
         self._score: Callable[[Method, Callable[[], None]], Scores]
+        calibration = given_calibration(options)
+        if calibration is not None and options.response == "auto":
+            options.response = calibration.settings.get("camera", {}).get("response", options.response)
         reference = None
         if options.hold_out_frames is None:
             reference, origin = _reference(recording, options)
@@ -155,7 +160,9 @@ class Protocol:
                 recording, reference, method, hdr_vdp=options.hdrvdp, on_image=count
             )
         names = None if options.methods is None else [n.strip() for n in options.methods.split(",")]
-        self.methods = baselines.chosen_methods(names, response=options.response, held_out=reference is None)
+        self.methods = baselines.chosen_methods(
+            names, response=options.response, held_out=reference is None, calibration=calibration
+        )
 
     def score(self, method: Method) -> Scores:
         """Score one method, with progress."""

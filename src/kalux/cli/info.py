@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from kalux.cli.calibrations import add_calibration, calibration_lines, given_calibration
 from kalux.cli.parser import Parser, UsageError, number, whole
 from kalux.cli.terminal import say
 from kalux.frames import MOSAICS
@@ -35,6 +36,7 @@ def add_command(commands: Any) -> None:
     add_recording(parser)
     group = parser.add_argument_group("contrast thresholds")
     group.add_argument("--no-estimate", action="store_true", help="do not estimate contrast thresholds")
+    add_calibration(parser.add_argument_group("calibration"))
     parser.set_defaults(run=run)
 
 
@@ -108,7 +110,10 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     from kalux.info import describe, format_description
 
     recording = open_recording(options)
+    calibration = given_calibration(options)
     say(format_description(describe(recording)))
+    if calibration is not None:
+        say("\n".join(calibration_lines(calibration)))
     if not options.no_estimate:
         say("\n".join(f"  estimate   {text}" for text in estimates(recording)))
 

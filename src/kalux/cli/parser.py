@@ -50,6 +50,7 @@ class Parser(argparse.ArgumentParser):
         options, unknown = self.parse_known_args(args, namespace)
         if unknown:
             parser = self._command_parser(getattr(options, "command", None))
+            parser = parser._command_parser(getattr(options, "subcommand", None))
             parser.error(_unknown(unknown[0], list(parser._option_string_actions)))
         return options
 
@@ -58,6 +59,12 @@ class Parser(argparse.ArgumentParser):
             if isinstance(action, argparse._SubParsersAction) and command in action.choices:
                 return action.choices[command]  # type: ignore[no-any-return]
         return self
+
+    def add_commands(self, commands: Any, dest: str) -> None:
+        """Add commands below this one: modules with ``add_command``; which was chosen goes to ``dest``."""
+        parsers = self.add_subparsers(dest=dest, prog=self.prog, parser_class=Parser)
+        for command in commands:
+            command.add_command(parsers)
 
 
 class HelpFormatter(argparse.RawDescriptionHelpFormatter):

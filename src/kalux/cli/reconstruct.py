@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from kalux.cli.calibrations import add_calibration, given_calibration
 from kalux.cli.checking import Contents, check_recording
 from kalux.cli.flags import HelpSettings, add_display, add_settings, given_settings
 from kalux.cli.info import add_recording, open_recording
@@ -46,6 +47,7 @@ examples:
 _ORIGINS = {
     "settings": "given",
     "recording": "from the recording",
+    "calibration": "calibrated",
     "estimate": "estimated",
     "assumed": "assumed",
 }
@@ -112,6 +114,7 @@ def _add_settings(parser: Parser) -> None:
     group.add_argument(
         "--settings", type=Path, metavar="FILE", help="TOML that changes the preset; an output's kalux.toml"
     )
+    add_calibration(group)
     # Not a flag: a line of help for all of them.
     group.add_argument(
         "--GROUP.NAME",
@@ -174,8 +177,11 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
 
 
 def chosen_settings(options: argparse.Namespace) -> Settings:
-    """The preset, changed by the file, changed by the flags."""
+    """The preset, changed by calibrations, changed by the file, changed by the flags."""
     settings = preset(options.preset)
+    calibration = given_calibration(options)
+    if calibration is not None:
+        settings = calibration.apply(settings)
     if options.settings is not None:
         settings = load(options.settings, settings)
     settings = from_dict(given_settings(options), settings)
@@ -204,6 +210,7 @@ def make_plan(
         times=times,
         at=options.at,
         settings=settings,
+        calibration=given_calibration(options),
         lookahead=not options.causal,
         smooth=options.smooth,
     )
@@ -311,6 +318,7 @@ def metadata(
     return {
         "command": shlex.join(command),
         "preset": options.preset,
+        "calibration": [str(path) for path in options.calibration or []],
         "settings": to_dict(made.settings),
         "thresholds": {"origin": made.threshold_origin, "estimate": estimate},
         "input": {

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.deblur import between, count_events, integrate_exposure, latent_middle
+from kalux.calibration.values import Calibration
 from kalux.errors import InputError
 from kalux.evaluation.exposures import linear_frame, reference_exposure
 from kalux.events import EVENT_DTYPE, EventArray
@@ -126,18 +127,32 @@ def edi_video(recording: Recording, times: Times, *, settings: Settings | None =
 
 
 def filtered(
-    recording: Recording, times: Times, *, settings: Settings, smooth: bool = False
+    recording: Recording,
+    times: Times,
+    *,
+    settings: Settings,
+    calibration: Calibration | None = None,
+    smooth: bool = False,
 ) -> Iterator[Image]:
     """`kalux.reconstruct` with given settings: the AKF, the complementary filter."""
-    for image in reconstruct(recording, times=times, settings=settings, smooth=smooth):
+    for image in reconstruct(
+        recording, times=times, settings=settings, calibration=calibration, smooth=smooth
+    ):
         yield image.intensity
 
 
 def filtered_estimates(
-    recording: Recording, times: Times, *, settings: Settings, smooth: bool = False
+    recording: Recording,
+    times: Times,
+    *,
+    settings: Settings,
+    calibration: Calibration | None = None,
+    smooth: bool = False,
 ) -> Iterator[Estimated]:
     """As `filtered`, with the variances."""
-    for image in reconstruct(recording, times=times, settings=settings, smooth=smooth):
+    for image in reconstruct(
+        recording, times=times, settings=settings, calibration=calibration, smooth=smooth
+    ):
         yield Estimated(image.intensity, image.variance, image.log_offset)
 
 
@@ -152,31 +167,41 @@ OPTIONAL: Final = ("iccv2021-flir",)
 """Not among those that are compared if nothing is said: for one camera only."""
 
 
-def methods(response: str = AUTO) -> dict[str, Method]:
-    """All methods by name; ``response`` is the camera's, as in `kalux.settings.CameraSettings`."""
-    presets = {name: _with_response(PRESETS[name], response) for name in _FILTERS}
+def methods(response: str = AUTO, calibration: Calibration | None = None) -> dict[str, Method]:
+    """All methods by name; ``response`` is the camera's, as in `kalux.settings.CameraSettings`.
+
+    A calibration changes the settings of all filters.
+    """
+    known = Calibration() if calibration is None else calibration
+    presets = {name: known.apply(_with_response(PRESETS[name], response)) for name in _FILTERS}
     return {
         "hold": Method("hold the last frame", partial(hold_last_frame, response=response)),
         "mean": Method("mean of the neighbours", partial(mean_of_neighbours, response=response), True),
         "edi": Method("EDI video", partial(edi_video, settings=presets["default"])),
-        **{name: filter_method(label, presets[name]) for name, label in _FILTERS.items()},
-        "smooth": filter_method("AKF default, both ways", presets["default"], smooth=True),
+        **{name: filter_method(label, presets[name], calibration) for name, label in _FILTERS.items()},
+        "smooth": filter_method("AKF default, both ways", presets["default"], calibration, smooth=True),
     }
 
 
-def filter_method(label: str, settings: Settings, *, smooth: bool = False) -> Method:
-    """`kalux.reconstruct` with these settings as a method."""
-    with_variance = partial(filtered_estimates, settings=settings, smooth=smooth)
+def filter_method(
+    label: str, settings: Settings, calibration: Calibration | None = None, *, smooth: bool = False
+) -> Method:
+    """`kalux.reconstruct` with these settings as a method; of a calibration the pixels are taken."""
+    with_variance = partial(filtered_estimates, settings=settings, calibration=calibration, smooth=smooth)
     return Method(
         label,
-        partial(filtered, settings=settings, smooth=smooth),
+        partial(filtered, settings=settings, calibration=calibration, smooth=smooth),
         estimates=None if settings.filter.kind == "cf" else with_variance,
         settings=settings,
     )
 
 
 def chosen_methods(
-    names: Iterable[str] | None = None, *, response: str = AUTO, held_out: bool = False
+    names: Iterable[str] | None = None,
+    *,
+    response: str = AUTO,
+    held_out: bool = False,
+    calibration: Calibration | None = None,
 ) -> list[Method]:
     """Methods by name, in that order.
 
@@ -189,6 +214,8 @@ def chosen_methods(
         Of the camera, as in `kalux.settings.CameraSettings`.
     held_out
         Whether frames are held out.
+    calibration
+        What was measured of the sensor, for all filters.
 
     Raises
     ------
@@ -200,7 +227,7 @@ def chosen_methods(
     # These methods are of the kind that this module defines, so it can be imported only now.
     from kalux.evaluation.specs import FORMS, outside_method
 
-    known = methods(response)
+    known = methods(response, calibration)
     if names is None:
         names = [n for n, m in known.items() if n not in OPTIONAL and (held_out or not m.needs_held_out)]
     chosen = []

@@ -34,6 +34,7 @@ from kalux.models.camera import (
     log_covariance,
     log_intensity,
 )
+from kalux.models.pixels import PixelCalibration
 from kalux.settings import Settings
 
 Array = NDArray[np.float64]
@@ -261,13 +262,20 @@ class Method(Protocol):
 
 
 def make_method(
-    settings: Settings, thresholds: tuple[float, float], lookahead: bool, shape: tuple[int, int]
+    settings: Settings,
+    thresholds: tuple[float, float],
+    lookahead: bool,
+    shape: tuple[int, int],
+    pixels: PixelCalibration | None = None,
 ) -> Method:
-    """The method that the settings name, with the nominal (on, off) thresholds."""
+    """The method that the settings name, with the nominal (on, off) thresholds.
+
+    ``pixels`` is what is known of single pixels beforehand; only the bridge uses it.
+    """
     if settings.filter.kind == "cf":
         return HeldFrames(settings, thresholds, lookahead, shape)
     if settings.filter.augmentation == "bridge":
-        return BridgedFrames(settings, thresholds, lookahead, shape)
+        return BridgedFrames(settings, thresholds, lookahead, shape, pixels)
     return InterpolatedFrames(settings, thresholds, lookahead, shape)
 
 
@@ -326,6 +334,26 @@ class BridgedFrames(_Common):
 
     _FIRST_INTERVAL: Final = 0.04  # s, spread of a single frame's information until a second one is known
 
+    def __init__(
+        self,
+        settings: Settings,
+        thresholds: tuple[float, float],
+        lookahead: bool,
+        shape: tuple[int, int],
+        pixels: PixelCalibration | None,
+    ) -> None:
+        super().__init__(settings, thresholds, lookahead, shape)
+        self._prior = (
+            bridge.nominal_thresholds(shape, settings.events.threshold_spread, np.float32)
+            if pixels is None
+            else Thresholds(
+                *(
+                    values.astype(np.float32)
+                    for values in (pixels.on, pixels.off, pixels.on_variance, pixels.off_variance)
+                )
+            )
+        )
+
     def node(self, shot: Shot) -> int:
         return shot.middle if self.lookahead else shot.end
 
@@ -365,7 +393,7 @@ class BridgedFrames(_Common):
         return latent
 
     def start(self, shot: Shot, events: Chunks) -> tuple[BridgeMemory, Segment | None, State]:
-        thresholds = bridge.nominal_thresholds(self.shape, self.settings.events.threshold_spread, np.float32)
+        thresholds = self._prior
         latent = self.latent(shot, events, thresholds)
         begin = self.begin_time(shot)
         newest = make_clock(self.shape, begin - shot.start)

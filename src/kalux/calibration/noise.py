@@ -1,0 +1,496 @@
+"""Noise of both sensors from a recording: background events, hot and dead pixels, frame noise, clipping levels.
+
+Everything is taken from where nothing happens. A pixel is *quiet* while its eight neighbours have been silent for 10 ms
+and stay so for 10 ms; what it says then is noise, and the quiet time itself is known exactly, so that the rate needs no
+correction. Frame noise is the photon transfer curve of pixels that see no event between two frames.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import cv2
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux.augmentation.deblur import between, count_events
+from kalux.calibration.delay import estimate_delay
+from kalux.calibration.intervals import intervals
+from kalux.calibration.thresholds import shortest_interval
+from kalux.calibration.values import Calibration
+from kalux.recording import Recording
+from kalux.settings import CameraSettings
+
+Array = NDArray[np.float64]
+
+QUIET: Final = 10_000
+"""us around a neighbour's event in which a pixel is not quiet: what an edge at 100 pixels/s takes for a pixel."""
+
+MAX_FRAMES: Final = 400
+_WINDOW: Final = 100_000  # us
+_BLOCK: Final = 16  # pixels
+_NEARLY: Final = 0.85
+_HOT_FACTOR: Final = 10.0  # times the typical rate
+_HOT_SIGNIFICANCE: Final = 8.0  # standard deviations above the typical count
+_HOT_LEAST: Final = 5  # events
+_DEAD_EXPECTED: Final = 25.0  # events of the neighbours' median, of a pixel that says nothing
+_BINS: Final = 32  # of the response, for the photon transfer curve
+_BIN_LEAST: Final = 200  # pixels
+_BELIEVED: Final = 0.3
+"""Largest relative standard error of the frame noise with which it is taken as a setting."""
+_PILE: Final = 4.0  # times as many pixels as in the levels beside it
+
+
+class EventNoise(NamedTuple):
+    """Background events.
+
+    Attributes
+    ----------
+    rate
+        Hz per pixel, of pixels that are not hot.
+    rate_error
+        Standard error from the spread over parts of the sensor and of time, Hz.
+    rates
+        (H, W) Hz: of every pixel, shrunk towards ``rate`` as far as it was seldom quiet.
+    hot, dead
+        (H, W) bool: pixels that fire without reason; pixels that say nothing where all neighbours do.
+    quiet_share
+        Share of the sensor's time that was quiet.
+    """
+
+    rate: float
+    rate_error: float
+    rates: Array
+    hot: NDArray[np.bool_]
+    dead: NDArray[np.bool_]
+    quiet_share: float
+
+
+class FrameNoise(NamedTuple):
+    """Photon transfer: variance = read^2 + shot * intensity, white = 1.
+
+    Attributes
+    ----------
+    read, shot
+        Standard deviation in the dark, and variance per intensity.
+    at_half
+        Standard deviation at half of white.
+    error
+        Standard error of ``at_half``.
+    levels, variances
+        The points of the curve.
+    """
+
+    read: float
+    shot: float
+    at_half: float
+    error: float
+    levels: Array
+    variances: Array
+
+
+class Levels(NamedTuple):
+    """Where the frames clip, share of white; None where no pile of pixels is seen."""
+
+    black: float | None
+    saturation: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseCalibration:
+    """All of it; None what the recording does not tell.
+
+    Attributes
+    ----------
+    events, frames, levels
+        See there.
+    delay, apparent_delay
+        Of the events, us (`kalux.calibration.delay`).
+    refractory_at_most
+        Shortest time between two events of a pixel that is not chance, us: no refractory period is longer.
+    """
+
+    events: EventNoise | None
+    frames: FrameNoise | None
+    levels: Levels
+    delay: int | None
+    apparent_delay: int | None
+    refractory_at_most: int | None
+
+    def calibration(self) -> Calibration:
+        """As settings with standard errors, and maps of the pixels."""
+        events: dict[str, float | int] = {}
+        camera: dict[str, float] = {}
+        errors: dict[str, float] = {}
+        measured: dict[str, float | int] = {}
+        maps: dict[str, NDArray[np.generic]] = {}
+        if self.events is not None:
+            events["noise_rate"] = self.events.rate
+            errors["noise_rate"] = self.events.rate_error
+            measured |= {
+                "hot_pixels": int(self.events.hot.sum()),
+                "dead_pixels": int(self.events.dead.sum()),
+                "quiet_share": self.events.quiet_share,
+            }
+            maps |= {"hot": self.events.hot, "dead": self.events.dead, "noise_rate": self.events.rates}
+        if self.delay is not None and self.apparent_delay is not None:
+            events["delay"] = self.delay
+            measured["apparent_delay"] = self.apparent_delay
+        if self.refractory_at_most is not None:
+            measured["refractory_at_most"] = self.refractory_at_most
+        if self.frames is not None:
+            if self.frames.error < _BELIEVED * self.frames.at_half:
+                camera["frame_noise"] = self.frames.at_half
+                errors["frame_noise"] = self.frames.error
+            measured |= {"read_noise": self.frames.read, "shot_noise": self.frames.shot}
+        if self.levels.saturation is not None:
+            measured["white_level"] = self.levels.saturation
+            camera["saturation"] = min(self.levels.saturation, CameraSettings().saturation)
+        if self.levels.black is not None:
+            measured["black_level"] = self.levels.black
+        settings = {"camera": camera, "events": events}
+        return Calibration({g: v for g, v in settings.items() if v}, errors, measured, maps)
+
+
+def calibrate_noise(recording: Recording, camera: CameraSettings) -> NoiseCalibration:
+    """Measure the noise of a recording's sensor.
+
+    Parameters
+    ----------
+    recording
+        With frames and exposures; a still camera, or still parts of the scene, tell most.
+    camera
+        Response and saturation.
+
+    Raises
+    ------
+    ExposureError
+        If the frames' exposures are not known.
+    """
+    delay = estimate_delay(recording, camera)
+    return NoiseCalibration(
+        events=event_noise(recording),
+        frames=frame_noise(recording, camera),
+        levels=clipping_levels(recording),
+        delay=None if delay is None else delay.delay,
+        apparent_delay=None if delay is None else delay.apparent,
+        refractory_at_most=shortest_interval(recording) or None,
+    )
+
+
+# --- events ---------------------------------------------------------------------------------------------------
+
+
+def event_noise(recording: Recording) -> EventNoise | None:
+    """Background rate, hot and dead pixels; None without events, or where next to nothing is ever quiet (1 %)."""
+    first, last = _span(recording)
+    if first is None or last is None or last <= first:
+        return None
+    tally = _tallied(recording, first, last, np.zeros(recording.sensor_size, np.bool_))
+    hot = _hot_pixels(tally)
+    if hot.any():  # again without them: their neighbours are quiet after all
+        tally = _tallied(recording, first, last, hot)
+    share = float(tally.quiet.sum() / (hot.size * (last - first)))
+    if share < 0.01:
+        return None
+    rate, error = _typical_rate(tally, hot)
+    counts, quiet = tally.counts.sum(axis=0), tally.quiet.sum(axis=0) * 1e-6
+    dead = _dead_pixels(tally.all)
+    return EventNoise(rate, error, shrunk_rates(counts, quiet, rate, hot), hot, dead, share)
+
+
+def _span(recording: Recording) -> tuple[int | None, int | None]:
+    first = last = None
+    for chunk in recording.events():
+        first = int(chunk["t"][0]) if first is None else first
+        last = int(chunk["t"][-1])
+    return first, last
+
+
+class _Tally(NamedTuple):
+    """Per window of time and pixel (N, H, W): events while quiet, quiet time (us); (H, W) all events."""
+
+    counts: NDArray[np.int32]
+    quiet: NDArray[np.int64]
+    all: NDArray[np.int64]
+
+
+_MOST_WINDOWS: Final = 32
+
+
+def _tallied(recording: Recording, first: int, last: int, ignored: NDArray[np.bool_]) -> _Tally:
+    """Count events in quiet time; those of ignored pixels do not end their neighbours' quiet."""
+    height, width = recording.sensor_size
+    windows = int(np.clip((last - first) // _WINDOW, 1, _MOST_WINDOWS))
+    length = (last - first) / windows
+    counts = np.zeros((windows, height, width), np.int32)
+    quiet = np.zeros((windows, height, width), np.int64)
+    total = np.zeros((height, width), np.int64)
+    busy_until = np.full((height, width), first, np.int64)  # silence before the first event is not known
+    pending = np.full((height, width), -1, np.int64)  # an event in quiet time, until its future is quiet, too
+    for chunk in recording.events():
+        t, x, y = (chunk[name] for name in ("t", "x", "y"))
+        _tally(t, x, y, first, length, QUIET, ignored, busy_until, pending, counts, quiet, total)
+    _close(last, first, length, QUIET, busy_until, pending, counts, quiet)
+    return _Tally(counts, quiet, total)
+
+
+@nb.njit(cache=True, nogil=True)
+def _add_quiet(start, end, first, length, row, column, quiet):  # type: ignore[no-untyped-def]
+    """Spread the quiet time from start to end over the windows."""
+    while start < end:
+        window = min(int((start - first) / length), quiet.shape[0] - 1)
+        stop = end if window == quiet.shape[0] - 1 else min(end, int(first + (window + 1) * length) + 1)
+        quiet[window, row, column] += stop - start
+        start = stop
+
+
+@nb.njit(cache=True, nogil=True)
+def _tally(t, x, y, first, length, gap, ignored, busy_until, pending, counts, quiet, total):  # type: ignore[no-untyped-def]
+    height, width = total.shape
+    for i in range(len(t)):
+        now, row, column = t[i], y[i], x[i]
+        total[row, column] += 1
+        # The pixel's own event is noise if it is in quiet time before, and no neighbour follows (decided later).
+        if now >= busy_until[row, column]:
+            if pending[row, column] >= 0 and now - pending[row, column] >= gap:
+                window = min(int((pending[row, column] - first) / length), counts.shape[0] - 1)
+                counts[window, row, column] += 1
+                pending[row, column] = now
+            elif pending[row, column] < 0:
+                pending[row, column] = now
+            else:  # a second one shortly after: both are counted, the first now
+                window = min(int((pending[row, column] - first) / length), counts.shape[0] - 1)
+                counts[window, row, column] += 1
+                pending[row, column] = now
+        if ignored[row, column]:
+            continue
+        for r in range(max(0, row - 1), min(height, row + 2)):
+            for c in range(max(0, column - 1), min(width, column + 2)):
+                if r == row and c == column:
+                    continue
+                # Quiet until `gap` before this event.
+                end = now - gap
+                if end > busy_until[r, c]:
+                    _add_quiet(busy_until[r, c], end, first, length, r, c, quiet)
+                if pending[r, c] >= 0:
+                    if pending[r, c] <= end:
+                        window = min(int((pending[r, c] - first) / length), counts.shape[0] - 1)
+                        counts[window, r, c] += 1
+                    pending[r, c] = -1
+                busy_until[r, c] = max(busy_until[r, c], now + gap)
+
+
+@nb.njit(cache=True, nogil=True)
+def _close(last, first, length, gap, busy_until, pending, counts, quiet):  # type: ignore[no-untyped-def]
+    """The end of the recording."""
+    end = last - gap
+    for row in range(busy_until.shape[0]):
+        for column in range(busy_until.shape[1]):
+            if end > busy_until[row, column]:
+                _add_quiet(busy_until[row, column], end, first, length, row, column, quiet)
+            if 0 <= pending[row, column] <= end:
+                window = min(int((pending[row, column] - first) / length), counts.shape[0] - 1)
+                counts[window, row, column] += 1
+
+
+def _hot_pixels(tally: _Tally) -> NDArray[np.bool_]:
+    """Pixels that fire in quiet time ten times as often as is typical, and far more often than chance has it."""
+    counts, quiet = tally.counts.sum(axis=0), tally.quiet.sum(axis=0)
+    hot = np.zeros(counts.shape, np.bool_)
+    for _ in range(5):
+        rate = counts[~hot].sum() / max(quiet[~hot].sum(), 1)
+        expected = rate * quiet
+        excess = counts - expected
+        found = (
+            (counts >= _HOT_LEAST)
+            & (counts > _HOT_FACTOR * expected)
+            & (excess > _HOT_SIGNIFICANCE * np.sqrt(expected + 0.25))
+        )
+        if (found == hot).all():
+            break
+        hot = found
+    return hot
+
+
+def _typical_rate(tally: _Tally, hot: NDArray[np.bool_]) -> tuple[float, float]:
+    """Hz per pixel, and its standard error: of those blocks and windows of time that are nearly the quietest (85 %).
+
+    Where something moves, faint edges make single events, too, so that the busier blocks say little. Noise itself
+    makes all of them less quiet alike.
+    """
+    height, width = hot.shape
+    rows, columns = -(-height // _BLOCK), -(-width // _BLOCK)
+    index = (np.arange(height)[:, None] // _BLOCK) * columns + np.arange(width) // _BLOCK
+    good = ~hot
+    size = rows * columns
+    counts = np.array([np.bincount(index[good], c[good], size) for c in tally.counts]).ravel()
+    quiet = np.array([np.bincount(index[good], q[good], size) for q in tally.quiet]).ravel() * 1e-6
+    full = np.bincount(index[good], minlength=size)
+    possible = np.tile(full, len(tally.counts)).astype(np.float64)
+    share = quiet / np.maximum(possible, 1)
+    used = (possible > 0) & (quiet > 0) & (share >= _NEARLY * np.quantile(share[possible > 0], 0.95))
+    rate = counts[used].sum() / quiet[used].sum()
+    # Jackknife over blocks of the sensor.
+    block = np.tile(np.arange(size), len(tally.counts))[used]
+    by_block = np.bincount(block, counts[used], size), np.bincount(block, quiet[used], size)
+    seen = by_block[1] > 0
+    n = int(seen.sum())
+    without = (counts[used].sum() - by_block[0][seen]) / np.maximum(
+        quiet[used].sum() - by_block[1][seen], 1e-9
+    )
+    error = float(np.sqrt((n - 1) * np.var(without))) if n > 1 else float("inf")
+    return float(rate), error
+
+
+def shrunk_rates(counts: Array, quiet: Array, rate: float, hot: NDArray[np.bool_]) -> Array:
+    """Noise rate of every pixel, Hz, by a gamma prior whose spread is that of the pixels (method of moments).
+
+    Parameters
+    ----------
+    counts, quiet
+        (H, W) events in quiet time, and that time, s.
+    rate
+        The typical one, Hz.
+    hot
+        Pixels that neither widen the prior nor are shrunk.
+    """
+    good = ~hot & (quiet > 0)
+    expected = rate * quiet[good]
+    if rate <= 0 or not good.any():
+        return np.full(counts.shape, rate)
+    extra = ((counts[good] - expected) ** 2 - expected).sum() / max((expected**2).sum(), 1e-12)
+    shape = 1.0 / min(max(float(extra), 1e-3), 10.0)
+    rates = (counts + shape) / (quiet + shape / rate)
+    return np.asarray(np.where(hot & (quiet > 0), counts / np.maximum(quiet, 1e-9), rates), np.float64)
+
+
+def _dead_pixels(total: NDArray[np.int64]) -> NDArray[np.bool_]:
+    around = cv2.medianBlur(total.clip(0, 65535).astype(np.uint16), 5)
+    return np.asarray((total == 0) & (around >= _DEAD_EXPECTED), np.bool_)
+
+
+# --- frames ---------------------------------------------------------------------------------------------------
+
+
+def frame_noise(recording: Recording, camera: CameraSettings) -> FrameNoise | None:
+    """Photon transfer curve of pixels without events nearby (5x5) from one exposure's start to the next one's end.
+
+    Half of the variance of the difference of two frames, in units of the intensity at this exposure (after the inverse
+    response), by levels; the median over frame pairs, so that pairs with faint motion do not count. Differences are
+    taken from their mean per level first, as exposures change. None where fewer than two levels are seen.
+    """
+    # Where noise leaves no pixel without events in 5x5 around it, 3x3 must do; it lets more faint motion in.
+    return _transfer(recording, camera, 5) or _transfer(recording, camera, 3)
+
+
+def _transfer(recording: Recording, camera: CameraSettings, size: int) -> FrameNoise | None:
+    kernel = np.ones((size, size), np.uint8)
+    points: list[list[tuple[float, float, int]]] = [[] for _ in range(_BINS)]
+    longest = max((frame.exposure for frame in recording.frames()), default=0)
+    for interval in intervals(recording, camera, margin=longest, most_frames=MAX_FRAMES):
+        first, second = interval.first, interval.second
+        events = between(interval.events, first.start, second.end)
+        on, off = count_events(events, recording.sensor_size)
+        still = cv2.dilate((on + off > 0).astype(np.uint8), kernel) == 0
+        before, after = first.intensity / first.white, second.intensity / second.white
+        if not 0.9 < first.white / second.white < 1.1:
+            continue
+        mean = (before + after) / 2
+        good = still & ~first.clipped & ~second.clipped & (mean > 0.01)
+        index = np.minimum((mean[good] * _BINS).astype(np.int64), _BINS - 1)
+        difference = (after - before)[good]
+        order = np.argsort(index, kind="stable")
+        stops = np.searchsorted(index[order], np.arange(_BINS + 1))
+        level = mean[good][order]
+        difference = difference[order]
+        for k in range(_BINS):
+            part = slice(stops[k], stops[k + 1])
+            if stops[k + 1] - stops[k] >= _BIN_LEAST:
+                points[k].append(
+                    (
+                        float(level[part].mean()),
+                        trimmed_variance(difference[part]) / 2,
+                        stops[k + 1] - stops[k],
+                    )
+                )
+    levels, variances, weights = [], [], []
+    for found in points:
+        if found:
+            levels.append(float(np.median([p[0] for p in found])))
+            variances.append(float(np.median([p[1] for p in found])))
+            weights.append(float(np.sqrt(sum(p[2] for p in found))))
+    if len(levels) < 2:
+        return None
+    return photon_transfer(np.array(levels), np.array(variances), np.array(weights))
+
+
+def trimmed_variance(values: Array) -> float:
+    """Variance without what lies beyond four standard deviations (edges that move), about the mean."""
+    kept = values
+    for _ in range(5):
+        centre, spread = kept.mean(), kept.std()
+        inside = values[np.abs(values - centre) <= 4 * spread]
+        if len(inside) == len(kept):
+            break
+        kept = inside
+    return float(kept.var())
+
+
+def photon_transfer(levels: Array, variances: Array, weights: Array) -> FrameNoise:
+    """Fit variance = read^2 + shot * level, neither negative; relative errors alike at all levels."""
+    from scipy.optimize import nnls
+
+    relative = weights / np.maximum(variances, 1e-10)
+    design = np.column_stack([np.ones_like(levels), levels]) * relative[:, None]
+    solution, _ = nnls(design, variances * relative)
+    fitted = solution[0] + solution[1] * levels
+    at_half = float(np.sqrt(solution[0] + 0.5 * solution[1]))
+    scatter = float(
+        np.sqrt(np.mean((variances / np.maximum(fitted, 1e-12) - 1) ** 2) / max(len(levels) - 2, 1))
+    )
+    return FrameNoise(
+        float(np.sqrt(solution[0])), float(solution[1]), at_half, at_half * scatter / 2, levels, variances
+    )
+
+
+def clipping_levels(recording: Recording) -> Levels:
+    """Where pixels pile up at either end of the frames' histogram: the inner edge of the pile.
+
+    A pile ends the histogram in its upper (lower) quarter and is at least four times as frequent as the levels
+    inside it. Where the sensor has fixed pattern noise it spreads over some levels.
+    """
+    histogram = np.zeros(256)
+    for index, frame in enumerate(recording.frames()):
+        if index == MAX_FRAMES:
+            break
+        values = np.rint(255 * np.clip(frame.normalised(), 0, 1)).astype(np.int64)
+        histogram += np.bincount(values.ravel(), minlength=256)
+    if not histogram.any():
+        return Levels(None, None)
+    bottom, top = (_pile(values) for values in (histogram[::-1], histogram))
+    return Levels(
+        None if bottom is None else (255 - bottom + 0.5) / 255, None if top is None else (top - 0.5) / 255
+    )
+
+
+_PILE_REACH: Final = 64  # levels: a quarter
+_BESIDE: Final = 20  # levels, just inside a pile
+
+
+def _pile(histogram: Array) -> int | None:
+    """The innermost level of a pile at the upper end; None where there is none."""
+    present = np.flatnonzero(np.cumsum(histogram[::-1])[::-1] > 1e-4 * histogram.sum())
+    end = int(present[-1])
+    if end < len(histogram) - _PILE_REACH:
+        return None
+    edge = end
+    while edge > _BESIDE:
+        beside = max(float(np.median(histogram[edge - _BESIDE : edge])), 1.0)
+        if histogram[edge] < 1.5 * beside:
+            break
+        edge -= 1
+    inside = max(float(np.median(histogram[max(edge - _BESIDE, 0) : edge + 1])), 1.0)
+    return edge + 1 if edge < end and histogram[edge + 1 :].max() >= _PILE * inside else None

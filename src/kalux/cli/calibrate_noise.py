@@ -1,0 +1,82 @@
+"""``kalux calibrate noise``: noise of events and frames from a recording."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from kalux.cli.calibrate_contrast import add_result, check_result, finish
+from kalux.cli.calibrations import add_calibration, given_calibration
+from kalux.cli.info import add_recording, open_recording
+from kalux.cli.parser import Parser, whole
+from kalux.cli.terminal import say
+
+_DESCRIPTION = """\
+Measure the background noise of the events (rate, hot and dead pixels), the noise of the frames (read and shot), where
+they clip, and the events' delay. A still camera, or still parts of the scene, tell most.
+
+With --fit, what is left (scale and spread of the thresholds, I_0, variances) is fitted to the recording's own frames:
+every second is held out, and the settings are chosen under which they are most likely."""
+
+_EXAMPLES = """\
+examples:
+  kalux calibrate noise still.aedat4 -o noise.toml
+  kalux calibrate noise drive.aedat4 --fit --calibration contrast.toml -o drive.toml"""
+
+
+def add_command(commands: Any) -> None:
+    """Add ``noise`` to the group."""
+    parser: Parser = commands.add_parser(
+        "noise", description=_DESCRIPTION, epilog=_EXAMPLES, usage="kalux calibrate noise REC -o FILE.toml"
+    )
+    add_recording(parser)
+    group = parser.add_argument_group("what is known")
+    group.add_argument("--response", help="of the camera, as in --camera.response (default linear)")
+    add_calibration(group)
+    group = parser.add_argument_group("fit")
+    group.add_argument("--fit", action="store_true", help="fit the rest to held-out frames")
+    group.add_argument(
+        "--evaluations", type=whole, default=60, metavar="N", help="reconstructions at most (default 60)"
+    )
+    group.add_argument(
+        "--fit-frames",
+        type=whole,
+        default=40,
+        metavar="N",
+        help="of the recording's first N frames (default 40)",
+    )
+    add_result(parser)
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace, command: list[str]) -> None:
+    """Run the command."""
+    import dataclasses
+
+    from kalux.calibration.noise import calibrate_noise
+    from kalux.calibration.values import Calibration
+    from kalux.cli.progress import Progress
+    from kalux.settings import preset
+
+    check_result(options)
+    recording = open_recording(options)
+    known = given_calibration(options) or Calibration()
+    if options.response is not None:
+        known = known.merged(Calibration({"camera": {"response": options.response}}))
+    found = calibrate_noise(recording, known.apply(preset("default")).camera).calibration()
+    if options.fit:
+        from kalux.evaluation.fit import fit_settings
+
+        start = known.merged(found)
+        with Progress("fitting", images=options.evaluations, quiet=options.quiet) as progress:
+            fitted = fit_settings(
+                recording,
+                start,
+                evaluations=options.evaluations,
+                most_frames=options.fit_frames,
+                on_evaluation=lambda: progress.add(images=1),
+            )
+        if not options.quiet:
+            say(fitted.described())
+        found = start.merged(fitted.calibration())
+    finish(dataclasses.replace(found, provenance={}), recording, options, command)

@@ -1,0 +1,103 @@
+"""``kalux calibrate response``: the camera's response from images at several exposure times."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from kalux.cli.calibrate_contrast import add_result, check_result, finish
+from kalux.cli.parser import Parser, UsageError
+from kalux.cli.terminal import say
+
+if TYPE_CHECKING:
+    from kalux.calibration.response import ResponseCalibration
+    from kalux.recording import Recording
+
+_DESCRIPTION = """\
+Measure the camera's response function: from images of one still scene at three or more exposure times (from their EXIF,
+or --times), or from one recording under auto-exposure whose still pixels are seen at several exposures. By Debevec's
+and by Robertson's method; the one that predicts images better from one another is taken."""
+
+_EXAMPLES = """\
+examples:
+  kalux calibrate response room_*.jpg -o response.toml --plot response.png
+  kalux calibrate response a.png b.png c.png --times 0.001,0.004,0.016 -o response.toml
+  kalux calibrate response auto_exposure.aedat4 -o response.toml"""
+
+_IMAGES: Final = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm")
+
+
+def add_command(commands: Any) -> None:
+    """Add ``response`` to the group."""
+    parser: Parser = commands.add_parser(
+        "response",
+        description=_DESCRIPTION,
+        epilog=_EXAMPLES,
+        usage="kalux calibrate response IMAGE IMAGE IMAGE ... | REC -o FILE.toml",
+    )
+    group = parser.add_argument_group("what to look at")
+    group.add_argument("inputs", nargs="+", metavar="IMAGE|REC", help="images, or one recording")
+    group.add_argument("--times", metavar="S,S,..", help="exposure times of the images, s, in their order")
+    group.add_argument(
+        "--per-channel", action="store_true", help="a curve for each colour (default: one for all)"
+    )
+    add_result(parser)
+    parser.add_argument(
+        "--plot", type=Path, metavar="FILE.png", help="picture of the curves; needs kalux[plots]"
+    )
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace, command: list[str]) -> None:
+    """Run the command."""
+    from kalux.calibration.response import calibrate_response
+
+    check_result(options)
+    if options.plot is not None:
+        from kalux.calibration.figures import require_matplotlib
+        from kalux.cli.output import check_file
+
+        require_matplotlib()
+        check_file(options.plot, overwrite=options.overwrite)
+    images, times, recording = _inputs(options)
+    found = calibrate_response(images, times, per_channel=options.per_channel)
+    finish(found.calibration(), recording, options, command)
+    if not options.quiet:
+        say("\n".join(report(found)))
+    if options.plot is not None:
+        from kalux.calibration.figures import response_figure
+        from kalux.writers.files import output_errors, write_whole
+
+        with output_errors(options.plot):
+            write_whole(options.plot, response_figure(found.curves))
+
+
+def report(found: ResponseCalibration) -> list[str]:
+    """How well each image is predicted, and by which method."""
+    lines = [f"{'exposure s':>12}  residual, % of full scale (left out of the merged radiance)"]
+    for time, inside, out in zip(found.exposures, found.residuals, found.left_out, strict=True):
+        pairs = ", ".join(f"{100 * a:.2f} ({100 * b:.2f})" for a, b in zip(inside, out, strict=True))
+        lines.append(f"{time:12.6g}  {pairs}")
+    return lines
+
+
+def _inputs(options: argparse.Namespace) -> tuple[Any, list[float], Recording | None]:
+    from kalux.calibration.response import read_exposure, read_image, still_pixels
+
+    paths = [Path(name) for name in options.inputs]
+    if len(paths) == 1 and paths[0].suffix.lower() not in _IMAGES:
+        import kalux
+
+        if options.times is not None:
+            raise UsageError("--times is for images; a recording has exposure times")
+        recording = kalux.open(paths[0])
+        return *still_pixels(recording), recording
+    if options.times is None:
+        times = [read_exposure(path) for path in paths]
+    else:
+        try:
+            times = [float(word) for word in options.times.split(",")]
+        except ValueError:
+            raise UsageError(f"--times is {options.times!r}; numbers with commas are needed") from None
+    return [read_image(path) for path in paths], times, None

@@ -1,0 +1,180 @@
+"""Noise, hot pixels and clipping levels, of sensors where they are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kalux import EVENT_DTYPE, Frame, Recording
+from kalux.calibration.noise import (
+    calibrate_noise,
+    clipping_levels,
+    event_noise,
+    frame_noise,
+    photon_transfer,
+    shrunk_rates,
+    trimmed_variance,
+)
+from kalux.datasets import SensorSettings, demo_scene, simulate, static
+from kalux.events import make_events
+from kalux.settings import CameraSettings
+
+from builders import unlabelled
+
+CAMERA = CameraSettings()
+SIZE = (64, 96)
+NOTHING = np.empty(0, EVENT_DTYPE)
+SCENE = demo_scene(sensor_size=(90, 120), duration=600_000)
+
+
+def noise_events(rate, *, hot=(), hot_rate=200.0, seconds=1.0, seed=0):
+    """Poisson events of every pixel, and of some hot ones (y, x)."""
+    rng = np.random.default_rng(seed)
+    rates = np.full(SIZE, rate)
+    for y, x in hot:
+        rates[y, x] = hot_rate
+    counts = rng.poisson(rates * seconds)
+    y, x = (np.repeat(i.ravel(), counts.ravel()) for i in np.indices(SIZE))
+    t = np.sort(rng.integers(0, int(seconds * 1e6), len(x)))
+    order = rng.permutation(len(x))
+    return make_events(t, x[order], y[order], rng.integers(0, 2, len(x)))
+
+
+@pytest.mark.parametrize("rate", [0.3, 3.0])
+def test_the_rate_of_pure_noise(rate):
+    found = event_noise(Recording.from_arrays(noise_events(rate, seconds=2.0), [], sensor_size=SIZE))
+    assert found.rate == pytest.approx(rate, rel=0.08)
+    assert found.rate_error < 0.1 * rate
+    assert not found.hot.any()
+    assert found.rates.mean() == pytest.approx(rate, rel=0.1)
+
+
+def test_noise_beside_motion_is_not_much_overestimated():
+    """Faint edges that make single events look like noise: an upper bound where everything moves."""
+    found = event_noise(unlabelled(simulate(SCENE, SensorSettings(noise_rate=3.0))))
+    assert 2.7 < found.rate < 5.0
+
+
+def test_hot_pixels_are_found_and_are_not_counted_in_the_rate():
+    hot = [(10, 10), (30, 50), (63, 95)]
+    found = event_noise(Recording.from_arrays(noise_events(1.0, hot=hot), [], sensor_size=SIZE))
+    assert sorted(zip(*(i.tolist() for i in np.nonzero(found.hot)), strict=True)) == hot
+    assert found.rate == pytest.approx(1.0, rel=0.15)
+    assert found.rates[30, 50] > 50
+
+
+def test_a_pixel_that_says_nothing_among_many_that_do_is_dead():
+    events = noise_events(60.0)
+    events = events[~((events["x"] == 20) & (events["y"] == 30))]
+    found = event_noise(Recording.from_arrays(events, [], sensor_size=SIZE))
+    # At 60 Hz hardly anything is quiet, so no rate can be told; at the default gap this is None.
+    assert found is None
+    sparse = noise_events(40.0, seconds=1.0)
+    columns = sparse["x"] >= 48  # the right half noisy, the left half quiet but for one pixel's neighbours
+    sparse = sparse[columns & ~((sparse["x"] == 70) & (sparse["y"] == 30))]
+    found = event_noise(Recording.from_arrays(sparse, [], sensor_size=SIZE))
+    assert found.dead[30, 70]
+    assert found.dead.sum() == 1
+
+
+def test_no_events_tell_nothing():
+    assert event_noise(Recording.from_arrays(NOTHING, [], sensor_size=SIZE)) is None
+
+
+def test_chunks_do_not_matter(monkeypatch):
+    recording = Recording.from_arrays(noise_events(2.0), [], sensor_size=SIZE)
+    whole = event_noise(recording)
+    monkeypatch.setattr("kalux.recording.CHUNK_EVENTS", 777)
+    again = event_noise(recording)
+    assert again.rate == whole.rate
+    np.testing.assert_array_equal(again.rates, whole.rates)
+
+
+def test_rates_of_pixels_that_are_seldom_quiet_are_the_typical_one():
+    counts = np.zeros((4, 50))
+    quiet = np.full((4, 50), 1e-6)
+    np.testing.assert_allclose(shrunk_rates(counts, quiet, 2.0, np.zeros((4, 50), bool)), 2.0, rtol=1e-3)
+
+
+# --- frames ---------------------------------------------------------------------------------------------------
+
+
+def test_read_and_shot_noise_of_a_still_ramp():
+    """Variance 0.005^2 + quantisation 1/12 of a level + intensity / 5000 electrons."""
+    rng = np.random.default_rng(1)
+    irradiance = np.broadcast_to(np.linspace(0.02, 0.9, 200), (150, 200))
+    frames = []
+    for k in range(12):
+        response = rng.poisson(irradiance * 5000) / 5000 + 0.005 * rng.standard_normal(irradiance.shape)
+        frames.append(
+            Frame(np.rint(255 * response.clip(0, 1)).astype(np.uint8), 40_000 * k, 40_000 * k + 10_000)
+        )
+    recording = Recording.from_arrays(NOTHING, frames, sensor_size=irradiance.shape)
+    found = frame_noise(recording, CAMERA)
+    assert found.shot == pytest.approx(1 / 5000, rel=0.05)
+    assert found.read == pytest.approx(np.hypot(0.005, 1 / 255 / np.sqrt(12)), rel=0.1)
+    assert found.at_half == pytest.approx(np.sqrt(found.read**2 + found.shot / 2))
+
+
+def test_frames_in_motion_have_hardly_more_noise_than_still_ones():
+    sensor = SensorSettings(noise_rate=0.5, read_noise=0.01)
+    found = frame_noise(unlabelled(simulate(SCENE, sensor)), CAMERA)
+    assert 0.009 < found.at_half < 0.02
+
+
+def test_outliers_do_not_make_variance():
+    rng = np.random.default_rng(0)
+    values = rng.standard_normal(20_000)
+    values[:200] += 50
+    assert trimmed_variance(values) == pytest.approx(1.0, abs=0.05)
+
+
+def test_photon_transfer_is_a_line_without_negative_parts():
+    levels = np.linspace(0.1, 0.9, 9)
+    found = photon_transfer(levels, 1e-5 + 2e-4 * levels, np.ones(9))
+    assert (found.read**2, found.shot) == (pytest.approx(1e-5), pytest.approx(2e-4))
+    falling = photon_transfer(levels, 1e-4 * (1 - levels), np.ones(9))
+    assert falling.shot == 0.0
+
+
+# --- levels ---------------------------------------------------------------------------------------------------
+
+
+def with_levels(values):
+    frames = [Frame(values.astype(np.uint8).reshape(100, 200), 0, 5_000)]
+    return Recording.from_arrays(NOTHING, frames, sensor_size=(100, 200))
+
+
+def test_piles_at_both_ends_are_clipping():
+    rng = np.random.default_rng(2)
+    values = rng.integers(0, 256, 20_000)
+    values[:2000] = rng.integers(250, 254, 2000)  # fixed pattern noise spreads the top
+    values[values > 253] = 100
+    values[2000:5000] = 0
+    found = clipping_levels(with_levels(values))
+    assert found.saturation == pytest.approx(249.5 / 255)
+    assert found.black == pytest.approx(0.5 / 255)
+
+
+def test_a_bright_wall_in_a_dark_picture_is_not_clipping():
+    rng = np.random.default_rng(2)
+    values = rng.integers(20, 90, 20_000)
+    values[:5000] = 100
+    assert clipping_levels(with_levels(values)) == (None, None)
+
+
+# --- all of it ------------------------------------------------------------------------------------------------
+
+
+def test_settings_of_a_noise_calibration():
+    sensor = SensorSettings(noise_rate=1.0, read_noise=0.008, refractory=300.0)
+    found = calibrate_noise(unlabelled(simulate(SCENE, sensor)), CAMERA).calibration()
+    assert {"noise_rate", "delay"} <= {*found.settings["events"]}
+    assert found.settings["camera"]["saturation"] == 0.98
+    assert 300 <= found.measured["refractory_at_most"] < 900
+    assert found.maps["hot"].shape == SCENE.sensor_size
+    still = calibrate_noise(
+        unlabelled(simulate(static(0.5, sensor_size=SIZE, duration=400_000), sensor)), CAMERA
+    )
+    assert still.delay is None
+    assert still.events.rate == pytest.approx(1.0, rel=0.2)

@@ -1,0 +1,132 @@
+"""Contrast thresholds in earnest, from recordings whose thresholds are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import kalux
+from kalux import Recording
+from kalux.calibration.thresholds import calibrate_contrast, shortest_interval, shrunk
+from kalux.datasets import SensorSettings, demo_scene, simulate, static
+from kalux.settings import CameraSettings
+
+from builders import unlabelled
+
+CAMERA = CameraSettings()
+SCENE = demo_scene(sensor_size=(90, 120))
+
+
+def first_frames(recording, count, start=0):
+    """A recording of some frames, with the events around them."""
+    frames = list(recording.frames())[start : start + count]
+    t = np.concatenate(list(recording.events()))
+    inside = (t["t"] >= frames[0].exposure_start - 5_000) & (t["t"] <= frames[-1].exposure_end + 20_000)
+    return Recording.from_arrays(t[inside], frames, sensor_size=recording.sensor_size)
+
+
+SENSOR = SensorSettings(
+    threshold_on=0.25, threshold_off=0.2, threshold_mismatch=0.1, noise_rate=3.0, read_noise=0.006
+)
+
+
+@pytest.fixture(scope="module")
+def simulation():
+    """A window in a dim room, a part of it saturated; 10 % mismatch and noise."""
+    return simulate(SCENE, SENSOR)
+
+
+@pytest.fixture(scope="module")
+def found(simulation):
+    return calibrate_contrast(unlabelled(simulation), CAMERA)
+
+
+def test_within_five_percent_with_mismatch_noise_and_saturation(simulation, found):
+    assert np.mean([frame.image == 255 for frame in simulation.frames]) > 0.02
+    assert found.on == pytest.approx(0.25, rel=0.05)
+    assert found.off == pytest.approx(0.2, rel=0.05)
+
+
+def test_within_fifteen_percent_from_five_frames(simulation):
+    for start in (0, 12):
+        few = calibrate_contrast(first_frames(unlabelled(simulation), 5, start), CAMERA)
+        assert few.intervals == 4
+        assert few.on == pytest.approx(0.25, rel=0.15)
+        assert few.off == pytest.approx(0.2, rel=0.15)
+
+
+def test_the_refractory_period_is_made_up_for_where_it_is_known():
+    """With 500 us lost after every event the plain fit is several percent too large."""
+    sensor = SensorSettings(threshold_on=0.3, threshold_off=0.2, refractory=500.0)
+    recording = unlabelled(simulate(SCENE, sensor))
+    known = calibrate_contrast(recording, CAMERA, delay=0, refractory=500)
+    plain = calibrate_contrast(recording, CAMERA, delay=0)
+    assert known.on == pytest.approx(0.3, rel=0.05)
+    assert known.off == pytest.approx(0.2, rel=0.05)
+    assert plain.off > 1.04 * known.off
+
+
+def test_the_spread_is_found_and_standard_errors_are_small(found):
+    for spread in (found.spread_on, found.spread_off):
+        assert spread == pytest.approx(0.1, abs=0.035)
+    assert found.on_error < 0.01 * found.on
+    assert found.off_error < 0.01 * found.off
+
+
+def test_pixels_have_the_error_that_they_claim(simulation, found):
+    """Standardised errors of the pixels' thresholds are within 30 % of one, and the errors beat those of the mean."""
+    truths = (simulation.threshold_on, simulation.threshold_off)
+    maps = ((found.on_factor, found.on_variance), (found.off_factor, found.off_variance))
+    for truth, (factor, variance) in zip(truths, maps, strict=True):
+        told = variance < 0.8 * variance.max()
+        assert told.sum() > 100
+        error = (factor - truth / truth.mean())[told]
+        assert (error / np.sqrt(variance[told])).std() == pytest.approx(1.0, abs=0.3)
+        assert error.std() < 0.8 * (truth / truth.mean())[told].std()
+
+
+def test_a_delay_of_the_events_is_recovered(simulation, found):
+    assert abs(found.delay) < 1_500
+    events = simulation.events.copy()
+    events["t"] += 5_000
+    late = Recording.from_arrays(events, simulation.frames, sensor_size=simulation.scene.sensor_size)
+    again = calibrate_contrast(late, CAMERA)
+    assert again.delay - found.delay == pytest.approx(5_000, abs=1_500)
+    assert again.on == pytest.approx(0.25, rel=0.08)
+
+
+def test_halves_of_slider_depth_agree(shared_data):
+    """ON within 3 %, OFF within 15 % (measured: 0.732 and 0.738, 0.490 and 0.436)."""
+    recording = kalux.open(shared_data / "slider_depth", exposure=10_000)
+    first, second = (
+        calibrate_contrast(first_frames(recording, 44, start), CAMERA, delay=0) for start in (0, 43)
+    )
+    assert second.on == pytest.approx(first.on, rel=0.05)
+    assert second.off == pytest.approx(first.off, rel=0.15)
+
+
+def test_a_still_scene_tells_nothing():
+    scene = static(0.4, sensor_size=(32, 40), duration=300_000)
+    assert calibrate_contrast(unlabelled(simulate(scene, SensorSettings(noise_rate=1.0))), CAMERA) is None
+
+
+def test_the_shortest_interval_is_not_that_of_noise():
+    """Noise follows an event at any time; with a refractory period of 400 us others do not follow before."""
+    sensor = SensorSettings(refractory=400.0, noise_rate=3.0)
+    edge = shortest_interval(unlabelled(simulate(SCENE, sensor)))
+    assert 400 <= edge < 900
+
+
+def test_shrinkage_finds_mean_and_covariance():
+    rng = np.random.default_rng(3)
+    truth = rng.multivariate_normal([0.0, 0.0], [[0.04, 0.01], [0.01, 0.02]], 4000)
+    normal = np.column_stack([rng.uniform(10, 200, 4000), np.zeros(4000), rng.uniform(10, 200, 4000)])
+    noisy = truth + rng.standard_normal((4000, 2)) / np.sqrt(normal[:, [0, 2]])
+    normal[:500] = 0.0  # say nothing
+    mean, covariance, values, left = shrunk(normal, normal[:, [0, 2]] * noisy)
+    np.testing.assert_allclose(mean, 0.0, atol=0.02)
+    np.testing.assert_allclose(covariance, [[0.04, 0.01], [0.01, 0.02]], atol=0.005)
+    np.testing.assert_allclose(values[:500], 0.0, atol=1e-9)
+    np.testing.assert_allclose(left[:500, 0], covariance[0, 0], rtol=0.01)
+    error = (values - truth)[500:]
+    np.testing.assert_allclose((error**2 / left[500:]).mean(axis=0), 1.0, atol=0.1)

@@ -1,0 +1,95 @@
+"""``kalux calibrate`` and ``--calibration``."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from kalux import load_calibration
+from kalux.models.camera import Response
+
+from builders import blocks
+
+
+@pytest.fixture
+def unlabelled_file(write_recording, tmp_path):
+    """A recording that states no thresholds; those of the simulation are 0.2."""
+    return write_recording(tmp_path / "rec.h5", contrast_threshold=None)
+
+
+def test_contrast_is_measured_written_and_used(cli, unlabelled_file, tmp_path):
+    out = tmp_path / "contrast.toml"
+    done = cli("calibrate", "contrast", unlabelled_file, "-o", out, "--delay", 0)
+    assert done.code == 0, done.err
+    assert "threshold_on" in done.out
+    assert "(log intensity)" in done.out
+    found = load_calibration(out)
+    assert found.settings["events"]["threshold_on"] == pytest.approx(0.2, rel=0.15)
+    assert found.provenance["recording"] == str(unlabelled_file)
+
+    info = cli("info", unlabelled_file, "--no-estimate", "--calibration", out)
+    assert info.code == 0
+    assert "map threshold_on" in info.out
+    assert "made by" in info.out
+
+    made = cli("reconstruct", unlabelled_file, "-o", tmp_path / "o", "--format", "npy", "--calibration", out)
+    assert made.code == 0, made.err
+    assert "(calibrated)" in made.out
+    assert "warning" not in made.err  # the thresholds are measured
+    flagged = cli(
+        "reconstruct",
+        unlabelled_file,
+        *("-o", tmp_path / "p", "--format", "npy", "--calibration", out, "--events.threshold-on", 0.3),
+    )
+    assert "on 0.300" in flagged.out
+
+
+def test_a_calibration_is_not_overwritten(cli, unlabelled_file, tmp_path):
+    out = tmp_path / "noise.toml"
+    assert cli("calibrate", "noise", unlabelled_file, "-o", out, "--quiet").code == 0
+    again = cli("calibrate", "noise", unlabelled_file, "-o", out)
+    assert again.code == 2
+    assert "--overwrite" in again.error
+    assert cli("calibrate", "noise", unlabelled_file, "-o", out, "--overwrite", "--quiet").code == 0
+
+
+def test_fit_says_before_and_after(cli, unlabelled_file, tmp_path):
+    out = tmp_path / "fit.toml"
+    done = cli("calibrate", "noise", unlabelled_file, "--fit", "--evaluations", 3, "-o", out)
+    assert done.code == 0, done.err
+    assert "negative log likelihood per held-out pixel" in done.out
+    measured = load_calibration(out).measured
+    assert measured["nll_after"] <= measured["nll_before"]
+    assert measured["held_out_mse_after"] <= measured["held_out_mse_before"]
+
+
+def test_response_from_images_with_given_times(cli, tmp_path):
+    picture = cv2.GaussianBlur(blocks(0.5, 300.0, shape=(80, 96)), (0, 0), 1.0)
+    curve, times, paths = Response.gamma(2.0), [0.001, 0.004, 0.016, 0.064], []
+    for k, t in enumerate(times):
+        paths.append(tmp_path / f"{k}.png")
+        cv2.imwrite(str(paths[-1]), np.rint(255 * curve(np.minimum(picture * t, 1.0))).astype(np.uint8))
+    out = tmp_path / "response.toml"
+    done = cli("calibrate", "response", *paths, "--times", ",".join(map(str, times)), "-o", out)
+    assert done.code == 0, done.err
+    found = Response.named(load_calibration(out).settings["camera"]["response"])
+    assert float(found.inverse(np.array([0.5]))[0]) == pytest.approx(0.25, abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["calibrate"], "calibrate what?"),
+        (["calibrate", "nonsense"], "nonsense"),
+        (["calibrate", "contrast", "REC", "-o", "a.txt"], "ends in .toml"),
+        (["calibrate", "contrast", "REC", "--refactory", "3"], "did you mean --refractory"),
+        (["calibrate", "response", "REC"], "exposure times, three are needed"),
+        (["calibrate", "response", "a.png", "b.png", "--times", "x,y"], "numbers with commas"),
+        (["info", "REC", "--calibration", "nowhere.toml"], "cannot be read"),
+    ],
+)
+def test_mistakes_are_one_line(cli, unlabelled_file, arguments, message):
+    done = cli(*[unlabelled_file if word == "REC" else word for word in arguments])
+    assert done.code == 2
+    assert message in done.error
