@@ -125,7 +125,7 @@ def test_usage_of_calibrate_rig(cli, files, tmp_path, arguments, told):
 def test_calibrate_needs_to_know_what(cli):
     done = cli("calibrate")
     assert done.code == 2
-    assert "still needed: what" in done.error
+    assert "calibrate what?" in done.error
 
 
 def test_nothing_is_overwritten(cli, files, tmp_path):
