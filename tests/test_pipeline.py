@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import tracemalloc
-from functools import lru_cache
+from functools import lru_cache, reduce
 
 import numpy as np
 import pytest
@@ -12,7 +12,8 @@ import pytest
 from kalux import PRESETS, Frame, Reconstructor, Recording, pipeline, reconstruct
 from kalux.datasets import SensorSettings
 from kalux.errors import EventError, FrameError, InputError, SettingsError
-from kalux.events import make_events
+from kalux.events import EVENT_DTYPE, make_events
+from kalux.models.camera import BrightTail, Camera, count_bright
 from kalux.pipeline import execute, plan
 
 from builders import VARIANTS, altered, events, frame, moving_blocks, random_stream, unlabelled
@@ -454,3 +455,27 @@ def test_the_other_presets_run_and_default_is_better_where_frames_can_tell(prese
     default, _ = errors(simulation, reconstruct(rec, times=times), unsaturated)
     other, _ = errors(simulation, reconstruct(rec, times=times, preset=preset), unsaturated)
     assert default < other
+
+
+def test_the_bright_tail_comes_from_the_frames_and_can_be_given():
+    made = plan(recording(), at="frames").settings
+    counts = [count_bright(Camera.named("linear", 0.98), f.normalised()) for f in recording().frames()]
+    expected = reduce(BrightTail.joined, counts).scale
+    assert made.filter.bright_tail == expected
+    given = altered(PRESETS["default"], "filter", bright_tail=0.7)
+    assert plan(recording(), at="frames", settings=given).settings.filter.bright_tail == 0.7
+
+
+def test_highlights_are_believed_less_where_thresholds_are_estimated():
+    """A pixel that events take beyond white: by a prior of the tail's scale, rather than 1.5."""
+    frames = [Frame(np.full((4, 4), 200, np.uint8), t, t + 1000) for t in (0, 50_000)]
+    rise = np.zeros(8, EVENT_DTYPE)
+    rise["t"], rise["p"] = np.arange(60_000, 68_000, 1000), True
+    source = Recording.from_arrays(rise, frames, sensor_size=(4, 4))
+    stated = altered(PRESETS["default"], "events", threshold_on=0.2, threshold_off=0.2)
+    seen = []
+    for origin in ("settings", "estimate"):
+        chosen = dataclasses.replace(plan(source, times=[67_000], settings=stated), threshold_origin=origin)
+        (image,) = execute(source, chosen)
+        seen.append(image.intensity[0, 0])
+    assert seen[0] > seen[1] > 1

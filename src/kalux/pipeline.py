@@ -20,6 +20,7 @@ from kalux.calibration.white_balance import grey_world
 from kalux.errors import FrameError, InputError
 from kalux.events import EventArray
 from kalux.frames import Frame
+from kalux.models.camera import BrightTail, Camera, count_bright
 from kalux.models.colour import white_balance
 from kalux.models.pixels import PixelCalibration, require_size
 from kalux.reconstructor import Estimate, Image, Reconstructor
@@ -96,9 +97,13 @@ def plan(
         raise InputError(
             "reconstruct: the complementary filter has no variance, so that it cannot be smoothed"
         )
-    exposures = _exposures(recording)
-    reference = chosen.camera.reference_exposure or round(float(np.median(exposures[:, 1] - exposures[:, 0])))
     response = chosen_response(chosen.camera.response, recording.response)
+    exposures, tail = _exposures(recording, Camera.named(response, chosen.camera.saturation))
+    if chosen.filter.bright_tail is None:
+        chosen = dataclasses.replace(
+            chosen, filter=dataclasses.replace(chosen.filter, bright_tail=tail.scale)
+        )
+    reference = chosen.camera.reference_exposure or round(float(np.median(exposures[:, 1] - exposures[:, 0])))
     chosen = dataclasses.replace(
         chosen, camera=dataclasses.replace(chosen.camera, reference_exposure=reference, response=response)
     )
@@ -270,12 +275,15 @@ def _push_next(
     return True
 
 
-def _exposures(recording: Recording) -> NDArray[np.int64]:
-    """(K, 2) exposure starts and ends, us."""
-    exposures = [(frame.exposure_start, frame.exposure_end) for frame in recording.frames()]
+def _exposures(recording: Recording, camera: Camera) -> tuple[NDArray[np.int64], BrightTail]:
+    """(K, 2) exposure starts and ends, us, and the frames' bright tail."""
+    exposures, tail = [], BrightTail()
+    for frame in recording.frames():
+        exposures.append((frame.exposure_start, frame.exposure_end))
+        tail = tail.joined(count_bright(camera, frame.normalised()))
     if not exposures:
         raise FrameError(f"{recording.source.path}: no frames; kalux needs frames as well as events")
-    return np.array(exposures, np.int64)
+    return np.array(exposures, np.int64), tail
 
 
 def _with_white_balance(recording: Recording, settings: Settings) -> Settings:

@@ -22,7 +22,7 @@ from kalux.filters.buffer import EventBuffer
 from kalux.filters.methods import Method, Segment, Shot, make_method, take_shot
 from kalux.filters.readout import HighlightPrior, intensity, regularised, total_variance
 from kalux.frames import Frame, check_frame
-from kalux.models.camera import Camera
+from kalux.models.camera import Camera, count_bright
 from kalux.models.colour import (
     Gains,
     calm_highlights,
@@ -208,6 +208,7 @@ class Reconstructor:
         self._progress: _Progress | None = None
         self._last_frame: Frame | None = None
         self._frame_count = 0
+        self._tail: float | None = None  # of the first frame
         self._event_count = 0
         self._last_event: int | None = None
         self._complete_until: int | None = None
@@ -228,6 +229,8 @@ class Reconstructor:
         self._require_open()
         check_frame(frame, self.sensor_size, index=self._frame_count, previous=self._last_frame)
         self._reference = self._reference or frame.exposure
+        if self._tail is None:
+            self._tail = count_bright(self._camera, frame.normalised()).scale
         self._shots.append(take_shot(frame, self._camera, self._reference, self._gains_of(frame)))
         self._last_frame = frame
         self._frame_count += 1
@@ -384,9 +387,13 @@ class Reconstructor:
     def image(self, estimate: Estimate) -> Image:
         """The image of an estimate: highlights as far as they are believed (K6), with what neighbours know (K12)."""
         # The prior needs a variance, which the complementary filter has not.
-        scale = self.settings.filter.highlight_scale if self.settings.filter.kind == "akf" else 0.0
-        events = self.settings.events
-        spread = events.extrapolation_spread if self._estimated else events.threshold_spread
+        filtered, events = self.settings.filter, self.settings.events
+        scale = filtered.highlight_scale if filtered.kind == "akf" else 0.0
+        spread = events.threshold_spread
+        if self._estimated:
+            tail = filtered.bright_tail or self._tail
+            assert tail is not None
+            scale, spread = min(scale, filtered.highlight_tail * tail), events.extrapolation_spread
         prior = HighlightPrior(
             white=estimate.white, scale2=scale**2, stretch=spread**2 / scale if scale > 0 else 0.0
         )

@@ -9,8 +9,10 @@ from hypothesis import strategies as st
 
 from kalux.errors import SettingsError
 from kalux.models.camera import (
+    BrightTail,
     Camera,
     Response,
+    count_bright,
     covariance,
     inverse_response,
     log_bias,
@@ -294,3 +296,31 @@ def test_the_certainty_of_a_curve_is_its_slope():
 def test_curves_that_are_none(name, message):
     with pytest.raises(SettingsError, match=message):
         Response.named(name)
+
+
+# --- the bright tail ------------------------------------------------------------------------------------------
+
+
+@given(st.floats(0.3, 2.0))
+def test_the_scale_of_an_exponential_tail_is_found(scale):
+    """Of log intensities that fall off exponentially from half of white on."""
+    rng = np.random.default_rng(0)
+    levels = 0.475 * np.exp(rng.exponential(scale, 200_000))
+    found = count_bright(Camera.named("linear", 0.98), np.minimum(levels, 1.0).reshape(400, 500)).scale
+    assert found == pytest.approx(scale, rel=0.03)
+
+
+def test_frames_without_white_and_frames_all_white_are_at_the_bounds():
+    dark, white = np.full((4, 4), 0.6), np.ones((4, 4))
+    camera = Camera.named("linear", 0.98)
+    assert count_bright(camera, dark).scale == 0.3
+    assert count_bright(camera, white).scale == 2.0
+    both = count_bright(camera, dark).joined(count_bright(camera, white))
+    assert both == BrightTail(32, 16)
+    assert both.scale == pytest.approx(1.0)
+
+
+def test_the_tail_is_one_of_light_not_of_response():
+    levels = np.linspace(0, 1, 1000).reshape(20, 50)
+    linear, gamma = Camera.named("linear", 0.98), Camera.named("gamma:2.2", 0.98)
+    assert count_bright(gamma, levels ** (1 / 2.2)) == count_bright(linear, levels)

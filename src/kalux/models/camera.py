@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -261,6 +261,43 @@ def inverse_response(camera: Camera, response: Array, exposure_ratio: float) -> 
         Reference exposure time over this frame's: 1.0 in the result is a saturated pixel at the reference.
     """
     return camera.response.inverse(response) * exposure_ratio
+
+
+class BrightTail(NamedTuple):
+    """How many pixels of frames are at least half as bright as white, and how many about white."""
+
+    half: int = 0
+    white: int = 0
+
+    def joined(self, other: BrightTail) -> BrightTail:
+        """Both together."""
+        return BrightTail(self.half + other.half, self.white + other.white)
+
+    @property
+    def scale(self) -> float:
+        """Of an exponential distribution of the log intensity that falls as much from half of white to white.
+
+        Bounded by 0.3, also where nothing is white, and 2: beyond these the few pixels say nothing.
+        """
+        if self.white == 0:
+            return _TAIL_BOUNDS[0]
+        fall = float(np.log(max(self.half, self.white) / self.white))
+        low, high = _TAIL_BOUNDS
+        return float(np.clip(np.log(2.0) / max(fall, 1e-3), low, high))
+
+
+_TAIL_BOUNDS: Final = (0.3, 2.0)
+
+ABOUT_WHITE: Final = 0.95
+"""Intensity, white = 1, that counts as white for `BrightTail`: below where sensors clip unevenly."""
+
+
+def count_bright(camera: Camera, response: Array) -> BrightTail:
+    """`BrightTail` of one frame: its response (H, W), or (H, W, 3) of which the mean counts, 0 to 1."""
+    grey = response if response.ndim == 2 else response.mean(axis=-1)
+    edges = np.array([ABOUT_WHITE / 2, ABOUT_WHITE])
+    half, white = camera.response(edges)
+    return BrightTail(int(np.count_nonzero(grey >= half)), int(np.count_nonzero(grey >= white)))
 
 
 def covariance(weight: Array, sigma_im2: float, floor: float) -> Array:
