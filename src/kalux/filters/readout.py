@@ -21,6 +21,9 @@ where events have come of late: that of mid-exposure frames and of times half-wa
 HIDDEN_STILL: Final = (0.005, 0.04)
 """The same where no event has come of late."""
 
+_NOTHING: Final = np.float32(1e9)
+"""Variance of a pixel that knows nothing; its square is still a float32."""
+
 _BLOCK: Final = 256
 """Pixels that are looked at together: the highlights of a block are brought together, so that they go through vector
 code and the others do not pay for them."""
@@ -183,7 +186,9 @@ def regularised(
         Distance of the neighbours: 2 in a Bayer mosaic, whose pixels repeat their colours.
     """
     out = log_intensity.astype(np.float32)
-    _regularise(log_intensity, variance, moving, np.float32(difference * difference), pitch, out)
+    _regularise(
+        out.copy(), np.minimum(variance, _NOTHING), moving, np.float32(difference * difference), pitch, out
+    )
     return out
 
 
@@ -201,21 +206,34 @@ def neighbour_weight(excess, variance, neighbour_variance, allowed):  # type: ig
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _regularise(log_intensity, variance, moving, allowed, pitch, out):  # type: ignore[no-untyped-def]
+    """All pixels of a row at a time, neighbour by neighbour, so that it becomes vector code."""
     height, width = log_intensity.shape
+    # A frame of pixels that know nothing: the border needs no special case.
+    level = np.zeros((height + 2 * pitch, width + 2 * pitch), np.float32)
+    doubt = np.full(level.shape, _NOTHING)
+    level[pitch : pitch + height, pitch : pitch + width] = log_intensity
+    doubt[pitch : pitch + height, pitch : pitch + width] = variance
+    information, deviation = np.empty(width, np.float32), np.empty(width, np.float32)
     for row in range(height):
+        if not moving[row].any():
+            continue
+        own_level, own_doubt = log_intensity[row], variance[row]
         for column in range(width):
-            if not moving[row, column]:
+            information[column] = ONE / own_doubt[column]
+            deviation[column] = np.float32(0.0)
+        for place in range(9):
+            down, right = place // 3 - 1, place % 3 - 1
+            if down == 0 and right == 0:
                 continue
-            value, own = np.float32(log_intensity[row, column]), variance[row, column]
-            information = ONE / own
-            deviation = np.float32(0.0)
-            for i in range(row - pitch, row + pitch + 1, pitch):
-                for j in range(column - pitch, column + pitch + 1, pitch):
-                    if (i == row and j == column) or i < 0 or j < 0 or i >= height or j >= width:
-                        continue
-                    distance2 = np.float32((i - row) * (i - row) + (j - column) * (j - column))
-                    excess = np.float32(log_intensity[i, j]) - value
-                    weight = neighbour_weight(excess, own, variance[i, j], allowed * distance2)
-                    deviation += weight * excess
-                    information += weight
-            out[row, column] = value + deviation / information
+            spread = allowed * np.float32(pitch * pitch * (down * down + right * right))
+            first = pitch + right * pitch
+            other_level = level[row + pitch + down * pitch, first : first + width]
+            other_doubt = doubt[row + pitch + down * pitch, first : first + width]
+            for column in range(width):
+                excess = other_level[column] - own_level[column]
+                weight = neighbour_weight(excess, own_doubt[column], other_doubt[column], spread)
+                deviation[column] += weight * excess
+                information[column] += weight
+        for column in range(width):
+            if moving[row, column]:
+                out[row, column] = own_level[column] + deviation[column] / information[column]
