@@ -1,6 +1,9 @@
 """kalux: HDR video with per-pixel uncertainty from hybrid event cameras."""
 
+from pathlib import Path
 from typing import TYPE_CHECKING
+
+from kalux.kernel_cache import ensure_writable
 
 if TYPE_CHECKING:
     from kalux.calibration.values import Calibration, load_calibration
@@ -30,6 +33,9 @@ __all__ = [
     "preset",
     "reconstruct",
 ]
+
+ensure_writable(Path(__file__).parent)
+del Path, ensure_writable
 
 # Names are imported when they are first used: numba, OpenCV and h5py take half a second.
 if not TYPE_CHECKING:
