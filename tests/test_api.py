@@ -5,6 +5,8 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import pytest
+
 import kalux
 
 
@@ -38,6 +40,33 @@ def test_import_reads_nothing_and_prints_nothing():
     )
     assert done.stdout.strip() == kalux.__version__
     assert done.stderr == ""
+
+
+def test_import_waits_with_heavy_libraries():
+    """Half a second of numba, OpenCV and h5py is for the first name that needs them."""
+    code = "import sys, kalux; print(*sys.modules); kalux.Settings; kalux.Recording; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    before, after = (set(line.split()) for line in done.stdout.splitlines())
+    assert not {"numpy", "numba", "cv2", "h5py", "scipy"} & before
+    assert "h5py" in after
+
+
+def test_names_are_listed_before_they_are_imported():
+    code = "import kalux; print(*dir(kalux))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert {*kalux.__all__, "settings", "display", "pipeline"} <= set(done.stdout.split())
+
+
+def test_a_name_that_is_not_there_is_an_error():
+    with pytest.raises(AttributeError, match="no attribute 'reconstrct'"):
+        kalux.reconstrct  # noqa: B018
+    assert not hasattr(kalux, "__wrapped__")
+
+
+def test_modules_are_there_without_their_own_import():
+    code = "import kalux; print(kalux.settings.Settings is kalux.Settings)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "True"
 
 
 def test_every_error_is_a_kalux_error():

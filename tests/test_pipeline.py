@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import threading
 import tracemalloc
 from functools import lru_cache, reduce
 
@@ -106,6 +107,56 @@ def test_the_origin_of_time_does_not_matter(variant, lookahead):
     assert [image.t + shift for image in here] == [image.t for image in there]
     for a, b in zip(here, there, strict=True):
         np.testing.assert_array_equal(a.intensity, b.intensity)
+
+
+# --- threads --------------------------------------------------------------------------------------------
+
+
+@every_variant
+@pytest.mark.parametrize("smooth", [False, True], ids=["forward", "smooth"])
+def test_threads_change_nothing(variant, smooth, monkeypatch):
+    if smooth and VARIANTS[variant].filter.kind == "cf":
+        pytest.skip("the complementary filter cannot be smoothed")
+    monkeypatch.setattr("kalux.recording.CHUNK_EVENTS", 50)
+    rec = recording(5)
+    made = plan(rec, rate_hz=300, settings=VARIANTS[variant], smooth=smooth)
+    expected = list(execute(rec, made))
+    for threads in (2, 4):
+        counts = []
+        assert_same(execute(rec, made, counts.append, threads=threads), expected)
+        assert sum(counts) <= rec.source.count_events()
+        assert counts
+
+
+def test_images_before_the_damage_come_whatever_the_threads():
+    """An error of reading comes after the images that do not need what could not be read."""
+    whole = recording(6)
+    made = plan(whole, rate_hz=300)
+    stream = np.concatenate(list(whole.events()))
+
+    def chunks():
+        yield stream[: len(stream) // 2]
+        raise EventError("damaged here")
+
+    broken = Recording(dataclasses.replace(whole.source, events=chunks))
+    one, two = [], []
+    for seen, threads in ((one, 1), (two, 2)):
+        with pytest.raises(EventError, match="damaged here"):
+            seen.extend(execute(broken, made, threads=threads))
+    assert 0 < len(one) < len(made.times)
+    assert_same(one, list(execute(whole, made))[: len(one)])
+    assert_same(two, one)
+    assert threading.active_count() == 1
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+def test_a_reconstruction_that_is_given_up_leaves_no_thread(smooth):
+    rec = recording(7)
+    images = execute(rec, plan(rec, rate_hz=300, smooth=smooth), threads=2)
+    next(images)
+    assert threading.active_count() > 1
+    images.close()
+    assert threading.active_count() == 1
 
 
 # --- which times ----------------------------------------------------------------------------------------

@@ -350,12 +350,22 @@ def tone_map_next(
         The intensity is not two-dimensional, is empty, or is not finite; or the state is of other settings.
     """
     settings = settings or DisplaySettings()
-    colour = colour_of(image)
-    intensity = _checked(image.intensity if colour is None else colour)
-    statistics = _measure(intensity, settings.curve)
-    if state is not None:
-        statistics = _smoothed(state, statistics, image.t, settings.smoothing)
-    return _apply(intensity, settings, statistics), ToneState(int(image.t), statistics)
+    intensity = _checked(_shown(image))
+    following = _next_state(intensity, image.t, settings, state)
+    return _apply(intensity, settings, following.statistics), following
+
+
+def next_state(
+    image: TimedImage, settings: DisplaySettings | None = None, state: ToneState | None = None
+) -> ToneState:
+    """The part of `tone_map_next` that must go from image to image: its state. `apply` with its statistics is the rest.
+
+    Raises
+    ------
+    InputError
+        As of `tone_map_next`.
+    """
+    return _next_state(_checked(_shown(image)), image.t, settings or DisplaySettings(), state)
 
 
 def measure(intensity: NDArray[Any], curve: Curve) -> Statistics:
@@ -468,6 +478,18 @@ def _smoothed(state: ToneState, statistics: Statistics, t: int, smoothing: float
         return statistics
     seconds = max(0, int(t) - state.t) * 1e-6
     return state.statistics - math.expm1(-seconds / smoothing) * (statistics - state.statistics)
+
+
+def _next_state(intensity: Float32, t: int, settings: DisplaySettings, state: ToneState | None) -> ToneState:
+    statistics = _measure(intensity, settings.curve)
+    if state is not None:
+        statistics = _smoothed(state, statistics, t, settings.smoothing)
+    return ToneState(int(t), statistics)
+
+
+def _shown(image: TimedImage) -> Float32:
+    colour = colour_of(image)
+    return image.intensity if colour is None else colour
 
 
 def _sampled(intensity: Float32) -> Float32:

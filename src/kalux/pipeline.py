@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -12,6 +13,7 @@ from typing import Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.ahead import ahead
 from kalux.calibration.contrast import ThresholdEstimate, estimate_thresholds
 from kalux.calibration.delay import DelayEstimate, estimate_delay
 from kalux.calibration.event_model import EventModel, estimate_event_model
@@ -192,14 +194,29 @@ def execute(
     plan: Plan,
     on_events: Callable[[int], None] | None = None,
     on_backward: Callable[[int], None] | None = None,
-) -> Iterator[Image]:
+    *,
+    threads: int = 1,
+) -> Generator[Image, None, None]:
     """Carry out a plan. The callbacks are told the number of events of every chunk read, for progress:
 
     ``on_backward`` in the backward pass of a smoothed reconstruction, ``on_events`` in the pass that makes the images.
+    With more than one of ``threads``, events are read, and images are made, in two threads of their own while the
+    caller uses the images before; the callbacks are then called in the second. The images are the same.
     """
+    images = _images(recording, plan, on_events, on_backward, threads > 1)
+    return ahead(images) if threads > 1 else images
+
+
+def _images(
+    recording: Recording,
+    plan: Plan,
+    on_events: Callable[[int], None] | None,
+    on_backward: Callable[[int], None] | None,
+    read_ahead: bool,
+) -> Generator[Image, None, None]:
     engine = _engine(recording, plan, plan.settings)
     if not plan.smooth:
-        for estimate in _estimates(recording, engine, plan, on_events):
+        for estimate in _estimates(recording, engine, plan, on_events, read_ahead):
             yield engine.image(estimate)
         return
     with tempfile.TemporaryDirectory(prefix="kalux-") as folder:
@@ -210,7 +227,7 @@ def execute(
             Path(folder),
             on_backward,
         )
-        for estimate in _estimates(recording, engine, plan, on_events):
+        for estimate in _estimates(recording, engine, plan, on_events, read_ahead):
             yield engine.image(combine(estimate, backward.estimate(estimate.t)))
 
 
@@ -226,12 +243,29 @@ def _engine(recording: Recording, plan: Plan, settings: Settings) -> Reconstruct
 
 
 def _estimates(
-    recording: Recording, engine: Reconstructor, plan: Plan, on_events: Callable[[int], None] | None
+    recording: Recording,
+    engine: Reconstructor,
+    plan: Plan,
+    on_events: Callable[[int], None] | None,
+    read_ahead: bool,
 ) -> Iterator[Estimate]:
     """Drive the engine over the recording, reading each time of the plan as soon as it is final."""
+    if not read_ahead:
+        yield from _driven(recording, iter(recording.events()), engine, plan, on_events)
+        return
+    with contextlib.closing(ahead(recording.events(), 1)) as chunks:
+        yield from _driven(recording, chunks, engine, plan, on_events)
+
+
+def _driven(
+    recording: Recording,
+    chunks: Iterator[EventArray],
+    engine: Reconstructor,
+    plan: Plan,
+    on_events: Callable[[int], None] | None,
+) -> Iterator[Estimate]:
     pending = iter(plan.times.tolist())
     t = next(pending, None)
-    chunks = iter(recording.events())
     ended = False
     for frame in recording.frames():
         engine.push_frame(frame)

@@ -7,6 +7,7 @@ import dataclasses
 import errno
 import os
 import signal
+import threading
 import time
 import tomllib
 
@@ -16,7 +17,9 @@ import numpy as np
 import pytest
 
 import kalux
+from kalux.cli import reconstruct as reconstruct_command
 from kalux.datasets import SensorSettings, colour_photograph, pan, simulate_colour
+from kalux.errors import InputError
 from kalux.models.colour import luminance
 from kalux.writers import folder
 
@@ -437,11 +440,114 @@ class TestRealRecordings:
         assert "--exposure 10000" in found.error
 
 
+class TestThreads:
+    @pytest.mark.parametrize("kind", ["png", "exr", "npy", "mp4"])
+    def test_results_do_not_depend_on_them(self, cli, recording, tmp_path, kind):
+        contents = {}
+        for threads in (1, 2, 4):
+            out = tmp_path / f"{threads}" / ("o.mp4" if kind == "mp4" else "o")
+            flags = () if kind == "mp4" else ("--format", kind)
+            done = cli("reconstruct", recording, "-o", out, "--rate", 200, "--threads", threads, *flags)
+            assert done.code == 0
+            files = [out] if kind == "mp4" else sorted(out.glob(f"*.{kind}"))
+            assert len(files) == (1 if kind == "mp4" else len(times_in(out)))
+            contents[threads] = [file.read_bytes() for file in files]
+        assert contents[1] == contents[2] == contents[4]
+
+    @pytest.mark.parametrize("threads", ["0", "-1", "two"])
+    def test_at_least_one(self, cli, recording, tmp_path, threads):
+        found = cli("reconstruct", recording, "-o", tmp_path / "o", "--threads", threads)
+        assert found.code == 2
+        assert "--threads" in found.error
+
+    @pytest.mark.parametrize("threads", [1, 2, 4])
+    def test_a_reader_that_fails_late_leaves_the_images_before(
+        self, cli, recording, tmp_path, monkeypatch, threads
+    ):
+        """The file changes after it was checked: nothing hangs, and what is finished stays valid."""
+        events = kalux.Recording._checked_events
+        done = told_when_planned(monkeypatch)
+
+        def failing(self):
+            for chunk in events(self):
+                yield chunk[: len(chunk) // 2]
+                if done:
+                    raise InputError("the file has changed")
+                yield chunk[len(chunk) // 2 :]
+
+        monkeypatch.setattr(kalux.Recording, "_checked_events", failing)
+        out = tmp_path / "out"
+        found = cli(
+            "reconstruct", recording, "-o", out, "--rate", 200, "--format", "npy", "--threads", threads
+        )
+        assert found.code == 2
+        assert "the file has changed" in found.err
+        assert len(images_in(out)) == len(times_in(out)) > 5
+        assert f"{len(images_in(out))} images are finished and valid in {out}" in found.err
+        assert tomllib.loads((out / "kalux.toml").read_text())["complete"] is False
+        assert threading.active_count() == 1
+
+    @pytest.mark.parametrize("threads", [1, 2, 4])
+    def test_a_writer_that_fails_ends_the_filter(self, cli, recording, tmp_path, monkeypatch, threads):
+        whole = folder.write_whole
+
+        def full(path, data):
+            if path.name == "000003.npy":
+                raise OSError(errno.ENOSPC, "No space left on device")
+            whole(path, data)
+
+        monkeypatch.setattr(folder, "write_whole", full)
+        out = tmp_path / "out"
+        found = cli(
+            "reconstruct", recording, "-o", out, "--rate", 5000, "--format", "npy", "--threads", threads
+        )
+        assert found.code == 2
+        assert "no space is left" in found.err
+        assert len(times_in(out)) == len(images_in(out)) == 3
+        assert threading.active_count() == 1
+
+    @pytest.mark.parametrize("threads", [1, 3])
+    @pytest.mark.parametrize("name", ["v.mp4", "npy"])
+    def test_an_interrupt_in_the_filter(self, cli, recording, tmp_path, monkeypatch, threads, name):
+        image = kalux.Reconstructor.image
+
+        def interrupted(self, estimate):
+            if estimate.t > first + 100_000:
+                raise KeyboardInterrupt
+            return image(self, estimate)
+
+        first = next(iter(kalux.open(recording).frames())).exposure_start
+        monkeypatch.setattr(kalux.Reconstructor, "image", interrupted)
+        out = tmp_path / name
+        flags = () if name == "v.mp4" else ("--format", "npy")
+        found = cli("reconstruct", recording, "-o", out, "--rate", 200, "--threads", threads, *flags)
+        assert found.code == 130
+        assert f"interrupted; 21 images are finished and valid in {out}" in found.err
+        assert threading.active_count() == 1
+
+
+def told_when_planned(monkeypatch):
+    """A list that holds something once the plan is made."""
+    done = []
+    make_plan = reconstruct_command.make_plan
+
+    def planned(*arguments):
+        made = make_plan(*arguments)
+        done.append(made)
+        return made
+
+    monkeypatch.setattr(reconstruct_command, "make_plan", planned)
+    return done
+
+
 class TestInterrupt:
     @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-    def test_what_is_finished_stays_valid(self, start_cli, recording, tmp_path, number):
+    @pytest.mark.parametrize("threads", [1, 4])
+    def test_what_is_finished_stays_valid(self, start_cli, recording, tmp_path, number, threads):
         out = tmp_path / "out"
-        process = start_cli("reconstruct", recording, "-o", out, "--rate", 100_000, "--format", "npy")
+        process = start_cli(
+            "reconstruct", recording, "-o", out, "--rate", 100_000, "--format", "npy", "--threads", threads
+        )
         wait_for(process, lambda: (out / "000020.npy").exists())
         process.send_signal(number)
         _, stderr = process.communicate(timeout=30)

@@ -9,6 +9,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 import tomllib
 from io import FileIO
@@ -544,3 +545,84 @@ for k in range(10**6):
         assert cv2.imread(str(out / name), cv2.IMREAD_UNCHANGED).shape == (64, 64)
     assert settings_of(out)["complete"] is False
     assert len(names) - 1 <= settings_of(out)["images"] <= len(names)
+
+
+class TestSeveralEncoders:
+    @pytest.mark.parametrize("format", ["png", "exr", "npy"])
+    def test_the_files_are_the_same(self, tmp_path, format):
+        for threads in (1, 2, 4):
+            with open_writer(tmp_path / str(threads), format=format, threads=threads) as writer:
+                for k in range(9):
+                    writer.write(make_image(k))
+            assert writer.images == 9
+            assert_same_folder(tmp_path / "1", tmp_path / str(threads))
+        assert settings_of(tmp_path / "4")["complete"] is True
+
+    def test_what_is_listed_is_there_meanwhile(self, tmp_path):
+        with open_writer(tmp_path / "o", format="npy", threads=3) as writer:
+            for k in range(9):
+                writer.write(make_image(k))
+                assert len(listed(tmp_path / "o")) == writer.images == max(0, k + 1 - 3)
+                assert_valid_npy(tmp_path / "o")
+        assert len(listed(tmp_path / "o")) == writer.images == 9
+
+    @pytest.mark.parametrize("error", [KeyboardInterrupt, InputError])
+    def test_an_interrupt_leaves_all_that_was_given(self, tmp_path, error):
+        def write():
+            with open_writer(tmp_path / "o", format="png", threads=4) as writer:
+                for k in range(7):
+                    writer.write(make_image(k))
+                raise error
+
+        with pytest.raises(error):
+            write()
+        assert_valid(tmp_path / "o", 7, complete=False)
+        assert threading.active_count() == 1
+
+    @pytest.mark.parametrize("last", [4, 12], ids=["when it closes", "while it writes"])
+    def test_a_full_disk_ends_it_there(self, tmp_path, monkeypatch, last):
+        def write():
+            with open_writer(tmp_path / "o", format="png", threads=3) as writer:
+                for k in range(last):
+                    writer.write(make_image(k))
+
+        full_disk(monkeypatch, "000002.png.part")
+        with pytest.raises(OutputError, match=r"000002.png: no space .*; the 2 images listed in"):
+            write()
+        assert_valid(tmp_path / "o", 2, complete=False)
+        assert threading.active_count() == 1
+
+    def test_an_error_of_encoding_is_raised(self, tmp_path, monkeypatch):
+        def broken(picture):
+            raise MemoryError("no room")
+
+        monkeypatch.setattr("kalux.writers.images.png_bytes", broken)
+        writer = open_writer(tmp_path / "o", format="png", threads=2)
+        writer.write(make_image(0))
+        with pytest.raises(MemoryError, match="no room"):
+            writer.close()
+        assert_valid(tmp_path / "o", 0, complete=False)
+        writer.close()
+
+    def test_a_wrong_image_is_refused_at_once(self, tmp_path):
+        with open_writer(tmp_path / "o", format="png", threads=4) as writer:
+            writer.write(make_image(0))
+            with pytest.raises(InputError, match="image 1: the intensity is"):
+                writer.write(make_image(1, shape=(5, 5)))
+        assert_valid(tmp_path / "o", 1, complete=False)
+
+    def test_none_is_refused(self, tmp_path):
+        with pytest.raises(SettingsError, match="threads is 0"):
+            open_writer(tmp_path / "o", format="png", threads=0)
+
+
+def assert_same_folder(expected, found):
+    names = sorted(path.name for path in expected.iterdir())
+    assert sorted(path.name for path in found.iterdir()) == names
+    for name in names:
+        assert (expected / name).read_bytes() == (found / name).read_bytes()
+
+
+def assert_valid_npy(out):
+    for name in listed(out):
+        assert np.isfinite(np.load(out / name)).all()

@@ -2,24 +2,11 @@
 
 from __future__ import annotations
 
+import importlib
 import sys
 import traceback
 from collections.abc import Sequence
 
-from kalux.cli import (
-    ahdr,
-    benchmark,
-    calibrate,
-    convert,
-    datasets,
-    demo,
-    evaluate,
-    hdr_reference,
-    info,
-    reconstruct,
-    register,
-    simulate,
-)
 from kalux.cli.parser import Parser, UsageError, normalised
 from kalux.cli.signals import termination_as_interrupt
 from kalux.cli.terminal import close_output, error_line
@@ -28,20 +15,20 @@ from kalux.errors import InternalError, KaluxError
 DONE, BUG, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 
 COMMANDS = (
-    info,
-    reconstruct,
-    convert,
-    register,
-    calibrate,
-    evaluate,
-    benchmark,
-    simulate,
-    demo,
-    ahdr,
-    hdr_reference,
-    datasets,
+    "info",
+    "reconstruct",
+    "convert",
+    "register",
+    "calibrate",
+    "evaluate",
+    "benchmark",
+    "simulate",
+    "demo",
+    "ahdr",
+    "hdr-reference",
+    "datasets",
 )
-"""The modules of the commands, in the order of the help."""
+"""The commands, in the order of the help; each has a module of its name."""
 
 _DESCRIPTION = """\
 HDR video with per-pixel uncertainty from cameras that give events and frames.
@@ -117,7 +104,7 @@ def _notes(error: BaseException) -> list[str]:
 
 
 def _run(arguments: list[str]) -> int:
-    parser = make_parser()
+    parser = make_parser(next((word for word in arguments if word in COMMANDS), None))
     try:
         options = parser.parse_args(normalised(arguments))
     except SystemExit as done:  # --help and --version have printed what was asked for
@@ -128,11 +115,14 @@ def _run(arguments: list[str]) -> int:
     return DONE
 
 
-def make_parser() -> Parser:
-    """The parser of all commands."""
+def make_parser(command: str | None = None) -> Parser:
+    """The parser with the flags of one command; of the others it knows the names, which need no imports."""
     parser = Parser(prog="kalux", description=_DESCRIPTION, epilog=_EXAMPLES, usage="kalux COMMAND ...")
     parser.add_version()
     commands = parser.add_subparsers(dest="command", prog="kalux", parser_class=Parser)
-    for command in COMMANDS:
-        command.add_command(commands)
+    for name in COMMANDS:
+        if name == command:
+            importlib.import_module(f"kalux.cli.{name.replace('-', '_')}").add_command(commands)
+        else:
+            commands.add_parser(name)
     return parser

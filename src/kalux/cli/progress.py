@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import sys
+import threading
 import time
 from types import TracebackType
 from typing import Self
@@ -20,7 +21,7 @@ BAR_EVERY = 0.1
 
 
 class Progress:
-    """Counts images and events; a context manager that draws meanwhile.
+    """Counts images and events, in whatever threads they are made; a context manager that draws meanwhile.
 
     Parameters
     ----------
@@ -45,6 +46,7 @@ class Progress:
         self._quiet = quiet
         self._started = self._drawn = time.monotonic()
         self._bar: Bar | None = None
+        self._lock = threading.Lock()
 
     @property
     def seconds(self) -> float:
@@ -73,13 +75,14 @@ class Progress:
 
     def add(self, *, images: int = 0, events: int = 0) -> None:
         """Count, and draw if it is time to."""
-        self.images += images
-        self.events += events
-        now = time.monotonic()
-        if self._quiet or now - self._drawn < (LINE_EVERY if self._bar is None else BAR_EVERY):
-            return
-        self._drawn = now
-        self._draw()
+        with self._lock:
+            self.images += images
+            self.events += events
+            now = time.monotonic()
+            if self._quiet or now - self._drawn < (LINE_EVERY if self._bar is None else BAR_EVERY):
+                return
+            self._drawn = now
+            self._draw()
 
     def _draw(self) -> None:
         text = progress_text(

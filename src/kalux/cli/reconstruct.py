@@ -14,12 +14,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from kalux.ahead import default_threads
 from kalux.cli.calibrations import add_calibration, given_calibration
 from kalux.cli.checking import Contents, check_recording
 from kalux.cli.flags import HelpSettings, add_display, add_settings, given_settings
 from kalux.cli.info import add_recording, open_recording
 from kalux.cli.output import DEFAULT_RATE, FOLDER_FORMATS, Output, check_output, chosen_output
-from kalux.cli.parser import Parser, UsageError, number
+from kalux.cli.parser import Parser, UsageError, number, whole
 from kalux.cli.progress import Progress, short_number
 from kalux.cli.terminal import say, warn
 from kalux.cli.times import load_times
@@ -103,6 +104,9 @@ def _add_output(parser: Parser) -> None:
     )
     group.add_argument("--grey", action="store_true", help="of a recording in colour, the luminance alone")
     group.add_argument("--overwrite", action="store_true", help="replace a former output of kalux")
+    group.add_argument(
+        "--threads", type=whole, metavar="N", help="processor cores to use, at least 1 (default all, up to 8)"
+    )
     group.add_argument("--quiet", action="store_true", help="print warnings and errors only")
 
 
@@ -149,6 +153,8 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     """Run the command."""
     if options._ is not None:
         raise UsageError("GROUP.NAME stands for the name of a setting; --help-settings lists them")
+    if options.threads is not None and options.threads < 1:
+        raise UsageError(f"--threads is {options.threads}; it must be 1 or more")
     output = chosen_output(options)
     settings = chosen_settings(options)
     check_output(output)
@@ -353,7 +359,8 @@ def write_images(
     recording: Recording, made: Plan, output: Output, described: dict[str, Any], options: argparse.Namespace
 ) -> tuple[float, int]:
     """Carry out the plan; returns the seconds it took and the number of images."""
-    writer = output.open(described)
+    threads = options.threads or default_threads()
+    writer = output.open(described, encoders=max(1, threads - 1))
     progress = Progress("reconstructing", images=len(made.times), quiet=options.quiet)
     backward = Progress("backward pass", quiet=options.quiet)
     images = execute(
@@ -361,9 +368,10 @@ def write_images(
         made,
         lambda count: progress.add(events=count),
         lambda count: backward.add(events=count),
+        threads=threads,
     )
     try:
-        with writer:
+        with writer, contextlib.closing(images):
             # The first image comes when the backward pass, if there is one, is done.
             with backward if made.smooth else contextlib.nullcontext():
                 first = next(images, None)

@@ -42,6 +42,7 @@ class Writer(ABC):
         self.path = path
         self._times: tuple[int, int] | None = None
         self._images = 0
+        self._taken = 0
         self._shape: tuple[int, ...] | None = None
         self._in_colour: bool | None = None
         self._failed = False
@@ -70,15 +71,12 @@ class Writer(ABC):
             state = "closed" if self._closed else "unusable after an error"
             raise OutputError(f"{self.path}: cannot write an image, the writer is {state}")
         try:
-            check_image(image, self._images, self._shape, self._in_colour)
+            check_image(image, self._taken, self._shape, self._in_colour)
             with uninterrupted():
                 self._write(image)
-                first = self._times[0] if self._times else int(image.t)
-                self._times = first, int(image.t)
                 self._shape = image.intensity.shape
                 self._in_colour = colour_of(image) is not None
-                self._images += 1
-                self._written()
+                self._taken += 1
         except BaseException:
             # An interrupt is raised here only before the image or after all of it.
             self._failed = True
@@ -127,10 +125,12 @@ class Writer(ABC):
 
     @abstractmethod
     def _write(self, image: ImageLike) -> None:
-        """Write a checked image, all of it or nothing."""
+        """Write a checked image, all of it or nothing; then, or later, `_count` it."""
 
-    def _written(self) -> None:  # noqa: B027
-        """Called when the counts include the image."""
+    def _count(self, t: int) -> None:
+        """An image, of the time ``t`` (us), is written."""
+        self._times = self._times[0] if self._times else int(t), int(t)
+        self._images += 1
 
     @abstractmethod
     def _finish(self, complete: bool) -> None:

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
+from collections import deque
+from concurrent.futures import ThreadPoolExecutor
 from io import FileIO
 from pathlib import Path
+from typing import NamedTuple
 
 from kalux.display import ToneState
 from kalux.errors import OutputError
 from kalux.writers.base import ImageLike, Writer
 from kalux.writers.files import output_errors, remove_quietly, write_whole
-from kalux.writers.images import Encode
+from kalux.writers.images import Bytes, Encode
 from kalux.writers.settings_file import SettingsFile, require_ours
 
 LISTING = "timestamps.csv"
@@ -24,17 +28,46 @@ REMOVING = ".timestamps.csv.removing"
 _LINE = re.compile(r"\d+,-?\d+,(\d{6,}\.(?:png|exr|npy))")
 
 
+class Pending(NamedTuple):
+    """An image that is being encoded.
+
+    Attributes
+    ----------
+    t
+        Its time, us.
+    data
+        Gives its file when that is ready.
+    """
+
+    t: int
+    data: Bytes
+
+
 class FolderWriter(Writer):
-    """Writes every image to its own file, then its line into the list, then the count into the settings."""
+    """Writes every image to its own file, then its line into the list, then the count into the settings.
+
+    With several ``encoders``, that many images are encoded at a time, in threads of their own. They are still written
+    in order, each after up to as many calls of `write`: so late, too, is the error of one that cannot be.
+    """
 
     def __init__(
-        self, path: Path, encode: Encode, suffix: str, settings: SettingsFile, *, overwrite: bool
+        self,
+        path: Path,
+        encode: Encode,
+        suffix: str,
+        settings: SettingsFile,
+        *,
+        overwrite: bool,
+        encoders: int = 1,
     ) -> None:
         super().__init__(path)
         self._encode = encode
         self._suffix = suffix
         self._settings = settings
         self._state: ToneState | None = None
+        self._encoders = encoders
+        self._pool = ThreadPoolExecutor(encoders, "kalux-encode") if encoders > 1 else None
+        self._pending: deque[Pending] = deque()
         with output_errors(path, "the output folder cannot be used"):
             prepare_folder(path, overwrite=overwrite)
             settings.write(complete=False, images=0, times=None)
@@ -42,9 +75,25 @@ class FolderWriter(Writer):
             self._listing = FileIO(path / LISTING, "a")
 
     def _write(self, image: ImageLike) -> None:
+        data, self._state = self._encode(image, self._state)
+        self._pending.append(
+            Pending(int(image.t), data if self._pool is None else self._pool.submit(data).result)
+        )
+        self._store(0 if self._pool is None else self._encoders)
+
+    def _store(self, most: int) -> None:
+        """Write images, the first first, until at most ``most`` are pending. After an error the rest is given up."""
+        try:
+            while len(self._pending) > most:
+                self._store_next(self._pending.popleft())
+        except BaseException:
+            self._pending.clear()
+            raise
+
+    def _store_next(self, image: Pending) -> None:
         name = f"{self._images:06d}{self._suffix}"
         file = self.path / name
-        data, following = self._encode(image, self._state)
+        data = image.data()
         with output_errors(file, self._consequence()):
             if os.path.lexists(file):
                 raise OutputError(
@@ -52,19 +101,33 @@ class FolderWriter(Writer):
                 )
             write_whole(file, data)
             try:
-                append_line(self._listing, f"{self._images},{int(image.t)},{name}\n")
+                append_line(self._listing, f"{self._images},{image.t},{name}\n")
             except BaseException:
                 remove_quietly(file)
                 raise
-        self._state = following
-
-    def _written(self) -> None:
-        with output_errors(self._settings.path, self._consequence()):
-            self._settings.write(complete=False, images=self._images, times=self._times)
+        self._count(image.t)
+        self._write_settings(complete=False)
 
     def _finish(self, complete: bool) -> None:
-        with output_errors(self._settings.path, self._consequence()):
+        try:
+            self._store(0)
+        except BaseException:
+            with contextlib.suppress(
+                OutputError
+            ):  # the settings on disk are those of an incomplete output already
+                self._end_files(complete=False)
+            raise
+        self._end_files(complete=complete)
+
+    def _end_files(self, *, complete: bool) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+        with output_errors(self.path / LISTING, self._consequence()):
             self._listing.close()
+        self._write_settings(complete=complete)
+
+    def _write_settings(self, *, complete: bool) -> None:
+        with output_errors(self._settings.path, self._consequence()):
             self._settings.write(complete=complete, images=self._images, times=self._times)
 
     def _consequence(self) -> str:

@@ -1,4 +1,7 @@
-"""One image as the bytes of a file: PNG, EXR, NPY."""
+"""One image as the bytes of a file: PNG, EXR, NPY.
+
+What depends on the images before is done at once, the rest, most of the work, whenever there is a thread for it.
+"""
 
 from __future__ import annotations
 
@@ -6,30 +9,45 @@ import io
 from collections.abc import Callable
 from typing import Any, Literal
 
-import cv2
 import numpy as np
 import OpenEXR
 from numpy.typing import NDArray
 
-from kalux.display import DisplaySettings, ToneState, colour_of, to_uint8, to_uint16, tone_map_next
+from kalux.display import DisplaySettings, ToneState, apply, colour_of, next_state, to_uint8, to_uint16
 from kalux.writers.base import ImageLike
+from kalux.writers.png import png_bytes
 
-Encode = Callable[[ImageLike, ToneState | None], tuple[bytes, ToneState | None]]
-"""An image and the state of the display before it, to the file and the state after it."""
+Bytes = Callable[[], bytes]
+"""Makes a file; in any thread, and in any order."""
+
+Encode = Callable[[ImageLike, ToneState | None], tuple[Bytes, ToneState | None]]
+"""An image and the state of the display before it, to what makes the file, and the state after it."""
 
 
 def encode_png(display: DisplaySettings, bits: Literal[8, 16]) -> Encode:
     """PNGs of the display-mapped intensity or colour, 0 to 1 as 0 to 65535 (or 255), rounded to nearest."""
     quantise: Callable[[NDArray[Any]], NDArray[Any]] = to_uint16 if bits == 16 else to_uint8
 
-    def encode(image: ImageLike, state: ToneState | None) -> tuple[bytes, ToneState | None]:
-        mapped, following = tone_map_next(image, display, state)
-        return png_bytes(quantise(mapped)), following
+    def encode(image: ImageLike, state: ToneState | None) -> tuple[Bytes, ToneState | None]:
+        following = next_state(image, display, state)
+        colour = colour_of(image)
+        shown = image.intensity if colour is None else colour
+        return lambda: png_bytes(quantise(apply(shown, display, following.statistics))), following
 
     return encode
 
 
-def encode_exr(image: ImageLike, state: ToneState | None) -> tuple[bytes, ToneState | None]:
+def encode_exr(image: ImageLike, state: ToneState | None) -> tuple[Bytes, ToneState | None]:
+    """See `exr_bytes`."""
+    return lambda: exr_bytes(image), state
+
+
+def encode_npy(image: ImageLike, state: ToneState | None) -> tuple[Bytes, ToneState | None]:
+    """See `npy_bytes`."""
+    return lambda: npy_bytes(image), state
+
+
+def exr_bytes(image: ImageLike) -> bytes:
     """OpenEXR, 32-bit float, ZIP: the intensity as Y, or the colour as R, G, B; ``variance``; attribute ``t_us``."""
     header = {
         "compression": OpenEXR.ZIP_COMPRESSION,
@@ -43,24 +61,13 @@ def encode_exr(image: ImageLike, state: ToneState | None) -> tuple[bytes, ToneSt
     channels = {name: np.ascontiguousarray(v) for name, v in {**values, "variance": image.variance}.items()}
     file = io.BytesIO()
     OpenEXR.File(header, channels).write(file)
-    return file.getvalue(), state
+    return file.getvalue()
 
 
-def encode_npy(image: ImageLike, state: ToneState | None) -> tuple[bytes, ToneState | None]:
+def npy_bytes(image: ImageLike) -> bytes:
     """NumPy's format, float32 (2, height, width): intensity, variance; or (4, ...): red, green, blue, variance."""
     colour = colour_of(image)
     values = [image.intensity] if colour is None else list(np.moveaxis(colour, 2, 0))
     file = io.BytesIO()
     np.save(file, np.stack([*values, image.variance]), allow_pickle=False)
-    return file.getvalue(), state
-
-
-def png_bytes(picture: NDArray[Any]) -> bytes:
-    """A grey or RGB uint8 or uint16 picture as PNG."""
-    if picture.ndim == 3:
-        picture = np.ascontiguousarray(picture[..., ::-1])  # OpenCV's order
-    # Without parameters OpenCV takes its fastest way. Asking for a level, even for 1, leaves that way and
-    # takes two to three times as long, for files of about the same size.
-    done, encoded = cv2.imencode(".png", picture)
-    assert done, "OpenCV encodes every uint8 or uint16 picture"
-    return encoded.tobytes()
+    return file.getvalue()

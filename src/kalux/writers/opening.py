@@ -28,6 +28,7 @@ def open_writer(
     metadata: Mapping[str, Any] | None = None,
     png_bits: Literal[8, 16] = 16,
     video: VideoSettings | None = None,
+    threads: int = 1,
 ) -> Writer:
     """Open an output for images.
 
@@ -50,6 +51,9 @@ def open_writer(
         Bits per pixel of a PNG.
     video
         Compression of a video.
+    threads
+        Of a folder, how many images are encoded at a time. With more than one, images are written, and errors of
+        writing are raised, up to as many calls later, at the latest in ``close()``; images given must not be changed.
 
     Returns
     -------
@@ -59,8 +63,8 @@ def open_writer(
     Raises
     ------
     SettingsError
-        The format is unknown or does not fit the name, a setting is out of its range, or the metadata has no
-        TOML form.
+        The format is unknown or does not fit the name, a setting or ``threads`` is out of its range, or the
+        metadata has no TOML form.
     OutputError
         The output exists and ``overwrite`` is False, or it cannot be created.
     """
@@ -71,6 +75,8 @@ def open_writer(
     ticks = make_ticks(rate_hz, video)
     if png_bits not in (8, 16):
         raise SettingsError(f"png_bits is {png_bits}; it must be 8 or 16")
+    if threads < 1:
+        raise SettingsError(f"threads is {threads}; it must be 1 or more")
     described: dict[str, Any] = {"format": chosen, "rate_hz": rate_hz}
     if chosen in ("png", "mp4"):
         described["display"] = settings_table(display)
@@ -82,7 +88,7 @@ def open_writer(
         return VideoWriter(path, display, video, ticks, beside, overwrite=overwrite)
     inside = settings_file(path / SETTINGS, metadata or {}, described)
     encode = {"png": encode_png(display, png_bits), "exr": encode_exr, "npy": encode_npy}[chosen]
-    return FolderWriter(path, encode, f".{chosen}", inside, overwrite=overwrite)
+    return FolderWriter(path, encode, f".{chosen}", inside, overwrite=overwrite, encoders=threads)
 
 
 def choose_format(path: Path, format: str | None) -> str:

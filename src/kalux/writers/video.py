@@ -156,6 +156,7 @@ class VideoWriter(Writer):
             container.mux(stream.encode(frame))
         self._whole = True
         self._state, self._last = following, pts
+        self._count(image.t)
 
     def _finish(self, complete: bool) -> None:
         try:

@@ -1,0 +1,120 @@
+"""Work in other threads, in order: what one step makes is made while the next step uses what came before it.
+
+Which thread does a thing never changes what comes out, only when. Standard library only.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections import deque
+from collections.abc import Generator, Iterable
+from typing import Final, Generic, TypeVar
+
+T = TypeVar("T")
+
+MOST_THREADS: Final = 8
+"""Used where nothing is said, at most: one filters, and even EXR images, the slowest to encode, are done by seven."""
+
+
+def default_threads() -> int:
+    """As many as this process has processor cores, up to `MOST_THREADS`."""
+    try:
+        cores = len(os.sched_getaffinity(0))
+    except AttributeError:  # not on macOS and Windows
+        cores = os.cpu_count() or 1
+    return min(cores, MOST_THREADS)
+
+
+def ahead(items: Iterable[T], depth: int = 2) -> Generator[T, None, None]:
+    """The same items in the same order, made in a thread of their own, up to ``depth`` before they are asked for.
+
+    An error in the making is raised where its item would have come. Closing the iterator, or an exception where it is
+    used, ends the thread: at once where it waits, else after the item that it is making, and ``items`` is closed in it.
+    The iterator must be run to its end or be closed, as generators are.
+
+    Parameters
+    ----------
+    items
+        Made one by one, in that thread only.
+    depth
+        How many are held, beside the one being made and the one in use: memory is bounded by it.
+    """
+    belt: _Belt[T] = _Belt(depth)
+    thread = threading.Thread(target=_make, args=(items, belt), name="kalux-ahead", daemon=True)
+    thread.start()
+    try:
+        while (item := belt.take()) is not None:
+            yield item.value
+    finally:
+        belt.stop()
+        thread.join()
+
+
+class _Item(Generic[T]):
+    """An item, so that None can be one."""
+
+    def __init__(self, value: T) -> None:
+        self.value = value
+
+
+class _Belt(Generic[T]):
+    """Items on their way from one thread to another."""
+
+    def __init__(self, depth: int) -> None:
+        self._depth = depth
+        self._items: deque[_Item[T]] = deque()
+        self._changed = threading.Condition()
+        self._stopped = self._ended = False
+        self._error: BaseException | None = None
+
+    def put(self, value: T) -> bool:
+        """Wait for room; False: nobody wants it any more."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._stopped or len(self._items) < self._depth)
+            if not self._stopped:
+                self._items.append(_Item(value))
+                self._changed.notify_all()
+            return not self._stopped
+
+    def end(self, error: BaseException | None) -> None:
+        """There are no more items; why, if it was an error."""
+        with self._changed:
+            self._ended, self._error = True, error
+            self._changed.notify_all()
+
+    def take(self) -> _Item[T] | None:
+        """Wait for the next item; None: that was all. Raises the error that ended them."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._items or self._ended)
+            if self._items:
+                item = self._items.popleft()
+                self._changed.notify_all()
+                return item
+            if self._error is not None:
+                raise self._error
+            return None
+
+    def stop(self) -> None:
+        """Nobody wants any more, neither items nor the errors of making them."""
+        with self._changed:
+            self._stopped = True
+            self._items.clear()
+            self._changed.notify_all()
+
+
+def _make(items: Iterable[T], belt: _Belt[T]) -> None:
+    error: BaseException | None = None
+    try:
+        iterator = iter(items)
+        try:
+            for value in iterator:
+                if not belt.put(value):
+                    break
+        finally:
+            close = getattr(iterator, "close", None)
+            if close is not None:
+                close()
+    except BaseException as failure:  # raised in the thread that takes
+        error = failure
+    belt.end(error)

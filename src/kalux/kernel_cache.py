@@ -1,0 +1,59 @@
+"""Where compiled loops are kept: beside the package, or elsewhere where that cannot be written.
+
+numba keeps them in ``__pycache__`` beside the source. Of a package that is installed read-only, and without a home
+folder that can be written, it refuses even to be told of a function that shall be cached. Standard library only:
+this runs whenever kalux is imported.
+"""
+
+from __future__ import annotations
+
+import atexit
+import os
+import shutil
+import sys
+import tempfile
+from pathlib import Path
+from typing import Final
+
+VARIABLE: Final = "NUMBA_CACHE_DIR"
+"""The environment variable of numba that says where; kalux sets it only where nobody has and it is needed."""
+
+
+def ensure_writable(package: Path) -> None:
+    """See to it that numba finds a place: the package, ``~/.cache/kalux``, or one for this process.
+
+    ``XDG_CACHE_HOME`` stands for ``~/.cache`` where it is set.
+    """
+    if os.environ.get(VARIABLE) or _is_writable(package):
+        return
+    place = _user_folder() or _temporary_folder()
+    os.environ[VARIABLE] = str(place)
+    if "numba" in sys.modules:  # it has read its environment already
+        sys.modules["numba"].config.CACHE_DIR = str(place)
+
+
+def _is_writable(package: Path) -> bool:
+    cache = package / "__pycache__"
+    return os.access(cache if cache.exists() else package, os.W_OK | os.X_OK)
+
+
+def _user_folder() -> Path | None:
+    """The folder for caches of this user, which others cannot write: its files are trusted."""
+    base = os.environ.get("XDG_CACHE_HOME")
+    try:
+        place = (Path(base) if base else Path.home() / ".cache") / "kalux"
+        place.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except (OSError, RuntimeError):  # RuntimeError: there is no home
+        return None
+    return place if os.access(place, os.W_OK | os.X_OK) else None
+
+
+def _temporary_folder() -> Path:
+    place, owner = Path(tempfile.mkdtemp(prefix="kalux-")), os.getpid()
+
+    def remove() -> None:
+        if os.getpid() == owner:  # not in a forked child
+            shutil.rmtree(place, ignore_errors=True)
+
+    atexit.register(remove)
+    return place

@@ -1,0 +1,146 @@
+"""Work in other threads: the same items in order, errors where they belong, and no thread left."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+import time
+
+import pytest
+
+from kalux.ahead import MOST_THREADS, ahead, default_threads
+
+
+@pytest.fixture(autouse=True)
+def no_thread_is_left():
+    before = threading.active_count()
+    yield
+    assert threading.active_count() == before
+
+
+@pytest.mark.parametrize("depth", [1, 2, 100])
+@pytest.mark.parametrize("count", [0, 1, 3, 1000])
+def test_the_same_items_in_order(depth, count):
+    assert list(ahead(range(count), depth)) == list(range(count))
+
+
+def test_none_is_an_item():
+    assert list(ahead([None, 1, None])) == [None, 1, None]
+
+
+def test_they_are_made_in_another_thread_and_only_there():
+    def made():
+        try:
+            yield threading.get_ident()
+            yield threading.get_ident()
+        finally:
+            idents.append(threading.get_ident())
+
+    idents = []
+    idents += ahead(made())
+    assert len(set(idents)) == 1
+    assert idents[0] != threading.get_ident()
+
+
+@pytest.mark.parametrize("depth", [1, 3])
+def test_not_more_is_made_than_asked_for(depth):
+    """Back-pressure: what is held, what is being made, and what is in use."""
+    made = []
+
+    def count():
+        for k in range(100):
+            made.append(k)
+            yield k
+
+    items = ahead(count(), depth)
+    for k in range(5):
+        assert next(items) == k
+        deadline = time.monotonic() + 5
+        while len(made) < k + depth + 2 and time.monotonic() < deadline:
+            time.sleep(0.001)
+        time.sleep(0.01)
+        assert len(made) == k + depth + 2
+    items.close()
+
+
+def test_nothing_starts_before_the_first_item_is_asked_for():
+    items = ahead(iter([1]))
+    assert "kalux-ahead" not in [thread.name for thread in threading.enumerate()]
+    items.close()
+
+
+@pytest.mark.parametrize("kind", [ValueError, KeyboardInterrupt, SystemExit])
+def test_an_error_comes_where_its_item_would_have(kind):
+    def failing():
+        yield from range(3)
+        raise kind("here")
+
+    seen = []
+    with pytest.raises(kind, match="here"):
+        seen.extend(ahead(failing(), 10))
+    assert seen == [0, 1, 2]
+
+
+def test_an_error_before_the_first_item():
+    class Unreadable:
+        def __iter__(self):
+            raise OSError("no file")
+
+    with pytest.raises(OSError, match="no file"):
+        next(ahead(Unreadable()))
+
+
+@pytest.mark.parametrize("endless", [True, False], ids=["waiting", "at the end"])
+def test_closing_ends_the_making(endless):
+    closed = []
+
+    def numbers():
+        try:
+            yield from itertools.count() if endless else range(2)
+        finally:
+            closed.append(True)
+
+    items = ahead(numbers())
+    next(items)
+    items.close()
+    assert closed == [True]
+    assert list(items) == []
+
+
+def test_an_exception_where_the_items_are_used_ends_the_making():
+    def use():
+        for item in ahead(itertools.count()):
+            if item == 3:
+                raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        use()
+
+
+def test_what_nobody_asked_for_may_fail():
+    def failing():
+        yield 1
+        raise ValueError("never met")
+
+    items = ahead(failing(), 5)
+    assert next(items) == 1
+    items.close()
+
+
+def test_one_in_another():
+    inner = ahead(range(1000), 1)
+    assert list(ahead((k * k for k in inner), 1)) == [k * k for k in range(1000)]
+    inner = ahead(itertools.count(), 1)
+    outer = ahead((k for k in inner), 1)
+    assert next(outer) == 0
+    outer.close()
+    inner.close()
+
+
+def test_the_default_is_the_cores_there_are(monkeypatch):
+    assert 1 <= default_threads() <= MOST_THREADS
+    monkeypatch.setattr("os.sched_getaffinity", lambda pid: set(range(64)), raising=False)
+    assert default_threads() == MOST_THREADS
+    monkeypatch.delattr("os.sched_getaffinity")
+    monkeypatch.setattr("os.cpu_count", lambda: None)
+    assert default_threads() == 1
