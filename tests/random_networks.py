@@ -87,3 +87,27 @@ def save(case: Case, path: Path, **more) -> Path:
     """A checkpoint of a random network."""
     torch.save({"state_dict": published(case, random_network(case)), **more}, path)
     return path
+
+
+ALEXNET = {
+    0: (64, 3, 11, 11),
+    3: (192, 64, 5, 5),
+    6: (384, 192, 3, 3),
+    8: (256, 384, 3, 3),
+    10: (256, 256, 3, 3),
+}
+
+
+def write_lpips(folder: Path) -> tuple[Path, Path]:
+    """Random weights of LPIPS, as torchvision and the authors store them."""
+    drawn = torch.Generator().manual_seed(0)
+    tensors = {"classifier.1.weight": torch.zeros(2)}
+    for number, shape in ALEXNET.items():
+        weight = torch.randn(shape, generator=drawn)
+        tensors[f"features.{number}.weight"] = weight / (shape[1] * shape[2] * shape[3]) ** 0.5
+        tensors[f"features.{number}.bias"] = 0.1 * torch.randn(shape[0], generator=drawn)
+    torch.save(tensors, folder / "alexnet.pth")
+    widths = [shape[0] for shape in ALEXNET.values()]
+    linear = {f"lin{i}.model.1.weight": torch.rand(1, n, 1, 1, generator=drawn) for i, n in enumerate(widths)}
+    torch.save(linear, folder / "alex.pth")
+    return folder / "alexnet.pth", folder / "alex.pth"

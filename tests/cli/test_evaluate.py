@@ -12,7 +12,10 @@ import pytest
 
 from kalux.evaluation.baselines import methods
 from kalux.evaluation.held_out import evaluate_held_out, hold_out_frames
+from kalux.readers import hdf5
 from kalux.recording import open as open_recording
+
+from builders import moving_blocks
 
 
 @pytest.fixture(scope="session")
@@ -168,3 +171,41 @@ def test_an_interrupt_leaves_no_file(cli, recording, tmp_path, monkeypatch):
     found = cli("evaluate", recording, "-o", tmp_path / "s.csv")
     assert found.code == 130
     assert list(tmp_path.iterdir()) == []
+
+
+def test_lpips_is_a_column(cli, tmp_path):
+    pytest.importorskip("torch", reason="needs PyTorch; pip install -e '.[learned]' brings it")
+    from random_networks import write_lpips
+
+    simulation = moving_blocks(size=(64, 64))
+    path = tmp_path / "large.h5"
+    hdf5.write(
+        path,
+        sensor_size=(64, 64),
+        events=[simulation.events],
+        frames=simulation.frames,
+        contrast_threshold=(0.2, 0.2),
+    )
+    files = ",".join(map(str, write_lpips(tmp_path)))
+    out = tmp_path / "scores.csv"
+    found = cli("evaluate", path, "--methods", "hold", "--lpips", files, "-o", out)
+    assert found.code == 0, found.err
+    assert found.out.splitlines()[1].split()[-1] == "LPIPS"
+    (row,) = csv.DictReader(out.open())
+    assert float(row["lpips"]) == pytest.approx(float(found.out.splitlines()[2].split()[-1]), abs=6e-4)
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [("none.pth", "none.pth: no such file"), ("a,b,c", "or two with a comma"), (",", "two")],
+)
+@pytest.mark.parametrize("command", ["evaluate", "benchmark"])
+def test_weights_of_lpips_that_are_wrong_are_told_before_the_work(
+    cli, recording, tmp_path, command, given, told
+):
+    pytest.importorskip("torch", reason="needs PyTorch; pip install -e '.[learned]' brings it")
+    more = ("-o", tmp_path / "out") if command == "benchmark" else ()
+    found = cli(command, recording, "--methods", "hold", "--lpips", given, *more)
+    assert found.code == 2
+    assert told in found.error
+    assert "hold the last frame" not in found.out

@@ -13,29 +13,12 @@ torch = pytest.importorskip("torch", reason="needs PyTorch; pip install -e '.[le
 from kalux.errors import FormatError, InputError, MissingDependencyError  # noqa: E402
 from kalux.evaluation import lpips as module  # noqa: E402
 from kalux.evaluation.lpips import load_lpips, lpips  # noqa: E402
-
-SHAPES = {
-    0: (64, 3, 11, 11),
-    3: (192, 64, 5, 5),
-    6: (384, 192, 3, 3),
-    8: (256, 384, 3, 3),
-    10: (256, 256, 3, 3),
-}
+from random_networks import ALEXNET, write_lpips  # noqa: E402
 
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
-    """As torchvision and the authors store them."""
-    folder, drawn = tmp_path_factory.mktemp("weights"), torch.Generator().manual_seed(0)
-    tensors = {"classifier.1.weight": torch.zeros(2)}
-    for number, shape in SHAPES.items():
-        tensors[f"features.{number}.weight"] = torch.randn(shape, generator=drawn) / np.prod(shape[1:]) ** 0.5
-        tensors[f"features.{number}.bias"] = 0.1 * torch.randn(shape[0], generator=drawn)
-    torch.save(tensors, folder / "alexnet.pth")
-    widths = [shape[0] for shape in SHAPES.values()]
-    linear = {f"lin{i}.model.1.weight": torch.rand(1, n, 1, 1, generator=drawn) for i, n in enumerate(widths)}
-    torch.save(linear, folder / "alex.pth")
-    return folder / "alexnet.pth", folder / "alex.pth"
+    return write_lpips(tmp_path_factory.mktemp("weights"))
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +34,7 @@ def pictures(seed=0):
 def test_equation_1_by_modules_and_loops(weights):
     """Equation 1 of the paper, written with PyTorch's layers and NumPy."""
     layers = []
-    for number, shape in SHAPES.items():
+    for number, shape in ALEXNET.items():
         layer = torch.nn.Conv2d(
             shape[1], shape[0], shape[2], *((4, 2) if number == 0 else (1, shape[2] // 2))
         )

@@ -10,6 +10,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from kalux.cli.metrics import add_metrics, lpips_files, lpips_weights, named_methods
 from kalux.cli.parser import Parser, UsageError, whole
 from kalux.cli.terminal import error_line, say
 
@@ -26,7 +27,7 @@ the same command does only what is missing. Needs the extra kalux[evaluation].
 
 SET is a recording, a folder with recordings, or a TOML file that lists sequences (docs/benchmark.md).
 methods: as of kalux evaluate; without --methods hold, mean (where frames are held out), edi, cf, iccv2021,
-default, smooth."""
+default, smooth. In the name of a file or folder {sequence} stands for the name of the sequence."""
 
 _EXAMPLES = """\
 examples:
@@ -39,10 +40,10 @@ a TOML file:
   title = "My sequences"
   [[sequence]]
   path = "slider_depth"                # relative to the file
-  exposure = 10000                     # us; also: name, title, group, stamp, response
+  exposure = 10000                     # us; also: name, title, group, stamp, response, calibration
   [[sequence]]
   path = "pan.mat"
-  truth = "pan_hdr.npz"                # or hold_out_frames = 2"""
+  truth = "pan_hdr.npz"                # or hold_out_frames = 2, or ahdr = {low = 10, high = 90}"""
 
 CSV, JSON, REPORT = "results.csv", "results.json", "report.html"
 _LISTED: Final = 6
@@ -66,7 +67,11 @@ def add_command(commands: Any) -> None:
         choices=("start", "middle", "end"),
         help="with --exposure: what a frame's time stamp marks (default start)",
     )
-    group.add_argument("--response", default="linear", help="of the cameras: linear, srgb or gamma:EXPONENT")
+    group.add_argument(
+        "--response",
+        default="auto",
+        help="of the cameras: linear, srgb, gamma:EXPONENT (default: what the recording states, else linear)",
+    )
     group.add_argument(
         "--hold-out-frames",
         type=whole,
@@ -74,8 +79,7 @@ def add_command(commands: Any) -> None:
         help="hold out every N-th frame even where there is truth",
     )
     group = parser.add_argument_group("what is computed")
-    group.add_argument("--methods", metavar="A,B", help="names, in this order, with commas")
-    group.add_argument("--hdrvdp", action="store_true", help="HDR-VDP's Q as well, 0.2 s per VGA image")
+    add_metrics(group)
     group = parser.add_argument_group("where")
     one = group.add_mutually_exclusive_group()
     one.add_argument(
@@ -109,8 +113,13 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
         response=options.response,
         hold_out_frames=options.hold_out_frames,
     )
-    names = None if options.methods is None else [n.strip() for n in options.methods.split(",") if n.strip()]
-    plan = make_plan(gather(options.sets, common), names, hdr_vdp=options.hdrvdp)
+    lpips_weights(options)  # what is wrong with them is told before the work
+    plan = make_plan(
+        gather(options.sets, common),
+        named_methods(options),
+        hdr_vdp=options.hdrvdp,
+        lpips=lpips_files(options),
+    )
     stores.prepare(options.out)
     store = stores.Store(options.out)
     records = (

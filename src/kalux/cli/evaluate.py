@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 from kalux.cli.calibrations import add_calibration, given_calibration
 from kalux.cli.checking import check_recording
 from kalux.cli.info import add_recording, open_recording
+from kalux.cli.metrics import add_metrics, lpips_weights, named_methods
 from kalux.cli.parser import Parser, UsageError, whole
 from kalux.cli.terminal import say, warn
 
@@ -71,8 +72,7 @@ def add_command(commands: Any) -> None:
     )
     add_calibration(group)
     group = parser.add_argument_group("what is computed")
-    group.add_argument("--methods", metavar="A,B", help="names, in this order, with commas")
-    group.add_argument("--hdrvdp", action="store_true", help="HDR-VDP's Q as well, 0.2 s per VGA image")
+    add_metrics(group)
     group.add_argument(
         "--blur-consistency", action="store_true", help="do images, integrated, give the frames? PSNR"
     )
@@ -144,6 +144,7 @@ class Protocol:
         calibration = given_calibration(options)
         if calibration is not None and options.response == "auto":
             options.response = calibration.settings.get("camera", {}).get("response", options.response)
+        weights = lpips_weights(options)
         reference = None
         if options.hold_out_frames is None:
             reference, origin = _reference(recording, options)
@@ -152,16 +153,18 @@ class Protocol:
             held = held_out.hold_out_frames(recording, every, response=options.response)
             self.described, self._images = held.described(), len(held.compared)
             self._score = lambda method, count: held_out.evaluate_held_out(
-                held, method, clip=options.clip, hdr_vdp=options.hdrvdp, on_image=count
+                held, method, clip=options.clip, hdr_vdp=options.hdrvdp, lpips=weights, on_image=count
             )
         else:
             self.described, self._images = reference.described(origin), len(reference.times)
             self._score = lambda method, count: truth.evaluate_truth(
-                recording, reference, method, hdr_vdp=options.hdrvdp, on_image=count
+                recording, reference, method, hdr_vdp=options.hdrvdp, lpips=weights, on_image=count
             )
-        names = None if options.methods is None else [n.strip() for n in options.methods.split(",")]
         self.methods = baselines.chosen_methods(
-            names, response=options.response, held_out=reference is None, calibration=calibration
+            named_methods(options),
+            response=options.response,
+            held_out=reference is None,
+            calibration=calibration,
         )
 
     def score(self, method: Method) -> Scores:
@@ -231,6 +234,7 @@ def table_head(options: argparse.Namespace) -> str:
     """The names of the columns."""
     head = f"{'method':<26}" + "".join(f"{name:>14}" for name, _ in _COLUMNS)
     head += f"{'HDR-VDP Q':>14}" if options.hdrvdp else ""
+    head += f"{'LPIPS':>14}" if options.lpips else ""
     return head + (f"{'blur dB':>14}" if options.blur_consistency else "")
 
 
@@ -238,6 +242,7 @@ def table_row(scores: Scores, consistency: BlurConsistency | None) -> str:
     """The means of a method."""
     row = f"{scores.method:<26}" + "".join(f"{shown(scores):>14}" for _, shown in _COLUMNS)
     row += "" if scores.q is None else f"{scores.q:>14.3f}"
+    row += "" if scores.lpips is None else f"{scores.lpips:>14.3f}"
     return row + ("" if consistency is None else f"{consistency.psnr:>14.2f}")
 
 

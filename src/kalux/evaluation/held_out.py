@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from kalux.errors import FrameError, InputError
 from kalux.evaluation.baselines import Method
 from kalux.evaluation.exposures import exposure_times, linear_frame, means_of, reference_exposure
+from kalux.evaluation.lpips import LpipsWeights
 from kalux.evaluation.pairs import Array
 from kalux.evaluation.scores import Pair, Scores, score
 from kalux.frames import Frame
@@ -143,6 +144,7 @@ def evaluate_held_out(
     *,
     clip: bool = False,
     hdr_vdp: bool = False,
+    lpips: LpipsWeights | None = None,
     on_image: Callable[[], None] = lambda: None,
 ) -> Scores:
     """Compare a method's images with the frames that were held out.
@@ -157,6 +159,8 @@ def evaluate_held_out(
         Clip the reconstruction where the camera does, before it is compared.
     hdr_vdp
         Whether Q is computed, which takes most of the time.
+    lpips
+        Weights, if LPIPS is to be computed.
     on_image
         Called after every image.
 
@@ -174,6 +178,7 @@ def evaluate_held_out(
         scale=held.scale,
         clipped=clip,
         hdr_vdp=hdr_vdp,
+        lpips=lpips,
         on_image=on_image,
     )
 

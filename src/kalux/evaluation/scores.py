@@ -10,9 +10,13 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kalux.display import encode_srgb
 from kalux.errors import InputError
 from kalux.evaluation.hdr_vdp import hdrvdp
+from kalux.evaluation.lpips import LpipsWeights
+from kalux.evaluation.lpips import lpips as lpips_distance
 from kalux.evaluation.metrics import log_mse, mse, psnr, ssim
+from kalux.evaluation.pairs import Array
 
 LOG_OFFSET: Final = 0.02
 """Of the log-MSE, in units of white."""
@@ -20,7 +24,7 @@ LOG_OFFSET: Final = 0.02
 DISPLAY_LUMINANCE: Final = 255.0
 """cd/m2 at which HDR-VDP is shown an intensity of 1, as in the paper's evaluation."""
 
-METRICS: Final = ("mse", "psnr", "ssim", "log_mse", "q")
+METRICS: Final = ("mse", "psnr", "ssim", "log_mse", "q", "lpips")
 
 
 @dataclass(frozen=True)
@@ -37,6 +41,9 @@ class ImageScores:
         As in `kalux.evaluation.metrics`; psnr in dB, log_mse of log(I + 0.02).
     q
         HDR-VDP's Q; None where it was not asked for.
+    lpips
+        LPIPS of the pictures that sRGB's curve makes of intensity over the data range; None where it was not asked
+        for.
     """
 
     t: int
@@ -46,6 +53,7 @@ class ImageScores:
     ssim: float
     log_mse: float
     q: float | None
+    lpips: float | None = None
 
 
 @dataclass(frozen=True)
@@ -67,7 +75,7 @@ class Scores:
     clipped
         Whether the images were clipped as the camera clips before they were compared.
     negative
-        How many compared values of the method's images are below 0. They count as 0 in log-MSE and HDR-VDP.
+        How many compared values of the method's images are below 0. They count as 0 in log-MSE, HDR-VDP and LPIPS.
     notes
         Of the method.
     """
@@ -111,6 +119,11 @@ class Scores:
         """Mean of the images' HDR-VDP Q; None where it was not asked for."""
         return None if self.images[0].q is None else self._mean("q")
 
+    @property
+    def lpips(self) -> float | None:
+        """Mean of the images' LPIPS; None where it was not asked for."""
+        return None if self.images[0].lpips is None else self._mean("lpips")
+
     def means(self) -> dict[str, float | None]:
         """All means by name."""
         return {name: getattr(self, name) for name in METRICS}
@@ -123,7 +136,7 @@ class Scores:
         if self.clipped:
             done.append("the reconstruction clipped where the camera clips")
         if self.negative:
-            done.append(f"{self.negative} negative values taken as 0 in log-MSE and HDR-VDP")
+            done.append(f"{self.negative} negative values taken as 0 in log-MSE, HDR-VDP and LPIPS")
         return [*done, *self.notes]
 
     def _mean(self, name: str) -> float:
@@ -168,9 +181,10 @@ def score(
     clipped: bool = False,
     notes: tuple[str, ...] = (),
     hdr_vdp: bool = False,
+    lpips: LpipsWeights | None = None,
     on_image: Callable[[], None] = lambda: None,
 ) -> Scores:
-    """Score every pair; ``on_image`` is called after each, the rest is as in `Scores`.
+    """Score every pair; ``on_image`` is called after each, ``lpips`` asks for LPIPS, the rest is as in `Scores`.
 
     Raises
     ------
@@ -183,7 +197,9 @@ def score(
     for t, test, reference, mask, *_ in pairs:
         test, reference = np.asarray(test) / scale, np.asarray(reference) / scale
         try:
-            images.append(score_image(t, test, reference, data_range, mask=mask, hdr_vdp=hdr_vdp))
+            images.append(
+                score_image(t, test, reference, data_range, mask=mask, hdr_vdp=hdr_vdp, lpips=lpips)
+            )
         except InputError as error:
             raise InputError(f"{method}, image at {t} us: {error}") from error
         negative += int(np.count_nonzero(test < 0 if mask is None else (test < 0) & mask))
@@ -201,8 +217,12 @@ def score_image(
     *,
     mask: NDArray[np.bool_] | None = None,
     hdr_vdp: bool = False,
+    lpips: LpipsWeights | None = None,
 ) -> ImageScores:
-    """All metrics of one image; see `ImageScores`. HDR-VDP is shown the reference where pixels are not compared."""
+    """All metrics of one image; see `ImageScores`.
+
+    HDR-VDP and LPIPS are shown the reference where pixels are not compared.
+    """
     test, reference = np.asarray(test, np.float64), np.asarray(reference, np.float64)
     error = mse(test, reference, mask=mask)
     lit = np.maximum(test, 0.0)
@@ -213,15 +233,26 @@ def score_image(
         psnr=psnr(test, reference, data_range=data_range, mask=mask),
         ssim=ssim(test, reference, data_range=data_range, mask=mask),
         log_mse=log_mse(lit, reference, offset=LOG_OFFSET, mask=mask),
-        q=_quality(lit, reference, mask) if hdr_vdp else None,
+        q=None if not hdr_vdp else _quality(*_compared(lit, reference, mask)),
+        lpips=None if lpips is None else _perceptual(*_compared(lit, reference, mask), data_range, lpips),
     )
 
 
-def _quality(test: NDArray[np.float64], reference: NDArray[np.float64], mask: Any) -> float:
-    if mask is not None:
-        reference = np.where(mask, reference, 0.0)
-        test = np.where(mask, test, reference)
+def _compared(test: Array, reference: Array, mask: NDArray[np.bool_] | None) -> tuple[Array, Array]:
+    """Both images, alike where nothing is compared."""
+    if mask is None:
+        return test, reference
+    shown = np.where(mask, reference, 0.0)
+    return np.where(mask, test, shown), shown
+
+
+def _quality(test: Array, reference: Array) -> float:
     return hdrvdp(DISPLAY_LUMINANCE * test, DISPLAY_LUMINANCE * reference).Q
+
+
+def _perceptual(test: Array, reference: Array, data_range: float, weights: LpipsWeights) -> float:
+    pictures = (encode_srgb(np.maximum(i / data_range, 0.0).astype(np.float32)) for i in (test, reference))
+    return lpips_distance(*pictures, data_range=1.0, weights=weights)
 
 
 def finite_or_none(value: Any) -> Any:

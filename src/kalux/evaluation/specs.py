@@ -34,6 +34,20 @@ _SPEC: Final = re.compile(
 )
 
 
+def spec_path(spec: str) -> Path | None:
+    """The file or folder that a method's text names; None: it names none."""
+    match = _SPEC.fullmatch(spec)
+    return None if match is None else Path(match["path"])
+
+
+def relocated(spec: str, folder: Path) -> str:
+    """The same text, its file or folder absolute; relative ones are relative to ``folder``."""
+    match = _SPEC.fullmatch(spec)
+    if match is None:
+        return spec
+    return f"{spec[: match.start('path')]}{(folder / match['path']).absolute()}{spec[match.end('path') :]}"
+
+
 def outside_method(spec: str, *, response: str = "linear") -> Method | None:
     """The method that a text names; None if it has no such form. ``response`` is the camera's, for ``?scaled``.
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from kalux.errors import FormatError, FrameError, InputError
 from kalux.evaluation.baselines import Method
+from kalux.evaluation.lpips import LpipsWeights
 from kalux.evaluation.scores import Pair, Scores, score
 from kalux.readers import GroundTruth
 from kalux.recording import Recording
@@ -113,6 +114,7 @@ def evaluate_truth(
     method: Method,
     *,
     hdr_vdp: bool = False,
+    lpips: LpipsWeights | None = None,
     on_image: Callable[[], None] = lambda: None,
 ) -> Scores:
     """Compare a method's images with the truth.
@@ -127,6 +129,8 @@ def evaluate_truth(
         From `kalux.evaluation.baselines`, or one's own.
     hdr_vdp
         Whether Q is computed, which takes most of the time.
+    lpips
+        Weights, if LPIPS is to be computed.
     on_image
         Called after every image.
 
@@ -142,6 +146,7 @@ def evaluate_truth(
         protocol=reference.described(),
         data_range=reference.data_range,
         hdr_vdp=hdr_vdp,
+        lpips=lpips,
         on_image=on_image,
     )
 

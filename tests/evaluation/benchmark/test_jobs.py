@@ -10,13 +10,19 @@ import pytest
 
 import kalux
 from kalux.calibration.event_model import LOG_OFFSETS
+from kalux.calibration.values import Calibration, to_files
+from kalux.datasets.ahdr import ArtificialCamera, artificial_hdr
 from kalux.errors import InputError
 from kalux.evaluation.baselines import methods
 from kalux.evaluation.benchmark import jobs
-from kalux.evaluation.benchmark.jobs import Failed, make_job, moments, run_job, uses_held_out
-from kalux.evaluation.benchmark.sequences import Options
+from kalux.evaluation.benchmark.jobs import Failed, Finished, make_job, moments, run_job, uses_held_out
+from kalux.evaluation.benchmark.sequences import ArtificialHdr, Options, Sequence
 from kalux.evaluation.held_out import evaluate_held_out, hold_out_frames
+from kalux.evaluation.lpips import load_lpips
 from kalux.evaluation.truth import evaluate_truth, load_truth, prepare_reference
+from kalux.readers import hdf5
+
+from builders import moving_blocks
 
 
 def test_the_numbers_are_those_of_the_library(small_set):
@@ -118,3 +124,85 @@ def test_a_missing_recording_is_named(small_set):
     missing = dataclasses.replace(small_set.without, path=small_set.folder / "none.h5")
     with pytest.raises(InputError, match=r"none\.h5"):
         make_job(missing, "hold", held_out=True, hdr_vdp=False)
+
+
+def test_artificial_hdr_is_what_the_library_makes_of_it(small_set):
+    """With all frames, and with frames held out, when the neighbours are a fair comparison, too."""
+    recording = kalux.open(small_set.without.path)
+    for every in (None, 2):
+        options = Options(ahdr=ArtificialHdr(low=10, high=90), hold_out_frames=every)
+        sequence = dataclasses.replace(small_set.without, options=options)
+        assert uses_held_out(sequence) == (every is not None)
+        made = artificial_hdr(recording, ArtificialCamera(10 / 255, 90 / 255), every=every)
+        truth = prepare_reference(made, made.ground_truth())
+        for name in ("default", "mean") if every else ("default",):
+            done = run_job(make_job(sequence, name, held_out=every is not None, hdr_vdp=False))
+            assert isinstance(done, Finished), done
+            expected = evaluate_truth(made, truth, methods()[name])
+            assert done.record["scores"]["means"] == expected.means()
+        assert "of artificial HDR, black up to 10 and white from 90" in done.record["scores"]["protocol"]
+
+
+def test_a_calibration_changes_filters_and_the_key(small_set):
+    for file, data in to_files(
+        Calibration({"events": {"threshold_on": 0.35}}), small_set.folder / "cal.toml"
+    ).items():
+        file.write_bytes(data)
+    options = Options(calibration=(small_set.folder / "cal.toml",))
+    sequence = dataclasses.replace(small_set.without, options=options)
+    jobs_made = [make_job(sequence, "default", held_out=True, hdr_vdp=False)]
+    assert run_job(jobs_made[0]).record["method"]["settings"]["events"]["threshold_on"] == 0.35
+    os.utime(small_set.folder / "cal.toml", ns=(3, 3))
+    jobs_made += [make_job(sequence, "default", held_out=True, hdr_vdp=False), small_set.job("default")]
+    assert len({job.key for job in jobs_made}) == 3
+
+
+def test_a_folder_of_images_takes_part_wherever_the_job_runs(small_set, tmp_path, monkeypatch):
+    """Relative to the folder that is given, with the sequence's name in it; its notes reach the scores."""
+    held = hold_out_frames(kalux.open(small_set.without.path))
+    folder = tmp_path / "results" / "b"
+    folder.mkdir(parents=True)
+    lines = ["t_us,file"]
+    for i, t in enumerate(held.times.ravel()):
+        np.save(folder / f"{i}.npy", np.zeros((32, 40), np.float32))
+        lines.append(f"{t},{i}.npy")
+    (folder / "timestamps.csv").write_text("\n".join(lines) + "\n")
+
+    def job():
+        return make_job(
+            small_set.without, "theirs=results/{sequence}", held_out=True, hdr_vdp=False, folder=tmp_path
+        )
+
+    made = job()
+    monkeypatch.chdir("/")
+    done = run_job(made).record
+    assert (done["method"]["name"], done["method"]["label"]) == ("theirs=results/{sequence}", "theirs")
+    assert f"{held.times.size} images of {folder}" in done["scores"]["adjustments"][-1]
+    np.save(folder / "0.npy", np.zeros((32, 40), np.float64))
+    assert job().key != made.key
+
+
+def test_lpips_is_computed_where_it_is_asked_for(tmp_path):
+    pytest.importorskip("torch", reason="needs PyTorch; pip install -e '.[learned]' brings it")
+    from random_networks import write_lpips
+
+    files = write_lpips(tmp_path)
+    simulation = moving_blocks(size=(64, 64))
+    path = tmp_path / "large.h5"
+    hdf5.write(
+        path,
+        sensor_size=(64, 64),
+        events=[simulation.events],
+        frames=simulation.frames,
+        contrast_threshold=(0.2, 0.2),
+    )
+    sequence = Sequence(name="large", path=path, options=Options(), title="Large")
+    with_it, without = (
+        make_job(sequence, "hold", held_out=True, hdr_vdp=False, lpips=weights) for weights in (files, ())
+    )
+    assert with_it.key != without.key
+    assert run_job(without).record["scores"]["means"]["lpips"] is None
+    held = hold_out_frames(kalux.open(path))
+    expected = evaluate_held_out(held, methods()["hold"], lpips=load_lpips(*files)).lpips
+    assert expected > 0
+    assert run_job(with_it).record["scores"]["means"]["lpips"] == expected

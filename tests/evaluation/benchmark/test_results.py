@@ -6,6 +6,7 @@ import csv
 import io
 import json
 
+import numpy as np
 import pytest
 
 from kalux.errors import InputError
@@ -42,6 +43,17 @@ def test_a_sequence_that_cannot_be_opened_fails_alone(small_set):
     assert [job.name for job in plan.jobs] == ["a/hold", "a/cf"]
     assert set(plan.failures) == {("b", "hold"), ("b", "cf")}
     assert "not a recording" in plan.failures["b", "hold"].message
+
+
+def test_images_that_are_missing_for_one_sequence_fail_alone(small_set, monkeypatch):
+    folder = small_set.folder / "results" / "a"
+    folder.mkdir(parents=True)
+    (folder / "timestamps.csv").write_text("t_us,file\n0,0.npy\n")
+    np.save(folder / "0.npy", np.zeros((32, 40), np.float32))
+    monkeypatch.chdir(small_set.folder)
+    plan = planned(small_set, ["hold", "theirs=results/{sequence}"])
+    assert [job.name for job in plan.jobs] == ["a/hold", "a/theirs=results/{sequence}", "b/hold"]
+    assert list(plan.failures) == [("b", "theirs=results/{sequence}")]
 
 
 def test_an_unknown_method_is_refused_at_once(small_set):

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import pytest
 
+import kalux
+from kalux.calibration.values import Calibration, to_files
 from kalux.errors import ExposureError, InputError
-from kalux.evaluation.benchmark.sequences import Options, gather, load, truth_beside
+from kalux.evaluation.benchmark.sequences import ArtificialHdr, Options, gather, load
+from kalux.evaluation.truth import truth_beside
+from kalux.models.camera import Response
 from kalux.readers import hdf5
 
 
@@ -21,7 +25,7 @@ def test_a_folder_gives_its_recordings_and_their_truth_but_not_the_truth_as_a_re
 def test_held_out_frames_that_are_asked_for_win_over_truth(small_set):
     (found,) = gather([small_set.folder / "a.h5"], Options(hold_out_frames=3)).sequences
     assert found.truth_file() is None
-    assert truth_beside(found.path) is not None
+    assert truth_beside(found.path).is_file()
 
 
 def test_a_toml_file_lists_sequences_relative_to_itself(small_set):
@@ -50,6 +54,14 @@ def test_a_toml_file_lists_sequences_relative_to_itself(small_set):
         ("[[sequence]]\npath = 'x'\nexposure = '3'", "exposure is '3'; int is needed"),
         ("[[sequence]]\npath = 'x'\nexposure = true", "int is needed"),
         ("[[sequence]]\npath = 'x'\ntruth = 'y'\nhold_out_frames = 2", "exclude each other"),
+        ("[[sequence]]\npath = 'x'\nahdr = {cut = 30, low = 3}", "cut is for both ends"),
+        ("[[sequence]]\npath = 'x'\nahdr = {low = 90, high = 10}", "black < white"),
+        ("[[sequence]]\npath = 'x'\nahdr = {black = 3}", "says no level"),
+        ("[[sequence]]\npath = 'x'\nahdr = {lo = 3}", "ahdr: unknown key 'lo'; known are cut"),
+        ("[[sequence]]\npath = 'x'\nahdr = {low = '3'}", "low is '3'; int or float is needed"),
+        ("[[sequence]]\npath = 'x'\ntruth = 'y'\nahdr = {cut = 30}", "originals are the truth"),
+        ("[[sequence]]\npath = 'x'\ncalibration = 3", "str or list is needed"),
+        ("[[sequence]]\npath = 'x'\ncalibration = [3]", "files of kalux calibrate"),
         ("methods = [3]\n[[sequence]]\npath = 'x'", "a list of names"),
     ],
 )
@@ -93,3 +105,42 @@ def test_an_exposure_is_for_recordings_that_store_none(small_set, simulation):
     assert next(iter(given.open().frames())).exposure == 7
     with pytest.raises(ExposureError):
         gather([path]).sequences[0].open().frames()
+
+
+def test_a_toml_file_makes_artificial_hdr_of_a_recording(small_set):
+    path = small_set.folder / "bench.toml"
+    path.write_text(
+        '[[sequence]]\npath = "a.h5"\nahdr = {low = 10, high = 90.5}\nhold_out_frames = 2\n'
+        '[[sequence]]\npath = "b.h5"\nahdr = {cut = 80, black = 14}\n'
+    )
+    first, second = gather([path]).sequences
+    assert first.options.ahdr == ArtificialHdr(low=10, high=90.5)
+    assert second.options.ahdr == ArtificialHdr(low=80, high=175, black=14)
+    whole = kalux.open(small_set.folder / "a.h5")
+    made = first.open()
+    assert made.response == "s-curve:" + repr((10 / 255) / (90.5 / 255))
+    assert len(made.frames()) == len(whole.frames()) - len(made.ground_truth().times)
+    assert first.truth_file() is None, "the truth beside it is not that of the artificial camera"
+    assert len(second.open().ground_truth().times) == len(whole.frames())
+
+
+def test_what_a_calibration_says_of_the_camera_is_not_taken_for_an_artificial_one(small_set):
+    settings = {"camera": {"response": "srgb"}, "events": {"threshold_on": 0.2}}
+    for file, data in to_files(Calibration(settings), small_set.folder / "cal.toml").items():
+        file.write_bytes(data)
+    path = small_set.folder / "bench.toml"
+    path.write_text(
+        '[[sequence]]\npath = "a.h5"\ncalibration = "cal.toml"\n'
+        '[[sequence]]\npath = "b.h5"\ncalibration = ["cal.toml"]\nahdr = {cut = 30}\n'
+    )
+    real, artificial = gather([path]).sequences
+    assert (real.response, artificial.response) == ("srgb", "auto")
+    assert real.calibration.settings == settings
+    assert artificial.calibration.settings == {"events": {"threshold_on": 0.2}}
+    assert real.files()[-1] == artificial.files()[-1] == small_set.folder / "cal.toml"
+    frame = next(iter(kalux.open(small_set.folder / "b.h5").frames()))
+    known = Response.srgb().inverse(frame.normalised()) * 255 / 225
+    truth = artificial.open().ground_truth().images[0]
+    assert truth == pytest.approx(known, rel=1e-5), (
+        "its originals are inverted by the response of the real one"
+    )

@@ -20,16 +20,18 @@ import kalux
 from kalux.errors import InputError, KaluxError
 from kalux.evaluation.baselines import Method, chosen_methods, frames_around
 from kalux.evaluation.benchmark.calibration import Calibrations
-from kalux.evaluation.benchmark.sequences import EVERY, Sequence, files_under
+from kalux.evaluation.benchmark.sequences import EVERY, Options, Sequence, files_under
 from kalux.evaluation.exposures import linear_frame, reference_exposure
 from kalux.evaluation.held_out import held_out_pairs, hold_out_frames
+from kalux.evaluation.lpips import load_lpips
 from kalux.evaluation.scores import Pair, Scores, finite_or_none, score
+from kalux.evaluation.specs import relocated, spec_path
 from kalux.evaluation.truth import load_truth, prepare_reference, truth_pairs
 from kalux.models.camera import Camera, Response
 from kalux.recording import Recording
-from kalux.settings import to_dict
+from kalux.settings import chosen_response, to_dict
 
-LAYOUT: Final = 1
+LAYOUT: Final = 2
 """Of the files of jobs; part of every key, so that others are not taken for one's own."""
 
 MOMENTS: Final = 3
@@ -58,6 +60,10 @@ class Job:
         Digest of all that the scores depend on, from `make_job`.
     version
         Of the kalux that made the job; another one refuses to run it.
+    folder
+        That a file or folder in the method's name is relative to; absolute.
+    lpips
+        Files of weights, as of `kalux.evaluation.lpips.load_lpips`; empty: LPIPS is not computed.
     """
 
     sequence: Sequence
@@ -66,6 +72,8 @@ class Job:
     hdr_vdp: bool
     key: str
     version: str
+    folder: Path
+    lpips: tuple[Path, ...] = ()
 
     @property
     def name(self) -> str:
@@ -109,7 +117,7 @@ Outcome = Finished | Failed
 
 
 def uses_held_out(sequence: Sequence) -> bool:
-    """Whether a sequence is compared with held-out frames: it says so, or has no ground truth.
+    """Whether frames of a sequence are held out from methods: it says so, or has no ground truth.
 
     Raises
     ------
@@ -121,19 +129,30 @@ def uses_held_out(sequence: Sequence) -> bool:
     return sequence.truth_file() is None and sequence.open().source.ground_truth is None
 
 
-def make_job(sequence: Sequence, method: str, *, held_out: bool, hdr_vdp: bool) -> Job:
-    """A job with its key.
+def make_job(
+    sequence: Sequence,
+    method: str,
+    *,
+    held_out: bool,
+    hdr_vdp: bool,
+    folder: Path = Path(),
+    lpips: tuple[Path, ...] = (),
+) -> Job:
+    """A job with its key; the rest is as in `Job`.
 
-    The key is a digest of: path, size and time of change of every file of the sequence, and of the file in a method's
-    name; the sequence's options; the method's name and settings; whether Q is computed; the version of kalux.
+    The key is a digest of: path, size and time of change of every file of the sequence, of the file or folder in a
+    method's name, and of the weights of LPIPS; the sequence's options; the method's name and settings; whether Q is
+    computed; the version of kalux.
 
     Raises
     ------
-    InputError
-        If there is no such method.
+    KaluxError
+        If there is no such method, or what it or the sequence names cannot be read.
     """
-    chosen = _method(method, sequence, held_out)
-    named = Path(method.partition(":")[2]) if ":" in method else None
+    folder = folder.absolute()
+    weights = tuple(file.absolute() for file in lpips)
+    chosen = _method(method, sequence, held_out, folder)
+    named = spec_path(method_text(method, sequence.name, folder))
     parts = {
         "layout": LAYOUT,
         "kalux": kalux.__version__,
@@ -143,12 +162,13 @@ def make_job(sequence: Sequence, method: str, *, held_out: bool, hdr_vdp: bool) 
         "method": method,
         "method_files": []
         if named is None or not named.exists()
-        else list(map(_identity, files_under(named))),
+        else [_identity(path) for path in files_under(named)],
         "settings": None if chosen.settings is None else to_dict(chosen.settings),
         "hdr_vdp": hdr_vdp,
+        "lpips": [_identity(path) for path in weights],
     }
     digest = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
-    return Job(sequence, method, held_out, hdr_vdp, digest, kalux.__version__)
+    return Job(sequence, method, held_out, hdr_vdp, digest, kalux.__version__, folder, weights)
 
 
 def _identity(path: Path) -> tuple[str, int, int]:
@@ -159,8 +179,16 @@ def _identity(path: Path) -> tuple[str, int, int]:
     return str(path.absolute()), status.st_size, status.st_mtime_ns
 
 
-def _method(name: str, sequence: Sequence, held_out: bool) -> Method:
-    return chosen_methods([name], response=sequence.options.response, held_out=held_out)[0]
+def _method(name: str, sequence: Sequence, held_out: bool, folder: Path) -> Method:
+    text = method_text(name, sequence.name, folder)
+    return chosen_methods(
+        [text], response=sequence.response, held_out=held_out, calibration=sequence.calibration
+    )[0]
+
+
+def method_text(name: str, sequence: str, folder: Path) -> str:
+    """A method's name, ``{sequence}`` replaced by that of the sequence, and its file or folder made absolute."""
+    return relocated(name.replace("{sequence}", sequence), folder)
 
 
 def run_job(job: Job) -> Outcome:
@@ -181,7 +209,7 @@ def run_job(job: Job) -> Outcome:
 def _run(job: Job) -> Finished:
     started = time.perf_counter()
     recording = job.sequence.open()
-    method = _method(job.method, job.sequence, job.held_out)
+    method = _method(job.method, job.sequence, job.held_out, job.folder)
     comparison = _comparison(job, recording)
     calibrations = Calibrations()
     pictures = Pictures(moments(comparison.images))
@@ -199,7 +227,9 @@ def _run(job: Job) -> Finished:
         protocol=comparison.described,
         data_range=comparison.data_range,
         scale=comparison.scale,
+        notes=method.notes,
         hdr_vdp=job.hdr_vdp,
+        lpips=load_lpips(*job.lpips) if job.lpips else None,
     )
     record = {
         "layout": LAYOUT,
@@ -219,7 +249,9 @@ def _run(job: Job) -> Finished:
     inputs = comparison.given
     return Finished(
         finite_or_none(record),
-        pictures.arrays(inputs, reference_exposure(inputs), job.sequence.options.response),
+        pictures.arrays(
+            inputs, reference_exposure(inputs), chosen_response(job.sequence.response, inputs.response)
+        ),
     )
 
 
@@ -227,7 +259,9 @@ def described(job: Job) -> dict[str, Any]:
     """The sequence of a job, as plain values."""
     sequence = job.sequence
     options = {
-        k: str(v) if isinstance(v, Path) else v for k, v in dataclasses.asdict(sequence.options).items()
+        **dataclasses.asdict(sequence.options),
+        "truth": None if sequence.options.truth is None else str(sequence.options.truth),
+        "calibration": [str(file) for file in sequence.options.calibration],
     }
     return {
         "name": sequence.name,
@@ -291,8 +325,8 @@ class _Comparison:
 
 def _comparison(job: Job, recording: Recording) -> _Comparison:
     options = job.sequence.options
-    if job.held_out:
-        held = hold_out_frames(recording, options.hold_out_frames or EVERY, response=options.response)
+    if job.held_out and options.ahdr is None:
+        held = hold_out_frames(recording, options.hold_out_frames or EVERY, response=job.sequence.response)
         return _Comparison(
             held.described(),
             held.kept,
@@ -307,13 +341,22 @@ def _comparison(job: Job, recording: Recording) -> _Comparison:
         raise InputError(f"{recording.source.path}: its ground truth has gone; start again")
     reference = prepare_reference(recording, truth, mask)
     return _Comparison(
-        reference.described(),
+        reference.described("" if options.ahdr is None else _artificial_described(options)),
         recording,
         len(reference.times),
         reference.data_range,
         1.0,
         lambda m: truth_pairs(recording, reference, m),
     )
+
+
+def _artificial_described(options: Options) -> str:
+    """Whose truth that of an artificial recording is."""
+    assert options.ahdr is not None
+    frames = "original frames"
+    if options.hold_out_frames is not None:
+        frames = f"original frames held out, one of {options.hold_out_frames}"
+    return f" of artificial HDR, black up to {options.ahdr.low:g} and white from {options.ahdr.high:g} of 255, {frames}"
 
 
 class Clock:
@@ -381,6 +424,12 @@ def _masked(image: NDArray[Any], pair: Pair) -> NDArray[Any]:
 # The camera model, for Figure 2.
 
 
+def _short(responses: list[str]) -> str:
+    """A response's name, without the values of a measured one."""
+    kind, _, values = responses[len(responses) // 2].partition(":")
+    return "as calibrated" if kind == "curve" else f"{kind}:{values}" if values else kind
+
+
 def camera_curves(recording: Recording, method: Method) -> dict[str, Any] | None:
     """f^w (5) and R_bar (6) for sigma_im^2 = 1 over the camera's response, as the method uses them.
 
@@ -394,7 +443,8 @@ def camera_curves(recording: Recording, method: Method) -> dict[str, Any] | None
     if settings is None or settings.filter.kind == "cf":
         return None
     camera_settings = settings.camera
-    response = Response.named(camera_settings.response)
+    named = chosen_response(camera_settings.response, recording.response).split(";")
+    response = Response.named(named[len(named) // 2])  # of three the green
     table = recording.source.inverse_covariance
     saturation = camera_settings.saturation
     camera = (
@@ -410,7 +460,7 @@ def camera_curves(recording: Recording, method: Method) -> dict[str, Any] | None
         usable, floor = levels < saturation, 1e-6
     r_bar = np.maximum(weight, floor) ** -1
     return {
-        "source": f"response {camera_settings.response}" if table is None else "table of the recording (f_Q)",
+        "source": f"response {_short(named)}" if table is None else "table of the recording (f_Q)",
         "response": levels.round(5).tolist(),
         "weight": [float(w) if u else 0.0 for w, u in zip(weight, usable, strict=True)],
         "covariance": [float(r) if u else None for r, u in zip(r_bar, usable, strict=True)],

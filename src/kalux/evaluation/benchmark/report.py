@@ -143,13 +143,17 @@ def _metric_head(metric: Metric) -> str:
 
 def _metric_notes(results: Results) -> str:
     quality = " Q: HDR-VDP 3.0.6, an intensity of 1 shown as 255 cd/m²."
-    with_q = any(metric.name == "q" for metric in results.shown())
+    perceptual = (
+        " LPIPS v0.1, AlexNet: of intensities over the data range with the sRGB curve, not clipped; masked pixels as "
+        "in the reference."
+    )
+    shown = {metric.name for metric in results.shown()}
     return (
         '<p class="soft">MSE of linear intensity. 1 is white: a saturated pixel at the median exposure (ground truth), '
         "or the 99.5th percentile of all frames (held-out frames). SSIM of Wang et al., 11 × 11 Gaussian windows. "
         "log-MSE of log(I + 0.02). Nothing is clipped. A dash: the method looks at the very frames it would be "
         "compared with."
-        f"{quality if with_q else ''}</p>"
+        f"{quality if 'q' in shown else ''}{perceptual if 'lpips' in shown else ''}</p>"
     )
 
 
@@ -348,7 +352,18 @@ def _scores(results: Results, records: dict[str, dict[str, Any]]) -> str:
     said = [
         f"{len(first['per_image'])} images, {first['pixels']:,} pixels; data range {first['data_range']:.4g}"
     ]
-    said += [text for text in first["adjustments"] if "negative" not in text]
+    everywhere = [
+        text
+        for text in first["adjustments"]
+        if "negative" not in text and all(text in r["scores"]["adjustments"] for r in records.values())
+    ]
+    said += everywhere
+    said += [
+        f"{results.label(method)}: {text}"
+        for method, record in records.items()
+        for text in record["scores"]["adjustments"]
+        if text not in everywhere and "negative" not in text
+    ]
     said.append("s: seconds to make the images, on one thread")
     return (
         f'<p class="soft">{escape("; ".join(said))}.</p>'

@@ -7,6 +7,7 @@ import io
 import json
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -17,6 +18,7 @@ from kalux.evaluation.baselines import chosen_methods
 from kalux.evaluation.benchmark.jobs import GROUPS, Failed, Job, make_job, uses_held_out
 from kalux.evaluation.benchmark.sequences import Benchmark, Sequence
 from kalux.evaluation.scores import METRICS
+from kalux.evaluation.specs import relocated
 
 DEFAULT_METHODS: Final = ("hold", "mean", "edi", "cf", "iccv2021", "default", "smooth")
 """Two that use frames only, two that use events as well, the paper, and kalux."""
@@ -56,7 +58,11 @@ SHOWN: Final = (
     Metric("ssim", "SSIM", "", 1.0, 3, False),
     Metric("log_mse", "log-MSE", "× 100", 100.0, 2, True),
     Metric("q", "HDR-VDP Q", "", 1.0, 2, False),
+    Metric("lpips", "LPIPS", "", 1.0, 3, True),
 )
+OPTIONAL: Final = ("q", "lpips")
+"""Metrics that are computed only if they are asked for."""
+
 PSNR: Final = Metric("psnr", "PSNR", "dB", 1.0, 2, False)
 
 
@@ -83,7 +89,13 @@ class Plan:
     failures: dict[tuple[str, str], Failed]
 
 
-def make_plan(benchmark: Benchmark, methods: Iterable[str] | None = None, *, hdr_vdp: bool = False) -> Plan:
+def make_plan(
+    benchmark: Benchmark,
+    methods: Iterable[str] | None = None,
+    *,
+    hdr_vdp: bool = False,
+    lpips: tuple[Path, ...] = (),
+) -> Plan:
     """The jobs of a benchmark: every method on every sequence where it is a fair comparison.
 
     Parameters
@@ -91,28 +103,47 @@ def make_plan(benchmark: Benchmark, methods: Iterable[str] | None = None, *, hdr
     benchmark
         From `kalux.evaluation.benchmark.sequences.gather`.
     methods
-        Names; they win over those of the benchmark. Default: `DEFAULT_METHODS`.
+        Names; they win over those of the benchmark. Default: `DEFAULT_METHODS`. In the name of a file or folder
+        ``{sequence}`` stands for that of the sequence.
     hdr_vdp
         Whether Q is computed.
+    lpips
+        Files of weights, as of `kalux.evaluation.lpips.load_lpips`; empty: LPIPS is not computed.
 
     Raises
     ------
     InputError
         If there is no such method.
     """
+    folder = (Path() if methods else benchmark.folder).absolute()
     names = tuple(dict.fromkeys(methods or benchmark.methods or DEFAULT_METHODS))
-    known = dict(zip(names, chosen_methods(names, held_out=True), strict=True))
+    fair_only_held_out = {
+        name
+        for name in names
+        if "{sequence}" not in name
+        and chosen_methods([relocated(name, folder)], held_out=True)[0].needs_held_out
+    }
     jobs: list[Job] = []
     failures: dict[tuple[str, str], Failed] = {}
     for sequence in benchmark.sequences:
         try:
             held_out = uses_held_out(sequence)
-            wanted = [name for name in names if held_out or not known[name].needs_held_out]
-            jobs += [make_job(sequence, name, held_out=held_out, hdr_vdp=hdr_vdp) for name in wanted]
+            wanted = [name for name in names if held_out or name not in fair_only_held_out]
         except KaluxError as error:
-            failed = Failed(" ".join(str(error).split()), is_bug=False)
-            failures.update({(sequence.name, name): failed for name in names})
+            failures.update({(sequence.name, name): _failed(error) for name in names})
+            continue
+        for name in wanted:
+            try:
+                jobs.append(
+                    make_job(sequence, name, held_out=held_out, hdr_vdp=hdr_vdp, folder=folder, lpips=lpips)
+                )
+            except KaluxError as error:
+                failures[sequence.name, name] = _failed(error)
     return Plan(benchmark.title, benchmark.sequences, names, tuple(jobs), failures)
+
+
+def _failed(error: KaluxError) -> Failed:
+    return Failed(" ".join(str(error).split()), is_bug=False)
 
 
 @dataclass(frozen=True)
@@ -163,8 +194,9 @@ class Results:
 
     def shown(self) -> list[Metric]:
         """The metrics that were computed."""
-        with_q = any(record["scores"]["means"].get("q") is not None for record in self.records.values())
-        return [metric for metric in SHOWN if metric.name != "q" or with_q]
+        means = [record["scores"]["means"] for record in self.records.values()]
+        asked = {name for name in OPTIONAL if any(mean.get(name) is not None for mean in means)}
+        return [metric for metric in SHOWN if metric.name not in OPTIONAL or metric.name in asked]
 
     def best(self, metric: Metric, values: dict[str, float | None]) -> set[str]:
         """The methods whose value is best, to the digits that are shown; none if there is but one."""
@@ -194,7 +226,7 @@ def _rows(results: Results) -> Iterator[tuple[str, str, str, float | str]]:
         if record is None:
             continue
         means = record["scores"]["means"]
-        values = {name: means[name] for name in METRICS if name != "q" or means[name] is not None}
+        values = {name: means[name] for name in METRICS if name not in OPTIONAL or means[name] is not None}
         calibration = record["calibration"]
         if calibration is not None:
             values |= {name: calibration["all"][name] for name in ("one_sigma", "rms_z")}

@@ -6,22 +6,58 @@ import dataclasses
 import re
 import tomllib
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import kalux
+from kalux.calibration.values import Calibration, load_calibration
+from kalux.datasets.ahdr import ArtificialCamera, artificial_hdr
 from kalux.errors import InputError
+from kalux.evaluation.truth import truth_beside
 from kalux.frames import Stamp
 from kalux.readers import READERS
 from kalux.recording import Recording
+from kalux.settings import AUTO
 
 TRUTH_SUFFIX: Final = "_gt.npz"
 """Reference images beside a recording: ``pan_gt.npz`` beside ``pan.mat``."""
 
 EVERY: Final = 2
 """Every second frame is held out where there is no ground truth."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArtificialHdr:
+    """An artificial camera that the frames of a recording are seen by, as `kalux ahdr` makes it.
+
+    The artificial recording is never stored: its frames are made as they are read, wherever a job runs.
+
+    Attributes
+    ----------
+    low, high
+        Levels of the real camera, of 255, up to which it sees black and from which it sees white.
+    black
+        Level of the real camera, of 255, that is black.
+
+    Raises
+    ------
+    InputError
+        If the levels are not in order.
+    """
+
+    low: float
+    high: float
+    black: float = 0.0
+
+    def __post_init__(self) -> None:
+        _ = self.camera
+
+    @property
+    def camera(self) -> ArtificialCamera:
+        """The artificial camera."""
+        return ArtificialCamera(self.low / 255, self.high / 255)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,13 +76,20 @@ class Options:
         File of reference images. Default: those beside the recording, or its own.
     hold_out_frames
         Every n-th frame is held out, even where there is truth.
+    ahdr
+        The recording is made artificial HDR; the original frames are the truth, with ``hold_out_frames`` those that
+        are held out.
+    calibration
+        Files of `kalux calibrate`, for all filters. What they say of the camera does not hold for an artificial one.
     """
 
     exposure: int | None = None
     stamp: Stamp = "start"
-    response: str = "linear"
+    response: str = AUTO
     truth: Path | None = None
     hold_out_frames: int | None = None
+    ahdr: ArtificialHdr | None = None
+    calibration: tuple[Path, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,28 +124,67 @@ class Sequence:
         KaluxError
             As of `kalux.open`.
         """
+        options = self.options
         recording = kalux.open(self.path)
-        if recording.exposure_known or self.options.exposure is None:
+        if not recording.exposure_known and options.exposure is not None:
+            recording = kalux.open(self.path, exposure=options.exposure, stamp=options.stamp)
+        if options.ahdr is None:
             return recording
-        return kalux.open(self.path, exposure=self.options.exposure, stamp=self.options.stamp)
+        return artificial_hdr(
+            recording,
+            options.ahdr.camera,
+            response=self._camera_response(),
+            black=options.ahdr.black / 255,
+            every=options.hold_out_frames,
+        )
+
+    @property
+    def response(self) -> str:
+        """Of the camera whose frames methods see, as in `kalux.settings.CameraSettings`."""
+        # An artificial recording states that of its camera.
+        return AUTO if self.options.ahdr is not None else self._camera_response()
+
+    @property
+    def calibration(self) -> Calibration | None:
+        """What was measured of the sensor; None: nothing.
+
+        Raises
+        ------
+        KaluxError
+            As of `kalux.calibration.values.load_calibration`.
+        """
+        if not self.options.calibration:
+            return None
+        known = load_calibration(*self.options.calibration)
+        if self.options.ahdr is None:
+            return known
+        kept = {group: values for group, values in known.settings.items() if group != "camera"}
+        return dataclasses.replace(known, settings=kept)
+
+    def _camera_response(self) -> str:
+        if self.options.response != AUTO or not self.options.calibration:
+            return self.options.response
+        known = load_calibration(*self.options.calibration).settings.get("camera", {})
+        return str(known.get("response", AUTO))
 
     def truth_file(self) -> Path | None:
         """The file of reference images that is named, or lies beside the recording; None: there is none."""
-        if self.options.hold_out_frames is not None:
+        if self.options.hold_out_frames is not None or self.options.ahdr is not None:
             return None
-        return self.options.truth or truth_beside(self.path)
+        beside = truth_beside(self.path)
+        return self.options.truth or (beside if beside.is_file() else None)
 
     def files(self) -> list[Path]:
         """All files that the scores depend on, in order."""
         path = Path(str(self.path).partition("?")[0]) if not self.path.exists() else self.path
         truth = self.truth_file()
-        return [*files_under(path), *([] if truth is None else [truth])]
-
-
-def truth_beside(path: Path) -> Path | None:
-    """``X_gt.npz`` beside ``X.mat``, if it is there."""
-    beside = path.with_name(path.stem + TRUTH_SUFFIX)
-    return beside if beside.is_file() else None
+        maps = (file.with_suffix(".npz") for file in self.options.calibration)
+        return [
+            *files_under(path),
+            *([] if truth is None else [truth]),
+            *self.options.calibration,
+            *(file for file in maps if file.is_file()),
+        ]
 
 
 def files_under(path: Path) -> list[Path]:
@@ -122,11 +204,14 @@ class Benchmark:
         In the order of the columns; names differ.
     methods
         Names as `kalux.evaluation.baselines.chosen_methods` takes them; None: all that are compared by default.
+    folder
+        That files and folders in the names of methods are relative to.
     """
 
     title: str
     sequences: tuple[Sequence, ...]
     methods: tuple[str, ...] | None = None
+    folder: Path = Path()
 
 
 def gather(sets: Iterable[str | Path], options: Options | None = None) -> Benchmark:
@@ -146,20 +231,20 @@ def gather(sets: Iterable[str | Path], options: Options | None = None) -> Benchm
     """
     common = options or Options()
     found: list[Sequence] = []
-    titles, methods = [], []
+    listings: list[Benchmark] = []
     for given in sets:
         path = Path(given).absolute()
         if path.suffix.lower() == ".toml":
             listed = load(path)
-            titles.append(listed.title)
-            methods.append(listed.methods)
+            listings.append(listed)
             found += listed.sequences
         else:
             found += [_sequence(path, common) for path in _recordings(path)]
     if not found:
         raise InputError("benchmark: no sequence is given; give recordings, folders of them, or a TOML file")
-    title = titles[0] if len(titles) == 1 else "Benchmark"
-    return Benchmark(title, _unique(found), methods[0] if len(methods) == 1 else None)
+    if len(listings) != 1:
+        return Benchmark("Benchmark", _unique(found))
+    return dataclasses.replace(listings[0], sequences=_unique(found))
 
 
 def load(path: Path) -> Benchmark:
@@ -185,32 +270,42 @@ def load(path: Path) -> Benchmark:
     if methods is not None and not all(isinstance(name, str) for name in methods):
         raise InputError(f"{path}: methods is {methods!r}; a list of names is needed")
     return Benchmark(
-        values.get("title", path.stem), _unique(sequences), None if methods is None else tuple(methods)
+        values.get("title", path.stem),
+        _unique(sequences),
+        None if methods is None else tuple(methods),
+        path.parent,
     )
 
 
-_FILE_KEYS: Final[dict[str, type]] = {"title": str, "methods": list, "sequence": list}
-_SEQUENCE_KEYS: Final[dict[str, type]] = {
-    "path": str,
-    "name": str,
-    "title": str,
-    "group": str,
-    "exposure": int,
-    "stamp": str,
-    "response": str,
-    "truth": str,
-    "hold_out_frames": int,
+_Kinds = Mapping[str, tuple[type, ...]]
+
+_NUMBER: Final = (int, float)
+_FILE_KEYS: Final[_Kinds] = {"title": (str,), "methods": (list,), "sequence": (list,)}
+_SEQUENCE_KEYS: Final[_Kinds] = {
+    "path": (str,),
+    "name": (str,),
+    "title": (str,),
+    "group": (str,),
+    "exposure": (int,),
+    "stamp": (str,),
+    "response": (str,),
+    "truth": (str,),
+    "hold_out_frames": (int,),
+    "ahdr": (dict,),
+    "calibration": (str, list),
 }
+_AHDR_KEYS: Final[_Kinds] = {"cut": _NUMBER, "low": _NUMBER, "high": _NUMBER, "black": _NUMBER}
 
 
-def _check_keys(where: str, values: Any, keys: dict[str, type]) -> None:
+def _check_keys(where: str, values: Any, keys: _Kinds) -> None:
     if not isinstance(values, dict):
         raise InputError(f"{where} is {values!r}; a table is needed")
     for key, value in values.items():
         if key not in keys:
             raise InputError(f"{where}: unknown key {key!r}; known are {', '.join(keys)}")
         if not isinstance(value, keys[key]) or isinstance(value, bool):
-            raise InputError(f"{where}: {key} is {value!r}; {keys[key].__name__} is needed")
+            needed = " or ".join(kind.__name__ for kind in keys[key])
+            raise InputError(f"{where}: {key} is {value!r}; {needed} is needed")
 
 
 def _listed(where: str, folder: Path, entry: Any) -> Sequence:
@@ -222,7 +317,20 @@ def _listed(where: str, folder: Path, entry: Any) -> Sequence:
     if "truth" in options:
         if "hold_out_frames" in options:
             raise InputError(f"{where}: truth and hold_out_frames exclude each other; give one")
+        if "ahdr" in options:
+            raise InputError(
+                f"{where}: truth and ahdr exclude each other; the originals are the truth of ahdr"
+            )
         options["truth"] = (folder / options["truth"]).absolute()
+    if "ahdr" in options:
+        options["ahdr"] = _artificial(f"{where}: ahdr", options["ahdr"])
+    if "calibration" in options:
+        files = (
+            options["calibration"] if isinstance(options["calibration"], list) else [options["calibration"]]
+        )
+        if not files or not all(isinstance(file, str) for file in files):
+            raise InputError(f"{where}: calibration is {files!r}; files of kalux calibrate are needed")
+        options["calibration"] = tuple((folder / file).absolute() for file in files)
     path = (folder / entry["path"]).absolute()
     plain = _sequence(path, Options(**options))
     return dataclasses.replace(
@@ -231,6 +339,21 @@ def _listed(where: str, folder: Path, entry: Any) -> Sequence:
         title=entry.get("title", entry.get("name", plain.title)),
         group=entry.get("group"),
     )
+
+
+def _artificial(where: str, values: Any) -> ArtificialHdr:
+    _check_keys(where, values, _AHDR_KEYS)
+    if "cut" in values:
+        if "low" in values or "high" in values:
+            raise InputError(f"{where}: cut is for both ends; give it, or low and high")
+        values = {**values, "low": values["cut"], "high": 255 - values["cut"]}
+        del values["cut"]
+    elif not {"low", "high"} & values.keys():
+        raise InputError(f"{where}: says no level; give cut, or low and high, of 255")
+    try:
+        return ArtificialHdr(**{"low": 0.0, "high": 255.0, **values})
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
 
 
 def _sequence(path: Path, options: Options) -> Sequence:
