@@ -13,10 +13,14 @@ import pytest
 
 import kalux
 from kalux import readers
+from kalux.calibration.values import Calibration
 from kalux.cli.signals import interrupts_held
 from kalux.frames import Frame
 from kalux.models.colour import sample_mosaic
 from kalux.readers import GroundTruth
+from kalux.writers.calibration import save_calibration
+
+CONTRAST = {"threshold_on": 0.31, "threshold_off": 0.42}
 
 
 def same_frame(a, b):
@@ -152,7 +156,7 @@ def test_the_recording_itself_is_not_replaced(cli, recording):
 
 @pytest.mark.parametrize(
     ("name", "told"),
-    [("copy.aedat4", "ends in .h5"), ("copy", "ends in .h5"), ("none/copy.h5", "no such folder")],
+    [("copy.mp4", "ends in .h5"), ("copy", "or in .aedat4"), ("none/copy.h5", "no such folder")],
 )
 def test_names_that_cannot_be_used(cli, recording, tmp_path, name, told):
     found = cli("convert", recording, tmp_path / name)
@@ -194,6 +198,90 @@ def test_an_interrupt_leaves_nothing(start_cli, write_recording, simulation, tmp
     _, stderr = process.communicate(timeout=30)
     assert (process.returncode, stderr) == (130, "kalux: interrupted; nothing was written\n")
     assert list(tmp_path.iterdir()) == [path]
+
+
+class TestAedat4:
+    """What the other format holds is the same; what it cannot hold is said in one line."""
+
+    def test_of_a_real_recording_all_is_kept(self, cli, shared_data, tmp_path):
+        path = shared_data / "newton_davis346.aedat4"
+        found = cli("convert", path, tmp_path / "copy.aedat4")
+        assert (found.code, found.err) == (0, "")
+        copy = kalux.open(tmp_path / "copy.aedat4")
+        assert copy.source.format == "aedat4"
+        assert_same(copy, kalux.open(path))
+
+    def test_what_has_no_place_is_named(self, cli, write_recording, simulation, tmp_path):
+        frames = [
+            dataclasses.replace(f, image=f.image.astype(np.uint16), white=300.0) for f in simulation.frames
+        ]
+        reference = GroundTruth(np.array([5]), np.zeros((1, *simulation.scene.sensor_size), np.float32))
+        path = write_recording(
+            tmp_path / "rec.h5",
+            frames=frames,
+            mosaic="GBRG",
+            response="gamma:2.2",
+            ground_truth=reference,
+            inverse_covariance=np.ones(256),
+        )
+        found = cli("convert", path, tmp_path / "copy.aedat4", "--quiet")
+        assert found.code == 0
+        assert found.out == ""
+        assert found.err == (
+            "kalux: warning: AEDAT 4 has no place for contrast thresholds, image noise, reference images, the response "
+            "gamma:2.2, the white value 300, the Bayer pattern (--bayer GBRG opens the copy with it): not in the copy, "
+            "kalux HDF5 (.h5) would keep all\n"
+        )
+        copy = kalux.open(tmp_path / "copy.aedat4", mosaic="GBRG")
+        assert np.array_equal(np.concatenate(list(copy.events())), simulation.events)
+        for ours, theirs in zip(copy.frames(), frames, strict=True):
+            assert np.array_equal(ours.image, theirs.image)
+            assert (ours.exposure_start, ours.exposure_end) == (theirs.exposure_start, theirs.exposure_end)
+
+    def test_frames_of_floats_are_refused(self, cli, write_recording, simulation, tmp_path):
+        frames = [dataclasses.replace(f, image=f.image.astype(np.float32)) for f in simulation.frames]
+        path = write_recording(tmp_path / "rec.h5", frames=frames, contrast_threshold=None)
+        found = cli("convert", path, tmp_path / "copy.aedat4")
+        assert found.code == 2
+        assert "frame 0 has pixels of float32" in found.error
+        assert [file.name for file in tmp_path.iterdir()] == ["rec.h5"]
+
+    def test_a_calibration_is_refused(self, cli, recording, tmp_path):
+        save_calibration(Calibration({"events": CONTRAST}), tmp_path / "c.toml")
+        found = cli("convert", recording, tmp_path / "copy.aedat4", "--calibration", tmp_path / "c.toml")
+        assert found.code == 2
+        assert "AEDAT 4 has no place" in found.error
+
+
+class TestCalibration:
+    """Thresholds and the response go into the copy; what a copy cannot state is said."""
+
+    def test_thresholds_and_response_replace_what_the_recording_states(self, cli, recording, tmp_path):
+        save_calibration(Calibration({"events": {**CONTRAST, "delay": 500}}), tmp_path / "contrast.toml")
+        save_calibration(Calibration({"camera": {"response": "gamma:2.2"}}), tmp_path / "response.toml")
+        flags = [v for name in ("contrast", "response") for v in ("--calibration", tmp_path / f"{name}.toml")]
+        found = cli("convert", recording, tmp_path / "copy.h5", *flags)
+        assert found.code == 0
+        assert found.err.count("\n") == 1
+        assert "the copy cannot state events.delay" in found.err
+        copy = kalux.open(tmp_path / "copy.h5")
+        assert copy.contrast_threshold == (0.31, 0.42)
+        assert copy.response == "gamma:2.2"
+
+    def test_what_it_does_not_know_stays_as_it_was(self, cli, recording, tmp_path):
+        save_calibration(Calibration({"camera": {"response": "srgb"}}), tmp_path / "response.toml")
+        found = cli("convert", recording, tmp_path / "copy.h5", "--calibration", tmp_path / "response.toml")
+        assert (found.code, found.err) == (0, "")
+        copy = kalux.open(tmp_path / "copy.h5")
+        assert copy.contrast_threshold == kalux.open(recording).contrast_threshold
+        assert copy.response == "srgb"
+
+    def test_one_that_says_neither_is_refused(self, cli, recording, tmp_path):
+        save_calibration(Calibration({"camera": {"frame_noise": 0.01}}), tmp_path / "noise.toml")
+        found = cli("convert", recording, tmp_path / "copy.h5", "--calibration", tmp_path / "noise.toml")
+        assert found.code == 2
+        assert "neither contrast thresholds nor a response" in found.error
+        assert not (tmp_path / "copy.h5").exists()
 
 
 class TestInterruptsHeld:

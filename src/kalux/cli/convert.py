@@ -1,32 +1,40 @@
-"""``kalux convert``: any recording as kalux HDF5, with nothing lost."""
+"""``kalux convert``: any recording as kalux HDF5, with nothing lost, or as AEDAT 4."""
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
+from kalux.cli.calibrations import add_calibration, given_calibration
 from kalux.cli.info import add_recording, open_recording
 from kalux.cli.parser import Parser, UsageError
 from kalux.cli.terminal import say, warn
 
 if TYPE_CHECKING:
+    from kalux.events import EventArray
+    from kalux.frames import Frame
     from kalux.recording import Recording
 
 T = TypeVar("T")
 
 _DESCRIPTION = """\
-Copy a recording of any format that kalux reads into one kalux HDF5 file: events, frames with their
-exposures and white value, contrast thresholds, image noise and reference images, unchanged. Every event
-and frame is checked."""
+Copy a recording of any format that kalux reads into one file. kalux HDF5 (.h5) holds events, frames with
+their exposures and white value, contrast thresholds, image noise and reference images, unchanged. AEDAT 4
+(.aedat4), for other programs, holds events and frames of 8 or 16 bits with their exposures, unchanged; what
+it has no place for is said. Every event and frame is checked."""
 
 _EXAMPLES = """\
 examples:
   kalux convert night_drive.aedat4 night_drive.h5
+  kalux convert night_drive.bag night_drive.aedat4
   kalux convert slider_depth slider.h5 --exposure 10000 --stamp start"""
 
-_SUFFIXES = (".h5", ".hdf5")
+_HDF5 = (".h5", ".hdf5")
+_AEDAT4 = (".aedat4",)
+_THRESHOLDS = ("threshold_on", "threshold_off")
 
 
 def add_command(commands: Any) -> None:
@@ -35,13 +43,14 @@ def add_command(commands: Any) -> None:
         "convert",
         description=_DESCRIPTION,
         epilog=_EXAMPLES,
-        usage="kalux convert REC OUT.h5 [flags]",
+        usage="kalux convert REC OUT.h5|OUT.aedat4 [flags]",
     )
     add_recording(parser)
     group = parser.add_argument_group("output")
-    group.add_argument("out", metavar="OUT.h5", type=Path, help="the kalux HDF5 file")
+    group.add_argument("out", metavar="OUT", type=Path, help="kalux HDF5 (.h5) or AEDAT 4 (.aedat4)")
     group.add_argument("--overwrite", action="store_true", help="replace the file if it is there")
     group.add_argument("--quiet", action="store_true", help="print warnings and errors only")
+    add_calibration(parser.add_argument_group("calibration: thresholds and response go into OUT.h5"))
     parser.set_defaults(run=run)
 
 
@@ -50,8 +59,9 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     from kalux.cli.output import check_file
     from kalux.cli.progress import Progress, short_number
 
-    check_name(options.out, Path(options.recording))
+    check_name(options.out, Path(options.recording), (*_HDF5, *_AEDAT4))
     check_file(options.out, overwrite=options.overwrite)
+    stated = _calibrated(options)
     recording = open_recording(options)
     if not recording.exposure_known:
         warn(
@@ -64,8 +74,14 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
             f"the recording does not say how large the sensor is; the copy says {width}x{height}, which holds all "
             "events"
         )
+    to_aedat4 = options.out.suffix.lower() in _AEDAT4
+    if to_aedat4 and (lost := _not_in_aedat4(recording)):
+        warn(f"AEDAT 4 has no place for {', '.join(lost)}: not in the copy, kalux HDF5 (.h5) would keep all")
     with Progress("converting", quiet=options.quiet) as progress:
-        write_copy(recording, options.out, progress)
+        if to_aedat4:
+            _write_aedat4(recording, options.out, progress)
+        else:
+            write_copy(recording, options.out, progress, stated)
     if not options.quiet:
         seconds = max(progress.seconds, 1e-3)
         say(
@@ -74,22 +90,100 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
         )
 
 
-def check_name(out: Path, recording: Path) -> None:
-    """Refuse names that say something else than kalux HDF5, and the recording's own.
+def check_name(out: Path, recording: Path, suffixes: tuple[str, ...] = _HDF5) -> None:
+    """Refuse names that say another format than is written, and the recording's own.
 
     Raises
     ------
     UsageError
         With what to do instead.
     """
-    if out.suffix.lower() not in _SUFFIXES:
-        raise UsageError(f"{out}: the output is a kalux HDF5 file; give a name that ends in .h5")
+    if out.suffix.lower() not in suffixes:
+        also = ", or in .aedat4 for AEDAT 4" if ".aedat4" in suffixes else ""
+        raise UsageError(f"{out}: the output is a kalux HDF5 file; give a name that ends in .h5{also}")
     if out.exists() and recording.exists() and out.samefile(recording):
         raise UsageError(f"{out}: this is the recording itself; choose another name for the copy")
 
 
-def write_copy(recording: Recording, out: Path, progress: Any) -> None:
-    """Write all that a recording holds; the file appears when it is complete.
+class Stated(NamedTuple):
+    """What a copy says of the sensor in place of the recording; None: what the recording says."""
+
+    contrast_threshold: tuple[float, float] | None = None
+    response: str | None = None
+
+
+def _calibrated(options: argparse.Namespace) -> Stated:
+    """What of the calibrations that are given a kalux HDF5 file can say; a warning names the rest.
+
+    Raises
+    ------
+    UsageError
+        If there is nothing of it, or the output is AEDAT 4.
+    """
+    calibration = given_calibration(options)
+    if calibration is None:
+        return Stated()
+    if options.out.suffix.lower() in _AEDAT4:
+        raise UsageError(
+            "--calibration: AEDAT 4 has no place for what was measured; write kalux HDF5 (.h5), or give the "
+            "calibration to reconstruct"
+        )
+    events = calibration.settings.get("events", {})
+    thresholds = tuple(float(events[name]) for name in _THRESHOLDS if events.get(name) is not None)
+    response = calibration.settings.get("camera", {}).get("response")
+    found = Stated(
+        (thresholds[0], thresholds[1]) if len(thresholds) == 2 else None,
+        None if response in (None, "auto") else response,
+    )
+    if found == Stated():
+        raise UsageError(
+            "--calibration: has neither contrast thresholds nor a response, and a recording can state nothing else; "
+            "give it to reconstruct, evaluate or info"
+        )
+    others = [f"{group}.{name}" for group, values in calibration.settings.items() for name in values]
+    kept = [*(f"events.{name}" for name in _THRESHOLDS), "camera.response"]
+    left = [*(name for name in others if name not in kept), *(f"map {name}" for name in calibration.maps)]
+    if left:
+        warn(
+            f"of the calibration, the copy cannot state {', '.join(left)}; go on giving it to --calibration for these"
+        )
+    return found
+
+
+def _not_in_aedat4(recording: Recording) -> list[str]:
+    """What the recording holds that the other format cannot."""
+    source = recording.source
+    first = next(iter(recording.stored_frames()), None)
+    usual = None if first is None else dataclasses.replace(first, white=None).white_value
+    white = None if first is None or first.white_value == usual else first.white_value
+    found = [
+        ("contrast thresholds", recording.contrast_threshold),
+        ("image noise", source.inverse_covariance),
+        ("reference images", source.ground_truth),
+        (f"the response {recording.response}", recording.response),
+        (f"the white value {white:g}" if white is not None else "", white),
+        (f"the Bayer pattern (--bayer {recording.mosaic} opens the copy with it)", recording.mosaic),
+    ]
+    return [name for name, value in found if value is not None]
+
+
+def _write_aedat4(recording: Recording, out: Path, progress: Any) -> None:
+    from kalux.cli.signals import interrupts_held
+    from kalux.writers import aedat4
+
+    with interrupts_held() as let_through:
+        events, frames = _streams(recording, progress, let_through)
+        aedat4.write(
+            out,
+            sensor_size=recording.sensor_size,
+            events=events,
+            frames=frames,
+            exposure_known=recording.exposure_known,
+        )
+
+
+def write_copy(recording: Recording, out: Path, progress: Any, stated: Stated | None = None) -> None:
+    """Write all that a recording holds as kalux HDF5; the file appears when it is complete.
 
     Raises
     ------
@@ -102,19 +196,31 @@ def write_copy(recording: Recording, out: Path, progress: Any) -> None:
     from kalux.readers import hdf5
 
     # An interrupt inside HDF5 would crash it: it waits for the next chunk or frame.
+    stated = stated or Stated()
     with interrupts_held() as let_through:
+        events, frames = _streams(recording, progress, let_through)
         hdf5.write(
             out,
             sensor_size=recording.sensor_size,
-            events=_counted(recording.events(), lambda chunk: progress.add(events=len(chunk)), let_through),
-            frames=_counted(recording.stored_frames(), lambda _: progress.add(images=1), let_through),
+            events=events,
+            frames=frames,
             exposure_known=recording.exposure_known,
-            contrast_threshold=recording.contrast_threshold,
+            contrast_threshold=stated.contrast_threshold or recording.contrast_threshold,
             inverse_covariance=recording.source.inverse_covariance,
             ground_truth=recording.ground_truth(),
             mosaic=recording.mosaic,
-            response=recording.response,
+            response=stated.response or recording.response,
         )
+
+
+def _streams(
+    recording: Recording, progress: Any, let_through: Callable[[], None]
+) -> tuple[Iterator[EventArray], Iterator[Frame]]:
+    """Events and frames as stored, with progress."""
+    return (
+        _counted(recording.events(), lambda chunk: progress.add(events=len(chunk)), let_through),
+        _counted(recording.stored_frames(), lambda _: progress.add(images=1), let_through),
+    )
 
 
 def _counted(items: Iterable[T], count: Callable[[T], None], let_through: Callable[[], None]) -> Iterator[T]:

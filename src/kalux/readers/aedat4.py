@@ -29,10 +29,13 @@ from kalux.readers.source import TRIGGER_DTYPE, Source, TriggerArray, one_line, 
 from kalux.readers.streams import in_order, rechunk
 
 T = TypeVar("T")
-_MAGIC: Final = b"#!AER-DAT4.0\r\n"
-_PACKET_HEADER: Final = struct.Struct("<ii")  # stream, size in bytes
-# OpenCV's numbers of pixel types: 8 or 16 bits, one channel, BGR or BGRA
-_PIXELS: Final[dict[int, tuple[np.dtype[Any], int]]] = {
+MAGIC: Final = b"#!AER-DAT4.0\r\n"
+"""The first bytes of a file."""
+
+PACKET_HEADER: Final = struct.Struct("<ii")
+"""Before every packet: stream, size in bytes."""
+
+PIXELS: Final[dict[int, tuple[np.dtype[Any], int]]] = {
     0: (np.dtype("u1"), 1),
     2: (np.dtype("<u2"), 1),
     16: (np.dtype("u1"), 3),
@@ -40,6 +43,8 @@ _PIXELS: Final[dict[int, tuple[np.dtype[Any], int]]] = {
     24: (np.dtype("u1"), 4),
     26: (np.dtype("<u2"), 4),
 }
+"""OpenCV's numbers of pixel types: 8 or 16 bits, one channel, BGR or BGRA."""
+
 _DAVIS_FILTER: Final[Mosaic] = "RGGB"
 _DEMOSAICED: Final = (
     f"The frames were made RGB from the Bayer mosaic of a DAVIS, taken as {_DAVIS_FILTER}; every pixel gets its own "
@@ -102,7 +107,7 @@ def recognises(path: Path) -> bool:
     if not path.is_file():
         return False
     with path.open("rb") as file:
-        return file.read(len(_MAGIC)) == _MAGIC
+        return file.read(len(MAGIC)) == MAGIC
 
 
 def read(path: Path) -> Source:
@@ -237,12 +242,12 @@ def _stored_frames(container: _Container, stream: _Stream) -> Iterator[Frame]:
 
 def _frame(table: _Table, where: str) -> Frame:
     kind = table.scalar(5, "<b", 0)
-    if kind not in _PIXELS:
+    if kind not in PIXELS:
         raise FormatError(
             f"{where}: its frames have the unknown pixel type {kind}; 8 or 16 bits, grey or BGR, are needed"
         )
     width, height = table.scalar(6, "<h", 0), table.scalar(7, "<h", 0)
-    dtype, channels = _PIXELS[kind]
+    dtype, channels = PIXELS[kind]
     start, size = table.vector(10)
     if width <= 0 or height <= 0 or size != width * height * channels * dtype.itemsize:
         raise ValueError(f"{size} bytes of pixels for {width}x{height}")
@@ -264,7 +269,7 @@ def _open(path: Path, file: BinaryIO) -> _Container:
     """Read the header and find all packets, without decompressing any."""
     file.seek(0, 2)
     file_size = file.tell()
-    file.seek(len(_MAGIC))
+    file.seek(len(MAGIC))
     prefix = _exactly(file, 4)
     header = _root(prefix + _exactly(file, struct.unpack("<I", prefix)[0]), "IOHE")
     compression = header.scalar(0, "<i", 0)
@@ -304,10 +309,8 @@ def _packets(path: Path, file: BinaryIO, position: int, end: int) -> dict[int, a
     found: Counter[int] = Counter()
     while position < end:
         file.seek(position)
-        number, size = _PACKET_HEADER.unpack(
-            file.read(_PACKET_HEADER.size).ljust(_PACKET_HEADER.size, b"\xff")
-        )
-        start = position + _PACKET_HEADER.size
+        number, size = PACKET_HEADER.unpack(file.read(PACKET_HEADER.size).ljust(PACKET_HEADER.size, b"\xff"))
+        start = position + PACKET_HEADER.size
         if size < 0 or start + size > end:
             raise FormatError(
                 f"{path}: cut short or damaged: the packet at byte {position} (number {found.total()}) does "
