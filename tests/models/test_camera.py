@@ -11,6 +11,7 @@ from kalux.errors import SettingsError
 from kalux.models.camera import (
     Camera,
     Response,
+    black_ceiling,
     covariance,
     inverse_response,
     log_bias,
@@ -294,3 +295,13 @@ def test_the_certainty_of_a_curve_is_its_slope():
 def test_curves_that_are_none(name, message):
     with pytest.raises(SettingsError, match=message):
         Response.named(name)
+
+
+def test_black_hides_the_irradiance_of_half_a_level():
+    """Of a linear response half a level; of an s-curve its toe; nothing of what is not black; by the exposure."""
+    response = np.array([0.0, 0.4 / 255, 1 / 255, 1.0])
+    linear = black_ceiling(Camera.named("linear", 0.98), response, 2.0)
+    np.testing.assert_allclose(linear, [1 / 255, 1 / 255, np.inf, np.inf])
+    crushed = black_ceiling(Camera.named("s-curve:0.3", 0.98), response, 1.0)
+    assert 0.3 < crushed[0] < 0.33
+    assert np.isinf(crushed[2:]).all()
