@@ -1,7 +1,8 @@
 """The slow oracle: float64, one pixel at a time, the paper's equations (and docs/equations.md, K1 to K7) as written.
 
 Nothing here is incremental: L^A(t) is summed from the events anew at every t, integrals are taken by Gauss-Legendre
-quadrature where a closed form would repeat the code under test. Lookahead mode only; 8-bit frames, linear response.
+quadrature where a closed form would repeat the code under test. Lookahead mode only; 8-bit frames. The paper's
+filter has a linear response only; I and f^w of others are `kalux.models.camera`'s.
 """
 
 from __future__ import annotations
@@ -11,6 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import lambertw
+
+from kalux.models.camera import Camera
+from kalux.settings import chosen_response
 
 US = 1e-6
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(24)
@@ -27,12 +31,15 @@ class Pixel:
     intensity: list[float]
     white: list[float]
     clipped: list[bool]
+    weight: list[float]
+    black: list[bool]
     events: list[tuple[int, bool, int, int]]
 
 
 def pixels(events, frames, sensor_size, settings, begin):
     """Split a recording into pixels. The newest event around each event is looked up in the whole stream."""
     height, width = sensor_size
+    camera = Camera.named(chosen_response(settings.camera.response, None), settings.camera.saturation)
     reference = settings.camera.reference_exposure
     out = {}
     for row in range(height):
@@ -55,9 +62,11 @@ def pixels(events, frames, sensor_size, settings, begin):
                 [f.exposure_start for f in frames],
                 [(f.exposure_start + f.exposure_end) // 2 for f in frames],
                 [f.exposure_end for f in frames],
-                [r * q for r, q in zip(response, ratio, strict=True)],
+                [r * float(camera.response.inverse(q)) for r, q in zip(ratio, response, strict=True)],
                 ratio,
                 [r >= settings.camera.saturation for r in response],
+                [float(camera.weight(r)) for r in response],
+                [r == 0 for r in response],
                 own,
             )
     return out
@@ -189,8 +198,24 @@ def bridged(pixel, settings, times, on, off):
     var_on = var_off = ev.threshold_spread**2
     learned = []
 
+    hidden_by_black = float(
+        Camera.named(chosen_response(c.response, None), c.saturation).response.inverse(0.5 / 255)
+    )
+
+    def crushed(k):  # K7
+        return pixel.black[k] and hidden_by_black > c.frame_noise
+
+    def ceiling(k, middle):  # K7: the most that L is at the middle of the exposure
+        if not crushed(k):
+            return np.inf
+        most = hidden_by_black * pixel.white[k]
+        return middle + np.log(most + i0) - np.log(np.sqrt(0.001 * most) + i0)
+
     def latent(k):  # K3
         log_frame = np.log(pixel.intensity[k] + i0)
+        if crushed(k):
+            most = hidden_by_black * pixel.white[k]
+            log_frame = np.log(np.sqrt(0.001 * most) + i0)
         a, b = on * scale_on, off * scale_off
         start, peak = edi(pixel, k, log_frame, a, b) if settings.filter.deblur else (log_frame, log_frame)
         middle = start
@@ -199,6 +224,9 @@ def bridged(pixel, settings, times, on, off):
             middle += event_sum(pixel, pixel.starts[k], pixel.middles[k], a, b)
             inside = sum(pixel.starts[k] < t <= pixel.ends[k] for t, *_ in pixel.events)
         variance = (c.frame_noise * pixel.white[k]) ** 2 / (pixel.intensity[k] + i0) ** 2
+        variance /= max(pixel.weight[k], 1e-6)
+        if crushed(k):
+            variance = 3 * np.log((most + i0) / i0) ** 2 / 12
         variance += ev.deblur_variance * c2 * inside
         clipped = pixel.clipped[k] or peak >= np.log(c.saturation * pixel.white[k] + i0)
         return middle, UNMEASURED if clipped else variance
@@ -286,7 +314,9 @@ def bridged(pixel, settings, times, on, off):
         _, b, _, right, *_ = intervals[index]
         if t != b:
             return value, variance
-        return (max(value, right[0]) if right[1] >= UNMEASURED else value), variance + drifts[index]
+        value = max(value, right[0]) if right[1] >= UNMEASURED else value
+        most = np.inf if index + 1 == len(intervals) else ceiling(index, right[0])
+        return min(value, most), variance + drifts[index]
 
     def raised(value):  # K7: what events take below the next frame's bound was too low all the time
         a, b, left, right, *_ = intervals[index]

@@ -21,6 +21,9 @@ VARIANTS = {
     "default-blurred": dataclasses.replace(
         PRESETS["default"], filter=dataclasses.replace(PRESETS["default"].filter, deblur=False)
     ),
+    "default-black": dataclasses.replace(
+        PRESETS["default"], camera=dataclasses.replace(PRESETS["default"].camera, response="s-curve:0.1")
+    ),
     "iccv2021": PRESETS["iccv2021"],
     "iccv2021-exact": dataclasses.replace(
         PRESETS["iccv2021"], filter=dataclasses.replace(PRESETS["iccv2021"].filter, solution="exact")
@@ -36,7 +39,11 @@ def streams(draw):
     t, frames = draw(st.integers(0, 10**6)), []
     for _ in range(count):
         exposure = draw(st.integers(1000, 30_000))
-        levels = draw(st.lists(st.integers(0, 255), min_size=HEIGHT * WIDTH, max_size=HEIGHT * WIDTH))
+        levels = draw(
+            st.lists(
+                st.one_of(st.just(0), st.integers(0, 255)), min_size=HEIGHT * WIDTH, max_size=HEIGHT * WIDTH
+            )
+        )
         frames.append(Frame(np.array(levels, np.uint8).reshape(HEIGHT, WIDTH), t, t + exposure))
         t += exposure + draw(st.integers(0, 40_000))
     begin, end = frames[0].exposure_start - 1000, frames[-1].exposure_end + 20_000

@@ -184,7 +184,7 @@ def test_float32_frames_make_a_float32_segment():
     on, off = rng.integers(0, 9, (2, *shape)).astype(float)
     wide = join(*frames, on, off)
     narrow = join(
-        *(Latent(*(part.astype(np.float32) for part in frame)) for frame in frames),
+        *(Latent(*(part.astype(np.float32) for part in frame[:2])) for frame in frames),
         on.astype(np.float32),
         off.astype(np.float32),
         nominal_thresholds(shape, 0.1, np.float32),

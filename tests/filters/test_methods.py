@@ -7,8 +7,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from kalux import Frame, Reconstructor
+from kalux import PRESETS, Frame, Reconstructor
 from kalux.augmentation.bridge import UNMEASURED, UNSEEN, Latent, floor_before, lift
+from kalux.events import make_events
+from kalux.filters.methods import make_method, take_shot
+from kalux.models.camera import Camera, Response
 
 from builders import VARIANTS, altered, events, random_stream
 
@@ -122,3 +125,37 @@ def test_a_masked_pixel_is_no_bound():
     np.testing.assert_array_equal(level, [[-1.0, 0.0, -1.0]])
     floor = floor_before(frame, np.full((1, 3), 0.5), np.ones((1, 3), bool))
     np.testing.assert_array_equal(floor, [[-np.inf, -0.5, -np.inf]])
+
+
+# --- black ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("lookahead", [True, False])
+def test_black_is_a_bound_where_the_response_hides_something(lookahead):
+    """On events alone take a pixel up without end; black frames say that it is no brighter than half a level."""
+    response = "s-curve:0.1"
+    settings = dataclasses.replace(
+        PRESETS["default"],
+        camera=dataclasses.replace(PRESETS["default"].camera, response=response, log_offset=0.01),
+        events=dataclasses.replace(PRESETS["default"].events, threshold_on=0.3, threshold_off=0.3),
+    )
+    engine = Reconstructor((1, 1), settings=settings, lookahead=lookahead)
+    frames = [Frame(np.zeros((1, 1), np.uint8), t, t + 1000) for t in range(0, 400_000, 40_000)]
+    for frame in frames:
+        engine.push_frame(frame)
+    t = np.arange(2000, 361_000, 4000)
+    zeros = np.zeros(len(t), np.int64)
+    engine.push_events(make_events(t, zeros, zeros, zeros + 1))
+    engine.finish()
+    most = float(Response.named(response).inverse(np.array(0.5 / 255)))
+    at = frames[-1].middle if lookahead else frames[-1].exposure_end
+    assert 0.1 < most < 0.13
+    assert engine.read(at).intensity[0, 0] <= most + 1e-5
+
+
+def test_black_of_a_linear_response_is_a_measurement():
+    """It hides less than the frame's noise."""
+    shot = take_shot(Frame(np.array([[0, 9]], np.uint8), 0, 1000), Camera.named("linear", 0.98), 1000)
+    method = make_method(PRESETS["default"], (0.2, 0.2), True, (1, 2))
+    assert method.crushed(shot) is None
+    assert method.latent(shot, [], method._prior).ceiling is None

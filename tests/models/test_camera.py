@@ -12,6 +12,7 @@ from kalux.models.camera import (
     BrightTail,
     Camera,
     Response,
+    black_ceiling,
     count_bright,
     covariance,
     inverse_response,
@@ -324,3 +325,13 @@ def test_the_tail_is_one_of_light_not_of_response():
     levels = np.linspace(0, 1, 1000).reshape(20, 50)
     linear, gamma = Camera.named("linear", 0.98), Camera.named("gamma:2.2", 0.98)
     assert count_bright(gamma, levels ** (1 / 2.2)) == count_bright(linear, levels)
+
+
+def test_black_hides_the_irradiance_of_half_a_level():
+    """Of a linear response half a level; of an s-curve its toe; nothing of what is not black; by the exposure."""
+    response = np.array([0.0, 0.4 / 255, 1 / 255, 1.0])
+    linear = black_ceiling(Camera.named("linear", 0.98), response, 2.0)
+    np.testing.assert_allclose(linear, [1 / 255, 1 / 255, np.inf, np.inf])
+    crushed = black_ceiling(Camera.named("s-curve:0.3", 0.98), response, 1.0)
+    assert 0.3 < crushed[0] < 0.33
+    assert np.isinf(crushed[2:]).all()

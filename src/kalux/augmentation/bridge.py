@@ -36,11 +36,13 @@ _SCALE_DRIFT: Final = 1e-5  # variance per frame: a calibration never becomes ce
 class Latent(NamedTuple):
     """A deblurred frame at one moment: (H, W) log intensity and its variance.
 
-    The variance is `UNMEASURED` where the frame is clipped, `UNSEEN` where it is masked.
+    The variance is `UNMEASURED` where the frame is clipped, `UNSEEN` where it is masked. ``ceiling`` is the most that a
+    black pixel can be, inf where the value is a measurement; None where black hides nothing.
     """
 
     value: Array
     variance: Array
+    ceiling: Array | None = None
 
 
 class Thresholds(NamedTuple):
@@ -125,6 +127,12 @@ def lift(log_intensity: Array, frame: Latent) -> None:
     _lift(log_intensity.reshape(-1), frame.value.reshape(-1), frame.variance.reshape(-1))
 
 
+def lower(log_intensity: Array, frame: Latent) -> None:
+    """The same of a black pixel: it was no brighter than its ceiling. In place."""
+    if frame.ceiling is not None:
+        np.minimum(log_intensity, frame.ceiling, out=log_intensity)
+
+
 @nb.njit(cache=True, nogil=True)
 def _lift(log_intensity, value, variance):  # type: ignore[no-untyped-def]
     for i in range(len(value)):
@@ -181,7 +189,7 @@ def bridge(
         bound=second,
     )
     learned = Thresholds(*factors)
-    _bridge(first, second, on, off, thresholds, noise, seconds, segment, learned)
+    _bridge(Latent(*first[:2]), Latent(*second[:2]), on, off, thresholds, noise, seconds, segment, learned)
     return segment, learned
 
 

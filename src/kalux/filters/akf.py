@@ -21,7 +21,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.bridge import BridgedSegment, lift
+from kalux.augmentation.bridge import BridgedSegment, lift, lower
 from kalux.augmentation.deblur import events_until
 from kalux.augmentation.interpolation import InterpolatedSegment
 from kalux.compiled import (
@@ -201,6 +201,7 @@ def read_bridged(segment: BridgedSegment, cursor: BridgedCursor, t: int) -> tupl
     if t == segment.end:
         if segment.bound is not None:
             lift(log_intensity, segment.bound)  # K7
+            lower(log_intensity, segment.bound)
         if segment.drift is not None:
             variance += segment.drift  # K10
     return log_intensity, variance

@@ -28,6 +28,7 @@ from kalux.frames import Frame
 from kalux.models import colour
 from kalux.models.camera import (
     Camera,
+    black_ceiling,
     covariance,
     inverse_response,
     log_bias,
@@ -64,6 +65,8 @@ class Shot(NamedTuple):
         (N,) bool: saturated, so that the value is no measurement.
     white
         Intensity of a saturated pixel of this frame: the reference exposure over the frame's own.
+    level_ceiling
+        (N,) the most that I can be at levels that are black; inf at others.
     chroma, chroma_weight
         Of a frame in RGB: (H, W, 3) float32 ratio of each channel to the luminance, and (H, W) how reliable it is, 0
         where a channel is clipped to 1; else None.
@@ -79,6 +82,7 @@ class Shot(NamedTuple):
     level_weight: Array
     level_clipped: NDArray[np.bool_]
     white: float
+    level_ceiling: Array
     chroma: NDArray[np.float32] | None = None
     chroma_weight: NDArray[np.float32] | None = None
     valid: NDArray[np.bool_] | None = None
@@ -125,7 +129,7 @@ def take_shot(
     ratio = reference_exposure / frame.exposure
     if frame.image.ndim == 3:
         return _colour_shot(frame, camera, ratio, gains)
-    levels, response, intensity, weight = _leveled(frame, camera, ratio)
+    levels, response, intensity, weight, ceiling = _leveled(frame, camera, ratio)
     return Shot(
         start=frame.exposure_start,
         middle=frame.middle,
@@ -135,17 +139,19 @@ def take_shot(
         level_weight=weight,
         level_clipped=response >= camera.saturation,
         white=ratio,
+        level_ceiling=ceiling,
         valid=frame.valid,
     )
 
 
 class _Leveled(NamedTuple):
-    """Which level every pixel has, and of every level its response, I and f^w."""
+    """Which level every pixel has, and of every level its response, I, f^w and, where black, the most it can be."""
 
     levels: NDArray[np.integer[Any]]
     response: Array
     intensity: Array
     weight: Array
+    ceiling: Array
 
 
 def _leveled(frame: Frame, camera: Camera, ratio: float) -> _Leveled:
@@ -165,14 +171,16 @@ def _leveled(frame: Frame, camera: Camera, ratio: float) -> _Leveled:
     levels = levels.astype(np.int32)
     for row, column in np.ndindex(2, 2):
         levels[row::2, column::2] += "RGB".index(frame.mosaic[2 * row + column]) * len(response)
-    intensity, weight = zip(
-        *(_by_response(camera.of_channel(c), response, ratio) for c in range(3)), strict=True
+    of_colours = zip(*(_by_response(camera.of_channel(c), response, ratio) for c in range(3)), strict=True)
+    return _Leveled(levels, np.tile(response, 3), *(np.concatenate(values) for values in of_colours))
+
+
+def _by_response(camera: Camera, response: Array, ratio: float) -> tuple[Array, Array, Array]:
+    return (
+        inverse_response(camera, response, ratio),
+        camera.weight(np.clip(response, 0.0, 1.0)),
+        black_ceiling(camera, response, ratio),
     )
-    return _Leveled(levels, np.tile(response, 3), np.concatenate(intensity), np.concatenate(weight))
-
-
-def _by_response(camera: Camera, response: Array, ratio: float) -> tuple[Array, Array]:
-    return inverse_response(camera, response, ratio), camera.weight(np.clip(response, 0.0, 1.0))
 
 
 def _colour_shot(frame: Frame, camera: Camera, ratio: float, gains: colour.Gains) -> Shot:
@@ -198,6 +206,9 @@ def _colour_shot(frame: Frame, camera: Camera, ratio: float, gains: colour.Gains
         level_weight=(1 / np.square(spread)).ravel(),
         level_clipped=(of_clipped > _CLIPPED_SHARE * np.maximum(y, 0)).ravel(),
         white=ratio,
+        level_ceiling=colour.luminance(
+            np.stack([g * part[3] for g, part in zip(gains, parts, strict=True)], -1)
+        ).ravel(),
         chroma=colour.chromaticity(rgb, _CHROMA_FLOOR * ratio),
         chroma_weight=np.clip((camera.saturation - brightest) / room, 0, 1).astype(np.float32),
         valid=frame.valid,
@@ -206,11 +217,11 @@ def _colour_shot(frame: Frame, camera: Camera, ratio: float, gains: colour.Gains
 
 def _channel(
     frame: Frame, camera: Camera, ratio: float, channel: int
-) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """I, f^w and clipped of one channel of an RGB frame, (H, W)."""
+) -> tuple[Array, Array, NDArray[np.bool_], Array]:
+    """I, f^w, clipped, and the most that black can be, of one channel of an RGB frame, (H, W)."""
     own = dataclasses.replace(frame, image=np.ascontiguousarray(frame.image[..., channel]))
-    levels, response, intensity, weight = _leveled(own, camera.of_channel(channel), ratio)
-    return intensity[levels], weight[levels], (response >= camera.saturation)[levels]
+    levels, response, intensity, weight, ceiling = _leveled(own, camera.of_channel(channel), ratio)
+    return intensity[levels], weight[levels], (response >= camera.saturation)[levels], ceiling[levels]
 
 
 class Segment(Protocol):
@@ -308,6 +319,13 @@ class _Common:
         return max(self.settings.filter.initial_variance, float(np.var(seen)) if seen.size else 0.0)
 
 
+_DARKEST: Final = 0.001
+"""What is black is taken to be spread evenly in log I from here, white = 1, a quarter of an 8-bit level."""
+
+_BLACK_FRAMES: Final = 3.0
+"""Black says the same in every frame: so many of them count as one (docs/equations.md, K7)."""
+
+
 class BridgeMemory(NamedTuple):
     """The latest frame, deblurred; the pixels' thresholds; the frame interval in s (0: not known yet).
 
@@ -379,10 +397,15 @@ class BridgedFrames(_Common):
         )
         r_bar = covariance(shot.level_weight, (self.settings.camera.frame_noise * shot.white) ** 2, 1e-6)
         level_variance = log_covariance(shot.level_intensity, r_bar, self.offset)
+        level_variance[shot.level_clipped] = bridge.UNMEASURED
+        level_log = log_intensity(shot.level_intensity, self.offset)
+        crushed = self.crushed(shot)
+        if crushed is not None:
+            level_log[crushed], level_variance[crushed] = self.black(shot.level_ceiling[crushed])
         latent = latent_frame(
             shot.levels,
-            log_intensity(shot.level_intensity, self.offset),
-            np.where(shot.level_clipped, bridge.UNMEASURED, level_variance),
+            level_log,
+            level_variance,
             pixels,
             duration=shot.end - shot.start,
             white=float(np.log(self.settings.camera.saturation * shot.white + self.offset)),
@@ -390,7 +413,25 @@ class BridgedFrames(_Common):
         )
         if shot.valid is not None:
             latent.variance[~shot.valid] = bridge.UNSEEN
-        return latent
+        if crushed is None:
+            return latent
+        room = np.where(crushed, np.log(shot.level_ceiling + self.offset) - level_log, np.inf)
+        return latent._replace(ceiling=latent.value + room.astype(np.float32)[shot.levels])
+
+    def crushed(self, shot: Shot) -> NDArray[np.bool_] | None:
+        """(N,) levels that are black and hide more than the frame's noise; None where black does not.
+
+        Of a linear response it hides less: there, 0 is a measurement like others.
+        """
+        black = np.isfinite(shot.level_ceiling)
+        hides = shot.level_ceiling > self.settings.camera.frame_noise * shot.white
+        return black & hides if hides[black].any() else None
+
+    def black(self, ceiling: Array) -> tuple[Array, Array]:
+        """What I up to ``ceiling`` says of log(I + I_0): its middle, and its variance (K7)."""
+        middle = np.sqrt(_DARKEST * ceiling)
+        range_ = np.log1p(ceiling / self.offset)
+        return np.log(middle + self.offset), _BLACK_FRAMES * np.square(range_) / 12
 
     def start(self, shot: Shot, events: Chunks) -> tuple[BridgeMemory, Segment | None, State]:
         thresholds = self._prior
@@ -402,7 +443,7 @@ class BridgedFrames(_Common):
         if self.lookahead:
             on, off = self.counts(events, begin, shot.middle)
             memory = BridgeMemory(latent, thresholds, 0.0, on, off, far, far, shot.start)
-            value, variance = latent
+            value, variance = latent.value, latent.variance
             if shot.middle > begin:
                 lead_in = bridge.extend_backward(latent, on, off, thresholds, self.noise, begin, shot.middle)
                 lead_in = lead_in._replace(still_since=shot.start)
@@ -411,7 +452,8 @@ class BridgedFrames(_Common):
         else:
             on, off = self.counts(events, shot.middle, shot.end)
             memory = BridgeMemory(latent, thresholds, 0.0, on, off, far, far, shot.start)
-            value, variance = self._carried(memory)
+            carried = self._carried(memory)
+            value, variance = carried.value, carried.variance
         unmeasured = variance >= bridge.UNMEASURED
         variance = np.where(unmeasured, np.float32(self.settings.filter.initial_variance), variance)
         if shot.valid is not None:
@@ -487,6 +529,7 @@ class BridgedFrames(_Common):
         return Latent(
             memory.latent.value + step,
             memory.latent.variance + self.noise.step_variance * (memory.on + memory.off),
+            None if memory.latent.ceiling is None else memory.latent.ceiling + step,
         )
 
     def begin(self, segment: Any, state: State) -> akf.BridgedCursor:

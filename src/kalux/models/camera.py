@@ -300,6 +300,23 @@ def count_bright(camera: Camera, response: Array) -> BrightTail:
     return BrightTail(int(np.count_nonzero(grey >= half)), int(np.count_nonzero(grey >= white)))
 
 
+def black_ceiling(camera: Camera, response: Array, exposure_ratio: float) -> Array:
+    """What black hides: the most that I can be, (N,); inf where the response is not black.
+
+    A response of less than half a level of 8 bits may be anything up to the irradiance of half a level.
+
+    Parameters
+    ----------
+    response
+        (N,) I^F, 0 to 1.
+    exposure_ratio
+        As in `inverse_response`.
+    """
+    half = 0.5 / (_LEVELS - 1)
+    hidden = float(camera.response.inverse(np.array(half)))
+    return np.where(response < half, hidden * exposure_ratio, np.inf)
+
+
 def covariance(weight: Array, sigma_im2: float, floor: float) -> Array:
     """R_bar of equation (6): sigma_im^2 / f^w, saturated by a floor of f^w.
 
