@@ -8,11 +8,10 @@ import pytest
 
 from kalux import Frame, Recording
 from kalux.calibration.figures import require_matplotlib, response_figure
+from kalux.calibration.photographs import read_exposure, read_photograph
 from kalux.calibration.response import (
     aligned,
     calibrate_response,
-    read_exposure,
-    read_image,
     smooth_knots,
     still_pixels,
 )
@@ -48,9 +47,9 @@ def test_photographs_are_predicted_to_two_percent_of_full_scale(shared_data):
     """Every pixel of seven photographs, 1/4096 to 2 s, from the radiance merged from them; clipped pixels included."""
     pytest.importorskip("PIL")
     paths = sorted((shared_data / "exposures").glob("*.jpg"))
-    times = [read_exposure(path) for path in paths]
+    times = [read_exposure(path).seconds for path in paths]
     assert sorted(times) == [2.0**-k for k in (12, 10, 7, 5, 3, 1, -1)]
-    found = calibrate_response([read_image(path) for path in paths], times)
+    found = calibrate_response([read_photograph(path) for path in paths], times)
     assert found.residual < 0.02
     assert np.sqrt(np.mean(found.left_out**2)) < 0.03
     weight = found.curves[0].weight(np.array([0.1, 0.5, 0.97]))

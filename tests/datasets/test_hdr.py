@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from kalux.calibration.response import calibrate_response
 from kalux.datasets import hdr
 from kalux.datasets.registration import warped
 from kalux.errors import FormatError, InputError
@@ -55,6 +56,18 @@ def test_the_response_is_recovered(scene, curve, within):
     level = np.linspace(30, 240, 50) / 255
     logs = np.log(found.inverse(level) / curve.inverse(level))
     assert np.abs(logs - np.median(logs)).max() < within
+
+
+def test_the_response_is_that_which_a_calibration_finds(scene):
+    """Of the very same photographs; and it is Debevec's, whose curve is right to a percent."""
+    pictures = photographs(scene)
+    found = hdr.recover_response(pictures)
+    calibrated = calibrate_response([p.levels for p in pictures], [p.exposure for p in pictures])
+    level = np.linspace(0, 1, 256)
+    assert calibrated.fits[0][0].method == "debevec"
+    assert np.array_equal(found.inverse(level), calibrated.curves[0].inverse(level))
+    logs = np.log(found.inverse(level[20:245]) / Response.srgb().inverse(level[20:245]))
+    assert np.std(logs) < 0.01
 
 
 def test_radiance_is_measured(scene):

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import kalux
+from kalux.calibration.homography import find_features
 from kalux.datasets import SensorSettings, combine, handheld, pan, photograph_scene, simulate, spin
 from kalux.datasets.registration import (
     displacement,
-    find_features,
     is_plausible,
     match_features,
     refined,

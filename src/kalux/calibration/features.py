@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.calibration.alignment import Shots, levels
+from kalux.calibration.homography import agreed_homography, alike, find_features
 from kalux.calibration.registration import Registration
 from kalux.calibration.rig import Lens
 from kalux.errors import InputError
@@ -63,8 +64,6 @@ def match_cameras(
     net = on - off
     activity = [float(np.abs(b - a).sum()) for a, b in zip(shots.log[:-1], shots.log[1:], strict=True)]
     chosen = np.sort(np.argsort(activity)[::-1][:_PAIRS])
-    sift = cv2.SIFT.create(nfeatures=3000, contrastThreshold=0.01)
-    matcher = cv2.BFMatcher(cv2.NORM_L2)
     # Frames are shrunk to about the event camera's pixels: their finer detail has no counterpart.
     shrink = min(1.0, 1.3 * size[1] / frames_lens.sensor_size[1])
     ours: list[Array] = []
@@ -73,23 +72,21 @@ def match_cameras(
         both = shots.usable[k] & shots.usable[k + 1]
         change = np.where(both, shots.log[k + 1] - shots.log[k], 0.0).astype(np.float32)
         small = cv2.resize(change, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
-        one = sift.detectAndCompute(_picture(net[k + 1] - net[k]), None)
-        other = sift.detectAndCompute(_picture(small), None)
-        if one[1] is None or other[1] is None or min(len(one[0]), len(other[0])) < 2:
-            continue
-        for pair in matcher.knnMatch(one[1], other[1], k=2):
-            if len(pair) == 2 and pair[0].distance < _RATIO * pair[1].distance:
-                ours.append(np.array(one[0][pair[0].queryIdx].pt))
-                theirs.append((np.array(other[0][pair[0].trainIdx].pt) + 0.5) / shrink - 0.5)
+        one, other = (
+            find_features(_picture(image), width=0, most=3000, contrast=0.01)
+            for image in (net[k + 1] - net[k], small)
+        )
+        here, there = alike(one, other, _RATIO)
+        ours += list(here)
+        theirs += list((there + 0.5) / shrink - 0.5)
     if len(ours) < _LEAST:
         raise _no_match(len(ours), 0)
     a, b = _straight(events_lens, np.array(ours)), _straight(frames_lens, np.array(theirs))
     known = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1)
-    homography, inliers = cv2.findHomography(a[known], b[known], cv2.USAC_MAGSAC, _TOLERANCE, maxIters=10_000)
-    agree = 0 if inliers is None else int(np.count_nonzero(inliers))
+    homography, agree = agreed_homography(a[known], b[known], _TOLERANCE)
     if homography is None or agree < _LEAST:
         raise _no_match(len(ours), agree)
-    found = Registration(events_lens, frames_lens, np.asarray(homography, np.float64))
+    found = Registration(events_lens, frames_lens, homography)
     return Matched(found, agree, len(ours))
 
 

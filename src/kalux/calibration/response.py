@@ -1,23 +1,23 @@
 """The camera response function from images of one scene at several exposure times.
 
-Debevec & Malik 1997 and Robertson et al. 2003, both as in OpenCV, give an irradiance for every level of the response.
-It is made monotone and smooth, and judged by prediction: the radiance of every pixel is merged from all images but one,
-and says what that one must show. The better of the two methods is taken.
+Debevec & Malik 1997 (`kalux.calibration.debevec`) and Robertson et al. 2003 (as in OpenCV, made monotone and smooth)
+give an irradiance for every level of the response. They are judged by prediction: the radiance of every pixel is
+merged from all images but one, and says what that one must show.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.calibration.debevec import debevec_response
 from kalux.calibration.values import Calibration
-from kalux.errors import FrameError, InputError, MissingDependencyError
+from kalux.errors import FrameError, InputError
 from kalux.events import EventArray
 from kalux.frames import Frame
 from kalux.models.camera import Response
@@ -26,17 +26,16 @@ from kalux.recording import Recording
 Array = NDArray[np.float64]
 ImageArray = NDArray[np.uint8]
 MethodName = Literal["debevec", "robertson"]
+CalibrationName = Literal["auto", "debevec", "robertson"]
 
 KNOTS: Final = 33
 """Of the curve: every eighth level of 8 bits. Finer steps of a measured curve are noise."""
 
 _LEVELS: Final = 256
-_GREY_SAMPLES: Final = 1_600  # pixels of Debevec's least squares, which has 256 unknowns besides
-_SMOOTHNESS: Final = 60.0  # Debevec's lambda
 _TRUSTED: Final = (4 / 255, 250 / 255)  # of the response: beyond, images say only that it is dark or clipped
 _WIDTH: Final = 1.5  # of the smoothing, in knots
 _LEAST_PIXELS: Final = 500
-_MOST_PIXELS: Final = 40_000  # that the curve is fitted to; it is judged by all
+_MOST_PIXELS: Final = 40_000  # that Robertson's curve is fitted to, and both are compared on
 
 
 class ResponseFit(NamedTuple):
@@ -66,7 +65,7 @@ class ResponseCalibration:
     curves
         One for all channels, or one per channel.
     fits
-        What the other method found, too: per curve, best first.
+        What the other method found, too: per curve, the preferred one first.
     residuals
         (images, curves) root mean square of each image predicted from the merged radiance, share of full scale.
     left_out
@@ -111,7 +110,11 @@ def curve_text(knots: Array) -> str:
 
 
 def calibrate_response(
-    images: Sequence[ImageArray], exposures: Sequence[float], *, per_channel: bool = False
+    images: Sequence[ImageArray],
+    exposures: Sequence[float],
+    *,
+    per_channel: bool = False,
+    method: CalibrationName = "auto",
 ) -> ResponseCalibration:
     """Measure the response from images of one still scene.
 
@@ -123,6 +126,8 @@ def calibrate_response(
         Their exposure times, s.
     per_channel
         One curve per colour channel; otherwise one for all, which is what most cameras have.
+    method
+        As of `fit_response`.
 
     Raises
     ------
@@ -138,22 +143,13 @@ def calibrate_response(
     if per_channel:
         channels = [stack[..., c] for c in range(stack.shape[-1])]
     else:
-        channels = [np.concatenate([stack[..., c] for c in range(stack.shape[-1])], axis=2)]
+        channels = [side_by_side(stack)]
     fits, residuals, left_out = [], [], []
     for channel in channels:
-        flat = _flat_pixels(channel)
-        strip = channel.reshape(len(times), 1, -1)
-        _require_pixels(strip)
-        methods: tuple[MethodName, ...] = ("debevec", "robertson")
-        some = np.ascontiguousarray(strip[..., flat[:: max(1, len(flat) // _MOST_PIXELS)]])
-        fitted = [fit for method in methods if (fit := _fitted(method, some, times)) is not None]
-        if not fitted:
-            raise InputError(
-                "response: no curve fits the images; do they show one still scene, with these times?"
-            )
-        found = sorted(fitted, key=lambda fit: fit.residual)
-        fits.append(tuple(found))
+        found = fit_response(channel, times, method)
+        fits.append(found)
         best = Response.curve(found[0].knots)
+        strip = channel.reshape(len(times), 1, -1)
         residuals.append(prediction_residuals(best, strip, times, leave_out=False))
         left_out.append(prediction_residuals(best, strip, times))
     curves = tuple(Response.curve(found[0].knots) for found in fits)
@@ -232,43 +228,79 @@ def _flat_pixels(images: ImageArray) -> NDArray[np.int64]:
     return np.flatnonzero(steepest.ravel() <= np.median(steepest))
 
 
-def _fitted(method: MethodName, strip: ImageArray, times: Array) -> ResponseFit | None:
-    """One method's curve; ``strip`` (K, H, W) uint8. None where it diverges."""
-    if method == "debevec":
-        table = _debevec(strip, times)
-    else:
-        images = [cv2.merge([image] * 3) for image in strip]  # OpenCV 5.0 crashes on one channel
-        calibrator = cv2.createCalibrateRobertson(max_iter=60, threshold=0.001)
-        table = np.asarray(calibrator.process(images, times.astype(np.float32)), np.float64).reshape(
-            _LEVELS, -1
-        )[:, 0]
+def side_by_side(stack: ImageArray) -> ImageArray:
+    """Images (K, H, W, C) with their channels next to one another, (K, H, W C): one response for all."""
+    return np.concatenate([stack[..., c] for c in range(stack.shape[-1])], axis=2)
+
+
+def fit_response(
+    images: ImageArray, times: Array, method: CalibrationName = "auto"
+) -> tuple[ResponseFit, ...]:
+    """The response by every method that succeeds, the preferred one first.
+
+    Parameters
+    ----------
+    images
+        (K, H, W) uint8 of one scene, in place, in order of exposure.
+    times
+        (K,) exposures, ascending, in any unit.
+    method
+        The only one to try. ``"auto"``: both; Debevec's is preferred unless Robertson's predicts images from one
+        another with an error at least 10 % smaller. On simulated photographs the former's curve is the better one
+        by far.
+
+    Raises
+    ------
+    InputError
+        If too few pixels are well exposed twice, or no curve fits.
+    """
+    _require_pixels(images)
+    flat = _flat_pixels(images)
+    strip = images.reshape(len(times), 1, -1)
+    some = np.ascontiguousarray(strip[..., flat[:: max(1, len(flat) // _MOST_PIXELS)]])
+    tables: list[tuple[MethodName, Array | None]] = []
+    if method != "robertson":
+        tables.append(("debevec", _debevec(strip[..., flat], times)))
+    if method != "debevec":
+        tables.append(("robertson", _robertson(some, times)))
+    found: list[ResponseFit] = []
+    for name, knots in tables:
+        if knots is not None:
+            left = prediction_residuals(Response.curve(knots), some, times)
+            found.append(ResponseFit(name, knots, float(np.sqrt(np.mean(left**2)))))
+    if not found:
+        raise InputError(
+            "response: no curve fits the images; do they show one still scene, with these times?"
+        )
+    return tuple(
+        sorted(found, key=lambda fit: fit.residual * (_PREFERENCE if fit.method == "debevec" else 1.0))
+    )
+
+
+_PREFERENCE: Final = 0.9
+
+
+def _debevec(strip: ImageArray, times: Array) -> Array | None:
+    """33 knots; None where too little is exposed well in neighbouring images."""
+    try:
+        curve = debevec_response(list(strip), times.tolist())
+    except InputError:
+        return None
+    knots = curve.inverse(np.linspace(0.0, 1.0, KNOTS))
+    # The smallest step that the curve's text and its inverse keep apart.
+    knots = np.maximum.accumulate(knots + np.arange(KNOTS) * 1e-7)
+    return np.asarray((knots - knots[0]) / (knots[-1] - knots[0]))
+
+
+def _robertson(strip: ImageArray, times: Array) -> Array | None:
+    """33 knots; None where it diverges."""
+    images = [cv2.merge([image] * 3) for image in strip]  # OpenCV 5.0 crashes on one channel
+    calibrator = cv2.createCalibrateRobertson(max_iter=60, threshold=0.001)
+    found = np.asarray(calibrator.process(images, times.astype(np.float32)), np.float64)
+    table = found.reshape(_LEVELS, -1)[:, 0]
     if np.count_nonzero(np.isfinite(table) & (table > 0)) < _LEVELS // 2:
         return None
-    knots = smooth_knots(table, _level_counts(strip))
-    response = Response.curve(knots)
-    residual = float(np.sqrt(np.mean(prediction_residuals(response, strip, times) ** 2)))
-    return ResponseFit(method, knots, residual)
-
-
-def _debevec(strip: ImageArray, times: Array) -> Array:
-    """OpenCV's Debevec on pixels chosen over the whole range of brightness, rather than on a grid of the image."""
-    chosen = _spread_pixels(strip, _GREY_SAMPLES)
-    side = int(np.sqrt(len(chosen)))
-    images = [
-        np.ascontiguousarray(image.ravel()[chosen[: side * side]].reshape(side, side)) for image in strip
-    ]
-    calibrator = cv2.createCalibrateDebevec(samples=side * side, lambda_=_SMOOTHNESS, random=False)
-    table = calibrator.process(images, times.astype(np.float32))
-    return np.asarray(table, np.float64).reshape(_LEVELS, -1)[:, 0]
-
-
-def _spread_pixels(strip: ImageArray, count: int) -> NDArray[np.int64]:
-    """Indices of pixels evenly over ranks of brightness, of those that are well exposed twice."""
-    low, high = _TRUSTED
-    flat = strip.reshape(len(strip), -1)
-    good = np.flatnonzero(((flat > 255 * low) & (flat < 255 * high)).sum(axis=0) >= 2)
-    ranked = good[np.argsort(flat[:, good].sum(axis=0, dtype=np.int64), kind="stable")]
-    return ranked[np.linspace(0, len(ranked) - 1, min(count, len(ranked))).astype(np.int64)]
+    return smooth_knots(table, _level_counts(strip))
 
 
 def _level_counts(strip: ImageArray) -> Array:
@@ -341,56 +373,7 @@ def prediction_residuals(
     return out
 
 
-# --- where images come from -----------------------------------------------------------------------------------
-
-
-def read_exposure(path: str | Path) -> float:
-    """The exposure time of a photograph, s, from its EXIF.
-
-    Where it holds the shutter speed as a power of two (APEX), that is taken: the exposure time beside it is rounded
-    to what is customary, 1/30 s for 1/32 s.
-
-    Raises
-    ------
-    MissingDependencyError
-        If Pillow is not installed.
-    InputError
-        If the file cannot be read, or says no exposure time.
-    """
-    try:
-        from PIL import Image, UnidentifiedImageError
-    except ImportError as error:
-        raise MissingDependencyError(
-            "exposure times of photographs are read by Pillow; pip install 'kalux[hdr]', or give --times"
-        ) from error
-    try:
-        with Image.open(path) as image:
-            exif = image.getexif().get_ifd(0x8769)
-    except (OSError, UnidentifiedImageError) as error:
-        raise InputError(f"{path}: cannot be read as a photograph: {error}") from error
-    if 0x829A not in exif or not float(exif[0x829A]) > 0:
-        raise InputError(f"{path}: its EXIF says no exposure time; give the times of all images (--times, s)")
-    nominal = float(exif[0x829A])
-    exact = 2.0 ** -float(exif.get(0x9201, -np.log2(nominal)))
-    return exact if abs(exact / nominal - 1.0) < 0.1 else nominal
-
-
-def read_image(path: str | Path) -> ImageArray:
-    """An image of 8 bits: (H, W), or (H, W, 3) RGB.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read, or has more than 8 bits.
-    """
-    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    if image is None:
-        raise InputError(f"{path}: cannot be read as an image")
-    if image.dtype != np.uint8:
-        raise InputError(f"{path}: has {image.dtype} pixels; images of 8 bits are needed")
-    if image.ndim == 3:
-        image = cv2.cvtColor(image, cv2.COLOR_BGRA2RGB if image.shape[2] == 4 else cv2.COLOR_BGR2RGB)
-    return np.asarray(image, np.uint8)
+# --- images of a recording -----------------------------------------------------------------------------------
 
 
 def still_pixels(recording: Recording, most_frames: int = 400) -> tuple[list[ImageArray], list[float]]:

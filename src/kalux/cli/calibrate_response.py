@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 _DESCRIPTION = """\
 Measure the camera's response function: from images of one still scene at three or more exposure times (from their EXIF,
 or --times), or from one recording under auto-exposure whose still pixels are seen at several exposures. By Debevec's
-and by Robertson's method; the one that predicts images better from one another is taken."""
+method, or by Robertson's where that predicts the images clearly better from one another."""
 
 _EXAMPLES = """\
 examples:
@@ -42,6 +42,12 @@ def add_command(commands: Any) -> None:
     group.add_argument(
         "--per-channel", action="store_true", help="a curve for each colour (default: one for all)"
     )
+    group.add_argument(
+        "--method",
+        choices=("auto", "debevec", "robertson"),
+        default="auto",
+        help="debevec is what kalux hdr-reference takes (default auto)",
+    )
     add_result(parser)
     parser.add_argument(
         "--plot", type=Path, metavar="FILE.png", help="picture of the curves; needs kalux[plots]"
@@ -61,7 +67,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
         require_matplotlib()
         check_file(options.plot, overwrite=options.overwrite)
     images, times, recording = _inputs(options)
-    found = calibrate_response(images, times, per_channel=options.per_channel)
+    found = calibrate_response(images, times, per_channel=options.per_channel, method=options.method)
     finish(found.calibration(), recording, options, command)
     if not options.quiet:
         say("\n".join(report(found)))
@@ -83,7 +89,8 @@ def report(found: ResponseCalibration) -> list[str]:
 
 
 def _inputs(options: argparse.Namespace) -> tuple[Any, list[float], Recording | None]:
-    from kalux.calibration.response import read_exposure, read_image, still_pixels
+    from kalux.calibration.photographs import read_exposure, read_photograph
+    from kalux.calibration.response import still_pixels
 
     paths = [Path(name) for name in options.inputs]
     if len(paths) == 1 and paths[0].suffix.lower() not in _IMAGES:
@@ -94,10 +101,12 @@ def _inputs(options: argparse.Namespace) -> tuple[Any, list[float], Recording | 
         recording = kalux.open(paths[0])
         return *still_pixels(recording), recording
     if options.times is None:
-        times = [read_exposure(path) for path in paths]
+        stated = [read_exposure(path) for path in paths]
+        # Seconds at the sensitivity and aperture of the first, where these differ.
+        times = [one.seconds * one.gain / stated[0].gain for one in stated]
     else:
         try:
             times = [float(word) for word in options.times.split(",")]
         except ValueError:
             raise UsageError(f"--times is {options.times!r}; numbers with commas are needed") from None
-    return [read_image(path) for path in paths], times, None
+    return [read_photograph(path) for path in paths], times, None

@@ -51,7 +51,8 @@ def add_command(commands: Any) -> None:
         "--response",
         metavar="NAME",
         default="debevec",
-        help="debevec or robertson recover it; linear, srgb, gamma:EXPONENT state it (default debevec)",
+        help="debevec (default), robertson or auto recover it, as kalux calibrate response --method; linear, srgb, "
+        "gamma:EXPONENT, curve:... state it",
     )
     group.add_argument(
         "--align", choices=("homography", "none"), default="homography", help="none: a tripod that held"
@@ -151,7 +152,7 @@ def _reference(options: argparse.Namespace, is_image: bool) -> HdrReference:
 
     if is_image:
         return hdr.read_radiance(options.photos)
-    recovered = options.response in ("debevec", "robertson")
+    recovered = options.response in ("auto", "debevec", "robertson")
     response = options.response if recovered else Response.named(options.response)
     pictures = hdr.read_bracket(options.photos, _times(options.times))
     return hdr.hdr_reference(

@@ -2,16 +2,15 @@
 
 The order of things, each a function::
 
-    files -> pictures with exposures -> alignment (features, homography) -> response (Debevec [1]_ or Robertson [2]_)
+    files -> pictures with exposures -> alignment (features, homography) -> response (`kalux.calibration.response`)
     -> true exposures -> consistency (what moved) -> merge (radiance, weighted by its noise)
 
-Values of pixels are called levels, 0 to 1. The three channels of a colour camera share one response, that of green:
-a camera applies one tone curve to all, and grey stays grey.
+Values of pixels are called levels, 0 to 1. The three channels of a colour camera share one response: a camera applies
+one tone curve to all, and grey stays grey.
 
 References
 ----------
-.. [1] P. Debevec, J. Malik, "Recovering High Dynamic Range Radiance Maps from Photographs", SIGGRAPH 1997.
-.. [2] M. Robertson, S. Borman, R. Stevenson, "Estimation-theoretic approach to dynamic range enhancement using
+.. [1] M. Robertson, S. Borman, R. Stevenson, "Estimation-theoretic approach to dynamic range enhancement using
    multiple exposures", J. Electronic Imaging 12(2), 2003.
 """
 
@@ -20,56 +19,44 @@ from __future__ import annotations
 import csv
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import isotonic_regression
 
+from kalux.calibration.debevec import CLIPPED_HIGH, CLIPPED_LOW, LEAST_SHARED, LEAST_SPREAD
+from kalux.calibration.homography import find_features
+from kalux.calibration.photographs import read_exposure, read_photograph
+from kalux.calibration.response import CalibrationName, fit_response, side_by_side
 from kalux.datasets.registration import (
     Match,
     displacement,
-    find_features,
     match_features,
     tone_compressed,
     warped,
     warped_mask,
 )
-from kalux.errors import FormatError, InputError, MissingDependencyError
+from kalux.errors import FormatError, InputError
 from kalux.models.camera import Response
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
-CalibrationName = Literal["debevec", "robertson"]
 
 SUFFIXES: Final = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
 LUMINANCE: Final = np.array([0.2126, 0.7152, 0.0722])
 """Of linear red, green and blue, ITU-R BT.709, the primaries of sRGB."""
 
-CLIPPED_LOW: Final = 8 / 255
-CLIPPED_HIGH: Final = 250 / 255
-"""Levels beyond which a picture says only that the scene is darker or brighter: processed pictures compress the last
-few levels before white, and have an offset and noise of a few levels at black."""
-
 _TAPER: Final = (
     10 / 255
 )  # levels over which a weight rises from 0 at a clipped end, so that merging has no seams
 _LEVEL_NOISE: Final = 1 / 255  # standard deviation of a level: quantisation, and the losses of JPEG
-_LEAST_SPREAD: Final = 0.03  # relative standard deviation between exposures, never less: shutters, lamps
 _INCONSISTENT: Final = 4.0  # standard deviations
 _ALIGNED: Final = 0.3  # pixels: less is not worth the blur of resampling, and features know it no better
 _LEAST_COMMON: Final = 40  # features: with fewer, the corners of a homography are a guess
-_LEAST_SHARED: Final = 500  # values measured in two exposures, for anything that is estimated from them
-_LOW, _HIGH = round(255 * CLIPPED_LOW) + 1, round(255 * CLIPPED_HIGH) - 1
-_STIFFNESS: Final = 3.0  # of a recovered response: chosen on simulated photographs (docs/datasets.md)
-_FIT_NOISE: Final = 2.0  # levels
-_FITS: Final = 8
 _QUIET: Final = 40 / 255  # level from which noise is small beside the spread between exposures
-_ROBERTSON_PIXELS: Final = 300_000  # more say nothing new, and take their time
 
 
 # --- pictures ---------------------------------------------------------------------------------------------
@@ -140,8 +127,9 @@ def read_bracket(folder: Path, exposures: Path | Sequence[float] | None = None) 
             )
         found = [float(value) for value in exposures]
     else:
-        found = [exif_exposure(path) for path in paths]
-    pictures = [Picture(p.name, _read(p), e) for p, e in zip(paths, found, strict=True)]
+        stated = [read_exposure(path) for path in paths]
+        found = [one.seconds * one.gain for one in stated]
+    pictures = [Picture(p.name, read_photograph(p), e) for p, e in zip(paths, found, strict=True)]
     check_bracket(pictures, str(folder))
     return sorted(pictures, key=lambda picture: -picture.exposure)
 
@@ -172,16 +160,6 @@ def check_bracket(pictures: Sequence[Picture], where: str = "bracket") -> None:
         raise InputError(f"{where}: all exposures are equal; a bracket needs different ones")
 
 
-def _read(path: Path) -> NDArray[Any]:
-    # Not turned as EXIF says: a bracket is compared as the sensor saw it.
-    image = cv2.imread(str(path), cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    if image is None or image.dtype not in (np.uint8, np.uint16) or image.ndim not in (2, 3):
-        raise FormatError(f"{path}: not an image of 8 or 16 bits, or damaged; copy it again")
-    if image.ndim == 2:
-        return np.asarray(image)
-    return np.ascontiguousarray(image[..., 2::-1])
-
-
 def _listed_exposures(path: Path) -> dict[str, float]:
     try:
         with path.open(newline="") as file:
@@ -201,54 +179,6 @@ def _seconds(text: str) -> float:
 
 
 parse_seconds = _seconds
-
-
-def exif_exposure(path: Path) -> float:
-    """Exposure from EXIF: seconds, times ISO / 100 and over the squared f-number where these are stated.
-
-    The exposure time in EXIF is what the camera's display shows, 1/30 or 1/125; shutters make powers of two, 1/32
-    and 1/128, which is what the APEX value ``ShutterSpeedValue`` says. It is taken where the two agree within a
-    quarter of a stop (docs/datasets.md has the measurement).
-
-    Raises
-    ------
-    InputError
-        If there is no exposure time.
-    MissingDependencyError
-        If Pillow is not installed.
-    """
-    try:
-        from PIL import ExifTags
-        from PIL import Image as Pillow
-    except ImportError as error:
-        raise MissingDependencyError(
-            f"{path}: reading exposure times from EXIF needs Pillow; pip install 'kalux[hdr]', or give the times"
-        ) from error
-    try:
-        with Pillow.open(path) as file:
-            tags = file.getexif().get_ifd(ExifTags.IFD.Exif)
-    except OSError as error:
-        raise FormatError(f"{path}: not an image, or damaged; copy it again") from error
-    seconds = _positive(tags.get(ExifTags.Base.ExposureTime))
-    apex = tags.get(ExifTags.Base.ShutterSpeedValue)
-    exact = None if apex is None else _positive(2.0 ** -float(apex))
-    if seconds is None or (exact is not None and abs(np.log2(exact / seconds)) < 0.25):
-        seconds = exact
-    if seconds is None:
-        raise InputError(f"{path}: no exposure time in its EXIF data; give the exposure times")
-    iso = _positive(tags.get(ExifTags.Base.ISOSpeedRatings)) or 100.0
-    aperture = _positive(tags.get(ExifTags.Base.FNumber)) or 1.0
-    return seconds * iso / 100 / aperture**2
-
-
-def _positive(value: Any) -> float | None:
-    if isinstance(value, tuple):
-        value = value[0] if value else None
-    try:
-        number = float(value)
-    except (TypeError, ValueError, ZeroDivisionError):
-        return None
-    return number if np.isfinite(number) and number > 0 else None
 
 
 # --- alignment --------------------------------------------------------------------------------------------
@@ -333,7 +263,7 @@ def _between(fixed: Picture, moving: Picture) -> tuple[Array | None, Match]:
         np.asarray(_luminance(p.response) > 4 / 255) & (p.response.reshape(*first.shape, -1).max(2) < 0.97)
         for p in (fixed, moving)
     )
-    if min(np.count_nonzero(mask) for mask in masks) < _LEAST_SHARED:
+    if min(np.count_nonzero(mask) for mask in masks) < LEAST_SHARED:
         return None, Match(None, 0, 0)
     low = max(np.percentile(log[mask], 1) for log, mask in zip((first, second), masks, strict=True))
     high = min(np.percentile(log[mask], 99.5) for log, mask in zip((first, second), masks, strict=True))
@@ -356,18 +286,15 @@ def _luminance(image: NDArray[Any]) -> Array:
 
 
 def recover_response(pictures: Sequence[Picture], method: CalibrationName = "debevec") -> Response:
-    """The camera's response from aligned photographs of 8 bits.
-
-    Levels that are clipped are left out, so that the curve goes on straight from them to 0 and 1.
+    """The camera's response from aligned photographs of 8 bits, as `kalux.calibration.response` fits it.
 
     Parameters
     ----------
     pictures
         Sorted by exposure.
     method
-        ``"debevec"``: their equations [1]_, with the unknown irradiance of a pixel eliminated between neighbouring
-        exposures, so that all pixels take part, and solved robustly, each weighted by its noise. ``"robertson"``:
-        OpenCV's, of which the logarithm is smoothed, since it fits every level by itself.
+        Of `kalux.calibration.response.fit_response`; ``"auto"``: the one that it prefers, as `kalux calibrate response`
+        does. Here it is Debevec's: it is judged by the ratios of exposures, which make the radiance.
 
     Raises
     ------
@@ -378,115 +305,13 @@ def recover_response(pictures: Sequence[Picture], method: CalibrationName = "deb
         raise InputError(
             "the response of photographs of 16 bits cannot be recovered; state it: linear where they are raw"
         )
-    planes = [_green(picture.levels) for picture in pictures]
-    times = [picture.exposure for picture in pictures]
-    counts = _level_pairs(planes)
-    if sum(int(count.sum()) for count in counts) < _LEAST_SHARED:
-        raise InputError(
-            "too little is exposed well in two photographs to recover the response; state the response, or take "
-            "exposures closer to each other"
-        )
-    if method == "debevec":
-        return _extended(_log_response(counts, times))
-    # Thrice the same channel: OpenCV's Robertson writes beyond its arrays for images of one channel.
-    step = max(1, int(np.ceil(np.sqrt(planes[0].size / _ROBERTSON_PIXELS))))
-    thrice = [np.ascontiguousarray(np.repeat(p[::step, ::step, None], 3, axis=2)) for p in planes]
-    calibration = cv2.createCalibrateRobertson(max_iter=60, threshold=0.005)
-    found = np.asarray(calibration.process(thrice, np.array(times, np.float32)), np.float64)[:, 0, 0]
-    seen = sum(count.sum(axis=0) + count.sum(axis=1) for count in counts)[_LOW : _HIGH + 1]
-    return _extended(_smoothed(np.log(np.maximum(found[_LOW : _HIGH + 1], 1e-6)), seen))
-
-
-def _green(levels: NDArray[Any]) -> NDArray[Any]:
-    """The channel whose response is recovered: a camera mixes least into green when it makes its colours."""
-    return levels if levels.ndim == 2 else np.ascontiguousarray(levels[..., 1])
-
-
-def _level_pairs(planes: Sequence[NDArray[Any]]) -> list[Array]:
-    """For neighbouring exposures, (256, 256): how often which levels meet in a pixel, of those that are not clipped."""
-    counts = []
-    for first, second in pairwise(planes):
-        joint = np.bincount(first.ravel().astype(np.int64) * 256 + second.ravel(), minlength=1 << 16)
-        count = joint.reshape(256, 256).astype(np.float64)
-        count[:_LOW], count[_HIGH + 1 :], count[:, :_LOW], count[:, _HIGH + 1 :] = 0, 0, 0, 0
-        counts.append(count)
-    return counts
-
-
-def _log_response(counts: Sequence[Array], exposures: Sequence[float]) -> Array:
-    """log irradiance g of the levels that are not clipped, up to a constant.
-
-    Minimises the sum over pixels of rho((g(z_a) - g(z_b) - log(t_a / t_b)) / sigma), plus the curvature of g, where
-    sigma is the noise of both levels times the slope of g; rho is Huber's.
-    """
-    size = _HIGH + 1 - _LOW
-    rows, columns, weights, changes = [], [], [], []
-    for count, (first, second) in zip(counts, pairwise(exposures), strict=True):
-        a, b = np.nonzero(count)
-        rows.append(a - _LOW)
-        columns.append(b - _LOW)
-        # Equal total weight of all pairs: dark exposures of a dark scene have few pixels, and the upper levels.
-        weights.append(count[a, b] / max(count.sum(), 1.0))
-        changes.append(np.full(len(a), np.log(first / second)))
-    a, b, n, change = (np.concatenate(part) for part in (rows, columns, weights, changes))
-    n *= size / n.sum()
-    g = np.log(Response.srgb().inverse(np.arange(_LOW, _HIGH + 1) / 255))
-    stiffness = _stiffness()
-    for _ in range(_FITS):
-        slope = np.maximum(np.gradient(g), 1e-4)
-        sigma = np.sqrt((slope[a] ** 2 + slope[b] ** 2) * _FIT_NOISE**2 + _LEAST_SPREAD**2)
-        residual = np.abs(g[a] - g[b] - change) / sigma
-        w = n * np.minimum(1.0, 1.5 / np.maximum(residual, 1e-9)) / sigma**2
-        normal = np.zeros((size, size))
-        for i, j, sign in ((a, a, 1.0), (b, b, 1.0), (a, b, -1.0), (b, a, -1.0)):
-            np.add.at(normal, (i, j), sign * w)
-        right = np.zeros(size)
-        np.add.at(right, a, w * change)
-        np.add.at(right, b, -w * change)
-        normal += stiffness
-        normal[128 - _LOW, 128 - _LOW] += 1.0  # the constant
-        g = _increasing(np.linalg.solve(normal, right))
-    return g
-
-
-def _stiffness() -> Array:
-    """The quadratic form of the curvature of g over the logarithm of the level, in which power laws are straight.
-
-    Exposures with equal ratios leave every ripple of that period in g undetermined; only this decides there.
-    """
-    level = np.arange(_LOW + 1, _HIGH, dtype=np.float64)
-    size, row = _HIGH + 1 - _LOW, np.arange(len(level))
-    bend = np.zeros((len(level), size))
-    bend[row, row], bend[row, row + 1], bend[row, row + 2] = (
-        level**2 - level / 2,
-        -2 * level**2,
-        level**2 + level / 2,
-    )
-    return _STIFFNESS * (bend.T / level) @ bend
-
-
-def _smoothed(g: Array, weight: Array) -> Array:
-    """A curve with its curvature penalised as by `_stiffness`; weights are numbers of pixels."""
-    share = weight / weight.mean() / _LEAST_SPREAD**2
-    return _increasing(np.linalg.solve(np.diag(share) + _stiffness(), share * g))
-
-
-def _increasing(g: NDArray[Any]) -> Array:
-    """The nearest curve whose neighbouring levels differ by at least a tenth of the mean step."""
-    step = 0.1 * (g[-1] - g[0]) / len(g)
-    ramp = step * np.arange(len(g))
-    return np.asarray(isotonic_regression(g - ramp).x + ramp, np.float64)
-
-
-def _extended(g: Array) -> Response:
-    """A response from the logarithm of the irradiance of the levels that are not clipped."""
-    inner = np.exp(g)
-    slope = (inner[-1] - inner[-11]) / 10
-    irradiance = np.empty(256)
-    irradiance[_LOW : _HIGH + 1] = inner
-    irradiance[_HIGH + 1 :] = inner[-1] + slope * np.arange(1, 256 - _HIGH)
-    irradiance[: _LOW + 1] = inner[0] * np.arange(_LOW + 1) / _LOW
-    return Response.tabulated(irradiance)
+    # Shortest first, as the response is fitted.
+    stack = np.stack([np.atleast_3d(picture.levels) for picture in reversed(pictures)])
+    times = np.array([picture.exposure for picture in reversed(pictures)])
+    try:
+        return Response.curve(fit_response(side_by_side(stack), times, method)[0].knots)
+    except InputError as error:
+        raise InputError(f"{error}; or state the response") from None
 
 
 def measured_exposures(
@@ -503,7 +328,7 @@ def measured_exposures(
         neighbour = index - 1 if index > reference else index + 1
         ratio = pictures[index].exposure / pictures[neighbour].exposure
         logs = _log_ratio(pictures[neighbour], pictures[index], response, covered[neighbour] & covered[index])
-        if len(logs) >= _LEAST_SHARED:
+        if len(logs) >= LEAST_SHARED:
             ratio = float(np.exp(np.median(logs)))
         found[index] = found[neighbour] * ratio
     return [found[index] for index in range(len(pictures))]
@@ -663,12 +488,12 @@ def relative_spread(pictures: Sequence[Picture], response: Response, covered: Se
     spreads, counts = [], []
     for k in range(len(pictures) - 1):
         logs = _log_ratio(pictures[k], pictures[k + 1], response, covered[k] & covered[k + 1], _QUIET)
-        if len(logs) >= _LEAST_SHARED:
+        if len(logs) >= LEAST_SHARED:
             spreads.append(1.4826 * float(np.median(np.abs(logs - np.median(logs)))))
             counts.append(len(logs))
     if not spreads:
-        return _LEAST_SPREAD
-    return max(float(np.sqrt(np.average(np.square(spreads), weights=counts))), _LEAST_SPREAD)
+        return LEAST_SPREAD
+    return max(float(np.sqrt(np.average(np.square(spreads), weights=counts))), LEAST_SPREAD)
 
 
 # --- merge ------------------------------------------------------------------------------------------------
@@ -717,7 +542,7 @@ def merge(
     """Radiance of aligned photographs, and where it was measured.
 
     The mean of each exposure's estimate E = CRF^-1(level) / t, weighted by the inverse of its variance,
-    (t dlevel/dE)^2 for noise of the level (Robertson [2]_), and nothing at clipped levels, tapered over ten levels.
+    (t dlevel/dE)^2 for noise of the level (Robertson [1]_), and nothing at clipped levels, tapered over ten levels.
 
     Parameters
     ----------

@@ -21,6 +21,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.calibration.homography import Features, agreed_homography, alike, find_features
 from kalux.errors import InputError
 from kalux.frames import Frame
 from kalux.models.camera import Camera, Response, inverse_response
@@ -36,8 +37,6 @@ LEAST_INLIERS: Final = 15
 
 _RATIO: Final = 0.8  # of the distances of the best and the second best match (Lowe)
 _INLIER_DISTANCE: Final = 2.0  # pixels of the fixed image: SIFT in noisy, blurry frames
-_WORK_WIDTH: Final = 640  # smaller images are enlarged for SIFT, which finds little in 240 x 180
-_MOST_FEATURES: Final = 6000
 _ITERATIONS: Final = 20
 _UNSMOOTHED: Final = 1.2  # pixels per pixel: bilinear sampling alone smooths as much
 _CONVERGED: Final = 0.002  # pixels
@@ -69,50 +68,19 @@ def tone_compressed(log_intensity: NDArray[Any], low: float, high: float) -> NDA
     return np.asarray(np.rint(255 * np.clip(share, 0.0, 1.0)), np.uint8)
 
 
-class Features(NamedTuple):
-    """SIFT features of a picture: its (height, width), positions (N, 2) in its pixels, and descriptors (N, 128)."""
-
-    size: tuple[int, int]
-    points: Array
-    descriptors: Any
-
-
 def match_features(fixed: Features, moving: Features) -> Match:
     """The homography on which most features of two pictures, of any two sizes, agree."""
-    points, moving_points = fixed.points, moving.points
-    if min(len(points), len(moving_points)) < 4:
-        return Match(None, 0, 0)
-    pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(fixed.descriptors, moving.descriptors, k=2)
-    good = [p[0] for p in pairs if len(p) == 2 and p[0].distance < _RATIO * p[1].distance]
-    if len(good) < 4:
-        return Match(None, len(good), 0)
-    source = np.array([points[m.queryIdx] for m in good])
-    target = np.array([moving_points[m.trainIdx] for m in good])
+    source, target = alike(fixed, moving, _RATIO)
+    if len(source) < 4:
+        return Match(None, len(source), 0)
     # From the moving to the fixed image, so that the inlier distance is in pixels of the fixed one.
-    found, inliers = cv2.findHomography(target, source, cv2.USAC_MAGSAC, _INLIER_DISTANCE, None, 5000, 0.9999)
-    if found is None or not np.isfinite(found).all() or abs(np.linalg.det(found)) < 1e-12:
-        return Match(None, len(good), 0)
+    found, count = agreed_homography(target, source, _INLIER_DISTANCE)
+    if found is None or abs(np.linalg.det(found)) < 1e-12:
+        return Match(None, len(source), 0)
     matrix: Array = np.asarray(np.linalg.inv(found), np.float64)
-    count = int(np.count_nonzero(inliers))
     if count < LEAST_INLIERS or not is_plausible(matrix, fixed.size):
-        return Match(None, len(good), count)
-    return Match(matrix / matrix[2, 2], len(good), count)
-
-
-def find_features(picture: NDArray[np.uint8], mask: Mask) -> Features:
-    """SIFT features of an (H, W) picture, where the mask is True."""
-    size = (picture.shape[0], picture.shape[1])
-    scale = max(_WORK_WIDTH / size[1], 1.0)
-    allowed = mask.astype(np.uint8)
-    if scale > 1.0:
-        larger = (round(size[1] * scale), round(size[0] * scale))
-        picture = np.asarray(cv2.resize(picture, larger, interpolation=cv2.INTER_CUBIC), np.uint8)
-        allowed = np.asarray(cv2.resize(allowed, larger, interpolation=cv2.INTER_NEAREST), np.uint8)
-    # A low threshold: the ratio test and the homography judge the features, not their contrast.
-    sift = cv2.SIFT.create(_MOST_FEATURES, contrastThreshold=0.02)
-    keypoints, descriptors = sift.detectAndCompute(picture, allowed)
-    points = np.array([k.pt for k in keypoints], np.float64).reshape(-1, 2)
-    return Features(size, (points + 0.5) / scale - 0.5, descriptors)
+        return Match(None, len(source), count)
+    return Match(matrix / matrix[2, 2], len(source), count)
 
 
 def is_plausible(matrix: Array, size: tuple[int, int]) -> bool:

@@ -1,0 +1,101 @@
+"""Photographs: their pixels, and what their EXIF says of the exposure."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux.errors import FormatError, InputError, MissingDependencyError
+
+
+class Exposure(NamedTuple):
+    """How a photograph was exposed.
+
+    Attributes
+    ----------
+    seconds
+        Exposure time.
+    sensitivity
+        ISO / 100; 1 where it is not stated.
+    aperture
+        f-number; 1 where it is not stated.
+    """
+
+    seconds: float
+    sensitivity: float = 1.0
+    aperture: float = 1.0
+
+    @property
+    def gain(self) -> float:
+        """By what the level of a pixel depends on the same light and time."""
+        return self.sensitivity / self.aperture**2
+
+
+def read_exposure(path: Path) -> Exposure:
+    """The exposure of a photograph from its EXIF.
+
+    The exposure time in EXIF is what a camera's display shows, 1/30 or 1/125; shutters make powers of two, 1/32
+    and 1/128, which is what the APEX value ``ShutterSpeedValue`` says. It is taken where the two agree within a
+    quarter of a stop (docs/datasets.md has the measurement).
+
+    Raises
+    ------
+    InputError
+        If there is no exposure time.
+    FormatError
+        If the file is no image.
+    MissingDependencyError
+        If Pillow is not installed.
+    """
+    try:
+        from PIL import ExifTags
+        from PIL import Image as Pillow
+    except ImportError as error:
+        raise MissingDependencyError(
+            f"{path}: reading exposure times from EXIF needs Pillow; pip install 'kalux[hdr]', or give the times "
+            "(--times)"
+        ) from error
+    try:
+        with Pillow.open(path) as file:
+            tags = file.getexif().get_ifd(ExifTags.IFD.Exif)
+    except OSError as error:
+        raise FormatError(f"{path}: not an image, or damaged; copy it again") from error
+    seconds = _positive(tags.get(ExifTags.Base.ExposureTime))
+    apex = tags.get(ExifTags.Base.ShutterSpeedValue)
+    exact = None if apex is None else _positive(2.0 ** -float(apex))
+    if seconds is None or (exact is not None and abs(np.log2(exact / seconds)) < 0.25):
+        seconds = exact
+    if seconds is None:
+        raise InputError(f"{path}: no exposure time in its EXIF data; give the exposure times (--times)")
+    iso = _positive(tags.get(ExifTags.Base.ISOSpeedRatings)) or 100.0
+    aperture = _positive(tags.get(ExifTags.Base.FNumber)) or 1.0
+    return Exposure(seconds, iso / 100, aperture)
+
+
+def _positive(value: Any) -> float | None:
+    if isinstance(value, tuple):
+        value = value[0] if value else None
+    try:
+        number = float(value)
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    return number if np.isfinite(number) and number > 0 else None
+
+
+def read_photograph(path: Path) -> NDArray[Any]:
+    """The levels of an image of 8 or 16 bits: (H, W), or (H, W, 3) red, green, blue.
+
+    Raises
+    ------
+    FormatError
+        If it cannot be read, or has other levels.
+    """
+    # Not turned as EXIF says: a bracket is compared as the sensor saw it.
+    image = cv2.imread(str(path), cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image is None or image.dtype not in (np.uint8, np.uint16) or image.ndim not in (2, 3):
+        raise FormatError(f"{path}: not an image of 8 or 16 bits, or damaged; copy it again")
+    return np.asarray(image) if image.ndim == 2 else np.ascontiguousarray(image[..., 2::-1])
