@@ -231,6 +231,15 @@ def test_unknown_pixel_types_are_refused(path):
         list(readers.read(path).frames())
 
 
+@pytest.mark.parametrize("place", [0, 250, 499])
+def test_a_polarity_that_is_none_is_refused(path, place):
+    content = bytearray(small_events().tobytes())
+    content[16 * place + 12] = 2
+    path.write_bytes(aedat4_file([(0, flatbuffer("EVTS", {0: ("vector", 500, bytes(content))}))]))
+    with pytest.raises(FormatError, match="polarity is neither 0 nor 1"):
+        list(readers.read(path).events())
+
+
 def test_a_file_without_events_and_frames_is_refused(path):
     path.write_bytes(aedat4_file([], streams=[("IMUS", (0, 0))]))
     with pytest.raises(FormatError, match="neither events nor frames"):

@@ -9,6 +9,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, Final
 
 import numpy as np
@@ -25,8 +26,20 @@ EVENT_PACKETS: Final = ("event_camera_msgs/EventPacket", "event_array_msgs/Event
 
 _RECORD: Final = 13  # bytes of an event of an EventArray in ROS 1: x, y, secs, nsecs, polarity
 _CDR_RECORD: Final = 16  # ... in ROS 2, aligned; the last one is 13
+_JOINED_WORDS: Final = 1 << 16
 _BACKWARDS_US: Final = 10 << 12  # as in evt
-_NUMBERS: Final = {c: (struct.calcsize("<" + c), struct.Struct("<" + c).unpack_from) for c in "BIiQ"}
+
+
+@cache
+def _fields(codes: str, shift: int | None) -> struct.Struct:
+    """Numbers one after the other; aligned, the first is ``shift`` bytes past a multiple of 8."""
+    layout, position = "<", shift or 0
+    for code in codes:
+        size = struct.calcsize("<" + code)
+        gap = 0 if shift is None else -position % size
+        layout += f"{gap}x{code}"
+        position += gap + size
+    return struct.Struct(layout)
 
 
 class Message:
@@ -51,18 +64,13 @@ class Message:
         """A number, by its code in `struct`: one of B, I, i, Q."""
         return self.numbers(code)[0]
 
-    def numbers(self, codes: str) -> list[int]:
+    def numbers(self, codes: str) -> tuple[int, ...]:
         """Several numbers."""
-        out = []
-        data, position, cdr = self.data, self.position, self.cdr
-        for code in codes:
-            size, unpack = _NUMBERS[code]
-            if cdr:
-                position += (4 - position) % size  # aligned from where the four bytes end
-            out.append(unpack(data, position)[0])
-            position += size
-        self.position = position
-        return out
+        # Of CDR, numbers are aligned from where the four bytes end.
+        fields = _fields(codes, (self.position - 4) % 8 if self.cdr else None)
+        position = self.position
+        self.position += fields.size
+        return fields.unpack_from(self.data, position)
 
     def text(self) -> str:
         """A string."""
@@ -243,7 +251,17 @@ def _open_packets(messages: Messages) -> EventTopic:
 
 def _open_evt3(size: tuple[int, int], packets: Callable[[], Iterator[_Packet]]) -> EventTopic:
     def words() -> Iterator[NDArray[Any]]:
-        return (packet.words("<u2") for packet in packets())
+        # Joined: drivers send packets of a few hundred events, each a call of a compiled loop.
+        held: list[NDArray[Any]] = []
+        count = 0
+        for packet in packets():
+            held.append(packet.words("<u2"))
+            count += len(held[-1])
+            if count >= _JOINED_WORDS:
+                yield np.concatenate(held)
+                held, count = [], 0
+        if held:
+            yield np.concatenate(held)
 
     offset = _evt3_offset(size, packets())
 
