@@ -13,6 +13,7 @@ Linux only.
 from __future__ import annotations
 
 import argparse
+import faulthandler
 import os
 import random
 import resource
@@ -307,6 +308,7 @@ def attempt(path: Path, limit: float, memory_mb: int, log: Path) -> Outcome:
             descriptor = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
             os.dup2(descriptor, 1)
             os.dup2(descriptor, 2)
+            faulthandler.enable(file=2)
             status = _READ if read_all(path) else _REFUSED
         except BaseException as error:
             in_one_line = f"{type(error).__name__}: {' '.join(str(error).split())}"
