@@ -299,6 +299,8 @@ _READ, _REFUSED, _FAILED = 0, 3, 4
 
 def attempt(path: Path, limit: float, memory_mb: int, log: Path) -> Outcome:
     """Read in a process of its own."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    inherited_mb = pages * resource.getpagesize() / (1 << 20)
     child = os.fork()
     if child == 0:
         status = _FAILED
@@ -323,8 +325,7 @@ def attempt(path: Path, limit: float, memory_mb: int, log: Path) -> Outcome:
     if not finished:
         os.kill(child, signal.SIGKILL)
     _, status, usage = os.wait4(child, 0)
-    own = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    held_mb = (usage.ru_maxrss - own) / 1024
+    held_mb = usage.ru_maxrss / 1024 - inherited_mb
     if not finished:
         return Outcome(False, f"not done after {limit:g} s")
     if os.WIFSIGNALED(status):
