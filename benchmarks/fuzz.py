@@ -299,12 +299,13 @@ _READ, _REFUSED, _FAILED = 0, 3, 4
 
 def attempt(path: Path, limit: float, memory_mb: int, log: Path) -> Outcome:
     """Read in a process of its own."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    inherited_mb = pages * resource.getpagesize() / (1 << 20)
+    receive, send = os.pipe()
     child = os.fork()
     if child == 0:
         status = _FAILED
         try:
+            # What it begins with: less than its parent has, since pages of files are not passed on.
+            os.write(send, Path("/proc/self/statm").read_text().split()[1].encode())
             resource.setrlimit(resource.RLIMIT_AS, (ADDRESS_SPACE, ADDRESS_SPACE))
             resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
             descriptor = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
@@ -317,6 +318,7 @@ def attempt(path: Path, limit: float, memory_mb: int, log: Path) -> Outcome:
             os.write(2, f"{traceback.format_exc()}\n{in_one_line}\n".encode(errors="replace"))
         finally:
             os._exit(status)
+    os.close(send)
     watch = os.pidfd_open(child)
     try:
         finished = bool(select.select([watch], [], [], limit)[0])
@@ -325,7 +327,9 @@ def attempt(path: Path, limit: float, memory_mb: int, log: Path) -> Outcome:
     if not finished:
         os.kill(child, signal.SIGKILL)
     _, status, usage = os.wait4(child, 0)
-    held_mb = usage.ru_maxrss / 1024 - inherited_mb
+    begun_mb = int(os.read(receive, 32) or b"0") * resource.getpagesize() / (1 << 20)
+    os.close(receive)
+    held_mb = usage.ru_maxrss / 1024 - begun_mb
     if not finished:
         return Outcome(False, f"not done after {limit:g} s")
     if os.WIFSIGNALED(status):
