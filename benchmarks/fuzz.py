@@ -13,6 +13,7 @@ Linux only.
 from __future__ import annotations
 
 import argparse
+import faulthandler
 import os
 import random
 import resource
@@ -298,21 +299,26 @@ _READ, _REFUSED, _FAILED = 0, 3, 4
 
 def attempt(path: Path, limit: float, memory_mb: int, log: Path) -> Outcome:
     """Read in a process of its own."""
+    receive, send = os.pipe()
     child = os.fork()
     if child == 0:
         status = _FAILED
         try:
+            # What it begins with: less than its parent has, since pages of files are not passed on.
+            os.write(send, Path("/proc/self/statm").read_text().split()[1].encode())
             resource.setrlimit(resource.RLIMIT_AS, (ADDRESS_SPACE, ADDRESS_SPACE))
             resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
             descriptor = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
             os.dup2(descriptor, 1)
             os.dup2(descriptor, 2)
+            faulthandler.enable(file=2)
             status = _READ if read_all(path) else _REFUSED
         except BaseException as error:
             in_one_line = f"{type(error).__name__}: {' '.join(str(error).split())}"
             os.write(2, f"{traceback.format_exc()}\n{in_one_line}\n".encode(errors="replace"))
         finally:
             os._exit(status)
+    os.close(send)
     watch = os.pidfd_open(child)
     try:
         finished = bool(select.select([watch], [], [], limit)[0])
@@ -321,8 +327,9 @@ def attempt(path: Path, limit: float, memory_mb: int, log: Path) -> Outcome:
     if not finished:
         os.kill(child, signal.SIGKILL)
     _, status, usage = os.wait4(child, 0)
-    own = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    held_mb = (usage.ru_maxrss - own) / 1024
+    begun_mb = int(os.read(receive, 32) or b"0") * resource.getpagesize() / (1 << 20)
+    os.close(receive)
+    held_mb = usage.ru_maxrss / 1024 - begun_mb
     if not finished:
         return Outcome(False, f"not done after {limit:g} s")
     if os.WIFSIGNALED(status):
