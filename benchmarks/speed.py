@@ -47,12 +47,12 @@ LIMITS = {
 compiled = {name: nb.njit(getattr(literal, name)) for name in ("advance", "integrate", "store")}
 
 
-def stream(size, count, start=0, seed=0):
+def stream(size, count, start=0, seed=0, rate=RATE):
     """Events of the sweeping edge from ``start`` (us) on."""
     height, width = size
     rng = np.random.default_rng(seed)
     events = np.zeros(count, EVENT_DTYPE)
-    events["t"] = np.sort(rng.integers(1, count * 1_000_000 // RATE, count))
+    events["t"] = np.sort(rng.integers(1, count * 1_000_000 // rate, count))
     events["x"] = (events["t"] // 100 % width + rng.integers(0, 40, count)) % width
     events["y"] = rng.integers(0, height, count)
     events["p"] = rng.random(count) < 0.5

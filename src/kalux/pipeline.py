@@ -200,24 +200,34 @@ def execute(
     """Carry out a plan. The callbacks are told the number of events of every chunk read, for progress:
 
     ``on_backward`` in the backward pass of a smoothed reconstruction, ``on_events`` in the pass that makes the images.
-    With more than one of ``threads``, events are read, and images are made, in two threads of their own while the
-    caller uses the images before; the callbacks are then called in the second. The images are the same.
+    With more than one of ``threads``, reading, filtering, and making images of what the filter says have a thread each,
+    while the caller uses the images before; the callbacks are then called in the second. The images are the same.
     """
-    images = _images(recording, plan, on_events, on_backward, threads > 1)
-    return ahead(images) if threads > 1 else images
+    engine = _engine(recording, plan, plan.settings)
+    several = threads > 1
+    estimates = _smoothed_estimates(recording, engine, plan, on_events, on_backward, several)
+    images = _images(engine, ahead(estimates) if several else estimates)
+    yield from ahead(images) if several else images
 
 
 def _images(
+    engine: Reconstructor, estimates: Generator[Estimate, None, None]
+) -> Generator[Image, None, None]:
+    with contextlib.closing(estimates):
+        for estimate in estimates:
+            yield engine.image(estimate)
+
+
+def _smoothed_estimates(
     recording: Recording,
+    engine: Reconstructor,
     plan: Plan,
     on_events: Callable[[int], None] | None,
     on_backward: Callable[[int], None] | None,
     read_ahead: bool,
-) -> Generator[Image, None, None]:
-    engine = _engine(recording, plan, plan.settings)
+) -> Generator[Estimate, None, None]:
     if not plan.smooth:
-        for estimate in _estimates(recording, engine, plan, on_events, read_ahead):
-            yield engine.image(estimate)
+        yield from _estimates(recording, engine, plan, on_events, read_ahead)
         return
     with tempfile.TemporaryDirectory(prefix="kalux-") as folder:
         backward = Backward(
@@ -228,7 +238,7 @@ def _images(
             on_backward,
         )
         for estimate in _estimates(recording, engine, plan, on_events, read_ahead):
-            yield engine.image(combine(estimate, backward.estimate(estimate.t)))
+            yield combine(estimate, backward.estimate(estimate.t))
 
 
 def _engine(recording: Recording, plan: Plan, settings: Settings) -> Reconstructor:
