@@ -149,3 +149,13 @@ def test_real_recordings(shared_data):
     events_only = format_description(describe(recording.open(shared_data / "formats" / "dvxplorer.aedat4")))
     assert "frames     none" in events_only
     assert "The file has no frames." in events_only
+
+
+@pytest.mark.parametrize(
+    ("response", "told"),
+    [("s-curve:0.1", "s-curve:0.1, as recorded"), ("curve:0 0.2 1", "curve of 3 knots, as recorded")],
+)
+def test_a_response_that_is_recorded_is_told(tmp_path, response, told):
+    path = tmp_path / "rec.h5"
+    hdf5.write(path, sensor_size=SIZE, events=[small_events()], frames=small_frames(), response=response)
+    assert told in format_description(describe(recording.open(path)))

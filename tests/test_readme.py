@@ -44,3 +44,24 @@ def test_its_links_lead_somewhere():
     assert "docs/equations.md" in links
     for link in links:
         assert (ROOT / link).exists(), link
+
+
+def test_all_pages_are_linked_and_their_links_lead_somewhere():
+    """Of docs/, headings included."""
+    pages = sorted((ROOT / "docs").glob("*.md"))
+    for page in pages:
+        assert f"docs/{page.name}" in README, page.name
+        for link, heading in re.findall(
+            r"\]\(((?!http)[^)#]*)(?:#([^)]+))?\)", page.read_text(encoding="utf-8")
+        ):
+            target = page.parent / link if link else page
+            assert target.exists(), f"{page.name}: {link}"
+            if heading:
+                titles = re.findall(r"^#+ (.*)$", target.read_text(encoding="utf-8"), re.MULTILINE)
+                known = [re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles]
+                assert heading in known, f"{page.name}: {link}#{heading}"
+
+
+def test_the_api_page_has_every_public_name():
+    rows = re.findall(r"^\| `(\w+)` \|", (ROOT / "docs" / "api.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert sorted(rows) == sorted(kalux.__all__)

@@ -113,6 +113,8 @@ class Description:
         Of the frames: ``"grey"``, ``"RGB"``, or the pattern of a mosaic; None without frames.
     stored_in_rgb
         Whether a mosaic is stored as RGB that was made of it.
+    response
+        Of the frame camera, as in `kalux.settings.CameraSettings`; None if the recording does not state it.
     """
 
     path: str
@@ -128,6 +130,7 @@ class Description:
     missing: tuple[str, ...]
     colours: str | None = None
     stored_in_rgb: bool = False
+    response: str | None = None
 
 
 def describe(recording: Recording, *, estimated_threshold: tuple[float, float] | None = None) -> Description:
@@ -164,6 +167,7 @@ def describe(recording: Recording, *, estimated_threshold: tuple[float, float] |
         missing=source.missing,
         colours=None if first is None else first.colours,
         stored_in_rgb=stored is not None and stored.image.ndim == 3 and recording.mosaic is not None,
+        response=recording.response,
     )
 
 
@@ -256,6 +260,8 @@ def format_description(description: Description) -> str:
         overlap = "none: events and frames do not overlap in time" if not description.overlap else None
         rows.append(("overlap", overlap or f"{_time(description.overlap)} covered by both events and frames"))
     rows.append(("threshold", _threshold_text(description)))
+    if description.response is not None:
+        rows.append(("response", f"{_response_text(description.response)}, as recorded"))
     if description.has_ground_truth:
         rows.append(("reference", "ground truth images are included"))
     rows += [("note", sentence) for sentence in description.missing]
@@ -325,6 +331,14 @@ def _threshold_text(description: Description) -> str:
         if threshold is not None
     ]
     return "; ".join(texts) or "not recorded"
+
+
+def _response_text(response: str) -> str:
+    """A response's name, without all values of a measured curve."""
+    return "; ".join(
+        f"curve of {len(part.split())} knots" if part.startswith("curve:") else part
+        for part in response.split(";")
+    )
 
 
 def _span(first: int, last: int) -> str:

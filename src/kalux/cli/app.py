@@ -34,18 +34,18 @@ _DESCRIPTION = """\
 HDR video with per-pixel uncertainty from cameras that give events and frames.
 
 commands:
-  info         what is in a recording, and what kalux would use of it
-  reconstruct  make images or a video from a recording
-  convert      copy a recording of any format into one kalux HDF5 file
-  register     make one recording of an event camera's events and another camera's frames
-  calibrate    measure cameras: thresholds, noise, response, two-camera rigs, clock offsets
-  evaluate     compare methods with ground truth, or with frames held out
-  benchmark    the same for many recordings, with a report
-  simulate     make a recording with ground truth from an HDR photograph, images or a video
-  demo         simulate a scene, reconstruct it, and compare with the truth
-  ahdr         a recording with frames clipped on purpose, the originals as truth
+  info           what is in a recording, and what kalux would use of it
+  reconstruct    make images or a video from a recording
+  convert        copy a recording of any format into one kalux HDF5 file
+  register       make one recording of an event camera's events and another camera's frames
+  calibrate      measure cameras: thresholds, noise, response, two-camera rigs, clock offsets
+  evaluate       compare methods with ground truth, or with frames held out
+  benchmark      the same for many recordings, with a report
+  simulate       make a recording with ground truth from an HDR photograph, images or a video
+  demo           simulate a scene, reconstruct it, and compare with the truth
+  ahdr           a recording with frames clipped on purpose, the originals as truth
   hdr-reference  radiance from bracketed exposures, and ground truth from it
-  datasets     published sets: licence, page, layout; checks a folder
+  datasets       published sets: licence, page, layout; checks a folder
 
 kalux COMMAND --help says more."""
 

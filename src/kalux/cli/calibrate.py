@@ -28,7 +28,7 @@ are for --calibration of other commands, those of rig and offset for kalux regis
 
 commands:
   contrast     the events' thresholds, global and of every pixel
-  noise        noise events, hot and dead pixels, noise and clipping of the frames; --fit to held-out frames
+  noise        noise events, hot and dead pixels, noise and clipping of frames; --fit: to held-out frames
   response     the frame camera's response, from images at several exposures
   rig          lenses and pose of an event camera and a frame camera, from a blinking board
   offset       the offset between the clocks of frames and events

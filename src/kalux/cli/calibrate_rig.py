@@ -18,8 +18,8 @@ hold the rig still before it, move, hold still again: 15 to 30 places, tilted, a
 _EXAMPLES = """\
 examples:
   kalux calibrate rig board.raw board_frames/ --board 9x6 --square 30 -o rig.toml
-  kalux calibrate rig board.raw board.mp4 --frames-start 0 --frames-rate 30 --board 9x6 --square 30 -o rig.toml
-  kalux calibrate rig board.raw frames/ --board 9x6 --square 30 --charuco 5X5_100 --marker 22 -o rig.toml"""
+  kalux calibrate rig board.raw board.mp4 --frames-start 0 --board 9x6 --square 30 -o rig.toml
+  kalux calibrate rig board.raw frames/ --board 9x6 --charuco 5X5_100 --marker 22 -o rig.toml"""
 
 
 def add_command(subparsers: Any) -> None:

@@ -39,7 +39,7 @@ examples:
   kalux evaluate night_drive.aedat4
   kalux evaluate pan.mat --truth pan_gt.npz --hdrvdp -o scores.csv
   kalux evaluate slider_depth --exposure 10000 --hold-out-frames 4 --methods hold,cf,default
-  kalux evaluate night_drive.aedat4 --methods default,firenet:firenet_1000.pth.tar,mine=results/night"""
+  kalux evaluate night_drive.aedat4 --methods default,firenet:firenet.pth,mine=results/night"""
 
 _SUFFIXES: Final = (".csv", ".json")
 _OWN: Final = Path()  # --truth without a file

@@ -5,7 +5,9 @@ from __future__ import annotations
 import argparse
 import difflib
 import re
+import textwrap
 from collections.abc import Callable, Sequence
+from itertools import groupby
 from typing import Any, Never
 
 from kalux.cli.terminal import say
@@ -72,6 +74,14 @@ class HelpFormatter(argparse.RawDescriptionHelpFormatter):
 
     def __init__(self, prog: str, **options: Any) -> None:
         super().__init__(prog, max_help_position=28, width=100, **options)
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        """Paragraphs wrapped, indented lines (examples, tables) as they are."""
+        lines: list[str] = []
+        for indented, group in groupby(text.splitlines(), key=lambda line: line[:1] in ("", " ")):
+            part = [*group]
+            lines += part if indented else textwrap.wrap(" ".join(part), width)
+        return "".join(f"{indent}{line}".rstrip() + "\n" for line in lines)
 
     def _metavar_formatter(
         self, action: argparse.Action, default_metavar: str

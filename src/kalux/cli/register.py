@@ -28,8 +28,8 @@ cameras; docs/rig.md goes through all of it."""
 _EXAMPLES = """\
 examples:
   kalux register drive.raw --frames drive_frames/ --rig rig.toml --timing triggers -o drive.h5
-  kalux register drive.raw --frames drive_frames/ --rig rig.toml --distance 20 -o drive.h5 --overlay overlay.png
-  kalux register drive.raw --frames drive.mp4 --frames-start 0 --frames-rate 30 --exposure 8000 -o drive.h5"""
+  kalux register drive.raw --frames drive_frames/ --rig rig.toml --distance 20 -o drive.h5
+  kalux register drive.raw --frames drive.mp4 --exposure 8000 --frames-start 0 -o drive.h5"""
 
 
 def add_command(commands: Any) -> None:
