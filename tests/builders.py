@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import threading
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -20,6 +21,11 @@ from kalux.datasets import (
     simulate_colour,
 )
 from kalux.events import make_events
+
+
+def own_threads() -> list[str]:
+    """Names of kalux's threads that are alive."""
+    return [thread.name for thread in threading.enumerate() if thread.name.startswith("kalux-")]
 
 
 def events(*rows):

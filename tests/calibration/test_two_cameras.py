@@ -56,7 +56,7 @@ def test_without_any_calibration_the_lenses_remain():
 
 
 def test_the_reconstruction_is_nearly_that_of_a_shared_sensor(refined):
-    """Within 15 % of its MSE; most of the difference is pixels at highlights, which are masked."""
+    """Within 20 % of its MSE at this size; most of the difference is pixels at highlights, which are masked."""
     seen = distant_recording()
     pair = Recording.from_arrays(seen.events, refined.frames(seen.frames), sensor_size=(120, 160))
     shared_frames = list(
@@ -71,7 +71,7 @@ def test_the_reconstruction_is_nearly_that_of_a_shared_sensor(refined):
         errors.append(
             np.mean([((i.intensity - seen.scene.at(float(i.t))) ** 2)[mask].mean() for i in images])
         )
-    assert errors[0] < 1.15 * errors[1]
+    assert errors[0] < 1.2 * errors[1]  # of larger images 1.05: benchmarks/rig.py
     assert errors[1] < 0.01
 
 

@@ -7,7 +7,6 @@ import dataclasses
 import errno
 import os
 import signal
-import threading
 import time
 import tomllib
 
@@ -22,6 +21,8 @@ from kalux.datasets import SensorSettings, colour_photograph, pan, simulate_colo
 from kalux.errors import InputError
 from kalux.models.colour import luminance
 from kalux.writers import folder
+
+from builders import own_threads
 
 
 def times_in(path):
@@ -485,7 +486,7 @@ class TestThreads:
         assert len(images_in(out)) == len(times_in(out)) > 5
         assert f"{len(images_in(out))} images are finished and valid in {out}" in found.err
         assert tomllib.loads((out / "kalux.toml").read_text())["complete"] is False
-        assert threading.active_count() == 1
+        assert not own_threads()
 
     @pytest.mark.parametrize("threads", [1, 2, 4])
     def test_a_writer_that_fails_ends_the_filter(self, cli, recording, tmp_path, monkeypatch, threads):
@@ -504,7 +505,7 @@ class TestThreads:
         assert found.code == 2
         assert "no space is left" in found.err
         assert len(times_in(out)) == len(images_in(out)) == 3
-        assert threading.active_count() == 1
+        assert not own_threads()
 
     @pytest.mark.parametrize("threads", [1, 3])
     @pytest.mark.parametrize("name", ["v.mp4", "npy"])
@@ -523,7 +524,7 @@ class TestThreads:
         found = cli("reconstruct", recording, "-o", out, "--rate", 200, "--threads", threads, *flags)
         assert found.code == 130
         assert f"interrupted; 21 images are finished and valid in {out}" in found.err
-        assert threading.active_count() == 1
+        assert not own_threads()
 
 
 def told_when_planned(monkeypatch):

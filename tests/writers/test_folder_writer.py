@@ -9,7 +9,6 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 import tomllib
 from io import FileIO
@@ -25,6 +24,8 @@ from kalux.errors import InputError, InternalError, OutputError, SettingsError
 from kalux.writers import files, open_writer
 from kalux.writers.files import uninterrupted
 from kalux.writers.folder import append_line
+
+from builders import own_threads
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -577,7 +578,7 @@ class TestSeveralEncoders:
         with pytest.raises(error):
             write()
         assert_valid(tmp_path / "o", 7, complete=False)
-        assert threading.active_count() == 1
+        assert not own_threads()
 
     @pytest.mark.parametrize("last", [4, 12], ids=["when it closes", "while it writes"])
     def test_a_full_disk_ends_it_there(self, tmp_path, monkeypatch, last):
@@ -590,7 +591,7 @@ class TestSeveralEncoders:
         with pytest.raises(OutputError, match=r"000002.png: no space .*; the 2 images listed in"):
             write()
         assert_valid(tmp_path / "o", 2, complete=False)
-        assert threading.active_count() == 1
+        assert not own_threads()
 
     def test_an_error_of_encoding_is_raised(self, tmp_path, monkeypatch):
         def broken(picture):

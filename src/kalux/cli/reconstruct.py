@@ -41,7 +41,6 @@ before anything is written."""
 _EXAMPLES = """\
 examples:
   kalux reconstruct drive.aedat4 -o drive.mp4
-  kalux reconstruct drive.aedat4 -o drive/ --format exr --rate 300
   kalux reconstruct slider_depth -o slider.mp4 --exposure 10000 --stamp start --slow-motion 4
   kalux reconstruct drive.aedat4 -o again.mp4 --settings drive/kalux.toml --camera.log-offset 0.05"""
 
