@@ -71,7 +71,7 @@ def test_the_reconstruction_is_nearly_that_of_a_shared_sensor(refined):
         errors.append(
             np.mean([((i.intensity - seen.scene.at(float(i.t))) ** 2)[mask].mean() for i in images])
         )
-    assert errors[0] < 1.2 * errors[1]  # of larger images 1.05: benchmarks/rig.py
+    assert errors[0] < 1.2 * errors[1]  # of larger images 1.1: benchmarks/rig.py
     assert errors[1] < 0.01
 
 
