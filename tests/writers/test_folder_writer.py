@@ -524,7 +524,7 @@ def test_unknown_formats_say_what_is_possible(tmp_path, name, format, match):
 def test_a_killed_process_leaves_a_valid_folder(tmp_path):
     script = """
 import sys
-sys.path.insert(0, sys.argv[2])
+sys.path[:0] = sys.argv[2:]
 from test_folder_writer import make_image
 from kalux.writers import open_writer
 writer = open_writer(sys.argv[1], format="png")
@@ -532,7 +532,8 @@ for k in range(10**6):
     writer.write(make_image(k, (64, 64)))
 """
     out = tmp_path / "o"
-    process = subprocess.Popen([sys.executable, "-c", script, str(out), str(Path(__file__).parent)])
+    here = Path(__file__).parent
+    process = subprocess.Popen([sys.executable, "-c", script, str(out), str(here), str(here.parent)])
     try:
         deadline = time.monotonic() + 20
         while not (out / "000020.png").exists() and time.monotonic() < deadline:
