@@ -111,10 +111,9 @@ def plan(
     )
     chosen = _with_white_balance(recording, chosen)
     chosen, delay = _with_delay(recording, chosen)
-    offset_known = chosen.camera.log_offset is not None
     filled, origin, estimate = _with_thresholds(recording, chosen)
     filled, model = _with_event_model(recording, filled)
-    if estimate is not None and not offset_known:  # it was made with another I_0
+    if estimate is not None and filled.camera.offset != chosen.camera.offset:  # it was made with another I_0
         unfilled = dataclasses.replace(
             filled.events,
             threshold_on=chosen.events.threshold_on,

@@ -11,7 +11,7 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from kalux.errors import SettingsError
+from kalux.errors import InputError, KaluxError, SettingsError
 
 FilterName = Literal["akf", "cf"]
 AugmentationName = Literal["bridge", "paper"]
@@ -246,6 +246,24 @@ def from_dict(values: Mapping[str, Any], base: Settings) -> Settings:
     return dataclasses.replace(base, **groups)
 
 
+def read_toml(
+    path: Path, *, unreadable: type[KaluxError] = InputError, damaged: type[KaluxError] = InputError
+) -> dict[str, Any]:
+    """The tables of a TOML file.
+
+    Raises
+    ------
+    KaluxError
+        ``unreadable`` if the file cannot be read, ``damaged`` if it is not TOML.
+    """
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise unreadable(f"{path}: cannot be read: {error}") from error
+    except tomllib.TOMLDecodeError as error:
+        raise damaged(f"{path}: not valid TOML: {error}") from error
+
+
 def load(path: str | Path, base: Settings) -> Settings:
     """Change ``base`` by a TOML file: tables ``[camera]``, ``[events]``, ``[filter]``, as in ``kalux.toml``.
 
@@ -256,12 +274,7 @@ def load(path: str | Path, base: Settings) -> Settings:
     SettingsError
         If the file cannot be read, is not TOML, or holds an unknown setting.
     """
-    try:
-        values = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise SettingsError(f"{path}: cannot be read: {error}") from error
-    except tomllib.TOMLDecodeError as error:
-        raise SettingsError(f"{path}: not valid TOML: {error}") from error
+    values = read_toml(Path(path), unreadable=SettingsError, damaged=SettingsError)
     chosen = values.get("settings", values)
     if not isinstance(chosen, Mapping):
         raise SettingsError(f"{path}: settings is not a table of settings")

@@ -7,7 +7,6 @@ the maps, named with its checksum (docs/calibration.md).
 from __future__ import annotations
 
 import hashlib
-import tomllib
 import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -19,9 +18,9 @@ import numpy as np
 import tomli_w
 from numpy.typing import NDArray
 
-from kalux.errors import FormatError, InputError, SettingsError
+from kalux.errors import FormatError, SettingsError
 from kalux.models.pixels import PixelCalibration
-from kalux.settings import Settings, from_dict, preset
+from kalux.settings import Settings, from_dict, preset, read_toml
 
 VERSION: Final = 1
 """Of the file format."""
@@ -205,12 +204,7 @@ def load_calibration(path: str | Path, *more: str | Path) -> Calibration:
 
 
 def _load(path: Path) -> Calibration:
-    try:
-        body = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read: {error}") from error
-    except tomllib.TOMLDecodeError as error:
-        raise FormatError(f"{path}: not valid TOML: {error}") from error
+    body = read_toml(path, damaged=FormatError)
     version = body.get("kalux_calibration")
     if not isinstance(version, int):
         raise FormatError(f"{path}: not a calibration; kalux calibrate makes them")

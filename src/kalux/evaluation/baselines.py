@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain, pairwise
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -126,19 +126,9 @@ def edi_video(recording: Recording, times: Times, *, settings: Settings | None =
             yield np.maximum(np.exp(moved) - camera.offset, 0.0).astype(np.float32)
 
 
-def filtered(
-    recording: Recording,
-    times: Times,
-    *,
-    settings: Settings,
-    calibration: Calibration | None = None,
-    smooth: bool = False,
-) -> Iterator[Image]:
-    """`kalux.reconstruct` with given settings: the AKF, the complementary filter."""
-    for image in reconstruct(
-        recording, times=times, settings=settings, calibration=calibration, smooth=smooth
-    ):
-        yield image.intensity
+def filtered(recording: Recording, times: Times, **options: Any) -> Iterator[Image]:
+    """The images of `filtered_estimates`."""
+    return (made.intensity for made in filtered_estimates(recording, times, **options))
 
 
 def filtered_estimates(
@@ -149,7 +139,7 @@ def filtered_estimates(
     calibration: Calibration | None = None,
     smooth: bool = False,
 ) -> Iterator[Estimated]:
-    """As `filtered`, with the variances."""
+    """`kalux.reconstruct` with given settings, the AKF or the complementary filter: images and their variances."""
     for image in reconstruct(
         recording, times=times, settings=settings, calibration=calibration, smooth=smooth
     ):

@@ -12,9 +12,9 @@ hundred is granted ten times the standard deviation, or a few flickering pixels 
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from itertools import islice
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -23,7 +23,7 @@ from scipy.special import log_ndtr
 
 from kalux.calibration.values import Calibration
 from kalux.errors import InputError
-from kalux.evaluation.held_out import HeldOut, hold_out_frames
+from kalux.evaluation.held_out import HeldOut, hold_out_frames, with_frames
 from kalux.frames import Frame
 from kalux.models.camera import Camera, Response, covariance, inverse_response, log_covariance
 from kalux.pipeline import plan, reconstruct
@@ -177,22 +177,7 @@ def fit_settings(
 
 
 def _first_frames(recording: Recording, count: int) -> Recording:
-    def frames() -> Iterator[Frame]:
-        for index, frame in enumerate(recording.frames()):
-            if index == count:
-                return
-            yield frame
-
-    return Recording(
-        dataclasses.replace(
-            recording.source,
-            events=lambda: iter(recording.events()),
-            frames=frames,
-            count_frames=lambda: sum(1 for _ in frames()),
-            exposure_known=True,
-            ground_truth=None,
-        )
-    )
+    return with_frames(recording, lambda: islice(recording.frames(), count))
 
 
 def _filled_in(held: HeldOut, settings: Settings) -> Settings:

@@ -125,6 +125,11 @@ def without_frames(recording: Recording, every: int) -> Recording:
     def frames() -> Iterator[Frame]:
         return (frame for i, frame in enumerate(recording.frames()) if i % every != every - 1)
 
+    return with_frames(recording, frames)
+
+
+def with_frames(recording: Recording, frames: Callable[[], Iterator[Frame]]) -> Recording:
+    """The recording with some of its own frames only, their exposures known, and without its ground truth."""
     return Recording(
         dataclasses.replace(
             recording.source,

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from kalux.errors import FormatError
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.frames import Frame
-from kalux.readers.characters import DOT, FIVE, NEWLINE, NINE, ONE, SPACE, ZERO, skip_blanks
+from kalux.readers.characters import DOT, FIVE, NEWLINE, NINE, ONE, SPACE, ZERO, parsed_blocks, skip_blanks
 from kalux.readers.images import in_colour, read_image
 from kalux.readers.source import SIZE_UNKNOWN, Source, reading
 
@@ -160,27 +160,15 @@ def _check_beginning(path: Path, root: _Place) -> tuple[int, int] | None:
 
 def _read_events(path: Path) -> Iterator[EventArray]:
     root = _root_again(path)
-    buffer = bytearray(_BLOCK_BYTES)  # used again and again: fresh memory costs as much as the parsing
-    filled = line_number = 0
     with reading(path, *_DAMAGE), (root / _EVENTS).open("rb") as file:
-        while True:
-            got = file.readinto(memoryview(buffer)[filled:])  # type: ignore[attr-defined]
-            if not got and filled:
-                buffer[filled] = NEWLINE  # the last line may lack its end
-                got = 1
-            if not got:
-                return
-            filled += got
-            end = buffer.rfind(b"\n", 0, filled) + 1
-            if filled - end > _LONGEST_LINE:
-                number = line_number + buffer.count(b"\n", 0, end) + 1
-                raise _bad_line(path, number, bytes(buffer[end:filled]), "the line is too long")
-            if end:
-                events, lines = _parse_block(path, memoryview(buffer)[:end], line_number)
-                buffer[: filled - end] = buffer[end:filled]
-                filled -= end
-                line_number += lines
-                yield events
+        yield from parsed_blocks(
+            file,
+            lambda text, lines: _parse_block(path, text, lines),
+            lambda number, line: _bad_line(path, number, line, "the line is too long"),
+            lines_before=0,
+            block_bytes=_BLOCK_BYTES,
+            longest_line=_LONGEST_LINE,
+        )
 
 
 def _parse_block(path: Path, text: memoryview, lines_before: int) -> tuple[EventArray, int]:

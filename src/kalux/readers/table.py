@@ -18,7 +18,18 @@ from numpy.typing import NDArray
 
 from kalux.errors import FormatError
 from kalux.events import EVENT_DTYPE, EventArray
-from kalux.readers.characters import DOT, FIVE, NEWLINE, NINE, ONE, SPACE, TAB, ZERO, skip_blanks
+from kalux.readers.characters import (
+    DOT,
+    FIVE,
+    NEWLINE,
+    NINE,
+    ONE,
+    SPACE,
+    TAB,
+    ZERO,
+    parsed_blocks,
+    skip_blanks,
+)
 from kalux.readers.columns import RENAME, UNIT_ASSUMED, Columns, find_columns
 from kalux.readers.source import SIZE_UNKNOWN, Source, reading, smallest_size
 
@@ -169,28 +180,16 @@ def _once(roles: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def _events(path: Path, header: _Header) -> Iterator[EventArray]:
-    buffer = bytearray(_BLOCK_BYTES)  # used again and again: fresh memory costs as much as the parsing
-    filled, line_number = 0, header.lines
     with reading(path), path.open("rb") as file:
         file.seek(header.begin)
-        while True:
-            got = file.readinto(memoryview(buffer)[filled:])
-            if not got and filled:
-                buffer[filled] = NEWLINE  # the last line may lack its end
-                got = 1
-            if not got:
-                return
-            filled += got
-            end = buffer.rfind(b"\n", 0, filled) + 1
-            if filled - end > _LONGEST_LINE:
-                number = line_number + buffer.count(b"\n", 0, end) + 1
-                raise _bad_line(path, number, bytes(buffer[end:filled]), "it is too long")
-            if end:
-                events, lines = _parse_block(path, memoryview(buffer)[:end], header, line_number)
-                buffer[: filled - end] = buffer[end:filled]
-                filled -= end
-                line_number += lines
-                yield events
+        yield from parsed_blocks(
+            file,
+            lambda text, lines: _parse_block(path, text, header, lines),
+            lambda number, line: _bad_line(path, number, line, "it is too long"),
+            lines_before=header.lines,
+            block_bytes=_BLOCK_BYTES,
+            longest_line=_LONGEST_LINE,
+        )
 
 
 def _parse_block(path: Path, text: memoryview, header: _Header, lines_before: int) -> tuple[EventArray, int]:

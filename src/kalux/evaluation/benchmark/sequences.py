@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import re
-import tomllib
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -19,7 +18,7 @@ from kalux.evaluation.truth import truth_beside
 from kalux.frames import Stamp
 from kalux.readers import READERS
 from kalux.recording import Recording
-from kalux.settings import AUTO
+from kalux.settings import AUTO, read_toml
 
 TRUTH_SUFFIX: Final = "_gt.npz"
 """Reference images beside a recording: ``pan_gt.npz`` beside ``pan.mat``."""
@@ -255,12 +254,7 @@ def load(path: Path) -> Benchmark:
     InputError
         If it cannot be read, is no TOML, or says something unknown; names the sequence.
     """
-    try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read: {error}") from error
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: not valid TOML: {error}") from error
+    values = read_toml(path)
     _check_keys(f"{path}", values, _FILE_KEYS)
     entries = values.get("sequence", [])
     if not entries:
