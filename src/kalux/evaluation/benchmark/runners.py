@@ -80,7 +80,9 @@ def _pool(jobs: list[Job], processes: int) -> Generator[tuple[Job, Outcome | Non
         for process in ours:
             process.terminate()
         for process in ours:
-            process.join()
+            # The pool's own thread waits for it, too: if that is told first, join returns before the end is noted.
+            while process.is_alive():
+                process.join(0.05)
 
 
 def _ignore_interrupts() -> None:
