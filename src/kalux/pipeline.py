@@ -386,8 +386,7 @@ def _with_thresholds(
 def _with_event_model(
     recording: Recording, settings: Settings, thresholds_are_estimated: bool
 ) -> tuple[Settings, EventModel | None]:
-    """Fill in I_0, the variance of a step and the refractory period: from the settings, else an estimate, else the usual.
-    """
+    """Fill in I_0, variance of steps and refractory period: from the settings, else an estimate, else the usual."""
     camera, events = settings.camera, settings.events
     of_steps = (events.step_variance, events.refractory_period) if _uses_steps(settings) else ()
     if None not in (camera.log_offset, *of_steps):
@@ -413,9 +412,7 @@ def _with_event_model(
             events = dataclasses.replace(events, refractory_period=model.refractory_period)
     # What could not be estimated is written down as it will be used.
     camera = dataclasses.replace(camera, log_offset=camera.offset)
-    events = dataclasses.replace(
-        events, step_variance=events.step_noise, refractory_period=events.refractory
-    )
+    events = dataclasses.replace(events, step_variance=events.step_noise, refractory_period=events.refractory)
     return dataclasses.replace(settings, camera=camera, events=events), model
 
 

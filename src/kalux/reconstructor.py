@@ -280,7 +280,9 @@ class Reconstructor:
             check_events(array, self.sensor_size, first_index=self._event_count, previous_t=previous)
             words = event_words(array)[~self._ignored[array["y"], array["x"]]]
             kept = words.reshape(-1).view(EVENT_DTYPE)  # words keep the weights
-        if not self._events.append(kept, self.sensor_size, earliest=previous, delay=self._delay, weighed=weighed):
+        if not self._events.append(
+            kept, self.sensor_size, earliest=previous, delay=self._delay, weighed=weighed
+        ):
             check_events(array, self.sensor_size, first_index=self._event_count, previous_t=previous)
         if len(array) == 0:
             return

@@ -253,9 +253,7 @@ def _finish_exposure(pixels, exposure, log_mean, to_middle, to_end, peak, events
                 plane[row, column] = logarithm(plane[row, column])
 
 
-def count_events(
-    events: EventArray, shape: tuple[int, int], *, weighed: bool = False
-) -> tuple[Array, Array]:
+def count_events(events: EventArray, shape: tuple[int, int], *, weighed: bool = False) -> tuple[Array, Array]:
     """Number of on and off events of every pixel, two (H, W) float64; the sums of their weights if they carry such."""
     on, off = count_chunks([events], shape, weighed=weighed)
     return on.astype(np.float64), off.astype(np.float64)

@@ -45,16 +45,19 @@ class EventClock:
     """
 
     def __init__(self, sensor_size: tuple[int, int], refractory_period: float) -> None:
-        height, self._width = sensor_size
-        self.refractory_period = refractory_period
-        self._latest: NDArray[np.int64] = np.full(height * self._width, _NEVER, np.int64)
+        self._sensor_size = sensor_size
+        self._refractory_period = np.float32(refractory_period)
+        self._latest: NDArray[np.int64] | None = None  # once it is needed
 
     def weigh(self, words: NDArray[np.int64]) -> None:
         """Write the weights of the next events into their words (`kalux.compiled.event_words`), in place."""
-        if self.refractory_period > 0:
-            _weigh(words, self._latest, np.uint64(self._width), np.float32(self.refractory_period))
-        else:
+        if self._refractory_period == 0:
             _weigh_equally(words)
+            return
+        height, width = self._sensor_size
+        if self._latest is None:
+            self._latest = np.full(height * width, _NEVER, np.int64)
+        _weigh(words, self._latest, np.uint64(width), self._refractory_period)
 
     def weighed(self, events: EventArray) -> EventArray:
         """A copy of the next events, with their weights."""
@@ -66,7 +69,7 @@ class EventClock:
 @nb.njit(cache=True, inline="always", error_model="numpy")
 def step_weight(since_pixel, refractory_period):  # type: ignore[no-untyped-def]
     """K13: how many thresholds an event tells of, ``since_pixel`` after the pixel's previous one; float32, us."""
-    if since_pixel < _EARLY * refractory_period:
+    if since_pixel <= _EARLY * refractory_period:  # also without a period, of events at one time
         return ONE
     looked = since_pixel - refractory_period
     return MOST if since_pixel > MOST * looked else since_pixel / looked

@@ -1,5 +1,5 @@
-"""Where a recording's events become logarithmic, how much one event's step varies, and what the refractory period hides:
-by maximum likelihood.
+"""Where a recording's events become logarithmic, how much one event's step varies, and what the refractory period
+hides: by maximum likelihood.
 
 Events are steps of log(I + I_d), with I_d the dark current of their pixels, seen by the frames' scale. The state is
 log(I + I_0), equation (8); it moves as the events say only if I_0 is near I_d. Too large, and steps in the dark are
@@ -39,12 +39,14 @@ _MIN_SAMPLES: Final = 1_000
 _MAX_FRAMES: Final = 80
 _LEAST_NET: Final = 2  # as for the thresholds: a net count of one may be noise
 _DARKEST: Final = 0.01  # two to three levels of 8 bits: below, a frame's log is rounding
-_SHORTEST_EVENTS: Final = 500_000  # of which the shortest interval is taken: its edge is then that of 10,000 pairs
+_SHORTEST_EVENTS: Final = (
+    500_000  # of which the shortest interval is taken: its edge is then that of 10,000 pairs
+)
 _FIT_STEPS: Final = 8
 _LEAST_GAIN: Final = 0.01
-"""In log likelihood per sample, for a refractory period to be believed. Eleven simulations and three real recordings,
-thresholds stated: 0.034 to 0.65 where there is one, less than 0 where nothing is lost; thresholds estimated, in which the
-loss can hide: 0.014 and 0.32 where it is found, 0.002 and less where nothing is lost."""
+"""In log likelihood per sample, for a refractory period to be believed. On eleven simulations and three recordings,
+thresholds stated, it was 0.034 to 0.65 where there is one, and less than 0 where nothing is lost; thresholds estimated,
+in which the loss can hide, 0.014 and 0.32 where it is found, and 0.002 at most where nothing is lost."""
 _FREEDOM: Final = 4.0  # degrees of freedom of Student's t, whose tails take flicker and occlusions
 
 
@@ -179,7 +181,10 @@ def _refractory(
     """Index of the refractory period and the I_0 that make the frames most likely; None where the period is 0."""
     losses = [
         min(
-            (model.best(_rescaled(samples, index, model, log_offset, scale_is_free), (log_offset,))[0], log_offset)
+            (
+                model.best(_rescaled(samples, index, model, log_offset, scale_is_free), (log_offset,))[0],
+                log_offset,
+            )
             for log_offset in log_offsets
         )
         for index in range(len(samples.periods))
@@ -212,7 +217,7 @@ def _rescaled(samples: _Tried, index: int, model: _Model, log_offset: float, sca
 
 
 def _robust_fit(design: Array, values: Array) -> Array:
-    """Least squares with Huber's weights; a column that is nearly empty gets a coefficient near 0."""
+    """Least squares with Huber's weights; a column that is nearly empty gets a coefficient near 0, no less."""
     weights = np.ones(len(values))
     solution: Array = np.zeros(design.shape[1])
     for _ in range(_FIT_STEPS):
@@ -221,7 +226,7 @@ def _robust_fit(design: Array, values: Array) -> Array:
         solution = np.linalg.solve(normal, weighted.T @ values).astype(np.float64)
         residual = np.abs(values - design @ solution)
         weights = np.minimum(1.0, HUBER * NORMAL_MAD * np.median(residual) / np.maximum(residual, 1e-12))
-    return solution
+    return np.maximum(solution, 0.0)  # an event never tells of less than nothing
 
 
 def negative_log_likelihood(
@@ -271,7 +276,7 @@ def _samples(
                 *(values[:, chosen].astype(np.float64) for values in pixels),
             )
         )
-        count += np.count_nonzero(chosen)
+        count += int(np.count_nonzero(chosen))
         if count >= MAX_SAMPLES:
             break
     if not found:

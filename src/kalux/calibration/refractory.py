@@ -47,7 +47,7 @@ def shortest_interval(recording: Recording, most_events: int = 3_000_000) -> int
 
 
 def possible_periods(shortest: int) -> tuple[int, ...]:
-    """Refractory periods that pixels may have whose shortest interval is ``shortest``, us; 0, nothing is lost, first."""
+    """Refractory periods, us, of pixels whose shortest interval is ``shortest``; first 0, nothing is lost."""
     return (0, *sorted({round(share * shortest) for share in _TRIED} - {0}))
 
 
@@ -70,11 +70,11 @@ class Counts:
         self._late = late
 
     def add(self, events: EventArray) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """(R, 2, H, W) sums of the weights (K13) of the next events, on and off; and the same of the late ones alone."""
+        """(R, 2, H, W) sums of the weights (K13) of the next events, on and off; the same of the late ones alone."""
         shape = len(self._periods), 2, *self._latest.shape
         every, late = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-        columns = (events[name] for name in ("t", "x", "y", "p"))
-        _add(*columns, self._latest, self._periods, self._late, every, late)
+        t, x, y, p = (events[name] for name in ("t", "x", "y", "p"))
+        _add(t, x, y, p, self._latest, self._periods, self._late, every, late)
         return every, late
 
 
