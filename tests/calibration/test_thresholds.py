@@ -64,6 +64,8 @@ def test_the_refractory_period_is_made_up_for_where_it_is_known():
     assert known.on == pytest.approx(0.3, rel=0.05)
     assert known.off == pytest.approx(0.2, rel=0.05)
     assert plain.off > 1.04 * known.off
+    assert known.calibration().settings["events"]["refractory_period"] == 500
+    assert "refractory_period" not in plain.calibration().settings["events"]
 
 
 def test_the_spread_is_found_and_standard_errors_are_small(found):

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import cv2
 import numba as nb
@@ -82,6 +82,8 @@ class ContrastCalibration:
         How much the variance of the fit grows per event, in units of c_on c_off.
     shortest_interval
         Shortest time between two events of a pixel that is not chance, us.
+    refractory
+        Refractory period, us, that the thresholds take account of; 0: none.
     samples, intervals
         Pixels of the global fit, and frame intervals that were looked at.
     on_factor, off_factor, on_variance, off_variance
@@ -101,6 +103,7 @@ class ContrastCalibration:
     residual: float
     step_variance: float
     shortest_interval: int
+    refractory: int
     samples: int
     intervals: int
     on_factor: Array
@@ -110,11 +113,13 @@ class ContrastCalibration:
 
     def calibration(self) -> Calibration:
         """As settings with standard errors, and maps of the pixels."""
-        settings = {
+        settings: dict[str, Any] = {
             "threshold_on": self.on,
             "threshold_off": self.off,
             "threshold_spread": float(np.hypot(self.spread_on, self.spread_off) / np.sqrt(2)),
         }
+        if self.refractory > 0:
+            settings["refractory_period"] = self.refractory
         errors = {"threshold_on": self.on_error, "threshold_off": self.off_error}
         names = ("spread_on", "spread_off", "correlation", "trailing", "residual", "shortest_interval")
         measured = {name: getattr(self, name) for name in (*names, "samples", "intervals")}
@@ -446,6 +451,7 @@ def _per_pixel(
         residual=fit.residual,
         step_variance=variance.per_event / (fit.on * fit.off),
         shortest_interval=view.shortest,
+        refractory=view.refractory,
         samples=len(data.change),
         intervals=count,
         on_factor=np.clip(1 + offset[:, 0], 0.3, 3.0).reshape(shape),
