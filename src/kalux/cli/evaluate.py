@@ -29,8 +29,9 @@ Compare what methods reconstruct from a recording with its ground truth or, wher
 that were held out from them. Needs the extra kalux[evaluation].
 
 methods: hold (the last frame), mean (of the frames around; held-out frames only), edi (nearest frame,
-deblurred and moved by events), cf, iccv2021, iccv2021-flir, default, smooth (default, both ways in time).
-Without --methods all but iccv2021-flir. Networks, with their weights (need the extra kalux[learned]):
+deblurred and moved by events), cf, iccv2021, iccv2021-flir, default, smooth (default, both ways in time),
+davis240c, davis346, prophesee-flir. Without --methods all but iccv2021-flir and the last three, which are for
+one camera each. Networks, with their weights (need the extra kalux[learned]):
 e2vid:FILE, e2vid+:FILE, firenet:FILE, firenet+:FILE, hypere2vid:FILE. Any other method: NAME=FOLDER of images
 with a timestamps.csv."""
 

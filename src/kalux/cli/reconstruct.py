@@ -254,9 +254,10 @@ def _origin(made: Plan, options: argparse.Namespace) -> Any:
 def threshold_warning(made: Plan) -> str:
     """What it means that nobody knows the thresholds."""
     how = "estimated from the recording" if made.threshold_origin == "estimate" else "unknown and assumed"
+    sensor = "" if made.threshold_origin == "estimate" else ", or the sensor's --preset"
     return (
         f"the contrast thresholds are {how}, so brightness above white is uncertain; "
-        "if you know them, give --events.threshold-on and --events.threshold-off"
+        f"if you know them, give --events.threshold-on and --events.threshold-off{sensor}"
     )
 
 
