@@ -403,7 +403,8 @@ _DAVIS240C: Final = EventSettings(
 )
 
 _DAVIS346: Final = EventSettings(
-    # Two recordings, whole and in parts, one dim and one in the sun: 0.28 to 0.33 and 0.33 to 0.41 but for a few parts.
+    # Two recordings, one dim and one in the sun: 0.28 and 0.33 on, 0.33 and 0.38 off; parts of 2 to 8 frames 0.23 to
+    # 0.38 and 0.27 to 0.42.
     # The sensor can be set down to 14.3 and 22.5 % of contrast (the same table).
     usual_threshold_on=0.31,
     usual_threshold_off=0.37,
@@ -422,8 +423,8 @@ _PROPHESEE_FLIR: Final = Settings(
         frame_noise=0.0022,
     ),
     events=EventSettings(
-        # 25 % of contrast are nominal for Prophesee's sensors at their default bias currents, 0.22; lost events in the
-        # refractory period make steps look larger, 0.27 on a simulated rig of 0.22.
+        # 25 % of contrast, 0.22, is nominal for Prophesee's sensors; events lost in the refractory period make steps
+        # look larger, 0.27 on a simulated rig of 0.22.
         usual_threshold_on=0.25,
         usual_threshold_off=0.25,
         # Background noise is 0.1 Hz per pixel at 25 C in the light (Gallego 2022, Table 1). Events are doubtful for
