@@ -8,7 +8,6 @@ import dataclasses
 import importlib.metadata
 import itertools
 import shlex
-import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,7 +29,7 @@ from kalux.info import ORIGINS, settled
 from kalux.pipeline import Plan, execute, plan
 from kalux.reconstructor import Reconstructor
 from kalux.recording import Recording
-from kalux.settings import PRESETS, Settings, from_dict, load, preset, to_dict
+from kalux.settings import PRESETS, Settings, from_dict, load, preset, read_toml, to_dict
 
 if TYPE_CHECKING:
     from kalux.writers import Writer
@@ -234,7 +233,7 @@ def _origin(made: Plan, options: argparse.Namespace) -> Any:
         or {"threshold_on", "threshold_off"} & {*flags}
     ):
         return made.threshold_origin
-    former = tomllib.loads(options.settings.read_text(encoding="utf-8")).get("thresholds", {})
+    former = read_toml(options.settings).get("thresholds", {})
     origin = former.get("origin") if isinstance(former, dict) else None
     return origin if origin in ORIGINS else made.threshold_origin
 
