@@ -63,6 +63,25 @@ def test_truth_beside_the_recording_is_found_and_told(cli, write_recording, simu
     assert "held-out" in cli("evaluate", path, "--hold-out-frames", "3", "--methods", "hold").out
 
 
+def test_truth_beside_the_recording_comes_before_its_own(cli, write_recording, simulation, tmp_path):
+    """As in `kalux benchmark`, with the same numbers."""
+    truth = simulation.truth()
+    path = write_recording(tmp_path / "pan.h5", ground_truth=truth)
+    own = cli("evaluate", path, "--methods", "hold").out
+    np.savez(tmp_path / "pan_gt.npz", times_us=truth.times, gt=2 * truth.images)
+    found = cli("evaluate", path, "--methods", "hold", "-o", tmp_path / "scores.csv").out
+    assert "ground truth: " in own
+    assert f"ground truth of {tmp_path / 'pan_gt.npz'}: " in found
+    assert cli("benchmark", path, "--methods", "hold", "-o", tmp_path / "bench", "--quiet").code == 0
+    (said,) = csv.DictReader((tmp_path / "scores.csv").open())
+    (benched,) = (
+        row["value"]
+        for row in csv.DictReader((tmp_path / "bench" / "results.csv").open())
+        if row["metric"] == "mse"
+    )
+    assert float(said["mse"]) == pytest.approx(float(benched), rel=1e-6)
+
+
 def test_the_numbers_are_those_of_the_library_in_table_and_files(cli, recording, tmp_path):
     table, whole = tmp_path / "s.csv", tmp_path / "s.json"
     arguments = ("evaluate", recording, "--methods", "hold,cf", "--hdrvdp", "--blur-consistency", "--quiet")
