@@ -155,7 +155,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
         warn(text)
     made = make_plan(recording, contents, settings, times, options)
     if made.threshold_origin in ("estimate", "assumed"):
-        warn(threshold_warning(made))
+        warn(threshold_warning(made, options.preset))
     if not options.quiet:
         say("\n".join(decided(recording, contents, made, settings, output, options)))
     seconds, images = write_images(
@@ -241,10 +241,10 @@ def _origin(made: Plan, options: argparse.Namespace) -> Any:
 # Say.
 
 
-def threshold_warning(made: Plan) -> str:
+def threshold_warning(made: Plan, name: str) -> str:
     """What it means that nobody knows the thresholds."""
     how = "estimated from the recording" if made.threshold_origin == "estimate" else "unknown and assumed"
-    sensor = "" if made.threshold_origin == "estimate" else ", or the sensor's --preset"
+    sensor = ", or the sensor's --preset" if made.threshold_origin == "assumed" and name == "default" else ""
     return (
         f"the contrast thresholds are {how}, so brightness above white is uncertain; "
         f"if you know them, give --events.threshold-on and --events.threshold-off{sensor}"
