@@ -8,7 +8,7 @@ import tempfile
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,9 +32,6 @@ from kalux.settings import preset as named_preset
 from kalux.smoothing import Backward, combine, reversed_settings
 
 ThresholdOrigin = Literal["settings", "recording", "calibration", "estimate", "assumed"]
-
-_ASSUMED_THRESHOLD: Final = 0.2
-"""Where nothing moves enough to estimate the thresholds they hardly matter: a usual setting of DVS sensors."""
 
 
 @dataclass(frozen=True)
@@ -346,18 +343,18 @@ def _are_calibrated(settings: Settings, calibration: Calibration) -> bool:
 
 
 def _with_delay(recording: Recording, settings: Settings) -> tuple[Settings, DelayEstimate | None]:
-    """Fill in the events' delay: from the settings, else an estimate, else 0."""
+    """Fill in the events' delay: from the settings, else an estimate, else the usual."""
     if settings.events.delay is not None:
         return settings, None
     estimate = estimate_delay(recording, settings.camera)
-    delay = 0 if estimate is None else estimate.delay
+    delay = settings.events.usual_delay if estimate is None else estimate.delay
     return dataclasses.replace(settings, events=dataclasses.replace(settings.events, delay=delay)), estimate
 
 
 def _with_thresholds(
     recording: Recording, settings: Settings
 ) -> tuple[Settings, ThresholdOrigin, ThresholdEstimate | None]:
-    """Fill in the thresholds: from the settings, else the recording, else an estimate."""
+    """Fill in the thresholds: from the settings, else the recording, else an estimate, else the usual."""
     events = settings.events
     if events.threshold_on is not None and events.threshold_off is not None:
         return settings, "settings", None
@@ -373,8 +370,10 @@ def _with_thresholds(
             delay=events.delay or 0,
             refractory_period=events.refractory,
         )
-        origin = "assumed" if estimate is None else "estimate"
-        found = (_ASSUMED_THRESHOLD, _ASSUMED_THRESHOLD) if estimate is None else (estimate.on, estimate.off)
+        if estimate is None:
+            return dataclasses.replace(settings, events=events.assuming()), "assumed", None
+        origin = "estimate"
+        found = (estimate.on, estimate.off)
     events = dataclasses.replace(
         events,
         threshold_on=events.threshold_on if events.threshold_on is not None else found[0],

@@ -158,7 +158,7 @@ class BackwardPass:
             else:
                 newest = self.engine.newest_frame_end
                 assert newest is not None
-                self.engine.advance(newest + (self.engine.settings.events.delay or 0))
+                self.engine.advance(newest + self.engine.settings.events.lateness)
             return
         self.engine.push_weighed(block)
         self.events += len(block)
@@ -266,6 +266,6 @@ def reversed_settings(settings: Settings) -> Settings:
         settings.events,
         threshold_on=settings.events.threshold_off,
         threshold_off=settings.events.threshold_on,
-        delay=-(settings.events.delay or 0),
+        delay=-settings.events.lateness,
     )
     return dataclasses.replace(settings, events=events)
