@@ -24,6 +24,7 @@ def test_says_all_that_reconstruct_would_settle(cli, write_recording, tmp_path):
         "delay",
         "I_0",
         "step",
+        "refractory",
         "exposure",
         "bright tail",
         "response",

@@ -240,6 +240,7 @@ class TestWhatIsSaid:
             "delay",
             "I_0",
             "step",
+            "refractory",
             "exposure",
             "bright",
             "response",
