@@ -33,6 +33,9 @@ from kalux.smoothing import Backward, combine, reversed_settings
 
 ThresholdOrigin = Literal["settings", "recording", "calibration", "estimate", "assumed"]
 
+_DOUBTED: Final[tuple[ThresholdOrigin, ...]] = ("calibration", "estimate", "assumed")
+"""Thresholds of these origins are not quite the pixels' own: highlights are then believed less."""
+
 _ASSUMED_THRESHOLD: Final = 0.2
 """Where nothing moves enough to estimate the thresholds they hardly matter: a usual setting of DVS sensors."""
 
@@ -100,11 +103,7 @@ def plan(
             "reconstruct: the complementary filter has no variance, so that it cannot be smoothed"
         )
     response = chosen_response(chosen.camera.response, recording.response)
-    exposures, tail = _exposures(recording, Camera.named(response, chosen.camera.saturation))
-    if chosen.filter.bright_tail is None:
-        chosen = dataclasses.replace(
-            chosen, filter=dataclasses.replace(chosen.filter, bright_tail=tail.scale)
-        )
+    exposures = _exposures(recording)
     reference = chosen.camera.reference_exposure or round(float(np.median(exposures[:, 1] - exposures[:, 0])))
     chosen = dataclasses.replace(
         chosen, camera=dataclasses.replace(chosen.camera, reference_exposure=reference, response=response)
@@ -122,6 +121,8 @@ def plan(
         filled, origin, estimate = _with_thresholds(recording, dataclasses.replace(filled, events=unfilled))
     if origin == "settings" and _are_calibrated(filled, known):
         origin = "calibration"
+    if origin in _DOUBTED:
+        filled = _with_bright_tail(recording, filled)
     wanted = _times(recording, exposures, rate_hz, times, at, filled, lookahead)
     if known.pixels is not None:
         require_size(known.pixels, recording.sensor_size)
@@ -245,7 +246,7 @@ def _engine(recording: Recording, plan: Plan, settings: Settings) -> Reconstruct
         recording.sensor_size,
         settings=settings,
         lookahead=plan.lookahead,
-        threshold_is_estimate=plan.threshold_origin in ("calibration", "estimate", "assumed"),
+        threshold_is_estimate=plan.threshold_origin in _DOUBTED,
         inverse_covariance=recording.source.inverse_covariance,
         pixels=plan.pixels,
     )
@@ -318,15 +319,23 @@ def _push_next(
     return True
 
 
-def _exposures(recording: Recording, camera: Camera) -> tuple[NDArray[np.int64], BrightTail]:
-    """(K, 2) exposure starts and ends, us, and the frames' bright tail."""
-    exposures, tail = [], BrightTail()
-    for frame in recording.frames():
-        exposures.append((frame.exposure_start, frame.exposure_end))
-        tail = tail.joined(count_bright(camera, frame.normalised()))
+def _exposures(recording: Recording) -> NDArray[np.int64]:
+    """(K, 2) exposure starts and ends, us."""
+    exposures = [(frame.exposure_start, frame.exposure_end) for frame in recording.frames()]
     if not exposures:
         raise FrameError(f"{recording.source.path}: no frames; kalux needs frames as well as events")
-    return np.array(exposures, np.int64), tail
+    return np.array(exposures, np.int64)
+
+
+def _with_bright_tail(recording: Recording, settings: Settings) -> Settings:
+    """Fill in how fast the brightness of the frames' pixels falls off towards white."""
+    if settings.filter.bright_tail is not None:
+        return settings
+    camera = Camera.named(settings.camera.response, settings.camera.saturation)
+    tail = BrightTail()
+    for frame in recording.frames():
+        tail = tail.joined(count_bright(camera, frame.normalised()))
+    return dataclasses.replace(settings, filter=dataclasses.replace(settings.filter, bright_tail=tail.scale))
 
 
 def _with_white_balance(recording: Recording, settings: Settings) -> Settings:
