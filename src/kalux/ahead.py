@@ -27,7 +27,7 @@ def default_threads() -> int:
     return min(cores, MOST_THREADS)
 
 
-def ahead(items: Iterable[T], depth: int = 2) -> Generator[T, None, None]:
+def ahead(items: Iterable[T], depth: int = 2, name: str = "ahead") -> Generator[T, None, None]:
     """The same items in the same order, made in a thread of their own, up to ``depth`` before they are asked for.
 
     An error in the making is raised where its item would have come. Closing the iterator, or an exception where it is
@@ -40,9 +40,11 @@ def ahead(items: Iterable[T], depth: int = 2) -> Generator[T, None, None]:
         Made one by one, in that thread only.
     depth
         How many are held, beside the one being made and the one in use: memory is bounded by it.
+    name
+        Of the thread, after "kalux-", for tools that show threads.
     """
     belt: _Belt[T] = _Belt(depth)
-    thread = threading.Thread(target=_make, args=(items, belt), name="kalux-ahead", daemon=True)
+    thread = threading.Thread(target=_make, args=(items, belt), name=f"kalux-{name}", daemon=True)
     thread.start()
     try:
         while (item := belt.take()) is not None:
@@ -59,10 +61,12 @@ class InOrder(Generic[T]):
     ----------
     threads
         How many are done at a time, in threads of their own. 1: each is done where and when it is taken.
+    name
+        As of `ahead`.
     """
 
-    def __init__(self, threads: int) -> None:
-        self._pool = ThreadPoolExecutor(threads, "kalux-in-order") if threads > 1 else None
+    def __init__(self, threads: int, name: str = "in-order") -> None:
+        self._pool = ThreadPoolExecutor(threads, f"kalux-{name}") if threads > 1 else None
         self._pending: deque[Callable[[], T]] = deque()
 
     def __len__(self) -> int:

@@ -206,8 +206,8 @@ def execute(
     engine = _engine(recording, plan, plan.settings)
     several = threads > 1
     estimates = _smoothed_estimates(recording, engine, plan, on_events, on_backward, several)
-    images = _images(engine, ahead(estimates) if several else estimates)
-    yield from ahead(images) if several else images
+    images = _images(engine, ahead(estimates, name="filter") if several else estimates)
+    yield from ahead(images, name="images") if several else images
 
 
 def _images(
@@ -263,7 +263,7 @@ def _estimates(
     if not read_ahead:
         yield from _driven(recording, iter(recording.events()), engine, plan, on_events)
         return
-    with contextlib.closing(ahead(recording.events(), 1)) as chunks:
+    with contextlib.closing(ahead(recording.events(), 1, "read")) as chunks:
         yield from _driven(recording, chunks, engine, plan, on_events)
 
 

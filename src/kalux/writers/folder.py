@@ -60,7 +60,7 @@ class FolderWriter(Writer):
         self._settings = settings
         self._state: ToneState | None = None
         self._encoders = encoders
-        self._pending: InOrder[Encoded] = InOrder(encoders)
+        self._pending: InOrder[Encoded] = InOrder(encoders, "encode")
         with output_errors(path, "the output folder cannot be used"):
             prepare_folder(path, overwrite=overwrite)
             settings.write(complete=False, images=0, times=None)

@@ -141,7 +141,7 @@ class VideoWriter(Writer):
     ) -> None:
         super().__init__(path)
         self._threads = threads
-        self._pending: InOrder[Picture] = InOrder(threads)
+        self._pending: InOrder[Picture] = InOrder(threads, "pictures")
         self._display = display
         self._video = video
         self._ticks = ticks
