@@ -400,6 +400,28 @@ class TestSeveralThreads:
         assert names(tmp_path) == set()
         assert not own_threads()
 
+    @pytest.mark.parametrize("threads", [1, 4])
+    def test_what_was_encoded_before_an_error_is_kept(self, tmp_path, monkeypatch, threads):
+        made = video.video_frame
+
+        def broken(mapped):
+            if mapped[0, 0] > 0.9:
+                raise MemoryError("no room")
+            return made(mapped)
+
+        def write():
+            with open_writer(tmp_path / "v.mp4", display=LINEAR, threads=threads) as writer:
+                for k in range(6):
+                    writer.write(make_image(1000 * k, phase=np.pi / 2 if k == 4 else 0.0))
+
+        monkeypatch.setattr(video, "video_frame", broken)
+        with pytest.raises(MemoryError, match="no room"):
+            write()
+        assert len(decoded(tmp_path / "v.mp4")[0]) == settings_of(tmp_path / "v.mp4")["images"] == 4
+        assert settings_of(tmp_path / "v.mp4")["complete"] is False
+        assert names(tmp_path) == {"v.mp4", "v.mp4.kalux.toml"}
+        assert not own_threads()
+
 
 def test_in_another_thread(tmp_path):
     from concurrent.futures import ThreadPoolExecutor

@@ -205,6 +205,14 @@ class VideoWriter(Writer):
     def _finish(self, complete: bool) -> None:
         try:
             self._encode(0)
+        except BaseException:
+            with contextlib.suppress(OutputError):  # the error that comes first is told
+                self._end_video(complete=False)
+            raise
+        self._end_video(complete=complete)
+
+    def _end_video(self, *, complete: bool) -> None:
+        try:
             if self._open is None and complete:
                 raise OutputError(f"{self.path}: not written, there was no image")
             if not self._whole:
