@@ -56,7 +56,7 @@ class VideoSettings:
         Constant rate factor of x264, 0 to 51: less is better and larger; 18 looks like the original.
     preset
         Of x264, ``ultrafast`` to ``veryslow``: slower is smaller. The default takes a third of the time of
-        ``veryfast``; at the same ``crf`` its pictures are nearer to the original, its files two to five times as large.
+        ``veryfast``; at the same ``crf`` its pictures are nearer to the original, its files 2.5 to 6 times as large.
     slow_motion
         Times are stretched by this factor: 10 shows 300 images per second at 30.
     """
