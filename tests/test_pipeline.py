@@ -551,12 +551,17 @@ def test_the_other_presets_run_and_default_is_better_where_frames_can_tell(prese
 
 
 def test_the_bright_tail_comes_from_the_frames_and_can_be_given():
-    made = plan(recording(), at="frames").settings
-    counts = [count_bright(Camera.named("linear", 0.98), f.normalised()) for f in recording().frames()]
+    doubted = recording(0, None)
+    made = plan(doubted, at="frames").settings
+    counts = [count_bright(Camera.named("linear", 0.98), f.normalised()) for f in doubted.frames()]
     expected = reduce(BrightTail.joined, counts).scale
     assert made.filter.bright_tail == expected
     given = altered(PRESETS["default"], "filter", bright_tail=0.7)
-    assert plan(recording(), at="frames", settings=given).settings.filter.bright_tail == 0.7
+    assert plan(doubted, at="frames", settings=given).settings.filter.bright_tail == 0.7
+
+
+def test_the_bright_tail_is_not_looked_for_where_thresholds_are_stated():
+    assert plan(recording(), at="frames").settings.filter.bright_tail is None
 
 
 def test_highlights_are_believed_less_where_thresholds_are_estimated():

@@ -8,7 +8,7 @@ import tempfile
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,9 @@ from kalux.settings import preset as named_preset
 from kalux.smoothing import Backward, combine, reversed_settings
 
 ThresholdOrigin = Literal["settings", "recording", "calibration", "estimate", "assumed"]
+
+_DOUBTED: Final[tuple[ThresholdOrigin, ...]] = ("calibration", "estimate", "assumed")
+"""Thresholds of these origins are not quite the pixels' own: highlights are then believed less."""
 
 
 @dataclass(frozen=True)
@@ -97,11 +100,7 @@ def plan(
             "reconstruct: the complementary filter has no variance, so that it cannot be smoothed"
         )
     response = chosen_response(chosen.camera.response, recording.response)
-    exposures, tail = _exposures(recording, Camera.named(response, chosen.camera.saturation))
-    if chosen.filter.bright_tail is None:
-        chosen = dataclasses.replace(
-            chosen, filter=dataclasses.replace(chosen.filter, bright_tail=tail.scale)
-        )
+    exposures = _exposures(recording)
     reference = chosen.camera.reference_exposure or round(float(np.median(exposures[:, 1] - exposures[:, 0])))
     chosen = dataclasses.replace(
         chosen, camera=dataclasses.replace(chosen.camera, reference_exposure=reference, response=response)
@@ -119,6 +118,8 @@ def plan(
         filled, origin, estimate = _with_thresholds(recording, dataclasses.replace(filled, events=unfilled))
     if origin == "settings" and _are_calibrated(filled, known):
         origin = "calibration"
+    if origin in _DOUBTED:
+        filled = _with_bright_tail(recording, filled)
     wanted = _times(recording, exposures, rate_hz, times, at, filled, lookahead)
     if known.pixels is not None:
         require_size(known.pixels, recording.sensor_size)
@@ -202,8 +203,8 @@ def execute(
     engine = _engine(recording, plan, plan.settings)
     several = threads > 1
     estimates = _smoothed_estimates(recording, engine, plan, on_events, on_backward, several)
-    images = _images(engine, ahead(estimates) if several else estimates)
-    yield from ahead(images) if several else images
+    images = _images(engine, ahead(estimates, name="filter") if several else estimates)
+    yield from ahead(images, name="images") if several else images
 
 
 def _images(
@@ -242,7 +243,7 @@ def _engine(recording: Recording, plan: Plan, settings: Settings) -> Reconstruct
         recording.sensor_size,
         settings=settings,
         lookahead=plan.lookahead,
-        threshold_is_estimate=plan.threshold_origin in ("calibration", "estimate", "assumed"),
+        threshold_is_estimate=plan.threshold_origin in _DOUBTED,
         inverse_covariance=recording.source.inverse_covariance,
         pixels=plan.pixels,
     )
@@ -259,7 +260,7 @@ def _estimates(
     if not read_ahead:
         yield from _driven(recording, iter(recording.events()), engine, plan, on_events)
         return
-    with contextlib.closing(ahead(recording.events(), 1)) as chunks:
+    with contextlib.closing(ahead(recording.events(), 1, "read")) as chunks:
         yield from _driven(recording, chunks, engine, plan, on_events)
 
 
@@ -315,15 +316,23 @@ def _push_next(
     return True
 
 
-def _exposures(recording: Recording, camera: Camera) -> tuple[NDArray[np.int64], BrightTail]:
-    """(K, 2) exposure starts and ends, us, and the frames' bright tail."""
-    exposures, tail = [], BrightTail()
-    for frame in recording.frames():
-        exposures.append((frame.exposure_start, frame.exposure_end))
-        tail = tail.joined(count_bright(camera, frame.normalised()))
+def _exposures(recording: Recording) -> NDArray[np.int64]:
+    """(K, 2) exposure starts and ends, us."""
+    exposures = [(frame.exposure_start, frame.exposure_end) for frame in recording.frames()]
     if not exposures:
         raise FrameError(f"{recording.source.path}: no frames; kalux needs frames as well as events")
-    return np.array(exposures, np.int64), tail
+    return np.array(exposures, np.int64)
+
+
+def _with_bright_tail(recording: Recording, settings: Settings) -> Settings:
+    """Fill in how fast the brightness of the frames' pixels falls off towards white."""
+    if settings.filter.bright_tail is not None:
+        return settings
+    camera = Camera.named(settings.camera.response, settings.camera.saturation)
+    tail = BrightTail()
+    for frame in recording.frames():
+        tail = tail.joined(count_bright(camera, frame.normalised()))
+    return dataclasses.replace(settings, filter=dataclasses.replace(settings.filter, bright_tail=tail.scale))
 
 
 def _with_white_balance(recording: Recording, settings: Settings) -> Settings:

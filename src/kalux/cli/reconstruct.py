@@ -337,7 +337,7 @@ def write_images(
 ) -> tuple[float, int]:
     """Carry out the plan; returns the seconds it took and the number of images."""
     threads = options.threads or default_threads()
-    writer = output.open(described, encoders=max(1, threads - 1))
+    writer = output.open(described, threads)
     progress = Progress("reconstructing", images=len(made.times), quiet=options.quiet)
     backward = Progress("backward pass", quiet=options.quiet)
     images = execute(
