@@ -545,38 +545,44 @@ def _percentiles(intensity: Float32, percents: list[float]) -> Statistics:
     positions = np.array(percents) / 100 * (_sampled(intensity).size - 1)
     ranks = np.stack([np.floor(positions), np.ceil(positions)]).astype(np.int64)
     # Few numbers are left to be put in order: those that share their first bits with one that is looked for.
-    kept, places = _narrowed(bits, step, ranks.ravel())
-    values: Statistics = np.partition(kept, places)[places].view(np.float32).astype(np.float64)
-    values = values.reshape(2, -1)
+    sample, total = _counted(bits, step)
+    ends = np.cumsum(total)
+    bins = np.searchsorted(ends, ranks, side="right")
+    wanted = np.zeros(len(total), np.uint64)
+    wanted[bins] = 1
+    kept = np.empty(int(total[wanted > 0].sum()) + 1, np.int32)
+    _keep(sample, wanted, kept)
+    places = ranks - (ends - np.cumsum(total * (wanted > 0)))[bins]
+    values = np.partition(kept[:-1], places.ravel())[places].view(np.float32).astype(np.float64)
     found: Statistics = values[0] + (positions - ranks[0]) * (values[1] - values[0])
     return found
 
 
 @nb.njit(cache=True, nogil=True)
-def _narrowed(bits, step, ranks):  # type: ignore[no-untyped-def]
-    """The numbers among which those of the ranks are, and their ranks there."""
+def _counted(bits, step):  # type: ignore[no-untyped-def]
+    """A sample of an image, and how many of it have the same first bits."""
     height, width = bits.shape
     across = (width + step - 1) // step
     sample = np.empty(across * ((height + step - 1) // step), np.uint32)
     for row in range(0, height, step):
         for k in range(across):
             sample[row // step * across + k] = bits[row, k * step]
-    counts = np.zeros((4, 1 << (31 - _COARSE_BITS)), np.int32)  # four, so that equal neighbours need not wait
+    counts = np.zeros((4, 1 << (31 - _COARSE_BITS)), np.int64)  # four, so that equal neighbours need not wait
     for i in range(np.uint64(len(sample))):
-        counts[i & np.uint64(3), np.uint64(sample[i]) >> np.uint64(_COARSE_BITS)] += np.int32(1)
-    total = counts.sum(axis=0)
-    ends = np.cumsum(total)
-    bins = np.searchsorted(ends, ranks, side="right")  # those that hold the ranks
-    wanted = np.zeros(len(total), np.uint64)
-    for k in bins:
-        wanted[k] = 1
-    places = ranks - (ends - np.cumsum(total * (wanted > 0)))[bins]
-    kept = np.empty(len(sample) + 1, np.int32)
+        counts[i & np.uint64(3), np.uint64(sample[i]) >> np.uint64(_COARSE_BITS)] += 1
+    for k in range(1, 4):
+        for i in range(counts.shape[1]):
+            counts[0, i] += counts[k, i]
+    return sample, counts[0]
+
+
+@nb.njit(cache=True, nogil=True)
+def _keep(sample, wanted, kept):  # type: ignore[no-untyped-def]
+    """Those whose first bits are wanted; ``kept`` has room for one more."""
     found = np.uint64(0)
     for i in range(np.uint64(len(sample))):
         kept[found] = sample[i]
         found += wanted[np.uint64(sample[i]) >> np.uint64(_COARSE_BITS)]
-    return kept[:found], places
 
 
 def _measure(intensity: Float32, curve: Curve) -> Statistics:
