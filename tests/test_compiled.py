@@ -15,6 +15,7 @@ from kalux.compiled import (
     event_words,
     exponential,
     logarithm,
+    packed,
     unpack,
 )
 from kalux.events import EVENT_DTYPE
@@ -86,3 +87,13 @@ def test_unpacked_records_are_their_fields(names, count):
     for plane, name in zip(planes, names, strict=True):
         np.testing.assert_array_equal(plane[:count], records[name][3 : 3 + count])
     assert (planes[:, count:] == -1).all()
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (3, 5), (480, 640)])
+def test_packed_records_lie_in_one_line_each(shape):
+    records = packed(shape, np.dtype([(name, "f4") for name in "abcdefgh"]))
+    assert records.shape == shape
+    assert records.ctypes.data % 64 == 0
+    records["h"] = 1.0
+    assert (records["h"] == 1.0).all()
+    assert records.flags.c_contiguous

@@ -6,6 +6,7 @@ they take and return float32: a literal number would turn float32 arithmetic int
 
 from __future__ import annotations
 
+import math
 from typing import Any, Final
 
 import numba as nb
@@ -52,6 +53,22 @@ def event_row(word):  # type: ignore[no-untyped-def]
 def event_is_on(word):  # type: ignore[no-untyped-def]
     """p of an event's second word; the three bytes above it are padding and may hold anything."""
     return ((np.uint64(word) >> np.uint64(32)) & np.uint64(0xFF)) != np.uint64(0)
+
+
+_LINE: Final = 64
+"""Bytes that the memory hands out at a time."""
+
+
+def packed(shape: tuple[int, ...], dtype: np.dtype[np.void]) -> NDArray[np.void]:
+    """An array of records, not filled, of which none lies in two lines of the memory that holds one each.
+
+    NumPy's arrays commonly begin 16 bytes behind a line, so that every other record of 32 bytes lies in two: the filter
+    then takes 1.35 times as long, and EDI 1.8 times.
+    """
+    size = math.prod(shape) * dtype.itemsize
+    memory = np.empty(size + _LINE, np.uint8)
+    first = -memory.ctypes.data % _LINE
+    return memory[first : first + size].view(dtype).reshape(shape)
 
 
 def _prefetch(typing_context: Any, array: Any, index: Any) -> Any:

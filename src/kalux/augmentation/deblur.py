@@ -31,7 +31,9 @@ from kalux.compiled import (
     event_words,
     exponential,
     logarithm,
+    packed,
     prefetch,
+    unpack,
 )
 from kalux.events import EventArray
 
@@ -53,6 +55,12 @@ EXPOSURE_PIXEL: Final = np.dtype(
     align=True,
 )
 """What a pixel remembers within an exposure: 32 bytes, half a cache line, fetched and stored at once."""
+
+_FIELDS: Final = len(EXPOSURE_PIXEL.names or ())
+_LEVEL, _INTEGRAL, _SINCE, _PEAK, _AT_MIDDLE, _EVENTS = (
+    (EXPOSURE_PIXEL.names or ()).index(name)
+    for name in ("level", "integral", "since", "peak", "at_middle", "events")
+)
 
 _LARGEST: Final = np.float32(1e37)
 
@@ -109,7 +117,7 @@ def expose(
 ) -> NDArray[np.void]:
     """What every pixel remembers of an exposure, (H, W) of `EXPOSURE_PIXEL`. Parameters of `integrate_exposure`."""
     height, width = step_on.shape
-    pixels = np.empty(height * width, EXPOSURE_PIXEL)
+    pixels = packed((height * width,), EXPOSURE_PIXEL)
     _begin_exposure(pixels, step_on, step_off)
     for chunk in chunks:
         inside = between(chunk, start, end)
@@ -214,31 +222,30 @@ def _integrate(words, pixels, width, start, middle):  # type: ignore[no-untyped-
 
 
 @nb.njit(cache=True, inline="always", error_model="numpy")
-def mean_level(pixel, duration):  # type: ignore[no-untyped-def]
+def mean_level(level, integral, since, duration):  # type: ignore[no-untyped-def]
     """Mean of the level of an `EXPOSURE_PIXEL` over its exposure of ``duration`` us; finite also of a broken pixel."""
-    mean = (pixel.integral + pixel.level * (duration - pixel.since)) / duration
+    mean = (integral + level * (duration - since)) / duration
     return mean if mean < _LARGEST else _LARGEST
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@nb.njit(cache=True, nogil=True, error_model="numpy", fastmath=FUSED)
 def _finish_exposure(pixels, exposure, log_mean, to_middle, to_end, peak, events):  # type: ignore[no-untyped-def]
     height, width = events.shape
     duration = np.float32(exposure)
+    fields = np.empty((_FIELDS, width), np.float32)
     for row in range(height):
-        for column in range(width):
-            i = row * width + column
-            prefetch(pixels, min(i + AHEAD, len(pixels) - 1))
-            pixel = pixels[i]
-            log_mean[row, column] = mean_level(pixel, duration)
-            to_middle[row, column] = pixel.at_middle
-            to_end[row, column] = pixel.level
-            peak[row, column] = pixel.peak
-            events[row, column] = pixel.events
-        for column in range(width):
-            log_mean[row, column] = logarithm(log_mean[row, column])
-        for plane in (to_middle, to_end, peak):
-            for column in range(width):
-                plane[row, column] = logarithm(plane[row, column])
+        unpack(pixels, row * width, width, fields)
+        for column in range(np.uint64(width)):  # a loop each: each is vector code then
+            level, integral, since = fields[_LEVEL, column], fields[_INTEGRAL, column], fields[_SINCE, column]
+            log_mean[row, column] = logarithm(mean_level(level, integral, since, duration))
+        for column in range(np.uint64(width)):
+            to_middle[row, column] = logarithm(fields[_AT_MIDDLE, column])
+        for column in range(np.uint64(width)):
+            to_end[row, column] = logarithm(fields[_LEVEL, column])
+        for column in range(np.uint64(width)):
+            peak[row, column] = logarithm(fields[_PEAK, column])
+        for column in range(np.uint64(width)):
+            events[row, column] = fields[_EVENTS, column]
 
 
 def count_events(events: EventArray, shape: tuple[int, int]) -> tuple[Array, Array]:

@@ -33,6 +33,7 @@ from kalux.compiled import (
     event_is_on,
     event_row,
     event_words,
+    packed,
     prefetch,
     unpack,
 )
@@ -176,7 +177,7 @@ class _Scalars(NamedTuple):
 def begin_bridged(segment: BridgedSegment, state: State) -> BridgedCursor:
     """The cursor at the start of a segment: L stays, L^A is the segment's. The clock's origin is the start."""
     clock: Clock = state.newest.astype(np.int32)
-    pixels = np.empty(clock.shape, BRIDGED_PIXEL)
+    pixels = packed(clock.shape, BRIDGED_PIXEL)
     level = state.log_intensity
     if segment.floor is not None:
         level = np.maximum(level, segment.floor)  # K7
