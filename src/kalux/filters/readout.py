@@ -164,14 +164,13 @@ def read_out(
     variance : ndarray
         (H, W) float32.
     """
-    shape = log_intensity.shape
-    if moving is None:
-        moving, hidden, difference = np.zeros(shape, np.bool_), _NOTHING_HIDDEN, 0.0
-    out, total = np.empty(shape, np.float32), np.empty(shape, np.float32)
+    known = variance.astype(np.float32, copy=False)
+    out = np.empty(log_intensity.shape, np.float32)
+    total = known if moving is None else np.empty_like(out)
     _read_out(
         log_intensity.astype(np.float32, copy=False),
-        variance.astype(np.float32, copy=False),
-        moving,
+        known,
+        np.empty((0, 0), np.bool_) if moving is None else moving,
         tuple(np.float32(value) for value in hidden),
         np.float32(difference * difference),
         pitch,
@@ -200,20 +199,23 @@ def _read_out(  # type: ignore[no-untyped-def]
     level, marks = np.empty(size, np.float32), np.zeros(size, np.uint8)
     words = marks.view(np.uint64)
     places, excess, doubt = np.empty(size, np.uint64), np.empty(size, np.float32), np.empty(size, np.float32)
-    for row in range(-pitch, height):
+    told = moving.size > 0
+    for row in range(-pitch if told else 0, height):
         following, below = np.uint64(row + pitch), np.uint64((row + pitch) % count)
-        if following < np.uint64(height):
+        if told and following < np.uint64(height):
             _take_row(log_intensity, variance, moving, hidden, following, total, levels, doubts, below)
-        else:
+        elif told:
             for column in range(np.uint64(size + 2 * _MARGIN)):
                 doubts[below, column] = _NOTHING
         if row < 0:
             continue
         at, above, here = np.uint64(row), np.uint64((row - pitch) % count), np.uint64(row % count)
         for column in range(np.uint64(width)):
-            level[column] = levels[here, column + np.uint64(_MARGIN)]
-            marks[column] = moving[at, column]
-        if allowed > np.float32(0.0) and _any(words, 0, size):
+            level[column] = log_intensity[at, column]
+        if told:
+            for column in range(np.uint64(width)):
+                marks[column] = moving[at, column]
+        if told and allowed > np.float32(0.0) and _any(words, 0, size):
             _regularise(levels, doubts, above, here, below, marks, words, allowed, pitch, level)
         for column in range(np.uint64(width)):
             marks[column] = level[column] > white
