@@ -60,9 +60,10 @@ def advance(events, state, rate, step_variance, noise_rate, event_variance, thre
 
 
 def integrate(events, start, end, step_on, step_off):
-    """log of the mean of exp E over an exposure."""
+    """What EDI says of an exposure: log of the mean of exp E, E at the middle and the end, its peak, events."""
     shape = step_on.shape
     mean, level, since = np.zeros(shape), np.zeros(shape), np.full(shape, start, np.int64)
+    to_middle, peak, number = np.zeros(shape), np.zeros(shape), np.zeros(shape, np.int64)
     for i in range(len(events)):
         event = events[i]
         t, x, y = event["t"], np.int64(event["x"]), np.int64(event["y"])
@@ -72,8 +73,12 @@ def integrate(events, start, end, step_on, step_off):
             level[y, x] += step_on[y, x]
         else:
             level[y, x] -= step_off[y, x]
+        peak[y, x] = max(peak[y, x], level[y, x])
+        number[y, x] += 1
+        if t <= (start + end) // 2:
+            to_middle[y, x] = level[y, x]
     mean += np.exp(level) * (end - since)
-    return np.log(mean / (end - start))
+    return np.log(mean / (end - start)), to_middle, level, peak, number
 
 
 def store(events, newest):

@@ -4,10 +4,20 @@ from __future__ import annotations
 
 import numba as nb
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kalux.compiled import event_column, event_is_on, event_row, event_words, exponential, logarithm
+from kalux.compiled import (
+    event_column,
+    event_is_on,
+    event_row,
+    event_words,
+    exponential,
+    logarithm,
+    packed,
+    unpack,
+)
 from kalux.events import EVENT_DTYPE
 
 
@@ -59,3 +69,31 @@ def test_words_share_the_memory():
     events = np.zeros(3, EVENT_DTYPE)
     event_words(events[1:])[0, 0] = 7
     assert events["t"].tolist() == [0, 7, 0]
+
+
+@nb.njit
+def unpacked(records, first, count, planes):
+    unpack(records, first, count, planes)
+
+
+@pytest.mark.parametrize("names", ["ab", "abcdefgh"])
+@pytest.mark.parametrize("count", [0, 1, 15, 16, 17, 40])
+def test_unpacked_records_are_their_fields(names, count):
+    """Whole vectors and what is left over; nothing beyond them is written."""
+    records = np.zeros(50, [(name, "f4") for name in names])
+    records.view(np.float32)[:] = np.arange(50 * len(names))
+    planes = np.full((len(names), 40), -1.0, np.float32)
+    unpacked(records, 3, count, planes)
+    for plane, name in zip(planes, names, strict=True):
+        np.testing.assert_array_equal(plane[:count], records[name][3 : 3 + count])
+    assert (planes[:, count:] == -1).all()
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (3, 5), (480, 640)])
+def test_packed_records_lie_in_one_line_each(shape):
+    records = packed(shape, np.dtype([(name, "f4") for name in "abcdefgh"]))
+    assert records.shape == shape
+    assert records.ctypes.data % 64 == 0
+    records["h"] = 1.0
+    assert (records["h"] == 1.0).all()
+    assert records.flags.c_contiguous

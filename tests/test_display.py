@@ -13,6 +13,7 @@ from hypothesis.extra import numpy as hnp
 
 from kalux.display import (
     CURVES,
+    SAMPLES,
     Auto,
     Clahe,
     DisplaySettings,
@@ -20,6 +21,7 @@ from kalux.display import (
     Linear,
     Percentile,
     Reinhard,
+    _percentiles,
     apply,
     curve_from_name,
     decode_srgb,
@@ -334,3 +336,29 @@ def test_settings_out_of_range_are_refused(make):
 def test_settings_survive_a_table(name):
     table = settings_table(DisplaySettings(curve_from_name(name)))
     assert curve_from_name(table["curve"], **table[name]) == curve_from_name(name)
+
+
+@given(
+    st.sampled_from([(1, 1), (2, 3), (40, 50), (300, 400), (513, 600)]),
+    st.sampled_from(["spread", "one value", "few values", "black"]),
+    st.lists(st.floats(0.0, 100.0), min_size=1, max_size=3),
+)
+def test_percentiles_are_numpys(shape, kind, percents):
+    """Of a sample of every other pixel where there are many; also where all numbers are alike."""
+    rng = np.random.default_rng(0)
+    image = {
+        "spread": np.exp(rng.normal(0, 3, shape)),
+        "one value": np.full(shape, 0.7),
+        "few values": rng.integers(0, 3, shape) / 2,
+        "black": np.zeros(shape),
+    }[kind].astype(np.float32)
+    step = 2 if image.size >= 4 * SAMPLES else 1
+    expected = np.percentile(image[::step, ::step].astype(np.float64), percents)
+    np.testing.assert_allclose(_percentiles(image, percents), expected, rtol=1e-6)
+
+
+@given(st.lists(st.floats(-1.0, 2.0, width=32), min_size=1, max_size=70))
+def test_integers_are_rounded_to_the_nearest(values):
+    for to_integer, top in ((to_uint8, 255), (to_uint16, 65535)):
+        expected = np.rint(np.clip(np.float32(values), 0, 1) * np.float32(top))
+        np.testing.assert_array_equal(to_integer(np.float32(values)), expected)

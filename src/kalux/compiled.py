@@ -6,6 +6,7 @@ they take and return float32: a literal number would turn float32 arithmetic int
 
 from __future__ import annotations
 
+import math
 from typing import Any, Final
 
 import numba as nb
@@ -70,6 +71,22 @@ def event_weight(word, unit):  # type: ignore[no-untyped-def]
     return ONE + np.float32(np.int32((np.uint64(word) >> np.uint64(40)) & np.uint64(0xFFFF))) * unit
 
 
+_LINE: Final = 64
+"""Bytes that the memory hands out at a time."""
+
+
+def packed(shape: tuple[int, ...], dtype: np.dtype[np.void]) -> NDArray[np.void]:
+    """An array of records, not filled, of which none lies in two lines of the memory that holds one each.
+
+    NumPy's arrays commonly begin 16 bytes behind a line, so that every other record of 32 bytes lies in two: the filter
+    then takes 1.35 times as long, and EDI 1.8 times.
+    """
+    size = math.prod(shape) * dtype.itemsize
+    memory = np.empty(size + _LINE, np.uint8)
+    first = -memory.ctypes.data % _LINE
+    return memory[first : first + size].view(dtype).reshape(shape)
+
+
 def _prefetch(typing_context: Any, array: Any, index: Any) -> Any:
     signature = types.void(array, index)
 
@@ -90,6 +107,65 @@ def _prefetch(typing_context: Any, array: Any, index: Any) -> Any:
 
 prefetch: Any = intrinsic(_prefetch)
 """Ask for the memory of ``array[index]``, 1-D, which will be written soon."""
+
+
+LANES: Final = 16
+"""Records that `unpack` takes at a time: what the widest vector instructions hold of float32."""
+
+
+def _unpack_of(lanes: int) -> Any:
+    def unpack(typing_context: Any, records: Any, first: Any, planes: Any, column: Any) -> Any:
+        fields = records.dtype.size // 4  # a power of two
+
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            f32, i32, i64 = ir.FloatType(), ir.IntType(32), ir.IntType(64)
+            vector = ir.VectorType(f32, lanes)
+
+            def at(array: Any, number: Any, offset: Any) -> Any:
+                """Address of ``lanes`` numbers, ``offset`` float32 behind an element of an array."""
+                place = builder.bitcast(builder.gep(array.data, [number]), f32.as_pointer())
+                return builder.bitcast(builder.gep(place, [offset]), vector.as_pointer())
+
+            def split(mixed: list[Any]) -> list[Any]:
+                """One vector per field of vectors over which as many fields are spread in turns."""
+                if len(mixed) == 1:
+                    return mixed
+                parts = []
+                for odd in (0, 1):
+                    chosen = ir.Constant(ir.VectorType(i32, lanes), [2 * i + odd for i in range(lanes)])
+                    pairs = zip(mixed[::2], mixed[1::2], strict=True)
+                    parts.append(split([builder.shuffle_vector(a, b, chosen) for a, b in pairs]))
+                return [field for pair in zip(*parts, strict=True) for field in pair]
+
+            source = context.make_array(signature.args[0])(context, builder, arguments[0])
+            mixed = [builder.load(at(source, arguments[1], i64(k * lanes)), align=4) for k in range(fields)]
+            target = context.make_array(signature.args[2])(context, builder, arguments[2])
+            width = cgutils.unpack_tuple(builder, target.shape, 2)[1]  # type: ignore[no-untyped-call]
+            for k, values in enumerate(split(mixed)):
+                offset = builder.add(builder.mul(i64(k), width), arguments[3])
+                builder.store(values, at(target, i64(0), offset), align=4)
+            return context.get_dummy_value()
+
+        return types.void(records, first, planes, column), generate
+
+    return intrinsic(unpack)
+
+
+_unpack_many, _unpack_one = _unpack_of(LANES), _unpack_of(1)
+
+
+@nb.njit(cache=True, inline="always")
+def unpack(records, first, count, planes):  # type: ignore[no-untyped-def]
+    """Copy ``count`` records of float32 from ``first`` on, 1-D, into ``planes``, float32, a row for each field.
+
+    The number of fields is a power of two. The compiler's own vector code would pick the fields one by one; here 16
+    records are loaded as they lie and sorted within registers.
+    """
+    whole = count // LANES * LANES
+    for column in range(0, whole, LANES):
+        _unpack_many(records, first + column, planes, column)
+    for column in range(whole, count):
+        _unpack_one(records, first + column, planes, column)
 
 
 def _as_float_of(typing_context: Any, bits: Any) -> Any:
@@ -168,8 +244,8 @@ def exponential(x):  # type: ignore[no-untyped-def]
 @nb.njit(cache=True, inline="always", error_model="numpy")
 def logarithm(x):  # type: ignore[no-untyped-def]
     """log(x) of a normal positive float32, to 2e-7 of itself or 1e-7, whichever is larger; finite whatever x is."""
-    bits = _as_integer(x) - _SQRT_HALF_BITS
-    exponent = np.float32(bits >> np.int32(23))
+    bits = np.int32(_as_integer(x) - _SQRT_HALF_BITS)  # numba's integers become 64 bits wide otherwise
+    exponent = np.float32(np.int32(bits >> np.int32(23)))
     m = _as_float((bits & np.int32(0x007FFFFF)) + _SQRT_HALF_BITS) - ONE
     p = _LOG[0]
     p = p * m + _LOG[1]

@@ -15,11 +15,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol
+from typing import Any, Final, Literal, NamedTuple, Protocol
 
+import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.compiled import FUSED, ONE, exponential, logarithm
 from kalux.errors import InputError, SettingsError
 from kalux.models.colour import luminance
 
@@ -36,8 +38,16 @@ SMALLEST = 1e-3
 LARGEST = 1e30
 """Larger intensities count as this, so that no formula overflows."""
 
+_NO_SHOULDER: Final = 1.0 + 1e-3
+"""An image whose bright end is no brighter needs none."""
+
 BINS = 256
 SAMPLES = 1 << 16
+
+_INFINITE_BITS: Final = np.int32(0x7F800000)
+_COARSE_BITS: Final = 19
+"""The exponent and four bits more are what is left of a positive float32 without its last ones: in the order of the
+numbers themselves, and 4096 at most."""
 
 
 class TimedImage(Protocol):
@@ -408,12 +418,12 @@ def apply(intensity: NDArray[Any], settings: DisplaySettings, statistics: Statis
 
 def to_uint8(mapped: NDArray[Any]) -> NDArray[np.uint8]:
     """Values 0 to 1 as uint8, 0 to 255, rounded to nearest; outside is clipped."""
-    return _to_integer(mapped, 255).astype(np.uint8)
+    return _to_integer(mapped, np.empty(np.shape(mapped), np.uint8), 255)
 
 
 def to_uint16(mapped: NDArray[Any]) -> NDArray[np.uint16]:
     """Values 0 to 1 as uint16, 0 to 65535, rounded to nearest; outside is clipped."""
-    return _to_integer(mapped, 65535).astype(np.uint16)
+    return _to_integer(mapped, np.empty(np.shape(mapped), np.uint16), 65535)
 
 
 def encode_srgb(linear: Float32) -> Float32:
@@ -444,10 +454,22 @@ def _in_colour(colour: Float32, y: Float32, grey: Float32) -> Float32:
     return encode_srgb(np.clip(shown, 0, 1))
 
 
-def _to_integer(mapped: NDArray[Any], top: int) -> Float32:
-    scaled = np.clip(np.asarray(mapped, np.float32), 0, 1) * np.float32(top)
-    rounded: Float32 = np.rint(scaled, out=scaled)
-    return rounded
+def _to_integer(mapped: NDArray[Any], integers: NDArray[Any], top: int) -> NDArray[Any]:
+    values = np.ascontiguousarray(mapped, np.float32)
+    _quantise(values.reshape(-1), np.float32(top), integers.reshape(-1))
+    return integers
+
+
+@nb.njit(cache=True, nogil=True)
+def _quantise(values, top, integers):  # type: ignore[no-untyped-def]
+    rounding = np.float32(
+        1.5 * 2**23
+    )  # added and taken away again, it rounds to a whole number, halves to even ones
+    for i in range(len(values)):
+        value = values[i]
+        value = value if value > np.float32(0.0) else np.float32(0.0)
+        value = value if value < ONE else ONE
+        integers[i] = np.int32((value * top + rounding) - rounding)
 
 
 def _require(good: bool, name: str, value: float, rule: str) -> None:
@@ -460,15 +482,30 @@ def _require_percentile(name: str, value: float) -> None:
 
 
 def _checked(intensity: NDArray[Any]) -> Float32:
-    checked = np.asarray(intensity, np.float32)
+    checked = np.ascontiguousarray(intensity, np.float32)
     if (checked.ndim != 2 and checked.shape[2:] != (3,)) or checked.size == 0:
         raise InputError(
             f"display: the intensity has shape {checked.shape}; (height, width) or (height, width, 3) is needed"
         )
-    if not np.isfinite(checked).all():
+    bounded = np.empty_like(checked)
+    if not _bound(checked.reshape(-1), checked.view(np.int32).reshape(-1), bounded.reshape(-1)):
         y, x = (int(i[0]) for i in np.nonzero(~np.isfinite(checked))[:2])
         raise InputError(f"display: the intensity at x={x}, y={y} is not finite (NaN or infinite)")
-    return np.clip(checked, np.float32(0), np.float32(LARGEST))
+    return bounded
+
+
+@nb.njit(cache=True, nogil=True)
+def _bound(values, bits, bounded):  # type: ignore[no-untyped-def]
+    """Values from 0 to `LARGEST`; whether all were finite."""
+    zero, largest = np.float32(0.0), np.float32(LARGEST)
+    strange = np.int32(0)
+    for i in range(len(values)):
+        value = values[i]
+        value = value if value > zero else zero
+        bounded[i] = value if value < largest else largest
+        exponent = np.int32(bits[i] & _INFINITE_BITS)
+        strange = exponent if exponent > strange else strange
+    return strange != _INFINITE_BITS
 
 
 def _smoothed(state: ToneState, statistics: Statistics, t: int, smoothing: float) -> Statistics:
@@ -492,9 +529,60 @@ def _shown(image: TimedImage) -> Float32:
     return image.intensity if colour is None else colour
 
 
+def _sample_step(intensity: Float32) -> int:
+    return max(1, math.isqrt(intensity.size // SAMPLES))
+
+
 def _sampled(intensity: Float32) -> Float32:
-    step = max(1, math.isqrt(intensity.size // SAMPLES))
+    step = _sample_step(intensity)
     return intensity[::step, ::step]
+
+
+def _percentiles(intensity: Float32, percents: list[float]) -> Statistics:
+    """Percentiles of a sampled image without negative numbers, linear between the two nearest of them."""
+    bits = np.ascontiguousarray(intensity).view(np.int32)
+    step = _sample_step(intensity)
+    positions = np.array(percents) / 100 * (_sampled(intensity).size - 1)
+    ranks = np.stack([np.floor(positions), np.ceil(positions)]).astype(np.int64)
+    # Few numbers are left to be put in order: those that share their first bits with one that is looked for.
+    sample, total = _counted(bits, step)
+    ends = np.cumsum(total)
+    bins = np.searchsorted(ends, ranks, side="right")
+    wanted = np.zeros(len(total), np.uint64)
+    wanted[bins] = 1
+    kept = np.empty(int(total[wanted > 0].sum()) + 1, np.int32)
+    _keep(sample, wanted, kept)
+    places = ranks - (ends - np.cumsum(total * (wanted > 0)))[bins]
+    values = np.partition(kept[:-1], places.ravel())[places].view(np.float32).astype(np.float64)
+    found: Statistics = values[0] + (positions - ranks[0]) * (values[1] - values[0])
+    return found
+
+
+@nb.njit(cache=True, nogil=True)
+def _counted(bits, step):  # type: ignore[no-untyped-def]
+    """A sample of an image, and how many of it have the same first bits."""
+    height, width = bits.shape
+    across = (width + step - 1) // step
+    sample = np.empty(across * ((height + step - 1) // step), np.uint32)
+    for row in range(0, height, step):
+        for k in range(across):
+            sample[row // step * across + k] = bits[row, k * step]
+    counts = np.zeros((4, 1 << (31 - _COARSE_BITS)), np.int64)  # four, so that equal neighbours need not wait
+    for i in range(np.uint64(len(sample))):
+        counts[i & np.uint64(3), np.uint64(sample[i]) >> np.uint64(_COARSE_BITS)] += 1
+    for k in range(1, 4):
+        for i in range(counts.shape[1]):
+            counts[0, i] += counts[k, i]
+    return sample, counts[0]
+
+
+@nb.njit(cache=True, nogil=True)
+def _keep(sample, wanted, kept):  # type: ignore[no-untyped-def]
+    """Those whose first bits are wanted; ``kept`` has room for one more."""
+    found = np.uint64(0)
+    for i in range(np.uint64(len(sample))):
+        kept[found] = sample[i]
+        found += wanted[np.uint64(sample[i]) >> np.uint64(_COARSE_BITS)]
 
 
 def _measure(intensity: Float32, curve: Curve) -> Statistics:
@@ -504,12 +592,12 @@ def _measure(intensity: Float32, curve: Curve) -> Statistics:
         case Linear():
             return np.empty(0)
         case Percentile():
-            return np.percentile(_sampled(intensity), [curve.low, curve.high]).astype(np.float64)
+            return _percentiles(intensity, [curve.low, curve.high])
         case Auto():
-            return _log(np.percentile(_sampled(intensity), [50, curve.high]))
+            return _log(_percentiles(intensity, [50, curve.high]))
         case Reinhard() | Drago():
             sampled = _sampled(intensity)
-            bright = _log(np.percentile(sampled, [curve.high]))
+            bright = _log(_percentiles(intensity, [curve.high]))
             return np.append(_log(sampled).mean(), bright)
         case Clahe():
             return _measure_clahe(intensity, curve)
@@ -571,23 +659,56 @@ def _stretched(intensity: Float32, black: float, white: float) -> Float32:
 
 
 def _auto(intensity: Float32, curve: Auto, median: float, white: float) -> Float32:
-    shown = _shoulder(intensity, curve.knee, white)
-    middle = max(float(_shoulder(np.array([[median]], np.float32), curve.knee, white)[0, 0]), SMALLEST)
+    shoulder = _shoulder(curve.knee, white)
+    middle = max(float(_rolled(np.float32(median), shoulder)), SMALLEST)
     power = min(max(math.log(min(middle, 0.99)) / math.log(MID_GREY), 1.0), curve.lift)
-    if power == 1.0:
-        return shown
-    return np.power(np.clip(shown, 0, 1, out=shown), np.float32(1 / power))
+    shown = np.empty(intensity.shape, np.float32)
+    values = np.ascontiguousarray(intensity).reshape(-1)
+    _show(values, shoulder, white > _NO_SHOULDER, np.float32(1 / power), shown.reshape(-1))
+    return shown
 
 
-def _shoulder(intensity: Float32, knee: float, white: float) -> Float32:
-    if white <= 1.0 + 1e-3:
-        return intensity.copy()
+class _Shoulder(NamedTuple):
+    """float32: where it begins, how far it goes, and a (gain) and scale of scale log(1 + a x)."""
+
+    knee: np.float32
+    room: np.float32
+    gain: np.float32
+    scale: np.float32
+
+
+def _shoulder(knee: float, white: float) -> _Shoulder:
+    """That of an image with nothing above 1 is none: it begins beyond every intensity."""
+    if white <= _NO_SHOULDER:
+        return _Shoulder(np.float32(2 * LARGEST), np.float32(0), np.float32(0), np.float32(0))
     gain = _shoulder_gain(1 - knee, white - knee)
-    above = np.clip(intensity - np.float32(knee), 0, np.float32(white - knee))
     scale = (1 - knee) / math.log1p(gain * (white - knee))
-    rolled = np.float32(scale) * np.log1p(np.float32(gain) * above)
-    mapped: Float32 = np.minimum(intensity, np.float32(knee)) + rolled
-    return mapped
+    return _Shoulder(np.float32(knee), np.float32(white - knee), np.float32(gain), np.float32(scale))
+
+
+@nb.njit(cache=True, inline="always")
+def _rolled(intensity, shoulder):  # type: ignore[no-untyped-def]
+    """The shoulder: the intensity up to the knee, then a logarithm up to 1."""
+    knee, room, gain, scale = shoulder
+    above = intensity - knee
+    above = above if above > np.float32(0.0) else np.float32(0.0)
+    above = above if above < room else room
+    low = intensity if intensity < knee else knee
+    return low + scale * logarithm(ONE + gain * above)
+
+
+@nb.njit(cache=True, nogil=True, fastmath=FUSED)
+def _show(values, shoulder, rolled, power, shown):  # type: ignore[no-untyped-def]
+    """Shoulder and power, each where there is one, limited to 0 to 1."""
+    zero = np.float32(0.0)
+    for i in range(len(values)):
+        value = _rolled(values[i], shoulder) if rolled else values[i]
+        shown[i] = value if value < ONE else ONE
+    if power != ONE:
+        for i in range(len(values)):
+            value = shown[i]
+            lifted = exponential(power * logarithm(value))
+            shown[i] = lifted if value > zero else zero
 
 
 def _shoulder_gain(height: float, width: float) -> float:
@@ -630,7 +751,7 @@ def _drago(intensity: Float32, bias: float, average: float, bright: float) -> Fl
 
 def _measure_clahe(intensity: Float32, curve: Clahe) -> Statistics:
     """Log limits of the image, then tiles x tiles distributions at BINS + 1 edges, in one vector."""
-    limits = _log(np.percentile(_sampled(intensity), [0.1, 99.9]))
+    limits = _log(_percentiles(intensity, [0.1, 99.9]))
     position = _log_position(intensity, limits)
     bins = np.minimum(position.astype(np.int64), BINS - 1)
     rows = np.arange(intensity.shape[0]) * curve.tiles // intensity.shape[0]

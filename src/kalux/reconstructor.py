@@ -22,7 +22,7 @@ from kalux.events import EVENT_DTYPE, EventArray, as_events, check_events
 from kalux.filters.akf import State
 from kalux.filters.buffer import EventBuffer
 from kalux.filters.methods import Method, Segment, Shot, make_method, take_shot
-from kalux.filters.readout import HighlightPrior, intensity, regularised, total_variance
+from kalux.filters.readout import HighlightPrior, hidden_variance, read_out
 from kalux.frames import Frame, check_frame
 from kalux.models.camera import Camera, count_bright
 from kalux.models.colour import (
@@ -409,21 +409,20 @@ class Reconstructor:
         prior = HighlightPrior(
             white=estimate.white, scale2=scale**2, stretch=spread**2 / scale if scale > 0 else 0.0
         )
-        moving, neighbours = estimate.moving, self.settings.filter.neighbours
+        mosaic = self._last_frame is not None and self._last_frame.mosaic is not None
         on, off = self.thresholds
-        variance = total_variance(estimate.variance, moving, estimate.between, on * off)
-        log_intensity = estimate.log_intensity
-        if moving is not None and neighbours > 0:
-            mosaic = self._last_frame is not None and self._last_frame.mosaic is not None
-            pitch = 2 if mosaic else 1  # neighbours of the same colour
-            log_intensity = regularised(log_intensity, variance, moving, neighbours, pitch)
-        image = Image(
-            t=estimate.t,
-            intensity=intensity(log_intensity, variance, self.settings.camera.offset, prior),
-            variance=variance,
-            log_offset=self.settings.camera.offset,
-            final=estimate.final,
+        offset = self.settings.camera.offset
+        intensity, variance = read_out(
+            estimate.log_intensity,
+            estimate.variance,
+            offset,
+            prior,
+            estimate.moving,
+            hidden_variance(estimate.between, on * off),
+            self.settings.filter.neighbours,
+            pitch=2 if mosaic else 1,  # neighbours of the same colour
         )
+        image = Image(estimate.t, intensity, variance, offset, estimate.final)
         return (
             image
             if self._colours == "grey"

@@ -86,6 +86,25 @@ def test_bridged_form_solves_the_equations(value, augmented, variance, forward, 
     np.testing.assert_allclose([read[0][0, 0], read[1][0, 0]], expected, rtol=2e-6, atol=2e-6)  # float32
 
 
+@pytest.mark.parametrize("width", [1, 63, 64, 65, 150])
+def test_every_pixel_is_read(width):
+    """The closed form over images narrower and wider than what is read together; every quantity differs."""
+    rng = np.random.default_rng(0)
+    shape = (3, width)
+    of = [np.float32(np.exp(rng.normal(-2, 1, shape))) for _ in range(8)]
+    augmented, slope, step, forward, backward, events, value, variance = of
+    segment = BridgedSegment(
+        0, 50_000, augmented, slope, step, step, forward, backward, events, 0.1, 10.0, None
+    )
+    start = State(value, variance, make_clock(shape, 0))
+    found = akf.read_bridged(segment, akf.begin_bridged(segment, start), 30_000)
+    rate = 10.0 * (1 / forward + 1 / (backward + 0.1 * events))
+    information = 1 / variance + 0.03 * rate
+    expected = augmented + 0.03 * slope + (value - augmented) / variance / information
+    np.testing.assert_allclose(found[0], expected, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(found[1], 1 / information, rtol=1e-5)
+
+
 @given(levels, levels, levels, variances, st.tuples(*[variances] * 4), st.integers(1, 30_000))
 @settings(max_examples=40, deadline=None)
 def test_exact_form_solves_the_equations(value, forward, backward, variance, covariances, t):

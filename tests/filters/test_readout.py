@@ -9,17 +9,30 @@ from hypothesis import strategies as st
 from scipy.special import lambertw
 
 from kalux.filters.readout import (
+    Hidden,
     HighlightPrior,
     believed_highlight,
-    intensity,
+    hidden_variance,
     neighbour_weight,
-    regularised,
-    total_variance,
+    read_out,
 )
+from kalux.settings import preset
+
+import naive
 
 OFF = HighlightPrior(white=0.0, scale2=0.0, stretch=0.0)
+NOTHING_HIDDEN = Hidden(0.0, 0.0)
 excesses = st.floats(0.0, 12.0)
 stretches = st.floats(1e-4, 2.0)
+
+
+def intensity(value, variance, offset, prior):
+    return read_out(value, variance, offset, prior)[0]
+
+
+def regularised(value, variance, moving, difference):
+    """L after K12."""
+    return np.log(read_out(value, variance, 0.0, OFF, moving, NOTHING_HIDDEN, difference)[0])
 
 
 def lambert(excess, variance, scale2, stretch):
@@ -119,11 +132,17 @@ def test_the_white_level_is_continuous():
 def test_the_hidden_variance_is_larger_between_frames_and_where_things_move():
     moving = np.array([[True, False]])
     variance = np.full((1, 2), 0.01, np.float32)
-    at, between = (total_variance(variance, moving, s, 0.04) - variance for s in (0.0, 1.0))
+
+    def hidden(between, threshold2):
+        given = hidden_variance(between, threshold2)
+        return read_out(np.zeros((1, 2)), variance, 0.03, OFF, moving, given)[1] - variance
+
+    at, between = hidden(0.0, 0.04), hidden(1.0, 0.04)
     assert (between > at).all()
     assert at[0, 0] > at[0, 1] > 0
-    np.testing.assert_allclose(total_variance(variance, moving, 1.0, 0.16) - variance, 4 * between, rtol=1e-5)
-    assert total_variance(variance, None, 1.0, 0.04) is variance
+    np.testing.assert_allclose(hidden(1.0, 0.16), 4 * between, rtol=1e-5)
+    untold = read_out(np.zeros((1, 2)), variance, 0.03, OFF, None, hidden_variance(1.0, 0.04))[1]
+    np.testing.assert_array_equal(untold, variance)
 
 
 # --- neighbours ----------------------------------------------------------------------------------------------
@@ -150,7 +169,7 @@ def test_still_and_well_known_pixels_stay():
     truth, noisy = noisy_edge()
     moving = np.zeros(truth.shape, bool)
     variance = np.full(truth.shape, 0.01, np.float32)
-    np.testing.assert_array_equal(regularised(noisy, variance, moving, 0.1), noisy)
+    np.testing.assert_allclose(regularised(noisy, variance, moving, 0.1), noisy, atol=1e-6)
     moving[5, 5], variance[5, 5] = True, 1e-6
     np.testing.assert_allclose(regularised(noisy, variance, moving, 0.1), noisy, atol=2e-4)
 
@@ -160,3 +179,26 @@ def test_a_neighbour_weighs_at_most_its_information(excess, own, other, allowed)
     weight = neighbour_weight(*np.float32([excess, own, other, allowed]))
     assert 0.0 < weight <= 1.0 / (other + allowed) * (1 + 1e-5)
     assert weight == neighbour_weight(*np.float32([-excess, own, other, allowed]))
+
+
+@pytest.mark.parametrize(("shape", "moves"), [((3, 5), 0.6), ((7, 100), 0.02), ((6, 64), 0.5)])
+@pytest.mark.parametrize("pitch", [1, 2])
+def test_images_are_the_oracles(shape, moves, pitch):
+    """K6, K11 and K12 pixel by pixel, over images narrower and wider than what is looked at together."""
+    rng = np.random.default_rng(1)
+    value, variance = rng.normal(-0.5, 1.0, shape), np.exp(rng.normal(-3.0, 2.0, shape))
+    moving = rng.random(shape) < moves
+    hidden, chosen = Hidden(0.01, 0.03), preset("default")
+    white, stretch, offset = 0.8, 0.7, chosen.camera.offset
+    prior = HighlightPrior(np.log(white + offset), chosen.filter.highlight_scale**2, stretch)
+    given = value.astype(np.float32), variance.astype(np.float32)
+    found = read_out(*given, offset, prior, moving, hidden, 0.3, pitch)
+    total = variance + np.where(moving, hidden.moving, hidden.still)
+    level = np.empty(shape)
+    for part in np.ndindex(pitch, pitch):  # a mosaic's colours know nothing of each other
+        own = np.s_[part[0] :: pitch, part[1] :: pitch]
+        level[own] = naive.regularised(value[own], total[own], moving[own], 0.3 * pitch)
+    expected = np.vectorize(lambda v, p: naive.intensity(v, p, chosen, white, stretch))(level, total)
+    np.testing.assert_allclose(found[1], total, rtol=1e-6)
+    np.testing.assert_allclose(found[0], expected, rtol=1e-5, atol=1e-6)
+    assert (value > prior.white).sum() > 2

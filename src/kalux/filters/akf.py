@@ -35,7 +35,9 @@ from kalux.compiled import (
     event_row,
     event_weight,
     event_words,
+    packed,
     prefetch,
+    unpack,
 )
 from kalux.events import EventArray
 from kalux.filters.common import EPOCH, MICROSECOND, Clock, moved_clock, newest_around, newest_around_inside
@@ -126,6 +128,15 @@ BRIDGED_PIXEL: Final = np.dtype(
 )
 """What the bridged form knows of a pixel: 32 bytes, half a cache line, fetched and stored at once."""
 
+_BLOCK: Final = 64
+"""Pixels that are read together: few enough that their fields stay in registers and the nearest cache."""
+
+_FIELDS: Final = len(BRIDGED_PIXEL.names or ())
+_INFORMATION, _WEIGHTED, _AUGMENTED, _FORWARD, _BACKWARD, _COMING = (
+    (BRIDGED_PIXEL.names or ()).index(name)
+    for name in ("information", "weighted", "augmented", "forward", "backward", "coming")
+)
+
 
 @dataclass
 class BridgedCursor:
@@ -168,7 +179,7 @@ class _Scalars(NamedTuple):
 def begin_bridged(segment: BridgedSegment, state: State) -> BridgedCursor:
     """The cursor at the start of a segment: L stays, L^A is the segment's. The clock's origin is the start."""
     clock: Clock = state.newest.astype(np.int32)
-    pixels = np.empty(clock.shape, BRIDGED_PIXEL)
+    pixels = packed(clock.shape, BRIDGED_PIXEL)
     level = state.log_intensity
     if segment.floor is not None:
         level = np.maximum(level, segment.floor)  # K7
@@ -296,21 +307,37 @@ def _read_bridged(  # type: ignore[no-untyped-def]
     segment, pixels, clock, now, beyond, since_start, log_intensity, variance
 ):
     rate, step_variance = np.float32(segment.rate), np.float32(segment.step_variance)
+    moment = now, beyond, since_start
     height, width = variance.shape
-    stride = width + 2
+    planes = np.empty((_FIELDS, min(width, _BLOCK)), np.float32)
     for row in range(height):
-        for column in range(width):
-            at = (row + 1) * stride + column + 1
-            prefetch(pixels, at + AHEAD)  # also keeps the compiler from vector code, which gathers: slower
-            pixel = pixels[at]
-            seconds = _since(clock[at], now) + beyond
-            information = predicted_information(
-                pixel.information, _pixel_rate(pixel, rate, step_variance), seconds
-            )
-            inverse = ONE / information
-            moved = pixel.augmented + np.float32(segment.slope[row, column]) * since_start
-            log_intensity[row, column] = moved + pixel.weighted * inverse
-            variance[row, column] = inverse
+        at = (row + 1) * (width + 2) + 1
+        rows = clock[at : at + width], segment.slope[row], log_intensity[row], variance[row]
+        if width < _BLOCK:
+            _read_block(pixels, at, 0, width, planes, rate, step_variance, moment, rows)
+            continue
+        for first in range(0, width, _BLOCK):  # the last block begins where it ends with the row
+            first = min(first, width - _BLOCK)
+            _read_block(pixels, at, first, _BLOCK, planes, rate, step_variance, moment, rows)
+
+
+@nb.njit(cache=True, inline="always", error_model="numpy")
+def _read_block(pixels, at, first, count, planes, rate, step_variance, moment, rows):  # type: ignore[no-untyped-def]
+    """L and P of ``count`` pixels, which lie in ``pixels`` from ``at`` + ``first`` on; vector code."""
+    now, beyond, since_start = moment
+    times, slope, log_intensity, variance = rows
+    unpack(pixels, at + first, count, planes)
+    information, weighted, augmented = planes[_INFORMATION], planes[_WEIGHTED], planes[_AUGMENTED]
+    forward, backward, coming = planes[_FORWARD], planes[_BACKWARD], planes[_COMING]
+    for i in range(count):
+        column = np.uint64(first) + np.uint64(i)
+        seconds = _since(times[column], now) + beyond
+        backward_variance = backward[i] + coming[i] * step_variance
+        rate_now = measurement_rate(rate, forward[i], backward_variance)
+        inverse = ONE / predicted_information(information[i], rate_now, seconds)
+        moved = augmented[i] + np.float32(slope[column]) * since_start
+        log_intensity[column] = moved + weighted[i] * inverse
+        variance[column] = inverse
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")

@@ -603,7 +603,7 @@ def _latent_frame(  # type: ignore[no-untyped-def]
             i = row * width + column
             prefetch(pixels, min(i + AHEAD, len(pixels) - 1))
             pixel = pixels[i]
-            mean = mean_level(pixel, duration)
+            mean = mean_level(pixel.level, pixel.integral, pixel.since, duration)
             middle[column] = pixel.at_middle / mean
             peak[column] = pixel.peak / mean
             variance[row, column] = event_variance * pixel.events

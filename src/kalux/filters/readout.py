@@ -8,7 +8,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.compiled import ONE, exponential, logarithm
+from kalux.compiled import FUSED, ONE, exponential, logarithm
 
 Array = NDArray[np.floating[Any]]
 
@@ -24,9 +24,12 @@ HIDDEN_STILL: Final = (0.005, 0.04)
 _NOTHING: Final = np.float32(1e9)
 """Variance of a pixel that knows nothing; its square is still a float32."""
 
-_BLOCK: Final = 256
-"""Pixels that are looked at together: the highlights of a block are brought together, so that they go through vector
-code and the others do not pay for them."""
+_BLOCK: Final = 32
+"""Pixels of a row that are looked at together: those of a block where nothing moves are not compared with their
+neighbours, and those of one without highlights are not searched for them."""
+
+_MARGIN: Final = 16
+"""Pixels that know nothing on both sides of a row, at least as many as the pitch: the border needs no special case."""
 
 
 class HighlightPrior(NamedTuple):
@@ -86,110 +89,26 @@ def lambert_w(x):  # type: ignore[no-untyped-def]
     return w * (ONE + z / (ONE + w) * (q - z) / (q - two * z))
 
 
-def intensity(
-    log_intensity: Array, variance: Array, log_offset: float, prior: HighlightPrior
-) -> NDArray[np.float32]:
-    """I of a state, (H, W) float32: linear, 1 = a saturated frame pixel at the reference exposure, never negative.
+class Hidden(NamedTuple):
+    """Variance of what no event has told yet (docs/equations.md, K11), of pixels without and with an event of late."""
 
-    Parameters
-    ----------
-    log_intensity, variance
-        (H, W) L = log(I + I_0) and P.
-    log_offset
-        I_0.
-    prior
-        Of highlights.
-    """
-    out = np.empty(log_intensity.shape, np.float32)
-    _intensity(
-        log_intensity.reshape(-1), variance.reshape(-1), np.float32(log_offset), prior, out.reshape(-1)
-    )
-    return out
+    still: float
+    moving: float
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
-def _intensity(log_intensity, variance, log_offset, prior, out):  # type: ignore[no-untyped-def]
-    zero = np.float32(0.0)
-    white, scale2, stretch = np.float32(prior.white), np.float32(prior.scale2), np.float32(prior.stretch)
-    places = np.empty(_BLOCK, np.int64)
-    excess, doubt = np.empty(_BLOCK, np.float32), np.empty(_BLOCK, np.float32)
-    for first in range(0, len(out), _BLOCK):
-        logs, variances = log_intensity[first : first + _BLOCK], variance[first : first + _BLOCK]
-        block = out[first : first + _BLOCK]
-        highlights = 0
-        for i in range(len(block)):
-            value = np.float32(logs[i])
-            highlights += int(value > white)
-            block[i] = max(exponential(value) - log_offset, zero)
-        if highlights == 0 or scale2 == zero:
-            continue
-        count = 0
-        for i in range(len(block)):
-            places[count] = i
-            count += int(np.float32(logs[i]) > white)
-        for k in range(highlights):
-            excess[k] = np.float32(logs[places[k]]) - white
-            doubt[k] = np.float32(variances[places[k]])
-        for k in range(highlights):
-            believed = white + believed_highlight(excess[k], doubt[k], scale2, stretch)
-            excess[k] = max(exponential(believed) - log_offset, zero)
-        for k in range(highlights):
-            block[places[k]] = excess[k]
+_NOTHING_HIDDEN: Final = Hidden(0.0, 0.0)
 
 
-def total_variance(
-    variance: Array, moving: NDArray[np.bool_] | None, between: float, threshold2: float
-) -> NDArray[np.float32]:
-    """P and the variance of what no event has told yet (docs/equations.md, K11), (H, W) float32.
-
-    Parameters
-    ----------
-    variance
-        (H, W) P.
-    moving
-        (H, W): pixels with an event of late; None: P as it is.
-    between
-        0 at a frame, 1 half-way between two.
-    threshold2
-        c^2.
-    """
-    if moving is None:
-        return variance.astype(np.float32, copy=False)
-    still, move = (
-        np.float32(threshold2 * (at + between * half)) for at, half in (HIDDEN_STILL, HIDDEN_MOVING)
-    )
-    return variance.astype(np.float32, copy=False) + np.where(moving, move, still)
+def hidden_variance(between: float, threshold2: float) -> Hidden:
+    """K11 at ``between``, 0 at a frame and 1 half-way between two, with ``threshold2`` = c^2."""
+    still, moving = (threshold2 * (at + between * half) for at, half in (HIDDEN_STILL, HIDDEN_MOVING))
+    return Hidden(still, moving)
 
 
-def regularised(
-    log_intensity: Array,
-    variance: NDArray[np.float32],
-    moving: NDArray[np.bool_],
-    difference: float,
-    pitch: int = 1,
-) -> NDArray[np.float32]:
-    """L with what neighbours know (docs/equations.md, K12), (H, W) float32; still pixels are as they were.
-
-    The mean of a pixel and its eight neighbours, weighted by the information that each has about it: a neighbour at
-    distance d differs by a normal amount of variance ``difference``^2 d^2, unless there is an edge between, which a
-    difference beyond what both variances explain tells.
-
-    Parameters
-    ----------
-    log_intensity, variance
-        (H, W) L, and its variance.
-    moving
-        (H, W): pixels that are changed.
-    difference
-        Standard deviation of the difference of L between pixels one apart where there is no edge.
-    pitch
-        Distance of the neighbours: 2 in a Bayer mosaic, whose pixels repeat their colours.
-    """
-    out = log_intensity.astype(np.float32)
-    _regularise(
-        out.copy(), np.minimum(variance, _NOTHING), moving, np.float32(difference * difference), pitch, out
-    )
-    return out
+@nb.njit(cache=True, inline="always")
+def total_variance(variance, moving, hidden):  # type: ignore[no-untyped-def]
+    """P and the variance of what no event has told yet (docs/equations.md, K11)."""
+    return variance + (hidden[1] if moving else hidden[0])
 
 
 @nb.njit(cache=True, inline="always")
@@ -204,36 +123,181 @@ def neighbour_weight(excess, variance, neighbour_variance, allowed):  # type: ig
     return both * both / (own * edge * edge)
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
-def _regularise(log_intensity, variance, moving, allowed, pitch, out):  # type: ignore[no-untyped-def]
-    """All pixels of a row at a time, neighbour by neighbour, so that it becomes vector code."""
+def read_out(
+    log_intensity: Array,
+    variance: Array,
+    log_offset: float,
+    prior: HighlightPrior,
+    moving: NDArray[np.bool_] | None = None,
+    hidden: Hidden = _NOTHING_HIDDEN,
+    difference: float = 0.0,
+    pitch: int = 1,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """I of a state, and the variance of its logarithm; in one pass over the rows, none of which is stored in between.
+
+    Neighbours (docs/equations.md, K12): L of a moving pixel becomes the mean of itself and its eight neighbours,
+    weighted by the information that each has about it. A neighbour at distance d differs by a normal amount of variance
+    ``difference``^2 d^2, unless there is an edge between, which a difference beyond what both variances explain tells.
+
+    Parameters
+    ----------
+    log_intensity, variance
+        (H, W) L = log(I + I_0) and P.
+    log_offset
+        I_0.
+    prior
+        Of highlights.
+    moving
+        (H, W): pixels with an event of late; None: not told, so that neither K11 nor K12 is done.
+    hidden
+        What is added to P.
+    difference
+        Standard deviation of the difference of L between pixels one apart where there is no edge; 0: neighbours say
+        nothing.
+    pitch
+        Distance of the neighbours: 2 in a Bayer mosaic, whose pixels repeat their colours.
+
+    Returns
+    -------
+    intensity : ndarray
+        (H, W) float32: linear, 1 = a saturated frame pixel at the reference exposure, never negative.
+    variance : ndarray
+        (H, W) float32.
+    """
+    known = variance.astype(np.float32, copy=False)
+    out = np.empty(log_intensity.shape, np.float32)
+    total = known if moving is None else np.empty_like(out)
+    _read_out(
+        log_intensity.astype(np.float32, copy=False),
+        known,
+        np.empty((0, 0), np.bool_) if moving is None else moving,
+        tuple(np.float32(value) for value in hidden),
+        np.float32(difference * difference),
+        pitch,
+        tuple(np.float32(value) for value in prior),
+        np.float32(log_offset),
+        out,
+        total,
+    )
+    return out, total
+
+
+# The loops below take whole arrays and a row's number: a view of a row costs more than a part of what is done with it.
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy", fastmath=FUSED)
+def _read_out(  # type: ignore[no-untyped-def]
+    log_intensity, variance, moving, hidden, allowed, pitch, prior, log_offset, out, total
+):
+    white, scale2, _ = prior
     height, width = log_intensity.shape
-    # A frame of pixels that know nothing: the border needs no special case.
-    level = np.zeros((height + 2 * pitch, width + 2 * pitch), np.float32)
-    doubt = np.full(level.shape, _NOTHING)
-    level[pitch : pitch + height, pitch : pitch + width] = log_intensity
-    doubt[pitch : pitch + height, pitch : pitch + width] = variance
-    information, deviation = np.empty(width, np.float32), np.empty(width, np.float32)
-    for row in range(height):
-        if not moving[row].any():
+    size = (width + _BLOCK - 1) // _BLOCK * _BLOCK
+    # The rows that neighbours of one row lie in, each in the place of its number modulo theirs, between margins.
+    count = 2 * pitch + 1
+    levels = np.zeros((count, size + 2 * _MARGIN), np.float32)
+    doubts = np.full(levels.shape, _NOTHING)
+    level, marks = np.empty(size, np.float32), np.zeros(size, np.uint8)
+    words = marks.view(np.uint64)
+    places, excess, doubt = np.empty(size, np.uint64), np.empty(size, np.float32), np.empty(size, np.float32)
+    told = moving.size > 0
+    for row in range(-pitch if told else 0, height):
+        following, below = np.uint64(row + pitch), np.uint64((row + pitch) % count)
+        if told and following < np.uint64(height):
+            _take_row(log_intensity, variance, moving, hidden, following, total, levels, doubts, below)
+        elif told:
+            for column in range(np.uint64(size + 2 * _MARGIN)):
+                doubts[below, column] = _NOTHING
+        if row < 0:
             continue
-        own_level, own_doubt = log_intensity[row], variance[row]
-        for column in range(width):
-            information[column] = ONE / own_doubt[column]
-            deviation[column] = np.float32(0.0)
-        for place in range(9):
-            down, right = place // 3 - 1, place % 3 - 1
-            if down == 0 and right == 0:
-                continue
-            spread = allowed * np.float32(pitch * pitch * (down * down + right * right))
-            first = pitch + right * pitch
-            other_level = level[row + pitch + down * pitch, first : first + width]
-            other_doubt = doubt[row + pitch + down * pitch, first : first + width]
-            for column in range(width):
-                excess = other_level[column] - own_level[column]
-                weight = neighbour_weight(excess, own_doubt[column], other_doubt[column], spread)
-                deviation[column] += weight * excess
-                information[column] += weight
-        for column in range(width):
-            if moving[row, column]:
-                out[row, column] = own_level[column] + deviation[column] / information[column]
+        at, above, here = np.uint64(row), np.uint64((row - pitch) % count), np.uint64(row % count)
+        for column in range(np.uint64(width)):
+            level[column] = log_intensity[at, column]
+        if told:
+            for column in range(np.uint64(width)):
+                marks[column] = moving[at, column]
+        if told and allowed > np.float32(0.0) and _any(words, 0, size):
+            _regularise(levels, doubts, above, here, below, marks, words, allowed, pitch, level)
+        for column in range(np.uint64(width)):
+            marks[column] = level[column] > white
+            out[at, column] = max(exponential(level[column]) - log_offset, np.float32(0.0))
+        if scale2 > np.float32(0.0) and _any(words, 0, size):
+            _believe(level, total, at, marks, words, prior, log_offset, places, excess, doubt, out)
+
+
+@nb.njit(cache=True, inline="always")
+def _any(words, first, count):  # type: ignore[no-untyped-def]
+    """Whether any of ``count`` bytes from ``first`` on is not 0: multiples of 8, with the bytes as ``words`` of 8."""
+    found = np.uint64(0)
+    for k in range(count // 8):
+        found |= words[np.uint64(first // 8) + np.uint64(k)]
+    return found != np.uint64(0)
+
+
+@nb.njit(cache=True, inline="always")
+def _take_row(  # type: ignore[no-untyped-def]
+    log_intensity, variance, moving, hidden, row, total, levels, doubts, place
+):
+    """K11 of a row, and what its neighbours need to know of it."""
+    for column in range(np.uint64(total.shape[1])):
+        at = column + np.uint64(_MARGIN)
+        known = total_variance(variance[row, column], moving[row, column], hidden)
+        total[row, column] = known
+        doubts[place, at] = known if known < _NOTHING else _NOTHING
+        levels[place, at] = log_intensity[row, column]
+
+
+@nb.njit(cache=True, inline="always", error_model="numpy")
+def _regularise(  # type: ignore[no-untyped-def]
+    levels, doubts, above, here, below, moves, words, allowed, pitch, level
+):
+    """K12 of a row: its L in ``level``, where the pixel moves."""
+    near, far = allowed * np.float32(pitch * pitch), allowed * np.float32(2 * pitch * pitch)
+    for first in range(0, len(level), _BLOCK):
+        if not _any(words, first, _BLOCK):
+            continue
+        for i in range(_BLOCK):
+            column = np.uint64(first) + np.uint64(i)
+            at = column + np.uint64(_MARGIN)
+            left, right = at - np.uint64(pitch), at + np.uint64(pitch)
+            own = levels[here, at], doubts[here, at]
+            mean = ONE / own[1], np.float32(0.0)
+            mean = _with_neighbour(mean, own, levels[above, left], doubts[above, left], far)
+            mean = _with_neighbour(mean, own, levels[above, at], doubts[above, at], near)
+            mean = _with_neighbour(mean, own, levels[above, right], doubts[above, right], far)
+            mean = _with_neighbour(mean, own, levels[here, left], doubts[here, left], near)
+            mean = _with_neighbour(mean, own, levels[here, right], doubts[here, right], near)
+            mean = _with_neighbour(mean, own, levels[below, left], doubts[below, left], far)
+            mean = _with_neighbour(mean, own, levels[below, at], doubts[below, at], near)
+            mean = _with_neighbour(mean, own, levels[below, right], doubts[below, right], far)
+            information, deviation = mean
+            level[column] = own[0] + deviation / information if moves[column] else own[0]
+
+
+@nb.njit(cache=True, inline="always", error_model="numpy")
+def _with_neighbour(mean, own, level, doubt, allowed):  # type: ignore[no-untyped-def]
+    """(information, sum of weighted differences) of a mean, with one more neighbour."""
+    excess = level - own[0]
+    weight = neighbour_weight(excess, own[1], doubt, allowed)
+    return mean[0] + weight, mean[1] + weight * excess
+
+
+@nb.njit(cache=True, inline="always", error_model="numpy")
+def _believe(  # type: ignore[no-untyped-def]
+    level, variance, row, marks, words, prior, log_offset, places, excess, doubt, out
+):
+    """K6 of the marked pixels of a row, brought together so that they go through vector code and others do not pay."""
+    white, scale2, stretch = prior
+    count = np.uint64(0)
+    for first in range(0, len(level), _BLOCK):
+        if _any(words, first, _BLOCK):
+            for column in range(np.uint64(first), np.uint64(first + _BLOCK)):
+                places[count] = column
+                count += np.uint64(marks[column])
+    for k in range(count):
+        excess[k] = level[places[k]] - white
+        doubt[k] = variance[row, places[k]]
+    for k in range(count):
+        believed = believed_highlight(excess[k], doubt[k], scale2, stretch)
+        excess[k] = max(exponential(white + believed) - log_offset, np.float32(0.0))
+    for k in range(count):
+        out[row, places[k]] = excess[k]
