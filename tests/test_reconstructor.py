@@ -768,4 +768,5 @@ def test_an_unknown_threshold_is_learned():
 
 
 def engine_without_threshold():
-    return Reconstructor((1, 1))
+    """Without K14: the levels of the tests stand still between two events."""
+    return Reconstructor((1, 1), settings=altered(PRESETS["default"], "events", trail=0.0))

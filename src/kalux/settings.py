@@ -112,6 +112,9 @@ class EventSettings:
         Standard deviation of the log of the scale of what events say of highlights beyond white, where no
         frame can check it, when the threshold is only an estimate. 0.15: how well large steps between well
         exposed frames agree with estimated thresholds, on three real and eleven simulated recordings.
+    trail
+        By how much, in c, a pixel is on average beyond the level of its newest event, at most (docs/equations.md,
+        K14): events trail the light. 0 turns it off. 0.4 (docs/tuning.md).
     sigma_proc2, sigma_iso2, sigma_ref2, refractory_bound
         The paper's event noise: 0.0005 1/s, 0.03 1/s, 0.01, and 10 ms (released code), in s. For
         augmentation "paper" only.
@@ -126,6 +129,7 @@ class EventSettings:
     deblur_variance: float = 0.05
     noise_rate: float = 3.0
     extrapolation_spread: float = 0.15
+    trail: float = 0.4
     sigma_proc2: float = 0.0005
     sigma_iso2: float = 0.03
     sigma_ref2: float = 0.01

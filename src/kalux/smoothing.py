@@ -261,5 +261,6 @@ def reversed_settings(settings: Settings) -> Settings:
         threshold_on=settings.events.threshold_off,
         threshold_off=settings.events.threshold_on,
         delay=-(settings.events.delay or 0),
+        trail=0.0,
     )
     return dataclasses.replace(settings, events=events)
