@@ -191,7 +191,7 @@ def paper(pixel, settings, times, on, off):
 
 
 def trail_scales(every, settings):
-    """K14: s of every interval between two frames, and last of what follows the last frame, in seconds."""
+    """K14: s of the lead-in, of every interval between two frames, and of what follows the last, in seconds."""
     span = number = 0.0
     out = []
     middles = next(iter(every.values())).middles
@@ -202,7 +202,7 @@ def trail_scales(every, settings):
                 if max(start, end - (end - start) // 4) < t <= end and p == q and t - before < 100_000:
                     span, number = span + t - before, number + 1
         out.append(1.1 * US * (span + 1e6) / (number + 100))
-    return [*out[1:], out[-1]]
+    return [*out, out[-1]]
 
 
 def trail(pixel, t, scale, height, on, off):
@@ -260,12 +260,10 @@ def bridged(pixel, settings, times, on, off, scales):
         inside = [p for t, p, *_ in pixel.events if a < t <= b]
         return sum(inside), len(inside) - sum(inside)
 
-    def grown(k, t):  # K14, since the beginning of interval k; nothing before the first frame
-        if k < 0:
-            return 0.0
-        return trail(pixel, t, scales[k], ev.trail, on, off) - trail(
-            pixel, pixel.middles[k], scales[k], ev.trail, on, off
-        )
+    def grown(index, t):  # K14, since the frame at which the interval begins, or that of the lead-in
+        frame = pixel.middles[max(index - 1, 0)]
+        now, then = (trail(pixel, q, scales[index], ev.trail, on, off) for q in (t, frame))
+        return now - then
 
     begin = pixel.starts[0]
     first = latent(0)
@@ -274,7 +272,7 @@ def bridged(pixel, settings, times, on, off, scales):
         second = latent(k + 1)
         a, b = pixel.middles[k], pixel.middles[k + 1]
         n_on, n_off = counts(a, b)
-        mismatch = second[0] - first[0] - (on * scale_on * n_on - off * scale_off * n_off) - grown(k, b)
+        mismatch = second[0] - first[0] - (on * scale_on * n_on - off * scale_off * n_off) - grown(k + 1, b)
         total = first[1] + second[1] + var_on * (on * n_on) ** 2 + var_off * (off * n_off) ** 2
         total += ev.step_noise * c2 * (n_on + n_off) + ev.quantisation_variance * c2
         intervals.append((a, b, first, second, scale_on, scale_off, var_on, var_off, mismatch / total))
@@ -343,7 +341,7 @@ def bridged(pixel, settings, times, on, off, scales):
 
     def bounded(t):  # K7 and K10
         value, variance = predict(t)
-        value += grown(index - 1, t)
+        value += grown(index, t)
         _, b, _, right, *_ = intervals[index]
         if t != b:
             return value, variance
@@ -357,7 +355,7 @@ def bridged(pixel, settings, times, on, off, scales):
             return value
         n_on, n_off = counts(a, b)
         up, down = (own_step(intervals[index], p, on, off, ev, c2, counts) for p in (True, False))
-        return max(value, right[0] - (n_on * up + n_off * down) - grown(index - 1, b))
+        return max(value, right[0] - (n_on * up + n_off * down) - grown(index, b))
 
     def step_to(limit):
         nonlocal state, at

@@ -11,7 +11,7 @@ the recording: 1.1 times the mean interval between two events of one polarity at
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from typing import Any, Final, NamedTuple
 
 import numba as nb
@@ -75,13 +75,16 @@ class Trail(NamedTuple):
     Attributes
     ----------
     start
-        (H, W) f at the start of the segment.
+        (H, W) f at the start of the segment, where L^A is a frame's; in the lead-in to the first frame, at its end.
     polarity
         (H, W) int8: that of the newest event there, 1 or -1; 0: none so far.
     scale
         s, seconds.
     on, off
         h c of either polarity; 0 turns it off.
+    end
+        Backward in time, where ``on`` and ``off`` are 0: f at the end of the segment, which only its last state holds;
+        at other times f is added later. None: forward.
     """
 
     start: FloatArray
@@ -89,6 +92,20 @@ class Trail(NamedTuple):
     scale: float
     on: float
     off: float
+    end: FloatArray | None = None
+
+
+class FrameTrail(NamedTuple):
+    """f at a frame's middle, (H, W) each, forward in time, for the backward filter.
+
+    Attributes
+    ----------
+    before, after
+        With the s of the interval before the frame, and with that of the interval after it.
+    """
+
+    before: FloatArray
+    after: FloatArray
 
 
 def nothing_followed(shape: tuple[int, int]) -> Followed:
@@ -97,7 +114,7 @@ def nothing_followed(shape: tuple[int, int]) -> Followed:
 
 
 def follow(
-    chunks: Sequence[EventArray], before: Followed, start: int, end: int
+    chunks: Iterable[EventArray], before: Followed, start: int, end: int
 ) -> tuple[FloatArray, FloatArray, Followed]:
     """Number of on and off events of every pixel, (H, W) each, and what is known after them.
 
@@ -167,6 +184,11 @@ def _trail_at(newest, t, scale, on, off, out):  # type: ignore[no-untyped-def]
         age = np.float32(t - (newest[i] >> 1)) * MICROSECOND32
         height = on if newest[i] & 1 else -off
         out[i] = height * beyond(age, scale)
+
+
+def given_trail(start: FloatArray, end: FloatArray) -> Trail:
+    """The trail of a segment that is filtered backward in time: f at the times where it starts and ends."""
+    return Trail(start, np.zeros(start.shape, np.int8), 1.0, 0.0, 0.0, end)
 
 
 def add_trail(

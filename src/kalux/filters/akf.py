@@ -200,7 +200,30 @@ def advance_bridged(
 
 
 def read_bridged(segment: BridgedSegment, cursor: BridgedCursor, t: int) -> tuple[FloatArray, FloatArray]:
-    """L and P at ``t`` (us), which must not lie before an event the cursor has taken. Changes nothing."""
+    """L and P at ``t`` (us), which must not lie before an event the cursor has taken. Changes nothing.
+
+    Backward in time L is without what the light is ahead of its events (K14).
+    """
+    log_intensity, variance = _read(segment, cursor, t)
+    if t == segment.end and segment.trail is not None and segment.trail.end is not None:
+        log_intensity -= segment.trail.end
+    return log_intensity, variance
+
+
+def trail_bridged(segment: BridgedSegment, cursor: BridgedCursor, t: int) -> FloatArray | None:
+    """(H, W) how far the light is ahead of its events at ``t`` (us), K14; None where that is not told."""
+    if segment.trail is None:
+        return None
+    ahead = np.zeros(segment.augmented.shape, np.float32)
+    since_nothing = segment.trail._replace(start=ahead)
+    within = min(t - cursor.origin, EPOCH)
+    out = np.zeros_like(ahead)
+    add_trail(since_nothing, cursor.polarity, cursor.clock, within, out)
+    return out
+
+
+def _read(segment: BridgedSegment, cursor: BridgedCursor, t: int) -> tuple[FloatArray, FloatArray]:
+    """The same with all that is known at the end of the segment."""
     log_intensity, variance = np.empty((2, *segment.augmented.shape), np.float32)
     within = min(t - cursor.origin, EPOCH)
     beyond = np.float32((t - cursor.origin - within) * 1e-6)
@@ -210,6 +233,8 @@ def read_bridged(segment: BridgedSegment, cursor: BridgedCursor, t: int) -> tupl
     if segment.trail is not None:
         add_trail(segment.trail, cursor.polarity, cursor.clock, within, log_intensity)  # K14
     if t == segment.end:
+        if segment.trail is not None and segment.trail.end is not None:
+            log_intensity += segment.trail.end
         if segment.bound is not None:
             lift(log_intensity, segment.bound)  # K7
             lower(log_intensity, segment.bound)
@@ -227,7 +252,7 @@ def moving_bridged(segment: BridgedSegment, cursor: BridgedCursor) -> NDArray[np
 
 def end_bridged(segment: BridgedSegment, cursor: BridgedCursor) -> State:
     """The state at the end of the segment."""
-    log_intensity, variance = read_bridged(segment, cursor, segment.end)
+    log_intensity, variance = _read(segment, cursor, segment.end)
     return State(log_intensity, variance, moved_clock(cursor.clock, segment.end - cursor.origin))
 
 

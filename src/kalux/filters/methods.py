@@ -18,7 +18,16 @@ from numpy.typing import NDArray
 from kalux.augmentation import bridge, deblur, interpolation
 from kalux.augmentation.bridge import BridgedSegment, BridgeNoise, Latent, Thresholds
 from kalux.augmentation.deblur import ExposureIntegrals, all_between, count_chunks, mean_level
-from kalux.augmentation.trail import Followed, Trail, follow, nothing_followed, polarity_of, trail_at
+from kalux.augmentation.trail import (
+    Followed,
+    FrameTrail,
+    Trail,
+    follow,
+    given_trail,
+    nothing_followed,
+    polarity_of,
+    trail_at,
+)
 from kalux.compiled import AHEAD, logarithm, prefetch
 from kalux.errors import SettingsError
 from kalux.events import EventArray
@@ -73,6 +82,8 @@ class Shot(NamedTuple):
         where a channel is clipped to 1; else None.
     valid
         (H, W) bool: where the frame says anything at all; None: everywhere.
+    trail
+        Backward in time: how far the light is ahead of its events at the middle (K14).
     """
 
     start: int
@@ -87,6 +98,7 @@ class Shot(NamedTuple):
     chroma: NDArray[np.float32] | None = None
     chroma_weight: NDArray[np.float32] | None = None
     valid: NDArray[np.bool_] | None = None
+    trail: FrameTrail | None = None
 
     @property
     def intensity(self) -> Array:
@@ -272,6 +284,9 @@ class Method(Protocol):
     def moving(self, segment: Any, cursor: Any) -> NDArray[np.bool_] | None:
         """(H, W): pixels with an event in this frame interval or the one before; None: the method does not tell."""
 
+    def trail(self, segment: Any, cursor: Any, t: int) -> Floats | None:
+        """(H, W): how far the light is ahead of its events at ``t`` (K14); None: the method does not tell."""
+
 
 def make_method(
     settings: Settings,
@@ -300,6 +315,9 @@ class _Common:
         self.offset = settings.camera.offset
 
     def moving(self, segment: Any, cursor: Any) -> NDArray[np.bool_] | None:
+        return None
+
+    def trail(self, segment: Any, cursor: Any, t: int) -> Floats | None:
         return None
 
     def log_frame(self, shot: Shot) -> Array:
@@ -449,7 +467,7 @@ class BridgedFrames(_Common):
             value, variance = latent.value, latent.variance
             if shot.middle > begin:
                 lead_in = bridge.extend_backward(latent, on, off, thresholds, self.noise, begin, shot.middle)
-                lead_in = lead_in._replace(still_since=shot.start)
+                lead_in = lead_in._replace(still_since=shot.start, trail=self._lead_in_trail(shot, followed))
                 value = lead_in.augmented
                 variance = lead_in.backward_variance + lead_in.step_variance * lead_in.events
         else:
@@ -474,7 +492,10 @@ class BridgedFrames(_Common):
             if not self.lookahead:
                 latent = self._carried(memory, shot)
             alone = bridge.extend(latent, memory.thresholds, self.noise, start, FAR_FUTURE, seconds, None)
-            trail = self._trail(memory.followed, start, memory.followed.scale)
+            if shot.trail is None:
+                trail = self._trail(memory.followed, start, memory.followed.scale)
+            else:
+                trail = given_trail(shot.trail.before, np.zeros(self.shape, np.float32))
             return alone._replace(still_since=_still_since(memory, start, seconds), trail=trail), memory
         interval = (following.middle - shot.middle) * 1e-6
         second = self.latent(following, events, memory.thresholds)
@@ -482,7 +503,11 @@ class BridgedFrames(_Common):
         if self.lookahead:
             scale = at_middle.scale
             trail = self._trail(memory.followed, start, scale)
-            grown = self._trail_at(at_middle, following.middle, scale) - trail.start
+            at_end = self._trail_at(at_middle, following.middle, scale)
+            if shot.trail is not None and following.trail is not None:
+                at_end = following.trail.after
+                trail = given_trail(shot.trail.before, at_end)
+            grown = at_end - trail.start
             joined, learned = bridge.bridge(
                 memory.latent,
                 second._replace(value=second.value - grown),
@@ -557,6 +582,13 @@ class BridgedFrames(_Common):
             height * self.off,
         )
 
+    def _lead_in_trail(self, shot: Shot, followed: Followed) -> Trail:
+        """The same before the middle of the first exposure, where the frame keeps its level."""
+        if shot.trail is not None:
+            return given_trail(shot.trail.after, shot.trail.after)
+        trail = self._trail(followed, shot.middle, followed.scale)
+        return trail._replace(polarity=np.zeros(self.shape, np.int8))
+
     def _trail_at(self, followed: Followed, t: int, scale: float) -> NDArray[np.float32]:
         height = self.settings.events.trail
         return trail_at(followed.newest, t, (scale, height * self.on, height * self.off))
@@ -605,6 +637,9 @@ class BridgedFrames(_Common):
 
     def moving(self, segment: Any, cursor: akf.BridgedCursor) -> NDArray[np.bool_]:
         return akf.moving_bridged(segment, cursor)
+
+    def trail(self, segment: Any, cursor: akf.BridgedCursor, t: int) -> NDArray[np.float32] | None:
+        return akf.trail_bridged(segment, cursor, t)
 
 
 def _still_since(memory: BridgeMemory, start: int, seconds: float) -> int:
