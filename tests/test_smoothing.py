@@ -14,7 +14,7 @@ from kalux.errors import InputError, OutputError
 from kalux.events import make_events
 from kalux.pipeline import plan
 from kalux.reconstructor import Estimate, Reconstructor
-from kalux.smoothing import Spill, combine, reversed_settings
+from kalux.smoothing import Spill, Trails, combine, reversed_settings
 
 from builders import altered
 
@@ -108,6 +108,52 @@ def test_windows_and_blocks_change_nothing(monkeypatch, window, block):
     for one, other in zip(kalux.reconstruct(source, times=times, smooth=True), expected, strict=True):
         np.testing.assert_array_equal(one.intensity, other.intensity)
         np.testing.assert_array_equal(one.variance, other.variance)
+
+
+@pytest.mark.parametrize("delay", [0, 2_500])
+@pytest.mark.parametrize("hot", [False, True])
+def test_the_backward_filter_is_told_what_the_forward_one_knows(tmp_path, delay, hot):
+    """K14: f at the middles of the frames, with the s of the intervals on either side."""
+    source = recording(4)
+    broken = np.zeros(SIZE, bool)
+    broken[2, 3] = hot
+    settings = plan(source, rate_hz=10, settings=altered(PRESETS["default"], "events", delay=delay)).settings
+    trails = Trails(Spill(source, tmp_path), settings, broken if hot else None)
+    events = np.concatenate(list(source.events()))
+    engine = Reconstructor(SIZE, settings=settings)
+    frames = list(source.frames())
+    for frame in frames:
+        engine.push_frame(frame)
+    engine.push_events(events[~broken[events["y"], events["x"]]])
+    engine.finish()
+    for k, frame in enumerate(frames):
+        told = trails.reversed_trail(len(frames) - 1 - k)
+        np.testing.assert_allclose(engine.trail(frame.middle), told.before, atol=1e-6)
+        np.testing.assert_allclose(engine.trail(frame.middle + 1), told.after, atol=1e-3)
+    assert np.abs(told.after).max() > 0.01
+
+
+def test_smoothing_follows_a_steady_change_between_its_events():
+    """Both filters are ahead of their events as the light is; without K14 both hold the same step."""
+    times = np.arange(1, 10) * 16_667
+    zeros = np.zeros(len(times), np.int64)
+    frames = [
+        Frame(np.full((1, 1), 0.25 * np.exp(12e-6 * (t - 79_500)) - 0.004, np.float32), t, t + 1_000, 1.0)
+        for t in range(0, 160_000, 40_000)
+    ]
+    source = Recording.from_arrays(
+        make_events(times, zeros, zeros, zeros + 1), frames, sensor_size=(1, 1), contrast_threshold=0.2
+    )
+    reads = np.arange(42_000, 118_000, 1_000)
+
+    def error(trail):
+        settings = altered(PRESETS["default"], "events", trail=trail, noise_rate=0.0, delay=0)
+        settings = altered(settings, "camera", log_offset=0.004)
+        images = kalux.reconstruct(source, times=reads, settings=settings, smooth=True)
+        found = np.log([image.intensity[0, 0] + 0.004 for image in images])
+        return np.sqrt(np.mean((found - np.log(0.25) - 12e-6 * (reads - 80_000)) ** 2))
+
+    assert error(0.4) < 0.8 * error(0.0)
 
 
 def test_after_the_last_frame_the_forward_pass_is_alone():
