@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from kalux import PRESETS, Frame, Reconstructor
 from kalux.augmentation import trail
 from kalux.augmentation.deblur import count_chunks
+from kalux.augmentation.refractory import EventClock
 from kalux.events import make_events
 
 from builders import altered
@@ -20,7 +21,8 @@ SHAPE = (3, 4)
 def random_events(seed, count=400, span=200_000):
     rng = np.random.default_rng(seed)
     t = np.sort(rng.integers(1, span + 1, count))
-    return make_events(t, rng.integers(0, 4, count), rng.integers(0, 3, count), rng.random(count) < 0.7)
+    events = make_events(t, rng.integers(0, 4, count), rng.integers(0, 3, count), rng.random(count) < 0.7)
+    return EventClock(SHAPE, 200).weighed(events)
 
 
 @given(seed=st.integers(0, 100), cuts=st.lists(st.integers(0, 400), max_size=4))
@@ -33,7 +35,7 @@ def test_what_is_followed_does_not_depend_on_the_arrays_that_hold_it(seed, cuts)
     ):
         for a, b in zip(one, other, strict=True):
             np.testing.assert_array_equal(a, b)
-    for one, other in zip((on, off), count_chunks([events], SHAPE), strict=True):
+    for one, other in zip((on, off), count_chunks([events], SHAPE, weighed=True), strict=True):
         np.testing.assert_array_equal(one, other)
 
 

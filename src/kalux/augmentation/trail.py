@@ -20,10 +20,11 @@ from numpy.typing import NDArray
 
 from kalux.compiled import (
     MICROSECOND32,
-    ONE,
+    WEIGHT_UNIT,
     event_column,
     event_is_on,
     event_row,
+    event_weight,
     event_words,
 )
 from kalux.events import EventArray
@@ -116,7 +117,7 @@ def nothing_followed(shape: tuple[int, int]) -> Followed:
 def follow(
     chunks: Iterable[EventArray], before: Followed, start: int, end: int
 ) -> tuple[FloatArray, FloatArray, Followed]:
-    """Number of on and off events of every pixel, (H, W) each, and what is known after them.
+    """Sums of the weights of on and of off events of every pixel, (H, W) each, and what is known after them.
 
     ``chunks`` are the events with ``start`` < t <= ``end`` (us) in time order, and ``before`` is what was known before.
     Intervals are taken from the last quarter of that time: fewer would do, and all of them cost.
@@ -145,7 +146,7 @@ def _follow(words, counts, newest, width, late):  # type: ignore[no-untyped-def]
             counted = np.int64((difference & 1 == 0) & (difference < 2 * LONGEST))
             span += (difference >> 1) * counted
             count += counted
-        counts[is_on, at] += ONE
+        counts[is_on, at] += event_weight(word, WEIGHT_UNIT)
         newest[at] = code
     return span, count
 
