@@ -1,25 +1,33 @@
 """The whole way, from a file of events and frames to a file of images: faster than real time or not?
 
-    python benchmarks/pipeline.py [--seconds 4] [--rate 300] [--threads 1 2] [--only 346x260 mp4 ...]
+    python benchmarks/pipeline.py [--seconds 4 ...] [--rate 300] [--threads 1 2] [--only 346x260 mp4 aedat4 ...]
+    python benchmarks/pipeline.py --seconds 10 60 --rounds 1 --threads 2     # does memory grow with the length?
+    python benchmarks/pipeline.py --stages --threads 2                       # where the processor time goes
 
-Writes synthetic recordings (the stream of benchmarks/speed.py) as kalux HDF5, and runs ``kalux reconstruct`` on them
-in a process of its own, as a user would: start-up, checking, choosing settings and all. The settings that it would
-otherwise estimate are given, ``--estimate`` leaves them to it. Shown are seconds on the clock and of all processor
-cores per second of recording (below 1 on the clock is faster than real time), those on the clock of the part that
-makes and writes images, and the largest memory held. Where other work runs, the processor time tells more: two cores
-cannot need less of the clock than half of it.
+Writes synthetic recordings (the stream of benchmarks/speed.py) as kalux HDF5 or AEDAT4, and runs ``kalux reconstruct``
+on them in a process of its own, as a user would: start-up, checking, choosing settings and all. The settings that it
+would otherwise estimate are given, ``--estimate`` leaves them to it. Shown are seconds on the clock and of all
+processor cores per second of recording (below 1 on the clock is faster than real time), those on the clock of the part
+that makes and writes images, and the largest memory held. Where other work runs, the processor time tells more: two
+cores cannot need less of the clock than half of it. ``--stages`` shows the processor time of each thread and step
+instead.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import io
+import itertools
 import multiprocessing
 import os
 import re
 import shutil
 import sys
 import tempfile
+import threading
 import time
+from collections import Counter
 from pathlib import Path
 
 import kalux
@@ -33,21 +41,18 @@ OUTPUTS = {
     "exr": ("out", "--format", "exr"),
     "npy": ("out", "--format", "npy"),
 }
+INPUTS = ("h5", "aedat4")
 GIVEN = (
-    "--events.delay",
-    "0",
-    "--camera.log-offset",
-    "0.05",
-    "--events.step-variance",
-    "0.2",
-    "--events.refractory-period",
-    "0",
+    *("--events.delay", "0", "--camera.log-offset", "0.05", "--events.step-variance", "0.2"),
+    *("--events.threshold-on", "0.2", "--events.threshold-off", "0.2"),
+    *("--events.refractory-period", "0"),
 )
 
 
 def write_recording(path, size, rate, seconds):
-    """A recording of the sweeping edge; returns the number of its events."""
+    """A recording of the sweeping edge, in the format of the file's name."""
     from kalux.readers import hdf5
+    from kalux.writers import aedat4
 
     from speed import EXPOSURE, FRAME, THRESHOLD, picture, stream
 
@@ -67,14 +72,11 @@ def write_recording(path, size, rate, seconds):
         kalux.Frame(pictures[k % 4], FRAME * k, FRAME * k + EXPOSURE)
         for k in range((end - EXPOSURE) // FRAME + 1)
     ]
-    hdf5.write(
-        path,
-        sensor_size=size,
-        events=events(),
-        frames=frames,
-        contrast_threshold=(THRESHOLD, THRESHOLD),
-    )
-    return kalux.open(path).source.count_events()
+    if path.suffix == ".aedat4":
+        aedat4.write(path, sensor_size=size, events=events(), frames=frames)
+    else:
+        threshold = (THRESHOLD, THRESHOLD)
+        hdf5.write(path, sensor_size=size, events=events(), frames=frames, contrast_threshold=threshold)
 
 
 def run(arguments):
@@ -95,6 +97,45 @@ def run(arguments):
     return wall, used.ru_utime + used.ru_stime, written, used.ru_maxrss / 1024
 
 
+def stages(arguments):
+    """``kalux`` in this process: processor seconds of its steps before images are made, and of each thread then."""
+    from kalux.cli import app, reconstruct
+
+    used = Counter({"importing": time.process_time()})
+    lock = threading.Lock()
+    run_thread = threading.Thread.run
+
+    def timed_thread(thread):
+        try:
+            run_thread(thread)
+        finally:
+            with lock:
+                used[f"thread {thread.name.removeprefix('kalux-').split('_')[0]}"] += time.thread_time()
+
+    def timed(name, function):
+        def call(*given):
+            start = time.thread_time()
+            try:
+                return function(*given)
+            finally:
+                used[name] += time.thread_time() - start
+
+        return call
+
+    threading.Thread.run = timed_thread
+    for title, name in (
+        ("checking", "check_recording"),
+        ("planning", "make_plan"),
+        ("thread main", "write_images"),
+    ):
+        setattr(reconstruct, name, timed(title, getattr(reconstruct, name)))
+    with contextlib.redirect_stdout(io.StringIO()):
+        if app.main([str(argument) for argument in arguments]):
+            sys.exit(f"kalux failed: {arguments}")
+    used["libraries' threads and the rest"] = time.process_time() - sum(used.values())
+    return used
+
+
 def apart(function, *arguments):
     """Call a function in another process: the memory of this one, which those it starts inherit, stays small."""
     with multiprocessing.get_context("spawn").Pool(1) as pool:
@@ -102,8 +143,8 @@ def apart(function, *arguments):
 
 
 def encoder_seconds(size, count):
-    """Processor seconds that OpenEXR alone takes for images of the recording's kind."""
-    from kalux.writers.images import exr_bytes
+    """Processor seconds that OpenEXR's own library alone takes for images of the recording's kind."""
+    import OpenEXR
 
     from speed import EXPOSURE, FRAME, THRESHOLD, picture, stream
 
@@ -115,51 +156,88 @@ def encoder_seconds(size, count):
     image = engine.read(EXPOSURE + 5_000)
     start = time.process_time()
     for _ in range(10):
-        exr_bytes(image)
+        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+        OpenEXR.File(header, {"Y": image.intensity, "variance": image.variance}).write(io.BytesIO())
     return (time.process_time() - start) / 10 * count
+
+
+def command_for(recording, kind, options, threads):
+    """The arguments of ``kalux``, and what they make."""
+    out, *flags = OUTPUTS[kind]
+    made = recording.with_name(out)
+    given = () if options.estimate else GIVEN
+    arguments = ["reconstruct", recording, "-o", made, "--rate", options.rate, "--threads", threads]
+    return [*arguments, *flags, *given], made
+
+
+def remove(made):
+    """Remove an output."""
+    shutil.rmtree(made, ignore_errors=True)
+    made.unlink(missing_ok=True)
+    Path(f"{made}.kalux.toml").unlink(missing_ok=True)
+
+
+def measure(recording, kind, options, threads):
+    """The fastest of several runs."""
+    least = None
+    for _ in range(options.rounds):
+        arguments, made = command_for(recording, kind, options, threads)
+        found = run(arguments)
+        remove(made)
+        least = found if least is None or found < least else least
+    return least
+
+
+def measure_stages(recording, kind, options, threads):
+    """Of every step and thread, the least of several runs."""
+    least = {}
+    for _ in range(options.rounds):
+        arguments, made = command_for(recording, kind, options, threads)
+        for name, seconds in apart(stages, arguments).items():
+            least[name] = min(seconds, least.get(name, seconds))
+        remove(made)
+    return least
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seconds", type=float, default=4.0, help="length of the recordings")
+    parser.add_argument("--seconds", type=float, nargs="+", default=[4.0], help="lengths of the recordings")
     parser.add_argument("--rate", type=int, default=300, help="images per second")
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--rounds", type=int, default=3, help="of which the fastest counts")
-    parser.add_argument("--estimate", action="store_true", help="let kalux estimate delay, offset and noise")
-    parser.add_argument("--only", nargs="+", choices=[*SENSORS, *OUTPUTS], default=[])
+    parser.add_argument("--estimate", action="store_true", help="let kalux estimate thresholds, delay, noise")
+    parser.add_argument("--stages", action="store_true", help="processor time of each step and thread")
+    parser.add_argument("--only", nargs="+", choices=[*SENSORS, *OUTPUTS, *INPUTS], default=[])
     options = parser.parse_args()
     sensors = [name for name in SENSORS if name in options.only] or list(SENSORS)
     outputs = [name for name in OUTPUTS if name in options.only] or ["mp4", "png", "exr"]
+    inputs = [name for name in INPUTS if name in options.only] or ["h5"]
+    print(f"Per second of recording, {options.rate} images/s, {os.cpu_count()} cores")
+    titles = f"{'clock':>8}{'CPU':>8}{'images':>8}{'MB':>7}"
     print(
-        f"Per second of recording, {options.rate} images/s, {options.seconds:g} s long, {os.cpu_count()} cores\n"
-        f"{'sensor':9}{'M ev/s':>7} {'output':8}{'threads':>7}{'clock':>8}{'CPU':>8}{'images':>8}{'MB':>7}"
+        f"{'sensor':9}{'M ev/s':>7} {'input':8}{'seconds':>8} {'output':8}{'threads':>7}"
+        f"{'' if options.stages else titles}"
     )
     with tempfile.TemporaryDirectory(prefix="kalux-speed-") as folder:
-        for name in sensors:
+        for name, kind_in, seconds in itertools.product(sensors, inputs, options.seconds):
             size, rate = SENSORS[name]
-            recording = Path(folder) / f"{name}.h5"
-            apart(write_recording, recording, size, rate, options.seconds)
-            for kind in outputs:
-                for threads in options.threads:
-                    least = None
-                    for _ in range(options.rounds):
-                        out, *flags = OUTPUTS[kind]
-                        made = Path(folder) / out
-                        flags += () if options.estimate else GIVEN
-                        command = ["reconstruct", recording, "-o", made, "--rate", options.rate, *flags]
-                        found = run([*command, "--threads", threads])
-                        shutil.rmtree(made, ignore_errors=True)
-                        made.unlink(missing_ok=True)
-                        Path(f"{made}.kalux.toml").unlink(missing_ok=True)
-                        least = found if least is None or found < least else least
-                    wall, cpu, written, memory = least
-                    print(
-                        f"{name:9}{rate / 1e6:7.0f} {kind:8}{threads:7}{wall / options.seconds:8.2f}"
-                        f"{cpu / options.seconds:8.2f}{written / options.seconds:8.2f}{memory:7.0f}",
-                        flush=True,
-                    )
-            if "exr" in outputs:
-                print(f"{name:9}{'':7} OpenEXR alone {'':9}{apart(encoder_seconds, size, options.rate):8.2f}")
+            recording = Path(folder) / f"{name}.{kind_in}"
+            apart(write_recording, recording, size, rate, seconds)
+            for kind, threads in itertools.product(outputs, options.threads):
+                row = f"{name:9}{rate / 1e6:7.0f} {kind_in:8}{seconds:8g} {kind:8}{threads:7}"
+                if options.stages:
+                    print(row)
+                    for step, used in measure_stages(recording, kind, options, threads).items():
+                        print(f"{'':9}{step:34}{used / seconds:8.2f}", flush=True)
+                    continue
+                wall, cpu, written, memory = measure(recording, kind, options, threads)
+                times = "".join(f"{value / seconds:8.2f}" for value in (wall, cpu, written))
+                print(f"{row}{times}{memory:7.0f}", flush=True)
+            recording.unlink()
+        if "exr" in outputs and not options.stages:
+            for name in sensors:
+                alone = apart(encoder_seconds, SENSORS[name][0], options.rate)
+                print(f"{name:9} OpenEXR's own library, which kalux does not write with: CPU {alone:.2f}")
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from kalux.ahead import MOST_THREADS, ahead, default_threads
+from kalux.ahead import MOST_THREADS, InOrder, ahead, default_threads
 
 
 @pytest.fixture(autouse=True)
@@ -135,6 +135,48 @@ def test_one_in_another():
     assert next(outer) == 0
     outer.close()
     inner.close()
+
+
+class TestInOrder:
+    @pytest.mark.parametrize("threads", [1, 2, 4])
+    def test_what_is_made_comes_in_the_order_of_giving(self, threads):
+        work = InOrder(threads)
+        for k in range(20):
+            work.give(lambda k=k: time.sleep(0.001 * (k % 3)) or k)
+        assert len(work) == 20
+        assert [work.take() for _ in range(20)] == list(range(20))
+        with pytest.raises(IndexError):
+            work.take()
+        work.end()
+
+    def test_several_are_done_at_a_time(self):
+        """Each of two waits for the other."""
+        work, both = InOrder(2), threading.Barrier(2)
+        for _ in range(2):
+            work.give(lambda: both.wait(timeout=20))
+        assert sorted(work.take() for _ in range(2)) == [0, 1]
+        work.end()
+
+    @pytest.mark.parametrize("threads", [1, 3])
+    def test_an_error_comes_where_its_result_would_have(self, threads):
+        work = InOrder(threads)
+        for divisor in (1, 0, 2):
+            work.give(lambda divisor=divisor: 2 // divisor)
+        assert work.take() == 2
+        with pytest.raises(ZeroDivisionError):
+            work.take()
+        assert work.take() == 1
+        work.end()
+
+    @pytest.mark.parametrize("threads", [1, 3])
+    def test_the_end_gives_up_what_was_not_taken(self, threads):
+        work = InOrder(threads)
+        for _ in range(100):
+            work.give(lambda: time.sleep(0.01))
+        start = time.monotonic()
+        work.end()
+        assert len(work) == 0
+        assert time.monotonic() - start < 0.5
 
 
 def test_the_default_is_the_cores_there_are(monkeypatch):

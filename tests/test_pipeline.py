@@ -9,6 +9,7 @@ from functools import lru_cache, reduce
 import numpy as np
 import pytest
 
+import kalux
 from kalux import PRESETS, Frame, Reconstructor, Recording, pipeline, reconstruct
 from kalux.datasets import SensorSettings
 from kalux.errors import EventError, FrameError, InputError, SettingsError
@@ -271,7 +272,49 @@ def test_and_last_an_assumption():
     made = plan(recording(0, None), rate_hz=10)
     assert made.threshold_origin == "assumed"
     assert made.estimate is None
-    assert made.settings.events.threshold_on == made.settings.events.threshold_off == 0.2
+    assert made.settings.events.threshold_on == made.settings.events.threshold_off == 0.25
+    assert (made.settings.events.threshold_spread, made.settings.events.delay) == (0.5, 0)
+
+
+def test_of_a_sensor_the_usual_is_assumed():
+    """One frame tells no threshold, no delay and no step."""
+    frames = [frame(100, 0, 10_000)]
+    alone = Recording.from_arrays(events(), frames, sensor_size=(1, 1))
+    made = plan(alone, at="frames", preset="davis346")
+    usual = PRESETS["davis346"].events
+    found = made.settings.events
+    assert made.threshold_origin == "assumed"
+    assert (found.threshold_on, found.threshold_off) == (usual.usual_threshold_on, usual.usual_threshold_off)
+    assert (found.delay, found.step_variance) == (usual.usual_delay, usual.usual_step_variance)
+    assert found.threshold_spread == 0.2
+
+
+def test_a_sensors_usual_thresholds_give_way_to_the_recordings():
+    known = plan(recording(), at="frames", preset="davis346")
+    assert known.threshold_origin == "recording"
+    assert (known.settings.events.threshold_on, known.settings.events.threshold_off) == (0.25, 0.2)
+    told = plan(unlabelled(moving_blocks(0.08, 0.9)), at="frames", preset="davis240c")
+    assert told.threshold_origin == "estimate"
+    assert told.settings.events.threshold_on == pytest.approx(0.2, rel=0.12)
+
+
+@pytest.mark.parametrize(
+    ("name", "preset", "part"),
+    [("newton_davis346.aedat4", "davis346", 0.6), ("slider_depth", "davis240c", 0.95)],
+)
+def test_a_sensors_preset_helps_where_there_is_one_frame(shared_data, name, preset, part):
+    """The next frame is nearer to what is made of the frame before it and of the events."""
+    unknown = {} if "aedat4" in name else {"exposure": 10_000}
+    whole = kalux.open(shared_data / name, **unknown)
+    shown, wanted = list(whole.frames())[2:4]
+    near = [e[(e["t"] >= shown.exposure_start) & (e["t"] <= wanted.exposure_end)] for e in whole.events()]
+    alone = Recording.from_arrays(np.concatenate(near), [shown], sensor_size=whole.sensor_size)
+
+    def error(preset: str) -> float:
+        (image,) = reconstruct(alone, times=[wanted.middle], preset=preset)
+        return float(np.mean((image.intensity - wanted.normalised()) ** 2))
+
+    assert error(preset) < part * error("default")
 
 
 def test_highlights_are_believed_less_where_the_threshold_is_an_estimate():
@@ -508,12 +551,17 @@ def test_the_other_presets_run_and_default_is_better_where_frames_can_tell(prese
 
 
 def test_the_bright_tail_comes_from_the_frames_and_can_be_given():
-    made = plan(recording(), at="frames").settings
-    counts = [count_bright(Camera.named("linear", 0.98), f.normalised()) for f in recording().frames()]
+    doubted = recording(0, None)
+    made = plan(doubted, at="frames").settings
+    counts = [count_bright(Camera.named("linear", 0.98), f.normalised()) for f in doubted.frames()]
     expected = reduce(BrightTail.joined, counts).scale
     assert made.filter.bright_tail == expected
     given = altered(PRESETS["default"], "filter", bright_tail=0.7)
-    assert plan(recording(), at="frames", settings=given).settings.filter.bright_tail == 0.7
+    assert plan(doubted, at="frames", settings=given).settings.filter.bright_tail == 0.7
+
+
+def test_the_bright_tail_is_not_looked_for_where_thresholds_are_stated():
+    assert plan(recording(), at="frames").settings.filter.bright_tail is None
 
 
 def test_highlights_are_believed_less_where_thresholds_are_estimated():

@@ -767,6 +767,19 @@ def test_an_unknown_threshold_is_learned():
     assert 0.4 < thresholds.off[0, 0] < 0.75
 
 
+def test_a_live_stream_takes_what_is_usual_of_the_sensor():
+    live, usual = Reconstructor((1, 1), preset="davis346"), PRESETS["davis346"].events
+    assert live.thresholds == (usual.usual_threshold_on, usual.usual_threshold_off)
+    live.push_frame(frame(100, 0, 2_000))
+    live.push_events(pixel_events([12_000], [1]))
+    early, late = (
+        float(live.read(t).intensity[0, 0]) for t in (12_000 - usual.usual_delay + d for d in (-500, 500))
+    )
+    assert late > early  # the event is taken to have happened as much earlier
+    stated = Reconstructor((1, 1), preset="davis346", contrast_threshold=0.2)
+    assert stated.thresholds == (0.2, 0.2)
+
+
 def engine_without_threshold():
     """Without K14: the levels of the tests stand still between two events."""
     return Reconstructor((1, 1), settings=altered(PRESETS["default"], "events", trail=0.0))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import numpy as np
 import pytest
 import tomli_w
 from hypothesis import given
@@ -29,7 +30,8 @@ NUMBERS = [
 
 
 def test_presets():
-    assert list(PRESETS) == ["default", "iccv2021", "iccv2021-flir", "cf"]
+    sensors = ["davis240c", "davis346", "prophesee-flir"]
+    assert list(PRESETS) == ["default", *sensors, "iccv2021", "iccv2021-flir", "cf"]
     assert all(preset(name) is PRESETS[name] for name in PRESETS)
     assert preset("default") == Settings()
 
@@ -65,8 +67,51 @@ def test_complementary_preset():
     assert cf.filter.highlight_scale == 0.0
 
 
+@pytest.mark.parametrize("name", ["davis240c", "davis346", "prophesee-flir"])
+def test_sensors_leave_what_a_recording_tells_to_the_recording(name):
+    """They are the default but for what is usual, and for what nobody estimates."""
+    chosen = preset(name)
+    events, camera = chosen.events, chosen.camera
+    assert events.threshold_on is events.threshold_off is events.delay is events.step_variance is None
+    assert camera.log_offset is camera.reference_exposure is None
+    assert camera.response == "auto"
+    usual = {entry.name: entry.default for entry in dataclasses.fields(events) if "usual" in entry.name}
+    same = altered(chosen, "events", **usual, threshold_spread=0.1, noise_rate=3.0)
+    assert altered(same, "camera", frame_noise=0.006) == DEFAULT
+
+
+def test_thresholds_of_davis_sensors_are_above_the_least_they_can_be_set_to():
+    """11 %, and 14.3 and 22.5 % of contrast: Gallego et al., TPAMI 2022, Table 1."""
+    small, large = preset("davis240c").events, preset("davis346").events
+    assert min(small.usual_threshold_on, small.usual_threshold_off) > np.log(1.11)
+    assert large.usual_threshold_on > np.log(1.143)
+    assert large.usual_threshold_off > np.log(1.225)
+
+
+def test_frame_noise_of_the_flir():
+    """Read and photon noise at half of white of the IMX265, averaged over the pixels that become one."""
+    electrons = np.hypot(2.3, np.sqrt(10_400 / 2))
+    pixels = (2048 / 640) ** 2
+    assert preset("prophesee-flir").camera.frame_noise == pytest.approx(
+        electrons / 10_400 / np.sqrt(pixels), rel=0.02
+    )
+
+
+def test_what_is_usual_is_assumed_where_nothing_is_set():
+    events = EventSettings(usual_threshold_on=0.3, usual_threshold_off=0.4, usual_spread=0.2, usual_delay=-7)
+    assumed = events.assuming()
+    assert (assumed.threshold_on, assumed.threshold_off, assumed.threshold_spread) == (0.3, 0.4, 0.2)
+    half = dataclasses.replace(events, threshold_on=0.25, threshold_spread=0.5).assuming()
+    assert (half.threshold_on, half.threshold_off, half.threshold_spread) == (0.25, 0.4, 0.5)
+    known = dataclasses.replace(events, threshold_on=0.25, threshold_off=0.2)
+    assert known.assuming() is known
+    assert (events.lateness, dataclasses.replace(events, delay=0).lateness) == (-7, 0)
+
+
 def test_unknown_preset():
-    with pytest.raises(SettingsError, match="'iccv2022'; known are default, iccv2021, iccv2021-flir, cf"):
+    with pytest.raises(
+        SettingsError, match=r"'iccv2022'; known are default, davis240c, .*, iccv2021, iccv2021-flir, cf"
+    ):
         preset("iccv2022")
 
 

@@ -8,7 +8,8 @@ from __future__ import annotations
 import os
 import threading
 from collections import deque
-from collections.abc import Generator, Iterable
+from collections.abc import Callable, Generator, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Final, Generic, TypeVar
 
 T = TypeVar("T")
@@ -26,7 +27,7 @@ def default_threads() -> int:
     return min(cores, MOST_THREADS)
 
 
-def ahead(items: Iterable[T], depth: int = 2) -> Generator[T, None, None]:
+def ahead(items: Iterable[T], depth: int = 2, name: str = "ahead") -> Generator[T, None, None]:
     """The same items in the same order, made in a thread of their own, up to ``depth`` before they are asked for.
 
     An error in the making is raised where its item would have come. Closing the iterator, or an exception where it is
@@ -39,9 +40,11 @@ def ahead(items: Iterable[T], depth: int = 2) -> Generator[T, None, None]:
         Made one by one, in that thread only.
     depth
         How many are held, beside the one being made and the one in use: memory is bounded by it.
+    name
+        Of the thread, after "kalux-", for tools that show threads.
     """
     belt: _Belt[T] = _Belt(depth)
-    thread = threading.Thread(target=_make, args=(items, belt), name="kalux-ahead", daemon=True)
+    thread = threading.Thread(target=_make, args=(items, belt), name=f"kalux-{name}", daemon=True)
     thread.start()
     try:
         while (item := belt.take()) is not None:
@@ -49,6 +52,39 @@ def ahead(items: Iterable[T], depth: int = 2) -> Generator[T, None, None]:
     finally:
         belt.stop()
         thread.join()
+
+
+class InOrder(Generic[T]):
+    """Pieces of work that may be done at the same time; what they make is taken in the order in which they were given.
+
+    Parameters
+    ----------
+    threads
+        How many are done at a time, in threads of their own. 1: each is done where and when it is taken.
+    name
+        As of `ahead`.
+    """
+
+    def __init__(self, threads: int, name: str = "in-order") -> None:
+        self._pool = ThreadPoolExecutor(threads, f"kalux-{name}") if threads > 1 else None
+        self._pending: deque[Callable[[], T]] = deque()
+
+    def __len__(self) -> int:
+        return len(self._pending)
+
+    def give(self, work: Callable[[], T]) -> None:
+        """Add a piece of work."""
+        self._pending.append(work if self._pool is None else self._pool.submit(work).result)
+
+    def take(self) -> T:
+        """What the first piece made, once it is done; raises its error. IndexError: there is none."""
+        return self._pending.popleft()()
+
+    def end(self) -> None:
+        """Give up what has not been taken, and end the threads."""
+        self._pending.clear()
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
 
 
 class _Item(Generic[T]):

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from kalux.events import EventArray
 from kalux.frames import Frame
 from kalux.recording import Recording
+from kalux.settings import AUTO, Settings
+
+if TYPE_CHECKING:
+    from kalux.pipeline import Plan
 
 _RATE_BIN: Final = 10_000  # us, over which the peak event rate is taken
 _SATURATED: Final = 0.99  # of white: DAVIS frames clip a few values below it
@@ -331,6 +335,94 @@ def _threshold_text(description: Description) -> str:
         if threshold is not None
     ]
     return "; ".join(texts) or "not recorded"
+
+
+# What a reconstruction settles
+
+ORIGINS: Final = {
+    "settings": "given",
+    "recording": "from the recording",
+    "calibration": "calibrated",
+    "estimate": "estimated",
+    "assumed": "usual of the preset, the recording does not tell",
+}
+"""What to call where thresholds come from (`kalux.pipeline.ThresholdOrigin`)."""
+
+_GIVEN: Final = "given"
+_USUAL: Final = ORIGINS["assumed"]
+
+
+def settled(recording: Recording, plan: Plan, asked: Settings) -> list[tuple[str, str]]:
+    """What the settings left to the recording: name, value with its unit and where that comes from.
+
+    Parameters
+    ----------
+    recording, plan
+        From `kalux.pipeline.plan`.
+    asked
+        The settings before the plan filled in what was missing; what they state is said to be given.
+    """
+    camera, events = plan.settings.camera, plan.settings.events
+    origin = ORIGINS[plan.threshold_origin]
+    if plan.estimate is not None:
+        origin += f" from {plan.estimate.samples:,} samples, residual {plan.estimate.residual:.2f}"
+    rows = [
+        (
+            "thresholds",
+            f"on {events.threshold_on:.3f}, off {events.threshold_off:.3f} log intensity ({origin})",
+        ),
+        ("delay", f"events {events.lateness * 1e-3:g} ms late ({_delay_origin(plan, asked)})"),
+        (
+            "I_0",
+            f"{camera.offset:g} of white, events are steps of log(I + I_0) "
+            f"({_model_origin(plan, asked.camera.log_offset)})",
+        ),
+    ]
+    if events.step_variance is not None:
+        rows.append(
+            (
+                "step",
+                f"variance of one event {events.step_variance:g} c^2, c its threshold "
+                f"({_model_origin(plan, asked.events.step_variance)})",
+            )
+        )
+    if events.refractory_period is not None:
+        what = (
+            f"{events.refractory_period * 1e-3:g} ms" if events.refractory_period else "nothing is lost in it"
+        )
+        rows.append(("refractory", f"{what} ({_model_origin(plan, asked.events.refractory_period)})"))
+    given = asked.camera.reference_exposure is not None
+    rows.append(
+        (
+            "exposure",
+            f"{(camera.reference_exposure or 0) * 1e-3:g} ms makes a saturated pixel 1.0 "
+            f"({_GIVEN if given else 'median of the frames'})",
+        )
+    )
+    if plan.settings.filter.bright_tail is not None and plan.settings.filter.highlight_scale > 0:
+        how = "measured" if asked.filter.bright_tail is None else _GIVEN
+        rows.append(("bright tail", f"{plan.settings.filter.bright_tail:.2f} log intensity ({how})"))
+    stated = "usual, the recording does not state it" if recording.response is None else "as recorded"
+    how = stated if asked.camera.response == AUTO else _GIVEN
+    rows.append(("response", f"{_response_text(camera.response)} ({how})"))
+    if camera.white_balance != asked.camera.white_balance:
+        rows.append(("white balance", f"{camera.white_balance} for red, green, blue (measured)"))
+    return rows
+
+
+def _delay_origin(plan: Plan, asked: Settings) -> str:
+    found = plan.delay_estimate
+    if found is None:
+        return _USUAL if asked.events.delay is None else _GIVEN
+    return (
+        f"estimated: {found.apparent * 1e-3:.1f} ms explain the frames {100 * found.improvement:.0f} % better"
+    )
+
+
+def _model_origin(plan: Plan, asked: float | None) -> str:
+    if asked is not None:
+        return _GIVEN
+    return _USUAL if plan.event_model is None else f"estimated from {plan.event_model.samples:,} samples"
 
 
 def _response_text(response: str) -> str:

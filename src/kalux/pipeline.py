@@ -33,8 +33,8 @@ from kalux.smoothing import Backward, combine, reversed_settings
 
 ThresholdOrigin = Literal["settings", "recording", "calibration", "estimate", "assumed"]
 
-_ASSUMED_THRESHOLD: Final = 0.2
-"""Where nothing moves enough to estimate the thresholds they hardly matter: a usual setting of DVS sensors."""
+_DOUBTED: Final[tuple[ThresholdOrigin, ...]] = ("calibration", "estimate", "assumed")
+"""Thresholds of these origins are not quite the pixels' own: highlights are then believed less."""
 
 
 @dataclass(frozen=True)
@@ -100,11 +100,7 @@ def plan(
             "reconstruct: the complementary filter has no variance, so that it cannot be smoothed"
         )
     response = chosen_response(chosen.camera.response, recording.response)
-    exposures, tail = _exposures(recording, Camera.named(response, chosen.camera.saturation))
-    if chosen.filter.bright_tail is None:
-        chosen = dataclasses.replace(
-            chosen, filter=dataclasses.replace(chosen.filter, bright_tail=tail.scale)
-        )
+    exposures = _exposures(recording)
     reference = chosen.camera.reference_exposure or round(float(np.median(exposures[:, 1] - exposures[:, 0])))
     chosen = dataclasses.replace(
         chosen, camera=dataclasses.replace(chosen.camera, reference_exposure=reference, response=response)
@@ -122,6 +118,8 @@ def plan(
         filled, origin, estimate = _with_thresholds(recording, dataclasses.replace(filled, events=unfilled))
     if origin == "settings" and _are_calibrated(filled, known):
         origin = "calibration"
+    if origin in _DOUBTED:
+        filled = _with_bright_tail(recording, filled)
     wanted = _times(recording, exposures, rate_hz, times, at, filled, lookahead)
     if known.pixels is not None:
         require_size(known.pixels, recording.sensor_size)
@@ -205,8 +203,8 @@ def execute(
     engine = _engine(recording, plan, plan.settings)
     several = threads > 1
     estimates = _smoothed_estimates(recording, engine, plan, on_events, on_backward, several)
-    images = _images(engine, ahead(estimates) if several else estimates)
-    yield from ahead(images) if several else images
+    images = _images(engine, ahead(estimates, name="filter") if several else estimates)
+    yield from ahead(images, name="images") if several else images
 
 
 def _images(
@@ -256,7 +254,7 @@ def _engine(recording: Recording, plan: Plan, settings: Settings) -> Reconstruct
         recording.sensor_size,
         settings=settings,
         lookahead=plan.lookahead,
-        threshold_is_estimate=plan.threshold_origin in ("calibration", "estimate", "assumed"),
+        threshold_is_estimate=plan.threshold_origin in _DOUBTED,
         inverse_covariance=recording.source.inverse_covariance,
         pixels=plan.pixels,
     )
@@ -273,7 +271,7 @@ def _estimates(
     if not read_ahead:
         yield from _driven(recording, iter(recording.events()), engine, plan, on_events)
         return
-    with contextlib.closing(ahead(recording.events(), 1)) as chunks:
+    with contextlib.closing(ahead(recording.events(), 1, "read")) as chunks:
         yield from _driven(recording, chunks, engine, plan, on_events)
 
 
@@ -329,15 +327,23 @@ def _push_next(
     return True
 
 
-def _exposures(recording: Recording, camera: Camera) -> tuple[NDArray[np.int64], BrightTail]:
-    """(K, 2) exposure starts and ends, us, and the frames' bright tail."""
-    exposures, tail = [], BrightTail()
-    for frame in recording.frames():
-        exposures.append((frame.exposure_start, frame.exposure_end))
-        tail = tail.joined(count_bright(camera, frame.normalised()))
+def _exposures(recording: Recording) -> NDArray[np.int64]:
+    """(K, 2) exposure starts and ends, us."""
+    exposures = [(frame.exposure_start, frame.exposure_end) for frame in recording.frames()]
     if not exposures:
         raise FrameError(f"{recording.source.path}: no frames; kalux needs frames as well as events")
-    return np.array(exposures, np.int64), tail
+    return np.array(exposures, np.int64)
+
+
+def _with_bright_tail(recording: Recording, settings: Settings) -> Settings:
+    """Fill in how fast the brightness of the frames' pixels falls off towards white."""
+    if settings.filter.bright_tail is not None:
+        return settings
+    camera = Camera.named(settings.camera.response, settings.camera.saturation)
+    tail = BrightTail()
+    for frame in recording.frames():
+        tail = tail.joined(count_bright(camera, frame.normalised()))
+    return dataclasses.replace(settings, filter=dataclasses.replace(settings.filter, bright_tail=tail.scale))
 
 
 def _with_white_balance(recording: Recording, settings: Settings) -> Settings:
@@ -357,18 +363,18 @@ def _are_calibrated(settings: Settings, calibration: Calibration) -> bool:
 
 
 def _with_delay(recording: Recording, settings: Settings) -> tuple[Settings, DelayEstimate | None]:
-    """Fill in the events' delay: from the settings, else an estimate, else 0."""
+    """Fill in the events' delay: from the settings, else an estimate, else the usual."""
     if settings.events.delay is not None:
         return settings, None
     estimate = estimate_delay(recording, settings.camera)
-    delay = 0 if estimate is None else estimate.delay
+    delay = settings.events.usual_delay if estimate is None else estimate.delay
     return dataclasses.replace(settings, events=dataclasses.replace(settings.events, delay=delay)), estimate
 
 
 def _with_thresholds(
     recording: Recording, settings: Settings
 ) -> tuple[Settings, ThresholdOrigin, ThresholdEstimate | None]:
-    """Fill in the thresholds: from the settings, else the recording, else an estimate."""
+    """Fill in the thresholds: from the settings, else the recording, else an estimate, else the usual."""
     events = settings.events
     if events.threshold_on is not None and events.threshold_off is not None:
         return settings, "settings", None
@@ -384,8 +390,10 @@ def _with_thresholds(
             delay=events.delay or 0,
             refractory_period=events.refractory,
         )
-        origin = "assumed" if estimate is None else "estimate"
-        found = (_ASSUMED_THRESHOLD, _ASSUMED_THRESHOLD) if estimate is None else (estimate.on, estimate.off)
+        if estimate is None:
+            return dataclasses.replace(settings, events=events.assuming()), "assumed", None
+        origin = "estimate"
+        found = (estimate.on, estimate.off)
     events = dataclasses.replace(
         events,
         threshold_on=events.threshold_on if events.threshold_on is not None else found[0],

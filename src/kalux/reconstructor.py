@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,15 +37,6 @@ from kalux.models.colour import (
 from kalux.models.pixels import PixelCalibration, require_size
 from kalux.settings import Settings
 from kalux.settings import preset as named_preset
-
-_UNKNOWN_THRESHOLD: Final = 0.25
-"""Contrast threshold assumed where neither a recording nor the user says one: in the middle of what DAVIS and
-Prophesee sensors are set to (0.1 to 0.4). kalux.reconstruct estimates it instead."""
-
-
-_UNKNOWN_SPREAD: Final = 0.5
-"""Prior spread of the threshold there, so that every pixel's own is learned quickly: a third of the error of the usual
-0.1 where the true threshold is 0.15."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +134,8 @@ class Reconstructor:
         True: an image uses the frame after it too (11)-(13), so that it is final one frame later. False: only
         the past, for robots.
     contrast_threshold
-        Log-intensity step of an event, or (on, off). Settings win. Default 0.25, and the pixels' own are learned.
+        Log-intensity step of an event, or (on, off). Settings win. Default: the preset's usual ones, and the pixels'
+        own are learned.
     threshold_is_estimate
         Whether the threshold was estimated: highlights beyond white, where no frame checks it, are then
         believed less.
@@ -186,11 +178,13 @@ class Reconstructor:
         chosen = self.settings.events
         unknown = on is None and chosen.threshold_on is None
         self._estimated = threshold_is_estimate or unknown
-        self.thresholds = (
-            chosen.threshold_on or on or _UNKNOWN_THRESHOLD,
-            chosen.threshold_off or off or _UNKNOWN_THRESHOLD,
-        )
-        self._delay = chosen.delay or 0
+        assumed = dataclasses.replace(
+            chosen, threshold_on=chosen.threshold_on or on, threshold_off=chosen.threshold_off or off
+        ).assuming()
+        assert assumed.threshold_on is not None
+        assert assumed.threshold_off is not None
+        self.thresholds = (assumed.threshold_on, assumed.threshold_off)
+        self._delay = chosen.lateness
         camera = self.settings.camera
         self._camera = Camera.named(camera.response, camera.saturation)
         if inverse_covariance is not None:
@@ -199,7 +193,7 @@ class Reconstructor:
             )
         self._gains = white_balance(camera.white_balance)
         self._reference = camera.reference_exposure or reference_exposure
-        used = _with_spread(self.settings, _UNKNOWN_SPREAD) if unknown else self.settings
+        used = dataclasses.replace(self.settings, events=assumed)
         if pixels is not None:
             require_size(pixels, self.sensor_size)
         self._ignored = pixels.hot if pixels is not None and pixels.hot.any() else None
@@ -610,12 +604,6 @@ def _between(progress: _Progress, t: int) -> float:
         return 1.0
     share = (t - segment.start) / (segment.end - segment.start)
     return 4.0 * share * (1.0 - share)
-
-
-def _with_spread(settings: Settings, least: float) -> Settings:
-    """The settings with a prior spread of the threshold of at least ``least``."""
-    spread = max(least, settings.events.threshold_spread)
-    return dataclasses.replace(settings, events=dataclasses.replace(settings.events, threshold_spread=spread))
 
 
 def _pair(threshold: float | tuple[float, float] | None) -> tuple[float | None, float | None]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -22,9 +22,6 @@ SolutionName = Literal["exact", "printed"]
 
 UNKNOWN_LOG_OFFSET: Final = 0.03
 """I_0 where it is not known: what real recordings of DAVIS sensors agree with best (docs/tuning.md)."""
-
-UNKNOWN_STEP_VARIANCE: Final = 0.2
-"""Variance of an event's step, c^2, where it is not known: the same recordings."""
 
 
 def chosen_response(setting: str, stated: str | None) -> str:
@@ -49,7 +46,7 @@ class CameraSettings:
         (`kalux.calibration.event_model`), 0.03 where it cannot be told. The paper's code: 1.
     frame_noise
         sigma_im of equation (6) as the standard deviation of a well exposed pixel of one frame; white = 1.
-        0.006 is what the paper's 7e5 1/s amounts to at 40 frames/s.
+        0.006 is what the paper's 7e5 1/s amounts to at 25 frames/s.
     confidence
         1 / sigma_im^2 of equation (6) as the paper uses it, a rate in 1/s: 7e5 (DAVIS), 7e7 (FLIR). For
         augmentation "paper" only.
@@ -99,7 +96,7 @@ class EventSettings:
         recordings more.
     step_variance
         Variance of one event's step in units of c^2. None: an estimate from the recording
-        (`kalux.calibration.event_model`), 0.2 where it cannot be told (docs/tuning.md).
+        (`kalux.calibration.event_model`).
     refractory_period
         For how long after an event a pixel does not look, us: what the light did meanwhile is added to its next event
         (docs/equations.md, K13). None: an estimate from the recording, 0 where its frames say that nothing is lost
@@ -119,6 +116,17 @@ class EventSettings:
     trail
         By how much, in c, a pixel is on average beyond the level of its newest event, at most (docs/equations.md,
         K14): events trail the light. 0 turns it off. 0.4 (docs/tuning.md).
+    usual_threshold_on, usual_threshold_off
+        Where a recording (one frame, a live stream, or nothing that moves) does not tell the thresholds: what the
+        sensor usually has. 0.25: in the middle of what DAVIS and Prophesee sensors are set to (0.1 to 0.4).
+    usual_spread
+        Relative standard deviation of the true threshold around the usual one; the prior of its calibration is then
+        at least this wide. 0.5: in a live stream a third of the error of 0.1 where the true threshold is 0.15.
+    usual_delay
+        The delay where the recording does not tell it, us. 0: as stamped.
+    usual_step_variance
+        The step's variance where the recording does not tell it, c^2. 0.2: between recordings of two sensors and
+        larger than most, since too small a value believes events too much (docs/tuning.md).
     sigma_proc2, sigma_iso2, sigma_ref2, refractory_bound
         The paper's event noise: 0.0005 1/s, 0.03 1/s, 0.01, and 10 ms (released code), in s. For
         augmentation "paper" only.
@@ -135,6 +143,11 @@ class EventSettings:
     noise_rate: float = 3.0
     extrapolation_spread: float = 0.15
     trail: float = 0.4
+    usual_threshold_on: float = 0.25
+    usual_threshold_off: float = 0.25
+    usual_spread: float = 0.5
+    usual_delay: int = 0
+    usual_step_variance: float = 0.2
     sigma_proc2: float = 0.0005
     sigma_iso2: float = 0.03
     sigma_ref2: float = 0.01
@@ -143,7 +156,23 @@ class EventSettings:
     @property
     def step_noise(self) -> float:
         """Variance of one event's step in units of c^2, also where nobody has said or estimated it."""
-        return UNKNOWN_STEP_VARIANCE if self.step_variance is None else self.step_variance
+        return self.usual_step_variance if self.step_variance is None else self.step_variance
+
+    @property
+    def lateness(self) -> int:
+        """The delay, us, also where nobody has said or estimated it."""
+        return self.usual_delay if self.delay is None else self.delay
+
+    def assuming(self) -> EventSettings:
+        """With the usual thresholds where none is set, and a prior as wide as these are uncertain."""
+        if self.threshold_on is not None and self.threshold_off is not None:
+            return self
+        return replace(
+            self,
+            threshold_on=self.usual_threshold_on if self.threshold_on is None else self.threshold_on,
+            threshold_off=self.usual_threshold_off if self.threshold_off is None else self.threshold_off,
+            threshold_spread=max(self.threshold_spread, self.usual_spread),
+        )
 
     @property
     def refractory(self) -> int:
@@ -307,12 +336,14 @@ _POSITIVE: Final = {
     "reference_exposure",
     "threshold_on",
     "threshold_off",
+    "usual_threshold_on",
+    "usual_threshold_off",
     "bright_tail",
     "initial_variance",
     "cutoff",
 }
-_WHOLE: Final = {"delay", "reference_exposure", "refractory_period"}
-_SIGNED: Final = {"delay"}
+_WHOLE: Final = {"delay", "usual_delay", "reference_exposure", "refractory_period"}
+_SIGNED: Final = {"delay", "usual_delay"}
 _CHOICES: Final = {
     "kind": ("akf", "cf"),
     "augmentation": ("bridge", "paper"),
@@ -353,7 +384,8 @@ def _check_value(label: str, name: str, value: Any, default: Any) -> None:
 
 _PAPER: Final = Settings(
     camera=CameraSettings(log_offset=1.0),
-    events=EventSettings(delay=0),
+    # 0.1 is the released code's threshold where the recording has none.
+    events=EventSettings(delay=0, usual_threshold_on=0.1, usual_threshold_off=0.1),
     filter=FilterSettings(
         augmentation="paper",
         solution="printed",
@@ -363,11 +395,68 @@ _PAPER: Final = Settings(
     ),
 )
 
+# Sensors. Thresholds, delay and step variance depend on bias currents, light and motion, and a few frames tell them
+# better than the sensor's name does: they stay automatic. Presets say what is usual where nothing can be told (one
+# frame, little motion, a live stream), and what no estimate looks for. Measured by kalux: docs/tuning.md, Sensors.
+
+_DAVIS240C: Final = EventSettings(
+    # slider_depth, whole and in parts of 2 to 8 frames: 0.58 to 0.69 and 0.43 to 0.49. One recording only, of the IJRR
+    # data set. The sensor can be set down to 11 % of contrast (Gallego 2022, Table 1).
+    usual_threshold_on=0.66,
+    usual_threshold_off=0.46,
+    # More than the 7 % between parts of a recording: others may have other bias currents. Of 0.1 to 0.5, 0.1 and 0.2
+    # are the best for live streams of these recordings.
+    usual_spread=0.2,
+    # The same recording: 1.0 to 1.8 ms. Its exposures (10 ms, from the stamp on) are a guess, which is part of this.
+    usual_delay=1500,
+    # 0.1 in most parts, 0.2 in some.
+    usual_step_variance=0.15,
+    # 0.09 between pixels is measured, but a pixel's steps also differ with contrast and light; v2e has 0.03 of 0.2.
+    # Held-out frames of all three recordings of DAVIS sensors prefer it to 0.1.
+    threshold_spread=0.15,
+)
+
+_DAVIS346: Final = EventSettings(
+    # Two recordings, one dim and one in the sun: 0.28 and 0.33 on, 0.33 and 0.38 off; parts of 2 to 8 frames 0.23 to
+    # 0.38 and 0.27 to 0.42.
+    # The sensor can be set down to 14.3 and 22.5 % of contrast (the same table).
+    usual_threshold_on=0.31,
+    usual_threshold_off=0.37,
+    usual_spread=0.2,  # as of the DAVIS240C
+    # 3.0 ms (exposures of 20 ms, dim) and 4.7 ms (0.5 ms, sun): latency, and that events trail the light.
+    usual_delay=3900,
+    # 0.05 and 0.1: the larger, since too small a value believes events too much.
+    usual_step_variance=0.1,
+    threshold_spread=0.15,  # as of the DAVIS240C
+)
+
+_PROPHESEE_FLIR: Final = Settings(
+    camera=CameraSettings(
+        # 2.3 electrons of read noise and 10,400 at white (IMX265, EMVA 1288) are 0.0069 at half of white, mostly photon
+        # noise; `kalux register` averages about ten of its 2048 x 1536 pixels to one of 640 x 480.
+        frame_noise=0.0022,
+    ),
+    events=EventSettings(
+        # 25 % of contrast, 0.22, is nominal for Prophesee's sensors; events lost in the refractory period make steps
+        # look larger, 0.27 on a simulated rig of 0.22.
+        usual_threshold_on=0.25,
+        usual_threshold_off=0.25,
+        # Background noise is 0.1 Hz per pixel at 25 C in the light (Gallego 2022, Table 1). Events are doubtful for
+        # other reasons, too: the default is far above what DAVIS sensors have. A third of it gains 2 % on the rig.
+        noise_rate=1.0,
+    ),
+)
+
 PRESETS: Final[Mapping[str, Settings]] = {
     "default": Settings(),
+    "davis240c": Settings(events=_DAVIS240C),
+    "davis346": Settings(events=_DAVIS346),
+    "prophesee-flir": _PROPHESEE_FLIR,
     "iccv2021": _PAPER,
     "iccv2021-flir": dataclasses.replace(_PAPER, camera=dataclasses.replace(_PAPER.camera, confidence=7e7)),
     "cf": Settings(filter=FilterSettings(kind="cf", deblur=False, highlight_scale=0.0, neighbours=0.0)),
 }
-"""``default``: best on ground truth. ``iccv2021``: the paper to the letter with the confidence of its DAVIS,
-``iccv2021-flir`` of its FLIR. ``cf``: the complementary filter."""
+"""``default``: best on ground truth; what is not known is estimated from the recording. ``davis240c``, ``davis346``,
+``prophesee-flir`` (the paper's two cameras side by side): the same, with what a recording of that sensor often cannot
+tell. ``iccv2021``: the paper to the letter with the confidence of its DAVIS, ``iccv2021-flir`` of its FLIR. ``cf``: the
+complementary filter."""

@@ -178,7 +178,7 @@ class Trails:
         self._spill = spill
         self._heights = events.trail * events.threshold_on, events.trail * events.threshold_off
         self._scales: list[float] = []
-        delay = events.delay or 0
+        delay = events.lateness
         followed = None
         for index in range(len(spill)):
             exposure = spill.exposure(index)
@@ -245,7 +245,7 @@ class BackwardPass:
             else:
                 newest = self.engine.newest_frame_end
                 assert newest is not None
-                self.engine.advance(newest + (self.engine.settings.events.delay or 0))
+                self.engine.advance(newest + self.engine.settings.events.lateness)
             return
         self.engine.push_weighed(block)
         self.events += len(block)
@@ -364,7 +364,7 @@ def reversed_settings(settings: Settings) -> Settings:
         settings.events,
         threshold_on=settings.events.threshold_off,
         threshold_off=settings.events.threshold_on,
-        delay=-(settings.events.delay or 0),
+        delay=-settings.events.lateness,
         trail=0.0,
     )
     return dataclasses.replace(settings, events=events)

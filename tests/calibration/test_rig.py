@@ -84,7 +84,7 @@ def test_the_file_gives_the_rig_back(rig, tmp_path):
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        (lambda text: "a = [", "not TOML"),
+        (lambda text: "a = [", "not valid TOML"),
         (lambda text: "b = 1\n", "not a rig file"),
         (lambda text: text.replace("kalux_rig = 1", "kalux_rig = 9"), "version 9"),
         (lambda text: text.replace("translation_m", "translation"), "translation_m' is missing"),

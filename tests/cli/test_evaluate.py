@@ -10,7 +10,7 @@ import sys
 import numpy as np
 import pytest
 
-from kalux.evaluation.baselines import methods
+from kalux.evaluation.baselines import OPTIONAL, methods
 from kalux.evaluation.held_out import evaluate_held_out, hold_out_frames
 from kalux.readers import hdf5
 from kalux.recording import open as open_recording
@@ -33,7 +33,7 @@ def test_frames_are_held_out_where_there_is_no_truth(cli, recording):
     lines = found.out.splitlines()
     assert "held-out frames: every 2nd dropped" in lines[0]
     assert lines[1].split() == ["method", "MSE", "x100", "PSNR", "dB", "SSIM", "log-MSE", "x100"]
-    assert labels(found.out)[:7] == [m.label for n, m in methods().items() if n != "iccv2021-flir"]
+    assert labels(found.out)[:7] == [m.label for n, m in methods().items() if n not in OPTIONAL]
     assert "images, " in lines[9]
     assert "pixels compared; data range 1" in lines[9]
 
@@ -61,6 +61,25 @@ def test_truth_beside_the_recording_is_found_and_told(cli, write_recording, simu
     assert f"ground truth of {tmp_path / 'pan_gt.npz'}: " in found
     assert cli("evaluate", path, "--truth", "--methods", "hold").out == found
     assert "held-out" in cli("evaluate", path, "--hold-out-frames", "3", "--methods", "hold").out
+
+
+def test_truth_beside_the_recording_comes_before_its_own(cli, write_recording, simulation, tmp_path):
+    """As in `kalux benchmark`, with the same numbers."""
+    truth = simulation.truth()
+    path = write_recording(tmp_path / "pan.h5", ground_truth=truth)
+    own = cli("evaluate", path, "--methods", "hold").out
+    np.savez(tmp_path / "pan_gt.npz", times_us=truth.times, gt=2 * truth.images)
+    found = cli("evaluate", path, "--methods", "hold", "-o", tmp_path / "scores.csv").out
+    assert "ground truth: " in own
+    assert f"ground truth of {tmp_path / 'pan_gt.npz'}: " in found
+    assert cli("benchmark", path, "--methods", "hold", "-o", tmp_path / "bench", "--quiet").code == 0
+    (said,) = csv.DictReader((tmp_path / "scores.csv").open())
+    (benched,) = (
+        row["value"]
+        for row in csv.DictReader((tmp_path / "bench" / "results.csv").open())
+        if row["metric"] == "mse"
+    )
+    assert float(said["mse"]) == pytest.approx(float(benched), rel=1e-6)
 
 
 def test_the_numbers_are_those_of_the_library_in_table_and_files(cli, recording, tmp_path):

@@ -10,9 +10,39 @@ import pytest
 def test_estimates_thresholds_that_the_recording_does_not_state(cli, write_recording, tmp_path):
     found = cli("info", write_recording(tmp_path / "rec.h5", contrast_threshold=None))
     assert (found.code, found.err) == (0, "")
-    last = found.out.splitlines()[-1]
-    told = re.fullmatch(r"  estimate   threshold ON (\S+), OFF (\S+); residual \S+ of \S+ samples", last)
+    line = r"  thresholds +on (\S+), off (\S+) log intensity \(estimated from \S+ samples, residual \S+\)"
+    told = re.search(line, found.out)
     assert [float(value) for value in told.groups()] == pytest.approx([0.2, 0.2], rel=0.2)
+
+
+def test_says_all_that_reconstruct_would_settle(cli, write_recording, tmp_path):
+    """The same lines that it prints when it does."""
+    path = write_recording(tmp_path / "rec.h5", contrast_threshold=None)
+    said = cli("info", path).out.split("reconstruct would use, with the preset default\n")[1].splitlines()
+    assert [line.split("  ")[1].strip() for line in said] == [
+        "thresholds",
+        "delay",
+        "I_0",
+        "step",
+        "refractory",
+        "exposure",
+        "bright tail",
+        "response",
+    ]
+    done = cli("reconstruct", path, "-o", tmp_path / "out", "--at", "frames").out
+    assert [line.split() for line in said] == [
+        line.split() for line in done.splitlines() if line.split()[0] in {row.split()[0] for row in said}
+    ]
+
+
+def test_a_preset_says_what_is_usual(cli, write_recording, simulation, tmp_path):
+    path = write_recording(tmp_path / "rec.h5", contrast_threshold=None, events=[simulation.events[:50]])
+    found = cli("info", path, "--preset", "davis346").out
+    usual = "(usual of the preset, the recording does not tell)"
+    assert f"on 0.310, off 0.370 log intensity {usual}" in found
+    assert f"events 3.9 ms late {usual}" in found
+    assert f"variance of one event 0.1 c^2, c its threshold {usual}" in found
+    assert cli("info", path, "--preset", "best").code == 2
 
 
 @pytest.mark.parametrize("flags", [(), ("--no-estimate",)])
@@ -20,8 +50,8 @@ def test_estimates_nothing_where_it_need_not(cli, recording, write_recording, tm
     path = write_recording(tmp_path / "rec.h5", contrast_threshold=None) if flags else recording
     found = cli("info", path, *flags)
     assert found.code == 0
-    assert "threshold ON" not in found.out
-    assert ("events' delay" in found.out or "ms late" in found.out) == (not flags)
+    assert "estimated from" not in found.out.partition("I_0")[0]
+    assert ("ms late" in found.out) == (not flags)
 
 
 def test_a_recording_without_exposures_is_described(cli, damaged):
@@ -44,14 +74,31 @@ def test_damage_is_one_line(cli, damaged, damage):
 
 def test_a_still_scene_has_no_estimate(cli, write_recording, simulation, tmp_path):
     path = write_recording(tmp_path / "rec.h5", contrast_threshold=None, events=[simulation.events[:50]])
-    assert "cannot be estimated, too little moves" in cli("info", path).out
+    found = cli("info", path).out
+    assert "on 0.250, off 0.250 log intensity (usual of the preset, the recording does not tell)" in found
+    assert "events 0 ms late (usual" in found
+    assert "0.03 of white, events are steps of log(I + I_0) (usual" in found
+
+
+def test_without_frames_nothing_is_estimated(cli, write_recording, tmp_path):
+    assert cli("info", write_recording(tmp_path / "rec.h5", frames=[])).out.endswith("it needs frames\n")
+
+
+def test_a_calibration_is_used(cli, write_recording, tmp_path):
+    (tmp_path / "c.toml").write_text(
+        "kalux_calibration = 1\n[settings.events]\nthreshold_on = 0.3\nthreshold_off = 0.28\ndelay = 500\n"
+    )
+    path = write_recording(tmp_path / "rec.h5", contrast_threshold=None)
+    found = cli("info", path, "--calibration", tmp_path / "c.toml").out
+    assert "on 0.300, off 0.280 log intensity (calibrated)" in found
+    assert "events 0.5 ms late (given)" in found
 
 
 class TestRealRecordings:
     @pytest.mark.parametrize("name", ["street_davis346.aedat4", "newton_davis346.aedat4"])
     def test_thresholds_are_plausible(self, cli, shared_data, name):
         found = cli("info", shared_data / name)
-        on, off = re.search(r"estimate +threshold ON (\S+), OFF ([^\s;]+)", found.out).groups()
+        on, off = re.search(r"thresholds +on (\S+), off (\S+) log", found.out).groups()
         assert 0.1 < float(on) < 0.5
         assert 0.1 < float(off) < 0.5
 

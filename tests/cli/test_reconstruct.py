@@ -238,8 +238,12 @@ class TestWhatIsSaid:
             "recording",
             "thresholds",
             "delay",
-            "events",
+            "I_0",
+            "step",
+            "refractory",
             "exposure",
+            "bright",
+            "response",
             "filter",
             "images",
             "wrote",
@@ -253,6 +257,18 @@ class TestWhatIsSaid:
         assert (found.code, found.out) == (0, "")
         assert found.err.startswith("kalux: warning: the contrast thresholds are estimated")
         assert found.err.count("\n") == 1
+
+    @pytest.mark.parametrize(("preset", "hinted"), [("default", True), ("davis346", False)])
+    def test_one_frame_tells_no_threshold_and_a_preset_is_hinted_at(
+        self, cli, write_recording, simulation, tmp_path, preset, hinted
+    ):
+        recording = write_recording(
+            tmp_path / "rec.h5", contrast_threshold=None, frames=simulation.frames[:1]
+        )
+        flags = ("--at", "frames", "--quiet", "--preset", preset)
+        found = cli("reconstruct", recording, "-o", tmp_path / "out", *flags)
+        assert "thresholds are unknown and assumed" in found.err
+        assert ("or the sensor's --preset" in found.err) == hinted
 
     @pytest.mark.parametrize("shift", [None, 10**9])
     def test_events_that_say_nothing_of_the_frames_are_a_warning(

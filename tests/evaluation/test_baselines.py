@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kalux import Frame, Recording, reconstruct
+from kalux import PRESETS, Frame, Recording, reconstruct
 from kalux.datasets import SensorSettings
 from kalux.errors import InputError
 from kalux.evaluation.baselines import (
@@ -116,3 +116,10 @@ def test_choice_by_name():
         chosen_methods(["mean"])
     with pytest.raises(InputError, match="no method is given"):
         chosen_methods([])
+
+
+@pytest.mark.parametrize("name", ["davis240c", "davis346", "prophesee-flir"])
+def test_presets_of_sensors_are_methods_if_they_are_named(name):
+    (method,) = chosen_methods([name])
+    assert method.settings == PRESETS[name]
+    assert method.label not in [m.label for m in chosen_methods(held_out=True)]

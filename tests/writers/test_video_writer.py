@@ -22,6 +22,8 @@ from kalux.errors import InputError, OutputError, SettingsError
 from kalux.writers import VideoSettings, open_writer, video
 from kalux.writers.video import video_frame
 
+from builders import own_threads
+
 LINEAR = DisplaySettings(Linear())
 
 
@@ -193,12 +195,12 @@ def test_a_video_without_images_is_an_error(tmp_path):
 
 CHILD = """
 import resource, sys
-sys.path.insert(0, sys.argv[2])
+sys.path[:0] = sys.argv[3:]
 import numpy as np
 from test_video_writer import Image
 from kalux.errors import OutputError
 from kalux.writers import open_writer
-limit = int(sys.argv[3])
+limit = int(sys.argv[2])
 rng = np.random.default_rng(0)
 noise = [rng.uniform(0, 1, (120, 160)).astype(np.float32) for _ in range(8)]
 if limit:
@@ -217,8 +219,9 @@ except KeyboardInterrupt:
 
 
 def child(out: Path, limit: int = 0) -> subprocess.Popen:
-    arguments = [sys.executable, "-c", CHILD, str(out), str(Path(__file__).parent), str(limit)]
-    return subprocess.Popen(arguments, stdout=subprocess.PIPE, text=True)
+    here = Path(__file__).parent
+    arguments = [str(out), str(limit), str(here), str(here.parent)]
+    return subprocess.Popen([sys.executable, "-c", CHILD, *arguments], stdout=subprocess.PIPE, text=True)
 
 
 def wait_for(process: subprocess.Popen, line: str) -> None:
@@ -357,6 +360,67 @@ def test_options_out_of_range(tmp_path, options):
 def test_video_settings_out_of_range(options):
     with pytest.raises(SettingsError):
         VideoSettings(**options)
+
+
+class TestSeveralThreads:
+    def write(self, out: Path, threads: int, images: int = 20) -> None:
+        with open_writer(out, rate_hz=300, threads=threads) as writer:
+            for k in range(images):
+                writer.write(make_image(round(k * 1e6 / 300), phase=0.1 * k))
+
+    def test_the_video_is_the_same(self, tmp_path):
+        for threads in (1, 2, 4):
+            self.write(tmp_path / f"{threads}.mp4", threads)
+        assert len(decoded(tmp_path / "1.mp4")[0]) == 20
+        for threads in (2, 4):
+            assert (tmp_path / f"{threads}.mp4").read_bytes() == (tmp_path / "1.mp4").read_bytes()
+        assert not own_threads()
+
+    @pytest.mark.parametrize("error", [KeyboardInterrupt, InputError])
+    def test_an_interrupt_leaves_all_that_was_given(self, tmp_path, error):
+        def write():
+            with open_writer(tmp_path / "v.mp4", threads=4) as writer:
+                for k in range(7):
+                    writer.write(make_image(1000 * k))
+                raise error
+
+        with pytest.raises(error):
+            write()
+        assert len(decoded(tmp_path / "v.mp4")[0]) == settings_of(tmp_path / "v.mp4")["images"] == 7
+        assert not own_threads()
+
+    @pytest.mark.parametrize("images", [2, 20], ids=["when it closes", "while it writes"])
+    def test_an_error_of_encoding_leaves_nothing(self, tmp_path, monkeypatch, images):
+        def broken(mapped):
+            raise MemoryError("no room")
+
+        monkeypatch.setattr(video, "video_frame", broken)
+        with pytest.raises(MemoryError, match="no room"):
+            self.write(tmp_path / "v.mp4", 3, images)
+        assert names(tmp_path) == set()
+        assert not own_threads()
+
+    @pytest.mark.parametrize("threads", [1, 4])
+    def test_what_was_encoded_before_an_error_is_kept(self, tmp_path, monkeypatch, threads):
+        made = video.video_frame
+
+        def broken(mapped):
+            if mapped[0, 0] > 0.9:
+                raise MemoryError("no room")
+            return made(mapped)
+
+        def write():
+            with open_writer(tmp_path / "v.mp4", display=LINEAR, threads=threads) as writer:
+                for k in range(6):
+                    writer.write(make_image(1000 * k, phase=np.pi / 2 if k == 4 else 0.0))
+
+        monkeypatch.setattr(video, "video_frame", broken)
+        with pytest.raises(MemoryError, match="no room"):
+            write()
+        assert len(decoded(tmp_path / "v.mp4")[0]) == settings_of(tmp_path / "v.mp4")["images"] == 4
+        assert settings_of(tmp_path / "v.mp4")["complete"] is False
+        assert names(tmp_path) == {"v.mp4", "v.mp4.kalux.toml"}
+        assert not own_threads()
 
 
 def test_in_another_thread(tmp_path):

@@ -7,7 +7,6 @@ matrix; the pose takes a point from the event camera to the frame camera, X_fram
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.errors import FormatError, InputError
+from kalux.settings import read_toml
 
 Array = NDArray[np.float64]
 
@@ -206,12 +206,7 @@ def load_rig(path: Path) -> Rig:
     FormatError
         If it is not a rig file, or of a newer version.
     """
-    try:
-        table = tomllib.loads(path.read_text("utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise FormatError(f"{path}: not TOML: {error}") from error
+    table = read_toml(path, damaged=FormatError)
     version = table.get("kalux_rig")
     if not isinstance(version, int):
         raise FormatError(f"{path}: not a rig file (kalux_rig is missing); kalux calibrate rig makes one")

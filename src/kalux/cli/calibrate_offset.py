@@ -10,6 +10,7 @@ from kalux.cli.calibrate_rig import write_picture, write_text
 from kalux.cli.info import add_recording, open_recording
 from kalux.cli.parser import Parser, UsageError, number
 from kalux.cli.terminal import say, warn
+from kalux.errors import InputError
 
 _DESCRIPTION = """\
 Estimate what has to be added to the frames' times to have those of the events, where no trigger tells it: by
@@ -121,16 +122,15 @@ def read_offset(text: str) -> float:
     UsageError
         If it is neither.
     """
-    import tomllib
+    from kalux.settings import read_toml
 
     try:
         return float(text)
     except ValueError:
         pass
     try:
-        table = tomllib.loads(Path(text).read_text("utf-8"))
-        return float(table["offset_us"])
-    except OSError as error:
-        raise UsageError(f"--offset {text}: neither a number of us nor a file: {error.strerror}") from error
+        return float(read_toml(Path(text))["offset_us"])
+    except InputError as error:
+        raise UsageError(f"--offset: neither a number of us nor a file: {error}") from error
     except (ValueError, KeyError, TypeError) as error:
         raise UsageError(f"--offset {text}: not an offset file of kalux calibrate offset") from error

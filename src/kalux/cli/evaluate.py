@@ -29,8 +29,9 @@ Compare what methods reconstruct from a recording with its ground truth or, wher
 that were held out from them. Needs the extra kalux[evaluation].
 
 methods: hold (the last frame), mean (of the frames around; held-out frames only), edi (nearest frame,
-deblurred and moved by events), cf, iccv2021, iccv2021-flir, default, smooth (default, both ways in time).
-Without --methods all but iccv2021-flir. Networks, with their weights (need the extra kalux[learned]):
+deblurred and moved by events), cf, iccv2021, iccv2021-flir, default, smooth (default, both ways in time),
+davis240c, davis346, prophesee-flir. Without --methods all but iccv2021-flir and the last three, which are for
+one camera each. Networks, with their weights (need the extra kalux[learned]):
 e2vid:FILE, e2vid+:FILE, firenet:FILE, firenet+:FILE, hypere2vid:FILE. Any other method: NAME=FOLDER of images
 with a timestamps.csv."""
 
@@ -194,30 +195,18 @@ class Protocol:
 
 def _reference(recording: Recording, options: argparse.Namespace) -> tuple[Any, str]:
     """The ground truth that is asked for, or there, and where it was found; None: none."""
-    from kalux.evaluation.truth import load_truth, prepare_reference, truth_beside
+    from kalux.evaluation.truth import find_truth, prepare_reference, truth_file
 
-    if options.truth is None or options.truth == _OWN:
-        images = recording.ground_truth()
-        mask = None if images is None else images.masks
-        beside = truth_beside(recording.source.path)
-        if images is None and beside.is_file():
-            images, mask = load_truth(beside)
-        if images is None and options.truth == _OWN:
-            raise UsageError(
-                f"{recording.source.path}: has no ground truth; give --truth FILE.npz, or --hold-out-frames 2"
-            )
-    else:
-        images, mask = load_truth(options.truth)
+    path = recording.source.path
+    file = truth_file(path, None if options.truth in (None, _OWN) else options.truth)
+    images, mask = find_truth(recording, file)
     if images is None:
+        if options.truth == _OWN:
+            raise UsageError(f"{path}: has no ground truth; give --truth FILE.npz, or --hold-out-frames 2")
         return None, ""
-    origin = ""
-    if options.truth not in (None, _OWN):
-        origin = f" of {options.truth}"
-    elif recording.source.ground_truth is None:
-        origin = f" of {beside}"
     if options.clip:
         raise UsageError("--clip is for held-out frames, the recording has ground truth; --hold-out-frames 2")
-    return prepare_reference(recording, images, mask), origin
+    return prepare_reference(recording, images, mask), "" if file is None else f" of {file}"
 
 
 # Say.

@@ -10,14 +10,16 @@ from kalux.cli.calibrations import add_calibration, calibration_lines, given_cal
 from kalux.cli.parser import Parser, UsageError, number, whole
 from kalux.cli.terminal import say
 from kalux.frames import MOSAICS
+from kalux.settings import PRESETS, Settings, preset
 
 if TYPE_CHECKING:
-    from kalux.calibration.delay import DelayEstimate
+    from kalux.calibration.values import Calibration
+    from kalux.info import Description
     from kalux.recording import Recording
 
 _DESCRIPTION = """\
-Say what is in a recording: the sensor, frames and events, exposures, what is missing. Where it states no
-contrast threshold, that is estimated as reconstruct would do it."""
+Say what is in a recording: the sensor, frames and events, exposures, what is missing; and what reconstruct
+would find out from it: contrast thresholds, delay, and the noise of events, with units and origin."""
 
 _EXAMPLES = """\
 examples:
@@ -34,9 +36,10 @@ def add_command(commands: Any) -> None:
         usage="kalux info REC [flags]",
     )
     add_recording(parser)
-    group = parser.add_argument_group("contrast thresholds")
-    group.add_argument("--no-estimate", action="store_true", help="do not estimate contrast thresholds")
-    add_calibration(parser.add_argument_group("calibration"))
+    group = parser.add_argument_group("what reconstruct would use")
+    group.add_argument("--no-estimate", action="store_true", help="leave it out, which is faster")
+    group.add_argument("--preset", default="default", metavar="NAME", help="|".join(PRESETS))
+    add_calibration(group)
     parser.set_defaults(run=run)
 
 
@@ -109,42 +112,34 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     """Run the command."""
     from kalux.info import describe, format_description
 
+    settings = preset(options.preset)
     recording = open_recording(options)
     calibration = given_calibration(options)
-    say(format_description(describe(recording)))
+    description = describe(recording)
+    say(format_description(description))
     if calibration is not None:
         say("\n".join(calibration_lines(calibration)))
     if not options.no_estimate:
-        say("\n".join(f"  estimate   {text}" for text in estimates(recording)))
+        say("\n".join(settled_lines(recording, description, settings, calibration, options.preset)))
 
 
-def estimates(recording: Recording) -> list[str]:
-    """What the recording itself says of its sensor: a line each."""
-    from kalux.calibration.delay import estimate_delay
-    from kalux.settings import CameraSettings
+def settled_lines(
+    recording: Recording,
+    description: Description,
+    settings: Settings,
+    calibration: Calibration | None,
+    name: str,
+) -> list[str]:
+    """What a reconstruction would settle, a line each; why it could not, if it could not."""
+    from kalux.info import settled
+    from kalux.pipeline import plan
 
+    title = f"reconstruct would use, with the preset {name}"
+    if not description.frames.count:
+        return [title, "  nothing: it needs frames"]
     if not recording.exposure_known:
-        return ["nothing can be estimated without exposure times; give --exposure"]
-    found = estimate_delay(recording, CameraSettings())
-    delay = "the events' delay cannot be told"
-    if found is not None:
-        delay = (
-            f"events explain the frames best when taken as {found.apparent * 1e-3:.1f} ms late "
-            f"({100 * found.improvement:.0f} % better than as stamped)"
-        )
-    thresholds = [] if recording.contrast_threshold is not None else [estimate_text(recording, found)]
-    return [delay, *thresholds]
-
-
-def estimate_text(recording: Recording, delay: DelayEstimate | None) -> str:
-    """The estimated contrast thresholds, and how well they are known."""
-    from kalux.calibration.contrast import estimate_thresholds
-    from kalux.settings import CameraSettings
-
-    estimate = estimate_thresholds(recording, CameraSettings(), delay=0 if delay is None else delay.delay)
-    if estimate is None:
-        return "thresholds cannot be estimated, too little moves before well exposed pixels"
-    return (
-        f"threshold ON {estimate.on:.3f}, OFF {estimate.off:.3f}; "
-        f"residual {estimate.residual:.2f} of {estimate.samples:,} samples"
-    )
+        return [title, "  nothing can be estimated without exposure times; give --exposure"]
+    asked = settings if calibration is None else calibration.apply(settings)
+    rows = settled(recording, plan(recording, at="frames", settings=asked, calibration=calibration), asked)
+    width = max(len(label) for label, _ in rows)
+    return [title, *(f"  {label:<{width}}  {text}" for label, text in rows)]

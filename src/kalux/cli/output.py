@@ -58,8 +58,8 @@ class Output:
             return self.path.with_name(f"{self.path.name}.kalux.toml")
         return self.path / "kalux.toml"
 
-    def open(self, described: dict[str, Any], encoders: int = 1) -> Writer:
-        """The writer, with ``described`` for the settings file; ``encoders`` images of a folder at a time."""
+    def open(self, described: dict[str, Any], threads: int = 1) -> Writer:
+        """The writer, with ``described`` for the settings file; ``threads`` images are encoded at a time."""
         from kalux.writers import open_writer
 
         return open_writer(
@@ -71,7 +71,7 @@ class Output:
             metadata=described,
             png_bits=8 if self.png_bits == 8 else 16,
             video=self.video,
-            threads=encoders,
+            threads=threads,
         )
 
 

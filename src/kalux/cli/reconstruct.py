@@ -8,7 +8,6 @@ import dataclasses
 import importlib.metadata
 import itertools
 import shlex
-import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,10 +25,11 @@ from kalux.cli.terminal import say, warn
 from kalux.cli.times import load_times
 from kalux.display import CURVES
 from kalux.errors import InputError
+from kalux.info import ORIGINS, settled
 from kalux.pipeline import Plan, execute, plan
 from kalux.reconstructor import Reconstructor
 from kalux.recording import Recording
-from kalux.settings import PRESETS, Settings, from_dict, load, preset, to_dict
+from kalux.settings import PRESETS, Settings, from_dict, load, preset, read_toml, to_dict
 
 if TYPE_CHECKING:
     from kalux.writers import Writer
@@ -43,14 +43,6 @@ examples:
   kalux reconstruct drive.aedat4 -o drive.mp4
   kalux reconstruct slider_depth -o slider.mp4 --exposure 10000 --stamp start --slow-motion 4
   kalux reconstruct drive.aedat4 -o again.mp4 --settings drive/kalux.toml --camera.log-offset 0.05"""
-
-_ORIGINS = {
-    "settings": "given",
-    "recording": "from the recording",
-    "calibration": "calibrated",
-    "estimate": "estimated",
-    "assumed": "assumed",
-}
 
 
 def add_command(commands: Any) -> None:
@@ -111,9 +103,7 @@ def _add_output(parser: Parser) -> None:
 
 def _add_settings(parser: Parser) -> None:
     group = parser.add_argument_group("settings")
-    group.add_argument(
-        "--preset", default="default", metavar="NAME", help=f"{', '.join(PRESETS)} (default: default)"
-    )
+    group.add_argument("--preset", default="default", metavar="NAME", help="|".join(PRESETS))
     group.add_argument(
         "--settings", type=Path, metavar="FILE", help="TOML that changes the preset; an output's kalux.toml"
     )
@@ -165,9 +155,9 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
         warn(text)
     made = make_plan(recording, contents, settings, times, options)
     if made.threshold_origin in ("estimate", "assumed"):
-        warn(threshold_warning(made))
+        warn(threshold_warning(made, options.preset))
     if not options.quiet:
-        say("\n".join(decided(recording, contents, made, output, options)))
+        say("\n".join(decided(recording, contents, made, settings, output, options)))
     seconds, images = write_images(
         recording, made, output, metadata(recording, made, options, command), options
     )
@@ -243,32 +233,35 @@ def _origin(made: Plan, options: argparse.Namespace) -> Any:
         or {"threshold_on", "threshold_off"} & {*flags}
     ):
         return made.threshold_origin
-    former = tomllib.loads(options.settings.read_text(encoding="utf-8")).get("thresholds", {})
+    former = read_toml(options.settings).get("thresholds", {})
     origin = former.get("origin") if isinstance(former, dict) else None
-    return origin if origin in _ORIGINS else made.threshold_origin
+    return origin if origin in ORIGINS else made.threshold_origin
 
 
 # Say.
 
 
-def threshold_warning(made: Plan) -> str:
+def threshold_warning(made: Plan, name: str) -> str:
     """What it means that nobody knows the thresholds."""
     how = "estimated from the recording" if made.threshold_origin == "estimate" else "unknown and assumed"
+    sensor = ", or the sensor's --preset" if made.threshold_origin == "assumed" and name == "default" else ""
     return (
         f"the contrast thresholds are {how}, so brightness above white is uncertain; "
-        "if you know them, give --events.threshold-on and --events.threshold-off"
+        f"if you know them, give --events.threshold-on and --events.threshold-off{sensor}"
     )
 
 
 def decided(
-    recording: Recording, contents: Contents, made: Plan, output: Output, options: argparse.Namespace
+    recording: Recording,
+    contents: Contents,
+    made: Plan,
+    asked: Settings,
+    output: Output,
+    options: argparse.Namespace,
 ) -> list[str]:
     """What is about to be done, in a few lines."""
     height, width = recording.sensor_size
-    source, events, camera = recording.source, made.settings.events, made.settings.camera
-    origin = _ORIGINS[made.threshold_origin]
-    if made.estimate is not None:
-        origin += f" from {made.estimate.samples:,} samples, residual {made.estimate.residual:.2f}"
+    source = recording.source
     begin, end = ((int(t) - contents.start) * 1e-6 for t in (made.times[0], made.times[-1]))
     spacing = "at given times" if output.rate_hz is None else f"at {output.rate_hz:g} Hz"
     if options.at is not None:
@@ -278,13 +271,12 @@ def decided(
     return [
         f"recording   {source.path}: {source.format}, {width}x{height} pixels, {contents.seconds:.3f} s, "
         f"{contents.frames:,} frames, {contents.events:,} events",
-        f"thresholds  on {events.threshold_on:.3f}, off {events.threshold_off:.3f} ({origin})",
-        f"delay       events {(events.delay or 0) * 1e-3:g} ms late ({_delay_origin(made)})",
-        f"events      steps of log(I + {camera.offset:g}), variance {events.step_noise:g} c^2 each, "
-        f"{f'refractory {events.refractory * 1e-3:g} ms' if events.refractory else 'nothing lost between'} "
-        f"({_model_origin(made)})",
+        *(
+            f"{label:<11} {text}"
+            for label, text in settled(recording, made, asked)
+            if label != "white balance"
+        ),
         *colours,
-        f"exposure    {(camera.reference_exposure or 0) * 1e-3:g} ms makes a saturated pixel 1.0",
         f"filter      {made.settings.filter.kind}, preset {options.preset}"
         f"{'' if options.settings is None else f' changed by {options.settings}'}, {ahead}",
         f"images      {len(made.times):,} {spacing}, {begin:.3f} to {end:.3f} s -> {output.path} ({output.format})",
@@ -298,21 +290,6 @@ def _colour_line(contents: Contents, made: Plan, options: argparse.Namespace) ->
         else f"Bayer mosaic {contents.colours}, demosaiced after the filter"
     )
     return f"{what}; white balance {made.settings.camera.white_balance}{', written in grey' if options.grey else ''}"
-
-
-def _delay_origin(made: Plan) -> str:
-    if made.delay_estimate is None:
-        return "given, or not to be told from the recording"
-    found = made.delay_estimate
-    return (
-        f"estimated: {found.apparent * 1e-3:.1f} ms explain the frames {100 * found.improvement:.0f} % better"
-    )
-
-
-def _model_origin(made: Plan) -> str:
-    if made.event_model is None:
-        return "given, or not to be told from the recording"
-    return f"estimated from {made.event_model.samples:,} samples"
 
 
 def metadata(
@@ -360,7 +337,7 @@ def write_images(
 ) -> tuple[float, int]:
     """Carry out the plan; returns the seconds it took and the number of images."""
     threads = options.threads or default_threads()
-    writer = output.open(described, encoders=max(1, threads - 1))
+    writer = output.open(described, threads)
     progress = Progress("reconstructing", images=len(made.times), quiet=options.quiet)
     backward = Progress("backward pass", quiet=options.quiet)
     images = execute(

@@ -151,9 +151,12 @@ _FILTERS: Final = {
     "iccv2021": "AKF iccv2021",
     "iccv2021-flir": "AKF iccv2021-flir",
     "default": "AKF default",
+    "davis240c": "AKF davis240c",
+    "davis346": "AKF davis346",
+    "prophesee-flir": "AKF prophesee-flir",
 }
 
-OPTIONAL: Final = ("iccv2021-flir",)
+OPTIONAL: Final = ("iccv2021-flir", "davis240c", "davis346", "prophesee-flir")
 """Not among those that are compared if nothing is said: for one camera only."""
 
 

@@ -199,7 +199,8 @@ def _changed(settings: Settings, factors: Mapping[str, float]) -> Settings:
 
 def _fitted_values(settings: Settings) -> dict[str, dict[str, float | int]]:
     values: dict[str, dict[str, float | int]] = {"camera": {}, "events": {}}
-    for name in ("threshold_on", "threshold_off", "delay", "step_variance", "threshold_spread", "noise_rate"):
+    names = ("threshold_on", "threshold_off", "delay", "step_variance", "threshold_spread", "noise_rate")
+    for name in (*names, "refractory_period"):
         values["events"][name] = getattr(settings.events, name)
     for name in ("frame_noise", "log_offset"):
         values["camera"][name] = getattr(settings.camera, name)

@@ -171,6 +171,27 @@ def truth_beside(path: Path) -> Path:
     return path.with_name(f"{name}_gt.npz")
 
 
+def truth_file(path: Path, named: Path | None = None) -> Path | None:
+    """The file of reference images that is named, or else lies beside the recording at ``path``; None: neither."""
+    beside = truth_beside(path)
+    return named or (beside if beside.is_file() else None)
+
+
+def find_truth(
+    recording: Recording, file: Path | None
+) -> tuple[GroundTruth | None, NDArray[np.bool_] | None]:
+    """Reference images and a mask of ``file`` (from `truth_file`), or else those that the recording holds.
+
+    A file comes first: somebody has made it for this recording, e.g. with `kalux hdr-reference`, and can take it away.
+
+    Raises
+    ------
+    InputError, FormatError
+        As of `load_truth`, or as of `Recording.ground_truth`.
+    """
+    return (recording.ground_truth(), None) if file is None else load_truth(file)
+
+
 def load_truth(path: Path) -> tuple[GroundTruth, NDArray[np.bool_] | None]:
     """Reference images from a ``.npz``: ``times_us`` or ``times`` (T, us), ``gt`` or ``images`` (T, H, W).
 

@@ -314,21 +314,26 @@ def _tick(clock, stamp):  # type: ignore[no-untyped-def]
     return clock + step - (step >> 31 << 32)
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _read_word(word, begun, clock, now):  # type: ignore[no-untyped-def]
+    """Address; clock and time, us, of which the latter never decreases; whether the clock goes back too far."""
+    clock = _tick(clock, np.int64(word & np.uint64(0xFFFFFFFF)))
+    last = now if begun else clock
+    return np.int64(word >> np.uint64(32)), clock, max(last, clock), clock + _BACKWARDS_US < last
+
+
 @njit(cache=True, nogil=True)
 def _decode_events(words, state, events, triggers, height, width):  # type: ignore[no-untyped-def]
     started, clock, now = state[_STARTED], state[_HIGH], state[_NOW]
     capacity, trigger_capacity = len(events) - _ROOM, len(triggers)
     count, count_triggers, i = 0, 0, 0
     while i < len(words) and count < capacity and count_triggers < trigger_capacity:
-        address = np.int64(words[i] >> np.uint64(32))
-        clock = _tick(clock, np.int64(words[i] & np.uint64(0xFFFFFFFF)))
-        if not started:
-            started, now = 1, clock
-        if clock + _BACKWARDS_US < now:
+        address, clock, now, back = _read_word(words[i], started, clock, now)
+        started = 1
+        if back:
             state[_ERROR] = 1
             break
         i += 1
-        now = max(now, clock)
         if address & 0x80000400 == 0:
             x = address >> 12 & 0x3FF
             y = address >> 22 & 0x1FF
@@ -336,14 +341,10 @@ def _decode_events(words, state, events, triggers, height, width):  # type: igno
             x = width - 1 - x if x < width else x
             y = height - 1 - y if y < height else y
             events[count, 0] = now
-            events[count, 1] = (
-                np.uint64(x) | np.uint64(y) << np.uint64(16) | np.uint64(address >> 11 & 1) << np.uint64(32)
-            )
+            events[count, 1] = evt._place(x, y, address >> 11 & 1)
             count += 1
         elif address & 0x80000C06 == 0x402:
-            triggers[count_triggers, 0] = now
-            triggers[count_triggers, 1] = address & 1
-            count_triggers += 1
+            count_triggers = evt._put_trigger(triggers, count_triggers, now, 0, address & 1)
     state[_STARTED], state[_HIGH], state[_NOW] = started, clock, now
     return i, count, count_triggers
 
@@ -356,15 +357,12 @@ def _decode_samples(words, state, resets, marks, image):  # type: ignore[no-unty
     state[_DONE] = 0
     i = 0
     while i < len(words):
-        address = np.int64(words[i] >> np.uint64(32))
-        clock = _tick(clock, np.int64(words[i] & np.uint64(0xFFFFFFFF)))
-        if not begun:
-            begun, now = 1, clock
-        if clock + _BACKWARDS_US < now:
+        address, clock, now, back = _read_word(words[i], begun, clock, now)
+        begun = 1
+        if back:
             state[_BACK] = 1
             break
         i += 1
-        now = max(now, clock)
         if address & 0x80000000 == 0:
             events += address >> 10 & 1 ^ 1
             continue

@@ -179,6 +179,14 @@ def _place(x, y, polarity):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, inline="always")
+def _put_trigger(triggers, count, t, pin, edge):  # type: ignore[no-untyped-def]
+    """How many triggers there are with this one."""
+    triggers[count, 0] = t
+    triggers[count, 1] = pin << 1 | edge
+    return count + 1
+
+
+@njit(cache=True, nogil=True, inline="always")
 def _unwrap(high, new, wrap, backwards):  # type: ignore[no-untyped-def]
     """The high time, us, that is meant by its lowest bits.
 
@@ -249,9 +257,7 @@ def _decode_evt3(words, state, events, triggers, height, width):  # type: ignore
                     column += 1
             x += length
         elif kind == 0xA:  # EXT_TRIGGER
-            triggers[count_triggers, 0] = now
-            triggers[count_triggers, 1] = (word >> 8 & 0xF) << 1 | word & 1
-            count_triggers += 1
+            count_triggers = _put_trigger(triggers, count_triggers, now, word >> 8 & 0xF, word & 1)
         elif kind == 0x1:  # rows of events that are not changes of brightness, in old cameras
             y = _NO_ROW
     state[_STARTED], state[_HIGH], state[_LOW], state[_NOW] = started, high, low, now
@@ -266,6 +272,17 @@ def _evt2_high(state, started, high, now, new):  # type: ignore[no-untyped-def]
     if high + _BACKWARDS_US < now:
         state[_ERROR] = 1
     return high
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _evt2_now(now, high, head):  # type: ignore[no-untyped-def]
+    """The time, us, of an event or trigger of EVT2 and 2.1, never before the one before."""
+    return max(now, high + (head >> 22 & 0x3F))
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _evt2_trigger(triggers, count, now, head):  # type: ignore[no-untyped-def]
+    return _put_trigger(triggers, count, now, head >> 8 & 0x1F, head & 1)
 
 
 @njit(cache=True, nogil=True)
@@ -286,15 +303,13 @@ def _decode_evt2(words, state, events, triggers, height, width):  # type: ignore
         elif not started:
             continue
         elif kind <= 0x1:  # CD_OFF, CD_ON
-            now = max(now, high + (word >> 22 & 0x3F))
+            now = _evt2_now(now, high, word)
             events[count, 0] = now
             events[count, 1] = _place(word >> 11 & 0x7FF, word & 0x7FF, kind)
             count += 1
         elif kind == 0xA:  # EXT_TRIGGER
-            now = max(now, high + (word >> 22 & 0x3F))
-            triggers[count_triggers, 0] = now
-            triggers[count_triggers, 1] = (word >> 8 & 0x1F) << 1 | word & 1
-            count_triggers += 1
+            now = _evt2_now(now, high, word)
+            count_triggers = _evt2_trigger(triggers, count_triggers, now, word)
     state[_STARTED], state[_HIGH], state[_NOW] = started, high, now
     return i, count, count_triggers
 
@@ -319,7 +334,7 @@ def _decode_evt21(words, state, events, triggers, height, width, head_shift):  #
         elif not started:
             continue
         elif kind <= 0x1:  # NEG, POS: a bit for each of 32 columns
-            now = max(now, high + (head >> 22 & 0x3F))
+            now = _evt2_now(now, high, head)
             column = head >> 11 & 0x7FF
             rest = _place(0, head & 0x7FF, kind)
             while valid:
@@ -330,10 +345,8 @@ def _decode_evt21(words, state, events, triggers, height, width, head_shift):  #
                 valid >>= 1
                 column += 1
         elif kind == 0xA:  # EXT_TRIGGER
-            now = max(now, high + (head >> 22 & 0x3F))
-            triggers[count_triggers, 0] = now
-            triggers[count_triggers, 1] = (head >> 8 & 0x1F) << 1 | head & 1
-            count_triggers += 1
+            now = _evt2_now(now, high, head)
+            count_triggers = _evt2_trigger(triggers, count_triggers, now, head)
     state[_STARTED], state[_HIGH], state[_NOW] = started, high, now
     return i, count, count_triggers
 

@@ -137,8 +137,11 @@ def _events(path: Path) -> Iterator[EventArray]:
         step = max(CHUNK_EVENTS // stored, 1) * stored
         for start in range(0, len(columns[0]), step):
             events: EventArray = np.empty(min(step, len(columns[0]) - start), EVENT_DTYPE)
-            for name, column in zip(_COLUMNS, columns, strict=True):
-                events[name] = column[start : start + step]
+            # One by one: other threads of Python wait while HDF5 reads.
+            for first in range(0, len(events), stored):
+                part = events[first : first + stored]
+                for name, column in zip(_COLUMNS, columns, strict=True):
+                    part[name] = column[start + first : start + first + stored]
             yield events
 
 

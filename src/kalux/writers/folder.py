@@ -5,22 +5,24 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-from collections import deque
-from concurrent.futures import ThreadPoolExecutor
+import time
 from io import FileIO
 from pathlib import Path
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
+from kalux.ahead import InOrder
 from kalux.display import ToneState
 from kalux.errors import OutputError
 from kalux.writers.base import ImageLike, Writer
 from kalux.writers.files import output_errors, remove_quietly, write_whole
-from kalux.writers.images import Bytes, Encode
+from kalux.writers.images import Encode
 from kalux.writers.settings_file import SettingsFile, require_ours
 
 LISTING = "timestamps.csv"
 SETTINGS = "kalux.toml"
 HEADER = "index,t_us,file"
+SETTINGS_EVERY: Final = 1.0
+"""Seconds between counts of images in the settings: replacing a file makes some file systems wait for the disk."""
 
 # While old outputs are being removed their list has this name, so that an interrupted removal can be resumed
 # and no list names a file that is gone.
@@ -28,23 +30,15 @@ REMOVING = ".timestamps.csv.removing"
 _LINE = re.compile(r"\d+,-?\d+,(\d{6,}\.(?:png|exr|npy))")
 
 
-class Pending(NamedTuple):
-    """An image that is being encoded.
-
-    Attributes
-    ----------
-    t
-        Its time, us.
-    data
-        Gives its file when that is ready.
-    """
+class Encoded(NamedTuple):
+    """An image's time, us, and its file."""
 
     t: int
-    data: Bytes
+    data: bytes
 
 
 class FolderWriter(Writer):
-    """Writes every image to its own file, then its line into the list, then the count into the settings.
+    """Writes every image to its own file, then its line into the list; their count into the settings once a second.
 
     With several ``encoders``, that many images are encoded at a time, in threads of their own. They are still written
     in order, each after up to as many calls of `write`: so late, too, is the error of one that cannot be.
@@ -66,47 +60,46 @@ class FolderWriter(Writer):
         self._settings = settings
         self._state: ToneState | None = None
         self._encoders = encoders
-        self._pool = ThreadPoolExecutor(encoders, "kalux-encode") if encoders > 1 else None
-        self._pending: deque[Pending] = deque()
+        self._pending: InOrder[Encoded] = InOrder(encoders, "encode")
         with output_errors(path, "the output folder cannot be used"):
             prepare_folder(path, overwrite=overwrite)
             settings.write(complete=False, images=0, times=None)
+            self._told = time.monotonic()
             write_whole(path / LISTING, f"{HEADER}\n".encode())
             self._listing = FileIO(path / LISTING, "a")
 
     def _write(self, image: ImageLike) -> None:
         data, self._state = self._encode(image, self._state)
-        self._pending.append(
-            Pending(int(image.t), data if self._pool is None else self._pool.submit(data).result)
-        )
-        self._store(0 if self._pool is None else self._encoders)
+        t = int(image.t)
+        self._pending.give(lambda: Encoded(t, data()))
+        self._store(0 if self._encoders == 1 else self._encoders)
 
     def _store(self, most: int) -> None:
         """Write images, the first first, until at most ``most`` are pending. After an error the rest is given up."""
         try:
             while len(self._pending) > most:
-                self._store_next(self._pending.popleft())
+                self._store_next(self._pending.take())
         except BaseException:
-            self._pending.clear()
+            self._pending.end()
             raise
 
-    def _store_next(self, image: Pending) -> None:
+    def _store_next(self, image: Encoded) -> None:
         name = f"{self._images:06d}{self._suffix}"
         file = self.path / name
-        data = image.data()
         with output_errors(file, self._consequence()):
             if os.path.lexists(file):
                 raise OutputError(
                     f"{file}: there already, and not an output of kalux; move it or write to another folder"
                 )
-            write_whole(file, data)
+            write_whole(file, image.data)
             try:
                 append_line(self._listing, f"{self._images},{image.t},{name}\n")
             except BaseException:
                 remove_quietly(file)
                 raise
         self._count(image.t)
-        self._write_settings(complete=False)
+        if time.monotonic() - self._told >= SETTINGS_EVERY:
+            self._write_settings(complete=False)
 
     def _finish(self, complete: bool) -> None:
         try:
@@ -120,8 +113,7 @@ class FolderWriter(Writer):
         self._end_files(complete=complete)
 
     def _end_files(self, *, complete: bool) -> None:
-        if self._pool is not None:
-            self._pool.shutdown(cancel_futures=True)
+        self._pending.end()
         with output_errors(self.path / LISTING, self._consequence()):
             self._listing.close()
         self._write_settings(complete=complete)
@@ -129,6 +121,7 @@ class FolderWriter(Writer):
     def _write_settings(self, *, complete: bool) -> None:
         with output_errors(self._settings.path, self._consequence()):
             self._settings.write(complete=complete, images=self._images, times=self._times)
+        self._told = time.monotonic()
 
     def _consequence(self) -> str:
         return f"the {self._images} images listed in {self.path / LISTING} are whole"

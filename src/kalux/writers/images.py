@@ -10,11 +10,11 @@ from collections.abc import Callable
 from typing import Any, Literal
 
 import numpy as np
-import OpenEXR
 from numpy.typing import NDArray
 
 from kalux.display import DisplaySettings, ToneState, apply, colour_of, next_state, to_uint8, to_uint16
 from kalux.writers.base import ImageLike
+from kalux.writers.exr import exr_file
 from kalux.writers.png import png_bytes
 
 Bytes = Callable[[], bytes]
@@ -49,19 +49,11 @@ def encode_npy(image: ImageLike, state: ToneState | None) -> tuple[Bytes, ToneSt
 
 def exr_bytes(image: ImageLike) -> bytes:
     """OpenEXR, 32-bit float, ZIP: the intensity as Y, or the colour as R, G, B; ``variance``; attribute ``t_us``."""
-    header = {
-        "compression": OpenEXR.ZIP_COMPRESSION,
-        "type": OpenEXR.scanlineimage,
-        "t_us": str(int(image.t)),
-    }
     colour = colour_of(image)
     values = (
         {"Y": image.intensity} if colour is None else dict(zip("RGB", np.moveaxis(colour, 2, 0), strict=True))
     )
-    channels = {name: np.ascontiguousarray(v) for name, v in {**values, "variance": image.variance}.items()}
-    file = io.BytesIO()
-    OpenEXR.File(header, channels).write(file)
-    return file.getvalue()
+    return exr_file({**values, "variance": image.variance}, {"t_us": str(int(image.t))})
 
 
 def npy_bytes(image: ImageLike) -> bytes:

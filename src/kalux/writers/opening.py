@@ -52,8 +52,9 @@ def open_writer(
     video
         Compression of a video.
     threads
-        Of a folder, how many images are encoded at a time. With more than one, images are written, and errors of
-        writing are raised, up to as many calls later, at the latest in ``close()``; images given must not be changed.
+        Of a folder, how many images are encoded at a time; of a video, how many are mapped to pictures, which one
+        encoder takes in turn. With more than one, images are written, and errors of writing are raised, up to as many
+        calls later, at the latest in ``close()``; images given must not be changed.
 
     Returns
     -------
@@ -85,7 +86,7 @@ def open_writer(
     if chosen == "mp4":
         described["video"] = plain(video, "video")
         beside = settings_file(path.with_name(f"{path.name}.{SETTINGS}"), metadata or {}, described)
-        return VideoWriter(path, display, video, ticks, beside, overwrite=overwrite)
+        return VideoWriter(path, display, video, ticks, beside, overwrite=overwrite, threads=threads)
     inside = settings_file(path / SETTINGS, metadata or {}, described)
     encode = {"png": encode_png(display, png_bits), "exr": encode_exr, "npy": encode_npy}[chosen]
     return FolderWriter(path, encode, f".{chosen}", inside, overwrite=overwrite, encoders=threads)

@@ -97,7 +97,7 @@ def require_ours(path: Path) -> None:
 def versions() -> dict[str, str]:
     """The versions of kalux, Python and the libraries that writing uses."""
     packages = {"kalux": "kalux", "numpy": "numpy", "opencv": "opencv-python-headless", "av": "av"}
-    found = {name: _version(package) for name, package in {**packages, "OpenEXR": "OpenEXR"}.items()}
+    found = {name: _version(package) for name, package in {**packages, "isal": "isal"}.items()}
     return {"python": platform.python_version(), **{n: v for n, v in found.items() if v}}
 
 

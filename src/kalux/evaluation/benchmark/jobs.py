@@ -26,7 +26,7 @@ from kalux.evaluation.held_out import held_out_pairs, hold_out_frames
 from kalux.evaluation.lpips import load_lpips
 from kalux.evaluation.scores import Pair, Scores, finite_or_none, score
 from kalux.evaluation.specs import relocated, spec_path
-from kalux.evaluation.truth import load_truth, prepare_reference, truth_pairs
+from kalux.evaluation.truth import find_truth, prepare_reference, truth_pairs
 from kalux.models.camera import Camera, Response
 from kalux.recording import Recording
 from kalux.settings import chosen_response, to_dict
@@ -335,8 +335,7 @@ def _comparison(job: Job, recording: Recording) -> _Comparison:
             held.scale,
             lambda m: held_out_pairs(held, m),
         )
-    path = job.sequence.truth_file()
-    truth, mask = (recording.ground_truth(), None) if path is None else load_truth(path)
+    truth, mask = find_truth(recording, job.sequence.truth_file())
     if truth is None:
         raise InputError(f"{recording.source.path}: its ground truth has gone; start again")
     reference = prepare_reference(recording, truth, mask)

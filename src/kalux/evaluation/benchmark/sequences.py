@@ -14,7 +14,7 @@ import kalux
 from kalux.calibration.values import Calibration, load_calibration
 from kalux.datasets.ahdr import ArtificialCamera, artificial_hdr
 from kalux.errors import InputError
-from kalux.evaluation.truth import truth_beside
+from kalux.evaluation.truth import truth_file
 from kalux.frames import Stamp
 from kalux.readers import READERS
 from kalux.recording import Recording
@@ -170,8 +170,7 @@ class Sequence:
         """The file of reference images that is named, or lies beside the recording; None: there is none."""
         if self.options.hold_out_frames is not None or self.options.ahdr is not None:
             return None
-        beside = truth_beside(self.path)
-        return self.options.truth or (beside if beside.is_file() else None)
+        return truth_file(self.path, self.options.truth)
 
     def files(self) -> list[Path]:
         """All files that the scores depend on, in order."""
