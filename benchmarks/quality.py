@@ -42,6 +42,7 @@ def variants(ablation: bool) -> dict[str, Settings]:
             ("no threshold per pixel", "events", {"threshold_spread": 0.0}),
             ("no delay", "events", {"delay": 0}),
             ("no slope", "events", {"quantisation_variance": 0.0}),
+            ("no trail", "events", {"trail": 0.0}),
             ("no neighbours", "filter", {"neighbours": 0.0}),
             ("neighbours 0.15", "filter", {"neighbours": 0.15}),
             ("neighbours 0.6", "filter", {"neighbours": 0.6}),

@@ -206,8 +206,33 @@ def paper(pixel, settings, times, on, off):
 # kalux's own.
 
 
-def bridged(pixel, settings, times, on, off):
-    """L(t) and P(t) of one pixel, docs/equations.md, K1 to K5, K7, K10 and K13."""
+def trail_scales(every, settings):
+    """K14: s of the lead-in, of every interval between two frames, and of what follows the last, in seconds."""
+    span = number = 0.0
+    out = []
+    middles = next(iter(every.values())).middles
+    for start, end in zip([next(iter(every.values())).starts[0], *middles[:-1]], middles, strict=True):
+        span, number = span / 2, number / 2
+        for pixel in every.values():
+            for (before, p, *_), (t, q, *_) in itertools.pairwise(pixel.events):
+                if max(start, end - (end - start) // 4) < t <= end and p == q and t - before < 100_000:
+                    span, number = span + t - before, number + 1
+        out.append(1.1 * US * (span + 1e6) / (number + 100))
+    return [*out, out[-1]]
+
+
+def trail(pixel, t, scale, height, on, off):
+    """K14: how far the pixel is beyond its newest event."""
+    earlier = [(q, p) for q, p, *_ in pixel.events if q <= t]
+    if not earlier:
+        return 0.0
+    newest, polarity = earlier[-1]
+    x = (t - newest) * US / scale
+    return height * (on if polarity else -off) * 2 * x / (1 + x * x)
+
+
+def bridged(pixel, settings, times, on, off, scales):
+    """L(t) and P(t) of one pixel, docs/equations.md, K1 to K5, K7, K10, K13 and K14."""
     c, ev = settings.camera, settings.events
     i0, count, c2 = c.offset, len(pixel.starts), on * off
     scale_on, scale_off = 1.0, 1.0
@@ -251,6 +276,11 @@ def bridged(pixel, settings, times, on, off):
         inside = [(p, w) for t, p, *_, w in pixel.events if a < t <= b]
         return sum(w for p, w in inside if p), sum(w for p, w in inside if not p)
 
+    def grown(index, t):  # K14, since the frame at which the interval begins, or that of the lead-in
+        frame = pixel.middles[max(index - 1, 0)]
+        now, then = (trail(pixel, q, scales[index], ev.trail, on, off) for q in (t, frame))
+        return now - then
+
     begin = pixel.starts[0]
     first = latent(0)
     intervals = [(begin, pixel.middles[0], None, first, scale_on, scale_off, var_on, var_off, 0.0)]
@@ -258,7 +288,7 @@ def bridged(pixel, settings, times, on, off):
         second = latent(k + 1)
         a, b = pixel.middles[k], pixel.middles[k + 1]
         n_on, n_off = counts(a, b)
-        mismatch = second[0] - first[0] - (on * scale_on * n_on - off * scale_off * n_off)
+        mismatch = second[0] - first[0] - (on * scale_on * n_on - off * scale_off * n_off) - grown(k + 1, b)
         total = first[1] + second[1] + var_on * (on * n_on) ** 2 + var_off * (off * n_off) ** 2
         total += ev.step_noise * c2 * (n_on + n_off) + ev.quantisation_variance * c2
         intervals.append((a, b, first, second, scale_on, scale_off, var_on, var_off, mismatch / total))
@@ -327,6 +357,7 @@ def bridged(pixel, settings, times, on, off):
 
     def bounded(t):  # K7 and K10
         value, variance = predict(t)
+        value += grown(index, t)
         _, b, _, right, *_ = intervals[index]
         if t != b:
             return value, variance
@@ -340,7 +371,7 @@ def bridged(pixel, settings, times, on, off):
             return value
         n_on, n_off = counts(a, b)
         up, down = (own_step(intervals[index], p, on, off, ev, c2, counts) for p in (True, False))
-        return max(value, right[0] - (n_on * up + n_off * down))
+        return max(value, right[0] - (n_on * up + n_off * down) - grown(index, b))
 
     def step_to(limit):
         nonlocal state, at
@@ -467,7 +498,9 @@ def reconstruct(events, frames, sensor_size, settings, times):
         begin = frames[0].exposure_start
     on, off = settings.events.threshold_on, settings.events.threshold_off
     out = np.empty((4, len(times), *sensor_size))
-    for (row, column), pixel in pixels(events, frames, sensor_size, settings, begin).items():
-        out[:2, :, row, column] = method(pixel, settings, times, on, off).T
+    every = pixels(events, frames, sensor_size, settings, begin)
+    more = (trail_scales(every, settings),) if method is bridged else ()
+    for (row, column), pixel in every.items():
+        out[:2, :, row, column] = method(pixel, settings, times, on, off, *more).T
         out[2:, :, row, column] = np.transpose([hidden(pixel, settings, t, on, off) for t in times])
     return out[0], out[1], out[2], out[3].astype(bool)

@@ -300,7 +300,7 @@ def test_a_sensors_usual_thresholds_give_way_to_the_recordings():
 
 @pytest.mark.parametrize(
     ("name", "preset", "part"),
-    [("newton_davis346.aedat4", "davis346", 0.5), ("slider_depth", "davis240c", 0.7)],
+    [("newton_davis346.aedat4", "davis346", 0.6), ("slider_depth", "davis240c", 0.95)],
 )
 def test_a_sensors_preset_helps_where_there_is_one_frame(shared_data, name, preset, part):
     """The next frame is nearer to what is made of the frame before it and of the events."""

@@ -781,4 +781,5 @@ def test_a_live_stream_takes_what_is_usual_of_the_sensor():
 
 
 def engine_without_threshold():
-    return Reconstructor((1, 1))
+    """Without K14: the levels of the tests stand still between two events."""
+    return Reconstructor((1, 1), settings=altered(PRESETS["default"], "events", trail=0.0))

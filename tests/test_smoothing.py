@@ -16,7 +16,9 @@ from kalux.errors import InputError, OutputError
 from kalux.events import make_events
 from kalux.pipeline import plan
 from kalux.reconstructor import Estimate, Reconstructor
-from kalux.smoothing import Spill, combine, reversed_settings
+from kalux.smoothing import Spill, Trails, combine, reversed_settings
+
+from builders import altered
 
 SIZE = (6, 8)
 
@@ -47,8 +49,12 @@ def mirrored(source):
     )
 
 
+STEPS = altered(PRESETS["default"], "events", trail=0.0)
+"""Nothing is known between two events (no K14), so that both directions of time are alike."""
+
+
 def engine_over(source):
-    settings = plan(source, rate_hz=10).settings
+    settings = plan(source, rate_hz=10, settings=STEPS).settings
     engine = Reconstructor(SIZE, settings=settings)
     for frame in source.frames():
         engine.push_frame(frame)
@@ -63,7 +69,9 @@ def test_smoothing_is_two_filters_combined_by_information():
     forward, backward = engine_over(source), engine_over(mirrored(source))
     times = list(range(1_000, 172_000, 7_000))
     seen_backward = {t: backward.estimate(-t) for t in times[::-1]}
-    for image, t in zip(kalux.reconstruct(source, times=times, smooth=True), times, strict=True):
+    for image, t in zip(
+        kalux.reconstruct(source, times=times, settings=STEPS, smooth=True), times, strict=True
+    ):
         a, b = forward.estimate(t), seen_backward[t]
         weights = 1 / a.variance, 1 / b.variance
         level = (weights[0] * a.log_intensity + weights[1] * b.log_intensity) / (weights[0] + weights[1])
@@ -79,11 +87,12 @@ def test_smoothing_is_two_filters_combined_by_information():
 
 
 def test_the_mirrored_recording_gives_the_mirrored_video():
-    """Nothing in a smoothed image knows the direction of time."""
+    """Nothing in a smoothed image knows the direction of time, but for K14."""
     source = recording(1)
     times = np.arange(2_500, 171_000, 8_000)  # no event or edge falls on them
-    ahead = list(kalux.reconstruct(source, times=times, smooth=True))
-    back = list(kalux.reconstruct(mirrored(source), times=-times[::-1], smooth=True))[::-1]
+    ahead = list(kalux.reconstruct(source, times=times, settings=STEPS, smooth=True))
+    reverse = kalux.reconstruct(mirrored(source), times=-times[::-1], settings=STEPS, smooth=True)
+    back = list(reverse)[::-1]
     for one, other in zip(ahead, back, strict=True):
         # The middle of an exposure of an odd number of microseconds is rounded to the other side.
         np.testing.assert_allclose(one.variance, other.variance, rtol=1e-3)
@@ -101,6 +110,52 @@ def test_windows_and_blocks_change_nothing(monkeypatch, window, block):
     for one, other in zip(kalux.reconstruct(source, times=times, smooth=True), expected, strict=True):
         np.testing.assert_array_equal(one.intensity, other.intensity)
         np.testing.assert_array_equal(one.variance, other.variance)
+
+
+@pytest.mark.parametrize("delay", [0, 2_500])
+@pytest.mark.parametrize("hot", [False, True])
+def test_the_backward_filter_is_told_what_the_forward_one_knows(tmp_path, delay, hot):
+    """K14: f at the middles of the frames, with the s of the intervals on either side."""
+    source = recording(4)
+    broken = np.zeros(SIZE, bool)
+    broken[2, 3] = hot
+    settings = plan(source, rate_hz=10, settings=altered(PRESETS["default"], "events", delay=delay)).settings
+    trails = Trails(Spill(source, tmp_path), settings, broken if hot else None)
+    events = np.concatenate(list(source.events()))
+    engine = Reconstructor(SIZE, settings=settings)
+    frames = list(source.frames())
+    for frame in frames:
+        engine.push_frame(frame)
+    engine.push_events(events[~broken[events["y"], events["x"]]])
+    engine.finish()
+    for k, frame in enumerate(frames):
+        told = trails.reversed_trail(len(frames) - 1 - k)
+        np.testing.assert_allclose(engine.trail(frame.middle), told.before, atol=1e-6)
+        np.testing.assert_allclose(engine.trail(frame.middle + 1), told.after, atol=1e-3)
+    assert np.abs(told.after).max() > 0.01
+
+
+def test_smoothing_follows_a_steady_change_between_its_events():
+    """Both filters are ahead of their events as the light is; without K14 both hold the same step."""
+    times = np.arange(1, 10) * 16_667
+    zeros = np.zeros(len(times), np.int64)
+    frames = [
+        Frame(np.full((1, 1), 0.25 * np.exp(12e-6 * (t - 79_500)) - 0.004, np.float32), t, t + 1_000, 1.0)
+        for t in range(0, 160_000, 40_000)
+    ]
+    source = Recording.from_arrays(
+        make_events(times, zeros, zeros, zeros + 1), frames, sensor_size=(1, 1), contrast_threshold=0.2
+    )
+    reads = np.arange(42_000, 118_000, 1_000)
+
+    def error(trail):
+        settings = altered(PRESETS["default"], "events", trail=trail, noise_rate=0.0, delay=0)
+        settings = altered(settings, "camera", log_offset=0.004)
+        images = kalux.reconstruct(source, times=reads, settings=settings, smooth=True)
+        found = np.log([image.intensity[0, 0] + 0.004 for image in images])
+        return np.sqrt(np.mean((found - np.log(0.25) - 12e-6 * (reads - 80_000)) ** 2))
+
+    assert error(0.4) < 0.8 * error(0.0)
 
 
 def test_after_the_last_frame_the_forward_pass_is_alone():

@@ -227,15 +227,26 @@ def _smoothed_estimates(
         yield from _estimates(recording, engine, plan, on_events, read_ahead)
         return
     with tempfile.TemporaryDirectory(prefix="kalux-") as folder:
+        trail = _trail(plan)
         backward = Backward(
             recording,
             _engine(recording, plan, reversed_settings(plan.settings)),
             plan.times,
             Path(folder),
             on_backward,
+            trail=trail,
         )
         for estimate in _estimates(recording, engine, plan, on_events, read_ahead):
-            yield combine(estimate, backward.estimate(estimate.t))
+            ahead_of_events = None if trail is None else engine.trail(estimate.t)
+            yield combine(estimate, backward.estimate(estimate.t), ahead_of_events)
+
+
+def _trail(plan: Plan) -> tuple[Settings, NDArray[np.bool_] | None] | None:
+    """What the backward filter must know of K14, where the forward one follows it."""
+    if plan.settings.filter.augmentation != "bridge" or plan.settings.events.trail == 0:
+        return None
+    hot = None if plan.pixels is None or not plan.pixels.hot.any() else plan.pixels.hot
+    return plan.settings, hot
 
 
 def _engine(recording: Recording, plan: Plan, settings: Settings) -> Reconstructor:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.refractory import EventClock
+from kalux.augmentation.trail import FrameTrail
 from kalux.compiled import event_words
 from kalux.errors import InputError, SettingsError
 from kalux.events import EVENT_DTYPE, EventArray, as_events, check_events
@@ -215,8 +216,10 @@ class Reconstructor:
 
     # Pushing.
 
-    def push_frame(self, frame: Frame) -> None:
+    def push_frame(self, frame: Frame, *, trail: FrameTrail | None = None) -> None:
         """Add the next frame.
+
+        ``trail`` is for the backward filter of `kalux.smoothing`: how far the light is ahead of its events (K14).
 
         Raises
         ------
@@ -228,7 +231,8 @@ class Reconstructor:
         self._reference = self._reference or frame.exposure
         if self._tail is None:
             self._tail = count_bright(self._camera, frame.normalised()).scale
-        self._shots.append(take_shot(frame, self._camera, self._reference, self._gains_of(frame)))
+        shot = take_shot(frame, self._camera, self._reference, self._gains_of(frame))
+        self._shots.append(shot if trail is None else shot._replace(trail=trail))
         self._last_frame = frame
         self._frame_count += 1
 
@@ -395,6 +399,15 @@ class Reconstructor:
             _between(progress, t) if self.lookahead else 1.0,
             self._chroma(progress, t),
         )
+
+    def trail(self, t: int) -> NDArray[np.floating[Any]] | None:
+        """(H, W) how far, in log intensity, the light is ahead of its events at ``t`` (us), K14.
+
+        ``t`` is a time that can be read. None: the method does not tell.
+        """
+        progress = self._progress_to(t)
+        self._take(progress, t)
+        return self._method.trail(progress.segment, progress.cursor, t)
 
     def image(self, estimate: Estimate) -> Image:
         """The image of an estimate: highlights as far as they are believed (K6), with what neighbours know (K12)."""

@@ -113,6 +113,9 @@ class EventSettings:
         Standard deviation of the log of the scale of what events say of highlights beyond white, where no
         frame can check it, when the threshold is only an estimate. 0.15: how well large steps between well
         exposed frames agree with estimated thresholds, on three real and eleven simulated recordings.
+    trail
+        By how much, in c, a pixel is on average beyond the level of its newest event, at most (docs/equations.md,
+        K14): events trail the light. 0 turns it off. 0.4 (docs/tuning.md).
     usual_threshold_on, usual_threshold_off
         Where a recording (one frame, a live stream, or nothing that moves) does not tell the thresholds: what the
         sensor usually has. 0.25: in the middle of what DAVIS and Prophesee sensors are set to (0.1 to 0.4).
@@ -139,6 +142,7 @@ class EventSettings:
     deblur_variance: float = 0.05
     noise_rate: float = 3.0
     extrapolation_spread: float = 0.15
+    trail: float = 0.4
     usual_threshold_on: float = 0.25
     usual_threshold_off: float = 0.25
     usual_spread: float = 0.5

@@ -17,14 +17,16 @@ from __future__ import annotations
 
 import dataclasses
 import pickle
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.augmentation.deblur import between
 from kalux.augmentation.refractory import EventClock
+from kalux.augmentation.trail import FrameTrail, follow, nothing_followed, trail_at
 from kalux.compiled import event_words
 from kalux.errors import OutputError
 from kalux.events import EVENT_DTYPE, EventArray
@@ -61,6 +63,7 @@ class Spill:
         self._folder = folder
         self._events = folder / "events.bin"
         self._exposures: list[tuple[int, int, float | None, Mosaic | None, bool]] = []
+        self.sensor_size = recording.sensor_size
         self.count = 0
         try:
             with self._events.open("wb") as file:
@@ -116,11 +119,88 @@ class Spill:
         block["p"] = ~block["p"]
         return block
 
+    def exposure(self, index: int) -> tuple[int, int]:
+        """Start and end of a frame's exposure, us."""
+        return self._exposures[index][:2]
+
+    def events_between(self, start: int, end: int, without: NDArray[np.bool_] | None) -> Iterator[EventArray]:
+        """The events with ``start`` < t <= ``end`` (us), in blocks, but for those of some pixels, (H, W) bool."""
+        if self.count == 0:
+            return
+        inside = between(np.memmap(self._events, EVENT_DTYPE, "r"), start, end)
+        for first in range(0, len(inside), _BLOCK_EVENTS):
+            events = np.array(inside[first : first + _BLOCK_EVENTS])
+            yield events if without is None else events[~without[events["y"], events["x"]]]
+
+    def save_newest(self, index: int, newest: NDArray[np.int64]) -> None:
+        """Keep what is known of the newest events at the middle of a frame."""
+        try:
+            np.save(self._newest_path(index), newest)
+        except OSError as error:
+            raise OutputError(
+                f"{self._folder}: the backward pass cannot be spilled: {error.strerror or error}"
+            ) from error
+
+    def load_newest(self, index: int) -> NDArray[np.int64]:
+        """What was kept."""
+        newest: NDArray[np.int64] = np.load(self._newest_path(index))
+        return newest
+
+    def _newest_path(self, index: int) -> Path:
+        return self._folder / f"newest_{index:06d}.npy"
+
     def _frame_path(self, index: int) -> Path:
         return self._folder / f"frame_{index:06d}.npy"
 
     def _mask_path(self, index: int) -> Path:
         return self._folder / f"valid_{index:06d}.npy"
+
+
+class Trails:
+    """How far the light is ahead of its events (K14) at the middle of every frame, on disk, for the backward filter.
+
+    The light is ahead of the event before: the backward filter, for which that is still to come, must be told.
+
+    Parameters
+    ----------
+    spill
+        Of the recording.
+    settings
+        Of the forward filter, with its thresholds and its delay.
+    hot
+        (H, W) bool: pixels whose events are left out; None: none.
+    """
+
+    def __init__(self, spill: Spill, settings: Settings, hot: NDArray[np.bool_] | None) -> None:
+        events = settings.events
+        assert events.threshold_on is not None
+        assert events.threshold_off is not None
+        self._spill = spill
+        self._heights = events.trail * events.threshold_on, events.trail * events.threshold_off
+        self._scales: list[float] = []
+        delay = events.lateness
+        followed = None
+        for index in range(len(spill)):
+            exposure = spill.exposure(index)
+            if followed is None:
+                followed = nothing_followed(spill.sensor_size)
+                start = exposure[0]
+            end = sum(exposure) // 2
+            chunks = spill.events_between(start + delay, end + delay, hot)
+            _, _, followed = follow(chunks, followed, start + delay, end + delay)
+            spill.save_newest(index, followed.newest - 2 * delay)
+            self._scales.append(followed.scale)
+            start = end
+
+    def reversed_trail(self, index: int) -> FrameTrail:
+        """Of the frame ``index`` of the reversed recording."""
+        forward = len(self._spill) - 1 - index
+        newest = self._spill.load_newest(forward)
+        middle = sum(self._spill.exposure(forward)) // 2
+        after = min(forward + 1, len(self._spill) - 1)
+        return FrameTrail(
+            *(trail_at(newest, middle, (self._scales[k], *self._heights)) for k in (forward, after))
+        )
 
 
 class BackwardPass:
@@ -131,7 +211,13 @@ class BackwardPass:
         self.frames = 0
         self.events = 0
 
-    def reach(self, spill: Spill, t: int, on_events: Callable[[int], None] | None = None) -> None:
+    def reach(
+        self,
+        spill: Spill,
+        trails: Trails | None,
+        t: int,
+        on_events: Callable[[int], None] | None = None,
+    ) -> None:
         """Push until ``t`` (us, reversed) is final, freeing what lies before it."""
         engine = self.engine
         while True:
@@ -144,7 +230,8 @@ class BackwardPass:
             elif self.frames < len(spill):
                 if engine.final_until is not None:
                     engine.forget(engine.final_until)
-                engine.push_frame(spill.reversed_frame(self.frames))
+                trail = None if trails is None else trails.reversed_trail(self.frames)
+                engine.push_frame(spill.reversed_frame(self.frames), trail=trail)
                 self.frames += 1
             else:
                 engine.end_frames()
@@ -179,6 +266,8 @@ class Backward:
         An existing folder for what is spilled, the caller's to remove.
     on_events
         Told the number of events of every block that the first pass has taken.
+    trail
+        Settings and hot pixels of the forward filter, if it tells how far the light is ahead of its events (K14).
 
     Raises
     ------
@@ -193,9 +282,12 @@ class Backward:
         times: NDArray[np.int64],
         folder: Path,
         on_events: Callable[[int], None] | None = None,
+        *,
+        trail: tuple[Settings, NDArray[np.bool_] | None] | None = None,
     ) -> None:
         height, width = recording.sensor_size
         self._spill = Spill(recording, folder, engine.settings.events.refractory)
+        self._trails = None if trail is None else Trails(self._spill, *trail)
         times = times[times <= self._spill.end]
         window = max(1, _WINDOW_BYTES // (16 * height * width))
         self._windows = [times[i : i + window] for i in range(0, len(times), window)]
@@ -204,7 +296,7 @@ class Backward:
         self._next_window = 0
         backward = BackwardPass(engine)
         for index in reversed(range(len(self._windows))):
-            backward.reach(self._spill, -int(self._windows[index][-1]), on_events)
+            backward.reach(self._spill, self._trails, -int(self._windows[index][-1]), on_events)
             self._save(index, backward)
 
     def estimate(self, t: int) -> Estimate | None:
@@ -222,7 +314,7 @@ class Backward:
         for t in self._windows[self._next_window][::-1].tolist():
             if t in self._current:
                 continue
-            backward.reach(self._spill, -t)
+            backward.reach(self._spill, self._trails, -t)
             self._current[t] = dataclasses.replace(backward.engine.estimate(-t), chroma=None)
         self._state_path(self._next_window).unlink()
         self._next_window += 1
@@ -239,14 +331,20 @@ class Backward:
         return self._folder / f"state_{index:06d}.pickle"
 
 
-def combine(forward: Estimate, backward: Estimate | None) -> Estimate:
-    """The smoothed estimate of two filters, in the forward one's time; the forward one where it is alone."""
+def combine(
+    forward: Estimate, backward: Estimate | None, trail: NDArray[np.floating[Any]] | None = None
+) -> Estimate:
+    """The smoothed estimate of two filters, in the forward one's time; the forward one where it is alone.
+
+    ``trail`` is how far the light is ahead of its events (K14), which the backward filter's reads are without.
+    """
     if backward is None:
         return forward
     first, second = 1.0 / forward.variance, 1.0 / backward.variance
+    behind = backward.log_intensity if trail is None else backward.log_intensity + trail
     return Estimate(
         t=forward.t,
-        log_intensity=(first * forward.log_intensity + second * backward.log_intensity) / (first + second),
+        log_intensity=(first * forward.log_intensity + second * behind) / (first + second),
         variance=np.minimum(forward.variance, backward.variance),
         white=forward.white,
         final=forward.final,
@@ -267,5 +365,6 @@ def reversed_settings(settings: Settings) -> Settings:
         threshold_on=settings.events.threshold_off,
         threshold_off=settings.events.threshold_on,
         delay=-settings.events.lateness,
+        trail=0.0,
     )
     return dataclasses.replace(settings, events=events)

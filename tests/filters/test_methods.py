@@ -82,7 +82,7 @@ def test_values_that_are_not_valid_have_no_weight(variant, lookahead, seed):
 @ALL
 @MODES
 def test_pixels_that_are_never_valid_follow_their_events(variant, lookahead):
-    settings = altered(VARIANTS[variant], "events", noise_rate=0.0)
+    settings = altered(VARIANTS[variant], "events", noise_rate=0.0, trail=0.0)
     settings = altered(settings, "filter", highlight_scale=0.0, neighbours=0.0)
     frames = [
         Frame(np.full((1, 2), 100, np.uint8), t, t + 10_000, valid=np.array([[True, False]]))
@@ -137,7 +137,7 @@ def test_black_is_a_bound_where_the_response_hides_something(lookahead):
     settings = dataclasses.replace(
         PRESETS["default"],
         camera=dataclasses.replace(PRESETS["default"].camera, response=response, log_offset=0.01),
-        events=dataclasses.replace(PRESETS["default"].events, threshold_on=0.3, threshold_off=0.3),
+        events=dataclasses.replace(PRESETS["default"].events, threshold_on=0.3, threshold_off=0.3, trail=0.0),
     )
     engine = Reconstructor((1, 1), settings=settings, lookahead=lookahead)
     frames = [Frame(np.zeros((1, 1), np.uint8), t, t + 1000) for t in range(0, 400_000, 40_000)]

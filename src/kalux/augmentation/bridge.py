@@ -20,6 +20,8 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.augmentation.trail import Trail
+
 Array = NDArray[np.floating[Any]]
 
 UNMEASURED: Final = 2.0**40
@@ -74,6 +76,7 @@ class BridgedSegment(NamedTuple):
     for each of the ``events`` still to come. At ``start`` the level is ``floor`` or more (`floor_before`; None: no
     bound). At ``end`` the pixel obeys the frame ``bound`` (`lift`), and its variance grows by ``drift``, what its
     thresholds may have been wrong by (`drift`; None: nothing). Pixels without an event after ``still_since`` are still.
+    Beyond what L^A and the state say here, the level is ahead of its newest event by ``trail`` (K14; None: it is not).
     """
 
     start: int
@@ -91,6 +94,7 @@ class BridgedSegment(NamedTuple):
     drift: Array | None = None
     still_since: int = 0
     floor: Array | None = None
+    trail: Trail | None = None
 
 
 def drift(

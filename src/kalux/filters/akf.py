@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from kalux.augmentation.bridge import BridgedSegment, lift, lower
 from kalux.augmentation.deblur import events_until
 from kalux.augmentation.interpolation import InterpolatedSegment
+from kalux.augmentation.trail import add_trail
 from kalux.compiled import (
     AHEAD,
     FUSED,
@@ -149,12 +150,15 @@ class BridgedCursor:
     clock
         Newest event of every pixel, us after ``origin``. The pixel's state holds from there, or from ``origin``
         if that is later.
+    polarity
+        1 or -1, that of the newest event of every pixel, laid out as the clock is; 0: not known.
     origin
         us: the segment's start, then a whole number of epochs later.
     """
 
     pixels: NDArray[np.void]
     clock: Clock
+    polarity: NDArray[np.int8]
     origin: int
 
 
@@ -183,8 +187,11 @@ def begin_bridged(segment: BridgedSegment, state: State) -> BridgedCursor:
     level = state.log_intensity
     if segment.floor is not None:
         level = np.maximum(level, segment.floor)  # K7
-    _begin_bridged(segment, level, state.variance, pixels)
-    return BridgedCursor(pixels, clock, segment.start)
+    _begin_bridged(_compiled(segment), level, state.variance, pixels)
+    polarity = np.zeros(clock.shape, np.int8)
+    if segment.trail is not None:
+        polarity[1:-1, 1:-1] = segment.trail.polarity
+    return BridgedCursor(pixels, clock, polarity, segment.start)
 
 
 def advance_bridged(
@@ -194,9 +201,11 @@ def advance_bridged(
     scalars = _Scalars(*(np.float32(value) for value in (segment.rate, segment.step_variance, *noise)))
     stride = np.uint64(cursor.clock.shape[1])
     while len(events):
-        pixels, clock = cursor.pixels.reshape(-1), cursor.clock.reshape(-1)
+        pixels, clock, polarity = (
+            plane.reshape(-1) for plane in (cursor.pixels, cursor.clock, cursor.polarity)
+        )
         count = events_until(events, cursor.origin + EPOCH)
-        _advance_bridged(event_words(events[:count]), pixels, clock, stride, cursor.origin, scalars)
+        _advance_bridged(event_words(events[:count]), pixels, clock, polarity, stride, cursor.origin, scalars)
         events = events[count:]
         if len(events):
             epochs = (int(events["t"][0]) - 1 - segment.start) // EPOCH
@@ -204,14 +213,41 @@ def advance_bridged(
 
 
 def read_bridged(segment: BridgedSegment, cursor: BridgedCursor, t: int) -> tuple[FloatArray, FloatArray]:
-    """L and P at ``t`` (us), which must not lie before an event the cursor has taken. Changes nothing."""
+    """L and P at ``t`` (us), which must not lie before an event the cursor has taken. Changes nothing.
+
+    Backward in time L is without what the light is ahead of its events (K14).
+    """
+    log_intensity, variance = _read(segment, cursor, t)
+    if t == segment.end and segment.trail is not None and segment.trail.end is not None:
+        log_intensity -= segment.trail.end
+    return log_intensity, variance
+
+
+def trail_bridged(segment: BridgedSegment, cursor: BridgedCursor, t: int) -> FloatArray | None:
+    """(H, W) how far the light is ahead of its events at ``t`` (us), K14; None where that is not told."""
+    if segment.trail is None:
+        return None
+    ahead = np.zeros(segment.augmented.shape, np.float32)
+    since_nothing = segment.trail._replace(start=ahead)
+    within = min(t - cursor.origin, EPOCH)
+    out = np.zeros_like(ahead)
+    add_trail(since_nothing, cursor.polarity, cursor.clock, within, out)
+    return out
+
+
+def _read(segment: BridgedSegment, cursor: BridgedCursor, t: int) -> tuple[FloatArray, FloatArray]:
+    """The same with all that is known at the end of the segment."""
     log_intensity, variance = np.empty((2, *segment.augmented.shape), np.float32)
     within = min(t - cursor.origin, EPOCH)
     beyond = np.float32((t - cursor.origin - within) * 1e-6)
     since_start = np.float32((t - segment.start) * 1e-6)
     pixels, clock = cursor.pixels.reshape(-1), cursor.clock.reshape(-1)
-    _read_bridged(segment, pixels, clock, within, beyond, since_start, log_intensity, variance)
+    _read_bridged(_compiled(segment), pixels, clock, within, beyond, since_start, log_intensity, variance)
+    if segment.trail is not None:
+        add_trail(segment.trail, cursor.polarity, cursor.clock, within, log_intensity)  # K14
     if t == segment.end:
+        if segment.trail is not None and segment.trail.end is not None:
+            log_intensity += segment.trail.end
         if segment.bound is not None:
             lift(log_intensity, segment.bound)  # K7
             lower(log_intensity, segment.bound)
@@ -229,15 +265,20 @@ def moving_bridged(segment: BridgedSegment, cursor: BridgedCursor) -> NDArray[np
 
 def end_bridged(segment: BridgedSegment, cursor: BridgedCursor) -> State:
     """The state at the end of the segment."""
-    log_intensity, variance = read_bridged(segment, cursor, segment.end)
+    log_intensity, variance = _read(segment, cursor, segment.end)
     return State(log_intensity, variance, moved_clock(cursor.clock, segment.end - cursor.origin))
 
 
 def _move_origin(segment: BridgedSegment, cursor: BridgedCursor, origin: int) -> None:
     """Predict every pixel at a later origin of the clock, so that its times do not overflow."""
-    _predict_bridged(segment, cursor.pixels, cursor.clock, origin - cursor.origin)
+    _predict_bridged(_compiled(segment), cursor.pixels, cursor.clock, origin - cursor.origin)
     cursor.clock = moved_clock(cursor.clock, origin - cursor.origin)
     cursor.origin = origin
+
+
+def _compiled(segment: BridgedSegment) -> BridgedSegment:
+    """What the loops need of a segment: they are compiled anew for every combination of optional parts."""
+    return segment._replace(trail=None)
 
 
 @nb.njit(cache=True, inline="always")
@@ -271,7 +312,7 @@ def _begin_bridged(segment, log_intensity, variance, pixels):  # type: ignore[no
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy", fastmath=FUSED)
-def _advance_bridged(words, pixels, clock, stride, origin, scalars):  # type: ignore[no-untyped-def]
+def _advance_bridged(words, pixels, clock, polarity, stride, origin, scalars):  # type: ignore[no-untyped-def]
     corner = stride + np.uint64(1)
     last = len(words) - 1
     for i in range(len(words)):
@@ -300,6 +341,7 @@ def _advance_bridged(words, pixels, clock, stride, origin, scalars):  # type: ig
         pixel.forward += weight * scalars.step_variance
         pixel.coming -= weight
         clock[at] = now
+        polarity[at] = np.int8(2) * np.int8(event_is_on(word)) - np.int8(1)
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")

@@ -18,6 +18,16 @@ from numpy.typing import NDArray
 from kalux.augmentation import bridge, deblur, interpolation
 from kalux.augmentation.bridge import BridgedSegment, BridgeNoise, Latent, Thresholds
 from kalux.augmentation.deblur import ExposureIntegrals, all_between, count_chunks, mean_level
+from kalux.augmentation.trail import (
+    Followed,
+    FrameTrail,
+    Trail,
+    follow,
+    given_trail,
+    nothing_followed,
+    polarity_of,
+    trail_at,
+)
 from kalux.compiled import AHEAD, logarithm, prefetch
 from kalux.errors import SettingsError
 from kalux.events import EventArray
@@ -72,6 +82,8 @@ class Shot(NamedTuple):
         where a channel is clipped to 1; else None.
     valid
         (H, W) bool: where the frame says anything at all; None: everywhere.
+    trail
+        Backward in time: how far the light is ahead of its events at the middle (K14).
     """
 
     start: int
@@ -86,6 +98,7 @@ class Shot(NamedTuple):
     chroma: NDArray[np.float32] | None = None
     chroma_weight: NDArray[np.float32] | None = None
     valid: NDArray[np.bool_] | None = None
+    trail: FrameTrail | None = None
 
     @property
     def intensity(self) -> Array:
@@ -271,6 +284,9 @@ class Method(Protocol):
     def moving(self, segment: Any, cursor: Any) -> NDArray[np.bool_] | None:
         """(H, W): pixels with an event in this frame interval or the one before; None: the method does not tell."""
 
+    def trail(self, segment: Any, cursor: Any, t: int) -> Floats | None:
+        """(H, W): how far the light is ahead of its events at ``t`` (K14); None: the method does not tell."""
+
 
 def make_method(
     settings: Settings,
@@ -299,6 +315,9 @@ class _Common:
         self.offset = settings.camera.offset
 
     def moving(self, segment: Any, cursor: Any) -> NDArray[np.bool_] | None:
+        return None
+
+    def trail(self, segment: Any, cursor: Any, t: int) -> Floats | None:
         return None
 
     def log_frame(self, shot: Shot) -> Array:
@@ -342,6 +361,8 @@ class BridgeMemory(NamedTuple):
     far_on: Floats
     far_off: Floats
     since: int
+    followed: Followed
+    at_middle: Followed
 
 
 class BridgedFrames(_Common):
@@ -439,21 +460,22 @@ class BridgedFrames(_Common):
         latent = self.latent(shot, events, thresholds)
         begin = self.begin_time(shot)
         newest = make_clock(self.shape, begin - shot.start)
-        lead_in = None
+        lead_in, unknown = None, nothing_followed(self.shape)
         far = np.zeros(self.shape, np.float32)
         if self.lookahead:
-            on, off = self.counts(events, begin, shot.middle)
-            memory = BridgeMemory(latent, thresholds, 0.0, on, off, far, far, shot.start)
+            on, off, followed = self.follow(events, begin, shot.middle, unknown)
+            memory = BridgeMemory(latent, thresholds, 0.0, on, off, far, far, shot.start, followed, followed)
             value, variance = latent.value, latent.variance
             if shot.middle > begin:
                 lead_in = bridge.extend_backward(latent, on, off, thresholds, self.noise, begin, shot.middle)
-                lead_in = lead_in._replace(still_since=shot.start)
+                lead_in = lead_in._replace(still_since=shot.start, trail=self._lead_in_trail(shot, followed))
                 value = lead_in.augmented
                 variance = lead_in.backward_variance + lead_in.step_variance * lead_in.events
         else:
+            # The clock begins at the end of the exposure: nothing is known of what came before.
             on, off = self.counts(events, shot.middle, shot.end)
-            memory = BridgeMemory(latent, thresholds, 0.0, on, off, far, far, shot.start)
-            carried = self._carried(memory)
+            memory = BridgeMemory(latent, thresholds, 0.0, on, off, far, far, shot.start, unknown, unknown)
+            carried = self._carried(memory, shot)
             value, variance = carried.value, carried.variance
         unmeasured = variance >= bridge.UNMEASURED
         variance = np.where(unmeasured, np.float32(self.settings.filter.initial_variance), variance)
@@ -469,24 +491,51 @@ class BridgedFrames(_Common):
             seconds = memory.interval or self._FIRST_INTERVAL
             latent = memory.latent
             if not self.lookahead:
-                latent = self._carried(memory)
+                latent = self._carried(memory, shot)
             alone = bridge.extend(latent, memory.thresholds, self.noise, start, FAR_FUTURE, seconds, None)
-            return alone._replace(still_since=_still_since(memory, start, seconds)), memory
+            if shot.trail is None:
+                trail = self._trail(memory.followed, start, memory.followed.scale)
+            else:
+                trail = given_trail(shot.trail.before, np.zeros(self.shape, np.float32))
+            return alone._replace(still_since=_still_since(memory, start, seconds), trail=trail), memory
         interval = (following.middle - shot.middle) * 1e-6
         second = self.latent(following, events, memory.thresholds)
-        on, off = self.counts(events, start, following.middle)
+        on, off, at_middle = self.follow(events, start, following.middle, memory.followed)
         if self.lookahead:
+            scale = at_middle.scale
+            trail = self._trail(memory.followed, start, scale)
+            at_end = self._trail_at(at_middle, following.middle, scale)
+            if shot.trail is not None and following.trail is not None:
+                at_end = following.trail.after
+                trail = given_trail(shot.trail.before, at_end)
+            grown = at_end - trail.start
             joined, learned = bridge.bridge(
-                memory.latent, second, on, off, memory.thresholds, self.noise, start, following.middle
+                memory.latent,
+                second._replace(value=second.value - grown),
+                on,
+                off,
+                memory.thresholds,
+                self.noise,
+                start,
+                following.middle,
             )
-            net = joined.step_on * on - joined.step_off * off
+            net = joined.step_on * on - joined.step_off * off + grown
             unmeasured = memory.latent.variance >= bridge.UNMEASURED
-            joined = joined._replace(floor=bridge.floor_before(second, net, unmeasured))
+            joined = joined._replace(
+                bound=second, floor=bridge.floor_before(second, net, unmeasured), trail=trail
+            )
             joined, far_on, far_off = self._drifting(joined, memory, second, on, off)
-            return joined, BridgeMemory(second, learned, interval, on, off, far_on, far_off, memory.since)
+            return joined, BridgeMemory(
+                second, learned, interval, on, off, far_on, far_off, memory.since, at_middle, at_middle
+            )
+        scale = (
+            memory.followed.scale
+        )  # of what came before: what the segment holds is still to come when it is read
+        grown = self._trail_at(at_middle, following.middle, scale)
+        grown -= self._trail_at(memory.at_middle, shot.middle, scale)
         _, learned = bridge.bridge(
             memory.latent,
-            second,
+            second._replace(value=second.value - grown),
             on + memory.on,
             off + memory.off,
             memory.thresholds,
@@ -494,19 +543,56 @@ class BridgedFrames(_Common):
             shot.middle,
             following.middle,
         )
-        tail = self.counts(events, following.middle, following.end)
-        after = BridgeMemory(second, learned, interval, *tail, memory.far_on, memory.far_off, memory.since)
+        tail_on, tail_off, followed = self.follow(events, following.middle, following.end, at_middle)
+        after = memory._replace(
+            latent=second,
+            thresholds=learned,
+            interval=interval,
+            on=tail_on,
+            off=tail_off,
+            followed=followed,
+            at_middle=at_middle,
+        )
         forward = bridge.extend(
-            self._carried(memory),
+            self._carried(memory, shot),
             memory.thresholds,
             self.noise,
             start,
             following.end,
             memory.interval or self._FIRST_INTERVAL,
-            self._carried(after),
+            self._carried(after, following),
         )
-        forward, far_on, far_off = self._drifting(forward, memory, second, on + tail[0], off + tail[1])
+        forward, far_on, far_off = self._drifting(forward, memory, second, on + tail_on, off + tail_off)
+        forward = forward._replace(trail=self._trail(memory.followed, start, scale))
         return forward, after._replace(far_on=far_on, far_off=far_off)
+
+    def follow(
+        self, events: Chunks, start: int, end: int, before: Followed
+    ) -> tuple[Floats, Floats, Followed]:
+        """`counts`, and what is known of the pixels' newest events at ``end`` (K14)."""
+        return follow(all_between(events, start, end), before, start, end)
+
+    def _trail(self, followed: Followed, start: int, scale: float) -> Trail:
+        """By how much events trail the light in the segment from ``start`` on (K14)."""
+        height = self.settings.events.trail
+        return Trail(
+            self._trail_at(followed, start, scale),
+            polarity_of(followed.newest),
+            scale,
+            height * self.on,
+            height * self.off,
+        )
+
+    def _lead_in_trail(self, shot: Shot, followed: Followed) -> Trail:
+        """The same before the middle of the first exposure, where the frame keeps its level."""
+        if shot.trail is not None:
+            return given_trail(shot.trail.after, shot.trail.after)
+        trail = self._trail(followed, shot.middle, followed.scale)
+        return trail._replace(polarity=np.zeros(self.shape, np.int8))
+
+    def _trail_at(self, followed: Followed, t: int, scale: float) -> NDArray[np.float32]:
+        height = self.settings.events.trail
+        return trail_at(followed.newest, t, (scale, height * self.on, height * self.off))
 
     def _drifting(
         self, segment: BridgedSegment, memory: BridgeMemory, second: Latent, on: Floats, off: Floats
@@ -524,9 +610,12 @@ class BridgedFrames(_Common):
         )
         return segment, far_on, far_off
 
-    def _carried(self, memory: BridgeMemory) -> Latent:
-        """The latest frame from the middle to the end of its exposure, with the events between (10)."""
+    def _carried(self, memory: BridgeMemory, shot: Shot) -> Latent:
+        """The latest frame, ``shot``, from the middle to the end of its exposure, with the events between (10)."""
         step = self.on * memory.thresholds.on * memory.on - self.off * memory.thresholds.off * memory.off
+        scale = memory.followed.scale
+        step += self._trail_at(memory.followed, shot.end, scale)
+        step -= self._trail_at(memory.at_middle, shot.middle, scale)
         return Latent(
             memory.latent.value + step,
             memory.latent.variance + self.noise.step_variance * (memory.on + memory.off),
@@ -549,6 +638,9 @@ class BridgedFrames(_Common):
 
     def moving(self, segment: Any, cursor: akf.BridgedCursor) -> NDArray[np.bool_]:
         return akf.moving_bridged(segment, cursor)
+
+    def trail(self, segment: Any, cursor: akf.BridgedCursor, t: int) -> NDArray[np.float32] | None:
+        return akf.trail_bridged(segment, cursor, t)
 
 
 def _still_since(memory: BridgeMemory, start: int, seconds: float) -> int:
