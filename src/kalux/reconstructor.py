@@ -15,14 +15,16 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.augmentation.highlights import Unshown
 from kalux.errors import InputError, SettingsError
 from kalux.events import as_events, check_events
 from kalux.filters.akf import State
 from kalux.filters.buffer import EventBuffer
+from kalux.filters.highlights import event_noise, lift_to_expected, lift_to_mean
 from kalux.filters.methods import Method, Segment, Shot, make_method, take_shot
 from kalux.filters.readout import HighlightPrior, intensity, regularised, total_variance
 from kalux.frames import Frame, check_frame
-from kalux.models.camera import Camera, count_bright
+from kalux.models.camera import Camera, beyond_white, count_bright
 from kalux.models.colour import (
     Gains,
     calm_highlights,
@@ -101,6 +103,8 @@ class Estimate:
         0 at a frame, 1 half-way between two, and where the next one is not known or not used.
     chroma
         Of frames in RGB: float32 (H, W, 3), the ratios of the channels to the luminance; else None.
+    unshown
+        Pixels that no frame has measured until then, of which L is a bound; None: there are none.
     """
 
     t: int
@@ -111,6 +115,7 @@ class Estimate:
     moving: NDArray[np.bool_] | None = None
     between: float = 0.0
     chroma: NDArray[np.float32] | None = None
+    unshown: Unshown | None = None
 
 
 class _Progress:
@@ -382,6 +387,7 @@ class Reconstructor:
             self._method.moving(progress.segment, progress.cursor),
             _between(progress, t) if self.lookahead else 1.0,
             self._chroma(progress, t),
+            self._unshown(progress),
         )
 
     def image(self, estimate: Estimate) -> Image:
@@ -391,23 +397,33 @@ class Reconstructor:
         scale = filtered.highlight_scale if filtered.kind == "akf" else 0.0
         spread = events.threshold_spread
         if self._estimated:
-            tail = filtered.bright_tail or self._tail
-            assert tail is not None
-            scale, spread = min(scale, filtered.highlight_tail * tail), events.extrapolation_spread
+            scale, spread = (
+                min(scale, filtered.highlight_tail * self._tail_beyond),
+                events.extrapolation_spread,
+            )
         prior = HighlightPrior(
             white=estimate.white, scale2=scale**2, stretch=spread**2 / scale if scale > 0 else 0.0
         )
         moving, neighbours = estimate.moving, self.settings.filter.neighbours
         on, off = self.thresholds
-        variance = total_variance(estimate.variance, moving, estimate.between, on * off)
-        log_intensity = estimate.log_intensity
+        log_intensity, variance = estimate.log_intensity, estimate.variance
+        unshown = estimate.unshown
+        if unshown is not None:
+            log_intensity, variance = log_intensity.copy(), variance.copy()
+            noise = event_noise(variance, unshown, filtered.initial_variance)
+            lift_to_expected(log_intensity, variance, unshown, noise)
+        variance = total_variance(variance, moving, estimate.between, on * off)
         if moving is not None and neighbours > 0:
             mosaic = self._last_frame is not None and self._last_frame.mosaic is not None
             pitch = 2 if mosaic else 1  # neighbours of the same colour
             log_intensity = regularised(log_intensity, variance, moving, neighbours, pitch)
+        doubt = variance
+        if unshown is not None:
+            doubt = variance.copy()
+            lift_to_mean(log_intensity, doubt, estimate.log_intensity, unshown, noise)
         image = Image(
             t=estimate.t,
-            intensity=intensity(log_intensity, variance, self.settings.camera.offset, prior),
+            intensity=intensity(log_intensity, doubt, self.settings.camera.offset, prior),
             variance=variance,
             log_offset=self.settings.camera.offset,
             final=estimate.final,
@@ -417,6 +433,20 @@ class Reconstructor:
             if self._colours == "grey"
             else dataclasses.replace(image, colour=self._coloured(image, estimate))
         )
+
+    def _unshown(self, progress: _Progress) -> Unshown | None:
+        """Pixels that no frame has measured yet (K13), where highlights are looked at."""
+        filtered = self.settings.filter
+        if filtered.highlight_scale == 0 or filtered.unshown_tail == 0:
+            return None
+        return self._method.unshown(progress.segment, filtered.unshown_tail * self._tail_beyond)
+
+    @property
+    def _tail_beyond(self) -> float:
+        """How far the frames' bright tail goes on beyond white."""
+        tail = self.settings.filter.bright_tail or self._tail
+        assert tail is not None
+        return beyond_white(tail)
 
     @property
     def _colours(self) -> str:

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from kalux.errors import OutputError
 from kalux.events import EVENT_DTYPE, EventArray
+from kalux.filters.highlights import only_bounded, smoothed_unshown
 from kalux.frames import Frame, Mosaic
 from kalux.reconstructor import Estimate, Reconstructor
 from kalux.recording import Recording
@@ -238,15 +239,22 @@ def combine(forward: Estimate, backward: Estimate | None) -> Estimate:
     if backward is None:
         return forward
     first, second = 1.0 / forward.variance, 1.0 / backward.variance
+    level = (first * forward.log_intensity + second * backward.log_intensity) / (first + second)
+    # Where one of the two knows only a bound, it is one, and the other counts (docs/equations.md, K13).
+    higher = np.maximum(forward.log_intensity, backward.log_intensity)
+    for own, other in ((forward, backward), (backward, forward)):
+        bounded = only_bounded(own.unshown, other.unshown)
+        level.reshape(-1)[bounded] = higher.reshape(-1)[bounded]
     return Estimate(
         t=forward.t,
-        log_intensity=(first * forward.log_intensity + second * backward.log_intensity) / (first + second),
+        log_intensity=level,
         variance=np.minimum(forward.variance, backward.variance),
         white=forward.white,
         final=forward.final,
         moving=_either(forward.moving, backward.moving),
         between=forward.between,
         chroma=forward.chroma,
+        unshown=smoothed_unshown(forward.unshown, backward.unshown),
     )
 
 

@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation import bridge, deblur, interpolation
-from kalux.augmentation.bridge import BridgedSegment, BridgeNoise, Latent, Thresholds
+from kalux.augmentation.bridge import BridgedSegment, BridgeNoise, Latent, Thresholds, UnshownMemory
 from kalux.augmentation.deblur import ExposureIntegrals, all_between, count_chunks, mean_level
+from kalux.augmentation.highlights import Unshown, begin_unshown, expected_excess, follow_unshown
 from kalux.compiled import AHEAD, logarithm, prefetch
 from kalux.errors import SettingsError
 from kalux.events import EventArray
@@ -271,6 +272,9 @@ class Method(Protocol):
     def moving(self, segment: Any, cursor: Any) -> NDArray[np.bool_] | None:
         """(H, W): pixels with an event in this frame interval or the one before; None: the method does not tell."""
 
+    def unshown(self, segment: Any, prior: float) -> Unshown | None:
+        """Pixels that no frame has measured until then (K13); None: there are none, or the method does not tell."""
+
 
 def make_method(
     settings: Settings,
@@ -299,6 +303,9 @@ class _Common:
         self.offset = settings.camera.offset
 
     def moving(self, segment: Any, cursor: Any) -> NDArray[np.bool_] | None:
+        return None
+
+    def unshown(self, segment: Any, prior: float) -> Unshown | None:
         return None
 
     def log_frame(self, shot: Shot) -> Array:
@@ -331,7 +338,7 @@ class BridgeMemory(NamedTuple):
 
     In causal mode also the counts of events between the middle and the end of the latest exposure. Of pixels that the
     latest frames did not measure, the counts since one did (to the latest node); 0 elsewhere. ``since`` is the start of
-    the first exposure, us.
+    the first exposure, us. ``unshown`` is of the pixels that no frame has measured yet.
     """
 
     latent: Latent
@@ -342,6 +349,7 @@ class BridgeMemory(NamedTuple):
     far_on: Floats
     far_off: Floats
     since: int
+    unshown: UnshownMemory
 
 
 class BridgedFrames(_Common):
@@ -442,16 +450,20 @@ class BridgedFrames(_Common):
         far = np.zeros(self.shape, np.float32)
         if self.lookahead:
             on, off = self.counts(events, begin, shot.middle)
-            memory = BridgeMemory(latent, thresholds, 0.0, on, off, far, far, shot.start)
+            memory = BridgeMemory(
+                latent, thresholds, 0.0, on, off, far, far, shot.start, begin_unshown(latent)
+            )
             value, variance = latent.value, latent.variance
             if shot.middle > begin:
                 lead_in = bridge.extend_backward(latent, on, off, thresholds, self.noise, begin, shot.middle)
-                lead_in = lead_in._replace(still_since=shot.start)
+                lead_in = lead_in._replace(still_since=shot.start, unshown=memory.unshown)
                 value = lead_in.augmented
                 variance = lead_in.backward_variance + lead_in.step_variance * lead_in.events
         else:
             on, off = self.counts(events, shot.middle, shot.end)
-            memory = BridgeMemory(latent, thresholds, 0.0, on, off, far, far, shot.start)
+            memory = BridgeMemory(
+                latent, thresholds, 0.0, on, off, far, far, shot.start, begin_unshown(latent)
+            )
             carried = self._carried(memory)
             value, variance = carried.value, carried.variance
         unmeasured = variance >= bridge.UNMEASURED
@@ -470,7 +482,8 @@ class BridgedFrames(_Common):
             if not self.lookahead:
                 latent = self._carried(memory)
             alone = bridge.extend(latent, memory.thresholds, self.noise, start, FAR_FUTURE, seconds, None)
-            return alone._replace(still_since=_still_since(memory, start, seconds)), memory
+            alone = alone._replace(still_since=_still_since(memory, start, seconds), unshown=memory.unshown)
+            return alone, memory
         interval = (following.middle - shot.middle) * 1e-6
         second = self.latent(following, events, memory.thresholds)
         on, off = self.counts(events, start, following.middle)
@@ -482,8 +495,10 @@ class BridgedFrames(_Common):
             unmeasured = memory.latent.variance >= bridge.UNMEASURED
             joined = joined._replace(floor=bridge.floor_before(second, net, unmeasured))
             joined, far_on, far_off = self._drifting(joined, memory, second, on, off)
-            return joined, BridgeMemory(second, learned, interval, on, off, far_on, far_off, memory.since)
-        _, learned = bridge.bridge(
+            unshown = follow_unshown(memory.unshown, second, net)
+            after = BridgeMemory(second, learned, interval, on, off, far_on, far_off, memory.since, unshown)
+            return joined._replace(unshown=unshown), after
+        behind, learned = bridge.bridge(
             memory.latent,
             second,
             on + memory.on,
@@ -494,7 +509,11 @@ class BridgedFrames(_Common):
             following.middle,
         )
         tail = self.counts(events, following.middle, following.end)
-        after = BridgeMemory(second, learned, interval, *tail, memory.far_on, memory.far_off, memory.since)
+        net = behind.step_on * (on + memory.on) - behind.step_off * (off + memory.off)
+        unshown = follow_unshown(memory.unshown, second, net)
+        after = BridgeMemory(
+            second, learned, interval, *tail, memory.far_on, memory.far_off, memory.since, unshown
+        )
         forward = bridge.extend(
             self._carried(memory),
             memory.thresholds,
@@ -505,6 +524,7 @@ class BridgedFrames(_Common):
             self._carried(after),
         )
         forward, far_on, far_off = self._drifting(forward, memory, second, on + tail[0], off + tail[1])
+        forward = forward._replace(unshown=memory.unshown)
         return forward, after._replace(far_on=far_on, far_off=far_off)
 
     def _drifting(
@@ -548,6 +568,9 @@ class BridgedFrames(_Common):
 
     def moving(self, segment: Any, cursor: akf.BridgedCursor) -> NDArray[np.bool_]:
         return akf.moving_bridged(segment, cursor)
+
+    def unshown(self, segment: BridgedSegment, prior: float) -> Unshown | None:
+        return None if segment.unshown is None else expected_excess(segment.unshown, prior)
 
 
 def _still_since(memory: BridgeMemory, start: int, seconds: float) -> int:
