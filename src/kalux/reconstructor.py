@@ -20,7 +20,7 @@ from kalux.errors import InputError, SettingsError
 from kalux.events import as_events, check_events
 from kalux.filters.akf import State
 from kalux.filters.buffer import EventBuffer
-from kalux.filters.highlights import event_noise, lift_to_expected, lift_to_mean
+from kalux.filters.highlights import lift_to_expected, lift_to_mean
 from kalux.filters.methods import Method, Segment, Shot, make_method, take_shot
 from kalux.filters.readout import HighlightPrior, intensity, regularised, total_variance
 from kalux.frames import Frame, check_frame
@@ -387,7 +387,7 @@ class Reconstructor:
             self._method.moving(progress.segment, progress.cursor),
             _between(progress, t) if self.lookahead else 1.0,
             self._chroma(progress, t),
-            self._unshown(progress),
+            self._unshown(progress, variance),
         )
 
     def image(self, estimate: Estimate) -> Image:
@@ -410,8 +410,7 @@ class Reconstructor:
         unshown = estimate.unshown
         if unshown is not None:
             log_intensity, variance = log_intensity.copy(), variance.copy()
-            noise = event_noise(variance, unshown, filtered.initial_variance)
-            lift_to_expected(log_intensity, variance, unshown, noise)
+            lift_to_expected(log_intensity, variance, unshown)
         variance = total_variance(variance, moving, estimate.between, on * off)
         if moving is not None and neighbours > 0:
             mosaic = self._last_frame is not None and self._last_frame.mosaic is not None
@@ -420,7 +419,7 @@ class Reconstructor:
         doubt = variance
         if unshown is not None:
             doubt = variance.copy()
-            lift_to_mean(log_intensity, doubt, estimate.log_intensity, unshown, noise)
+            lift_to_mean(log_intensity, doubt, estimate.log_intensity, unshown)
         image = Image(
             t=estimate.t,
             intensity=intensity(log_intensity, doubt, self.settings.camera.offset, prior),
@@ -434,12 +433,12 @@ class Reconstructor:
             else dataclasses.replace(image, colour=self._coloured(image, estimate))
         )
 
-    def _unshown(self, progress: _Progress) -> Unshown | None:
+    def _unshown(self, progress: _Progress, variance: NDArray[np.floating[Any]]) -> Unshown | None:
         """Pixels that no frame has measured yet (K13), where highlights are looked at."""
         filtered = self.settings.filter
         if filtered.highlight_scale == 0 or filtered.unshown_tail == 0:
             return None
-        return self._method.unshown(progress.segment, filtered.unshown_tail * self._tail_beyond)
+        return self._method.unshown(progress.segment, variance, filtered.unshown_tail * self._tail_beyond)
 
     @property
     def _tail_beyond(self) -> float:

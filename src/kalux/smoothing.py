@@ -6,8 +6,9 @@ L' and P' of the backward one, the estimate is the two-filter smoother (Fraser a
 
     L_s = (L / P + L' / P') / (1 / P + 1 / P').
 
-Both have seen the frames around the image, so their variances are not independent where frames are well exposed;
-the smaller of the two is given out.
+Where one of them knows no more than a bound, it counts as one (docs/equations.md, K13). Both have seen the frames
+around the image, so their variances are not independent where frames are well exposed; the smaller of the two is given
+out.
 
 Memory is bounded: the recording is spilled to disk, where it can be read backward, and the backward pass is done
 twice, first to save its state before every window of images, then window by window for the images themselves.
@@ -26,7 +27,7 @@ from numpy.typing import NDArray
 
 from kalux.errors import OutputError
 from kalux.events import EVENT_DTYPE, EventArray
-from kalux.filters.highlights import only_bounded, smoothed_unshown
+from kalux.filters.highlights import obey_bounds, smoothed_unshown
 from kalux.frames import Frame, Mosaic
 from kalux.reconstructor import Estimate, Reconstructor
 from kalux.recording import Recording
@@ -240,11 +241,8 @@ def combine(forward: Estimate, backward: Estimate | None) -> Estimate:
         return forward
     first, second = 1.0 / forward.variance, 1.0 / backward.variance
     level = (first * forward.log_intensity + second * backward.log_intensity) / (first + second)
-    # Where one of the two knows only a bound, it is one, and the other counts (docs/equations.md, K13).
-    higher = np.maximum(forward.log_intensity, backward.log_intensity)
     for own, other in ((forward, backward), (backward, forward)):
-        bounded = only_bounded(own.unshown, other.unshown)
-        level.reshape(-1)[bounded] = higher.reshape(-1)[bounded]
+        obey_bounds(level, own.log_intensity, own.unshown, other.log_intensity, other.variance, other.unshown)
     return Estimate(
         t=forward.t,
         log_intensity=level,

@@ -37,10 +37,13 @@ class Unshown(NamedTuple):
     excess
         (N,) float32: how far above their bounds they are expected, log intensity; the mean, and the standard deviation
         too, of an exponential distribution.
+    noise
+        (N,) float32: variance of the bounds, that of the events.
     """
 
     pixels: NDArray[np.int64]
     excess: NDArray[np.float32]
+    noise: NDArray[np.float32]
 
 
 def begin_unshown(first: Latent) -> UnshownMemory:
@@ -79,10 +82,19 @@ def follow_unshown(memory: UnshownMemory, following: Latent, net: Floats) -> Uns
     )
 
 
-def expected_excess(memory: UnshownMemory, prior: float) -> Unshown | None:
+def expected_excess(
+    memory: UnshownMemory, variance: Floats, initial_variance: float, prior: float
+) -> Unshown | None:
     """How far pixels are expected above their bounds, from what others around have told; None: there are none.
 
-    ``prior`` is what is expected where none has told, log intensity.
+    Parameters
+    ----------
+    memory
+        Which pixels, and what has been told.
+    variance, initial_variance
+        (H, W) P, and what it began as: what has come to it is noise of the events.
+    prior
+        What is expected where no pixel has told, log intensity.
     """
     if len(memory.pixels) == 0:
         return None
@@ -95,7 +107,12 @@ def expected_excess(memory: UnshownMemory, prior: float) -> Unshown | None:
     below, beside = np.minimum(top + 1, mean.shape[0] - 1), np.minimum(left + 1, mean.shape[1] - 1)
     upper = mean[top, left] * (1 - right) + mean[top, beside] * right
     lower = mean[below, left] * (1 - right) + mean[below, beside] * right
-    return Unshown(memory.pixels, (upper * (1 - down) + lower * down).astype(np.float32))
+    noise = np.maximum(variance.reshape(-1)[memory.pixels] - initial_variance, 0.0)
+    return Unshown(
+        memory.pixels,
+        (upper * (1 - down) + lower * down).astype(np.float32),
+        noise.astype(np.float32, copy=False),
+    )
 
 
 def _nearness(parts: int) -> Floats:

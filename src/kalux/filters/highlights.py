@@ -11,38 +11,25 @@ from kalux.augmentation.highlights import Unshown
 
 Floats = NDArray[np.floating[Any]]
 
-_LEAST_SPREAD: Final = 0.3
+_LEAST_SPREAD: Final = np.float32(0.3)
 """Standard deviation that is left where pixels around say that all lie just above their bounds."""
 
 
-def event_noise(variance: Floats, unshown: Unshown, initial_variance: float) -> Floats:
-    """(N,) what events have added to P, (H, W), which began as ``initial_variance``."""
-    added: Floats = variance.reshape(-1)[unshown.pixels] - np.float32(initial_variance)
-    return np.maximum(added, np.float32(0.0))
-
-
-def lift_to_expected(log_intensity: Floats, variance: Floats, unshown: Unshown, noise: Floats) -> None:
-    """From its bound, (H, W), to where a pixel is expected, with the variance of that. In place.
-
-    ``noise`` is that of `event_noise`.
-    """
+def lift_to_expected(log_intensity: Floats, variance: Floats, unshown: Unshown) -> None:
+    """From its bound, (H, W), to where a pixel is expected, with the variance of that. In place."""
     log_intensity.reshape(-1)[unshown.pixels] += unshown.excess
-    spread = np.maximum(unshown.excess, np.float32(_LEAST_SPREAD))
-    variance.reshape(-1)[unshown.pixels] = spread**2 + noise
+    variance.reshape(-1)[unshown.pixels] = np.maximum(unshown.excess, _LEAST_SPREAD) ** 2 + unshown.noise
 
 
-def lift_to_mean(
-    log_intensity: Floats, variance: Floats, bound: Floats, unshown: Unshown, noise: Floats
-) -> None:
+def lift_to_mean(log_intensity: Floats, variance: Floats, bound: Floats, unshown: Unshown) -> None:
     """From there, after neighbours were heard (K12), to the log of the *mean* intensity: half the variance more.
 
-    The bound, (H, W), still holds. The variance that is left is that of the events, by which the prior on highlights
-    (K6) is to doubt them. In place.
+    The bound, (H, W), still holds. The variance becomes that of the events, by which the prior on highlights (K6) is to
+    doubt what they say. In place.
     """
-    level, bounds = log_intensity.reshape(-1), bound.reshape(-1)
-    pixels = unshown.pixels
-    level[pixels] = np.maximum(level[pixels], bounds[pixels]) + unshown.excess**2 / 2
-    variance.reshape(-1)[pixels] = noise
+    level, pixels = log_intensity.reshape(-1), unshown.pixels
+    level[pixels] = np.maximum(level[pixels], bound.reshape(-1)[pixels]) + unshown.excess**2 / 2
+    variance.reshape(-1)[pixels] = unshown.noise
 
 
 def smoothed_unshown(forward: Unshown | None, backward: Unshown | None) -> Unshown | None:
@@ -52,11 +39,29 @@ def smoothed_unshown(forward: Unshown | None, backward: Unshown | None) -> Unsho
     pixels, first, second = np.intersect1d(
         forward.pixels, backward.pixels, assume_unique=True, return_indices=True
     )
-    return Unshown(pixels, (forward.excess[first] + backward.excess[second]) / 2)
+    excess = (forward.excess[first] + backward.excess[second]) / np.float32(2.0)
+    return Unshown(pixels, excess, np.minimum(forward.noise[first], backward.noise[second]))
 
 
-def only_bounded(unshown: Unshown | None, other: Unshown | None) -> NDArray[np.int64]:
-    """Places of pixels of which one direction knows no more than a bound, and the other more."""
+def obey_bounds(
+    smoothed: Floats,
+    bound: Floats,
+    unshown: Unshown | None,
+    level: Floats,
+    variance: Floats,
+    other: Unshown | None,
+) -> None:
+    """Smoothed L, (H, W), where one direction knows no more than a ``bound``: that of the other direction. In place.
+
+    ``level`` and ``variance`` are the other direction's, ``other`` the pixels of which that knows no more either. Where
+    its level is below the bound, both are wrong, each in proportion to its variance.
+    """
     if unshown is None:
-        return np.empty(0, np.int64)
-    return unshown.pixels if other is None else np.setdiff1d(unshown.pixels, other.pixels, assume_unique=True)
+        return
+    only = np.ones(len(unshown.pixels), np.bool_)
+    if other is not None:
+        only = np.isin(unshown.pixels, other.pixels, assume_unique=True, invert=True)
+    pixels = unshown.pixels[only]
+    known, doubt = level.reshape(-1)[pixels], variance.reshape(-1)[pixels]
+    short = np.maximum(bound.reshape(-1)[pixels] - known, np.float32(0.0))
+    smoothed.reshape(-1)[pixels] = known + short * doubt / (doubt + unshown.noise[only])

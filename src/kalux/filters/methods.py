@@ -272,8 +272,11 @@ class Method(Protocol):
     def moving(self, segment: Any, cursor: Any) -> NDArray[np.bool_] | None:
         """(H, W): pixels with an event in this frame interval or the one before; None: the method does not tell."""
 
-    def unshown(self, segment: Any, prior: float) -> Unshown | None:
-        """Pixels that no frame has measured until then (K13); None: there are none, or the method does not tell."""
+    def unshown(self, segment: Any, variance: Floats, prior: float) -> Unshown | None:
+        """Pixels that no frame has measured until then (K13), given P there; None: the method knows none.
+
+        ``prior`` is how far above their bounds they are expected where none around has told.
+        """
 
 
 def make_method(
@@ -305,7 +308,7 @@ class _Common:
     def moving(self, segment: Any, cursor: Any) -> NDArray[np.bool_] | None:
         return None
 
-    def unshown(self, segment: Any, prior: float) -> Unshown | None:
+    def unshown(self, segment: Any, variance: Floats, prior: float) -> Unshown | None:
         return None
 
     def log_frame(self, shot: Shot) -> Array:
@@ -569,8 +572,10 @@ class BridgedFrames(_Common):
     def moving(self, segment: Any, cursor: akf.BridgedCursor) -> NDArray[np.bool_]:
         return akf.moving_bridged(segment, cursor)
 
-    def unshown(self, segment: BridgedSegment, prior: float) -> Unshown | None:
-        return None if segment.unshown is None else expected_excess(segment.unshown, prior)
+    def unshown(self, segment: BridgedSegment, variance: Floats, prior: float) -> Unshown | None:
+        if segment.unshown is None:
+            return None
+        return expected_excess(segment.unshown, variance, self.settings.filter.initial_variance, prior)
 
 
 def _still_since(memory: BridgeMemory, start: int, seconds: float) -> int:
