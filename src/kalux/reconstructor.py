@@ -20,7 +20,7 @@ from kalux.errors import InputError, SettingsError
 from kalux.events import as_events, check_events
 from kalux.filters.akf import State
 from kalux.filters.buffer import EventBuffer
-from kalux.filters.highlights import lift_to_expected, lift_to_mean
+from kalux.filters.highlights import lift_to_expected, mean_level
 from kalux.filters.methods import Method, Segment, Shot, make_method, take_shot
 from kalux.filters.readout import HighlightPrior, intensity, regularised, total_variance
 from kalux.frames import Frame, check_frame
@@ -406,25 +406,26 @@ class Reconstructor:
         )
         moving, neighbours = estimate.moving, self.settings.filter.neighbours
         on, off = self.thresholds
-        log_intensity, variance = estimate.log_intensity, estimate.variance
-        unshown = estimate.unshown
+        variance = total_variance(estimate.variance, moving, estimate.between, on * off)
+        log_intensity, unshown = estimate.log_intensity, estimate.unshown
         if unshown is not None:
-            log_intensity, variance = log_intensity.copy(), variance.copy()
+            log_intensity = log_intensity.copy()
             lift_to_expected(log_intensity, variance, unshown)
-        variance = total_variance(variance, moving, estimate.between, on * off)
         if moving is not None and neighbours > 0:
             mosaic = self._last_frame is not None and self._last_frame.mosaic is not None
             pitch = 2 if mosaic else 1  # neighbours of the same colour
             log_intensity = regularised(log_intensity, variance, moving, neighbours, pitch)
-        doubt = variance
+        offset = self.settings.camera.offset
+        linear = intensity(log_intensity, variance, offset, prior)
         if unshown is not None:
-            doubt = variance.copy()
-            lift_to_mean(log_intensity, doubt, estimate.log_intensity, unshown)
+            # The prior on highlights (K6) is to doubt what events say of these pixels, not that they are bright.
+            level = mean_level(log_intensity, estimate.log_intensity, unshown)
+            linear.reshape(-1)[unshown.pixels] = intensity(level, unshown.noise, offset, prior)
         image = Image(
             t=estimate.t,
-            intensity=intensity(log_intensity, doubt, self.settings.camera.offset, prior),
+            intensity=linear,
             variance=variance,
-            log_offset=self.settings.camera.offset,
+            log_offset=offset,
             final=estimate.final,
         )
         return (

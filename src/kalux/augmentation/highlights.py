@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from typing import Any, Final, NamedTuple
 
+import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
@@ -101,18 +102,36 @@ def expected_excess(
     rows, columns = (_nearness(n) for n in memory.told.shape)
     told, tellers = (rows @ values @ columns for values in (memory.told, memory.tellers))
     mean = np.maximum((told + _PRIOR_PIXELS * prior) / (tellers + _PRIOR_PIXELS), 0.0)
-    place = np.divmod(memory.pixels, memory.shape[1])
-    # Linear between the middles of the parts.
-    (top, down), (left, right) = (_between(p, n) for p, n in zip(place, mean.shape, strict=True))
-    below, beside = np.minimum(top + 1, mean.shape[0] - 1), np.minimum(left + 1, mean.shape[1] - 1)
-    upper = mean[top, left] * (1 - right) + mean[top, beside] * right
-    lower = mean[below, left] * (1 - right) + mean[below, beside] * right
-    noise = np.maximum(variance.reshape(-1)[memory.pixels] - initial_variance, 0.0)
-    return Unshown(
+    excess, noise = np.empty((2, len(memory.pixels)), np.float32)
+    flat = variance.reshape(-1)
+    _at_pixels(
         memory.pixels,
-        (upper * (1 - down) + lower * down).astype(np.float32),
-        noise.astype(np.float32, copy=False),
+        memory.shape[1],
+        mean.astype(np.float32),
+        flat,
+        np.float32(initial_variance),
+        excess,
+        noise,
     )
+    return Unshown(memory.pixels, excess, noise)
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _at_pixels(pixels, width, mean, variance, initial_variance, excess, noise):  # type: ignore[no-untyped-def]
+    """The ``mean`` of the parts, linear between their middles, and what has come to the variance."""
+    one, zero = np.float32(1.0), np.float32(0.0)
+    last_row, last_column = mean.shape[0] - 1, mean.shape[1] - 1
+    for i in range(len(pixels)):
+        row, column = divmod(pixels[i], width)
+        y = max((np.float32(row) + np.float32(0.5)) / np.float32(_PART) - np.float32(0.5), zero)
+        x = max((np.float32(column) + np.float32(0.5)) / np.float32(_PART) - np.float32(0.5), zero)
+        top, left = min(int(y), last_row), min(int(x), last_column)
+        below, beside = min(top + 1, last_row), min(left + 1, last_column)
+        down, right = y - np.float32(top), x - np.float32(left)
+        upper = mean[top, left] * (one - right) + mean[top, beside] * right
+        lower = mean[below, left] * (one - right) + mean[below, beside] * right
+        excess[i] = upper * (one - down) + lower * down
+        noise[i] = max(np.float32(variance[pixels[i]]) - initial_variance, zero)
 
 
 def _nearness(parts: int) -> Floats:
@@ -120,10 +139,3 @@ def _nearness(parts: int) -> Floats:
     distance = _PART * np.subtract.outer(np.arange(parts), np.arange(parts))
     nearness: Floats = np.exp(-0.5 * (distance / _RANGE) ** 2)
     return nearness
-
-
-def _between(place: NDArray[np.int64], parts: int) -> tuple[NDArray[np.int64], Floats]:
-    """The part whose middle comes before a place, and the share of the way from there to the next one's."""
-    position = np.clip((place + 0.5) / _PART - 0.5, 0.0, parts - 1.0)
-    before = position.astype(np.int64)
-    return before, position - before

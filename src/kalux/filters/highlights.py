@@ -21,15 +21,20 @@ def lift_to_expected(log_intensity: Floats, variance: Floats, unshown: Unshown) 
     variance.reshape(-1)[unshown.pixels] = np.maximum(unshown.excess, _LEAST_SPREAD) ** 2 + unshown.noise
 
 
-def lift_to_mean(log_intensity: Floats, variance: Floats, bound: Floats, unshown: Unshown) -> None:
-    """From there, after neighbours were heard (K12), to the log of the *mean* intensity: half the variance more.
+def mean_level(log_intensity: Floats, bound: Floats, unshown: Unshown) -> Floats:
+    """(N,) log of the *mean* intensity of these pixels: half the variance more than the mean of the log.
 
-    The bound, (H, W), still holds. The variance becomes that of the events, by which the prior on highlights (K6) is to
-    doubt what they say. In place.
+    Parameters
+    ----------
+    log_intensity
+        (H, W) L of `lift_to_expected`, after neighbours were heard (K12).
+    bound
+        (H, W) as before: it still holds.
     """
-    level, pixels = log_intensity.reshape(-1), unshown.pixels
-    level[pixels] = np.maximum(level[pixels], bound.reshape(-1)[pixels]) + unshown.excess**2 / 2
-    variance.reshape(-1)[pixels] = unshown.noise
+    pixels = unshown.pixels
+    level = np.maximum(log_intensity.reshape(-1)[pixels], bound.reshape(-1)[pixels])
+    mean: Floats = level + unshown.excess**2 / np.float32(2.0)
+    return mean
 
 
 def smoothed_unshown(forward: Unshown | None, backward: Unshown | None) -> Unshown | None:
