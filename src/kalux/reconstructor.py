@@ -20,7 +20,7 @@ from kalux.errors import InputError, SettingsError
 from kalux.events import as_events, check_events
 from kalux.filters.akf import State
 from kalux.filters.buffer import EventBuffer
-from kalux.filters.highlights import lift_to_expected, mean_level
+from kalux.filters.highlights import lifted, read_unshown
 from kalux.filters.methods import Method, Segment, Shot, make_method, take_shot
 from kalux.filters.readout import HighlightPrior, intensity, regularised, total_variance
 from kalux.frames import Frame, check_frame
@@ -406,21 +406,20 @@ class Reconstructor:
         )
         moving, neighbours = estimate.moving, self.settings.filter.neighbours
         on, off = self.thresholds
-        variance = total_variance(estimate.variance, moving, estimate.between, on * off)
-        log_intensity, unshown = estimate.log_intensity, estimate.unshown
+        log_intensity, variance, unshown = estimate.log_intensity, estimate.variance, estimate.unshown
         if unshown is not None:
-            log_intensity = log_intensity.copy()
-            lift_to_expected(log_intensity, variance, unshown)
+            log_intensity, variance = lifted(log_intensity, variance, unshown)
+        level = log_intensity
+        variance = total_variance(variance, moving, estimate.between, on * off)
+        mosaic = self._last_frame is not None and self._last_frame.mosaic is not None
+        pitch = 2 if mosaic else 1  # neighbours of the same colour
         if moving is not None and neighbours > 0:
-            mosaic = self._last_frame is not None and self._last_frame.mosaic is not None
-            pitch = 2 if mosaic else 1  # neighbours of the same colour
             log_intensity = regularised(log_intensity, variance, moving, neighbours, pitch)
         offset = self.settings.camera.offset
         linear = intensity(log_intensity, variance, offset, prior)
         if unshown is not None:
-            # The prior on highlights (K6) is to doubt what events say of these pixels, not that they are bright.
-            level = mean_level(log_intensity, estimate.log_intensity, unshown)
-            linear.reshape(-1)[unshown.pixels] = intensity(level, unshown.noise, offset, prior)
+            bound = estimate.log_intensity
+            read_unshown(linear, level, variance, bound, unshown, moving, offset, prior, neighbours, pitch)
         image = Image(
             t=estimate.t,
             intensity=linear,
@@ -435,7 +434,7 @@ class Reconstructor:
         )
 
     def _unshown(self, progress: _Progress, variance: NDArray[np.floating[Any]]) -> Unshown | None:
-        """Pixels that no frame has measured yet (K13), where highlights are looked at."""
+        """Pixels that no frame has measured yet (K15), where highlights are looked at."""
         filtered = self.settings.filter
         if filtered.highlight_scale == 0 or filtered.unshown_tail == 0:
             return None

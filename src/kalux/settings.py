@@ -164,7 +164,7 @@ class FilterSettings:
         not go far beyond white. 3 (docs/tuning.md).
     unshown_tail
         How far above their bounds pixels are taken to lie that every frame so far has clipped, where none around has
-        told (docs/equations.md, K13): a multiple of the same. 0 leaves them at their bounds. 0.5 (docs/tuning.md).
+        told (docs/equations.md, K15): a multiple of the same. 0 leaves them at their bounds. 0.5 (docs/tuning.md).
     bright_tail
         That scale; None: from the recording's frames, in a live stream from the first.
     neighbours

@@ -6,7 +6,7 @@ L' and P' of the backward one, the estimate is the two-filter smoother (Fraser a
 
     L_s = (L / P + L' / P') / (1 / P + 1 / P').
 
-Where one of them knows no more than a bound, it counts as one (docs/equations.md, K13). Both have seen the frames
+Where one of them knows no more than a bound, it counts as one (docs/equations.md, K15). Both have seen the frames
 around the image, so their variances are not independent where frames are well exposed; the smaller of the two is given
 out.
 

@@ -46,7 +46,7 @@ class Latent(NamedTuple):
 
 
 class UnshownMemory(NamedTuple):
-    """At a node: pixels that no frame has measured yet, and what others have told since (K13).
+    """At a node: pixels that no frame has measured yet, and what others have told since (K15).
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Highlights that no frame has shown yet: clipped in every frame since the start (docs/equations.md, K13).
+"""Highlights that no frame has shown yet: clipped in every frame since the start (docs/equations.md, K15).
 
 Of such a pixel the frames and its events give a bound. How far above its bound it is, pixels tell that were like it and
 have left saturation: where a frame first measures one, its distance from its bound is known. It is learned as the

@@ -1,13 +1,16 @@
-"""Read-out of highlights that no frame has shown yet (docs/equations.md, K13)."""
+"""Read-out of highlights that no frame has shown yet (docs/equations.md, K15)."""
 
 from __future__ import annotations
 
 from typing import Any, Final
 
+import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.highlights import Unshown
+from kalux.compiled import ONE, exponential
+from kalux.filters.readout import HighlightPrior, believed_highlight, neighbour_weight
 
 Floats = NDArray[np.floating[Any]]
 
@@ -15,26 +18,83 @@ _LEAST_SPREAD: Final = np.float32(0.3)
 """Standard deviation that is left where pixels around say that all lie just above their bounds."""
 
 
-def lift_to_expected(log_intensity: Floats, variance: Floats, unshown: Unshown) -> None:
-    """From its bound, (H, W), to where a pixel is expected, with the variance of that. In place."""
-    log_intensity.reshape(-1)[unshown.pixels] += unshown.excess
-    variance.reshape(-1)[unshown.pixels] = np.maximum(unshown.excess, _LEAST_SPREAD) ** 2 + unshown.noise
+def lifted(log_intensity: Floats, variance: Floats, unshown: Unshown) -> tuple[Floats, Floats]:
+    """L and P, (H, W), with pixels where they are expected above their bounds, and the variance of that."""
+    level, spread = log_intensity.copy(), variance.copy()
+    level.reshape(-1)[unshown.pixels] += unshown.excess
+    spread.reshape(-1)[unshown.pixels] = np.maximum(unshown.excess, _LEAST_SPREAD) ** 2 + unshown.noise
+    return level, spread
 
 
-def mean_level(log_intensity: Floats, bound: Floats, unshown: Unshown) -> Floats:
-    """(N,) log of the *mean* intensity of these pixels: half the variance more than the mean of the log.
+def read_unshown(
+    image: NDArray[np.float32],
+    level: Floats,
+    variance: NDArray[np.float32],
+    bound: Floats,
+    unshown: Unshown,
+    moving: NDArray[np.bool_] | None,
+    log_offset: float,
+    prior: HighlightPrior,
+    difference: float,
+    pitch: int,
+) -> None:
+    """Pixels that no frame has shown are given the mean of their intensity. In place.
 
     Parameters
     ----------
-    log_intensity
-        (H, W) L of `lift_to_expected`, after neighbours were heard (K12).
+    image
+        (H, W) I.
+    level, variance
+        (H, W) L of `lifted`, and its variance (K11).
     bound
-        (H, W) as before: it still holds.
+        (H, W) L: what neighbours say of a pixel (K12) does not take it below.
+    moving, difference, pitch
+        Of K12, as in `kalux.filters.readout`.
+    log_offset, prior
+        I_0, and the prior on highlights (K6), which is to doubt what events say of them, not that they are bright.
     """
-    pixels = unshown.pixels
-    level = np.maximum(log_intensity.reshape(-1)[pixels], bound.reshape(-1)[pixels])
-    mean: Floats = level + unshown.excess**2 / np.float32(2.0)
-    return mean
+    if moving is None or difference == 0:
+        moving = np.zeros(image.shape, np.bool_)
+    mean = np.empty(len(unshown.pixels), np.float32)
+    difference2 = np.float32(difference * difference)
+    _hear_neighbours(unshown.pixels, level, variance, bound, moving, difference2, pitch, mean)
+    white, scale2, stretch = (np.float32(value) for value in prior)
+    _take_mean(unshown.excess, unshown.noise, np.float32(log_offset), white, scale2, stretch, mean)
+    image.reshape(-1)[unshown.pixels] = mean
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _hear_neighbours(pixels, level, variance, bound, moving, difference2, pitch, heard):  # type: ignore[no-untyped-def]
+    """K12 of single pixels: L, at least the bound."""
+    height, width = level.shape
+    for i in range(len(pixels)):
+        row, column = divmod(pixels[i], width)
+        own, doubt = np.float32(level[row, column]), np.float32(variance[row, column])
+        heard[i] = own
+        if not moving[row, column]:
+            continue
+        information, deviation = ONE / doubt, np.float32(0.0)
+        for down in range(-1, 2):
+            for right in range(-1, 2):
+                y, x = row + down * pitch, column + right * pitch
+                inside = 0 <= y < height and 0 <= x < width
+                if inside and (down != 0 or right != 0):
+                    excess = np.float32(level[y, x]) - own
+                    allowed = difference2 * np.float32(pitch * pitch * (down * down + right * right))
+                    weight = neighbour_weight(excess, doubt, np.float32(variance[y, x]), allowed)
+                    deviation += weight * excess
+                    information += weight
+        heard[i] = max(own + deviation / information, np.float32(bound[row, column]))
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _take_mean(excess, noise, log_offset, white, scale2, stretch, mean):  # type: ignore[no-untyped-def]
+    """From L to the mean of the intensity, in place, without branches, so that it becomes vector code."""
+    half, zero = np.float32(0.5), np.float32(0.0)
+    for i in range(len(mean)):
+        level = mean[i] + half * excess[i] * excess[i]
+        believed = white + believed_highlight(max(level - white, zero), noise[i], scale2, stretch)
+        mean[i] = max(exponential(believed if level > white else level) - log_offset, zero)
 
 
 def smoothed_unshown(forward: Unshown | None, backward: Unshown | None) -> Unshown | None:

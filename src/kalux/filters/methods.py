@@ -273,7 +273,7 @@ class Method(Protocol):
         """(H, W): pixels with an event in this frame interval or the one before; None: the method does not tell."""
 
     def unshown(self, segment: Any, variance: Floats, prior: float) -> Unshown | None:
-        """Pixels that no frame has measured until then (K13), given P there; None: the method knows none.
+        """Pixels that no frame has measured until then (K15), given P there; None: the method knows none.
 
         ``prior`` is how far above their bounds they are expected where none around has told.
         """
