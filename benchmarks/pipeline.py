@@ -33,7 +33,16 @@ OUTPUTS = {
     "exr": ("out", "--format", "exr"),
     "npy": ("out", "--format", "npy"),
 }
-GIVEN = ("--events.delay", "0", "--camera.log-offset", "0.05", "--events.step-variance", "0.2")
+GIVEN = (
+    "--events.delay",
+    "0",
+    "--camera.log-offset",
+    "0.05",
+    "--events.step-variance",
+    "0.2",
+    "--events.refractory-period",
+    "0",
+)
 
 
 def write_recording(path, size, rate, seconds):

@@ -25,6 +25,7 @@ import kalux
 from kalux.augmentation import deblur
 from kalux.augmentation.bridge import BridgeNoise, Latent, nominal_thresholds
 from kalux.augmentation.bridge import bridge as join
+from kalux.augmentation.refractory import EventClock
 from kalux.events import EVENT_DTYPE
 from kalux.filters import akf, complementary
 from kalux.filters.common import make_clock
@@ -92,7 +93,7 @@ def segment_of(size, events):
     ]
     thresholds = nominal_thresholds(size, 0.1, np.float32)
     noise = BridgeNoise(THRESHOLD, THRESHOLD, 0.2 * THRESHOLD**2, THRESHOLD**2 / 2)
-    on, off = deblur.count_chunks([events], size)
+    on, off = deblur.count_chunks([events], size, weighed=True)
     segment, _ = join(*frames, on, off, thresholds, noise, 0, int(events["t"][-1]) + 1)
     return segment, akf.State(frames[0].value, frames[0].variance, make_clock(size, 0))
 
@@ -118,7 +119,7 @@ def literal_state(segment, state):
 
 def loops(size, count, rounds):
     """Million events/s of each event loop."""
-    events = stream(size, count)
+    events = EventClock(size, 0).weighed(stream(size, count))
     few = events[:20_000]
     segment, state = segment_of(size, events)
     noise = akf.BridgedNoise(3.0, 0.2, THRESHOLD**2)

@@ -1,4 +1,4 @@
-"""The slow oracle: float64, one pixel at a time, the paper's equations (and docs/equations.md, K1 to K7) as written.
+"""The slow oracle: float64, one pixel at a time, the paper's equations (and docs/equations.md, K1 to K13) as written.
 
 Nothing here is incremental: L^A(t) is summed from the events anew at every t, integrals are taken by Gauss-Legendre
 quadrature where a closed form would repeat the code under test. Lookahead mode only; 8-bit frames. The paper's
@@ -23,7 +23,7 @@ UNMEASURED = 1e12
 
 @dataclass
 class Pixel:
-    """What one pixel sees. Events: time, polarity, newest event in the 3x3 pixels, newest of its own."""
+    """What one pixel sees. Events: time, polarity, newest event in the 3x3 pixels, newest of its own, weight (K13)."""
 
     starts: list[int]
     middles: list[int]
@@ -33,7 +33,7 @@ class Pixel:
     clipped: list[bool]
     weight: list[float]
     black: list[bool]
-    events: list[tuple[int, bool, int, int]]
+    events: list[tuple[int, bool, int, int, float]]
 
 
 def pixels(events, frames, sensor_size, settings, begin):
@@ -55,8 +55,16 @@ def pixels(events, frames, sensor_size, settings, begin):
                     q["t"] for q in earlier if abs(int(q["y"]) - row) <= 1 and abs(int(q["x"]) - column) <= 1
                 ]
                 same = [q["t"] for q in earlier if (q["y"], q["x"]) == (row, column)]
+                previous = [q["t"] for q in events[:i] if (q["y"], q["x"]) == (row, column)]
+                weight = event_weight(e["t"] - previous[-1], settings) if previous else 1.0
                 own.append(
-                    (int(e["t"]), bool(e["p"]), int(max(near, default=begin)), int(max(same, default=begin)))
+                    (
+                        int(e["t"]),
+                        bool(e["p"]),
+                        int(max(near, default=begin)),
+                        int(max(same, default=begin)),
+                        weight,
+                    )
                 )
             out[row, column] = Pixel(
                 [f.exposure_start for f in frames],
@@ -72,15 +80,23 @@ def pixels(events, frames, sensor_size, settings, begin):
     return out
 
 
+def event_weight(since, settings):
+    """K13: how many thresholds an event tells of that comes ``since`` us after the pixel's previous one."""
+    period = settings.events.refractory
+    if period == 0 or since <= 0.95 * period:
+        return 1.0
+    return 6.0 if since <= period else min(since / (since - period), 6.0)
+
+
 def event_sum(pixel, a, b, on, off):
     """int_a^b e(gamma) d gamma: the steps of the events with a < t <= b."""
-    return sum((on if p else -off) for t, p, _, _ in pixel.events if a < t <= b)
+    return sum(w * (on if p else -off) for t, p, _, _, w in pixel.events if a < t <= b)
 
 
 def edi(pixel, k, log_frame, on, off):
     """EDI: (L^D(start), largest L^D in the exposure), straight from B + I_0 = 1/T int exp(L(t)) dt."""
     s, e = pixel.starts[k], pixel.ends[k]
-    inside = [(t, on if p else -off) for t, p, *_ in pixel.events if s < t <= e]
+    inside = [(t, w * (on if p else -off)) for t, p, _, _, w in pixel.events if s < t <= e]
     edges = [s, *[t for t, _ in inside], e]
     levels = [0.0, *np.cumsum([step for _, step in inside])]  # after each event, also of several at one time
     mean = sum(np.exp(v) * (b - a) for v, a, b in zip(levels, edges[:-1], edges[1:], strict=True)) / (e - s)
@@ -170,7 +186,7 @@ def paper(pixel, settings, times, on, off):
     def step_to(limit):
         nonlocal state, at
         while pending and pending[0][0] <= limit:
-            t, polarity, near, same = pending.pop(0)
+            t, polarity, near, same, _ = pending.pop(0)
             value, variance = predict(k, state, at, t)
             q = ev.sigma_proc2 * (t - same) * US + ev.sigma_iso2 * (t - near) * US  # (2)
             q += ev.sigma_ref2 if (t - same) * US <= ev.refractory_bound else 0.0
@@ -191,7 +207,7 @@ def paper(pixel, settings, times, on, off):
 
 
 def bridged(pixel, settings, times, on, off):
-    """L(t) and P(t) of one pixel, docs/equations.md, K1 to K5, K7 and K10."""
+    """L(t) and P(t) of one pixel, docs/equations.md, K1 to K5, K7, K10 and K13."""
     c, ev = settings.camera, settings.events
     i0, count, c2 = c.offset, len(pixel.starts), on * off
     scale_on, scale_off = 1.0, 1.0
@@ -222,7 +238,7 @@ def bridged(pixel, settings, times, on, off):
         inside = 0
         if settings.filter.deblur:
             middle += event_sum(pixel, pixel.starts[k], pixel.middles[k], a, b)
-            inside = sum(pixel.starts[k] < t <= pixel.ends[k] for t, *_ in pixel.events)
+            inside = sum(w for t, *_, w in pixel.events if pixel.starts[k] < t <= pixel.ends[k])
         variance = (c.frame_noise * pixel.white[k]) ** 2 / (pixel.intensity[k] + i0) ** 2
         variance /= max(pixel.weight[k], 1e-6)
         if crushed(k):
@@ -232,8 +248,8 @@ def bridged(pixel, settings, times, on, off):
         return middle, UNMEASURED if clipped else variance
 
     def counts(a, b):
-        inside = [p for t, p, *_ in pixel.events if a < t <= b]
-        return sum(inside), len(inside) - sum(inside)
+        inside = [(p, w) for t, p, *_, w in pixel.events if a < t <= b]
+        return sum(w for p, w in inside if p), sum(w for p, w in inside if not p)
 
     begin = pixel.starts[0]
     first = latent(0)
@@ -329,12 +345,12 @@ def bridged(pixel, settings, times, on, off):
     def step_to(limit):
         nonlocal state, at
         while pending and pending[0][0] <= limit:
-            t, polarity, near, _ = pending.pop(0)
+            t, polarity, near, _, weight = pending.pop(0)
             value, variance = predict(t)
             signal = 1 / (1 + 9 * ev.noise_rate * (t - near) * US)  # K5
             # Several events may share a time: this one alone moves L^A by its own step.
-            step = own_step(intervals[index], polarity, on, off, ev, c2, counts)
-            q = c2 * (ev.step_noise + signal * (1 - signal))
+            step = weight * own_step(intervals[index], polarity, on, off, ev, c2, counts)
+            q = weight * c2 * (ev.step_noise + signal * (1 - signal))
             state = (value + signal * step, variance + q)
             at = t
 

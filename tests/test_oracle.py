@@ -24,6 +24,9 @@ VARIANTS = {
     "default-black": dataclasses.replace(
         PRESETS["default"], camera=dataclasses.replace(PRESETS["default"].camera, response="s-curve:0.1")
     ),
+    "default-refractory": dataclasses.replace(
+        PRESETS["default"], events=dataclasses.replace(PRESETS["default"].events, refractory_period=2_000)
+    ),
     "iccv2021": PRESETS["iccv2021"],
     "iccv2021-exact": dataclasses.replace(
         PRESETS["iccv2021"], filter=dataclasses.replace(PRESETS["iccv2021"].filter, solution="exact")
@@ -48,7 +51,8 @@ def streams(draw):
         t += exposure + draw(st.integers(0, 40_000))
     begin, end = frames[0].exposure_start - 1000, frames[-1].exposure_end + 20_000
     edges = [edge for f in frames for edge in (f.exposure_start, f.middle, f.exposure_end)]
-    moments = st.one_of(st.integers(begin, end), st.sampled_from(edges))
+    bursts = st.integers(edges[1], edges[1] + 12_000)
+    moments = st.one_of(st.integers(begin, end), bursts, st.sampled_from(edges))
     events = draw(
         st.lists(
             st.tuples(moments, st.integers(0, WIDTH - 1), st.integers(0, HEIGHT - 1), st.booleans()),

@@ -9,6 +9,8 @@ import pytest
 
 import kalux
 from kalux import PRESETS, Frame, Recording, smoothing
+from kalux.augmentation.refractory import EventClock
+from kalux.compiled import event_words
 from kalux.datasets import SensorSettings, demo_scene, simulate
 from kalux.errors import InputError, OutputError
 from kalux.events import make_events
@@ -144,6 +146,17 @@ def test_the_spilled_recording_is_the_recording_reversed(tmp_path):
         assert (found.exposure_start, found.exposure_end) == (frame.exposure_start, frame.exposure_end)
         np.testing.assert_array_equal(found.image, frame.image)
     assert len(spill.reversed_events(spill.count)) == 0
+
+
+def test_weights_of_spilled_events_are_those_of_time_going_forward(tmp_path):
+    source = recording(5)
+    spill = Spill(source, tmp_path, 2_000)
+    backward = [event_words(spill.reversed_events(first)) for first in range(0, spill.count, 10**6)]
+    clock = EventClock(source.sensor_size, 2_000)
+    forward = np.concatenate([event_words(clock.weighed(chunk)) for chunk in source.events()])
+    weights = forward[:, 1] >> 40
+    assert len(np.unique(weights)) > 3
+    np.testing.assert_array_equal(np.concatenate(backward)[::-1, 1] >> 40, weights)
 
 
 def test_the_spill_keeps_masks(tmp_path):

@@ -31,6 +31,10 @@ FUSED: Final = {"contract"}
 instruction, which rounds once instead of twice."""
 
 
+WEIGHT_UNIT: Final = np.float32(1 / 4096)
+"""Of the weights that events carry (`event_weight`): sums of a few thousand are exact in float32."""
+
+
 def event_words(events: EventArray) -> NDArray[np.int64]:
     """The same memory as (N, 2) int64: the time, and x, y and p in its lower 16, next 16 and next 8 bits."""
     return np.ascontiguousarray(events).view(np.int64).reshape(-1, 2)
@@ -52,6 +56,18 @@ def event_row(word):  # type: ignore[no-untyped-def]
 def event_is_on(word):  # type: ignore[no-untyped-def]
     """p of an event's second word; the three bytes above it are padding and may hold anything."""
     return ((np.uint64(word) >> np.uint64(32)) & np.uint64(0xFF)) != np.uint64(0)
+
+
+@nb.njit(cache=True, inline="always")
+def weighed(word, extra):  # type: ignore[no-untyped-def]
+    """An event's second word with a weight of 1 and ``extra`` units of `WEIGHT_UNIT`, 0 to 65535, in its padding."""
+    return (word & np.int64(0xFF_FFFF_FFFF)) | (np.int64(extra) << np.int64(40))
+
+
+@nb.njit(cache=True, inline="always")
+def event_weight(word, unit):  # type: ignore[no-untyped-def]
+    """The weight of an event's second word: `WEIGHT_UNIT` where events carry one, 0, for 1, where they do not."""
+    return ONE + np.float32(np.int32((np.uint64(word) >> np.uint64(40)) & np.uint64(0xFFFF))) * unit
 
 
 def _prefetch(typing_context: Any, array: Any, index: Any) -> Any:

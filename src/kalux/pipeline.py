@@ -112,8 +112,8 @@ def plan(
     chosen = _with_white_balance(recording, chosen)
     chosen, delay = _with_delay(recording, chosen)
     filled, origin, estimate = _with_thresholds(recording, chosen)
-    filled, model = _with_event_model(recording, filled)
-    if estimate is not None and filled.camera.offset != chosen.camera.offset:  # it was made with another I_0
+    filled, model = _with_event_model(recording, filled, estimate is not None)
+    if estimate is not None and _was_for_others(chosen, filled):
         unfilled = dataclasses.replace(
             filled.events,
             threshold_on=chosen.events.threshold_on,
@@ -367,7 +367,11 @@ def _with_thresholds(
     if found is None:
         paper = settings.filter.augmentation == "paper"
         estimate = estimate_thresholds(
-            recording, settings.camera, of_log_offset=paper, delay=events.delay or 0
+            recording,
+            settings.camera,
+            of_log_offset=paper,
+            delay=events.delay or 0,
+            refractory_period=events.refractory,
         )
         origin = "assumed" if estimate is None else "estimate"
         found = (_ASSUMED_THRESHOLD, _ASSUMED_THRESHOLD) if estimate is None else (estimate.on, estimate.off)
@@ -379,10 +383,13 @@ def _with_thresholds(
     return dataclasses.replace(settings, events=events), origin, estimate
 
 
-def _with_event_model(recording: Recording, settings: Settings) -> tuple[Settings, EventModel | None]:
-    """Fill in I_0 and the variance of an event's step: from the settings, else an estimate, else the usual."""
+def _with_event_model(
+    recording: Recording, settings: Settings, thresholds_are_estimated: bool
+) -> tuple[Settings, EventModel | None]:
+    """Fill in I_0, variance of steps and refractory period: from the settings, else an estimate, else the usual."""
     camera, events = settings.camera, settings.events
-    if camera.log_offset is not None and (events.step_variance is not None or not _uses_steps(settings)):
+    of_steps = (events.step_variance, events.refractory_period) if _uses_steps(settings) else ()
+    if None not in (camera.log_offset, *of_steps):
         return settings, None
     assert events.threshold_on is not None
     assert events.threshold_off is not None
@@ -393,16 +400,25 @@ def _with_event_model(recording: Recording, settings: Settings) -> tuple[Setting
         delay=events.delay or 0,
         threshold_spread=events.threshold_spread,
         quantisation_variance=events.quantisation_variance,
+        refractory_period=events.refractory_period if _uses_steps(settings) else 0,
+        thresholds_are_estimated=thresholds_are_estimated,
     )
     if model is not None:
         if camera.log_offset is None:
             camera = dataclasses.replace(camera, log_offset=model.log_offset)
         if events.step_variance is None:
             events = dataclasses.replace(events, step_variance=model.step_variance)
+        if events.refractory_period is None:
+            events = dataclasses.replace(events, refractory_period=model.refractory_period)
     # What could not be estimated is written down as it will be used.
     camera = dataclasses.replace(camera, log_offset=camera.offset)
-    events = dataclasses.replace(events, step_variance=events.step_noise)
+    events = dataclasses.replace(events, step_variance=events.step_noise, refractory_period=events.refractory)
     return dataclasses.replace(settings, camera=camera, events=events), model
+
+
+def _was_for_others(before: Settings, after: Settings) -> bool:
+    """Whether thresholds were estimated with another I_0 or another refractory period."""
+    return before.camera.offset != after.camera.offset or before.events.refractory != after.events.refractory
 
 
 def _uses_steps(settings: Settings) -> bool:

@@ -16,8 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.highlights import Unshown
+from kalux.augmentation.refractory import EventClock
+from kalux.compiled import event_words
 from kalux.errors import InputError, SettingsError
-from kalux.events import as_events, check_events
+from kalux.events import EVENT_DTYPE, EventArray, as_events, check_events
 from kalux.filters.akf import State
 from kalux.filters.buffer import EventBuffer
 from kalux.filters.highlights import lifted, read_unshown
@@ -207,7 +209,8 @@ class Reconstructor:
         self._ignored = pixels.hot if pixels is not None and pixels.hot.any() else None
         self._method: Method = make_method(used, self.thresholds, lookahead, self.sensor_size, pixels)
         self._shots: list[Shot] = []  # from the current segment's frame on
-        self._events = EventBuffer()  # those after the current segment's start
+        clock = EventClock(self.sensor_size, chosen.refractory)
+        self._events = EventBuffer(clock)  # those after the current segment's start
         self._state: State | None = None  # at the current segment's start
         self._memory: Any = None
         self._progress: _Progress | None = None
@@ -259,8 +262,20 @@ class Reconstructor:
         EventError
             Unknown layout, unsorted, older than what was pushed or declared complete, outside the sensor.
         """
+        self._push(as_events(events), weighed=False)
+
+    def push_weighed(self, events: EventArray) -> None:
+        """The same with events that carry their weights (`kalux.augmentation.refractory`), as a backward pass has them.
+
+        Raises
+        ------
+        EventError
+            As `push_events`.
+        """
+        self._push(events, weighed=True)
+
+    def _push(self, array: EventArray, *, weighed: bool) -> None:
         self._require_open()
-        array = as_events(events)
         previous = self._last_event
         if self._complete_until is not None:
             earliest = self._complete_until + 1 + self._delay
@@ -268,8 +283,11 @@ class Reconstructor:
         kept = array
         if self._ignored is not None:
             check_events(array, self.sensor_size, first_index=self._event_count, previous_t=previous)
-            kept = array[~self._ignored[array["y"], array["x"]]]
-        if not self._events.append(kept, self.sensor_size, earliest=previous, delay=self._delay):
+            words = event_words(array)[~self._ignored[array["y"], array["x"]]]
+            kept = words.reshape(-1).view(EVENT_DTYPE)  # words keep the weights
+        if not self._events.append(
+            kept, self.sensor_size, earliest=previous, delay=self._delay, weighed=weighed
+        ):
             check_events(array, self.sensor_size, first_index=self._event_count, previous_t=previous)
         if len(array) == 0:
             return

@@ -100,6 +100,10 @@ class EventSettings:
     step_variance
         Variance of one event's step in units of c^2. None: an estimate from the recording
         (`kalux.calibration.event_model`), 0.2 where it cannot be told (docs/tuning.md).
+    refractory_period
+        For how long after an event a pixel does not look, us: what the light did meanwhile is added to its next event
+        (docs/equations.md, K13). None: an estimate from the recording, 0 where its frames say that nothing is lost
+        and in a live stream. For augmentation "bridge" only.
     quantisation_variance
         Variance, in c^2, of the change that events have not yet told at both ends of a frame interval: two
         uniform distributions one threshold wide, 2/12.
@@ -122,6 +126,7 @@ class EventSettings:
     delay: int | None = None
     threshold_spread: float = 0.1
     step_variance: float | None = None
+    refractory_period: int | None = None
     quantisation_variance: float = 1 / 6
     deblur_variance: float = 0.05
     noise_rate: float = 3.0
@@ -135,6 +140,11 @@ class EventSettings:
     def step_noise(self) -> float:
         """Variance of one event's step in units of c^2, also where nobody has said or estimated it."""
         return UNKNOWN_STEP_VARIANCE if self.step_variance is None else self.step_variance
+
+    @property
+    def refractory(self) -> int:
+        """The refractory period, us, 0 where nobody has said or estimated it."""
+        return 0 if self.refractory_period is None else self.refractory_period
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -301,7 +311,7 @@ _POSITIVE: Final = {
     "initial_variance",
     "cutoff",
 }
-_WHOLE: Final = {"delay", "reference_exposure"}
+_WHOLE: Final = {"delay", "reference_exposure", "refractory_period"}
 _SIGNED: Final = {"delay"}
 _CHOICES: Final = {
     "kind": ("akf", "cf"),

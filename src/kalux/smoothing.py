@@ -25,6 +25,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.augmentation.refractory import EventClock
+from kalux.compiled import event_words
 from kalux.errors import OutputError
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.filters.highlights import obey_bounds, smoothed_unshown
@@ -46,6 +48,8 @@ class Spill:
     ----------
     recording
         Copied when the spill is made: events into one file, every frame into one.
+    refractory_period
+        us; the events are weighed as time goes forward (`kalux.augmentation.refractory`).
     folder
         An existing folder, the caller's to remove.
 
@@ -55,15 +59,16 @@ class Spill:
         The disk is full or the folder cannot be written.
     """
 
-    def __init__(self, recording: Recording, folder: Path) -> None:
+    def __init__(self, recording: Recording, folder: Path, refractory_period: float = 0.0) -> None:
         self._folder = folder
         self._events = folder / "events.bin"
         self._exposures: list[tuple[int, int, float | None, Mosaic | None, bool]] = []
         self.count = 0
         try:
             with self._events.open("wb") as file:
+                clock = EventClock(recording.sensor_size, refractory_period)
                 for chunk in recording.events():
-                    chunk.tofile(file)
+                    event_words(clock.weighed(chunk)).tofile(file)
                     self.count += len(chunk)
             for index, frame in enumerate(recording.frames()):
                 np.save(self._frame_path(index), frame.image)
@@ -102,12 +107,13 @@ class Spill:
     def reversed_events(self, first: int) -> EventArray:
         """A block of the reversed recording's events, from its event ``first`` on; empty at the end."""
         last = min(first + _BLOCK_EVENTS, self.count)
-        block = np.fromfile(
+        words = np.fromfile(
             self._events,
-            EVENT_DTYPE,
-            count=last - first,
+            np.int64,
+            count=2 * (last - first),
             offset=(self.count - last) * EVENT_DTYPE.itemsize,
-        )[::-1].copy()
+        ).reshape(-1, 2)
+        block: EventArray = words[::-1].copy().reshape(-1).view(EVENT_DTYPE)  # as words, with their weights
         block["t"] = -block["t"]
         block["p"] = ~block["p"]
         return block
@@ -156,7 +162,7 @@ class BackwardPass:
                 assert newest is not None
                 self.engine.advance(newest + (self.engine.settings.events.delay or 0))
             return
-        self.engine.push_events(block)
+        self.engine.push_weighed(block)
         self.events += len(block)
         if on_events is not None:
             on_events(len(block))
@@ -191,7 +197,7 @@ class Backward:
         on_events: Callable[[int], None] | None = None,
     ) -> None:
         height, width = recording.sensor_size
-        self._spill = Spill(recording, folder)
+        self._spill = Spill(recording, folder, engine.settings.events.refractory)
         times = times[times <= self._spill.end]
         window = max(1, _WINDOW_BYTES // (16 * height * width))
         self._windows = [times[i : i + window] for i in range(0, len(times), window)]

@@ -60,6 +60,24 @@ def test_a_delay_is_taken_into_account(recordings):
     assert known == estimate_event_model(recordings[0.03], CameraSettings(), THRESHOLDS)
 
 
+@pytest.mark.parametrize("period", [600.0, 2_000.0])
+def test_a_refractory_period_is_found_and_the_offset_in_spite_of_it(period):
+    """Edges that pass in a few milliseconds; without the losses the same scene has none."""
+    lossy = recorded(log_offset=0.004, refractory=period)
+    found = estimate_event_model(lossy, CameraSettings(), THRESHOLDS, refractory_period=None)
+    assert 0.6 * period <= found.refractory_period <= 1.15 * period
+    assert found.log_offset in (0.004, 0.008)
+    ignored = estimate_event_model(lossy, CameraSettings(), THRESHOLDS)
+    assert ignored.refractory_period == 0
+
+
+def test_no_refractory_period_is_found_where_nothing_is_lost(recordings):
+    for recording in recordings.values():
+        found = estimate_event_model(recording, CameraSettings(), THRESHOLDS, refractory_period=None)
+        assert found.refractory_period == 0
+        assert found == estimate_event_model(recording, CameraSettings(), THRESHOLDS)
+
+
 def test_a_still_scene_says_nothing():
     still = photograph_scene(np.full((40, 60), 0.5), pan(0), sensor_size=(36, 48), duration=300_000)
     recording = simulate(still, SensorSettings(noise_rate=1.0), seed=0).recording()
@@ -88,15 +106,17 @@ def test_a_plan_fills_in_what_is_not_given(recordings):
     made = plan(recording, at="frames")
     assert made.settings.camera.log_offset == made.event_model.log_offset == 0.06
     assert made.settings.events.step_variance == made.event_model.step_variance
+    assert made.settings.events.refractory_period == made.event_model.refractory_period == 0
     default = PRESETS["default"]
     given = dataclasses.replace(
         default,
         camera=dataclasses.replace(default.camera, log_offset=0.02),
-        events=dataclasses.replace(default.events, step_variance=0.3),
+        events=dataclasses.replace(default.events, step_variance=0.3, refractory_period=700),
     )
     kept = plan(recording, at="frames", settings=given)
     assert kept.event_model is None
     assert (kept.settings.camera.log_offset, kept.settings.events.step_variance) == (0.02, 0.3)
+    assert kept.settings.events.refractory_period == 700
 
 
 def test_where_it_cannot_be_told_the_usual_is_written_down(recordings):

@@ -7,7 +7,7 @@ import pytest
 
 import kalux
 from kalux import Recording
-from kalux.calibration.thresholds import calibrate_contrast, shortest_interval, shrunk
+from kalux.calibration.thresholds import calibrate_contrast, shrunk
 from kalux.datasets import SensorSettings, demo_scene, simulate, static
 from kalux.settings import CameraSettings
 
@@ -64,6 +64,8 @@ def test_the_refractory_period_is_made_up_for_where_it_is_known():
     assert known.on == pytest.approx(0.3, rel=0.05)
     assert known.off == pytest.approx(0.2, rel=0.05)
     assert plain.off > 1.04 * known.off
+    assert known.calibration().settings["events"]["refractory_period"] == 500
+    assert "refractory_period" not in plain.calibration().settings["events"]
 
 
 def test_the_spread_is_found_and_standard_errors_are_small(found):
@@ -108,13 +110,6 @@ def test_halves_of_slider_depth_agree(shared_data):
 def test_a_still_scene_tells_nothing():
     scene = static(0.4, sensor_size=(32, 40), duration=300_000)
     assert calibrate_contrast(unlabelled(simulate(scene, SensorSettings(noise_rate=1.0))), CAMERA) is None
-
-
-def test_the_shortest_interval_is_not_that_of_noise():
-    """Noise follows an event at any time; with a refractory period of 400 us others do not follow before."""
-    sensor = SensorSettings(refractory=400.0, noise_rate=3.0)
-    edge = shortest_interval(unlabelled(simulate(SCENE, sensor)))
-    assert 400 <= edge < 900
 
 
 def test_shrinkage_finds_mean_and_covariance():

@@ -12,6 +12,7 @@ from scipy.integrate import solve_ivp
 
 from kalux.augmentation.bridge import UNMEASURED, BridgedSegment, Latent
 from kalux.augmentation.interpolation import InterpolatedSegment
+from kalux.augmentation.refractory import EventClock
 from kalux.events import make_events
 from kalux.filters import akf
 from kalux.filters.akf import State
@@ -33,7 +34,8 @@ def bridged_state(value, variance, newest=0):
 
 def events_at(times, polarity):
     zeros = np.zeros(len(times), np.int64)
-    return make_events(np.array(times, np.int64), zeros, zeros, np.array(polarity, bool))
+    events = make_events(np.array(times, np.int64), zeros, zeros, np.array(polarity, bool))
+    return EventClock((1, 1), 0).weighed(events)
 
 
 def integrate(rates, start, end, value, variance):

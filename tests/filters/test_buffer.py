@@ -9,6 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from kalux.augmentation.refractory import EventClock
+from kalux.compiled import event_words
 from kalux.events import EVENT_DTYPE
 from kalux.filters import buffer
 from kalux.filters.buffer import EventBuffer
@@ -43,7 +45,7 @@ def test_against_one_array(cuts, drops, block, data):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(buffer, "_BLOCK", block)
         patch.setattr(buffer, "_SPARE", block)
-        held, dropped = EventBuffer(), 0
+        held, dropped = EventBuffer(EventClock(SIZE, 0)), 0
         for first, last in zip([0, *cuts], [*cuts, 300], strict=True):
             assert held.append(whole[first:last], SIZE, earliest=None, delay=0)
             if drops:
@@ -63,7 +65,7 @@ def test_against_one_array(cuts, drops, block, data):
 
 
 def test_times_are_moved_by_the_delay_and_the_callers_events_are_not():
-    held, pushed = EventBuffer(), events((10, 0, 0, 1), (20, 4, 3, 0))
+    held, pushed = EventBuffer(EventClock(SIZE, 0)), events((10, 0, 0, 1), (20, 4, 3, 0))
     assert held.append(pushed, SIZE, earliest=10, delay=7)
     assert held.chunks[0]["t"].tolist() == [3, 13]
     assert pushed["t"].tolist() == [10, 20]
@@ -82,7 +84,7 @@ def test_times_are_moved_by_the_delay_and_the_callers_events_are_not():
     ids=["too early", "unsorted", "right of the sensor", "below it"],
 )
 def test_what_is_refused_leaves_nothing_behind(rows):
-    held = EventBuffer()
+    held = EventBuffer(EventClock(SIZE, 0))
     assert held.append(events((10, 1, 1, 1)), SIZE, earliest=None, delay=0)
     assert not held.append(events(*rows), SIZE, earliest=10, delay=0)
     assert len(held) == 1
@@ -91,17 +93,39 @@ def test_what_is_refused_leaves_nothing_behind(rows):
 
 
 def test_single_events_share_memory():
-    held = EventBuffer()
+    held = EventBuffer(EventClock(SIZE, 0))
     for t in range(1000):
         held.append(events((t, 0, 0, 1)), SIZE, earliest=None, delay=0)
     assert len(held.chunks) == 1
 
 
 def test_a_small_rest_of_a_large_block_is_copied_out_of_it():
-    held, many = EventBuffer(), np.zeros(3 << 20, EVENT_DTYPE)
+    held, many = EventBuffer(EventClock(SIZE, 0)), np.zeros(3 << 20, EVENT_DTYPE)
     many["t"] = np.arange(len(many))
     held.append(many, SIZE, earliest=None, delay=0)
     held.drop(len(many) - 3)
     assert len(held) == 2
     assert held.chunks[0].base is None or held.chunks[0].base.nbytes < 1000
     assert held.number(len(many)) == len(many)
+
+
+def words(chunks):
+    return np.concatenate([np.empty((0, 2), np.int64), *map(event_words, chunks)])
+
+
+@given(cuts=st.lists(st.integers(0, 300), max_size=10).map(sorted), until=st.integers(-10, 1010))
+def test_weights_are_those_of_the_whole_stream_and_stay(cuts, until):
+    """In any pieces; after dropping, which may copy what is left, after pickling, and as ``weighed`` events again."""
+    whole = stream(300)
+    weighed = EventClock(SIZE, 20).weighed(whole)
+    assert len(np.unique(event_words(weighed)[:, 1] >> 40)) > 5
+    held, again = EventBuffer(EventClock(SIZE, 20)), EventBuffer(EventClock(SIZE, 20))
+    for first, last in zip([0, *cuts], [*cuts, 300], strict=True):
+        assert held.append(whole[first:last], SIZE, earliest=None, delay=0)
+        assert again.append(weighed[first:last], SIZE, earliest=None, delay=0, weighed=True)
+    np.testing.assert_array_equal(words(held.chunks), event_words(weighed))
+    for either in (held, again):
+        either.drop(until)
+        expected = event_words(weighed)[weighed["t"] > until]
+        np.testing.assert_array_equal(words(either.chunks), expected)
+        np.testing.assert_array_equal(words(pickle.loads(pickle.dumps(either)).chunks), expected)

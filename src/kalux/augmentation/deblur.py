@@ -25,9 +25,11 @@ from kalux.compiled import (
     AHEAD,
     FUSED,
     ONE,
+    WEIGHT_UNIT,
     event_column,
     event_is_on,
     event_row,
+    event_weight,
     event_words,
     exponential,
     logarithm,
@@ -46,7 +48,7 @@ EXPOSURE_PIXEL: Final = np.dtype(
         ("since", "f4"),  # time of that event, us after s
         ("peak", "f4"),  # largest level
         ("at_middle", "f4"),  # level at the middle
-        ("events", "f4"),  # number
+        ("events", "f4"),  # sum of their weights
         ("up", "f4"),  # e^c of an on event, e^-c of an off event
         ("down", "f4"),
     ],
@@ -98,23 +100,31 @@ def integrate_exposure(
         (H, W) positive log-intensity steps of an event of either polarity.
     """
     chunks = [events] if isinstance(events, np.ndarray) else events
-    pixels = expose(chunks, start, end, step_on, step_off)
+    pixels = expose(chunks, start, end, step_on, step_off, weighed=False)
     integrals = ExposureIntegrals(*np.empty((5, *step_on.shape), np.float32))
     _finish_exposure(pixels.reshape(-1), end - start, *integrals)
     return integrals
 
 
 def expose(
-    chunks: Sequence[EventArray], start: int, end: int, step_on: Floats, step_off: Floats
+    chunks: Sequence[EventArray], start: int, end: int, step_on: Floats, step_off: Floats, *, weighed: bool
 ) -> NDArray[np.void]:
-    """What every pixel remembers of an exposure, (H, W) of `EXPOSURE_PIXEL`. Parameters of `integrate_exposure`."""
+    """What every pixel remembers of an exposure, (H, W) of `EXPOSURE_PIXEL`. Parameters of `integrate_exposure`.
+
+    ``weighed`` says that the events carry weights (`kalux.augmentation.refractory`).
+    """
     height, width = step_on.shape
     pixels = np.empty(height * width, EXPOSURE_PIXEL)
     _begin_exposure(pixels, step_on, step_off)
     for chunk in chunks:
         inside = between(chunk, start, end)
-        _integrate(event_words(inside), pixels, np.uint64(width), start, (start + end) // 2)
+        _integrate(event_words(inside), pixels, np.uint64(width), start, (start + end) // 2, _unit(weighed))
     return pixels.reshape(height, width)
+
+
+def _unit(weighed: bool) -> np.float32:
+    """Of the events' weights: 0 makes all of them 1."""
+    return WEIGHT_UNIT if weighed else np.float32(0.0)
 
 
 def still_exposure(shape: tuple[int, int]) -> ExposureIntegrals:
@@ -192,7 +202,7 @@ def _begin_exposure(pixels, step_on, step_off):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy", fastmath=FUSED)
-def _integrate(words, pixels, width, start, middle):  # type: ignore[no-untyped-def]
+def _integrate(words, pixels, width, start, middle, unit):  # type: ignore[no-untyped-def]
     # A level beyond float32 (88 in log intensity: a broken pixel) becomes infinite or 0; `logarithm` is finite there.
     last = len(words) - 1
     for i in range(len(words)):
@@ -204,11 +214,13 @@ def _integrate(words, pixels, width, start, middle):  # type: ignore[no-untyped-
         level, up, down = pixel.level, pixel.up, pixel.down
         pixel.integral += level * (now - pixel.since)
         pixel.since = now
-        level *= up if event_is_on(word) else down
+        factor = up if event_is_on(word) else down
+        weight = event_weight(word, unit)
+        level *= factor if weight == ONE else exponential(weight * logarithm(factor))
         peak = pixel.peak
         pixel.level = level
         pixel.peak = level if level > peak else peak
-        pixel.events += ONE
+        pixel.events += weight
         if words[i, 0] <= middle:
             pixel.at_middle = level
 
@@ -241,23 +253,26 @@ def _finish_exposure(pixels, exposure, log_mean, to_middle, to_end, peak, events
                 plane[row, column] = logarithm(plane[row, column])
 
 
-def count_events(events: EventArray, shape: tuple[int, int]) -> tuple[Array, Array]:
-    """Number of on and off events of every pixel, two (H, W) float64."""
-    on, off = count_chunks([events], shape)
+def count_events(events: EventArray, shape: tuple[int, int], *, weighed: bool = False) -> tuple[Array, Array]:
+    """Number of on and off events of every pixel, two (H, W) float64; the sums of their weights if they carry such."""
+    on, off = count_chunks([events], shape, weighed=weighed)
     return on.astype(np.float64), off.astype(np.float64)
 
 
-def count_chunks(chunks: Sequence[EventArray], shape: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
-    """The same of events in several arrays, two (H, W) float32."""
+def count_chunks(
+    chunks: Sequence[EventArray], shape: tuple[int, int], *, weighed: bool
+) -> tuple[FloatArray, FloatArray]:
+    """The same of events in several arrays, two (H, W) float32; sums of weights where the events carry such."""
     height, width = shape
     counts = np.zeros((2, height * width), np.float32)
     for chunk in chunks:
-        _count(event_words(chunk), counts, np.uint64(width))
+        _count(event_words(chunk), counts, np.uint64(width), _unit(weighed))
     return counts[1].reshape(shape), counts[0].reshape(shape)
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _count(words, counts, width):  # type: ignore[no-untyped-def]
+def _count(words, counts, width, unit):  # type: ignore[no-untyped-def]
     for i in range(len(words)):
         word = words[i, 1]
-        counts[np.uint64(event_is_on(word)), event_row(word) * width + event_column(word)] += ONE
+        at = event_row(word) * width + event_column(word)
+        counts[np.uint64(event_is_on(word)), at] += event_weight(word, unit)

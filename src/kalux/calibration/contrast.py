@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.deblur import between, count_events
+from kalux.augmentation.refractory import EventClock
 from kalux.calibration.intervals import intervals
 from kalux.recording import Recording
 from kalux.settings import CameraSettings
@@ -21,7 +22,7 @@ MAX_SAMPLES: Final = 400_000
 _MIN_SAMPLES: Final = 200
 _UNEXPLAINED: Final = 0.8  # of the typical change; 0.3 to 0.6 on recordings of moving scenes, 3 on flicker
 NORMAL_MAD: Final = 1.4826  # standard deviation over median absolute deviation, of a normal distribution
-_HUBER: Final = 1.345  # 95 % efficiency for normal residuals (Huber 1981)
+HUBER: Final = 1.345  # 95 % efficiency for normal residuals (Huber 1981)
 _MAX_FRAMES: Final = 200
 
 
@@ -45,7 +46,12 @@ class ThresholdEstimate(NamedTuple):
 
 
 def estimate_thresholds(
-    recording: Recording, camera: CameraSettings, *, of_log_offset: bool = False, delay: int = 0
+    recording: Recording,
+    camera: CameraSettings,
+    *,
+    of_log_offset: bool = False,
+    delay: int = 0,
+    refractory_period: int = 0,
 ) -> ThresholdEstimate | None:
     """Global on and off thresholds, by robust regression of log frame differences on event counts.
 
@@ -65,6 +71,8 @@ def estimate_thresholds(
         Steps of log(I + I_0) instead of log I, s = 1, as in the paper's model.
     delay
         How much later than the frames' clock events are stamped, us.
+    refractory_period
+        Of the pixels, us: what is lost in it is added to the events (docs/equations.md, K13).
 
     Returns None where the recording has too few such pixels (200), e.g. because nothing moves, or where the
     events hardly explain how the frames change (residual above 0.8 of the change), e.g. because they are flicker.
@@ -78,7 +86,7 @@ def estimate_thresholds(
     ons: list[Array] = []
     offs: list[Array] = []
     count = 0
-    for difference, on, off in _samples(recording, camera, of_log_offset, delay):
+    for difference, on, off in _samples(recording, camera, of_log_offset, delay, refractory_period):
         differences.append(difference)
         ons.append(on)
         offs.append(off)
@@ -113,7 +121,7 @@ def fit_thresholds(difference: Array, on: Array, off: Array) -> ThresholdEstimat
         scale = NORMAL_MAD * float(np.median(np.abs(residual)))
         if scale < 1e-9:
             break  # an exact fit: nothing to weigh down
-        weights = np.minimum(1.0, _HUBER * scale / np.maximum(np.abs(residual), 1e-12))
+        weights = np.minimum(1.0, HUBER * scale / np.maximum(np.abs(residual), 1e-12))
         if np.abs(solution - previous).max() < 1e-5:
             break
     if not (solution > 0).all():
@@ -122,12 +130,13 @@ def fit_thresholds(difference: Array, on: Array, off: Array) -> ThresholdEstimat
 
 
 def _samples(
-    recording: Recording, camera: CameraSettings, of_log_offset: bool, delay: int
+    recording: Recording, camera: CameraSettings, of_log_offset: bool, delay: int, refractory_period: int
 ) -> Iterator[tuple[Array, Array, Array]]:
     """Log difference and on and off counts (times s) of the usable pixels, one frame interval at a time."""
+    clock = EventClock(recording.sensor_size, refractory_period)
     for interval in intervals(recording, camera, margin=abs(delay), most_frames=_MAX_FRAMES):
-        inside = between(interval.events, interval.start + delay, interval.end + delay)
-        on, off = count_events(inside, recording.sensor_size)
+        inside = clock.weighed(between(interval.events, interval.start + delay, interval.end + delay))
+        on, off = count_events(inside, recording.sensor_size, weighed=True)
         chosen = interval.usable & (np.abs(on - off) >= 2)
         level = interval.level[chosen]
         share = np.ones_like(level) if of_log_offset else level / (level + camera.offset)

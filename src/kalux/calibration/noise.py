@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from kalux.augmentation.deblur import between, count_events
 from kalux.calibration.delay import estimate_delay
 from kalux.calibration.intervals import intervals
-from kalux.calibration.thresholds import shortest_interval
+from kalux.calibration.refractory import shortest_interval
 from kalux.calibration.values import Calibration
 from kalux.recording import Recording
 from kalux.settings import CameraSettings

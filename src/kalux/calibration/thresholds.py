@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import cv2
 import numba as nb
@@ -28,8 +28,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.deblur import between, integrate_exposure, latent_middle, latent_peak
+from kalux.augmentation.refractory import step_weight
 from kalux.calibration.contrast import NORMAL_MAD, estimate_thresholds
 from kalux.calibration.intervals import Interval, intervals
+from kalux.calibration.refractory import shortest_interval
 from kalux.calibration.values import Calibration
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.filters.methods import Shot
@@ -53,8 +55,6 @@ _WHITE: Final = 0.95  # of the response: the whole deblurred path lies below
 _CROWDED: Final = 3.0
 """Intervals with events closer than this many times the smallest inter-event interval are left out. With 3, a
 refractory period of 200 us costs 4 % where edges pass at 50 thresholds per 10 ms, without it 8 %."""
-_EDGE: Final = 0.02  # of the most frequent inter-event interval: what is rarer and shorter is noise
-_EDGE_BINS: Final = np.logspace(1, 6, 51)  # us
 _TILES: Final = 8  # per side: blocks of the jackknife
 _EM_STEPS: Final = 60
 _LEAST_SPREAD: Final = 0.01
@@ -82,6 +82,8 @@ class ContrastCalibration:
         How much the variance of the fit grows per event, in units of c_on c_off.
     shortest_interval
         Shortest time between two events of a pixel that is not chance, us.
+    refractory
+        Refractory period, us, that the thresholds take account of; 0: none.
     samples, intervals
         Pixels of the global fit, and frame intervals that were looked at.
     on_factor, off_factor, on_variance, off_variance
@@ -101,6 +103,7 @@ class ContrastCalibration:
     residual: float
     step_variance: float
     shortest_interval: int
+    refractory: int
     samples: int
     intervals: int
     on_factor: Array
@@ -110,11 +113,13 @@ class ContrastCalibration:
 
     def calibration(self) -> Calibration:
         """As settings with standard errors, and maps of the pixels."""
-        settings = {
+        settings: dict[str, Any] = {
             "threshold_on": self.on,
             "threshold_off": self.off,
             "threshold_spread": float(np.hypot(self.spread_on, self.spread_off) / np.sqrt(2)),
         }
+        if self.refractory > 0:
+            settings["refractory_period"] = self.refractory
         errors = {"threshold_on": self.on_error, "threshold_off": self.off_error}
         names = ("spread_on", "spread_off", "correlation", "trailing", "residual", "shortest_interval")
         measured = {name: getattr(self, name) for name in (*names, "samples", "intervals")}
@@ -172,38 +177,6 @@ def calibrate_contrast(
     return _per_pixel(recording, camera, view, fit, data[0], delay)
 
 
-def shortest_interval(recording: Recording, most_events: int = 3_000_000) -> int:
-    """Lower edge of the times between two events of a pixel, us: no refractory period is longer.
-
-    Where their histogram over log time first reaches 2 % of its peak; below that are noise events, which follow the
-    others at any time. Of the first ``most_events``; 0 without events that follow one another.
-    """
-    last = np.full(recording.sensor_size, -1, np.int64)
-    histogram = np.zeros(len(_EDGE_BINS) - 1, np.int64)
-    count = 0
-    for chunk in recording.events():
-        histogram += np.histogram(_intervals_of(chunk["t"], chunk["x"], chunk["y"], last), _EDGE_BINS)[0]
-        count += len(chunk)
-        if count >= most_events:
-            break
-    if not histogram.any():
-        return 0
-    return round(float(_EDGE_BINS[int(np.argmax(histogram >= _EDGE * histogram.max()))]))
-
-
-@nb.njit(cache=True, nogil=True)
-def _intervals_of(t, x, y, last):  # type: ignore[no-untyped-def]
-    found = np.empty(len(t), np.int64)
-    n = 0
-    for i in range(len(t)):
-        before = last[y[i], x[i]]
-        if before >= 0:
-            found[n] = t[i] - before
-            n += 1
-        last[y[i], x[i]] = t[i]
-    return found[:n]
-
-
 # --- samples --------------------------------------------------------------------------------------------------
 
 
@@ -257,7 +230,7 @@ class _History:
         crowded = np.zeros(self._shape, np.bool_)
         least = _CROWDED * max(self._view.shortest, self._view.refractory)
         t, x, y, p = (events[name] for name in ("t", "x", "y", "p"))
-        _count(t, x, y, p, self._last, self.sign, least, float(self._view.refractory), on, off, crowded)
+        _count(t, x, y, p, self._last, self.sign, least, np.float32(self._view.refractory), on, off, crowded)
         return on, off, crowded
 
 
@@ -268,8 +241,7 @@ def _count(t, x, y, p, last, sign, least, refractory, on, off, crowded):  # type
         since = t[i] - last[row, column]
         if since < least:
             crowded[row, column] = True
-        # While the pixel was held in reset the light went on at the pace at which it then crossed the threshold.
-        weight = since / (since - refractory) if since > 1.5 * refractory else 1.0
+        weight = step_weight(np.float32(since), refractory)  # K13
         if p[i]:
             on[row, column] += weight
             sign[row, column] = 1.0
@@ -479,6 +451,7 @@ def _per_pixel(
         residual=fit.residual,
         step_variance=variance.per_event / (fit.on * fit.off),
         shortest_interval=view.shortest,
+        refractory=view.refractory,
         samples=len(data.change),
         intervals=count,
         on_factor=np.clip(1 + offset[:, 0], 0.3, 3.0).reshape(shape),

@@ -56,6 +56,7 @@ UNITS: Final[Mapping[str, str]] = {
     "trailing": "log intensity",
     "residual": "log intensity",
     "shortest_interval": "us",
+    "refractory_period": "us",
     "refractory_at_most": "us",
     "residual_full_scale": "root mean square of images predicted from the merged radiance, share of full scale",
     "left_out_full_scale": "root mean square of images predicted from the others, share of full scale",

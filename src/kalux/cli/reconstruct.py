@@ -280,7 +280,8 @@ def decided(
         f"{contents.frames:,} frames, {contents.events:,} events",
         f"thresholds  on {events.threshold_on:.3f}, off {events.threshold_off:.3f} ({origin})",
         f"delay       events {(events.delay or 0) * 1e-3:g} ms late ({_delay_origin(made)})",
-        f"events      steps of log(I + {camera.offset:g}), variance {events.step_noise:g} c^2 each "
+        f"events      steps of log(I + {camera.offset:g}), variance {events.step_noise:g} c^2 each, "
+        f"{f'refractory {events.refractory * 1e-3:g} ms' if events.refractory else 'nothing lost between'} "
         f"({_model_origin(made)})",
         *colours,
         f"exposure    {(camera.reference_exposure or 0) * 1e-3:g} ms makes a saturated pixel 1.0",

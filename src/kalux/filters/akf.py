@@ -29,9 +29,11 @@ from kalux.compiled import (
     FUSED,
     MICROSECOND32,
     ONE,
+    WEIGHT_UNIT,
     event_column,
     event_is_on,
     event_row,
+    event_weight,
     event_words,
     prefetch,
 )
@@ -118,7 +120,7 @@ BRIDGED_PIXEL: Final = np.dtype(
         (
             "coming",
             "f4",
-        ),  # number of those; exact, where taking away their variances would leave rounding errors
+        ),  # sum of their weights; exact, where taking away their variances would leave rounding errors
     ],
     align=True,
 )
@@ -177,7 +179,7 @@ def begin_bridged(segment: BridgedSegment, state: State) -> BridgedCursor:
 def advance_bridged(
     segment: BridgedSegment, cursor: BridgedCursor, events: EventArray, noise: BridgedNoise
 ) -> None:
-    """Take the cursor over events of the segment, in place."""
+    """Take the cursor over events of the segment, which carry weights (`kalux.augmentation.refractory`), in place."""
     scalars = _Scalars(*(np.float32(value) for value in (segment.rate, segment.step_variance, *noise)))
     stride = np.uint64(cursor.clock.shape[1])
     while len(events):
@@ -275,16 +277,17 @@ def _advance_bridged(words, pixels, clock, stride, origin, scalars):  # type: ig
         age = np.float32(np.int32(now - newest_around_inside(clock, at, stride))) * MICROSECOND32
         signal = signal_probability(scalars.noise_rate, age)
         step_on, step_off = pixel.step_on, pixel.step_off
-        step = step_on if event_is_on(word) else -step_off
+        weight = event_weight(word, WEIGHT_UNIT)
+        step = weight * (step_on if event_is_on(word) else -step_off)
         kept = information_kept(
-            information, threshold_noise(scalars.event_variance, scalars.threshold2, signal)
+            information, weight * threshold_noise(scalars.event_variance, scalars.threshold2, signal)
         )
         # The state moves by the expected step, L^A by the whole one: the frames have told which it was.
         pixel.weighted = (pixel.weighted - information * (ONE - signal) * step) * kept
         pixel.information = information * kept
         pixel.augmented += step
-        pixel.forward += scalars.step_variance
-        pixel.coming -= ONE
+        pixel.forward += weight * scalars.step_variance
+        pixel.coming -= weight
         clock[at] = now
 
 

@@ -9,6 +9,7 @@ import numba as nb
 import numpy as np
 
 from kalux.augmentation.deblur import events_until
+from kalux.augmentation.refractory import EventClock
 from kalux.compiled import event_column, event_row, event_words
 from kalux.events import EVENT_DTYPE, EventArray
 
@@ -31,9 +32,10 @@ class _Block:
 
 
 class EventBuffer:
-    """Events in time order, numbered from 0 on as they were appended."""
+    """Events in time order, numbered from 0 on as they were appended, with the weights that ``clock`` gives them."""
 
-    def __init__(self) -> None:
+    def __init__(self, clock: EventClock) -> None:
+        self._clock = clock
         self._blocks: list[_Block] = []
         self._spare: EventArray | None = None
         self._first = 0  # number of the first event held
@@ -45,9 +47,9 @@ class EventBuffer:
         """Pickled without the free memory."""
         blocks = []
         for block in self._blocks:
-            blocks.append(_Block(block.events.copy()))
+            blocks.append(_Block(_copied(block.events)))
             blocks[-1].stop = len(blocks[-1].memory)
-        return {"_blocks": blocks, "_spare": None, "_first": self._first}
+        return {"_clock": self._clock, "_blocks": blocks, "_spare": None, "_first": self._first}
 
     @property
     def first(self) -> int:
@@ -60,9 +62,15 @@ class EventBuffer:
         return [block.events for block in self._blocks]
 
     def append(
-        self, events: EventArray, sensor_size: tuple[int, int], *, earliest: int | None, delay: int
+        self,
+        events: EventArray,
+        sensor_size: tuple[int, int],
+        *,
+        earliest: int | None,
+        delay: int,
+        weighed: bool = False,
     ) -> bool:
-        """Copy events to the end, ``delay`` us earlier than stamped.
+        """Copy events to the end, ``delay`` us earlier than stamped; ``weighed`` ones carry their weights already.
 
         False, and nothing is appended, unless they are in time order, none is stamped before ``earliest`` (us), and all
         lie inside the sensor, (height, width).
@@ -82,6 +90,8 @@ class EventBuffer:
         free = event_words(block.memory[block.stop : block.stop + count])
         if not _copy_checked(event_words(events), free, least, delay, height, width):
             return False
+        if not weighed:
+            self._clock.weigh(free)
         block.stop += count
         if not (self._blocks and self._blocks[-1] is block):
             self._blocks.append(block)
@@ -129,8 +139,13 @@ class EventBuffer:
     def _shrink(self, block: _Block) -> None:
         """A small rest must not keep a large block in memory."""
         if len(block.memory) > _SPARE:
-            rest = block.events.copy()
+            rest = _copied(block.events)
             block.memory, block.start, block.stop = rest, 0, len(rest)
+
+
+def _copied(events: EventArray) -> EventArray:
+    """A copy with the events' weights, which NumPy's copy takes for padding and leaves out."""
+    return event_words(events).copy().reshape(-1).view(EVENT_DTYPE)
 
 
 @nb.njit(cache=True, nogil=True)

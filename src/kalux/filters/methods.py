@@ -317,7 +317,7 @@ class _Common:
 
     def counts(self, events: Chunks, start: int, end: int) -> tuple[Floats, Floats]:
         """Number of on and off events of every pixel with start < t <= end."""
-        return count_chunks(all_between(events, start, end), self.shape)
+        return count_chunks(all_between(events, start, end), self.shape, weighed=True)
 
     def unseen(self, shot: Shot) -> NDArray[np.bool_]:
         """(H, W) bool: where the frame says nothing."""
@@ -405,6 +405,7 @@ class BridgedFrames(_Common):
             shot.end,
             np.float32(self.on) * thresholds.on,
             np.float32(self.off) * thresholds.off,
+            weighed=True,
         )
         r_bar = covariance(shot.level_weight, (self.settings.camera.frame_noise * shot.white) ** 2, 1e-6)
         level_variance = log_covariance(shot.level_intensity, r_bar, self.offset)
@@ -685,7 +686,7 @@ class InterpolatedFrames(_Common):
 
     def nominal(self, events: Chunks) -> Array:
         """Sum of the nominal event steps, (H, W)."""
-        on, off = (count.astype(np.float64) for count in count_chunks(events, self.shape))
+        on, off = (count.astype(np.float64) for count in count_chunks(events, self.shape, weighed=False))
         return self.on * on - self.off * off
 
     def exposure(self, shot: Shot, events: Chunks) -> ExposureIntegrals:

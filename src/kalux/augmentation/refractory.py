@@ -1,0 +1,94 @@
+"""What the light did while a pixel could not report it: a weight for every event.
+
+After an event a pixel is held in reset for its refractory period, and compares with the light at the end of that, not
+with the light at the event. What changed meanwhile is never reported. If the light goes on at one pace from one event
+to the next, it changes by the threshold in the time in which the pixel looks, so that from event to event it changes by
+the threshold times
+
+    w = Delta / (Delta - refractory period)                                                (docs/equations.md, K13)
+
+with Delta the time since the pixel's previous event. Every event is given its weight once, when it arrives, in the
+bytes that `kalux.events.EVENT_DTYPE` leaves unused; all that adds up steps multiplies by it.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux.compiled import AHEAD, ONE, WEIGHT_UNIT, event_column, event_row, event_words, prefetch, weighed
+from kalux.events import EVENT_DTYPE, EventArray
+
+MOST: Final = np.float32(6.0)
+"""Largest weight. Near the refractory period the formula has no end; 4 to 6 do best where 2 ms are lost of edges that
+take as long (docs/equations.md, K13)."""
+
+_EARLY: Final = np.float32(0.95)
+"""Shares of the refractory period from which on an event counts as one that came at its end: pixels differ. What comes
+earlier is noise, of which no light was missed."""
+
+_NEVER: Final = -(1 << 60)
+
+
+class EventClock:
+    """When every pixel had its latest event: what weighing a stream of events needs to know of the past.
+
+    Parameters
+    ----------
+    sensor_size
+        (height, width), pixels.
+    refractory_period
+        us; 0: every event has the weight 1.
+    """
+
+    def __init__(self, sensor_size: tuple[int, int], refractory_period: float) -> None:
+        self._sensor_size = sensor_size
+        self._refractory_period = np.float32(refractory_period)
+        self._latest: NDArray[np.int64] | None = None  # once it is needed
+
+    def weigh(self, words: NDArray[np.int64]) -> None:
+        """Write the weights of the next events into their words (`kalux.compiled.event_words`), in place."""
+        if self._refractory_period == 0:
+            _weigh_equally(words)
+            return
+        height, width = self._sensor_size
+        if self._latest is None:
+            self._latest = np.full(height * width, _NEVER, np.int64)
+        _weigh(words, self._latest, np.uint64(width), self._refractory_period)
+
+    def weighed(self, events: EventArray) -> EventArray:
+        """A copy of the next events, with their weights."""
+        words = event_words(events).copy()
+        self.weigh(words)
+        return words.reshape(-1).view(EVENT_DTYPE)
+
+
+@nb.njit(cache=True, inline="always", error_model="numpy")
+def step_weight(since_pixel, refractory_period):  # type: ignore[no-untyped-def]
+    """K13: how many thresholds an event tells of, ``since_pixel`` after the pixel's previous one; float32, us."""
+    if since_pixel <= _EARLY * refractory_period:  # also without a period, of events at one time
+        return ONE
+    looked = since_pixel - refractory_period
+    return MOST if since_pixel > MOST * looked else since_pixel / looked
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _weigh(words, latest, width, refractory_period):  # type: ignore[no-untyped-def]
+    last = len(words) - 1
+    for i in range(len(words)):
+        ahead = words[min(i + AHEAD, last), 1]
+        prefetch(latest, event_row(ahead) * width + event_column(ahead))
+        t, word = words[i, 0], words[i, 1]
+        at = event_row(word) * width + event_column(word)
+        weight = step_weight(np.float32(t - latest[at]), refractory_period)
+        latest[at] = t
+        words[i, 1] = weighed(word, np.int32((weight - ONE) / WEIGHT_UNIT + np.float32(0.5)))
+
+
+@nb.njit(cache=True, nogil=True)
+def _weigh_equally(words):  # type: ignore[no-untyped-def]
+    for i in range(len(words)):
+        words[i, 1] = weighed(words[i, 1], np.int32(0))

@@ -1,0 +1,84 @@
+"""Weights of events, for what pixels miss in their refractory period."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kalux.augmentation.deblur import count_events, integrate_exposure
+from kalux.augmentation.refractory import MOST, EventClock, step_weight
+from kalux.compiled import WEIGHT_UNIT, event_words
+from kalux.events import EVENT_DTYPE, make_events
+
+SIZE = (3, 4)
+
+
+def stream(count, seed=0, span=20_000):
+    rng = np.random.default_rng(seed)
+    t = np.sort(rng.integers(0, span, count))
+    return make_events(t, rng.integers(0, 4, count), rng.integers(0, 3, count), rng.random(count) < 0.5)
+
+
+def weights(events):
+    """As they are stored."""
+    return 1 + ((event_words(events)[:, 1] >> 40) & 0xFFFF) * WEIGHT_UNIT
+
+
+@given(st.floats(1, 1e6), st.floats(1, 1e5))
+def test_a_weight_lies_between_one_and_the_most(since, period):
+    weight = step_weight(np.float32(since), np.float32(period))
+    assert 1 <= weight <= MOST
+
+
+@pytest.mark.parametrize(
+    ("since", "weight"), [(200, 1), (940, 1), (960, 6), (1_000, 6), (1_250, 5), (2_000, 2), (11_000, 1.1)]
+)
+def test_weights_under_a_refractory_period_of_a_millisecond(since, weight):
+    """What comes earlier than the period allows is noise; twice the period after, half of the change was missed."""
+    assert step_weight(np.float32(since), np.float32(1_000)) == pytest.approx(weight)
+
+
+@given(slope=st.floats(10, 80), period=st.integers(500, 5_000))
+def test_a_pixel_that_is_held_in_reset_is_made_good(slope, period):
+    """A ramp of ``slope`` thresholds per s: an event every 1/slope s of looking, after the period of not looking."""
+    gap = round(1e6 / slope + period)
+    times = gap * np.arange(1, 40)
+    events = make_events(times, *np.zeros((2, 39), int), np.ones(39, bool))
+    weighed = EventClock((1, 1), period).weighed(events)
+    told = count_events(weighed[1:], (1, 1), weighed=True)[0][0, 0]
+    assert told == pytest.approx(slope * 1e-6 * (times[-1] - times[0]), rel=2e-3)
+
+
+def test_no_period_makes_all_weights_one_whatever_the_padding_held():
+    events = stream(50)
+    event_words(events)[:, 1] |= np.int64(0x1234) << 40
+    np.testing.assert_array_equal(weights(EventClock(SIZE, 0).weighed(events)), 1)
+
+
+@given(st.lists(st.integers(0, 200), max_size=8).map(sorted))
+def test_weights_do_not_depend_on_chunks(cuts):
+    events = stream(200)
+    clock = EventClock(SIZE, 300)
+    parts = [clock.weighed(events[a:b]) for a, b in zip([0, *cuts], [*cuts, 200], strict=True)]
+    together = weights(EventClock(SIZE, 300).weighed(events))
+    np.testing.assert_array_equal(np.concatenate([weights(part) for part in parts]), together)
+    assert together.max() > 2
+
+
+def test_events_themselves_stay_as_they_are():
+    events = stream(100)
+    weighed = EventClock(SIZE, 300).weighed(events)
+    for name in EVENT_DTYPE.names:
+        np.testing.assert_array_equal(weighed[name], events[name])
+
+
+def test_weights_count_only_where_they_are_asked_for():
+    """Calibrations and the paper's own equations count events."""
+    events = EventClock(SIZE, 300).weighed(stream(100))
+    plain, weighed = (np.sum(count_events(events, SIZE, weighed=flag)) for flag in (False, True))
+    assert plain == 100
+    assert weighed == pytest.approx(weights(events).sum())
+    steps = np.full(SIZE, 0.2)
+    assert integrate_exposure(events, -1, 20_000, steps, steps).events.sum() == 100
