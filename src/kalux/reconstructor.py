@@ -22,7 +22,7 @@ from kalux.errors import InputError, SettingsError
 from kalux.events import EVENT_DTYPE, EventArray, as_events, check_events
 from kalux.filters.akf import State
 from kalux.filters.buffer import EventBuffer
-from kalux.filters.highlights import lifted, read_unshown
+from kalux.filters.highlights import lifted, read_unshown, tempered
 from kalux.filters.methods import Method, Segment, Shot, make_method, take_shot
 from kalux.filters.readout import HighlightPrior, intensity, regularised, total_variance
 from kalux.frames import Frame, check_frame
@@ -426,6 +426,7 @@ class Reconstructor:
         on, off = self.thresholds
         log_intensity, variance, unshown = estimate.log_intensity, estimate.variance, estimate.unshown
         if unshown is not None:
+            unshown = tempered(unshown, log_intensity, prior)
             log_intensity, variance = lifted(log_intensity, variance, unshown)
         level = log_intensity
         variance = total_variance(variance, moving, estimate.between, on * off)

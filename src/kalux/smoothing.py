@@ -248,7 +248,15 @@ def combine(forward: Estimate, backward: Estimate | None) -> Estimate:
     first, second = 1.0 / forward.variance, 1.0 / backward.variance
     level = (first * forward.log_intensity + second * backward.log_intensity) / (first + second)
     for own, other in ((forward, backward), (backward, forward)):
-        obey_bounds(level, own.log_intensity, own.unshown, other.log_intensity, other.variance, other.unshown)
+        obey_bounds(
+            level,
+            own.log_intensity,
+            own.variance,
+            own.unshown,
+            other.log_intensity,
+            other.variance,
+            other.unshown,
+        )
     return Estimate(
         t=forward.t,
         log_intensity=level,

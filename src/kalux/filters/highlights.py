@@ -18,6 +18,22 @@ _LEAST_SPREAD: Final = np.float32(0.3)
 """Standard deviation that is left where pixels around say that all lie just above their bounds."""
 
 
+def tempered(unshown: Unshown, bound: Floats, prior: HighlightPrior) -> Unshown:
+    """What is expected above a bound that is beyond white itself: highlights end somewhere.
+
+    Above the bound the exponential distribution of `Unshown` and the normal one of the prior on highlights (K6) fall at
+    the rates 1 / e and d / s^2, d the bound's distance from white: together, e becomes 1 / (1 / e + d / s^2).
+
+    Parameters
+    ----------
+    bound
+        (H, W) L.
+    """
+    beyond = np.maximum(bound.reshape(-1)[unshown.pixels] - np.float32(prior.white), np.float32(0.0))
+    steeper = np.float32(1.0) + unshown.excess * beyond / np.float32(prior.scale2)
+    return unshown._replace(excess=unshown.excess / steeper)
+
+
 def lifted(log_intensity: Floats, variance: Floats, unshown: Unshown) -> tuple[Floats, Floats]:
     """L and P, (H, W), with pixels where they are expected above their bounds, and the variance of that."""
     level, spread = log_intensity.copy(), variance.copy()
@@ -111,6 +127,7 @@ def smoothed_unshown(forward: Unshown | None, backward: Unshown | None) -> Unsho
 def obey_bounds(
     smoothed: Floats,
     bound: Floats,
+    own: Floats,
     unshown: Unshown | None,
     level: Floats,
     variance: Floats,
@@ -118,8 +135,9 @@ def obey_bounds(
 ) -> None:
     """Smoothed L, (H, W), where one direction knows no more than a ``bound``: that of the other direction. In place.
 
-    ``level`` and ``variance`` are the other direction's, ``other`` the pixels of which that knows no more either. Where
-    its level is below the bound, both are wrong, each in proportion to its variance.
+    ``own`` is P of the direction with the bounds; ``level`` and ``variance`` are the other's, ``other`` the pixels of
+    which that knows no more either. Where its level is below the bound, both are wrong, each in proportion to its
+    variance. Where it is less sure than the bound, it does not count alone.
     """
     if unshown is None:
         return
@@ -127,6 +145,7 @@ def obey_bounds(
     if other is not None:
         only = np.isin(unshown.pixels, other.pixels, assume_unique=True, invert=True)
     pixels = unshown.pixels[only]
-    known, doubt = level.reshape(-1)[pixels], variance.reshape(-1)[pixels]
+    known, doubt, noise = level.reshape(-1)[pixels], variance.reshape(-1)[pixels], unshown.noise[only]
     short = np.maximum(bound.reshape(-1)[pixels] - known, np.float32(0.0))
-    smoothed.reshape(-1)[pixels] = known + short * doubt / (doubt + unshown.noise[only])
+    surer = doubt < own.reshape(-1)[pixels]
+    smoothed.reshape(-1)[pixels[surer]] = (known + short * doubt / (doubt + noise))[surer]
