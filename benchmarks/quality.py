@@ -38,6 +38,7 @@ def variants(ablation: bool) -> dict[str, Settings]:
         for label, group, change in (
             ("no deblurring", "filter", {"deblur": False}),
             ("no highlight prior", "filter", {"highlight_scale": 0.0}),
+            ("unshown at their bounds", "filter", {"unshown_tail": 0.0}),
             ("no noise probability", "events", {"noise_rate": 0.0}),
             ("no threshold per pixel", "events", {"threshold_spread": 0.0}),
             ("no delay", "events", {"delay": 0}),

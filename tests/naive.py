@@ -34,6 +34,8 @@ class Pixel:
     weight: list[float]
     black: list[bool]
     events: list[tuple[int, bool, int, int, float]]
+    shown: int = 0
+    excess: float = 0.0
 
 
 def pixels(events, frames, sensor_size, settings, begin):
@@ -232,7 +234,7 @@ def trail(pixel, t, scale, height, on, off):
 
 
 def bridged(pixel, settings, times, on, off, scales):
-    """L(t) and P(t) of one pixel, docs/equations.md, K1 to K5, K7, K10, K13 and K14."""
+    """L(t) and P(t) of one pixel, docs/equations.md, K1 to K5, K7, K10, K13 and K14; what K15 needs."""
     c, ev = settings.camera, settings.events
     i0, count, c2 = c.offset, len(pixel.starts), on * off
     scale_on, scale_off = 1.0, 1.0
@@ -299,6 +301,18 @@ def bridged(pixel, settings, times, on, off, scales):
         var_off += 1e-5 - gain_off**2 * total
         learned.append((scale_on, scale_off))
         first = second
+    pixel.shown, bound = (
+        0,
+        intervals[0][3][0],
+    )  # K15: from which frame on it is known, and how far it was then
+    if intervals[0][3][1] >= UNMEASURED:
+        pixel.shown = count
+        for k, (a, b, _, right, s_on, s_off, *_) in enumerate(intervals[1:], 1):
+            bound += event_sum(pixel, a, b, on * s_on, off * s_off) + grown(k, b)
+            if right[1] < UNMEASURED:
+                pixel.shown, pixel.excess = k, max(right[0] - bound, 0.0)
+                break
+            bound = max(bound, right[0])
     last = (pixel.middles[-1], None, first, None, scale_on, scale_off, var_on, var_off, 0.0)
     intervals.append(last)
 
@@ -474,6 +488,36 @@ def regularised(level, variance, moving, difference):
     return out
 
 
+def unshown(split, settings, frames, t):
+    """K15: (H, W) how far above their bounds pixels are expected that no frame has shown; nan where one has.
+
+    Of a sensor no larger than one part.
+    """
+    looked = min(sum(f.middle < t for f in frames), len(frames) - 1)  # the newest frame that is used
+    response = Camera.named(chosen_response(settings.camera.response, None), 0.98).response
+    levels = response(np.array([0.475, 0.95]))
+    half, white = (np.count_nonzero(frames[0].image / 255 >= level) for level in levels)
+    fall = np.log(max(half, white) / white) if white else np.inf
+    tail = min(max(np.log(2) / max(fall, 1e-3), 0.3), 2.0)
+    told = [p.excess for p in split.values() if 0 < p.shown <= looked]
+    mean = (sum(told) + 10 * settings.filter.unshown_tail * (tail - 0.25)) / (len(told) + 10)
+    out = np.full(frames[0].image.shape, np.nan)
+    for place, pixel in split.items():
+        if pixel.shown > looked:
+            out[place] = mean
+    return out
+
+
+def lifted(level, variance, excess, settings, top):
+    """K15: where pixels are expected, the variance of that, the excess beyond white, and the noise of the events."""
+    filtered = settings.filter
+    beyond = np.maximum(level - top, 0) / filtered.highlight_scale**2
+    excess = np.nan_to_num(excess / (1 + excess * beyond), nan=-1.0)
+    where, noise = excess >= 0, np.maximum(variance - filtered.initial_variance, 0)
+    spread = np.where(where, np.maximum(excess, 0.3) ** 2 + noise, variance)
+    return np.where(where, level + excess, level), spread, np.where(where, excess, 0.0), noise
+
+
 def intensity(log_intensity, variance, settings, white, stretch):
     """Read-out, K6."""
     i0, scale2 = settings.camera.offset, settings.filter.highlight_scale**2
@@ -489,7 +533,7 @@ def intensity(log_intensity, variance, settings, white, stretch):
 
 
 def reconstruct(events, frames, sensor_size, settings, times):
-    """L, P, hidden variance (K11) and whether pixels move at ``times``, four (T, H, W) arrays."""
+    """Of ``times``, (T, H, W) each: L, P, hidden variance (K11), whether pixels move, and what is expected (K15)."""
     kind = settings.filter.kind
     if kind == "cf":
         method, begin = complementary, (frames[0].exposure_start + frames[0].exposure_end) // 2
@@ -503,4 +547,8 @@ def reconstruct(events, frames, sensor_size, settings, times):
     for (row, column), pixel in every.items():
         out[:2, :, row, column] = method(pixel, settings, times, on, off, *more).T
         out[2:, :, row, column] = np.transpose([hidden(pixel, settings, t, on, off) for t in times])
-    return out[0], out[1], out[2], out[3].astype(bool)
+    if kind == "cf" or settings.filter.augmentation == "paper":
+        expected = np.full(out[0].shape, np.nan)
+    else:
+        expected = np.array([unshown(every, settings, frames, t) for t in times])
+    return out[0], out[1], out[2], out[3].astype(bool), expected

@@ -78,7 +78,9 @@ def test_engine_agrees_with_the_oracle(name, data):
         events=dataclasses.replace(chosen.events, threshold_on=0.21, threshold_off=0.17),
         camera=dataclasses.replace(chosen.camera, reference_exposure=10_000),
     )
-    expected, variance, hidden, moving = naive.reconstruct(events, frames, (HEIGHT, WIDTH), chosen, times)
+    expected, variance, hidden, moving, excess = naive.reconstruct(
+        events, frames, (HEIGHT, WIDTH), chosen, times
+    )
     engine = Reconstructor((HEIGHT, WIDTH), settings=chosen)
     for frame in frames:
         engine.push_frame(frame)
@@ -90,11 +92,17 @@ def test_engine_agrees_with_the_oracle(name, data):
         white = white_at(t, k, frames, name, chosen.camera.offset)
         scale, value, total = chosen.filter.highlight_scale, expected[i], np.nan_to_num(variance[i])
         stretch = chosen.events.threshold_spread**2 / scale if scale > 0 else 0.0
+        bound, noise, beyond = value, total, np.zeros(total.shape)
+        unshown = ~np.isnan(excess[i])
+        if unshown.any():
+            top = np.log(white + chosen.camera.offset)
+            value, total, beyond, noise = naive.lifted(value, total, excess[i], chosen, top)
         if chosen.filter.neighbours > 0:
             total = total + hidden[i]
             value = naive.regularised(value, total, moving[i], chosen.filter.neighbours)
+        value = np.where(unshown, np.maximum(value, bound) + beyond**2 / 2, value)
         level = np.vectorize(lambda v, p: naive.intensity(v, p, chosen, white, stretch))(  # noqa: B023
-            value, total
+            value, np.where(unshown, noise, total)
         )
         offset = chosen.camera.offset
         np.testing.assert_allclose(np.log(image.intensity + offset), np.log(level + offset), atol=1e-4)

@@ -67,10 +67,8 @@ def test_a_causal_image_is_what_a_robot_would_see(variant):
     """Cutting the recording off after an image does not change it."""
     stream = random_stream(2)
     times = [shot.exposure_end + 7_000 for shot in stream.frames]
-    options = {
-        "settings": altered(VARIANTS[variant], "camera", reference_exposure=10_000),
-        "lookahead": False,
-    }
+    given = altered(VARIANTS[variant], "camera", reference_exposure=10_000)
+    options = {"settings": altered(given, "filter", bright_tail=0.5), "lookahead": False}
     whole = list(reconstruct(recording(2), times=times, **options))
     for image in whole:
         seen = stream.events[stream.events["t"] <= image.t]

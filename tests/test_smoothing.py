@@ -9,6 +9,7 @@ import pytest
 
 import kalux
 from kalux import PRESETS, Frame, Recording, smoothing
+from kalux.augmentation.highlights import Unshown
 from kalux.augmentation.refractory import EventClock
 from kalux.compiled import event_words
 from kalux.datasets import SensorSettings, demo_scene, simulate
@@ -53,8 +54,8 @@ STEPS = altered(PRESETS["default"], "events", trail=0.0)
 """Nothing is known between two events (no K14), so that both directions of time are alike."""
 
 
-def engine_over(source):
-    settings = plan(source, rate_hz=10, settings=STEPS).settings
+def engine_over(source, chosen=None):
+    settings = plan(source, rate_hz=10, settings=STEPS if chosen is None else chosen).settings
     engine = Reconstructor(SIZE, settings=settings)
     for frame in source.frames():
         engine.push_frame(frame)
@@ -66,12 +67,12 @@ def engine_over(source):
 
 def test_smoothing_is_two_filters_combined_by_information():
     source = recording()
-    forward, backward = engine_over(source), engine_over(mirrored(source))
+    chosen = dataclasses.replace(STEPS, filter=dataclasses.replace(STEPS.filter, unshown_tail=0.0))
+    forward, backward = (engine_over(of, chosen) for of in (source, mirrored(source)))
     times = list(range(1_000, 172_000, 7_000))
     seen_backward = {t: backward.estimate(-t) for t in times[::-1]}
-    for image, t in zip(
-        kalux.reconstruct(source, times=times, settings=STEPS, smooth=True), times, strict=True
-    ):
+    images = kalux.reconstruct(source, times=times, settings=chosen, smooth=True)
+    for image, t in zip(images, times, strict=True):
         a, b = forward.estimate(t), seen_backward[t]
         weights = 1 / a.variance, 1 / b.variance
         level = (weights[0] * a.log_intensity + weights[1] * b.log_intensity) / (weights[0] + weights[1])
@@ -243,6 +244,20 @@ def test_where_one_filter_knows_nothing_the_other_is_taken():
     found = combine(forward, backward)
     assert found.log_intensity[0, 0] == pytest.approx(1.0, abs=1e-9)
     assert (found.t, found.variance[0, 0]) == (5, 0.01)
+
+
+def test_where_one_filter_knows_only_a_bound_it_is_one():
+    """Of three pixels the first filter has bounds, the second measured two, one of them below its bound."""
+    of = {"noise": np.full(3, 0.1, np.float32), "excess": np.full(3, 0.4, np.float32)}
+    first = Estimate(
+        5, np.zeros((1, 3)), np.full((1, 3), 1.1), 0.0, True, unshown=Unshown(np.arange(3), **of)
+    )
+    seen = Unshown(np.array([2]), np.full(1, 0.2, np.float32), np.full(1, 0.3, np.float32))
+    level, variance = np.array([[0.5, -0.2, 0.0]]), np.array([[0.1, 0.1, 1.3]])
+    found = combine(first, Estimate(-5, level, variance, 0.0, True, unshown=seen))
+    np.testing.assert_allclose(found.log_intensity, [[0.5, -0.1, 0.0]], atol=1e-7)
+    assert found.unshown.pixels.tolist() == [2]
+    assert found.unshown.excess[0] == pytest.approx(0.3)
 
 
 @pytest.mark.parametrize(

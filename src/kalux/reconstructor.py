@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.augmentation.highlights import Unshown
 from kalux.augmentation.refractory import EventClock
 from kalux.augmentation.trail import FrameTrail
 from kalux.compiled import event_words
@@ -22,10 +23,11 @@ from kalux.errors import InputError, SettingsError
 from kalux.events import EVENT_DTYPE, EventArray, as_events, check_events
 from kalux.filters.akf import State
 from kalux.filters.buffer import EventBuffer
+from kalux.filters.highlights import lifted, read_unshown, tempered
 from kalux.filters.methods import Method, Segment, Shot, make_method, take_shot
 from kalux.filters.readout import HighlightPrior, hidden_variance, read_out
 from kalux.frames import Frame, check_frame
-from kalux.models.camera import Camera, count_bright
+from kalux.models.camera import Camera, beyond_white, count_bright
 from kalux.models.colour import (
     Gains,
     calm_highlights,
@@ -95,6 +97,8 @@ class Estimate:
         0 at a frame, 1 half-way between two, and where the next one is not known or not used.
     chroma
         Of frames in RGB: float32 (H, W, 3), the ratios of the channels to the luminance; else None.
+    unshown
+        Pixels that no frame has measured until then, of which L is a bound; None: there are none.
     """
 
     t: int
@@ -105,6 +109,7 @@ class Estimate:
     moving: NDArray[np.bool_] | None = None
     between: float = 0.0
     chroma: NDArray[np.float32] | None = None
+    unshown: Unshown | None = None
 
 
 class _Progress:
@@ -398,6 +403,7 @@ class Reconstructor:
             self._method.moving(progress.segment, progress.cursor),
             _between(progress, t) if self.lookahead else 1.0,
             self._chroma(progress, t),
+            self._unshown(progress, variance),
         )
 
     def trail(self, t: int) -> NDArray[np.floating[Any]] | None:
@@ -416,31 +422,49 @@ class Reconstructor:
         scale = filtered.highlight_scale if filtered.kind == "akf" else 0.0
         spread = events.threshold_spread
         if self._estimated:
-            tail = filtered.bright_tail or self._tail
-            assert tail is not None
-            scale, spread = min(scale, filtered.highlight_tail * tail), events.extrapolation_spread
+            scale, spread = (
+                min(scale, filtered.highlight_tail * self._tail_beyond),
+                events.extrapolation_spread,
+            )
         prior = HighlightPrior(
             white=estimate.white, scale2=scale**2, stretch=spread**2 / scale if scale > 0 else 0.0
         )
         mosaic = self._last_frame is not None and self._last_frame.mosaic is not None
         on, off = self.thresholds
         offset = self.settings.camera.offset
-        intensity, variance = read_out(
-            estimate.log_intensity,
-            estimate.variance,
-            offset,
-            prior,
-            estimate.moving,
-            hidden_variance(estimate.between, on * off),
-            self.settings.filter.neighbours,
-            pitch=2 if mosaic else 1,  # neighbours of the same colour
-        )
-        image = Image(estimate.t, intensity, variance, offset, estimate.final)
+        log_intensity, variance, unshown = estimate.log_intensity, estimate.variance, estimate.unshown
+        if unshown is not None:
+            unshown = tempered(unshown, log_intensity, prior)
+            log_intensity, variance = lifted(log_intensity, variance, unshown)
+        moving, neighbours = estimate.moving, self.settings.filter.neighbours
+        pitch = 2 if mosaic else 1  # neighbours of the same colour
+        hidden = hidden_variance(estimate.between, on * off)
+        intensity, total = read_out(log_intensity, variance, offset, prior, moving, hidden, neighbours, pitch)
+        if unshown is not None:
+            bound = estimate.log_intensity
+            read_unshown(
+                intensity, log_intensity, total, bound, unshown, moving, offset, prior, neighbours, pitch
+            )
+        image = Image(estimate.t, intensity, total, offset, estimate.final)
         return (
             image
             if self._colours == "grey"
             else dataclasses.replace(image, colour=self._coloured(image, estimate))
         )
+
+    def _unshown(self, progress: _Progress, variance: NDArray[np.floating[Any]]) -> Unshown | None:
+        """Pixels that no frame has measured yet (K15), where highlights are looked at."""
+        filtered = self.settings.filter
+        if filtered.highlight_scale == 0 or filtered.unshown_tail == 0:
+            return None
+        return self._method.unshown(progress.segment, variance, filtered.unshown_tail * self._tail_beyond)
+
+    @property
+    def _tail_beyond(self) -> float:
+        """How far the frames' bright tail goes on beyond white."""
+        tail = self.settings.filter.bright_tail or self._tail
+        assert tail is not None
+        return beyond_white(tail)
 
     @property
     def _colours(self) -> str:

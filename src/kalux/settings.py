@@ -202,9 +202,12 @@ class FilterSettings:
         Standard deviation, in log intensity, of how far scenes go beyond white: what is not known of a
         highlight is drawn towards white by it. 0 turns it off. 1.5 (docs/tuning.md).
     highlight_tail
-        The same where thresholds are only an estimate, as a multiple of the scale of the frames' bright tail
-        (`kalux.models.camera.BrightTail`), but no more than highlight_scale: scenes of which little saturates do
-        not go far beyond white. 0.75 (docs/tuning.md).
+        The same where thresholds are only an estimate, as a multiple of how far the frames' bright tail goes on
+        (`kalux.models.camera.beyond_white`), but no more than highlight_scale: scenes of which little saturates do
+        not go far beyond white. 3 (docs/tuning.md).
+    unshown_tail
+        How far above their bounds pixels are taken to lie that every frame so far has clipped, where none around has
+        told (docs/equations.md, K15): a multiple of the same. 0 leaves them at their bounds. 0.5 (docs/tuning.md).
     bright_tail
         That scale; None: from the recording's frames, in a live stream from the first.
     neighbours
@@ -220,7 +223,8 @@ class FilterSettings:
     deblur: bool = True
     initial_variance: float = 1.0
     highlight_scale: float = 1.5
-    highlight_tail: float = 0.75
+    highlight_tail: float = 3.0
+    unshown_tail: float = 0.5
     bright_tail: float | None = None
     neighbours: float = 0.3
     cutoff: float = 1.0

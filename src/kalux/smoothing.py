@@ -6,8 +6,9 @@ L' and P' of the backward one, the estimate is the two-filter smoother (Fraser a
 
     L_s = (L / P + L' / P') / (1 / P + 1 / P').
 
-Both have seen the frames around the image, so their variances are not independent where frames are well exposed;
-the smaller of the two is given out.
+Where one of them knows no more than a bound, it counts as one (docs/equations.md, K15). Both have seen the frames
+around the image, so their variances are not independent where frames are well exposed; the smaller of the two is given
+out.
 
 Memory is bounded: the recording is spilled to disk, where it can be read backward, and the backward pass is done
 twice, first to save its state before every window of images, then window by window for the images themselves.
@@ -30,6 +31,7 @@ from kalux.augmentation.trail import FrameTrail, follow, nothing_followed, trail
 from kalux.compiled import event_words
 from kalux.errors import OutputError
 from kalux.events import EVENT_DTYPE, EventArray
+from kalux.filters.highlights import obey_bounds, smoothed_unshown
 from kalux.frames import Frame, Mosaic
 from kalux.reconstructor import Estimate, Reconstructor
 from kalux.recording import Recording
@@ -342,15 +344,23 @@ def combine(
         return forward
     first, second = 1.0 / forward.variance, 1.0 / backward.variance
     behind = backward.log_intensity if trail is None else backward.log_intensity + trail
+    level = (first * forward.log_intensity + second * behind) / (first + second)
+    directions = (
+        (forward.log_intensity, forward.variance, forward.unshown),
+        (behind, backward.variance, backward.unshown),
+    )
+    for own, other in (directions, directions[::-1]):
+        obey_bounds(level, *own, *other)
     return Estimate(
         t=forward.t,
-        log_intensity=(first * forward.log_intensity + second * behind) / (first + second),
+        log_intensity=level,
         variance=np.minimum(forward.variance, backward.variance),
         white=forward.white,
         final=forward.final,
         moving=_either(forward.moving, backward.moving),
         between=forward.between,
         chroma=forward.chroma,
+        unshown=smoothed_unshown(forward.unshown, backward.unshown),
     )
 
 

@@ -47,6 +47,28 @@ class Latent(NamedTuple):
     ceiling: Array | None = None
 
 
+class UnshownMemory(NamedTuple):
+    """At a node: pixels that no frame has measured yet, and what others have told since (K15).
+
+    Attributes
+    ----------
+    pixels
+        (N,) their places in the flattened image, ascending.
+    bound
+        (N,) float32, the least that L can be.
+    shape
+        (H, W).
+    told, tellers
+        Of every part of the image: sum of the distances of pixels from their bounds, and the number of these pixels.
+    """
+
+    pixels: NDArray[np.int64]
+    bound: NDArray[np.float32]
+    shape: tuple[int, int]
+    told: Array
+    tellers: Array
+
+
 class Thresholds(NamedTuple):
     """What is known of every pixel's thresholds: (H, W) factors of the nominal ones, and their variances."""
 
@@ -77,6 +99,7 @@ class BridgedSegment(NamedTuple):
     bound). At ``end`` the pixel obeys the frame ``bound`` (`lift`), and its variance grows by ``drift``, what its
     thresholds may have been wrong by (`drift`; None: nothing). Pixels without an event after ``still_since`` are still.
     Beyond what L^A and the state say here, the level is ahead of its newest event by ``trail`` (K14; None: it is not).
+    ``unshown`` is of the pixels that no frame has measured until ``end``, or ``start`` in causal mode.
     """
 
     start: int
@@ -95,6 +118,7 @@ class BridgedSegment(NamedTuple):
     still_since: int = 0
     floor: Array | None = None
     trail: Trail | None = None
+    unshown: UnshownMemory | None = None
 
 
 def drift(

@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation import bridge, deblur, interpolation
-from kalux.augmentation.bridge import BridgedSegment, BridgeNoise, Latent, Thresholds
+from kalux.augmentation.bridge import BridgedSegment, BridgeNoise, Latent, Thresholds, UnshownMemory
 from kalux.augmentation.deblur import ExposureIntegrals, all_between, count_chunks, mean_level
+from kalux.augmentation.highlights import Unshown, begin_unshown, expected_excess, follow_unshown
 from kalux.augmentation.trail import (
     Followed,
     FrameTrail,
@@ -287,6 +288,12 @@ class Method(Protocol):
     def trail(self, segment: Any, cursor: Any, t: int) -> Floats | None:
         """(H, W): how far the light is ahead of its events at ``t`` (K14); None: the method does not tell."""
 
+    def unshown(self, segment: Any, variance: Floats, prior: float) -> Unshown | None:
+        """Pixels that no frame has measured until then (K15), given P there; None: the method knows none.
+
+        ``prior`` is how far above their bounds they are expected where none around has told.
+        """
+
 
 def make_method(
     settings: Settings,
@@ -320,6 +327,9 @@ class _Common:
     def trail(self, segment: Any, cursor: Any, t: int) -> Floats | None:
         return None
 
+    def unshown(self, segment: Any, variance: Floats, prior: float) -> Unshown | None:
+        return None
+
     def log_frame(self, shot: Shot) -> Array:
         log_frame: Array = log_intensity(shot.level_intensity, self.offset)[shot.levels]
         return log_frame
@@ -350,7 +360,7 @@ class BridgeMemory(NamedTuple):
 
     In causal mode also the counts of events between the middle and the end of the latest exposure. Of pixels that the
     latest frames did not measure, the counts since one did (to the latest node); 0 elsewhere. ``since`` is the start of
-    the first exposure, us.
+    the first exposure, us. ``unshown`` is of the pixels that no frame has measured yet.
     """
 
     latent: Latent
@@ -363,6 +373,7 @@ class BridgeMemory(NamedTuple):
     since: int
     followed: Followed
     at_middle: Followed
+    unshown: UnshownMemory
 
 
 class BridgedFrames(_Common):
@@ -464,17 +475,45 @@ class BridgedFrames(_Common):
         far = np.zeros(self.shape, np.float32)
         if self.lookahead:
             on, off, followed = self.follow(events, begin, shot.middle, unknown)
-            memory = BridgeMemory(latent, thresholds, 0.0, on, off, far, far, shot.start, followed, followed)
+            memory = BridgeMemory(
+                latent,
+                thresholds,
+                0.0,
+                on,
+                off,
+                far,
+                far,
+                shot.start,
+                followed,
+                followed,
+                begin_unshown(latent),
+            )
             value, variance = latent.value, latent.variance
             if shot.middle > begin:
                 lead_in = bridge.extend_backward(latent, on, off, thresholds, self.noise, begin, shot.middle)
-                lead_in = lead_in._replace(still_since=shot.start, trail=self._lead_in_trail(shot, followed))
+                lead_in = lead_in._replace(
+                    still_since=shot.start,
+                    trail=self._lead_in_trail(shot, followed),
+                    unshown=memory.unshown,
+                )
                 value = lead_in.augmented
                 variance = lead_in.backward_variance + lead_in.step_variance * lead_in.events
         else:
             # The clock begins at the end of the exposure: nothing is known of what came before.
             on, off = self.counts(events, shot.middle, shot.end)
-            memory = BridgeMemory(latent, thresholds, 0.0, on, off, far, far, shot.start, unknown, unknown)
+            memory = BridgeMemory(
+                latent,
+                thresholds,
+                0.0,
+                on,
+                off,
+                far,
+                far,
+                shot.start,
+                unknown,
+                unknown,
+                begin_unshown(latent),
+            )
             carried = self._carried(memory, shot)
             value, variance = carried.value, carried.variance
         unmeasured = variance >= bridge.UNMEASURED
@@ -497,7 +536,10 @@ class BridgedFrames(_Common):
                 trail = self._trail(memory.followed, start, memory.followed.scale)
             else:
                 trail = given_trail(shot.trail.before, np.zeros(self.shape, np.float32))
-            return alone._replace(still_since=_still_since(memory, start, seconds), trail=trail), memory
+            alone = alone._replace(
+                still_since=_still_since(memory, start, seconds), trail=trail, unshown=memory.unshown
+            )
+            return alone, memory
         interval = (following.middle - shot.middle) * 1e-6
         second = self.latent(following, events, memory.thresholds)
         on, off, at_middle = self.follow(events, start, following.middle, memory.followed)
@@ -525,15 +567,26 @@ class BridgedFrames(_Common):
                 bound=second, floor=bridge.floor_before(second, net, unmeasured), trail=trail
             )
             joined, far_on, far_off = self._drifting(joined, memory, second, on, off)
-            return joined, BridgeMemory(
-                second, learned, interval, on, off, far_on, far_off, memory.since, at_middle, at_middle
+            unshown = follow_unshown(memory.unshown, second, net)
+            after = BridgeMemory(
+                second,
+                learned,
+                interval,
+                on,
+                off,
+                far_on,
+                far_off,
+                memory.since,
+                at_middle,
+                at_middle,
+                unshown,
             )
-        scale = (
-            memory.followed.scale
-        )  # of what came before: what the segment holds is still to come when it is read
+            return joined._replace(unshown=unshown), after
+        # Of what came before: what the segment holds is still to come when it is read.
+        scale = memory.followed.scale
         grown = self._trail_at(at_middle, following.middle, scale)
         grown -= self._trail_at(memory.at_middle, shot.middle, scale)
-        _, learned = bridge.bridge(
+        behind, learned = bridge.bridge(
             memory.latent,
             second._replace(value=second.value - grown),
             on + memory.on,
@@ -544,6 +597,7 @@ class BridgedFrames(_Common):
             following.middle,
         )
         tail_on, tail_off, followed = self.follow(events, following.middle, following.end, at_middle)
+        net = behind.step_on * (on + memory.on) - behind.step_off * (off + memory.off) + grown
         after = memory._replace(
             latent=second,
             thresholds=learned,
@@ -552,6 +606,7 @@ class BridgedFrames(_Common):
             off=tail_off,
             followed=followed,
             at_middle=at_middle,
+            unshown=follow_unshown(memory.unshown, second, net),
         )
         forward = bridge.extend(
             self._carried(memory, shot),
@@ -563,7 +618,7 @@ class BridgedFrames(_Common):
             self._carried(after, following),
         )
         forward, far_on, far_off = self._drifting(forward, memory, second, on + tail_on, off + tail_off)
-        forward = forward._replace(trail=self._trail(memory.followed, start, scale))
+        forward = forward._replace(trail=self._trail(memory.followed, start, scale), unshown=memory.unshown)
         return forward, after._replace(far_on=far_on, far_off=far_off)
 
     def follow(
@@ -641,6 +696,11 @@ class BridgedFrames(_Common):
 
     def trail(self, segment: Any, cursor: akf.BridgedCursor, t: int) -> NDArray[np.float32] | None:
         return akf.trail_bridged(segment, cursor, t)
+
+    def unshown(self, segment: BridgedSegment, variance: Floats, prior: float) -> Unshown | None:
+        if segment.unshown is None:
+            return None
+        return expected_excess(segment.unshown, variance, self.settings.filter.initial_variance, prior)
 
 
 def _still_since(memory: BridgeMemory, start: int, seconds: float) -> int:

@@ -288,6 +288,15 @@ class BrightTail(NamedTuple):
 
 _TAIL_BOUNDS: Final = (0.3, 2.0)
 
+_NO_TAIL: Final = 0.25
+"""Scale of a tail that does not go on beyond white, just below the least that is told."""
+
+
+def beyond_white(scale: float) -> float:
+    """How far a bright tail of this `BrightTail.scale` goes on beyond white, up to a factor: 0.05 at least."""
+    return max(scale, _TAIL_BOUNDS[0]) - _NO_TAIL
+
+
 ABOUT_WHITE: Final = 0.95
 """Intensity, white = 1, that counts as white for `BrightTail`: below where sensors clip unevenly."""
 

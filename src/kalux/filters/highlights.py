@@ -1,0 +1,151 @@
+"""Read-out of highlights that no frame has shown yet (docs/equations.md, K15)."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux.augmentation.highlights import Unshown
+from kalux.compiled import ONE, exponential
+from kalux.filters.readout import HighlightPrior, believed_highlight, neighbour_weight
+
+Floats = NDArray[np.floating[Any]]
+
+_LEAST_SPREAD: Final = np.float32(0.3)
+"""Standard deviation that is left where pixels around say that all lie just above their bounds."""
+
+
+def tempered(unshown: Unshown, bound: Floats, prior: HighlightPrior) -> Unshown:
+    """What is expected above a bound that is beyond white itself: highlights end somewhere.
+
+    Above the bound the exponential distribution of `Unshown` and the normal one of the prior on highlights (K6) fall at
+    the rates 1 / e and d / s^2, d the bound's distance from white: together, e becomes 1 / (1 / e + d / s^2).
+
+    Parameters
+    ----------
+    bound
+        (H, W) L.
+    """
+    beyond = np.maximum(bound.reshape(-1)[unshown.pixels] - np.float32(prior.white), np.float32(0.0))
+    steeper = np.float32(1.0) + unshown.excess * beyond / np.float32(prior.scale2)
+    return unshown._replace(excess=unshown.excess / steeper)
+
+
+def lifted(log_intensity: Floats, variance: Floats, unshown: Unshown) -> tuple[Floats, Floats]:
+    """L and P, (H, W), with pixels where they are expected above their bounds, and the variance of that."""
+    level, spread = log_intensity.copy(), variance.copy()
+    level.reshape(-1)[unshown.pixels] += unshown.excess
+    spread.reshape(-1)[unshown.pixels] = np.maximum(unshown.excess, _LEAST_SPREAD) ** 2 + unshown.noise
+    return level, spread
+
+
+def read_unshown(
+    image: NDArray[np.float32],
+    level: Floats,
+    variance: NDArray[np.float32],
+    bound: Floats,
+    unshown: Unshown,
+    moving: NDArray[np.bool_] | None,
+    log_offset: float,
+    prior: HighlightPrior,
+    difference: float,
+    pitch: int,
+) -> None:
+    """Pixels that no frame has shown are given the mean of their intensity. In place.
+
+    Parameters
+    ----------
+    image
+        (H, W) I.
+    level, variance
+        (H, W) L of `lifted`, and its variance (K11).
+    bound
+        (H, W) L: what neighbours say of a pixel (K12) does not take it below.
+    moving, difference, pitch
+        Of K12, as in `kalux.filters.readout`.
+    log_offset, prior
+        I_0, and the prior on highlights (K6), which is to doubt what events say of them, not that they are bright.
+    """
+    if moving is None or difference == 0:
+        moving = np.zeros(image.shape, np.bool_)
+    mean = np.empty(len(unshown.pixels), np.float32)
+    difference2 = np.float32(difference * difference)
+    _hear_neighbours(unshown.pixels, level, variance, bound, moving, difference2, pitch, mean)
+    white, scale2, stretch = (np.float32(value) for value in prior)
+    _take_mean(unshown.excess, unshown.noise, np.float32(log_offset), white, scale2, stretch, mean)
+    image.reshape(-1)[unshown.pixels] = mean
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _hear_neighbours(pixels, level, variance, bound, moving, difference2, pitch, heard):  # type: ignore[no-untyped-def]
+    """K12 of single pixels: L, at least the bound."""
+    height, width = level.shape
+    for i in range(len(pixels)):
+        row, column = divmod(pixels[i], width)
+        own, doubt = np.float32(level[row, column]), np.float32(variance[row, column])
+        heard[i] = own
+        if not moving[row, column]:
+            continue
+        information, deviation = ONE / doubt, np.float32(0.0)
+        for down in range(-1, 2):
+            for right in range(-1, 2):
+                y, x = row + down * pitch, column + right * pitch
+                inside = 0 <= y < height and 0 <= x < width
+                if inside and (down != 0 or right != 0):
+                    excess = np.float32(level[y, x]) - own
+                    allowed = difference2 * np.float32(pitch * pitch * (down * down + right * right))
+                    weight = neighbour_weight(excess, doubt, np.float32(variance[y, x]), allowed)
+                    deviation += weight * excess
+                    information += weight
+        heard[i] = max(own + deviation / information, np.float32(bound[row, column]))
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _take_mean(excess, noise, log_offset, white, scale2, stretch, mean):  # type: ignore[no-untyped-def]
+    """From L to the mean of the intensity, in place, without branches, so that it becomes vector code."""
+    half, zero = np.float32(0.5), np.float32(0.0)
+    for i in range(len(mean)):
+        level = mean[i] + half * excess[i] * excess[i]
+        believed = white + believed_highlight(max(level - white, zero), noise[i], scale2, stretch)
+        mean[i] = max(exponential(believed if level > white else level) - log_offset, zero)
+
+
+def smoothed_unshown(forward: Unshown | None, backward: Unshown | None) -> Unshown | None:
+    """Pixels that no frame of the recording measures; of what both directions expect, the mean."""
+    if forward is None or backward is None:
+        return None
+    pixels, first, second = np.intersect1d(
+        forward.pixels, backward.pixels, assume_unique=True, return_indices=True
+    )
+    excess = (forward.excess[first] + backward.excess[second]) / np.float32(2.0)
+    return Unshown(pixels, excess, np.minimum(forward.noise[first], backward.noise[second]))
+
+
+def obey_bounds(
+    smoothed: Floats,
+    bound: Floats,
+    own: Floats,
+    unshown: Unshown | None,
+    level: Floats,
+    variance: Floats,
+    other: Unshown | None,
+) -> None:
+    """Smoothed L, (H, W), where one direction knows no more than a ``bound``: that of the other direction. In place.
+
+    ``own`` is P of the direction with the bounds; ``level`` and ``variance`` are the other's, ``other`` the pixels of
+    which that knows no more either. Where its level is below the bound, both are wrong, each in proportion to its
+    variance. Where it is less sure than the bound, it does not count alone.
+    """
+    if unshown is None:
+        return
+    only = np.ones(len(unshown.pixels), np.bool_)
+    if other is not None:
+        only = np.isin(unshown.pixels, other.pixels, assume_unique=True, invert=True)
+    pixels = unshown.pixels[only]
+    known, doubt, noise = level.reshape(-1)[pixels], variance.reshape(-1)[pixels], unshown.noise[only]
+    short = np.maximum(bound.reshape(-1)[pixels] - known, np.float32(0.0))
+    surer = doubt < own.reshape(-1)[pixels]
+    smoothed.reshape(-1)[pixels[surer]] = (known + short * doubt / (doubt + noise))[surer]

@@ -1,0 +1,97 @@
+"""How pixels that no frame has shown are read out, and what smoothing makes of their bounds."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kalux.augmentation.highlights import Unshown
+from kalux.filters.highlights import lifted, obey_bounds, read_unshown, smoothed_unshown, tempered
+from kalux.filters.readout import HighlightPrior, intensity, regularised
+
+OFFSET = 0.03
+WHITE = float(np.log(1 + OFFSET))
+PRIOR = HighlightPrior(WHITE, 2.25, 0.0)
+
+
+def unshown(pixels, excess, noise=0.0):
+    count = len(pixels)
+    return Unshown(np.array(pixels), np.full(count, excess, np.float32), np.full(count, noise, np.float32))
+
+
+def read(level, where, difference=0.0, moving=None, pitch=1):
+    bound = np.asarray(level, np.float32)
+    raised, spread = lifted(bound, np.full(bound.shape, 0.01, np.float32), where)
+    image = intensity(raised, spread, OFFSET, PRIOR)
+    read_unshown(image, raised, spread, bound, where, moving, OFFSET, PRIOR, difference, pitch)
+    return image
+
+
+def test_at_white_it_is_the_mean_of_what_is_expected():
+    """The log of the mean intensity of a normal distribution: mean and half the variance."""
+    image = read(np.full((2, 2), WHITE), unshown([1], 0.4))
+    assert image[0, 1] == pytest.approx(1.03 * np.exp(0.4 + 0.08) - 0.03, rel=1e-5)
+    assert image[0, 0] == pytest.approx(1.0, abs=1e-6)
+
+
+def test_noise_of_the_events_draws_to_white():
+    level = np.full((1, 2), WHITE + 1.0)
+    assert read(level, unshown([0], 0.4, 1.0))[0, 0] < read(level, unshown([0], 0.4, 0.0))[0, 0]
+
+
+@pytest.mark.parametrize("pitch", [1, 2])
+def test_neighbours_are_heard_as_by_other_pixels(pitch):
+    """K12 with the expected levels, of the pixels of the same colour."""
+    rng = np.random.default_rng(3)
+    level = (WHITE + 0.3 + 0.2 * rng.random((6, 7))).astype(np.float32)
+    where = unshown(np.arange(0, 42, 3), 0.5, 0.02)
+    moving = rng.random((6, 7)) < 0.8
+    raised, spread = lifted(level, np.full((6, 7), 0.05, np.float32), where)
+    image = intensity(raised, spread, OFFSET, PRIOR)
+    read_unshown(image, raised, spread, level, where, moving, OFFSET, PRIOR, 0.3, pitch)
+    heard = regularised(raised, spread, moving, 0.3, pitch).reshape(-1)[where.pixels]
+    assert (heard != raised.reshape(-1)[where.pixels]).any()
+    expected = intensity(
+        np.maximum(heard, level.reshape(-1)[where.pixels]) + where.excess**2 / 2, where.noise, OFFSET, PRIOR
+    )
+    np.testing.assert_allclose(image.reshape(-1)[where.pixels], expected, rtol=1e-5)
+
+
+def test_dark_neighbours_do_not_take_a_pixel_below_its_bound():
+    level = np.full((3, 3), WHITE - 0.4, np.float32)
+    level[1, 1] = WHITE
+    image = read(level, unshown([4], 0.01), 0.3, np.ones((3, 3), bool))
+    assert image[1, 1] >= 1.0
+
+
+def test_far_beyond_white_less_is_expected_above():
+    bound = np.array([[WHITE - 1, WHITE, WHITE + 2.25]], np.float32)
+    found = tempered(unshown([0, 1, 2], 0.5), bound, PRIOR)
+    np.testing.assert_allclose(found.excess, [0.5, 0.5, 1 / 3], rtol=1e-6)
+
+
+def test_of_both_directions_only_what_neither_has_seen_is_left():
+    found = smoothed_unshown(unshown([1, 4, 7], 0.2, 0.3), unshown([4, 7, 9], 0.4, 0.1))
+    np.testing.assert_array_equal(found.pixels, [4, 7])
+    np.testing.assert_allclose(found.excess, 0.3, rtol=1e-6)
+    np.testing.assert_allclose(found.noise, 0.1, rtol=1e-6)
+    assert smoothed_unshown(found, None) is None
+
+
+def obeyed(bound, noise, level, doubt, other=None):
+    smoothed = np.array([[-9.0]])
+    own = np.array([[1.0 + noise]])
+    args = (np.array([[bound]]), own, unshown([0], 0.2, noise), np.array([[level]]), np.array([[doubt]]))
+    obey_bounds(smoothed, *args, other)
+    return float(smoothed[0, 0])
+
+
+def test_where_one_direction_knows_only_a_bound_the_other_counts():
+    assert obeyed(0.0, 0.1, 1.5, 0.1) == 1.5
+    assert obeyed(2.0, 0.1, 1.5, 0.1) == pytest.approx(1.75)  # both are as sure
+    assert obeyed(2.0, 0.0, 1.5, 0.1) == 2.0
+
+
+def test_but_not_where_it_is_less_sure_or_knows_no_more():
+    assert obeyed(0.0, 0.1, 1.5, 3.0) == -9.0
+    assert obeyed(0.0, 0.1, 1.5, 0.1, unshown([0], 0.2)) == -9.0
