@@ -96,11 +96,13 @@ class Estimate:
     final
         As of `Image`.
     moving
-        (H, W) bool: pixels with an event in this frame interval or the one before; None: not told.
+        (H, W) bool: pixels with an event in this frame interval, also one to come, or the one before; None: not told.
     between
         0 at a frame, 1 half-way between two, and where the next one is not known or not used.
     chroma
         Of frames in RGB: float32 (H, W, 3), the ratios of the channels to the luminance; else None.
+    silent_change
+        (H, W): mean square change of silent pixels around each, from one frame to the next; None: not told.
     """
 
     t: int
@@ -111,6 +113,7 @@ class Estimate:
     moving: NDArray[np.bool_] | None = None
     between: float = 0.0
     chroma: NDArray[np.float32] | None = None
+    silent_change: NDArray[np.floating[Any]] | None = None
 
 
 class _Progress:
@@ -382,6 +385,7 @@ class Reconstructor:
             self._method.moving(progress.segment, progress.cursor),
             _between(progress, t) if self.lookahead else 1.0,
             self._chroma(progress, t),
+            self._method.silent_change(progress.segment),
         )
 
     def image(self, estimate: Estimate) -> Image:
@@ -399,7 +403,9 @@ class Reconstructor:
         )
         moving, neighbours = estimate.moving, self.settings.filter.neighbours
         on, off = self.thresholds
-        variance = total_variance(estimate.variance, moving, estimate.between, on * off)
+        variance = total_variance(
+            estimate.variance, moving, estimate.between, on * off, estimate.silent_change
+        )
         log_intensity = estimate.log_intensity
         if moving is not None and neighbours > 0:
             mosaic = self._last_frame is not None and self._last_frame.mosaic is not None

@@ -126,6 +126,17 @@ def test_the_hidden_variance_is_larger_between_frames_and_where_things_move():
     assert total_variance(variance, None, 1.0, 0.04) is variance
 
 
+def test_still_pixels_hide_what_silent_ones_around_them_show():
+    variance, change = np.full((1, 2), 0.01, np.float32), np.array([[0.0, 0.02]], np.float32)
+    still = np.zeros((1, 2), bool)
+    hidden = total_variance(variance, still, 1.0, 0.04, change) - variance
+    assert hidden[0, 0] < 0.001
+    assert hidden[0, 1] == pytest.approx(hidden[0, 0] + 0.35 * 0.02, rel=1e-4)
+    np.testing.assert_allclose(
+        total_variance(variance, ~still, 1.0, 0.04, change), 0.01 + 0.04 * 0.14, rtol=1e-4
+    )
+
+
 # --- neighbours ----------------------------------------------------------------------------------------------
 
 

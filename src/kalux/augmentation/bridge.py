@@ -74,6 +74,7 @@ class BridgedSegment(NamedTuple):
     for each of the ``events`` still to come. At ``start`` the level is ``floor`` or more (`floor_before`; None: no
     bound). At ``end`` the pixel obeys the frame ``bound`` (`lift`), and its variance grows by ``drift``, what its
     thresholds may have been wrong by (`drift`; None: nothing). Pixels without an event after ``still_since`` are still.
+    ``silent_change`` is what silent pixels around each change from one frame to the next (`unseen`; None: not known).
     """
 
     start: int
@@ -91,6 +92,7 @@ class BridgedSegment(NamedTuple):
     drift: Array | None = None
     still_since: int = 0
     floor: Array | None = None
+    silent_change: Array | None = None
 
 
 def drift(

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from kalux.augmentation import bridge, deblur, interpolation
 from kalux.augmentation.bridge import BridgedSegment, BridgeNoise, Latent, Thresholds
 from kalux.augmentation.deblur import ExposureIntegrals, all_between, count_chunks, mean_level
+from kalux.augmentation.unseen import UNKNOWN_CHANGE, silent_change
 from kalux.compiled import AHEAD, logarithm, prefetch
 from kalux.errors import SettingsError
 from kalux.events import EventArray
@@ -269,7 +270,10 @@ class Method(Protocol):
         """The state at the end of the segment."""
 
     def moving(self, segment: Any, cursor: Any) -> NDArray[np.bool_] | None:
-        """(H, W): pixels with an event in this frame interval or the one before; None: the method does not tell."""
+        """(H, W): pixels with an event in this frame interval, also one to come, or the one before; None: not told."""
+
+    def silent_change(self, segment: Any) -> Floats | None:
+        """(H, W): `unseen.silent_change` of the segment; None: the method or the segment does not tell."""
 
 
 def make_method(
@@ -301,6 +305,9 @@ class _Common:
     def moving(self, segment: Any, cursor: Any) -> NDArray[np.bool_] | None:
         return None
 
+    def silent_change(self, segment: Any) -> Floats | None:
+        return None
+
     def log_frame(self, shot: Shot) -> Array:
         log_frame: Array = log_intensity(shot.level_intensity, self.offset)[shot.levels]
         return log_frame
@@ -323,7 +330,7 @@ _DARKEST: Final = 0.001
 """What is black is taken to be spread evenly in log I from here, white = 1, a quarter of an 8-bit level."""
 
 _BLACK_FRAMES: Final = 3.0
-"""Black says the same in every frame: so many of them count as one (docs/equations.md, K7)."""
+"""Black says the same in every frame: so many of them count as one, and all as no more (docs/equations.md, K7)."""
 
 
 class BridgeMemory(NamedTuple):
@@ -342,6 +349,7 @@ class BridgeMemory(NamedTuple):
     far_on: Floats
     far_off: Floats
     since: int
+    silent_change: Floats
 
 
 class BridgedFrames(_Common):
@@ -440,9 +448,10 @@ class BridgedFrames(_Common):
         newest = make_clock(self.shape, begin - shot.start)
         lead_in = None
         far = np.zeros(self.shape, np.float32)
+        unknown = np.full(self.shape, UNKNOWN_CHANGE * self.on * self.off, np.float32)
         if self.lookahead:
             on, off = self.counts(events, begin, shot.middle)
-            memory = BridgeMemory(latent, thresholds, 0.0, on, off, far, far, shot.start)
+            memory = BridgeMemory(latent, thresholds, 0.0, on, off, far, far, shot.start, unknown)
             value, variance = latent.value, latent.variance
             if shot.middle > begin:
                 lead_in = bridge.extend_backward(latent, on, off, thresholds, self.noise, begin, shot.middle)
@@ -451,7 +460,7 @@ class BridgedFrames(_Common):
                 variance = lead_in.backward_variance + lead_in.step_variance * lead_in.events
         else:
             on, off = self.counts(events, shot.middle, shot.end)
-            memory = BridgeMemory(latent, thresholds, 0.0, on, off, far, far, shot.start)
+            memory = BridgeMemory(latent, thresholds, 0.0, on, off, far, far, shot.start, unknown)
             carried = self._carried(memory)
             value, variance = carried.value, carried.variance
         unmeasured = variance >= bridge.UNMEASURED
@@ -470,7 +479,10 @@ class BridgedFrames(_Common):
             if not self.lookahead:
                 latent = self._carried(memory)
             alone = bridge.extend(latent, memory.thresholds, self.noise, start, FAR_FUTURE, seconds, None)
-            return alone._replace(still_since=_still_since(memory, start, seconds)), memory
+            alone = alone._replace(
+                still_since=_still_since(memory, start, seconds), silent_change=memory.silent_change
+            )
+            return alone, memory
         interval = (following.middle - shot.middle) * 1e-6
         second = self.latent(following, events, memory.thresholds)
         on, off = self.counts(events, start, following.middle)
@@ -480,10 +492,13 @@ class BridgedFrames(_Common):
             )
             net = joined.step_on * on - joined.step_off * off
             unmeasured = memory.latent.variance >= bridge.UNMEASURED
-            joined = joined._replace(floor=bridge.floor_before(second, net, unmeasured))
+            change = self._silent_change(joined)
+            joined = joined._replace(floor=bridge.floor_before(second, net, unmeasured), silent_change=change)
             joined, far_on, far_off = self._drifting(joined, memory, second, on, off)
-            return joined, BridgeMemory(second, learned, interval, on, off, far_on, far_off, memory.since)
-        _, learned = bridge.bridge(
+            return joined, BridgeMemory(
+                second, learned, interval, on, off, far_on, far_off, memory.since, change
+            )
+        behind, learned = bridge.bridge(
             memory.latent,
             second,
             on + memory.on,
@@ -494,7 +509,16 @@ class BridgedFrames(_Common):
             following.middle,
         )
         tail = self.counts(events, following.middle, following.end)
-        after = BridgeMemory(second, learned, interval, *tail, memory.far_on, memory.far_off, memory.since)
+        after = BridgeMemory(
+            second,
+            learned,
+            interval,
+            *tail,
+            memory.far_on,
+            memory.far_off,
+            memory.since,
+            self._silent_change(behind),
+        )
         forward = bridge.extend(
             self._carried(memory),
             memory.thresholds,
@@ -504,8 +528,12 @@ class BridgedFrames(_Common):
             memory.interval or self._FIRST_INTERVAL,
             self._carried(after),
         )
+        forward = forward._replace(silent_change=memory.silent_change)
         forward, far_on, far_off = self._drifting(forward, memory, second, on + tail[0], off + tail[1])
         return forward, after._replace(far_on=far_on, far_off=far_off)
+
+    def _silent_change(self, segment: BridgedSegment) -> Floats:
+        return silent_change(segment, self.noise.quantisation_variance, self.on * self.off)
 
     def _drifting(
         self, segment: BridgedSegment, memory: BridgeMemory, second: Latent, on: Floats, off: Floats
@@ -513,8 +541,14 @@ class BridgedFrames(_Common):
         """The segment with what its pixels may drift (K10), and the counts since they were measured, at its end."""
         unmeasured = second.variance >= bridge.UNMEASURED
         grown = bridge.drift(memory.thresholds, self.noise, memory.far_on, memory.far_off, on, off)
+        # From its last measurement on, nothing but events tells of changes: what they have not told yet, at one end.
+        grown[memory.latent.variance < bridge.UNMEASURED] += self.noise.quantisation_variance / 2
+        grown[~unmeasured] = 0.0
+        if second.ceiling is not None:
+            black = np.isfinite(second.ceiling)
+            grown[black] += second.variance[black] / (_BLACK_FRAMES * (_BLACK_FRAMES + 1))
         segment = segment._replace(
-            drift=np.where(unmeasured, grown, np.float32(0.0)),
+            drift=grown,
             still_since=_still_since(memory, segment.start, memory.interval or self._FIRST_INTERVAL),
         )
         far_on, far_off = (
@@ -548,6 +582,9 @@ class BridgedFrames(_Common):
 
     def moving(self, segment: Any, cursor: akf.BridgedCursor) -> NDArray[np.bool_]:
         return akf.moving_bridged(segment, cursor)
+
+    def silent_change(self, segment: BridgedSegment) -> Floats | None:
+        return segment.silent_change
 
 
 def _still_since(memory: BridgeMemory, start: int, seconds: float) -> int:

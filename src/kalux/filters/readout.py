@@ -8,6 +8,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.augmentation.unseen import UNKNOWN_CHANGE
 from kalux.compiled import ONE, exponential, logarithm
 
 Array = NDArray[np.floating[Any]]
@@ -18,8 +19,12 @@ HIDDEN_MOVING: Final = (0.02, 0.12)
 where events have come of late: that of mid-exposure frames and of times half-way between on eleven simulated scenes
 (docs/equations.md, K11)."""
 
-HIDDEN_STILL: Final = (0.005, 0.04)
-"""The same where no event has come of late."""
+HIDDEN_STILL: Final = 0.35
+"""Where no event has come of late: half-way between two frames, in units of the mean square change of the silent pixels
+around from one to the other (`kalux.augmentation.unseen`); at a frame nothing."""
+
+HIDDEN_LEAST: Final = 0.005
+"""In c^2, there in any case: the same scenes at their frames."""
 
 _NOTHING: Final = np.float32(1e9)
 """Variance of a pixel that knows nothing; its square is still a float32."""
@@ -138,7 +143,11 @@ def _intensity(log_intensity, variance, log_offset, prior, out):  # type: ignore
 
 
 def total_variance(
-    variance: Array, moving: NDArray[np.bool_] | None, between: float, threshold2: float
+    variance: Array,
+    moving: NDArray[np.bool_] | None,
+    between: float,
+    threshold2: float,
+    silent_change: Array | None = None,
 ) -> NDArray[np.float32]:
     """P and the variance of what no event has told yet (docs/equations.md, K11), (H, W) float32.
 
@@ -147,17 +156,21 @@ def total_variance(
     variance
         (H, W) P.
     moving
-        (H, W): pixels with an event of late; None: P as it is.
+        (H, W): pixels with an event of late, or about to have one; None: P as it is.
     between
         0 at a frame, 1 half-way between two.
     threshold2
         c^2.
+    silent_change
+        (H, W): mean square change of silent pixels from one frame to the next; None: not known.
     """
     if moving is None:
         return variance.astype(np.float32, copy=False)
-    still, move = (
-        np.float32(threshold2 * (at + between * half)) for at, half in (HIDDEN_STILL, HIDDEN_MOVING)
-    )
+    c2 = np.float32(threshold2)
+    at, half = HIDDEN_MOVING
+    move = np.float32(at + between * half) * c2
+    change = np.float32(UNKNOWN_CHANGE) * c2 if silent_change is None else silent_change
+    still = np.float32(between * HIDDEN_STILL) * change + np.float32(HIDDEN_LEAST) * c2
     return variance.astype(np.float32, copy=False) + np.where(moving, move, still)
 
 
