@@ -19,7 +19,7 @@ from kalux.settings import chosen_response
 US = 1e-6
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(24)
 UNMEASURED = 1e12
-HIDDEN_MOVING = (0.02, 0.12)
+HIDDEN_MOVING = (0.01, 0.12)
 
 
 @dataclass
@@ -209,7 +209,7 @@ def bridged(pixel, settings, times, on, off):
     )
 
     def crushed(k):  # K7
-        return pixel.black[k] and hidden_by_black > c.frame_noise
+        return pixel.black[k] and hidden_by_black > 1.5 / 255
 
     def ceiling(k, middle):  # K7: the most that L is at the middle of the exposure
         if not crushed(k):
@@ -229,7 +229,9 @@ def bridged(pixel, settings, times, on, off):
         if settings.filter.deblur:
             middle += event_sum(pixel, pixel.starts[k], pixel.middles[k], a, b)
             inside = sum(pixel.starts[k] < t <= pixel.ends[k] for t, *_ in pixel.events)
-        variance = (c.frame_noise * pixel.white[k]) ** 2 / (pixel.intensity[k] + i0) ** 2
+        read, shot = c.noise
+        variance = (read * pixel.white[k]) ** 2 + shot * pixel.white[k] * pixel.intensity[k]
+        variance /= (max(pixel.intensity[k], 1.5 * read * pixel.white[k]) + i0) ** 2
         variance /= max(pixel.weight[k], 1e-6)
         if crushed(k):
             variance = 3 * np.log((most + i0) / i0) ** 2 / 12
@@ -433,7 +435,7 @@ def hidden(pixels, place, moving, t, on, off):
             change = max(sum(near) / len(near), 0.0)
         if not pixels[place].changes[latest][0]:
             change = 0.4 * c2
-    return 0.005 * c2 + change * 0.35 * between
+    return 0.003 * c2 + change * 0.35 * between
 
 
 def regularised(level, variance, moving, difference):

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from kalux.augmentation.deblur import between, count_events
 from kalux.calibration.intervals import intervals
+from kalux.models.camera import noise_variance
 from kalux.recording import Recording
 from kalux.settings import CameraSettings
 
@@ -101,12 +102,13 @@ def estimate_event_model(
         return None
     signals = Samples(*(values[chosen] for values in samples))
 
+    # Frames are taken as they are, with the blur that the filter removes: what that changes is not the events' error.
+    noise = (max(camera.noise[0], camera.usual_frame_noise), camera.noise[1])
+
     def best(among: Samples, log_offsets: tuple[float, ...]) -> tuple[float, float]:
         tried = [(i, q) for i in log_offsets for q in STEP_VARIANCES]
         losses = [
-            negative_log_likelihood(
-                among, thresholds, i, q, camera.frame_noise, threshold_spread, quantisation_variance
-            )
+            negative_log_likelihood(among, thresholds, i, q, noise, threshold_spread, quantisation_variance)
             for i, q in tried
         ]
         return tried[int(np.argmin(losses))]
@@ -122,7 +124,7 @@ def negative_log_likelihood(
     thresholds: tuple[float, float],
     log_offset: float,
     step_variance: float,
-    frame_noise: float,
+    noise: tuple[float, float],
     threshold_spread: float,
     quantisation_variance: float,
 ) -> float:
@@ -135,8 +137,8 @@ def negative_log_likelihood(
     change = np.log(samples.after + log_offset) - np.log(samples.before + log_offset)
     mismatch = change - (on * samples.on - off * samples.off)
     variance = (
-        (frame_noise / (samples.before + log_offset)) ** 2
-        + (frame_noise / (samples.after + log_offset)) ** 2
+        noise_variance(samples.before, noise, 1.0) / (samples.before + log_offset) ** 2
+        + noise_variance(samples.after, noise, 1.0) / (samples.after + log_offset) ** 2
         + threshold_spread**2 * ((on * samples.on) ** 2 + (off * samples.off) ** 2)
         + on * off * (step_variance * (samples.on + samples.off) + quantisation_variance)
     )

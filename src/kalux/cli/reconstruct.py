@@ -284,6 +284,7 @@ def decided(
         f"({_model_origin(made)})",
         *colours,
         f"exposure    {(camera.reference_exposure or 0) * 1e-3:g} ms makes a saturated pixel 1.0",
+        *([] if camera.frame_noise is None else [_noise_line(made)]),
         f"filter      {made.settings.filter.kind}, preset {options.preset}"
         f"{'' if options.settings is None else f' changed by {options.settings}'}, {ahead}",
         f"images      {len(made.times):,} {spacing}, {begin:.3f} to {end:.3f} s -> {output.path} ({output.format})",
@@ -306,6 +307,13 @@ def _delay_origin(made: Plan) -> str:
     return (
         f"estimated: {found.apparent * 1e-3:.1f} ms explain the frames {100 * found.improvement:.0f} % better"
     )
+
+
+def _noise_line(made: Plan) -> str:
+    camera = made.settings.camera
+    read, shot = camera.noise
+    how = "given, or not to be told from the recording" if made.frame_noise is None else "estimated"
+    return f"frame noise {read:.2g} of white in the dark, {np.sqrt(read**2 + shot / 2):.2g} at half of it ({how})"
 
 
 def _model_origin(made: Plan) -> str:

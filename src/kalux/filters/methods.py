@@ -31,6 +31,7 @@ from kalux.models.camera import (
     Camera,
     black_ceiling,
     covariance,
+    frame_log_covariance,
     inverse_response,
     log_bias,
     log_covariance,
@@ -112,7 +113,7 @@ _CLIPPED_SHARE: Final = 0.2
 twice as bright as it can show: as little as a few events are off."""
 
 _CHROMA_FLOOR: Final = 0.006
-"""Noise of a pixel, white = 1, below which a ratio of channels says nothing; `CameraSettings.frame_noise`'s default."""
+"""Noise of a pixel, white = 1, below which a ratio of channels says nothing; `CameraSettings.usual_frame_noise`."""
 
 
 def take_shot(
@@ -329,6 +330,9 @@ class _Common:
 _DARKEST: Final = 0.001
 """What is black is taken to be spread evenly in log I from here, white = 1, a quarter of an 8-bit level."""
 
+_CRUSHED: Final = 1.5 / 255
+"""Intensity, white = 1, that black must hide to be no measurement: three times what it hides of a linear response."""
+
 _BLACK_FRAMES: Final = 3.0
 """Black says the same in every frame: so many of them count as one, and all as no more (docs/equations.md, K7)."""
 
@@ -403,8 +407,9 @@ class BridgedFrames(_Common):
             np.float32(self.on) * thresholds.on,
             np.float32(self.off) * thresholds.off,
         )
-        r_bar = covariance(shot.level_weight, (self.settings.camera.frame_noise * shot.white) ** 2, 1e-6)
-        level_variance = log_covariance(shot.level_intensity, r_bar, self.offset)
+        level_variance = frame_log_covariance(
+            shot.level_intensity, shot.level_weight, self.settings.camera.noise, shot.white, self.offset
+        )
         level_variance[shot.level_clipped] = bridge.UNMEASURED
         level_log = log_intensity(shot.level_intensity, self.offset)
         crushed = self.crushed(shot)
@@ -427,12 +432,12 @@ class BridgedFrames(_Common):
         return latent._replace(ceiling=latent.value + room.astype(np.float32)[shot.levels])
 
     def crushed(self, shot: Shot) -> NDArray[np.bool_] | None:
-        """(N,) levels that are black and hide more than the frame's noise; None where black does not.
+        """(N,) levels that are black and hide more than a linear response's would; None where black does not.
 
-        Of a linear response it hides less: there, 0 is a measurement like others.
+        With a linear response 0 is a measurement like others.
         """
         black = np.isfinite(shot.level_ceiling)
-        hides = shot.level_ceiling > self.settings.camera.frame_noise * shot.white
+        hides = shot.level_ceiling > _CRUSHED * shot.white
         return black & hides if hides[black].any() else None
 
     def black(self, ceiling: Array) -> tuple[Array, Array]:

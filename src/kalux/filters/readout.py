@@ -14,7 +14,7 @@ from kalux.compiled import ONE, exponential, logarithm
 Array = NDArray[np.floating[Any]]
 
 
-HIDDEN_MOVING: Final = (0.02, 0.12)
+HIDDEN_MOVING: Final = (0.01, 0.12)
 """Variance, in c^2, of what a pixel does between its events, at a frame and in addition half-way between two frames,
 where events have come of late: that of mid-exposure frames and of times half-way between on eleven simulated scenes
 (docs/equations.md, K11)."""
@@ -23,7 +23,7 @@ HIDDEN_STILL: Final = 0.35
 """Where no event has come of late: half-way between two frames, in units of the mean square change of the silent pixels
 around from one to the other (`kalux.augmentation.unseen`); at a frame nothing."""
 
-HIDDEN_LEAST: Final = 0.005
+HIDDEN_LEAST: Final = 0.003
 """In c^2, there in any case: the same scenes at their frames."""
 
 _NOTHING: Final = np.float32(1e9)
