@@ -25,7 +25,6 @@ Array = NDArray[np.float64]
 MAX_FRAMES: Final = 80
 
 _BEYOND_NEIGHBOURS: Final = np.array([[0, -0.25, 0], [-0.25, 1, -0.25], [0, -0.25, 0]])
-_SHARE: Final = float(np.sum(_BEYOND_NEIGHBOURS**2))  # of white noise's variance that this leaves: 1.25
 
 _BINS: Final = 32  # of the intensity, 1 = saturated
 _LEAST: Final = 200  # pixels of a frame pair in a bin
@@ -134,13 +133,19 @@ def _points(recording: Recording, camera: CameraSettings, most_frames: int) -> t
 
 
 def _beyond_neighbours(interval: Interval) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """(H, W): mean intensity, the part of its change that neighbours do not share, and where these tell the noise."""
+    """(H, W): mean intensity, the part of its change that neighbours do not share, and where these tell the noise.
+
+    The part has the variance of the change where that is white noise. Frames in RGB have been demosaiced, most of them
+    compressed too, so that neighbours share their noise: the whole change is taken.
+    """
     first, second = interval.first, interval.second
     before, after = first.intensity / first.white, second.intensity / second.white
     level = (before + after) / 2
     weight = np.sqrt((first.weight + second.weight) / 2)
     change = np.ascontiguousarray((after - before) * weight)
-    beyond = cv2.filter2D(change, cv2.CV_64F, _BEYOND_NEIGHBOURS)
+    beyond = change
+    if first.chroma is None:
+        beyond = cv2.filter2D(change, cv2.CV_64F, _BEYOND_NEIGHBOURS) / np.linalg.norm(_BEYOND_NEIGHBOURS)
     bad = first.clipped | second.clipped | (level <= _DARKEST)
     for shot in (first, second):
         if shot.valid is not None:
@@ -158,7 +163,7 @@ def _add(points: _Points, level: Array, difference: Array) -> None:
     stops = np.searchsorted(index[order], np.arange(_BINS + 1))
     for found, start, stop in zip(points, stops, stops[1:], strict=False):
         if stop - start >= _LEAST:
-            variance = trimmed_variance(difference[start:stop]) / (2 * _SHARE)
+            variance = trimmed_variance(difference[start:stop]) / 2
             found.append((float(level[start:stop].mean()), variance, int(stop - start)))
 
 
