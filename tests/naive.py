@@ -19,7 +19,7 @@ from kalux.settings import chosen_response
 US = 1e-6
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(24)
 UNMEASURED = 1e12
-HIDDEN_MOVING = (0.01, 0.12)
+HIDDEN_MOVING = (0.005, 0.12)
 
 
 @dataclass
@@ -255,7 +255,8 @@ def bridged(pixel, settings, times, on, off):
         total += ev.step_noise * c2 * (n_on + n_off) + ev.quantisation_variance * c2
         intervals.append((a, b, first, second, scale_on, scale_off, var_on, var_off, mismatch / total))
         q0, noise = ev.quantisation_variance * c2, first[1] + second[1]
-        squared = min((q0 * mismatch / total) ** 2, c2) - noise * (q0 / (noise + q0)) ** 2
+        told = (q0 / (noise + q0)) ** 2
+        squared = min((q0 * mismatch / total) ** 2, c2) - noise * told + (1 - told) * 0.1 * c2
         pixel.changes.append((noise < UNMEASURED, n_on + n_off == 0, squared))
         gain_on, gain_off = var_on * on * n_on / total, -var_off * off * n_off / total  # K2
         scale_on = min(max(scale_on + gain_on * mismatch, 0.3), 3.0)

@@ -133,7 +133,7 @@ def test_still_pixels_hide_what_silent_ones_around_them_show():
     assert hidden[0, 0] < 0.001
     assert hidden[0, 1] == pytest.approx(hidden[0, 0] + 0.35 * 0.02, rel=1e-4)
     np.testing.assert_allclose(
-        total_variance(variance, ~still, 1.0, 0.04, change), 0.01 + 0.04 * 0.13, rtol=1e-4
+        total_variance(variance, ~still, 1.0, 0.04, change), 0.01 + 0.04 * 0.125, rtol=1e-4
     )
 
 

@@ -19,6 +19,9 @@ _UNMEASURED_CHANGE: Final = 0.4
 """The same where a frame does not measure the pixel, so that none says that it has changed little: the variance
 half-way to such a frame is then that of a moving pixel, as on the same scenes."""
 
+_ENOUGH: Final = 25.0
+"""Pixels without noise, or as much information in more of them, that tell the change of the whole image."""
+
 _WINDOW: Final = 5
 """Pixels: one difference says little of a mean square. 3 to 9 predict the errors of these scenes about alike."""
 
@@ -28,7 +31,7 @@ def silent_change(segment: BridgedSegment, quantisation_variance: float, thresho
 
     The mean is over the pixels of 5 x 5 that have no event in the segment and are measured by both frames, of the
     squares of what the frames say of their change (``segment.slope``), at most c^2, since more cannot be hidden, less
-    what the frames' noise makes of them.
+    what the frames' noise makes of them. As far as noise hides a pixel's change, that of the whole image stands in.
 
     Parameters
     ----------
@@ -46,8 +49,13 @@ def silent_change(segment: BridgedSegment, quantisation_variance: float, thresho
     silent = measured & (segment.events == 0)
     change = np.minimum(np.square(segment.slope.astype(np.float32, copy=False) * seconds), most)
     # The slope takes the share q0 / V of the mismatch (K1), and so of the frames' noise in it.
-    change -= noise * np.square(q0 / (noise + q0))
+    share = np.square(q0 / (noise + q0))
+    change -= noise * share
+    share[~silent] = 0.0
     change[~silent] = 0.0
+    seen = float(share.sum())
+    whole = max(float(change.sum()), 0.0) / seen if seen > _ENOUGH else UNKNOWN_CHANGE * threshold2
+    change += np.where(silent, 1 - share, np.float32(0.0)) * np.float32(whole)
     total, count = (_sum_around(values) for values in (change, silent.astype(np.float32)))
     mean: Array = np.maximum(total, 0.0) / np.maximum(count, 1.0)
     mean[count < 0.5] = UNKNOWN_CHANGE * most

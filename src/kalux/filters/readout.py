@@ -14,7 +14,7 @@ from kalux.compiled import ONE, exponential, logarithm
 Array = NDArray[np.floating[Any]]
 
 
-HIDDEN_MOVING: Final = (0.01, 0.12)
+HIDDEN_MOVING: Final = (0.005, 0.12)
 """Variance, in c^2, of what a pixel does between its events, at a frame and in addition half-way between two frames,
 where events have come of late: that of mid-exposure frames and of times half-way between on eleven simulated scenes
 (docs/equations.md, K11)."""
