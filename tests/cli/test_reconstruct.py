@@ -240,6 +240,7 @@ class TestWhatIsSaid:
             "delay",
             "events",
             "exposure",
+            "noise",
             "filter",
             "images",
             "wrote",
