@@ -313,7 +313,8 @@ def _noise_line(made: Plan) -> str:
     camera = made.settings.camera
     read, shot = camera.noise
     how = "given, or not to be told from the recording" if made.frame_noise is None else "estimated"
-    return f"noise       of frames: {read:.2g} of white in the dark, {np.sqrt(read**2 + shot / 2):.2g} at half of it ({how})"
+    half = np.sqrt(read**2 + shot / 2)
+    return f"noise       of frames: {read:.2g} of white in the dark, {half:.2g} at half of it ({how})"
 
 
 def _model_origin(made: Plan) -> str:
