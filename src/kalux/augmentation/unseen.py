@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, Final
 
 import cv2
+import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
@@ -42,25 +43,56 @@ def silent_change(segment: BridgedSegment, quantisation_variance: float, thresho
     threshold2
         c^2.
     """
+    shape = segment.slope.shape
+    change, untold, silent, mean = (np.empty(shape, np.float32) for _ in range(4))
     seconds = np.float32((segment.end - segment.start) * 1e-6)
     q0, most = np.float32(quantisation_variance), np.float32(threshold2)
-    noise = (segment.forward_variance + segment.backward_variance).astype(np.float32, copy=False)
-    measured = noise < UNMEASURED
-    silent = measured & (segment.events == 0)
-    change = np.minimum(np.square(segment.slope.astype(np.float32, copy=False) * seconds), most)
-    # The slope takes the share q0 / V of the mismatch (K1), and so of the frames' noise in it.
-    share = np.square(q0 / (noise + q0))
-    change -= noise * share
-    share[~silent] = 0.0
-    change[~silent] = 0.0
-    seen = float(share.sum())
-    whole = max(float(change.sum()), 0.0) / seen if seen > _ENOUGH else UNKNOWN_CHANGE * threshold2
-    change += np.where(silent, 1 - share, np.float32(0.0)) * np.float32(whole)
-    total, count = (_sum_around(values) for values in (change, silent.astype(np.float32)))
-    mean: Array = np.maximum(total, 0.0) / np.maximum(count, 1.0)
-    mean[count < 0.5] = UNKNOWN_CHANGE * most
-    mean[~measured] = _UNMEASURED_CHANGE * most
+    variances = segment.forward_variance, segment.backward_variance
+    of_all, told = _told(segment.slope, *variances, segment.events, seconds, q0, most, change, untold, silent)
+    whole = max(of_all, 0.0) / told if told > _ENOUGH else UNKNOWN_CHANGE * threshold2
+    change += untold * np.float32(whole)
+    unknown, unmeasured = (np.float32(u * threshold2) for u in (UNKNOWN_CHANGE, _UNMEASURED_CHANGE))
+    _mean(_sum_around(change), _sum_around(silent), *variances, unknown, unmeasured, mean)
     return mean
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _told(  # type: ignore[no-untyped-def]
+    slope, forward, backward, events, seconds, q0, most, change, untold, silent
+):
+    """Of silent pixels (0 elsewhere): squared change without noise, and the share of it that noise hides; both sums."""
+    zero, one = np.float32(0.0), np.float32(1.0)
+    unmeasured = np.float32(UNMEASURED)
+    of_all = told = 0.0
+    for row in range(slope.shape[0]):
+        sum_change = sum_share = zero
+        for column in range(slope.shape[1]):
+            i = row, column
+            noise = np.float32(forward[i]) + np.float32(backward[i])
+            # The slope takes the share q0 / V of the mismatch (K1), and so of the frames' noise in it.
+            share = q0 / (noise + q0)
+            share *= share
+            moved = np.float32(slope[i]) * seconds
+            is_silent = one if noise < unmeasured and events[i] == zero else zero
+            part = is_silent * (min(moved * moved, most) - min(noise, unmeasured) * share)
+            change[i], silent[i], untold[i] = part, is_silent, is_silent * (one - share)
+            sum_change += part
+            sum_share += is_silent * share
+        of_all += float(sum_change)
+        told += float(sum_share)
+    return of_all, told
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _mean(total, count, forward, backward, unknown, unmeasured_change, mean):  # type: ignore[no-untyped-def]
+    zero, one = np.float32(0.0), np.float32(1.0)
+    unmeasured = np.float32(UNMEASURED)
+    for row in range(total.shape[0]):
+        for column in range(total.shape[1]):
+            i = row, column
+            near = max(total[i], zero) / max(count[i], one) if count[i] > np.float32(0.5) else unknown
+            measured = np.float32(forward[i]) + np.float32(backward[i]) < unmeasured
+            mean[i] = near if measured else unmeasured_change
 
 
 def _sum_around(values: NDArray[np.float32]) -> NDArray[np.float32]:
