@@ -8,7 +8,7 @@ filter has a linear response only; I and f^w of others are `kalux.models.camera`
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.special import lambertw
@@ -19,11 +19,17 @@ from kalux.settings import chosen_response
 US = 1e-6
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(24)
 UNMEASURED = 1e12
+HIDDEN_MOVING = (0.005, 0.12)
 
 
 @dataclass
 class Pixel:
-    """What one pixel sees. Events: time, polarity, newest event in the 3x3 pixels, newest of its own, weight (K13)."""
+    """What one pixel sees. Events: time, polarity, newest event in the 3x3 pixels, newest of its own, weight
+    (K13).
+
+    Changes, of frame intervals, K11: whether both frames measure it, whether it is silent, and how much its L changed,
+    squared, without what noise makes of that.
+    """
 
     starts: list[int]
     middles: list[int]
@@ -36,6 +42,7 @@ class Pixel:
     events: list[tuple[int, bool, int, int, float]]
     shown: int = 0
     excess: float = 0.0
+    changes: list[tuple[bool, bool, float]] = field(default_factory=list)
 
 
 def pixels(events, frames, sensor_size, settings, begin):
@@ -246,7 +253,7 @@ def bridged(pixel, settings, times, on, off, scales):
     )
 
     def crushed(k):  # K7
-        return pixel.black[k] and hidden_by_black > c.frame_noise
+        return pixel.black[k] and hidden_by_black > 1.5 / 255
 
     def ceiling(k, middle):  # K7: the most that L is at the middle of the exposure
         if not crushed(k):
@@ -266,7 +273,9 @@ def bridged(pixel, settings, times, on, off, scales):
         if settings.filter.deblur:
             middle += event_sum(pixel, pixel.starts[k], pixel.middles[k], a, b)
             inside = sum(w for t, *_, w in pixel.events if pixel.starts[k] < t <= pixel.ends[k])
-        variance = (c.frame_noise * pixel.white[k]) ** 2 / (pixel.intensity[k] + i0) ** 2
+        read, shot = c.noise
+        variance = (read * pixel.white[k]) ** 2 + shot * pixel.white[k] * pixel.intensity[k]
+        variance /= (max(pixel.intensity[k], 1.5 * read * pixel.white[k]) + i0) ** 2
         variance /= max(pixel.weight[k], 1e-6)
         if crushed(k):
             variance = 3 * np.log((most + i0) / i0) ** 2 / 12
@@ -294,6 +303,10 @@ def bridged(pixel, settings, times, on, off, scales):
         total = first[1] + second[1] + var_on * (on * n_on) ** 2 + var_off * (off * n_off) ** 2
         total += ev.step_noise * c2 * (n_on + n_off) + ev.quantisation_variance * c2
         intervals.append((a, b, first, second, scale_on, scale_off, var_on, var_off, mismatch / total))
+        q0, noise = ev.quantisation_variance * c2, first[1] + second[1]
+        told = (q0 / (noise + q0)) ** 2
+        squared = min((q0 * mismatch / total) ** 2, c2) - noise * told + (1 - told) * 0.1 * c2
+        pixel.changes.append((noise < UNMEASURED, n_on + n_off == 0, squared))
         gain_on, gain_off = var_on * on * n_on / total, -var_off * off * n_off / total  # K2
         scale_on = min(max(scale_on + gain_on * mismatch, 0.3), 3.0)
         scale_off = min(max(scale_off + gain_off * mismatch, 0.3), 3.0)
@@ -319,15 +332,16 @@ def bridged(pixel, settings, times, on, off, scales):
     def drift():  # K10: what the thresholds add to the variance at the end of every interval
         far_on = far_off = 0
         yield 0.0
-        for a, b, _, right, _, _, v_on, v_off, _ in intervals[1:-1]:
+        for k, (a, b, left, right, _, _, v_on, v_off, _) in enumerate(intervals[1:-1], 1):
             n_on, n_off = counts(a, b)
             if right[1] < UNMEASURED:
                 far_on = far_off = 0
-                yield 0.0
+                yield right[1] / 12 if crushed(k) else 0.0  # K7
                 continue
+            unseen = ev.quantisation_variance * c2 / 2 if left[1] < UNMEASURED else 0.0
             before = v_on * (on * far_on) ** 2 + v_off * (off * far_off) ** 2
             far_on, far_off = far_on + n_on, far_off + n_off
-            yield v_on * (on * far_on) ** 2 + v_off * (off * far_off) ** 2 - before
+            yield v_on * (on * far_on) ** 2 + v_off * (off * far_off) ** 2 - before + unseen
 
     drifts = list(drift())
 
@@ -449,24 +463,42 @@ def complementary(pixel, settings, times, on, off):
     return np.array(out)
 
 
-def hidden(pixel, settings, t, on, off):
-    """K11: (the variance of what no event has told, whether the pixel moves)."""
+def is_moving(pixel, t):
+    """K11: whether an event comes in this frame interval or came in the one before."""
     middles, first = pixel.middles, pixel.starts[0]
     k = sum(m < t for m in middles) - 1  # segments end where the next one's frame is read
-    start, end = first, middles[0]
-    still_since = first
+    since, until = first, t
     if k >= 0:
-        start = middles[k]
-        end = middles[k + 1] if k + 1 < len(middles) else None
-        seconds = 0.04e6
-        if k > 0:
-            seconds = middles[k] - middles[k - 1]
-        still_since = max(start - round(seconds), first)
-    newest = max([q for q, *_ in pixel.events if q <= t], default=first)
-    share = 0.5 if k < 0 or end is None else (t - start) / (end - start)
-    moving = newest > still_since
-    at, half = (0.02, 0.12) if moving else (0.005, 0.04)
-    return on * off * (at + half * 4 * share * (1 - share)), moving
+        seconds = middles[k] - middles[k - 1] if k > 0 else 0.04e6
+        since = max(middles[k] - round(seconds), first)
+    if k + 1 < len(middles):
+        until = middles[k + 1]
+    return any(since < q <= until for q, *_ in pixel.events)
+
+
+def hidden(pixels, place, moving, t, on, off):
+    """K11: the variance of what no event has told."""
+    c2, middles = on * off, pixels[place].middles
+    k = sum(m < t for m in middles) - 1
+    share, latest = 0.5, k - 1
+    if 0 <= k < len(middles) - 1:
+        share, latest = (t - middles[k]) / (middles[k + 1] - middles[k]), k
+    between = 4 * share * (1 - share)
+    if moving:
+        return c2 * (HIDDEN_MOVING[0] + HIDDEN_MOVING[1] * between)
+    change = 0.1 * c2
+    if latest >= 0:
+        row, column = place
+        near = [
+            q.changes[latest][2]
+            for (i, j), q in pixels.items()
+            if abs(i - row) <= 2 and abs(j - column) <= 2 and all(q.changes[latest][:2])
+        ]
+        if near:
+            change = max(sum(near) / len(near), 0.0)
+        if not pixels[place].changes[latest][0]:
+            change = 0.4 * c2
+    return 0.003 * c2 + change * 0.35 * between
 
 
 def regularised(level, variance, moving, difference):
@@ -546,9 +578,11 @@ def reconstruct(events, frames, sensor_size, settings, times):
     more = (trail_scales(every, settings),) if method is bridged else ()
     for (row, column), pixel in every.items():
         out[:2, :, row, column] = method(pixel, settings, times, on, off, *more).T
-        out[2:, :, row, column] = np.transpose([hidden(pixel, settings, t, on, off) for t in times])
-    if kind == "cf" or settings.filter.augmentation == "paper":
-        expected = np.full(out[0].shape, np.nan)
-    else:
-        expected = np.array([unshown(every, settings, frames, t) for t in times])
+    if method is not bridged:
+        return out[0], out[1], out[2], out[3].astype(bool), np.full(out[0].shape, np.nan)
+    for (row, column), pixel in every.items():
+        for i, t in enumerate(times):
+            out[3, i, row, column] = is_moving(pixel, t)
+            out[2, i, row, column] = hidden(every, (row, column), out[3, i, row, column], t, on, off)
+    expected = np.array([unshown(every, settings, frames, t) for t in times])
     return out[0], out[1], out[2], out[3].astype(bool), expected

@@ -374,7 +374,7 @@ def test_images_before_the_damage_are_returned(monkeypatch):
     stream = random_stream(6)
     # All is given: to estimate it reads ahead, and would find the damage before the first image.
     chosen = altered(PRESETS["default"], "events", delay=0, step_variance=0.2, refractory_period=0)
-    chosen = altered(chosen, "camera", log_offset=0.03)
+    chosen = altered(chosen, "camera", log_offset=0.03, frame_noise=0.006)
     good = list(reconstruct(recording(6), at="frames", settings=chosen))
     place = int(stream.events["t"].searchsorted(stream.frames[2].exposure_end)) + 12
     broken = stream.events.copy()
@@ -546,6 +546,31 @@ def test_the_other_presets_run_and_default_is_better_where_frames_can_tell(prese
     default, _ = errors(simulation, reconstruct(rec, times=times), unsaturated)
     other, _ = errors(simulation, reconstruct(rec, times=times, preset=preset), unsaturated)
     assert default < other
+
+
+def test_the_frame_noise_comes_from_the_frames_and_can_be_given():
+    rng = np.random.default_rng(0)
+    ramp = np.broadcast_to(np.linspace(20, 200, 80), (60, 80))
+    frames = [
+        Frame((ramp + rng.normal(0, 2, ramp.shape)).round().astype(np.uint8), t, t + 1000)
+        for t in range(0, 400_000, 50_000)
+    ]
+    source = Recording.from_arrays(np.empty(0, EVENT_DTYPE), frames, sensor_size=ramp.shape)
+    made = plan(source, at="frames")
+    assert made.frame_noise.read == made.settings.camera.frame_noise == pytest.approx(2 / 255, rel=0.1)
+    assert made.frame_noise.shot == made.settings.camera.shot_noise
+    for given, expected in (
+        ({"frame_noise": 0.004}, (0.004, 0.0)),
+        ({"frame_noise": 0.004, "shot_noise": 1e-4}, (0.004, 1e-4)),
+        ({"shot_noise": 1e-4}, (made.frame_noise.read, 1e-4)),
+    ):
+        settings = altered(PRESETS["default"], "camera", **given)
+        assert plan(source, at="frames", settings=settings).settings.camera.noise == expected
+    unknown = plan(recording(), at="frames")  # its pixels are too few to tell
+    assert unknown.frame_noise is None
+    assert unknown.settings.camera.noise == (unknown.settings.camera.usual_frame_noise, 0.0)
+    paper = plan(source, at="frames", preset="iccv2021").settings
+    assert paper.camera.frame_noise is None  # it has a confidence instead
 
 
 def test_the_bright_tail_comes_from_the_frames_and_can_be_given():

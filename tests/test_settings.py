@@ -229,8 +229,8 @@ def test_every_number_is_checked(group, name, value):
 
 
 def test_none_is_only_for_what_can_be_unknown():
-    with pytest.raises(SettingsError, match=r"camera\.frame_noise needs a number"):
-        altered(DEFAULT, "camera", frame_noise=None)
+    with pytest.raises(SettingsError, match=r"camera\.usual_frame_noise needs a number"):
+        altered(DEFAULT, "camera", usual_frame_noise=None)
 
 
 def test_from_dict_does_not_change_its_base():

@@ -76,11 +76,13 @@ def test_smoothing_is_two_filters_combined_by_information():
         a, b = forward.estimate(t), seen_backward[t]
         weights = 1 / a.variance, 1 / b.variance
         level = (weights[0] * a.log_intensity + weights[1] * b.log_intensity) / (weights[0] + weights[1])
+        known = [e.silent_change for e in (a, b) if e.silent_change is not None]
         either = dataclasses.replace(
             a,
             log_intensity=level,
             variance=np.minimum(a.variance, b.variance),
             moving=a.moving | b.moving,
+            silent_change=np.mean(known, axis=0),
         )
         expected = forward.image(either)
         np.testing.assert_allclose(image.intensity, expected.intensity, rtol=1e-6)

@@ -399,6 +399,11 @@ def settled(recording: Recording, plan: Plan, asked: Settings) -> list[tuple[str
             f"({_GIVEN if given else 'median of the frames'})",
         )
     )
+    if camera.frame_noise is not None:
+        read, shot = camera.noise
+        how = _GIVEN if asked.camera.frame_noise is not None else "estimated" if plan.frame_noise else _USUAL
+        half = np.sqrt(read**2 + shot / 2)
+        rows.append(("noise", f"of frames {read:.2g} of white in the dark, {half:.2g} at half of it ({how})"))
     if plan.settings.filter.bright_tail is not None and plan.settings.filter.highlight_scale > 0:
         how = "measured" if asked.filter.bright_tail is None else _GIVEN
         rows.append(("bright tail", f"{plan.settings.filter.bright_tail:.2f} log intensity ({how})"))

@@ -17,6 +17,7 @@ from kalux.ahead import ahead
 from kalux.calibration.contrast import ThresholdEstimate, estimate_thresholds
 from kalux.calibration.delay import DelayEstimate, estimate_delay
 from kalux.calibration.event_model import EventModel, estimate_event_model
+from kalux.calibration.frame_noise import FrameNoise, estimate_frame_noise
 from kalux.calibration.values import Calibration
 from kalux.calibration.white_balance import grey_world
 from kalux.errors import FrameError, InputError
@@ -44,7 +45,7 @@ class Plan:
     Attributes
     ----------
     settings
-        With thresholds, delay, I_0, step variance, reference exposure and white balance filled in.
+        With thresholds, delay, frame noise, I_0, step variance, reference exposure and white balance filled in.
     threshold_origin
         Whether the thresholds come from the settings, the recording, a calibration, an estimate, or are assumed.
     estimate
@@ -61,6 +62,8 @@ class Plan:
         Whether images use all of the recording after them.
     pixels
         What a calibration says of single pixels.
+    frame_noise
+        The fit of the frames' noise, where there was one.
     """
 
     settings: Settings
@@ -72,6 +75,7 @@ class Plan:
     lookahead: bool
     smooth: bool
     pixels: PixelCalibration | None = None
+    frame_noise: FrameNoise | None = None
 
 
 def plan(
@@ -106,6 +110,7 @@ def plan(
         chosen, camera=dataclasses.replace(chosen.camera, reference_exposure=reference, response=response)
     )
     chosen = _with_white_balance(recording, chosen)
+    chosen, noise = _with_frame_noise(recording, chosen)
     chosen, delay = _with_delay(recording, chosen)
     filled, origin, estimate = _with_thresholds(recording, chosen)
     filled, model = _with_event_model(recording, filled, estimate is not None)
@@ -123,7 +128,7 @@ def plan(
     wanted = _times(recording, exposures, rate_hz, times, at, filled, lookahead)
     if known.pixels is not None:
         require_size(known.pixels, recording.sensor_size)
-    return Plan(filled, origin, estimate, delay, model, wanted, lookahead, smooth, known.pixels)
+    return Plan(filled, origin, estimate, delay, model, wanted, lookahead, smooth, known.pixels, noise)
 
 
 def reconstruct(
@@ -369,6 +374,20 @@ def _with_delay(recording: Recording, settings: Settings) -> tuple[Settings, Del
     estimate = estimate_delay(recording, settings.camera)
     delay = settings.events.usual_delay if estimate is None else estimate.delay
     return dataclasses.replace(settings, events=dataclasses.replace(settings.events, delay=delay)), estimate
+
+
+def _with_frame_noise(recording: Recording, settings: Settings) -> tuple[Settings, FrameNoise | None]:
+    """Fill in the frames' noise, where the filter uses it: from the settings, else an estimate, else the usual."""
+    camera = settings.camera
+    if camera.frame_noise is not None or not _uses_steps(settings):
+        return settings, None
+    found = estimate_frame_noise(recording, camera)
+    if found is not None and not found.believed:
+        found = None
+    read, shot = camera.noise if found is None else (found.read, found.shot)
+    shot = shot if camera.shot_noise is None else camera.shot_noise
+    camera = dataclasses.replace(camera, frame_noise=read, shot_noise=shot)
+    return dataclasses.replace(settings, camera=camera), found
 
 
 def _with_thresholds(

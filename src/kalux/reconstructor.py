@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from kalux.augmentation.highlights import Unshown
 from kalux.augmentation.refractory import EventClock
 from kalux.augmentation.trail import FrameTrail
+from kalux.augmentation.unseen import UNKNOWN_CHANGE
 from kalux.compiled import event_words
 from kalux.errors import InputError, SettingsError
 from kalux.events import EVENT_DTYPE, EventArray, as_events, check_events
@@ -92,13 +93,15 @@ class Estimate:
     final
         As of `Image`.
     moving
-        (H, W) bool: pixels with an event in this frame interval or the one before; None: not told.
+        (H, W) bool: pixels with an event in this frame interval, also one to come, or the one before; None: not told.
     between
         0 at a frame, 1 half-way between two, and where the next one is not known or not used.
     chroma
         Of frames in RGB: float32 (H, W, 3), the ratios of the channels to the luminance; else None.
     unshown
         Pixels that no frame has measured until then, of which L is a bound; None: there are none.
+    silent_change
+        (H, W): mean square change of silent pixels around each, from one frame to the next; None: not told.
     """
 
     t: int
@@ -110,6 +113,7 @@ class Estimate:
     between: float = 0.0
     chroma: NDArray[np.float32] | None = None
     unshown: Unshown | None = None
+    silent_change: NDArray[np.floating[Any]] | None = None
 
 
 class _Progress:
@@ -404,6 +408,7 @@ class Reconstructor:
             _between(progress, t) if self.lookahead else 1.0,
             self._chroma(progress, t),
             self._unshown(progress, variance),
+            self._method.silent_change(progress.segment),
         )
 
     def trail(self, t: int) -> NDArray[np.floating[Any]] | None:
@@ -439,7 +444,12 @@ class Reconstructor:
         moving, neighbours = estimate.moving, self.settings.filter.neighbours
         pitch = 2 if mosaic else 1  # neighbours of the same colour
         hidden = hidden_variance(estimate.between, on * off)
-        intensity, total = read_out(log_intensity, variance, offset, prior, moving, hidden, neighbours, pitch)
+        change = estimate.silent_change
+        if change is None:
+            change = np.full(log_intensity.shape, UNKNOWN_CHANGE * on * off, np.float32)
+        intensity, total = read_out(
+            log_intensity, variance, offset, prior, moving, hidden, change, neighbours, pitch
+        )
         if unshown is not None:
             bound = estimate.log_intensity
             read_unshown(

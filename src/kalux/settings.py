@@ -44,9 +44,13 @@ class CameraSettings:
         I_0 of equation (8); white = 1. Events are steps of log I, so it must be small; below the dark current
         of the event pixels it only magnifies noise. None: an estimate from the recording
         (`kalux.calibration.event_model`), 0.03 where it cannot be told. The paper's code: 1.
-    frame_noise
-        sigma_im of equation (6) as the standard deviation of a well exposed pixel of one frame; white = 1.
-        0.006 is what the paper's 7e5 1/s amounts to at 25 frames/s.
+    frame_noise, shot_noise
+        sigma_im of equation (6) for one frame: standard deviation in the dark, and variance per intensity; white = 1.
+        None: an estimate from the recording (`kalux.calibration.frame_noise`); a shot noise beside a given frame noise
+        is 0.
+    usual_frame_noise
+        The frame noise where the recording does not tell it, without shot noise. 0.006 is what the paper's 7e5 1/s
+        amounts to at 25 frames/s.
     confidence
         1 / sigma_im^2 of equation (6) as the paper uses it, a rate in 1/s: 7e5 (DAVIS), 7e7 (FLIR). For
         augmentation "paper" only.
@@ -66,7 +70,9 @@ class CameraSettings:
 
     response: str = AUTO
     log_offset: float | None = None
-    frame_noise: float = 0.006
+    frame_noise: float | None = None
+    shot_noise: float | None = None
+    usual_frame_noise: float = 0.006
     confidence: float = 7e5
     weight_floor: float = 0.09
     saturation: float = 0.98
@@ -77,6 +83,12 @@ class CameraSettings:
     def offset(self) -> float:
         """I_0, also where nobody has said or estimated it."""
         return UNKNOWN_LOG_OFFSET if self.log_offset is None else self.log_offset
+
+    @property
+    def noise(self) -> tuple[float, float]:
+        """Frame noise and shot noise, also where nobody has said or estimated them."""
+        read = self.usual_frame_noise if self.frame_noise is None else self.frame_noise
+        return read, self.shot_noise or 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -334,6 +346,7 @@ def load(path: str | Path, base: Settings) -> Settings:
 _POSITIVE: Final = {
     "log_offset",
     "frame_noise",
+    "usual_frame_noise",
     "confidence",
     "weight_floor",
     "saturation",

@@ -361,11 +361,21 @@ def combine(
         between=forward.between,
         chroma=forward.chroma,
         unshown=smoothed_unshown(forward.unshown, backward.unshown),
+        silent_change=_mean_of_both(forward.silent_change, backward.silent_change),
     )
 
 
 def _either(first: NDArray[np.bool_] | None, second: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
     return None if first is None or second is None else first | second
+
+
+def _mean_of_both(
+    first: NDArray[np.floating[Any]] | None, second: NDArray[np.floating[Any]] | None
+) -> NDArray[np.floating[Any]] | None:
+    """Before the first frame and after the last only one of them knows."""
+    if first is None or second is None:
+        return second if first is None else first
+    return (first + second) / 2
 
 
 def reversed_settings(settings: Settings) -> Settings:

@@ -95,7 +95,7 @@ def test_likelihood_compares_densities_of_the_intensity():
         before[kept], after[kept], np.maximum(steps, 0)[kept] * 1.0, np.maximum(-steps, 0)[kept] * 1.0
     )
     losses = [
-        negative_log_likelihood(samples, THRESHOLDS, offset, 0.05, 1e-3, 0.02, 1 / 6)
+        negative_log_likelihood(samples, THRESHOLDS, offset, 0.05, (1e-3, 0.0), 0.02, 1 / 6)
         for offset in event_model.LOG_OFFSETS
     ]
     assert event_model.LOG_OFFSETS[int(np.argmin(losses))] == 0.03

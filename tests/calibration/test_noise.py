@@ -10,10 +10,7 @@ from kalux.calibration.noise import (
     calibrate_noise,
     clipping_levels,
     event_noise,
-    frame_noise,
-    photon_transfer,
     shrunk_rates,
-    trimmed_variance,
 )
 from kalux.datasets import SensorSettings, demo_scene, simulate, static
 from kalux.events import make_events
@@ -96,47 +93,6 @@ def test_rates_of_pixels_that_are_seldom_quiet_are_the_typical_one():
     np.testing.assert_allclose(shrunk_rates(counts, quiet, 2.0, np.zeros((4, 50), bool)), 2.0, rtol=1e-3)
 
 
-# --- frames ---------------------------------------------------------------------------------------------------
-
-
-def test_read_and_shot_noise_of_a_still_ramp():
-    """Variance 0.005^2 + quantisation 1/12 of a level + intensity / 5000 electrons."""
-    rng = np.random.default_rng(1)
-    irradiance = np.broadcast_to(np.linspace(0.02, 0.9, 200), (150, 200))
-    frames = []
-    for k in range(12):
-        response = rng.poisson(irradiance * 5000) / 5000 + 0.005 * rng.standard_normal(irradiance.shape)
-        frames.append(
-            Frame(np.rint(255 * response.clip(0, 1)).astype(np.uint8), 40_000 * k, 40_000 * k + 10_000)
-        )
-    recording = Recording.from_arrays(NOTHING, frames, sensor_size=irradiance.shape)
-    found = frame_noise(recording, CAMERA)
-    assert found.shot == pytest.approx(1 / 5000, rel=0.05)
-    assert found.read == pytest.approx(np.hypot(0.005, 1 / 255 / np.sqrt(12)), rel=0.1)
-    assert found.at_half == pytest.approx(np.sqrt(found.read**2 + found.shot / 2))
-
-
-def test_frames_in_motion_have_hardly_more_noise_than_still_ones():
-    sensor = SensorSettings(noise_rate=0.5, read_noise=0.01)
-    found = frame_noise(unlabelled(simulate(SCENE, sensor)), CAMERA)
-    assert 0.009 < found.at_half < 0.02
-
-
-def test_outliers_do_not_make_variance():
-    rng = np.random.default_rng(0)
-    values = rng.standard_normal(20_000)
-    values[:200] += 50
-    assert trimmed_variance(values) == pytest.approx(1.0, abs=0.05)
-
-
-def test_photon_transfer_is_a_line_without_negative_parts():
-    levels = np.linspace(0.1, 0.9, 9)
-    found = photon_transfer(levels, 1e-5 + 2e-4 * levels, np.ones(9))
-    assert (found.read**2, found.shot) == (pytest.approx(1e-5), pytest.approx(2e-4))
-    falling = photon_transfer(levels, 1e-4 * (1 - levels), np.ones(9))
-    assert falling.shot == 0.0
-
-
 # --- levels ---------------------------------------------------------------------------------------------------
 
 
@@ -171,6 +127,9 @@ def test_settings_of_a_noise_calibration():
     found = calibrate_noise(unlabelled(simulate(SCENE, sensor)), CAMERA).calibration()
     assert {"noise_rate", "delay"} <= {*found.settings["events"]}
     assert found.settings["camera"]["saturation"] == 0.98
+    assert found.settings["camera"]["frame_noise"] == pytest.approx(0.008, rel=0.2)
+    assert {"frame_noise", "shot_noise"} <= {*found.errors}
+    assert found.measured["noise_at_half"] >= found.settings["camera"]["frame_noise"]
     assert 300 <= found.measured["refractory_at_most"] < 900
     assert found.maps["hot"].shape == SCENE.sensor_size
     still = calibrate_noise(

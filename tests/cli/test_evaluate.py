@@ -32,7 +32,7 @@ def test_frames_are_held_out_where_there_is_no_truth(cli, recording):
     assert found.code == 0, found.err
     lines = found.out.splitlines()
     assert "held-out frames: every 2nd dropped" in lines[0]
-    assert lines[1].split() == ["method", "MSE", "x100", "PSNR", "dB", "SSIM", "log-MSE", "x100"]
+    assert lines[1].split() == ["method", "MSE", "x100", "PSNR", "dB", "SSIM", "log-MSE", "x100", "rms", "z"]
     assert labels(found.out)[:7] == [m.label for n, m in methods().items() if n not in OPTIONAL]
     assert "images, " in lines[9]
     assert "pixels compared; data range 1" in lines[9]
@@ -99,6 +99,17 @@ def test_the_numbers_are_those_of_the_library_in_table_and_files(cli, recording,
         assert (row["pixels"], row["clipped"]) == (str(scores.pixels), "False")
         assert f"{100 * scores.mse:.3f}" in out
     assert [path.name for path in tmp_path.iterdir() if path.name.startswith(".")] == []
+
+
+def test_whether_the_uncertainty_is_true_is_a_column(cli, recording, tmp_path):
+    """Of methods that give one."""
+    out = cli("evaluate", recording, "--methods", "hold,default", "-o", tmp_path / "s.csv").out
+    hold, default = csv.DictReader((tmp_path / "s.csv").open())
+    assert (hold["rms_z"], hold["median_z"], hold["one_sigma"]) == ("", "", "")
+    assert 0.2 < float(default["rms_z"]) < 5
+    assert 0 < float(default["one_sigma"]) < 1
+    row = next(line for line in out.splitlines() if line.startswith("AKF default"))
+    assert row.split()[-1] == f"{float(default['rms_z']):.2f}"
 
 
 def test_equal_images_are_valid_json(cli, write_recording, simulation, tmp_path):

@@ -26,6 +26,7 @@ def test_says_all_that_reconstruct_would_settle(cli, write_recording, tmp_path):
         "step",
         "refractory",
         "exposure",
+        "noise",
         "bright tail",
         "response",
     ]

@@ -242,6 +242,7 @@ class TestWhatIsSaid:
             "step",
             "refractory",
             "exposure",
+            "noise",
             "bright",
             "response",
             "filter",

@@ -9,7 +9,7 @@ import kalux
 from kalux import Recording
 from kalux.datasets import SensorSettings
 from kalux.errors import FrameError, InputError
-from kalux.evaluation.baselines import Method, methods
+from kalux.evaluation.baselines import Estimated, Method, methods
 from kalux.evaluation.consistency import blur_consistency, valid_pixels
 from kalux.evaluation.held_out import (
     clipped_as,
@@ -88,6 +88,29 @@ def test_pixels_that_are_not_valid_do_not_count():
     assert scores.mse == pytest.approx(0, abs=1e-12)
     assert scores.images[0].pixels == mask.sum()
     np.testing.assert_array_equal(valid_pixels(frames[0]), mask)
+
+
+def test_a_held_out_frames_own_noise_is_no_error_of_the_method():
+    """A method that knows the noise-free scene, and says how well: z is 1 only with the noise of the frames."""
+    rng = np.random.default_rng(0)
+    size = (80, 100)
+    truth = np.broadcast_to(np.linspace(0.2, 0.6, 100), size)
+    shown = [np.rint(255 * (truth + 0.02 * rng.standard_normal(size))) for _ in range(12)]
+    frames = [frame(values, 100 * i, 100 * i + 10) for i, values in enumerate(shown)]
+    recording = Recording.from_arrays(pixel_events([], []), frames, sensor_size=size, contrast_threshold=0.2)
+    held = hold_out_frames(recording)
+    assert held.noise[0] == pytest.approx(0.02, rel=0.1)
+
+    def estimates(recording, times):
+        sigma = 0.01 / (truth + 0.03)
+        for group in np.split(times, len(times) // held.times.shape[1]):
+            error = 0.01 * rng.standard_normal(truth.shape)
+            for _ in group:
+                yield Estimated(truth + error, sigma**2, 0.03)
+
+    method = Method("knows", lambda recording, times: iter(()), estimates=estimates)
+    found = evaluate_held_out(held, method)
+    assert found.uncertainty()["rms_z"] == pytest.approx(1.0, abs=0.06)
 
 
 def test_nothing_is_clipped_unless_asked_for():

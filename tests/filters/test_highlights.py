@@ -7,11 +7,23 @@ import pytest
 
 from kalux.augmentation.highlights import Unshown
 from kalux.filters.highlights import lifted, obey_bounds, read_unshown, smoothed_unshown, tempered
-from kalux.filters.readout import HighlightPrior, intensity, regularised
+from kalux.filters.readout import Hidden, HighlightPrior, read_out
 
 OFFSET = 0.03
 WHITE = float(np.log(1 + OFFSET))
 PRIOR = HighlightPrior(WHITE, 2.25, 0.0)
+OFF = HighlightPrior(WHITE, 0.0, 0.0)
+
+
+def intensity(value, variance, offset, prior):
+    return read_out(value, variance, offset, prior)[0]
+
+
+def regularised(value, variance, moving, difference, pitch):
+    """L after K12."""
+    nothing = Hidden(0.0, 0.0, 0.0)
+    image = read_out(value, variance, OFFSET, OFF, moving, nothing, None, difference, pitch)[0]
+    return np.log(image + OFFSET)
 
 
 def unshown(pixels, excess, noise=0.0):
@@ -51,9 +63,8 @@ def test_neighbours_are_heard_as_by_other_pixels(pitch):
     read_unshown(image, raised, spread, level, where, moving, OFFSET, PRIOR, 0.3, pitch)
     heard = regularised(raised, spread, moving, 0.3, pitch).reshape(-1)[where.pixels]
     assert (heard != raised.reshape(-1)[where.pixels]).any()
-    expected = intensity(
-        np.maximum(heard, level.reshape(-1)[where.pixels]) + where.excess**2 / 2, where.noise, OFFSET, PRIOR
-    )
+    least = np.maximum(heard, level.reshape(-1)[where.pixels])
+    expected = intensity((least + where.excess**2 / 2)[None], where.noise[None], OFFSET, PRIOR)[0]
     np.testing.assert_allclose(image.reshape(-1)[where.pixels], expected, rtol=1e-5)
 
 

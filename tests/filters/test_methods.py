@@ -153,6 +153,36 @@ def test_black_is_a_bound_where_the_response_hides_something(lookahead):
     assert engine.read(at).intensity[0, 0] <= most + 1e-5
 
 
+def test_all_black_frames_together_say_no_more_than_one():
+    """P of a pixel that stays black ends at the spread of what black hides, however many frames say it."""
+    settings = altered(PRESETS["default"], "camera", response="s-curve:0.1", log_offset=0.01)
+    engine = Reconstructor((1, 1), settings=settings, contrast_threshold=THRESHOLD)
+    times = range(0, 4_000_000, 40_000)
+    for t in times:
+        engine.push_frame(Frame(np.zeros((1, 1), np.uint8), t, t + 1000))
+    engine.finish()
+    most = float(Response.named("s-curve:0.1").inverse(np.array(0.5 / 255)))
+    spread = np.log1p(most / 0.01) ** 2 / 12
+    assert engine.estimate(times[-1] + 500).variance[0, 0] == pytest.approx(spread, rel=1e-3)
+
+
+def test_a_pixel_that_frames_cease_to_measure_may_have_changed_unseen():
+    """P grows by half of what is hidden at both ends of a frame interval, once."""
+    settings = altered(PRESETS["default"], "events", threshold_on=0.2, threshold_off=0.2)
+    engine = Reconstructor((1, 1), settings=settings)
+    frames = [
+        Frame(np.full((1, 1), v, np.uint8), 40_000 * k, 40_000 * k + 10_000)
+        for k, v in enumerate((100, 100, 255, 255, 255))
+    ]
+    for frame in frames:
+        engine.push_frame(frame)
+    engine.finish()
+    before, clipped, after = (float(engine.estimate(frames[k].middle).variance[0, 0]) for k in (1, 2, 4))
+    assert clipped == pytest.approx(before + 0.04 / 12, rel=0.01, abs=before)
+    assert clipped > 3 * before
+    assert after == pytest.approx(clipped, rel=1e-3)
+
+
 def test_black_of_a_linear_response_is_a_measurement():
     """It hides less than the frame's noise."""
     shot = take_shot(Frame(np.array([[0, 9]], np.uint8), 0, 1000), Camera.named("linear", 0.98), 1000)

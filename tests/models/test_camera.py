@@ -15,10 +15,12 @@ from kalux.models.camera import (
     black_ceiling,
     count_bright,
     covariance,
+    frame_log_covariance,
     inverse_response,
     log_bias,
     log_covariance,
     log_intensity,
+    noise_variance,
 )
 
 RESPONSES = {
@@ -223,6 +225,37 @@ def test_covariance_by_hand():
     weight = np.array([1.0, 0.5, 0.09, 0.01, 0.0])
     expected = np.array([1.0, 2.0, 1 / 0.09, 1 / 0.09, 1 / 0.09]) / 7e5
     np.testing.assert_allclose(covariance(weight, 1 / 7e5, 0.09), expected, rtol=1e-12)
+
+
+def test_read_and_shot_noise_by_hand():
+    """Half the exposure: the frame saw half of I, and is doubled, noise and all."""
+    intensity = np.array([-0.1, 0.0, 0.5, 2.0])
+    expected = 4 * (0.01**2 + 1e-4 * np.array([0.0, 0.0, 0.25, 1.0]))
+    np.testing.assert_allclose(noise_variance(intensity, (0.01, 1e-4), 2.0), expected, rtol=1e-12)
+
+
+def test_covariance_of_a_frame_by_hand():
+    """(6) and (9); near black as at one and a half standard deviations of the noise."""
+    intensity, weight = np.array([0.0, 0.01, 0.015, 0.5]), np.array([1.0, 1.0, 1.0, 0.5])
+    expected = 1e-4 / np.array([0.045, 0.045, 0.045, 0.53]) ** 2 / weight
+    found = frame_log_covariance(intensity, weight, (0.01, 0.0), 1.0, 0.03)
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
+def test_dark_pixels_are_not_made_brighter_by_their_noise():
+    """The mean of many frames by information: its error in log intensity, beside that of R at each value."""
+    rng = np.random.default_rng(0)
+    read, offset, truth = 0.005, 0.004, 0.002
+    value = np.maximum(truth + read * rng.standard_normal(100_000), 0.0)
+    error = log_intensity(value, offset) - np.log(truth + offset)
+
+    def mean(covariances):
+        return np.average(error, weights=1 / covariances)
+
+    at_value = log_covariance(value, np.full(value.shape, read**2), offset)
+    own = frame_log_covariance(value, np.ones(value.shape), (read, 0.0), 1.0, offset)
+    assert mean(at_value) > 0.4
+    assert abs(mean(own)) < 0.4 * mean(at_value)
 
 
 @given(weight=unit, floor=st.floats(1e-6, 1.0))

@@ -100,6 +100,7 @@ class BridgedSegment(NamedTuple):
     thresholds may have been wrong by (`drift`; None: nothing). Pixels without an event after ``still_since`` are still.
     Beyond what L^A and the state say here, the level is ahead of its newest event by ``trail`` (K14; None: it is not).
     ``unshown`` is of the pixels that no frame has measured until ``end``, or ``start`` in causal mode.
+    ``silent_change`` is what silent pixels around each change from one frame to the next (`unseen`; None: not known).
     """
 
     start: int
@@ -119,6 +120,7 @@ class BridgedSegment(NamedTuple):
     floor: Array | None = None
     trail: Trail | None = None
     unshown: UnshownMemory | None = None
+    silent_change: Array | None = None
 
 
 def drift(

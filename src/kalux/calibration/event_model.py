@@ -23,6 +23,7 @@ from kalux.augmentation.deblur import between
 from kalux.calibration.contrast import HUBER, NORMAL_MAD
 from kalux.calibration.intervals import intervals
 from kalux.calibration.refractory import LATE, Counts, possible_periods, shortest_interval
+from kalux.models.camera import noise_variance
 from kalux.recording import Recording
 from kalux.settings import CameraSettings
 
@@ -107,7 +108,7 @@ class _Model(NamedTuple):
     """What the likelihood needs to know beside what is tried."""
 
     thresholds: tuple[float, float]
-    frame_noise: float
+    frame_noise: tuple[float, float]
     threshold_spread: float
     quantisation_variance: float
 
@@ -163,7 +164,9 @@ def estimate_event_model(
     signals = samples.those((net >= _LEAST_NET) & (np.minimum(samples.before, samples.after) > _DARKEST))
     if len(signals.before) < _MIN_SAMPLES:
         return None
-    model = _Model(thresholds, camera.frame_noise, threshold_spread, quantisation_variance)
+    # Frames are taken as they are, with the blur that the filter removes: what that changes is not the events' error.
+    noise = (max(camera.noise[0], camera.usual_frame_noise), camera.noise[1])
+    model = _Model(thresholds, noise, threshold_spread, quantisation_variance)
     log_offsets = LOG_OFFSETS if camera.log_offset is None else (camera.log_offset,)
     found = _refractory(signals, model, log_offsets, thresholds_are_estimated) if len(periods) > 1 else None
     if found is None:
@@ -234,7 +237,7 @@ def negative_log_likelihood(
     thresholds: tuple[float, float],
     log_offset: float,
     step_variance: float,
-    frame_noise: float,
+    noise: tuple[float, float],
     threshold_spread: float,
     quantisation_variance: float,
 ) -> float:
@@ -247,8 +250,8 @@ def negative_log_likelihood(
     change = np.log(samples.after + log_offset) - np.log(samples.before + log_offset)
     mismatch = change - (on * samples.on - off * samples.off)
     variance = (
-        (frame_noise / (samples.before + log_offset)) ** 2
-        + (frame_noise / (samples.after + log_offset)) ** 2
+        noise_variance(samples.before, noise, 1.0) / (samples.before + log_offset) ** 2
+        + noise_variance(samples.after, noise, 1.0) / (samples.after + log_offset) ** 2
         + threshold_spread**2 * ((on * samples.on) ** 2 + (off * samples.off) ** 2)
         + on * off * (step_variance * (samples.on + samples.off) + quantisation_variance)
     )

@@ -2,7 +2,7 @@
 
 Everything is taken from where nothing happens. A pixel is *quiet* while its eight neighbours have been silent for 10 ms
 and stay so for 10 ms; what it says then is noise, and the quiet time itself is known exactly, so that the rate needs no
-correction. Frame noise is the photon transfer curve of pixels that see no event between two frames.
+correction. Frame noise is in `kalux.calibration.frame_noise`.
 """
 
 from __future__ import annotations
@@ -15,9 +15,8 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.deblur import between, count_events
 from kalux.calibration.delay import estimate_delay
-from kalux.calibration.intervals import intervals
+from kalux.calibration.frame_noise import FrameNoise, estimate_frame_noise
 from kalux.calibration.refractory import shortest_interval
 from kalux.calibration.values import Calibration
 from kalux.recording import Recording
@@ -36,10 +35,6 @@ _HOT_FACTOR: Final = 10.0  # times the typical rate
 _HOT_SIGNIFICANCE: Final = 8.0  # standard deviations above the typical count
 _HOT_LEAST: Final = 5  # events
 _DEAD_EXPECTED: Final = 25.0  # events of the neighbours' median, of a pixel that says nothing
-_BINS: Final = 32  # of the response, for the photon transfer curve
-_BIN_LEAST: Final = 200  # pixels
-_BELIEVED: Final = 0.3
-"""Largest relative standard error of the frame noise with which it is taken as a setting."""
 _PILE: Final = 4.0  # times as many pixels as in the levels beside it
 
 
@@ -66,29 +61,6 @@ class EventNoise(NamedTuple):
     hot: NDArray[np.bool_]
     dead: NDArray[np.bool_]
     quiet_share: float
-
-
-class FrameNoise(NamedTuple):
-    """Photon transfer: variance = read^2 + shot * intensity, white = 1.
-
-    Attributes
-    ----------
-    read, shot
-        Standard deviation in the dark, and variance per intensity.
-    at_half
-        Standard deviation at half of white.
-    error
-        Standard error of ``at_half``.
-    levels, variances
-        The points of the curve.
-    """
-
-    read: float
-    shot: float
-    at_half: float
-    error: float
-    levels: Array
-    variances: Array
 
 
 class Levels(NamedTuple):
@@ -141,10 +113,13 @@ class NoiseCalibration:
         if self.refractory_at_most is not None:
             measured["refractory_at_most"] = self.refractory_at_most
         if self.frames is not None:
-            if self.frames.error < _BELIEVED * self.frames.at_half:
-                camera["frame_noise"] = self.frames.at_half
-                errors["frame_noise"] = self.frames.error
-            measured |= {"read_noise": self.frames.read, "shot_noise": self.frames.shot}
+            if self.frames.believed:
+                camera |= {"frame_noise": self.frames.read, "shot_noise": self.frames.shot}
+                errors |= {
+                    "frame_noise": self.frames.error * self.frames.read,
+                    "shot_noise": 2 * self.frames.error * self.frames.shot,
+                }
+            measured["noise_at_half"] = self.frames.at_half
         if self.levels.saturation is not None:
             measured["white_level"] = self.levels.saturation
             camera["saturation"] = min(self.levels.saturation, CameraSettings().saturation)
@@ -172,7 +147,7 @@ def calibrate_noise(recording: Recording, camera: CameraSettings) -> NoiseCalibr
     delay = estimate_delay(recording, camera)
     return NoiseCalibration(
         events=event_noise(recording),
-        frames=frame_noise(recording, camera),
+        frames=estimate_frame_noise(recording, camera, most_frames=MAX_FRAMES),
         levels=clipping_levels(recording),
         delay=None if delay is None else delay.delay,
         apparent_delay=None if delay is None else delay.apparent,
@@ -373,87 +348,6 @@ def _dead_pixels(total: NDArray[np.int64]) -> NDArray[np.bool_]:
 
 
 # --- frames ---------------------------------------------------------------------------------------------------
-
-
-def frame_noise(recording: Recording, camera: CameraSettings) -> FrameNoise | None:
-    """Photon transfer curve of pixels without events nearby (5x5) from one exposure's start to the next one's end.
-
-    Half of the variance of the difference of two frames, in units of the intensity at this exposure (after the inverse
-    response), by levels; the median over frame pairs, so that pairs with faint motion do not count. Differences are
-    taken from their mean per level first, as exposures change. None where fewer than two levels are seen.
-    """
-    # Where noise leaves no pixel without events in 5x5 around it, 3x3 must do; it lets more faint motion in.
-    return _transfer(recording, camera, 5) or _transfer(recording, camera, 3)
-
-
-def _transfer(recording: Recording, camera: CameraSettings, size: int) -> FrameNoise | None:
-    kernel = np.ones((size, size), np.uint8)
-    points: list[list[tuple[float, float, int]]] = [[] for _ in range(_BINS)]
-    longest = max((frame.exposure for frame in recording.frames()), default=0)
-    for interval in intervals(recording, camera, margin=longest, most_frames=MAX_FRAMES):
-        first, second = interval.first, interval.second
-        events = between(interval.events, first.start, second.end)
-        on, off = count_events(events, recording.sensor_size)
-        still = cv2.dilate((on + off > 0).astype(np.uint8), kernel) == 0
-        before, after = first.intensity / first.white, second.intensity / second.white
-        if not 0.9 < first.white / second.white < 1.1:
-            continue
-        mean = (before + after) / 2
-        good = still & ~first.clipped & ~second.clipped & (mean > 0.01)
-        index = np.minimum((mean[good] * _BINS).astype(np.int64), _BINS - 1)
-        difference = (after - before)[good]
-        order = np.argsort(index, kind="stable")
-        stops = np.searchsorted(index[order], np.arange(_BINS + 1))
-        level = mean[good][order]
-        difference = difference[order]
-        for k in range(_BINS):
-            part = slice(stops[k], stops[k + 1])
-            if stops[k + 1] - stops[k] >= _BIN_LEAST:
-                points[k].append(
-                    (
-                        float(level[part].mean()),
-                        trimmed_variance(difference[part]) / 2,
-                        stops[k + 1] - stops[k],
-                    )
-                )
-    levels, variances, weights = [], [], []
-    for found in points:
-        if found:
-            levels.append(float(np.median([p[0] for p in found])))
-            variances.append(float(np.median([p[1] for p in found])))
-            weights.append(float(np.sqrt(sum(p[2] for p in found))))
-    if len(levels) < 2:
-        return None
-    return photon_transfer(np.array(levels), np.array(variances), np.array(weights))
-
-
-def trimmed_variance(values: Array) -> float:
-    """Variance without what lies beyond four standard deviations (edges that move), about the mean."""
-    kept = values
-    for _ in range(5):
-        centre, spread = kept.mean(), kept.std()
-        inside = values[np.abs(values - centre) <= 4 * spread]
-        if len(inside) == len(kept):
-            break
-        kept = inside
-    return float(kept.var())
-
-
-def photon_transfer(levels: Array, variances: Array, weights: Array) -> FrameNoise:
-    """Fit variance = read^2 + shot * level, neither negative; relative errors alike at all levels."""
-    from scipy.optimize import nnls
-
-    relative = weights / np.maximum(variances, 1e-10)
-    design = np.column_stack([np.ones_like(levels), levels]) * relative[:, None]
-    solution, _ = nnls(design, variances * relative)
-    fitted = solution[0] + solution[1] * levels
-    at_half = float(np.sqrt(solution[0] + 0.5 * solution[1]))
-    scatter = float(
-        np.sqrt(np.mean((variances / np.maximum(fitted, 1e-12) - 1) ** 2) / max(len(levels) - 2, 1))
-    )
-    return FrameNoise(
-        float(np.sqrt(solution[0])), float(solution[1]), at_half, at_half * scatter / 2, levels, variances
-    )
 
 
 def clipping_levels(recording: Recording) -> Levels:

@@ -216,6 +216,7 @@ _COLUMNS: Final[tuple[tuple[str, Callable[[Scores], str]], ...]] = (
     ("PSNR dB", lambda s: f"{s.psnr:.2f}"),
     ("SSIM", lambda s: f"{s.ssim:.3f}"),
     ("log-MSE x100", lambda s: f"{100 * s.log_mse:.2f}"),
+    ("rms z", lambda s: "" if (z := s.uncertainty()["rms_z"]) is None else f"{z:.2f}"),
 )
 
 
@@ -302,6 +303,7 @@ def _row(path: str, protocol: str, scores: Scores, consistency: BlurConsistency 
         "images": len(scores.images),
         "pixels": scores.pixels,
         **scores.means(),
+        **scores.uncertainty(),
         "blur_psnr": None if consistency is None else consistency.psnr,
         "data_range": scores.data_range,
         "scale": scores.scale,

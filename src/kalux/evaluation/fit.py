@@ -25,7 +25,7 @@ from kalux.calibration.values import Calibration
 from kalux.errors import InputError
 from kalux.evaluation.held_out import HeldOut, hold_out_frames, with_frames
 from kalux.frames import Frame
-from kalux.models.camera import Camera, Response, covariance, inverse_response, log_covariance
+from kalux.models.camera import Camera, Response, frame_log_covariance, inverse_response
 from kalux.pipeline import plan, reconstruct
 from kalux.recording import Recording
 from kalux.settings import Settings, from_dict, preset
@@ -46,7 +46,8 @@ STEPS: Final[Mapping[str, float]] = {
     "camera.frame_noise": 1.5,
     "camera.log_offset": 1.5,
 }
-"""What is fitted, and the factor of its first steps; ``threshold_scale`` is that of both thresholds."""
+"""What is fitted, and the factor of its first steps; ``threshold_scale`` is that of both thresholds, and shot noise
+goes with frame noise."""
 
 _ROUNDS: Final = 4  # of steps, each the square root of the last
 
@@ -194,6 +195,8 @@ def _changed(settings: Settings, factors: Mapping[str, float]) -> Settings:
             continue
         group, field = name.split(".")
         values[group][field] = getattr(getattr(settings, group), field) * factor
+        if field == "frame_noise":
+            values[group]["shot_noise"] = settings.camera.noise[1] * factor**2
     return from_dict(values, settings)
 
 
@@ -202,7 +205,7 @@ def _fitted_values(settings: Settings) -> dict[str, dict[str, float | int]]:
     names = ("threshold_on", "threshold_off", "delay", "step_variance", "threshold_spread", "noise_rate")
     for name in (*names, "refractory_period"):
         values["events"][name] = getattr(settings.events, name)
-    for name in ("frame_noise", "log_offset"):
+    for name in ("frame_noise", "shot_noise", "log_offset"):
         values["camera"][name] = getattr(settings.camera, name)
     return values
 
@@ -234,10 +237,8 @@ def _negative_log_density(
     offset = settings.camera.offset
     response = frame.normalised()
     observed = np.maximum(inverse_response(camera, response, ratio), 0.0)
-    r_bar = covariance(
-        camera.weight(np.clip(response, 0, 1)), (settings.camera.frame_noise * ratio) ** 2, 1e-6
-    )
-    total = variance + log_covariance(observed, r_bar, offset)
+    weight = camera.weight(np.clip(response, 0, 1))
+    total = variance + frame_log_covariance(observed, weight, settings.camera.noise, ratio, offset)
     away = (np.log(observed + offset) - np.log(np.maximum(mean, 0.0) + offset)) / np.sqrt(total)
     narrow = np.log(1 - _OUTLIERS) - 0.5 * away**2
     wide = np.log(_OUTLIERS / _OUTLIER_SCALE) - 0.5 * (away / _OUTLIER_SCALE) ** 2

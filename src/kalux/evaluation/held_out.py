@@ -10,18 +10,22 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.calibration.frame_noise import estimate_frame_noise
 from kalux.errors import FrameError, InputError
 from kalux.evaluation.baselines import Method
 from kalux.evaluation.exposures import exposure_times, linear_frame, means_of, reference_exposure
 from kalux.evaluation.lpips import LpipsWeights
 from kalux.evaluation.pairs import Array
 from kalux.evaluation.scores import Pair, Scores, score
+from kalux.filters.methods import take_shot
 from kalux.frames import Frame
+from kalux.models.camera import Camera, frame_log_covariance
 from kalux.recording import Recording
 from kalux.settings import AUTO, CameraSettings, chosen_response
 
@@ -65,6 +69,13 @@ class HeldOut:
     reference_exposure: int
     scale: float
     response: str
+
+    @cached_property
+    def noise(self) -> tuple[float, float]:
+        """Read and shot noise of the frames, estimated from all of them: by it a held-out frame itself is off."""
+        settings = CameraSettings(response=self.response)
+        found = estimate_frame_noise(self.whole, settings)
+        return (found.read, found.shot) if found is not None and found.believed else settings.noise
 
     def described(self) -> str:
         """The protocol in words."""
@@ -192,7 +203,7 @@ def held_out_pairs(held: HeldOut, method: Method, *, clip: bool = False) -> Iter
     """A method's images with the frames that were held out; ``clip`` as in `evaluate_held_out`.
 
     The variance of the mean of the reads of an exposure is taken as the mean of theirs: reads a few milliseconds apart
-    share their errors.
+    share their errors. The noise of the frame itself is that of `HeldOut.noise`.
     """
     offset = 0.0
 
@@ -204,16 +215,22 @@ def held_out_pairs(held: HeldOut, method: Method, *, clip: bool = False) -> Iter
 
     chosen = {*held.compared.tolist()}
     frames = (frame for i, frame in enumerate(held.whole.frames()) if i in chosen)
+    camera = Camera.named(held.response, CameraSettings().saturation)
     for frame, means in zip(frames, means_of(read(), held.times.shape[1]), strict=True):
         image = clipped_as(means[0], frame, held.reference_exposure) if clip else means[0]
+        shot = take_shot(frame, camera, held.reference_exposure)
+        variance = means[1] if len(means) == 2 else None
         yield Pair(
             frame.middle,
             image,
-            linear_frame(frame, held.reference_exposure, held.response),
+            shot.intensity,
             frame.valid,
-            variance=means[1] if len(means) == 2 else None,
+            variance=variance,
             clipped=frame.normalised() >= CameraSettings().saturation,
             log_offset=offset,
+            noise=None
+            if variance is None
+            else frame_log_covariance(shot.intensity, shot.weight, held.noise, shot.white, offset),
         )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from kalux.display import encode_srgb
 from kalux.errors import InputError
+from kalux.evaluation.calibration import Calibrations
 from kalux.evaluation.hdr_vdp import hdrvdp
 from kalux.evaluation.lpips import LpipsWeights
 from kalux.evaluation.lpips import lpips as lpips_distance
@@ -25,6 +26,8 @@ DISPLAY_LUMINANCE: Final = 255.0
 """cd/m2 at which HDR-VDP is shown an intensity of 1, as in the paper's evaluation."""
 
 METRICS: Final = ("mse", "psnr", "ssim", "log_mse", "q", "lpips")
+UNCERTAINTY: Final = ("one_sigma", "rms_z", "median_z")
+"""Of `kalux.evaluation.calibration.Calibration.found`: 0.683, 1 and 1 are calibrated and Gaussian."""
 
 
 @dataclass(frozen=True)
@@ -78,6 +81,9 @@ class Scores:
         How many compared values of the method's images are below 0. They count as 0 in log-MSE, HDR-VDP and LPIPS.
     notes
         Of the method.
+    calibration
+        Whether its variances tell the truth, as `kalux.evaluation.calibration.Calibrations.found` says; None: there are
+        none.
     """
 
     method: str
@@ -88,6 +94,7 @@ class Scores:
     clipped: bool
     negative: int
     notes: tuple[str, ...] = ()
+    calibration: Mapping[str, Any] | None = None
 
     @property
     def pixels(self) -> int:
@@ -123,6 +130,11 @@ class Scores:
     def lpips(self) -> float | None:
         """Mean of the images' LPIPS; None where it was not asked for."""
         return None if self.images[0].lpips is None else self._mean("lpips")
+
+    def uncertainty(self) -> dict[str, float | None]:
+        """Of all pixels with a variance: `UNCERTAINTY` by name; None where the method has none."""
+        whole = None if self.calibration is None else self.calibration["all"]
+        return {name: None if whole is None else whole[name] for name in UNCERTAINTY}
 
     def means(self) -> dict[str, float | None]:
         """All means by name."""
@@ -160,6 +172,9 @@ class Pair(NamedTuple):
         (H, W) bool, True where the reference itself is clipped; None: nowhere.
     log_offset
         I_0 of the variance.
+    noise
+        (H, W), variance of log(reference + log_offset) by the noise of the reference itself; None: it has none, or
+        none that is known.
     """
 
     t: int
@@ -169,6 +184,7 @@ class Pair(NamedTuple):
     variance: NDArray[Any] | None = None
     clipped: NDArray[np.bool_] | None = None
     log_offset: float = 0.0
+    noise: NDArray[Any] | None = None
 
 
 def score(
@@ -193,8 +209,10 @@ def score(
     MissingDependencyError
         If scikit-image is not installed.
     """
-    images, negative = [], 0
-    for t, test, reference, mask, *_ in pairs:
+    images, negative, calibrations = [], 0, Calibrations()
+    for pair in pairs:
+        t, test, reference, mask, *_ = pair
+        calibrations.add(pair)
         test, reference = np.asarray(test) / scale, np.asarray(reference) / scale
         try:
             images.append(
@@ -206,7 +224,9 @@ def score(
         on_image()
     if not images:
         raise InputError(f"{method}: no images to compare")
-    return Scores(method, protocol, tuple(images), data_range, scale, clipped, negative, notes)
+    return Scores(
+        method, protocol, tuple(images), data_range, scale, clipped, negative, notes, calibrations.found()
+    )
 
 
 def score_image(

@@ -257,9 +257,10 @@ def _read(segment: BridgedSegment, cursor: BridgedCursor, t: int) -> tuple[Float
 
 
 def moving_bridged(segment: BridgedSegment, cursor: BridgedCursor) -> NDArray[np.bool_]:
-    """(H, W): pixels with an event since ``segment.still_since``."""
+    """(H, W): pixels with an event since ``segment.still_since``, or one to come in the segment."""
     inside = cursor.clock[1:-1, 1:-1]
     moving: NDArray[np.bool_] = inside > np.int32(max(segment.still_since - cursor.origin, -EPOCH))
+    moving |= segment.events > 0
     return moving
 
 

@@ -29,6 +29,7 @@ from kalux.augmentation.trail import (
     polarity_of,
     trail_at,
 )
+from kalux.augmentation.unseen import UNKNOWN_CHANGE, silent_change
 from kalux.compiled import AHEAD, logarithm, prefetch
 from kalux.errors import SettingsError
 from kalux.events import EventArray
@@ -41,6 +42,7 @@ from kalux.models.camera import (
     Camera,
     black_ceiling,
     covariance,
+    frame_log_covariance,
     inverse_response,
     log_bias,
     log_covariance,
@@ -125,7 +127,7 @@ _CLIPPED_SHARE: Final = 0.2
 twice as bright as it can show: as little as a few events are off."""
 
 _CHROMA_FLOOR: Final = 0.006
-"""Noise of a pixel, white = 1, below which a ratio of channels says nothing; `CameraSettings.frame_noise`'s default."""
+"""Noise of a pixel, white = 1, below which a ratio of channels says nothing; `CameraSettings.usual_frame_noise`."""
 
 
 def take_shot(
@@ -283,7 +285,10 @@ class Method(Protocol):
         """The state at the end of the segment."""
 
     def moving(self, segment: Any, cursor: Any) -> NDArray[np.bool_] | None:
-        """(H, W): pixels with an event in this frame interval or the one before; None: the method does not tell."""
+        """(H, W): pixels with an event in this frame interval, also one to come, or the one before; None: not told."""
+
+    def silent_change(self, segment: Any) -> Floats | None:
+        """(H, W): `unseen.silent_change` of the segment; None: the method or the segment does not tell."""
 
     def trail(self, segment: Any, cursor: Any, t: int) -> Floats | None:
         """(H, W): how far the light is ahead of its events at ``t`` (K14); None: the method does not tell."""
@@ -327,6 +332,9 @@ class _Common:
     def trail(self, segment: Any, cursor: Any, t: int) -> Floats | None:
         return None
 
+    def silent_change(self, segment: Any) -> Floats | None:
+        return None
+
     def unshown(self, segment: Any, variance: Floats, prior: float) -> Unshown | None:
         return None
 
@@ -351,8 +359,11 @@ class _Common:
 _DARKEST: Final = 0.001
 """What is black is taken to be spread evenly in log I from here, white = 1, a quarter of an 8-bit level."""
 
+_CRUSHED: Final = 1.5 / 255
+"""Intensity, white = 1, that black must hide to be no measurement: three times what it hides of a linear response."""
+
 _BLACK_FRAMES: Final = 3.0
-"""Black says the same in every frame: so many of them count as one (docs/equations.md, K7)."""
+"""Black says the same in every frame: so many of them count as one, and all as no more (docs/equations.md, K7)."""
 
 
 class BridgeMemory(NamedTuple):
@@ -374,6 +385,7 @@ class BridgeMemory(NamedTuple):
     followed: Followed
     at_middle: Followed
     unshown: UnshownMemory
+    silent_change: Floats
 
 
 class BridgedFrames(_Common):
@@ -428,8 +440,9 @@ class BridgedFrames(_Common):
             np.float32(self.off) * thresholds.off,
             weighed=True,
         )
-        r_bar = covariance(shot.level_weight, (self.settings.camera.frame_noise * shot.white) ** 2, 1e-6)
-        level_variance = log_covariance(shot.level_intensity, r_bar, self.offset)
+        level_variance = frame_log_covariance(
+            shot.level_intensity, shot.level_weight, self.settings.camera.noise, shot.white, self.offset
+        )
         level_variance[shot.level_clipped] = bridge.UNMEASURED
         level_log = log_intensity(shot.level_intensity, self.offset)
         crushed = self.crushed(shot)
@@ -452,12 +465,12 @@ class BridgedFrames(_Common):
         return latent._replace(ceiling=latent.value + room.astype(np.float32)[shot.levels])
 
     def crushed(self, shot: Shot) -> NDArray[np.bool_] | None:
-        """(N,) levels that are black and hide more than the frame's noise; None where black does not.
+        """(N,) levels that are black and hide more than a linear response's would; None where black does not.
 
-        Of a linear response it hides less: there, 0 is a measurement like others.
+        With a linear response 0 is a measurement like others.
         """
         black = np.isfinite(shot.level_ceiling)
-        hides = shot.level_ceiling > self.settings.camera.frame_noise * shot.white
+        hides = shot.level_ceiling > _CRUSHED * shot.white
         return black & hides if hides[black].any() else None
 
     def black(self, ceiling: Array) -> tuple[Array, Array]:
@@ -471,10 +484,11 @@ class BridgedFrames(_Common):
         latent = self.latent(shot, events, thresholds)
         begin = self.begin_time(shot)
         newest = make_clock(self.shape, begin - shot.start)
-        lead_in, unknown = None, nothing_followed(self.shape)
+        lead_in, nothing = None, nothing_followed(self.shape)
         far = np.zeros(self.shape, np.float32)
+        unknown = np.full(self.shape, UNKNOWN_CHANGE * self.on * self.off, np.float32)
         if self.lookahead:
-            on, off, followed = self.follow(events, begin, shot.middle, unknown)
+            on, off, followed = self.follow(events, begin, shot.middle, nothing)
             memory = BridgeMemory(
                 latent,
                 thresholds,
@@ -487,6 +501,7 @@ class BridgedFrames(_Common):
                 followed,
                 followed,
                 begin_unshown(latent),
+                unknown,
             )
             value, variance = latent.value, latent.variance
             if shot.middle > begin:
@@ -510,9 +525,10 @@ class BridgedFrames(_Common):
                 far,
                 far,
                 shot.start,
-                unknown,
-                unknown,
+                nothing,
+                nothing,
                 begin_unshown(latent),
+                unknown,
             )
             carried = self._carried(memory, shot)
             value, variance = carried.value, carried.variance
@@ -537,7 +553,10 @@ class BridgedFrames(_Common):
             else:
                 trail = given_trail(shot.trail.before, np.zeros(self.shape, np.float32))
             alone = alone._replace(
-                still_since=_still_since(memory, start, seconds), trail=trail, unshown=memory.unshown
+                still_since=_still_since(memory, start, seconds),
+                trail=trail,
+                unshown=memory.unshown,
+                silent_change=memory.silent_change,
             )
             return alone, memory
         interval = (following.middle - shot.middle) * 1e-6
@@ -563,8 +582,12 @@ class BridgedFrames(_Common):
             )
             net = joined.step_on * on - joined.step_off * off + grown
             unmeasured = memory.latent.variance >= bridge.UNMEASURED
+            change = self._silent_change(joined)
             joined = joined._replace(
-                bound=second, floor=bridge.floor_before(second, net, unmeasured), trail=trail
+                bound=second,
+                floor=bridge.floor_before(second, net, unmeasured),
+                trail=trail,
+                silent_change=change,
             )
             joined, far_on, far_off = self._drifting(joined, memory, second, on, off)
             unshown = follow_unshown(memory.unshown, second, net)
@@ -580,6 +603,7 @@ class BridgedFrames(_Common):
                 at_middle,
                 at_middle,
                 unshown,
+                change,
             )
             return joined._replace(unshown=unshown), after
         # Of what came before: what the segment holds is still to come when it is read.
@@ -607,6 +631,7 @@ class BridgedFrames(_Common):
             followed=followed,
             at_middle=at_middle,
             unshown=follow_unshown(memory.unshown, second, net),
+            silent_change=self._silent_change(behind),
         )
         forward = bridge.extend(
             self._carried(memory, shot),
@@ -618,7 +643,11 @@ class BridgedFrames(_Common):
             self._carried(after, following),
         )
         forward, far_on, far_off = self._drifting(forward, memory, second, on + tail_on, off + tail_off)
-        forward = forward._replace(trail=self._trail(memory.followed, start, scale), unshown=memory.unshown)
+        forward = forward._replace(
+            trail=self._trail(memory.followed, start, scale),
+            unshown=memory.unshown,
+            silent_change=memory.silent_change,
+        )
         return forward, after._replace(far_on=far_on, far_off=far_off)
 
     def follow(
@@ -649,14 +678,23 @@ class BridgedFrames(_Common):
         height = self.settings.events.trail
         return trail_at(followed.newest, t, (scale, height * self.on, height * self.off))
 
+    def _silent_change(self, segment: BridgedSegment) -> Floats:
+        return silent_change(segment, self.noise.quantisation_variance, self.on * self.off)
+
     def _drifting(
         self, segment: BridgedSegment, memory: BridgeMemory, second: Latent, on: Floats, off: Floats
     ) -> tuple[BridgedSegment, Floats, Floats]:
         """The segment with what its pixels may drift (K10), and the counts since they were measured, at its end."""
         unmeasured = second.variance >= bridge.UNMEASURED
         grown = bridge.drift(memory.thresholds, self.noise, memory.far_on, memory.far_off, on, off)
+        # From its last measurement on, nothing but events tells of changes: what they have not told yet, at one end.
+        grown[memory.latent.variance < bridge.UNMEASURED] += self.noise.quantisation_variance / 2
+        grown[~unmeasured] = 0.0
+        if second.ceiling is not None:
+            black = np.isfinite(second.ceiling)
+            grown[black] += second.variance[black] / (_BLACK_FRAMES * (_BLACK_FRAMES + 1))
         segment = segment._replace(
-            drift=np.where(unmeasured, grown, np.float32(0.0)),
+            drift=grown,
             still_since=_still_since(memory, segment.start, memory.interval or self._FIRST_INTERVAL),
         )
         far_on, far_off = (
@@ -701,6 +739,9 @@ class BridgedFrames(_Common):
         if segment.unshown is None:
             return None
         return expected_excess(segment.unshown, variance, self.settings.filter.initial_variance, prior)
+
+    def silent_change(self, segment: BridgedSegment) -> Floats | None:
+        return segment.silent_change
 
 
 def _still_since(memory: BridgeMemory, start: int, seconds: float) -> int:

@@ -13,13 +13,17 @@ from kalux.compiled import FUSED, ONE, exponential, logarithm
 Array = NDArray[np.floating[Any]]
 
 
-HIDDEN_MOVING: Final = (0.02, 0.12)
+HIDDEN_MOVING: Final = (0.005, 0.12)
 """Variance, in c^2, of what a pixel does between its events, at a frame and in addition half-way between two frames,
 where events have come of late: that of mid-exposure frames and of times half-way between on eleven simulated scenes
 (docs/equations.md, K11)."""
 
-HIDDEN_STILL: Final = (0.005, 0.04)
-"""The same where no event has come of late."""
+HIDDEN_STILL: Final = 0.35
+"""Where no event has come of late: half-way between two frames, in units of the mean square change of the silent pixels
+around from one to the other (`kalux.augmentation.unseen`); at a frame nothing."""
+
+HIDDEN_LEAST: Final = 0.003
+"""In c^2, there in any case: the same scenes at their frames."""
 
 _NOTHING: Final = np.float32(1e9)
 """Variance of a pixel that knows nothing; its square is still a float32."""
@@ -90,25 +94,31 @@ def lambert_w(x):  # type: ignore[no-untyped-def]
 
 
 class Hidden(NamedTuple):
-    """Variance of what no event has told yet (docs/equations.md, K11), of pixels without and with an event of late."""
+    """Variance of what no event has told yet (docs/equations.md, K11).
+
+    Of a still pixel ``still``, and ``changing`` times the mean square change of silent pixels around it; of one with an
+    event of late, or about to have one, ``moving``.
+    """
 
     still: float
+    changing: float
     moving: float
 
 
-_NOTHING_HIDDEN: Final = Hidden(0.0, 0.0)
+_NOTHING_HIDDEN: Final = Hidden(0.0, 0.0, 0.0)
 
 
 def hidden_variance(between: float, threshold2: float) -> Hidden:
     """K11 at ``between``, 0 at a frame and 1 half-way between two, with ``threshold2`` = c^2."""
-    still, moving = (threshold2 * (at + between * half) for at, half in (HIDDEN_STILL, HIDDEN_MOVING))
-    return Hidden(still, moving)
+    at, half = HIDDEN_MOVING
+    return Hidden(threshold2 * HIDDEN_LEAST, between * HIDDEN_STILL, threshold2 * (at + between * half))
 
 
 @nb.njit(cache=True, inline="always")
-def total_variance(variance, moving, hidden):  # type: ignore[no-untyped-def]
+def total_variance(variance, moving, change, hidden):  # type: ignore[no-untyped-def]
     """P and the variance of what no event has told yet (docs/equations.md, K11)."""
-    return variance + (hidden[1] if moving else hidden[0])
+    still, changing, of_moving = hidden
+    return variance + (of_moving if moving else still + changing * change)
 
 
 @nb.njit(cache=True, inline="always")
@@ -130,6 +140,7 @@ def read_out(
     prior: HighlightPrior,
     moving: NDArray[np.bool_] | None = None,
     hidden: Hidden = _NOTHING_HIDDEN,
+    silent_change: Array | None = None,
     difference: float = 0.0,
     pitch: int = 1,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -151,6 +162,9 @@ def read_out(
         (H, W): pixels with an event of late; None: not told, so that neither K11 nor K12 is done.
     hidden
         What is added to P.
+    silent_change
+        (H, W): mean square change of silent pixels around each, from one frame to the next, needed where ``hidden``
+        asks for it; None: 0.
     difference
         Standard deviation of the difference of L between pixels one apart where there is no edge; 0: neighbours say
         nothing.
@@ -171,6 +185,7 @@ def read_out(
         log_intensity.astype(np.float32, copy=False),
         known,
         np.empty((0, 0), np.bool_) if moving is None else moving,
+        known[:0, :0] if moving is None else _plane(silent_change, out.shape),
         tuple(np.float32(value) for value in hidden),
         np.float32(difference * difference),
         pitch,
@@ -182,12 +197,16 @@ def read_out(
     return out, total
 
 
+def _plane(values: Array | None, shape: tuple[int, ...]) -> NDArray[np.float32]:
+    return np.zeros(shape, np.float32) if values is None else np.ascontiguousarray(values, np.float32)
+
+
 # The loops below take whole arrays and a row's number: a view of a row costs more than a part of what is done with it.
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy", fastmath=FUSED)
 def _read_out(  # type: ignore[no-untyped-def]
-    log_intensity, variance, moving, hidden, allowed, pitch, prior, log_offset, out, total
+    log_intensity, variance, moving, change, hidden, allowed, pitch, prior, log_offset, out, total
 ):
     white, scale2, _ = prior
     height, width = log_intensity.shape
@@ -203,7 +222,9 @@ def _read_out(  # type: ignore[no-untyped-def]
     for row in range(-pitch if told else 0, height):
         following, below = np.uint64(row + pitch), np.uint64((row + pitch) % count)
         if told and following < np.uint64(height):
-            _take_row(log_intensity, variance, moving, hidden, following, total, levels, doubts, below)
+            _take_row(
+                log_intensity, variance, moving, change, hidden, following, total, levels, doubts, below
+            )
         elif told:
             for column in range(np.uint64(size + 2 * _MARGIN)):
                 doubts[below, column] = _NOTHING
@@ -235,12 +256,12 @@ def _any(words, first, count):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, inline="always")
 def _take_row(  # type: ignore[no-untyped-def]
-    log_intensity, variance, moving, hidden, row, total, levels, doubts, place
+    log_intensity, variance, moving, change, hidden, row, total, levels, doubts, place
 ):
     """K11 of a row, and what its neighbours need to know of it."""
     for column in range(np.uint64(total.shape[1])):
         at = column + np.uint64(_MARGIN)
-        known = total_variance(variance[row, column], moving[row, column], hidden)
+        known = total_variance(variance[row, column], moving[row, column], change[row, column], hidden)
         total[row, column] = known
         doubts[place, at] = known if known < _NOTHING else _NOTHING
         levels[place, at] = log_intensity[row, column]

@@ -326,12 +326,54 @@ def black_ceiling(camera: Camera, response: Array, exposure_ratio: float) -> Arr
     return np.where(response < half, hidden * exposure_ratio, np.inf)
 
 
-def covariance(weight: Array, sigma_im2: float, floor: float) -> Array:
+def covariance(weight: Array, sigma_im2: float | Array, floor: float) -> Array:
     """R_bar of equation (6): sigma_im^2 / f^w, saturated by a floor of f^w.
 
     The paper's numbers, 7e5 and 7e7, are inverse variances (docs/equations.md): sigma_im2 = 1 / 7e5.
     """
     return sigma_im2 / np.maximum(weight, floor)
+
+
+def noise_variance(intensity: Array, noise: tuple[float, float], white: float) -> Array:
+    """sigma_im^2 of equation (6) for one frame: that of its read and shot noise.
+
+    Parameters
+    ----------
+    intensity
+        I at the reference exposure; negative counts as 0.
+    noise
+        (read, shot): standard deviation in the dark, and variance per intensity, in units of a saturated pixel.
+    white
+        Intensity of a saturated pixel: reference exposure over the frame's own.
+    """
+    read, shot = noise
+    return (read * white) ** 2 + shot * white * np.maximum(intensity, 0.0)
+
+
+_DARK: Final = 1.5
+"""Standard deviations of the noise from black: below, R is that there. Given a value from 0 to here, and that I is at
+least 0, the variance of log(I + I_0) is the same within 20 % where the noise is I_0 or more, and 0.6 to 1 of this R."""
+
+
+def frame_log_covariance(
+    intensity: Array, weight: Array, noise: tuple[float, float], white: float, log_offset: float
+) -> Array:
+    """R of one frame's pixels, equations (6) and (9) with its read and shot noise.
+
+    Taken at its own value as printed, R of a pixel near black depends on its noise, and a mean of many frames gives
+    most weight to those in which the noise was bright: a dark pixel becomes too bright by as much as I_0.
+
+    Parameters
+    ----------
+    intensity, noise, white
+        As in `noise_variance`.
+    weight
+        f^w.
+    log_offset
+        I_0.
+    """
+    r_bar = covariance(weight, noise_variance(intensity, noise, white), 1e-6)
+    return log_covariance(np.maximum(intensity, _DARK * noise[0] * white), r_bar, log_offset)
 
 
 def log_intensity(intensity: Array, log_offset: float) -> Array:

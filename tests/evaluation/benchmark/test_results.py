@@ -76,7 +76,7 @@ def test_csv_is_tidy_and_holds_the_means(results):
         assert ((*key, "rms_z") in values) == (key[1] == "default")
         assert (*key, "q") not in values
     assert {metric for *_, metric in values} == {
-        *("mse", "psnr", "ssim", "log_mse", "one_sigma", "rms_z", "seconds")
+        *("mse", "psnr", "ssim", "log_mse", "one_sigma", "rms_z", "median_z", "seconds")
     }
 
 

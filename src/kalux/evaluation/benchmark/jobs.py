@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 import kalux
 from kalux.errors import InputError, KaluxError
 from kalux.evaluation.baselines import Method, chosen_methods, frames_around
-from kalux.evaluation.benchmark.calibration import Calibrations
 from kalux.evaluation.benchmark.sequences import EVERY, Options, Sequence, files_under
 from kalux.evaluation.exposures import linear_frame, reference_exposure
 from kalux.evaluation.held_out import held_out_pairs, hold_out_frames
@@ -31,7 +30,7 @@ from kalux.models.camera import Camera, Response
 from kalux.recording import Recording
 from kalux.settings import chosen_response, to_dict
 
-LAYOUT: Final = 2
+LAYOUT: Final = 3
 """Of the files of jobs; part of every key, so that others are not taken for one's own."""
 
 MOMENTS: Final = 3
@@ -211,13 +210,11 @@ def _run(job: Job) -> Finished:
     recording = job.sequence.open()
     method = _method(job.method, job.sequence, job.held_out, job.folder)
     comparison = _comparison(job, recording)
-    calibrations = Calibrations()
     pictures = Pictures(moments(comparison.images))
     clock = Clock()
 
     def watched() -> Iterator[Pair]:
         for i, pair in enumerate(clock.timed(comparison.pairs(method))):
-            calibrations.add(pair)
             pictures.add(i, pair)
             yield pair
 
@@ -241,7 +238,7 @@ def _run(job: Job) -> Finished:
             "settings": None if method.settings is None else to_dict(method.settings),
         },
         "scores": _scored(scores),
-        "calibration": calibrations.found(),
+        "calibration": scores.calibration,
         "camera": camera_curves(recording, method),
         "seconds": {"images": clock.seconds, "all": time.perf_counter() - started},
         "versions": versions(),

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 import kalux
 from kalux.evaluation.benchmark import page, pictures, svg
-from kalux.evaluation.benchmark.calibration import ONE_SIGMA
 from kalux.evaluation.benchmark.jobs import Job
 from kalux.evaluation.benchmark.results import PSNR, Metric, Results
 from kalux.evaluation.benchmark.sequences import Sequence as Recorded
 from kalux.evaluation.benchmark.store import Store
 from kalux.evaluation.benchmark.svg import Axis, Series
+from kalux.evaluation.calibration import ONE_SIGMA
 
 _FRAME, _REFERENCE = "frame", "reference"
 _SMALL: Final = 320
@@ -198,11 +198,13 @@ def _calibration(results: Results) -> str:
         "sure, or a few errors that are far larger than expected.</p>"
         '<p class="soft">Errors and σ are of log(I + I<sub>0</sub>) with the method’s own I<sub>0</sub>. Ground truth: '
         "all compared pixels count, also those that are clipped in the frames; “beyond white” are these. Held-out "
-        "frames: pixels that are clipped in the frame itself do not count; the variance is the mean over the exposure, "
-        "and the frame’s own noise counts as an error of the method.</p>"
+        "frames: pixels that are clipped in the frame itself do not count; the variance is the mean over the exposure "
+        "and, as the error is that of both, the frame’s own. Median z: of |z|, over that of Gaussian errors; below the "
+        "rms where a few pixels have most of the error.</p>"
         '<div class="wide"><table><thead><tr><th class="corner" rowspan="2">method</th>'
         '<th rowspan="2">pixels</th>'
         f'<th class="group" colspan="{span}">errors within 1 σ, %</th><th class="group" colspan="{span}">rms z</th>'
+        '<th rowspan="2">median z</th>'
         f'<th rowspan="2">rms error</th><th rowspan="2">rms σ</th></tr><tr>{below}{below}</tr></thead>'
         f"{''.join(bodies)}</table></div></section>"
     )
@@ -214,7 +216,7 @@ def _calibration_rows(
     found: list[tuple[str, dict[str, Any]]],
     parts: dict[str, str],
 ) -> str:
-    rows = [_subhead(escape(sequence.title), 2 * len(parts) + 3)]
+    rows = [_subhead(escape(sequence.title), 2 * len(parts) + 4)]
     for method, calibration in found:
         chosen = [calibration[part] for part in parts]
         if calibration["beyond_white"] is None:  # then what is up to white is all
@@ -222,7 +224,7 @@ def _calibration_rows(
         shares = ("–" if part is None else f"{100 * part['one_sigma']:.1f}" for part in chosen)
         spreads = ("–" if part is None else f"{part['rms_z']:.2f}" for part in chosen)
         whole = calibration["all"]
-        last = f"{whole['rms_error']:.3f}", f"{whole['rms_sigma']:.3f}"
+        last = f"{whole['median_z']:.2f}", f"{whole['rms_error']:.3f}", f"{whole['rms_sigma']:.3f}"
         cells = "".join(f"<td>{text}</td>" for text in (f"{whole['pixels']:,}", *shares, *spreads, *last))
         rows.append(f'<tr><th scope="row">{escape(results.label(method))}</th>{cells}</tr>')
     return f"<tbody>{''.join(rows)}</tbody>"

@@ -17,7 +17,7 @@ from kalux.errors import KaluxError
 from kalux.evaluation.baselines import chosen_methods
 from kalux.evaluation.benchmark.jobs import GROUPS, Failed, Job, make_job, uses_held_out
 from kalux.evaluation.benchmark.sequences import Benchmark, Sequence
-from kalux.evaluation.scores import METRICS
+from kalux.evaluation.scores import METRICS, UNCERTAINTY
 from kalux.evaluation.specs import relocated
 
 DEFAULT_METHODS: Final = ("hold", "mean", "edi", "cf", "iccv2021", "default", "smooth")
@@ -229,7 +229,7 @@ def _rows(results: Results) -> Iterator[tuple[str, str, str, float | str]]:
         values = {name: means[name] for name in METRICS if name not in OPTIONAL or means[name] is not None}
         calibration = record["calibration"]
         if calibration is not None:
-            values |= {name: calibration["all"][name] for name in ("one_sigma", "rms_z")}
+            values |= {name: calibration["all"][name] for name in UNCERTAINTY}
         values["seconds"] = record["seconds"]["images"]
         for name, value in values.items():
             yield job.sequence.name, job.method, name, "" if value is None else value

@@ -1,23 +1,28 @@
 """Is a method as sure as it ought to be? Errors of log(I + I_0) against the standard deviations it gives.
 
 With e the error and sigma the given standard deviation, z = e / sigma of a calibrated method has unit variance; if
-its errors are Gaussian, |z| < 1 for 68.3 % of the pixels.
+its errors are Gaussian, |z| < 1 for 68.3 % of the pixels. Where the reference has noise of its own, as a held-out frame
+has, its variance is added to that which the method gives: e is the error of both.
 """
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from kalux.evaluation.scores import Pair
+if TYPE_CHECKING:
+    from kalux.evaluation.scores import Pair
 
 LEVELS: Final = np.array([*np.arange(0.05, 0.96, 0.05), 0.99])
 """Shares of errors that bands around the estimate are to hold."""
 
 ONE_SIGMA: Final = float(stats.norm.cdf(1) - stats.norm.cdf(-1))
+
+_MEDIAN: Final = float(stats.norm.ppf(0.75))
+"""Of |z| of Gaussian errors."""
 
 _WIDTHS: Final = np.asarray(stats.norm.ppf((1 + LEVELS) / 2))
 _EDGES: Final = np.geomspace(1e-3, 1e1, 25)
@@ -79,7 +84,8 @@ class Calibration:
         """What was found, as plain values; None: no pixel has a variance.
 
         Keys: ``pixels`` and ``unusable`` (without a finite, positive variance); ``one_sigma``, the share of errors
-        within one given standard deviation; ``rms_z``; ``rms_error`` and ``rms_sigma``; ``coverage``, lists of
+        within one standard deviation; ``rms_z``, and ``median_z``, the median of |z| over that of Gaussian errors,
+        0.674 (interpolated in ``coverage``); ``rms_error`` and ``rms_sigma``; ``coverage``, lists of
         ``nominal`` and ``observed`` shares; ``by_sigma``, for classes of the given standard deviation with at least
         100 pixels: ``sigma`` (middle of the class), ``rms_error``, ``pixels``.
         """
@@ -94,6 +100,7 @@ class Calibration:
             "unusable": self._unusable,
             "one_sigma": self._within_one / n,
             "rms_z": float(np.sqrt(self._sum_z2 / n)),
+            "median_z": float(np.interp(0.5, [0.0, *(self._within / n)], [0.0, *_WIDTHS])) / _MEDIAN,
             "rms_error": float(np.sqrt(self._sum_error2 / n)),
             "rms_sigma": float(np.sqrt(self._sum_variance / n)),
             "coverage": {"nominal": LEVELS.round(2).tolist(), "observed": (self._within / n).tolist()},
@@ -127,9 +134,12 @@ class Calibrations:
         counted = np.ones(np.shape(pair.test), bool) if pair.mask is None else pair.mask
         if pair.clipped is not None:
             counted = counted & ~pair.clipped
+        variance = np.asarray(pair.variance, np.float64)
+        if pair.noise is not None:
+            variance = variance + np.where(variance > 0, pair.noise, 0.0)
         bright = np.asarray(pair.reference) > 1
         for name, part in (("all", counted), ("up_to_white", ~bright), ("beyond_white", bright)):
-            self._parts[name].add(pair.test, pair.reference, pair.variance, counted & part)
+            self._parts[name].add(pair.test, pair.reference, variance, counted & part)
 
     def found(self) -> dict[str, Any] | None:
         """``log_offset``, and for each part what `Calibration.found` says; None: no pixel has a variance."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from kalux.evaluation.benchmark.calibration import LEVELS, ONE_SIGMA, Calibration, Calibrations
+from kalux.evaluation.calibration import LEVELS, ONE_SIGMA, Calibration, Calibrations
 from kalux.evaluation.scores import Pair
 
 OFFSET = 0.03
@@ -35,6 +35,7 @@ def test_gaussian_errors_are_within_a_band_as_often_as_they_must_be(stated):
     assert got["pixels"] == 60_000
     assert got["rms_z"] == pytest.approx(1 / stated, rel=0.01)
     assert got["one_sigma"] == pytest.approx(2 * stats.norm.cdf(stated) - 1, abs=0.006)
+    assert got["median_z"] == pytest.approx(1 / stated, rel=0.03)
     widths = stats.norm.ppf((1 + LEVELS) / 2)
     expected = 2 * stats.norm.cdf(stated * widths) - 1
     assert got["coverage"]["observed"] == pytest.approx(expected, abs=0.008)
@@ -78,6 +79,27 @@ def test_masked_pixels_and_clipped_references_do_not_count_and_highlights_are_to
     bright = int(np.count_nonzero(reference[2:] > 1))
     assert 0 < bright < 10
     assert (got["beyond_white"]["pixels"], got["up_to_white"]["pixels"]) == (bright, 10 - bright)
+
+
+def test_the_noise_of_the_reference_is_no_error_of_the_method():
+    test, reference, variance = drawn()
+    rng = np.random.default_rng(1)
+    noise = np.full(variance.shape, 0.02**2)
+    noisy = np.exp(np.log(reference + OFFSET) + 0.02 * rng.standard_normal(noise.shape)) - OFFSET
+    told, untold = Calibrations(), Calibrations()
+    told.add(Pair(0, test, noisy, None, variance, log_offset=OFFSET, noise=noise))
+    untold.add(Pair(0, test, noisy, None, variance, log_offset=OFFSET))
+    assert told.found()["all"]["rms_z"] == pytest.approx(1.0, rel=0.01)
+    assert untold.found()["all"]["rms_z"] > 1.7
+
+
+def test_a_few_large_errors_raise_the_rms_and_not_the_median():
+    collected = Calibration(OFFSET)
+    test, reference, variance = drawn()
+    test[:2] *= 1.3
+    collected.add(test, reference, variance, np.ones(test.shape, bool))
+    assert collected.found()["rms_z"] > 2
+    assert collected.found()["median_z"] == pytest.approx(1.0, rel=0.05)
 
 
 def test_a_method_without_variances_has_no_calibration():

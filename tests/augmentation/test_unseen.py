@@ -1,0 +1,92 @@
+"""What silent pixels show of the change that no event tells."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kalux.augmentation.bridge import UNMEASURED, BridgeNoise, Latent, bridge, nominal_thresholds
+from kalux.augmentation.unseen import UNKNOWN_CHANGE, silent_change
+
+SHAPE = (40, 60)
+C2 = 0.04
+NOISE = BridgeNoise(0.2, 0.2, 0.2 * C2, C2 / 6)
+SECOND = 1_000_000
+
+
+def changes(change, *, on=None, variance=1e-4, clipped=None):
+    """`silent_change` of a level that changes by ``change`` between two frames of a variance."""
+    nothing = np.zeros(SHAPE, np.float32)
+    variances = np.broadcast_to(np.asarray(variance, np.float32), SHAPE).copy()
+    second = variances.copy()
+    if clipped is not None:
+        second[clipped] = UNMEASURED
+    on = nothing if on is None else on
+    level = np.asarray(np.broadcast_to(change, SHAPE), np.float32)
+    segment, _ = bridge(
+        Latent(nothing, variances),
+        Latent(level, second),
+        on,
+        nothing,
+        nominal_thresholds(SHAPE, 0.1, np.float32),
+        NOISE,
+        0,
+        SECOND,
+    )
+    return silent_change(segment, NOISE.quantisation_variance, C2)
+
+
+def test_a_change_that_all_pixels_share():
+    """The slope takes nearly all of it: the frames' noise is small."""
+    np.testing.assert_allclose(changes(0.05, variance=1e-8), 0.05**2, rtol=1e-4)
+
+
+def test_noise_is_no_change():
+    rng = np.random.default_rng(0)
+    sigma = 0.02
+    noise = sigma * np.sqrt(2) * rng.standard_normal(SHAPE)
+    assert changes(noise, variance=sigma**2).mean() < 0.2 * 2 * sigma**2
+    moved = changes(noise + 0.08, variance=sigma**2)
+    assert moved.mean() == pytest.approx(0.08**2, rel=0.05)
+
+
+def test_pixels_too_noisy_to_tell_are_told_of_the_whole_image():
+    change = np.full(SHAPE, 0.08)
+    noisy = np.full(SHAPE, 1e-8)
+    noisy[:, 40:] = 1.0
+    found = changes(change, variance=noisy)
+    np.testing.assert_allclose(found, 0.08**2, rtol=0.05)
+    alone = changes(0.0, variance=1.0)  # and where nothing tells, as usual
+    np.testing.assert_allclose(alone, UNKNOWN_CHANGE * C2, rtol=0.01)
+
+
+def test_it_belongs_to_the_place_where_it_is_seen():
+    change = np.zeros(SHAPE)
+    change[:, 30:] = 0.1
+    found = changes(change, variance=1e-8)
+    assert found[:, :28].max() < 1e-7
+    np.testing.assert_allclose(found[:, 32:], 0.01, rtol=1e-4)
+    np.testing.assert_allclose(found[5:-5, 30], 0.01 * 3 / 5, rtol=1e-4)
+
+
+def test_pixels_with_events_do_not_count_but_are_told_of_their_neighbours():
+    on = np.zeros(SHAPE, np.float32)
+    on[20, 30] = 1
+    change = np.full(SHAPE, 0.05)
+    change[20, 30] = 5.0
+    np.testing.assert_allclose(changes(change, on=on, variance=1e-8), 0.05**2, rtol=1e-4)
+
+
+def test_no_more_than_a_threshold_can_be_hidden():
+    np.testing.assert_allclose(changes(3.0, variance=1e-8), C2, rtol=1e-4)
+
+
+def test_where_nothing_is_known():
+    on = np.zeros(SHAPE, np.float32)
+    on[:, :20] = 1
+    np.testing.assert_allclose(changes(0.0, on=on)[:, :18], UNKNOWN_CHANGE * C2)
+    clipped = np.zeros(SHAPE, bool)
+    clipped[10, 10] = True
+    found = changes(0.0, clipped=clipped)
+    assert found[10, 10] == pytest.approx(0.4 * C2)
+    assert np.delete(found.ravel(), 10 * SHAPE[1] + 10).max() == 0.0

@@ -1,0 +1,136 @@
+"""Read and shot noise of sensors where they are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kalux import EVENT_DTYPE, Frame, Recording
+from kalux.calibration.frame_noise import (
+    estimate_frame_noise,
+    photon_transfer,
+    rounding_error,
+    trimmed_variance,
+)
+from kalux.datasets import SensorSettings, demo_scene, simulate
+from kalux.events import make_events
+from kalux.models.camera import Response
+from kalux.settings import CameraSettings
+
+from builders import unlabelled
+
+CAMERA = CameraSettings()
+NOTHING = np.empty(0, EVENT_DTYPE)
+SCENE = demo_scene(sensor_size=(90, 120), duration=600_000)
+LEVEL = 1 / 255 / np.sqrt(12)
+RAMP = np.broadcast_to(np.linspace(0.02, 0.9, 200), (150, 200))
+
+
+def still(irradiance, read, shot, *, frames=12, response=lambda i: i, changes=None, events=NOTHING):
+    """Frames of 8 bits, 40 ms apart, of a still scene; ``changes`` is added to every second one."""
+    rng = np.random.default_rng(1)
+    made = []
+    for k in range(frames):
+        now = irradiance if changes is None or k % 2 else irradiance + changes
+        noise = np.sqrt(read**2 + shot * irradiance) * rng.standard_normal(irradiance.shape)
+        values = np.rint(255 * response((now + noise).clip(0, 1))).astype(np.uint8)
+        made.append(Frame(values, 40_000 * k, 40_000 * k + 10_000))
+    return Recording.from_arrays(events, made, sensor_size=irradiance.shape)
+
+
+def test_read_and_shot_noise_of_a_still_ramp():
+    """Variance 0.005^2 + quantisation 1/12 of a level + intensity / 5000 electrons."""
+    found = estimate_frame_noise(still(RAMP, 0.005, 1 / 5000), CAMERA)
+    assert found.shot == pytest.approx(1 / 5000, rel=0.05)
+    assert found.read == pytest.approx(np.hypot(0.005, LEVEL), rel=0.1)
+    assert found.at_half == pytest.approx(np.sqrt(found.read**2 + found.shot / 2))
+    assert found.believed
+
+
+def test_noise_of_less_than_half_a_level_is_the_rounding():
+    found = estimate_frame_noise(still(RAMP, 1e-5, 0.0), CAMERA)
+    assert found.read == 0.5 / 255
+    assert found.shot < 1e-6
+
+
+def test_faint_motion_and_flicker_are_no_noise():
+    """Changes of up to five levels that neighbours share leave noise of less than one what it is."""
+    y, x = np.indices(RAMP.shape)
+    waves = 0.01 * np.sin(2 * np.pi * x / 40) * np.sin(2 * np.pi * y / 40)
+    found = estimate_frame_noise(still(RAMP, 0.003, 0.0, changes=waves + 0.01), CAMERA)
+    assert found.read == pytest.approx(np.hypot(0.003, LEVEL), rel=0.1)
+
+
+def test_pixels_with_events_around_do_not_count():
+    """A half of the scene flickers pixel by pixel, and says so."""
+    rng = np.random.default_rng(3)
+    changes = np.where(np.arange(200) < 100, 0.2, 0.0) * rng.random(RAMP.shape)
+    y, x = (i.ravel() for i in np.nonzero(changes))
+    t = np.arange(0, 480_000, 20_000).repeat(len(x))
+    events = make_events(t, np.tile(x, 24), np.tile(y, 24), np.ones(len(t), np.int64))
+    found = estimate_frame_noise(still(RAMP, 0.01, 0.0, changes=changes, events=events), CAMERA)
+    assert found.read == pytest.approx(np.hypot(0.01, LEVEL), rel=0.1)
+
+
+def test_a_response_that_is_not_linear():
+    """What (6) makes of it, sigma_im^2 / f^w, is the variance of the intensity; here 0.01^2 everywhere."""
+    camera = CameraSettings(response="gamma:1.5")
+    irradiance = np.broadcast_to(np.linspace(0.1, 0.8, 200), (150, 200))
+    found = estimate_frame_noise(still(irradiance, 0.01, 0.0, response=lambda i: i ** (1 / 1.5)), camera)
+    weight = Response.gamma(1.5).weight(found.levels ** (1 / 1.5))
+    np.testing.assert_allclose(found.variances / weight, 0.01**2, rtol=0.2)
+
+
+@pytest.mark.parametrize("read", [0.0, 0.004, 0.01])
+def test_frames_in_motion_have_hardly_more_noise_than_still_ones(read):
+    sensor = SensorSettings(noise_rate=0.5, read_noise=read)
+    found = estimate_frame_noise(unlabelled(simulate(SCENE, sensor)), CAMERA)
+    seen = np.sqrt(found.read**2 + found.shot * found.levels)
+    assert (seen > 0.85 * np.hypot(read, LEVEL)).all()
+    assert (seen < np.hypot(read, LEVEL) + 0.003).all()
+
+
+def test_the_estimate_looks_at_the_first_frames_only():
+    recording = still(RAMP, 0.005, 0.0)
+    some = estimate_frame_noise(recording, CAMERA, most_frames=4)
+    assert some.read == pytest.approx(np.hypot(0.005, LEVEL), rel=0.1)
+    assert some.read != estimate_frame_noise(recording, CAMERA).read
+
+
+def test_levels_that_are_alike_do_not_tell_read_from_shot_noise():
+    found = estimate_frame_noise(still(np.full((60, 80), 0.48), 0.01, 0.0), CAMERA)
+    assert found.read == pytest.approx(np.hypot(0.01, LEVEL), rel=0.05)
+    assert found.shot == 0.0
+
+
+def test_nothing_to_be_told():
+    y, x = (i.ravel() for i in np.indices((60, 80)))
+    t = np.arange(12).repeat(len(x)) * 40_000
+    busy = make_events(t, np.tile(x, 12), np.tile(y, 12), np.ones(len(t), np.int64))
+    flat = np.full((60, 80), 0.48)
+    assert estimate_frame_noise(still(flat, 0.002, 0.0), CAMERA) is None  # a single level
+    assert estimate_frame_noise(still(RAMP[:60, :80], 0.002, 0.0, events=busy), CAMERA) is None
+    assert estimate_frame_noise(still(RAMP, 0.01, 0.0, frames=1), CAMERA) is None
+
+
+def test_rounding():
+    assert rounding_error(Frame(np.zeros((1, 1), np.uint8), 0, 1)) == 0.5 / 255
+    assert rounding_error(Frame(np.zeros((1, 1), np.uint16), 0, 1, 1023)) == 0.5 / 1023
+    assert rounding_error(Frame(np.zeros((1, 1)), 0, 1)) == 0.0
+
+
+def test_outliers_do_not_make_variance():
+    rng = np.random.default_rng(0)
+    values = rng.standard_normal(20_000)
+    values[:200] += 50
+    assert trimmed_variance(values) == pytest.approx(1.0, abs=0.05)
+
+
+def test_photon_transfer_is_a_line_without_negative_parts():
+    levels = np.linspace(0.1, 0.9, 9)
+    found = photon_transfer(levels, 1e-5 + 2e-4 * levels, np.ones(9))
+    assert (found.read**2, found.shot) == (pytest.approx(1e-5), pytest.approx(2e-4))
+    falling = photon_transfer(levels, 1e-4 * (1 - levels), np.ones(9))
+    assert falling.shot == 0.0
+    scattered = photon_transfer(levels, np.where(np.arange(9) % 2, 1e-4, 1e-6), np.ones(9))
+    assert not scattered.believed
