@@ -123,7 +123,7 @@ def plan(
         filled, origin, estimate = _with_thresholds(recording, dataclasses.replace(filled, events=unfilled))
     if origin == "settings" and _are_calibrated(filled, known):
         origin = "calibration"
-    if origin in _DOUBTED:
+    if origin in _DOUBTED or (_uses_steps(filled) and filled.filter.unshown_tail > 0):
         filled = _with_bright_tail(recording, filled)
     wanted = _times(recording, exposures, rate_hz, times, at, filled, lookahead)
     if known.pixels is not None:
@@ -347,7 +347,7 @@ def _with_bright_tail(recording: Recording, settings: Settings) -> Settings:
     camera = Camera.named(settings.camera.response, settings.camera.saturation)
     tail = BrightTail()
     for frame in recording.frames():
-        tail = tail.joined(count_bright(camera, frame.normalised()))
+        tail = tail.joined(count_bright(camera, frame.image, frame.white_value))
     return dataclasses.replace(settings, filter=dataclasses.replace(settings.filter, bright_tail=tail.scale))
 
 

@@ -239,7 +239,7 @@ class Reconstructor:
         check_frame(frame, self.sensor_size, index=self._frame_count, previous=self._last_frame)
         self._reference = self._reference or frame.exposure
         if self._tail is None:
-            self._tail = count_bright(self._camera, frame.normalised()).scale
+            self._tail = count_bright(self._camera, frame.image, frame.white_value).scale
         shot = take_shot(frame, self._camera, self._reference, self._gains_of(frame))
         self._shots.append(shot if trail is None else shot._replace(trail=trail))
         self._last_frame = frame

@@ -357,6 +357,9 @@ def test_frames_without_white_and_frames_all_white_are_at_the_bounds():
 def test_the_tail_is_one_of_light_not_of_response():
     levels = np.linspace(0, 1, 1000).reshape(20, 50)
     linear, gamma = Camera.named("linear", 0.98), Camera.named("gamma:2.2", 0.98)
+    for white in (255, 200):  # as recorded, and normalised
+        image = np.random.default_rng(1).integers(0, white + 1, (30, 40)).astype(np.uint8)
+        assert count_bright(linear, image, white) == count_bright(linear, image / white)
     assert count_bright(gamma, levels ** (1 / 2.2)) == count_bright(linear, levels)
 
 
