@@ -532,7 +532,7 @@ def unshown(split, settings, frames, t):
     fall = np.log(max(half, white) / white) if white else np.inf
     tail = min(max(np.log(2) / max(fall, 1e-3), 0.3), 2.0)
     told = [p.excess for p in split.values() if 0 < p.shown <= looked]
-    mean = (sum(told) + 10 * settings.filter.unshown_tail * (tail - 0.25)) / (len(told) + 10)
+    mean = (sum(told) + 10 * settings.filter.unshown_tail * min(tail - 0.25, 0.5)) / (len(told) + 10)
     out = np.full(frames[0].image.shape, np.nan)
     for place, pixel in split.items():
         if pixel.shown > looked:

@@ -583,8 +583,12 @@ def test_the_bright_tail_comes_from_the_frames_and_can_be_given():
     assert plan(doubted, at="frames", settings=given).settings.filter.bright_tail == 0.7
 
 
-def test_the_bright_tail_is_not_looked_for_where_thresholds_are_stated():
-    assert plan(recording(), at="frames").settings.filter.bright_tail is None
+def test_the_bright_tail_is_not_looked_for_where_nothing_asks_for_it():
+    """Thresholds are stated, and no highlight is expected above its bound."""
+    chosen = altered(PRESETS["default"], "filter", unshown_tail=0.0)
+    assert plan(recording(), at="frames", settings=chosen).settings.filter.bright_tail is None
+    assert plan(recording(), at="frames").settings.filter.bright_tail is not None
+    assert plan(recording(), at="frames", preset="iccv2021").settings.filter.bright_tail is None
 
 
 def test_highlights_are_believed_less_where_thresholds_are_estimated():

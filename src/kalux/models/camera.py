@@ -292,9 +292,9 @@ _NO_TAIL: Final = 0.25
 """Scale of a tail that does not go on beyond white, just below the least that is told."""
 
 _MOST_BEYOND: Final = 0.5
-"""Where much of a frame is white, its tail says no more than that highlights go far: how far, pixels that leave saturation
-tell. On eleven simulated scenes bounds of 0.5, 0.8 and none are alike (relative MSE 0.165, 0.163, 0.164); without one,
-scenes of which a large part is white but hardly more come out four times as bright."""
+"""Where much of a frame is white, its tail says no more than that highlights go far: how far, pixels that leave
+saturation tell. On eleven simulated scenes bounds of 0.5, 0.8 and none are alike (relative MSE 0.165, 0.163, 0.164);
+without one, scenes of which a large part is white but hardly more come out four times as bright."""
 
 
 def beyond_white(scale: float) -> float:
