@@ -122,8 +122,9 @@ def test_every_way_of_filtering_has_colours(mosaic, options):
 def test_a_clipped_frame_is_neutral_whatever_the_white_balance():
     """Gains would make magenta of what is white only because it is clipped."""
     image = np.full((4, 4, 3), 255, np.uint8)
+    at_bounds = altered(DEFAULT, "filter", unshown_tail=0.0)
     live = Reconstructor(
-        (4, 4), settings=altered(DEFAULT, "camera", white_balance="1.9;1;1.6"), contrast_threshold=0.2
+        (4, 4), settings=altered(at_bounds, "camera", white_balance="1.9;1;1.6"), contrast_threshold=0.2
     )
     live.push_frame(Frame(image, 0, 1000))
     colour = live.read(1000).colour
@@ -153,7 +154,7 @@ def test_a_sky_whose_blue_is_clipped_is_still_measured():
         live.push_frame(Frame(image, 0, 1000))
         variances.append(float(live.read(1000).variance.max()))
     assert variances[0] < 0.01
-    assert variances[1] > 0.5
+    assert variances[1] > 0.08  # K15: at least 0.3 in log intensity
 
 
 def test_channels_have_their_own_response():

@@ -77,7 +77,7 @@ def test_sensors_leave_what_a_recording_tells_to_the_recording(name):
     assert camera.response == "auto"
     usual = {entry.name: entry.default for entry in dataclasses.fields(events) if "usual" in entry.name}
     same = altered(chosen, "events", **usual, threshold_spread=0.1, noise_rate=3.0)
-    assert altered(same, "camera", frame_noise=0.006) == DEFAULT
+    assert altered(same, "camera", usual_frame_noise=0.006) == DEFAULT
 
 
 def test_thresholds_of_davis_sensors_are_above_the_least_they_can_be_set_to():
@@ -92,7 +92,7 @@ def test_frame_noise_of_the_flir():
     """Read and photon noise at half of white of the IMX265, averaged over the pixels that become one."""
     electrons = np.hypot(2.3, np.sqrt(10_400 / 2))
     pixels = (2048 / 640) ** 2
-    assert preset("prophesee-flir").camera.frame_noise == pytest.approx(
+    assert preset("prophesee-flir").camera.usual_frame_noise == pytest.approx(
         electrons / 10_400 / np.sqrt(pixels), rel=0.02
     )
 

@@ -490,7 +490,9 @@ class Reconstructor:
         gains = self._gains_of(frame)
         colour = demosaic(image.intensity, frame.mosaic, self.settings.camera.offset, gains)
         # The complementary filter knows no variance: its highlights are taken as any are that were never seen.
-        variance = np.minimum(image.variance, np.float32(self.settings.filter.initial_variance))
+        # What is expected above a bound (K15) is no knowledge of its colour: there, P counts.
+        known = np.maximum(image.variance, estimate.variance)
+        variance = np.minimum(known, np.float32(self.settings.filter.initial_variance))
         return calm_highlights(colour, variance, gains)
 
     def _chroma(self, progress: _Progress, t: int) -> NDArray[np.float32] | None:

@@ -451,7 +451,7 @@ _PROPHESEE_FLIR: Final = Settings(
     camera=CameraSettings(
         # 2.3 electrons of read noise and 10,400 at white (IMX265, EMVA 1288) are 0.0069 at half of white, mostly photon
         # noise; `kalux register` averages about ten of its 2048 x 1536 pixels to one of 640 x 480.
-        frame_noise=0.0022,
+        usual_frame_noise=0.0022,
     ),
     events=EventSettings(
         # 25 % of contrast, 0.22, is nominal for Prophesee's sensors; events lost in the refractory period make steps

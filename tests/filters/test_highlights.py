@@ -31,11 +31,11 @@ def unshown(pixels, excess, noise=0.0):
     return Unshown(np.array(pixels), np.full(count, excess, np.float32), np.full(count, noise, np.float32))
 
 
-def read(level, where, difference=0.0, moving=None, pitch=1):
+def read(level, where, difference=0.0, moving=None, pitch=1, prior=PRIOR):
     bound = np.asarray(level, np.float32)
     raised, spread = lifted(bound, np.full(bound.shape, 0.01, np.float32), where)
-    image = intensity(raised, spread, OFFSET, PRIOR)
-    read_unshown(image, raised, spread, bound, where, moving, OFFSET, PRIOR, difference, pitch)
+    image = intensity(raised, spread, OFFSET, prior)
+    read_unshown(image, raised, spread, bound, where, moving, OFFSET, prior, difference, pitch)
     return image
 
 
@@ -49,6 +49,14 @@ def test_at_white_it_is_the_mean_of_what_is_expected():
 def test_noise_of_the_events_draws_to_white():
     level = np.full((1, 2), WHITE + 1.0)
     assert read(level, unshown([0], 0.4, 1.0))[0, 0] < read(level, unshown([0], 0.4, 0.0))[0, 0]
+
+
+def test_without_a_prior_events_are_not_doubted():
+    off = HighlightPrior(WHITE, 0.0, 0.0)
+    where, bound = unshown([0, 1], 0.4, 1.0), np.array([[WHITE, WHITE + 1.0]], np.float32)
+    where.noise[0] = 0.0
+    assert tempered(where, bound, off) is where
+    np.testing.assert_allclose(read(bound, where, prior=off), np.exp(bound + 0.4 + 0.08) - OFFSET, rtol=1e-5)
 
 
 @pytest.mark.parametrize("pitch", [1, 2])

@@ -22,13 +22,16 @@ def tempered(unshown: Unshown, bound: Floats, prior: HighlightPrior) -> Unshown:
     """What is expected above a bound that is beyond white itself: highlights end somewhere.
 
     Above the bound the exponential distribution of `Unshown` and the normal one of the prior on highlights (K6) fall at
-    the rates 1 / e and d / s^2, d the bound's distance from white: together, e becomes 1 / (1 / e + d / s^2).
+    the rates 1 / e and d / s^2, d the bound's distance from white: together, e becomes 1 / (1 / e + d / s^2). Without
+    that prior nothing changes.
 
     Parameters
     ----------
     bound
         (H, W) L.
     """
+    if prior.scale2 == 0:
+        return unshown
     beyond = np.maximum(bound.reshape(-1)[unshown.pixels] - np.float32(prior.white), np.float32(0.0))
     steeper = np.float32(1.0) + unshown.excess * beyond / np.float32(prior.scale2)
     return unshown._replace(excess=unshown.excess / steeper)
@@ -107,10 +110,11 @@ def _hear_neighbours(pixels, level, variance, bound, moving, difference2, pitch,
 def _take_mean(excess, noise, log_offset, white, scale2, stretch, mean):  # type: ignore[no-untyped-def]
     """From L to the mean of the intensity, in place, without branches, so that it becomes vector code."""
     half, zero = np.float32(0.5), np.float32(0.0)
+    doubted = scale2 > zero
     for i in range(len(mean)):
         level = mean[i] + half * excess[i] * excess[i]
         believed = white + believed_highlight(max(level - white, zero), noise[i], scale2, stretch)
-        mean[i] = max(exponential(believed if level > white else level) - log_offset, zero)
+        mean[i] = max(exponential(believed if doubted and level > white else level) - log_offset, zero)
 
 
 def smoothed_unshown(forward: Unshown | None, backward: Unshown | None) -> Unshown | None:
