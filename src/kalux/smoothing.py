@@ -349,8 +349,8 @@ def combine(
         (forward.log_intensity, forward.variance, forward.unshown),
         (behind, backward.variance, backward.unshown),
     )
-    for own, other in (directions, directions[::-1]):
-        obey_bounds(level, *own, *other)
+    for (bound, _, unshown), other in (directions, directions[::-1]):
+        obey_bounds(level, bound, unshown, *other)
     return Estimate(
         t=forward.t,
         log_intensity=level,

@@ -99,18 +99,22 @@ def test_of_both_directions_only_what_neither_has_seen_is_left():
 
 def obeyed(bound, noise, level, doubt, other=None):
     smoothed = np.array([[-9.0]])
-    own = np.array([[1.0 + noise]])
-    args = (np.array([[bound]]), own, unshown([0], 0.2, noise), np.array([[level]]), np.array([[doubt]]))
+    args = np.array([[bound]]), unshown([0], 0.2, noise), np.array([[level]]), np.array([[doubt]])
     obey_bounds(smoothed, *args, other)
     return float(smoothed[0, 0])
 
 
 def test_where_one_direction_knows_only_a_bound_the_other_counts():
-    assert obeyed(0.0, 0.1, 1.5, 0.1) == 1.5
-    assert obeyed(2.0, 0.1, 1.5, 0.1) == pytest.approx(1.75)  # both are as sure
-    assert obeyed(2.0, 0.0, 1.5, 0.1) == 2.0
+    assert obeyed(0.0, 0.1, 1.5, 1e-3) == pytest.approx(1.5, abs=1e-4)
+    assert obeyed(2.0, 0.0, 1.5, 1e-3) == pytest.approx(2.0, abs=1e-4)
+    raised = 1.5 + 0.5 * 0.01 / (0.01 + 0.01)  # both are as sure
+    assert obeyed(2.0, 0.01, 1.5, 0.01) == pytest.approx(raised, abs=1e-3)
 
 
-def test_but_not_where_it_is_less_sure_or_knows_no_more():
-    assert obeyed(0.0, 0.1, 1.5, 3.0) == -9.0
+def test_as_far_as_it_is_sure():
+    assert obeyed(0.0, 0.0, 1.5, 0.5) == pytest.approx((1.5 + 0.2) / 2)
+    assert obeyed(0.0, 0.0, 1.5, 50.0) == pytest.approx(0.2, abs=1e-3)
+
+
+def test_where_neither_knows_more_nothing_changes():
     assert obeyed(0.0, 0.1, 1.5, 0.1, unshown([0], 0.2)) == -9.0

@@ -18,6 +18,11 @@ _LEAST_SPREAD: Final = np.float32(0.3)
 """Standard deviation that is left where pixels around say that all lie just above their bounds."""
 
 
+_BOUND_VARIANCE: Final = np.float32(0.5)
+"""Of the other direction of time, at which a bound counts as much as its level: less costs simulated scenes, whose events
+are exact, more costs real ones, whose levels drift."""
+
+
 def tempered(unshown: Unshown, bound: Floats, prior: HighlightPrior) -> Unshown:
     """What is expected above a bound that is beyond white itself: highlights end somewhere.
 
@@ -131,7 +136,6 @@ def smoothed_unshown(forward: Unshown | None, backward: Unshown | None) -> Unsho
 def obey_bounds(
     smoothed: Floats,
     bound: Floats,
-    own: Floats,
     unshown: Unshown | None,
     level: Floats,
     variance: Floats,
@@ -139,9 +143,9 @@ def obey_bounds(
 ) -> None:
     """Smoothed L, (H, W), where one direction knows no more than a ``bound``: that of the other direction. In place.
 
-    ``own`` is P of the direction with the bounds; ``level`` and ``variance`` are the other's, ``other`` the pixels of
-    which that knows no more either. Where its level is below the bound, both are wrong, each in proportion to its
-    variance. Where it is less sure than the bound, it does not count alone.
+    ``level`` and ``variance`` are the other's L and P, ``other`` the pixels of which that knows no more either. Where its
+    level is below the bound, both are wrong, each in proportion to its variance; what is expected above the bound counts
+    as far as the other direction is not sure.
     """
     if unshown is None:
         return
@@ -150,6 +154,7 @@ def obey_bounds(
         only = np.isin(unshown.pixels, other.pixels, assume_unique=True, invert=True)
     pixels = unshown.pixels[only]
     known, doubt, noise = level.reshape(-1)[pixels], variance.reshape(-1)[pixels], unshown.noise[only]
-    short = np.maximum(bound.reshape(-1)[pixels] - known, np.float32(0.0))
-    surer = doubt < own.reshape(-1)[pixels]
-    smoothed.reshape(-1)[pixels[surer]] = (known + short * doubt / (doubt + noise))[surer]
+    bounds = bound.reshape(-1)[pixels]
+    raised = known + np.maximum(bounds - known, np.float32(0.0)) * doubt / (doubt + noise)
+    share = doubt**2 / (doubt**2 + (_BOUND_VARIANCE + noise) ** 2)
+    smoothed.reshape(-1)[pixels] = raised + share * (bounds + unshown.excess[only] - raised)
