@@ -112,7 +112,7 @@ def test_where_one_direction_knows_only_a_bound_the_other_counts():
 
 
 def test_as_far_as_it_is_sure():
-    assert obeyed(0.0, 0.0, 1.5, 0.5) == pytest.approx((1.5 + 0.2) / 2)
+    assert obeyed(0.0, 0.0, 1.5, 0.3) == pytest.approx((1.5 + 0.2) / 2)
     assert obeyed(0.0, 0.0, 1.5, 50.0) == pytest.approx(0.2, abs=1e-3)
 
 

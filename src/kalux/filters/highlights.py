@@ -18,9 +18,10 @@ _LEAST_SPREAD: Final = np.float32(0.3)
 """Standard deviation that is left where pixels around say that all lie just above their bounds."""
 
 
-_BOUND_VARIANCE: Final = np.float32(0.5)
-"""Of the other direction of time, at which a bound counts as much as its level: less costs simulated scenes, whose events
-are exact, more costs real ones, whose levels drift."""
+_BOUND_VARIANCE: Final = np.float32(0.3)
+"""Of the other direction of time, at which a bound counts as much as its level. Less costs simulated scenes, whose
+thresholds are stated (mean relative MSE 0.112 at 0.2, 0.103 at 0.35, 0.099 at 0.5), more costs real levels that drift
+(artificial HDR of slider_depth, MSE x 100: 1.0 at 0.15, 1.4 at 0.3, 2.2 at 0.5)."""
 
 
 def tempered(unshown: Unshown, bound: Floats, prior: HighlightPrior) -> Unshown:
@@ -143,9 +144,9 @@ def obey_bounds(
 ) -> None:
     """Smoothed L, (H, W), where one direction knows no more than a ``bound``: that of the other direction. In place.
 
-    ``level`` and ``variance`` are the other's L and P, ``other`` the pixels of which that knows no more either. Where its
-    level is below the bound, both are wrong, each in proportion to its variance; what is expected above the bound counts
-    as far as the other direction is not sure.
+    ``level`` and ``variance`` are the other's L and P, ``other`` the pixels of which that knows no more either. Where
+    its level is below the bound, both are wrong, each in proportion to its variance; what is expected above the bound
+    counts as far as the other direction is not sure.
     """
     if unshown is None:
         return
