@@ -44,8 +44,8 @@ LIMITS = {
     "EDI / literal in numba": 4.0,
 }
 """Ratios of million events/s at 640x480 that `--check` asks for: a tenth to a third below what was found (4.1 to 5.9,
-0.163 to 0.178, 1110 and more, 2.0, 4.9 to 5.4). Pixels that straddle the lines of the memory, for one, lessen the first, the
-second and the last by a quarter to two fifths."""
+0.163 to 0.178, 1110 and more, 2.0, 4.9 to 5.4). Pixels that straddle the lines of the memory, for one, lessen the
+first, the second and the last by a quarter to two fifths."""
 
 compiled = {name: nb.njit(getattr(literal, name)) for name in ("advance", "integrate", "store")}
 
