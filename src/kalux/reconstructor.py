@@ -445,7 +445,7 @@ class Reconstructor:
         pitch = 2 if mosaic else 1  # neighbours of the same colour
         hidden = hidden_variance(estimate.between, on * off)
         change = estimate.silent_change
-        if change is None:
+        if change is None and moving is not None:  # K11 needs it only there
             change = np.full(log_intensity.shape, UNKNOWN_CHANGE * on * off, np.float32)
         intensity, total = read_out(
             log_intensity, variance, offset, prior, moving, hidden, change, neighbours, pitch

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.deblur import between
-from kalux.calibration.contrast import NORMAL_MAD
+from kalux.calibration.contrast import HUBER, NORMAL_MAD
 from kalux.calibration.registration import Registration
 from kalux.errors import InputError
 from kalux.events import EventArray
@@ -46,7 +46,6 @@ _STEPS: Final = 6
 _CLOSE: Final = 0.01  # pixels, and ms: steps below it end a round
 _MOST_SAMPLES: Final = 200_000  # neighbouring pixels, blurred, say the same
 _HALF_STEP: Final = 1_000  # us, of the derivative by the offset
-_HUBER: Final = 1.345
 _WELL_EXPOSED: Final = (0.03, 0.95)
 _SPREAD: Final = 200_000
 """us: a step is spread over no longer than this: what is older than that has mostly been still."""
@@ -350,7 +349,7 @@ def _normal_equations(
     scale = max(NORMAL_MAD * float(np.median(np.abs(everything))), 1e-6)
     matrices, vectors, before, after = [], [], 0.0, 0.0
     for residual, jacobian, change in rows:
-        weight = np.minimum(1.0, _HUBER * scale / np.maximum(np.abs(residual), 1e-12))
+        weight = np.minimum(1.0, HUBER * scale / np.maximum(np.abs(residual), 1e-12))
         weighted = jacobian * weight[:, None]
         matrices.append(weighted.T @ jacobian)
         vectors.append(weighted.T @ residual)

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from kalux.augmentation.deblur import between, integrate_exposure, latent_middle, latent_peak
 from kalux.augmentation.refractory import step_weight
-from kalux.calibration.contrast import NORMAL_MAD, estimate_thresholds
+from kalux.calibration.contrast import HUBER, NORMAL_MAD, estimate_thresholds
 from kalux.calibration.intervals import Interval, intervals
 from kalux.calibration.refractory import shortest_interval
 from kalux.calibration.values import Calibration
@@ -50,7 +50,6 @@ _IN_TIME: Final = (0.7, 0.95, 1.15)
 """h over the mean threshold where events are in time: 1 in theory, 0.79 to 1.02 on five simulated scenes. Between the
 outer values no delay is corrected, beyond them until the middle one is reached."""
 _MIN_SAMPLES: Final = 500
-_HUBER: Final = 1.345  # 95 % efficiency for normal residuals (Huber 1981)
 _WHITE: Final = 0.95  # of the response: the whole deblurred path lies below
 _CROWDED: Final = 3.0
 """Intervals with events closer than this many times the smallest inter-event interval are left out. With 3, a
@@ -337,7 +336,7 @@ def _fit(data: _Samples) -> _Fit | None:
         solution = np.linalg.solve(normal, weighted.T @ data.change).astype(np.float64)
         residual = data.change - data.explained @ solution
         scale = max(NORMAL_MAD * float(np.median(np.abs(residual))), 1e-9)
-        weights = np.minimum(1.0, _HUBER * scale / np.maximum(np.abs(residual), 1e-12))
+        weights = np.minimum(1.0, HUBER * scale / np.maximum(np.abs(residual), 1e-12))
         if np.abs(solution - previous).max() < 1e-5:
             break
     on, off, trailing = (float(v) for v in solution)
@@ -429,7 +428,7 @@ def _per_pixel(
         predicted = part.explained[:, :2] * plain[:2]  # by factor 1 of either threshold
         residual = part.change - part.explained @ plain
         spread = np.sqrt(variance.still + variance.per_event * np.abs(part.explained[:, :2]).sum(axis=1))
-        weight = np.minimum(1.0, 2 * _HUBER * spread / np.maximum(np.abs(residual), 1e-12)) / spread**2
+        weight = np.minimum(1.0, 2 * HUBER * spread / np.maximum(np.abs(residual), 1e-12)) / spread**2
         for column, (i, j) in enumerate(((0, 0), (0, 1), (1, 1))):
             normal[:, column] += np.bincount(part.pixel, weight * predicted[:, i] * predicted[:, j], size)
         for i in range(2):

@@ -489,20 +489,24 @@ class BridgedFrames(_Common):
         unknown = np.full(self.shape, UNKNOWN_CHANGE * self.on * self.off, np.float32)
         if self.lookahead:
             on, off, followed = self.follow(events, begin, shot.middle, nothing)
-            memory = BridgeMemory(
-                latent,
-                thresholds,
-                0.0,
-                on,
-                off,
-                far,
-                far,
-                shot.start,
-                followed,
-                followed,
-                begin_unshown(latent),
-                unknown,
-            )
+        else:
+            # The clock begins at the end of the exposure: nothing is known of what came before.
+            (on, off), followed = self.counts(events, shot.middle, shot.end), nothing
+        memory = BridgeMemory(
+            latent=latent,
+            thresholds=thresholds,
+            interval=0.0,
+            on=on,
+            off=off,
+            far_on=far,
+            far_off=far,
+            since=shot.start,
+            followed=followed,
+            at_middle=followed,
+            unshown=begin_unshown(latent),
+            silent_change=unknown,
+        )
+        if self.lookahead:
             value, variance = latent.value, latent.variance
             if shot.middle > begin:
                 lead_in = bridge.extend_backward(latent, on, off, thresholds, self.noise, begin, shot.middle)
@@ -514,22 +518,6 @@ class BridgedFrames(_Common):
                 value = lead_in.augmented
                 variance = lead_in.backward_variance + lead_in.step_variance * lead_in.events
         else:
-            # The clock begins at the end of the exposure: nothing is known of what came before.
-            on, off = self.counts(events, shot.middle, shot.end)
-            memory = BridgeMemory(
-                latent,
-                thresholds,
-                0.0,
-                on,
-                off,
-                far,
-                far,
-                shot.start,
-                nothing,
-                nothing,
-                begin_unshown(latent),
-                unknown,
-            )
             carried = self._carried(memory, shot)
             value, variance = carried.value, carried.variance
         unmeasured = variance >= bridge.UNMEASURED
@@ -591,19 +579,18 @@ class BridgedFrames(_Common):
             )
             joined, far_on, far_off = self._drifting(joined, memory, second, on, off)
             unshown = follow_unshown(memory.unshown, second, net)
-            after = BridgeMemory(
-                second,
-                learned,
-                interval,
-                on,
-                off,
-                far_on,
-                far_off,
-                memory.since,
-                at_middle,
-                at_middle,
-                unshown,
-                change,
+            after = memory._replace(
+                latent=second,
+                thresholds=learned,
+                interval=interval,
+                on=on,
+                off=off,
+                far_on=far_on,
+                far_off=far_off,
+                followed=at_middle,
+                at_middle=at_middle,
+                unshown=unshown,
+                silent_change=change,
             )
             return joined._replace(unshown=unshown), after
         # Of what came before: what the segment holds is still to come when it is read.
