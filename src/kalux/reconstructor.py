@@ -425,7 +425,7 @@ class Reconstructor:
         # The prior needs a variance, which the complementary filter has not.
         filtered, events = self.settings.filter, self.settings.events
         scale = filtered.highlight_scale if filtered.kind == "akf" else 0.0
-        spread = events.threshold_spread
+        spread = events.mismatch
         if self._estimated:
             scale, spread = (
                 min(scale, filtered.highlight_tail * self._tail_beyond),

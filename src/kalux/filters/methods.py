@@ -406,7 +406,7 @@ class BridgedFrames(_Common):
     ) -> None:
         super().__init__(settings, thresholds, lookahead, shape)
         self._prior = (
-            bridge.nominal_thresholds(shape, settings.events.threshold_spread, np.float32)
+            bridge.nominal_thresholds(shape, settings.events.mismatch, np.float32)
             if pixels is None
             else Thresholds(
                 *(
@@ -707,7 +707,7 @@ class BridgedFrames(_Common):
 
     def advance(self, segment: Any, cursor: akf.BridgedCursor, events: EventArray) -> None:
         settings = self.settings.events
-        noise = akf.BridgedNoise(settings.noise_rate, settings.step_noise, self.on * self.off)
+        noise = akf.BridgedNoise(settings.background_rate, settings.step_noise, self.on * self.off)
         akf.advance_bridged(segment, cursor, events, noise)
 
     def read(self, segment: Any, cursor: akf.BridgedCursor, t: int) -> tuple[Floats, Floats]:
