@@ -95,7 +95,7 @@ class BridgedSegment(NamedTuple):
     the way to the end to the way from the start. The covariance of L^A as a measurement is
     R = 1 / (rate (1/forward + 1/backward)), ``rate`` in 1/s, where ``forward`` is ``forward_variance`` and
     ``step_variance`` for each event since the start, and ``backward`` is ``backward_variance`` and ``step_variance``
-    for each of the ``events`` still to come. At ``start`` the level is ``floor`` or more (`floor_before`; None: no
+    for each of the ``events`` still to come (None: not known, and none are counted). At ``start`` the level is ``floor`` or more (`floor_before`; None: no
     bound). At ``end`` the pixel obeys the frame ``bound`` (`lift`), and its variance grows by ``drift``, what its
     thresholds may have been wrong by (`drift`; None: nothing). Pixels without an event after ``still_since`` are still.
     Beyond what L^A and the state say here, the level is ahead of its newest event by ``trail`` (K14; None: it is not).
@@ -111,7 +111,7 @@ class BridgedSegment(NamedTuple):
     step_off: Array
     forward_variance: Array
     backward_variance: Array
-    events: Array
+    events: Array | None
     step_variance: float
     rate: float
     bound: Latent | None
@@ -290,7 +290,7 @@ def extend(
         step_off=noise.threshold_off * thresholds.off,
         forward_variance=frame.variance,
         backward_variance=np.full_like(frame.value, UNMEASURED),
-        events=np.zeros_like(frame.value),
+        events=None,
         step_variance=noise.step_variance,
         rate=1.0 / seconds,
         bound=bound,

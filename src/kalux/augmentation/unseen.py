@@ -43,6 +43,7 @@ def silent_change(segment: BridgedSegment, quantisation_variance: float, thresho
     threshold2
         c^2.
     """
+    assert segment.events is not None
     shape = segment.slope.shape
     change, untold, silent, mean = (np.empty(shape, np.float32) for _ in range(4))
     seconds = np.float32((segment.end - segment.start) * 1e-6)

@@ -139,7 +139,10 @@ STEP_PIXEL: Final = np.dtype(
 """What events need besides: 32 bytes, so that none lies in two lines of memory."""
 
 _BLOCK: Final = 128
-"""Pixels that are read or begun together: few enough that their fields stay in the nearest cache."""
+"""Pixels that are read together: few enough that their fields stay in the nearest cache."""
+
+_BEGUN: Final = 64
+"""The same where a segment begins, with more fields."""
 
 _STATE_FIELDS: Final = STATE_PIXEL.itemsize // 4
 _STEP_FIELDS: Final = STEP_PIXEL.itemsize // 4
@@ -162,6 +165,8 @@ class BridgedCursor:
         1 or -1, that of the newest event of every pixel, laid out as the clock is; 0: not known.
     origin
         us: the segment's start, then a whole number of epochs later.
+    moving
+        `moving_bridged`, once it has been asked for, where it is the same throughout the segment.
     """
 
     pixels: NDArray[np.void]
@@ -169,6 +174,7 @@ class BridgedCursor:
     clock: Clock
     polarity: NDArray[np.int8]
     origin: int
+    moving: NDArray[np.bool_] | None = None
 
 
 class BridgedNoise(NamedTuple):
@@ -207,7 +213,8 @@ def begin_bridged(
         level = np.maximum(level, segment.floor)  # K7
     scalars = np.float32(segment.rate), np.float32(segment.step_variance)
     variances = segment.forward_variance, segment.backward_variance
-    given = segment.augmented, segment.step_on, segment.step_off, *variances, segment.events
+    coming = np.zeros_like(segment.augmented) if segment.events is None else segment.events
+    given = segment.augmented, segment.step_on, segment.step_off, *variances, coming
     _begin_bridged(given, scalars, level, state.variance, pixels.reshape(-1), steps.reshape(-1))
     polarity[1:-1, 1:-1] = 0 if segment.trail is None else segment.trail.polarity
     return BridgedCursor(pixels, steps, clock, polarity, segment.start)
@@ -275,10 +282,14 @@ def _read(segment: BridgedSegment, cursor: BridgedCursor, t: int) -> tuple[Float
 
 
 def moving_bridged(segment: BridgedSegment, cursor: BridgedCursor) -> NDArray[np.bool_]:
-    """(H, W): pixels with an event since ``segment.still_since``, or one to come in the segment."""
+    """(H, W): pixels with an event since ``segment.still_since``, or one to come in the segment; not to be changed."""
+    if cursor.moving is not None:
+        return cursor.moving
     inside = cursor.clock[1:-1, 1:-1]
     moving: NDArray[np.bool_] = inside > np.int32(max(segment.still_since - cursor.origin, -EPOCH))
-    moving |= segment.events > 0
+    if segment.events is not None:  # all events of the segment are among them, whenever this is asked for
+        moving |= segment.events > 0
+        cursor.moving = moving
     return moving
 
 
@@ -306,33 +317,33 @@ def _begin_bridged(given, scalars, log_intensity, variance, pixels, steps):  # t
     rate, step_variance = scalars
     augmented, step_on, step_off, forward, backward, events = given
     height, width = log_intensity.shape
-    states = np.empty((_STATE_FIELDS, _BLOCK), np.float32)
-    steppings = np.zeros((_STEP_FIELDS, _BLOCK), np.float32)
-    for row in range(height):
-        at = (row + 1) * (width + 2) + 1
-        for first in range(0, width, _BLOCK):
-            count = min(width - first, _BLOCK)
-            _copy(step_on, row, first, count, steppings[_STEP_ON])
-            _copy(step_off, row, first, count, steppings[_STEP_OFF])
-            _copy(forward, row, first, count, steppings[_FORWARD])
-            _copy(backward, row, first, count, steppings[_BACKWARD])
-            _copy(events, row, first, count, steppings[_COMING])
-            _copy(variance, row, first, count, states[_INFORMATION])
-            _copy(log_intensity, row, first, count, states[_WEIGHTED])
-            _copy(augmented, row, first, count, states[_AUGMENTED])
+    states = np.empty((_STATE_FIELDS, _BEGUN), np.float32)
+    known = np.zeros((_STEP_FIELDS, _BEGUN), np.float32)
+    information, weighted, level, rates = states[_INFORMATION], states[_WEIGHTED], states[_AUGMENTED], states[_RATE]
+    first_variance, last_variance, coming = known[_FORWARD], known[_BACKWARD], known[_COMING]
+    for row in range(np.uint64(height)):
+        at = (row + np.uint64(1)) * np.uint64(width + 2) + np.uint64(1)
+        for first in range(np.uint64(0), np.uint64(width), np.uint64(_BEGUN)):
+            count = min(np.uint64(width) - first, np.uint64(_BEGUN))
+            _copy(step_on, row, first, count, known[_STEP_ON])
+            _copy(step_off, row, first, count, known[_STEP_OFF])
+            _copy(forward, row, first, count, first_variance)
+            _copy(backward, row, first, count, last_variance)
+            _copy(events, row, first, count, coming)
+            _copy(augmented, row, first, count, level)
             for i in range(count):
-                information = ONE / states[_INFORMATION, i]
-                states[_INFORMATION, i] = information
-                states[_WEIGHTED, i] = information * (states[_WEIGHTED, i] - states[_AUGMENTED, i])
-                coming = steppings[_BACKWARD, i] + steppings[_COMING, i] * step_variance
-                states[_RATE, i] = measurement_rate(rate, steppings[_FORWARD, i], coming)
-            pack(states, pixels, at + first, count)
-            pack(steppings, steps, at + first, count)
+                information[i] = ONE / np.float32(variance[row, first + i])
+            for i in range(count):
+                weighted[i] = information[i] * (np.float32(log_intensity[row, first + i]) - level[i])
+            for i in range(count):
+                rates[i] = measurement_rate(rate, first_variance[i], last_variance[i] + coming[i] * step_variance)
+            pack(states, pixels, np.int64(at + first), np.int64(count))
+            pack(known, steps, np.int64(at + first), np.int64(count))
 
 
 @nb.njit(cache=True, inline="always")
 def _copy(plane, row, first, count, out):  # type: ignore[no-untyped-def]
-    """A part of a row as float32. One array at a time: of many at once the compiler cannot tell that they differ."""
+    """A part of a row as float32; vector code, as loops over many arrays at once are not."""
     for i in range(count):
         out[i] = np.float32(plane[row, first + i])
 
