@@ -87,6 +87,18 @@ def packed(shape: tuple[int, ...], dtype: np.dtype[np.void]) -> NDArray[np.void]
     return memory[first : first + size].view(dtype).reshape(shape)
 
 
+def apart(count: int, shape: tuple[int, ...], dtype: Any = np.float32) -> NDArray[Any]:
+    """``count`` arrays, not filled, for loops over all of them at once: (count, *shape).
+
+    Planes of many sensors are whole pages of memory, so that the same pixel of all of them would compete for the same
+    few places of the nearest cache, and stores would wait for loads that have nothing to do with them: a loop over
+    twenty planes then takes 1.4 times as long. These lie a line of the cache further apart each.
+    """
+    size = math.prod(shape)
+    line = _LINE // np.dtype(dtype).itemsize
+    return np.empty((count, size + line), dtype)[:, :size].reshape(count, *shape)
+
+
 def _prefetch(typing_context: Any, array: Any, index: Any) -> Any:
     signature = types.void(array, index)
 
@@ -154,7 +166,9 @@ class _Rows:
         self.builder, self.lanes = builder, lanes
         self.vector = ir.VectorType(ir.FloatType(), lanes)
         records, self._first, planes, self._column = (
-            context.make_array(kind)(context, builder, argument) if isinstance(kind, types.Array) else argument
+            context.make_array(kind)(context, builder, argument)
+            if isinstance(kind, types.Array)
+            else argument
             for kind, argument in zip(signature.args, arguments, strict=True)
         )
         self._records, self._planes = records.data, planes.data
@@ -224,9 +238,7 @@ def _pack_of(lanes: int) -> Any:
                 pairs = zip(mix(parts[::2]), mix(parts[1::2]), strict=True)
                 return [rows.chosen(a, b, half) for a, b in pairs for half in (turns[:lanes], turns[lanes:])]
 
-            for k, values in enumerate(
-                mix([builder.load(rows.of_plane(k), align=4) for k in range(fields)])
-            ):
+            for k, values in enumerate(mix([builder.load(rows.of_plane(k), align=4) for k in range(fields)])):
                 builder.store(values, rows.of_records(k), align=4)
             return context.get_dummy_value()
 

@@ -295,16 +295,16 @@ def relative_levels(exposure, block, duration, fields, middle, peak, events):  #
     first = block * np.uint64(EXPOSED)
     count = min(np.uint64(len(exposure.pixels)) - first, np.uint64(EXPOSED))
     unpack(exposure.pixels, np.int64(first), np.int64(count), fields)
+    level, integral, since = fields[_LEVEL], fields[_INTEGRAL], fields[_SINCE]
+    at_middle, largest, count_of = fields[_AT_MIDDLE], fields[_PEAK], fields[_EVENTS]
+    for i in range(count):  # a loop each: each is vector code then
+        events[i] = mean_level(level[i], integral[i], since[i], duration)
     for i in range(count):
-        mean = mean_level(fields[_LEVEL, i], fields[_INTEGRAL, i], fields[_SINCE, i], duration)
-        middle[i] = fields[_AT_MIDDLE, i] / mean
-        peak[i] = fields[_PEAK, i] / mean
+        middle[i] = logarithm(at_middle[i] / events[i])
     for i in range(count):
-        middle[i] = logarithm(middle[i])
+        peak[i] = logarithm(largest[i] / events[i])
     for i in range(count):
-        peak[i] = logarithm(peak[i])
-    for i in range(count):
-        events[i] = fields[_EVENTS, i]
+        events[i] = count_of[i]
 
 
 # Not FUSED: the paper's (12) divides small differences of these, which would bring another rounding out a hundredfold.

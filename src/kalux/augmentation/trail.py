@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from kalux.compiled import (
     MICROSECOND32,
     WEIGHT_UNIT,
+    apart,
     event_column,
     event_is_on,
     event_row,
@@ -128,14 +129,16 @@ def follow(
     Intervals are taken from the last quarter of that time: fewer would do, and all of them cost.
     """
     shape = before.newest.shape
-    counts, newest = np.zeros((2, *shape), np.float32), before.newest.copy()
-    planes = counts.reshape(2, -1), newest.reshape(-1), np.uint64(shape[1])
+    counts, newest = apart(2, (before.newest.size,)), before.newest.copy()
+    counts[:] = 0
+    planes = counts, newest.reshape(-1), np.uint64(shape[1])
     span, intervals = _KEPT * before.span, _KEPT * before.intervals
     late = end - (end - start) // 4
     for chunk in chunks:
         more, number = _follow(event_words(chunk), *planes, late)
         span, intervals = span + more, intervals + number
-    return counts[1], counts[0], Followed(newest, span, intervals)
+    off, on = counts.reshape(2, *shape)
+    return on, off, Followed(newest, span, intervals)
 
 
 @nb.njit(cache=True, nogil=True)

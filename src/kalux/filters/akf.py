@@ -195,9 +195,7 @@ class _Scalars(NamedTuple):
     threshold2: np.float32
 
 
-def begin_bridged(
-    segment: BridgedSegment, state: State, spare: BridgedCursor | None = None
-) -> BridgedCursor:
+def begin_bridged(segment: BridgedSegment, state: State, spare: BridgedCursor | None = None) -> BridgedCursor:
     """The cursor at the start of a segment: L stays, L^A is the segment's. The clock's origin is the start.
 
     ``spare`` is a cursor of the same size that is used no more, whose memory the new one takes.
@@ -319,7 +317,12 @@ def _begin_bridged(given, scalars, log_intensity, variance, pixels, steps):  # t
     height, width = log_intensity.shape
     states = np.empty((_STATE_FIELDS, _BEGUN), np.float32)
     known = np.zeros((_STEP_FIELDS, _BEGUN), np.float32)
-    information, weighted, level, rates = states[_INFORMATION], states[_WEIGHTED], states[_AUGMENTED], states[_RATE]
+    information, weighted, level, rates = (
+        states[_INFORMATION],
+        states[_WEIGHTED],
+        states[_AUGMENTED],
+        states[_RATE],
+    )
     first_variance, last_variance, coming = known[_FORWARD], known[_BACKWARD], known[_COMING]
     for row in range(np.uint64(height)):
         at = (row + np.uint64(1)) * np.uint64(width + 2) + np.uint64(1)
@@ -336,7 +339,9 @@ def _begin_bridged(given, scalars, log_intensity, variance, pixels, steps):  # t
             for i in range(count):
                 weighted[i] = information[i] * (np.float32(log_intensity[row, first + i]) - level[i])
             for i in range(count):
-                rates[i] = measurement_rate(rate, first_variance[i], last_variance[i] + coming[i] * step_variance)
+                rates[i] = measurement_rate(
+                    rate, first_variance[i], last_variance[i] + coming[i] * step_variance
+                )
             pack(states, pixels, np.int64(at + first), np.int64(count))
             pack(known, steps, np.int64(at + first), np.int64(count))
 

@@ -38,6 +38,7 @@ from kalux.augmentation.trail import (
     trail_at,
 )
 from kalux.augmentation.unseen import UNKNOWN_CHANGE, silent_change
+from kalux.compiled import apart
 from kalux.errors import SettingsError
 from kalux.events import EventArray
 from kalux.filters import akf, complementary
@@ -584,7 +585,7 @@ class BridgedFrames(_Common):
                 start,
                 following.middle,
             )
-            net = joined.step_on * on - joined.step_off * off + grown
+            net = bridge.net_change(joined, on, off, grown)
             unmeasured = memory.latent.variance >= bridge.UNMEASURED
             change = self._silent_change(joined)
             joined = joined._replace(
@@ -624,7 +625,7 @@ class BridgedFrames(_Common):
             following.middle,
         )
         tail_on, tail_off, followed = self.follow(events, following.middle, following.end, at_middle)
-        net = behind.step_on * (on + memory.on) - behind.step_off * (off + memory.off) + grown
+        net = bridge.net_change(behind, on + memory.on, off + memory.off, grown)
         after = memory._replace(
             latent=second,
             thresholds=learned,
@@ -688,21 +689,16 @@ class BridgedFrames(_Common):
         self, segment: BridgedSegment, memory: BridgeMemory, second: Latent, on: Floats, off: Floats
     ) -> tuple[BridgedSegment, Floats, Floats]:
         """The segment with what its pixels may drift (K10), and the counts since they were measured, at its end."""
-        unmeasured = second.variance >= bridge.UNMEASURED
-        grown = bridge.drift(memory.thresholds, self.noise, memory.far_on, memory.far_off, on, off)
-        # From its last measurement on, nothing but events tells of changes: what they have not told yet, at one end.
-        grown[memory.latent.variance < bridge.UNMEASURED] += self.noise.quantisation_variance / 2
-        grown[~unmeasured] = 0.0
+        far = memory.far_on, memory.far_off
+        grown, far_on, far_off = bridge.drift(
+            memory.latent, second, memory.thresholds, self.noise, far, (on, off)
+        )
         if second.ceiling is not None:
             black = np.isfinite(second.ceiling)
             grown[black] += second.variance[black] / (_BLACK_FRAMES * (_BLACK_FRAMES + 1))
         segment = segment._replace(
             drift=grown,
             still_since=_still_since(memory, segment.start, memory.interval or self._FIRST_INTERVAL),
-        )
-        far_on, far_off = (
-            np.where(unmeasured, far + now, np.float32(0.0))
-            for far, now in ((memory.far_on, on), (memory.far_off, off))
         )
         return segment, far_on, far_off
 
@@ -782,7 +778,7 @@ def latent_frame(
     event_variance
         What each event of the exposure adds to the variance.
     """
-    latent = np.empty((2, levels.size), np.float32)
+    latent = apart(2, (levels.size,))
     scalars = np.float32(duration), np.float32(white), np.float32(event_variance)
     tables = level_log.astype(np.float32), level_variance.astype(np.float32)
     _latent_frame(levels.reshape(-1), *tables, exposure, *scalars, *latent)
