@@ -59,10 +59,14 @@ def event_is_on(word):  # type: ignore[no-untyped-def]
     return ((np.uint64(word) >> np.uint64(32)) & np.uint64(0xFF)) != np.uint64(0)
 
 
+UNWEIGHED: Final = np.int64(0xFF_FFFF_FFFF)
+"""The bits of an event's second word without its weight; by themselves they have the weight 1."""
+
+
 @nb.njit(cache=True, inline="always")
 def weighed(word, extra):  # type: ignore[no-untyped-def]
     """An event's second word with a weight of 1 and ``extra`` units of `WEIGHT_UNIT`, 0 to 65535, in its padding."""
-    return (word & np.int64(0xFF_FFFF_FFFF)) | (np.int64(extra) << np.int64(40))
+    return (word & UNWEIGHED) | (np.int64(extra) << np.int64(40))
 
 
 @nb.njit(cache=True, inline="always")

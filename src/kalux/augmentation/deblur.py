@@ -129,7 +129,7 @@ class Exposure(NamedTuple):
 
 
 EXPOSED: Final = 64
-"""Pixels of a block: few enough that their fields stay in the nearest cache, and that still parts of images are found."""
+"""Pixels of a block: few enough that fields stay in the nearest cache, and that parts where nothing moves are found."""
 
 
 def expose(

@@ -49,7 +49,8 @@ def silent_change(segment: BridgedSegment, quantisation_variance: float, thresho
     """
     assert segment.events is not None
     shape = segment.slope.shape
-    change, untold, silent, mean = apart(4, shape)
+    change, untold, mean = apart(3, shape)
+    silent = np.empty(shape, np.uint8)
     seconds = np.float32((segment.end - segment.start) * 1e-6)
     q0, most = np.float32(quantisation_variance), np.float32(threshold2)
     variances = segment.forward_variance, segment.backward_variance
@@ -92,7 +93,7 @@ def _told(given, seconds, q0, most, told_of):  # type: ignore[no-untyped-def]
         for k in pixels:
             untold[first + k] = is_silent[k] * (one - share[k])
         for k in pixels:
-            silent[first + k] = is_silent[k]
+            silent[first + k] = np.uint8(is_silent[k])
         for k in pixels:
             sum_change[k] += change[first + k]
         for k in pixels:
@@ -107,13 +108,12 @@ def _mean(total, count, forward, backward, unknown, unmeasured_change, mean):  #
     for row in range(total.shape[0]):
         for column in range(total.shape[1]):
             i = row, column
-            near = max(total[i], zero) / max(count[i], one) if count[i] > np.float32(0.5) else unknown
+            near = max(total[i], zero) / max(np.float32(count[i]), one) if count[i] > 0 else unknown
             measured = np.float32(forward[i]) + np.float32(backward[i]) < unmeasured
             mean[i] = near if measured else unmeasured_change
 
 
-def _sum_around(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Over 5 x 5 pixels; beyond the border there is nothing."""
+def _sum_around(values: NDArray[Any]) -> NDArray[Any]:
+    """Over 5 x 5 pixels, in the same type; beyond the border there is nothing."""
     size = (_WINDOW, _WINDOW)
-    summed = cv2.boxFilter(values, cv2.CV_32F, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
-    return np.asarray(summed, np.float32)
+    return np.asarray(cv2.boxFilter(values, -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT))

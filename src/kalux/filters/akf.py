@@ -206,14 +206,13 @@ def begin_bridged(segment: BridgedSegment, state: State, spare: BridgedCursor | 
         polarity = np.zeros(clock.shape, np.int8)
     else:
         pixels, steps, polarity = spare.pixels, spare.steps, spare.polarity
-    level = state.log_intensity
-    if segment.floor is not None:
-        level = np.maximum(level, segment.floor)  # K7
+    floor = state.log_intensity if segment.floor is None else segment.floor
     scalars = np.float32(segment.rate), np.float32(segment.step_variance)
     variances = segment.forward_variance, segment.backward_variance
     coming = np.zeros_like(segment.augmented) if segment.events is None else segment.events
     given = segment.augmented, segment.step_on, segment.step_off, *variances, coming
-    _begin_bridged(given, scalars, level, state.variance, pixels.reshape(-1), steps.reshape(-1))
+    before = state.log_intensity, floor, state.variance
+    _begin_bridged(given, scalars, before, pixels.reshape(-1), steps.reshape(-1))
     polarity[1:-1, 1:-1] = 0 if segment.trail is None else segment.trail.polarity
     return BridgedCursor(pixels, steps, clock, polarity, segment.start)
 
@@ -311,8 +310,9 @@ def _since(clock, now):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _begin_bridged(given, scalars, log_intensity, variance, pixels, steps):  # type: ignore[no-untyped-def]
+def _begin_bridged(given, scalars, before, pixels, steps):  # type: ignore[no-untyped-def]
     rate, step_variance = scalars
+    log_intensity, floor, variance = before
     augmented, step_on, step_off, forward, backward, events = given
     height, width = log_intensity.shape
     states = np.empty((_STATE_FIELDS, _BEGUN), np.float32)
@@ -337,7 +337,10 @@ def _begin_bridged(given, scalars, log_intensity, variance, pixels, steps):  # t
             for i in range(count):
                 information[i] = ONE / np.float32(variance[row, first + i])
             for i in range(count):
-                weighted[i] = information[i] * (np.float32(log_intensity[row, first + i]) - level[i])
+                known_before = max(
+                    np.float32(log_intensity[row, first + i]), np.float32(floor[row, first + i])
+                )  # K7
+                weighted[i] = information[i] * (known_before - level[i])
             for i in range(count):
                 rates[i] = measurement_rate(
                     rate, first_variance[i], last_variance[i] + coming[i] * step_variance
