@@ -49,7 +49,8 @@ def silent_change(segment: BridgedSegment, quantisation_variance: float, thresho
     """
     assert segment.events is not None
     shape = segment.slope.shape
-    change, untold, mean = apart(3, shape)
+    change, untold = apart(2, shape)
+    mean = np.empty(shape, np.float32)
     silent = np.empty(shape, np.uint8)
     seconds = np.float32((segment.end - segment.start) * 1e-6)
     q0, most = np.float32(quantisation_variance), np.float32(threshold2)

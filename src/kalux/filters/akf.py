@@ -224,9 +224,11 @@ def advance_bridged(
     scalars = _Scalars(*(np.float32(value) for value in (segment.rate, segment.step_variance, *noise)))
     stride = np.uint64(cursor.clock.shape[1])
     while len(events):
-        planes = (p.reshape(-1) for p in (cursor.pixels, cursor.steps, cursor.clock, cursor.polarity))
+        pixels, steps = cursor.pixels.reshape(-1), cursor.steps.reshape(-1)
+        clock, polarity = cursor.clock.reshape(-1), cursor.polarity.reshape(-1)
         count = events_until(events, cursor.origin + EPOCH)
-        _advance_bridged(event_words(events[:count]), *planes, stride, cursor.origin, scalars)
+        words = event_words(events[:count])
+        _advance_bridged(words, pixels, steps, clock, polarity, stride, cursor.origin, scalars)
         events = events[count:]
         if len(events):
             epochs = (int(events["t"][0]) - 1 - segment.start) // EPOCH
@@ -263,10 +265,10 @@ def _read(segment: BridgedSegment, cursor: BridgedCursor, t: int) -> tuple[Float
     within = min(t - cursor.origin, EPOCH)
     beyond = np.float32((t - cursor.origin - within) * 1e-6)
     since_start = np.float32((t - segment.start) * 1e-6)
-    planes = (plane.reshape(-1) for plane in (cursor.pixels, cursor.clock, cursor.polarity))
+    pixels, clock, polarity = (p.reshape(-1) for p in (cursor.pixels, cursor.clock, cursor.polarity))
     trail = no_trail(shape) if segment.trail is None else segment.trail
-    moment = within, beyond, since_start
-    _read_bridged(*planes, segment.slope, trail.start, trail.heights, moment, log_intensity, variance)
+    moment, out = (within, beyond, since_start), (log_intensity, variance)
+    _read_bridged(pixels, clock, polarity, segment.slope, trail.start, trail.heights, moment, *out)
     if t == segment.end:
         if segment.trail is not None and segment.trail.end is not None:
             log_intensity += segment.trail.end

@@ -533,7 +533,7 @@ class BridgedFrames(_Common):
                     unshown=memory.unshown,
                 )
                 value = lead_in.augmented
-                variance = lead_in.backward_variance + lead_in.step_variance * lead_in.events
+                variance = lead_in.backward_variance + lead_in.step_variance * (on + off)
         else:
             carried = self._carried(memory, shot)
             value, variance = carried.value, carried.variance
