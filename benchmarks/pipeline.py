@@ -123,11 +123,7 @@ def stages(arguments):
         return call
 
     threading.Thread.run = timed_thread
-    for title, name in (
-        ("checking", "check_recording"),
-        ("planning", "make_plan"),
-        ("thread main", "write_images"),
-    ):
+    for title, name in (("planning", "make_plan"), ("thread main", "write_images")):
         setattr(reconstruct, name, timed(title, getattr(reconstruct, name)))
     with contextlib.redirect_stdout(io.StringIO()):
         if app.main([str(argument) for argument in arguments]):

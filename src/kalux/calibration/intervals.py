@@ -123,3 +123,10 @@ def joined(first: EventArray, second: EventArray) -> EventArray:
     """Events one after the other. NumPy would copy them field by field, in ten times the time."""
     words = np.concatenate([event_words(first), event_words(second)])
     return words.reshape(-1).view(EVENT_DTYPE)
+
+
+def spread(chosen: NDArray[np.bool_], most: int) -> NDArray[np.int64]:
+    """Flat indices of the pixels chosen, at most ``most`` of them, spread evenly."""
+    indices = np.flatnonzero(chosen)
+    count = len(indices)
+    return indices if count <= most else indices[np.arange(most) * count // most]

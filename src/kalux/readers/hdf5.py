@@ -10,9 +10,11 @@ from typing import Any, Final, NamedTuple, TypeVar
 
 import h5py
 import hdf5plugin
+import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.compiled import event_words
 from kalux.errors import FormatError, FrameError, OutputError
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.frames import MOSAICS, Frame, Mosaic
@@ -135,14 +137,30 @@ def _events(path: Path) -> Iterator[EventArray]:
         # Whole chunks of the file: reading across their borders decompresses each twice.
         stored = (columns[0].chunks or (CHUNK_EVENTS,))[0]
         step = max(CHUNK_EVENTS // stored, 1) * stored
+        buffers = [np.empty(stored, column.dtype) for column in columns]
         for start in range(0, len(columns[0]), step):
             events: EventArray = np.empty(min(step, len(columns[0]) - start), EVENT_DTYPE)
-            # One by one: other threads of Python wait while HDF5 reads.
+            # One by one: other threads that read HDF5 wait meanwhile.
             for first in range(0, len(events), stored):
                 part = events[first : first + stored]
-                for name, column in zip(_COLUMNS, columns, strict=True):
-                    part[name] = column[start + first : start + first + stored]
+                for column, buffer in zip(columns, buffers, strict=True):
+                    column.read_direct(buffer, np.s_[start + first : start + first + len(part)], np.s_[: len(part)])
+                _join(*_fields(buffers), event_words(part))
             yield events
+
+
+def _fields(columns: Iterable[NDArray[Any]]) -> Iterator[NDArray[Any]]:
+    """The columns of a file as they are in events."""
+    for name, column in zip(_COLUMNS, columns, strict=True):
+        yield column.astype(EVENT_DTYPE[name], copy=False)
+
+
+@nb.njit(cache=True, nogil=True)
+def _join(t, x, y, p, words):  # type: ignore[no-untyped-def]
+    """Events of columns that are at least as long. NumPy would go over their memory once for every column."""
+    for i in range(len(words)):
+        words[i, 0] = t[i]
+        words[i, 1] = np.int64(x[i]) | np.int64(y[i]) << 16 | np.int64(p[i]) << 32
 
 
 def _frames(path: Path) -> Iterator[Frame]:
