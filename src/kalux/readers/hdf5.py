@@ -137,14 +137,17 @@ def _events(path: Path) -> Iterator[EventArray]:
         # Whole chunks of the file: reading across their borders decompresses each twice.
         stored = (columns[0].chunks or (CHUNK_EVENTS,))[0]
         step = max(CHUNK_EVENTS // stored, 1) * stored
-        buffers = [np.empty(stored, column.dtype) for column in columns]
+        buffers = [np.empty(min(stored, len(column)), column.dtype) for column in columns]
+        spaces = [column.id.get_space() for column in columns]
         for start in range(0, len(columns[0]), step):
             events: EventArray = np.empty(min(step, len(columns[0]) - start), EVENT_DTYPE)
             # One by one: other threads that read HDF5 wait meanwhile.
             for first in range(0, len(events), stored):
                 part = events[first : first + stored]
-                for column, buffer in zip(columns, buffers, strict=True):
-                    column.read_direct(buffer, np.s_[start + first : start + first + len(part)], np.s_[: len(part)])
+                memory = h5py.h5s.create_simple((len(part),))
+                for column, space, buffer in zip(columns, spaces, buffers, strict=True):
+                    space.select_hyperslab((start + first,), (len(part),))
+                    column.id.read(memory, space, buffer)
                 _join(*_fields(buffers), event_words(part))
             yield events
 
@@ -168,10 +171,10 @@ def _frames(path: Path) -> Iterator[Frame]:
         group = file["frames"]
         white = float(group.attrs["white"]) if "white" in group.attrs else None
         starts, ends = group["exposure_start"][...], group["exposure_end"][...]
-        masks = group.get("valid")
+        images, masks = group["image"], group.get("valid")
         for index, (start, end) in enumerate(zip(starts, ends, strict=True)):
             valid = None if masks is None else masks[index].astype(bool)
-            yield Frame(group["image"][index], int(start), int(end), white, valid=valid)
+            yield Frame(images[index], int(start), int(end), white, valid=valid)
 
 
 def _ground_truth(path: Path) -> GroundTruth:
