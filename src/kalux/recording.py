@@ -203,9 +203,7 @@ class Recording:
             earliest = _FIRST if previous_t is None else previous_t
             if not _are_fine(event_words(chunk), earliest, np.uint64(height), np.uint64(width)):
                 where = str(self.source.path)
-                check_events(
-                    chunk, self.sensor_size, where=where, first_index=count, previous_t=previous_t
-                )
+                check_events(chunk, self.sensor_size, where=where, first_index=count, previous_t=previous_t)
             if len(chunk):
                 count += len(chunk)
                 previous_t = int(chunk["t"][-1])

@@ -225,9 +225,10 @@ def _in_bins(level, difference, kept):  # type: ignore[no-untyped-def]
     sums, counts = np.zeros(_BINS), np.zeros(_BINS + 1, np.int64)
     for i in range(len(kept)):
         value = level[kept[i]]
-        index[i] = min(np.int64(value * _BINS), _BINS - 1)
-        sums[index[i]] += value
-        counts[index[i] + 1] += 1
+        k = min(int(value * _BINS), _BINS - 1)
+        index[i] = k
+        sums[k] += value
+        counts[k + 1] += 1
     stops = np.cumsum(counts)
     ordered, free = np.empty(len(kept)), stops.copy()
     for i in range(len(kept)):

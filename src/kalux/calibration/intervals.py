@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.deblur import between, events_until
+from kalux.augmentation.deblur import all_between
 from kalux.compiled import event_words
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.filters.methods import Shot, take_shot
@@ -84,7 +84,7 @@ def intervals(
     response = chosen_response(camera.response, recording.response)
     model = Camera.named(response, camera.saturation)
     chunks = iter(recording.events())
-    buffer: EventArray = np.empty(0, EVENT_DTYPE)
+    held: list[EventArray] = []
     previous: tuple[Frame, Shot] | None = None
     reference = float(camera.reference_exposure or 0)
     for index, frame in enumerate(recording.frames()):
@@ -92,37 +92,39 @@ def intervals(
             return
         reference = reference or float(frame.exposure)
         shot = take_shot(frame, model, reference)
-        while len(buffer) == 0 or buffer["t"][-1] <= shot.middle + margin:
+        while not held or held[-1]["t"][-1] <= shot.middle + margin:
             chunk = next(chunks, None)
             if chunk is None:
                 break
             if previous is None:  # only the margin before the first interval needs to be kept
-                buffer = _after(buffer, shot.middle - margin)
-            buffer = joined(buffer, chunk)
+                held = _later(held, shot.middle - margin)
+            held.append(chunk)
         if previous is not None:
             before, first = previous
             yield Interval(
                 start=first.middle,
                 end=shot.middle,
-                events=between(buffer, first.middle - margin, shot.middle + margin),
+                events=_joined(all_between(held, first.middle - margin, shot.middle + margin)),
                 first=first,
                 second=shot,
                 frames=(before, frame),
                 log_offset=camera.offset,
             )
-        buffer = _after(buffer, shot.middle - margin)
+        held = _later(held, shot.middle - margin)
         previous = frame, shot
 
 
-def _after(events: EventArray, t: int) -> EventArray:
-    """The events after ``t`` (us)."""
-    return events[events_until(events, t) :]
+def _later(chunks: list[EventArray], t: int) -> list[EventArray]:
+    """Those that have events after ``t`` (us)."""
+    return [chunk for chunk in chunks if chunk["t"][-1] > t]
 
 
-def joined(first: EventArray, second: EventArray) -> EventArray:
+def _joined(chunks: list[EventArray]) -> EventArray:
     """Events one after the other. NumPy would copy them field by field, in ten times the time."""
-    words = np.concatenate([event_words(first), event_words(second)])
-    return words.reshape(-1).view(EVENT_DTYPE)
+    if len(chunks) == 1:
+        return chunks[0]
+    words = [np.empty((0, 2), np.int64), *map(event_words, chunks)]
+    return np.concatenate(words).reshape(-1).view(EVENT_DTYPE)
 
 
 def spread(chosen: NDArray[np.bool_], most: int) -> NDArray[np.int64]:

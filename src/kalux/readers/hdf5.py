@@ -148,14 +148,12 @@ def _events(path: Path) -> Iterator[EventArray]:
                 for column, space, buffer in zip(columns, spaces, buffers, strict=True):
                     space.select_hyperslab((start + first,), (len(part),))
                     column.id.read(memory, space, buffer)
-                _join(*_fields(buffers), event_words(part))
+                t, x, y, p = (
+                    buffer.astype(EVENT_DTYPE[name], copy=False)
+                    for name, buffer in zip(_COLUMNS, buffers, strict=True)
+                )
+                _join(t, x, y, p, event_words(part))
             yield events
-
-
-def _fields(columns: Iterable[NDArray[Any]]) -> Iterator[NDArray[Any]]:
-    """The columns of a file as they are in events."""
-    for name, column in zip(_COLUMNS, columns, strict=True):
-        yield column.astype(EVENT_DTYPE[name], copy=False)
 
 
 @nb.njit(cache=True, nogil=True)
