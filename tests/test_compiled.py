@@ -9,12 +9,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kalux.compiled import (
+    INFINITE_BITS,
     event_column,
     event_is_on,
     event_row,
     event_words,
     exponential,
     logarithm,
+    magnitude_bits,
     packed,
     unpack,
 )
@@ -97,3 +99,12 @@ def test_packed_records_lie_in_one_line_each(shape):
     records["h"] = 1.0
     assert (records["h"] == 1.0).all()
     assert records.flags.c_contiguous
+
+
+@given(st.lists(st.floats(width=32), max_size=70))
+def test_the_largest_bits_tell_infinite_from_finite_and_from_nan(numbers):
+    values = np.array(numbers, np.float32)
+    found = magnitude_bits(values)
+    assert (found < INFINITE_BITS) == np.isfinite(values).all()
+    assert (found > INFINITE_BITS) == np.isnan(values).any()
+    assert magnitude_bits(np.stack([values, -values])[:, ::2]) == magnitude_bits(values[::2])
