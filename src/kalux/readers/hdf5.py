@@ -6,7 +6,7 @@ import io
 import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any, Final, NamedTuple, TypeVar
+from typing import Any, Final, Literal, NamedTuple, TypeVar
 
 import h5py
 import hdf5plugin
@@ -336,15 +336,28 @@ class _Sink(io.FileIO):
             yield item
 
 
-def _packing() -> dict[str, Any]:
-    """Compression, with a checksum of each chunk, which Blosc lacks."""
-    return {"fletcher32": True, **hdf5plugin.Blosc(cname="zstd", clevel=3, shuffle=hdf5plugin.Blosc.SHUFFLE)}
+def _packing(
+    codec: Literal["zstd", "lz4", "lz4hc"] = "zstd", level: int = 3, *, bits: bool = False
+) -> dict[str, Any]:
+    """Compression of bytes or ``bits`` of one significance together; with a checksum, which Blosc lacks."""
+    shuffle = hdf5plugin.Blosc.BITSHUFFLE if bits else hdf5plugin.Blosc.SHUFFLE
+    return {"fletcher32": True, **hdf5plugin.Blosc(cname=codec, clevel=level, shuffle=shuffle)}
+
+
+def _event_packing(column: str) -> dict[str, Any]:
+    """As small as zstd packs them (3 % more or less), and faster: a third in reading, a tenth to a half in writing."""
+    return _packing("lz4hc", 5) if column == "t" else _packing("lz4", 9, bits=True)
 
 
 def _write_events(group: Any, chunks: Iterable[EventArray]) -> None:
     columns = {
         name: group.create_dataset(
-            name, (0,), EVENT_DTYPE[name], maxshape=(None,), chunks=(_EVENTS_PER_CHUNK,), **_packing()
+            name,
+            (0,),
+            EVENT_DTYPE[name],
+            maxshape=(None,),
+            chunks=(_EVENTS_PER_CHUNK,),
+            **_event_packing(name),
         )
         for name in _COLUMNS
     }
