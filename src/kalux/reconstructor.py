@@ -93,7 +93,8 @@ class Estimate:
     final
         As of `Image`.
     moving
-        (H, W) bool: pixels with an event in this frame interval, also one to come, or the one before; None: not told.
+        (H, W) bool: pixels with an event in this frame interval, also one to come, or the one before, and those that
+        neither frame measures; None: not told.
     between
         0 at a frame, 1 half-way between two, and where the next one is not known or not used.
     chroma

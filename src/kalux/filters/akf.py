@@ -21,7 +21,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.bridge import BridgedSegment, lift, lower
+from kalux.augmentation.bridge import UNMEASURED, BridgedSegment, lift, lower
 from kalux.augmentation.deblur import events_until
 from kalux.augmentation.interpolation import InterpolatedSegment
 from kalux.augmentation.trail import add_trail
@@ -257,10 +257,14 @@ def _read(segment: BridgedSegment, cursor: BridgedCursor, t: int) -> tuple[Float
 
 
 def moving_bridged(segment: BridgedSegment, cursor: BridgedCursor) -> NDArray[np.bool_]:
-    """(H, W): pixels with an event since ``segment.still_since``, or one to come in the segment."""
+    """(H, W): pixels with an event since ``segment.still_since`` or to come in the segment, and unmeasured ones.
+
+    Still pixels are those of which frames have shown the fine texture many times, as none has of a clipped one.
+    """
     inside = cursor.clock[1:-1, 1:-1]
     moving: NDArray[np.bool_] = inside > np.int32(max(segment.still_since - cursor.origin, -EPOCH))
     moving |= segment.events > 0
+    moving |= np.minimum(segment.forward_variance, segment.backward_variance) >= UNMEASURED
     return moving
 
 

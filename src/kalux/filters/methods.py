@@ -285,7 +285,7 @@ class Method(Protocol):
         """The state at the end of the segment."""
 
     def moving(self, segment: Any, cursor: Any) -> NDArray[np.bool_] | None:
-        """(H, W): pixels with an event in this frame interval, also one to come, or the one before; None: not told."""
+        """(H, W): pixels with an event in this frame interval, also one to come, or the one before, or unmeasured."""
 
     def silent_change(self, segment: Any) -> Floats | None:
         """(H, W): `unseen.silent_change` of the segment; None: the method or the segment does not tell."""
