@@ -103,6 +103,8 @@ class Estimate:
         Pixels that no frame has measured until then, of which L is a bound; None: there are none.
     silent_change
         (H, W): mean square change of silent pixels around each, from one frame to the next; None: not told.
+    unmeasured
+        (H, W) bool: pixels that neither the frame before nor the one after measures; None: not told.
     """
 
     t: int
@@ -115,6 +117,7 @@ class Estimate:
     chroma: NDArray[np.float32] | None = None
     unshown: Unshown | None = None
     silent_change: NDArray[np.floating[Any]] | None = None
+    unmeasured: NDArray[np.bool_] | None = None
 
 
 class _Progress:
@@ -410,6 +413,7 @@ class Reconstructor:
             self._chroma(progress, t),
             self._unshown(progress, variance),
             self._method.silent_change(progress.segment),
+            self._method.unmeasured(progress.segment),
         )
 
     def trail(self, t: int) -> NDArray[np.floating[Any]] | None:

@@ -264,8 +264,16 @@ def moving_bridged(segment: BridgedSegment, cursor: BridgedCursor) -> NDArray[np
     inside = cursor.clock[1:-1, 1:-1]
     moving: NDArray[np.bool_] = inside > np.int32(max(segment.still_since - cursor.origin, -EPOCH))
     moving |= segment.events > 0
-    moving |= np.minimum(segment.forward_variance, segment.backward_variance) >= UNMEASURED
+    moving |= unmeasured_bridged(segment)
     return moving
+
+
+def unmeasured_bridged(segment: BridgedSegment) -> NDArray[np.bool_]:
+    """(H, W): pixels that neither of the segment's frames measures."""
+    unmeasured: NDArray[np.bool_] = (
+        np.minimum(segment.forward_variance, segment.backward_variance) >= UNMEASURED
+    )
+    return unmeasured
 
 
 def end_bridged(segment: BridgedSegment, cursor: BridgedCursor) -> State:
