@@ -409,7 +409,7 @@ def bridged(pixel, settings, times, on, off, scales):
         while pending and pending[0][0] <= limit:
             t, polarity, near, _, weight = pending.pop(0)
             value, variance = predict(t)
-            signal = 1 / (1 + 9 * ev.noise_rate * (t - near) * US)  # K5
+            signal = 1 / (1 + (9 * ev.noise_rate * (t - near) * US) ** 2)  # K5
             # Several events may share a time: this one alone moves L^A by its own step.
             step = weight * own_step(intervals[index], polarity, on, off, ev, c2, counts)
             q = weight * c2 * (ev.step_noise + signal * (1 - signal))
