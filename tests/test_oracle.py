@@ -98,8 +98,8 @@ def test_engine_agrees_with_the_oracle(name, data):
             top = np.log(white + chosen.camera.offset)
             value, total, beyond, noise = naive.lifted(value, total, excess[i], chosen, top)
         if chosen.filter.neighbours > 0:
-            total = total + hidden[i]
-            value = naive.regularised(value, total, moving[i], chosen.filter.neighbours)
+            hears = moving[i] | (total > 0.01)
+            value, total = naive.regularised(value, total + hidden[i], hears, chosen.filter.neighbours)
         value = np.where(unshown, np.maximum(value, bound) + beyond**2 / 2, value)
         level = np.vectorize(lambda v, p: naive.intensity(v, p, chosen, white, stretch))(  # noqa: B023
             value, np.where(unshown, noise, total)
