@@ -447,9 +447,9 @@ class Reconstructor:
         change = estimate.silent_change
         if change is None and moving is not None:  # K11 needs it only there
             change = np.full(log_intensity.shape, UNKNOWN_CHANGE * on * off, np.float32)
-        noted = None if unshown is None else unshown.pixels
+        pixels = None if unshown is None else unshown.pixels
         intensity, total, heard = read_out(
-            log_intensity, variance, offset, prior, moving, hidden, change, neighbours, pitch, noted
+            log_intensity, variance, offset, prior, moving, hidden, change, neighbours, pitch, pixels
         )
         if unshown is not None:
             read_unshown(intensity, heard, estimate.log_intensity, unshown, offset, prior)

@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from scipy.special import lambertw
 
 from kalux.filters.readout import (
-    UNMEASURED,
     Hidden,
     HighlightPrior,
     believed_highlight,
@@ -21,7 +20,7 @@ from kalux.settings import preset
 
 import naive
 
-OFF = HighlightPrior(white=0.0, scale2=0.0, stretch=0.0)
+OFF = HighlightPrior(white=np.inf, scale2=0.0, stretch=0.0)
 NOTHING_HIDDEN = Hidden(0.0, 0.0, 0.0)
 excesses = st.floats(0.0, 12.0)
 stretches = st.floats(1e-4, 2.0)
@@ -187,25 +186,25 @@ def test_still_and_well_known_pixels_stay():
     np.testing.assert_allclose(regularised(noisy, variance, moving, 0.1), noisy, atol=2e-4)
 
 
-def test_still_pixels_that_no_frame_measures_hear_their_neighbours():
+def test_still_pixels_beyond_white_hear_their_neighbours():
+    """No frame has shown their texture."""
     truth, noisy = noisy_edge()
-    still = np.zeros(truth.shape, bool)
-    variance = np.full(truth.shape, 0.01, np.float32)
-    variance[:, :5] = 2 * UNMEASURED
-    smooth = regularised(noisy, variance, still, 0.1)
-    assert np.mean((smooth - truth)[:, :5] ** 2) < 0.4 * np.mean((noisy - truth)[:, :5] ** 2)
-    np.testing.assert_allclose(smooth[:, 5:], noisy[:, 5:], atol=1e-6)
+    still, variance = np.zeros(truth.shape, bool), np.full(truth.shape, 0.01, np.float32)
+    prior = HighlightPrior(white=1.0, scale2=0.0, stretch=0.0)
+    smooth = np.log(read_out(noisy, variance, 0.0, prior, still, NOTHING_HIDDEN, None, 0.1)[0])
+    assert np.mean((smooth - truth)[:, 15:] ** 2) < 0.4 * np.mean((noisy - truth)[:, 15:] ** 2)
+    np.testing.assert_allclose(smooth[:, :15], noisy[:, :15], atol=1e-6)
 
 
 @pytest.mark.parametrize("neighbour", [1e-6, 0.04, 1e6])
 def test_the_variance_falls_by_what_neighbours_do_not_share(neighbour):
     """To half of it and half of what independent errors would leave."""
-    variance = np.full((5, 5), neighbour, np.float32)
-    variance[2, 2] = 0.04
-    hears = variance == np.float32(0.04)
-    left = read_out(np.zeros((5, 5)), variance, 0.0, OFF, hears, NOTHING_HIDDEN, None, 0.1)[1]
+    variance, moving = np.full((5, 5), neighbour, np.float32), np.zeros((5, 5), bool)
+    variance[2, 2], moving[2, 2] = 0.04, True
+    left = read_out(np.zeros((5, 5)), variance, 0.0, OFF, moving, NOTHING_HIDDEN, None, 0.1)[1]
     independent = 1 / (1 / 0.04 + 4 / (neighbour + 0.01) + 4 / (neighbour + 0.02))
     assert left[2, 2] == pytest.approx(0.02 + 0.5 * independent, rel=1e-5)
+    np.testing.assert_array_equal(left[~moving], variance[~moving])
 
 
 def test_patches_tell_a_faint_edge_from_noise():
@@ -237,12 +236,15 @@ def test_pixels_beyond_what_hears_change_nothing():
     np.testing.assert_allclose(alone[~few], level[~few], atol=1e-6)
 
 
-def test_noted_pixels_are_told_as_they_are_read():
+def test_pixels_that_no_frame_has_shown_are_told_as_they_are_read():
+    """Their variance is not lessened."""
     truth, noisy = noisy_edge()
     variance, pixels = np.full(truth.shape, 0.01, np.float32), np.array([0, 29, 30, 444, 599])
     given = noisy, variance, 0.0, OFF, np.ones(truth.shape, bool), NOTHING_HIDDEN, None, 0.1, 1
-    image, _, levels = read_out(*given, pixels)
+    image, left, levels = read_out(*given, pixels)
     np.testing.assert_allclose(np.exp(levels), image.reshape(-1)[pixels], rtol=1e-6)
+    np.testing.assert_array_equal(left.reshape(-1)[pixels], variance.reshape(-1)[pixels])
+    assert np.count_nonzero(left == variance) == len(pixels)
 
 
 @pytest.mark.parametrize(("shape", "moves"), [((3, 5), 0.6), ((7, 100), 0.02), ((6, 64), 0.5)])
@@ -259,7 +261,7 @@ def test_images_are_the_oracles(shape, moves, pitch):
     given = value.astype(np.float32), variance.astype(np.float32)
     found = read_out(*given, offset, prior, moving, hidden, change, 0.3, pitch)
     total = variance + np.where(moving, hidden.moving, hidden.still + hidden.changing * change)
-    hears, level = moving | (variance > UNMEASURED), np.empty(shape)
+    hears, level = moving | (value > prior.white), np.empty(shape)
     for part in np.ndindex(pitch, pitch):  # a mosaic's colours know nothing of each other
         own = np.s_[part[0] :: pitch, part[1] :: pitch]
         level[own], total[own] = naive.regularised(value[own], total[own], hears[own], 0.3 * pitch)

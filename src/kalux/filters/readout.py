@@ -34,10 +34,6 @@ _BLOCK: Final = 32
 _MARGIN: Final = 16
 """Pixels that know nothing on both sides of a row, at least three times the pitch: the border needs no special case."""
 
-UNMEASURED: Final = np.float32(0.01)
-"""P, an error of a tenth, from which on a still pixel is not one that frames have shown many times. 0.003 is as good on
-eleven simulated scenes, 0.03 costs 1 % of their error, and real ones see no difference."""
-
 SHARED: Final = np.float32(0.5)
 """Correlation of the errors of neighbours where P is over 0.03: 0.1 to 0.5 on eleven simulated scenes; those of real
 sensors, whose thresholds and bandwidth are wrong for all pixels alike, are not less alike."""
@@ -184,14 +180,14 @@ def read_out(
     silent_change: Array | None = None,
     difference: float = 0.0,
     pitch: int = 1,
-    noted: NDArray[np.int64] | None = None,
+    unshown: NDArray[np.int64] | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """I of a state, and the variance of its logarithm; in one pass over the rows, none of which is stored in between.
 
-    Neighbours (docs/equations.md, K12): L of a pixel that moves, or that is not well known, becomes the mean of itself
-    and its eight neighbours, weighted by the information that each has about it. A neighbour at distance d differs by a
-    normal amount of variance ``difference``^2 d^2, unless there is an edge between, which patches around both tell
-    that differ by more than their variances explain.
+    Neighbours (docs/equations.md, K12): L of a pixel that moves, or is beyond white, becomes the mean of itself and its
+    eight neighbours, weighted by the information that each has about it. A neighbour at distance d differs by a normal
+    amount of variance ``difference``^2 d^2, unless there is an edge between, which patches around both tell that differ
+    by more than their variances explain.
 
     Parameters
     ----------
@@ -213,8 +209,9 @@ def read_out(
         nothing.
     pitch
         Distance of the neighbours: 2 in a Bayer mosaic, whose pixels repeat their colours.
-    noted
-        (N,) pixels in the flattened image, ascending, of which L is wanted as well.
+    unshown
+        (N,) pixels in the flattened image, ascending, that no frame has shown: their L is wanted as well, and
+        neighbours do not lessen their variance, since what they hide (K15) all of them hide alike.
 
     Returns
     -------
@@ -223,10 +220,10 @@ def read_out(
     variance : ndarray
         (H, W) float32.
     levels : ndarray
-        (N,) float32: L of the ``noted`` pixels, after their neighbours are heard.
+        (N,) float32: L of the ``unshown`` pixels, after their neighbours are heard.
     """
-    noted = np.empty(0, np.int64) if noted is None else noted
-    heard = np.empty(len(noted), np.float32)
+    unshown = np.empty(0, np.int64) if unshown is None else unshown
+    heard = np.empty(len(unshown), np.float32)
     known = variance.astype(np.float32, copy=False)
     out = np.empty(log_intensity.shape, np.float32)
     total = known if moving is None else np.empty_like(out)
@@ -240,7 +237,7 @@ def read_out(
         pitch,
         tuple(np.float32(value) for value in prior),
         np.float32(log_offset),
-        noted,
+        unshown,
         out,
         total,
         heard,
@@ -266,7 +263,7 @@ def _read_out(  # type: ignore[no-untyped-def]
     pitch,
     prior,
     log_offset,
-    noted,
+    unshown,
     out,
     total,
     heard,
@@ -294,7 +291,7 @@ def _read_out(  # type: ignore[no-untyped-def]
     level, marks = np.empty(size, np.float32), np.zeros(size, np.uint8)
     words = marks.view(np.uint64)
     places, excess, doubt = np.empty(size, np.uint64), np.empty(size, np.float32), np.empty(size, np.float32)
-    note = 0
+    met = 0
     for row in range(-3 * pitch if told else 0, height):
         following = row + 3 * pitch
         if told and following < height:
@@ -303,7 +300,7 @@ def _read_out(  # type: ignore[no-untyped-def]
             ring.doubts[following % count] = _NOTHING
         first, last = size, 0
         if hear:
-            _mark_hearing(moving, variance, following, ring)
+            _mark_hearing(moving, log_intensity, white, following, ring)
             for place in range(count):
                 first, last = min(first, ring.spans[place, 0]), max(last, ring.spans[place, 1])
         if first < last and row + pitch >= 0:
@@ -315,9 +312,12 @@ def _read_out(  # type: ignore[no-untyped-def]
             level[column] = log_intensity[at, column]
         if first < last:
             _hear_neighbours(row, first, min(last, width), allowed, pitch, ring, level, total)
-        while note < len(noted) and noted[note] < (row + 1) * width:
-            heard[note] = level[noted[note] - row * width]
-            note += 1
+        while met < len(unshown) and unshown[met] < (row + 1) * width:
+            place = unshown[met] - row * width
+            heard[met] = level[place]
+            if told:
+                total[row, place] = ring.doubts[row % count, place + _MARGIN]
+            met += 1
         for column in range(np.uint64(width)):
             marks[column] = level[column] > white
             out[at, column] = max(exponential(level[column]) - log_offset, np.float32(0.0))
@@ -349,7 +349,7 @@ def _take_row(  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True)
-def _mark_hearing(moving, variance, row, ring):  # type: ignore[no-untyped-def]
+def _mark_hearing(moving, log_intensity, white, row, ring):  # type: ignore[no-untyped-def]
     """Which pixels of a row hear their neighbours, and from which block of columns to which; none outside the image."""
     place = np.uint64(row % len(ring.levels))
     first, last = ring.hears.shape[1], 0
@@ -357,7 +357,7 @@ def _mark_hearing(moving, variance, row, ring):  # type: ignore[no-untyped-def]
     if row < len(moving):
         at = np.uint64(row)
         for column in range(np.uint64(moving.shape[1])):
-            ring.hears[place, column] = moving[at, column] | (variance[at, column] > UNMEASURED)
+            ring.hears[place, column] = moving[at, column] | (log_intensity[at, column] > white)
         for block in range(0, ring.hears.shape[1], _BLOCK):
             if _any(words, block, _BLOCK):
                 first, last = min(first, block), block + _BLOCK
