@@ -45,7 +45,7 @@ INPUTS = ("h5", "aedat4")
 GIVEN = (
     *("--events.delay", "0", "--camera.log-offset", "0.05", "--events.step-variance", "0.2"),
     *("--events.threshold-on", "0.2", "--events.threshold-off", "0.2"),
-    *("--events.refractory-period", "0"),
+    *("--events.refractory-period", "0", "--events.threshold-spread", "0.1", "--events.noise-rate", "0.1"),
 )
 
 

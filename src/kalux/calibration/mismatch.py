@@ -89,12 +89,13 @@ def estimate_mismatch(recording: Recording, camera: CameraSettings, events: Even
     for interval in intervals(recording, camera, margin=abs(delay), most_frames=_MAX_FRAMES):
         weighed, _ = counts.add(between(interval.events, interval.start + delay, interval.end + delay))
         first, second = interval.first, interval.second
-        told = ~first.clipped & ~second.clipped & (np.minimum(first.intensity, second.intensity) > _DARKEST)
+        before, after = first.intensity, second.intensity
+        told = ~first.clipped & ~second.clipped & (np.minimum(before, after) > _DARKEST)
         variance = sum(
-            noise_variance(shot.intensity, noise, 1.0) / (shot.intensity + camera.offset) ** 2
-            for shot in (first, second)
+            noise_variance(intensity, noise, 1.0) / (intensity + camera.offset) ** 2
+            for intensity in (before, after)
         )
-        change = np.log(second.intensity + camera.offset) - np.log(first.intensity + camera.offset)
+        change = np.log(after + camera.offset) - np.log(before + camera.offset)
         steps = thresholds[:, None, None] * weighed[0]
         of_steps = events.step_noise, events.quantisation_variance, events.usual_threshold_spread
         samples += _add(change, variance, told, steps, thresholds, of_steps, products)
