@@ -791,7 +791,12 @@ def _latent_frame(  # type: ignore[no-untyped-def]
 ):
     unmeasured = np.float32(bridge.UNMEASURED)
     fields = np.empty((EXPOSURE_FIELDS, EXPOSED), np.float32)
-    middle, peak, events, log_frame, known = np.empty((5, EXPOSED), np.float32)
+    middle, peak, events = (
+        np.empty(EXPOSED, np.float32),
+        np.empty(EXPOSED, np.float32),
+        np.empty(EXPOSED, np.float32),
+    )
+    log_frame, known = np.empty(EXPOSED, np.float32), np.empty(EXPOSED, np.float32)
     for block in range(np.uint64(len(exposure.touched))):
         relative_levels(exposure, block, duration, fields, middle, peak, events)
         first = block * np.uint64(EXPOSED)
