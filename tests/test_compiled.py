@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kalux.compiled import (
+    INFINITE_BITS,
     event_column,
     event_is_on,
     event_row,
@@ -16,6 +17,7 @@ from kalux.compiled import (
     exponential,
     largest_around,
     logarithm,
+    magnitude_bits,
     pack,
     packed,
     unpack,
@@ -130,3 +132,12 @@ def test_packed_records_lie_in_one_line_each(shape):
     records["h"] = 1.0
     assert (records["h"] == 1.0).all()
     assert records.flags.c_contiguous
+
+
+@given(st.lists(st.floats(width=32), max_size=70))
+def test_the_largest_bits_tell_infinite_from_finite_and_from_nan(numbers):
+    values = np.array(numbers, np.float32)
+    found = magnitude_bits(values)
+    assert (found < INFINITE_BITS) == np.isfinite(values).all()
+    assert (found > INFINITE_BITS) == np.isnan(values).any()
+    assert magnitude_bits(np.stack([values, -values])[:, ::2]) == magnitude_bits(values[::2])

@@ -370,3 +370,21 @@ def logarithm(x):  # type: ignore[no-untyped-def]
     square = m * m
     tail = exponent * _LN2_LOW + p * m * square
     return (tail - _HALF * square) + m + exponent * _LN2_HIGH
+
+
+INFINITE_BITS: Final = 0x7F800000
+"""Of an infinite float32 without its sign. Those of finite numbers are less, those of NaN more."""
+
+
+def magnitude_bits(values: NDArray[np.float32]) -> int:
+    """The largest bits, without signs, of some float32: tells in one pass of what kind they are. 0 of none."""
+    return int(_magnitude_bits(np.ascontiguousarray(values).view(np.int32).reshape(-1)))
+
+
+@nb.njit(cache=True, nogil=True)
+def _magnitude_bits(bits):  # type: ignore[no-untyped-def]
+    largest = np.int32(0)
+    for i in range(len(bits)):
+        magnitude = np.int32(bits[i] & np.int32(0x7FFFFFFF))
+        largest = magnitude if magnitude > largest else largest
+    return largest
