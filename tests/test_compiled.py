@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from kalux.compiled import (
     INFINITE_BITS,
+    apart,
     event_column,
     event_is_on,
     event_row,
@@ -122,6 +123,17 @@ def test_packed_records_have_the_fields_of_planes(names, count):
     for plane, name in zip(planes, names, strict=True):
         np.testing.assert_array_equal(records[name][3 : 3 + count], plane[:count])
     assert (records.view(np.float32).reshape(50, -1)[[0, 1, 2, *range(3 + count, 50)]] == -1).all()
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (3, 5), (480, 640)])
+def test_planes_apart_begin_at_different_places_of_a_page(shape):
+    planes = apart(5, shape)
+    assert planes.shape == (5, *shape)
+    assert all(plane.flags.c_contiguous for plane in planes)
+    begins = {plane.ctypes.data // 64 % 64 for plane in planes}
+    assert len(begins) == 5
+    planes[:] = np.arange(5)[:, None, None]
+    assert all((plane == k).all() for k, plane in enumerate(planes))
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (3, 5), (480, 640)])

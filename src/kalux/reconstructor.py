@@ -413,7 +413,7 @@ class Reconstructor:
             self._chroma(progress, t),
             self._unshown(progress, variance),
             self._method.silent_change(progress.segment),
-            self._method.unmeasured(progress.segment),
+            self._method.unmeasured(progress.segment, progress.cursor),
         )
 
     def trail(self, t: int) -> NDArray[np.floating[Any]] | None:

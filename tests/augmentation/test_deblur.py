@@ -10,8 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kalux.augmentation.deblur import (
+    EXPOSED,
     between,
     count_events,
+    expose,
     integrate_exposure,
     latent_end,
     latent_middle,
@@ -19,7 +21,10 @@ from kalux.augmentation.deblur import (
     latent_start,
     still_exposure,
 )
+from kalux.augmentation.refractory import EventClock
 from kalux.datasets import SensorSettings, pan, photograph_scene, simulate
+from kalux.events import make_events
+from kalux.filters.methods import latent_frame
 from kalux.models.camera import log_intensity
 
 from builders import blocks, events, pixel_events
@@ -227,3 +232,34 @@ def test_deblurring_gains_8_db_on_a_photograph(shared_data):
     blurred, sharp = gain_over_blur(2 * picture, 80.0, center=(350.0, 700.0))
     assert 30 < blurred < 35
     assert sharp - blurred >= 8
+
+
+def test_only_blocks_with_an_event_are_looked_at():
+    """Memory of an earlier exposure that is used again does not show, nor does where an event falls."""
+    rng = np.random.default_rng(3)
+    shape = (9, 50)  # blocks go on over the ends of rows
+    thresholds = tuple(rng.uniform(0.5, 2.0, shape).astype(np.float32) for _ in range(2))
+    spare = None
+    for places in ([], [0], [63, 64, 449], rng.integers(0, 450, 200)):
+        t = np.sort(rng.integers(1001, 2000, len(places)))
+        row, column = np.divmod(np.asarray(places, np.int64), shape[1])
+        array = make_events(t, column, row, rng.integers(0, 2, len(places)))
+        array = EventClock(shape, 0).weighed(array)
+        exposure = expose([array], 1000, 2000, thresholds, (ON, OFF), weighed=True, spare=spare)
+        np.testing.assert_array_equal(
+            np.flatnonzero(exposure.touched), np.unique(np.asarray(places, int) // EXPOSED)
+        )
+        level, variance = latent_frame(
+            np.zeros(shape, np.uint8),
+            np.array([-1.0]),
+            np.array([0.01]),
+            exposure,
+            duration=1000,
+            white=1e9,
+            event_variance=0.001,
+        )[:2]
+        steps = (ON * thresholds[0], OFF * thresholds[1])
+        whole = integrate_exposure(array, 1000, 2000, *steps)
+        np.testing.assert_allclose(level, -1.0 - whole.log_mean + whole.to_middle, atol=1e-6)
+        np.testing.assert_allclose(variance, 0.01 + 0.001 * whole.events, rtol=1e-6)
+        spare = exposure.pixels

@@ -299,3 +299,26 @@ def drifting_segment(end, shape=(1, 1)):
     """Nothing is known of L^A, so that only events move the state."""
     zero, step, unknown = np.zeros(shape), np.full(shape, 0.4), np.full(shape, UNMEASURED)
     return BridgedSegment(0, end, zero, zero, step, step, unknown, unknown, zero, 0.0, 1.0, None)
+
+
+def test_memory_that_is_used_again_does_not_show():
+    """A cursor in the memory of another reads as one in its own."""
+    rng = np.random.default_rng(1)
+    shape = (5, 70)
+    used = akf.begin_bridged(drifting_segment(100_000, shape), random_state(rng, shape))
+    times = np.arange(1, 400) * 100
+    events = make_events(times, rng.integers(0, 70, 399), rng.integers(0, 5, 399), rng.integers(0, 2, 399))
+    akf.advance_bridged(drifting_segment(100_000, shape), used, events, akf.BridgedNoise(3.0, 0.2, 0.04))
+    start = random_state(rng, shape)
+    segment = drifting_segment(100_000, shape)
+    fresh, again = akf.begin_bridged(segment, start), akf.begin_bridged(segment, start, used)
+    assert again.pixels is used.pixels
+    for cursor in (fresh, again):
+        akf.advance_bridged(segment, cursor, events, akf.BridgedNoise(3.0, 0.2, 0.04))
+    for one, other in zip(*(akf.read_bridged(segment, c, 50_000) for c in (fresh, again)), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def random_state(rng, shape):
+    value, variance = rng.normal(size=shape), rng.uniform(0.01, 0.1, shape)
+    return State(value.astype(np.float32), variance.astype(np.float32), make_clock(shape, 0))

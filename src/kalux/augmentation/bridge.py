@@ -163,7 +163,7 @@ def drift(
     -------
     (H, W) what the variance grows by, and the on and off events since the last measurement, up to ``second``.
     """
-    grown, far_on, far_off = np.zeros((3, *second.variance.shape), np.float32)
+    grown, far_on, far_off = apart(3, second.variance.shape)
     of_on, of_off = np.float32(noise.threshold_on**2), np.float32(noise.threshold_off**2)
     untold = np.float32(noise.quantisation_variance / 2)
     planes = first.variance, second.variance, thresholds.on_variance, thresholds.off_variance, *far, *counts
@@ -190,6 +190,7 @@ def _drift(  # type: ignore[no-untyped-def]
 ):
     unmeasured, two = np.float32(UNMEASURED), np.float32(2.0)
     for i in range(len(grown)):
+        grown[i] = new_on[i] = new_off[i] = np.float32(0.0)
         if after[i] < unmeasured:
             continue
         drifted = on_variance[i] * of_on * on[i] * (two * far_on[i] + on[i])
@@ -204,7 +205,7 @@ def floor_before(second: Latent, net: Array, unmeasured: NDArray[np.bool_]) -> A
     What is not known of such a pixel is a constant: if events lead from it to less than the next frame's bound, it was
     too low all the time. ``net`` is what events add to the level between the frames.
     """
-    floor = np.full_like(net, -np.inf)
+    floor = np.empty_like(net)
     planes = unmeasured, second.variance, second.value, net, floor
     _floor_before(*(plane.reshape(-1) for plane in planes))
     return floor
@@ -213,8 +214,8 @@ def floor_before(second: Latent, net: Array, unmeasured: NDArray[np.bool_]) -> A
 @nb.njit(cache=True, nogil=True)
 def _floor_before(unmeasured, variance, value, net, floor):  # type: ignore[no-untyped-def]
     for i in range(len(floor)):
-        if unmeasured[i] and UNMEASURED <= variance[i] < UNSEEN:
-            floor[i] = value[i] - net[i]
+        bound = unmeasured[i] and UNMEASURED <= variance[i] < UNSEEN
+        floor[i] = value[i] - net[i] if bound else -np.inf
 
 
 def lift(log_intensity: Array, frame: Latent) -> None:

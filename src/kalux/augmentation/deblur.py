@@ -108,7 +108,7 @@ def integrate_exposure(
     chunks = [events] if isinstance(events, np.ndarray) else events
     exposure = expose(chunks, start, end, (step_on, step_off), (1.0, 1.0), weighed=False)
     integrals = np.zeros((5, *step_on.shape), np.float32)
-    _finish_exposure(*exposure, end - start, integrals.reshape(5, -1))
+    _finish_exposure(*exposure, end - start, *integrals.reshape(5, -1))
     return ExposureIntegrals(*integrals)
 
 
@@ -309,10 +309,11 @@ def relative_levels(exposure, block, duration, fields, middle, peak, events):  #
 
 # Not FUSED: the paper's (12) divides small differences of these, which would bring another rounding out a hundredfold.
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _finish_exposure(pixels, touched, exposure, integrals):  # type: ignore[no-untyped-def]
+def _finish_exposure(  # type: ignore[no-untyped-def]
+    pixels, touched, exposure, log_mean, to_middle, to_end, largest, count_of
+):
     """Fill the planes of `ExposureIntegrals`, which are 0 where nothing has moved."""
     duration = np.float32(exposure)
-    log_mean, to_middle, to_end, largest, count_of = integrals
     fields = np.empty((EXPOSURE_FIELDS, EXPOSED), np.float32)
     level, integral, since = fields[_LEVEL], fields[_INTEGRAL], fields[_SINCE]
     at_middle, peak, events = fields[_AT_MIDDLE], fields[_PEAK], fields[_EVENTS]

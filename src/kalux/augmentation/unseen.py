@@ -75,8 +75,12 @@ def _told(given, seconds, q0, most, told_of):  # type: ignore[no-untyped-def]
     slope, forward, backward, events = given
     change, untold, silent = told_of
     zero, one, unmeasured = np.float32(0.0), np.float32(1.0), np.float32(UNMEASURED)
-    noise, share, is_silent = np.empty((3, _BLOCK), np.float32)
-    sum_change, sum_share = np.zeros((2, _BLOCK))
+    noise, share, is_silent = (
+        np.empty(_BLOCK, np.float32),
+        np.empty(_BLOCK, np.float32),
+        np.empty(_BLOCK, np.float32),
+    )
+    sum_change, sum_share = np.zeros(_BLOCK), np.zeros(_BLOCK)
     for first in range(np.uint64(0), np.uint64(len(slope)), np.uint64(_BLOCK)):
         pixels = range(min(np.uint64(len(slope)) - first, np.uint64(_BLOCK)))
         for k in pixels:

@@ -167,6 +167,8 @@ class BridgedCursor:
         us: the segment's start, then a whole number of epochs later.
     moving
         `moving_bridged`, once it has been asked for, where it is the same throughout the segment.
+    unmeasured
+        `unmeasured_bridged`, once it has been asked for.
     """
 
     pixels: NDArray[np.void]
@@ -175,6 +177,7 @@ class BridgedCursor:
     polarity: NDArray[np.int8]
     origin: int
     moving: NDArray[np.bool_] | None = None
+    unmeasured: NDArray[np.bool_] | None = None
 
 
 class BridgedNoise(NamedTuple):
@@ -290,19 +293,19 @@ def moving_bridged(segment: BridgedSegment, cursor: BridgedCursor) -> NDArray[np
         return cursor.moving
     inside = cursor.clock[1:-1, 1:-1]
     moving: NDArray[np.bool_] = inside > np.int32(max(segment.still_since - cursor.origin, -EPOCH))
-    moving |= unmeasured_bridged(segment)
+    moving |= unmeasured_bridged(segment, cursor)
     if segment.events is not None:  # all events of the segment are among them, whenever this is asked for
         moving |= segment.events > 0
         cursor.moving = moving
     return moving
 
 
-def unmeasured_bridged(segment: BridgedSegment) -> NDArray[np.bool_]:
-    """(H, W): pixels that neither of the segment's frames measures."""
-    unmeasured: NDArray[np.bool_] = (
-        np.minimum(segment.forward_variance, segment.backward_variance) >= UNMEASURED
-    )
-    return unmeasured
+def unmeasured_bridged(segment: BridgedSegment, cursor: BridgedCursor) -> NDArray[np.bool_]:
+    """(H, W): pixels that neither of the segment's frames measures; not to be changed."""
+    if cursor.unmeasured is None:
+        variances = segment.forward_variance, segment.backward_variance
+        cursor.unmeasured = np.minimum(*variances) >= UNMEASURED
+    return cursor.unmeasured
 
 
 def end_bridged(segment: BridgedSegment, cursor: BridgedCursor) -> State:

@@ -295,7 +295,7 @@ class Method(Protocol):
     def moving(self, segment: Any, cursor: Any) -> NDArray[np.bool_] | None:
         """(H, W): pixels with an event in this frame interval, also one to come, or the one before, or unmeasured."""
 
-    def unmeasured(self, segment: Any) -> NDArray[np.bool_] | None:
+    def unmeasured(self, segment: Any, cursor: Any) -> NDArray[np.bool_] | None:
         """(H, W): pixels that neither the frame before nor the one after measures; None: the method does not tell."""
 
     def silent_change(self, segment: Any) -> Floats | None:
@@ -340,7 +340,7 @@ class _Common:
     def moving(self, segment: Any, cursor: Any) -> NDArray[np.bool_] | None:
         return None
 
-    def unmeasured(self, segment: Any) -> NDArray[np.bool_] | None:
+    def unmeasured(self, segment: Any, cursor: Any) -> NDArray[np.bool_] | None:
         return None
 
     def trail(self, segment: Any, cursor: Any, t: int) -> Floats | None:
@@ -740,8 +740,8 @@ class BridgedFrames(_Common):
     def moving(self, segment: Any, cursor: akf.BridgedCursor) -> NDArray[np.bool_]:
         return akf.moving_bridged(segment, cursor)
 
-    def unmeasured(self, segment: BridgedSegment) -> NDArray[np.bool_]:
-        return akf.unmeasured_bridged(segment)
+    def unmeasured(self, segment: BridgedSegment, cursor: akf.BridgedCursor) -> NDArray[np.bool_]:
+        return akf.unmeasured_bridged(segment, cursor)
 
     def trail(self, segment: Any, cursor: akf.BridgedCursor, t: int) -> NDArray[np.float32] | None:
         return akf.trail_bridged(segment, cursor, t)
@@ -800,7 +800,12 @@ def _latent_frame(  # type: ignore[no-untyped-def]
 ):
     unmeasured = np.float32(bridge.UNMEASURED)
     fields = np.empty((EXPOSURE_FIELDS, EXPOSED), np.float32)
-    middle, peak, events, log_frame, known = np.empty((5, EXPOSED), np.float32)
+    middle, peak, events = (
+        np.empty(EXPOSED, np.float32),
+        np.empty(EXPOSED, np.float32),
+        np.empty(EXPOSED, np.float32),
+    )
+    log_frame, known = np.empty(EXPOSED, np.float32), np.empty(EXPOSED, np.float32)
     for block in range(np.uint64(len(exposure.touched))):
         relative_levels(exposure, block, duration, fields, middle, peak, events)
         first = block * np.uint64(EXPOSED)
