@@ -13,6 +13,7 @@ from kalux.augmentation.highlights import Unshown
 from kalux.augmentation.refractory import EventClock
 from kalux.compiled import event_words
 from kalux.datasets import SensorSettings, demo_scene, simulate
+from kalux.datasets.ahdr import ArtificialCamera, artificial_hdr
 from kalux.errors import InputError, OutputError
 from kalux.events import make_events
 from kalux.pipeline import plan
@@ -193,6 +194,23 @@ def test_smoothing_is_closer_to_the_truth():
             (np.log(i.intensity + 0.02), np.log(g + 0.02)) for i, g in zip(images, truth.images, strict=True)
         ]
         errors.append(np.mean([(a - b) ** 2 for a, b in logs]))
+    assert errors[1] < 0.9 * errors[0]
+
+
+def test_smoothing_is_closer_to_the_truth_of_a_real_recording(shared_data):
+    """Artificial HDR of twenty frames, where the originals are not saturated themselves."""
+    whole = kalux.open(shared_data / "slider_depth", exposure=10_000)
+    frames = list(whole.frames())[30:50]
+    begin, end = frames[0].exposure_start, frames[-1].exposure_end
+    events = np.concatenate([e[(e["t"] > begin) & (e["t"] < end)] for e in whole.events()])
+    part = Recording.from_arrays(events, frames, sensor_size=whole.sensor_size)
+    source = artificial_hdr(part, ArtificialCamera(10 / 255, 90 / 255), saturation=108 / 255)
+    truth = source.ground_truth()
+    errors = []
+    for smooth in (False, True):
+        images = kalux.reconstruct(source, times=truth.times, smooth=smooth)
+        intensities = np.array([image.intensity for image in images])
+        errors.append(np.square(intensities - truth.images)[truth.masks].mean())
     assert errors[1] < 0.9 * errors[0]
 
 
