@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.ahead import ahead
-from kalux.calibration.contrast import ThresholdEstimate, estimate_thresholds
+from kalux.calibration.contrast import ThresholdEstimate, Usual, estimate_thresholds
 from kalux.calibration.delay import DelayEstimate, estimate_delay
 from kalux.calibration.event_model import EventModel, estimate_event_model
 from kalux.calibration.frame_noise import FrameNoise, estimate_frame_noise
@@ -114,12 +114,8 @@ def plan(
     chosen, delay = _with_delay(recording, chosen)
     filled, origin, estimate = _with_thresholds(recording, chosen)
     filled, model = _with_event_model(recording, filled, estimate is not None)
-    if estimate is not None and _was_for_others(chosen, filled):
-        unfilled = dataclasses.replace(
-            filled.events,
-            threshold_on=chosen.events.threshold_on,
-            threshold_off=chosen.events.threshold_off,
-        )
+    if estimate is not None and chosen.camera.offset != filled.camera.offset:
+        unfilled = dataclasses.replace(chosen.events, step_variance=filled.events.step_variance)
         filled, origin, estimate = _with_thresholds(recording, dataclasses.replace(filled, events=unfilled))
     if origin == "settings" and _are_calibrated(filled, known):
         origin = "calibration"
@@ -405,9 +401,10 @@ def _with_thresholds(
         estimate = estimate_thresholds(
             recording,
             settings.camera,
+            Usual(events.usual_threshold_on, events.usual_threshold_off, events.usual_spread),
             of_log_offset=paper,
             delay=events.delay or 0,
-            refractory_period=events.refractory,
+            refractory_period=events.refractory_period if _uses_steps(settings) else 0,
         )
         if estimate is None:
             return dataclasses.replace(settings, events=events.assuming()), "assumed", None
@@ -418,6 +415,14 @@ def _with_thresholds(
         threshold_on=events.threshold_on if events.threshold_on is not None else found[0],
         threshold_off=events.threshold_off if events.threshold_off is not None else found[1],
     )
+    if estimate is not None:
+        events = dataclasses.replace(
+            events,
+            threshold_spread=max(events.threshold_spread, estimate.spread),
+            refractory_period=estimate.refractory_period
+            if _uses_steps(settings)
+            else events.refractory_period,
+        )
     return dataclasses.replace(settings, events=events), origin, estimate
 
 
@@ -452,11 +457,6 @@ def _with_event_model(
     camera = dataclasses.replace(camera, log_offset=camera.offset)
     events = dataclasses.replace(events, step_variance=events.step_noise, refractory_period=events.refractory)
     return dataclasses.replace(settings, camera=camera, events=events), model
-
-
-def _was_for_others(before: Settings, after: Settings) -> bool:
-    """Whether thresholds were estimated with another I_0 or another refractory period."""
-    return before.camera.offset != after.camera.offset or before.events.refractory != after.events.refractory
 
 
 def _uses_steps(settings: Settings) -> bool:

@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.deblur import between
-from kalux.calibration.contrast import HUBER, NORMAL_MAD
 from kalux.calibration.intervals import intervals
 from kalux.calibration.refractory import LATE, Counts, possible_periods, shortest_interval
+from kalux.calibration.regression import HUBER, NORMAL_MAD
 from kalux.models.camera import noise_variance
 from kalux.recording import Recording
 from kalux.settings import CameraSettings
