@@ -157,7 +157,10 @@ def test_a_still_scene_tells_nothing(noise_rate):
 
 def test_frames_alone_tell_nothing():
     frames = [Frame(np.full((32, 40), v, np.uint8), t, t + 5000) for t, v in ((0, 90), (40_000, 120))]
-    assert estimate_thresholds(Recording.from_arrays(events(), frames, sensor_size=(32, 40)), CAMERA, USUAL) is None
+    assert (
+        estimate_thresholds(Recording.from_arrays(events(), frames, sensor_size=(32, 40)), CAMERA, USUAL)
+        is None
+    )
 
 
 def test_unknown_exposures_are_an_error():
