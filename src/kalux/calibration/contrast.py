@@ -105,7 +105,8 @@ def estimate_thresholds(
     camera
         Response and I_0.
     usual
-        The thresholds before the recording has said anything.
+        The thresholds before the recording has said anything. Of a spread of 0: they are known, and only the refractory
+        period is found.
     of_log_offset
         Steps of log(I + I_0) instead of log I, s = 1, as in the paper's model.
     delay
@@ -136,7 +137,7 @@ def estimate_thresholds(
     if estimate is None or refractory_period is not None or not _loses(samples):
         return estimate
     periods = possible_periods(shortest)
-    period = _without_excess(periods, seen(*periods))
+    period = _without_excess(periods, seen(*periods), usual)
     if period == 0:
         return estimate
     lossy = _by_information(seen(period), usual, period)
@@ -262,14 +263,25 @@ def _excess(seen: _Seen, index: int) -> tuple[float, float]:
     return float(soon / late) - 1.0, float(np.hypot(errors[0], errors[1]) / late)
 
 
-def _without_excess(periods: tuple[int, ...], seen: _Seen) -> int:
-    """The refractory period, us, under which events that follow soon tell as much as late ones; 0 if unknown."""
-    excess = np.array([_excess(seen, index)[0] for index in range(len(periods))])
+def _without_excess(periods: tuple[int, ...], seen: _Seen, usual: Usual) -> int:
+    """The refractory period, us, under which events that follow soon tell as much as late ones; 0 if unknown.
+
+    With known thresholds the one under which these explain the frames.
+    """
+    excess = np.array(
+        [_excess(seen, k)[0] if usual.spread > 0 else _beyond(seen, k, usual) for k in range(len(periods))]
+    )
     if not np.isfinite(excess).all():
         return 0
     # A longer period always explains more; what noise makes otherwise is evened out.
     falling = np.minimum.accumulate(excess)
     return round(float(np.interp(0.0, -falling, periods)))
+
+
+def _beyond(seen: _Seen, index: int, known: Usual) -> float:
+    """By which share thresholds seem larger than they are, under a refractory period; nan if unknown."""
+    fit = two_stage(seen.steps.change, seen.explained(index), seen.counts_around(index))
+    return np.nan if fit is None else float(np.mean(fit.solution[:2] / known[:2])) - 1.0
 
 
 class PlainFit(NamedTuple):
