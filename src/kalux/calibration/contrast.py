@@ -29,17 +29,23 @@ _MIN_SAMPLES: Final = 200
 _SHORTEST_EVENTS: Final = 500_000
 """Of which the shortest interval is taken: its edge is then that of 10,000 pairs."""
 
+_MODEL: Final = 0.03
+"""Relative error of thresholds from the neighbours' counts, beside the statistical one: they are up to 3 % too large on
+ten of eleven simulated scenes."""
+
 _SHARED: Final = 0.1
 """Share of what frames do not explain in the neighbours' counts that may be common to neighbours."""
 
-_SUBTHRESHOLD: Final = 0.15
+_SUBTHRESHOLD: Final = 0.2
 """Relative error of thresholds from the neighbours' changes in frames, beside the statistical one: they are 1 to 13 %
-too large on eleven simulated scenes, and 12 to 30 % larger than those from counts on three real recordings."""
+too large on eleven simulated scenes, and 12 to 45 % larger than those from counts on three real recordings."""
 
 _LEAST_EXCESS: Final = 0.1
 """By how much more events that follow soon must tell than late ones, two standard errors taken off, for something to be
 lost in the refractory period. Where nothing is lost it is -0.07 to 0.02 on seven simulated scenes and three recordings,
 with 0.5 to 2 ms 0.23 to 0.84 on four."""
+
+_USUAL_EXCESS: Final = 0.02  # where nothing is lost: the mean of these
 
 _LEAST_GAIN: Final = 0.02
 """Share of the residual that the period found must take away. On the same four scenes it is 0.043 to 0.17, on edges of
@@ -187,10 +193,14 @@ def _by_information(seen: _Seen, usual: Usual, period: int) -> ThresholdEstimate
     if not fits:
         return None
     common = np.log1p(_SHARED * _unexplained(seen, by_counts, counts)) if by_counts is not None else np.inf
+    of_counts = _told(seen, by_counts, explained, counts, float(np.hypot(common, _MODEL)))
+    of_changes = _told(seen, by_changes, explained, changes, _SUBTHRESHOLD)
+    # What both cannot explain is noise that neighbours share.
+    apart = (of_counts.logs - of_changes.logs) ** 2 - 4 * (of_counts.variances + of_changes.variances)
     told = [
         _Told(np.log([usual.on, usual.off]), np.full(2, usual.spread**2)),
-        _told(seen, by_counts, explained, counts, common),
-        _told(seen, by_changes, explained, changes, _SUBTHRESHOLD),
+        of_counts._replace(variances=of_counts.variances + np.maximum(apart, 0.0)),
+        of_changes,
     ]
     information = np.array([1 / np.maximum(one.variances, 1e-9) for one in told])
     total = information.sum(axis=0)
@@ -229,38 +239,53 @@ def _unexplained(seen: _Seen, fit: Fit, counts: Array) -> float:
     return float(predicted @ predicted) * float(change @ change) / max(both, 1e-12) - 1.0
 
 
+class _Parted(NamedTuple):
+    """The regression on late events, events that follow soon, and turns, both events in units of the thresholds."""
+
+    explained: Array
+    instruments: Array
+    fit: Fit
+
+    @property
+    def excess(self) -> float:
+        """By which share events that follow soon tell more than late ones."""
+        return float(self.fit.solution[1] / self.fit.solution[0]) - 1.0
+
+
 def _loses(seen: _Seen) -> bool:
     """Whether events that follow soon clearly tell more than late ones, if nothing is lost."""
-    excess, error = _excess(seen, 0)
-    return excess - 2 * error > _LEAST_EXCESS
+    parted = _parted(seen, 0)
+    if parted is None:
+        return False
+    samples = seen.steps
+    late, soon, _ = standard_errors(
+        samples.change,
+        parted.explained,
+        parted.instruments,
+        parted.fit.weights,
+        samples.pixel,
+        seen.sensor_size,
+    )
+    error = float(np.hypot(late, soon) / parted.fit.solution[0])
+    return parted.excess - 2 * error > _LEAST_EXCESS
 
 
-def _excess(seen: _Seen, index: int) -> tuple[float, float]:
-    """By which share events that follow soon tell more than late ones, under a refractory period, and its error.
-
-    nan where it cannot be told.
-    """
+def _parted(seen: _Seen, index: int) -> _Parted | None:
+    """Under a refractory period; None where it is not determined."""
     samples = seen.steps
     fit = two_stage(samples.change, seen.explained(index), seen.counts_around(index))
     if fit is None:
-        return np.nan, np.nan
+        return None
     on, off, _ = fit.solution
 
-    def parted(events: Array, turned: Array) -> Array:
-        """(N, 3): steps of late events, of those that follow soon, and turns."""
+    def columns(events: Array, turned: Array) -> Array:
         both = on * events[:, index, :, 0] - off * events[:, index, :, 1]
         return np.column_stack([both, turned]) * seen.share[:, None]
 
-    explained = parted(samples.events, samples.turned)
-    instruments = parted(samples.events_around, samples.turned_around)
+    explained = columns(samples.events, samples.turned)
+    instruments = columns(samples.events_around, samples.turned_around)
     again = two_stage(samples.change, explained, instruments)
-    if again is None or not again.solution[0] > 0:
-        return np.nan, np.nan
-    late, soon, _ = again.solution
-    errors = standard_errors(
-        samples.change, explained, instruments, again.weights, samples.pixel, seen.sensor_size
-    )
-    return float(soon / late) - 1.0, float(np.hypot(errors[0], errors[1]) / late)
+    return None if again is None or not again.solution[0] > 0 else _Parted(explained, instruments, again)
 
 
 def _without_excess(periods: tuple[int, ...], seen: _Seen, usual: Usual) -> int:
@@ -268,20 +293,22 @@ def _without_excess(periods: tuple[int, ...], seen: _Seen, usual: Usual) -> int:
 
     With known thresholds the one under which these explain the frames.
     """
-    excess = np.array(
-        [_excess(seen, k)[0] if usual.spread > 0 else _beyond(seen, k, usual) for k in range(len(periods))]
-    )
+    excess = np.array([_excess(seen, index, usual) for index in range(len(periods))])
     if not np.isfinite(excess).all():
         return 0
     # A longer period always explains more; what noise makes otherwise is evened out.
     falling = np.minimum.accumulate(excess)
-    return round(float(np.interp(0.0, -falling, periods)))
+    left = _USUAL_EXCESS if usual.spread > 0 else 0.0
+    return round(float(np.interp(-left, -falling, periods)))
 
 
-def _beyond(seen: _Seen, index: int, known: Usual) -> float:
-    """By which share thresholds seem larger than they are, under a refractory period; nan if unknown."""
+def _excess(seen: _Seen, index: int, usual: Usual) -> float:
+    """What is near 0 under the right refractory period, and larger under shorter ones; nan if unknown."""
+    if usual.spread > 0:
+        parted = _parted(seen, index)
+        return np.nan if parted is None else parted.excess
     fit = two_stage(seen.steps.change, seen.explained(index), seen.counts_around(index))
-    return np.nan if fit is None else float(np.mean(fit.solution[:2] / known[:2])) - 1.0
+    return np.nan if fit is None else float(np.mean(fit.solution[:2] / usual[:2])) - 1.0
 
 
 class PlainFit(NamedTuple):

@@ -33,6 +33,11 @@ _MAX_OF_INTERVAL: Final = (
 _MAX_FRAMES: Final = 200
 _LEAST_AROUND: Final = 8.0  # events of the eight neighbours: where less happens it may be noise
 _LEAST_NEIGHBOURS: Final = 4  # that frames show well
+
+_ALIKE: Final = 0.3
+"""Log intensity by which the changes of neighbours that see the same edge differ, as in `filter.neighbours`: others are
+weighed down. A slow edge is at one pixel after the other; without, it makes thresholds a quarter too large."""
+
 _NEVER: Final = -(1 << 60)
 
 
@@ -44,14 +49,14 @@ class Steps(NamedTuple):
     change
         Of log(I + I_0) between the frames.
     change_around
-        Mean of the same of the neighbours.
+        Mean of the same of the neighbours, weighed by how alike these change.
     level
         Mean I of both frames.
     events, events_around
-        (N, P, 2, 2): sums of the weights (K13) of the pixel's own events, and means of its neighbours'; those that come
-        late after their predecessors first and those that follow soon second, of either on first and off second.
+        (N, P, 2, 2): sums of the weights (K13) of the pixel's own events, and such means of its neighbours'; those that
+        come late after their predecessors first and those that follow soon second, of either on first and off second.
     turned, turned_around
-        Change of the sign of the pixel's newest event, halved, and the mean of the neighbours'.
+        Change of the sign of the pixel's newest event, halved, and such a mean of its neighbours'.
     pixel
         Index of the pixel.
     """
@@ -209,7 +214,7 @@ def _something_happens(counts, usable):  # type: ignore[no-untyped-def]
     return found
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(cache=True, nogil=True, error_model="numpy")
 def _looked_at(counts, turned, change, usable, chosen):  # type: ignore[no-untyped-def]
     """Counts of the chosen pixels, and of their neighbours the mean counts, turns and changes."""
     width, size = counts.shape[1:]
@@ -218,17 +223,16 @@ def _looked_at(counts, turned, change, usable, chosen):  # type: ignore[no-untyp
     for n in range(len(chosen)):
         row, column = chosen[n] // width, chosen[n] % width
         own[n] = counts[row, column]
-        neighbours = 0
+        total = 0.0
         for i in range(row - 1, row + 2):
             for j in range(column - 1, column + 2):
-                if i == row and j == column:
-                    continue
-                around[n] += counts[i, j]
-                turned_around[n] += turned[i, j]
-                if usable[i, j]:
-                    change_around[n] += change[i, j]
-                    neighbours += 1
-        around[n] /= 8
-        turned_around[n] /= 8
-        change_around[n] /= neighbours
+                if usable[i, j] and not (i == row and j == column):
+                    weight = 1.0 / (1.0 + ((change[i, j] - change[row, column]) / _ALIKE) ** 2)
+                    around[n] += weight * counts[i, j]
+                    turned_around[n] += weight * turned[i, j]
+                    change_around[n] += weight * change[i, j]
+                    total += weight
+        around[n] /= total
+        turned_around[n] /= total
+        change_around[n] /= total
     return own, around, turned_around, change_around
