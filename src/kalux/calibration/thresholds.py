@@ -51,6 +51,9 @@ _IN_TIME: Final = (0.7, 0.95, 1.15)
 """h over the mean threshold where events are in time: 1 in theory, 0.79 to 1.02 on five simulated scenes. Between the
 outer values no delay is corrected, beyond them until the middle one is reached."""
 _MIN_SAMPLES: Final = 500
+_UNTOLD: Final = 0.1
+"""Share of the usual thresholds in the quick estimate, from which on a recording tells too little: 0.01 at most on
+fifteen scenes and recordings with motion, 0.17 where only lamps and noise make events."""
 _WHITE: Final = 0.95  # of the response: the whole deblurred path lies below
 _CROWDED: Final = 3.0
 """Intervals with events closer than this many times the smallest inter-event interval are left out. With 3, a
@@ -161,7 +164,7 @@ def calibrate_contrast(
     assumed = EventSettings()
     usual = Usual(assumed.usual_threshold_on, assumed.usual_threshold_off, assumed.usual_spread)
     first = estimate_thresholds(recording, camera, usual, delay=delay or 0)
-    if first is None:
+    if first is None or first.usual_share > _UNTOLD:
         return None
     view = _View((first.on, first.off), shortest_interval(recording), refractory)
     if delay is None:
