@@ -245,7 +245,7 @@ def bridged(pixel, settings, times, on, off, scales):
     c, ev = settings.camera, settings.events
     i0, count, c2 = c.offset, len(pixel.starts), on * off
     scale_on, scale_off = 1.0, 1.0
-    var_on = var_off = ev.threshold_spread**2
+    var_on = var_off = ev.mismatch**2
     learned = []
 
     hidden_by_black = float(
@@ -406,7 +406,7 @@ def bridged(pixel, settings, times, on, off, scales):
         while pending and pending[0][0] <= limit:
             t, polarity, near, _, weight = pending.pop(0)
             value, variance = predict(t)
-            signal = 1 / (1 + 9 * ev.noise_rate * (t - near) * US)  # K5
+            signal = 1 / (1 + 9 * ev.background_rate * (t - near) * US)  # K5
             # Several events may share a time: this one alone moves L^A by its own step.
             step = weight * own_step(intervals[index], polarity, on, off, ev, c2, counts)
             q = weight * c2 * (ev.step_noise + signal * (1 - signal))

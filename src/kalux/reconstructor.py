@@ -425,7 +425,7 @@ class Reconstructor:
         # The prior needs a variance, which the complementary filter has not.
         filtered, events = self.settings.filter, self.settings.events
         scale = filtered.highlight_scale if filtered.kind == "akf" else 0.0
-        spread = events.threshold_spread
+        spread = events.mismatch
         if self._estimated:
             scale, spread = (
                 min(scale, filtered.highlight_tail * self._tail_beyond),
@@ -626,10 +626,12 @@ class Reconstructor:
 
     def _take(self, progress: _Progress, t: int) -> None:
         """Take the cursor over the events up to ``t`` that it has not taken yet."""
-        for events in self._events.after(progress.taken, t):
+        taken = max(progress.taken, self._events.first)
+        for events in self._events.after(taken, t):
             self._method.advance(progress.segment, progress.cursor, events)
             progress.latest = int(events["t"][-1])
-        progress.taken = self._events.number(t)
+            taken += len(events)
+        progress.taken = taken
 
 
 def _between(progress: _Progress, t: int) -> float:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from kalux.augmentation.deblur import between, count_events
 from kalux.augmentation.refractory import EventClock
-from kalux.calibration.intervals import intervals
+from kalux.calibration.intervals import intervals, spread
 from kalux.models.camera import noise_variance
 from kalux.recording import Recording
 from kalux.settings import UNKNOWN_LOG_OFFSET, CameraSettings
@@ -197,9 +197,10 @@ def _samples(recording: Recording, camera: CameraSettings, delay: int, refractor
         inside = clock.weighed(between(interval.events, interval.start + delay, interval.end + delay))
         on, off = count_events(inside, recording.sensor_size, weighed=True)
         first, second = interval.first, interval.second
-        chosen = ~first.clipped & ~second.clipped & (on + off > 0)
-        found.append((first.intensity[chosen], second.intensity[chosen], on[chosen], off[chosen]))
-        count += int(np.count_nonzero(chosen))
+        chosen = spread(~first.clipped & ~second.clipped & (on + off > 0), MAX_SAMPLES - count)
+        pixels = (first.intensity, second.intensity, on, off)
+        found.append(tuple(values.ravel()[chosen] for values in pixels))
+        count += len(chosen)
         if count >= MAX_SAMPLES:
             break
     if not found:
