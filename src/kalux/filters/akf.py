@@ -21,7 +21,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.bridge import BridgedSegment, lift, lower
+from kalux.augmentation.bridge import UNMEASURED, BridgedSegment, lift, lower
 from kalux.augmentation.deblur import events_until
 from kalux.augmentation.interpolation import InterpolatedSegment
 from kalux.augmentation.trail import add_trail, ahead_of_event, no_trail
@@ -281,15 +281,28 @@ def _read(segment: BridgedSegment, cursor: BridgedCursor, t: int) -> tuple[Float
 
 
 def moving_bridged(segment: BridgedSegment, cursor: BridgedCursor) -> NDArray[np.bool_]:
-    """(H, W): pixels with an event since ``segment.still_since``, or one to come in the segment; not to be changed."""
+    """(H, W): pixels with an event since ``segment.still_since`` or to come in the segment, and unmeasured ones.
+
+    Still pixels are those of which frames have shown the fine texture many times, as none has of a clipped one.
+    Not to be changed.
+    """
     if cursor.moving is not None:
         return cursor.moving
     inside = cursor.clock[1:-1, 1:-1]
     moving: NDArray[np.bool_] = inside > np.int32(max(segment.still_since - cursor.origin, -EPOCH))
+    moving |= unmeasured_bridged(segment)
     if segment.events is not None:  # all events of the segment are among them, whenever this is asked for
         moving |= segment.events > 0
         cursor.moving = moving
     return moving
+
+
+def unmeasured_bridged(segment: BridgedSegment) -> NDArray[np.bool_]:
+    """(H, W): pixels that neither of the segment's frames measures."""
+    unmeasured: NDArray[np.bool_] = (
+        np.minimum(segment.forward_variance, segment.backward_variance) >= UNMEASURED
+    )
+    return unmeasured
 
 
 def end_bridged(segment: BridgedSegment, cursor: BridgedCursor) -> State:

@@ -293,7 +293,10 @@ class Method(Protocol):
         """The state at the end of the segment. The cursor must not be used after it: its memory is."""
 
     def moving(self, segment: Any, cursor: Any) -> NDArray[np.bool_] | None:
-        """(H, W): pixels with an event in this frame interval, also one to come, or the one before; None: not told."""
+        """(H, W): pixels with an event in this frame interval, also one to come, or the one before, or unmeasured."""
+
+    def unmeasured(self, segment: Any) -> NDArray[np.bool_] | None:
+        """(H, W): pixels that neither the frame before nor the one after measures; None: the method does not tell."""
 
     def silent_change(self, segment: Any) -> Floats | None:
         """(H, W): `unseen.silent_change` of the segment; None: the method or the segment does not tell."""
@@ -335,6 +338,9 @@ class _Common:
         self.offset = settings.camera.offset
 
     def moving(self, segment: Any, cursor: Any) -> NDArray[np.bool_] | None:
+        return None
+
+    def unmeasured(self, segment: Any) -> NDArray[np.bool_] | None:
         return None
 
     def trail(self, segment: Any, cursor: Any, t: int) -> Floats | None:
@@ -733,6 +739,9 @@ class BridgedFrames(_Common):
 
     def moving(self, segment: Any, cursor: akf.BridgedCursor) -> NDArray[np.bool_]:
         return akf.moving_bridged(segment, cursor)
+
+    def unmeasured(self, segment: BridgedSegment) -> NDArray[np.bool_]:
+        return akf.unmeasured_bridged(segment)
 
     def trail(self, segment: Any, cursor: akf.BridgedCursor, t: int) -> NDArray[np.float32] | None:
         return akf.trail_bridged(segment, cursor, t)
