@@ -42,10 +42,10 @@ too large on eleven simulated scenes, and 12 to 45 % larger than those from coun
 
 _LEAST_EXCESS: Final = 0.1
 """By how much more events that follow soon must tell than late ones, two standard errors taken off, for something to be
-lost in the refractory period. Where nothing is lost it is -0.07 to 0.02 on seven simulated scenes and three recordings,
-with 0.5 to 2 ms 0.23 to 0.84 on four."""
+lost in the refractory period. Where nothing is lost it is 0 to 0.03 on seven simulated scenes and -0.03, 0.04 and 0.14
++- 0.05 on three recordings, with 0.5 to 2 ms 0.22 to 0.83 on four scenes."""
 
-_USUAL_EXCESS: Final = 0.02  # where nothing is lost: the mean of these
+_USUAL_EXCESS: Final = 0.02  # where nothing is lost
 
 _LEAST_GAIN: Final = 0.02
 """Share of the residual that the period found must take away. On the same four scenes it is 0.043 to 0.17, on edges of
