@@ -45,7 +45,7 @@ def advance(events, state, rate, step_variance, noise_rate, event_variance, thre
         for row in range(max(y - 1, 0), min(y + 2, height)):
             for column in range(max(x - 1, 0), min(x + 2, width)):
                 newest = max(newest, state.newest[row, column])
-        signal = 1.0 / (1.0 + 9.0 * noise_rate * (t - newest) * US)  # K5
+        signal = 1.0 / (1.0 + (9.0 * noise_rate * (t - newest) * US) ** 2)  # K5
         if event["p"]:
             step = state.step_on[y, x]
         else:

@@ -505,23 +505,28 @@ def hidden(pixels, place, moving, t, on, off):
     return 0.003 * c2 + change * 0.35 * between
 
 
-def regularised(level, variance, moving, difference):
-    """K12, of whole images."""
-    out = level.copy()
-    height, width = level.shape
-    for row, column in zip(*np.nonzero(moving), strict=True):
-        total, weights = level[row, column] / variance[row, column], 1 / variance[row, column]
-        for i in range(max(row - 1, 0), min(row + 2, height)):
-            for j in range(max(column - 1, 0), min(column + 2, width)):
-                if (i, j) == (row, column):
-                    continue
-                own = variance[i, j] + difference**2 * ((i - row) ** 2 + (j - column) ** 2)
-                both = variance[row, column] + own
-                excess = level[i, j] - level[row, column]
-                weight = (1 + excess**2 / (4 * both)) ** -2 / own
-                total, weights = total + weight * level[i, j], weights + weight
-        out[row, column] = total / weights
-    return out
+def regularised(level, variance, hears, difference):
+    """K12, of whole images: L and its variance, where pixels hear their neighbours."""
+    out, doubt = level.copy(), variance.copy()
+    around = [(down, right) for down in (-1, 0, 1) for right in (-1, 0, 1)]
+    inside = set(np.ndindex(level.shape))
+    for row, column in zip(*np.nonzero(hears), strict=True):
+        information, total = 1 / variance[row, column], level[row, column] / variance[row, column]
+        for down, right in around:
+            other, differs = (row + down, column + right), difference**2 * (down**2 + right**2)
+            if differs == 0 or other not in inside:
+                continue
+            unlike = 0.0
+            for i, j in around:
+                one, two = (row + i, column + j), (row + down + i, column + right + j)
+                if one in inside and two in inside:
+                    noise = variance[one] + variance[two] + differs / 8
+                    unlike += (level[two] - level[one]) ** 2 / noise
+            weight = (1 + unlike / 18) ** -2 / (variance[other] + differs)
+            information, total = information + weight, total + weight * level[other]
+        out[row, column] = total / information
+        doubt[row, column] = 0.5 * variance[row, column] + 0.5 / information
+    return out, doubt
 
 
 def unshown(split, settings, frames, t):

@@ -94,12 +94,14 @@ def test_engine_agrees_with_the_oracle(name, data):
         stretch = chosen.events.mismatch**2 / scale if scale > 0 else 0.0
         bound, noise, beyond = value, total, np.zeros(total.shape)
         unshown = ~np.isnan(excess[i])
+        top = np.log(white + chosen.camera.offset)
         if unshown.any():
-            top = np.log(white + chosen.camera.offset)
             value, total, beyond, noise = naive.lifted(value, total, excess[i], chosen, top)
         if chosen.filter.neighbours > 0:
-            total = total + hidden[i]
-            value = naive.regularised(value, total, moving[i], chosen.filter.neighbours)
+            hears = moving[i] | (value > top)
+            known = total + hidden[i]
+            value, total = naive.regularised(value, known, hears, chosen.filter.neighbours)
+            total = np.where(unshown, known, total)
         value = np.where(unshown, np.maximum(value, bound) + beyond**2 / 2, value)
         level = np.vectorize(lambda v, p: naive.intensity(v, p, chosen, white, stretch))(  # noqa: B023
             value, np.where(unshown, noise, total)

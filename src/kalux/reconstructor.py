@@ -452,14 +452,12 @@ class Reconstructor:
         change = estimate.silent_change
         if change is None and moving is not None:  # K11 needs it only there
             change = np.full(log_intensity.shape, UNKNOWN_CHANGE * on * off, np.float32)
-        intensity, total = read_out(
-            log_intensity, variance, offset, prior, moving, hidden, change, neighbours, pitch
+        pixels = None if unshown is None else unshown.pixels
+        intensity, total, heard = read_out(
+            log_intensity, variance, offset, prior, moving, hidden, change, neighbours, pitch, pixels
         )
         if unshown is not None:
-            bound = estimate.log_intensity
-            read_unshown(
-                intensity, log_intensity, total, bound, unshown, moving, offset, prior, neighbours, pitch
-            )
+            read_unshown(intensity, heard, estimate.log_intensity, unshown, offset, prior)
         image = Image(estimate.t, intensity, total, offset, estimate.final)
         return (
             image

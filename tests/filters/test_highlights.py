@@ -34,8 +34,11 @@ def unshown(pixels, excess, noise=0.0):
 def read(level, where, difference=0.0, moving=None, pitch=1, prior=PRIOR):
     bound = np.asarray(level, np.float32)
     raised, spread = lifted(bound, np.full(bound.shape, 0.01, np.float32), where)
-    image = intensity(raised, spread, OFFSET, prior)
-    read_unshown(image, raised, spread, bound, where, moving, OFFSET, prior, difference, pitch)
+    hidden = Hidden(0.0, 0.0, 0.0)
+    image, _, heard = read_out(
+        raised, spread, OFFSET, prior, moving, hidden, None, difference, pitch, where.pixels
+    )
+    read_unshown(image, heard, bound, where, OFFSET, prior)
     return image
 
 
@@ -67,8 +70,9 @@ def test_neighbours_are_heard_as_by_other_pixels(pitch):
     where = unshown(np.arange(0, 42, 3), 0.5, 0.02)
     moving = rng.random((6, 7)) < 0.8
     raised, spread = lifted(level, np.full((6, 7), 0.05, np.float32), where)
-    image = intensity(raised, spread, OFFSET, PRIOR)
-    read_unshown(image, raised, spread, level, where, moving, OFFSET, PRIOR, 0.3, pitch)
+    image = np.zeros_like(level)
+    told = read_out(raised, spread, OFFSET, PRIOR, moving, Hidden(0, 0, 0), None, 0.3, pitch, where.pixels)[2]
+    read_unshown(image, told, level, where, OFFSET, PRIOR)
     heard = regularised(raised, spread, moving, 0.3, pitch).reshape(-1)[where.pixels]
     assert (heard != raised.reshape(-1)[where.pixels]).any()
     least = np.maximum(heard, level.reshape(-1)[where.pixels])

@@ -13,14 +13,14 @@ from kalux.filters.readout import (
     HighlightPrior,
     believed_highlight,
     hidden_variance,
-    neighbour_weight,
+    likeness,
     read_out,
 )
 from kalux.settings import preset
 
 import naive
 
-OFF = HighlightPrior(white=0.0, scale2=0.0, stretch=0.0)
+OFF = HighlightPrior(white=np.inf, scale2=0.0, stretch=0.0)
 NOTHING_HIDDEN = Hidden(0.0, 0.0, 0.0)
 excesses = st.floats(0.0, 12.0)
 stretches = st.floats(1e-4, 2.0)
@@ -186,11 +186,65 @@ def test_still_and_well_known_pixels_stay():
     np.testing.assert_allclose(regularised(noisy, variance, moving, 0.1), noisy, atol=2e-4)
 
 
-@given(st.floats(-4.0, 4.0), st.floats(1e-4, 1.0), st.floats(1e-4, 1.0), st.floats(1e-4, 1.0))
-def test_a_neighbour_weighs_at_most_its_information(excess, own, other, allowed):
-    weight = neighbour_weight(*np.float32([excess, own, other, allowed]))
-    assert 0.0 < weight <= 1.0 / (other + allowed) * (1 + 1e-5)
-    assert weight == neighbour_weight(*np.float32([-excess, own, other, allowed]))
+def test_still_pixels_beyond_white_hear_their_neighbours():
+    """No frame has shown their texture."""
+    truth, noisy = noisy_edge()
+    still, variance = np.zeros(truth.shape, bool), np.full(truth.shape, 0.01, np.float32)
+    prior = HighlightPrior(white=1.0, scale2=0.0, stretch=0.0)
+    smooth = np.log(read_out(noisy, variance, 0.0, prior, still, NOTHING_HIDDEN, None, 0.1)[0])
+    assert np.mean((smooth - truth)[:, 15:] ** 2) < 0.4 * np.mean((noisy - truth)[:, 15:] ** 2)
+    np.testing.assert_allclose(smooth[:, :15], noisy[:, :15], atol=1e-6)
+
+
+@pytest.mark.parametrize("neighbour", [1e-6, 0.04, 1e6])
+def test_the_variance_falls_by_what_neighbours_do_not_share(neighbour):
+    """To half of it and half of what independent errors would leave."""
+    variance, moving = np.full((5, 5), neighbour, np.float32), np.zeros((5, 5), bool)
+    variance[2, 2], moving[2, 2] = 0.04, True
+    left = read_out(np.zeros((5, 5)), variance, 0.0, OFF, moving, NOTHING_HIDDEN, None, 0.1)[1]
+    independent = 1 / (1 / 0.04 + 4 / (neighbour + 0.01) + 4 / (neighbour + 0.02))
+    assert left[2, 2] == pytest.approx(0.02 + 0.5 * independent, rel=1e-5)
+    np.testing.assert_array_equal(left[~moving], variance[~moving])
+
+
+def test_patches_tell_a_faint_edge_from_noise():
+    """Of a difference of three standard deviations an edge keeps more than a single pixel, which is noise."""
+    edge, single = np.zeros((2, 20, 30), np.float32)
+    edge[:, 15:] = single[10, 15] = 0.3
+    variance, moving = np.full((20, 30), 0.01, np.float32), np.ones((20, 30), bool)
+    across = np.diff(regularised(edge, variance, moving, 0.1)[10, 14:16])[0]
+    alone = regularised(single, variance, moving, 0.1)[10, 15]
+    assert across > 0.2
+    assert alone < 0.12
+
+
+@given(st.floats(0.0, 1e6), st.floats(0.0, 1e6))
+def test_likeness_is_a_share_and_falls(unlike, more):
+    near, far = (float(likeness(np.float32(value))) for value in (unlike, unlike + more))
+    assert 0.0 < far <= near <= 1.0
+
+
+def test_pixels_beyond_what_hears_change_nothing():
+    """Where rows and columns without pixels that hear are passed over, those beside are what they are alone."""
+    rng = np.random.default_rng(2)
+    level = rng.normal(0.0, 0.3, (40, 200)).astype(np.float32)
+    variance = np.full(level.shape, 0.005, np.float32)
+    few = np.zeros(level.shape, bool)
+    few[[3, 17, 18, 39], [2, 63, 64, 199]] = True
+    alone, all_of_them = (regularised(level, variance, hears, 0.2) for hears in (few, np.ones_like(few)))
+    np.testing.assert_array_equal(alone[few], all_of_them[few])
+    np.testing.assert_allclose(alone[~few], level[~few], atol=1e-6)
+
+
+def test_pixels_that_no_frame_has_shown_are_told_as_they_are_read():
+    """Their variance is not lessened."""
+    truth, noisy = noisy_edge()
+    variance, pixels = np.full(truth.shape, 0.01, np.float32), np.array([0, 29, 30, 444, 599])
+    given = noisy, variance, 0.0, OFF, np.ones(truth.shape, bool), NOTHING_HIDDEN, None, 0.1, 1
+    image, left, levels = read_out(*given, pixels)
+    np.testing.assert_allclose(np.exp(levels), image.reshape(-1)[pixels], rtol=1e-6)
+    np.testing.assert_array_equal(left.reshape(-1)[pixels], variance.reshape(-1)[pixels])
+    assert np.count_nonzero(left == variance) == len(pixels)
 
 
 @pytest.mark.parametrize(("shape", "moves"), [((3, 5), 0.6), ((7, 100), 0.02), ((6, 64), 0.5)])
@@ -207,11 +261,11 @@ def test_images_are_the_oracles(shape, moves, pitch):
     given = value.astype(np.float32), variance.astype(np.float32)
     found = read_out(*given, offset, prior, moving, hidden, change, 0.3, pitch)
     total = variance + np.where(moving, hidden.moving, hidden.still + hidden.changing * change)
-    level = np.empty(shape)
+    hears, level = moving | (value > prior.white), np.empty(shape)
     for part in np.ndindex(pitch, pitch):  # a mosaic's colours know nothing of each other
         own = np.s_[part[0] :: pitch, part[1] :: pitch]
-        level[own] = naive.regularised(value[own], total[own], moving[own], 0.3 * pitch)
+        level[own], total[own] = naive.regularised(value[own], total[own], hears[own], 0.3 * pitch)
     expected = np.vectorize(lambda v, p: naive.intensity(v, p, chosen, white, stretch))(level, total)
-    np.testing.assert_allclose(found[1], total, rtol=1e-6)
+    np.testing.assert_allclose(found[1], total, rtol=1e-5)
     np.testing.assert_allclose(found[0], expected, rtol=1e-5, atol=1e-6)
     assert (value > prior.white).sum() > 2

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.highlights import Unshown
-from kalux.compiled import ONE, exponential
-from kalux.filters.readout import HighlightPrior, believed_highlight, neighbour_weight
+from kalux.compiled import exponential
+from kalux.filters.readout import HighlightPrior, believed_highlight
 
 Floats = NDArray[np.floating[Any]]
 
@@ -47,15 +47,11 @@ def lifted(log_intensity: Floats, variance: Floats, unshown: Unshown) -> tuple[F
 
 def read_unshown(
     image: NDArray[np.float32],
-    level: Floats,
-    variance: NDArray[np.float32],
+    heard: Floats,
     bound: Floats,
     unshown: Unshown,
-    moving: NDArray[np.bool_] | None,
     log_offset: float,
     prior: HighlightPrior,
-    difference: float,
-    pitch: int,
 ) -> None:
     """Pixels that no frame has shown are given the mean of their intensity. In place.
 
@@ -63,47 +59,17 @@ def read_unshown(
     ----------
     image
         (H, W) I.
-    level, variance
-        (H, W) L of `lifted`, and its variance (K11).
+    heard
+        (N,) L of these pixels of `lifted`, after their neighbours are heard (K12).
     bound
-        (H, W) L: what neighbours say of a pixel (K12) does not take it below.
-    moving, difference, pitch
-        Of K12, as in `kalux.filters.readout`.
+        (H, W) L: what neighbours say of a pixel does not take it below.
     log_offset, prior
         I_0, and the prior on highlights (K6), which is to doubt what events say of them, not that they are bright.
     """
-    if moving is None or difference == 0:
-        moving = np.zeros(image.shape, np.bool_)
-    mean = np.empty(len(unshown.pixels), np.float32)
-    difference2 = np.float32(difference * difference)
-    _hear_neighbours(unshown.pixels, level, variance, bound, moving, difference2, pitch, mean)
+    mean = np.maximum(heard, bound.reshape(-1)[unshown.pixels]).astype(np.float32)
     white, scale2, stretch = (np.float32(value) for value in prior)
     _take_mean(unshown.excess, unshown.noise, np.float32(log_offset), white, scale2, stretch, mean)
     image.reshape(-1)[unshown.pixels] = mean
-
-
-@nb.njit(cache=True, nogil=True, error_model="numpy")
-def _hear_neighbours(pixels, level, variance, bound, moving, difference2, pitch, heard):  # type: ignore[no-untyped-def]
-    """K12 of single pixels: L, at least the bound."""
-    height, width = level.shape
-    for i in range(len(pixels)):
-        row, column = divmod(pixels[i], width)
-        own, doubt = np.float32(level[row, column]), np.float32(variance[row, column])
-        heard[i] = own
-        if not moving[row, column]:
-            continue
-        information, deviation = ONE / doubt, np.float32(0.0)
-        for down in range(-1, 2):
-            for right in range(-1, 2):
-                y, x = row + down * pitch, column + right * pitch
-                inside = 0 <= y < height and 0 <= x < width
-                if inside and (down != 0 or right != 0):
-                    excess = np.float32(level[y, x]) - own
-                    allowed = difference2 * np.float32(pitch * pitch * (down * down + right * right))
-                    weight = neighbour_weight(excess, doubt, np.float32(variance[y, x]), allowed)
-                    deviation += weight * excess
-                    information += weight
-        heard[i] = max(own + deviation / information, np.float32(bound[row, column]))
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")

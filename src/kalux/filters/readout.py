@@ -29,11 +29,53 @@ _NOTHING: Final = np.float32(1e9)
 """Variance of a pixel that knows nothing; its square is still a float32."""
 
 _BLOCK: Final = 32
-"""Pixels of a row that are looked at together: those of a block where nothing moves are not compared with their
-neighbours, and those of one without highlights are not searched for them."""
+"""Pixels of a row that are looked at together: those of a block without highlights are not searched for them."""
 
 _MARGIN: Final = 16
-"""Pixels that know nothing on both sides of a row, at least as many as the pitch: the border needs no special case."""
+"""Pixels that know nothing on both sides of a row, at least three times the pitch: the border needs no special case."""
+
+SHARED: Final = np.float32(0.5)
+"""Correlation of the errors of neighbours where P is over 0.03: 0.1 to 0.5 on eleven simulated scenes; those of real
+sensors, whose thresholds and bandwidth are wrong for all pixels alike, are not less alike."""
+
+_SLACK: Final = np.float32(1 / 8)
+"""Of the variance by which neighbours differ, the part by which alike patches differ beyond their noise."""
+
+_HALF_OF_PATCH: Final = np.float32(1 / 18)
+"""From the sum over a patch of nine to half its mean."""
+
+_DIRECTIONS: Final = ((0, 1), (1, -1), (1, 0), (1, 1))
+"""Rows and columns to four neighbours; the other four are those to whom a pixel is one of these."""
+
+
+class _Ring(NamedTuple):
+    """Rows around the one that is read out, each in the place of its number modulo theirs, between margins.
+
+    Attributes
+    ----------
+    levels, doubts
+        (R, W) L and its variance.
+    hears, spans
+        (R, W) whether pixels hear their neighbours, and (R, 2) between which columns any of a row do.
+    unlike
+        (4, R, W): how unlike pixels are to those in `_DIRECTIONS`, the sum of three in a row.
+    alike
+        (4, R, W): `likeness` to them.
+    near, far
+        (R, W): information that a neighbour has about a pixel beside it, and about one diagonally away.
+    scratch
+        (4, W).
+    """
+
+    levels: NDArray[np.float32]
+    doubts: NDArray[np.float32]
+    hears: NDArray[np.uint8]
+    spans: NDArray[np.int64]
+    unlike: NDArray[np.float32]
+    alike: NDArray[np.float32]
+    near: NDArray[np.float32]
+    far: NDArray[np.float32]
+    scratch: NDArray[np.float32]
 
 
 class HighlightPrior(NamedTuple):
@@ -121,16 +163,11 @@ def total_variance(variance, moving, change, hidden):  # type: ignore[no-untyped
     return variance + (of_moving if moving else still + changing * change)
 
 
-@nb.njit(cache=True, inline="always")
-def neighbour_weight(excess, variance, neighbour_variance, allowed):  # type: ignore[no-untyped-def]
-    """Information that a neighbour has about a pixel; ``excess`` is the difference of their L.
-
-    1 / (P' + s^2) (1 + excess^2 / (4 v))^-2 with v = P + P' + s^2: near exp(-excess^2 / (2 v)), with one division.
-    """
-    own = neighbour_variance + allowed
-    both = variance + own
-    edge = both + np.float32(0.25) * excess * excess
-    return both * both / (own * edge * edge)
+@nb.njit(cache=True, inline="always", error_model="numpy")
+def likeness(unlikeness):  # type: ignore[no-untyped-def]
+    """How far two pixels are of one surface, 0 to 1, of the sum over a patch of e^2 / (P + P' + slack)."""
+    edge = ONE + unlikeness * _HALF_OF_PATCH
+    return ONE / (edge * edge)
 
 
 def read_out(
@@ -143,12 +180,14 @@ def read_out(
     silent_change: Array | None = None,
     difference: float = 0.0,
     pitch: int = 1,
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    unshown: NDArray[np.int64] | None = None,
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """I of a state, and the variance of its logarithm; in one pass over the rows, none of which is stored in between.
 
-    Neighbours (docs/equations.md, K12): L of a moving pixel becomes the mean of itself and its eight neighbours,
-    weighted by the information that each has about it. A neighbour at distance d differs by a normal amount of variance
-    ``difference``^2 d^2, unless there is an edge between, which a difference beyond what both variances explain tells.
+    Neighbours (docs/equations.md, K12): L of a pixel that moves, or is beyond white, becomes the mean of itself and its
+    eight neighbours, weighted by the information that each has about it. A neighbour at distance d differs by a normal
+    amount of variance ``difference``^2 d^2, unless there is an edge between, which patches around both tell that differ
+    by more than their variances explain.
 
     Parameters
     ----------
@@ -170,6 +209,9 @@ def read_out(
         nothing.
     pitch
         Distance of the neighbours: 2 in a Bayer mosaic, whose pixels repeat their colours.
+    unshown
+        (N,) pixels in the flattened image, ascending, that no frame has shown: their L is wanted as well, and
+        neighbours do not lessen their variance, since what they hide (K15) all of them hide alike.
 
     Returns
     -------
@@ -177,7 +219,11 @@ def read_out(
         (H, W) float32: linear, 1 = a saturated frame pixel at the reference exposure, never negative.
     variance : ndarray
         (H, W) float32.
+    levels : ndarray
+        (N,) float32: L of the ``unshown`` pixels, after their neighbours are heard.
     """
+    unshown = np.empty(0, np.int64) if unshown is None else unshown
+    heard = np.empty(len(unshown), np.float32)
     known = variance.astype(np.float32, copy=False)
     out = np.empty(log_intensity.shape, np.float32)
     total = known if moving is None else np.empty_like(out)
@@ -191,10 +237,12 @@ def read_out(
         pitch,
         tuple(np.float32(value) for value in prior),
         np.float32(log_offset),
+        unshown,
         out,
         total,
+        heard,
     )
-    return out, total
+    return out, total, heard
 
 
 def _plane(values: Array | None, shape: tuple[int, ...]) -> NDArray[np.float32]:
@@ -206,38 +254,70 @@ def _plane(values: Array | None, shape: tuple[int, ...]) -> NDArray[np.float32]:
 
 @nb.njit(cache=True, nogil=True, error_model="numpy", fastmath=FUSED)
 def _read_out(  # type: ignore[no-untyped-def]
-    log_intensity, variance, moving, change, hidden, allowed, pitch, prior, log_offset, out, total
+    log_intensity,
+    variance,
+    moving,
+    change,
+    hidden,
+    allowed,
+    pitch,
+    prior,
+    log_offset,
+    unshown,
+    out,
+    total,
+    heard,
 ):
     white, scale2, _ = prior
     height, width = log_intensity.shape
     size = (width + _BLOCK - 1) // _BLOCK * _BLOCK
-    # The rows that neighbours of one row lie in, each in the place of its number modulo theirs, between margins.
-    count = 2 * pitch + 1
-    levels = np.zeros((count, size + 2 * _MARGIN), np.float32)
-    doubts = np.full(levels.shape, _NOTHING)
+    told = moving.size > 0
+    hear = told and allowed > np.float32(0.0)
+    # A row's neighbours and the patches around them lie in rows to three times the pitch ahead and one behind.
+    count = 4 * pitch + 1
+    spans = np.zeros((count, 2), np.int64)
+    spans[:, 0] = size
+    ring = _Ring(
+        np.zeros((count, size + 2 * _MARGIN), np.float32),
+        np.full((count, size + 2 * _MARGIN), _NOTHING),
+        np.zeros((count, size), np.uint8),
+        spans,
+        np.zeros((4, count, size + 2 * _MARGIN), np.float32),
+        np.zeros((4, count, size + 2 * _MARGIN), np.float32),
+        np.zeros((count, size + 2 * _MARGIN), np.float32),
+        np.zeros((count, size + 2 * _MARGIN), np.float32),
+        np.zeros((4, size + 2 * _MARGIN), np.float32),
+    )
     level, marks = np.empty(size, np.float32), np.zeros(size, np.uint8)
     words = marks.view(np.uint64)
     places, excess, doubt = np.empty(size, np.uint64), np.empty(size, np.float32), np.empty(size, np.float32)
-    told = moving.size > 0
-    for row in range(-pitch if told else 0, height):
-        following, below = np.uint64(row + pitch), np.uint64((row + pitch) % count)
-        if told and following < np.uint64(height):
-            _take_row(
-                log_intensity, variance, moving, change, hidden, following, total, levels, doubts, below
-            )
+    met = 0
+    for row in range(-3 * pitch if told else 0, height):
+        following = row + 3 * pitch
+        if told and following < height:
+            _take_row(log_intensity, variance, moving, change, hidden, np.uint64(following), total, ring)
         elif told:
-            for column in range(np.uint64(size + 2 * _MARGIN)):
-                doubts[below, column] = _NOTHING
+            ring.doubts[following % count] = _NOTHING
+        first, last = size, 0
+        if hear:
+            _mark_hearing(moving, log_intensity, white, following, ring)
+            for place in range(count):
+                first, last = min(first, ring.spans[place, 0]), max(last, ring.spans[place, 1])
+        if first < last and row + pitch >= 0:
+            _compare(row + pitch, first, last, allowed, pitch, ring)
         if row < 0:
             continue
-        at, above, here = np.uint64(row), np.uint64((row - pitch) % count), np.uint64(row % count)
+        at = np.uint64(row)
         for column in range(np.uint64(width)):
             level[column] = log_intensity[at, column]
-        if told:
-            for column in range(np.uint64(width)):
-                marks[column] = moving[at, column]
-        if told and allowed > np.float32(0.0) and _any(words, 0, size):
-            _regularise(levels, doubts, above, here, below, marks, words, allowed, pitch, level)
+        if first < last:
+            _hear_neighbours(row, first, min(last, width), allowed, pitch, ring, level, total)
+        while met < len(unshown) and unshown[met] < (row + 1) * width:
+            place = unshown[met] - row * width
+            heard[met] = level[place]
+            if told:
+                total[row, place] = ring.doubts[row % count, place + _MARGIN]
+            met += 1
         for column in range(np.uint64(width)):
             marks[column] = level[column] > white
             out[at, column] = max(exponential(level[column]) - log_offset, np.float32(0.0))
@@ -256,50 +336,99 @@ def _any(words, first, count):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, inline="always")
 def _take_row(  # type: ignore[no-untyped-def]
-    log_intensity, variance, moving, change, hidden, row, total, levels, doubts, place
+    log_intensity, variance, moving, change, hidden, row, total, ring
 ):
     """K11 of a row, and what its neighbours need to know of it."""
+    place = row % np.uint64(len(ring.levels))
     for column in range(np.uint64(total.shape[1])):
         at = column + np.uint64(_MARGIN)
         known = total_variance(variance[row, column], moving[row, column], change[row, column], hidden)
         total[row, column] = known
-        doubts[place, at] = known if known < _NOTHING else _NOTHING
-        levels[place, at] = log_intensity[row, column]
+        ring.doubts[place, at] = known if known < _NOTHING else _NOTHING
+        ring.levels[place, at] = log_intensity[row, column]
 
 
-@nb.njit(cache=True, inline="always", error_model="numpy")
-def _regularise(  # type: ignore[no-untyped-def]
-    levels, doubts, above, here, below, moves, words, allowed, pitch, level
-):
-    """K12 of a row: its L in ``level``, where the pixel moves."""
+@nb.njit(cache=True)
+def _mark_hearing(moving, log_intensity, white, row, ring):  # type: ignore[no-untyped-def]
+    """Which pixels of a row hear their neighbours, and from which block of columns to which; none outside the image."""
+    place = np.uint64(row % len(ring.levels))
+    first, last = ring.hears.shape[1], 0
+    words = ring.hears[place].view(np.uint64)
+    if row < len(moving):
+        at = np.uint64(row)
+        for column in range(np.uint64(moving.shape[1])):
+            ring.hears[place, column] = moving[at, column] | (log_intensity[at, column] > white)
+        for block in range(0, ring.hears.shape[1], _BLOCK):
+            if _any(words, block, _BLOCK):
+                first, last = min(first, block), block + _BLOCK
+    ring.spans[place, 0], ring.spans[place, 1] = first, last
+
+
+# Positions are counted from the first of a loop, so that none is below another: unsigned numbers that wrap around keep
+# a loop from becoming vector code.
+
+
+@nb.njit(cache=True, error_model="numpy", fastmath=FUSED)
+def _compare(row, first, last, allowed, pitch, ring):  # type: ignore[no-untyped-def]
+    """How unlike a row's pixels are to those in `_DIRECTIONS`, where columns ``first`` to ``last`` need it."""
+    count = len(ring.levels)
+    here, below = np.uint64(row % count), np.uint64((row + pitch) % count)
+    levels, doubts, single, unlike = ring.levels, ring.doubts, ring.scratch, ring.unlike
+    start, size = _MARGIN + first - 2 * pitch, np.uint64(last - first + 4 * pitch)
+    own, left, right = np.uint64(start), np.uint64(pitch), np.uint64(2 * pitch)
+    for k in range(np.uint64(4)):
+        down, across = _DIRECTIONS[k]
+        there, other = below if down == 1 else here, np.uint64(start + across * pitch)
+        slack = allowed * np.float32(pitch * pitch * (down + across * across)) * _SLACK
+        for i in range(size):
+            excess = levels[there, other + i] - levels[here, own + i]
+            single[k, i] = excess * excess / (doubts[here, own + i] + doubts[there, other + i] + slack)
+        for i in range(size - np.uint64(2 * pitch)):
+            unlike[k, here, own + left + i] = single[k, i] + single[k, left + i] + single[k, right + i]
     near, far = allowed * np.float32(pitch * pitch), allowed * np.float32(2 * pitch * pitch)
-    for first in range(0, len(level), _BLOCK):
-        if not _any(words, first, _BLOCK):
-            continue
-        for i in range(_BLOCK):
-            column = np.uint64(first) + np.uint64(i)
-            at = column + np.uint64(_MARGIN)
-            left, right = at - np.uint64(pitch), at + np.uint64(pitch)
-            own = levels[here, at], doubts[here, at]
-            mean = ONE / own[1], np.float32(0.0)
-            mean = _with_neighbour(mean, own, levels[above, left], doubts[above, left], far)
-            mean = _with_neighbour(mean, own, levels[above, at], doubts[above, at], near)
-            mean = _with_neighbour(mean, own, levels[above, right], doubts[above, right], far)
-            mean = _with_neighbour(mean, own, levels[here, left], doubts[here, left], near)
-            mean = _with_neighbour(mean, own, levels[here, right], doubts[here, right], near)
-            mean = _with_neighbour(mean, own, levels[below, left], doubts[below, left], far)
-            mean = _with_neighbour(mean, own, levels[below, at], doubts[below, at], near)
-            mean = _with_neighbour(mean, own, levels[below, right], doubts[below, right], far)
-            information, deviation = mean
-            level[column] = own[0] + deviation / information if moves[column] else own[0]
+    for i in range(size):
+        ring.near[here, own + i] = ONE / (doubts[here, own + i] + near)
+    for i in range(size):
+        ring.far[here, own + i] = ONE / (doubts[here, own + i] + far)
 
 
-@nb.njit(cache=True, inline="always", error_model="numpy")
-def _with_neighbour(mean, own, level, doubt, allowed):  # type: ignore[no-untyped-def]
-    """(information, sum of weighted differences) of a mean, with one more neighbour."""
-    excess = level - own[0]
-    weight = neighbour_weight(excess, own[1], doubt, allowed)
-    return mean[0] + weight, mean[1] + weight * excess
+@nb.njit(cache=True, error_model="numpy", fastmath=FUSED)
+def _hear_neighbours(row, first, last, allowed, pitch, ring, level, total):  # type: ignore[no-untyped-def]
+    """K12 of a row: L of the pixels that hear their neighbours in ``level``, their variances in ``total``."""
+    count = len(ring.levels)
+    here, above = np.uint64(row % count), np.uint64((row - pitch) % count)
+    below = np.uint64((row + pitch) % count)
+    levels, doubts, alike, unlike = ring.levels, ring.doubts, ring.alike, ring.unlike
+    information, deviation = ring.scratch[0], ring.scratch[1]
+    column, own, size = np.uint64(first), np.uint64(_MARGIN + first), np.uint64(last - first)
+    for i in range(size):
+        information[i] = ONE / doubts[here, own + i]
+        deviation[i] = np.float32(0.0)
+    for k in range(np.uint64(4)):
+        down, across = _DIRECTIONS[k]
+        start = np.uint64(_MARGIN + first - pitch)
+        for i in range(size + np.uint64(2 * pitch)):
+            at = start + i
+            alike[k, here, at] = likeness(unlike[k, above, at] + unlike[k, here, at] + unlike[k, below, at])
+        least = ring.far if down * across != 0 else ring.near
+        onward, back = (below, above) if down == 1 else (here, here)
+        after = np.uint64(_MARGIN + first + across * pitch)
+        before = np.uint64(_MARGIN + first - across * pitch)
+        for i in range(size):
+            weight = alike[k, here, own + i] * least[onward, after + i]
+            other = alike[k, back, before + i] * least[back, before + i]
+            level_here = levels[here, own + i]
+            information[i] += weight + other
+            deviation[i] += weight * (levels[onward, after + i] - level_here) + other * (
+                levels[back, before + i] - level_here
+            )
+    for i in range(size):
+        heard = levels[here, own + i] + deviation[i] / information[i]
+        level[column + i] = heard if ring.hears[here, column + i] else level[column + i]
+    at = np.uint64(row)
+    for i in range(size):
+        left = SHARED * doubts[here, own + i] + (ONE - SHARED) / information[i]
+        total[at, column + i] = left if ring.hears[here, column + i] else total[at, column + i]
 
 
 @nb.njit(cache=True, inline="always", error_model="numpy")
