@@ -115,6 +115,16 @@ def moving_blocks(
     return simulate(scene, sensor, exposures=exposures)
 
 
+def dark_scene(seed=0):
+    """A pan over texture from 0.005 to 1 of white."""
+    noise = np.random.default_rng(seed).standard_normal((40, 90))
+    for _ in range(3):
+        noise = (noise + np.roll(noise, 1, 0) + np.roll(noise, 1, 1)) / 3
+    share = (noise - noise.min()) / np.ptp(noise)
+    image = 0.005 * 200**share
+    return photograph_scene(image, pan(80), sensor_size=(36, 48), duration=600_000)
+
+
 @lru_cache(maxsize=4)
 def colour_blocks(
     mosaic: str | None = None,

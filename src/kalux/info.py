@@ -348,6 +348,7 @@ ORIGINS: Final = {
 }
 """What to call where thresholds come from (`kalux.pipeline.ThresholdOrigin`)."""
 
+_NOTABLE_SHARE: Final = 0.05
 _GIVEN: Final = "given"
 _USUAL: Final = ORIGINS["assumed"]
 
@@ -363,13 +364,10 @@ def settled(recording: Recording, plan: Plan, asked: Settings) -> list[tuple[str
         The settings before the plan filled in what was missing; what they state is said to be given.
     """
     camera, events = plan.settings.camera, plan.settings.events
-    origin = ORIGINS[plan.threshold_origin]
-    if plan.estimate is not None:
-        origin += f" from {plan.estimate.samples:,} samples, residual {plan.estimate.residual:.2f}"
     rows = [
         (
             "thresholds",
-            f"on {events.threshold_on:.3f}, off {events.threshold_off:.3f} log intensity ({origin})",
+            f"on {events.threshold_on:.3f}, off {events.threshold_off:.3f} log intensity ({_threshold_origin(plan)})",
         ),
         ("delay", f"events {events.lateness * 1e-3:g} ms late ({_delay_origin(plan, asked)})"),
         (
@@ -390,7 +388,7 @@ def settled(recording: Recording, plan: Plan, asked: Settings) -> list[tuple[str
         what = (
             f"{events.refractory_period * 1e-3:g} ms" if events.refractory_period else "nothing is lost in it"
         )
-        rows.append(("refractory", f"{what} ({_model_origin(plan, asked.events.refractory_period)})"))
+        rows.append(("refractory", f"{what} ({_refractory_origin(plan, asked)})"))
     if events.threshold_spread is not None:
         how = _estimated(asked.events.threshold_spread, plan.mismatch is not None)
         rows.append(
@@ -423,6 +421,28 @@ def settled(recording: Recording, plan: Plan, asked: Settings) -> list[tuple[str
     if camera.white_balance != asked.camera.white_balance:
         rows.append(("white balance", f"{camera.white_balance} for red, green, blue (measured)"))
     return rows
+
+
+def _threshold_origin(plan: Plan) -> str:
+    found = plan.estimate
+    if found is None or plan.threshold_origin not in ("estimate", "assumed"):
+        return ORIGINS[plan.threshold_origin]
+    if plan.threshold_origin == "assumed":
+        return (
+            f"{100 * found.usual_share:.0f} % usual of the preset, as the recording hardly tells: +- "
+            f"{100 * found.spread:.0f} %"
+        )
+    text = f"{ORIGINS['estimate']} from {found.samples:,} samples, residual {found.residual:.2f}"
+    text += f": +- {100 * found.spread:.0f} %"
+    if found.usual_share > _NOTABLE_SHARE:
+        text += f"; {100 * found.usual_share:.0f} % is the usual of the preset, as little moves"
+    return text
+
+
+def _refractory_origin(plan: Plan, asked: Settings) -> str:
+    if asked.events.refractory_period is not None:
+        return _GIVEN
+    return _USUAL if plan.estimate is None else f"estimated from {plan.estimate.samples:,} samples"
 
 
 def _delay_origin(plan: Plan, asked: Settings) -> str:

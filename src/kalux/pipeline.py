@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.ahead import ahead
-from kalux.calibration.contrast import ThresholdEstimate, estimate_thresholds
+from kalux.calibration.contrast import ThresholdEstimate, Usual, estimate_thresholds
 from kalux.calibration.delay import DelayEstimate, estimate_delay
 from kalux.calibration.event_model import EventModel, estimate_event_model
 from kalux.calibration.frame_noise import FrameNoise, estimate_frame_noise
@@ -30,7 +30,7 @@ from kalux.models.colour import white_balance
 from kalux.models.pixels import PixelCalibration, require_size
 from kalux.reconstructor import Estimate, Image, Reconstructor
 from kalux.recording import Recording
-from kalux.settings import Settings, chosen_response
+from kalux.settings import EventSettings, Settings, chosen_response
 from kalux.settings import preset as named_preset
 from kalux.smoothing import Backward, combine, reversed_settings
 
@@ -55,11 +55,12 @@ class Plan:
     Attributes
     ----------
     settings
-        With thresholds, delay, frame noise, I_0, step variance, reference exposure and white balance filled in.
+        With thresholds, refractory period, delay, frame noise, I_0, step variance, reference exposure and white balance
+        filled in.
     threshold_origin
         Whether the thresholds come from the settings, the recording, a calibration, an estimate, or are assumed.
     estimate
-        The fit, where there was one.
+        The fit of the thresholds and the refractory period, where there was one.
     delay_estimate
         The fit of the events' delay, where there was one.
     event_model
@@ -129,15 +130,13 @@ def plan(
     chosen, noise = _with_frame_noise(recording, chosen)
     chosen, delay = _with_delay(recording, chosen)
     filled, origin, estimate = _with_thresholds(recording, chosen)
-    filled, model = _with_event_model(recording, filled, estimate is not None)
-    if estimate is not None and _was_for_others(chosen, filled):
-        unfilled = dataclasses.replace(
-            filled.events,
-            threshold_on=chosen.events.threshold_on,
-            threshold_off=chosen.events.threshold_off,
-        )
+    filled, model = _with_event_model(recording, filled)
+    decides = estimate is not None and (origin in ("estimate", "assumed") or estimate.refractory_period > 0)
+    if decides and chosen.camera.offset != filled.camera.offset:
+        unfilled = dataclasses.replace(chosen.events, step_variance=filled.events.step_variance)
         filled, origin, estimate = _with_thresholds(recording, dataclasses.replace(filled, events=unfilled))
-    filled, mismatch = _with_mismatch(recording, filled)
+    unsure = estimate.spread if estimate is not None and origin in ("estimate", "assumed") else 0.0
+    filled, mismatch = _with_mismatch(recording, filled, unsure)
     filled, background = _with_background(recording, filled)
     if origin == "settings" and _are_calibrated(filled, known):
         origin = "calibration"
@@ -424,41 +423,55 @@ def _with_frame_noise(recording: Recording, settings: Settings) -> tuple[Setting
 def _with_thresholds(
     recording: Recording, settings: Settings
 ) -> tuple[Settings, ThresholdOrigin, ThresholdEstimate | None]:
-    """Fill in the thresholds: from the settings, else the recording, else an estimate, else the usual."""
+    """Fill in thresholds and refractory period: from the settings, else the recording, else an estimate, else usual."""
     events = settings.events
-    if events.threshold_on is not None and events.threshold_off is not None:
-        return settings, "settings", None
-    estimate = None
-    origin: ThresholdOrigin = "recording"
-    found = recording.contrast_threshold
-    if found is None:
-        paper = settings.filter.augmentation == "paper"
-        estimate = estimate_thresholds(
-            recording,
-            settings.camera,
-            of_log_offset=paper,
-            delay=events.delay or 0,
-            refractory_period=events.refractory,
-        )
-        if estimate is None:
-            return dataclasses.replace(settings, events=events.assuming()), "assumed", None
-        origin = "estimate"
-        found = (estimate.on, estimate.off)
-    events = dataclasses.replace(
+    stated = (recording.contrast_threshold or (None, None)) if not _has_thresholds(events) else (None, None)
+    origin: ThresholdOrigin = "settings" if _has_thresholds(events) else "recording"
+    known = dataclasses.replace(
         events,
-        threshold_on=events.threshold_on if events.threshold_on is not None else found[0],
-        threshold_off=events.threshold_off if events.threshold_off is not None else found[1],
+        threshold_on=stated[0] if events.threshold_on is None else events.threshold_on,
+        threshold_off=stated[1] if events.threshold_off is None else events.threshold_off,
     )
-    return dataclasses.replace(settings, events=events), origin, estimate
+    finds_period = _uses_steps(settings) and events.refractory_period is None
+    if _has_thresholds(known) and not finds_period:
+        return dataclasses.replace(settings, events=known), origin, None
+    usual = Usual(events.usual_threshold_on, events.usual_threshold_off, events.usual_spread)
+    if known.threshold_on is not None and known.threshold_off is not None:
+        usual = Usual(known.threshold_on, known.threshold_off, 0.0)
+    estimate = estimate_thresholds(
+        recording,
+        settings.camera,
+        usual,
+        of_log_offset=settings.filter.augmentation == "paper",
+        delay=events.delay or 0,
+        refractory_period=events.refractory_period if _uses_steps(settings) else 0,
+    )
+    if finds_period:
+        period = 0 if estimate is None else estimate.refractory_period
+        known = dataclasses.replace(known, refractory_period=period)
+    if not _has_thresholds(known):
+        origin = "assumed" if estimate is None or estimate.usual_share > 0.5 else "estimate"
+        known = known.assuming() if estimate is None else _estimated(known, estimate)
+    return dataclasses.replace(settings, events=known), origin, estimate
 
 
-def _with_event_model(
-    recording: Recording, settings: Settings, thresholds_are_estimated: bool
-) -> tuple[Settings, EventModel | None]:
-    """Fill in I_0, variance of steps and refractory period: from the settings, else an estimate, else the usual."""
+def _has_thresholds(events: EventSettings) -> bool:
+    return events.threshold_on is not None and events.threshold_off is not None
+
+
+def _estimated(events: EventSettings, estimate: ThresholdEstimate) -> EventSettings:
+    """With the estimated thresholds where none is set."""
+    return dataclasses.replace(
+        events,
+        threshold_on=estimate.on if events.threshold_on is None else events.threshold_on,
+        threshold_off=estimate.off if events.threshold_off is None else events.threshold_off,
+    )
+
+
+def _with_event_model(recording: Recording, settings: Settings) -> tuple[Settings, EventModel | None]:
+    """Fill in I_0 and the variance of steps: from the settings, else an estimate, else the usual."""
     camera, events = settings.camera, settings.events
-    of_steps = (events.step_variance, events.refractory_period) if _uses_steps(settings) else ()
-    if None not in (camera.log_offset, *of_steps):
+    if camera.log_offset is not None and (events.step_variance is not None or not _uses_steps(settings)):
         return settings, None
     assert events.threshold_on is not None
     assert events.threshold_off is not None
@@ -469,29 +482,31 @@ def _with_event_model(
         delay=events.delay or 0,
         threshold_spread=events.mismatch,
         quantisation_variance=events.quantisation_variance,
-        refractory_period=events.refractory_period if _uses_steps(settings) else 0,
-        thresholds_are_estimated=thresholds_are_estimated,
+        refractory_period=events.refractory if _uses_steps(settings) else 0,
     )
     if model is not None:
         if camera.log_offset is None:
             camera = dataclasses.replace(camera, log_offset=model.log_offset)
         if events.step_variance is None:
             events = dataclasses.replace(events, step_variance=model.step_variance)
-        if events.refractory_period is None:
-            events = dataclasses.replace(events, refractory_period=model.refractory_period)
     # What could not be estimated is written down as it will be used.
     camera = dataclasses.replace(camera, log_offset=camera.offset)
-    events = dataclasses.replace(events, step_variance=events.step_noise, refractory_period=events.refractory)
+    events = dataclasses.replace(events, step_variance=events.step_noise)
     return dataclasses.replace(settings, camera=camera, events=events), model
 
 
-def _with_mismatch(recording: Recording, settings: Settings) -> tuple[Settings, Mismatch | None]:
-    """Fill in the thresholds' spread between pixels: from the settings, else an estimate, else the usual."""
+def _with_mismatch(
+    recording: Recording, settings: Settings, unsure: float
+) -> tuple[Settings, Mismatch | None]:
+    """Fill in the thresholds' spread between pixels: from the settings, else an estimate, else the usual.
+
+    Where the thresholds themselves are estimated, with the relative error ``unsure``, that is a part of it.
+    """
     events = settings.events
     if events.threshold_spread is not None or not _uses_steps(settings):
         return settings, None
     found = estimate_mismatch(recording, settings.camera, events)
-    spread = events.mismatch if found is None else found.spread
+    spread = float(np.hypot(events.mismatch if found is None else found.spread, unsure))
     return dataclasses.replace(settings, events=dataclasses.replace(events, threshold_spread=spread)), found
 
 
@@ -504,11 +519,6 @@ def _with_background(recording: Recording, settings: Settings) -> tuple[Settings
     rate = events.background_rate if found is None else max(found.rate, LEAST_NOISE)
     settings = dataclasses.replace(settings, events=dataclasses.replace(events, noise_rate=rate))
     return settings, None if found is None else found.rate
-
-
-def _was_for_others(before: Settings, after: Settings) -> bool:
-    """Whether thresholds were estimated with another I_0 or another refractory period."""
-    return before.camera.offset != after.camera.offset or before.events.refractory != after.events.refractory
 
 
 def _uses_steps(settings: Settings) -> bool:

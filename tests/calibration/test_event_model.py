@@ -14,17 +14,9 @@ from kalux.datasets import SensorSettings, pan, photograph_scene, simulate
 from kalux.pipeline import plan
 from kalux.settings import CameraSettings
 
+from builders import dark_scene
+
 THRESHOLDS = (0.2, 0.2)
-
-
-def dark_scene(seed=0):
-    """A pan over texture from 0.005 to 1 of white."""
-    noise = np.random.default_rng(seed).standard_normal((40, 90))
-    for _ in range(3):
-        noise = (noise + np.roll(noise, 1, 0) + np.roll(noise, 1, 1)) / 3
-    share = (noise - noise.min()) / np.ptp(noise)
-    image = 0.005 * 200**share
-    return photograph_scene(image, pan(80), sensor_size=(36, 48), duration=600_000)
 
 
 def recorded(**sensor):
@@ -37,10 +29,12 @@ def recordings():
     return {offset: recorded(log_offset=offset) for offset in (0.004, 0.03, 0.06)}
 
 
-@pytest.mark.parametrize(("offset", "allowed"), [(0.004, (0.004, 0.008)), (0.03, (0.03,)), (0.06, (0.06,))])
+@pytest.mark.parametrize(
+    ("offset", "allowed"), [(0.004, (0.004, 0.008)), (0.03, (0.024, 0.036)), (0.06, (0.05, 0.06))]
+)
 def test_the_offset_of_the_events_logarithm_is_found(recordings, offset, allowed):
     found = estimate_event_model(recordings[offset], CameraSettings(), THRESHOLDS)
-    assert found.log_offset in allowed
+    assert allowed[0] <= found.log_offset <= allowed[1]
     assert found.samples > 5_000
 
 
@@ -60,22 +54,29 @@ def test_a_delay_is_taken_into_account(recordings):
     assert known == estimate_event_model(recordings[0.03], CameraSettings(), THRESHOLDS)
 
 
-@pytest.mark.parametrize("period", [600.0, 2_000.0])
-def test_a_refractory_period_is_found_and_the_offset_in_spite_of_it(period):
-    """Edges that pass in a few milliseconds; without the losses the same scene has none."""
-    lossy = recorded(log_offset=0.004, refractory=period)
-    found = estimate_event_model(lossy, CameraSettings(), THRESHOLDS, refractory_period=None)
-    assert 0.6 * period <= found.refractory_period <= 1.15 * period
-    assert found.log_offset in (0.004, 0.008)
-    ignored = estimate_event_model(lossy, CameraSettings(), THRESHOLDS)
-    assert ignored.refractory_period == 0
+def test_a_refractory_period_would_shift_the_offset():
+    """What is lost makes steps near white look larger, as a large I_0 does."""
+    lossy = recorded(log_offset=0.004, refractory=2_000.0)
+    known = estimate_event_model(lossy, CameraSettings(), THRESHOLDS, refractory_period=2_000)
+    assert known.log_offset < 0.01
+    assert estimate_event_model(lossy, CameraSettings(), THRESHOLDS).log_offset > 2 * known.log_offset
 
 
-def test_no_refractory_period_is_found_where_nothing_is_lost(recordings):
-    for recording in recordings.values():
-        found = estimate_event_model(recording, CameraSettings(), THRESHOLDS, refractory_period=None)
-        assert found.refractory_period == 0
-        assert found == estimate_event_model(recording, CameraSettings(), THRESHOLDS)
+def test_an_offset_between_those_tried_is_found(recordings):
+    """A factor of two, between values tried, is 20 % of newton's error."""
+    found = estimate_event_model(recorded(log_offset=0.02), CameraSettings(), THRESHOLDS)
+    assert found.log_offset == pytest.approx(0.02, rel=0.25)
+
+
+def test_noise_says_nothing_of_the_offset(recordings):
+    """The frames of one recording with the events of another, whose camera looked elsewhere: the usual I_0."""
+    frames = [*recordings[0.004].frames()]
+    still = [dataclasses.replace(frame, image=frames[0].image) for frame in frames]
+    others = Recording.from_arrays(
+        next(iter(recordings[0.06].events())), still, sensor_size=recordings[0.004].sensor_size
+    )
+    found = estimate_event_model(others, CameraSettings(), THRESHOLDS)
+    assert found is None or 0.02 < found.log_offset < 0.045
 
 
 def test_a_still_scene_says_nothing():
@@ -104,9 +105,9 @@ def test_likelihood_compares_densities_of_the_intensity():
 def test_a_plan_fills_in_what_is_not_given(recordings):
     recording = recordings[0.06]
     made = plan(recording, at="frames")
-    assert made.settings.camera.log_offset == made.event_model.log_offset == 0.06
+    assert made.settings.camera.log_offset == made.event_model.log_offset >= 0.05
     assert made.settings.events.step_variance == made.event_model.step_variance
-    assert made.settings.events.refractory_period == made.event_model.refractory_period == 0
+    assert made.settings.events.refractory_period == made.estimate.refractory_period == 0
     default = PRESETS["default"]
     given = dataclasses.replace(
         default,

@@ -112,6 +112,11 @@ def test_a_still_scene_tells_nothing():
     assert calibrate_contrast(unlabelled(simulate(scene, SensorSettings(noise_rate=1.0))), CAMERA) is None
 
 
+def test_noise_and_lamps_tell_nothing(shared_data):
+    """A bench before which nothing moves: counts alone would find thresholds of 0.004 and 0.015."""
+    assert calibrate_contrast(kalux.open(shared_data / "bench_davis346.aedat4"), CAMERA) is None
+
+
 def test_shrinkage_finds_mean_and_covariance():
     rng = np.random.default_rng(3)
     truth = rng.multivariate_normal([0.0, 0.0], [[0.04, 0.01], [0.01, 0.02]], 4000)

@@ -10,7 +10,7 @@ import pytest
 def test_estimates_thresholds_that_the_recording_does_not_state(cli, write_recording, tmp_path):
     found = cli("info", write_recording(tmp_path / "rec.h5", contrast_threshold=None))
     assert (found.code, found.err) == (0, "")
-    line = r"  thresholds +on (\S+), off (\S+) log intensity \(estimated from \S+ samples, residual \S+\)"
+    line = r"  thresholds +on (\S+), off (\S+) log intensity \(estimated from \S+ samples, residual \S+: \+- \d+ %\)"
     told = re.search(line, found.out)
     assert [float(value) for value in told.groups()] == pytest.approx([0.2, 0.2], rel=0.2)
 

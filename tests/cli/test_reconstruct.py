@@ -241,6 +241,8 @@ class TestWhatIsSaid:
             "I_0",
             "step",
             "refractory",
+            "spread",
+            "background",
             "exposure",
             "noise",
             "bright",

@@ -25,8 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.deblur import between
-from kalux.calibration.contrast import HUBER, NORMAL_MAD
 from kalux.calibration.registration import Registration
+from kalux.calibration.regression import HUBER, NORMAL_MAD
 from kalux.errors import InputError
 from kalux.events import EventArray
 from kalux.frames import Frame

@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.deblur import between, count_chunks
-from kalux.calibration.contrast import NORMAL_MAD, fit_thresholds
+from kalux.calibration.contrast import fit_thresholds
 from kalux.calibration.intervals import intervals, spread
+from kalux.calibration.regression import NORMAL_MAD
 from kalux.events import EventArray
 from kalux.recording import Recording
 from kalux.settings import CameraSettings

@@ -14,9 +14,9 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.deblur import between
+from kalux.augmentation.deblur import between, count_chunks
+from kalux.augmentation.refractory import EventClock
 from kalux.calibration.intervals import intervals
-from kalux.calibration.refractory import Counts
 from kalux.models.camera import noise_variance
 from kalux.recording import Recording
 from kalux.settings import CameraSettings, EventSettings
@@ -82,12 +82,13 @@ def estimate_mismatch(recording: Recording, camera: CameraSettings, events: Even
     assert events.threshold_off is not None
     thresholds = np.array([events.threshold_on, events.threshold_off])
     noise = (max(camera.noise[0], camera.usual_frame_noise), camera.noise[1])
-    counts = Counts(recording.sensor_size, (events.refractory,), np.inf)
+    clock = EventClock(recording.sensor_size, events.refractory)
     delay = events.lateness
     products: Array = np.zeros((*recording.sensor_size, *_PRODUCTS))
     samples = 0
     for interval in intervals(recording, camera, margin=abs(delay), most_frames=_MAX_FRAMES):
-        weighed, _ = counts.add(between(interval.events, interval.start + delay, interval.end + delay))
+        inside = clock.weighed(between(interval.events, interval.start + delay, interval.end + delay))
+        counts = count_chunks([inside], recording.sensor_size, weighed=True)
         first, second = interval.first, interval.second
         before, after = first.intensity, second.intensity
         told = ~first.clipped & ~second.clipped & (np.minimum(before, after) > _DARKEST)
@@ -96,7 +97,7 @@ def estimate_mismatch(recording: Recording, camera: CameraSettings, events: Even
             for intensity in (before, after)
         )
         change = np.log(after + camera.offset) - np.log(before + camera.offset)
-        steps = thresholds[:, None, None] * weighed[0]
+        steps = thresholds[:, None, None] * np.stack(counts)
         of_steps = events.step_noise, events.quantisation_variance, events.usual_threshold_spread
         samples += _add(change, variance, told, steps, thresholds, of_steps, products)
         if samples >= MAX_SAMPLES:

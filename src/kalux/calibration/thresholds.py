@@ -29,14 +29,15 @@ from numpy.typing import NDArray
 
 from kalux.augmentation.deblur import between, integrate_exposure, latent_middle, latent_peak
 from kalux.augmentation.refractory import step_weight
-from kalux.calibration.contrast import HUBER, NORMAL_MAD, estimate_thresholds
+from kalux.calibration.contrast import Usual, estimate_thresholds
 from kalux.calibration.intervals import Interval, intervals
 from kalux.calibration.refractory import shortest_interval
+from kalux.calibration.regression import HUBER, NORMAL_MAD, standard_errors, two_stage
 from kalux.calibration.values import Calibration
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.filters.methods import Shot
 from kalux.recording import Recording
-from kalux.settings import CameraSettings
+from kalux.settings import CameraSettings, EventSettings
 
 Array = NDArray[np.float64]
 
@@ -50,11 +51,13 @@ _IN_TIME: Final = (0.7, 0.95, 1.15)
 """h over the mean threshold where events are in time: 1 in theory, 0.79 to 1.02 on five simulated scenes. Between the
 outer values no delay is corrected, beyond them until the middle one is reached."""
 _MIN_SAMPLES: Final = 500
+_UNTOLD: Final = 0.1
+"""Share of the usual thresholds in the quick estimate, from which on a recording tells too little: 0.01 at most on
+fifteen scenes and recordings with motion, 0.17 where only lamps and noise make events."""
 _WHITE: Final = 0.95  # of the response: the whole deblurred path lies below
 _CROWDED: Final = 3.0
 """Intervals with events closer than this many times the smallest inter-event interval are left out. With 3, a
 refractory period of 200 us costs 4 % where edges pass at 50 thresholds per 10 ms, without it 8 %."""
-_TILES: Final = 8  # per side: blocks of the jackknife
 _EM_STEPS: Final = 60
 _LEAST_SPREAD: Final = 0.01
 
@@ -158,8 +161,10 @@ def calibrate_contrast(
     ExposureError
         If the frames' exposures are not known.
     """
-    first = estimate_thresholds(recording, camera, delay=delay or 0)
-    if first is None:
+    assumed = EventSettings()
+    usual = Usual(assumed.usual_threshold_on, assumed.usual_threshold_off, assumed.usual_spread)
+    first = estimate_thresholds(recording, camera, usual, delay=delay or 0)
+    if first is None or first.usual_share > _UNTOLD:
         return None
     view = _View((first.on, first.off), shortest_interval(recording), refractory)
     if delay is None:
@@ -321,26 +326,14 @@ class _Fit(NamedTuple):
 
 
 def _fit(data: _Samples) -> _Fit | None:
-    """Two-stage least squares with Huber's weights; None where it is not determined."""
+    """The global fit; None where it is not determined."""
     if len(data.change) < _MIN_SAMPLES:
         return None
-    weights = np.ones(len(data.change))
-    solution: Array = np.zeros(3)
-    scale = 0.0
-    for _ in range(40):
-        weighted = data.instruments * weights[:, None]
-        normal = weighted.T @ data.explained
-        if np.linalg.cond(normal) > 1e6:
-            return None
-        previous = solution
-        solution = np.linalg.solve(normal, weighted.T @ data.change).astype(np.float64)
-        residual = data.change - data.explained @ solution
-        scale = max(NORMAL_MAD * float(np.median(np.abs(residual))), 1e-9)
-        weights = np.minimum(1.0, HUBER * scale / np.maximum(np.abs(residual), 1e-12))
-        if np.abs(solution - previous).max() < 1e-5:
-            break
-    on, off, trailing = (float(v) for v in solution)
-    return _Fit(on, off, trailing, scale, weights) if on > 0 and off > 0 else None
+    found = two_stage(data.change, data.explained, data.instruments)
+    if found is None:
+        return None
+    on, off, trailing = (float(v) for v in found.solution)
+    return _Fit(on, off, trailing, found.residual, found.weights) if on > 0 and off > 0 else None
 
 
 def _delay_of_trailing(recording: Recording, camera: CameraSettings, view: _View) -> int:
@@ -357,29 +350,6 @@ def _delay_of_trailing(recording: Recording, camera: CameraSettings, view: _View
     if low <= ratio[_SEARCHED.index(0)] <= high or not ratio[-1] <= wanted <= ratio[0]:
         return 0
     return round(float(np.interp(wanted, ratio[::-1], _SEARCHED[::-1])))
-
-
-def _errors(data: _Samples, fit: _Fit, shape: tuple[int, int]) -> Array:
-    """Standard errors of the three parameters: jackknife over tiles of the sensor, weights kept."""
-    row, column = np.divmod(data.pixel, shape[1])
-    tile = (row * _TILES // shape[0]) * _TILES + column * _TILES // shape[1]
-    weighted = data.instruments * fit.weights[:, None]
-    size = _TILES**2
-    normal, right = np.zeros((size, 3, 3)), np.zeros((size, 3))
-    for i in range(3):
-        right[:, i] = np.bincount(tile, weighted[:, i] * data.change, size)
-        for j in range(3):
-            normal[:, i, j] = np.bincount(tile, weighted[:, i] * data.explained[:, j], size)
-    used = np.flatnonzero(np.abs(normal).sum(axis=(1, 2)) > 0)
-    without = [
-        np.linalg.solve(normal.sum(axis=0) - normal[k], right.sum(axis=0) - right[k])
-        for k in used
-        if np.linalg.cond(normal.sum(axis=0) - normal[k]) < 1e8
-    ]
-    if len(without) < 4:
-        return np.full(3, np.inf)
-    spread: Array = np.sqrt((len(without) - 1) * np.var(np.array(without), axis=0))
-    return spread
 
 
 # --- single pixels --------------------------------------------------------------------------------------------
@@ -434,7 +404,9 @@ def _per_pixel(
         for i in range(2):
             right[:, i] += np.bincount(part.pixel, weight * predicted[:, i] * residual, size)
     _, covariance, offset, left = shrunk(normal, right)
-    errors = _errors(data, fit, recording.sensor_size)
+    errors = standard_errors(
+        data.change, data.explained, data.instruments, fit.weights, data.pixel, recording.sensor_size
+    )
     shape = recording.sensor_size
     spreads = np.sqrt(np.diag(covariance))
     return ContrastCalibration(

@@ -255,6 +255,8 @@ def threshold_warning(made: Plan, name: str) -> str:
     """What it means that nobody knows the thresholds."""
     how = "estimated from the recording" if made.threshold_origin == "estimate" else "unknown and assumed"
     sensor = ", or the sensor's --preset" if made.threshold_origin == "assumed" and name == "default" else ""
+    if made.estimate is not None:
+        how += f" (+- {100 * made.estimate.spread:.0f} %)"
     return (
         f"the contrast thresholds are {how}, so brightness above white is uncertain; "
         f"if you know them, give --events.threshold-on and --events.threshold-off{sensor}"

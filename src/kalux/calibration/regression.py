@@ -1,0 +1,93 @@
+"""Robust regressions on event counts, which are wrong themselves: by instruments."""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+NORMAL_MAD: Final = 1.4826  # standard deviation over median absolute deviation, of a normal distribution
+HUBER: Final = 1.345  # 95 % efficiency for normal residuals (Huber 1981)
+
+_ITERATIONS: Final = 40
+_LARGEST_CONDITION: Final = 1e6
+_TILES: Final = 8  # per side: blocks of the jackknife
+_LEAST_TILES: Final = 4
+
+
+class Fit(NamedTuple):
+    """A regression by instruments.
+
+    Attributes
+    ----------
+    solution
+        (K,) coefficients.
+    residual
+        Robust standard deviation of the residuals.
+    weights
+        (N,) Huber's weights.
+    """
+
+    solution: Array
+    residual: float
+    weights: Array
+
+
+def two_stage(values: Array, explained: Array, instruments: Array) -> Fit | None:
+    """Coefficients of (N, K) ``explained`` in (N,) ``values`` by two-stage least squares with Huber's weights.
+
+    The columns of ``explained`` may have errors that those of ``instruments``, as many, do not share: least squares
+    would then give too small coefficients (attenuation). None where the coefficients are not determined.
+    """
+    weights = np.ones(len(values))
+    solution: Array = np.zeros(explained.shape[1])
+    scale = 0.0
+    for _ in range(_ITERATIONS):
+        weighted = instruments * weights[:, None]
+        normal = weighted.T @ explained
+        if not np.linalg.cond(normal) <= _LARGEST_CONDITION:
+            return None
+        previous = solution
+        solution = np.linalg.solve(normal, weighted.T @ values).astype(np.float64)
+        residual = np.abs(values - explained @ solution)
+        scale = max(NORMAL_MAD * float(np.median(residual)), 1e-9)
+        weights = np.minimum(1.0, HUBER * scale / np.maximum(residual, 1e-12))
+        if np.abs(solution - previous).max() < 1e-5:
+            break
+    return Fit(solution, scale, weights)
+
+
+def standard_errors(
+    values: Array,
+    explained: Array,
+    instruments: Array,
+    weights: Array,
+    pixel: NDArray[np.int64],
+    shape: tuple[int, int],
+) -> Array:
+    """Of the coefficients of `two_stage`: jackknife over 8 x 8 parts of the sensor, weights kept; inf if too few tell.
+
+    ``pixel`` (N,) is the index of every sample's pixel in a sensor of ``shape``.
+    """
+    row, column = np.divmod(pixel, shape[1])
+    tile = (row * _TILES // shape[0]) * _TILES + column * _TILES // shape[1]
+    weighted = instruments * weights[:, None]
+    size, count = _TILES**2, explained.shape[1]
+    normal, right = np.zeros((size, count, count)), np.zeros((size, count))
+    for i in range(count):
+        right[:, i] = np.bincount(tile, weighted[:, i] * values, size)
+        for j in range(count):
+            normal[:, i, j] = np.bincount(tile, weighted[:, i] * explained[:, j], size)
+    used = np.flatnonzero(np.abs(normal).sum(axis=(1, 2)) > 0)
+    without = [
+        np.linalg.solve(normal.sum(axis=0) - normal[k], right.sum(axis=0) - right[k])
+        for k in used
+        if np.linalg.cond(normal.sum(axis=0) - normal[k]) < 100 * _LARGEST_CONDITION
+    ]
+    if len(without) < _LEAST_TILES:
+        return np.full(count, np.inf)
+    spread: Array = np.sqrt((len(without) - 1) * np.var(np.array(without), axis=0))
+    return spread
