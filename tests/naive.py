@@ -43,6 +43,7 @@ class Pixel:
     shown: int = 0
     excess: float = 0.0
     changes: list[tuple[bool, bool, float]] = field(default_factory=list)
+    measured: list[bool] = field(default_factory=list)
 
 
 def pixels(events, frames, sensor_size, settings, begin):
@@ -245,7 +246,7 @@ def bridged(pixel, settings, times, on, off, scales):
     c, ev = settings.camera, settings.events
     i0, count, c2 = c.offset, len(pixel.starts), on * off
     scale_on, scale_off = 1.0, 1.0
-    var_on = var_off = ev.threshold_spread**2
+    var_on = var_off = ev.mismatch**2
     learned = []
 
     hidden_by_black = float(
@@ -294,9 +295,11 @@ def bridged(pixel, settings, times, on, off, scales):
 
     begin = pixel.starts[0]
     first = latent(0)
+    pixel.measured.append(first[1] < UNMEASURED)
     intervals = [(begin, pixel.middles[0], None, first, scale_on, scale_off, var_on, var_off, 0.0)]
     for k in range(count - 1):
         second = latent(k + 1)
+        pixel.measured.append(second[1] < UNMEASURED)
         a, b = pixel.middles[k], pixel.middles[k + 1]
         n_on, n_off = counts(a, b)
         mismatch = second[0] - first[0] - (on * scale_on * n_on - off * scale_off * n_off) - grown(k + 1, b)
@@ -406,7 +409,7 @@ def bridged(pixel, settings, times, on, off, scales):
         while pending and pending[0][0] <= limit:
             t, polarity, near, _, weight = pending.pop(0)
             value, variance = predict(t)
-            signal = 1 / (1 + 9 * ev.noise_rate * (t - near) * US)  # K5
+            signal = 1 / (1 + (9 * ev.background_rate * (t - near) * US) ** 2)  # K5
             # Several events may share a time: this one alone moves L^A by its own step.
             step = weight * own_step(intervals[index], polarity, on, off, ev, c2, counts)
             q = weight * c2 * (ev.step_noise + signal * (1 - signal))
@@ -464,7 +467,7 @@ def complementary(pixel, settings, times, on, off):
 
 
 def is_moving(pixel, t):
-    """K11: whether an event comes in this frame interval or came in the one before."""
+    """K11, K12: whether an event comes in this frame interval or came in the one before, or no frame measures."""
     middles, first = pixel.middles, pixel.starts[0]
     k = sum(m < t for m in middles) - 1  # segments end where the next one's frame is read
     since, until = first, t
@@ -473,7 +476,8 @@ def is_moving(pixel, t):
         since = max(middles[k] - round(seconds), first)
     if k + 1 < len(middles):
         until = middles[k + 1]
-    return any(since < q <= until for q, *_ in pixel.events)
+    unmeasured = not any(pixel.measured[max(k, 0) : k + 2])
+    return unmeasured or any(since < q <= until for q, *_ in pixel.events)
 
 
 def hidden(pixels, place, moving, t, on, off):
@@ -501,12 +505,12 @@ def hidden(pixels, place, moving, t, on, off):
     return 0.003 * c2 + change * 0.35 * between
 
 
-def regularised(level, variance, hears, difference):
-    """K12, of whole images: L and its variance, where pixels hear their neighbours."""
+def regularised(level, variance, moving, difference):
+    """K12, of whole images: L and its variance."""
     out, doubt = level.copy(), variance.copy()
     around = [(down, right) for down in (-1, 0, 1) for right in (-1, 0, 1)]
     inside = set(np.ndindex(level.shape))
-    for row, column in zip(*np.nonzero(hears), strict=True):
+    for row, column in zip(*np.nonzero(moving), strict=True):
         information, total = 1 / variance[row, column], level[row, column] / variance[row, column]
         for down, right in around:
             other, differs = (row + down, column + right), difference**2 * (down**2 + right**2)
@@ -521,7 +525,7 @@ def regularised(level, variance, hears, difference):
             weight = (1 + unlike / 18) ** -2 / (variance[other] + differs)
             information, total = information + weight, total + weight * level[other]
         out[row, column] = total / information
-        doubt[row, column] = 0.5 * variance[row, column] + 0.5 / information
+        doubt[row, column] = 0.7 * variance[row, column] + 0.3 / information
     return out, doubt
 
 

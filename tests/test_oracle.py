@@ -91,16 +91,15 @@ def test_engine_agrees_with_the_oracle(name, data):
         k = max([j for j, f in enumerate(frames) if engine_node(f, name) < t], default=-1)
         white = white_at(t, k, frames, name, chosen.camera.offset)
         scale, value, total = chosen.filter.highlight_scale, expected[i], np.nan_to_num(variance[i])
-        stretch = chosen.events.threshold_spread**2 / scale if scale > 0 else 0.0
+        stretch = chosen.events.mismatch**2 / scale if scale > 0 else 0.0
         bound, noise, beyond = value, total, np.zeros(total.shape)
         unshown = ~np.isnan(excess[i])
         top = np.log(white + chosen.camera.offset)
         if unshown.any():
             value, total, beyond, noise = naive.lifted(value, total, excess[i], chosen, top)
         if chosen.filter.neighbours > 0:
-            hears = moving[i] | (value > top)
             known = total + hidden[i]
-            value, total = naive.regularised(value, known, hears, chosen.filter.neighbours)
+            value, total = naive.regularised(value, known, moving[i], chosen.filter.neighbours)
             total = np.where(unshown, known, total)
         value = np.where(unshown, np.maximum(value, bound) + beyond**2 / 2, value)
         level = np.vectorize(lambda v, p: naive.intensity(v, p, chosen, white, stretch))(  # noqa: B023

@@ -80,7 +80,9 @@ def test_smoothing_is_two_filters_combined_by_information():
         either = dataclasses.replace(
             a,
             log_intensity=level,
-            variance=np.minimum(a.variance, b.variance),
+            variance=np.where(
+                a.unmeasured & b.unmeasured, 1 / (weights[0] + weights[1]), np.minimum(a.variance, b.variance)
+            ),
             moving=a.moving | b.moving,
             silent_change=np.mean(known, axis=0),
         )
@@ -248,6 +250,19 @@ def test_where_one_filter_knows_nothing_the_other_is_taken():
     assert (found.t, found.variance[0, 0]) == (5, 0.01)
 
 
+def test_what_no_frame_measures_is_known_from_two_sides():
+    """Where frames do, both filters have seen the same ones, and together know no more than the better of them."""
+    zero, variance = np.zeros((1, 2)), np.full((1, 2), 0.3)
+    unmeasured = np.array([[True, False]])
+    forward, backward = (
+        Estimate(t, zero, variance, 0.0, final=True, unmeasured=unmeasured | also)
+        for t, also in ((5, [[False, False]]), (-5, [[False, True]]))
+    )
+    found = combine(forward, backward)
+    np.testing.assert_allclose(found.variance, [[0.15, 0.3]])
+    np.testing.assert_array_equal(found.unmeasured, unmeasured)
+
+
 def test_where_one_filter_knows_only_a_bound_it_is_one():
     """Of three pixels the first filter has bounds, the second measured two, one of them below its bound."""
     of = {"noise": np.full(3, 0.1, np.float32), "excess": np.full(3, 0.4, np.float32)}
@@ -258,8 +273,8 @@ def test_where_one_filter_knows_only_a_bound_it_is_one():
     level, variance = np.array([[0.5, -0.2, 0.0]]), np.array([[1e-3, 0.1, 1.3]])
     found = combine(first, Estimate(-5, level, variance, 0.0, True, unshown=seen))
     share = 0.1**2 / (
-        0.1**2 + 0.4**2
-    )  # of what is expected above the bound, the second filter not being sure
+        0.1**2 + 1.1**2
+    )  # of what is expected above the bound, as unsure as the second filter is
     level = [[0.5, -0.1 + share * 0.5, 0.0]]
     np.testing.assert_allclose(found.log_intensity, level, atol=1e-5)
     assert found.unshown.pixels.tolist() == [2]

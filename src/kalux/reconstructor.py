@@ -93,7 +93,8 @@ class Estimate:
     final
         As of `Image`.
     moving
-        (H, W) bool: pixels with an event in this frame interval, also one to come, or the one before; None: not told.
+        (H, W) bool: pixels with an event in this frame interval, also one to come, or the one before, and those that
+        neither frame measures; None: not told.
     between
         0 at a frame, 1 half-way between two, and where the next one is not known or not used.
     chroma
@@ -102,6 +103,8 @@ class Estimate:
         Pixels that no frame has measured until then, of which L is a bound; None: there are none.
     silent_change
         (H, W): mean square change of silent pixels around each, from one frame to the next; None: not told.
+    unmeasured
+        (H, W) bool: pixels that neither the frame before nor the one after measures; None: not told.
     """
 
     t: int
@@ -114,6 +117,7 @@ class Estimate:
     chroma: NDArray[np.float32] | None = None
     unshown: Unshown | None = None
     silent_change: NDArray[np.floating[Any]] | None = None
+    unmeasured: NDArray[np.bool_] | None = None
 
 
 class _Progress:
@@ -409,6 +413,7 @@ class Reconstructor:
             self._chroma(progress, t),
             self._unshown(progress, variance),
             self._method.silent_change(progress.segment),
+            self._method.unmeasured(progress.segment),
         )
 
     def trail(self, t: int) -> NDArray[np.floating[Any]] | None:
@@ -425,7 +430,7 @@ class Reconstructor:
         # The prior needs a variance, which the complementary filter has not.
         filtered, events = self.settings.filter, self.settings.events
         scale = filtered.highlight_scale if filtered.kind == "akf" else 0.0
-        spread = events.threshold_spread
+        spread = events.mismatch
         if self._estimated:
             scale, spread = (
                 min(scale, filtered.highlight_tail * self._tail_beyond),
@@ -624,10 +629,12 @@ class Reconstructor:
 
     def _take(self, progress: _Progress, t: int) -> None:
         """Take the cursor over the events up to ``t`` that it has not taken yet."""
-        for events in self._events.after(progress.taken, t):
+        taken = max(progress.taken, self._events.first)
+        for events in self._events.after(taken, t):
             self._method.advance(progress.segment, progress.cursor, events)
             progress.latest = int(events["t"][-1])
-        progress.taken = self._events.number(t)
+            taken += len(events)
+        progress.taken = taken
 
 
 def _between(progress: _Progress, t: int) -> float:

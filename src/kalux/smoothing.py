@@ -6,9 +6,9 @@ L' and P' of the backward one, the estimate is the two-filter smoother (Fraser a
 
     L_s = (L / P + L' / P') / (1 / P + 1 / P').
 
-Where one of them knows no more than a bound, it counts as one (docs/equations.md, K15). Both have seen the frames
-around the image, so their variances are not independent where frames are well exposed; the smaller of the two is given
-out.
+Where one of them knows no more than a bound, it counts as one (docs/equations.md, K15). The variance is
+1 / (1 / P + 1 / P') where neither frame around the image measures the pixel: there each direction goes by events of its
+own. Elsewhere both have seen these frames, and the smaller of the two variances is given out.
 
 Memory is bounded: the recording is spilled to disk, where it can be read backward, and the backward pass is done
 twice, first to save its state before every window of images, then window by window for the images themselves.
@@ -349,12 +349,17 @@ def combine(
         (forward.log_intensity, forward.variance, forward.unshown),
         (behind, backward.variance, backward.unshown),
     )
-    for (bound, _, unshown), other in (directions, directions[::-1]):
-        obey_bounds(level, bound, unshown, *other)
+    obey_bounds(level, *directions)
+    obey_bounds(level, *directions[::-1])
+    variance = np.minimum(forward.variance, backward.variance)
+    unmeasured = None
+    if forward.unmeasured is not None and backward.unmeasured is not None:
+        unmeasured = forward.unmeasured & backward.unmeasured
+        np.divide(1.0, first + second, out=variance, where=unmeasured)
     return Estimate(
         t=forward.t,
         log_intensity=level,
-        variance=np.minimum(forward.variance, backward.variance),
+        variance=variance,
         white=forward.white,
         final=forward.final,
         moving=_either(forward.moving, backward.moving),
@@ -362,6 +367,7 @@ def combine(
         chroma=forward.chroma,
         unshown=smoothed_unshown(forward.unshown, backward.unshown),
         silent_change=_mean_of_both(forward.silent_change, backward.silent_change),
+        unmeasured=unmeasured,
     )
 
 
