@@ -505,12 +505,12 @@ def hidden(pixels, place, moving, t, on, off):
     return 0.003 * c2 + change * 0.35 * between
 
 
-def regularised(level, variance, hears, difference):
-    """K12, of whole images: L and its variance, where pixels hear their neighbours."""
+def regularised(level, variance, moving, difference):
+    """K12, of whole images: L and its variance."""
     out, doubt = level.copy(), variance.copy()
     around = [(down, right) for down in (-1, 0, 1) for right in (-1, 0, 1)]
     inside = set(np.ndindex(level.shape))
-    for row, column in zip(*np.nonzero(hears), strict=True):
+    for row, column in zip(*np.nonzero(moving), strict=True):
         information, total = 1 / variance[row, column], level[row, column] / variance[row, column]
         for down, right in around:
             other, differs = (row + down, column + right), difference**2 * (down**2 + right**2)
@@ -525,7 +525,7 @@ def regularised(level, variance, hears, difference):
             weight = (1 + unlike / 18) ** -2 / (variance[other] + differs)
             information, total = information + weight, total + weight * level[other]
         out[row, column] = total / information
-        doubt[row, column] = 0.5 * variance[row, column] + 0.5 / information
+        doubt[row, column] = 0.7 * variance[row, column] + 0.3 / information
     return out, doubt
 
 

@@ -98,9 +98,8 @@ def test_engine_agrees_with_the_oracle(name, data):
         if unshown.any():
             value, total, beyond, noise = naive.lifted(value, total, excess[i], chosen, top)
         if chosen.filter.neighbours > 0:
-            hears = moving[i] | (value > top)
             known = total + hidden[i]
-            value, total = naive.regularised(value, known, hears, chosen.filter.neighbours)
+            value, total = naive.regularised(value, known, moving[i], chosen.filter.neighbours)
             total = np.where(unshown, known, total)
         value = np.where(unshown, np.maximum(value, bound) + beyond**2 / 2, value)
         level = np.vectorize(lambda v, p: naive.intensity(v, p, chosen, white, stretch))(  # noqa: B023

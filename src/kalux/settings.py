@@ -240,9 +240,8 @@ class FilterSettings:
     bright_tail
         That scale; None: from the recording's frames, in a live stream from the first.
     neighbours
-        Standard deviation, in log intensity, by which neighbouring pixels of a surface differ: pixels that move, or
-        that are beyond white, are given what their eight neighbours know (docs/equations.md, K12). 0 turns it off.
-        0.25 (docs/tuning.md).
+        Standard deviation, in log intensity, by which neighbouring pixels of a surface differ: moving pixels are
+        given what their eight neighbours know (docs/equations.md, K12). 0 turns it off. 0.25 (docs/tuning.md).
     cutoff
         Of the complementary filter, Hz. 1.0 (Scheerlinck 2018 uses 2 pi rad/s).
     """
