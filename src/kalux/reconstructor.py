@@ -26,7 +26,7 @@ from kalux.filters.akf import State
 from kalux.filters.buffer import EventBuffer
 from kalux.filters.highlights import lifted, read_unshown, tempered
 from kalux.filters.methods import Method, Segment, Shot, make_method, take_shot
-from kalux.filters.readout import HighlightPrior, hidden_variance, read_out
+from kalux.filters.readout import Around, HighlightPrior, hidden_variance, read_out
 from kalux.frames import Frame, check_frame
 from kalux.models.camera import Camera, beyond_white, count_bright
 from kalux.models.colour import (
@@ -102,6 +102,10 @@ class Estimate:
         Pixels that no frame has measured until then, of which L is a bound; None: there are none.
     silent_change
         (H, W): mean square change of silent pixels around each, from one frame to the next; None: not told.
+    around
+        What the frames around say of the pixels (K11); None: not told.
+    exposed
+        The share of the time for which frames are exposed, where the next one is known.
     """
 
     t: int
@@ -114,6 +118,8 @@ class Estimate:
     chroma: NDArray[np.float32] | None = None
     unshown: Unshown | None = None
     silent_change: NDArray[np.floating[Any]] | None = None
+    around: Around | None = None
+    exposed: float = 0.0
 
 
 class _Progress:
@@ -409,6 +415,8 @@ class Reconstructor:
             self._chroma(progress, t),
             self._unshown(progress, variance),
             self._method.silent_change(progress.segment),
+            self._method.around(progress.segment, t),
+            self._exposed(progress),
         )
 
     def trail(self, t: int) -> NDArray[np.floating[Any]] | None:
@@ -443,12 +451,21 @@ class Reconstructor:
             log_intensity, variance = lifted(log_intensity, variance, unshown)
         moving, neighbours = estimate.moving, self.settings.filter.neighbours
         pitch = 2 if mosaic else 1  # neighbours of the same colour
-        hidden = hidden_variance(estimate.between, on * off)
+        hidden = hidden_variance(estimate.between, on * off, estimate.exposed)
         change = estimate.silent_change
         if change is None and moving is not None:  # K11 needs it only there
             change = np.full(log_intensity.shape, UNKNOWN_CHANGE * on * off, np.float32)
         intensity, total = read_out(
-            log_intensity, variance, offset, prior, moving, hidden, change, neighbours, pitch
+            log_intensity,
+            variance,
+            offset,
+            prior,
+            moving,
+            hidden,
+            change,
+            neighbours,
+            pitch,
+            estimate.around,
         )
         if unshown is not None:
             bound = estimate.log_intensity
@@ -513,6 +530,14 @@ class Reconstructor:
             if shot.chroma is not None and shot.chroma_weight is not None
         ]
         return joined_chromaticity(parts)
+
+    def _exposed(self, progress: _Progress) -> float:
+        """The share of the time for which frames are exposed, by those around; 0 where the next is not known."""
+        if not (self.lookahead and progress.ready and progress.starts_frame):
+            return 0.0
+        first, second = self._shots[:2]
+        exposures = first.end - first.start + second.end - second.start
+        return min(exposures / 2 / (second.middle - first.middle), 1.0)
 
     def _white(self, progress: _Progress, t: int) -> float:
         """log(I + I_0) of the brightest level that frames show at ``t``: from one frame's to the next's."""

@@ -25,6 +25,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.augmentation.bridge import UNMEASURED
 from kalux.augmentation.deblur import between
 from kalux.augmentation.refractory import EventClock
 from kalux.augmentation.trail import FrameTrail, follow, nothing_followed, trail_at
@@ -354,7 +355,7 @@ def combine(
     return Estimate(
         t=forward.t,
         log_intensity=level,
-        variance=np.minimum(forward.variance, backward.variance),
+        variance=1.0 / (first + second),
         white=forward.white,
         final=forward.final,
         moving=_either(forward.moving, backward.moving),
@@ -362,6 +363,8 @@ def combine(
         chroma=forward.chroma,
         unshown=smoothed_unshown(forward.unshown, backward.unshown),
         silent_change=_mean_of_both(forward.silent_change, backward.silent_change),
+        around=None if forward.around is None else forward.around._replace(ahead=UNMEASURED),
+        exposed=forward.exposed,
     )
 
 

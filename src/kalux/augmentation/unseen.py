@@ -56,6 +56,42 @@ def silent_change(segment: BridgedSegment, quantisation_variance: float, thresho
     return mean
 
 
+def forget_silence(
+    grown: Array,
+    segment: BridgedSegment,
+    silent: NDArray[np.bool_],
+    change: Array,
+    quantisation_variance: float,
+) -> None:
+    """Add to ``grown``, (H, W), what the state of silent pixels loses from one frame to the next. In place.
+
+    What such a pixel changes is not told by events, and by frames only as far as the slope takes it, the share q0 / V
+    of the mismatch (K1): of the mean square change the square of the other share comes to P (docs/equations.md, K11).
+
+    Parameters
+    ----------
+    silent
+        (H, W): pixels without an event from one to the other that both frames measure.
+    change
+        From `silent_change`.
+    quantisation_variance
+        As in `BridgeNoise`.
+    """
+    variances = segment.forward_variance, segment.backward_variance
+    _forget(*variances, silent, change, np.float32(quantisation_variance), grown)
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _forget(forward, backward, silent, change, q0, grown):  # type: ignore[no-untyped-def]
+    zero = np.float32(0.0)
+    for row in range(grown.shape[0]):
+        for column in range(grown.shape[1]):
+            i = row, column
+            noise = np.float32(forward[i]) + np.float32(backward[i])
+            missed = noise / (noise + q0)
+            grown[i] += np.float32(change[i]) * missed * missed if silent[i] else zero
+
+
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _told(  # type: ignore[no-untyped-def]
     slope, forward, backward, events, seconds, q0, most, change, untold, silent

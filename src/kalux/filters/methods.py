@@ -29,13 +29,14 @@ from kalux.augmentation.trail import (
     polarity_of,
     trail_at,
 )
-from kalux.augmentation.unseen import UNKNOWN_CHANGE, silent_change
+from kalux.augmentation.unseen import UNKNOWN_CHANGE, forget_silence, silent_change
 from kalux.compiled import AHEAD, logarithm, prefetch
 from kalux.errors import SettingsError
 from kalux.events import EventArray
 from kalux.filters import akf, complementary
 from kalux.filters.akf import State
 from kalux.filters.common import make_clock
+from kalux.filters.readout import COMING_NOISE, Around
 from kalux.frames import Frame
 from kalux.models import colour
 from kalux.models.camera import (
@@ -290,6 +291,9 @@ class Method(Protocol):
     def silent_change(self, segment: Any) -> Floats | None:
         """(H, W): `unseen.silent_change` of the segment; None: the method or the segment does not tell."""
 
+    def around(self, segment: Any, t: int) -> Around | None:
+        """What the frames around ``t`` say of the pixels there (K11); None: the method does not tell."""
+
     def trail(self, segment: Any, cursor: Any, t: int) -> Floats | None:
         """(H, W): how far the light is ahead of its events at ``t`` (K14); None: the method does not tell."""
 
@@ -333,6 +337,9 @@ class _Common:
         return None
 
     def silent_change(self, segment: Any) -> Floats | None:
+        return None
+
+    def around(self, segment: Any, t: int) -> Around | None:
         return None
 
     def unshown(self, segment: Any, variance: Floats, prior: float) -> Unshown | None:
@@ -629,12 +636,12 @@ class BridgedFrames(_Common):
             memory.interval or self._FIRST_INTERVAL,
             self._carried(after, following),
         )
-        forward, far_on, far_off = self._drifting(forward, memory, second, on + tail_on, off + tail_off)
         forward = forward._replace(
             trail=self._trail(memory.followed, start, scale),
             unshown=memory.unshown,
             silent_change=memory.silent_change,
         )
+        forward, far_on, far_off = self._drifting(forward, memory, second, on + tail_on, off + tail_off)
         return forward, after._replace(far_on=far_on, far_off=far_off)
 
     def follow(
@@ -677,6 +684,10 @@ class BridgedFrames(_Common):
         # From its last measurement on, nothing but events tells of changes: what they have not told yet, at one end.
         grown[memory.latent.variance < bridge.UNMEASURED] += self.noise.quantisation_variance / 2
         grown[~unmeasured] = 0.0
+        if segment.silent_change is not None:
+            silent = ~unmeasured & (memory.latent.variance < bridge.UNMEASURED) & (on + off == 0)
+            q0 = self.noise.quantisation_variance
+            forget_silence(grown, segment, silent, segment.silent_change, q0)
         if second.ceiling is not None:
             black = np.isfinite(second.ceiling)
             grown[black] += second.variance[black] / (_BLACK_FRAMES * (_BLACK_FRAMES + 1))
@@ -729,6 +740,18 @@ class BridgedFrames(_Common):
 
     def silent_change(self, segment: BridgedSegment) -> Floats | None:
         return segment.silent_change
+
+    def around(self, segment: BridgedSegment, t: int) -> Around:
+        share = (t - segment.start) / (segment.end - segment.start)
+        return Around(
+            segment.forward_variance,
+            segment.backward_variance,
+            segment.events,
+            coming=(1.0 - share) * (self.noise.step_variance + COMING_NOISE * self.on * self.off),
+            ahead=0.0,
+            quantisation_variance=self.noise.quantisation_variance,
+            repeated=1.0 - 2.0 * share * (1.0 - share),
+        )
 
 
 def _still_since(memory: BridgeMemory, start: int, seconds: float) -> int:
