@@ -26,7 +26,8 @@ from kalux.filters.akf import State
 from kalux.filters.buffer import EventBuffer
 from kalux.filters.highlights import lifted, read_unshown, tempered
 from kalux.filters.methods import Method, Segment, Shot, make_method, take_shot
-from kalux.filters.readout import Around, HighlightPrior, hidden_variance, read_out
+from kalux.filters.readout import HighlightPrior, read_out
+from kalux.filters.uncertainty import Around, alone, given_variance, hidden_variance
 from kalux.frames import Frame, check_frame
 from kalux.models.camera import Camera, beyond_white, count_bright
 from kalux.models.colour import (
@@ -456,22 +457,15 @@ class Reconstructor:
         if change is None and moving is not None:  # K11 needs it only there
             change = np.full(log_intensity.shape, UNKNOWN_CHANGE * on * off, np.float32)
         intensity, total = read_out(
-            log_intensity,
-            variance,
-            offset,
-            prior,
-            moving,
-            hidden,
-            change,
-            neighbours,
-            pitch,
-            estimate.around,
+            log_intensity, variance, offset, prior, moving, alone(hidden), change, neighbours, pitch
         )
         if unshown is not None:
             bound = estimate.log_intensity
             read_unshown(
                 intensity, log_intensity, total, bound, unshown, moving, offset, prior, neighbours, pitch
             )
+        if moving is not None and change is not None:
+            total = given_variance(variance, moving, change, hidden, estimate.around)
         image = Image(estimate.t, intensity, total, offset, estimate.final)
         return (
             image

@@ -363,7 +363,7 @@ def combine(
         chroma=forward.chroma,
         unshown=smoothed_unshown(forward.unshown, backward.unshown),
         silent_change=_mean_of_both(forward.silent_change, backward.silent_change),
-        around=None if forward.around is None else forward.around._replace(ahead=UNMEASURED),
+        around=None if forward.around is None else forward.around._replace(counted=UNMEASURED),
         exposed=forward.exposed,
     )
 

@@ -36,7 +36,7 @@ from kalux.events import EventArray
 from kalux.filters import akf, complementary
 from kalux.filters.akf import State
 from kalux.filters.common import make_clock
-from kalux.filters.readout import COMING_NOISE, Around
+from kalux.filters.uncertainty import COMING_NOISE, Around
 from kalux.frames import Frame
 from kalux.models import colour
 from kalux.models.camera import (
@@ -748,7 +748,7 @@ class BridgedFrames(_Common):
             segment.backward_variance,
             segment.events,
             coming=(1.0 - share) * (self.noise.step_variance + COMING_NOISE * self.on * self.off),
-            ahead=0.0,
+            counted=0.0,
             quantisation_variance=self.noise.quantisation_variance,
             repeated=1.0 - 2.0 * share * (1.0 - share),
         )

@@ -13,22 +13,6 @@ from kalux.compiled import FUSED, ONE, exponential, logarithm
 Array = NDArray[np.floating[Any]]
 
 
-HIDDEN_MOVING: Final = 0.09
-"""Variance, in c^2, of what a pixel does between its events half-way between two frames, where events have come of
-late: of eleven simulated scenes, both ways in time and forward, and of the held-out frames of three real recordings
-(docs/equations.md, K11)."""
-
-HIDDEN_STILL: Final = 0.22
-"""Where no event has come of late, in units of the mean square change of the silent pixels around from one frame to the
-other (`kalux.augmentation.unseen`): the same scenes and frames. A random walk with both ends known would have 1/4."""
-
-HIDDEN_EXPOSED: Final = 0.09
-"""The share of these that is hidden at a frame that is exposed all the time, whose mean is not its middle: the same
-scenes, with exposures of a tenth to two thirds of the time."""
-
-COMING_NOISE: Final = 0.06
-"""Variance, in c^2, of an event that is still to come, beside that of its step: as it may be noise (K5). The same."""
-
 _NOTHING: Final = np.float32(1e9)
 """Variance of a pixel that knows nothing; its square is still a float32."""
 
@@ -111,56 +95,6 @@ class Hidden(NamedTuple):
 _NOTHING_HIDDEN: Final = Hidden(0.0, 0.0)
 
 
-def hidden_variance(between: float, threshold2: float, exposed: float = 0.0) -> Hidden:
-    """K11 at ``between``, 0 at a frame and 1 half-way between two, with ``threshold2`` = c^2.
-
-    ``exposed`` is the share of the time for which frames are exposed.
-    """
-    hidden = between + (1.0 - between) * HIDDEN_EXPOSED * exposed
-    return Hidden(hidden * HIDDEN_STILL, threshold2 * hidden * HIDDEN_MOVING)
-
-
-class Around(NamedTuple):
-    """What the frames around an image say of its pixels (docs/equations.md, K11).
-
-    Attributes
-    ----------
-    first, second
-        (H, W) variances of the frame before and of the one after.
-    events
-        (H, W) events between them.
-    coming
-        Variance that these add to what the second frame tells: of one event, times the share of the time to come.
-    ahead
-        0; or `UNMEASURED` where P counts the second frame already, as both ways in time.
-    quantisation_variance
-        q_0 of K1.
-    repeated
-        The share of the frames' noise that the image has: 1 at a frame, 1/2 half-way between two.
-    """
-
-    first: Array
-    second: Array
-    events: Array
-    coming: float
-    ahead: float
-    quantisation_variance: float
-    repeated: float
-
-
-@nb.njit(cache=True, inline="always", error_model="numpy")
-def frame_variance(variance, first, second, events, scalars):  # type: ignore[no-untyped-def]
-    """P with what the frames around say (docs/equations.md, K11).
-
-    The next frame tells of L, too: the bridge leads to it. And as far as the slope follows them, the noise of the frames
-    is in every image, however many there have been.
-    """
-    coming, ahead, q0, repeated = scalars
-    following = ahead + second + coming * events
-    share = q0 / (first + second + q0)
-    return max(variance * following / (variance + following), repeated * share * share * min(first, second))
-
-
 @nb.njit(cache=True, inline="always")
 def total_variance(variance, moving, change, hidden):  # type: ignore[no-untyped-def]
     """P and the variance of what no event has told yet (docs/equations.md, K11)."""
@@ -190,7 +124,6 @@ def read_out(
     silent_change: Array | None = None,
     difference: float = 0.0,
     pitch: int = 1,
-    around: Around | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """I of a state, and the variance of its logarithm; in one pass over the rows, none of which is stored in between.
 
@@ -218,8 +151,6 @@ def read_out(
         nothing.
     pitch
         Distance of the neighbours: 2 in a Bayer mosaic, whose pixels repeat their colours.
-    around
-        What the frames around say of the pixels; None: no more than P.
 
     Returns
     -------
@@ -231,15 +162,11 @@ def read_out(
     known = variance.astype(np.float32, copy=False)
     out = np.empty(log_intensity.shape, np.float32)
     total = known if moving is None else np.empty_like(out)
-    untold = known[:0, :0]
-    frames = (untold,) * 3 if around is None else tuple(_plane(plane, out.shape) for plane in around[:3])
     _read_out(
         log_intensity.astype(np.float32, copy=False),
         known,
-        frames,
-        (np.float32(0.0),) * 4 if around is None else tuple(np.float32(value) for value in around[3:]),
         np.empty((0, 0), np.bool_) if moving is None else moving,
-        untold if moving is None else _plane(silent_change, out.shape),
+        known[:0, :0] if moving is None else _plane(silent_change, out.shape),
         tuple(np.float32(value) for value in hidden),
         np.float32(difference * difference),
         pitch,
@@ -260,19 +187,7 @@ def _plane(values: Array | None, shape: tuple[int, ...]) -> NDArray[np.float32]:
 
 @nb.njit(cache=True, nogil=True, error_model="numpy", fastmath=FUSED)
 def _read_out(  # type: ignore[no-untyped-def]
-    log_intensity,
-    variance,
-    frames,
-    around,
-    moving,
-    change,
-    hidden,
-    allowed,
-    pitch,
-    prior,
-    log_offset,
-    out,
-    total,
+    log_intensity, variance, moving, change, hidden, allowed, pitch, prior, log_offset, out, total
 ):
     white, scale2, _ = prior
     height, width = log_intensity.shape
@@ -288,8 +203,9 @@ def _read_out(  # type: ignore[no-untyped-def]
     for row in range(-pitch if told else 0, height):
         following, below = np.uint64(row + pitch), np.uint64((row + pitch) % count)
         if told and following < np.uint64(height):
-            _take_variances(variance, frames, around, following, total)
-            _take_row(log_intensity, moving, change, hidden, following, total, levels, doubts, below)
+            _take_row(
+                log_intensity, variance, moving, change, hidden, following, total, levels, doubts, below
+            )
         elif told:
             for column in range(np.uint64(size + 2 * _MARGIN)):
                 doubts[below, column] = _NOTHING
@@ -320,26 +236,13 @@ def _any(words, first, count):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, inline="always")
-def _take_variances(variance, frames, around, row, total):  # type: ignore[no-untyped-def]
-    """P of a row, with what the frames around say, in ``total``."""
-    first, second, events = frames
-    if first.size == 0:
-        for column in range(np.uint64(total.shape[1])):
-            total[row, column] = variance[row, column]
-        return
-    for column in range(np.uint64(total.shape[1])):
-        at = row, column
-        total[at] = frame_variance(variance[at], first[at], second[at], events[at], around)
-
-
-@nb.njit(cache=True, inline="always")
 def _take_row(  # type: ignore[no-untyped-def]
-    log_intensity, moving, change, hidden, row, total, levels, doubts, place
+    log_intensity, variance, moving, change, hidden, row, total, levels, doubts, place
 ):
     """K11 of a row, and what its neighbours need to know of it."""
     for column in range(np.uint64(total.shape[1])):
         at = column + np.uint64(_MARGIN)
-        known = total_variance(total[row, column], moving[row, column], change[row, column], hidden)
+        known = total_variance(variance[row, column], moving[row, column], change[row, column], hidden)
         total[row, column] = known
         doubts[place, at] = known if known < _NOTHING else _NOTHING
         levels[place, at] = log_intensity[row, column]
