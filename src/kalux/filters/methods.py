@@ -36,7 +36,7 @@ from kalux.events import EventArray
 from kalux.filters import akf, complementary
 from kalux.filters.akf import State
 from kalux.filters.common import make_clock
-from kalux.filters.uncertainty import COMING_NOISE, Around
+from kalux.filters.uncertainty import WRONG_STEPS, Around
 from kalux.frames import Frame
 from kalux.models import colour
 from kalux.models.camera import (
@@ -743,14 +743,16 @@ class BridgedFrames(_Common):
 
     def around(self, segment: BridgedSegment, t: int) -> Around:
         share = (t - segment.start) / (segment.end - segment.start)
+        between = 4.0 * share * (1.0 - share)
         return Around(
             segment.forward_variance,
             segment.backward_variance,
             segment.events,
-            coming=(1.0 - share) * (self.noise.step_variance + COMING_NOISE * self.on * self.off),
+            coming=(1.0 - share) * self.noise.step_variance,
             counted=0.0,
             quantisation_variance=self.noise.quantisation_variance,
-            repeated=1.0 - 2.0 * share * (1.0 - share),
+            repeated=1.0 - between / 2.0,
+            wrong=WRONG_STEPS * between * self.on * self.off,
         )
 
 

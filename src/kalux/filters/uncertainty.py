@@ -17,7 +17,7 @@ from kalux.filters.readout import Hidden, total_variance
 
 Array = NDArray[np.floating[Any]]
 
-HIDDEN_MOVING: Final = 0.09
+HIDDEN_MOVING: Final = 0.08
 """Variance, in c^2, of what a pixel does between its events, half-way between two frames, where events have come of
 late: by the errors of images, forward and both ways in time, of eleven simulated scenes and of the held-out frames of
 three real recordings."""
@@ -30,10 +30,11 @@ HIDDEN_EXPOSED: Final = 0.09
 """What share of these is hidden at a frame that is exposed all the time, the mean of which is not the middle: the same
 scenes, exposed for a tenth to two thirds of the time."""
 
-COMING_NOISE: Final = 0.06
-"""Variance, in c^2, that an event to come adds to that of its step, because it may be noise (K5): the same scenes."""
+WRONG_STEPS: Final = 0.002
+"""Variance, in c^2 per squared number of events between two frames, half-way, of steps that are all wrong alike: the
+same scenes. A fifth of what thresholds that are 10 % off amount to (K10) where no frame ties them."""
 
-ALONE: Final = 1.5
+ALONE: Final = 1.6
 """What is hidden of a pixel before its neighbours are heard (K12), in units of what is after it. Their mean takes a
 fifth to a third of the squared errors."""
 
@@ -55,6 +56,8 @@ class Around(NamedTuple):
         q_0 of K1.
     repeated
         What share of the variance of the frames' noise is in the image: 1 at a frame, 1/2 half-way between two.
+    wrong
+        Variance of steps that are all wrong alike, per squared number of events.
     """
 
     first: Array
@@ -64,6 +67,7 @@ class Around(NamedTuple):
     counted: float
     quantisation_variance: float
     repeated: float
+    wrong: float
 
 
 def hidden_variance(between: float, threshold2: float, exposed: float = 0.0) -> Hidden:
@@ -84,13 +88,14 @@ def alone(hidden: Hidden) -> Hidden:
 def known_variance(variance, first, second, events, around):  # type: ignore[no-untyped-def]
     """Variance of what frames and events have told, from P and the variances of the frames around.
 
-    The next frame, seen through the events that are to come, tells of L besides P. And as far as the slope follows the
+    The next frame, seen through the events that are to come, tells of L besides P. As far as the slope follows the
     frames, the share q_0 / V of their mismatch (K1), their noise is in every image, however many have been seen.
     """
-    coming, counted, q0, repeated = around
+    coming, counted, q0, repeated, wrong = around
     following = counted + second + coming * events
     slope = q0 / (first + second + q0)
-    return max(variance * following / (variance + following), repeated * slope * slope * min(first, second))
+    known = max(variance * following / (variance + following), repeated * slope * slope * min(first, second))
+    return known + wrong * events * events
 
 
 def given_variance(
