@@ -365,6 +365,7 @@ def combine(
         silent_change=_mean_of_both(forward.silent_change, backward.silent_change),
         around=None if forward.around is None else forward.around._replace(counted=UNMEASURED),
         exposed=forward.exposed,
+        since=forward.since,
     )
 
 

@@ -58,6 +58,9 @@ Floats = NDArray[np.floating[Any]]
 Chunks = Sequence[EventArray]
 """Events in time order, in a few arrays."""
 
+USUAL_INTERVAL: Final = 40_000
+"""us between frames, over which the information of the first one is spread until a second one is known."""
+
 FAR_FUTURE: Final = 1 << 61
 """End of a segment that has no next frame, us."""
 
@@ -401,8 +404,6 @@ class BridgedFrames(_Common):
     Causal mode (``lookahead=False``) goes from the end of one exposure to the end of the next, forward only.
     """
 
-    _FIRST_INTERVAL: Final = 0.04  # s, spread of a single frame's information until a second one is known
-
     def __init__(
         self,
         settings: Settings,
@@ -538,7 +539,7 @@ class BridgedFrames(_Common):
     ) -> tuple[Segment, BridgeMemory]:
         start = self.node(shot)
         if following is None:
-            seconds = memory.interval or self._FIRST_INTERVAL
+            seconds = memory.interval or USUAL_INTERVAL * 1e-6
             latent = memory.latent
             if not self.lookahead:
                 latent = self._carried(memory, shot)
@@ -633,7 +634,7 @@ class BridgedFrames(_Common):
             self.noise,
             start,
             following.end,
-            memory.interval or self._FIRST_INTERVAL,
+            memory.interval or USUAL_INTERVAL * 1e-6,
             self._carried(after, following),
         )
         forward = forward._replace(
@@ -693,7 +694,7 @@ class BridgedFrames(_Common):
             grown[black] += second.variance[black] / (_BLACK_FRAMES * (_BLACK_FRAMES + 1))
         segment = segment._replace(
             drift=grown,
-            still_since=_still_since(memory, segment.start, memory.interval or self._FIRST_INTERVAL),
+            still_since=_still_since(memory, segment.start, memory.interval or USUAL_INTERVAL * 1e-6),
         )
         far_on, far_off = (
             np.where(unmeasured, far + now, np.float32(0.0))

@@ -70,13 +70,17 @@ class Around(NamedTuple):
     wrong: float
 
 
-def hidden_variance(between: float, threshold2: float, exposed: float = 0.0) -> Hidden:
+def hidden_variance(
+    between: float, threshold2: float, exposed: float = 0.0, since: float | None = None
+) -> Hidden:
     """What no event has told at ``between``, 0 at a frame and 1 half-way between two, with ``threshold2`` = c^2.
 
-    ``exposed`` is the share of the time for which frames are exposed.
+    ``exposed`` is the share of the time for which frames are exposed; ``since`` the time since the latest frame, in
+    intervals, where no next one is used: nothing then holds the other end of a silent pixel's change.
     """
     hidden = between + (1.0 - between) * HIDDEN_EXPOSED * exposed
-    return Hidden(hidden * HIDDEN_STILL, threshold2 * hidden * HIDDEN_MOVING)
+    still = hidden * HIDDEN_STILL if since is None else min(since, 1.0)
+    return Hidden(still, threshold2 * hidden * HIDDEN_MOVING)
 
 
 def alone(hidden: Hidden) -> Hidden:
