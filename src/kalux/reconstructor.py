@@ -420,7 +420,7 @@ class Reconstructor:
             self._chroma(progress, t),
             self._unshown(progress, variance),
             self._method.silent_change(progress.segment),
-            self._method.around(progress.segment, t),
+            self._method.around(progress.segment, t, self._joins(progress)),
             self._exposed(progress),
             self._since(progress, t),
         )

@@ -365,12 +365,17 @@ def combine(
         silent_change=_mean_of_both(forward.silent_change, backward.silent_change),
         around=None if forward.around is None else forward.around._replace(counted=UNMEASURED),
         exposed=forward.exposed,
-        since=forward.since,
+        since=_least(forward.since, backward.since),
     )
 
 
 def _either(first: NDArray[np.bool_] | None, second: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
     return None if first is None or second is None else first | second
+
+
+def _least(first: float | None, second: float | None) -> float | None:
+    """Where there is only one frame, one of them may not know the usual interval yet."""
+    return None if first is None or second is None else min(first, second)
 
 
 def _mean_of_both(

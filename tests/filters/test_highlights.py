@@ -21,7 +21,7 @@ def intensity(value, variance, offset, prior):
 
 def regularised(value, variance, moving, difference, pitch):
     """L after K12."""
-    nothing = Hidden(0.0, 0.0, 0.0)
+    nothing = Hidden(0.0, 0.0)
     image = read_out(value, variance, OFFSET, OFF, moving, nothing, None, difference, pitch)[0]
     return np.log(image + OFFSET)
 

@@ -294,8 +294,11 @@ class Method(Protocol):
     def silent_change(self, segment: Any) -> Floats | None:
         """(H, W): `unseen.silent_change` of the segment; None: the method or the segment does not tell."""
 
-    def around(self, segment: Any, t: int) -> Around | None:
-        """What the frames around ``t`` say of the pixels there (K11); None: the method does not tell."""
+    def around(self, segment: Any, t: int, joins: bool) -> Around | None:
+        """What the frames around ``t`` say of the pixels there (K11); None: the method does not tell.
+
+        ``joins``: the segment goes from one frame to the next and uses both.
+        """
 
     def trail(self, segment: Any, cursor: Any, t: int) -> Floats | None:
         """(H, W): how far the light is ahead of its events at ``t`` (K14); None: the method does not tell."""
@@ -342,7 +345,7 @@ class _Common:
     def silent_change(self, segment: Any) -> Floats | None:
         return None
 
-    def around(self, segment: Any, t: int) -> Around | None:
+    def around(self, segment: Any, t: int, joins: bool) -> Around | None:
         return None
 
     def unshown(self, segment: Any, variance: Floats, prior: float) -> Unshown | None:
@@ -687,6 +690,8 @@ class BridgedFrames(_Common):
         grown[~unmeasured] = 0.0
         if segment.silent_change is not None:
             silent = ~unmeasured & (memory.latent.variance < bridge.UNMEASURED) & (on + off == 0)
+            if second.ceiling is not None:
+                silent &= ~np.isfinite(second.ceiling)
             q0 = self.noise.quantisation_variance
             forget_silence(grown, segment, silent, segment.silent_change, q0)
         if second.ceiling is not None:
@@ -742,15 +747,15 @@ class BridgedFrames(_Common):
     def silent_change(self, segment: BridgedSegment) -> Floats | None:
         return segment.silent_change
 
-    def around(self, segment: BridgedSegment, t: int) -> Around:
-        share = (t - segment.start) / (segment.end - segment.start)
+    def around(self, segment: BridgedSegment, t: int, joins: bool) -> Around:
+        share = (t - segment.start) / (segment.end - segment.start) if joins else 0.0
         between = 4.0 * share * (1.0 - share)
         return Around(
             segment.forward_variance,
             segment.backward_variance,
             segment.events,
             coming=(1.0 - share) * self.noise.step_variance,
-            counted=0.0,
+            counted=0.0 if joins else bridge.UNMEASURED,
             quantisation_variance=self.noise.quantisation_variance,
             repeated=1.0 - between / 2.0,
             wrong=WRONG_STEPS * between * self.on * self.off,
