@@ -600,7 +600,7 @@ def intensity(log_intensity, variance, settings, white, stretch):
 
 
 def reconstruct(events, frames, sensor_size, settings, times):
-    """The pixels, and of ``times``, (T, H, W) each: L, P, hidden variance (K11), whether they move, what is expected."""
+    """The pixels, and of ``times``, (T, H, W) each: L, P, what is hidden (K11), who moves, what is expected (K15)."""
     kind = settings.filter.kind
     if kind == "cf":
         method, begin = complementary, (frames[0].exposure_start + frames[0].exposure_end) // 2

@@ -6,9 +6,8 @@ L' and P' of the backward one, the estimate is the two-filter smoother (Fraser a
 
     L_s = (L / P + L' / P') / (1 / P + 1 / P').
 
-Where one of them knows no more than a bound, it counts as one (docs/equations.md, K15). Both have seen the frames
-around the image, so their variances are not independent where frames are well exposed; the smaller of the two is given
-out.
+Where one of them knows no more than a bound, it counts as one (docs/equations.md, K15). The variance is
+1 / (1 / P + 1 / P'); what both have from the frames around the image, the noise of these, K11 sees to.
 
 Memory is bounded: the recording is spilled to disk, where it can be read backward, and the backward pass is done
 twice, first to save its state before every window of images, then window by window for the images themselves.
