@@ -83,10 +83,12 @@ def run(arguments):
     """``kalux`` in a process of its own: seconds on the clock, of the processor, in its last step, and megabytes."""
     with tempfile.TemporaryFile("w+") as output, open(os.devnull, "w") as nothing:
         actions = [(os.POSIX_SPAWN_DUP2, file.fileno(), k) for k, file in ((1, output), (2, nothing))]
+        # As users have it: Python keeps its byte code.
+        environment = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
         start = time.perf_counter()
         command = [sys.executable, "-m", "kalux", *map(str, arguments)]
         _, status, used = os.wait4(
-            os.posix_spawn(sys.executable, command, os.environ, file_actions=actions), 0
+            os.posix_spawn(sys.executable, command, environment, file_actions=actions), 0
         )
         wall = time.perf_counter() - start
         output.seek(0)
@@ -123,11 +125,7 @@ def stages(arguments):
         return call
 
     threading.Thread.run = timed_thread
-    for title, name in (
-        ("checking", "check_recording"),
-        ("planning", "make_plan"),
-        ("thread main", "write_images"),
-    ):
+    for title, name in (("planning", "make_plan"), ("thread main", "write_images")):
         setattr(reconstruct, name, timed(title, getattr(reconstruct, name)))
     with contextlib.redirect_stdout(io.StringIO()):
         if app.main([str(argument) for argument in arguments]):

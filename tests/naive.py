@@ -44,6 +44,7 @@ class Pixel:
     excess: float = 0.0
     changes: list[tuple[bool, bool, float, tuple[float, float]]] = field(default_factory=list)
     forgotten: list[float] = field(default_factory=list)
+    measured: list[bool] = field(default_factory=list)
 
 
 def pixels(events, frames, sensor_size, settings, begin):
@@ -246,9 +247,10 @@ def bridged(pixel, settings, times, on, off, scales):
     c, ev = settings.camera, settings.events
     i0, count, c2 = c.offset, len(pixel.starts), on * off
     scale_on, scale_off = 1.0, 1.0
-    var_on = var_off = ev.threshold_spread**2
+    var_on = var_off = ev.mismatch**2
     learned = []
     pixel.changes.clear()
+    pixel.measured.clear()
 
     hidden_by_black = float(
         Camera.named(chosen_response(c.response, None), c.saturation).response.inverse(0.5 / 255)
@@ -296,9 +298,11 @@ def bridged(pixel, settings, times, on, off, scales):
 
     begin = pixel.starts[0]
     first = latent(0)
+    pixel.measured.append(first[1] < UNMEASURED)
     intervals = [(begin, pixel.middles[0], None, first, scale_on, scale_off, var_on, var_off, 0.0)]
     for k in range(count - 1):
         second = latent(k + 1)
+        pixel.measured.append(second[1] < UNMEASURED)
         a, b = pixel.middles[k], pixel.middles[k + 1]
         n_on, n_off = counts(a, b)
         mismatch = second[0] - first[0] - (on * scale_on * n_on - off * scale_off * n_off) - grown(k + 1, b)
@@ -409,7 +413,7 @@ def bridged(pixel, settings, times, on, off, scales):
         while pending and pending[0][0] <= limit:
             t, polarity, near, _, weight = pending.pop(0)
             value, variance = predict(t)
-            signal = 1 / (1 + 9 * ev.noise_rate * (t - near) * US)  # K5
+            signal = 1 / (1 + (9 * ev.background_rate * (t - near) * US) ** 2)  # K5
             # Several events may share a time: this one alone moves L^A by its own step.
             step = weight * own_step(intervals[index], polarity, on, off, ev, c2, counts)
             q = weight * c2 * (ev.step_noise + signal * (1 - signal))
@@ -467,7 +471,7 @@ def complementary(pixel, settings, times, on, off):
 
 
 def is_moving(pixel, t):
-    """K11: whether an event comes in this frame interval or came in the one before."""
+    """K11, K12: whether an event comes in this frame interval or came in the one before, or no frame measures."""
     middles, first = pixel.middles, pixel.starts[0]
     k = sum(m < t for m in middles) - 1  # segments end where the next one's frame is read
     since, until = first, t
@@ -476,7 +480,8 @@ def is_moving(pixel, t):
         since = max(middles[k] - round(seconds), first)
     if k + 1 < len(middles):
         until = middles[k + 1]
-    return any(since < q <= until for q, *_ in pixel.events)
+    unmeasured = not any(pixel.measured[max(k, 0) : k + 2])
+    return unmeasured or any(since < q <= until for q, *_ in pixel.events)
 
 
 def silent_change(pixels, place, interval, c2):

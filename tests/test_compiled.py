@@ -9,12 +9,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kalux.compiled import (
+    INFINITE_BITS,
     event_column,
     event_is_on,
     event_row,
     event_words,
     exponential,
+    largest_around,
     logarithm,
+    magnitude_bits,
+    pack,
     packed,
     unpack,
 )
@@ -72,6 +76,20 @@ def test_words_share_the_memory():
 
 
 @nb.njit
+def largest_of_all(plane, stride, out):
+    for at in range(np.uint64(stride + 1), np.uint64(len(plane) - stride - 1)):
+        out[at] = largest_around(plane, at, stride)
+
+
+def test_the_largest_of_nine_up_to_the_last_pixel():
+    plane = np.random.default_rng(0).integers(-(2**30), 2**30, (7, 9)).astype(np.int32)
+    out = np.zeros_like(plane)
+    largest_of_all(plane.reshape(-1), np.uint64(9), out.reshape(-1))
+    for row, column in np.ndindex(5, 7):
+        assert out[row + 1, column + 1] == plane[row : row + 3, column : column + 3].max()
+
+
+@nb.njit
 def unpacked(records, first, count, planes):
     unpack(records, first, count, planes)
 
@@ -89,6 +107,23 @@ def test_unpacked_records_are_their_fields(names, count):
     assert (planes[:, count:] == -1).all()
 
 
+@nb.njit
+def repacked(planes, records, first, count):
+    pack(planes, records, first, count)
+
+
+@pytest.mark.parametrize("names", ["ab", "abcdefgh"])
+@pytest.mark.parametrize("count", [0, 1, 15, 16, 17, 40])
+def test_packed_records_have_the_fields_of_planes(names, count):
+    """Whole vectors and what is left over; nothing beyond them is written."""
+    records = np.full(50, -1, [(name, "f4") for name in names])
+    planes = np.arange(40.0 * len(names), dtype=np.float32).reshape(len(names), 40)
+    repacked(planes, records, 3, count)
+    for plane, name in zip(planes, names, strict=True):
+        np.testing.assert_array_equal(records[name][3 : 3 + count], plane[:count])
+    assert (records.view(np.float32).reshape(50, -1)[[0, 1, 2, *range(3 + count, 50)]] == -1).all()
+
+
 @pytest.mark.parametrize("shape", [(1, 1), (3, 5), (480, 640)])
 def test_packed_records_lie_in_one_line_each(shape):
     records = packed(shape, np.dtype([(name, "f4") for name in "abcdefgh"]))
@@ -97,3 +132,12 @@ def test_packed_records_lie_in_one_line_each(shape):
     records["h"] = 1.0
     assert (records["h"] == 1.0).all()
     assert records.flags.c_contiguous
+
+
+@given(st.lists(st.floats(width=32), max_size=70))
+def test_the_largest_bits_tell_infinite_from_finite_and_from_nan(numbers):
+    values = np.array(numbers, np.float32)
+    found = magnitude_bits(values)
+    assert (found < INFINITE_BITS) == np.isfinite(values).all()
+    assert (found > INFINITE_BITS) == np.isnan(values).any()
+    assert magnitude_bits(np.stack([values, -values])[:, ::2]) == magnitude_bits(values[::2])

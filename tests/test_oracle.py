@@ -91,7 +91,7 @@ def test_engine_agrees_with_the_oracle(name, data):
         k = max([j for j, f in enumerate(frames) if engine_node(f, name) < t], default=-1)
         white = white_at(t, k, frames, name, chosen.camera.offset)
         scale, value, total = chosen.filter.highlight_scale, expected[i], np.nan_to_num(variance[i])
-        stretch = chosen.events.threshold_spread**2 / scale if scale > 0 else 0.0
+        stretch = chosen.events.mismatch**2 / scale if scale > 0 else 0.0
         bound, noise, beyond = value, total, np.zeros(total.shape)
         unshown = ~np.isnan(excess[i])
         if unshown.any():

@@ -73,10 +73,11 @@ def test_sensors_leave_what_a_recording_tells_to_the_recording(name):
     chosen = preset(name)
     events, camera = chosen.events, chosen.camera
     assert events.threshold_on is events.threshold_off is events.delay is events.step_variance is None
+    assert events.threshold_spread is events.noise_rate is None
     assert camera.log_offset is camera.reference_exposure is None
     assert camera.response == "auto"
     usual = {entry.name: entry.default for entry in dataclasses.fields(events) if "usual" in entry.name}
-    same = altered(chosen, "events", **usual, threshold_spread=0.1, noise_rate=3.0)
+    same = altered(chosen, "events", **usual)
     assert altered(same, "camera", usual_frame_noise=0.006) == DEFAULT
 
 
@@ -166,8 +167,8 @@ def test_none_is_auto_in_files():
     """TOML has no None; left out, it could not undo the value of another preset."""
     assert to_dict(DEFAULT)["events"]["threshold_on"] == "auto"
     assert from_dict({"events": {"delay": "auto"}}, PRESETS["iccv2021"]).events.delay is None
-    with pytest.raises(SettingsError, match=r"events.noise_rate is 'auto'"):
-        from_dict({"events": {"noise_rate": "auto"}}, DEFAULT)
+    with pytest.raises(SettingsError, match=r"events.trail is 'auto'"):
+        from_dict({"events": {"trail": "auto"}}, DEFAULT)
     assert to_dict(altered(DEFAULT, "events", threshold_on=0.3))["events"]["threshold_on"] == 0.3
 
 

@@ -85,7 +85,7 @@ def test_smoothing_is_two_filters_combined_by_information():
             variance=1 / sum(weights),
             moving=a.moving | b.moving,
             silent_change=np.mean(known, axis=0),
-            around=a.around._replace(counted=UNMEASURED),
+            around=None if a.around is None else a.around._replace(counted=UNMEASURED),
             since=None if a.since is None else min(a.since, b.since),
         )
         expected = forward.image(either)
@@ -279,8 +279,8 @@ def test_where_one_filter_knows_only_a_bound_it_is_one():
     level, variance = np.array([[0.5, -0.2, 0.0]]), np.array([[1e-3, 0.1, 1.3]])
     found = combine(first, Estimate(-5, level, variance, 0.0, True, unshown=seen))
     share = 0.1**2 / (
-        0.1**2 + 0.4**2
-    )  # of what is expected above the bound, the second filter not being sure
+        0.1**2 + 1.1**2
+    )  # of what is expected above the bound, as unsure as the second filter is
     level = [[0.5, -0.1 + share * 0.5, 0.0]]
     np.testing.assert_allclose(found.log_intensity, level, atol=1e-5)
     assert found.unshown.pixels.tolist() == [2]

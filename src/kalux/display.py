@@ -21,7 +21,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.compiled import FUSED, ONE, exponential, logarithm
+from kalux.compiled import FUSED, INFINITE_BITS, ONE, exponential, logarithm, magnitude_bits
 from kalux.errors import InputError, SettingsError
 from kalux.models.colour import luminance
 
@@ -44,7 +44,6 @@ _NO_SHOULDER: Final = 1.0 + 1e-3
 BINS = 256
 SAMPLES = 1 << 16
 
-_INFINITE_BITS: Final = np.int32(0x7F800000)
 _COARSE_BITS: Final = 19
 """The exponent and four bits more are what is left of a positive float32 without its last ones: in the order of the
 numbers themselves, and 4096 at most."""
@@ -482,30 +481,21 @@ def _require_percentile(name: str, value: float) -> None:
 
 
 def _checked(intensity: NDArray[Any]) -> Float32:
+    """The intensity as it can be worked with, but for values that `_bounded` or the curve has to limit."""
     checked = np.ascontiguousarray(intensity, np.float32)
     if (checked.ndim != 2 and checked.shape[2:] != (3,)) or checked.size == 0:
         raise InputError(
             f"display: the intensity has shape {checked.shape}; (height, width) or (height, width, 3) is needed"
         )
-    bounded = np.empty_like(checked)
-    if not _bound(checked.reshape(-1), checked.view(np.int32).reshape(-1), bounded.reshape(-1)):
+    if magnitude_bits(checked) >= INFINITE_BITS:
         y, x = (int(i[0]) for i in np.nonzero(~np.isfinite(checked))[:2])
         raise InputError(f"display: the intensity at x={x}, y={y} is not finite (NaN or infinite)")
-    return bounded
+    return checked
 
 
-@nb.njit(cache=True, nogil=True)
-def _bound(values, bits, bounded):  # type: ignore[no-untyped-def]
-    """Values from 0 to `LARGEST`; whether all were finite."""
-    zero, largest = np.float32(0.0), np.float32(LARGEST)
-    strange = np.int32(0)
-    for i in range(len(values)):
-        value = values[i]
-        value = value if value > zero else zero
-        bounded[i] = value if value < largest else largest
-        exponent = np.int32(bits[i] & _INFINITE_BITS)
-        strange = exponent if exponent > strange else strange
-    return strange != _INFINITE_BITS
+def _bounded(values: Float32) -> Float32:
+    """A copy with values from 0 to `LARGEST`."""
+    return np.clip(values, np.float32(0.0), np.float32(LARGEST))
 
 
 def _smoothed(state: ToneState, statistics: Statistics, t: int, smoothing: float) -> Statistics:
@@ -529,29 +519,24 @@ def _shown(image: TimedImage) -> Float32:
     return image.intensity if colour is None else colour
 
 
-def _sample_step(intensity: Float32) -> int:
-    return max(1, math.isqrt(intensity.size // SAMPLES))
-
-
 def _sampled(intensity: Float32) -> Float32:
-    step = _sample_step(intensity)
+    step = max(1, math.isqrt(intensity.shape[0] * intensity.shape[1] // SAMPLES))
     return intensity[::step, ::step]
 
 
-def _percentiles(intensity: Float32, percents: list[float]) -> Statistics:
-    """Percentiles of a sampled image without negative numbers, linear between the two nearest of them."""
-    bits = np.ascontiguousarray(intensity).view(np.int32)
-    step = _sample_step(intensity)
-    positions = np.array(percents) / 100 * (_sampled(intensity).size - 1)
+def _percentiles(values: Float32, percents: list[float]) -> Statistics:
+    """Percentiles of values that are not negative, linear between the two nearest of them."""
+    bits = np.ascontiguousarray(values).view(np.uint32).reshape(-1)
+    positions = np.array(percents) / 100 * (len(bits) - 1)
     ranks = np.stack([np.floor(positions), np.ceil(positions)]).astype(np.int64)
     # Few numbers are left to be put in order: those that share their first bits with one that is looked for.
-    sample, total = _counted(bits, step)
+    total = _counted(bits)
     ends = np.cumsum(total)
     bins = np.searchsorted(ends, ranks, side="right")
     wanted = np.zeros(len(total), np.uint64)
     wanted[bins] = 1
     kept = np.empty(int(total[wanted > 0].sum()) + 1, np.int32)
-    _keep(sample, wanted, kept)
+    _keep(bits, wanted, kept)
     places = ranks - (ends - np.cumsum(total * (wanted > 0)))[bins]
     values = np.partition(kept[:-1], places.ravel())[places].view(np.float32).astype(np.float64)
     found: Statistics = values[0] + (positions - ranks[0]) * (values[1] - values[0])
@@ -559,21 +544,15 @@ def _percentiles(intensity: Float32, percents: list[float]) -> Statistics:
 
 
 @nb.njit(cache=True, nogil=True)
-def _counted(bits, step):  # type: ignore[no-untyped-def]
-    """A sample of an image, and how many of it have the same first bits."""
-    height, width = bits.shape
-    across = (width + step - 1) // step
-    sample = np.empty(across * ((height + step - 1) // step), np.uint32)
-    for row in range(0, height, step):
-        for k in range(across):
-            sample[row // step * across + k] = bits[row, k * step]
+def _counted(sample):  # type: ignore[no-untyped-def]
+    """How many of a sample have the same first bits."""
     counts = np.zeros((4, 1 << (31 - _COARSE_BITS)), np.int64)  # four, so that equal neighbours need not wait
     for i in range(np.uint64(len(sample))):
         counts[i & np.uint64(3), np.uint64(sample[i]) >> np.uint64(_COARSE_BITS)] += 1
     for k in range(1, 4):
         for i in range(counts.shape[1]):
             counts[0, i] += counts[k, i]
-    return sample, counts[0]
+    return counts[0]
 
 
 @nb.njit(cache=True, nogil=True)
@@ -586,28 +565,31 @@ def _keep(sample, wanted, kept):  # type: ignore[no-untyped-def]
 
 
 def _measure(intensity: Float32, curve: Curve) -> Statistics:
-    if intensity.ndim == 3:
-        intensity = luminance(intensity)
+    if isinstance(curve, Linear):
+        return np.empty(0)
+    values = _bounded(intensity if isinstance(curve, Clahe) else _sampled(intensity))
+    if values.ndim == 3:
+        values = luminance(values)
     match curve:
-        case Linear():
-            return np.empty(0)
         case Percentile():
-            return _percentiles(intensity, [curve.low, curve.high])
+            return _percentiles(values, [curve.low, curve.high])
         case Auto():
-            return _log(_percentiles(intensity, [50, curve.high]))
+            return _log(_percentiles(values, [50, curve.high]))
         case Reinhard() | Drago():
-            sampled = _sampled(intensity)
-            bright = _log(_percentiles(intensity, [curve.high]))
-            return np.append(_log(sampled).mean(), bright)
+            bright = _log(_percentiles(values, [curve.high]))
+            return np.append(_log(values).mean(), bright)
         case Clahe():
-            return _measure_clahe(intensity, curve)
+            return _measure_clahe(values, curve)
 
 
 def _apply(intensity: Float32, settings: DisplaySettings, statistics: Statistics) -> Float32:
     if intensity.ndim == 3:
-        y = luminance(intensity)
-        return _in_colour(intensity, y, _apply(y, settings, statistics))
-    mapped = _curved(intensity, settings.curve, statistics)
+        bounded = _bounded(intensity)
+        y = luminance(bounded)
+        return _in_colour(bounded, y, _apply(y, settings, statistics))
+    if isinstance(settings.curve, Auto):  # limits its values itself
+        return _encoded(_curved(intensity, settings.curve, statistics), settings)
+    mapped = _curved(_bounded(intensity), settings.curve, statistics)
     return _encoded(np.clip(mapped, 0, 1, out=mapped), settings)
 
 
@@ -700,14 +682,18 @@ def _rolled(intensity, shoulder):  # type: ignore[no-untyped-def]
 @nb.njit(cache=True, nogil=True, fastmath=FUSED)
 def _show(values, shoulder, rolled, power, shown):  # type: ignore[no-untyped-def]
     """Shoulder and power, each where there is one, limited to 0 to 1."""
-    zero = np.float32(0.0)
+    zero, largest = np.float32(0.0), np.float32(LARGEST)
     for i in range(len(values)):
-        value = _rolled(values[i], shoulder) if rolled else values[i]
+        value = values[i]
+        value = value if value > zero else zero
+        value = value if value < largest else largest
+        value = _rolled(value, shoulder) if rolled else value
         shown[i] = value if value < ONE else ONE
     if power != ONE:
         for i in range(len(values)):
             value = shown[i]
             lifted = exponential(power * logarithm(value))
+            lifted = lifted if lifted < ONE else ONE
             shown[i] = lifted if value > zero else zero
 
 
@@ -751,7 +737,7 @@ def _drago(intensity: Float32, bias: float, average: float, bright: float) -> Fl
 
 def _measure_clahe(intensity: Float32, curve: Clahe) -> Statistics:
     """Log limits of the image, then tiles x tiles distributions at BINS + 1 edges, in one vector."""
-    limits = _log(_percentiles(intensity, [0.1, 99.9]))
+    limits = _log(_percentiles(_sampled(intensity), [0.1, 99.9]))
     position = _log_position(intensity, limits)
     bins = np.minimum(position.astype(np.int64), BINS - 1)
     rows = np.arange(intensity.shape[0]) * curve.tiles // intensity.shape[0]

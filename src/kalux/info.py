@@ -391,6 +391,16 @@ def settled(recording: Recording, plan: Plan, asked: Settings) -> list[tuple[str
             f"{events.refractory_period * 1e-3:g} ms" if events.refractory_period else "nothing is lost in it"
         )
         rows.append(("refractory", f"{what} ({_model_origin(plan, asked.events.refractory_period)})"))
+    if events.threshold_spread is not None:
+        how = _estimated(asked.events.threshold_spread, plan.mismatch is not None)
+        rows.append(
+            ("spread", f"{100 * events.threshold_spread:.1f} % between the pixels' thresholds ({how})")
+        )
+    if events.noise_rate is not None:
+        how = _estimated(asked.events.noise_rate, plan.background_rate is not None)
+        if plan.background_rate is not None and plan.background_rate < events.noise_rate:
+            how = f"the least taken; measured {plan.background_rate:.2g}"
+        rows.append(("background", f"{events.noise_rate:.2g} Hz per pixel of events without reason ({how})"))
     given = asked.camera.reference_exposure is not None
     rows.append(
         (
@@ -428,6 +438,12 @@ def _model_origin(plan: Plan, asked: float | None) -> str:
     if asked is not None:
         return _GIVEN
     return _USUAL if plan.event_model is None else f"estimated from {plan.event_model.samples:,} samples"
+
+
+def _estimated(asked: float | None, found: bool) -> str:
+    if asked is not None:
+        return _GIVEN
+    return "measured" if found else _USUAL
 
 
 def _response_text(response: str) -> str:

@@ -94,7 +94,8 @@ class Estimate:
     final
         As of `Image`.
     moving
-        (H, W) bool: pixels with an event in this frame interval, also one to come, or the one before; None: not told.
+        (H, W) bool: pixels with an event in this frame interval, also one to come, or the one before, and those that
+        neither frame measures; None: not told.
     between
         0 at a frame, 1 half-way between two, and where the next one is not known or not used.
     chroma
@@ -104,7 +105,7 @@ class Estimate:
     silent_change
         (H, W): mean square change of silent pixels around each, from one frame to the next; None: not told.
     around
-        What the frames around say of the pixels (K11); None: not told.
+        What the frames around say of the pixels (K11); None: not told, or there is only one.
     exposed
         The share of the time for which frames are exposed, where the next one is known.
     since
@@ -420,7 +421,7 @@ class Reconstructor:
             self._chroma(progress, t),
             self._unshown(progress, variance),
             self._method.silent_change(progress.segment),
-            self._method.around(progress.segment, t, self._joins(progress)),
+            self._method.around(progress.segment, t) if self._joins(progress) else None,
             self._exposed(progress),
             self._since(progress, t),
         )
@@ -439,7 +440,7 @@ class Reconstructor:
         # The prior needs a variance, which the complementary filter has not.
         filtered, events = self.settings.filter, self.settings.events
         scale = filtered.highlight_scale if filtered.kind == "akf" else 0.0
-        spread = events.threshold_spread
+        spread = events.mismatch
         if self._estimated:
             scale, spread = (
                 min(scale, filtered.highlight_tail * self._tail_beyond),
@@ -659,10 +660,12 @@ class Reconstructor:
 
     def _take(self, progress: _Progress, t: int) -> None:
         """Take the cursor over the events up to ``t`` that it has not taken yet."""
-        for events in self._events.after(progress.taken, t):
+        taken = max(progress.taken, self._events.first)
+        for events in self._events.after(taken, t):
             self._method.advance(progress.segment, progress.cursor, events)
             progress.latest = int(events["t"][-1])
-        progress.taken = self._events.number(t)
+            taken += len(events)
+        progress.taken = taken
 
 
 def _between(progress: _Progress, t: int) -> float:

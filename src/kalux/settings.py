@@ -103,9 +103,8 @@ class EventSettings:
         How much later than the frames' clock events are stamped, us, e.g. by the latency of their pixels; None: an
         estimate from the recording (0 for a live stream).
     threshold_spread
-        Relative standard deviation of the threshold between pixels, prior of its calibration. 0.1: data
-        sheets and the literature give 2 to 10 % (Lichtsteiner 2008: 2.1 % of contrast at c = 0.2), real
-        recordings more.
+        Relative standard deviation of the threshold between pixels, prior of its calibration. None: an estimate from
+        the recording (`kalux.calibration.mismatch`).
     step_variance
         Variance of one event's step in units of c^2. None: an estimate from the recording
         (`kalux.calibration.event_model`).
@@ -119,8 +118,8 @@ class EventSettings:
     deblur_variance
         Variance, in c^2, that each event of an exposure adds to the deblurred frame. 0.05 (docs/tuning.md).
     noise_rate
-        Background noise, Hz per pixel, that makes isolated events doubtful. 3: typical of a DAVIS at its
-        default biases in room light.
+        Background noise, Hz per pixel, that makes isolated events doubtful. None: an estimate from the recording
+        (`kalux.calibration.noise`).
     extrapolation_spread
         Standard deviation of the log of the scale of what events say of highlights beyond white, where no
         frame can check it, when the threshold is only an estimate. 0.15: how well large steps between well
@@ -134,6 +133,12 @@ class EventSettings:
     usual_spread
         Relative standard deviation of the true threshold around the usual one; the prior of its calibration is then
         at least this wide. 0.5: in a live stream a third of the error of 0.1 where the true threshold is 0.15.
+    usual_threshold_spread
+        The spread between pixels where the recording does not tell it. 0.1: data sheets and the literature give 2 to
+        10 % (Lichtsteiner 2008: 2.1 % of contrast at c = 0.2), real recordings more.
+    usual_noise_rate
+        The background noise where the recording does not tell it. 3: typical of a DAVIS at its default biases in
+        room light.
     usual_delay
         The delay where the recording does not tell it, us. 0: as stamped.
     usual_step_variance
@@ -147,17 +152,19 @@ class EventSettings:
     threshold_on: float | None = None
     threshold_off: float | None = None
     delay: int | None = None
-    threshold_spread: float = 0.1
+    threshold_spread: float | None = None
     step_variance: float | None = None
     refractory_period: int | None = None
     quantisation_variance: float = 1 / 6
     deblur_variance: float = 0.05
-    noise_rate: float = 3.0
+    noise_rate: float | None = None
     extrapolation_spread: float = 0.15
     trail: float = 0.4
     usual_threshold_on: float = 0.25
     usual_threshold_off: float = 0.25
     usual_spread: float = 0.5
+    usual_threshold_spread: float = 0.1
+    usual_noise_rate: float = 3.0
     usual_delay: int = 0
     usual_step_variance: float = 0.2
     sigma_proc2: float = 0.0005
@@ -169,6 +176,16 @@ class EventSettings:
     def step_noise(self) -> float:
         """Variance of one event's step in units of c^2, also where nobody has said or estimated it."""
         return self.usual_step_variance if self.step_variance is None else self.step_variance
+
+    @property
+    def mismatch(self) -> float:
+        """Spread of the threshold between pixels, also where nobody has said or estimated it."""
+        return self.usual_threshold_spread if self.threshold_spread is None else self.threshold_spread
+
+    @property
+    def background_rate(self) -> float:
+        """Background noise, Hz per pixel, also where nobody has said or estimated it."""
+        return self.usual_noise_rate if self.noise_rate is None else self.noise_rate
 
     @property
     def lateness(self) -> int:
@@ -183,7 +200,7 @@ class EventSettings:
             self,
             threshold_on=self.usual_threshold_on if self.threshold_on is None else self.threshold_on,
             threshold_off=self.usual_threshold_off if self.threshold_off is None else self.threshold_off,
-            threshold_spread=max(self.threshold_spread, self.usual_spread),
+            threshold_spread=max(self.mismatch, self.usual_spread),
         )
 
     @property
@@ -430,7 +447,7 @@ _DAVIS240C: Final = EventSettings(
     usual_step_variance=0.15,
     # 0.09 between pixels is measured, but a pixel's steps also differ with contrast and light; v2e has 0.03 of 0.2.
     # Held-out frames of all three recordings of DAVIS sensors prefer it to 0.1.
-    threshold_spread=0.15,
+    usual_threshold_spread=0.15,
 )
 
 _DAVIS346: Final = EventSettings(
@@ -444,7 +461,7 @@ _DAVIS346: Final = EventSettings(
     usual_delay=3900,
     # 0.05 and 0.1: the larger, since too small a value believes events too much.
     usual_step_variance=0.1,
-    threshold_spread=0.15,  # as of the DAVIS240C
+    usual_threshold_spread=0.15,  # as of the DAVIS240C
 )
 
 _PROPHESEE_FLIR: Final = Settings(
@@ -460,7 +477,7 @@ _PROPHESEE_FLIR: Final = Settings(
         usual_threshold_off=0.25,
         # Background noise is 0.1 Hz per pixel at 25 C in the light (Gallego 2022, Table 1). Events are doubtful for
         # other reasons, too: the default is far above what DAVIS sensors have. A third of it gains 2 % on the rig.
-        noise_rate=1.0,
+        usual_noise_rate=1.0,
     ),
 )
 

@@ -349,8 +349,8 @@ def combine(
         (forward.log_intensity, forward.variance, forward.unshown),
         (behind, backward.variance, backward.unshown),
     )
-    for (bound, _, unshown), other in (directions, directions[::-1]):
-        obey_bounds(level, bound, unshown, *other)
+    obey_bounds(level, *directions)
+    obey_bounds(level, *directions[::-1])
     return Estimate(
         t=forward.t,
         log_intensity=level,

@@ -36,15 +36,15 @@ def changes(change, *, on=None, variance=1e-4, clipped=None):
     return silent_change(segment, NOISE.quantisation_variance, C2)
 
 
-def forgotten(variance, change, silent):
+def forgotten(variance, change, on, after=None):
     """What silence adds to P, of frames of a variance."""
     nothing = np.zeros(SHAPE, np.float32)
     frame = Latent(nothing, np.full(SHAPE, variance, np.float32))
     thresholds = nominal_thresholds(SHAPE, 0.1, np.float32)
     segment, _ = bridge(frame, frame, nothing, nothing, thresholds, NOISE, 0, SECOND)
-    grown = nothing.copy()
-    plane = np.full(SHAPE, change, np.float32)
-    forget_silence(grown, segment, silent, plane, NOISE.quantisation_variance)
+    grown, plane = nothing.copy(), np.full(SHAPE, change, np.float32)
+    second = frame if after is None else Latent(nothing, after)
+    forget_silence(grown, segment, second, (on, nothing), plane, NOISE.quantisation_variance)
     return grown
 
 
@@ -105,11 +105,12 @@ def test_where_nothing_is_known():
 
 
 def test_a_silent_pixel_forgets_what_the_slope_does_not_take():
-    silent = np.zeros(SHAPE, bool)
-    silent[:, :30] = True
-    assert forgotten(1e-8, 0.01, silent).max() < 1e-12  # precise frames: the slope takes all
-    noisy = forgotten(100.0, 0.01, silent)
+    on = np.zeros(SHAPE, np.float32)
+    on[:, 30:] = 1
+    assert forgotten(1e-8, 0.01, on).max() < 1e-12  # precise frames: the slope takes all
+    noisy = forgotten(100.0, 0.01, on)
     np.testing.assert_allclose(noisy[:, :30], 0.01, rtol=1e-3)
     assert (noisy[:, 30:] == 0).all()
-    alike = forgotten(NOISE.quantisation_variance / 2, 0.01, silent)  # half of the mismatch is the slope's
+    alike = forgotten(NOISE.quantisation_variance / 2, 0.01, on)  # half of the mismatch is the slope's
     np.testing.assert_allclose(alike[:, :30], 0.01 / 4, rtol=1e-5)
+    assert (forgotten(100.0, 0.01, on, np.full(SHAPE, UNMEASURED, np.float32)) == 0).all()

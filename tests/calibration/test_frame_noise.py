@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.optimize import nnls
 
 from kalux import EVENT_DTYPE, Frame, Recording
 from kalux.calibration.frame_noise import (
+    _enough_frames,
+    _not_negative,
     estimate_frame_noise,
     photon_transfer,
     rounding_error,
@@ -97,6 +102,16 @@ def test_the_estimate_looks_at_the_first_frames_only():
     assert some.read != estimate_frame_noise(recording, CAMERA).read
 
 
+def test_of_a_larger_sensor_fewer_frames_are_enough():
+    """As many pixels as 80 frames of a DAVIS346, and 20 frames at least."""
+    assert [_enough_frames(size) for size in ((260, 346), (180, 240), (480, 640), (720, 1280))] == [
+        80,
+        80,
+        24,
+        20,
+    ]
+
+
 def test_levels_that_are_alike_do_not_tell_read_from_shot_noise():
     found = estimate_frame_noise(still(np.full((60, 80), 0.48), 0.01, 0.0), CAMERA)
     assert found.read == pytest.approx(np.hypot(0.01, LEVEL), rel=0.05)
@@ -124,6 +139,7 @@ def test_outliers_do_not_make_variance():
     values = rng.standard_normal(20_000)
     values[:200] += 50
     assert trimmed_variance(values) == pytest.approx(1.0, abs=0.05)
+    assert trimmed_variance(values[200:]) == pytest.approx(values[200:][np.abs(values[200:]) < 4].var(), 1e-3)
 
 
 def test_photon_transfer_is_a_line_without_negative_parts():
@@ -134,3 +150,12 @@ def test_photon_transfer_is_a_line_without_negative_parts():
     assert falling.shot == 0.0
     scattered = photon_transfer(levels, np.where(np.arange(9) % 2, 1e-4, 1e-6), np.ones(9))
     assert not scattered.believed
+
+
+@given(st.integers(0, 10**6), st.booleans())
+def test_least_squares_without_negative_coefficients_are_scipys(seed, empty):
+    rng = np.random.default_rng(seed)
+    design, values = rng.normal(rng.normal(), 1, (9, 2)), rng.normal(rng.normal(), 2, 9)
+    if empty:
+        design[:, 1] = 0.0
+    np.testing.assert_allclose(_not_negative(design, values), nnls(design, values)[0], atol=1e-12)

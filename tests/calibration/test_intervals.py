@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from kalux import Recording
-from kalux.calibration.intervals import intervals
+from kalux.calibration.intervals import intervals, spread
 from kalux.settings import CameraSettings
 
 from builders import frame, pixel_events, random_stream
@@ -58,3 +58,13 @@ def test_pixels_that_are_not_valid_are_not_usable():
     rec = Recording.from_arrays(pixel_events([20_000], [1]), masked, sensor_size=(1, 3))
     (interval,) = intervals(rec, CAMERA, margin=0, most_frames=2)
     assert interval.usable.tolist() == [[True, False, False]]
+
+
+def test_of_many_pixels_some_are_taken_evenly():
+    chosen = np.arange(100).reshape(10, 10) % 3 == 0  # 34 pixels
+    np.testing.assert_array_equal(spread(chosen, 34), np.arange(0, 100, 3))
+    np.testing.assert_array_equal(spread(chosen, 17), np.arange(0, 100, 6))
+    some = spread(chosen, 7)
+    assert len(some) == 7
+    assert set(np.diff(some)) == {12, 15}
+    assert len(spread(chosen, 0)) == 0

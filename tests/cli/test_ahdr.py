@@ -20,6 +20,16 @@ def test_from_a_recording_to_scores(cli, recording, tmp_path):
     assert "s-curve" in kalux.open(out).response
 
 
+def test_what_saturates_in_the_original_is_no_truth(cli, recording, tmp_path):
+    out, found = tmp_path / "a.h5", {}
+    for level in (250, 70):
+        run = cli("ahdr", recording, "-o", out, "--cut-high", 60, "--saturation", level, "--overwrite")
+        assert run.code == 0, run.err
+        found[level] = kalux.open(out).ground_truth()
+        assert ("of 100.0 % of pixels" in run.out) == (found[level].masks is None)
+    assert (found[70].masks == (found[250].images * 60 < 69.99)).mean() > 0.999
+
+
 def test_held_out_frames(cli, recording, tmp_path):
     out = tmp_path / "a.h5"
     assert "4 of truth" in cli("ahdr", recording, "-o", out, "--cut", 60, "--hold-out-frames", "3").out
@@ -40,6 +50,7 @@ def test_a_cut_that_leaves_no_highlights_is_told(cli, recording, tmp_path):
         (["-o", "x.h5", "--cut", "30", "--cut-low", "3"], "--cut-low and --cut-high"),
         (["-o", "x.h5", "--cut-low", "90", "--cut-high", "80"], "black < white"),
         (["-o", "x.h5", "--hold-out-frames", "1"], "at least 2"),
+        (["-o", "x.h5", "--saturation", "80"], "the original saturates at 0.313725; more than"),
         (["-o", "x.h5", "--response", "film"], "unknown response"),
     ],
 )

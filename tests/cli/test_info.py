@@ -25,6 +25,8 @@ def test_says_all_that_reconstruct_would_settle(cli, write_recording, tmp_path):
         "I_0",
         "step",
         "refractory",
+        "spread",
+        "background",
         "exposure",
         "noise",
         "bright tail",

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import gc
+import io
 import os
 import signal
 import subprocess
@@ -11,7 +14,7 @@ import threading
 import pytest
 
 import kalux
-from kalux.cli.app import COMMANDS
+from kalux.cli.app import COMMANDS, _imported
 from kalux.cli.flags import setting_flags
 from kalux.cli.signals import termination_as_interrupt
 from kalux.settings import Settings, to_dict
@@ -24,6 +27,16 @@ def test_help_has_examples_and_fits_a_screen(cli, command):
     assert "examples:\n  kalux " in found.out
     assert len(found.out.splitlines()) < 60
     assert max(map(len, found.out.splitlines())) <= 110
+
+
+def test_garbage_is_collected_again_after_imports(monkeypatch):
+    monkeypatch.delitem(sys.modules, "this", raising=False)
+    with contextlib.redirect_stdout(io.StringIO()):
+        assert _imported("this") is sys.modules["this"]
+    assert gc.isenabled()
+    with pytest.raises(ModuleNotFoundError):
+        _imported("kalux.cli.nothing")
+    assert gc.isenabled()
 
 
 def test_help_names_every_command(cli):

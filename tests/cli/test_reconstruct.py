@@ -590,12 +590,13 @@ class TestInterrupt:
         with av.open(str(out)) as video:
             assert f"{video.streams.video[0].frames:,} images are finished and valid in {out}" in stderr
 
-    def test_before_the_first_image(self, cli, recording, tmp_path, monkeypatch):
+    @pytest.mark.parametrize("threads", [1, 4])
+    def test_before_the_first_image(self, cli, recording, tmp_path, monkeypatch, threads):
         def interrupt(*arguments):
             raise KeyboardInterrupt
 
-        monkeypatch.setattr("kalux.cli.reconstruct.check_recording", interrupt)
-        found = cli("reconstruct", recording, "-o", tmp_path / "out")
+        monkeypatch.setattr("kalux.cli.checking.check_recording", interrupt)
+        found = cli("reconstruct", recording, "-o", tmp_path / "out", "--threads", threads)
         assert (found.code, found.err) == (130, "kalux: interrupted; nothing was written\n")
         assert not (tmp_path / "out").exists()
 

@@ -48,6 +48,8 @@ def test_the_truth_is_the_original_in_units_of_artificial_white():
     for image, exposure in zip(truth.images, exposures, strict=True):
         assert np.allclose(image, LEVELS / 100 * (1000 / exposure), rtol=1e-5)
     assert np.array_equal(truth.masks[0], LEVELS / 255 < 0.98)
+    lower = artificial_hdr(recording_of([LEVELS] * 3), camera, saturation=112 / 255).ground_truth()
+    assert np.array_equal(lower.masks[0], LEVELS < 112)
 
 
 def test_black_and_the_real_response_are_taken_off():
@@ -106,6 +108,8 @@ def test_what_cannot_be():
     camera = ArtificialCamera.with_cut(30)
     with pytest.raises(InputError, match="every is 1"):
         artificial_hdr(recording, camera, every=1)
+    with pytest.raises(InputError, match=r"saturates at 1\.1"):
+        artificial_hdr(recording, camera, saturation=1.1)
     with pytest.raises(InputError, match="black is 1"):
         artificial_hdr(recording, camera, black=1.0)
     with pytest.raises(FrameError, match="too few"):

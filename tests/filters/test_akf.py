@@ -86,6 +86,18 @@ def test_bridged_form_solves_the_equations(value, augmented, variance, forward, 
     np.testing.assert_allclose([read[0][0, 0], read[1][0, 0]], expected, rtol=2e-6, atol=2e-6)  # float32
 
 
+@pytest.mark.parametrize(
+    ("forward", "backward", "moves"),
+    [(0.1, 0.1, False), (0.1, UNMEASURED, False), (UNMEASURED, 0.1, False), (UNMEASURED, UNMEASURED, True)],
+)
+def test_a_pixel_without_events_moves_if_no_frame_measures_it(forward, backward, moves):
+    zero, step = np.zeros((1, 1), np.float32), ONE * 0.2
+    covariances = ONE * forward, ONE * backward
+    segment = BridgedSegment(50_000, 90_000, zero, zero, step, step, *covariances, zero, 0.01, 10.0, None)
+    cursor = akf.begin_bridged(segment._replace(still_since=10_000), bridged_state(0.0, 1.0, 60_000))
+    assert akf.moving_bridged(segment, cursor)[0, 0] == moves
+
+
 @pytest.mark.parametrize("width", [1, 63, 64, 65, 150])
 def test_every_pixel_is_read(width):
     """The closed form over images narrower and wider than what is read together; every quantity differs."""

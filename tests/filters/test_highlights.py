@@ -99,8 +99,8 @@ def test_of_both_directions_only_what_neither_has_seen_is_left():
 
 def obeyed(bound, noise, level, doubt, other=None):
     smoothed = np.array([[-9.0]])
-    args = np.array([[bound]]), unshown([0], 0.2, noise), np.array([[level]]), np.array([[doubt]])
-    obey_bounds(smoothed, *args, other)
+    only_bound = np.array([[bound]]), np.array([[1.0 + noise]]), unshown([0], 0.2, noise)
+    obey_bounds(smoothed, only_bound, (np.array([[level]]), np.array([[doubt]]), other))
     return float(smoothed[0, 0])
 
 
@@ -112,7 +112,8 @@ def test_where_one_direction_knows_only_a_bound_the_other_counts():
 
 
 def test_as_far_as_it_is_sure():
-    assert obeyed(0.0, 0.0, 1.5, 0.3) == pytest.approx((1.5 + 0.2) / 2)
+    assert obeyed(0.0, 0.0, 1.5, 1.0) == pytest.approx((1.5 + 0.2) / 2)
+    assert obeyed(0.0, 0.5, 1.5, 1.5) == pytest.approx((1.5 + 0.2) / 2)
     assert obeyed(0.0, 0.0, 1.5, 50.0) == pytest.approx(0.2, abs=1e-3)
 
 

@@ -58,6 +58,7 @@ def test_signal_probability_limits():
     assert signal_probability(3.0, 0.0) == 1.0
     assert signal_probability(0.0, 1e9) == 1.0
     assert signal_probability(3.0, 1 / 27) == pytest.approx(0.5, rel=1e-12)
+    assert signal_probability(3.0, 0.5 / 27) == pytest.approx(0.8, rel=1e-12)
     assert signal_probability(3.0, 1e9) < 1e-9
 
 

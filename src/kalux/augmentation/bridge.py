@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.trail import Trail
+from kalux.compiled import apart
 
 Array = NDArray[np.floating[Any]]
 
@@ -95,9 +96,10 @@ class BridgedSegment(NamedTuple):
     the way to the end to the way from the start. The covariance of L^A as a measurement is
     R = 1 / (rate (1/forward + 1/backward)), ``rate`` in 1/s, where ``forward`` is ``forward_variance`` and
     ``step_variance`` for each event since the start, and ``backward`` is ``backward_variance`` and ``step_variance``
-    for each of the ``events`` still to come. At ``start`` the level is ``floor`` or more (`floor_before`; None: no
-    bound). At ``end`` the pixel obeys the frame ``bound`` (`lift`), and its variance grows by ``drift``, what its
-    thresholds may have been wrong by (`drift`; None: nothing). Pixels without an event after ``still_since`` are still.
+    for each of the ``events`` still to come (None: not known, and none are counted). At ``start`` the level is
+    ``floor`` or more (`floor_before`; None: no bound). At ``end`` the pixel obeys the frame ``bound`` (`lift`), and its
+    variance grows by ``drift``, what its thresholds may have been wrong by (`drift`; None: nothing). Pixels without an
+    event after ``still_since`` are still.
     Beyond what L^A and the state say here, the level is ahead of its newest event by ``trail`` (K14; None: it is not).
     ``unshown`` is of the pixels that no frame has measured until ``end``, or ``start`` in causal mode.
     ``silent_change`` is what silent pixels around each change from one frame to the next (`unseen`; None: not known).
@@ -111,7 +113,7 @@ class BridgedSegment(NamedTuple):
     step_off: Array
     forward_variance: Array
     backward_variance: Array
-    events: Array
+    events: Array | None
     step_variance: float
     rate: float
     bound: Latent | None
@@ -123,19 +125,77 @@ class BridgedSegment(NamedTuple):
     silent_change: Array | None = None
 
 
+def net_change(segment: BridgedSegment, on: Array, off: Array, grown: Array) -> Array:
+    """(H, W) what ``on`` and ``off`` events add to the level, and what the light has ``grown`` by after them (K14)."""
+    net = np.empty_like(grown)
+    _net_change(*(p.reshape(-1) for p in (segment.step_on, on, segment.step_off, off, grown, net)))
+    return net
+
+
+@nb.njit(cache=True, nogil=True)
+def _net_change(step_on, on, step_off, off, grown, net):  # type: ignore[no-untyped-def]
+    for i in range(len(net)):
+        net[i] = step_on[i] * on[i] - step_off[i] * off[i] + grown[i]
+
+
 def drift(
-    thresholds: Thresholds, noise: BridgeNoise, far_on: Array, far_off: Array, on: Array, off: Array
-) -> Array:
+    first: Latent,
+    second: Latent,
+    thresholds: Thresholds,
+    noise: BridgeNoise,
+    far: tuple[Array, Array],
+    counts: tuple[Array, Array],
+) -> tuple[Array, Array, Array]:
     """By how much events add to the variance of a pixel that no frame measures (docs/equations.md, K10).
 
     A threshold that is wrong is wrong for all events alike: after N of them the level is off by N times the error, and
-    the variance is N^2 times the threshold's. ``far_on`` and ``far_off`` events have come since a frame last measured
-    the pixel, ``on`` and ``off`` come now.
+    the variance is N^2 times the threshold's. From its last measurement on, nothing but events tells of changes: what
+    they have not told yet is added once.
+
+    Parameters
+    ----------
+    first, second
+        The frames before and after.
+    far, counts
+        (H, W) on and off events since a frame last measured the pixel, up to ``first``, and those that come then.
+
+    Returns
+    -------
+    (H, W) what the variance grows by, and the on and off events since the last measurement, up to ``second``.
     """
-    of_on = thresholds.on_variance * noise.threshold_on**2 * on * (2 * far_on + on)
-    of_off = thresholds.off_variance * noise.threshold_off**2 * off * (2 * far_off + off)
-    grown: Array = of_on + of_off
-    return grown
+    grown, far_on, far_off = np.zeros((3, *second.variance.shape), np.float32)
+    of_on, of_off = np.float32(noise.threshold_on**2), np.float32(noise.threshold_off**2)
+    untold = np.float32(noise.quantisation_variance / 2)
+    planes = first.variance, second.variance, thresholds.on_variance, thresholds.off_variance, *far, *counts
+    _drift(of_on, of_off, untold, *(p.reshape(-1) for p in (*planes, grown, far_on, far_off)))
+    return grown, far_on, far_off
+
+
+@nb.njit(cache=True, nogil=True)
+def _drift(  # type: ignore[no-untyped-def]
+    of_on,
+    of_off,
+    untold,
+    before,
+    after,
+    on_variance,
+    off_variance,
+    far_on,
+    far_off,
+    on,
+    off,
+    grown,
+    new_on,
+    new_off,
+):
+    unmeasured, two = np.float32(UNMEASURED), np.float32(2.0)
+    for i in range(len(grown)):
+        if after[i] < unmeasured:
+            continue
+        drifted = on_variance[i] * of_on * on[i] * (two * far_on[i] + on[i])
+        drifted += off_variance[i] * of_off * off[i] * (two * far_off[i] + off[i])
+        grown[i] = drifted + untold if before[i] < unmeasured else drifted
+        new_on[i], new_off[i] = far_on[i] + on[i], far_off[i] + off[i]
 
 
 def floor_before(second: Latent, net: Array, unmeasured: NDArray[np.bool_]) -> Array:
@@ -144,8 +204,17 @@ def floor_before(second: Latent, net: Array, unmeasured: NDArray[np.bool_]) -> A
     What is not known of such a pixel is a constant: if events lead from it to less than the next frame's bound, it was
     too low all the time. ``net`` is what events add to the level between the frames.
     """
-    bound = unmeasured & (second.variance >= UNMEASURED) & (second.variance < UNSEEN)
-    return np.where(bound, second.value - net, np.float32(-np.inf))
+    floor = np.full_like(net, -np.inf)
+    planes = unmeasured, second.variance, second.value, net, floor
+    _floor_before(*(plane.reshape(-1) for plane in planes))
+    return floor
+
+
+@nb.njit(cache=True, nogil=True)
+def _floor_before(unmeasured, variance, value, net, floor):  # type: ignore[no-untyped-def]
+    for i in range(len(floor)):
+        if unmeasured[i] and UNMEASURED <= variance[i] < UNSEEN:
+            floor[i] = value[i] - net[i]
 
 
 def lift(log_intensity: Array, frame: Latent) -> None:
@@ -201,9 +270,7 @@ def bridge(
     The segment, and the thresholds with what this interval says of them.
     """
     seconds = (end - start) * 1e-6
-    augmented, slope, step_on, step_off, events, *factors = np.empty(
-        (9, *first.value.shape), first.value.dtype
-    )
+    augmented, slope, step_on, step_off, events, *factors = apart(9, first.value.shape, first.value.dtype)
     segment = BridgedSegment(
         start=start,
         end=end,
@@ -290,7 +357,7 @@ def extend(
         step_off=noise.threshold_off * thresholds.off,
         forward_variance=frame.variance,
         backward_variance=np.full_like(frame.value, UNMEASURED),
-        events=np.zeros_like(frame.value),
+        events=None,
         step_variance=noise.step_variance,
         rate=1.0 / seconds,
         bound=bound,

@@ -33,6 +33,7 @@ from kalux.compiled import (
     event_words,
     exponential,
     logarithm,
+    pack,
     packed,
     prefetch,
     unpack,
@@ -58,11 +59,8 @@ EXPOSURE_PIXEL: Final = np.dtype(
 )
 """What a pixel remembers within an exposure: 32 bytes, half a cache line, fetched and stored at once."""
 
-_FIELDS: Final = len(EXPOSURE_PIXEL.names or ())
-_LEVEL, _INTEGRAL, _SINCE, _PEAK, _AT_MIDDLE, _EVENTS = (
-    (EXPOSURE_PIXEL.names or ()).index(name)
-    for name in ("level", "integral", "since", "peak", "at_middle", "events")
-)
+EXPOSURE_FIELDS: Final = len(EXPOSURE_PIXEL.names or ())
+_LEVEL, _INTEGRAL, _SINCE, _PEAK, _AT_MIDDLE, _EVENTS, _UP, _DOWN = range(EXPOSURE_FIELDS)
 
 _LARGEST: Final = np.float32(1e37)
 
@@ -108,26 +106,66 @@ def integrate_exposure(
         (H, W) positive log-intensity steps of an event of either polarity.
     """
     chunks = [events] if isinstance(events, np.ndarray) else events
-    pixels = expose(chunks, start, end, step_on, step_off, weighed=False)
-    integrals = ExposureIntegrals(*np.empty((5, *step_on.shape), np.float32))
-    _finish_exposure(pixels.reshape(-1), end - start, *integrals)
-    return integrals
+    exposure = expose(chunks, start, end, (step_on, step_off), (1.0, 1.0), weighed=False)
+    integrals = np.zeros((5, *step_on.shape), np.float32)
+    _finish_exposure(*exposure, end - start, integrals.reshape(5, -1))
+    return ExposureIntegrals(*integrals)
+
+
+class Exposure(NamedTuple):
+    """What the pixels remember of an exposure.
+
+    Attributes
+    ----------
+    pixels
+        (H W) of `EXPOSURE_PIXEL`, row after row; filled only where ``touched``.
+    touched
+        (H W / `EXPOSED`, rounded up) bool: of blocks of pixels that follow each other, whether one has had an event.
+        Elsewhere nothing has moved: the level is 1 throughout.
+    """
+
+    pixels: NDArray[np.void]
+    touched: NDArray[np.bool_]
+
+
+EXPOSED: Final = 64
+"""Pixels of a block: few enough that fields stay in the nearest cache, and that parts where nothing moves are found."""
 
 
 def expose(
-    chunks: Sequence[EventArray], start: int, end: int, step_on: Floats, step_off: Floats, *, weighed: bool
-) -> NDArray[np.void]:
-    """What every pixel remembers of an exposure, (H, W) of `EXPOSURE_PIXEL`. Parameters of `integrate_exposure`.
+    chunks: Sequence[EventArray],
+    start: int,
+    end: int,
+    thresholds: tuple[Floats, Floats],
+    nominal: tuple[float, float],
+    *,
+    weighed: bool,
+    spare: NDArray[np.void] | None = None,
+) -> Exposure:
+    """Take an exposure, from ``start`` to ``end`` (us), over its events.
 
-    ``weighed`` says that the events carry weights (`kalux.augmentation.refractory`).
+    Parameters
+    ----------
+    chunks
+        Time-ordered events; those outside (start, end] are ignored.
+    thresholds, nominal
+        (H, W) thresholds of an event of either polarity in units of the nominal ones, and these, log intensity.
+    weighed
+        Whether the events carry weights (`kalux.augmentation.refractory`).
+    spare
+        ``pixels`` of an exposure of the same size that is used no more, whose memory this one takes.
     """
-    height, width = step_on.shape
-    pixels = packed((height * width,), EXPOSURE_PIXEL)
-    _begin_exposure(pixels, step_on, step_off)
-    for chunk in chunks:
-        inside = between(chunk, start, end)
-        _integrate(event_words(inside), pixels, np.uint64(width), start, (start + end) // 2, _unit(weighed))
-    return pixels.reshape(height, width)
+    height, width = thresholds[0].shape
+    pixels = packed((height * width,), EXPOSURE_PIXEL) if spare is None else spare
+    touched = np.zeros(-(-len(pixels) // EXPOSED), np.bool_)
+    inside = [event_words(events) for events in all_between(chunks, start, end)]
+    for words in inside:
+        _touch(words, np.uint64(width), touched)
+    units = (np.float32(step) for step in nominal)
+    _begin_exposure(pixels, touched, *(plane.reshape(-1) for plane in thresholds), *units)
+    for words in inside:
+        _integrate(words, pixels, np.uint64(width), start, (start + end) // 2, _unit(weighed))
+    return Exposure(pixels, touched)
 
 
 def _unit(weighed: bool) -> np.float32:
@@ -188,26 +226,32 @@ def _events_until(words, t):  # type: ignore[no-untyped-def]
     return first
 
 
-# Elementary functions go over a row of the image at a time, in arrays of their own: vector code would pick the fields
-# of the packed pixels one by one, which is slower than plain code. `prefetch` keeps the compiler from it where fields
-# are written, `unpack` takes its place where they are read.
+# Elementary functions go over a block of pixels at a time, in arrays of their own: vector code would pick the fields
+# of the packed pixels one by one, which is slower than plain code. `pack` and `unpack` take its place.
+
+
+@nb.njit(cache=True, nogil=True)
+def _touch(words, width, touched):  # type: ignore[no-untyped-def]
+    for i in range(len(words)):
+        word = words[i, 1]
+        touched[(event_row(word) * width + event_column(word)) // np.uint64(EXPOSED)] = True
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _begin_exposure(pixels, step_on, step_off):  # type: ignore[no-untyped-def]
-    height, width = step_on.shape
-    up, down = np.empty(width, np.float32), np.empty(width, np.float32)
-    for row in range(height):
-        for column in range(width):
-            up[column] = exponential(np.float32(step_on[row, column]))
-            down[column] = exponential(-np.float32(step_off[row, column]))
-        for column in range(width):
-            i = row * width + column
-            prefetch(pixels, i)
-            pixel = pixels[i]
-            pixel.level = pixel.peak = pixel.at_middle = ONE
-            pixel.integral = pixel.since = pixel.events = np.float32(0.0)
-            pixel.up, pixel.down = up[column], down[column]
+def _begin_exposure(pixels, touched, on, off, unit_on, unit_off):  # type: ignore[no-untyped-def]
+    fields = np.empty((EXPOSURE_FIELDS, EXPOSED), np.float32)
+    fields[_LEVEL] = fields[_PEAK] = fields[_AT_MIDDLE] = ONE
+    fields[_INTEGRAL] = fields[_SINCE] = fields[_EVENTS] = np.float32(0.0)
+    up, down = fields[_UP], fields[_DOWN]
+    for block in range(np.uint64(len(touched))):
+        first = block * np.uint64(EXPOSED)
+        if touched[block]:
+            count = min(np.uint64(len(pixels)) - first, np.uint64(EXPOSED))
+            for i in range(count):
+                up[i] = exponential(unit_on * np.float32(on[first + i]))
+            for i in range(count):
+                down[i] = exponential(-(unit_off * np.float32(off[first + i])))
+            pack(fields, pixels, np.int64(first), np.int64(count))
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy", fastmath=FUSED)
@@ -241,25 +285,52 @@ def mean_level(level, integral, since, duration):  # type: ignore[no-untyped-def
     return mean if mean < _LARGEST else _LARGEST
 
 
+@nb.njit(cache=True, inline="always", error_model="numpy")
+def relative_levels(exposure, block, duration, fields, middle, peak, events):  # type: ignore[no-untyped-def]
+    """Of a block of an `Exposure`: the logarithms of the level at the middle and of the largest, both over the mean of
+    the exposure of ``duration`` us, and the sums of the events' weights. ``fields`` is scratch memory."""
+    if not exposure.touched[block]:
+        middle[:] = peak[:] = events[:] = np.float32(0.0)
+        return
+    first = block * np.uint64(EXPOSED)
+    count = min(np.uint64(len(exposure.pixels)) - first, np.uint64(EXPOSED))
+    unpack(exposure.pixels, np.int64(first), np.int64(count), fields)
+    level, integral, since = fields[_LEVEL], fields[_INTEGRAL], fields[_SINCE]
+    at_middle, largest, count_of = fields[_AT_MIDDLE], fields[_PEAK], fields[_EVENTS]
+    for i in range(count):  # a loop each: each is vector code then
+        events[i] = mean_level(level[i], integral[i], since[i], duration)
+    for i in range(count):
+        middle[i] = logarithm(at_middle[i] / events[i])
+    for i in range(count):
+        peak[i] = logarithm(largest[i] / events[i])
+    for i in range(count):
+        events[i] = count_of[i]
+
+
 # Not FUSED: the paper's (12) divides small differences of these, which would bring another rounding out a hundredfold.
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _finish_exposure(pixels, exposure, log_mean, to_middle, to_end, peak, events):  # type: ignore[no-untyped-def]
-    height, width = events.shape
+def _finish_exposure(pixels, touched, exposure, integrals):  # type: ignore[no-untyped-def]
+    """Fill the planes of `ExposureIntegrals`, which are 0 where nothing has moved."""
     duration = np.float32(exposure)
-    fields = np.empty((_FIELDS, width), np.float32)
-    for row in range(height):
-        unpack(pixels, row * width, width, fields)
-        for column in range(np.uint64(width)):  # a loop each: each is vector code then
-            level, integral, since = fields[_LEVEL, column], fields[_INTEGRAL, column], fields[_SINCE, column]
-            log_mean[row, column] = logarithm(mean_level(level, integral, since, duration))
-        for column in range(np.uint64(width)):
-            to_middle[row, column] = logarithm(fields[_AT_MIDDLE, column])
-        for column in range(np.uint64(width)):
-            to_end[row, column] = logarithm(fields[_LEVEL, column])
-        for column in range(np.uint64(width)):
-            peak[row, column] = logarithm(fields[_PEAK, column])
-        for column in range(np.uint64(width)):
-            events[row, column] = fields[_EVENTS, column]
+    log_mean, to_middle, to_end, largest, count_of = integrals
+    fields = np.empty((EXPOSURE_FIELDS, EXPOSED), np.float32)
+    level, integral, since = fields[_LEVEL], fields[_INTEGRAL], fields[_SINCE]
+    at_middle, peak, events = fields[_AT_MIDDLE], fields[_PEAK], fields[_EVENTS]
+    for block in range(np.uint64(len(touched))):
+        if touched[block]:
+            first = block * np.uint64(EXPOSED)
+            count = min(np.uint64(len(pixels)) - first, np.uint64(EXPOSED))
+            unpack(pixels, np.int64(first), np.int64(count), fields)
+            for i in range(count):  # a loop each: each is vector code then
+                log_mean[first + i] = logarithm(mean_level(level[i], integral[i], since[i], duration))
+            for i in range(count):
+                to_middle[first + i] = logarithm(at_middle[i])
+            for i in range(count):
+                to_end[first + i] = logarithm(level[i])
+            for i in range(count):
+                largest[first + i] = logarithm(peak[i])
+            for i in range(count):
+                count_of[first + i] = events[i]
 
 
 def count_events(events: EventArray, shape: tuple[int, int], *, weighed: bool = False) -> tuple[Array, Array]:

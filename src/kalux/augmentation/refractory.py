@@ -49,9 +49,14 @@ class EventClock:
         self._refractory_period = np.float32(refractory_period)
         self._latest: NDArray[np.int64] | None = None  # once it is needed
 
+    @property
+    def weighs(self) -> bool:
+        """Whether events may have other weights than 1."""
+        return bool(self._refractory_period > 0)
+
     def weigh(self, words: NDArray[np.int64]) -> None:
         """Write the weights of the next events into their words (`kalux.compiled.event_words`), in place."""
-        if self._refractory_period == 0:
+        if not self.weighs:
             _weigh_equally(words)
             return
         height, width = self._sensor_size

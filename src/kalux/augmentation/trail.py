@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from kalux.compiled import (
     MICROSECOND32,
     WEIGHT_UNIT,
+    apart,
     event_column,
     event_is_on,
     event_row,
@@ -95,6 +96,11 @@ class Trail(NamedTuple):
     off: float
     end: FloatArray | None = None
 
+    @property
+    def heights(self) -> tuple[np.float32, np.float32, np.float32]:
+        """s and h c of either polarity, as the compiled loops take them."""
+        return np.float32(self.scale), np.float32(self.on), np.float32(self.off)
+
 
 class FrameTrail(NamedTuple):
     """f at a frame's middle, (H, W) each, forward in time, for the backward filter.
@@ -123,14 +129,16 @@ def follow(
     Intervals are taken from the last quarter of that time: fewer would do, and all of them cost.
     """
     shape = before.newest.shape
-    counts, newest = np.zeros((2, *shape), np.float32), before.newest.copy()
-    planes = counts.reshape(2, -1), newest.reshape(-1), np.uint64(shape[1])
+    counts, newest = apart(2, (before.newest.size,)), before.newest.copy()
+    counts[:] = 0
+    planes = counts, newest.reshape(-1), np.uint64(shape[1])
     span, intervals = _KEPT * before.span, _KEPT * before.intervals
     late = end - (end - start) // 4
     for chunk in chunks:
         more, number = _follow(event_words(chunk), *planes, late)
         span, intervals = span + more, intervals + number
-    return counts[1], counts[0], Followed(newest, span, intervals)
+    off, on = counts.reshape(2, *shape)
+    return on, off, Followed(newest, span, intervals)
 
 
 @nb.njit(cache=True, nogil=True)
@@ -179,6 +187,15 @@ def beyond(age: Any, scale: Any) -> Any:
     return (age + age) * scale / (scale * scale + age * age)
 
 
+@nb.njit(cache=True, inline="always")
+def ahead_of_event(sign: Any, age: Any, heights: Any) -> Any:
+    """f of a pixel whose newest event, of polarity ``sign`` (0: not known), is ``age`` seconds old; float32."""
+    scale, on, off = heights
+    high = on if sign > 0 else np.float32(0.0)
+    high = -off if sign < 0 else high
+    return high * beyond(age, scale)
+
+
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _trail_at(newest, t, scale, on, off, out):  # type: ignore[no-untyped-def]
     for i in range(len(out)):
@@ -190,6 +207,12 @@ def _trail_at(newest, t, scale, on, off, out):  # type: ignore[no-untyped-def]
 def given_trail(start: FloatArray, end: FloatArray) -> Trail:
     """The trail of a segment that is filtered backward in time: f at the times where it starts and ends."""
     return Trail(start, np.zeros(start.shape, np.int8), 1.0, 0.0, 0.0, end)
+
+
+def no_trail(shape: tuple[int, int]) -> Trail:
+    """The trail of a segment in which the light is never ahead of its events."""
+    nothing = np.zeros(shape, np.float32)
+    return given_trail(nothing, nothing)
 
 
 def add_trail(
@@ -204,20 +227,15 @@ def add_trail(
     ``polarity`` and ``clock`` are those of the newest events at ``now`` (us after the clock's origin), with a frame of
     one pixel around the sensor.
     """
-    on, off, scale = (np.float32(value) for value in (trail.on, trail.off, trail.scale))
-    _add_trail(trail.start, polarity, clock, np.int32(now), scale, on, off, log_intensity)
+    _add_trail(trail.start, polarity, clock, np.int32(now), trail.heights, log_intensity)
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _add_trail(start, polarity, clock, now, scale, on, off, log_intensity):  # type: ignore[no-untyped-def]
-    zero = np.float32(0.0)
+def _add_trail(start, polarity, clock, now, heights, log_intensity):  # type: ignore[no-untyped-def]
     height, width = start.shape
     for row in range(height):
         signs, times = polarity[row + 1, 1 : width + 1], clock[row + 1, 1 : width + 1]
         first, out = start[row], log_intensity[row]
         for column in range(width):
-            sign = signs[column]
-            high = on if sign > 0 else zero
-            high = -off if sign < 0 else high
             age = np.float32(np.int32(now - times[column])) * MICROSECOND32
-            out[column] += high * beyond(age, scale) - first[column]
+            out[column] += ahead_of_event(signs[column], age, heights) - first[column]

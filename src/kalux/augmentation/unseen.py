@@ -9,7 +9,8 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.bridge import UNMEASURED, BridgedSegment
+from kalux.augmentation.bridge import UNMEASURED, BridgedSegment, Latent
+from kalux.compiled import apart
 
 Array = NDArray[np.floating[Any]]
 
@@ -22,6 +23,9 @@ half-way to such a frame is then that of a moving pixel, as on the same scenes."
 
 _ENOUGH: Final = 25.0
 """Pixels without noise, or as much information in more of them, that tell the change of the whole image."""
+
+_BLOCK: Final = 64
+"""Pixels that are looked at together: few enough that what lies between stays in the nearest cache."""
 
 _WINDOW: Final = 5
 """Pixels: one difference says little of a mean square. 3 to 9 predict the errors of these scenes about alike."""
@@ -43,14 +47,20 @@ def silent_change(segment: BridgedSegment, quantisation_variance: float, thresho
     threshold2
         c^2.
     """
+    assert segment.events is not None
     shape = segment.slope.shape
-    change, untold, silent, mean = (np.empty(shape, np.float32) for _ in range(4))
+    change, untold = apart(2, shape)
+    mean = np.empty(shape, np.float32)
+    silent = np.empty(shape, np.uint8)
     seconds = np.float32((segment.end - segment.start) * 1e-6)
     q0, most = np.float32(quantisation_variance), np.float32(threshold2)
     variances = segment.forward_variance, segment.backward_variance
-    of_all, told = _told(segment.slope, *variances, segment.events, seconds, q0, most, change, untold, silent)
+    given = tuple(plane.reshape(-1) for plane in (segment.slope, *variances, segment.events))
+    told_of = tuple(plane.reshape(-1) for plane in (change, untold, silent))
+    of_all, told = _told(given, seconds, q0, most, told_of)
     whole = max(of_all, 0.0) / told if told > _ENOUGH else UNKNOWN_CHANGE * threshold2
-    change += untold * np.float32(whole)
+    untold *= np.float32(whole)
+    change += untold
     unknown, unmeasured = (np.float32(u * threshold2) for u in (UNKNOWN_CHANGE, _UNMEASURED_CHANGE))
     _mean(_sum_around(change), _sum_around(silent), *variances, unknown, unmeasured, mean)
     return mean
@@ -59,7 +69,8 @@ def silent_change(segment: BridgedSegment, quantisation_variance: float, thresho
 def forget_silence(
     grown: Array,
     segment: BridgedSegment,
-    silent: NDArray[np.bool_],
+    second: Latent,
+    counts: tuple[Array, Array],
     change: Array,
     quantisation_variance: float,
 ) -> None:
@@ -70,53 +81,64 @@ def forget_silence(
 
     Parameters
     ----------
-    silent
-        (H, W): pixels without an event from one to the other that both frames measure.
+    second
+        The frame after. Pixels that it or the one before does not measure have P of their own (K10).
+    counts
+        (H, W) on and off events between the frames.
     change
         From `silent_change`.
     quantisation_variance
         As in `BridgeNoise`.
     """
-    variances = segment.forward_variance, segment.backward_variance
-    _forget(*variances, silent, change, np.float32(quantisation_variance), grown)
+    planes = segment.forward_variance, segment.backward_variance, second.variance, *counts, change, grown
+    _forget(np.float32(quantisation_variance), *(plane.reshape(-1) for plane in planes))
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _forget(forward, backward, silent, change, q0, grown):  # type: ignore[no-untyped-def]
-    zero = np.float32(0.0)
-    for row in range(grown.shape[0]):
-        for column in range(grown.shape[1]):
-            i = row, column
-            noise = np.float32(forward[i]) + np.float32(backward[i])
-            missed = noise / (noise + q0)
-            grown[i] += np.float32(change[i]) * missed * missed if silent[i] else zero
+def _forget(q0, forward, backward, after, on, off, change, grown):  # type: ignore[no-untyped-def]
+    zero, unmeasured = np.float32(0.0), np.float32(UNMEASURED)
+    for i in range(np.uint64(len(grown))):
+        noise = np.float32(forward[i]) + np.float32(backward[i])
+        missed = noise / (noise + q0)
+        measured = max(np.float32(forward[i]), np.float32(after[i])) < unmeasured
+        lost = np.float32(change[i]) * missed * missed
+        grown[i] += lost if measured and on[i] + off[i] == zero else zero
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _told(  # type: ignore[no-untyped-def]
-    slope, forward, backward, events, seconds, q0, most, change, untold, silent
-):
-    """Of silent pixels (0 elsewhere): squared change without noise, and the share of it that noise hides; both sums."""
-    zero, one = np.float32(0.0), np.float32(1.0)
-    unmeasured = np.float32(UNMEASURED)
-    of_all = told = 0.0
-    for row in range(slope.shape[0]):
-        sum_change = sum_share = zero
-        for column in range(slope.shape[1]):
-            i = row, column
-            noise = np.float32(forward[i]) + np.float32(backward[i])
+def _told(given, seconds, q0, most, told_of):  # type: ignore[no-untyped-def]
+    """Of silent pixels (0 elsewhere): squared change without noise, and the share of it that noise hides; both sums.
+
+    Flat planes, a few pixels at a time and few arrays a loop: vector code, and sums that do not depend on it.
+    """
+    slope, forward, backward, events = given
+    change, untold, silent = told_of
+    zero, one, unmeasured = np.float32(0.0), np.float32(1.0), np.float32(UNMEASURED)
+    noise, share, is_silent = np.empty((3, _BLOCK), np.float32)
+    sum_change, sum_share = np.zeros((2, _BLOCK))
+    for first in range(np.uint64(0), np.uint64(len(slope)), np.uint64(_BLOCK)):
+        pixels = range(min(np.uint64(len(slope)) - first, np.uint64(_BLOCK)))
+        for k in pixels:
+            noise[k] = np.float32(forward[first + k]) + np.float32(backward[first + k])
+        for k in pixels:
+            is_silent[k] = one if noise[k] < unmeasured and events[first + k] == zero else zero
+        for k in pixels:
             # The slope takes the share q0 / V of the mismatch (K1), and so of the frames' noise in it.
-            share = q0 / (noise + q0)
-            share *= share
-            moved = np.float32(slope[i]) * seconds
-            is_silent = one if noise < unmeasured and events[i] == zero else zero
-            part = is_silent * (min(moved * moved, most) - min(noise, unmeasured) * share)
-            change[i], silent[i], untold[i] = part, is_silent, is_silent * (one - share)
-            sum_change += part
-            sum_share += is_silent * share
-        of_all += float(sum_change)
-        told += float(sum_share)
-    return of_all, told
+            taken = q0 / (noise[k] + q0)
+            share[k] = taken * taken
+        for k in pixels:
+            moved = np.float32(slope[first + k]) * seconds
+            of_noise = min(noise[k], unmeasured) * share[k]
+            change[first + k] = is_silent[k] * (min(moved * moved, most) - of_noise)
+        for k in pixels:
+            untold[first + k] = is_silent[k] * (one - share[k])
+        for k in pixels:
+            silent[first + k] = np.uint8(is_silent[k])
+        for k in pixels:
+            sum_change[k] += change[first + k]
+        for k in pixels:
+            sum_share[k] += is_silent[k] * share[k]
+    return sum_change.sum(), sum_share.sum()
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
@@ -126,13 +148,12 @@ def _mean(total, count, forward, backward, unknown, unmeasured_change, mean):  #
     for row in range(total.shape[0]):
         for column in range(total.shape[1]):
             i = row, column
-            near = max(total[i], zero) / max(count[i], one) if count[i] > np.float32(0.5) else unknown
+            near = max(total[i], zero) / max(np.float32(count[i]), one) if count[i] > 0 else unknown
             measured = np.float32(forward[i]) + np.float32(backward[i]) < unmeasured
             mean[i] = near if measured else unmeasured_change
 
 
-def _sum_around(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Over 5 x 5 pixels; beyond the border there is nothing."""
+def _sum_around(values: NDArray[Any]) -> NDArray[Any]:
+    """Over 5 x 5 pixels, in the same type; beyond the border there is nothing."""
     size = (_WINDOW, _WINDOW)
-    summed = cv2.boxFilter(values, cv2.CV_32F, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
-    return np.asarray(summed, np.float32)
+    return np.asarray(cv2.boxFilter(values, -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT))

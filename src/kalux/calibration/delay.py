@@ -7,9 +7,10 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.deblur import between, count_events
+from kalux.augmentation.deblur import between, count_chunks
 from kalux.calibration.contrast import NORMAL_MAD, fit_thresholds
-from kalux.calibration.intervals import intervals
+from kalux.calibration.intervals import intervals, spread
+from kalux.events import EventArray
 from kalux.recording import Recording
 from kalux.settings import CameraSettings
 
@@ -109,13 +110,13 @@ def _samples(recording: Recording, camera: CameraSettings) -> tuple[Array, list[
     counts: list[list[tuple[Array, Array]]] = []
     total = 0
     for interval in intervals(recording, camera, margin=LARGEST, most_frames=_MAX_FRAMES):
-        seen = sum(count_events(interval.events, recording.sensor_size))
-        chosen = interval.usable & (seen >= 2)
-        differences.append(interval.change[chosen])
+        seen = sum(_counts(interval.events, recording.sensor_size))
+        chosen = spread(interval.usable & (seen >= 2), _MAX_SAMPLES - total)
+        differences.append(interval.change.ravel()[chosen])
         shifted = (between(interval.events, interval.start + d, interval.end + d) for d in grid)
-        pairs = (count_events(events, recording.sensor_size) for events in shifted)
-        counts.append([(on[chosen], off[chosen]) for on, off in pairs])
-        total += int(chosen.sum())
+        pairs = (_counts(events, recording.sensor_size) for events in shifted)
+        counts.append([(_of(on, chosen), _of(off, chosen)) for on, off in pairs])
+        total += len(chosen)
         if total >= _MAX_SAMPLES:
             break
     if not differences:
@@ -125,3 +126,12 @@ def _samples(recording: Recording, camera: CameraSettings) -> tuple[Array, list[
         for i in range(len(grid))
     ]
     return np.concatenate(differences), joined
+
+
+def _counts(events: EventArray, shape: tuple[int, int]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Number of on and off events of every pixel, (H, W)."""
+    return count_chunks([events], shape, weighed=False)
+
+
+def _of(counts: NDArray[np.float32], chosen: NDArray[np.int64]) -> Array:
+    return counts.ravel()[chosen].astype(np.float64)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from kalux.augmentation.deblur import between
 from kalux.calibration.contrast import HUBER, NORMAL_MAD
-from kalux.calibration.intervals import intervals
+from kalux.calibration.intervals import intervals, spread
 from kalux.calibration.refractory import LATE, Counts, possible_periods, shortest_interval
 from kalux.models.camera import noise_variance
 from kalux.recording import Recording
@@ -270,16 +270,17 @@ def _samples(
     for interval in intervals(recording, camera, margin=abs(delay), most_frames=_MAX_FRAMES):
         every, latecomers = counts.add(between(interval.events, interval.start + delay, interval.end + delay))
         first, second = interval.first, interval.second
-        chosen = ~first.clipped & ~second.clipped & (every[0].sum(axis=0) > 0)
+        usable = ~first.clipped & ~second.clipped & (every[0].sum(axis=0) > 0)
+        chosen = spread(usable, MAX_SAMPLES - count)
         pixels = (every[:, 0], every[:, 1], latecomers[:, 0], latecomers[:, 1])
         found.append(
             (
-                first.intensity[chosen],
-                second.intensity[chosen],
-                *(values[:, chosen].astype(np.float64) for values in pixels),
+                first.intensity.ravel()[chosen],
+                second.intensity.ravel()[chosen],
+                *(values.reshape(len(periods), -1)[:, chosen].astype(np.float64) for values in pixels),
             )
         )
-        count += int(np.count_nonzero(chosen))
+        count += len(chosen)
         if count >= MAX_SAMPLES:
             break
     if not found:

@@ -7,6 +7,7 @@ correction. Frame noise is in `kalux.calibration.frame_noise`.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -19,6 +20,7 @@ from kalux.calibration.delay import estimate_delay
 from kalux.calibration.frame_noise import FrameNoise, estimate_frame_noise
 from kalux.calibration.refractory import shortest_interval
 from kalux.calibration.values import Calibration
+from kalux.events import EventArray
 from kalux.recording import Recording
 from kalux.settings import CameraSettings
 
@@ -158,15 +160,18 @@ def calibrate_noise(recording: Recording, camera: CameraSettings) -> NoiseCalibr
 # --- events ---------------------------------------------------------------------------------------------------
 
 
-def event_noise(recording: Recording) -> EventNoise | None:
-    """Background rate, hot and dead pixels; None without events, or where next to nothing is ever quiet (1 %)."""
-    first, last = _span(recording)
+def event_noise(recording: Recording, most_events: int | None = None) -> EventNoise | None:
+    """Background rate, hot and dead pixels, from the first ``most_events``, or all.
+
+    Returns None without events, or where next to nothing is ever quiet (1 %).
+    """
+    first, last = _span(recording, most_events)
     if first is None or last is None or last <= first:
         return None
-    tally = _tallied(recording, first, last, np.zeros(recording.sensor_size, np.bool_))
+    tally = _tallied(recording, most_events, first, last, np.zeros(recording.sensor_size, np.bool_))
     hot = _hot_pixels(tally)
     if hot.any():  # again without them: their neighbours are quiet after all
-        tally = _tallied(recording, first, last, hot)
+        tally = _tallied(recording, most_events, first, last, hot)
     share = float(tally.quiet.sum() / (hot.size * (last - first)))
     if share < 0.01:
         return None
@@ -176,9 +181,19 @@ def event_noise(recording: Recording) -> EventNoise | None:
     return EventNoise(rate, error, shrunk_rates(counts, quiet, rate, hot), hot, dead, share)
 
 
-def _span(recording: Recording) -> tuple[int | None, int | None]:
-    first = last = None
+def _chunks(recording: Recording, most_events: int | None) -> Iterator[EventArray]:
+    left = most_events
     for chunk in recording.events():
+        yield chunk if left is None else chunk[:left]
+        if left is not None:
+            left -= len(chunk)
+            if left <= 0:
+                return
+
+
+def _span(recording: Recording, most_events: int | None) -> tuple[int | None, int | None]:
+    first = last = None
+    for chunk in _chunks(recording, most_events):
         first = int(chunk["t"][0]) if first is None else first
         last = int(chunk["t"][-1])
     return first, last
@@ -195,7 +210,9 @@ class _Tally(NamedTuple):
 _MOST_WINDOWS: Final = 32
 
 
-def _tallied(recording: Recording, first: int, last: int, ignored: NDArray[np.bool_]) -> _Tally:
+def _tallied(
+    recording: Recording, most_events: int | None, first: int, last: int, ignored: NDArray[np.bool_]
+) -> _Tally:
     """Count events in quiet time; those of ignored pixels do not end their neighbours' quiet."""
     height, width = recording.sensor_size
     windows = int(np.clip((last - first) // _WINDOW, 1, _MOST_WINDOWS))
@@ -205,7 +222,7 @@ def _tallied(recording: Recording, first: int, last: int, ignored: NDArray[np.bo
     total = np.zeros((height, width), np.int64)
     busy_until = np.full((height, width), first, np.int64)  # silence before the first event is not known
     pending = np.full((height, width), -1, np.int64)  # an event in quiet time, until its future is quiet, too
-    for chunk in recording.events():
+    for chunk in _chunks(recording, most_events):
         t, x, y = (chunk[name] for name in ("t", "x", "y"))
         _tally(t, x, y, first, length, QUIET, ignored, busy_until, pending, counts, quiet, total)
     _close(last, first, length, QUIET, busy_until, pending, counts, quiet)

@@ -134,7 +134,7 @@ class Calibration:
 
 
 def _prior_spread() -> float:
-    return preset("default").events.threshold_spread
+    return preset("default").events.mismatch
 
 
 # --- files ----------------------------------------------------------------------------------------------------

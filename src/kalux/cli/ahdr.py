@@ -44,6 +44,12 @@ def add_command(commands: Any) -> None:
         "--black", type=number, default=0.0, metavar="LEVEL", help="of 255: their black (default 0)"
     )
     group.add_argument(
+        "--saturation",
+        type=number,
+        metavar="LEVEL",
+        help="of 255: from it on they are saturated, and no truth (default 249.9); see docs/datasets.md",
+    )
+    group.add_argument(
         "--hold-out-frames",
         type=whole,
         metavar="N",
@@ -64,6 +70,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     from kalux.cli.output import check_file
     from kalux.cli.progress import Progress
     from kalux.datasets.ahdr import artificial_hdr
+    from kalux.settings import CameraSettings
 
     check_name(options.out, Path(options.recording))
     check_file(options.out, overwrite=options.overwrite)
@@ -73,6 +80,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
         camera,
         response=options.response,
         black=options.black / 255,
+        saturation=CameraSettings.saturation if options.saturation is None else options.saturation / 255,
         every=options.hold_out_frames,
     )
     white, black, pixels = 0, 0, 0
@@ -87,10 +95,12 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     if not options.quiet:
         truth = recording.ground_truth()
         assert truth is not None
+        known = truth.images if truth.masks is None else truth.images[truth.masks]
+        share = 100 * known.size / truth.images.size
         say(
             f"black up to {255 * camera.low:g} and white from {255 * camera.high:g} of 255: "
             f"{100 * white / pixels:.1f} % of pixels white, {100 * black / pixels:.1f} % black; "
-            f"truth up to {truth.images.max():.2f} x white"
+            f"truth up to {known.max(initial=0.0):.2f} x white, of {share:.1f} % of pixels"
         )
         say(f"wrote {progress.images:,} frames, {len(truth.times):,} of truth, to {options.out}")
 

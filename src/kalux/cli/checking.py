@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from concurrent.futures import CancelledError, ThreadPoolExecutor
+from typing import NamedTuple, TypeVar
 
+from kalux.augmentation.deblur import between
 from kalux.errors import FrameError
 from kalux.recording import Recording
+
+T = TypeVar("T")
 
 
 class Contents(NamedTuple):
@@ -69,9 +74,47 @@ def check_recording(recording: Recording, on_events: Callable[[int], None]) -> C
     if not exposures:
         raise FrameError(f"{recording.source.path}: no frames; kalux needs frames as well as events")
     start, end = exposures[0][0], exposures[-1][1]
-    count = between = 0
+    count = events_between = 0
     for chunk in recording.events():
         count += len(chunk)
-        between += int(chunk["t"].searchsorted(end, "right") - chunk["t"].searchsorted(start))
+        events_between += len(between(chunk, start - 1, end))
         on_events(len(chunk))
-    return Contents(len(exposures), count, start, end, between, colours)
+    return Contents(len(exposures), count, start, end, events_between, colours)
+
+
+def check_beside(
+    recording: Recording, on_events: Callable[[int], None], work: Callable[[], T], threads: int
+) -> tuple[Contents, T]:
+    """Check a recording, with several ``threads`` while something else is made of it; both results.
+
+    What is wrong with the recording is raised rather than what ``work`` raises, which may be because of it.
+
+    Parameters
+    ----------
+    recording, on_events
+        As of `check_recording`; with several threads called in another one.
+    work
+        Called in this thread.
+    threads
+        How many may be used.
+    """
+    if threads == 1:
+        return check_recording(recording, on_events), work()
+    stopped = threading.Event()
+
+    def counted(events: int) -> None:
+        if stopped.is_set():
+            raise CancelledError
+        on_events(events)
+
+    with ThreadPoolExecutor(1, "kalux-check") as pool:
+        checked = pool.submit(check_recording, recording, counted)
+        try:
+            try:
+                made = work()
+            except Exception:
+                checked.result()
+                raise
+            return checked.result(), made
+        finally:
+            stopped.set()  # ends the check where the work was interrupted

@@ -7,11 +7,10 @@ import sys
 import threading
 import time
 from types import TracebackType
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
-from rich.console import Console
-from rich.progress import BarColumn, TextColumn
-from rich.progress import Progress as Bar
+if TYPE_CHECKING:
+    from rich.progress import Progress as Bar
 
 LINE_EVERY = 5.0
 """Seconds between lines where stderr is not a terminal."""
@@ -56,13 +55,7 @@ class Progress:
     def __enter__(self) -> Self:
         self._started = self._drawn = time.monotonic()
         if not self._quiet and sys.stderr.isatty():
-            self._bar = Bar(
-                TextColumn("{task.description}"),
-                BarColumn(bar_width=24),
-                TextColumn("{task.fields[text]}"),
-                console=Console(stderr=True),
-                transient=True,
-            )
+            self._bar = _bar()
             self._bar.add_task(self._title, total=self._total_images or self._total_events or None, text="")
             self._bar.start()
         return self
@@ -94,6 +87,19 @@ class Progress:
             return
         with contextlib.suppress(OSError):
             print(f"kalux: {self._title}: {text}", file=sys.stderr, flush=True)
+
+
+def _bar() -> Bar:
+    from rich.console import Console  # 0.02 s, for a terminal only
+    from rich.progress import BarColumn, Progress, TextColumn
+
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(bar_width=24),
+        TextColumn("{task.fields[text]}"),
+        console=Console(stderr=True),
+        transient=True,
+    )
 
 
 def progress_text(

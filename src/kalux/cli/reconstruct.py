@@ -15,7 +15,7 @@ import numpy as np
 
 from kalux.ahead import default_threads
 from kalux.cli.calibrations import add_calibration, given_calibration
-from kalux.cli.checking import Contents, check_recording
+from kalux.cli.checking import Contents, check_beside
 from kalux.cli.flags import HelpSettings, add_display, add_settings, given_settings
 from kalux.cli.info import add_recording, open_recording
 from kalux.cli.output import DEFAULT_RATE, FOLDER_FORMATS, Output, check_output, chosen_output
@@ -149,11 +149,17 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     check_output(output)
     times = None if options.times is None else load_times(options.times)
     recording = open_recording(options)
+    threads = options.threads or default_threads()
     with Progress("checking", quiet=options.quiet) as progress:
-        contents = check_recording(recording, lambda count: progress.add(events=count))
+        contents, made = check_beside(
+            recording,
+            lambda count: progress.add(events=count),
+            lambda: make_plan(recording, settings, times, options),
+            threads,
+        )
     for text in contents.warnings():
         warn(text)
-    made = make_plan(recording, contents, settings, times, options)
+    made = part_of(made, contents, options)
     if made.threshold_origin in ("estimate", "assumed"):
         warn(threshold_warning(made, options.preset))
     if not options.quiet:
@@ -184,19 +190,13 @@ def chosen_settings(options: argparse.Namespace) -> Settings:
     return settings
 
 
-def make_plan(
-    recording: Recording,
-    contents: Contents,
-    settings: Settings,
-    times: Any,
-    options: argparse.Namespace,
-) -> Plan:
-    """Decide everything.
+def make_plan(recording: Recording, settings: Settings, times: Any, options: argparse.Namespace) -> Plan:
+    """Decide everything, of the whole recording.
 
     Raises
     ------
     InputError
-        No image lies in the part that was asked for, or as of `kalux.pipeline.plan`.
+        As of `kalux.pipeline.plan`.
     """
     rate = None if times is not None or options.at is not None else options.rate or DEFAULT_RATE
     made = plan(
@@ -209,7 +209,17 @@ def make_plan(
         lookahead=not options.causal,
         smooth=options.smooth,
     )
-    made = dataclasses.replace(made, threshold_origin=_origin(made, options))
+    return dataclasses.replace(made, threshold_origin=_origin(made, options))
+
+
+def part_of(made: Plan, contents: Contents, options: argparse.Namespace) -> Plan:
+    """The plan of the part that --start and --end leave.
+
+    Raises
+    ------
+    UsageError
+        No image lies in it.
+    """
     for flag, value in (("--start", options.start), ("--end", options.end)):
         if value is not None and not np.isfinite(value):
             raise UsageError(f"{flag} is {value}; seconds are needed")

@@ -80,6 +80,7 @@ def artificial_hdr(
     *,
     response: str = "auto",
     black: float = 0.0,
+    saturation: float = CameraSettings.saturation,
     every: int | None = None,
 ) -> Recording:
     """A recording as an artificial camera would have made it, with the original frames as ground truth.
@@ -97,6 +98,9 @@ def artificial_hdr(
         Of the real one, as in `kalux.settings.CameraSettings`.
     black
         Response, 0 to 1, that is black in the original frames (14 of 255 in the authors' data).
+    saturation
+        Response, 0 to 1, from which a pixel of the real camera is saturated, and no truth. Many sensors saturate far
+        below full scale: slider_depth's at 0.44 (docs/datasets.md).
     every
         Leave out every ``every``-th frame (numbers every - 1, 2 every - 1 ..., from 0); the truth is then those
         frames alone. At least 2. None: all frames are kept, and all are truth.
@@ -104,7 +108,7 @@ def artificial_hdr(
     Raises
     ------
     InputError
-        If ``every`` or ``black`` is out of its range.
+        If ``every``, ``black`` or ``saturation`` is out of its range.
     FrameError
         If there are too few frames, or all are black.
     """
@@ -112,6 +116,11 @@ def artificial_hdr(
         raise InputError(f"artificial HDR: every is {every}; at least 2 is needed")
     if not 0 <= black < 1:
         raise InputError(f"artificial HDR: black is {black}; 0 to less than 1 is possible")
+    if not camera.low < saturation <= 1:
+        raise InputError(
+            f"artificial HDR: the original saturates at {saturation:g}; more than the artificial camera's black, "
+            f"{camera.low:g}, and at most 1 is possible"
+        )
     real = Camera(Response.named(chosen_response(response, recording.response)))
     artificial = Response.named(camera.response)
     kept = [f.exposure for i, f in enumerate(recording.frames()) if every is None or i % every != every - 1]
@@ -135,7 +144,7 @@ def artificial_hdr(
                 image = _intensity(frame, real, black, reference / frame.exposure) / camera.high
                 times.append(frame.middle)
                 images.append(np.maximum(image, 0.0).astype(np.float32))
-                masks.append(frame.normalised() < CameraSettings().saturation)
+                masks.append(frame.normalised() < saturation)
         whole = np.stack(masks)
         return GroundTruth(np.array(times, np.int64), np.stack(images), None if whole.all() else whole)
 

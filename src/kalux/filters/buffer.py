@@ -10,7 +10,7 @@ import numpy as np
 
 from kalux.augmentation.deblur import events_until
 from kalux.augmentation.refractory import EventClock
-from kalux.compiled import event_column, event_row, event_words
+from kalux.compiled import UNWEIGHED, event_column, event_row, event_words
 from kalux.events import EVENT_DTYPE, EventArray
 
 _BLOCK: Final = 1 << 16
@@ -21,14 +21,18 @@ _SPARE: Final = 1 << 20
 
 
 class _Block:
-    """Events ``start`` to ``stop`` of some memory; what is behind them is free."""
+    """Events ``start`` to ``stop`` of some memory, the last of them at ``last`` (us); what is behind them is free."""
 
     def __init__(self, memory: EventArray) -> None:
-        self.memory, self.start, self.stop = memory, 0, 0
+        self.memory, self.start, self.stop, self.last = memory, 0, 0, 0
 
     @property
     def events(self) -> EventArray:
         return self.memory[self.start : self.stop]
+
+    def until(self, t: int) -> int:
+        """Number of the events up to and at ``t`` (us)."""
+        return self.stop - self.start if self.last <= t else events_until(self.events, t)
 
 
 class EventBuffer:
@@ -48,7 +52,7 @@ class EventBuffer:
         blocks = []
         for block in self._blocks:
             blocks.append(_Block(_copied(block.events)))
-            blocks[-1].stop = len(blocks[-1].memory)
+            blocks[-1].stop, blocks[-1].last = len(blocks[-1].memory), block.last
         return {"_clock": self._clock, "_blocks": blocks, "_spare": None, "_first": self._first}
 
     @property
@@ -88,11 +92,13 @@ class EventBuffer:
         height, width = (np.uint64(n) for n in sensor_size)
         least = np.iinfo(np.int64).min if earliest is None else earliest
         free = event_words(block.memory[block.stop : block.stop + count])
-        if not _copy_checked(event_words(events), free, least, delay, height, width):
+        kept = np.int64(-1) if weighed else UNWEIGHED
+        if not _copy_checked(event_words(events), free, least, delay, height, width, kept):
             return False
-        if not weighed:
+        if not weighed and self._clock.weighs:
             self._clock.weigh(free)
         block.stop += count
+        block.last = int(free[-1, 0])
         if not (self._blocks and self._blocks[-1] is block):
             self._blocks.append(block)
         return True
@@ -101,7 +107,7 @@ class EventBuffer:
         """Forget the events up to and at ``until`` (us)."""
         while self._blocks:
             block = self._blocks[0]
-            count = events_until(block.events, until)
+            count = block.until(until)
             block.start += count
             self._first += count
             if block.start < block.stop:
@@ -117,7 +123,7 @@ class EventBuffer:
         """Number of the first event after the time ``t`` (us), one more than that of the last if there is none."""
         number = self._first
         for block in self._blocks:
-            count = events_until(block.events, t)
+            count = block.until(t)
             number += count
             if count < block.stop - block.start:
                 break
@@ -129,8 +135,7 @@ class EventBuffer:
         for block in self._blocks:
             count = block.stop - block.start
             if number < first + count:
-                events = block.events[max(number - first, 0) :]
-                events = events[: events_until(events, until)]
+                events = block.events[max(number - first, 0) : block.until(until)]
                 if len(events) == 0:
                     return
                 yield events
@@ -149,13 +154,16 @@ def _copied(events: EventArray) -> EventArray:
 
 
 @nb.njit(cache=True, nogil=True)
-def _copy_checked(words, copy, earliest, delay, height, width):  # type: ignore[no-untyped-def]
-    """Copy event words with their times moved; False if an event is out of order or outside the sensor."""
+def _copy_checked(words, copy, earliest, delay, height, width, kept):  # type: ignore[no-untyped-def]
+    """Copy event words with their times moved; False if an event is out of order or outside the sensor.
+
+    ``kept`` are the bits of the second word that are copied.
+    """
     wrong = False
     for i in range(len(words)):
         t, word = words[i, 0], words[i, 1]
         wrong |= (t < earliest) | (event_column(word) >= width) | (event_row(word) >= height)
         earliest = t
         copy[i, 0] = t - delay
-        copy[i, 1] = word
+        copy[i, 1] = word & kept
     return not wrong

@@ -8,6 +8,8 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.compiled import largest_around
+
 MICROSECOND = 1e-6
 
 Clock = NDArray[np.int32]
@@ -59,9 +61,4 @@ def newest_around(newest, row, column):  # type: ignore[no-untyped-def]
 @nb.njit(cache=True, inline="always")
 def newest_around_inside(clock, at, stride):  # type: ignore[no-untyped-def]
     """The same of a flat `Clock` of rows of ``stride``, by a pixel's index in it."""
-    one = np.uint64(1)
-    above, below = at - stride, at + stride
-    upper = max(max(clock[above - one], clock[above]), clock[above + one])
-    here = max(max(clock[at - one], clock[at]), clock[at + one])
-    lower = max(max(clock[below - one], clock[below]), clock[below + one])
-    return max(max(upper, here), lower)
+    return largest_around(clock, at, stride)

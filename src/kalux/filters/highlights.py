@@ -18,12 +18,6 @@ _LEAST_SPREAD: Final = np.float32(0.3)
 """Standard deviation that is left where pixels around say that all lie just above their bounds."""
 
 
-_BOUND_VARIANCE: Final = np.float32(0.3)
-"""Of the other direction of time, at which a bound counts as much as its level. Less costs simulated scenes, whose
-thresholds are stated (mean relative MSE 0.112 at 0.2, 0.103 at 0.35, 0.099 at 0.5), more costs real levels that drift
-(artificial HDR of slider_depth, MSE x 100: 1.0 at 0.15, 1.4 at 0.3, 2.2 at 0.5)."""
-
-
 def tempered(unshown: Unshown, bound: Floats, prior: HighlightPrior) -> Unshown:
     """What is expected above a bound that is beyond white itself: highlights end somewhere.
 
@@ -136,26 +130,24 @@ def smoothed_unshown(forward: Unshown | None, backward: Unshown | None) -> Unsho
 
 def obey_bounds(
     smoothed: Floats,
-    bound: Floats,
-    unshown: Unshown | None,
-    level: Floats,
-    variance: Floats,
-    other: Unshown | None,
+    bound: tuple[Floats, Floats, Unshown | None],
+    known: tuple[Floats, Floats, Unshown | None],
 ) -> None:
-    """Smoothed L, (H, W), where one direction knows no more than a ``bound``: that of the other direction. In place.
+    """Smoothed L, (H, W), where one direction of time knows no more than a ``bound``: that of the other. In place.
 
-    ``level`` and ``variance`` are the other's L and P, ``other`` the pixels of which that knows no more either. Where
-    its level is below the bound, both are wrong, each in proportion to its variance; what is expected above the bound
-    counts as far as the other direction is not sure.
+    Both are L, P and the pixels that no frame has measured in that direction. Where the level that is ``known`` lies
+    below the bound, both are wrong, each in proportion to its variance; what is expected above the bound counts as far
+    as the other direction knows no better than this one, by the squares of their variances.
     """
+    bounds, own, unshown = bound
+    level, variance, other = known
     if unshown is None:
         return
     only = np.ones(len(unshown.pixels), np.bool_)
     if other is not None:
         only = np.isin(unshown.pixels, other.pixels, assume_unique=True, invert=True)
-    pixels = unshown.pixels[only]
-    known, doubt, noise = level.reshape(-1)[pixels], variance.reshape(-1)[pixels], unshown.noise[only]
-    bounds = bound.reshape(-1)[pixels]
-    raised = known + np.maximum(bounds - known, np.float32(0.0)) * doubt / (doubt + noise)
-    share = doubt**2 / (doubt**2 + (_BOUND_VARIANCE + noise) ** 2)
-    smoothed.reshape(-1)[pixels] = raised + share * (bounds + unshown.excess[only] - raised)
+    pixels, noise, excess = unshown.pixels[only], unshown.noise[only], unshown.excess[only]
+    least, vague, likely, doubt = (values.reshape(-1)[pixels] for values in (bounds, own, level, variance))
+    raised = likely + np.maximum(least - likely, np.float32(0.0)) * doubt / (doubt + noise)
+    share = doubt**2 / (doubt**2 + vague**2)
+    smoothed.reshape(-1)[pixels] = raised + share * (least + excess - raised)

@@ -17,7 +17,15 @@ from numpy.typing import NDArray
 
 from kalux.augmentation import bridge, deblur, interpolation
 from kalux.augmentation.bridge import BridgedSegment, BridgeNoise, Latent, Thresholds, UnshownMemory
-from kalux.augmentation.deblur import ExposureIntegrals, all_between, count_chunks, mean_level
+from kalux.augmentation.deblur import (
+    EXPOSED,
+    EXPOSURE_FIELDS,
+    Exposure,
+    ExposureIntegrals,
+    all_between,
+    count_chunks,
+    relative_levels,
+)
 from kalux.augmentation.highlights import Unshown, begin_unshown, expected_excess, follow_unshown
 from kalux.augmentation.trail import (
     Followed,
@@ -30,7 +38,7 @@ from kalux.augmentation.trail import (
     trail_at,
 )
 from kalux.augmentation.unseen import UNKNOWN_CHANGE, forget_silence, silent_change
-from kalux.compiled import AHEAD, logarithm, prefetch
+from kalux.compiled import apart
 from kalux.errors import SettingsError
 from kalux.events import EventArray
 from kalux.filters import akf, complementary
@@ -286,19 +294,16 @@ class Method(Protocol):
         """L and P at ``t``; P is infinite where the method has none."""
 
     def end(self, segment: Any, cursor: Any) -> State:
-        """The state at the end of the segment."""
+        """The state at the end of the segment. The cursor must not be used after it: its memory is."""
 
     def moving(self, segment: Any, cursor: Any) -> NDArray[np.bool_] | None:
-        """(H, W): pixels with an event in this frame interval, also one to come, or the one before; None: not told."""
+        """(H, W): pixels with an event in this frame interval, also one to come, or the one before, or unmeasured."""
 
     def silent_change(self, segment: Any) -> Floats | None:
         """(H, W): `unseen.silent_change` of the segment; None: the method or the segment does not tell."""
 
-    def around(self, segment: Any, t: int, joins: bool) -> Around | None:
-        """What the frames around ``t`` say of the pixels there (K11); None: the method does not tell.
-
-        ``joins``: the segment goes from one frame to the next and uses both.
-        """
+    def around(self, segment: Any, t: int) -> Around | None:
+        """What the two frames that a segment joins say of its pixels at ``t`` (K11); None: the method does not tell."""
 
     def trail(self, segment: Any, cursor: Any, t: int) -> Floats | None:
         """(H, W): how far the light is ahead of its events at ``t`` (K14); None: the method does not tell."""
@@ -345,7 +350,7 @@ class _Common:
     def silent_change(self, segment: Any) -> Floats | None:
         return None
 
-    def around(self, segment: Any, t: int, joins: bool) -> Around | None:
+    def around(self, segment: Any, t: int) -> Around | None:
         return None
 
     def unshown(self, segment: Any, variance: Floats, prior: float) -> Unshown | None:
@@ -416,8 +421,11 @@ class BridgedFrames(_Common):
         pixels: PixelCalibration | None,
     ) -> None:
         super().__init__(settings, thresholds, lookahead, shape)
+        # Fresh memory costs as much as filling it.
+        self._spare: akf.BridgedCursor | None = None
+        self._spare_exposure: NDArray[np.void] | None = None
         self._prior = (
-            bridge.nominal_thresholds(shape, settings.events.threshold_spread, np.float32)
+            bridge.nominal_thresholds(shape, settings.events.mismatch, np.float32)
             if pixels is None
             else Thresholds(
                 *(
@@ -426,6 +434,10 @@ class BridgedFrames(_Common):
                 )
             )
         )
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickled without the free memory."""
+        return {**self.__dict__, "_spare": None, "_spare_exposure": None}
 
     def node(self, shot: Shot) -> int:
         return shot.middle if self.lookahead else shot.end
@@ -443,14 +455,16 @@ class BridgedFrames(_Common):
 
     def latent(self, shot: Shot, events: Chunks, thresholds: Thresholds) -> Latent:
         """The frame without blur at the middle of its exposure, and its variance (K3)."""
-        pixels = deblur.expose(
+        exposure = deblur.expose(
             events if self.settings.filter.deblur else (),
             shot.start,
             shot.end,
-            np.float32(self.on) * thresholds.on,
-            np.float32(self.off) * thresholds.off,
+            (thresholds.on, thresholds.off),
+            (self.on, self.off),
             weighed=True,
+            spare=self._spare_exposure,
         )
+        self._spare_exposure = exposure.pixels
         level_variance = frame_log_covariance(
             shot.level_intensity, shot.level_weight, self.settings.camera.noise, shot.white, self.offset
         )
@@ -463,7 +477,7 @@ class BridgedFrames(_Common):
             shot.levels,
             level_log,
             level_variance,
-            pixels,
+            exposure,
             duration=shot.end - shot.start,
             white=float(np.log(self.settings.camera.saturation * shot.white + self.offset)),
             event_variance=self.settings.events.deblur_variance * self.on * self.off,
@@ -527,7 +541,7 @@ class BridgedFrames(_Common):
                     unshown=memory.unshown,
                 )
                 value = lead_in.augmented
-                variance = lead_in.backward_variance + lead_in.step_variance * lead_in.events
+                variance = lead_in.backward_variance + lead_in.step_variance * (on + off)
         else:
             carried = self._carried(memory, shot)
             value, variance = carried.value, carried.variance
@@ -579,7 +593,7 @@ class BridgedFrames(_Common):
                 start,
                 following.middle,
             )
-            net = joined.step_on * on - joined.step_off * off + grown
+            net = bridge.net_change(joined, on, off, grown)
             unmeasured = memory.latent.variance >= bridge.UNMEASURED
             change = self._silent_change(joined)
             joined = joined._replace(
@@ -619,7 +633,7 @@ class BridgedFrames(_Common):
             following.middle,
         )
         tail_on, tail_off, followed = self.follow(events, following.middle, following.end, at_middle)
-        net = behind.step_on * (on + memory.on) - behind.step_off * (off + memory.off) + grown
+        net = bridge.net_change(behind, on + memory.on, off + memory.off, grown)
         after = memory._replace(
             latent=second,
             thresholds=learned,
@@ -683,27 +697,19 @@ class BridgedFrames(_Common):
         self, segment: BridgedSegment, memory: BridgeMemory, second: Latent, on: Floats, off: Floats
     ) -> tuple[BridgedSegment, Floats, Floats]:
         """The segment with what its pixels may drift (K10), and the counts since they were measured, at its end."""
-        unmeasured = second.variance >= bridge.UNMEASURED
-        grown = bridge.drift(memory.thresholds, self.noise, memory.far_on, memory.far_off, on, off)
-        # From its last measurement on, nothing but events tells of changes: what they have not told yet, at one end.
-        grown[memory.latent.variance < bridge.UNMEASURED] += self.noise.quantisation_variance / 2
-        grown[~unmeasured] = 0.0
+        far = memory.far_on, memory.far_off
+        grown, far_on, far_off = bridge.drift(
+            memory.latent, second, memory.thresholds, self.noise, far, (on, off)
+        )
         if segment.silent_change is not None:
-            silent = ~unmeasured & (memory.latent.variance < bridge.UNMEASURED) & (on + off == 0)
-            if second.ceiling is not None:
-                silent &= ~np.isfinite(second.ceiling)
             q0 = self.noise.quantisation_variance
-            forget_silence(grown, segment, silent, segment.silent_change, q0)
+            forget_silence(grown, segment, second, (on, off), segment.silent_change, q0)
         if second.ceiling is not None:
             black = np.isfinite(second.ceiling)
-            grown[black] += second.variance[black] / (_BLACK_FRAMES * (_BLACK_FRAMES + 1))
+            grown[black] = second.variance[black] / (_BLACK_FRAMES * (_BLACK_FRAMES + 1))
         segment = segment._replace(
             drift=grown,
             still_since=_still_since(memory, segment.start, memory.interval or USUAL_INTERVAL * 1e-6),
-        )
-        far_on, far_off = (
-            np.where(unmeasured, far + now, np.float32(0.0))
-            for far, now in ((memory.far_on, on), (memory.far_off, off))
         )
         return segment, far_on, far_off
 
@@ -720,18 +726,21 @@ class BridgedFrames(_Common):
         )
 
     def begin(self, segment: Any, state: State) -> akf.BridgedCursor:
-        return akf.begin_bridged(segment, state)
+        spare, self._spare = self._spare, None
+        return akf.begin_bridged(segment, state, spare)
 
     def advance(self, segment: Any, cursor: akf.BridgedCursor, events: EventArray) -> None:
         settings = self.settings.events
-        noise = akf.BridgedNoise(settings.noise_rate, settings.step_noise, self.on * self.off)
+        noise = akf.BridgedNoise(settings.background_rate, settings.step_noise, self.on * self.off)
         akf.advance_bridged(segment, cursor, events, noise)
 
     def read(self, segment: Any, cursor: akf.BridgedCursor, t: int) -> tuple[Floats, Floats]:
         return akf.read_bridged(segment, cursor, t)
 
     def end(self, segment: Any, cursor: akf.BridgedCursor) -> State:
-        return akf.end_bridged(segment, cursor)
+        state = akf.end_bridged(segment, cursor)
+        self._spare = cursor
+        return state
 
     def moving(self, segment: Any, cursor: akf.BridgedCursor) -> NDArray[np.bool_]:
         return akf.moving_bridged(segment, cursor)
@@ -747,15 +756,16 @@ class BridgedFrames(_Common):
     def silent_change(self, segment: BridgedSegment) -> Floats | None:
         return segment.silent_change
 
-    def around(self, segment: BridgedSegment, t: int, joins: bool) -> Around:
-        share = (t - segment.start) / (segment.end - segment.start) if joins else 0.0
+    def around(self, segment: BridgedSegment, t: int) -> Around:
+        assert segment.events is not None
+        share = (t - segment.start) / (segment.end - segment.start)
         between = 4.0 * share * (1.0 - share)
         return Around(
             segment.forward_variance,
             segment.backward_variance,
             segment.events,
             coming=(1.0 - share) * self.noise.step_variance,
-            counted=0.0 if joins else bridge.UNMEASURED,
+            counted=0.0,
             quantisation_variance=self.noise.quantisation_variance,
             repeated=1.0 - between / 2.0,
             wrong=WRONG_STEPS * between * self.on * self.off,
@@ -771,7 +781,7 @@ def latent_frame(
     levels: NDArray[np.integer[Any]],
     level_log: Array,
     level_variance: Array,
-    pixels: NDArray[np.void],
+    exposure: Exposure,
     *,
     duration: int,
     white: float,
@@ -785,8 +795,8 @@ def latent_frame(
         (H, W) the level of every pixel.
     level_log, level_variance
         (N,) log(I + I_0) of each level, and its variance; `UNMEASURED` where clipped.
-    pixels
-        (H, W) EDI of the exposure, from `deblur.expose`.
+    exposure
+        EDI, from `deblur.expose`.
     duration
         Of the exposure, us.
     white
@@ -794,40 +804,33 @@ def latent_frame(
     event_variance
         What each event of the exposure adds to the variance.
     """
-    value, variance = np.empty((2, *levels.shape), np.float32)
+    latent = apart(2, (levels.size,))
     scalars = np.float32(duration), np.float32(white), np.float32(event_variance)
     tables = level_log.astype(np.float32), level_variance.astype(np.float32)
-    _latent_frame(levels, *tables, pixels.reshape(-1), *scalars, value, variance)
-    return Latent(value, variance)
+    _latent_frame(levels.reshape(-1), *tables, exposure, *scalars, *latent)
+    return Latent(*latent.reshape(2, *levels.shape))
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _latent_frame(  # type: ignore[no-untyped-def]
-    levels, level_log, level_variance, pixels, duration, white, event_variance, value, variance
+    levels, level_log, level_variance, exposure, duration, white, event_variance, value, variance
 ):
     unmeasured = np.float32(bridge.UNMEASURED)
-    height, width = levels.shape
-    # L^D at the middle, and at its peak, over log(B + I_0): their logarithms go over a row at a time.
-    middle, peak = np.empty(width, np.float32), np.empty(width, np.float32)
-    for row in range(height):
-        for column in range(width):
-            i = row * width + column
-            prefetch(pixels, min(i + AHEAD, len(pixels) - 1))
-            pixel = pixels[i]
-            mean = mean_level(pixel.level, pixel.integral, pixel.since, duration)
-            middle[column] = pixel.at_middle / mean
-            peak[column] = pixel.peak / mean
-            variance[row, column] = event_variance * pixel.events
-        for column in range(width):
-            middle[column] = logarithm(middle[column])
-            peak[column] = logarithm(peak[column])
-        for column in range(width):
-            level = levels[row, column]
-            log_frame = level_log[level]
-            known = level_variance[level] + variance[row, column]
-            value[row, column] = log_frame + middle[column]
-            clipped = log_frame + peak[column] >= white or known >= unmeasured
-            variance[row, column] = unmeasured if clipped else known
+    fields = np.empty((EXPOSURE_FIELDS, EXPOSED), np.float32)
+    middle, peak, events, log_frame, known = np.empty((5, EXPOSED), np.float32)
+    for block in range(np.uint64(len(exposure.touched))):
+        relative_levels(exposure, block, duration, fields, middle, peak, events)
+        first = block * np.uint64(EXPOSED)
+        count = min(np.uint64(len(levels)) - first, np.uint64(EXPOSED))
+        for i in range(count):  # looking up is no vector code, the rest is
+            log_frame[i] = level_log[levels[first + i]]
+            known[i] = level_variance[levels[first + i]]
+        for i in range(count):
+            value[first + i] = log_frame[i] + middle[i]
+        for i in range(count):
+            doubt = known[i] + event_variance * events[i]
+            clipped = log_frame[i] + peak[i] >= white or doubt >= unmeasured
+            variance[first + i] = unmeasured if clipped else doubt
 
 
 class InterpolationMemory(NamedTuple):

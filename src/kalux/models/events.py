@@ -61,10 +61,11 @@ def signal_probability(noise_rate: Any, since_any: Any) -> Any:
     """Probability that an event is signal, given the age of the newest event in its 3x3 pixels.
 
     Not in the paper (docs/equations.md, K5). Nine pixels together emit noise at 9 x ``noise_rate`` (Hz per
-    pixel); a signal that repeats after ``since_any`` seconds has a rate of 1 / since_any. The probability is
-    the share of the second in the sum of both.
+    pixel), at any time; the ages of signal fall off with the square of ``since_any`` (s). The odds of noise are
+    the square of the number of noise events that are expected in that time.
     """
-    return _ONE / (_ONE + _NEIGHBOURHOOD * noise_rate * since_any)
+    expected = _NEIGHBOURHOOD * noise_rate * since_any
+    return _ONE / (_ONE + expected * expected)
 
 
 @nb.njit(cache=True, inline="always")

@@ -24,13 +24,13 @@ from kalux.events import EVENT_DTYPE, EventArray
 from kalux.frames import Frame
 from kalux.readers.characters import DOT, FIVE, NEWLINE, NINE, ONE, SPACE, ZERO, parsed_blocks, skip_blanks
 from kalux.readers.images import in_colour, read_image
-from kalux.readers.source import SIZE_UNKNOWN, Source, reading
+from kalux.readers.source import CHUNK_EVENTS, SIZE_UNKNOWN, Source, reading
 
 _EVENTS: Final = "events.txt"
 _IMAGES: Final = "images.txt"
 _ZIP_SIGNATURE: Final = b"PK\x03\x04"
 # The shortest line, "0 0 0 0\n", has 8 bytes: a block holds at most CHUNK_EVENTS events.
-_BLOCK_BYTES: Final = 8 << 20
+_BLOCK_BYTES: Final = 8 * CHUNK_EVENTS
 _LONGEST_LINE: Final = 4096
 _PLAIN_DECIMAL: Final = re.compile(r"\d{1,12}(\.\d*)?|\.\d+")
 _DAMAGE: Final = (

@@ -16,8 +16,8 @@ from kalux.errors import FormatError, InputError, KaluxError
 from kalux.events import EventArray
 from kalux.frames import Frame, Mosaic
 
-CHUNK_EVENTS: Final = 1 << 20
-"""Events in a chunk, at most, where a format leaves the choice to the reader: 16 MiB."""
+CHUNK_EVENTS: Final = 1 << 19
+"""Events in a chunk, at most, where a format leaves the choice to the reader: 8 MiB, of which threads hold a few."""
 
 TRIGGER_DTYPE: Final = np.dtype([("t", "<i8"), ("id", "u1"), ("rising", "?")], align=True)
 """Dtype of an edge on a camera's trigger input: ``t`` int64 microseconds, ``id`` of the input, ``rising``."""

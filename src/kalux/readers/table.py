@@ -31,10 +31,10 @@ from kalux.readers.characters import (
     skip_blanks,
 )
 from kalux.readers.columns import RENAME, UNIT_ASSUMED, Columns, find_columns
-from kalux.readers.source import SIZE_UNKNOWN, Source, reading, smallest_size
+from kalux.readers.source import CHUNK_EVENTS, SIZE_UNKNOWN, Source, reading, smallest_size
 
 # The shortest line, "0,0,0,0\n", has 8 bytes: a block holds at most CHUNK_EVENTS events.
-_BLOCK_BYTES: Final = 8 << 20
+_BLOCK_BYTES: Final = 8 * CHUNK_EVENTS
 _LONGEST_LINE: Final = 4096
 _MOST_COLUMNS: Final = 64
 _NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")

@@ -5,11 +5,12 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import NoReturn, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.compiled import INFINITE_BITS, magnitude_bits
 from kalux.display import colour_of
 from kalux.errors import InputError, InternalError, KaluxError, OutputError
 from kalux.writers.files import uninterrupted
@@ -167,16 +168,17 @@ def check_image(
             wanted = " x ".join(str(n) for n in shape or image.intensity.shape)
             found = " x ".join(str(n) for n in values.shape)
             raise InputError(f"image {index}: the {name} is {found} (height x width), {wanted} is needed")
-    _refuse(~np.isfinite(image.intensity), "intensity", "not finite", image.t, index)
-    if colour is not None:
+    if magnitude_bits(image.intensity) >= INFINITE_BITS:
+        _refuse(~np.isfinite(image.intensity), "intensity", "not finite", image.t, index)
+    if colour is not None and magnitude_bits(colour) >= INFINITE_BITS:
         _refuse(~np.isfinite(colour), "colour", "not finite", image.t, index)
-    _refuse(np.isnan(image.variance), "variance", "NaN", image.t, index)
+    if magnitude_bits(image.variance) > INFINITE_BITS:
+        _refuse(np.isnan(image.variance), "variance", "NaN", image.t, index)
 
 
-def _refuse(bad: NDArray[Any], name: str, what: str, t: int, index: int) -> None:
-    if bad.any():
-        y, x = (int(i[0]) for i in np.nonzero(bad)[:2])
-        raise InternalError(
-            f"image {index} at {t} us: the {name} at x={x}, y={y} is {what}, so it is not written; "
-            "this is an error in kalux, please report it"
-        )
+def _refuse(bad: NDArray[np.bool_], name: str, what: str, t: int, index: int) -> NoReturn:
+    y, x = (int(i[0]) for i in np.nonzero(bad)[:2])
+    raise InternalError(
+        f"image {index} at {t} us: the {name} at x={x}, y={y} is {what}, so it is not written; "
+        "this is an error in kalux, please report it"
+    )

@@ -8,7 +8,6 @@ of the work.
 from __future__ import annotations
 
 import struct
-import zlib
 from typing import Any, Final
 
 import numpy as np
@@ -52,5 +51,5 @@ def _filtered(picture: NDArray[Any]) -> NDArray[np.uint8]:
 
 def _chunk(kind: bytes, data: bytes) -> list[bytes]:
     """Length, kind, data, and the checksum of the latter two."""
-    checksum = zlib.crc32(data, zlib.crc32(kind))
+    checksum = isal_zlib.crc32(data, isal_zlib.crc32(kind))
     return [struct.pack(">I", len(data)), kind, data, struct.pack(">I", checksum)]

@@ -8,6 +8,7 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -89,7 +90,7 @@ class Ticks:
     rate: Fraction | None
     slow_motion: Fraction
 
-    @property
+    @cached_property
     def time_base(self) -> Fraction:
         """Length of a tick in the video, seconds."""
         return (1 / self.rate if self.rate else MICROSECOND) * self.slow_motion

@@ -18,7 +18,7 @@ from kalux.evaluation.truth import truth_file
 from kalux.frames import Stamp
 from kalux.readers import READERS
 from kalux.recording import Recording
-from kalux.settings import AUTO, read_toml
+from kalux.settings import AUTO, CameraSettings, read_toml
 
 TRUTH_SUFFIX: Final = "_gt.npz"
 """Reference images beside a recording: ``pan_gt.npz`` beside ``pan.mat``."""
@@ -39,6 +39,8 @@ class ArtificialHdr:
         Levels of the real camera, of 255, up to which it sees black and from which it sees white.
     black
         Level of the real camera, of 255, that is black.
+    saturation
+        Level of the real camera, of 255, from which it is saturated and no truth.
 
     Raises
     ------
@@ -49,6 +51,7 @@ class ArtificialHdr:
     low: float
     high: float
     black: float = 0.0
+    saturation: float = 255 * CameraSettings.saturation
 
     def __post_init__(self) -> None:
         _ = self.camera
@@ -134,6 +137,7 @@ class Sequence:
             options.ahdr.camera,
             response=self._camera_response(),
             black=options.ahdr.black / 255,
+            saturation=options.ahdr.saturation / 255,
             every=options.hold_out_frames,
         )
 
@@ -287,7 +291,13 @@ _SEQUENCE_KEYS: Final[_Kinds] = {
     "ahdr": (dict,),
     "calibration": (str, list),
 }
-_AHDR_KEYS: Final[_Kinds] = {"cut": _NUMBER, "low": _NUMBER, "high": _NUMBER, "black": _NUMBER}
+_AHDR_KEYS: Final[_Kinds] = {
+    "cut": _NUMBER,
+    "low": _NUMBER,
+    "high": _NUMBER,
+    "black": _NUMBER,
+    "saturation": _NUMBER,
+}
 
 
 def _check_keys(where: str, values: Any, keys: _Kinds) -> None:

@@ -1,0 +1,80 @@
+"""The spread of thresholds between pixels, from recordings whose sensors are known."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from kalux import PRESETS, Recording
+from kalux.calibration.mismatch import SPREADS, estimate_mismatch
+from kalux.datasets import SensorSettings, pan, photograph_scene, simulate
+from kalux.pipeline import plan
+from kalux.settings import CameraSettings
+
+CAMERA = CameraSettings(log_offset=0.02)
+EVENTS = dataclasses.replace(
+    PRESETS["default"].events, threshold_on=0.2, threshold_off=0.2, refractory_period=0, delay=0
+)
+
+
+def scene(seed=0, flat=0.0):
+    """A pan over texture from 0.02 to 0.8 of white, with a share of rows that have none."""
+    noise = np.random.default_rng(seed).standard_normal((50, 130))
+    for _ in range(3):
+        noise = (noise + np.roll(noise, 1, 0) + np.roll(noise, 1, 1)) / 3
+    share = (noise - noise.min()) / np.ptp(noise)
+    share[: round(flat * len(share))] = 0.5
+    return photograph_scene(0.02 * 40**share, pan(80), sensor_size=(44, 60), duration=900_000)
+
+
+def found(spread, **sensor):
+    settings = SensorSettings(
+        threshold_on=0.2,
+        threshold_off=0.2,
+        log_offset=0.02,
+        exposure=1_000,
+        threshold_mismatch=spread,
+        **sensor,
+    )
+    return estimate_mismatch(simulate(scene(), settings, seed=3).recording(), CAMERA, EVENTS)
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.05, 0.1, 0.15])
+def test_the_spread_is_found(spread):
+    estimate = found(spread)
+    assert np.sqrt(max(estimate.variance, 0.0)) == pytest.approx(spread, rel=0.2, abs=0.05)
+    assert estimate.error < 0.002
+    assert SPREADS[0] <= estimate.spread <= SPREADS[1]
+
+
+def test_noise_that_is_new_in_each_interval_is_not_taken_for_it():
+    estimate = found(0.0, noise_rate=2.0, read_noise=0.01)
+    assert estimate.variance < 0.05**2
+    assert found(0.08, noise_rate=2.0, read_noise=0.01).variance == pytest.approx(0.08**2, rel=0.4)
+
+
+def test_the_plan_settles_it():
+    sensor = SensorSettings(threshold_on=0.2, threshold_off=0.2, threshold_mismatch=0.05, noise_rate=1.0)
+    recording = simulate(scene(flat=0.5), sensor, seed=3).recording()
+    made = plan(recording, at="frames")
+    assert made.mismatch.spread == made.settings.events.threshold_spread < 0.08
+    assert (
+        made.settings.events.noise_rate == pytest.approx(made.background_rate) == pytest.approx(1.0, rel=0.6)
+    )
+    given = dataclasses.replace(made.settings.events, threshold_spread=0.07, noise_rate=2.0)
+    again = plan(recording, at="frames", settings=dataclasses.replace(made.settings, events=given))
+    assert (again.mismatch, again.background_rate) == (None, None)
+    assert (again.settings.events.threshold_spread, again.settings.events.noise_rate) == (0.07, 2.0)
+
+
+def test_two_frames_tell_nothing():
+    """There are no two intervals without a common frame: the usual spread stays."""
+    whole = simulate(scene(), SensorSettings(threshold_on=0.2, threshold_off=0.2), seed=3).recording()
+    frames = list(whole.frames())[:2]
+    short = Recording.from_arrays(
+        next(iter(whole.events())), frames, sensor_size=whole.sensor_size, contrast_threshold=(0.2, 0.2)
+    )
+    assert estimate_mismatch(short, CAMERA, EVENTS) is None
+    assert plan(short, at="frames").settings.events.threshold_spread == 0.1

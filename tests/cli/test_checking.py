@@ -1,0 +1,84 @@
+"""The check of a recording, alone and beside other work."""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+
+import pytest
+
+from kalux import Recording
+from kalux.cli.checking import check_beside, check_recording
+from kalux.errors import EventError, InputError
+
+from builders import random_stream
+
+STREAM = random_stream(5)
+WHOLE = Recording.from_arrays(STREAM.events, STREAM.frames, sensor_size=STREAM.sensor_size)
+
+
+def in_parts(parts):
+    return Recording(dataclasses.replace(WHOLE.source, events=lambda: iter(parts)))
+
+
+BACKWARDS = in_parts([STREAM.events[100:], STREAM.events[:100]])
+
+
+def test_contents():
+    start, end = STREAM.frames[0].exposure_start, STREAM.frames[-1].exposure_end
+    counts = []
+    found = check_recording(in_parts([STREAM.events[:100], STREAM.events[100:]]), counts.append)
+    assert counts == [100, len(STREAM.events) - 100]
+    assert (found.frames, found.events, found.start, found.end) == (
+        len(STREAM.frames),
+        len(STREAM.events),
+        start,
+        end,
+    )
+    t = STREAM.events["t"]
+    assert found.events_between == ((t >= start) & (t <= end)).sum()
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_both_results_come_back(threads):
+    ran_in = []
+    found, made = check_beside(
+        WHOLE, lambda _: ran_in.append(threading.current_thread()), lambda: "made", threads
+    )
+    assert (found, made) == (check_recording(WHOLE, lambda _: None), "made")
+    assert (ran_in[0] is threading.current_thread()) == (threads == 1)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_what_is_wrong_with_the_recording_is_told_first(threads):
+    def refuse():
+        raise InputError("the work has failed")
+
+    with pytest.raises(EventError, match="event 50"):
+        check_beside(BACKWARDS, lambda _: None, refuse, threads)
+    with pytest.raises(EventError, match="event 50"):
+        check_beside(BACKWARDS, lambda _: None, lambda: None, threads)
+    with pytest.raises(InputError, match="the work has failed"):
+        check_beside(WHOLE, lambda _: None, refuse, threads)
+
+
+def test_an_interrupt_of_the_work_ends_the_check():
+    """Within a chunk: the parts of this recording would never end."""
+    begun = threading.Event()
+    counts = []
+
+    def parts():
+        yield STREAM.events
+        begun.set()
+        while True:
+            yield STREAM.events[-1:]
+
+    def interrupted():
+        begun.wait(10)
+        raise KeyboardInterrupt
+
+    endless = Recording(dataclasses.replace(WHOLE.source, events=parts))
+    with pytest.raises(KeyboardInterrupt):
+        check_beside(endless, counts.append, interrupted, 2)
+    assert counts
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("kalux-check")]
