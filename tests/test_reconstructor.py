@@ -437,7 +437,8 @@ def test_silent_pixels_do_not_see_the_events_of_others(variant, lookahead, monke
         a, b = quiet.estimate(t), busy.estimate(t)
         assert a.log_intensity[0, 0] == b.log_intensity[0, 0]
         assert a.variance[0, 0] == b.variance[0, 0]
-        assert quiet.image(a).intensity[0, 0] == busy.image(b).intensity[0, 0]
+        if a.log_intensity[0, 0] <= a.white:  # beyond, neighbours are heard (K12)
+            assert quiet.image(a).intensity[0, 0] == busy.image(b).intensity[0, 0]
 
 
 @every_variant
