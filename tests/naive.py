@@ -19,7 +19,7 @@ from kalux.settings import chosen_response
 US = 1e-6
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(24)
 UNMEASURED = 1e12
-HIDDEN_MOVING = (0.005, 0.12)
+USUAL_INTERVAL = 40_000
 
 
 @dataclass
@@ -27,8 +27,8 @@ class Pixel:
     """What one pixel sees. Events: time, polarity, newest event in the 3x3 pixels, newest of its own, weight
     (K13).
 
-    Changes, of frame intervals, K11: whether both frames measure it, whether it is silent, and how much its L changed,
-    squared, without what noise makes of that.
+    Changes, of frame intervals, K11: whether both frames measure it, whether it is silent, how much its L changed,
+    squared, without what noise makes of that, and the variances of both frames. Forgotten: what comes to P after each.
     """
 
     starts: list[int]
@@ -42,7 +42,8 @@ class Pixel:
     events: list[tuple[int, bool, int, int, float]]
     shown: int = 0
     excess: float = 0.0
-    changes: list[tuple[bool, bool, float]] = field(default_factory=list)
+    changes: list[tuple[bool, bool, float, tuple[float, float]]] = field(default_factory=list)
+    forgotten: list[float] = field(default_factory=list)
     measured: list[bool] = field(default_factory=list)
 
 
@@ -248,6 +249,8 @@ def bridged(pixel, settings, times, on, off, scales):
     scale_on, scale_off = 1.0, 1.0
     var_on = var_off = ev.mismatch**2
     learned = []
+    pixel.changes.clear()
+    pixel.measured.clear()
 
     hidden_by_black = float(
         Camera.named(chosen_response(c.response, None), c.saturation).response.inverse(0.5 / 255)
@@ -309,7 +312,7 @@ def bridged(pixel, settings, times, on, off, scales):
         q0, noise = ev.quantisation_variance * c2, first[1] + second[1]
         told = (q0 / (noise + q0)) ** 2
         squared = min((q0 * mismatch / total) ** 2, c2) - noise * told + (1 - told) * 0.1 * c2
-        pixel.changes.append((noise < UNMEASURED, n_on + n_off == 0, squared))
+        pixel.changes.append((noise < UNMEASURED, n_on + n_off == 0, squared, (first[1], second[1])))
         gain_on, gain_off = var_on * on * n_on / total, -var_off * off * n_off / total  # K2
         scale_on = min(max(scale_on + gain_on * mismatch, 0.3), 3.0)
         scale_off = min(max(scale_off + gain_off * mismatch, 0.3), 3.0)
@@ -339,7 +342,8 @@ def bridged(pixel, settings, times, on, off, scales):
             n_on, n_off = counts(a, b)
             if right[1] < UNMEASURED:
                 far_on = far_off = 0
-                yield right[1] / 12 if crushed(k) else 0.0  # K7
+                unseen = pixel.forgotten[k - 1] if pixel.forgotten else 0.0
+                yield right[1] / 12 if crushed(k) else unseen  # K7
                 continue
             unseen = ev.quantisation_variance * c2 / 2 if left[1] < UNMEASURED else 0.0
             before = v_on * (on * far_on) ** 2 + v_off * (off * far_off) ** 2
@@ -480,29 +484,61 @@ def is_moving(pixel, t):
     return unmeasured or any(since < q <= until for q, *_ in pixel.events)
 
 
+def silent_change(pixels, place, interval, c2):
+    """K11: the mean square change of the silent pixels around from one frame to the next."""
+    row, column = place
+    if not pixels[place].changes[interval][0]:
+        return 0.4 * c2
+    near = [
+        q.changes[interval][2]
+        for (i, j), q in pixels.items()
+        if abs(i - row) <= 2 and abs(j - column) <= 2 and all(q.changes[interval][:2])
+    ]
+    return max(sum(near) / len(near), 0.0) if near else 0.1 * c2
+
+
+def forgotten(pixels, place, c2, q0):
+    """K11: what the state of a pixel loses in every frame interval."""
+    for k, (measured, silent, _, noise) in enumerate(pixels[place].changes):
+        missed = sum(noise) / (sum(noise) + q0)
+        yield silent_change(pixels, place, k, c2) * missed**2 if measured and silent else 0.0
+
+
 def hidden(pixels, place, moving, t, on, off):
     """K11: the variance of what no event has told."""
-    c2, middles = on * off, pixels[place].middles
+    pixel, c2 = pixels[place], on * off
+    middles = pixel.middles
     k = sum(m < t for m in middles) - 1
-    share, latest = 0.5, k - 1
     if 0 <= k < len(middles) - 1:
-        share, latest = (t - middles[k]) / (middles[k + 1] - middles[k]), k
-    between = 4 * share * (1 - share)
+        gap = middles[k + 1] - middles[k]
+        share = (t - middles[k]) / gap
+        exposures = [pixel.ends[i] - pixel.starts[i] for i in (k, k + 1)]
+        between = 4 * share * (1 - share)
+        between += (1 - between) * 0.09 * min(sum(exposures) / 2 / gap, 1)
+        if moving:
+            return 0.08 * c2 * between
+        return 0.22 * between * silent_change(pixels, place, k, c2)
     if moving:
-        return c2 * (HIDDEN_MOVING[0] + HIDDEN_MOVING[1] * between)
-    change = 0.1 * c2
-    if latest >= 0:
-        row, column = place
-        near = [
-            q.changes[latest][2]
-            for (i, j), q in pixels.items()
-            if abs(i - row) <= 2 and abs(j - column) <= 2 and all(q.changes[latest][:2])
-        ]
-        if near:
-            change = max(sum(near) / len(near), 0.0)
-        if not pixels[place].changes[latest][0]:
-            change = 0.4 * c2
-    return 0.003 * c2 + change * 0.35 * between
+        return 0.08 * c2
+    gap = middles[-1] - middles[-2] if k > 0 else USUAL_INTERVAL
+    change = silent_change(pixels, place, k - 1, c2) if k > 0 else 0.1 * c2
+    return min(abs(t - middles[max(k, 0)]) / gap, 1) * change
+
+
+def known(pixel, variance, t, settings, c2):
+    """K11: P with what the frames around say, of a pixel between two frames."""
+    ev, middles = settings.events, pixel.middles
+    k = sum(m < t for m in middles) - 1
+    if not 0 <= k < len(middles) - 1:
+        return variance
+    a, b = middles[k], middles[k + 1]
+    share, (first, second) = (t - a) / (b - a), pixel.changes[k][3]
+    events = sum(w for q, *_, w in pixel.events if a < q <= b)
+    between = 4 * share * (1 - share)
+    following = second + (1 - share) * events * ev.step_noise * c2
+    q0 = ev.quantisation_variance * c2
+    common = (q0 / (first + second + q0)) ** 2 * min(first, second) * (1 - between / 2)
+    return max(1 / (1 / variance + 1 / following), common) + 0.002 * c2 * between * events**2
 
 
 def regularised(level, variance, moving, difference):
@@ -574,7 +610,7 @@ def intensity(log_intensity, variance, settings, white, stretch):
 
 
 def reconstruct(events, frames, sensor_size, settings, times):
-    """Of ``times``, (T, H, W) each: L, P, hidden variance (K11), whether pixels move, and what is expected (K15)."""
+    """The pixels, and of ``times``, (T, H, W) each: L, P, what is hidden (K11), who moves, what is expected (K15)."""
     kind = settings.filter.kind
     if kind == "cf":
         method, begin = complementary, (frames[0].exposure_start + frames[0].exposure_end) // 2
@@ -588,10 +624,16 @@ def reconstruct(events, frames, sensor_size, settings, times):
     for (row, column), pixel in every.items():
         out[:2, :, row, column] = method(pixel, settings, times, on, off, *more).T
     if method is not bridged:
-        return out[0], out[1], out[2], out[3].astype(bool), np.full(out[0].shape, np.nan)
+        return every, out[0], out[1], out[2], out[3].astype(bool), np.full(out[0].shape, np.nan)
+    for place, pixel in every.items():  # of which nothing depends on it but P and L
+        pixel.forgotten = list(
+            forgotten(every, place, on * off, settings.events.quantisation_variance * on * off)
+        )
+    for (row, column), pixel in every.items():
+        out[:2, :, row, column] = method(pixel, settings, times, on, off, *more).T
     for (row, column), pixel in every.items():
         for i, t in enumerate(times):
             out[3, i, row, column] = is_moving(pixel, t)
             out[2, i, row, column] = hidden(every, (row, column), out[3, i, row, column], t, on, off)
     expected = np.array([unshown(every, settings, frames, t) for t in times])
-    return out[0], out[1], out[2], out[3].astype(bool), expected
+    return every, out[0], out[1], out[2], out[3].astype(bool), expected

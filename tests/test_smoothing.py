@@ -9,6 +9,7 @@ import pytest
 
 import kalux
 from kalux import PRESETS, Frame, Recording, smoothing
+from kalux.augmentation.bridge import UNMEASURED
 from kalux.augmentation.highlights import Unshown
 from kalux.augmentation.refractory import EventClock
 from kalux.compiled import event_words
@@ -16,6 +17,7 @@ from kalux.datasets import SensorSettings, demo_scene, simulate
 from kalux.datasets.ahdr import ArtificialCamera, artificial_hdr
 from kalux.errors import InputError, OutputError
 from kalux.events import make_events
+from kalux.filters.uncertainty import Around
 from kalux.pipeline import plan
 from kalux.reconstructor import Estimate, Reconstructor
 from kalux.smoothing import Spill, Trails, combine, reversed_settings
@@ -81,11 +83,11 @@ def test_smoothing_is_two_filters_combined_by_information():
         either = dataclasses.replace(
             a,
             log_intensity=level,
-            variance=np.where(
-                a.unmeasured & b.unmeasured, 1 / (weights[0] + weights[1]), np.minimum(a.variance, b.variance)
-            ),
+            variance=1 / sum(weights),
             moving=a.moving | b.moving,
             silent_change=np.mean(known, axis=0),
+            around=None if a.around is None else a.around._replace(counted=UNMEASURED),
+            since=None if a.since is None else min(a.since, b.since),
         )
         expected = forward.image(either)
         np.testing.assert_allclose(image.intensity, expected.intensity, rtol=1e-6)
@@ -265,20 +267,24 @@ def test_where_one_filter_knows_nothing_the_other_is_taken():
     assert combine(forward, None) is forward
     found = combine(forward, backward)
     assert found.log_intensity[0, 0] == pytest.approx(1.0, abs=1e-9)
-    assert (found.t, found.variance[0, 0]) == (5, 0.01)
+    assert found.t == 5
+    assert found.variance[0, 0] == pytest.approx(0.01, rel=1e-9)
 
 
-def test_what_no_frame_measures_is_known_from_two_sides():
-    """Where frames do, both filters have seen the same ones, and together know no more than the better of them."""
-    zero, variance = np.zeros((1, 2)), np.full((1, 2), 0.3)
-    unmeasured = np.array([[True, False]])
+def test_what_two_filters_know_adds_up():
+    """Information does, and the frame between them is not counted a third time."""
+    level, ones, plane = np.array([[1.0]]), np.ones((1, 1)), np.full((1, 1), 0.01, np.float32)
+    around = Around(plane, plane, plane, 0.0, 0.0, 0.01, 1.0, 0.0)
     forward, backward = (
-        Estimate(t, zero, variance, 0.0, final=True, unmeasured=unmeasured | also)
-        for t, also in ((5, [[False, False]]), (-5, [[False, True]]))
+        Estimate(t, level, ones * 0.01 * k, 0.0, True, around=around, since=since)
+        for t, k, since in ((5, 1, None), (-5, 3, 0.5))
     )
     found = combine(forward, backward)
-    np.testing.assert_allclose(found.variance, [[0.15, 0.3]])
-    np.testing.assert_array_equal(found.unmeasured, unmeasured)
+    assert found.variance[0, 0] == pytest.approx(0.0075)
+    assert found.around.counted == UNMEASURED
+    assert found.since is None
+    early, late = (dataclasses.replace(e, since=s) for e, s in ((forward, 0.2), (backward, 0.1)))
+    assert combine(early, late).since == 0.1
 
 
 def test_where_one_filter_knows_only_a_bound_it_is_one():

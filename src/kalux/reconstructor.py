@@ -25,8 +25,9 @@ from kalux.events import EVENT_DTYPE, EventArray, as_events, check_events
 from kalux.filters.akf import State
 from kalux.filters.buffer import EventBuffer
 from kalux.filters.highlights import lifted, read_unshown, tempered
-from kalux.filters.methods import Method, Segment, Shot, make_method, take_shot
-from kalux.filters.readout import HighlightPrior, hidden_variance, read_out
+from kalux.filters.methods import USUAL_INTERVAL, Method, Segment, Shot, make_method, take_shot
+from kalux.filters.readout import HighlightPrior, read_out
+from kalux.filters.uncertainty import Around, alone, given_variance, hidden_variance
 from kalux.frames import Frame, check_frame
 from kalux.models.camera import Camera, beyond_white, count_bright
 from kalux.models.colour import (
@@ -103,8 +104,12 @@ class Estimate:
         Pixels that no frame has measured until then, of which L is a bound; None: there are none.
     silent_change
         (H, W): mean square change of silent pixels around each, from one frame to the next; None: not told.
-    unmeasured
-        (H, W) bool: pixels that neither the frame before nor the one after measures; None: not told.
+    around
+        What the frames around say of the pixels (K11); None: not told, or there is only one.
+    exposed
+        The share of the time for which frames are exposed, where the next one is known.
+    since
+        Where it is not known or not used: time to the only frame, in intervals between frames; else None.
     """
 
     t: int
@@ -117,7 +122,9 @@ class Estimate:
     chroma: NDArray[np.float32] | None = None
     unshown: Unshown | None = None
     silent_change: NDArray[np.floating[Any]] | None = None
-    unmeasured: NDArray[np.bool_] | None = None
+    around: Around | None = None
+    exposed: float = 0.0
+    since: float | None = None
 
 
 class _Progress:
@@ -219,6 +226,7 @@ class Reconstructor:
         self._progress: _Progress | None = None
         self._last_frame: Frame | None = None
         self._frame_count = 0
+        self._interval = USUAL_INTERVAL  # between the latest two frames whose segment is committed, us
         self._tail: float | None = None  # of the first frame
         self._event_count = 0
         self._last_event: int | None = None
@@ -413,7 +421,9 @@ class Reconstructor:
             self._chroma(progress, t),
             self._unshown(progress, variance),
             self._method.silent_change(progress.segment),
-            self._method.unmeasured(progress.segment, progress.cursor),
+            self._method.around(progress.segment, t) if self._joins(progress) else None,
+            self._exposed(progress),
+            self._since(progress, t),
         )
 
     def trail(self, t: int) -> NDArray[np.floating[Any]] | None:
@@ -448,16 +458,18 @@ class Reconstructor:
             log_intensity, variance = lifted(log_intensity, variance, unshown)
         moving, neighbours = estimate.moving, self.settings.filter.neighbours
         pitch = 2 if mosaic else 1  # neighbours of the same colour
-        hidden = hidden_variance(estimate.between, on * off)
+        hidden = hidden_variance(estimate.between, on * off, estimate.exposed, estimate.since)
         change = estimate.silent_change
         if change is None and moving is not None:  # K11 needs it only there
             change = np.full(log_intensity.shape, UNKNOWN_CHANGE * on * off, np.float32)
         pixels = None if unshown is None else unshown.pixels
         intensity, total, heard = read_out(
-            log_intensity, variance, offset, prior, moving, hidden, change, neighbours, pitch, pixels
+            log_intensity, variance, offset, prior, moving, alone(hidden), change, neighbours, pitch, pixels
         )
         if unshown is not None:
             read_unshown(intensity, heard, estimate.log_intensity, unshown, offset, prior)
+        if moving is not None and change is not None:
+            total = given_variance(variance, moving, change, hidden, estimate.around)
         image = Image(estimate.t, intensity, total, offset, estimate.final)
         return (
             image
@@ -505,7 +517,7 @@ class Reconstructor:
             return None
         fraction = 0.0
         shots = [first]
-        if self.lookahead and progress.ready and progress.starts_frame:
+        if self._joins(progress):
             second = self._shots[1]
             shots.append(second)
             fraction = min(max((t - first.middle) / (second.middle - first.middle), 0.0), 1.0)
@@ -517,11 +529,27 @@ class Reconstructor:
         ]
         return joined_chromaticity(parts)
 
+    def _joins(self, progress: _Progress) -> bool:
+        """Whether the segment uses the frames at both its ends."""
+        return self.lookahead and progress.ready and progress.starts_frame
+
+    def _exposed(self, progress: _Progress) -> float:
+        """The share of the time for which frames are exposed, by those around; 0 where there is only one."""
+        if not self._joins(progress):
+            return 0.0
+        first, second = self._shots[:2]
+        exposures = first.end - first.start + second.end - second.start
+        return min(exposures / 2 / (second.middle - first.middle), 1.0)
+
+    def _since(self, progress: _Progress, t: int) -> float | None:
+        """Time to the only frame, in intervals; None where there are two."""
+        return None if self._joins(progress) else abs(t - self._shots[0].middle) / self._interval
+
     def _white(self, progress: _Progress, t: int) -> float:
         """log(I + I_0) of the brightest level that frames show at ``t``: from one frame's to the next's."""
         offset = self.settings.camera.offset
         white = float(np.log(self._shots[0].white + offset))
-        if not (self.lookahead and progress.ready and progress.starts_frame):
+        if not self._joins(progress):
             return white
         segment = progress.segment
         fraction = (t - segment.start) / (segment.end - segment.start)
@@ -615,6 +643,7 @@ class Reconstructor:
         self._memory = progress.memory
         self._progress = None
         if progress.starts_frame:
+            self._interval = self._shots[1].middle - self._shots[0].middle
             self._shots.pop(0)
         self._events.drop(progress.segment.end)
 

@@ -7,8 +7,7 @@ L' and P' of the backward one, the estimate is the two-filter smoother (Fraser a
     L_s = (L / P + L' / P') / (1 / P + 1 / P').
 
 Where one of them knows no more than a bound, it counts as one (docs/equations.md, K15). The variance is
-1 / (1 / P + 1 / P') where neither frame around the image measures the pixel: there each direction goes by events of its
-own. Elsewhere both have seen these frames, and the smaller of the two variances is given out.
+1 / (1 / P + 1 / P'); what both have from the frames around the image, the noise of these, K11 sees to.
 
 Memory is bounded: the recording is spilled to disk, where it can be read backward, and the backward pass is done
 twice, first to save its state before every window of images, then window by window for the images themselves.
@@ -25,6 +24,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.augmentation.bridge import UNMEASURED
 from kalux.augmentation.deblur import between
 from kalux.augmentation.refractory import EventClock
 from kalux.augmentation.trail import FrameTrail, follow, nothing_followed, trail_at
@@ -351,15 +351,10 @@ def combine(
     )
     obey_bounds(level, *directions)
     obey_bounds(level, *directions[::-1])
-    variance = np.minimum(forward.variance, backward.variance)
-    unmeasured = None
-    if forward.unmeasured is not None and backward.unmeasured is not None:
-        unmeasured = forward.unmeasured & backward.unmeasured
-        np.divide(1.0, first + second, out=variance, where=unmeasured)
     return Estimate(
         t=forward.t,
         log_intensity=level,
-        variance=variance,
+        variance=1.0 / (first + second),
         white=forward.white,
         final=forward.final,
         moving=_either(forward.moving, backward.moving),
@@ -367,12 +362,19 @@ def combine(
         chroma=forward.chroma,
         unshown=smoothed_unshown(forward.unshown, backward.unshown),
         silent_change=_mean_of_both(forward.silent_change, backward.silent_change),
-        unmeasured=unmeasured,
+        around=None if forward.around is None else forward.around._replace(counted=UNMEASURED),
+        exposed=forward.exposed,
+        since=_least(forward.since, backward.since),
     )
 
 
 def _either(first: NDArray[np.bool_] | None, second: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
     return None if first is None or second is None else first | second
+
+
+def _least(first: float | None, second: float | None) -> float | None:
+    """Where there is only one frame, one of them may not know the usual interval yet."""
+    return None if first is None or second is None else min(first, second)
 
 
 def _mean_of_both(

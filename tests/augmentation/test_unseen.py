@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kalux.augmentation.bridge import UNMEASURED, BridgeNoise, Latent, bridge, nominal_thresholds
-from kalux.augmentation.unseen import UNKNOWN_CHANGE, silent_change
+from kalux.augmentation.unseen import UNKNOWN_CHANGE, forget_silence, silent_change
 
 SHAPE = (40, 60)
 C2 = 0.04
@@ -34,6 +34,18 @@ def changes(change, *, on=None, variance=1e-4, clipped=None):
         SECOND,
     )
     return silent_change(segment, NOISE.quantisation_variance, C2)
+
+
+def forgotten(variance, change, on, after=None):
+    """What silence adds to P, of frames of a variance."""
+    nothing = np.zeros(SHAPE, np.float32)
+    frame = Latent(nothing, np.full(SHAPE, variance, np.float32))
+    thresholds = nominal_thresholds(SHAPE, 0.1, np.float32)
+    segment, _ = bridge(frame, frame, nothing, nothing, thresholds, NOISE, 0, SECOND)
+    grown, plane = nothing.copy(), np.full(SHAPE, change, np.float32)
+    second = frame if after is None else Latent(nothing, after)
+    forget_silence(grown, segment, second, (on, nothing), plane, NOISE.quantisation_variance)
+    return grown
 
 
 def test_a_change_that_all_pixels_share():
@@ -90,3 +102,15 @@ def test_where_nothing_is_known():
     found = changes(0.0, clipped=clipped)
     assert found[10, 10] == pytest.approx(0.4 * C2)
     assert np.delete(found.ravel(), 10 * SHAPE[1] + 10).max() == 0.0
+
+
+def test_a_silent_pixel_forgets_what_the_slope_does_not_take():
+    on = np.zeros(SHAPE, np.float32)
+    on[:, 30:] = 1
+    assert forgotten(1e-8, 0.01, on).max() < 1e-12  # precise frames: the slope takes all
+    noisy = forgotten(100.0, 0.01, on)
+    np.testing.assert_allclose(noisy[:, :30], 0.01, rtol=1e-3)
+    assert (noisy[:, 30:] == 0).all()
+    alike = forgotten(NOISE.quantisation_variance / 2, 0.01, on)  # half of the mismatch is the slope's
+    np.testing.assert_allclose(alike[:, :30], 0.01 / 4, rtol=1e-5)
+    assert (forgotten(100.0, 0.01, on, np.full(SHAPE, UNMEASURED, np.float32)) == 0).all()

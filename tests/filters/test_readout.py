@@ -12,7 +12,6 @@ from kalux.filters.readout import (
     Hidden,
     HighlightPrior,
     believed_highlight,
-    hidden_variance,
     likeness,
     read_out,
 )
@@ -21,7 +20,7 @@ from kalux.settings import preset
 import naive
 
 OFF = HighlightPrior(white=np.inf, scale2=0.0, stretch=0.0)
-NOTHING_HIDDEN = Hidden(0.0, 0.0, 0.0)
+NOTHING_HIDDEN = Hidden(0.0, 0.0)
 excesses = st.floats(0.0, 12.0)
 stretches = st.floats(1e-4, 2.0)
 
@@ -126,37 +125,6 @@ def test_the_white_level_is_continuous():
     assert high == pytest.approx(low, abs=1e-6)
 
 
-# --- what no event has told ---------------------------------------------------------------------------------
-
-
-def test_the_hidden_variance_is_larger_between_frames_and_where_things_move():
-    moving = np.array([[True, False]])
-    variance = np.full((1, 2), 0.01, np.float32)
-
-    def hidden(between, threshold2):
-        given = hidden_variance(between, threshold2)
-        change = np.full((1, 2), 0.1 * threshold2)
-        return read_out(np.zeros((1, 2)), variance, 0.03, OFF, moving, given, change)[1] - variance
-
-    at, between = hidden(0.0, 0.04), hidden(1.0, 0.04)
-    assert (between > at).all()
-    assert at[0, 0] > at[0, 1] > 0
-    np.testing.assert_allclose(hidden(1.0, 0.16), 4 * between, rtol=1e-5)
-    untold = read_out(np.zeros((1, 2)), variance, 0.03, OFF, None, hidden_variance(1.0, 0.04))[1]
-    np.testing.assert_array_equal(untold, variance)
-
-
-def test_still_pixels_hide_what_silent_ones_around_them_show():
-    variance, change = np.full((1, 2), 0.01, np.float32), np.array([[0.0, 0.02]], np.float32)
-    still = np.zeros((1, 2), bool)
-    level, given = np.zeros((1, 2)), hidden_variance(1.0, 0.04)
-    hidden = read_out(level, variance, 0.03, OFF, still, given, change)[1] - variance
-    assert hidden[0, 0] < 0.001
-    assert hidden[0, 1] == pytest.approx(hidden[0, 0] + 0.35 * 0.02, rel=1e-4)
-    moving = read_out(level, variance, 0.03, OFF, ~still, given, change)[1]
-    np.testing.assert_allclose(moving, 0.01 + 0.04 * 0.125, rtol=1e-4)
-
-
 # --- neighbours ----------------------------------------------------------------------------------------------
 
 
@@ -244,13 +212,13 @@ def test_images_are_the_oracles(shape, moves, pitch):
     rng = np.random.default_rng(1)
     value, variance = rng.normal(-0.5, 1.0, shape), np.exp(rng.normal(-3.0, 2.0, shape))
     moving = rng.random(shape) < moves
-    hidden, chosen = Hidden(0.01, 0.5, 0.03), preset("default")
+    hidden, chosen = Hidden(0.5, 0.03), preset("default")
     change = rng.uniform(0, 0.05, shape).astype(np.float32)
     white, stretch, offset = 0.8, 0.7, chosen.camera.offset
     prior = HighlightPrior(np.log(white + offset), chosen.filter.highlight_scale**2, stretch)
     given = value.astype(np.float32), variance.astype(np.float32)
     found = read_out(*given, offset, prior, moving, hidden, change, 0.3, pitch)
-    total = variance + np.where(moving, hidden.moving, hidden.still + hidden.changing * change)
+    total = variance + np.where(moving, hidden.moving, hidden.changing * change)
     level = np.empty(shape)
     for part in np.ndindex(pitch, pitch):  # a mosaic's colours know nothing of each other
         own = np.s_[part[0] :: pitch, part[1] :: pitch]

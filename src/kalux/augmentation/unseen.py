@@ -9,7 +9,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.bridge import UNMEASURED, BridgedSegment
+from kalux.augmentation.bridge import UNMEASURED, BridgedSegment, Latent
 from kalux.compiled import apart
 
 Array = NDArray[np.floating[Any]]
@@ -64,6 +64,45 @@ def silent_change(segment: BridgedSegment, quantisation_variance: float, thresho
     unknown, unmeasured = (np.float32(u * threshold2) for u in (UNKNOWN_CHANGE, _UNMEASURED_CHANGE))
     _mean(_sum_around(change), _sum_around(silent), *variances, unknown, unmeasured, mean)
     return mean
+
+
+def forget_silence(
+    grown: Array,
+    segment: BridgedSegment,
+    second: Latent,
+    counts: tuple[Array, Array],
+    change: Array,
+    quantisation_variance: float,
+) -> None:
+    """Add to ``grown``, (H, W), what the state of silent pixels loses from one frame to the next. In place.
+
+    What such a pixel changes is not told by events, and by frames only as far as the slope takes it, the share q0 / V
+    of the mismatch (K1): of the mean square change the square of the other share comes to P (docs/equations.md, K11).
+
+    Parameters
+    ----------
+    second
+        The frame after. Pixels that it or the one before does not measure have P of their own (K10).
+    counts
+        (H, W) on and off events between the frames.
+    change
+        From `silent_change`.
+    quantisation_variance
+        As in `BridgeNoise`.
+    """
+    planes = segment.forward_variance, segment.backward_variance, second.variance, *counts, change, grown
+    _forget(np.float32(quantisation_variance), *(plane.reshape(-1) for plane in planes))
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _forget(q0, forward, backward, after, on, off, change, grown):  # type: ignore[no-untyped-def]
+    zero, unmeasured = np.float32(0.0), np.float32(UNMEASURED)
+    for i in range(np.uint64(len(grown))):
+        noise = np.float32(forward[i]) + np.float32(backward[i])
+        missed = noise / (noise + q0)
+        measured = max(np.float32(forward[i]), np.float32(after[i])) < unmeasured
+        lost = np.float32(change[i]) * missed * missed
+        grown[i] += lost if measured and on[i] + off[i] == zero else zero
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")

@@ -37,13 +37,14 @@ from kalux.augmentation.trail import (
     polarity_of,
     trail_at,
 )
-from kalux.augmentation.unseen import UNKNOWN_CHANGE, silent_change
+from kalux.augmentation.unseen import UNKNOWN_CHANGE, forget_silence, silent_change
 from kalux.compiled import apart
 from kalux.errors import SettingsError
 from kalux.events import EventArray
 from kalux.filters import akf, complementary
 from kalux.filters.akf import State
 from kalux.filters.common import make_clock
+from kalux.filters.uncertainty import WRONG_STEPS, Around
 from kalux.frames import Frame
 from kalux.models import colour
 from kalux.models.camera import (
@@ -64,6 +65,9 @@ Floats = NDArray[np.floating[Any]]
 
 Chunks = Sequence[EventArray]
 """Events in time order, in a few arrays."""
+
+USUAL_INTERVAL: Final = 40_000
+"""us between frames, over which the information of the first one is spread until a second one is known."""
 
 FAR_FUTURE: Final = 1 << 61
 """End of a segment that has no next frame, us."""
@@ -295,11 +299,11 @@ class Method(Protocol):
     def moving(self, segment: Any, cursor: Any) -> NDArray[np.bool_] | None:
         """(H, W): pixels with an event in this frame interval, also one to come, or the one before, or unmeasured."""
 
-    def unmeasured(self, segment: Any, cursor: Any) -> NDArray[np.bool_] | None:
-        """(H, W): pixels that neither the frame before nor the one after measures; None: the method does not tell."""
-
     def silent_change(self, segment: Any) -> Floats | None:
         """(H, W): `unseen.silent_change` of the segment; None: the method or the segment does not tell."""
+
+    def around(self, segment: Any, t: int) -> Around | None:
+        """What the two frames that a segment joins say of its pixels at ``t`` (K11); None: the method does not tell."""
 
     def trail(self, segment: Any, cursor: Any, t: int) -> Floats | None:
         """(H, W): how far the light is ahead of its events at ``t`` (K14); None: the method does not tell."""
@@ -340,13 +344,13 @@ class _Common:
     def moving(self, segment: Any, cursor: Any) -> NDArray[np.bool_] | None:
         return None
 
-    def unmeasured(self, segment: Any, cursor: Any) -> NDArray[np.bool_] | None:
-        return None
-
     def trail(self, segment: Any, cursor: Any, t: int) -> Floats | None:
         return None
 
     def silent_change(self, segment: Any) -> Floats | None:
+        return None
+
+    def around(self, segment: Any, t: int) -> Around | None:
         return None
 
     def unshown(self, segment: Any, variance: Floats, prior: float) -> Unshown | None:
@@ -407,8 +411,6 @@ class BridgedFrames(_Common):
 
     Causal mode (``lookahead=False``) goes from the end of one exposure to the end of the next, forward only.
     """
-
-    _FIRST_INTERVAL: Final = 0.04  # s, spread of a single frame's information until a second one is known
 
     def __init__(
         self,
@@ -554,7 +556,7 @@ class BridgedFrames(_Common):
     ) -> tuple[Segment, BridgeMemory]:
         start = self.node(shot)
         if following is None:
-            seconds = memory.interval or self._FIRST_INTERVAL
+            seconds = memory.interval or USUAL_INTERVAL * 1e-6
             latent = memory.latent
             if not self.lookahead:
                 latent = self._carried(memory, shot)
@@ -649,15 +651,15 @@ class BridgedFrames(_Common):
             self.noise,
             start,
             following.end,
-            memory.interval or self._FIRST_INTERVAL,
+            memory.interval or USUAL_INTERVAL * 1e-6,
             self._carried(after, following),
         )
-        forward, far_on, far_off = self._drifting(forward, memory, second, on + tail_on, off + tail_off)
         forward = forward._replace(
             trail=self._trail(memory.followed, start, scale),
             unshown=memory.unshown,
             silent_change=memory.silent_change,
         )
+        forward, far_on, far_off = self._drifting(forward, memory, second, on + tail_on, off + tail_off)
         return forward, after._replace(far_on=far_on, far_off=far_off)
 
     def follow(
@@ -699,12 +701,15 @@ class BridgedFrames(_Common):
         grown, far_on, far_off = bridge.drift(
             memory.latent, second, memory.thresholds, self.noise, far, (on, off)
         )
+        if segment.silent_change is not None:
+            q0 = self.noise.quantisation_variance
+            forget_silence(grown, segment, second, (on, off), segment.silent_change, q0)
         if second.ceiling is not None:
             black = np.isfinite(second.ceiling)
-            grown[black] += second.variance[black] / (_BLACK_FRAMES * (_BLACK_FRAMES + 1))
+            grown[black] = second.variance[black] / (_BLACK_FRAMES * (_BLACK_FRAMES + 1))
         segment = segment._replace(
             drift=grown,
-            still_since=_still_since(memory, segment.start, memory.interval or self._FIRST_INTERVAL),
+            still_since=_still_since(memory, segment.start, memory.interval or USUAL_INTERVAL * 1e-6),
         )
         return segment, far_on, far_off
 
@@ -740,9 +745,6 @@ class BridgedFrames(_Common):
     def moving(self, segment: Any, cursor: akf.BridgedCursor) -> NDArray[np.bool_]:
         return akf.moving_bridged(segment, cursor)
 
-    def unmeasured(self, segment: BridgedSegment, cursor: akf.BridgedCursor) -> NDArray[np.bool_]:
-        return akf.unmeasured_bridged(segment, cursor)
-
     def trail(self, segment: Any, cursor: akf.BridgedCursor, t: int) -> NDArray[np.float32] | None:
         return akf.trail_bridged(segment, cursor, t)
 
@@ -753,6 +755,21 @@ class BridgedFrames(_Common):
 
     def silent_change(self, segment: BridgedSegment) -> Floats | None:
         return segment.silent_change
+
+    def around(self, segment: BridgedSegment, t: int) -> Around:
+        assert segment.events is not None
+        share = (t - segment.start) / (segment.end - segment.start)
+        between = 4.0 * share * (1.0 - share)
+        return Around(
+            segment.forward_variance,
+            segment.backward_variance,
+            segment.events,
+            coming=(1.0 - share) * self.noise.step_variance,
+            counted=0.0,
+            quantisation_variance=self.noise.quantisation_variance,
+            repeated=1.0 - between / 2.0,
+            wrong=WRONG_STEPS * between * self.on * self.off,
+        )
 
 
 def _still_since(memory: BridgeMemory, start: int, seconds: float) -> int:

@@ -13,18 +13,6 @@ from kalux.compiled import FUSED, ONE, exponential, logarithm
 Array = NDArray[np.floating[Any]]
 
 
-HIDDEN_MOVING: Final = (0.005, 0.12)
-"""Variance, in c^2, of what a pixel does between its events, at a frame and in addition half-way between two frames,
-where events have come of late: that of mid-exposure frames and of times half-way between on eleven simulated scenes
-(docs/equations.md, K11)."""
-
-HIDDEN_STILL: Final = 0.35
-"""Where no event has come of late: half-way between two frames, in units of the mean square change of the silent pixels
-around from one to the other (`kalux.augmentation.unseen`); at a frame nothing."""
-
-HIDDEN_LEAST: Final = 0.003
-"""In c^2, there in any case: the same scenes at their frames."""
-
 _NOTHING: Final = np.float32(1e9)
 """Variance of a pixel that knows nothing; its square is still a float32."""
 
@@ -139,29 +127,22 @@ def lambert_w(x):  # type: ignore[no-untyped-def]
 class Hidden(NamedTuple):
     """Variance of what no event has told yet (docs/equations.md, K11).
 
-    Of a still pixel ``still``, and ``changing`` times the mean square change of silent pixels around it; of one with an
-    event of late, or about to have one, ``moving``.
+    Of a still pixel ``changing`` times the mean square change of silent pixels around it; of one with an event of late,
+    or about to have one, ``moving``.
     """
 
-    still: float
     changing: float
     moving: float
 
 
-_NOTHING_HIDDEN: Final = Hidden(0.0, 0.0, 0.0)
-
-
-def hidden_variance(between: float, threshold2: float) -> Hidden:
-    """K11 at ``between``, 0 at a frame and 1 half-way between two, with ``threshold2`` = c^2."""
-    at, half = HIDDEN_MOVING
-    return Hidden(threshold2 * HIDDEN_LEAST, between * HIDDEN_STILL, threshold2 * (at + between * half))
+_NOTHING_HIDDEN: Final = Hidden(0.0, 0.0)
 
 
 @nb.njit(cache=True, inline="always")
 def total_variance(variance, moving, change, hidden):  # type: ignore[no-untyped-def]
     """P and the variance of what no event has told yet (docs/equations.md, K11)."""
-    still, changing, of_moving = hidden
-    return variance + (of_moving if moving else still + changing * change)
+    changing, of_moving = hidden
+    return variance + (of_moving if moving else changing * change)
 
 
 @nb.njit(cache=True, inline="always", error_model="numpy")

@@ -1,0 +1,146 @@
+"""The variance that is given out with an image (docs/equations.md, K11).
+
+The filter's P counts what it has seen. Missing are what the next frame tells of the image before it, which its level
+has through the bridge; the noise of frames that all images share; and what no event has told.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final, NamedTuple
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux.compiled import FUSED
+from kalux.filters.readout import Hidden, total_variance
+
+Array = NDArray[np.floating[Any]]
+
+HIDDEN_MOVING: Final = 0.08
+"""Variance, in c^2, of what a pixel does between its events, half-way between two frames, where events have come of
+late: by the errors of images, forward and both ways in time, of eleven simulated scenes and of the held-out frames of
+three real recordings."""
+
+HIDDEN_STILL: Final = 0.22
+"""Where no event has come of late, in units of the mean square change of the silent pixels around from one frame to the
+other (`kalux.augmentation.unseen`): the same scenes. A random walk between two known ends would have 1/4."""
+
+HIDDEN_EXPOSED: Final = 0.09
+"""What share of these is hidden at a frame that is exposed all the time, the mean of which is not the middle: the same
+scenes, exposed for a tenth to two thirds of the time."""
+
+WRONG_STEPS: Final = 0.002
+"""Variance, in c^2 per squared number of events between two frames, half-way, of steps that are all wrong alike: the
+same scenes. A fifth of what thresholds that are 10 % off amount to (K10) where no frame ties them."""
+
+ALONE: Final = 1.6
+"""What is hidden of a pixel before its neighbours are heard (K12), in units of what is after it. Their mean takes a
+fifth to a third of the squared errors."""
+
+
+class Around(NamedTuple):
+    """What the frames around an image say of its pixels.
+
+    Attributes
+    ----------
+    first, second
+        (H, W) variances of the frame before and of the one after.
+    events
+        (H, W) events between them.
+    coming
+        Variance of one of these, times the share of the time between the frames that is to come.
+    counted
+        `UNMEASURED` where P counts the second frame already, as it does both ways in time; else 0.
+    quantisation_variance
+        q_0 of K1.
+    repeated
+        What share of the variance of the frames' noise is in the image: 1 at a frame, 1/2 half-way between two.
+    wrong
+        Variance of steps that are all wrong alike, per squared number of events.
+    """
+
+    first: Array
+    second: Array
+    events: Array
+    coming: float
+    counted: float
+    quantisation_variance: float
+    repeated: float
+    wrong: float
+
+
+def hidden_variance(
+    between: float, threshold2: float, exposed: float = 0.0, since: float | None = None
+) -> Hidden:
+    """What no event has told at ``between``, 0 at a frame and 1 half-way between two, with ``threshold2`` = c^2.
+
+    ``exposed`` is the share of the time for which frames are exposed; ``since`` the time since the latest frame, in
+    intervals, where no next one is used: nothing then holds the other end of a silent pixel's change.
+    """
+    hidden = between + (1.0 - between) * HIDDEN_EXPOSED * exposed
+    still = hidden * HIDDEN_STILL if since is None else min(since, 1.0)
+    return Hidden(still, threshold2 * hidden * HIDDEN_MOVING)
+
+
+def alone(hidden: Hidden) -> Hidden:
+    """The same of a pixel that has not heard its neighbours."""
+    return Hidden(*(ALONE * value for value in hidden))
+
+
+@nb.njit(cache=True, inline="always", error_model="numpy")
+def known_variance(variance, first, second, events, around):  # type: ignore[no-untyped-def]
+    """Variance of what frames and events have told, from P and the variances of the frames around.
+
+    The next frame, seen through the events that are to come, tells of L besides P. As far as the slope follows the
+    frames, the share q_0 / V of their mismatch (K1), their noise is in every image, however many have been seen.
+    """
+    coming, counted, q0, repeated, wrong = around
+    following = counted + second + coming * events
+    slope = q0 / (first + second + q0)
+    known = max(variance * following / (variance + following), repeated * slope * slope * min(first, second))
+    return known + wrong * events * events
+
+
+def given_variance(
+    variance: Array, moving: NDArray[np.bool_], silent_change: Array, hidden: Hidden, around: Around | None
+) -> NDArray[np.float32]:
+    """(H, W) the variance of log(I + I_0) that an image is given.
+
+    Parameters
+    ----------
+    variance
+        (H, W) P.
+    moving
+        (H, W): pixels with an event of late.
+    silent_change
+        (H, W): mean square change of silent pixels around each.
+    hidden
+        From `hidden_variance`.
+    around
+        None: nothing is said, P is what is known.
+    """
+    planes = (variance,) if around is None else (variance, *around[:3])
+    known, *frames = (np.ascontiguousarray(plane, np.float32) for plane in planes)
+    given = np.empty_like(known)
+    if around is not None:
+        scalars = tuple(np.float32(value) for value in around[3:])
+        first, second, events = (plane.reshape(-1) for plane in frames)
+        _know(known.reshape(-1), first, second, events, scalars, given.reshape(-1))
+        known = given
+    change = np.ascontiguousarray(silent_change, np.float32)
+    scaled = tuple(np.float32(value) for value in hidden)
+    _hide(known.reshape(-1), moving.reshape(-1), change.reshape(-1), scaled, given.reshape(-1))
+    return given
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy", fastmath=FUSED)
+def _know(variance, first, second, events, around, known):  # type: ignore[no-untyped-def]
+    for i in range(np.uint64(len(known))):
+        known[i] = known_variance(variance[i], first[i], second[i], events[i], around)
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy", fastmath=FUSED)
+def _hide(known, moving, change, hidden, given):  # type: ignore[no-untyped-def]
+    for i in range(np.uint64(len(given))):
+        given[i] = total_variance(known[i], moving[i], change[i], hidden)

@@ -1,0 +1,98 @@
+"""The variance that an image is given."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kalux.augmentation.bridge import UNMEASURED
+from kalux.filters.readout import Hidden
+from kalux.filters.uncertainty import ALONE, Around, alone, given_variance, hidden_variance, known_variance
+
+C2 = 0.04
+STILL = np.zeros((1, 2), bool)
+NO_CHANGE = np.zeros((1, 2), np.float32)
+NOTHING = Hidden(0.0, 0.0)
+variances = st.floats(1e-5, 1.0)
+
+
+def plane(value):
+    return np.full((1, 2), value, np.float32)
+
+
+def around(first=UNMEASURED, second=UNMEASURED, events=0.0, **changes):
+    scalars = {"coming": 0.0, "counted": 0.0, "quantisation_variance": C2 / 6, "repeated": 1.0, "wrong": 0.0}
+    return Around(plane(first), plane(second), plane(events), **{**scalars, **changes})
+
+
+def test_without_frames_and_events_p_is_given():
+    p = np.array([[0.01, 3.0]], np.float32)
+    np.testing.assert_array_equal(given_variance(p, STILL, NO_CHANGE, NOTHING, None), p)
+    np.testing.assert_allclose(given_variance(p, STILL, NO_CHANGE, NOTHING, around()), p, rtol=1e-6)
+
+
+@given(variances, variances, st.floats(0.0, 30.0), st.floats(0.0, 0.1))
+def test_the_next_frame_tells_of_the_image_before_it(p, second, events, coming):
+    """As much as it knows, and as the events between are sure; not where it is counted already."""
+    found = known_variance(*np.float32([p, UNMEASURED, second, events]), (coming, 0.0, C2 / 6, 1.0, 0.0))
+    assert 1 / found == pytest.approx(1 / p + 1 / (second + coming * events), rel=1e-4)
+    counted = known_variance(
+        *np.float32([p, UNMEASURED, second, events]), (coming, UNMEASURED, C2 / 6, 1.0, 0.0)
+    )
+    assert counted == pytest.approx(p, rel=1e-6)
+
+
+def test_noise_that_the_slope_follows_is_in_every_image():
+    """However many frames have been seen: with precise frames all of it, with noisy ones next to nothing."""
+    p = plane(1e-9)
+    precise, noisy = (
+        given_variance(p, STILL, NO_CHANGE, NOTHING, around(v, v, counted=UNMEASURED))[0, 0]
+        for v in (1e-5, 1.0)
+    )
+    assert precise == pytest.approx(1e-5, rel=0.02)
+    assert noisy < 1e-4
+    half = given_variance(p, STILL, NO_CHANGE, NOTHING, around(1e-5, 1e-5, counted=UNMEASURED, repeated=0.5))
+    assert half[0, 0] == pytest.approx(precise / 2, rel=1e-5)
+
+
+def test_steps_that_are_wrong_alike_add_up():
+    one, ten = (
+        given_variance(plane(0.01), STILL, NO_CHANGE, NOTHING, around(events=n, wrong=1e-4))[0, 0] - 0.01
+        for n in (1.0, 10.0)
+    )
+    assert ten == pytest.approx(100 * one, rel=1e-3)
+    assert one == pytest.approx(1e-4, rel=1e-3)
+
+
+def test_more_is_hidden_between_frames_in_long_exposures_and_where_things_move():
+    moving = np.array([[True, False]])
+    change = plane(0.1 * C2)
+
+    def hidden(between, threshold2=C2, exposed=0.0):
+        given = hidden_variance(between, threshold2, exposed)
+        return given_variance(plane(0.0), moving, change * threshold2 / C2, given, None)
+
+    assert (hidden(0.0) == 0).all()
+    assert (hidden(1.0) > hidden(0.5)).all()
+    assert hidden(1.0)[0, 0] > hidden(1.0)[0, 1] > 0
+    assert (hidden(0.0, exposed=0.5) > 0).all()
+    np.testing.assert_array_equal(hidden(1.0, exposed=0.5), hidden(1.0))
+    np.testing.assert_allclose(hidden(1.0, 4 * C2), 4 * hidden(1.0), rtol=1e-5)
+
+
+def test_still_pixels_hide_what_silent_ones_around_them_show():
+    change = np.array([[0.0, 0.02]], np.float32)
+    found = given_variance(plane(0.01), STILL, change, hidden_variance(1.0, C2), None) - 0.01
+    np.testing.assert_allclose(found, [[0.0, 0.22 * 0.02]], atol=1e-8)
+
+
+def test_without_a_next_frame_nothing_holds_the_other_end():
+    """Of a change that goes on from the frame, at most all."""
+    changing = [hidden_variance(1.0, C2, 0.0, since).changing for since in (0.0, 0.5, 1.0, 8.0)]
+    assert changing == [0.0, 0.5, 1.0, 1.0]
+
+
+def test_neighbours_that_are_heard_take_a_part_of_it():
+    assert alone(Hidden(0.1, 0.2)) == pytest.approx((0.1 * ALONE, 0.2 * ALONE))
