@@ -120,6 +120,8 @@ def plan(
         raise InputError(
             "reconstruct: the complementary filter has no variance, so that it cannot be smoothed"
         )
+    if known.pixels is not None:
+        require_size(known.pixels, recording.sensor_size)
     response = chosen_response(chosen.camera.response, recording.response)
     exposures = _exposures(recording)
     reference = chosen.camera.reference_exposure or round(float(np.median(exposures[:, 1] - exposures[:, 0])))
@@ -137,14 +139,12 @@ def plan(
         filled, origin, estimate = _with_thresholds(recording, dataclasses.replace(filled, events=unfilled))
     unsure = estimate.spread if estimate is not None and origin in ("estimate", "assumed") else 0.0
     filled, mismatch = _with_mismatch(recording, filled, unsure)
-    filled, background = _with_background(recording, filled)
+    filled, background = _with_background(recording, filled, known.pixels)
     if origin == "settings" and _are_calibrated(filled, known):
         origin = "calibration"
     if origin in _DOUBTED or (_uses_steps(filled) and filled.filter.unshown_tail > 0):
         filled = _with_bright_tail(recording, filled)
     wanted = _times(recording, exposures, rate_hz, times, at, filled, lookahead)
-    if known.pixels is not None:
-        require_size(known.pixels, recording.sensor_size)
     return Plan(
         filled,
         origin,
@@ -510,12 +510,14 @@ def _with_mismatch(
     return dataclasses.replace(settings, events=dataclasses.replace(events, threshold_spread=spread)), found
 
 
-def _with_background(recording: Recording, settings: Settings) -> tuple[Settings, float | None]:
+def _with_background(
+    recording: Recording, settings: Settings, pixels: PixelCalibration | None
+) -> tuple[Settings, float | None]:
     """Fill in the background noise: from the settings, else an estimate, else the usual."""
     events = settings.events
     if events.noise_rate is not None or not _uses_steps(settings):
         return settings, None
-    found = event_noise(recording, _NOISE_EVENTS)
+    found = event_noise(recording, _NOISE_EVENTS, None if pixels is None else pixels.hot)
     rate = events.background_rate if found is None else max(found.rate, LEAST_NOISE)
     settings = dataclasses.replace(settings, events=dataclasses.replace(events, noise_rate=rate))
     return settings, None if found is None else found.rate

@@ -160,18 +160,21 @@ def calibrate_noise(recording: Recording, camera: CameraSettings) -> NoiseCalibr
 # --- events ---------------------------------------------------------------------------------------------------
 
 
-def event_noise(recording: Recording, most_events: int | None = None) -> EventNoise | None:
-    """Background rate, hot and dead pixels, from the first ``most_events``, or all.
+def event_noise(
+    recording: Recording, most_events: int | None = None, known_hot: NDArray[np.bool_] | None = None
+) -> EventNoise | None:
+    """Background rate, hot and dead pixels, from the first ``most_events``, or all; ``known_hot`` ones do not count.
 
     Returns None without events, or where next to nothing is ever quiet (1 %).
     """
-    first, last = _span(recording, most_events)
+    known = np.zeros(recording.sensor_size, np.bool_) if known_hot is None else known_hot
+    first, last = _span(recording, most_events, known)
     if first is None or last is None or last <= first:
         return None
-    tally = _tallied(recording, most_events, first, last, np.zeros(recording.sensor_size, np.bool_))
-    hot = _hot_pixels(tally)
-    if hot.any():  # again without them: their neighbours are quiet after all
-        tally = _tallied(recording, most_events, first, last, hot)
+    tally = _tallied(_chunks(recording, most_events, known), first, last, known)
+    hot = _hot_pixels(tally) | known
+    if (hot & ~known).any():  # again without them: their neighbours are quiet after all
+        tally = _tallied(_chunks(recording, most_events, known), first, last, hot)
     share = float(tally.quiet.sum() / (hot.size * (last - first)))
     if share < 0.01:
         return None
@@ -181,19 +184,27 @@ def event_noise(recording: Recording, most_events: int | None = None) -> EventNo
     return EventNoise(rate, error, shrunk_rates(counts, quiet, rate, hot), hot, dead, share)
 
 
-def _chunks(recording: Recording, most_events: int | None) -> Iterator[EventArray]:
+def _chunks(
+    recording: Recording, most_events: int | None, ignored: NDArray[np.bool_]
+) -> Iterator[EventArray]:
     left = most_events
+    skip = bool(ignored.any())
     for chunk in recording.events():
-        yield chunk if left is None else chunk[:left]
+        seen = chunk[~ignored[chunk["y"], chunk["x"]]] if skip else chunk
+        seen = seen if left is None else seen[:left]
+        if len(seen):
+            yield seen
         if left is not None:
-            left -= len(chunk)
+            left -= len(seen)
             if left <= 0:
                 return
 
 
-def _span(recording: Recording, most_events: int | None) -> tuple[int | None, int | None]:
+def _span(
+    recording: Recording, most_events: int | None, known: NDArray[np.bool_]
+) -> tuple[int | None, int | None]:
     first = last = None
-    for chunk in _chunks(recording, most_events):
+    for chunk in _chunks(recording, most_events, known):
         first = int(chunk["t"][0]) if first is None else first
         last = int(chunk["t"][-1])
     return first, last
@@ -210,11 +221,9 @@ class _Tally(NamedTuple):
 _MOST_WINDOWS: Final = 32
 
 
-def _tallied(
-    recording: Recording, most_events: int | None, first: int, last: int, ignored: NDArray[np.bool_]
-) -> _Tally:
+def _tallied(chunks: Iterator[EventArray], first: int, last: int, ignored: NDArray[np.bool_]) -> _Tally:
     """Count events in quiet time; those of ignored pixels do not end their neighbours' quiet."""
-    height, width = recording.sensor_size
+    height, width = ignored.shape
     windows = int(np.clip((last - first) // _WINDOW, 1, _MOST_WINDOWS))
     length = (last - first) / windows
     counts = np.zeros((windows, height, width), np.int32)
@@ -222,7 +231,7 @@ def _tallied(
     total = np.zeros((height, width), np.int64)
     busy_until = np.full((height, width), first, np.int64)  # silence before the first event is not known
     pending = np.full((height, width), -1, np.int64)  # an event in quiet time, until its future is quiet, too
-    for chunk in _chunks(recording, most_events):
+    for chunk in chunks:
         t, x, y = (chunk[name] for name in ("t", "x", "y"))
         _tally(t, x, y, first, length, QUIET, ignored, busy_until, pending, counts, quiet, total)
     _close(last, first, length, QUIET, busy_until, pending, counts, quiet)
