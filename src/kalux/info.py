@@ -395,9 +395,9 @@ def settled(recording: Recording, plan: Plan, asked: Settings) -> list[tuple[str
             ("spread", f"{100 * events.threshold_spread:.1f} % between the pixels' thresholds ({how})")
         )
     if events.noise_rate is not None:
-        how = _estimated(asked.events.noise_rate, plan.background_rate is not None)
+        how = _estimated(asked.events.noise_rate, plan.background_rate == events.noise_rate)
         if plan.background_rate is not None and plan.background_rate < events.noise_rate:
-            how = f"the least taken; measured {plan.background_rate:.2g}"
+            how = f"the usual, which is the least; measured {plan.background_rate:.2g}"
         rows.append(("background", f"{events.noise_rate:.2g} Hz per pixel of events without reason ({how})"))
     given = asked.camera.reference_exposure is not None
     rows.append(

@@ -43,10 +43,6 @@ _DOUBTED: Final[tuple[ThresholdOrigin, ...]] = ("calibration", "estimate", "assu
 _NOISE_EVENTS: Final = 1_000_000
 """Of which the background noise is taken: at 15 million events/s the quiet time of 300,000 pixels in 70 ms."""
 
-LEAST_NOISE: Final = 0.5
-"""Hz per pixel, however little is measured: isolated events are doubtful for other reasons, too (flicker, faint edges).
-Street, with 0.005 Hz in the sun, is 4 % worse at this than at 3 and 6 % worse at 0.1; simulated scenes lose nothing."""
-
 
 @dataclass(frozen=True)
 class Plan:
@@ -513,12 +509,12 @@ def _with_mismatch(
 def _with_background(
     recording: Recording, settings: Settings, pixels: PixelCalibration | None
 ) -> tuple[Settings, float | None]:
-    """Fill in the background noise: from the settings, else an estimate, else the usual."""
+    """Fill in the background noise: from the settings, else the usual, or what is measured where that is more."""
     events = settings.events
     if events.noise_rate is not None or not _uses_steps(settings):
         return settings, None
     found = event_noise(recording, _NOISE_EVENTS, None if pixels is None else pixels.hot)
-    rate = events.background_rate if found is None else max(found.rate, LEAST_NOISE)
+    rate = events.background_rate if found is None else max(found.rate, events.usual_noise_rate)
     settings = dataclasses.replace(settings, events=dataclasses.replace(events, noise_rate=rate))
     return settings, None if found is None else found.rate
 
