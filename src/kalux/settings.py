@@ -243,7 +243,7 @@ class FilterSettings:
         That scale; None: from the recording's frames, in a live stream from the first.
     neighbours
         Standard deviation, in log intensity, by which neighbouring pixels of a surface differ: moving pixels are
-        given what their eight neighbours know (docs/equations.md, K12). 0 turns it off. 0.25 (docs/tuning.md).
+        given what their eight neighbours know (docs/equations.md, K12). 0 turns it off. 0.2 (docs/tuning.md).
     cutoff
         Of the complementary filter, Hz. 1.0 (Scheerlinck 2018 uses 2 pi rad/s).
     """
@@ -257,7 +257,7 @@ class FilterSettings:
     highlight_tail: float = 3.0
     unshown_tail: float = 0.5
     bright_tail: float | None = None
-    neighbours: float = 0.25
+    neighbours: float = 0.2
     cutoff: float = 1.0
 
 
