@@ -34,7 +34,7 @@ MAX_SAMPLES: Final = 100_000
 _MIN_SAMPLES: Final = 1_000
 _MAX_FRAMES: Final = 80
 _LEAST_NET: Final = 2  # as for the thresholds: a net count of one may be noise
-_DARKEST: Final = 0.01  # two to three levels of 8 bits: below, a frame's log is rounding
+DARKEST: Final = 0.01  # two to three levels of 8 bits: below, a frame's log is rounding
 _ALIKE: Final = 50.0
 """Samples that say what one says, if all that changes is explained: those of one edge in one interval."""
 
@@ -121,13 +121,11 @@ def estimate_event_model(
     """
     samples = _samples(recording, camera, delay, refractory_period)
     net = np.abs(samples.on - samples.off)
-    chosen = (net >= _LEAST_NET) & (np.minimum(samples.before, samples.after) > _DARKEST)
+    chosen = (net >= _LEAST_NET) & (np.minimum(samples.before, samples.after) > DARKEST)
     signals = Samples(*(values[chosen] for values in samples))
     if len(signals.before) < _MIN_SAMPLES:
         return None
-    # Frames are taken as they are, with the blur that the filter removes: what that changes is not the events' error.
-    noise = (max(camera.noise[0], camera.usual_frame_noise), camera.noise[1])
-    model = _Model(thresholds, noise, threshold_spread, quantisation_variance)
+    model = _Model(thresholds, noise_of_blurred(camera), threshold_spread, quantisation_variance)
     log_offset = _log_offset(signals, model) if camera.log_offset is None else camera.log_offset
     # Single events, most of them noise where nothing moves, say much of the step and nothing of I_0.
     _, step_variance = model.best(samples, log_offset)
@@ -160,6 +158,36 @@ def _log_offset(samples: Samples, model: _Model) -> float:
     return float(f"{offsets[index]:.2g}")
 
 
+def noise_of_blurred(camera: CameraSettings) -> tuple[float, float]:
+    """Frame and shot noise of frames that are taken as they are, with the blur that the filter removes.
+
+    What that changes is not the events' error.
+    """
+    return max(camera.noise[0], camera.usual_frame_noise), camera.noise[1]
+
+
+def mismatch_of(
+    samples: Samples,
+    thresholds: tuple[float, float],
+    log_offset: float,
+    step_variance: float,
+    noise: tuple[float, float],
+    threshold_spread: float,
+    quantisation_variance: float,
+) -> tuple[Array, Array]:
+    """What the frames changed beyond what events tell, and the variance that the bridge takes it to have (K1)."""
+    on, off = thresholds
+    change = np.log(samples.after + log_offset) - np.log(samples.before + log_offset)
+    mismatch = change - (on * samples.on - off * samples.off)
+    variance = (
+        noise_variance(samples.before, noise, 1.0) / (samples.before + log_offset) ** 2
+        + noise_variance(samples.after, noise, 1.0) / (samples.after + log_offset) ** 2
+        + threshold_spread**2 * ((on * samples.on) ** 2 + (off * samples.off) ** 2)
+        + on * off * (step_variance * (samples.on + samples.off) + quantisation_variance)
+    )
+    return mismatch, variance
+
+
 def negative_log_likelihood(
     samples: Samples,
     thresholds: tuple[float, float],
@@ -174,14 +202,8 @@ def negative_log_likelihood(
     The mismatch between frames and events (docs/equations.md, K1) is Student's t with the variance that the bridge
     takes it to have. The density is one of I, not of log(I + I_0), so that different I_0 can be compared.
     """
-    on, off = thresholds
-    change = np.log(samples.after + log_offset) - np.log(samples.before + log_offset)
-    mismatch = change - (on * samples.on - off * samples.off)
-    variance = (
-        noise_variance(samples.before, noise, 1.0) / (samples.before + log_offset) ** 2
-        + noise_variance(samples.after, noise, 1.0) / (samples.after + log_offset) ** 2
-        + threshold_spread**2 * ((on * samples.on) ** 2 + (off * samples.off) ** 2)
-        + on * off * (step_variance * (samples.on + samples.off) + quantisation_variance)
+    mismatch, variance = mismatch_of(
+        samples, thresholds, log_offset, step_variance, noise, threshold_spread, quantisation_variance
     )
     tails = (_FREEDOM + 1) / 2 * np.log1p(mismatch**2 / (_FREEDOM * variance))
     jacobian = np.log(samples.after + log_offset)

@@ -14,10 +14,11 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.deblur import between, count_chunks
+from kalux.augmentation.deblur import between, count_events
 from kalux.augmentation.refractory import EventClock
+from kalux.calibration.event_model import DARKEST, Samples, mismatch_of, noise_of_blurred
 from kalux.calibration.intervals import intervals
-from kalux.models.camera import noise_variance
+from kalux.calibration.regression import parts
 from kalux.recording import Recording
 from kalux.settings import CameraSettings, EventSettings
 
@@ -30,9 +31,7 @@ events, an edge that outruns the pixel), and calibrating pixels more freely for 
 
 MAX_SAMPLES: Final = 1_000_000
 _MAX_FRAMES: Final = 80
-_DARKEST: Final = 0.01  # as for I_0: below, a frame's log is rounding
 _CLIP: Final = 3.0  # standard deviations of a mismatch: flicker and occlusions say nothing of thresholds
-_BLOCKS: Final = 8  # of the sensor, either way, for the standard error
 
 
 class Mismatch(NamedTuple):
@@ -80,26 +79,30 @@ def estimate_mismatch(recording: Recording, camera: CameraSettings, events: Even
     """
     assert events.threshold_on is not None
     assert events.threshold_off is not None
-    thresholds = np.array([events.threshold_on, events.threshold_off])
-    noise = (max(camera.noise[0], camera.usual_frame_noise), camera.noise[1])
+    thresholds = events.threshold_on, events.threshold_off
+    noise = noise_of_blurred(camera)
     clock = EventClock(recording.sensor_size, events.refractory)
     delay = events.lateness
     products: Array = np.zeros((*recording.sensor_size, *_PRODUCTS))
     samples = 0
     for interval in intervals(recording, camera, margin=abs(delay), most_frames=_MAX_FRAMES):
         inside = clock.weighed(between(interval.events, interval.start + delay, interval.end + delay))
-        counts = count_chunks([inside], recording.sensor_size, weighed=True)
+        on, off = count_events(inside, recording.sensor_size, weighed=True)
         first, second = interval.first, interval.second
-        before, after = first.intensity, second.intensity
-        told = ~first.clipped & ~second.clipped & (np.minimum(before, after) > _DARKEST)
-        variance = sum(
-            noise_variance(intensity, noise, 1.0) / (intensity + camera.offset) ** 2
-            for intensity in (before, after)
+        seen = Samples(first.intensity, second.intensity, on, off)
+        bright = np.minimum(seen.before, seen.after) > DARKEST
+        told = ~first.clipped & ~second.clipped & bright & (on + off > 0)
+        mismatch, variance = mismatch_of(
+            seen,
+            thresholds,
+            camera.offset,
+            events.step_noise,
+            noise,
+            events.usual_threshold_spread,
+            events.quantisation_variance,
         )
-        change = np.log(after + camera.offset) - np.log(before + camera.offset)
-        steps = thresholds[:, None, None] * np.stack(counts)
-        of_steps = events.step_noise, events.quantisation_variance, events.usual_threshold_spread
-        samples += _add(change, variance, told, steps, thresholds, of_steps, products)
+        _add(mismatch, variance, told, thresholds[0] * on, thresholds[1] * off, products)
+        samples += int(np.count_nonzero(told))
         if samples >= MAX_SAMPLES:
             break
     return _solved(products, samples, events.usual_threshold_spread)
@@ -111,22 +114,15 @@ twice the products of neighbouring intervals."""
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _add(change, variance, told, steps, thresholds, of_steps, products):  # type: ignore[no-untyped-def]
-    """One interval; how many pixels it tells of."""
-    step_variance, quantisation, spread = of_steps
-    threshold2 = thresholds[0] * thresholds[1]
-    samples = 0
-    for row in range(change.shape[0]):
-        for column in range(change.shape[1]):
-            on, off = steps[0, row, column], steps[1, row, column]
-            known = told[row, column] and on + off > 0.0
-            samples += known
-            count = on / thresholds[0] + off / thresholds[1]
-            total = variance[row, column] + threshold2 * (step_variance * count + quantisation)
-            total += spread * spread * (on * on + off * off)
-            most = _CLIP * np.sqrt(total)
-            mismatch = min(max(change[row, column] - (on - off), -most), most)
-            weight = 1.0 / total if known else 0.0
+def _add(mismatches, variances, told, steps_on, steps_off, products):  # type: ignore[no-untyped-def]
+    """One interval."""
+    for row in range(told.shape[0]):
+        for column in range(told.shape[1]):
+            i = row, column
+            on, off = steps_on[i], steps_off[i]
+            most = _CLIP * np.sqrt(variances[i])
+            mismatch = min(max(mismatches[i], -most), most)
+            weight = 1.0 / variances[i] if told[i] else 0.0
             for polarity in range(2):
                 own, other = (on, off) if polarity == 0 else (-off, -on)
                 values = weight * mismatch * own, weight * own * own, weight * own * other
@@ -135,7 +131,6 @@ def _add(change, variance, told, steps, thresholds, of_steps, products):  # type
                     pixel[2] += values[k] * (values[k] + 2.0 * pixel[1])
                     pixel[0] += values[k]
                     pixel[1] = values[k]
-    return samples
 
 
 def _solved(products: Array, samples: int, usual: float) -> Mismatch | None:
@@ -153,9 +148,8 @@ def _solved(products: Array, samples: int, usual: float) -> Mismatch | None:
 
 def _jackknifed(found: Array, possible: Array) -> float:
     """Standard error of the ratio of the sums, over blocks of the sensor."""
-    height, width = found.shape
-    block = (np.arange(height)[:, None] * _BLOCKS // height) * _BLOCKS + np.arange(width) * _BLOCKS // width
-    sums = [np.bincount(block.ravel(), values.ravel()) for values in (found, possible)]
+    part = parts(found.shape).ravel()
+    sums = [np.bincount(part, values.ravel()) for values in (found, possible)]
     rest = [values.sum() - values for values in sums]
     kept = rest[1] > 0
     n = int(kept.sum())

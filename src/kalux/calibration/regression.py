@@ -60,6 +60,12 @@ def two_stage(values: Array, explained: Array, instruments: Array) -> Fit | None
     return Fit(solution, scale, weights)
 
 
+def parts(shape: tuple[int, int]) -> NDArray[np.int64]:
+    """(H, W) which of 8 x 8 parts of the sensor a pixel lies in, for a jackknife."""
+    height, width = shape
+    return (np.arange(height)[:, None] * _TILES // height) * _TILES + np.arange(width) * _TILES // width
+
+
 def standard_errors(
     values: Array,
     explained: Array,
@@ -72,8 +78,7 @@ def standard_errors(
 
     ``pixel`` (N,) is the index of every sample's pixel in a sensor of ``shape``.
     """
-    row, column = np.divmod(pixel, shape[1])
-    tile = (row * _TILES // shape[0]) * _TILES + column * _TILES // shape[1]
+    tile = parts(shape).ravel()[pixel]
     weighted = instruments * weights[:, None]
     size, count = _TILES**2, explained.shape[1]
     normal, right = np.zeros((size, count, count)), np.zeros((size, count))
