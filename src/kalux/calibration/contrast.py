@@ -41,15 +41,15 @@ ROUGH_SAMPLES: Final = 30_000
 then 0.02 on scenes where something is lost."""
 
 _MODEL: Final = 0.02
-"""Relative error of thresholds from the neighbours' counts, beside the statistical one: -1.3 to 4 %, 1.6 % in the root mean
-square, on seventeen simulated scenes."""
+"""Relative error of thresholds from the neighbours' counts, beside the statistical one: -1.3 to 4.3 %, 1.6 % in the root
+mean square, on seventeen simulated scenes."""
 
 _SHARED: Final = 0.1
 """Share of what frames do not explain in the neighbours' counts that may be common to neighbours."""
 
 _SUBTHRESHOLD: Final = 0.1
-"""Relative error of thresholds from the neighbours' changes in frames, beside the statistical one: they are 0 to 3 % larger
-than those from counts on seventeen simulated scenes, and 2 to 9 % on three real recordings."""
+"""Relative error of thresholds from the neighbours' changes in frames, beside the statistical one: they are 0 to 3 %
+larger than those from counts on seventeen simulated scenes, and 2 to 9 % on three real recordings."""
 
 _LEAST_EXCESS: Final = 0.15
 """By how much more events that follow soon must tell than late ones, three standard errors taken off, for something to

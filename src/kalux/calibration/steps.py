@@ -64,8 +64,8 @@ class Steps(NamedTuple):
         Mean I of both frames.
     events, events_around
         (N, P, 2, 2): sums of the parts of events' steps that lie between the frames, in thresholds, of the pixel
-        itself, and such means of its neighbours'; of events that come late after their predecessors first and of those that
-        follow soon second, of either on first and off second.
+        itself, and such means of its neighbours'; of events that come late after their predecessors first and of those
+        that follow soon second, of either on first and off second.
     pixel
         Index of the pixel.
     """
