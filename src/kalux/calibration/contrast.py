@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.calibration.refractory import LATE, possible_periods, shortest_interval
-from kalux.calibration.regression import HUBER, NORMAL_MAD, Fit, standard_errors, two_stage
+from kalux.calibration.regression import Fit, standard_errors, two_stage
 from kalux.calibration.steps import MAX_SAMPLES, Steps, steps
 from kalux.recording import Recording
 from kalux.settings import CameraSettings
@@ -41,8 +41,8 @@ ROUGH_SAMPLES: Final = 30_000
 then 0.02 on scenes where something is lost."""
 
 _MODEL: Final = 0.02
-"""Relative error of thresholds from the neighbours' counts, beside the statistical one: -1.3 to 4.3 %, 1.6 % in the root
-mean square, on seventeen simulated scenes."""
+"""Relative error of thresholds from the neighbours' counts, beside the statistical one: -1.3 to 4.3 %, 1.6 % in the
+root mean square, on seventeen simulated scenes."""
 
 _SHARED: Final = 0.1
 """Share of what frames do not explain in the neighbours' counts that may be common to neighbours."""
@@ -428,39 +428,3 @@ def _excess(seen: _Seen, index: int, usual: Usual) -> float:
         return np.nan if parted is None else parted.excess
     fit = two_stage(seen.steps.change, seen.explained(index), seen.counts_around(index))
     return np.nan if fit is None else float(np.mean(fit.solution[:2] / usual[:2])) - 1.0
-
-
-class PlainFit(NamedTuple):
-    """Thresholds (on, off) that fit best, log intensity, and the robust standard deviation of what they leave."""
-
-    on: float
-    off: float
-    residual: float
-
-
-def fit_thresholds(difference: Array, on: Array, off: Array) -> PlainFit | None:
-    """Thresholds by iteratively reweighted least squares; None if one is not determined.
-
-    ``difference`` (N,) log intensity; ``on``, ``off`` (N,) event counts.
-    """
-    design = np.column_stack([on, -off])
-    weights = np.ones(len(difference))
-    solution: Array = np.zeros(2)
-    scale = 0.0
-    for _ in range(20):
-        weighted = design * weights[:, None]
-        normal = weighted.T @ design
-        if np.linalg.cond(normal) > 1e8:
-            return None
-        previous = solution
-        solution = np.linalg.solve(normal, weighted.T @ difference).astype(np.float64)
-        residual = difference - design @ solution
-        scale = NORMAL_MAD * float(np.median(np.abs(residual)))
-        if scale < 1e-9:
-            break  # an exact fit: nothing to weigh down
-        weights = np.minimum(1.0, HUBER * scale / np.maximum(np.abs(residual), 1e-12))
-        if np.abs(solution - previous).max() < 1e-5:
-            break
-    if not (solution > 0).all():
-        return None
-    return PlainFit(float(solution[0]), float(solution[1]), scale)

@@ -13,8 +13,8 @@ _EDGE: Final = 0.02  # of the most frequent inter-event interval: what is rarer 
 _EDGE_BINS: Final = np.logspace(1, 6, 51)  # us
 
 _TRIED: Final = (0.35, 0.6, 0.85, 1.1)
-"""Refractory periods that are tried, as shares of the shortest interval, between which the best is interpolated. None is
-longer than that, but it is only known to lie in a bin of a quarter of its size."""
+"""Refractory periods that are tried, as shares of the shortest interval, between which the best is interpolated. None
+is longer than that, but it is only known to lie in a bin of a quarter of its size."""
 
 LATE: Final = 5.0
 """Events later than so many shortest intervals after their predecessors say little of the refractory period: at most a
