@@ -29,16 +29,16 @@ _MIN_SAMPLES: Final = 200
 _SHORTEST_EVENTS: Final = 500_000
 """Of which the shortest interval is taken: its edge is then that of 10,000 pairs."""
 
-_DELAY_SAMPLES: Final = 10_000
-"""Pixels for one delay: the best of all is then within 0.2 ms of that of more on twenty scenes and recordings."""
+ROUGH_SAMPLES: Final = 10_000
+"""Pixels for one delay, of which the best is then within 0.2 ms of that of more on twenty scenes and recordings, and
+for thresholds that I_0 is to be found with: these are then within 1 %, and two intervals have them."""
 
 _TRAILING: Final = (0, 2_000, 4_000)
 """us by which events may seem later than they are: 1.4 to 4.4 ms on seventeen scenes whose events are in time, of which
 `kalux.calibration.delay` takes seven tenths."""
 
-ROUGH_SAMPLES: Final = 30_000
-"""Pixels for the refractory period, and for thresholds that I_0 is to be found with: what is not known of the excess is
-then 0.02 on scenes where something is lost."""
+_PERIOD_SAMPLES: Final = 30_000
+"""Pixels for the refractory period: what is not known of the excess is then 0.02 on scenes where something is lost."""
 
 _MODEL: Final = 0.02
 """Relative error of thresholds from the neighbours' counts, beside the statistical one: -1.3 to 4.3 %, 1.6 % in the
@@ -245,7 +245,7 @@ class _View(NamedTuple):
         Half a threshold, by which events trail the light, is a part of ``delay``; spread over time they do not trail.
         """
         delays = tuple(delay - trailing for trailing in _TRAILING)
-        residuals = [seen.residual() for seen in self._seen(delays, (period,), _DELAY_SAMPLES, at_least=2)]
+        residuals = [seen.residual() for seen in self._seen(delays, (period,), ROUGH_SAMPLES)]
         if not np.isfinite(residuals).all():
             return self
         curvature, slope, _ = np.polyfit(_TRAILING, residuals, 2)
@@ -253,9 +253,8 @@ class _View(NamedTuple):
         best = float(np.clip(-0.5 * slope / curvature, 0.0, most)) if curvature > 0 else 0.0
         return self._replace(delay=delay - round(best))
 
-    def _seen(
-        self, delays: tuple[int, ...], periods: tuple[int, ...], most: int, at_least: int = 4
-    ) -> list[_Seen]:
+    def _seen(self, delays: tuple[int, ...], periods: tuple[int, ...], most: int) -> list[_Seen]:
+        at_least = 2 if most <= ROUGH_SAMPLES else 4
         late = LATE * self.shortest if self.shortest else np.inf
         found = steps(
             self.recording,
@@ -438,7 +437,7 @@ def _parted(seen: _Seen, index: int) -> _Parted | None:
 def _without_excess(view: _View) -> int:
     """The refractory period, us, under which events that follow soon tell as much as late ones; 0 if unknown."""
     periods = possible_periods(view.shortest)
-    seen = view.seen(*periods, most=ROUGH_SAMPLES)
+    seen = view.seen(*periods, most=_PERIOD_SAMPLES)
     parted = [_parted(seen, index) for index in range(len(periods))]
     excess = np.array([np.nan if one is None else one.excess for one in parted])
     if not np.isfinite(excess).all():
