@@ -47,9 +47,10 @@ root mean square, on seventeen simulated scenes."""
 _SHARED: Final = 0.1
 """Share of what frames do not explain in the neighbours' counts that may be common to neighbours."""
 
-_SUBTHRESHOLD: Final = 0.1
+_SUBTHRESHOLD: Final = 0.2
 """Relative error of thresholds from the neighbours' changes in frames, beside the statistical one: they are 0 to 3 %
-larger than those from counts on seventeen simulated scenes, and 2 to 9 % on three real recordings."""
+larger than those from counts on seventeen simulated scenes, and 2 to 9 % on three real recordings. They decide where
+nothing moves but noise, and there nothing says how wrong they are."""
 
 _LEAST_EXCESS: Final = 0.15
 """By how much more events that follow soon must tell than late ones, three standard errors taken off, for something to
@@ -202,11 +203,13 @@ def _estimate(
     samples = view.seen(period, most=most)
     if len(samples.share) < _MIN_SAMPLES:
         return None
-    estimate = _by_information(samples, usual, period, view.delay, 0.0)
-    if estimate is None or not 0 < view.shortest <= _LARGEST_SHORTEST:
-        return estimate
+    if not 0 < view.shortest <= _LARGEST_SHORTEST:
+        return _by_information(samples, usual, period, view.delay, 0.0)
     excess = _excess_of_soon(samples)
-    if not excess.value - 3 * excess.error > _LEAST_EXCESS:
+    # Where it is too uncertain to be believed, thresholds may still be as much too large.
+    maybe = _THRESHOLD_OF_EXCESS * max(excess.value - _USUAL_EXCESS, 0.0)
+    estimate = _by_information(samples, usual, period, view.delay, maybe)
+    if estimate is None or not excess.value - 3 * excess.error > _LEAST_EXCESS:
         return estimate
     for _ in range(2 if delay is not None else 1):  # what is lost looks like delay, too
         period = _without_excess(view)
@@ -388,7 +391,7 @@ class _Parted(NamedTuple):
 
 
 class _Excess(NamedTuple):
-    """By which share events that follow soon tell more than late ones, its standard error; nan if unknown.
+    """By which share events that follow soon tell more than late ones, and its standard error; 0 and inf if unknown.
 
     ``soon`` is the share of the changes that these events tell.
     """
@@ -402,7 +405,7 @@ def _excess_of_soon(seen: _Seen) -> _Excess:
     """If nothing is lost."""
     parted = _parted(seen, 0)
     if parted is None:
-        return _Excess(np.nan, np.nan, 0.0)
+        return _Excess(0.0, np.inf, 0.0)
     samples = seen.steps
     late, soon = standard_errors(
         samples.change,
