@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from kalux import PRESETS, Frame, Reconstructor
 from kalux.errors import EventError, ExposureError, FrameError, InputError, KaluxError, SettingsError
-from kalux.filters import methods
+from kalux.filters import bridged_frames
 
 from builders import VARIANTS, Stream, altered, events, frame, pixel_events, random_stream
 
@@ -428,7 +428,7 @@ def test_one_frame_and_one_event(variant, lookahead, polarity, step):
 def test_silent_pixels_do_not_see_the_events_of_others(variant, lookahead, monkeypatch):
     """But for what is hidden of them (K11): that is what silent neighbours show, and events make these fewer."""
     unknown = np.full((3, 4), 0.01, np.float32)
-    monkeypatch.setattr(methods, "silent_change", lambda *_: unknown)
+    monkeypatch.setattr(bridged_frames, "silent_change", lambda *_: unknown)
     stream = random_stream(5)
     silent = (stream.events["x"] != 0) | (stream.events["y"] != 0)
     quiet = filled(stream._replace(events=stream.events[:0]), variant, lookahead)

@@ -1,6 +1,6 @@
 """The engine: push events, push frames, read at any time.
 
-Time is cut into segments, one per frame (`kalux.filters.methods`). The engine holds the filter's state at the
+Time is cut into segments, one per frame (`kalux.filters.method`). The engine holds the filter's state at the
 start of the current segment and a cursor that has moved over some of its events. Reading evaluates the
 cursor's closed form and changes nothing, so results depend neither on when and how often one reads nor on how
 events were split into pushes.
@@ -25,8 +25,10 @@ from kalux.events import EVENT_DTYPE, EventArray, as_events, check_events
 from kalux.filters.akf import State
 from kalux.filters.buffer import EventBuffer
 from kalux.filters.highlights import lifted, read_unshown, tempered
-from kalux.filters.methods import USUAL_INTERVAL, Method, Segment, Shot, make_method, take_shot
+from kalux.filters.method import USUAL_INTERVAL, Method, Segment
+from kalux.filters.methods import make_method
 from kalux.filters.readout import HighlightPrior, read_out
+from kalux.filters.shots import Shot, take_shot
 from kalux.filters.uncertainty import Around, alone, given_variance, hidden_variance
 from kalux.frames import Frame, check_frame
 from kalux.models.camera import Camera, beyond_white, count_bright

@@ -24,7 +24,7 @@ from kalux.augmentation.deblur import (
 from kalux.augmentation.refractory import EventClock
 from kalux.datasets import SensorSettings, pan, photograph_scene, simulate
 from kalux.events import make_events
-from kalux.filters.methods import latent_frame
+from kalux.filters.bridged_frames import latent_frame
 from kalux.models.camera import log_intensity
 
 from builders import blocks, events, pixel_events

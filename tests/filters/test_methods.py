@@ -10,7 +10,8 @@ import pytest
 from kalux import PRESETS, Frame, Reconstructor
 from kalux.augmentation.bridge import UNMEASURED, UNSEEN, Latent, floor_before, lift
 from kalux.events import make_events
-from kalux.filters.methods import make_method, take_shot
+from kalux.filters.methods import make_method
+from kalux.filters.shots import take_shot
 from kalux.models.camera import Camera, Response
 
 from builders import VARIANTS, altered, events, random_stream
