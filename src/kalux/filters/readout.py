@@ -189,6 +189,8 @@ def read_out(
     difference: float = 0.0,
     pitch: int = 1,
     unshown: NDArray[np.int64] | None = None,
+    *,
+    with_variance: bool = True,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """I of a state, and the variance of its logarithm; in one pass over the rows, none of which is stored in between.
 
@@ -220,6 +222,8 @@ def read_out(
     unshown
         (N,) pixels in the flattened image, ascending, that no frame has shown: their L is wanted as well, and
         neighbours do not lessen their variance, since what they hide (K15) all of them hide alike.
+    with_variance
+        Whether the variance is wanted: else it is empty.
 
     Returns
     -------
@@ -234,7 +238,7 @@ def read_out(
     heard = np.empty(len(unshown), np.float32)
     known = variance.astype(np.float32, copy=False)
     out = np.empty(log_intensity.shape, np.float32)
-    total = known if moving is None else np.empty_like(out)
+    total = np.empty(out.shape if with_variance else (0, 0), np.float32)
     _read_out(
         log_intensity.astype(np.float32, copy=False),
         known,
@@ -271,9 +275,7 @@ def _ring(pitch: int) -> _Ring:
 
 
 def _lines(rows: int) -> NDArray[np.float32]:
-    """Zeros for some rows."""
     found: NDArray[np.float32] = packed((rows * _ROW,), np.dtype(np.float32))
-    found[:] = 0.0
     return found
 
 
@@ -362,8 +364,8 @@ def _read_out(  # type: ignore[no-untyped-def]
             if first < last:
                 _lessen(row, first, last, ring, left)
                 for k in range(begun, met[row]):
-                    place = np.uint64(unshown[k] - row * width - begin)
-                    left[place] = ring.known[here + _DOUBT + place]
+                    bound = np.uint64(unshown[k] - row * width - begin)
+                    left[bound] = ring.known[here + _DOUBT + bound]
             if len(total) > 0:
                 for i in range(size):
                     total[at, start + i] = left[i]
@@ -391,6 +393,7 @@ def _clear(ring):  # type: ignore[no-untyped-def]
     ring.least[:] = np.float32(0.0)
     ring.unlike[:] = np.float32(0.0)
     ring.alike[:] = np.float32(0.0)
+    ring.single[:] = np.float32(0.0)
     ring.hears[:] = np.uint8(0)
 
 
