@@ -591,7 +591,7 @@ def _percentiles_of_sample(values: Float32, percents: list[float]) -> Statistics
 
 @nb.njit(cache=True, nogil=True)
 def _narrowed(rows, ranks, bits):  # type: ignore[no-untyped-def]
-    """Fills ``bits``, with room for one more, with numbers among which those of some ranks are; their places and number.
+    """The numbers among which those of some ranks are, in ``bits``, with room for one more; their places, and how many.
 
     Numbers are compared by their bits: as float32 that are not negative, they are in the same order.
     """
