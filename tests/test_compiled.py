@@ -153,3 +153,4 @@ def test_the_largest_bits_tell_infinite_from_finite_and_from_nan(numbers):
     assert (found < INFINITE_BITS) == np.isfinite(values).all()
     assert (found > INFINITE_BITS) == np.isnan(values).any()
     assert magnitude_bits(np.stack([values, -values])[:, ::2]) == magnitude_bits(values[::2])
+    assert magnitude_bits(np.broadcast_to(values[:1], (3, 5))) == magnitude_bits(values[:1])
