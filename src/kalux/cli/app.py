@@ -11,7 +11,7 @@ from types import ModuleType
 
 from kalux.cli.parser import Parser, UsageError, normalised
 from kalux.cli.signals import termination_as_interrupt
-from kalux.cli.terminal import close_output, error_line
+from kalux.cli.terminal import close_output, error_line, hold_closed_streams
 from kalux.errors import InternalError, KaluxError
 
 DONE, BUG, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
@@ -73,6 +73,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         0 done, 1 an error in kalux, 2 bad input or usage, 130 interrupted.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
+    hold_closed_streams()
     try:
         with termination_as_interrupt():
             return _guarded(arguments)
