@@ -177,6 +177,15 @@ def test_standard_output_that_is_full_is_told(recording):
     assert done.stderr == "kalux: error: standard output: No space left on device\n"
 
 
+def test_an_interrupt_within_numba_is_an_interrupt(cli, recording, monkeypatch):
+    def interrupted(*arguments, **options):
+        raise SystemError("returned a result with an exception set") from KeyboardInterrupt()
+
+    monkeypatch.setattr(kalux, "open", interrupted)
+    found = cli("info", recording)
+    assert (found.code, found.err) == (130, "kalux: interrupted; what is finished is whole\n")
+
+
 class TestSignals:
     def test_termination_is_an_interrupt_even_where_interrupts_are_ignored(self):
         previous = signal.signal(signal.SIGINT, signal.SIG_IGN)

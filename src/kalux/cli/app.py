@@ -94,12 +94,20 @@ def _guarded(arguments: list[str]) -> int:
         error_line("interrupted", *(_notes(interrupt) or ["nothing was written"]))
         return INTERRUPTED
     except Exception as error:
+        if _is_interrupt(error):
+            error_line("interrupted", *(_notes(error) or ["what is finished is whole"]))
+            return INTERRUPTED
         traceback.print_exc()
         error_line(
             f"error: {type(error).__name__} inside kalux; this is an error in kalux, please report it with the "
             "lines above and the command"
         )
         return BUG
+
+
+def _is_interrupt(error: Exception) -> bool:
+    """Whether Ctrl-C came while a compiled loop was being loaded: numba makes a SystemError of it."""
+    return isinstance(error, SystemError) and isinstance(error.__cause__, KeyboardInterrupt)
 
 
 def _notes(error: BaseException) -> list[str]:
