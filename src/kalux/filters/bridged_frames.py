@@ -152,7 +152,6 @@ class BridgedFrames(CommonMethod):
             level_variance,
             exposure,
             duration=shot.end - shot.start,
-            white=float(np.log(self.settings.camera.saturation * shot.white + self.offset)),
             event_variance=self.settings.events.deblur_variance * self.on * self.off,
         )
         if shot.valid is not None:
@@ -457,10 +456,12 @@ def latent_frame(
     exposure: Exposure,
     *,
     duration: int,
-    white: float,
     event_variance: float,
 ) -> Latent:
     """A frame without blur at the middle of its exposure, and its variance (K3).
+
+    A pixel whose mean is below white is measured, however bright it was for a part of the exposure: a sensor adds up
+    light and clips the sum.
 
     Parameters
     ----------
@@ -472,13 +473,11 @@ def latent_frame(
         EDI, from `deblur.expose`.
     duration
         Of the exposure, us.
-    white
-        Log intensity from which a pixel is clipped: one that reached it within the exposure was, for a part of it.
     event_variance
         What each event of the exposure adds to the variance.
     """
     latent = apart(2, (levels.size,))
-    scalars = np.float32(duration), np.float32(white), np.float32(event_variance)
+    scalars = np.float32(duration), np.float32(event_variance)
     tables = level_log.astype(np.float32), level_variance.astype(np.float32)
     _latent_frame(levels.reshape(-1), *tables, exposure, *scalars, *latent)
     return Latent(*latent.reshape(2, *levels.shape))
@@ -486,18 +485,14 @@ def latent_frame(
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _latent_frame(  # type: ignore[no-untyped-def]
-    levels, level_log, level_variance, exposure, duration, white, event_variance, value, variance
+    levels, level_log, level_variance, exposure, duration, event_variance, value, variance
 ):
     unmeasured = np.float32(bridge.UNMEASURED)
     fields = np.empty((EXPOSURE_FIELDS, EXPOSED), np.float32)
-    middle, peak, events = (
-        np.empty(EXPOSED, np.float32),
-        np.empty(EXPOSED, np.float32),
-        np.empty(EXPOSED, np.float32),
-    )
+    middle, events = np.empty(EXPOSED, np.float32), np.empty(EXPOSED, np.float32)
     log_frame, known = np.empty(EXPOSED, np.float32), np.empty(EXPOSED, np.float32)
     for block in range(np.uint64(len(exposure.touched))):
-        relative_levels(exposure, block, duration, fields, middle, peak, events)
+        relative_levels(exposure, block, duration, fields, middle, events)
         first = block * np.uint64(EXPOSED)
         count = min(np.uint64(len(levels)) - first, np.uint64(EXPOSED))
         for i in range(count):  # looking up is no vector code, the rest is
@@ -507,5 +502,4 @@ def _latent_frame(  # type: ignore[no-untyped-def]
             value[first + i] = log_frame[i] + middle[i]
         for i in range(count):
             doubt = known[i] + event_variance * events[i]
-            clipped = log_frame[i] + peak[i] >= white or doubt >= unmeasured
-            variance[first + i] = unmeasured if clipped else doubt
+            variance[first + i] = min(doubt, unmeasured)
