@@ -306,35 +306,45 @@ def _copy(plane, row, first, count, out):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True, error_model="numpy", fastmath=FUSED)
 def _advance_bridged(words, pixels, steps, clock, polarity, stride, origin, scalars):  # type: ignore[no-untyped-def]
-    corner = stride + np.uint64(1)
+    # Each event's clock is looked at while the one before is filtered, so that neither waits for the other.
     last = len(words) - 1
+    event = _meet(words[0, 0], words[0, 1], clock, polarity, stride, origin, scalars)
     for i in range(len(words)):
         ahead = words[min(i + AHEAD, last), 1]
-        place = event_row(ahead) * stride + event_column(ahead) + corner
+        place = event_row(ahead) * stride + event_column(ahead) + stride + np.uint64(1)
         prefetch(pixels, place)
         prefetch(steps, place)
-        word = words[i, 1]
-        at = event_row(word) * stride + event_column(word) + corner
+        at, seconds, weight, is_on, unsure, noise = event
         pixel, known = pixels[at], steps[at]
-        now = np.int32(words[i, 0] - origin)
-        information = predicted_information(pixel.information, pixel.rate, _since(clock[at], now))
-        age = np.float32(np.int32(now - newest_around_inside(clock, at, stride))) * MICROSECOND32
-        signal = signal_probability(scalars.noise_rate, age)
+        information = predicted_information(pixel.information, pixel.rate, seconds)
         step_on, step_off = known.step_on, known.step_off
-        weight = event_weight(word, WEIGHT_UNIT)
-        step = weight * (step_on if event_is_on(word) else -step_off)
-        kept = information_kept(
-            information, weight * threshold_noise(scalars.event_variance, scalars.threshold2, signal)
-        )
+        step = weight * (step_on if is_on else -step_off)
+        kept = information_kept(information, noise)
         # The state moves by the expected step, L^A by the whole one: the frames have told which it was.
-        pixel.weighted = (pixel.weighted - information * (ONE - signal) * step) * kept
+        pixel.weighted = (pixel.weighted - information * unsure * step) * kept
         pixel.information = information * kept
         pixel.augmented += step
         forward, coming = known.forward + weight * scalars.step_variance, known.coming - weight
         pixel.rate = measurement_rate(scalars.rate, forward, known.backward + coming * scalars.step_variance)
         known.forward, known.coming = forward, coming
-        clock[at] = now
-        polarity[at] = np.int8(2) * np.int8(event_is_on(word)) - np.int8(1)
+        following = min(i + 1, last)
+        event = _meet(words[following, 0], words[following, 1], clock, polarity, stride, origin, scalars)
+
+
+@nb.njit(cache=True, inline="always", error_model="numpy")
+def _meet(t, word, clock, polarity, stride, origin, scalars):  # type: ignore[no-untyped-def]
+    """What an event is worth: its pixel's place, the seconds since that's state holds, its weight and polarity, the
+    probability that it is noise, and Q. Sets the clock; the same event may be met twice."""
+    at = event_row(word) * stride + event_column(word) + stride + np.uint64(1)
+    now = np.int32(t - origin)
+    seconds = _since(clock[at], now)
+    age = np.float32(np.int32(now - newest_around_inside(clock, at, stride))) * MICROSECOND32
+    signal = signal_probability(scalars.noise_rate, age)
+    weight, is_on = event_weight(word, WEIGHT_UNIT), event_is_on(word)
+    clock[at] = now
+    polarity[at] = np.int8(2) * np.int8(is_on) - np.int8(1)
+    noise = weight * threshold_noise(scalars.event_variance, scalars.threshold2, signal)
+    return at, seconds, weight, is_on, ONE - signal, noise
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
