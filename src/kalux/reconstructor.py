@@ -21,7 +21,7 @@ from kalux.augmentation.trail import FrameTrail
 from kalux.augmentation.unseen import UNKNOWN_CHANGE
 from kalux.compiled import event_words
 from kalux.errors import InputError, SettingsError
-from kalux.events import EVENT_DTYPE, EventArray, as_events, check_events
+from kalux.events import EVENT_DTYPE, EventArray, as_events, check_events, checked_size
 from kalux.filters.akf import State
 from kalux.filters.buffer import EventBuffer
 from kalux.filters.highlights import lifted, read_unshown, tempered
@@ -190,10 +190,7 @@ class Reconstructor:
         inverse_covariance: NDArray[np.float64] | None = None,
         pixels: PixelCalibration | None = None,
     ) -> None:
-        height, width = (int(n) for n in sensor_size)
-        if height <= 0 or width <= 0:
-            raise InputError(f"sensor_size is {sensor_size}; (height, width) in pixels is needed")
-        self.sensor_size = (height, width)
+        self.sensor_size = checked_size(sensor_size)
         self.settings = settings if settings is not None else named_preset(preset)
         self.lookahead = lookahead
         on, off = _pair(contrast_threshold)
