@@ -22,6 +22,7 @@ from kalux.augmentation.trail import (
     Followed,
     Trail,
     follow,
+    followed_pixels,
     given_trail,
     nothing_followed,
     polarity_of,
@@ -97,6 +98,7 @@ class BridgedFrames(CommonMethod):
         # Fresh memory costs as much as filling it.
         self._spare: akf_bridged.Cursor | None = None
         self._spare_exposure: NDArray[np.void] | None = None
+        self._spare_followed: NDArray[np.void] | None = None
         self._prior = (
             bridge.nominal_thresholds(shape, settings.events.mismatch, np.float32)
             if pixels is None
@@ -110,7 +112,7 @@ class BridgedFrames(CommonMethod):
 
     def __getstate__(self) -> dict[str, Any]:
         """Pickled without the free memory."""
-        return {**self.__dict__, "_spare": None, "_spare_exposure": None}
+        return {**self.__dict__, "_spare": None, "_spare_exposure": None, "_spare_followed": None}
 
     def node(self, shot: Shot) -> int:
         return shot.middle if self.lookahead else shot.end
@@ -339,7 +341,9 @@ class BridgedFrames(CommonMethod):
         self, events: Chunks, start: int, end: int, before: Followed
     ) -> tuple[Floats, Floats, Followed]:
         """`counts`, and what is known of the pixels' newest events at ``end`` (K14)."""
-        return follow(all_between(events, start, end), before, start, end)
+        if self._spare_followed is None:
+            self._spare_followed = followed_pixels(self.shape)
+        return follow(all_between(events, start, end), before, start, end, self._spare_followed)
 
     def _trail(self, followed: Followed, start: int, scale: float) -> Trail:
         """By how much events trail the light in the segment from ``start`` on (K14)."""
