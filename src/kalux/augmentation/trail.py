@@ -204,9 +204,21 @@ def _follow(words, codes, counts, width, late):  # type: ignore[no-untyped-def]
 def trail_at(newest: NDArray[np.int64], t: int, trail: tuple[float, float, float]) -> FloatArray:
     """f at ``t`` (us), (H, W) log intensity, given the newest events there; ``trail`` is s and h c_on, h c_off."""
     out = np.empty(newest.shape, np.float32)
-    scale, on, off = (np.float32(value) for value in trail)
-    _trail_at(newest.reshape(-1), t, scale, on, off, out.reshape(-1))
+    _trail_at(newest.reshape(-1), t, tuple(np.float32(value) for value in trail), out.reshape(-1))
     return out
+
+
+def trail_between(
+    first: NDArray[np.int64], last: NDArray[np.int64], span: tuple[int, int], trail: tuple[float, float, float]
+) -> tuple[FloatArray, FloatArray]:
+    """f at the first of two times ``span`` (us), and what it has grown by at the second, as `trail_at`, in one pass.
+
+    ``first`` and ``last`` are the newest events at these times.
+    """
+    start, grown = apart(2, first.shape)
+    scalars = tuple(np.float32(value) for value in trail)
+    _trail_between(first.reshape(-1), last.reshape(-1), *span, scalars, start.reshape(-1), grown.reshape(-1))
+    return start, grown
 
 
 def polarity_of(newest: NDArray[np.int64]) -> NDArray[np.int8]:
@@ -238,12 +250,24 @@ def ahead_of_event(sign: Any, age: Any, heights: Any) -> Any:
     return high * beyond(age, scale)
 
 
+@nb.njit(cache=True, inline="always", error_model="numpy")
+def _ahead_of_newest(newest, t, heights):  # type: ignore[no-untyped-def]
+    scale, on, off = heights
+    age = np.float32(t - (newest >> 1)) * MICROSECOND32
+    return (on if newest & 1 else -off) * beyond(age, scale)
+
+
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _trail_at(newest, t, scale, on, off, out):  # type: ignore[no-untyped-def]
+def _trail_at(newest, t, heights, out):  # type: ignore[no-untyped-def]
     for i in range(len(out)):
-        age = np.float32(t - (newest[i] >> 1)) * MICROSECOND32
-        height = on if newest[i] & 1 else -off
-        out[i] = height * beyond(age, scale)
+        out[i] = _ahead_of_newest(newest[i], t, heights)
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _trail_between(first, last, begin, end, heights, start, grown):  # type: ignore[no-untyped-def]
+    for i in range(len(start)):
+        start[i] = _ahead_of_newest(first[i], begin, heights)
+        grown[i] = _ahead_of_newest(last[i], end, heights) - start[i]
 
 
 def given_trail(start: FloatArray, end: FloatArray) -> Trail:
