@@ -467,7 +467,16 @@ class Reconstructor:
         pixels = None if unshown is None else unshown.pixels
         tells = with_variance or mosaic  # the colours of a mosaic's highlights depend on it
         intensity, total, heard = read_out(
-            *(log_intensity, variance, offset, prior, moving, alone(hidden), change, neighbours, pitch, pixels),
+            log_intensity,
+            variance,
+            offset,
+            prior,
+            moving,
+            alone(hidden),
+            change,
+            neighbours,
+            pitch,
+            pixels,
             with_variance=tells and moving is None,
         )
         if unshown is not None:

@@ -209,7 +209,10 @@ def trail_at(newest: NDArray[np.int64], t: int, trail: tuple[float, float, float
 
 
 def trail_between(
-    first: NDArray[np.int64], last: NDArray[np.int64], span: tuple[int, int], trail: tuple[float, float, float]
+    first: NDArray[np.int64],
+    last: NDArray[np.int64],
+    span: tuple[int, int],
+    trail: tuple[float, float, float],
 ) -> tuple[FloatArray, FloatArray]:
     """f at the first of two times ``span`` (us), and what it has grown by at the second, as `trail_at`, in one pass.
 
