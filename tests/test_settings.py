@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -268,3 +269,14 @@ def test_settings_errors_are_input_errors():
 def test_a_response_that_does_not_exist_is_found_before_any_frame():
     with pytest.raises(SettingsError, match="unknown response 'log'"):
         Reconstructor((2, 2), settings=altered(DEFAULT, "camera", response="log"))
+
+
+def test_every_setting_is_explained():
+    text = (Path(__file__).parents[1] / "docs" / "tuning.md").read_text(encoding="utf-8")
+    missing = [
+        f"{group}.{field.name}"
+        for group, kind in GROUPS.items()
+        for field in dataclasses.fields(kind)
+        if f"`{group}.{field.name}`" not in text
+    ]
+    assert missing == []

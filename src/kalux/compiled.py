@@ -79,8 +79,8 @@ _LINE: Final = 64
 """Bytes that the memory hands out at a time."""
 
 
-def packed(shape: tuple[int, ...], dtype: np.dtype[np.void]) -> NDArray[np.void]:
-    """An array of records, not filled, of which none lies in two lines of the memory that holds one each.
+def packed(shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """An array of records or numbers, not filled, of which none lies in two lines of the memory that holds one each.
 
     NumPy's arrays commonly begin 16 bytes behind a line, so that every other record of 32 bytes lies in two: the filter
     then takes 1.35 times as long, and EDI 1.8 times.
@@ -378,6 +378,8 @@ INFINITE_BITS: Final = 0x7F800000
 
 def magnitude_bits(values: NDArray[np.float32]) -> int:
     """The largest bits, without signs, of some float32: tells in one pass of what kind they are. 0 of none."""
+    if not any(values.strides):  # one number, repeated
+        values = values.reshape(-1)[:1]
     return int(_magnitude_bits(np.ascontiguousarray(values).view(np.int32).reshape(-1)))
 
 

@@ -382,6 +382,7 @@ def write_images(
         lambda count: progress.add(events=count),
         lambda count: backward.add(events=count),
         threads=threads,
+        with_variance=output.has_variance,
     )
     try:
         with writer, contextlib.closing(images):
