@@ -366,7 +366,7 @@ def combine(
     if shared is not None:
         variance = (information + 2.0 * shared * np.sqrt(first * second)) / information**2
         repeated = _repeated(forward.around, backward.around)
-        told = np.where(repeated, variance, told)
+        variance, told = np.where(repeated, told, variance), np.where(repeated, variance, told)
     change = _mean_of_both(forward.silent_change, backward.silent_change)
     return Estimate(
         t=forward.t,
