@@ -269,9 +269,10 @@ def _smoothed_estimates(
             on_backward,
             trail=trail,
         )
+        on, off = engine.thresholds
         for estimate in _estimates(recording, engine, plan, on_events, read_ahead):
             ahead_of_events = None if trail is None else engine.trail(estimate.t)
-            yield combine(estimate, backward.estimate(estimate.t), ahead_of_events)
+            yield combine(estimate, backward.estimate(estimate.t), ahead_of_events, on * off)
 
 
 def _trail(plan: Plan) -> tuple[Settings, NDArray[np.bool_] | None] | None:

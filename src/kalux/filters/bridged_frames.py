@@ -428,9 +428,12 @@ class BridgedFrames(CommonMethod):
         assert segment.events is not None
         share = (t - segment.start) / (segment.end - segment.start)
         between = 4.0 * share * (1.0 - share)
+        second = segment.backward_variance
+        if segment.bound is not None and segment.bound.ceiling is not None:
+            second = np.where(np.isfinite(segment.bound.ceiling), np.float32(bridge.REPEATED), second)
         return Around(
             segment.forward_variance,
-            segment.backward_variance,
+            second,
             segment.events,
             coming=(1.0 - share) * self.noise.step_variance,
             counted=0.0,
