@@ -87,7 +87,8 @@ _APART: Final = 7 * _LINE
 """Bytes: more than what loops take of a plane at a time, 64 float32, and lines of nine planes do not meet."""
 
 _begins: Final = itertools.count(0, 25)
-"""Lines of a page where the planes of a call of `apart` begin: far from those of the calls before. No result depends on it."""
+"""Lines of a page where the planes of a call of `apart` begin: far from those of the calls before. No result depends on
+it."""
 
 
 def packed(shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
@@ -115,7 +116,8 @@ def apart(count: int, shape: tuple[int, ...], dtype: Any = np.float32) -> NDArra
     piece = np.empty(count * step + 2 * _PAGE, np.uint8)
     first = -piece.ctypes.data % _PAGE + next(_begins) * _LINE % _PAGE
     planes = piece[first : first + count * step].reshape(count, step)[:, :size]
-    return planes.view(dtype).reshape(count, *shape)
+    apart_: NDArray[Any] = planes.view(dtype).reshape(count, *shape)
+    return apart_
 
 
 def _prefetch(typing_context: Any, array: Any, index: Any) -> Any:
