@@ -15,13 +15,14 @@ from numpy.typing import NDArray
 
 from kalux.augmentation.bridge import UNMEASURED, BridgedSegment, lift, lower
 from kalux.augmentation.deblur import events_until
-from kalux.augmentation.trail import add_trail, ahead_of_event, no_trail
+from kalux.augmentation.trail import NO_HEIGHTS, add_trail, ahead_of_event, no_trail
 from kalux.compiled import (
     AHEAD,
     FUSED,
     MICROSECOND32,
     ONE,
     WEIGHT_UNIT,
+    apart,
     event_column,
     event_is_on,
     event_row,
@@ -48,7 +49,7 @@ STATE_PIXEL: Final = np.dtype(
     [
         ("information", "f4"),  # J = 1/P after the pixel's latest event, or at the origin of the clock
         ("weighted", "f4"),  # J D, which stands still between events
-        ("augmented", "f4"),  # L^A without the part of its slope
+        ("augmented", "f4"),  # L^A without the part of its slope, less the trail at the start (K14)
         ("rate", "f4"),  # 1/R until the pixel's next event
     ],
     align=True,
@@ -145,10 +146,11 @@ def begin(segment: BridgedSegment, state: State, spare: Cursor | None = None) ->
     scalars = np.float32(segment.rate), np.float32(segment.step_variance)
     variances = segment.forward_variance, segment.backward_variance
     coming = np.zeros_like(segment.augmented) if segment.events is None else segment.events
-    given = segment.augmented, segment.step_on, segment.step_off, *variances, coming
+    trail = no_trail(coming.shape) if segment.trail is None else segment.trail
+    given = segment.augmented, segment.step_on, segment.step_off, *variances, coming, trail.start
     before = state.log_intensity, floor, state.variance
     _begin_bridged(given, scalars, before, pixels.reshape(-1), steps.reshape(-1))
-    polarity[1:-1, 1:-1] = 0 if segment.trail is None else segment.trail.polarity
+    polarity[1:-1, 1:-1] = trail.polarity
     return Cursor(pixels, steps, clock, polarity, segment.start)
 
 
@@ -194,14 +196,14 @@ def trail_ahead(segment: BridgedSegment, cursor: Cursor, t: int) -> FloatArray |
 def _read(segment: BridgedSegment, cursor: Cursor, t: int) -> tuple[FloatArray, FloatArray]:
     """The same with all that is known at the end of the segment."""
     shape = segment.augmented.shape
-    log_intensity, variance = np.empty((2, *shape), np.float32)
+    log_intensity, variance = apart(2, shape)
     within = min(t - cursor.origin, EPOCH)
     beyond = np.float32((t - cursor.origin - within) * 1e-6)
     since_start = np.float32((t - segment.start) * 1e-6)
     pixels, clock, polarity = (p.reshape(-1) for p in (cursor.pixels, cursor.clock, cursor.polarity))
-    trail = no_trail(shape) if segment.trail is None else segment.trail
+    heights = NO_HEIGHTS if segment.trail is None else segment.trail.heights
     moment, out = (within, beyond, since_start), (log_intensity, variance)
-    _read_bridged(pixels, clock, polarity, segment.slope, trail.start, trail.heights, moment, *out)
+    _read_bridged(pixels, clock, polarity, segment.slope, heights, moment, *out)
     if t == segment.end:
         if segment.trail is not None and segment.trail.end is not None:
             log_intensity += segment.trail.end
@@ -261,7 +263,7 @@ def _since(clock, now):  # type: ignore[no-untyped-def]
 def _begin_bridged(given, scalars, before, pixels, steps):  # type: ignore[no-untyped-def]
     rate, step_variance = scalars
     log_intensity, floor, variance = before
-    augmented, step_on, step_off, forward, backward, events = given
+    augmented, step_on, step_off, forward, backward, events, trail = given
     height, width = log_intensity.shape
     states = np.empty((_STATE_FIELDS, _BEGUN), np.float32)
     known = np.zeros((_STEP_FIELDS, _BEGUN), np.float32)
@@ -293,6 +295,8 @@ def _begin_bridged(given, scalars, before, pixels, steps):  # type: ignore[no-un
                 rates[i] = measurement_rate(
                     rate, first_variance[i], last_variance[i] + coming[i] * step_variance
                 )
+            for i in range(count):
+                level[i] -= np.float32(trail[row, first + i])
             pack(states, pixels, np.int64(at + first), np.int64(count))
             pack(known, steps, np.int64(at + first), np.int64(count))
 
@@ -306,40 +310,50 @@ def _copy(plane, row, first, count, out):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True, error_model="numpy", fastmath=FUSED)
 def _advance_bridged(words, pixels, steps, clock, polarity, stride, origin, scalars):  # type: ignore[no-untyped-def]
-    corner = stride + np.uint64(1)
+    # Each event's clock is looked at while the one before is filtered, so that neither waits for the other.
     last = len(words) - 1
+    event = _meet(words[0, 0], words[0, 1], clock, polarity, stride, origin, scalars)
     for i in range(len(words)):
         ahead = words[min(i + AHEAD, last), 1]
-        place = event_row(ahead) * stride + event_column(ahead) + corner
+        place = event_row(ahead) * stride + event_column(ahead) + stride + np.uint64(1)
         prefetch(pixels, place)
         prefetch(steps, place)
-        word = words[i, 1]
-        at = event_row(word) * stride + event_column(word) + corner
+        at, seconds, weight, is_on, unsure, noise = event
         pixel, known = pixels[at], steps[at]
-        now = np.int32(words[i, 0] - origin)
-        information = predicted_information(pixel.information, pixel.rate, _since(clock[at], now))
-        age = np.float32(np.int32(now - newest_around_inside(clock, at, stride))) * MICROSECOND32
-        signal = signal_probability(scalars.noise_rate, age)
+        information = predicted_information(pixel.information, pixel.rate, seconds)
         step_on, step_off = known.step_on, known.step_off
-        weight = event_weight(word, WEIGHT_UNIT)
-        step = weight * (step_on if event_is_on(word) else -step_off)
-        kept = information_kept(
-            information, weight * threshold_noise(scalars.event_variance, scalars.threshold2, signal)
-        )
+        step = weight * (step_on if is_on else -step_off)
+        kept = information_kept(information, noise)
         # The state moves by the expected step, L^A by the whole one: the frames have told which it was.
-        pixel.weighted = (pixel.weighted - information * (ONE - signal) * step) * kept
+        pixel.weighted = (pixel.weighted - information * unsure * step) * kept
         pixel.information = information * kept
         pixel.augmented += step
         forward, coming = known.forward + weight * scalars.step_variance, known.coming - weight
         pixel.rate = measurement_rate(scalars.rate, forward, known.backward + coming * scalars.step_variance)
         known.forward, known.coming = forward, coming
-        clock[at] = now
-        polarity[at] = np.int8(2) * np.int8(event_is_on(word)) - np.int8(1)
+        following = min(i + 1, last)
+        event = _meet(words[following, 0], words[following, 1], clock, polarity, stride, origin, scalars)
+
+
+@nb.njit(cache=True, inline="always", error_model="numpy")
+def _meet(t, word, clock, polarity, stride, origin, scalars):  # type: ignore[no-untyped-def]
+    """What an event is worth: its pixel's place, the seconds since that's state holds, its weight and polarity, the
+    probability that it is noise, and Q. Sets the clock; the same event may be met twice."""
+    at = event_row(word) * stride + event_column(word) + stride + np.uint64(1)
+    now = np.int32(t - origin)
+    seconds = _since(clock[at], now)
+    age = np.float32(np.int32(now - newest_around_inside(clock, at, stride))) * MICROSECOND32
+    signal = signal_probability(scalars.noise_rate, age)
+    weight, is_on = event_weight(word, WEIGHT_UNIT), event_is_on(word)
+    clock[at] = now
+    polarity[at] = np.int8(2) * np.int8(is_on) - np.int8(1)
+    noise = weight * threshold_noise(scalars.event_variance, scalars.threshold2, signal)
+    return at, seconds, weight, is_on, ONE - signal, noise
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _read_bridged(  # type: ignore[no-untyped-def]
-    pixels, clock, polarity, slope, trail, heights, moment, log_intensity, variance
+    pixels, clock, polarity, slope, heights, moment, log_intensity, variance
 ):
     height, width = variance.shape
     size = min(width, _BLOCK)
@@ -347,7 +361,7 @@ def _read_bridged(  # type: ignore[no-untyped-def]
     for row in range(height):
         at = (row + 1) * (width + 2) + 1
         newest = clock[at : at + width], polarity[at : at + width]
-        rows = slope[row], trail[row], log_intensity[row], variance[row]
+        rows = slope[row], log_intensity[row], variance[row]
         for first in range(0, width, size):  # the last block begins where it ends with the row
             first = min(first, width - size)
             unpack(pixels, at + first, size, planes)
@@ -359,7 +373,7 @@ def _read_block(planes, first, count, newest, heights, moment, rows, ahead):  # 
     """L and P of ``count`` pixels of a row from ``first`` on; vector code."""
     times, signs = newest
     now, beyond, since_start = moment
-    slope, trail, log_intensity, variance = rows
+    slope, log_intensity, variance = rows
     information, weighted, augmented, rate = (
         planes[_INFORMATION],
         planes[_WEIGHTED],
@@ -369,7 +383,7 @@ def _read_block(planes, first, count, newest, heights, moment, rows, ahead):  # 
     for i in range(count):
         column = np.uint64(first) + np.uint64(i)
         age = np.float32(np.int32(now - times[column])) * MICROSECOND32
-        ahead[i] = ahead_of_event(signs[column], age, heights) - trail[column]  # K14
+        ahead[i] = ahead_of_event(signs[column], age, heights)  # K14
     for i in range(count):
         column = np.uint64(first) + np.uint64(i)
         seconds = _since(times[column], now) + beyond
