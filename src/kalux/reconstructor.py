@@ -21,7 +21,7 @@ from kalux.augmentation.trail import FrameTrail
 from kalux.augmentation.unseen import UNKNOWN_CHANGE
 from kalux.compiled import event_words
 from kalux.errors import InputError, SettingsError
-from kalux.events import EVENT_DTYPE, EventArray, as_events, check_events
+from kalux.events import EVENT_DTYPE, EventArray, as_events, check_events, checked_size
 from kalux.filters.akf import State
 from kalux.filters.buffer import EventBuffer
 from kalux.filters.highlights import lifted, read_unshown, tempered
@@ -194,10 +194,7 @@ class Reconstructor:
         inverse_covariance: NDArray[np.float64] | None = None,
         pixels: PixelCalibration | None = None,
     ) -> None:
-        height, width = (int(n) for n in sensor_size)
-        if height <= 0 or width <= 0:
-            raise InputError(f"sensor_size is {sensor_size}; (height, width) in pixels is needed")
-        self.sensor_size = (height, width)
+        self.sensor_size = checked_size(sensor_size)
         self.settings = settings if settings is not None else named_preset(preset)
         self.lookahead = lookahead
         on, off = _pair(contrast_threshold)
@@ -441,8 +438,11 @@ class Reconstructor:
         self._take(progress, t)
         return self._method.trail(progress.segment, progress.cursor, t)
 
-    def image(self, estimate: Estimate) -> Image:
-        """The image of an estimate: highlights as far as they are believed (K6), with what neighbours know (K12)."""
+    def image(self, estimate: Estimate, *, with_variance: bool = True) -> Image:
+        """The image of an estimate: highlights as far as they are believed (K6), with what neighbours know (K12).
+
+        Where its variance is not wanted it is infinite: to tell it (K11) takes a seventh of the time.
+        """
         # The prior needs a variance, which the complementary filter has not.
         filtered, events = self.settings.filter, self.settings.events
         scale = filtered.highlight_scale if filtered.kind == "akf" else 0.0
@@ -472,12 +472,25 @@ class Reconstructor:
         if change is None and moving is not None:  # K11 needs it only there
             change = np.full(log_intensity.shape, UNKNOWN_CHANGE * on * off, np.float32)
         pixels = None if unshown is None else unshown.pixels
+        tells = with_variance or mosaic  # the colours of a mosaic's highlights depend on it
         intensity, total, heard = read_out(
-            log_intensity, variance, offset, prior, moving, alone(hidden), change, neighbours, pitch, pixels
+            log_intensity,
+            variance,
+            offset,
+            prior,
+            moving,
+            alone(hidden),
+            change,
+            neighbours,
+            pitch,
+            pixels,
+            with_variance=tells and moving is None,
         )
         if unshown is not None:
             read_unshown(intensity, heard, estimate.log_intensity, unshown, offset, prior)
-        if moving is not None and change is not None:
+        if not tells:
+            total = np.broadcast_to(np.float32(np.inf), intensity.shape)
+        elif moving is not None and change is not None:
             known = variance if told is None else told
             total = given_variance(known, moving, change, hidden, estimate.around)
         image = Image(estimate.t, intensity, total, offset, estimate.final)

@@ -48,6 +48,11 @@ _STANDS_STILL: Final = 0.005
 camera (`kalux.augmentation.unseen`)."""
 
 
+def _reason(error: OSError) -> str:
+    """Why something cannot be spilled; NumPy reports a full disk without saying so."""
+    return f"{error.strerror or 'no space is left on the disk'}; set TMPDIR to a folder with more"
+
+
 class Spill:
     """A recording on disk, in a form that can be read backward.
 
@@ -93,7 +98,7 @@ class Spill:
                 )
         except OSError as error:
             raise OutputError(
-                f"{folder}: the recording cannot be spilled for the backward pass: {error.strerror or error}"
+                f"{folder}: the recording cannot be spilled for the backward pass: {_reason(error)}"
             ) from error
 
     def __len__(self) -> int:
@@ -145,7 +150,7 @@ class Spill:
             np.save(self._newest_path(index), newest)
         except OSError as error:
             raise OutputError(
-                f"{self._folder}: the backward pass cannot be spilled: {error.strerror or error}"
+                f"{self._folder}: the backward pass cannot be spilled: {_reason(error)}"
             ) from error
 
     def load_newest(self, index: int) -> NDArray[np.int64]:
@@ -331,7 +336,7 @@ class Backward:
             self._state_path(index).write_bytes(pickle.dumps(backward, pickle.HIGHEST_PROTOCOL))
         except OSError as error:
             raise OutputError(
-                f"{self._folder}: the backward pass cannot be spilled: {error.strerror or error}"
+                f"{self._folder}: the backward pass cannot be spilled: {_reason(error)}"
             ) from error
 
     def _state_path(self, index: int) -> Path:

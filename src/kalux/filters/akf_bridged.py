@@ -15,13 +15,14 @@ from numpy.typing import NDArray
 
 from kalux.augmentation.bridge import UNMEASURED, BridgedSegment, lift, lower
 from kalux.augmentation.deblur import events_until
-from kalux.augmentation.trail import add_trail, ahead_of_event, no_trail
+from kalux.augmentation.trail import NO_HEIGHTS, add_trail, ahead_of_event, no_trail
 from kalux.compiled import (
     AHEAD,
     FUSED,
     MICROSECOND32,
     ONE,
     WEIGHT_UNIT,
+    apart,
     event_column,
     event_is_on,
     event_row,
@@ -48,7 +49,7 @@ STATE_PIXEL: Final = np.dtype(
     [
         ("information", "f4"),  # J = 1/P after the pixel's latest event, or at the origin of the clock
         ("weighted", "f4"),  # J D, which stands still between events
-        ("augmented", "f4"),  # L^A without the part of its slope
+        ("augmented", "f4"),  # L^A without the part of its slope, less the trail at the start (K14)
         ("rate", "f4"),  # 1/R until the pixel's next event
     ],
     align=True,
@@ -145,10 +146,11 @@ def begin(segment: BridgedSegment, state: State, spare: Cursor | None = None) ->
     scalars = np.float32(segment.rate), np.float32(segment.step_variance)
     variances = segment.forward_variance, segment.backward_variance
     coming = np.zeros_like(segment.augmented) if segment.events is None else segment.events
-    given = segment.augmented, segment.step_on, segment.step_off, *variances, coming
+    trail = no_trail(coming.shape) if segment.trail is None else segment.trail
+    given = segment.augmented, segment.step_on, segment.step_off, *variances, coming, trail.start
     before = state.log_intensity, floor, state.variance
     _begin_bridged(given, scalars, before, pixels.reshape(-1), steps.reshape(-1))
-    polarity[1:-1, 1:-1] = 0 if segment.trail is None else segment.trail.polarity
+    polarity[1:-1, 1:-1] = trail.polarity
     return Cursor(pixels, steps, clock, polarity, segment.start)
 
 
@@ -194,14 +196,14 @@ def trail_ahead(segment: BridgedSegment, cursor: Cursor, t: int) -> FloatArray |
 def _read(segment: BridgedSegment, cursor: Cursor, t: int) -> tuple[FloatArray, FloatArray]:
     """The same with all that is known at the end of the segment."""
     shape = segment.augmented.shape
-    log_intensity, variance = np.empty((2, *shape), np.float32)
+    log_intensity, variance = apart(2, shape)
     within = min(t - cursor.origin, EPOCH)
     beyond = np.float32((t - cursor.origin - within) * 1e-6)
     since_start = np.float32((t - segment.start) * 1e-6)
     pixels, clock, polarity = (p.reshape(-1) for p in (cursor.pixels, cursor.clock, cursor.polarity))
-    trail = no_trail(shape) if segment.trail is None else segment.trail
+    heights = NO_HEIGHTS if segment.trail is None else segment.trail.heights
     moment, out = (within, beyond, since_start), (log_intensity, variance)
-    _read_bridged(pixels, clock, polarity, segment.slope, trail.start, trail.heights, moment, *out)
+    _read_bridged(pixels, clock, polarity, segment.slope, heights, moment, *out)
     if t == segment.end:
         if segment.trail is not None and segment.trail.end is not None:
             log_intensity += segment.trail.end
@@ -261,7 +263,7 @@ def _since(clock, now):  # type: ignore[no-untyped-def]
 def _begin_bridged(given, scalars, before, pixels, steps):  # type: ignore[no-untyped-def]
     rate, step_variance = scalars
     log_intensity, floor, variance = before
-    augmented, step_on, step_off, forward, backward, events = given
+    augmented, step_on, step_off, forward, backward, events, trail = given
     height, width = log_intensity.shape
     states = np.empty((_STATE_FIELDS, _BEGUN), np.float32)
     known = np.zeros((_STEP_FIELDS, _BEGUN), np.float32)
@@ -293,6 +295,8 @@ def _begin_bridged(given, scalars, before, pixels, steps):  # type: ignore[no-un
                 rates[i] = measurement_rate(
                     rate, first_variance[i], last_variance[i] + coming[i] * step_variance
                 )
+            for i in range(count):
+                level[i] -= np.float32(trail[row, first + i])
             pack(states, pixels, np.int64(at + first), np.int64(count))
             pack(known, steps, np.int64(at + first), np.int64(count))
 
@@ -349,7 +353,7 @@ def _meet(t, word, clock, polarity, stride, origin, scalars):  # type: ignore[no
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _read_bridged(  # type: ignore[no-untyped-def]
-    pixels, clock, polarity, slope, trail, heights, moment, log_intensity, variance
+    pixels, clock, polarity, slope, heights, moment, log_intensity, variance
 ):
     height, width = variance.shape
     size = min(width, _BLOCK)
@@ -357,7 +361,7 @@ def _read_bridged(  # type: ignore[no-untyped-def]
     for row in range(height):
         at = (row + 1) * (width + 2) + 1
         newest = clock[at : at + width], polarity[at : at + width]
-        rows = slope[row], trail[row], log_intensity[row], variance[row]
+        rows = slope[row], log_intensity[row], variance[row]
         for first in range(0, width, size):  # the last block begins where it ends with the row
             first = min(first, width - size)
             unpack(pixels, at + first, size, planes)
@@ -369,7 +373,7 @@ def _read_block(planes, first, count, newest, heights, moment, rows, ahead):  # 
     """L and P of ``count`` pixels of a row from ``first`` on; vector code."""
     times, signs = newest
     now, beyond, since_start = moment
-    slope, trail, log_intensity, variance = rows
+    slope, log_intensity, variance = rows
     information, weighted, augmented, rate = (
         planes[_INFORMATION],
         planes[_WEIGHTED],
@@ -379,7 +383,7 @@ def _read_block(planes, first, count, newest, heights, moment, rows, ahead):  # 
     for i in range(count):
         column = np.uint64(first) + np.uint64(i)
         age = np.float32(np.int32(now - times[column])) * MICROSECOND32
-        ahead[i] = ahead_of_event(signs[column], age, heights) - trail[column]  # K14
+        ahead[i] = ahead_of_event(signs[column], age, heights)  # K14
     for i in range(count):
         column = np.uint64(first) + np.uint64(i)
         seconds = _since(times[column], now) + beyond

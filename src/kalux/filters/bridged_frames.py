@@ -22,10 +22,12 @@ from kalux.augmentation.trail import (
     Followed,
     Trail,
     follow,
+    followed_pixels,
     given_trail,
     nothing_followed,
     polarity_of,
     trail_at,
+    trail_between,
 )
 from kalux.augmentation.unseen import UNKNOWN_CHANGE, forget_silence, silent_change
 from kalux.compiled import apart
@@ -36,10 +38,7 @@ from kalux.filters.common import make_clock
 from kalux.filters.method import FAR_FUTURE, USUAL_INTERVAL, Chunks, CommonMethod, Segment
 from kalux.filters.shots import Shot
 from kalux.filters.uncertainty import WRONG_STEPS, Around
-from kalux.models.camera import (
-    frame_log_covariance,
-    log_intensity,
-)
+from kalux.models.camera import CRUSHED, frame_log_covariance, log_intensity
 from kalux.models.pixels import PixelCalibration
 from kalux.settings import Settings
 
@@ -49,9 +48,6 @@ Floats = NDArray[np.floating[Any]]
 
 _DARKEST: Final = 0.001
 """What is black is taken to be spread evenly in log I from here, white = 1, a quarter of an 8-bit level."""
-
-_CRUSHED: Final = 1.5 / 255
-"""Intensity, white = 1, that black must hide to be no measurement: three times what it hides of a linear response."""
 
 _BLACK_FRAMES: Final = 3.0
 """Black says the same in every frame: so many of them count as one, and all as no more (docs/equations.md, K7)."""
@@ -97,6 +93,7 @@ class BridgedFrames(CommonMethod):
         # Fresh memory costs as much as filling it.
         self._spare: akf_bridged.Cursor | None = None
         self._spare_exposure: NDArray[np.void] | None = None
+        self._spare_followed: NDArray[np.void] | None = None
         self._prior = (
             bridge.nominal_thresholds(shape, settings.events.mismatch, np.float32)
             if pixels is None
@@ -110,7 +107,7 @@ class BridgedFrames(CommonMethod):
 
     def __getstate__(self) -> dict[str, Any]:
         """Pickled without the free memory."""
-        return {**self.__dict__, "_spare": None, "_spare_exposure": None}
+        return {**self.__dict__, "_spare": None, "_spare_exposure": None, "_spare_followed": None}
 
     def node(self, shot: Shot) -> int:
         return shot.middle if self.lookahead else shot.end
@@ -167,7 +164,7 @@ class BridgedFrames(CommonMethod):
         With a linear response 0 is a measurement like others.
         """
         black = np.isfinite(shot.level_ceiling)
-        hides = shot.level_ceiling > _CRUSHED * shot.white
+        hides = shot.level_ceiling > CRUSHED * shot.white
         return black & hides if hides[black].any() else None
 
     def black(self, ceiling: Array) -> tuple[Array, Array]:
@@ -249,33 +246,31 @@ class BridgedFrames(CommonMethod):
         on, off, at_middle = self.follow(events, start, following.middle, memory.followed)
         if self.lookahead:
             scale = at_middle.scale
-            trail = self._trail(memory.followed, start, scale)
-            at_end = self._trail_at(at_middle, following.middle, scale)
             if shot.trail is not None and following.trail is not None:
-                at_end = following.trail.after
-                trail = given_trail(shot.trail.before, at_end)
-            grown = at_end - trail.start
+                trail = given_trail(shot.trail.before, following.trail.after)
+                grown = following.trail.after - trail.start
+            else:
+                span = start, following.middle
+                at_start, grown = trail_between(
+                    memory.followed.newest, at_middle.newest, span, (scale, *self._trail_heights)
+                )
+                trail = Trail(at_start, polarity_of(memory.followed.newest), scale, *self._trail_heights)
             joined, learned = bridge.bridge(
                 memory.latent,
-                second._replace(value=second.value - grown),
+                second,
                 on,
                 off,
                 memory.thresholds,
                 self.noise,
                 start,
                 following.middle,
+                grown,
             )
-            net = bridge.net_change(joined, on, off, grown)
-            unmeasured = memory.latent.variance >= bridge.UNMEASURED
             change = self._silent_change(joined)
-            joined = joined._replace(
-                bound=second,
-                floor=bridge.floor_before(second, net, unmeasured),
-                trail=trail,
-                silent_change=change,
-            )
+            joined = joined._replace(trail=trail, silent_change=change)
             joined, far_on, far_off = self._drifting(joined, memory, second, on, off)
-            unshown = follow_unshown(memory.unshown, second, net)
+            assert joined.net is not None
+            unshown = follow_unshown(memory.unshown, second, joined.net)
             after = memory._replace(
                 latent=second,
                 thresholds=learned,
@@ -296,16 +291,17 @@ class BridgedFrames(CommonMethod):
         grown -= self._trail_at(memory.at_middle, shot.middle, scale)
         behind, learned = bridge.bridge(
             memory.latent,
-            second._replace(value=second.value - grown),
+            second,
             on + memory.on,
             off + memory.off,
             memory.thresholds,
             self.noise,
             shot.middle,
             following.middle,
+            grown,
         )
+        assert behind.net is not None
         tail_on, tail_off, followed = self.follow(events, following.middle, following.end, at_middle)
-        net = bridge.net_change(behind, on + memory.on, off + memory.off, grown)
         after = memory._replace(
             latent=second,
             thresholds=learned,
@@ -314,7 +310,7 @@ class BridgedFrames(CommonMethod):
             off=tail_off,
             followed=followed,
             at_middle=at_middle,
-            unshown=follow_unshown(memory.unshown, second, net),
+            unshown=follow_unshown(memory.unshown, second, behind.net),
             silent_change=self._silent_change(behind),
         )
         forward = bridge.extend(
@@ -338,18 +334,14 @@ class BridgedFrames(CommonMethod):
         self, events: Chunks, start: int, end: int, before: Followed
     ) -> tuple[Floats, Floats, Followed]:
         """`counts`, and what is known of the pixels' newest events at ``end`` (K14)."""
-        return follow(all_between(events, start, end), before, start, end)
+        if self._spare_followed is None:
+            self._spare_followed = followed_pixels(self.shape)
+        return follow(all_between(events, start, end), before, start, end, self._spare_followed)
 
     def _trail(self, followed: Followed, start: int, scale: float) -> Trail:
         """By how much events trail the light in the segment from ``start`` on (K14)."""
-        height = self.settings.events.trail
-        return Trail(
-            self._trail_at(followed, start, scale),
-            polarity_of(followed.newest),
-            scale,
-            height * self.on,
-            height * self.off,
-        )
+        at_start = self._trail_at(followed, start, scale)
+        return Trail(at_start, polarity_of(followed.newest), scale, *self._trail_heights)
 
     def _lead_in_trail(self, shot: Shot, followed: Followed) -> Trail:
         """The same before the middle of the first exposure, where the frame keeps its level."""
@@ -359,8 +351,12 @@ class BridgedFrames(CommonMethod):
         return trail._replace(polarity=np.zeros(self.shape, np.int8))
 
     def _trail_at(self, followed: Followed, t: int, scale: float) -> NDArray[np.float32]:
+        return trail_at(followed.newest, t, (scale, *self._trail_heights))
+
+    @property
+    def _trail_heights(self) -> tuple[float, float]:
         height = self.settings.events.trail
-        return trail_at(followed.newest, t, (scale, height * self.on, height * self.off))
+        return height * self.on, height * self.off
 
     def _silent_change(self, segment: BridgedSegment) -> Floats:
         return silent_change(segment, self.noise.quantisation_variance, self.on * self.off)
