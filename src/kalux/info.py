@@ -476,7 +476,12 @@ def _threshold_origin(plan: Plan) -> str:
 def _refractory_origin(plan: Plan, asked: Settings) -> str:
     if asked.events.refractory_period is not None:
         return _GIVEN
-    return _USUAL if plan.estimate is None else f"estimated from {plan.estimate.samples:,} samples"
+    if plan.estimate is None:
+        return _USUAL
+    found = plan.estimate.refractory_period
+    hidden = found and not plan.settings.events.refractory
+    most = f"; it is {found * 1e-3:g} ms, but few events follow others so soon" if hidden else ""
+    return f"estimated from {plan.estimate.samples:,} samples{most}"
 
 
 def _delay_origin(plan: Plan, asked: Settings) -> str:
