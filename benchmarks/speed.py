@@ -27,7 +27,8 @@ from kalux.augmentation.bridge import BridgeNoise, Latent, nominal_thresholds
 from kalux.augmentation.bridge import bridge as join
 from kalux.augmentation.refractory import EventClock
 from kalux.events import EVENT_DTYPE
-from kalux.filters import akf, complementary
+from kalux.filters import akf_bridged, complementary
+from kalux.filters.akf import State
 from kalux.filters.common import make_clock
 
 import literal
@@ -97,7 +98,7 @@ def segment_of(size, events):
     noise = BridgeNoise(THRESHOLD, THRESHOLD, 0.2 * THRESHOLD**2, THRESHOLD**2 / 2)
     on, off = deblur.count_chunks([events], size, weighed=True)
     segment, _ = join(*frames, on, off, thresholds, noise, 0, int(events["t"][-1]) + 1)
-    return segment, akf.State(frames[0].value, frames[0].variance, make_clock(size, 0))
+    return segment, State(frames[0].value, frames[0].variance, make_clock(size, 0))
 
 
 def literal_state(segment, state):
@@ -124,7 +125,7 @@ def loops(size, count, rounds):
     events = EventClock(size, 0).weighed(stream(size, count))
     few = events[:20_000]
     segment, state = segment_of(size, events)
-    noise = akf.BridgedNoise(3.0, 0.2, THRESHOLD**2)
+    noise = akf_bridged.Noise(3.0, 0.2, THRESHOLD**2)
     scalars = segment.rate, segment.step_variance, *noise
     log_frame = state.log_intensity
     held = complementary.HeldSegment(0, 1 << 40, log_frame, 6.0, THRESHOLD, THRESHOLD)
@@ -133,8 +134,8 @@ def loops(size, count, rounds):
     works = {
         "storing only": (lambda: (events, np.zeros(size, np.int64)), compiled["store"]),
         "filter": (
-            lambda: (segment, akf.begin_bridged(segment, state), events, noise),
-            akf.advance_bridged,
+            lambda: (segment, akf_bridged.begin(segment, state), events, noise),
+            akf_bridged.advance,
         ),
         "filter, literal in numba": (
             lambda: (events, literal_state(segment, state), *scalars),

@@ -105,14 +105,13 @@ def event_sum(pixel, a, b, on, off):
 
 
 def edi(pixel, k, log_frame, on, off):
-    """EDI: (L^D(start), largest L^D in the exposure), straight from B + I_0 = 1/T int exp(L(t)) dt."""
+    """EDI: L^D(start), straight from B + I_0 = 1/T int exp(L(t)) dt."""
     s, e = pixel.starts[k], pixel.ends[k]
     inside = [(t, w * (on if p else -off)) for t, p, _, _, w in pixel.events if s < t <= e]
     edges = [s, *[t for t, _ in inside], e]
     levels = [0.0, *np.cumsum([step for _, step in inside])]  # after each event, also of several at one time
     mean = sum(np.exp(v) * (b - a) for v, a, b in zip(levels, edges[:-1], edges[1:], strict=True)) / (e - s)
-    start = log_frame - np.log(mean)
-    return start, start + max(levels)
+    return log_frame - np.log(mean)
 
 
 # The paper.
@@ -128,7 +127,7 @@ def paper(pixel, settings, times, on, off):
         for i, r in zip(pixel.intensity, r_bar, strict=True)  # (8)
     ]
     if fl.deblur:
-        start = [edi(pixel, k, log_frame[k], on, off)[0] for k in range(count)]
+        start = [edi(pixel, k, log_frame[k], on, off) for k in range(count)]
         end = [start[k] + event_sum(pixel, pixel.starts[k], pixel.ends[k], on, off) for k in range(count)]
     else:
         start, end = list(log_frame), list(log_frame)
@@ -242,6 +241,17 @@ def trail(pixel, t, scale, height, on, off):
     return height * (on if polarity else -off) * 2 * x / (1 + x * x)
 
 
+def hides(camera):
+    """K7: the most that black hides."""
+    response = Camera.named(chosen_response(camera.response, None), camera.saturation).response
+    return float(response.inverse(0.5 / 255))
+
+
+def is_crushed(pixel, k, camera):
+    """K7: whether black hides more than a linear response's would."""
+    return pixel.black[k] and hides(camera) > 1.5 / 255
+
+
 def bridged(pixel, settings, times, on, off, scales):
     """L(t) and P(t) of one pixel, docs/equations.md, K1 to K5, K7, K10, K13 and K14; what K15 needs."""
     c, ev = settings.camera, settings.events
@@ -252,12 +262,10 @@ def bridged(pixel, settings, times, on, off, scales):
     pixel.changes.clear()
     pixel.measured.clear()
 
-    hidden_by_black = float(
-        Camera.named(chosen_response(c.response, None), c.saturation).response.inverse(0.5 / 255)
-    )
+    hidden_by_black = hides(c)
 
     def crushed(k):  # K7
-        return pixel.black[k] and hidden_by_black > 1.5 / 255
+        return is_crushed(pixel, k, c)
 
     def ceiling(k, middle):  # K7: the most that L is at the middle of the exposure
         if not crushed(k):
@@ -271,8 +279,7 @@ def bridged(pixel, settings, times, on, off, scales):
             most = hidden_by_black * pixel.white[k]
             log_frame = np.log(np.sqrt(0.001 * most) + i0)
         a, b = on * scale_on, off * scale_off
-        start, peak = edi(pixel, k, log_frame, a, b) if settings.filter.deblur else (log_frame, log_frame)
-        middle = start
+        middle = edi(pixel, k, log_frame, a, b) if settings.filter.deblur else log_frame
         inside = 0
         if settings.filter.deblur:
             middle += event_sum(pixel, pixel.starts[k], pixel.middles[k], a, b)
@@ -284,8 +291,7 @@ def bridged(pixel, settings, times, on, off, scales):
         if crushed(k):
             variance = 3 * np.log((most + i0) / i0) ** 2 / 12
         variance += ev.deblur_variance * c2 * inside
-        clipped = pixel.clipped[k] or peak >= np.log(c.saturation * pixel.white[k] + i0)
-        return middle, UNMEASURED if clipped else variance
+        return middle, UNMEASURED if pixel.clipped[k] else variance
 
     def counts(a, b):
         inside = [(p, w) for t, p, *_, w in pixel.events if a < t <= b]
@@ -535,10 +541,13 @@ def known(pixel, variance, t, settings, c2):
     share, (first, second) = (t - a) / (b - a), pixel.changes[k][3]
     events = sum(w for q, *_, w in pixel.events if a < q <= b)
     between = 4 * share * (1 - share)
+    wrong = 0.002 * c2 * between * events**2
+    if is_crushed(pixel, k + 1, settings.camera):  # says what others have said
+        return variance + wrong
     following = second + (1 - share) * events * ev.step_noise * c2
     q0 = ev.quantisation_variance * c2
     common = (q0 / (first + second + q0)) ** 2 * min(first, second) * (1 - between / 2)
-    return max(1 / (1 / variance + 1 / following), common) + 0.002 * c2 * between * events**2
+    return max(1 / (1 / variance + 1 / following), common) + wrong
 
 
 def regularised(level, variance, moving, difference):

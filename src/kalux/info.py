@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from kalux.calibration.levels import find_ceiling
 from kalux.events import EventArray
-from kalux.frames import Frame
+from kalux.frames import Frame, Levels
 from kalux.recording import Recording
-from kalux.settings import AUTO, Settings
+from kalux.settings import AUTO, CameraSettings, Settings
 
 if TYPE_CHECKING:
     from kalux.pipeline import Plan
@@ -119,6 +120,8 @@ class Description:
         Whether a mosaic is stored as RGB that was made of it.
     response
         Of the frame camera, as in `kalux.settings.CameraSettings`; None if the recording does not state it.
+    doubt
+        What makes the frames' white value doubtful, if anything does.
     """
 
     path: str
@@ -135,6 +138,7 @@ class Description:
     colours: str | None = None
     stored_in_rgb: bool = False
     response: str | None = None
+    doubt: str | None = None
 
 
 def describe(recording: Recording, *, estimated_threshold: tuple[float, float] | None = None) -> Description:
@@ -156,7 +160,10 @@ def describe(recording: Recording, *, estimated_threshold: tuple[float, float] |
     first = next(iter(recording.stamped_frames()), None)
     stored = next(iter(recording.stored_frames()), None)
     events = summarise_events(recording.events())
-    frames = summarise_frames(recording.stamped_frames(), exposure_known=recording.exposure_known)
+    levels = Levels()
+    frames = summarise_frames(
+        levels.watched(recording.stamped_frames()), exposure_known=recording.exposure_known
+    )
     return Description(
         path=str(source.path),
         format=source.format,
@@ -172,6 +179,7 @@ def describe(recording: Recording, *, estimated_threshold: tuple[float, float] |
         colours=None if first is None else first.colours,
         stored_in_rgb=stored is not None and stored.image.ndim == 3 and recording.mosaic is not None,
         response=recording.response,
+        doubt=levels.doubt(),
     )
 
 
@@ -269,6 +277,8 @@ def format_description(description: Description) -> str:
     if description.has_ground_truth:
         rows.append(("reference", "ground truth images are included"))
     rows += [("note", sentence) for sentence in description.missing]
+    if description.doubt is not None:
+        rows.append(("note", description.doubt))
     label_width = max(len(label) for label, _ in rows)
     return "\n".join([description.path, *(f"  {label:<{label_width}}  {text}" for label, text in rows)])
 
@@ -349,6 +359,9 @@ ORIGINS: Final = {
 """What to call where thresholds come from (`kalux.pipeline.ThresholdOrigin`)."""
 
 _NOTABLE_SHARE: Final = 0.05
+_ALIKE: Final = (
+    0.99  # of the level at which pixels saturate: where nearly all do from here on, it is one level
+)
 _GIVEN: Final = "given"
 _USUAL: Final = ORIGINS["assumed"]
 
@@ -421,6 +434,27 @@ def settled(recording: Recording, plan: Plan, asked: Settings) -> list[tuple[str
     if camera.white_balance != asked.camera.white_balance:
         rows.append(("white balance", f"{camera.white_balance} for red, green, blue (measured)"))
     return rows
+
+
+def saturation_text(recording: Recording, plan: Plan, asked: Settings) -> str:
+    """From which level on pixels count as clipped, and where the recording shows that they are.
+
+    Parameters are those of `settled`; it looks at up to 80 frames once more (`kalux.calibration.levels`).
+    """
+    used = plan.settings.camera.saturation
+    how = "the usual" if asked.camera.saturation == CameraSettings.saturation else _GIVEN
+    text = f"from {used:.2g} of white ({how}); "
+    ceiling = find_ceiling(recording, plan.settings.camera, plan.settings.events)
+    if ceiling is None:
+        return text + "events do not go on where the frames end, or too few tell"
+    level = f"{ceiling.level:.2g}"
+    if ceiling.least < _ALIKE * ceiling.level:
+        level = f"{ceiling.least:.2g} to {2 * ceiling.level - ceiling.least:.2g}"
+    text += f"frames end at {level}, where events go on"
+    if ceiling.level < used:
+        percent = 100 * np.expm1(ceiling.excess)
+        text += f" by {percent:.0f} %: --camera.saturation {_ALIKE * ceiling.least:.2g} does not take that for measured"
+    return text
 
 
 def _threshold_origin(plan: Plan) -> str:

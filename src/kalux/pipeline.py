@@ -234,26 +234,28 @@ def execute(
     on_backward: Callable[[int], None] | None = None,
     *,
     threads: int = 1,
+    with_variance: bool = True,
 ) -> Generator[Image, None, None]:
     """Carry out a plan. The callbacks are told the number of events of every chunk read, for progress:
 
     ``on_backward`` in the backward pass of a smoothed reconstruction, ``on_events`` in the pass that makes the images.
     With more than one of ``threads``, reading, filtering, and making images of what the filter says have a thread each,
     while the caller uses the images before; the callbacks are then called in the second. The images are the same.
+    Not ``with_variance`` is faster; grey images then have an infinite one.
     """
     engine = _engine(recording, plan, plan.settings)
     several = threads > 1
     estimates = _smoothed_estimates(recording, engine, plan, on_events, on_backward, several)
-    images = _images(engine, ahead(estimates, name="filter") if several else estimates)
+    images = _images(engine, ahead(estimates, name="filter") if several else estimates, with_variance)
     yield from ahead(images, name="images") if several else images
 
 
 def _images(
-    engine: Reconstructor, estimates: Generator[Estimate, None, None]
+    engine: Reconstructor, estimates: Generator[Estimate, None, None], with_variance: bool
 ) -> Generator[Image, None, None]:
     with contextlib.closing(estimates):
         for estimate in estimates:
-            yield engine.image(estimate)
+            yield engine.image(estimate, with_variance=with_variance)
 
 
 def _smoothed_estimates(
@@ -277,9 +279,10 @@ def _smoothed_estimates(
             on_backward,
             trail=trail,
         )
+        on, off = engine.thresholds
         for estimate in _estimates(recording, engine, plan, on_events, read_ahead):
             ahead_of_events = None if trail is None else engine.trail(estimate.t)
-            yield combine(estimate, backward.estimate(estimate.t), ahead_of_events)
+            yield combine(estimate, backward.estimate(estimate.t), ahead_of_events, on * off)
 
 
 def _trail(plan: Plan) -> tuple[Settings, NDArray[np.bool_] | None] | None:

@@ -24,7 +24,7 @@ from kalux.augmentation.deblur import (
 from kalux.augmentation.refractory import EventClock
 from kalux.datasets import SensorSettings, pan, photograph_scene, simulate
 from kalux.events import make_events
-from kalux.filters.methods import latent_frame
+from kalux.filters.bridged_frames import latent_frame
 from kalux.models.camera import log_intensity
 
 from builders import blocks, events, pixel_events
@@ -255,7 +255,6 @@ def test_only_blocks_with_an_event_are_looked_at():
             np.array([0.01]),
             exposure,
             duration=1000,
-            white=1e9,
             event_variance=0.001,
         )[:2]
         steps = (ON * thresholds[0], OFF * thresholds[1])

@@ -8,9 +8,18 @@ import numpy as np
 import pytest
 
 from kalux import PRESETS, Frame, Reconstructor
-from kalux.augmentation.bridge import UNMEASURED, UNSEEN, Latent, floor_before, lift
+from kalux.augmentation.bridge import (
+    UNMEASURED,
+    UNSEEN,
+    BridgeNoise,
+    Latent,
+    bridge,
+    lift,
+    nominal_thresholds,
+)
 from kalux.events import make_events
-from kalux.filters.methods import make_method, take_shot
+from kalux.filters.methods import make_method
+from kalux.filters.shots import take_shot
 from kalux.models.camera import Camera, Response
 
 from builders import VARIANTS, altered, events, random_stream
@@ -123,8 +132,10 @@ def test_a_masked_pixel_is_no_bound():
     level = np.full((1, 3), -1.0)
     lift(level, frame)
     np.testing.assert_array_equal(level, [[-1.0, 0.0, -1.0]])
-    floor = floor_before(frame, np.full((1, 3), 0.5), np.ones((1, 3), bool))
-    np.testing.assert_array_equal(floor, [[-np.inf, -0.5, -np.inf]])
+    clipped = Latent(np.zeros((1, 3)), np.full((1, 3), UNMEASURED))
+    thresholds, noise = nominal_thresholds((1, 3), 0.1), BridgeNoise(0.5, 0.5, 0.05, 0.04)
+    joined, _ = bridge(clipped, frame, np.ones((1, 3)), np.zeros((1, 3)), thresholds, noise, 0, 40_000)
+    np.testing.assert_allclose(joined.floor, [[-np.inf, -0.5, -np.inf]], atol=1e-6)
 
 
 # --- black ----------------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from kalux.filters.readout import (
     Hidden,
     HighlightPrior,
     believed_highlight,
-    likeness,
+    edge,
     read_out,
 )
 from kalux.settings import preset
@@ -178,7 +178,7 @@ def test_patches_tell_a_faint_edge_from_noise():
 
 @given(st.floats(0.0, 1e6), st.floats(0.0, 1e6))
 def test_likeness_is_a_share_and_falls(unlike, more):
-    near, far = (float(likeness(np.float32(value))) for value in (unlike, unlike + more))
+    near, far = (float(1 / edge(np.float32(value)) ** 2) for value in (unlike, unlike + more))
     assert 0.0 < far <= near <= 1.0
 
 
@@ -205,7 +205,9 @@ def test_pixels_that_no_frame_has_shown_are_told_as_they_are_read():
     assert np.count_nonzero(left == variance) == len(pixels)
 
 
-@pytest.mark.parametrize(("shape", "moves"), [((3, 5), 0.6), ((7, 100), 0.02), ((6, 64), 0.5)])
+@pytest.mark.parametrize(
+    ("shape", "moves"), [((3, 5), 0.6), ((7, 100), 0.02), ((6, 64), 0.5), ((5, 1283), 0.05)]
+)
 @pytest.mark.parametrize("pitch", [1, 2])
 def test_images_are_the_oracles(shape, moves, pitch):
     """K6, K11 and K12 pixel by pixel, over images narrower and wider than what is looked at together."""

@@ -32,6 +32,9 @@ from 0 beside any information in use (1e-2 and more), and the formulas need no s
 UNSEEN: Final = 2.0**41
 """Variance of a pixel of which the frame says nothing (`Frame.valid`): as little weight, and no bound."""
 
+REPEATED: Final = 2.0**39
+"""Variance of a frame that measures a pixel, but tells of it only what others have told already (K11): black."""
+
 _SCALE_BOUNDS: Final = (0.3, 3.0)
 _SCALE_DRIFT: Final = 1e-5  # variance per frame: a calibration never becomes certain, temperatures drift
 
@@ -96,10 +99,11 @@ class BridgedSegment(NamedTuple):
     the way to the end to the way from the start. The covariance of L^A as a measurement is
     R = 1 / (rate (1/forward + 1/backward)), ``rate`` in 1/s, where ``forward`` is ``forward_variance`` and
     ``step_variance`` for each event since the start, and ``backward`` is ``backward_variance`` and ``step_variance``
-    for each of the ``events`` still to come (None: not known, and none are counted). At ``start`` the level is
-    ``floor`` or more (`floor_before`; None: no bound). At ``end`` the pixel obeys the frame ``bound`` (`lift`), and its
-    variance grows by ``drift``, what its thresholds may have been wrong by (`drift`; None: nothing). Pixels without an
-    event after ``still_since`` are still.
+    for each of the ``events`` still to come (None: not known, and none are counted). ``net`` is what all events add to
+    the level, and what the light grows by besides (None: not known). At ``start`` the level is ``floor`` or more where
+    that is known (K7; None: nowhere): of what no frame measures then, but a clipped one bounds at the end. At ``end``
+    the pixel obeys the frame ``bound`` (`lift`), and its variance grows by ``drift``, what its thresholds may have been
+    wrong by (`drift`; None: nothing). Pixels without an event after ``still_since`` are still.
     Beyond what L^A and the state say here, the level is ahead of its newest event by ``trail`` (K14; None: it is not).
     ``unshown`` is of the pixels that no frame has measured until ``end``, or ``start`` in causal mode.
     ``silent_change`` is what silent pixels around each change from one frame to the next (`unseen`; None: not known).
@@ -123,19 +127,7 @@ class BridgedSegment(NamedTuple):
     trail: Trail | None = None
     unshown: UnshownMemory | None = None
     silent_change: Array | None = None
-
-
-def net_change(segment: BridgedSegment, on: Array, off: Array, grown: Array) -> Array:
-    """(H, W) what ``on`` and ``off`` events add to the level, and what the light has ``grown`` by after them (K14)."""
-    net = np.empty_like(grown)
-    _net_change(*(p.reshape(-1) for p in (segment.step_on, on, segment.step_off, off, grown, net)))
-    return net
-
-
-@nb.njit(cache=True, nogil=True)
-def _net_change(step_on, on, step_off, off, grown, net):  # type: ignore[no-untyped-def]
-    for i in range(len(net)):
-        net[i] = step_on[i] * on[i] - step_off[i] * off[i] + grown[i]
+    net: Array | None = None
 
 
 def drift(
@@ -199,25 +191,6 @@ def _drift(  # type: ignore[no-untyped-def]
         new_on[i], new_off[i] = far_on[i] + on[i], far_off[i] + off[i]
 
 
-def floor_before(second: Latent, net: Array, unmeasured: NDArray[np.bool_]) -> Array:
-    """What a clipped frame says of the level one interval earlier (K7), where no frame measured that; -inf elsewhere.
-
-    What is not known of such a pixel is a constant: if events lead from it to less than the next frame's bound, it was
-    too low all the time. ``net`` is what events add to the level between the frames.
-    """
-    floor = np.empty_like(net)
-    planes = unmeasured, second.variance, second.value, net, floor
-    _floor_before(*(plane.reshape(-1) for plane in planes))
-    return floor
-
-
-@nb.njit(cache=True, nogil=True)
-def _floor_before(unmeasured, variance, value, net, floor):  # type: ignore[no-untyped-def]
-    for i in range(len(floor)):
-        bound = unmeasured[i] and UNMEASURED <= variance[i] < UNSEEN
-        floor[i] = value[i] - net[i] if bound else -np.inf
-
-
 def lift(log_intensity: Array, frame: Latent) -> None:
     """A clipped pixel does say one thing: it was no darker than this (docs/equations.md, K7). In place.
 
@@ -254,6 +227,7 @@ def bridge(
     noise: BridgeNoise,
     start: int,
     end: int,
+    grown: Array | None = None,
 ) -> tuple[BridgedSegment, Thresholds]:
     """Join two latent frames (docs/equations.md, K1), and learn the pixels' thresholds from them (K2).
 
@@ -265,13 +239,17 @@ def bridge(
         (H, W) number of events of each polarity between them.
     thresholds
         What is known of the pixels' thresholds so far.
+    grown
+        (H, W) by how much more the light changes than its events tell (K14); None: by nothing.
 
     Returns
     -------
     The segment, and the thresholds with what this interval says of them.
     """
     seconds = (end - start) * 1e-6
-    augmented, slope, step_on, step_off, events, *factors = apart(9, first.value.shape, first.value.dtype)
+    shape = first.value.shape
+    planes = tuple(apart(11, shape, first.value.dtype))
+    augmented, slope, step_on, step_off, events, net, floor, *factors = planes
     segment = BridgedSegment(
         start=start,
         end=end,
@@ -285,24 +263,33 @@ def bridge(
         step_variance=noise.step_variance,
         rate=0.5 / seconds,
         bound=second,
+        floor=floor,
+        net=net,
     )
-    learned = Thresholds(*factors)
-    _bridge(Latent(*first[:2]), Latent(*second[:2]), on, off, thresholds, noise, seconds, segment, learned)
-    return segment, learned
+    more = np.zeros(shape, first.value.dtype) if grown is None else grown
+    _bridge(*first[:2], *second[:2], on, off, more, thresholds, noise, seconds, planes)
+    return segment, Thresholds(*factors)
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _bridge(first, second, on, off, thresholds, noise, seconds, segment, learned):  # type: ignore[no-untyped-def]
-    """Fill ``segment`` and ``learned``; in float64, whatever the arrays' type."""
+def _bridge(  # type: ignore[no-untyped-def]
+    value, variance, next_value, next_variance, on, off, grown, thresholds, noise, seconds, planes
+):
+    """Fill ``planes``; in float64, whatever the arrays' type."""
     low, high = _SCALE_BOUNDS
+    augmented, slope, step_on, step_off, events, net, floor = planes[:7]
+    new_on, new_off, new_on_variance, new_off_variance = planes[7:]
     height, width = on.shape
-    for row in range(height):
+    told = np.empty(width)
+    for row in range(height):  # three loops each: one over all these arrays is no vector code
+        for column in range(width):
+            told[column] = np.float64(next_value[row, column]) - np.float64(grown[row, column])
         for column in range(width):
             i = row, column
             n_on, n_off = np.float64(on[i]), np.float64(off[i])
             scale_on, scale_off = np.float64(thresholds.on[i]), np.float64(thresholds.off[i])
             nominal_on, nominal_off = noise.threshold_on * scale_on, noise.threshold_off * scale_off
-            change = np.float64(second.value[i]) - np.float64(first.value[i])
+            change = told[column] - np.float64(value[i])
             mismatch = change - (nominal_on * n_on - nominal_off * n_off)
             on_variance, off_variance = (
                 np.float64(thresholds.on_variance[i]),
@@ -311,8 +298,8 @@ def _bridge(first, second, on, off, thresholds, noise, seconds, segment, learned
             on_covariance = on_variance * noise.threshold_on * n_on
             off_covariance = -off_variance * noise.threshold_off * n_off
             total = (
-                np.float64(first.variance[i])
-                + np.float64(second.variance[i])
+                np.float64(variance[i])
+                + np.float64(next_variance[i])
                 + on_covariance * noise.threshold_on * n_on
                 - off_covariance * noise.threshold_off * n_off
                 + noise.step_variance * (n_on + n_off)
@@ -320,19 +307,22 @@ def _bridge(first, second, on, off, thresholds, noise, seconds, segment, learned
             )
             inverse = 1.0 / total
             gain = mismatch * inverse
-            segment.augmented[i] = first.value[i] + gain * first.variance[i]
-            segment.slope[i] = gain * noise.quantisation_variance / seconds
-            segment.step_on[i] = nominal_on + gain * (
-                noise.threshold_on * on_covariance + noise.step_variance
-            )
-            segment.step_off[i] = nominal_off + gain * (
-                noise.threshold_off * off_covariance - noise.step_variance
-            )
-            segment.events[i] = n_on + n_off
-            learned.on[i] = min(max(scale_on + gain * on_covariance, low), high)
-            learned.off[i] = min(max(scale_off + gain * off_covariance, low), high)
-            learned.on_variance[i] = on_variance - on_covariance * on_covariance * inverse + _SCALE_DRIFT
-            learned.off_variance[i] = off_variance - off_covariance * off_covariance * inverse + _SCALE_DRIFT
+            augmented[i] = value[i] + gain * variance[i]
+            slope[i] = gain * noise.quantisation_variance / seconds
+            step_on[i] = nominal_on + gain * (noise.threshold_on * on_covariance + noise.step_variance)
+            step_off[i] = nominal_off + gain * (noise.threshold_off * off_covariance - noise.step_variance)
+            events[i] = n_on + n_off
+            new_on[i] = min(max(scale_on + gain * on_covariance, low), high)
+            new_off[i] = min(max(scale_off + gain * off_covariance, low), high)
+            new_on_variance[i] = on_variance - on_covariance * on_covariance * inverse + _SCALE_DRIFT
+            new_off_variance[i] = off_variance - off_covariance * off_covariance * inverse + _SCALE_DRIFT
+        for column in range(width):
+            i = row, column
+            net[i] = step_on[i] * on[i] - step_off[i] * off[i] + grown[i]
+            # What is not known of a pixel that no frame measured is a constant: if events lead from it to less than
+            # the next frame's bound, it was too low all the time.
+            bounded = variance[i] >= UNMEASURED and UNMEASURED <= next_variance[i] < UNSEEN
+            floor[i] = next_value[i] - net[i] if bounded else -np.inf
 
 
 def extend(

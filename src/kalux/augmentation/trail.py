@@ -11,6 +11,7 @@ the recording: 1.1 times the mean interval between two events of one polarity at
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from typing import Any, Final, NamedTuple
 
@@ -19,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.compiled import (
+    AHEAD,
     MICROSECOND32,
     WEIGHT_UNIT,
     apart,
@@ -27,6 +29,8 @@ from kalux.compiled import (
     event_row,
     event_weight,
     event_words,
+    packed,
+    prefetch,
 )
 from kalux.events import EventArray
 
@@ -34,6 +38,9 @@ FloatArray = NDArray[np.float32]
 
 NO_EVENT: Final = -(1 << 62)
 """Code of a pixel that has had no event."""
+
+FOLLOWED_PIXEL: Final = np.dtype([("newest", "i8"), ("off", "f4"), ("on", "f4")], align=True)
+"""What is counted of a pixel, in one line of memory: code of its newest event, weights of off and of on events."""
 
 SCALE: Final = 1.1
 """s over the mean interval. Of eleven simulated and three real recordings, whose means are 6 to 24 ms, the s that
@@ -121,50 +128,100 @@ def nothing_followed(shape: tuple[int, int]) -> Followed:
 
 
 def follow(
-    chunks: Iterable[EventArray], before: Followed, start: int, end: int
+    chunks: Iterable[EventArray],
+    before: Followed,
+    start: int,
+    end: int,
+    spare: NDArray[np.void] | None = None,
 ) -> tuple[FloatArray, FloatArray, Followed]:
     """Sums of the weights of on and of off events of every pixel, (H, W) each, and what is known after them.
 
-    ``chunks`` are the events with ``start`` < t <= ``end`` (us) in time order, and ``before`` is what was known before.
-    Intervals are taken from the last quarter of that time: fewer would do, and all of them cost.
+    Intervals are taken from the last quarter of the time: fewer would do, and all of them cost.
+
+    Parameters
+    ----------
+    chunks
+        The events with ``start`` < t <= ``end`` (us), in time order.
+    before
+        What was known before them.
+    spare
+        Memory to work in: `followed_pixels` of the sensor; None: it is made.
     """
-    shape = before.newest.shape
-    counts, newest = apart(2, (before.newest.size,)), before.newest.copy()
-    counts[:] = 0
-    planes = counts, newest.reshape(-1), np.uint64(shape[1])
+    pixels = followed_pixels(before.newest.shape) if spare is None else spare
+    _begin_following(before.newest.reshape(-1), pixels)
+    codes, counts, width = pixels.view(np.int64), pixels.view(np.float32), np.uint64(before.newest.shape[1])
     span, intervals = _KEPT * before.span, _KEPT * before.intervals
     late = end - (end - start) // 4
     for chunk in chunks:
-        more, number = _follow(event_words(chunk), *planes, late)
+        more, number = _follow(event_words(chunk), codes, counts, width, late)
         span, intervals = span + more, intervals + number
-    off, on = counts.reshape(2, *shape)
+    off, on = apart(2, before.newest.shape)
+    newest = np.empty_like(before.newest)
+    _end_following(pixels, newest.reshape(-1), off.reshape(-1), on.reshape(-1))
     return on, off, Followed(newest, span, intervals)
 
 
+def followed_pixels(shape: tuple[int, ...]) -> NDArray[np.void]:
+    """(H W) of `FOLLOWED_PIXEL`, not filled: what `follow` works in."""
+    return packed((math.prod(shape),), FOLLOWED_PIXEL)
+
+
 @nb.njit(cache=True, nogil=True)
-def _follow(words, counts, newest, width, late):  # type: ignore[no-untyped-def]
+def _begin_following(newest, pixels):  # type: ignore[no-untyped-def]
+    for i in range(len(pixels)):
+        pixels[i].newest = newest[i]
+        pixels[i].off = pixels[i].on = np.float32(0.0)
+
+
+@nb.njit(cache=True, nogil=True)
+def _end_following(pixels, newest, off, on):  # type: ignore[no-untyped-def]
+    for i in range(len(pixels)):
+        newest[i], off[i], on[i] = pixels[i].newest, pixels[i].off, pixels[i].on
+
+
+@nb.njit(cache=True, nogil=True)
+def _follow(words, codes, counts, width, late):  # type: ignore[no-untyped-def]
+    """``codes`` and ``counts`` are the memory of `FOLLOWED_PIXEL`, as int64 and as float32."""
     span, count = np.int64(0), np.int64(0)
+    two, last = np.uint64(2), len(words) - 1
     for i in range(len(words)):
+        ahead = words[min(i + AHEAD, last), 1]
+        prefetch(codes, (event_row(ahead) * width + event_column(ahead)) * two)
         word = words[i, 1]
-        at = event_row(word) * width + event_column(word)
+        at = (event_row(word) * width + event_column(word)) * two
         is_on = np.uint64(event_is_on(word))
         code = 2 * words[i, 0] + np.int64(is_on)
         if words[i, 0] > late:
-            difference = code - newest[at]  # even where the polarities are the same
+            difference = code - codes[at]  # even where the polarities are the same
             counted = np.int64((difference & 1 == 0) & (difference < 2 * LONGEST))
             span += (difference >> 1) * counted
             count += counted
-        counts[is_on, at] += event_weight(word, WEIGHT_UNIT)
-        newest[at] = code
+        codes[at] = code
+        counts[at * two + two + is_on] += event_weight(word, WEIGHT_UNIT)
     return span, count
 
 
 def trail_at(newest: NDArray[np.int64], t: int, trail: tuple[float, float, float]) -> FloatArray:
     """f at ``t`` (us), (H, W) log intensity, given the newest events there; ``trail`` is s and h c_on, h c_off."""
     out = np.empty(newest.shape, np.float32)
-    scale, on, off = (np.float32(value) for value in trail)
-    _trail_at(newest.reshape(-1), t, scale, on, off, out.reshape(-1))
+    _trail_at(newest.reshape(-1), t, tuple(np.float32(value) for value in trail), out.reshape(-1))
     return out
+
+
+def trail_between(
+    first: NDArray[np.int64],
+    last: NDArray[np.int64],
+    span: tuple[int, int],
+    trail: tuple[float, float, float],
+) -> tuple[FloatArray, FloatArray]:
+    """f at the first of two times ``span`` (us), and what it has grown by at the second, as `trail_at`, in one pass.
+
+    ``first`` and ``last`` are the newest events at these times.
+    """
+    start, grown = apart(2, first.shape)
+    scalars = tuple(np.float32(value) for value in trail)
+    _trail_between(first.reshape(-1), last.reshape(-1), *span, scalars, start.reshape(-1), grown.reshape(-1))
+    return start, grown
 
 
 def polarity_of(newest: NDArray[np.int64]) -> NDArray[np.int8]:
@@ -196,17 +253,33 @@ def ahead_of_event(sign: Any, age: Any, heights: Any) -> Any:
     return high * beyond(age, scale)
 
 
+@nb.njit(cache=True, inline="always", error_model="numpy")
+def _ahead_of_newest(newest, t, heights):  # type: ignore[no-untyped-def]
+    scale, on, off = heights
+    age = np.float32(t - (newest >> 1)) * MICROSECOND32
+    return (on if newest & 1 else -off) * beyond(age, scale)
+
+
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _trail_at(newest, t, scale, on, off, out):  # type: ignore[no-untyped-def]
+def _trail_at(newest, t, heights, out):  # type: ignore[no-untyped-def]
     for i in range(len(out)):
-        age = np.float32(t - (newest[i] >> 1)) * MICROSECOND32
-        height = on if newest[i] & 1 else -off
-        out[i] = height * beyond(age, scale)
+        out[i] = _ahead_of_newest(newest[i], t, heights)
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _trail_between(first, last, begin, end, heights, start, grown):  # type: ignore[no-untyped-def]
+    for i in range(len(start)):
+        start[i] = _ahead_of_newest(first[i], begin, heights)
+        grown[i] = _ahead_of_newest(last[i], end, heights) - start[i]
 
 
 def given_trail(start: FloatArray, end: FloatArray) -> Trail:
     """The trail of a segment that is filtered backward in time: f at the times where it starts and ends."""
     return Trail(start, np.zeros(start.shape, np.int8), 1.0, 0.0, 0.0, end)
+
+
+NO_HEIGHTS: Final = np.float32(1.0), np.float32(0.0), np.float32(0.0)
+"""`Trail.heights` of a segment in which the light is never ahead of its events."""
 
 
 def no_trail(shape: tuple[int, int]) -> Trail:

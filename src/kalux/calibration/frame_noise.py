@@ -19,7 +19,7 @@ from kalux.augmentation.deblur import between
 from kalux.calibration.intervals import Interval, intervals
 from kalux.compiled import event_column, event_row, event_words
 from kalux.events import EventArray
-from kalux.filters.methods import Shot
+from kalux.filters.shots import Shot
 from kalux.frames import Frame
 from kalux.recording import Recording
 from kalux.settings import CameraSettings

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from kalux.augmentation.deblur import all_between
 from kalux.compiled import event_words
 from kalux.events import EVENT_DTYPE, EventArray
-from kalux.filters.methods import Shot, take_shot
+from kalux.filters.shots import Shot, take_shot
 from kalux.frames import Frame
 from kalux.models.camera import Camera, log_intensity
 from kalux.recording import Recording

@@ -35,7 +35,7 @@ from kalux.calibration.refractory import shortest_interval
 from kalux.calibration.regression import HUBER, NORMAL_MAD, standard_errors, two_stage
 from kalux.calibration.values import Calibration
 from kalux.events import EVENT_DTYPE, EventArray
-from kalux.filters.methods import Shot
+from kalux.filters.shots import Shot
 from kalux.recording import Recording
 from kalux.settings import CameraSettings, EventSettings
 

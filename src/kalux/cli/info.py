@@ -72,6 +72,12 @@ def add_recording(parser: Parser) -> None:
         "--replace-frames", action="store_true", help="--frames instead of the recording's own"
     )
     group.add_argument(
+        "--white",
+        type=number,
+        metavar="LEVEL",
+        help="value of a saturated pixel, if not stored: 4095 of 12 bits in 16",
+    )
+    group.add_argument(
         "--bayer",
         type=_pattern,
         choices=(*MOSAICS, "none"),
@@ -105,6 +111,7 @@ def open_recording(options: argparse.Namespace) -> Recording:
         frames_rate=options.frames_rate,
         replace_frames=options.replace_frames,
         mosaic=options.bayer,
+        white=options.white,
     )
 
 
@@ -131,7 +138,7 @@ def settled_lines(
     name: str,
 ) -> list[str]:
     """What a reconstruction would settle, a line each; why it could not, if it could not."""
-    from kalux.info import settled
+    from kalux.info import saturation_text, settled
     from kalux.pipeline import plan
 
     title = f"reconstruct would use, with the preset {name}"
@@ -140,6 +147,7 @@ def settled_lines(
     if not recording.exposure_known:
         return [title, "  nothing can be estimated without exposure times; give --exposure"]
     asked = settings if calibration is None else calibration.apply(settings)
-    rows = settled(recording, plan(recording, at="frames", settings=asked, calibration=calibration), asked)
+    made = plan(recording, at="frames", settings=asked, calibration=calibration)
+    rows = [*settled(recording, made, asked), ("saturation", saturation_text(recording, made, asked))]
     width = max(len(label) for label, _ in rows)
     return [title, *(f"  {label:<{width}}  {text}" for label, text in rows)]

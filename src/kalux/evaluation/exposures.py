@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from kalux.errors import FrameError
 from kalux.evaluation.pairs import Array
-from kalux.filters.methods import take_shot
+from kalux.filters.shots import take_shot
 from kalux.frames import Frame
 from kalux.models.camera import Camera
 from kalux.recording import Recording

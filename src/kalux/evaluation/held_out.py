@@ -23,7 +23,7 @@ from kalux.evaluation.exposures import exposure_times, linear_frame, means_of, r
 from kalux.evaluation.lpips import LpipsWeights
 from kalux.evaluation.pairs import Array
 from kalux.evaluation.scores import Pair, Scores, score
-from kalux.filters.methods import take_shot
+from kalux.filters.shots import take_shot
 from kalux.frames import Frame
 from kalux.models.camera import Camera, frame_log_covariance
 from kalux.recording import Recording

@@ -1,4 +1,4 @@
-"""The filters: `akf` (14)-(21), `complementary`, and `readout` from state to intensity.
+"""The filters: `akf` (14)-(21) in two forms, `complementary`, and `readout` from state to intensity.
 
 Each filter is four functions over explicit values. ``begin(segment, state)`` takes the state at the start of
 a segment to a cursor of working arrays; ``advance(segment, cursor, events, noise)`` moves the cursor over

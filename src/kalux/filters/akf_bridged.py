@@ -1,0 +1,403 @@
+"""The asynchronous Kalman filter along a bridge (`kalux.augmentation.bridge`): kalux's own form, float32.
+
+The state takes the same calibrated steps and the same slope as L^A, and R changes only at events, so that J D stands
+still in between (`akf`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux.augmentation.bridge import UNMEASURED, BridgedSegment, lift, lower
+from kalux.augmentation.deblur import events_until
+from kalux.augmentation.trail import NO_HEIGHTS, add_trail, ahead_of_event, no_trail
+from kalux.compiled import (
+    AHEAD,
+    FUSED,
+    MICROSECOND32,
+    ONE,
+    WEIGHT_UNIT,
+    apart,
+    event_column,
+    event_is_on,
+    event_row,
+    event_weight,
+    event_words,
+    pack,
+    packed,
+    prefetch,
+    unpack,
+)
+from kalux.events import EventArray
+from kalux.filters.akf import (
+    State,
+    information_kept,
+    measurement_rate,
+    predicted_information,
+)
+from kalux.filters.common import EPOCH, Clock, moved_clock, newest_around_inside
+from kalux.models.events import signal_probability, threshold_noise
+
+FloatArray = NDArray[np.float32]
+
+STATE_PIXEL: Final = np.dtype(
+    [
+        ("information", "f4"),  # J = 1/P after the pixel's latest event, or at the origin of the clock
+        ("weighted", "f4"),  # J D, which stands still between events
+        ("augmented", "f4"),  # L^A without the part of its slope, less the trail at the start (K14)
+        ("rate", "f4"),  # 1/R until the pixel's next event
+    ],
+    align=True,
+)
+"""What an image needs of a pixel in the bridged form: 16 bytes, which every image reads."""
+
+STEP_PIXEL: Final = np.dtype(
+    {
+        "names": [
+            "step_on",
+            "step_off",
+            "forward",  # variance of L^A as seen from the start
+            "backward",  # the same from the end, without the events still to come
+            "coming",  # sum of their weights; exact, where taking away their variances would leave rounding errors
+        ],
+        "formats": ["f4"] * 5,
+        "itemsize": 32,
+    }
+)
+"""What events need besides: 32 bytes, so that none lies in two lines of memory."""
+
+_BLOCK: Final = 128
+"""Pixels that are read together: few enough that their fields stay in the nearest cache."""
+
+_BEGUN: Final = 64
+"""The same where a segment begins, with more fields."""
+
+_STATE_FIELDS: Final = STATE_PIXEL.itemsize // 4
+_STEP_FIELDS: Final = STEP_PIXEL.itemsize // 4
+_INFORMATION, _WEIGHTED, _AUGMENTED, _RATE = range(_STATE_FIELDS)
+_STEP_ON, _STEP_OFF, _FORWARD, _BACKWARD, _COMING = range(len(STEP_PIXEL.names or ()))
+
+
+@dataclass
+class Cursor:
+    """Working arrays of the bridged form; changed in place by `advance`.
+
+    Attributes
+    ----------
+    pixels, steps
+        (H + 2, W + 2) of `STATE_PIXEL` and `STEP_PIXEL`, laid out as the clock is.
+    clock
+        Newest event of every pixel, us after ``origin``. The pixel's state holds from there, or from ``origin``
+        if that is later.
+    polarity
+        1 or -1, that of the newest event of every pixel, laid out as the clock is; 0: not known.
+    origin
+        us: the segment's start, then a whole number of epochs later.
+    moving
+        `moving_pixels`, once it has been asked for, where it is the same throughout the segment.
+    unmeasured
+        `unmeasured_pixels`, once it has been asked for.
+    """
+
+    pixels: NDArray[np.void]
+    steps: NDArray[np.void]
+    clock: Clock
+    polarity: NDArray[np.int8]
+    origin: int
+    moving: NDArray[np.bool_] | None = None
+    unmeasured: NDArray[np.bool_] | None = None
+
+
+class Noise(NamedTuple):
+    """Scalars of the event noise: Hz per pixel, units of c^2, and c^2 itself."""
+
+    noise_rate: float
+    step_variance: float
+    threshold2: float
+
+
+class _Scalars(NamedTuple):
+    """Of the segment and the noise, float32."""
+
+    rate: np.float32
+    step_variance: np.float32
+    noise_rate: np.float32
+    event_variance: np.float32
+    threshold2: np.float32
+
+
+def begin(segment: BridgedSegment, state: State, spare: Cursor | None = None) -> Cursor:
+    """The cursor at the start of a segment: L stays, L^A is the segment's. The clock's origin is the start.
+
+    ``spare`` is a cursor of the same size that is used no more, whose memory the new one takes.
+    """
+    clock: Clock = state.newest.astype(np.int32)
+    if spare is None:
+        pixels, steps = packed(clock.shape, STATE_PIXEL), packed(clock.shape, STEP_PIXEL)
+        polarity = np.zeros(clock.shape, np.int8)
+    else:
+        pixels, steps, polarity = spare.pixels, spare.steps, spare.polarity
+    floor = state.log_intensity if segment.floor is None else segment.floor
+    scalars = np.float32(segment.rate), np.float32(segment.step_variance)
+    variances = segment.forward_variance, segment.backward_variance
+    coming = np.zeros_like(segment.augmented) if segment.events is None else segment.events
+    trail = no_trail(coming.shape) if segment.trail is None else segment.trail
+    given = segment.augmented, segment.step_on, segment.step_off, *variances, coming, trail.start
+    before = state.log_intensity, floor, state.variance
+    _begin_bridged(given, scalars, before, pixels.reshape(-1), steps.reshape(-1))
+    polarity[1:-1, 1:-1] = trail.polarity
+    return Cursor(pixels, steps, clock, polarity, segment.start)
+
+
+def advance(segment: BridgedSegment, cursor: Cursor, events: EventArray, noise: Noise) -> None:
+    """Take the cursor over events of the segment, which carry weights (`kalux.augmentation.refractory`), in place."""
+    scalars = _Scalars(*(np.float32(value) for value in (segment.rate, segment.step_variance, *noise)))
+    stride = np.uint64(cursor.clock.shape[1])
+    while len(events):
+        pixels, steps = cursor.pixels.reshape(-1), cursor.steps.reshape(-1)
+        clock, polarity = cursor.clock.reshape(-1), cursor.polarity.reshape(-1)
+        count = events_until(events, cursor.origin + EPOCH)
+        words = event_words(events[:count])
+        _advance_bridged(words, pixels, steps, clock, polarity, stride, cursor.origin, scalars)
+        events = events[count:]
+        if len(events):
+            epochs = (int(events["t"][0]) - 1 - segment.start) // EPOCH
+            _move_origin(cursor, segment.start + epochs * EPOCH)
+
+
+def read(segment: BridgedSegment, cursor: Cursor, t: int) -> tuple[FloatArray, FloatArray]:
+    """L and P at ``t`` (us), which must not lie before an event the cursor has taken. Changes nothing.
+
+    Backward in time L is without what the light is ahead of its events (K14).
+    """
+    log_intensity, variance = _read(segment, cursor, t)
+    if t == segment.end and segment.trail is not None and segment.trail.end is not None:
+        log_intensity -= segment.trail.end
+    return log_intensity, variance
+
+
+def trail_ahead(segment: BridgedSegment, cursor: Cursor, t: int) -> FloatArray | None:
+    """(H, W) how far the light is ahead of its events at ``t`` (us), K14; None where that is not told."""
+    if segment.trail is None:
+        return None
+    ahead = np.zeros(segment.augmented.shape, np.float32)
+    since_nothing = segment.trail._replace(start=ahead)
+    within = min(t - cursor.origin, EPOCH)
+    out = np.zeros_like(ahead)
+    add_trail(since_nothing, cursor.polarity, cursor.clock, within, out)
+    return out
+
+
+def _read(segment: BridgedSegment, cursor: Cursor, t: int) -> tuple[FloatArray, FloatArray]:
+    """The same with all that is known at the end of the segment."""
+    shape = segment.augmented.shape
+    log_intensity, variance = apart(2, shape)
+    within = min(t - cursor.origin, EPOCH)
+    beyond = np.float32((t - cursor.origin - within) * 1e-6)
+    since_start = np.float32((t - segment.start) * 1e-6)
+    pixels, clock, polarity = (p.reshape(-1) for p in (cursor.pixels, cursor.clock, cursor.polarity))
+    heights = NO_HEIGHTS if segment.trail is None else segment.trail.heights
+    moment, out = (within, beyond, since_start), (log_intensity, variance)
+    _read_bridged(pixels, clock, polarity, segment.slope, heights, moment, *out)
+    if t == segment.end:
+        if segment.trail is not None and segment.trail.end is not None:
+            log_intensity += segment.trail.end
+        if segment.bound is not None:
+            lift(log_intensity, segment.bound)  # K7
+            lower(log_intensity, segment.bound)
+        if segment.drift is not None:
+            variance += segment.drift  # K10
+    return log_intensity, variance
+
+
+def moving_pixels(segment: BridgedSegment, cursor: Cursor) -> NDArray[np.bool_]:
+    """(H, W): pixels with an event since ``segment.still_since`` or to come in the segment, and unmeasured ones.
+
+    Still pixels are those of which frames have shown the fine texture many times, as none has of a clipped one.
+    Not to be changed.
+    """
+    if cursor.moving is not None:
+        return cursor.moving
+    inside = cursor.clock[1:-1, 1:-1]
+    moving: NDArray[np.bool_] = inside > np.int32(max(segment.still_since - cursor.origin, -EPOCH))
+    moving |= unmeasured_pixels(segment, cursor)
+    if segment.events is not None:  # all events of the segment are among them, whenever this is asked for
+        moving |= segment.events > 0
+        cursor.moving = moving
+    return moving
+
+
+def unmeasured_pixels(segment: BridgedSegment, cursor: Cursor) -> NDArray[np.bool_]:
+    """(H, W): pixels that neither of the segment's frames measures; not to be changed."""
+    if cursor.unmeasured is None:
+        variances = segment.forward_variance, segment.backward_variance
+        cursor.unmeasured = np.minimum(*variances) >= UNMEASURED
+    return cursor.unmeasured
+
+
+def end(segment: BridgedSegment, cursor: Cursor) -> State:
+    """The state at the end of the segment."""
+    log_intensity, variance = _read(segment, cursor, segment.end)
+    return State(log_intensity, variance, moved_clock(cursor.clock, segment.end - cursor.origin))
+
+
+def _move_origin(cursor: Cursor, origin: int) -> None:
+    """Predict every pixel at a later origin of the clock, so that its times do not overflow."""
+    _predict_bridged(cursor.pixels, cursor.clock, origin - cursor.origin)
+    cursor.clock = moved_clock(cursor.clock, origin - cursor.origin)
+    cursor.origin = origin
+
+
+@nb.njit(cache=True, inline="always")
+def _since(clock, now):  # type: ignore[no-untyped-def]
+    """Seconds from the time for which a pixel's state holds until ``now``; both us after the origin."""
+    return np.float32(np.int32(now - max(clock, np.int32(0)))) * MICROSECOND32
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _begin_bridged(given, scalars, before, pixels, steps):  # type: ignore[no-untyped-def]
+    rate, step_variance = scalars
+    log_intensity, floor, variance = before
+    augmented, step_on, step_off, forward, backward, events, trail = given
+    height, width = log_intensity.shape
+    states = np.empty((_STATE_FIELDS, _BEGUN), np.float32)
+    known = np.zeros((_STEP_FIELDS, _BEGUN), np.float32)
+    information, weighted, level, rates = (
+        states[_INFORMATION],
+        states[_WEIGHTED],
+        states[_AUGMENTED],
+        states[_RATE],
+    )
+    first_variance, last_variance, coming = known[_FORWARD], known[_BACKWARD], known[_COMING]
+    for row in range(np.uint64(height)):
+        at = (row + np.uint64(1)) * np.uint64(width + 2) + np.uint64(1)
+        for first in range(np.uint64(0), np.uint64(width), np.uint64(_BEGUN)):
+            count = min(np.uint64(width) - first, np.uint64(_BEGUN))
+            _copy(step_on, row, first, count, known[_STEP_ON])
+            _copy(step_off, row, first, count, known[_STEP_OFF])
+            _copy(forward, row, first, count, first_variance)
+            _copy(backward, row, first, count, last_variance)
+            _copy(events, row, first, count, coming)
+            _copy(augmented, row, first, count, level)
+            for i in range(count):
+                information[i] = ONE / np.float32(variance[row, first + i])
+            for i in range(count):
+                known_before = max(
+                    np.float32(log_intensity[row, first + i]), np.float32(floor[row, first + i])
+                )  # K7
+                weighted[i] = information[i] * (known_before - level[i])
+            for i in range(count):
+                rates[i] = measurement_rate(
+                    rate, first_variance[i], last_variance[i] + coming[i] * step_variance
+                )
+            for i in range(count):
+                level[i] -= np.float32(trail[row, first + i])
+            pack(states, pixels, np.int64(at + first), np.int64(count))
+            pack(known, steps, np.int64(at + first), np.int64(count))
+
+
+@nb.njit(cache=True, inline="always")
+def _copy(plane, row, first, count, out):  # type: ignore[no-untyped-def]
+    """A part of a row as float32; vector code, as loops over many arrays at once are not."""
+    for i in range(count):
+        out[i] = np.float32(plane[row, first + i])
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy", fastmath=FUSED)
+def _advance_bridged(words, pixels, steps, clock, polarity, stride, origin, scalars):  # type: ignore[no-untyped-def]
+    # Each event's clock is looked at while the one before is filtered, so that neither waits for the other.
+    last = len(words) - 1
+    event = _meet(words[0, 0], words[0, 1], clock, polarity, stride, origin, scalars)
+    for i in range(len(words)):
+        ahead = words[min(i + AHEAD, last), 1]
+        place = event_row(ahead) * stride + event_column(ahead) + stride + np.uint64(1)
+        prefetch(pixels, place)
+        prefetch(steps, place)
+        at, seconds, weight, is_on, unsure, noise = event
+        pixel, known = pixels[at], steps[at]
+        information = predicted_information(pixel.information, pixel.rate, seconds)
+        step_on, step_off = known.step_on, known.step_off
+        step = weight * (step_on if is_on else -step_off)
+        kept = information_kept(information, noise)
+        # The state moves by the expected step, L^A by the whole one: the frames have told which it was.
+        pixel.weighted = (pixel.weighted - information * unsure * step) * kept
+        pixel.information = information * kept
+        pixel.augmented += step
+        forward, coming = known.forward + weight * scalars.step_variance, known.coming - weight
+        pixel.rate = measurement_rate(scalars.rate, forward, known.backward + coming * scalars.step_variance)
+        known.forward, known.coming = forward, coming
+        following = min(i + 1, last)
+        event = _meet(words[following, 0], words[following, 1], clock, polarity, stride, origin, scalars)
+
+
+@nb.njit(cache=True, inline="always", error_model="numpy")
+def _meet(t, word, clock, polarity, stride, origin, scalars):  # type: ignore[no-untyped-def]
+    """What an event is worth: its pixel's place, the seconds since that's state holds, its weight and polarity, the
+    probability that it is noise, and Q. Sets the clock; the same event may be met twice."""
+    at = event_row(word) * stride + event_column(word) + stride + np.uint64(1)
+    now = np.int32(t - origin)
+    seconds = _since(clock[at], now)
+    age = np.float32(np.int32(now - newest_around_inside(clock, at, stride))) * MICROSECOND32
+    signal = signal_probability(scalars.noise_rate, age)
+    weight, is_on = event_weight(word, WEIGHT_UNIT), event_is_on(word)
+    clock[at] = now
+    polarity[at] = np.int8(2) * np.int8(is_on) - np.int8(1)
+    noise = weight * threshold_noise(scalars.event_variance, scalars.threshold2, signal)
+    return at, seconds, weight, is_on, ONE - signal, noise
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _read_bridged(  # type: ignore[no-untyped-def]
+    pixels, clock, polarity, slope, heights, moment, log_intensity, variance
+):
+    height, width = variance.shape
+    size = min(width, _BLOCK)
+    planes, ahead = np.empty((_STATE_FIELDS, size), np.float32), np.empty(size, np.float32)
+    for row in range(height):
+        at = (row + 1) * (width + 2) + 1
+        newest = clock[at : at + width], polarity[at : at + width]
+        rows = slope[row], log_intensity[row], variance[row]
+        for first in range(0, width, size):  # the last block begins where it ends with the row
+            first = min(first, width - size)
+            unpack(pixels, at + first, size, planes)
+            _read_block(planes, first, size, newest, heights, moment, rows, ahead)
+
+
+@nb.njit(cache=True, inline="always", error_model="numpy")
+def _read_block(planes, first, count, newest, heights, moment, rows, ahead):  # type: ignore[no-untyped-def]
+    """L and P of ``count`` pixels of a row from ``first`` on; vector code."""
+    times, signs = newest
+    now, beyond, since_start = moment
+    slope, log_intensity, variance = rows
+    information, weighted, augmented, rate = (
+        planes[_INFORMATION],
+        planes[_WEIGHTED],
+        planes[_AUGMENTED],
+        planes[_RATE],
+    )
+    for i in range(count):
+        column = np.uint64(first) + np.uint64(i)
+        age = np.float32(np.int32(now - times[column])) * MICROSECOND32
+        ahead[i] = ahead_of_event(signs[column], age, heights)  # K14
+    for i in range(count):
+        column = np.uint64(first) + np.uint64(i)
+        seconds = _since(times[column], now) + beyond
+        inverse = ONE / predicted_information(information[i], rate[i], seconds)
+        moved = augmented[i] + np.float32(slope[column]) * since_start
+        log_intensity[column] = moved + weighted[i] * inverse + ahead[i]
+        variance[column] = inverse
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _predict_bridged(pixels, clock, span):  # type: ignore[no-untyped-def]
+    height, width = clock.shape
+    for row in range(1, height - 1):
+        for column in range(1, width - 1):
+            pixel = pixels[row, column]
+            seconds = np.float32(span - max(clock[row, column], 0)) * MICROSECOND32
+            pixel.information = predicted_information(pixel.information, pixel.rate, seconds)

@@ -1,0 +1,182 @@
+"""The asynchronous Kalman filter on an interpolated L^A: the paper's form, float64, exact or as printed.
+
+Nominal steps, and R linear in time (7). As printed, (17) and (20) are exact only while neither L^A nor R moves.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux.augmentation.interpolation import InterpolatedSegment
+from kalux.events import EventArray
+from kalux.filters.akf import (
+    State,
+    interpolated_covariance,
+    linear_covariance_integrals,
+    predicted_deviation,
+    predicted_information,
+)
+from kalux.filters.common import MICROSECOND, newest_around
+from kalux.models.events import event_noise
+
+Array = NDArray[np.float64]
+Times = NDArray[np.int64]
+
+
+class Cursor(NamedTuple):
+    """Working arrays of the paper's form, (H, W); changed in place by `advance`."""
+
+    log_intensity: Array
+    variance: Array
+    forward: Array
+    backward: Array
+    since: Times
+    newest: Times
+
+
+class Noise(NamedTuple):
+    """Parameters of equation (2), s and 1/s, and whether (17) and (20) are taken as printed."""
+
+    sigma_proc2: float
+    sigma_iso2: float
+    sigma_ref2: float
+    refractory_bound: float
+    printed: bool
+
+
+def begin(segment: InterpolatedSegment, state: State) -> Cursor:
+    """The cursor at the start of a segment."""
+    return Cursor(
+        log_intensity=state.log_intensity.astype(np.float64),
+        variance=state.variance.astype(np.float64),
+        forward=segment.forward.astype(np.float64),
+        backward=segment.backward.astype(np.float64),
+        since=np.full(state.newest.shape, segment.start, np.int64),
+        newest=state.newest.astype(np.int64),
+    )
+
+
+def advance(segment: InterpolatedSegment, cursor: Cursor, events: EventArray, noise: Noise) -> None:
+    """Take the cursor over events of the segment, in place."""
+    _advance_interpolated(segment, cursor, events["t"], events["x"], events["y"], events["p"], noise)
+
+
+def read(segment: InterpolatedSegment, cursor: Cursor, t: int, noise: Noise) -> tuple[Array, Array]:
+    """L and P at ``t`` (us), which must not lie before an event the cursor has taken. Changes nothing."""
+    out = np.empty_like(cursor.variance), np.empty_like(cursor.variance)
+    _read_interpolated(segment, cursor, t, noise.printed, *out)
+    return out
+
+
+@nb.njit(cache=True, inline="always")
+def _exposure_fraction(segment, t):  # type: ignore[no-untyped-def]
+    """The weight of L^{A+} in equation (13): 0 at the start of the exposure, 1 from its end."""
+    if t >= segment.exposure_end:
+        return 1.0
+    return (t - segment.start) / (segment.exposure_end - segment.start)
+
+
+@nb.njit(cache=True, inline="always")
+def _blended(segment, forward, backward, t):  # type: ignore[no-untyped-def]
+    """L^A(t) of equation (13)."""
+    fraction = _exposure_fraction(segment, t)
+    return (1.0 - fraction) * forward + fraction * backward
+
+
+@nb.njit(cache=True, inline="always")
+def _covariance(segment, row, column, t, after):  # type: ignore[no-untyped-def]
+    """R(t), equations (7) and (9); ``after`` picks the interval that follows tau^k."""
+    if after:
+        fraction = (t - segment.middle) / (segment.next_middle - segment.middle)
+        return interpolated_covariance(
+            segment.covariance_from[row, column], segment.covariance_after[row, column], fraction
+        )
+    fraction = (t - segment.previous_middle) / (segment.middle - segment.previous_middle)
+    return interpolated_covariance(
+        segment.covariance_before[row, column], segment.covariance_at[row, column], fraction
+    )
+
+
+@nb.njit(cache=True)
+def _predict_printed(segment, cursor, row, column, t):  # type: ignore[no-untyped-def]
+    """L and P by (17) and (20) as printed."""
+    since = cursor.since[row, column]
+    forward, backward = cursor.forward[row, column], cursor.backward[row, column]
+    information = 1.0 / cursor.variance[row, column]
+    covariance = _covariance(segment, row, column, t, t >= segment.middle)
+    predicted = predicted_information(information, 1.0 / covariance, (t - since) * MICROSECOND)
+    deviation = cursor.log_intensity[row, column] - _blended(segment, forward, backward, since)
+    predicted_value = predicted_deviation(deviation, information, predicted)
+    return predicted_value + _blended(segment, forward, backward, t), 1.0 / predicted
+
+
+@nb.njit(cache=True)
+def _predict_exact(segment, cursor, row, column, t):  # type: ignore[no-untyped-def]
+    """L and P by the exact solution, over stretches in which L^A and R are linear."""
+    now = cursor.since[row, column]
+    forward, backward = cursor.forward[row, column], cursor.backward[row, column]
+    information = 1.0 / cursor.variance[row, column]
+    augmented = _blended(segment, forward, backward, now)
+    # J D
+    weighted = (cursor.log_intensity[row, column] - augmented) * information
+    for k in range(3):
+        until = t
+        if k == 0:
+            until = min(t, segment.middle)
+        elif k == 1:
+            until = min(t, segment.exposure_end)
+        if until <= now:
+            continue
+        seconds = (until - now) * MICROSECOND
+        single, double = linear_covariance_integrals(
+            _covariance(segment, row, column, now, now >= segment.middle),
+            _covariance(segment, row, column, until, now >= segment.middle),
+            seconds,
+        )
+        end_value = _blended(segment, forward, backward, until)
+        weighted -= (end_value - augmented) / seconds * (information * seconds + double)
+        information += single
+        augmented = end_value
+        now = until
+    return weighted / information + augmented, 1.0 / information
+
+
+@nb.njit(cache=True, nogil=True)
+def _advance_interpolated(segment, cursor, t, x, y, p, noise):  # type: ignore[no-untyped-def]
+    for i in range(len(t)):
+        row, column, now = y[i], x[i], t[i]
+        if noise.printed:
+            value, variance = _predict_printed(segment, cursor, row, column, now)
+        else:
+            value, variance = _predict_exact(segment, cursor, row, column, now)
+        q = event_noise(
+            noise.sigma_proc2,
+            noise.sigma_iso2,
+            noise.sigma_ref2,
+            noise.refractory_bound,
+            (now - cursor.newest[row, column]) * MICROSECOND,
+            (now - newest_around(cursor.newest, row, column)) * MICROSECOND,
+        )
+        step = segment.step_on if p[i] else -segment.step_off
+        cursor.log_intensity[row, column] = value + step  # (15)
+        cursor.variance[row, column] = variance + q  # (21)
+        cursor.forward[row, column] += segment.scale_before[row, column] * step  # (10)
+        cursor.backward[row, column] += segment.scale_after[row, column] * step  # (11)
+        cursor.since[row, column] = now
+        cursor.newest[row, column] = now
+
+
+@nb.njit(cache=True, nogil=True)
+def _read_interpolated(segment, cursor, t, printed, log_intensity, variance):  # type: ignore[no-untyped-def]
+    height, width = variance.shape
+    for row in range(height):
+        for column in range(width):
+            if printed:
+                value = _predict_printed(segment, cursor, row, column, t)
+            else:
+                value = _predict_exact(segment, cursor, row, column, t)
+            log_intensity[row, column], variance[row, column] = value

@@ -1,0 +1,504 @@
+"""kalux's own way from frame to frame: `kalux.augmentation.bridge` joins them, the exact filter follows."""
+
+from __future__ import annotations
+
+from typing import Any, Final, NamedTuple
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux.augmentation import bridge, deblur
+from kalux.augmentation.bridge import BridgedSegment, BridgeNoise, Latent, Thresholds, UnshownMemory
+from kalux.augmentation.deblur import (
+    EXPOSED,
+    EXPOSURE_FIELDS,
+    Exposure,
+    all_between,
+    relative_levels,
+)
+from kalux.augmentation.highlights import Unshown, begin_unshown, expected_excess, follow_unshown
+from kalux.augmentation.trail import (
+    Followed,
+    Trail,
+    follow,
+    followed_pixels,
+    given_trail,
+    nothing_followed,
+    polarity_of,
+    trail_at,
+    trail_between,
+)
+from kalux.augmentation.unseen import UNKNOWN_CHANGE, forget_silence, silent_change
+from kalux.compiled import apart
+from kalux.events import EventArray
+from kalux.filters import akf_bridged
+from kalux.filters.akf import State
+from kalux.filters.common import make_clock
+from kalux.filters.method import FAR_FUTURE, USUAL_INTERVAL, Chunks, CommonMethod, Segment
+from kalux.filters.shots import Shot
+from kalux.filters.uncertainty import WRONG_STEPS, Around
+from kalux.models.camera import CRUSHED, frame_log_covariance, log_intensity
+from kalux.models.pixels import PixelCalibration
+from kalux.settings import Settings
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.floating[Any]]
+
+
+_DARKEST: Final = 0.001
+"""What is black is taken to be spread evenly in log I from here, white = 1, a quarter of an 8-bit level."""
+
+_BLACK_FRAMES: Final = 3.0
+"""Black says the same in every frame: so many of them count as one, and all as no more (docs/equations.md, K7)."""
+
+
+class BridgeMemory(NamedTuple):
+    """The latest frame, deblurred; the pixels' thresholds; the frame interval in s (0: not known yet).
+
+    In causal mode also the counts of events between the middle and the end of the latest exposure. Of pixels that the
+    latest frames did not measure, the counts since one did (to the latest node); 0 elsewhere. ``since`` is the start of
+    the first exposure, us. ``unshown`` is of the pixels that no frame has measured yet.
+    """
+
+    latent: Latent
+    thresholds: Thresholds
+    interval: float
+    on: Floats
+    off: Floats
+    far_on: Floats
+    far_off: Floats
+    since: int
+    followed: Followed
+    at_middle: Followed
+    unshown: UnshownMemory
+    silent_change: Floats
+
+
+class BridgedFrames(CommonMethod):
+    """The default: `bridge` from the middle of one exposure to that of the next, the exact filter.
+
+    Causal mode (``lookahead=False``) goes from the end of one exposure to the end of the next, forward only.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        thresholds: tuple[float, float],
+        lookahead: bool,
+        shape: tuple[int, int],
+        pixels: PixelCalibration | None,
+    ) -> None:
+        super().__init__(settings, thresholds, lookahead, shape)
+        # Fresh memory costs as much as filling it.
+        self._spare: akf_bridged.Cursor | None = None
+        self._spare_exposure: NDArray[np.void] | None = None
+        self._spare_followed: NDArray[np.void] | None = None
+        self._prior = (
+            bridge.nominal_thresholds(shape, settings.events.mismatch, np.float32)
+            if pixels is None
+            else Thresholds(
+                *(
+                    values.astype(np.float32)
+                    for values in (pixels.on, pixels.off, pixels.on_variance, pixels.off_variance)
+                )
+            )
+        )
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickled without the free memory."""
+        return {**self.__dict__, "_spare": None, "_spare_exposure": None, "_spare_followed": None}
+
+    def node(self, shot: Shot) -> int:
+        return shot.middle if self.lookahead else shot.end
+
+    def begin_time(self, shot: Shot) -> int:
+        return shot.start if self.lookahead else shot.end
+
+    def needed_until(self, shot: Shot) -> int:
+        return shot.end
+
+    @property
+    def noise(self) -> BridgeNoise:
+        events, c2 = self.settings.events, self.on * self.off
+        return BridgeNoise(self.on, self.off, events.step_noise * c2, events.quantisation_variance * c2)
+
+    def latent(self, shot: Shot, events: Chunks, thresholds: Thresholds) -> Latent:
+        """The frame without blur at the middle of its exposure, and its variance (K3)."""
+        exposure = deblur.expose(
+            events if self.settings.filter.deblur else (),
+            shot.start,
+            shot.end,
+            (thresholds.on, thresholds.off),
+            (self.on, self.off),
+            weighed=True,
+            spare=self._spare_exposure,
+        )
+        self._spare_exposure = exposure.pixels
+        level_variance = frame_log_covariance(
+            shot.level_intensity, shot.level_weight, self.settings.camera.noise, shot.white, self.offset
+        )
+        level_variance[shot.level_clipped] = bridge.UNMEASURED
+        level_log = log_intensity(shot.level_intensity, self.offset)
+        crushed = self.crushed(shot)
+        if crushed is not None:
+            level_log[crushed], level_variance[crushed] = self.black(shot.level_ceiling[crushed])
+        latent = latent_frame(
+            shot.levels,
+            level_log,
+            level_variance,
+            exposure,
+            duration=shot.end - shot.start,
+            event_variance=self.settings.events.deblur_variance * self.on * self.off,
+        )
+        if shot.valid is not None:
+            latent.variance[~shot.valid] = bridge.UNSEEN
+        if crushed is None:
+            return latent
+        room = np.where(crushed, np.log(shot.level_ceiling + self.offset) - level_log, np.inf)
+        return latent._replace(ceiling=latent.value + room.astype(np.float32)[shot.levels])
+
+    def crushed(self, shot: Shot) -> NDArray[np.bool_] | None:
+        """(N,) levels that are black and hide more than a linear response's would; None where black does not.
+
+        With a linear response 0 is a measurement like others.
+        """
+        black = np.isfinite(shot.level_ceiling)
+        hides = shot.level_ceiling > CRUSHED * shot.white
+        return black & hides if hides[black].any() else None
+
+    def black(self, ceiling: Array) -> tuple[Array, Array]:
+        """What I up to ``ceiling`` says of log(I + I_0): its middle, and its variance (K7)."""
+        middle = np.sqrt(_DARKEST * ceiling)
+        range_ = np.log1p(ceiling / self.offset)
+        return np.log(middle + self.offset), _BLACK_FRAMES * np.square(range_) / 12
+
+    def start(self, shot: Shot, events: Chunks) -> tuple[BridgeMemory, Segment | None, State]:
+        thresholds = self._prior
+        latent = self.latent(shot, events, thresholds)
+        begin = self.begin_time(shot)
+        newest = make_clock(self.shape, begin - shot.start)
+        lead_in, nothing = None, nothing_followed(self.shape)
+        far = np.zeros(self.shape, np.float32)
+        unknown = np.full(self.shape, UNKNOWN_CHANGE * self.on * self.off, np.float32)
+        if self.lookahead:
+            on, off, followed = self.follow(events, begin, shot.middle, nothing)
+        else:
+            # The clock begins at the end of the exposure: nothing is known of what came before.
+            (on, off), followed = self.counts(events, shot.middle, shot.end), nothing
+        memory = BridgeMemory(
+            latent=latent,
+            thresholds=thresholds,
+            interval=0.0,
+            on=on,
+            off=off,
+            far_on=far,
+            far_off=far,
+            since=shot.start,
+            followed=followed,
+            at_middle=followed,
+            unshown=begin_unshown(latent),
+            silent_change=unknown,
+        )
+        if self.lookahead:
+            value, variance = latent.value, latent.variance
+            if shot.middle > begin:
+                lead_in = bridge.extend_backward(latent, on, off, thresholds, self.noise, begin, shot.middle)
+                lead_in = lead_in._replace(
+                    still_since=shot.start,
+                    trail=self._lead_in_trail(shot, followed),
+                    unshown=memory.unshown,
+                )
+                value = lead_in.augmented
+                variance = lead_in.backward_variance + lead_in.step_variance * (on + off)
+        else:
+            carried = self._carried(memory, shot)
+            value, variance = carried.value, carried.variance
+        unmeasured = variance >= bridge.UNMEASURED
+        variance = np.where(unmeasured, np.float32(self.settings.filter.initial_variance), variance)
+        if shot.valid is not None:
+            variance[~shot.valid] = self.unseen_variance(shot)
+        return memory, lead_in, State(value, variance, newest)
+
+    def segment(
+        self, memory: BridgeMemory, shot: Shot, following: Shot | None, events: Chunks
+    ) -> tuple[Segment, BridgeMemory]:
+        start = self.node(shot)
+        if following is None:
+            seconds = memory.interval or USUAL_INTERVAL * 1e-6
+            latent = memory.latent
+            if not self.lookahead:
+                latent = self._carried(memory, shot)
+            alone = bridge.extend(latent, memory.thresholds, self.noise, start, FAR_FUTURE, seconds, None)
+            if shot.trail is None:
+                trail = self._trail(memory.followed, start, memory.followed.scale)
+            else:
+                trail = given_trail(shot.trail.before, np.zeros(self.shape, np.float32))
+            alone = alone._replace(
+                still_since=_still_since(memory, start, seconds),
+                trail=trail,
+                unshown=memory.unshown,
+                silent_change=memory.silent_change,
+            )
+            return alone, memory
+        interval = (following.middle - shot.middle) * 1e-6
+        second = self.latent(following, events, memory.thresholds)
+        on, off, at_middle = self.follow(events, start, following.middle, memory.followed)
+        if self.lookahead:
+            scale = at_middle.scale
+            if shot.trail is not None and following.trail is not None:
+                trail = given_trail(shot.trail.before, following.trail.after)
+                grown = following.trail.after - trail.start
+            else:
+                span = start, following.middle
+                at_start, grown = trail_between(
+                    memory.followed.newest, at_middle.newest, span, (scale, *self._trail_heights)
+                )
+                trail = Trail(at_start, polarity_of(memory.followed.newest), scale, *self._trail_heights)
+            joined, learned = bridge.bridge(
+                memory.latent,
+                second,
+                on,
+                off,
+                memory.thresholds,
+                self.noise,
+                start,
+                following.middle,
+                grown,
+            )
+            change = self._silent_change(joined)
+            joined = joined._replace(trail=trail, silent_change=change)
+            joined, far_on, far_off = self._drifting(joined, memory, second, on, off)
+            assert joined.net is not None
+            unshown = follow_unshown(memory.unshown, second, joined.net)
+            after = memory._replace(
+                latent=second,
+                thresholds=learned,
+                interval=interval,
+                on=on,
+                off=off,
+                far_on=far_on,
+                far_off=far_off,
+                followed=at_middle,
+                at_middle=at_middle,
+                unshown=unshown,
+                silent_change=change,
+            )
+            return joined._replace(unshown=unshown), after
+        # Of what came before: what the segment holds is still to come when it is read.
+        scale = memory.followed.scale
+        grown = self._trail_at(at_middle, following.middle, scale)
+        grown -= self._trail_at(memory.at_middle, shot.middle, scale)
+        behind, learned = bridge.bridge(
+            memory.latent,
+            second,
+            on + memory.on,
+            off + memory.off,
+            memory.thresholds,
+            self.noise,
+            shot.middle,
+            following.middle,
+            grown,
+        )
+        assert behind.net is not None
+        tail_on, tail_off, followed = self.follow(events, following.middle, following.end, at_middle)
+        after = memory._replace(
+            latent=second,
+            thresholds=learned,
+            interval=interval,
+            on=tail_on,
+            off=tail_off,
+            followed=followed,
+            at_middle=at_middle,
+            unshown=follow_unshown(memory.unshown, second, behind.net),
+            silent_change=self._silent_change(behind),
+        )
+        forward = bridge.extend(
+            self._carried(memory, shot),
+            memory.thresholds,
+            self.noise,
+            start,
+            following.end,
+            memory.interval or USUAL_INTERVAL * 1e-6,
+            self._carried(after, following),
+        )
+        forward = forward._replace(
+            trail=self._trail(memory.followed, start, scale),
+            unshown=memory.unshown,
+            silent_change=memory.silent_change,
+        )
+        forward, far_on, far_off = self._drifting(forward, memory, second, on + tail_on, off + tail_off)
+        return forward, after._replace(far_on=far_on, far_off=far_off)
+
+    def follow(
+        self, events: Chunks, start: int, end: int, before: Followed
+    ) -> tuple[Floats, Floats, Followed]:
+        """`counts`, and what is known of the pixels' newest events at ``end`` (K14)."""
+        if self._spare_followed is None:
+            self._spare_followed = followed_pixels(self.shape)
+        return follow(all_between(events, start, end), before, start, end, self._spare_followed)
+
+    def _trail(self, followed: Followed, start: int, scale: float) -> Trail:
+        """By how much events trail the light in the segment from ``start`` on (K14)."""
+        at_start = self._trail_at(followed, start, scale)
+        return Trail(at_start, polarity_of(followed.newest), scale, *self._trail_heights)
+
+    def _lead_in_trail(self, shot: Shot, followed: Followed) -> Trail:
+        """The same before the middle of the first exposure, where the frame keeps its level."""
+        if shot.trail is not None:
+            return given_trail(shot.trail.after, shot.trail.after)
+        trail = self._trail(followed, shot.middle, followed.scale)
+        return trail._replace(polarity=np.zeros(self.shape, np.int8))
+
+    def _trail_at(self, followed: Followed, t: int, scale: float) -> NDArray[np.float32]:
+        return trail_at(followed.newest, t, (scale, *self._trail_heights))
+
+    @property
+    def _trail_heights(self) -> tuple[float, float]:
+        height = self.settings.events.trail
+        return height * self.on, height * self.off
+
+    def _silent_change(self, segment: BridgedSegment) -> Floats:
+        return silent_change(segment, self.noise.quantisation_variance, self.on * self.off)
+
+    def _drifting(
+        self, segment: BridgedSegment, memory: BridgeMemory, second: Latent, on: Floats, off: Floats
+    ) -> tuple[BridgedSegment, Floats, Floats]:
+        """The segment with what its pixels may drift (K10), and the counts since they were measured, at its end."""
+        far = memory.far_on, memory.far_off
+        grown, far_on, far_off = bridge.drift(
+            memory.latent, second, memory.thresholds, self.noise, far, (on, off)
+        )
+        if segment.silent_change is not None:
+            q0 = self.noise.quantisation_variance
+            forget_silence(grown, segment, second, (on, off), segment.silent_change, q0)
+        if second.ceiling is not None:
+            black = np.isfinite(second.ceiling)
+            grown[black] = second.variance[black] / (_BLACK_FRAMES * (_BLACK_FRAMES + 1))
+        segment = segment._replace(
+            drift=grown,
+            still_since=_still_since(memory, segment.start, memory.interval or USUAL_INTERVAL * 1e-6),
+        )
+        return segment, far_on, far_off
+
+    def _carried(self, memory: BridgeMemory, shot: Shot) -> Latent:
+        """The latest frame, ``shot``, from the middle to the end of its exposure, with the events between (10)."""
+        step = self.on * memory.thresholds.on * memory.on - self.off * memory.thresholds.off * memory.off
+        scale = memory.followed.scale
+        step += self._trail_at(memory.followed, shot.end, scale)
+        step -= self._trail_at(memory.at_middle, shot.middle, scale)
+        return Latent(
+            memory.latent.value + step,
+            memory.latent.variance + self.noise.step_variance * (memory.on + memory.off),
+            None if memory.latent.ceiling is None else memory.latent.ceiling + step,
+        )
+
+    def begin(self, segment: Any, state: State) -> akf_bridged.Cursor:
+        spare, self._spare = self._spare, None
+        return akf_bridged.begin(segment, state, spare)
+
+    def advance(self, segment: Any, cursor: akf_bridged.Cursor, events: EventArray) -> None:
+        settings = self.settings.events
+        noise = akf_bridged.Noise(settings.background_rate, settings.step_noise, self.on * self.off)
+        akf_bridged.advance(segment, cursor, events, noise)
+
+    def read(self, segment: Any, cursor: akf_bridged.Cursor, t: int) -> tuple[Floats, Floats]:
+        return akf_bridged.read(segment, cursor, t)
+
+    def end(self, segment: Any, cursor: akf_bridged.Cursor) -> State:
+        state = akf_bridged.end(segment, cursor)
+        self._spare = cursor
+        return state
+
+    def moving(self, segment: Any, cursor: akf_bridged.Cursor) -> NDArray[np.bool_]:
+        return akf_bridged.moving_pixels(segment, cursor)
+
+    def trail(self, segment: Any, cursor: akf_bridged.Cursor, t: int) -> NDArray[np.float32] | None:
+        return akf_bridged.trail_ahead(segment, cursor, t)
+
+    def unshown(self, segment: BridgedSegment, variance: Floats, prior: float) -> Unshown | None:
+        if segment.unshown is None:
+            return None
+        return expected_excess(segment.unshown, variance, self.settings.filter.initial_variance, prior)
+
+    def silent_change(self, segment: BridgedSegment) -> Floats | None:
+        return segment.silent_change
+
+    def around(self, segment: BridgedSegment, t: int) -> Around:
+        assert segment.events is not None
+        share = (t - segment.start) / (segment.end - segment.start)
+        between = 4.0 * share * (1.0 - share)
+        second = segment.backward_variance
+        if segment.bound is not None and segment.bound.ceiling is not None:
+            second = np.where(np.isfinite(segment.bound.ceiling), np.float32(bridge.REPEATED), second)
+        return Around(
+            segment.forward_variance,
+            second,
+            segment.events,
+            coming=(1.0 - share) * self.noise.step_variance,
+            counted=0.0,
+            quantisation_variance=self.noise.quantisation_variance,
+            repeated=1.0 - between / 2.0,
+            wrong=WRONG_STEPS * between * self.on * self.off,
+        )
+
+
+def _still_since(memory: BridgeMemory, start: int, seconds: float) -> int:
+    """One frame interval before a segment, but not before the first exposure, us."""
+    return max(start - round(seconds * 1e6), memory.since)
+
+
+def latent_frame(
+    levels: NDArray[np.integer[Any]],
+    level_log: Array,
+    level_variance: Array,
+    exposure: Exposure,
+    *,
+    duration: int,
+    event_variance: float,
+) -> Latent:
+    """A frame without blur at the middle of its exposure, and its variance (K3).
+
+    A pixel whose mean is below white is measured, however bright it was for a part of the exposure: a sensor adds up
+    light and clips the sum.
+
+    Parameters
+    ----------
+    levels
+        (H, W) the level of every pixel.
+    level_log, level_variance
+        (N,) log(I + I_0) of each level, and its variance; `UNMEASURED` where clipped.
+    exposure
+        EDI, from `deblur.expose`.
+    duration
+        Of the exposure, us.
+    event_variance
+        What each event of the exposure adds to the variance.
+    """
+    latent = apart(2, (levels.size,))
+    scalars = np.float32(duration), np.float32(event_variance)
+    tables = level_log.astype(np.float32), level_variance.astype(np.float32)
+    _latent_frame(levels.reshape(-1), *tables, exposure, *scalars, *latent)
+    return Latent(*latent.reshape(2, *levels.shape))
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _latent_frame(  # type: ignore[no-untyped-def]
+    levels, level_log, level_variance, exposure, duration, event_variance, value, variance
+):
+    unmeasured = np.float32(bridge.UNMEASURED)
+    fields = np.empty((EXPOSURE_FIELDS, EXPOSED), np.float32)
+    middle, events = np.empty(EXPOSED, np.float32), np.empty(EXPOSED, np.float32)
+    log_frame, known = np.empty(EXPOSED, np.float32), np.empty(EXPOSED, np.float32)
+    for block in range(np.uint64(len(exposure.touched))):
+        relative_levels(exposure, block, duration, fields, middle, events)
+        first = block * np.uint64(EXPOSED)
+        count = min(np.uint64(len(levels)) - first, np.uint64(EXPOSED))
+        for i in range(count):  # looking up is no vector code, the rest is
+            log_frame[i] = level_log[levels[first + i]]
+            known[i] = level_variance[levels[first + i]]
+        for i in range(count):
+            value[first + i] = log_frame[i] + middle[i]
+        for i in range(count):
+            doubt = known[i] + event_variance * events[i]
+            variance[first + i] = min(doubt, unmeasured)

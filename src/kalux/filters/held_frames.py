@@ -1,0 +1,66 @@
+"""The complementary filter's way from frame to frame: each frame is held until the next."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux.events import EventArray
+from kalux.filters import complementary
+from kalux.filters.akf import State
+from kalux.filters.method import FAR_FUTURE, Chunks, CommonMethod, Segment
+from kalux.filters.shots import Shot
+from kalux.models.camera import (
+    log_intensity,
+)
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.floating[Any]]
+
+
+class HeldFrames(CommonMethod):
+    """The complementary filter on held frames: each from the middle of its exposure, or its end if causal."""
+
+    def node(self, shot: Shot) -> int:
+        return shot.middle if self.lookahead else shot.end
+
+    begin_time = node
+
+    def needed_until(self, shot: Shot) -> int:
+        return shot.end
+
+    def start(self, shot: Shot, events: Chunks) -> tuple[None, None, State]:
+        return None, None, self._state(self.frame(shot))
+
+    def frame(self, shot: Shot) -> Floats:
+        """log(I + I_0), (H, W) float32."""
+        log_frame: Floats = log_intensity(shot.level_intensity, self.offset).astype(np.float32)[shot.levels]
+        return log_frame
+
+    def segment(
+        self, memory: None, shot: Shot, following: Shot | None, events: Chunks
+    ) -> tuple[Segment, None]:
+        end = FAR_FUTURE if following is None else self.node(following)
+        gain = np.full(self.shape, 2 * np.pi * self.settings.filter.cutoff, np.float32)
+        if shot.valid is not None:
+            gain[~shot.valid] = 0.0
+        held = complementary.HeldSegment(self.node(shot), end, self.frame(shot), gain, self.on, self.off)
+        return held, None
+
+    def begin(self, segment: Any, state: State) -> complementary.Cursor:
+        return complementary.begin(segment, state.log_intensity)
+
+    def advance(self, segment: Any, cursor: complementary.Cursor, events: EventArray) -> None:
+        complementary.advance(segment, cursor, events)
+
+    def read(self, segment: Any, cursor: complementary.Cursor, t: int) -> tuple[Floats, Floats]:
+        return complementary.read(segment, cursor, t), np.full(self.shape, np.inf, np.float32)
+
+    def end(self, segment: Any, cursor: complementary.Cursor) -> State:
+        return self._state(complementary.read(segment, cursor, segment.end))
+
+    def _state(self, log_intensity: Floats) -> State:
+        """It has neither a variance nor a memory of events."""
+        return State(log_intensity, np.empty(0), np.empty(0, np.int64))

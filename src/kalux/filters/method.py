@@ -1,0 +1,144 @@
+"""What every method of driving a filter from frame to frame can be asked.
+
+A method cuts time at one moment per frame, its ``node``. Between two nodes lies a segment, whose augmentation
+follows from the frames at both ends and the events in between; a memory value carries what later segments need.
+`kalux.Reconstructor` is the only caller. The methods are `bridged_frames`, `interpolated_frames` and `held_frames`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux.augmentation.deblur import (
+    all_between,
+    count_chunks,
+)
+from kalux.augmentation.highlights import Unshown
+from kalux.events import EventArray
+from kalux.filters.akf import State
+from kalux.filters.shots import Shot
+from kalux.filters.uncertainty import Around
+from kalux.models.camera import (
+    log_intensity,
+)
+from kalux.settings import Settings
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.floating[Any]]
+
+Chunks = Sequence[EventArray]
+"""Events in time order, in a few arrays."""
+
+USUAL_INTERVAL: Final = 40_000
+"""us between frames, over which the information of the first one is spread until a second one is known."""
+
+FAR_FUTURE: Final = 1 << 61
+"""End of a segment that has no next frame, us."""
+
+
+class Segment(Protocol):
+    """What all segments have: their span in us."""
+
+    @property
+    def start(self) -> int: ...
+    @property
+    def end(self) -> int: ...
+
+
+class Method(Protocol):
+    """One way to filter. Memory, segments and cursors are values of the method's own; only it looks inside."""
+
+    lookahead: bool
+
+    def node(self, shot: Shot) -> int:
+        """The moment, us, at which a frame's segment begins."""
+
+    def begin_time(self, shot: Shot) -> int:
+        """The first moment, us, that can be read when ``shot`` is the first frame."""
+
+    def needed_until(self, shot: Shot) -> int:
+        """Events up to this time, us, are needed before the segment that ends at the frame is final."""
+
+    def start(self, shot: Shot, events: Chunks) -> tuple[Any, Segment | None, State]:
+        """From the first frame: memory, the segment before its node if there is one, and the first state."""
+
+    def segment(self, memory: Any, shot: Shot, following: Shot | None, events: Chunks) -> tuple[Segment, Any]:
+        """The segment from a frame to the next (None: not known, or none comes), and the memory after it.
+
+        ``events`` are those after the frame's node, as far as known.
+        """
+
+    def begin(self, segment: Any, state: State) -> Any:
+        """A cursor at the segment's start."""
+
+    def advance(self, segment: Any, cursor: Any, events: EventArray) -> None:
+        """Take the cursor over events, in place."""
+
+    def read(self, segment: Any, cursor: Any, t: int) -> tuple[Floats, Floats]:
+        """L and P at ``t``; P is infinite where the method has none."""
+
+    def end(self, segment: Any, cursor: Any) -> State:
+        """The state at the end of the segment. The cursor must not be used after it: its memory is."""
+
+    def moving(self, segment: Any, cursor: Any) -> NDArray[np.bool_] | None:
+        """(H, W): pixels with an event in this frame interval, also one to come, or the one before, or unmeasured."""
+
+    def silent_change(self, segment: Any) -> Floats | None:
+        """(H, W): `unseen.silent_change` of the segment; None: the method or the segment does not tell."""
+
+    def around(self, segment: Any, t: int) -> Around | None:
+        """What the two frames that a segment joins say of its pixels at ``t`` (K11); None: the method does not tell."""
+
+    def trail(self, segment: Any, cursor: Any, t: int) -> Floats | None:
+        """(H, W): how far the light is ahead of its events at ``t`` (K14); None: the method does not tell."""
+
+    def unshown(self, segment: Any, variance: Floats, prior: float) -> Unshown | None:
+        """Pixels that no frame has measured until then (K15), given P there; None: the method knows none.
+
+        ``prior`` is how far above their bounds they are expected where none around has told.
+        """
+
+
+class CommonMethod:
+    def __init__(
+        self, settings: Settings, thresholds: tuple[float, float], lookahead: bool, shape: tuple[int, int]
+    ) -> None:
+        self.settings, self.lookahead, self.shape = settings, lookahead, shape
+        self.on, self.off = thresholds
+        self.offset = settings.camera.offset
+
+    def moving(self, segment: Any, cursor: Any) -> NDArray[np.bool_] | None:
+        return None
+
+    def trail(self, segment: Any, cursor: Any, t: int) -> Floats | None:
+        return None
+
+    def silent_change(self, segment: Any) -> Floats | None:
+        return None
+
+    def around(self, segment: Any, t: int) -> Around | None:
+        return None
+
+    def unshown(self, segment: Any, variance: Floats, prior: float) -> Unshown | None:
+        return None
+
+    def log_frame(self, shot: Shot) -> Array:
+        log_frame: Array = log_intensity(shot.level_intensity, self.offset)[shot.levels]
+        return log_frame
+
+    def counts(self, events: Chunks, start: int, end: int) -> tuple[Floats, Floats]:
+        """Number of on and off events of every pixel with start < t <= end."""
+        return count_chunks(all_between(events, start, end), self.shape, weighed=True)
+
+    def unseen(self, shot: Shot) -> NDArray[np.bool_]:
+        """(H, W) bool: where the frame says nothing."""
+        return np.zeros(self.shape, bool) if shot.valid is None else ~shot.valid
+
+    def unseen_variance(self, shot: Shot) -> float:
+        """P of a pixel of which the first frame says nothing: it is distributed as the others are."""
+        seen = self.log_frame(shot)[shot.valid]
+        return max(self.settings.filter.initial_variance, float(np.var(seen)) if seen.size else 0.0)

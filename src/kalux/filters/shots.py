@@ -1,0 +1,202 @@
+"""A frame as the filters see it: linear intensity, weights, and what is clipped or black; in grey or in colour."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux.augmentation.trail import (
+    FrameTrail,
+)
+from kalux.errors import SettingsError
+from kalux.frames import Frame
+from kalux.models import colour
+from kalux.models.camera import (
+    Camera,
+    black_ceiling,
+    inverse_response,
+)
+
+Array = NDArray[np.float64]
+
+
+class Shot(NamedTuple):
+    """A frame as the filters see it: what each of its levels says, so that functions of it are taken once per level.
+
+    Attributes
+    ----------
+    start, middle, end
+        Of the exposure, us.
+    levels
+        (H, W) whole numbers: which level a pixel has. Frames of floating point have one per pixel.
+    level_intensity
+        (N,) I of equation (3) at the reference exposure; 1 = a saturated pixel there.
+    level_weight
+        (N,) f^w of the response.
+    level_clipped
+        (N,) bool: saturated, so that the value is no measurement.
+    white
+        Intensity of a saturated pixel of this frame: the reference exposure over the frame's own.
+    level_ceiling
+        (N,) the most that I can be at levels that are black; inf at others.
+    chroma, chroma_weight
+        Of a frame in RGB: (H, W, 3) float32 ratio of each channel to the luminance, and (H, W) how reliable it is, 0
+        where a channel is clipped to 1; else None.
+    valid
+        (H, W) bool: where the frame says anything at all; None: everywhere.
+    trail
+        Backward in time: how far the light is ahead of its events at the middle (K14).
+    """
+
+    start: int
+    middle: int
+    end: int
+    levels: NDArray[np.integer[Any]]
+    level_intensity: Array
+    level_weight: Array
+    level_clipped: NDArray[np.bool_]
+    white: float
+    level_ceiling: Array
+    chroma: NDArray[np.float32] | None = None
+    chroma_weight: NDArray[np.float32] | None = None
+    valid: NDArray[np.bool_] | None = None
+    trail: FrameTrail | None = None
+
+    @property
+    def intensity(self) -> Array:
+        """(H, W) I."""
+        intensity: Array = self.level_intensity[self.levels]
+        return intensity
+
+    @property
+    def weight(self) -> Array:
+        """(H, W) f^w."""
+        weight: Array = self.level_weight[self.levels]
+        return weight
+
+    @property
+    def clipped(self) -> NDArray[np.bool_]:
+        """(H, W) bool."""
+        clipped: NDArray[np.bool_] = self.level_clipped[self.levels]
+        return clipped
+
+
+_CLIPPED_SHARE: Final = 0.2
+"""A clipped channel with a smaller share of the luminance (the blue of a sky) is an error of that share where it is
+twice as bright as it can show: as little as a few events are off."""
+
+_CHROMA_FLOOR: Final = 0.006
+"""Noise of a pixel, white = 1, below which a ratio of channels says nothing; `CameraSettings.usual_frame_noise`."""
+
+
+def take_shot(
+    frame: Frame, camera: Camera, reference_exposure: float, gains: colour.Gains = (1.0, 1.0, 1.0)
+) -> Shot:
+    """Invert the response (3), scale to the reference exposure, weigh (5) and mark what is clipped.
+
+    ``gains`` is the white balance of frames in RGB, of which the luminance is taken; mosaics are filtered as recorded.
+
+    Raises
+    ------
+    SettingsError
+        If the camera has a response per colour and the frame is grey.
+    """
+    ratio = reference_exposure / frame.exposure
+    if frame.image.ndim == 3:
+        return _colour_shot(frame, camera, ratio, gains)
+    levels, response, intensity, weight, ceiling = _leveled(frame, camera, ratio)
+    return Shot(
+        start=frame.exposure_start,
+        middle=frame.middle,
+        end=frame.exposure_end,
+        levels=levels,
+        level_intensity=intensity,
+        level_weight=weight,
+        level_clipped=response >= camera.saturation,
+        white=ratio,
+        level_ceiling=ceiling,
+        valid=frame.valid,
+    )
+
+
+class _Leveled(NamedTuple):
+    """Which level every pixel has, and of every level its response, I, f^w and, where black, the most it can be."""
+
+    levels: NDArray[np.integer[Any]]
+    response: Array
+    intensity: Array
+    weight: Array
+    ceiling: Array
+
+
+def _leveled(frame: Frame, camera: Camera, ratio: float) -> _Leveled:
+    """The levels of a grey frame or a mosaic; where colours have responses of their own, theirs follow each other."""
+    levels: NDArray[np.integer[Any]]
+    if frame.image.dtype.kind == "f":
+        levels = np.arange(frame.image.size, dtype=np.int32).reshape(frame.image.shape)
+        response = frame.normalised().ravel()
+    else:
+        levels = frame.image.copy()  # the caller's memory may be filled again
+        values = np.arange(int(levels.max(initial=0)) + 1, dtype=levels.dtype)
+        response = Frame(values, 0, 1, frame.white).normalised()
+    if camera.colours is None:
+        return _Leveled(levels, response, *_by_response(camera, response, ratio))
+    if frame.mosaic is None:
+        raise SettingsError("response: three responses are for frames in colour or mosaics; these are grey")
+    levels = levels.astype(np.int32)
+    for row, column in np.ndindex(2, 2):
+        levels[row::2, column::2] += "RGB".index(frame.mosaic[2 * row + column]) * len(response)
+    of_colours = zip(*(_by_response(camera.of_channel(c), response, ratio) for c in range(3)), strict=True)
+    return _Leveled(levels, np.tile(response, 3), *(np.concatenate(values) for values in of_colours))
+
+
+def _by_response(camera: Camera, response: Array, ratio: float) -> tuple[Array, Array, Array]:
+    return (
+        inverse_response(camera, response, ratio),
+        camera.weight(np.clip(response, 0.0, 1.0)),
+        black_ceiling(camera, response, ratio),
+    )
+
+
+def _colour_shot(frame: Frame, camera: Camera, ratio: float, gains: colour.Gains) -> Shot:
+    """The luminance of an RGB frame, and its chromaticity (docs/colour.md).
+
+    Errors of the channels are taken as common to them, as demosaicing and compression make them: standard deviations
+    add. A pixel is clipped where clipped channels carry more than `_CLIPPED_SHARE` of the luminance.
+    """
+    parts = [_channel(frame, camera, ratio, c) for c in range(3)]
+    rgb = np.stack([gain * part[0] for gain, part in zip(gains, parts, strict=True)], axis=-1)
+    y = colour.luminance(rgb)
+    shares = [w * g for w, g in zip(colour.LUMINANCE, gains, strict=True)]
+    spread = sum(s / np.sqrt(np.maximum(part[1], 1e-6)) for s, part in zip(shares, parts, strict=True))
+    of_clipped = sum(s * part[0] * part[2] for s, part in zip(shares, parts, strict=True))
+    brightest = np.max(frame.image, axis=-1) / frame.white_value
+    room = max(camera.saturation - colour.RELIABLE, 1e-6)
+    return Shot(
+        start=frame.exposure_start,
+        middle=frame.middle,
+        end=frame.exposure_end,
+        levels=np.arange(y.size, dtype=np.int32).reshape(y.shape),
+        level_intensity=y.ravel(),
+        level_weight=(1 / np.square(spread)).ravel(),
+        level_clipped=(of_clipped > _CLIPPED_SHARE * np.maximum(y, 0)).ravel(),
+        white=ratio,
+        level_ceiling=colour.luminance(
+            np.stack([g * part[3] for g, part in zip(gains, parts, strict=True)], -1)
+        ).ravel(),
+        chroma=colour.chromaticity(rgb, _CHROMA_FLOOR * ratio),
+        chroma_weight=np.clip((camera.saturation - brightest) / room, 0, 1).astype(np.float32),
+        valid=frame.valid,
+    )
+
+
+def _channel(
+    frame: Frame, camera: Camera, ratio: float, channel: int
+) -> tuple[Array, Array, NDArray[np.bool_], Array]:
+    """I, f^w, clipped, and the most that black can be, of one channel of an RGB frame, (H, W)."""
+    own = dataclasses.replace(frame, image=np.ascontiguousarray(frame.image[..., channel]))
+    levels, response, intensity, weight, ceiling = _leveled(own, camera.of_channel(channel), ratio)
+    return intensity[levels], weight[levels], (response >= camera.saturation)[levels], ceiling[levels]
