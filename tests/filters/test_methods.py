@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 
 from kalux import PRESETS, Frame, Reconstructor
-from kalux.augmentation.bridge import UNMEASURED, UNSEEN, Latent, floor_before, lift
+from kalux.augmentation.bridge import (
+    UNMEASURED,
+    UNSEEN,
+    BridgeNoise,
+    Latent,
+    bridge,
+    lift,
+    nominal_thresholds,
+)
 from kalux.events import make_events
 from kalux.filters.methods import make_method
 from kalux.filters.shots import take_shot
@@ -124,8 +132,12 @@ def test_a_masked_pixel_is_no_bound():
     level = np.full((1, 3), -1.0)
     lift(level, frame)
     np.testing.assert_array_equal(level, [[-1.0, 0.0, -1.0]])
-    floor = floor_before(frame, np.full((1, 3), 0.5), np.ones((1, 3), bool))
-    np.testing.assert_array_equal(floor, [[-np.inf, -0.5, -np.inf]])
+    unmeasured, nothing = Latent(level, np.full((1, 3), UNMEASURED)), np.zeros((1, 3))
+    noise = BridgeNoise(0.2, 0.2, 0.008, 0.02)
+    segment, _ = bridge(
+        unmeasured, frame, nothing, nothing, nominal_thresholds((1, 3), 0.1), noise, 0, 40_000, nothing + 0.5
+    )
+    np.testing.assert_array_equal(segment.floor, [[-np.inf, -0.5, -np.inf]])
 
 
 # --- black ----------------------------------------------------------------------------------------------

@@ -97,10 +97,10 @@ class BridgedSegment(NamedTuple):
     R = 1 / (rate (1/forward + 1/backward)), ``rate`` in 1/s, where ``forward`` is ``forward_variance`` and
     ``step_variance`` for each event since the start, and ``backward`` is ``backward_variance`` and ``step_variance``
     for each of the ``events`` still to come (None: not known, and none are counted). ``net`` is what all events add to
-    the level, and what the light grows by besides (None: not known). At ``start`` the level is ``floor`` or more where
-    that is known (K7; None: nowhere): of what no frame measures then, but a clipped one bounds at the end. At ``end`` the pixel obeys the frame ``bound`` (`lift`), and its
-    variance grows by ``drift``, what its thresholds may have been wrong by (`drift`; None: nothing). Pixels without an
-    event after ``still_since`` are still.
+    the level, and what the light grows by besides (None: not known). At ``start`` the level is ``floor`` or more (K7;
+    None: no bound), which of a pixel that no frame measures then is what a clipped frame says of it at the end. At
+    ``end`` the pixel obeys the frame ``bound`` (`lift`), and its variance grows by ``drift``, what its thresholds may
+    have been wrong by (`drift`; None: nothing). Pixels without an event after ``still_since`` are still.
     Beyond what L^A and the state say here, the level is ahead of its newest event by ``trail`` (K14; None: it is not).
     ``unshown`` is of the pixels that no frame has measured until ``end``, or ``start`` in causal mode.
     ``silent_change`` is what silent pixels around each change from one frame to the next (`unseen`; None: not known).
@@ -245,8 +245,9 @@ def bridge(
     """
     seconds = (end - start) * 1e-6
     shape = first.value.shape
-    planes = tuple(apart(11, shape, first.value.dtype))
-    augmented, slope, step_on, step_off, events, net, floor, *factors = planes
+    planes = tuple(apart(7, shape, first.value.dtype))
+    augmented, slope, step_on, step_off, events, net, floor = planes
+    factors = tuple(apart(4, shape, first.value.dtype))  # needed for longer
     segment = BridgedSegment(
         start=start,
         end=end,
@@ -264,18 +265,18 @@ def bridge(
         net=net,
     )
     more = np.zeros(shape, first.value.dtype) if grown is None else grown
-    _bridge(*first[:2], *second[:2], on, off, more, thresholds, noise, seconds, planes)
+    _bridge(*first[:2], *second[:2], on, off, more, thresholds, noise, seconds, planes, factors)
     return segment, Thresholds(*factors)
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _bridge(  # type: ignore[no-untyped-def]
-    value, variance, next_value, next_variance, on, off, grown, thresholds, noise, seconds, planes
+    value, variance, next_value, next_variance, on, off, grown, thresholds, noise, seconds, planes, factors
 ):
-    """Fill ``planes``; in float64, whatever the arrays' type."""
+    """Fill ``planes`` and ``factors``; in float64, whatever the arrays' type."""
     low, high = _SCALE_BOUNDS
-    augmented, slope, step_on, step_off, events, net, floor = planes[:7]
-    new_on, new_off, new_on_variance, new_off_variance = planes[7:]
+    augmented, slope, step_on, step_off, events, net, floor = planes
+    new_on, new_off, new_on_variance, new_off_variance = factors
     height, width = on.shape
     told = np.empty(width)
     for row in range(height):  # three loops each: one over all these arrays is no vector code

@@ -140,7 +140,6 @@ def expose(
     nominal: tuple[float, float],
     *,
     weighed: bool,
-    spare: NDArray[np.void] | None = None,
 ) -> Exposure:
     """Take an exposure, from ``start`` to ``end`` (us), over its events.
 
@@ -152,11 +151,9 @@ def expose(
         (H, W) thresholds of an event of either polarity in units of the nominal ones, and these, log intensity.
     weighed
         Whether the events carry weights (`kalux.augmentation.refractory`).
-    spare
-        ``pixels`` of an exposure of the same size that is used no more, whose memory this one takes.
     """
     height, width = thresholds[0].shape
-    pixels = packed((height * width,), EXPOSURE_PIXEL) if spare is None else spare
+    pixels = packed((height * width,), EXPOSURE_PIXEL)
     touched = np.zeros(-(-len(pixels) // EXPOSED), np.bool_)
     inside = [event_words(events) for events in all_between(chunks, start, end)]
     for words in inside:
