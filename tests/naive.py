@@ -105,14 +105,13 @@ def event_sum(pixel, a, b, on, off):
 
 
 def edi(pixel, k, log_frame, on, off):
-    """EDI: (L^D(start), largest L^D in the exposure), straight from B + I_0 = 1/T int exp(L(t)) dt."""
+    """EDI: L^D(start), straight from B + I_0 = 1/T int exp(L(t)) dt."""
     s, e = pixel.starts[k], pixel.ends[k]
     inside = [(t, w * (on if p else -off)) for t, p, _, _, w in pixel.events if s < t <= e]
     edges = [s, *[t for t, _ in inside], e]
     levels = [0.0, *np.cumsum([step for _, step in inside])]  # after each event, also of several at one time
     mean = sum(np.exp(v) * (b - a) for v, a, b in zip(levels, edges[:-1], edges[1:], strict=True)) / (e - s)
-    start = log_frame - np.log(mean)
-    return start, start + max(levels)
+    return log_frame - np.log(mean)
 
 
 # The paper.
@@ -128,7 +127,7 @@ def paper(pixel, settings, times, on, off):
         for i, r in zip(pixel.intensity, r_bar, strict=True)  # (8)
     ]
     if fl.deblur:
-        start = [edi(pixel, k, log_frame[k], on, off)[0] for k in range(count)]
+        start = [edi(pixel, k, log_frame[k], on, off) for k in range(count)]
         end = [start[k] + event_sum(pixel, pixel.starts[k], pixel.ends[k], on, off) for k in range(count)]
     else:
         start, end = list(log_frame), list(log_frame)
@@ -271,8 +270,7 @@ def bridged(pixel, settings, times, on, off, scales):
             most = hidden_by_black * pixel.white[k]
             log_frame = np.log(np.sqrt(0.001 * most) + i0)
         a, b = on * scale_on, off * scale_off
-        start, peak = edi(pixel, k, log_frame, a, b) if settings.filter.deblur else (log_frame, log_frame)
-        middle = start
+        middle = edi(pixel, k, log_frame, a, b) if settings.filter.deblur else log_frame
         inside = 0
         if settings.filter.deblur:
             middle += event_sum(pixel, pixel.starts[k], pixel.middles[k], a, b)
@@ -284,8 +282,7 @@ def bridged(pixel, settings, times, on, off, scales):
         if crushed(k):
             variance = 3 * np.log((most + i0) / i0) ** 2 / 12
         variance += ev.deblur_variance * c2 * inside
-        clipped = pixel.clipped[k] or peak >= np.log(c.saturation * pixel.white[k] + i0)
-        return middle, UNMEASURED if clipped else variance
+        return middle, UNMEASURED if pixel.clipped[k] else variance
 
     def counts(a, b):
         inside = [(p, w) for t, p, *_, w in pixel.events if a < t <= b]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kalux.errors import ExposureError, FrameError
-from kalux.frames import Frame, check_frame, place_exposure
+from kalux.frames import Frame, Levels, check_frame, place_exposure
 
 
 def frame(start=100, end=200, dtype=np.uint8, shape=(3, 4), white=None, mosaic=None):
@@ -54,6 +54,49 @@ def test_colours():
 
 def check(one, **options):
     check_frame(one, (3, 4), where="here", index=7, **options)
+
+
+@pytest.mark.parametrize("white", [0, -1.0, np.nan, np.inf])
+def test_a_white_value_is_positive(white):
+    with pytest.raises(FrameError, match="frame 7 has the white value"):
+        check(frame(white=white))
+
+
+@pytest.mark.parametrize(
+    "times", [(0.01, 0.02), (100, np.nan), (100.5, 200), (100, None), (2 * 10**18, 3 * 10**18)]
+)
+def test_times_are_whole_microseconds(times):
+    """Seconds would otherwise pass as exposures of nothing."""
+    with pytest.raises(FrameError, match=r"frame 7 has an exposure from .* whole microseconds"):
+        check(frame(*times))
+
+
+@pytest.mark.parametrize("what", [np.ones((3, 4), np.uint8), Frame([[1, 2]], 0, 1), None])
+def test_what_is_no_frame_is_told(what):
+    with pytest.raises(FrameError, match=r"frame 7 is a .*; a kalux.Frame with a NumPy array is needed"):
+        check(what)
+
+
+@pytest.mark.parametrize(
+    ("values", "dtype", "white", "told"),
+    [
+        ((100, 1000), np.uint16, None, "--white 1023"),
+        ((100, 4080), np.uint16, None, "--white 4095"),
+        ((16383, 100), np.uint16, None, "--white 16383"),
+        ((100, 16384), np.uint16, None, None),
+        ((100, 4080), np.uint16, 4095, None),
+        ((0, 0), np.uint16, None, None),
+        ((10, 20), np.uint8, None, None),
+        ((0.5, 255.0), np.float32, None, "--white 255"),
+        ((0.5, 3.0), np.float32, None, None),
+    ],
+)
+def test_a_white_value_that_can_hardly_be_right_is_doubted(values, dtype, white, told):
+    frames = [Frame(np.full((2, 2), value, dtype), 0, 1, white) for value in values]
+    levels = Levels()
+    assert list(levels.watched(frames)) == frames
+    doubt = levels.doubt()
+    assert doubt is None if told is None else told in doubt
 
 
 def test_good_frames_pass():

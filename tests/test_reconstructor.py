@@ -558,6 +558,22 @@ def test_highlights_beyond_white_come_from_events():
     assert 1.0 < believed[1] < believed[0] <= 1.03 * np.exp(5 * 0.25)
 
 
+@both_modes
+def test_a_mean_below_white_is_measured_however_bright_the_pixel_was_meanwhile(lookahead):
+    """Twice white for a third of each exposure, a tenth of white else: a sensor clips the sum of the light."""
+    settings = altered(altered(PRESETS["default"], "camera", log_offset=0.004), "events", trail=0.0)
+    step = float(np.log(2.004 / 0.104)) / 12
+    live = Reconstructor((1, 1), settings=settings, lookahead=lookahead, contrast_threshold=step)
+    for start in (0, 40_000, 80_000):
+        live.push_frame(frame(round(255 * (2.0 + 0.1 + 0.1) / 3), start, start + 30_000))
+        live.push_events(pixel_events([start + 10_000] * 12, [1] * 12))
+        live.push_events(pixel_events([start + 20_000] * 12, [0] * 12))
+    live.finish()
+    read = live.read(95_000 if lookahead else 110_000)
+    assert read.variance[0, 0] < 0.5  # 1 and more where nothing is measured
+    assert read.intensity[0, 0] == pytest.approx(2.0 if lookahead else 0.1, rel=0.1)
+
+
 @pytest.mark.parametrize(
     ("image", "white"),
     [

@@ -107,6 +107,42 @@ def test_open_refuses_what_it_does_not_know(tmp_path):
             recording.open(path)
 
 
+def test_a_white_value_that_is_given_is_that_of_all_frames(tmp_path):
+    deep = [Frame(np.full(SIZE, 2048, np.uint16), t, t + 10) for t in (0, 20)]
+    path = tmp_path / "deep.h5"
+    hdf5.write(path, sensor_size=SIZE, events=[], frames=deep)
+    assert [f.white_value for f in recording.open(path).frames()] == [65535, 65535]
+    assert [f.normalised().max() for f in recording.open(path, white=4096).frames()] == [0.5, 0.5]
+    for white in (0, -1, np.nan):
+        with pytest.raises(InputError, match="the value of a saturated pixel is needed"):
+            recording.open(path, white=white)
+
+
+@pytest.mark.parametrize("size", [(0, 5), (-3, 5), (4.5, 5), 5, (1, 2, 3), "ab"])
+def test_impossible_sensor_sizes_are_refused(size):
+    with pytest.raises(InputError, match=r"sensor_size is .*; \(height, width\) in pixels is needed"):
+        recording.Recording.from_arrays([], [], sensor_size=size)
+
+
+@pytest.mark.parametrize(
+    ("make", "told"),
+    [
+        (lambda path: path.touch(), "an empty file, not a recording"),
+        (lambda path: path.mkdir(), "an empty folder, not a recording"),
+        (lambda path: (path.mkdir(), (path / "0.png").touch()), "a folder of images, which --frames takes"),
+    ],
+)
+def test_what_is_no_recording_is_named(tmp_path, make, told):
+    make(tmp_path / "it")
+    with pytest.raises(FormatError, match=told):
+        recording.open(tmp_path / "it")
+
+
+def test_a_name_that_is_too_long_is_an_input_error(tmp_path):
+    with pytest.raises(InputError, match="File name too long"):
+        recording.open(tmp_path / ("a" * 300))
+
+
 def test_empty_files_are_refused(tmp_path):
     for suffix in (".aedat4", ".mat", ".h5", ".zip"):
         path = tmp_path / f"empty{suffix}"

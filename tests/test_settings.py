@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -111,9 +112,26 @@ def test_what_is_usual_is_assumed_where_nothing_is_set():
 
 def test_unknown_preset():
     with pytest.raises(
-        SettingsError, match=r"'iccv2022'; known are default, davis240c, .*, iccv2021, iccv2021-flir, cf"
+        SettingsError,
+        match=r"'iccv2022', did you mean iccv2021.; known are default, davis240c, .*, iccv2021, iccv2021-flir, cf",
     ):
         preset("iccv2022")
+
+
+def test_a_preset_that_is_nearly_right_is_named():
+    with pytest.raises(SettingsError, match="did you mean davis346"):
+        preset("davis364")
+
+
+def test_files_that_are_no_text_are_refused(tmp_path):
+    (tmp_path / "bytes").write_bytes(b"[camera]\n\xff")
+    for name, told in (
+        ("bytes", "byte 9 is not UTF-8 text"),
+        ("absent", "cannot be read: No such file"),
+        (".", "Is a"),
+    ):
+        with pytest.raises(SettingsError, match=told):
+            load(tmp_path / name, DEFAULT)
 
 
 def test_settings_cannot_be_changed_in_place():
@@ -180,7 +198,15 @@ def test_none_is_auto_in_files():
     [
         ("[sensor]\nx = 1", r"unknown group \[sensor\]; known are camera, events, filter"),
         ("camera = 3", "camera is not a table"),
-        ("[camera]\nlog_ofset = 1", "unknown setting camera.log_ofset; known are .*log_offset"),
+        (
+            "[camera]\nlog_ofset = 1",
+            "setting camera.log_ofset, did you mean log_offset.; known are .*log_offset",
+        ),
+        ("[camera]\nlog-offset = 1", "camera.log-offset, did you mean log_offset"),
+        ("[camera]\nbrightness = 1", "unknown setting camera.brightness; known are"),
+        ("[camra]\nlog_offset = 1", r"unknown group \[camra\], did you mean camera"),
+        ("log_offset = 1", r"log_offset is a setting of \[camera\] and has to follow that line"),
+        ("preset = 'cf'", "a preset is given by --preset"),
         ("[camera]\nlog_offset = '1'", "camera.log_offset is '1'; a finite number is needed"),
         ("[camera]\nlog_offset = true", "camera.log_offset is True; a finite number is needed"),
         ("[camera]\nlog_offset = nan", "camera.log_offset is nan; a finite number is needed"),
@@ -215,13 +241,6 @@ def test_a_missing_file(tmp_path):
         load(tmp_path / "none.toml", DEFAULT)
 
 
-def test_a_file_that_is_not_text(tmp_path):
-    path = tmp_path / "image.toml"
-    path.write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(SettingsError, match="cannot be read"):
-        load(path, DEFAULT)
-
-
 @pytest.mark.parametrize(("group", "name"), NUMBERS)
 @pytest.mark.parametrize("value", [-1.0, float("nan"), float("inf"), "0.1", True])
 def test_every_number_is_checked(group, name, value):
@@ -250,3 +269,14 @@ def test_settings_errors_are_input_errors():
 def test_a_response_that_does_not_exist_is_found_before_any_frame():
     with pytest.raises(SettingsError, match="unknown response 'log'"):
         Reconstructor((2, 2), settings=altered(DEFAULT, "camera", response="log"))
+
+
+def test_every_setting_is_explained():
+    text = (Path(__file__).parents[1] / "docs" / "tuning.md").read_text(encoding="utf-8")
+    missing = [
+        f"{group}.{field.name}"
+        for group, kind in GROUPS.items()
+        for field in dataclasses.fields(kind)
+        if f"`{group}.{field.name}`" not in text
+    ]
+    assert missing == []

@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.errors import EventError
+from kalux.errors import EventError, InputError
 
 EVENT_DTYPE: Final = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "?")], align=True)
 """Dtype of an event: ``t`` int64 microseconds, ``x`` column and ``y`` row (uint16, 0-based), ``p`` bool,
@@ -98,6 +98,25 @@ def as_events(data: Any, *, columns: str | None = None, time_unit: str | None = 
         scale = _TIME_UNITS[time_unit]
         t = t.astype(np.int64) * int(scale) if scale >= 1 else t.astype(np.int64) // round(1 / scale)
     return make_events(t, found["x"], found["y"], found["p"])
+
+
+def checked_size(sensor_size: tuple[int, int]) -> tuple[int, int]:
+    """(height, width) as whole, positive numbers.
+
+    Raises
+    ------
+    InputError
+        If it is anything else.
+    """
+    try:
+        height, width = sensor_size
+        whole = (int(height), int(width))
+        fine = whole == (height, width) and min(whole) > 0
+    except (TypeError, ValueError):
+        fine = False
+    if not fine:
+        raise InputError(f"sensor_size is {sensor_size}; (height, width) in pixels is needed")
+    return whole
 
 
 def check_events(

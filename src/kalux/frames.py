@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, Final, Literal, get_args
 
@@ -18,6 +19,13 @@ Mosaic = Literal["RGGB", "BGGR", "GRBG", "GBRG"]
 """A Bayer pattern: the colours of the upper left 2x2 pixels, by rows."""
 
 MOSAICS: Final[tuple[Mosaic, ...]] = get_args(Mosaic)
+
+
+_LATEST: Final = 10**18
+"""us, 32 000 years: what later sums of times still have room for in an int64."""
+
+_LARGE_FLOAT: Final = 16.0
+"""Of frames in floats: more than a camera's highlights in units of white can be expected to have."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +122,15 @@ def check_frame(
     ExposureError
         An exposure that is empty, or that begins before the previous one has ended.
     """
+    if not isinstance(frame, Frame) or not isinstance(frame.image, np.ndarray):
+        got = type(frame.image if isinstance(frame, Frame) else frame).__name__
+        raise FrameError(f"{where}: frame {index} is a {got}; a kalux.Frame with a NumPy array is needed")
     image = frame.image
+    _check_times(frame, where, index)
+    if frame.white is not None and not (np.isfinite(frame.white) and frame.white > 0):
+        raise FrameError(
+            f"{where}: frame {index} has the white value {frame.white}; the value of a saturated pixel is needed"
+        )
     if image.shape not in (sensor_size, (*sensor_size, 3)):
         size = "x".join(str(n) for n in (*image.shape[:2][::-1], *image.shape[2:]))
         raise FrameError(
@@ -149,6 +165,57 @@ def check_frame(
         raise ExposureError(
             f"{where}: the exposure of frame {index} starts at {frame.exposure_start} us, before that of the "
             f"previous frame has ended ({previous.exposure_end} us); is the exposure time too long?"
+        )
+
+
+def _check_times(frame: Frame, where: str, index: int) -> None:
+    for time in (frame.exposure_start, frame.exposure_end):
+        whole = isinstance(time, (int, np.integer)) or (
+            isinstance(time, (float, np.floating)) and float(time).is_integer()
+        )
+        if not whole or not -_LATEST <= time <= _LATEST:
+            raise FrameError(
+                f"{where}: frame {index} has an exposure from {frame.exposure_start} to {frame.exposure_end}; whole "
+                "microseconds, at most 10^18, are needed"
+            )
+
+
+class Levels:
+    """Watches frames go by, and tells whether the white value that they state, or that their type has, can be right."""
+
+    def __init__(self) -> None:
+        self._frame: Frame | None = None
+        self._largest = 0.0
+
+    def watched(self, frames: Iterable[Frame]) -> Iterator[Frame]:
+        """The same frames."""
+        for frame in frames:
+            if frame.white is None and frame.image.dtype != np.uint8:
+                self._frame = frame
+                self._largest = max(self._largest, float(frame.image.max()))
+            yield frame
+
+    def doubt(self) -> str | None:
+        """What makes the white value doubtful, in one line; None if nothing does."""
+        if self._frame is None or not self._largest > 0:
+            return None
+        if self._frame.image.dtype.kind == "f":
+            return self._doubt_of_floats()
+        bits = next((bits for bits in (10, 12, 14) if self._largest < 1 << bits), None)
+        if bits is None:
+            return None
+        white = (1 << bits) - 1
+        return (
+            f"no pixel of the 16-bit frames is above {self._largest:.0f}, and 65535 is taken for white; if the camera "
+            f"has {bits} bits, give --white {white} (white={white})"
+        )
+
+    def _doubt_of_floats(self) -> str | None:
+        if self._largest < _LARGE_FLOAT:
+            return None
+        return (
+            f"pixels of the frames, which are floats, go up to {self._largest:g}, and 1 is taken for white; if they "
+            "are not in units of white, give the value of a saturated pixel, --white 255 (white=255)"
         )
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from kalux.events import EventArray
-from kalux.frames import Frame
+from kalux.frames import Frame, Levels
 from kalux.recording import Recording
 from kalux.settings import AUTO, Settings
 
@@ -119,6 +119,8 @@ class Description:
         Whether a mosaic is stored as RGB that was made of it.
     response
         Of the frame camera, as in `kalux.settings.CameraSettings`; None if the recording does not state it.
+    doubt
+        What makes the frames' white value doubtful, if anything does.
     """
 
     path: str
@@ -135,6 +137,7 @@ class Description:
     colours: str | None = None
     stored_in_rgb: bool = False
     response: str | None = None
+    doubt: str | None = None
 
 
 def describe(recording: Recording, *, estimated_threshold: tuple[float, float] | None = None) -> Description:
@@ -156,7 +159,10 @@ def describe(recording: Recording, *, estimated_threshold: tuple[float, float] |
     first = next(iter(recording.stamped_frames()), None)
     stored = next(iter(recording.stored_frames()), None)
     events = summarise_events(recording.events())
-    frames = summarise_frames(recording.stamped_frames(), exposure_known=recording.exposure_known)
+    levels = Levels()
+    frames = summarise_frames(
+        levels.watched(recording.stamped_frames()), exposure_known=recording.exposure_known
+    )
     return Description(
         path=str(source.path),
         format=source.format,
@@ -172,6 +178,7 @@ def describe(recording: Recording, *, estimated_threshold: tuple[float, float] |
         colours=None if first is None else first.colours,
         stored_in_rgb=stored is not None and stored.image.ndim == 3 and recording.mosaic is not None,
         response=recording.response,
+        doubt=levels.doubt(),
     )
 
 
@@ -269,6 +276,8 @@ def format_description(description: Description) -> str:
     if description.has_ground_truth:
         rows.append(("reference", "ground truth images are included"))
     rows += [("note", sentence) for sentence in description.missing]
+    if description.doubt is not None:
+        rows.append(("note", description.doubt))
     label_width = max(len(label) for label, _ in rows)
     return "\n".join([description.path, *(f"  {label:<{label_width}}  {text}" for label, text in rows)])
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from kalux import readers
 from kalux.compiled import event_column, event_row, event_words
 from kalux.errors import ExposureError, InputError
-from kalux.events import EventArray, as_events, check_events
+from kalux.events import EventArray, as_events, check_events, checked_size
 from kalux.frames import MOSAICS, Frame, Mosaic, Stamp, check_frame, place_exposure
 from kalux.models.colour import sample_mosaic
 from kalux.readers import CHUNK_EVENTS, GroundTruth, Source, joined
@@ -64,6 +64,8 @@ class Recording:
         Whether every frame has an exposure interval, from the file or from ``exposure``.
     mosaic
         The Bayer pattern of the sensor, from the file or as given; None: it has none, or none is known.
+    white
+        The value of a saturated pixel as given; None: what the frames say themselves.
     """
 
     def __init__(
@@ -73,9 +75,12 @@ class Recording:
         exposure: int | None = None,
         stamp: Stamp = "start",
         mosaic: Mosaic | Literal["none"] | None = None,
+        white: float | None = None,
     ) -> None:
-        if exposure is not None and exposure <= 0:
-            raise ExposureError(f"exposure is {exposure} us; it must be positive")
+        if exposure is not None and (exposure <= 0 or exposure != int(exposure)):
+            raise ExposureError(f"exposure is {exposure} us; it must be positive and whole")
+        if white is not None and not (np.isfinite(white) and white > 0):
+            raise InputError(f"white is {white}; the value of a saturated pixel is needed")
         if stamp not in ("start", "middle", "end"):
             raise InputError(f"stamp is {stamp!r}; it must be 'start', 'middle' or 'end'")
         if mosaic not in (None, "none", *MOSAICS):
@@ -84,6 +89,7 @@ class Recording:
         self.mosaic: Mosaic | None = source.mosaic if mosaic is None else None if mosaic == "none" else mosaic
         self.sensor_size = source.sensor_size
         self.exposure_known = source.exposure_known or exposure is not None
+        self.white = white
         self._exposure = exposure
         self._stamp: Stamp = stamp
 
@@ -122,9 +128,10 @@ class Recording:
 
         Raises
         ------
-        EventError, FrameError, ExposureError
+        EventError, FrameError, ExposureError, InputError
             At once, not only when iterated.
         """
+        size = checked_size(sensor_size)
         array = as_events(events, columns=columns, time_unit=time_unit)
         frame_list = list(frames)
         if isinstance(contrast_threshold, (int, float)):
@@ -138,7 +145,7 @@ class Recording:
             Source(
                 path=Path(name),
                 format="arrays",
-                sensor_size=(int(sensor_size[0]), int(sensor_size[1])),
+                sensor_size=size,
                 events=chunks,
                 frames=lambda: iter(frame_list),
                 count_events=lambda: len(array),
@@ -212,6 +219,8 @@ class Recording:
     def _checked_frames(self, *, as_stored: bool = False) -> Iterator[Frame]:
         previous = None
         for index, frame in enumerate(self.source.frames()):
+            if self.white is not None:
+                frame = dataclasses.replace(frame, white=self.white)
             if self._exposure is not None:
                 frame = place_exposure(frame, self._exposure, self._stamp)
             if not as_stored:
@@ -259,6 +268,7 @@ def open(
     frames_rate: float | None = None,
     replace_frames: bool = False,
     mosaic: Mosaic | Literal["none"] | None = None,
+    white: float | None = None,
 ) -> Recording:
     """Open a recording of any known format, recognised by its content.
 
@@ -281,6 +291,9 @@ def open(
     mosaic
         The Bayer pattern of the sensor, ``"RGGB"``, ``"BGGR"``, ``"GRBG"`` or ``"GBRG"``, where the recording does not
         state it or is wrong; ``"none"``: it has none. Frames in RGB then give every pixel its own channel back.
+    white
+        The value of a saturated pixel of the frames, where the recording does not state it: 4095 of 12 bits that are
+        stored in 16. Default: what the recording states, else the largest value of the type, 1 of floats.
 
     Raises
     ------
@@ -298,4 +311,4 @@ def open(
         raise InputError(
             "frames_start, frames_rate and replace_frames say what to do with frames; give frames"
         )
-    return Recording(source, exposure=exposure, stamp=stamp, mosaic=mosaic)
+    return Recording(source, exposure=exposure, stamp=stamp, mosaic=mosaic, white=white)

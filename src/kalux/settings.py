@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -284,7 +285,9 @@ def preset(name: str) -> Settings:
     try:
         return PRESETS[name]
     except KeyError:
-        raise SettingsError(f"preset: unknown preset {name!r}; known are {', '.join(PRESETS)}") from None
+        raise SettingsError(
+            f"preset: unknown preset {name!r}{_nearest(name, PRESETS)}; known are {', '.join(PRESETS)}"
+        ) from None
 
 
 def to_dict(settings: Settings) -> dict[str, dict[str, Any]]:
@@ -306,7 +309,7 @@ def from_dict(values: Mapping[str, Any], base: Settings) -> Settings:
     groups = {}
     for group, entries in values.items():
         if group not in ("camera", "events", "filter"):
-            raise SettingsError(f"settings: unknown group [{group}]; known are camera, events, filter")
+            raise SettingsError(f"settings: {_unknown_group(group, base)}; known are camera, events, filter")
         current = getattr(base, group)
         known = {entry.name for entry in dataclasses.fields(current)}
         if not isinstance(entries, Mapping):
@@ -314,7 +317,8 @@ def from_dict(values: Mapping[str, Any], base: Settings) -> Settings:
         for name in entries:
             if name not in known:
                 raise SettingsError(
-                    f"settings: unknown setting {group}.{name}; known are {', '.join(sorted(known))}"
+                    f"settings: unknown setting {group}.{name}{_nearest(name, known)}; known are "
+                    f"{', '.join(sorted(known))}"
                 )
         optional = {entry.name for entry in dataclasses.fields(current) if entry.default is None}
         chosen = {
@@ -322,6 +326,22 @@ def from_dict(values: Mapping[str, Any], base: Settings) -> Settings:
         }
         groups[group] = dataclasses.replace(current, **chosen)
     return dataclasses.replace(base, **groups)
+
+
+def _unknown_group(name: str, base: Settings) -> str:
+    """What is wrong with a table of this name, which may be a setting or a table without its group."""
+    for group in ("camera", "events", "filter"):
+        if name in {entry.name for entry in dataclasses.fields(getattr(base, group))}:
+            return f"{name} is a setting of [{group}] and has to follow that line"
+    if name == "preset":
+        return "a preset is given by --preset (preset=), not in the file"
+    return f"unknown group [{name}]{_nearest(name, ('camera', 'events', 'filter'))}"
+
+
+def _nearest(name: str, known: Iterable[str]) -> str:
+    """``", did you mean ...?"``, or nothing."""
+    near = difflib.get_close_matches(name.replace("-", "_"), known, 1)
+    return f", did you mean {near[0]}?" if near else ""
 
 
 def read_toml(
@@ -336,8 +356,10 @@ def read_toml(
     """
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise unreadable(f"{path}: cannot be read: {error}") from error
+    except OSError as error:
+        raise unreadable(f"{path}: cannot be read: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        raise damaged(f"{path}: not a TOML file: byte {error.start} is not UTF-8 text") from error
     except tomllib.TOMLDecodeError as error:
         raise damaged(f"{path}: not valid TOML: {error}") from error
 

@@ -254,7 +254,6 @@ def test_only_blocks_with_an_event_are_looked_at():
             np.array([0.01]),
             exposure,
             duration=1000,
-            white=1e9,
             event_variance=0.001,
         )[:2]
         steps = (ON * thresholds[0], OFF * thresholds[1])

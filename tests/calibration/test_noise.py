@@ -46,6 +46,14 @@ def test_the_rate_of_pure_noise(rate):
     assert found.rates.mean() == pytest.approx(rate, rel=0.1)
 
 
+def test_times_may_be_of_any_clock():
+    """Of 634 years: a float's step is then 4 us, and quiet time was once never spread to its end."""
+    events = noise_events(3.0, seconds=0.5)
+    found = event_noise(Recording.from_arrays(events, [], sensor_size=SIZE))
+    events["t"] += 2 * 10**16
+    assert event_noise(Recording.from_arrays(events, [], sensor_size=SIZE)).rate == pytest.approx(found.rate)
+
+
 def test_noise_beside_motion_is_not_much_overestimated():
     """Faint edges that make single events look like noise: an upper bound where everything moves."""
     found = event_noise(unlabelled(simulate(SCENE, SensorSettings(noise_rate=3.0))))

@@ -39,6 +39,16 @@ def test_contents():
     assert found.events_between == ((t >= start) & (t <= end)).sum()
 
 
+def test_events_in_another_unit_are_doubted():
+    """Of nanoseconds taken as microseconds a thousandth lies between the frames."""
+    late = STREAM.events.copy()
+    late["t"] = (late["t"] - late["t"][0]) * 1000 + late["t"][0]
+    found = check_recording(in_parts([late]), lambda count: None)
+    assert 0 < found.events_between < 0.1 * found.events
+    assert any("same unit and clock" in text for text in found.warnings())
+    assert not list(check_recording(WHOLE, lambda count: None).warnings())
+
+
 @pytest.mark.parametrize("threads", [1, 2])
 def test_both_results_come_back(threads):
     ran_in = []

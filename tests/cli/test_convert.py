@@ -320,6 +320,26 @@ class TestInterruptsHeld:
         assert done
 
 
+@pytest.mark.parametrize("suffix", [".h5", ".aedat4"])
+@pytest.mark.parametrize("length", [250, 300])
+def test_a_name_that_is_too_long_is_one_line(cli, recording, tmp_path, suffix, length):
+    """250 letters are allowed, but not for the temporary file beside."""
+    found = cli("convert", recording, tmp_path / ("a" * (length - len(suffix)) + suffix))
+    assert found.code == 2
+    assert found.err.endswith("File name too long\n")
+    assert "Traceback" not in found.err
+    assert not any(tmp_path.iterdir())
+
+
+def test_the_white_value_goes_into_the_copy(cli, write_recording, simulation, tmp_path):
+    deep = [dataclasses.replace(f, image=f.image.astype(np.uint16) << 4) for f in simulation.frames]
+    source = write_recording(tmp_path / "deep.h5", frames=deep)
+    assert "--white 4095" in cli("info", source, "--no-estimate").out
+    assert cli("convert", source, tmp_path / "copy.h5", "--white", 4095).code == 0
+    assert {frame.white_value for frame in kalux.open(tmp_path / "copy.h5").frames()} == {4095}
+    assert "--white" not in cli("info", tmp_path / "copy.h5", "--no-estimate").out
+
+
 @pytest.mark.parametrize(
     "name", ["newton_davis346.aedat4", "slider_depth", "hdr_pan/Oxford_Church_noisy.mat"]
 )

@@ -54,6 +54,25 @@ def test_every_setting_is_a_flag_with_its_default_and_text(cli):
         assert flag.text, f"{flag.key} is not explained in its docstring"
 
 
+def test_what_can_be_estimated_may_be_left_to_that(cli, recording, tmp_path):
+    """``auto``, as in TOML: over a settings file that says otherwise."""
+    assert "--camera.log-offset NUMBER  (default auto)" in cli("reconstruct", "--help-settings").out
+    (tmp_path / "fixed.toml").write_text("[camera]\nlog_offset = 0.25\n")
+    arguments = [
+        "reconstruct",
+        recording,
+        "-o",
+        tmp_path / "out",
+        "--settings",
+        tmp_path / "fixed.toml",
+        "--quiet",
+    ]
+    assert cli(*arguments, "--camera.log-offset", "auto", "--rate", "10").code == 0
+    assert "log_offset = 0.25" not in (tmp_path / "out" / "kalux.toml").read_text()
+    assert "'auto' is not a number" in cli(*arguments, "--events.trail", "auto").error
+    assert "'x' is not a number or auto" in cli(*arguments, "--camera.log-offset", "x").error
+
+
 def test_version(cli):
     assert cli("--version").out == f"kalux {kalux.__version__}\n"
 
@@ -62,7 +81,7 @@ def test_version(cli):
     ("arguments", "told"),
     [
         ([], "no command"),
-        (["reconstrct"], "'reconstrct'"),
+        (["reconstrct"], "'reconstrct', did you mean reconstruct?"),
         (["--fast"], "--fast"),
         (["info"], "still needed: REC"),
         (["info", "x", "--exposre", "3"], "did you mean --exposure?"),
@@ -128,6 +147,20 @@ def test_work_goes_on_when_nobody_reads_what_is_said(start_cli, recording, tmp_p
     assert "complete = true" in (tmp_path / "out" / "kalux.toml").read_text()
 
 
+@pytest.mark.parametrize("closed", [">&-", "2>&-", ">&- 2>&- <&-"])
+def test_closed_streams_are_no_error(recording, tmp_path, closed):
+    env = {**os.environ, "PYTHONPATH": os.path.dirname(os.path.dirname(kalux.__file__))}
+    command = f'exec "$0" -m kalux reconstruct "$1" -o "$2" --at frames --format npy {closed}'
+    done = subprocess.run(
+        ["sh", "-c", command, sys.executable, recording, tmp_path / "out"],
+        env=env,
+        capture_output=True,
+        text=True,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "complete = true" in (tmp_path / "out" / "kalux.toml").read_text()
+
+
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="this system has no /dev/full")
 def test_standard_output_that_is_full_is_told(recording):
     env = {**os.environ, "PYTHONPATH": os.path.dirname(os.path.dirname(kalux.__file__))}
@@ -142,6 +175,15 @@ def test_standard_output_that_is_full_is_told(recording):
         )
     assert done.returncode == 2
     assert done.stderr == "kalux: error: standard output: No space left on device\n"
+
+
+def test_an_interrupt_within_numba_is_an_interrupt(cli, recording, monkeypatch):
+    def interrupted(*arguments, **options):
+        raise SystemError("returned a result with an exception set") from KeyboardInterrupt()
+
+    monkeypatch.setattr(kalux, "open", interrupted)
+    found = cli("info", recording)
+    assert (found.code, found.err) == (130, "kalux: interrupted; what is finished is whole\n")
 
 
 class TestSignals:

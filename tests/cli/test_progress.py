@@ -15,11 +15,14 @@ def test_lines_where_there_is_no_terminal(capsys, monkeypatch):
     monkeypatch.setattr(progress, "LINE_EVERY", 0.0)
     with Progress("reconstructing", images=4) as shown:
         shown.add(events=1000)
-        shown.add(images=2)
+        shown.add(images=1)
+        shown.add(images=1)
     lines = capsys.readouterr().err.splitlines()
     assert lines[0].startswith("kalux: reconstructing: 0/4 images")
-    assert lines[1].startswith("kalux: reconstructing: 2/4 images")
-    assert lines[1].endswith("left")
+    assert lines[1].startswith("kalux: reconstructing: 1/4 images")
+    assert not lines[1].endswith("left")  # the first one compiles
+    assert lines[2].startswith("kalux: reconstructing: 2/4 images")
+    assert lines[2].endswith("left")
 
 
 def test_few_lines(capsys):
@@ -51,6 +54,8 @@ def test_quiet(capsys, monkeypatch):
 
 def test_texts():
     assert progress_text(30, 120, 6_000_000, 0, 2.0) == "30/120 images, 15 images/s, 3M events/s, 0:06 left"
+    started_slowly = progress_text(30, 120, 0, 0, 22.0, warm=(20.0, 1))
+    assert started_slowly == "30/120 images, 1.36 images/s, 0:06 left"
     assert progress_text(0, 0, 5_000_000, 0, 2.0) == "5M events, 2.5M events/s"
     assert [short_number(n) for n in (0.5, 12, 999.9, 12_345, 1e9)] == ["0.5", "12", "1k", "12.3k", "1G"]
     assert (clock(5), clock(65), clock(3700)) == ("0:05", "1:05", "1:01:40")

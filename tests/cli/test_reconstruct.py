@@ -337,10 +337,10 @@ class TestBadInput:
             (["--camera.log-ofset", "1"], "did you mean --camera.log-offset?"),
             (["--camera.log-offset", "-1"], "camera.log_offset is -1.0"),
             (["--camera.response", "film"], "unknown response 'film'"),
-            (["--filter.kind", "kalman"], "'akf', 'cf'"),
+            (["--filter.kind", "kalman"], "akf, cf"),
             (["--filter.deblur", "perhaps"], "'perhaps' is not true or false"),
             (["--GROUP.NAME", "1"], "--help-settings"),
-            (["--display", "bright"], "'auto', 'linear'"),
+            (["--display", "bright"], "auto, linear"),
             (["--display", "linear", "--display.knee", "1"], "it has black, white"),
             (["--display.lift", "99"], "lift is 99"),
             (["--png-bits", "12"], "--png-bits"),
@@ -609,3 +609,38 @@ def wait_for(process, ready):
         assert process.poll() is None, process.communicate()
         assert time.monotonic() < deadline
         time.sleep(0.01)
+
+
+@pytest.mark.parametrize("out", ["out", "out.mp4"])
+def test_names_need_not_be_utf8(cli, recording, tmp_path, out):
+    """Linux's names are bytes; in the settings file, which is UTF-8, "?" stands for what is not."""
+    source = tmp_path / os.fsdecode(b"rec\xff.h5")
+    source.write_bytes(recording.read_bytes())
+    target = tmp_path / os.fsdecode(os.fsencode(out).replace(b"u", b"\xff"))
+    assert cli("reconstruct", source, "-o", target, "--at", "frames", "--quiet").code == 0
+    settings = target / "kalux.toml" if target.is_dir() else tmp_path / f"{target.name}.kalux.toml"
+    assert "rec?.h5" in tomllib.loads(settings.read_text())["command"]
+    again = cli("reconstruct", source, "-o", tmp_path / "again.mp4", "--at", "frames", "--settings", settings)
+    assert again.code == 0
+
+
+def test_a_recording_that_is_a_folder_is_not_written_into(cli, tmp_path):
+    folder = tmp_path / "rec"
+    (folder / "images").mkdir(parents=True)
+    (folder / "events.txt").write_text("40 30\n0.000001 3 4 1\n")
+    before = sorted(tmp_path.rglob("*"))
+    for out in (folder, folder / "images", folder / "new.mp4"):
+        found = cli("reconstruct", folder, "--exposure", "1000", "-o", out, "--overwrite")
+        assert (found.code, "lies in the recording" in found.error) == (2, True)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_events_that_contradict_the_frames_are_told(cli, write_recording, simulation, tmp_path):
+    """Of the wrong polarity, or of another clock."""
+    inverted = simulation.events.copy()
+    inverted["p"] = ~inverted["p"]
+    for name, events in (("right", simulation.events), ("inverted", inverted)):
+        path = write_recording(tmp_path / f"{name}.h5", events=[events], contrast_threshold=None)
+        found = cli("reconstruct", path, "-o", tmp_path / name, "--at", "frames", "--quiet")
+        assert found.code == 0
+        assert ("do not explain how the frames change" in found.err) == (name == "inverted")

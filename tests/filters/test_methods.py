@@ -132,12 +132,10 @@ def test_a_masked_pixel_is_no_bound():
     level = np.full((1, 3), -1.0)
     lift(level, frame)
     np.testing.assert_array_equal(level, [[-1.0, 0.0, -1.0]])
-    unmeasured, nothing = Latent(level, np.full((1, 3), UNMEASURED)), np.zeros((1, 3))
-    noise = BridgeNoise(0.2, 0.2, 0.008, 0.02)
-    segment, _ = bridge(
-        unmeasured, frame, nothing, nothing, nominal_thresholds((1, 3), 0.1), noise, 0, 40_000, nothing + 0.5
-    )
-    np.testing.assert_array_equal(segment.floor, [[-np.inf, -0.5, -np.inf]])
+    clipped = Latent(np.zeros((1, 3)), np.full((1, 3), UNMEASURED))
+    thresholds, noise = nominal_thresholds((1, 3), 0.1), BridgeNoise(0.5, 0.5, 0.05, 0.04)
+    joined, _ = bridge(clipped, frame, np.ones((1, 3)), np.zeros((1, 3)), thresholds, noise, 0, 40_000)
+    np.testing.assert_allclose(joined.floor, [[-np.inf, -0.5, -np.inf]], atol=1e-6)
 
 
 # --- black ----------------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from kalux.filters.readout import (
     Hidden,
     HighlightPrior,
     believed_highlight,
-    likeness,
+    edge,
     read_out,
 )
 from kalux.settings import preset
@@ -178,7 +178,7 @@ def test_patches_tell_a_faint_edge_from_noise():
 
 @given(st.floats(0.0, 1e6), st.floats(0.0, 1e6))
 def test_likeness_is_a_share_and_falls(unlike, more):
-    near, far = (float(likeness(np.float32(value))) for value in (unlike, unlike + more))
+    near, far = (float(1 / edge(np.float32(value)) ** 2) for value in (unlike, unlike + more))
     assert 0.0 < far <= near <= 1.0
 
 

@@ -117,7 +117,8 @@ def test_packets_are_in_order_of_time(path):
 
 def first_times(container, stream):
     if stream.kind == "EVTS":
-        return [int(part["t"][0]) for part in container.read(stream, reader._events)]
+        parts = container.read(stream, reader._events)
+        return [int(np.frombuffer(part, EVENT_DTYPE)["t"][0]) for part in parts]
     return [frame.exposure_start for frame in reader._stored_frames(container, stream)]
 
 
@@ -127,8 +128,8 @@ def test_the_data_table_names_every_packet(path):
     data = path.read_bytes()
     with path.open("rb") as file:
         container = reader._open(path, file)
-    position = reader._root(data[14:], "IOHE").scalar(1, "<q", -1)
-    table = reader._root(data[position:], "FTAB")
+    position = reader._root(data[14:], b"IOHE").scalar(1, "<q", -1)
+    table = reader._root(data[position:], b"FTAB")
     start, count = table.vector(0)
     entries = []
     for place in range(start, start + 4 * count, 4):

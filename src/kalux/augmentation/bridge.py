@@ -32,6 +32,9 @@ from 0 beside any information in use (1e-2 and more), and the formulas need no s
 UNSEEN: Final = 2.0**41
 """Variance of a pixel of which the frame says nothing (`Frame.valid`): as little weight, and no bound."""
 
+REPEATED: Final = 2.0**39
+"""Variance of a frame that measures a pixel, but tells of it only what others have told already (K11): black."""
+
 _SCALE_BOUNDS: Final = (0.3, 3.0)
 _SCALE_DRIFT: Final = 1e-5  # variance per frame: a calibration never becomes certain, temperatures drift
 
@@ -97,10 +100,10 @@ class BridgedSegment(NamedTuple):
     R = 1 / (rate (1/forward + 1/backward)), ``rate`` in 1/s, where ``forward`` is ``forward_variance`` and
     ``step_variance`` for each event since the start, and ``backward`` is ``backward_variance`` and ``step_variance``
     for each of the ``events`` still to come (None: not known, and none are counted). ``net`` is what all events add to
-    the level, and what the light grows by besides (None: not known). At ``start`` the level is ``floor`` or more (K7;
-    None: no bound), which of a pixel that no frame measures then is what a clipped frame says of it at the end. At
-    ``end`` the pixel obeys the frame ``bound`` (`lift`), and its variance grows by ``drift``, what its thresholds may
-    have been wrong by (`drift`; None: nothing). Pixels without an event after ``still_since`` are still.
+    the level, and what the light grows by besides (None: not known). At ``start`` the level is ``floor`` or more where
+    that is known (K7; None: nowhere): of what no frame measures then, but a clipped one bounds at the end. At ``end``
+    the pixel obeys the frame ``bound`` (`lift`), and its variance grows by ``drift``, what its thresholds may have been
+    wrong by (`drift`; None: nothing). Pixels without an event after ``still_since`` are still.
     Beyond what L^A and the state say here, the level is ahead of its newest event by ``trail`` (K14; None: it is not).
     ``unshown`` is of the pixels that no frame has measured until ``end``, or ``start`` in causal mode.
     ``silent_change`` is what silent pixels around each change from one frame to the next (`unseen`; None: not known).

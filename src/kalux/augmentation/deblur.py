@@ -191,7 +191,7 @@ def latent_end(log_frame: Array, integrals: ExposureIntegrals) -> Array:
 
 
 def latent_peak(log_frame: Array, integrals: ExposureIntegrals) -> Array:
-    """The largest L^D within the exposure: tells a pixel that clipped for a part of it."""
+    """The largest L^D within the exposure: whether a pixel was brighter than white for a part of it."""
     return latent_start(log_frame, integrals) + integrals.peak
 
 
@@ -283,23 +283,21 @@ def mean_level(level, integral, since, duration):  # type: ignore[no-untyped-def
 
 
 @nb.njit(cache=True, inline="always", error_model="numpy")
-def relative_levels(exposure, block, duration, fields, middle, peak, events):  # type: ignore[no-untyped-def]
-    """Of a block of an `Exposure`: the logarithms of the level at the middle and of the largest, both over the mean of
-    the exposure of ``duration`` us, and the sums of the events' weights. ``fields`` is scratch memory."""
+def relative_levels(exposure, block, duration, fields, middle, events):  # type: ignore[no-untyped-def]
+    """Of a block of an `Exposure`: the logarithm of the level at the middle over the mean of the exposure, which lasts
+    ``duration`` us, and the sums of the events' weights. ``fields`` is scratch memory."""
     if not exposure.touched[block]:
-        middle[:] = peak[:] = events[:] = np.float32(0.0)
+        middle[:] = events[:] = np.float32(0.0)
         return
     first = block * np.uint64(EXPOSED)
     count = min(np.uint64(len(exposure.pixels)) - first, np.uint64(EXPOSED))
     unpack(exposure.pixels, np.int64(first), np.int64(count), fields)
     level, integral, since = fields[_LEVEL], fields[_INTEGRAL], fields[_SINCE]
-    at_middle, largest, count_of = fields[_AT_MIDDLE], fields[_PEAK], fields[_EVENTS]
+    at_middle, count_of = fields[_AT_MIDDLE], fields[_EVENTS]
     for i in range(count):  # a loop each: each is vector code then
         events[i] = mean_level(level[i], integral[i], since[i], duration)
     for i in range(count):
         middle[i] = logarithm(at_middle[i] / events[i])
-    for i in range(count):
-        peak[i] = logarithm(largest[i] / events[i])
     for i in range(count):
         events[i] = count_of[i]
 

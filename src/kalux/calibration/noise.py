@@ -243,7 +243,8 @@ def _add_quiet(start, end, first, length, row, column, quiet):  # type: ignore[n
     """Spread the quiet time from start to end over the windows."""
     while start < end:
         window = min(int((start - first) / length), quiet.shape[0] - 1)
-        stop = end if window == quiet.shape[0] - 1 else min(end, int(first + (window + 1) * length) + 1)
+        stop = end if window == quiet.shape[0] - 1 else min(end, first + int((window + 1) * length) + 1)
+        stop = max(stop, start + 1)  # over hundreds of years a float's step is more than 1 us
         quiet[window, row, column] += stop - start
         start = stop
 

@@ -160,7 +160,7 @@ def to_files(calibration: Calibration, path: str | Path) -> dict[Path, bytes]:
             "names": sorted(calibration.maps),
         }
     lines = [_with_unit(line) for line in tomli_w.dumps(body).splitlines()]
-    files[path] = "\n".join([FIRST_LINE, *lines, ""]).encode()
+    files[path] = "\n".join([FIRST_LINE, *lines, ""]).encode(errors="replace")
     return files
 
 

@@ -11,7 +11,7 @@ from types import ModuleType
 
 from kalux.cli.parser import Parser, UsageError, normalised
 from kalux.cli.signals import termination_as_interrupt
-from kalux.cli.terminal import close_output, error_line
+from kalux.cli.terminal import close_output, error_line, hold_closed_streams
 from kalux.errors import InternalError, KaluxError
 
 DONE, BUG, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
@@ -73,6 +73,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         0 done, 1 an error in kalux, 2 bad input or usage, 130 interrupted.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
+    hold_closed_streams()
     try:
         with termination_as_interrupt():
             return _guarded(arguments)
@@ -93,12 +94,20 @@ def _guarded(arguments: list[str]) -> int:
         error_line("interrupted", *(_notes(interrupt) or ["nothing was written"]))
         return INTERRUPTED
     except Exception as error:
+        if _is_interrupt(error):
+            error_line("interrupted", *(_notes(error) or ["what is finished is whole"]))
+            return INTERRUPTED
         traceback.print_exc()
         error_line(
             f"error: {type(error).__name__} inside kalux; this is an error in kalux, please report it with the "
             "lines above and the command"
         )
         return BUG
+
+
+def _is_interrupt(error: Exception) -> bool:
+    """Whether Ctrl-C came while a compiled loop was being loaded: numba makes a SystemError of it."""
+    return isinstance(error, SystemError) and isinstance(error.__cause__, KeyboardInterrupt)
 
 
 def _notes(error: BaseException) -> list[str]:

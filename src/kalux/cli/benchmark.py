@@ -219,7 +219,7 @@ def _write(out: Path, results: Results, store: Store) -> None:
         (REPORT, make_report(results, store)),
     ):
         with output_errors(out / name):
-            write_whole(out / name, text.encode())
+            write_whole(out / name, text.encode(errors="replace"))
 
 
 def _raise_failures(results: Results, out: Path) -> None:

@@ -49,7 +49,7 @@ def add_command(commands: Any) -> None:
         help="debevec is what kalux hdr-reference takes (default auto)",
     )
     add_result(parser)
-    parser.add_argument(
+    parser.add_argument_group("picture").add_argument(
         "--plot", type=Path, metavar="FILE.png", help="picture of the curves; needs kalux[plots]"
     )
     parser.set_defaults(run=run)

@@ -143,7 +143,7 @@ def write_text(path: Path, text: str) -> None:
     from kalux.writers.files import output_errors, write_whole
 
     with output_errors(path):
-        write_whole(path, text.encode())
+        write_whole(path, text.encode(errors="replace"))
 
 
 def write_picture(path: Path, picture: Any) -> None:

@@ -5,13 +5,17 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, ThreadPoolExecutor
-from typing import NamedTuple, TypeVar
+from typing import Final, NamedTuple, TypeVar
 
 from kalux.augmentation.deblur import between
 from kalux.errors import FrameError
+from kalux.frames import Levels
 from kalux.recording import Recording
 
 T = TypeVar("T")
+
+_FEW: Final = 0.1
+"""Of the events: a camera that records both has fewer of them between its frames only if it was started wrongly."""
 
 
 class Contents(NamedTuple):
@@ -27,6 +31,8 @@ class Contents(NamedTuple):
         The events from start to end.
     colours
         As of `kalux.Frame`: ``"grey"``, ``"RGB"`` or the pattern of a mosaic.
+    doubt
+        What makes the frames' white value doubtful, if anything does.
     """
 
     frames: int
@@ -35,6 +41,7 @@ class Contents(NamedTuple):
     end: int
     events_between: int
     colours: str
+    doubt: str | None = None
 
     @property
     def seconds(self) -> float:
@@ -43,12 +50,19 @@ class Contents(NamedTuple):
 
     def warnings(self) -> Iterator[str]:
         """What is allowed, but probably not meant."""
+        if self.doubt is not None:
+            yield self.doubt
         if self.events == 0:
             yield "there are no events; the images show the frames only"
         elif self.events_between == 0:
             yield (
                 f"none of the {self.events:,} events lies between the first and the last frame; do events and "
                 "frames have the same clock?"
+            )
+        elif self.events_between < _FEW * self.events:
+            yield (
+                f"only {self.events_between:,} of the {self.events:,} events lie between the first and the last frame; "
+                "are times of events and frames in the same unit and clock?"
             )
 
 
@@ -68,7 +82,8 @@ def check_recording(recording: Recording, on_events: Callable[[int], None]) -> C
         Whatever is wrong with the recording, or it has no frames.
     """
     exposures, colours = [], "grey"
-    for frame in recording.frames():
+    levels = Levels()
+    for frame in levels.watched(recording.frames()):
         exposures.append((frame.exposure_start, frame.exposure_end))
         colours = frame.colours
     if not exposures:
@@ -79,7 +94,7 @@ def check_recording(recording: Recording, on_events: Callable[[int], None]) -> C
         count += len(chunk)
         events_between += len(between(chunk, start - 1, end))
         on_events(len(chunk))
-    return Contents(len(exposures), count, start, end, events_between, colours)
+    return Contents(len(exposures), count, start, end, events_between, colours, levels.doubt())
 
 
 def check_beside(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import os
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
@@ -101,7 +102,7 @@ def check_name(out: Path, recording: Path, suffixes: tuple[str, ...] = _HDF5) ->
     if out.suffix.lower() not in suffixes:
         also = ", or in .aedat4 for AEDAT 4" if ".aedat4" in suffixes else ""
         raise UsageError(f"{out}: the output is a kalux HDF5 file; give a name that ends in .h5{also}")
-    if out.exists() and recording.exists() and out.samefile(recording):
+    if os.path.exists(out) and os.path.exists(recording) and out.samefile(recording):
         raise UsageError(f"{out}: this is the recording itself; choose another name for the copy")
 
 

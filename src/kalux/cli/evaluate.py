@@ -268,7 +268,9 @@ def write(
 
     as_text = as_csv if out.suffix.lower() == ".csv" else as_json
     with output_errors(out):
-        write_whole(out, as_text(str(recording.source.path), protocol, found, consistent).encode())
+        write_whole(
+            out, as_text(str(recording.source.path), protocol, found, consistent).encode(errors="replace")
+        )
 
 
 def as_csv(path: str, protocol: str, found: list[Scores], consistent: list[BlurConsistency | None]) -> str:

@@ -15,7 +15,7 @@ from kalux.cli.parser import number, true_or_false, whole
 from kalux.cli.terminal import say
 from kalux.display import CURVES, DisplaySettings, curve_from_name
 from kalux.errors import SettingsError
-from kalux.settings import Settings
+from kalux.settings import AUTO, Settings
 
 _WIDTH = 100
 _DISPLAY = "display_parameter."
@@ -55,7 +55,8 @@ def setting_flags() -> Iterator[Flag]:
     """A flag for every setting: ``--camera.log-offset``."""
     defaults = Settings()
     for group in dataclasses.fields(Settings):
-        yield from flags_of(getattr(defaults, group.name), group.name)
+        for flag in flags_of(getattr(defaults, group.name), group.name):
+            yield flag._replace(kind=_OrAuto(flag.kind)) if flag.default is None else flag
 
 
 def add_settings(parser: argparse.ArgumentParser) -> None:
@@ -164,8 +165,9 @@ def settings_help() -> str:
 
 def described(flag: Flag) -> list[str]:
     """Lines of help for a flag."""
-    default = _shown(flag.default)
-    value = "|".join(flag.choices) if flag.choices else _KINDS[flag.kind]
+    default = AUTO if isinstance(flag.kind, _OrAuto) else _shown(flag.default)
+    kind = flag.kind.convert if isinstance(flag.kind, _OrAuto) else flag.kind
+    value = "|".join(flag.choices) if flag.choices else _KINDS[kind]
     head = f"  {flag.name} {value}  (default {default})"
     return [head, *textwrap.wrap(flag.text, _WIDTH, initial_indent=" " * 6, subsequent_indent=" " * 6)]
 
@@ -196,6 +198,17 @@ def flags_of(instance: Any, group: str) -> Iterator[Flag]:
         name = f"--{group}.{field.name.replace('_', '-')}"
         default = getattr(instance, field.name)
         yield Flag(name, f"{group}.{field.name}", convert, choices, default, texts.get(field.name, ""))
+
+
+class _OrAuto:
+    """Turns a text into a value, but leaves ``auto`` as it is: what the setting is where nothing is said."""
+
+    def __init__(self, convert: Callable[[str], Any]) -> None:
+        self.convert = convert
+        self.__name__ = f"{convert.__name__} or {AUTO}"  # for messages
+
+    def __call__(self, text: str) -> Any:
+        return AUTO if text == AUTO else self.convert(text)
 
 
 def _conversion(hint: Any) -> tuple[Callable[[str], Any], tuple[str, ...] | None]:

@@ -72,6 +72,12 @@ def add_recording(parser: Parser) -> None:
         "--replace-frames", action="store_true", help="--frames instead of the recording's own"
     )
     group.add_argument(
+        "--white",
+        type=number,
+        metavar="LEVEL",
+        help="value of a saturated pixel, if not stored: 4095 of 12 bits in 16",
+    )
+    group.add_argument(
         "--bayer",
         type=_pattern,
         choices=(*MOSAICS, "none"),
@@ -105,6 +111,7 @@ def open_recording(options: argparse.Namespace) -> Recording:
         frames_rate=options.frames_rate,
         replace_frames=options.replace_frames,
         mosaic=options.bayer,
+        white=options.white,
     )
 
 

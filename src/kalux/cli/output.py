@@ -58,6 +58,11 @@ class Output:
             return self.path.with_name(f"{self.path.name}.kalux.toml")
         return self.path / "kalux.toml"
 
+    @property
+    def has_variance(self) -> bool:
+        """Whether images are written with their variance."""
+        return self.format in ("exr", "npy")
+
     def open(self, described: dict[str, Any], threads: int = 1) -> Writer:
         """The writer, with ``described`` for the settings file; ``threads`` images are encoded at a time."""
         from kalux.writers import open_writer

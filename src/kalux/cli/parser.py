@@ -120,16 +120,25 @@ def plainer(message: str) -> str:
     """The messages of `argparse` in plainer words."""
     message = re.sub(r"^argument ([^:]+): ", lambda match: f"{match[1]}: ", message)
     message = message.replace("the following arguments are required:", "still needed:")
-    message = message.replace("invalid choice: ", "there is no ")
+    message = re.sub(r"invalid choice: '([^']*)' \(choose from (.*)\)", _no_such_choice, message)
     return re.sub(r"invalid ([\w ]+) value: (.*)", r"\2 is not \1", message)
+
+
+def _no_such_choice(found: re.Match[str]) -> str:
+    known = [choice.strip(" '") for choice in found[2].split(",")]
+    return f"there is no {found[1]!r}{_nearest(found[1], known)} (choose from {', '.join(known)})"
+
+
+def _nearest(word: str, known: list[str]) -> str:
+    near = difflib.get_close_matches(word, known, 1)
+    return f", did you mean {near[0]}?" if near else ""
 
 
 def _unknown(argument: str, known: list[str]) -> str:
     flag = argument.partition("=")[0]
     if not flag.startswith("-"):
         return f"{argument}: one argument too many"
-    near = difflib.get_close_matches(flag, known, 1)
-    return f"unknown flag {flag}" + (f", did you mean {near[0]}?" if near else "")
+    return f"unknown flag {flag}{_nearest(flag, known)}"
 
 
 # Types of arguments: their names stand in messages ("'x' is not a number").

@@ -44,6 +44,7 @@ class Progress:
         self.images = self.events = 0
         self._quiet = quiet
         self._started = self._drawn = time.monotonic()
+        self._warm: tuple[float, int] | None = None
         self._bar: Bar | None = None
         self._lock = threading.Lock()
 
@@ -72,18 +73,29 @@ class Progress:
             self.images += images
             self.events += events
             now = time.monotonic()
+            if self._warm is None and self._done:
+                self._warm = (now - self._started, self._done)
             if self._quiet or now - self._drawn < (LINE_EVERY if self._bar is None else BAR_EVERY):
                 return
             self._drawn = now
             self._draw()
 
+    @property
+    def _done(self) -> int:
+        return self.images if self._total_images else self.events
+
     def _draw(self) -> None:
         text = progress_text(
-            self.images, self._total_images, self.events, self._total_events, self.seconds, self._unit
+            self.images,
+            self._total_images,
+            self.events,
+            self._total_events,
+            self.seconds,
+            self._unit,
+            warm=self._warm or (0.0, 0),
         )
         if self._bar is not None:
-            done = self.images if self._total_images else self.events
-            self._bar.update(self._bar.task_ids[0], completed=done, text=text)
+            self._bar.update(self._bar.task_ids[0], completed=self._done, text=text)
             return
         with contextlib.suppress(OSError):
             print(f"kalux: {self._title}: {text}", file=sys.stderr, flush=True)
@@ -103,9 +115,18 @@ def _bar() -> Bar:
 
 
 def progress_text(
-    images: int, total_images: int, events: int, total_events: int, seconds: float, unit: str = "images"
+    images: int,
+    total_images: int,
+    events: int,
+    total_events: int,
+    seconds: float,
+    unit: str = "images",
+    warm: tuple[float, int] = (0.0, 0),
 ) -> str:
-    """Such as ``120/360 images, 85 images/s, 4.2M events/s, 0:03 left``."""
+    """Such as ``120/360 images, 85 images/s, 4.2M events/s, 0:03 left``.
+
+    ``warm`` is when, s, and with how many the first were done, which often take as long as many others.
+    """
     seconds = max(seconds, 1e-3)
     parts = []
     if total_images:
@@ -117,8 +138,8 @@ def progress_text(
     if events or not total_images:
         parts.append(f"{short_number(events / seconds)} events/s")
     done, total = (images, total_images) if total_images else (events, total_events)
-    if done and total:
-        parts.append(f"{clock(seconds * max(total - done, 0) / done)} left")
+    if total and done > warm[1]:
+        parts.append(f"{clock((seconds - warm[0]) * max(total - done, 0) / (done - warm[1]))} left")
     return ", ".join(parts)
 
 

@@ -9,7 +9,7 @@ import importlib.metadata
 import itertools
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -32,7 +32,12 @@ from kalux.recording import Recording
 from kalux.settings import PRESETS, Settings, from_dict, load, preset, read_toml, to_dict
 
 if TYPE_CHECKING:
+    from kalux.calibration.contrast import ThresholdEstimate
     from kalux.writers import Writer
+
+_MANY_SAMPLES: Final = 1000
+_NEARLY_ALL: Final = 0.95
+"""Of many samples, whose thresholds are nearly all the usual ones: the events contradict the frames, or are noise."""
 
 _DESCRIPTION = """\
 Reconstruct HDR images, at any rate, from a recording of events and frames. The whole recording is checked
@@ -91,7 +96,7 @@ def _add_output(parser: Parser) -> None:
     group.add_argument(
         "--format",
         choices=FOLDER_FORMATS,
-        help="of a folder: png is a picture (default), exr and npy hold linear intensity and variance",
+        help="of a folder: png (default) for display; exr, npy linear, with variance",
     )
     group.add_argument("--grey", action="store_true", help="of a recording in colour, the luminance alone")
     group.add_argument("--overwrite", action="store_true", help="replace a former output of kalux")
@@ -147,6 +152,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     output = chosen_output(options)
     settings = chosen_settings(options)
     check_output(output)
+    _check_apart(output, Path(options.recording))
     times = None if options.times is None else load_times(options.times)
     recording = open_recording(options)
     threads = options.threads or default_threads()
@@ -162,6 +168,11 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     made = part_of(made, contents, options)
     if made.threshold_origin in ("estimate", "assumed"):
         warn(threshold_warning(made, options.preset))
+    if made.threshold_origin == "assumed" and made.estimate is not None and contradicts(made.estimate):
+        warn(
+            "the events do not explain how the frames change; if much moves, do both have the same clock (kalux "
+            "calibrate offset REC finds out), and is polarity 1 brighter?"
+        )
     if not options.quiet:
         say("\n".join(decided(recording, contents, made, settings, output, options)))
     seconds, images = write_images(
@@ -171,6 +182,14 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
         say(
             f"wrote       {images:,} images to {output.path} in {seconds:.1f} s "
             f"({short_number(images / seconds)} images/s), settings in {output.settings_path}"
+        )
+
+
+def _check_apart(output: Output, recording: Path) -> None:
+    """Refuse to write into the folder that is the recording."""
+    if recording.is_dir() and output.path.resolve().is_relative_to(recording.resolve()):
+        raise UsageError(
+            f"{output.path}: lies in the recording {recording}; choose another place for the output"
         )
 
 
@@ -261,6 +280,11 @@ def threshold_warning(made: Plan, name: str) -> str:
         f"the contrast thresholds are {how}, so brightness above white is uncertain; "
         f"if you know them, give --events.threshold-on and --events.threshold-off{sensor}"
     )
+
+
+def contradicts(estimate: ThresholdEstimate) -> bool:
+    """Whether many samples say next to nothing of the thresholds."""
+    return estimate.samples >= _MANY_SAMPLES and estimate.usual_share > _NEARLY_ALL
 
 
 def decided(
@@ -358,6 +382,7 @@ def write_images(
         lambda count: progress.add(events=count),
         lambda count: backward.add(events=count),
         threads=threads,
+        with_variance=output.has_variance,
     )
     try:
         with writer, contextlib.closing(images):

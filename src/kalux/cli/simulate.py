@@ -53,7 +53,7 @@ def add_command(commands: Any) -> None:
         epilog=_EXAMPLES,
         usage="kalux simulate SOURCE -o OUT.h5 [flags]",
     )
-    parser.add_argument(
+    parser.add_argument_group("what is seen").add_argument(
         "source",
         metavar="SOURCE",
         type=Path,

@@ -17,8 +17,9 @@ def say(text: str = "") -> None:
     OutputError
         Stdout cannot be written for another reason, e.g. a full disk.
     """
+    encoding = sys.stdout.encoding or "utf-8"  # which names of files may not fit
     try:
-        print(text, flush=True)
+        print(text.encode(encoding, "backslashreplace").decode(encoding), flush=True)
     except BrokenPipeError:
         _discard_output()
     except OSError as error:
@@ -36,6 +37,18 @@ def error_line(*parts: str) -> None:
     line = " ".join("; ".join(parts).split())
     with contextlib.suppress(OSError):
         print(f"kalux: {line}", file=sys.stderr, flush=True)
+
+
+def hold_closed_streams() -> None:
+    """Open to nothing what is closed of stdin, stdout and stderr: libraries print to whatever has these numbers."""
+    for number in (0, 1, 2):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free: this one
+    # What was closed when Python began is None.
+    sys.stdout = sys.stdout or open(1, "w", closefd=False)  # noqa: SIM115
+    sys.stderr = sys.stderr or open(2, "w", closefd=False)  # noqa: SIM115
 
 
 def close_output() -> None:

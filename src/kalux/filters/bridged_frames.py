@@ -37,10 +37,7 @@ from kalux.filters.common import make_clock
 from kalux.filters.method import FAR_FUTURE, USUAL_INTERVAL, Chunks, CommonMethod, Segment
 from kalux.filters.shots import Shot
 from kalux.filters.uncertainty import WRONG_STEPS, Around
-from kalux.models.camera import (
-    frame_log_covariance,
-    log_intensity,
-)
+from kalux.models.camera import CRUSHED, frame_log_covariance, log_intensity
 from kalux.models.pixels import PixelCalibration
 from kalux.settings import Settings
 
@@ -50,9 +47,6 @@ Floats = NDArray[np.floating[Any]]
 
 _DARKEST: Final = 0.001
 """What is black is taken to be spread evenly in log I from here, white = 1, a quarter of an 8-bit level."""
-
-_CRUSHED: Final = 1.5 / 255
-"""Intensity, white = 1, that black must hide to be no measurement: three times what it hides of a linear response."""
 
 _BLACK_FRAMES: Final = 3.0
 """Black says the same in every frame: so many of them count as one, and all as no more (docs/equations.md, K7)."""
@@ -144,7 +138,6 @@ class BridgedFrames(CommonMethod):
             level_variance,
             exposure,
             duration=shot.end - shot.start,
-            white=float(np.log(self.settings.camera.saturation * shot.white + self.offset)),
             event_variance=self.settings.events.deblur_variance * self.on * self.off,
         )
         if shot.valid is not None:
@@ -160,7 +153,7 @@ class BridgedFrames(CommonMethod):
         With a linear response 0 is a measurement like others.
         """
         black = np.isfinite(shot.level_ceiling)
-        hides = shot.level_ceiling > _CRUSHED * shot.white
+        hides = shot.level_ceiling > CRUSHED * shot.white
         return black & hides if hides[black].any() else None
 
     def black(self, ceiling: Array) -> tuple[Array, Array]:
@@ -419,9 +412,12 @@ class BridgedFrames(CommonMethod):
         assert segment.events is not None
         share = (t - segment.start) / (segment.end - segment.start)
         between = 4.0 * share * (1.0 - share)
+        second = segment.backward_variance
+        if segment.bound is not None and segment.bound.ceiling is not None:
+            second = np.where(np.isfinite(segment.bound.ceiling), np.float32(bridge.REPEATED), second)
         return Around(
             segment.forward_variance,
-            segment.backward_variance,
+            second,
             segment.events,
             coming=(1.0 - share) * self.noise.step_variance,
             counted=0.0,
@@ -443,10 +439,12 @@ def latent_frame(
     exposure: Exposure,
     *,
     duration: int,
-    white: float,
     event_variance: float,
 ) -> Latent:
     """A frame without blur at the middle of its exposure, and its variance (K3).
+
+    A pixel whose mean is below white is measured, however bright it was for a part of the exposure: a sensor adds up
+    light and clips the sum.
 
     Parameters
     ----------
@@ -458,13 +456,11 @@ def latent_frame(
         EDI, from `deblur.expose`.
     duration
         Of the exposure, us.
-    white
-        Log intensity from which a pixel is clipped: one that reached it within the exposure was, for a part of it.
     event_variance
         What each event of the exposure adds to the variance.
     """
     latent = apart(2, (levels.size,))
-    scalars = np.float32(duration), np.float32(white), np.float32(event_variance)
+    scalars = np.float32(duration), np.float32(event_variance)
     tables = level_log.astype(np.float32), level_variance.astype(np.float32)
     _latent_frame(levels.reshape(-1), *tables, exposure, *scalars, *latent)
     return Latent(*latent.reshape(2, *levels.shape))
@@ -472,18 +468,14 @@ def latent_frame(
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _latent_frame(  # type: ignore[no-untyped-def]
-    levels, level_log, level_variance, exposure, duration, white, event_variance, value, variance
+    levels, level_log, level_variance, exposure, duration, event_variance, value, variance
 ):
     unmeasured = np.float32(bridge.UNMEASURED)
     fields = np.empty((EXPOSURE_FIELDS, EXPOSED), np.float32)
-    middle, peak, events = (
-        np.empty(EXPOSED, np.float32),
-        np.empty(EXPOSED, np.float32),
-        np.empty(EXPOSED, np.float32),
-    )
+    middle, events = np.empty(EXPOSED, np.float32), np.empty(EXPOSED, np.float32)
     log_frame, known = np.empty(EXPOSED, np.float32), np.empty(EXPOSED, np.float32)
     for block in range(np.uint64(len(exposure.touched))):
-        relative_levels(exposure, block, duration, fields, middle, peak, events)
+        relative_levels(exposure, block, duration, fields, middle, events)
         first = block * np.uint64(EXPOSED)
         count = min(np.uint64(len(levels)) - first, np.uint64(EXPOSED))
         for i in range(count):  # looking up is no vector code, the rest is
@@ -493,5 +485,4 @@ def _latent_frame(  # type: ignore[no-untyped-def]
             value[first + i] = log_frame[i] + middle[i]
         for i in range(count):
             doubt = known[i] + event_variance * events[i]
-            clipped = log_frame[i] + peak[i] >= white or doubt >= unmeasured
-            variance[first + i] = unmeasured if clipped else doubt
+            variance[first + i] = min(doubt, unmeasured)

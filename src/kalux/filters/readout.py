@@ -8,19 +8,33 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.compiled import FUSED, ONE, exponential, logarithm
+from kalux.compiled import FUSED, ONE, exponential, logarithm, packed
 
 Array = NDArray[np.floating[Any]]
 
 
 _NOTHING: Final = np.float32(1e9)
-"""Variance of a pixel that knows nothing; its square is still a float32."""
+"""Variance of a pixel that knows nothing; the product of four sums of two is still a float32."""
+
+_SURE: Final = np.float32(1e-9)
+"""What is added to a variance is no less, so that the inverse of such a product is a float32 as well."""
 
 _BLOCK: Final = 32
 """Pixels of a row that are looked at together: those of a block without highlights are not searched for them."""
 
-_MARGIN: Final = 16
-"""Pixels that know nothing on both sides of a row, at least three times the pitch: the border needs no special case."""
+_STRIP: Final = 640
+"""Columns that are read out together, a multiple of `_BLOCK`: all of many sensors. A number that is known to the
+compiler makes vector code of loops over several rows at once; what is kept of these rows stays in the second cache."""
+
+_MARGIN: Final = 32
+"""Pixels on both sides of a row of a strip, a whole number of vectors: those of the strip beside, or, outside the
+image, such that know nothing. The border needs no special case."""
+
+_ASIDE: Final = 16
+"""So many of these are compared, at least three times the pitch: a vector, so that all begin where the cache's lines
+do."""
+
+_ROW: Final = _STRIP + 2 * _MARGIN
 
 SHARED: Final = np.float32(0.7)
 """Part of the variance that neighbours do not lessen, since their errors are alike: correlations are 0.1 to 0.5 on
@@ -37,34 +51,39 @@ _DIRECTIONS: Final = ((0, 1), (1, -1), (1, 0), (1, 1))
 """Rows and columns to four neighbours; the other four are those to whom a pixel is one of these."""
 
 
+_LEVEL, _DOUBT = np.uint64(0), np.uint64(_ROW)
+_NEAR, _FAR = np.uint64(0), np.uint64(_ROW)
+
+
 class _Ring(NamedTuple):
-    """Rows around the one that is read out, each in the place of its number modulo theirs, between margins.
+    """Rows of a strip around the one that is read out, each in the place of its number modulo theirs.
 
     Attributes
     ----------
-    levels, doubts
-        (R, W) L and its variance.
-    hears, spans
-        (R, W) whether pixels hear their neighbours, and (R, 2) between which columns any of a row do.
+    known
+        (R 2 _ROW,): of every row L and its variance.
+    least
+        (R 2 _ROW,): information that a neighbour has about a pixel beside it, and about one diagonally away.
     unlike
-        (4, R, W): how unlike pixels are to those in `_DIRECTIONS`, the sum of three in a row.
+        (R 4 _ROW,): how unlike pixels are to those in `_DIRECTIONS`, the sum of three in a row.
     alike
-        (4, R, W): `likeness` to them.
-    near, far
-        (R, W): information that a neighbour has about a pixel beside it, and about one diagonally away.
-    scratch
-        (4, W).
+        (R 4 _ROW,): how far they are of one surface with them (`edge`).
+    hears, spans
+        (R, _STRIP) whether pixels hear their neighbours, and (R, 2) between which columns any of a row do.
+    single
+        (4 _ROW,): how unlike the pixels of a row are, one by one.
+    heard
+        (2 _ROW,): L of a row and its variance, after its neighbours are heard.
     """
 
-    levels: NDArray[np.float32]
-    doubts: NDArray[np.float32]
-    hears: NDArray[np.uint8]
-    spans: NDArray[np.int64]
+    known: NDArray[np.float32]
+    least: NDArray[np.float32]
     unlike: NDArray[np.float32]
     alike: NDArray[np.float32]
-    near: NDArray[np.float32]
-    far: NDArray[np.float32]
-    scratch: NDArray[np.float32]
+    hears: NDArray[np.uint8]
+    spans: NDArray[np.int64]
+    single: NDArray[np.float32]
+    heard: NDArray[np.float32]
 
 
 class HighlightPrior(NamedTuple):
@@ -146,10 +165,17 @@ def total_variance(variance, moving, change, hidden):  # type: ignore[no-untyped
 
 
 @nb.njit(cache=True, inline="always", error_model="numpy")
-def likeness(unlikeness):  # type: ignore[no-untyped-def]
-    """How far two pixels are of one surface, 0 to 1, of the sum over a patch of e^2 / (P + P' + slack)."""
-    edge = ONE + unlikeness * _HALF_OF_PATCH
-    return ONE / (edge * edge)
+def edge(unlikeness):  # type: ignore[no-untyped-def]
+    """Between two pixels, of the sum over a patch of e^2 / (P + P' + slack): 1 where there is none.
+
+    They are of one surface as far as 1 / edge^2, 0 to 1, says.
+    """
+    return ONE + unlikeness * _HALF_OF_PATCH
+
+
+@nb.njit(cache=True, inline="always")
+def _squared(value):  # type: ignore[no-untyped-def]
+    return value * value
 
 
 def read_out(
@@ -163,6 +189,8 @@ def read_out(
     difference: float = 0.0,
     pitch: int = 1,
     unshown: NDArray[np.int64] | None = None,
+    *,
+    with_variance: bool = True,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """I of a state, and the variance of its logarithm; in one pass over the rows, none of which is stored in between.
 
@@ -194,6 +222,8 @@ def read_out(
     unshown
         (N,) pixels in the flattened image, ascending, that no frame has shown: their L is wanted as well, and
         neighbours do not lessen their variance, since what they hide (K15) all of them hide alike.
+    with_variance
+        Whether the variance is wanted: else it is empty.
 
     Returns
     -------
@@ -208,7 +238,7 @@ def read_out(
     heard = np.empty(len(unshown), np.float32)
     known = variance.astype(np.float32, copy=False)
     out = np.empty(log_intensity.shape, np.float32)
-    total = known if moving is None else np.empty_like(out)
+    total = np.empty(out.shape if with_variance else (0, 0), np.float32)
     _read_out(
         log_intensity.astype(np.float32, copy=False),
         known,
@@ -220,6 +250,7 @@ def read_out(
         tuple(np.float32(value) for value in prior),
         np.float32(log_offset),
         unshown,
+        _ring(pitch),
         out,
         total,
         heard,
@@ -227,11 +258,34 @@ def read_out(
     return out, total, heard
 
 
+def _ring(pitch: int) -> _Ring:
+    # A row's neighbours, and the patches around them, lie in rows to twice the pitch ahead and one behind; the rows
+    # that need what is made of them, in one more ahead.
+    count = 4 * pitch + 1
+    return _Ring(
+        known=_lines(2 * count),
+        least=_lines(2 * count),
+        unlike=_lines(4 * count),
+        alike=_lines(4 * count),
+        hears=np.empty((count, _STRIP), np.uint8),
+        spans=np.empty((count, 2), np.int64),
+        single=_lines(4),
+        heard=_lines(2),
+    )
+
+
+def _lines(rows: int) -> NDArray[np.float32]:
+    found: NDArray[np.float32] = packed((rows * _ROW,), np.dtype(np.float32))
+    return found
+
+
 def _plane(values: Array | None, shape: tuple[int, ...]) -> NDArray[np.float32]:
     return np.zeros(shape, np.float32) if values is None else np.ascontiguousarray(values, np.float32)
 
 
-# The loops below take whole arrays and a row's number: a view of a row costs more than a part of what is done with it.
+# The loops below take whole arrays and places in them: a view of a row costs more than a part of what is done with it.
+# Positions are counted from the first of a loop, so that none is below another: unsigned numbers that wrap around keep
+# a loop from becoming vector code. So do many arrays, and loops that write to an array of which they read another row.
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy", fastmath=FUSED)
@@ -246,65 +300,77 @@ def _read_out(  # type: ignore[no-untyped-def]
     prior,
     log_offset,
     unshown,
+    ring,
     out,
     total,
     heard,
 ):
     white, scale2, _ = prior
     height, width = log_intensity.shape
-    size = (width + _BLOCK - 1) // _BLOCK * _BLOCK
     told = moving.size > 0
     hear = told and allowed > np.float32(0.0)
-    # A row's neighbours and the patches around them lie in rows to three times the pitch ahead and one behind.
-    count = 4 * pitch + 1
-    spans = np.zeros((count, 2), np.int64)
-    spans[:, 0] = size
-    ring = _Ring(
-        np.zeros((count, size + 2 * _MARGIN), np.float32),
-        np.full((count, size + 2 * _MARGIN), _NOTHING),
-        np.zeros((count, size), np.uint8),
-        spans,
-        np.zeros((4, count, size + 2 * _MARGIN), np.float32),
-        np.zeros((4, count, size + 2 * _MARGIN), np.float32),
-        np.zeros((count, size + 2 * _MARGIN), np.float32),
-        np.zeros((count, size + 2 * _MARGIN), np.float32),
-        np.zeros((4, size + 2 * _MARGIN), np.float32),
-    )
-    level, marks = np.empty(size, np.float32), np.zeros(size, np.uint8)
+    count = len(ring.spans)
+    level, left = np.zeros(_STRIP, np.float32), np.zeros(_STRIP, np.float32)
+    marks = np.zeros(_STRIP, np.uint8)
     words = marks.view(np.uint64)
-    places, excess, doubt = np.empty(size, np.uint64), np.empty(size, np.float32), np.empty(size, np.float32)
-    met = 0
-    for row in range(-3 * pitch if told else 0, height):
-        following = row + 3 * pitch
-        if told and following < height:
-            _take_row(log_intensity, variance, moving, change, hidden, np.uint64(following), total, ring)
-        elif told:
-            ring.doubts[following % count] = _NOTHING
-        first, last = size, 0
-        if hear:
-            _mark_hearing(moving, following, ring)
-            for place in range(count):
-                first, last = min(first, ring.spans[place, 0]), max(last, ring.spans[place, 1])
-        if first < last and row + pitch >= 0:
-            _compare(row + pitch, first, last, allowed, pitch, ring)
-        if row < 0:
-            continue
-        at = np.uint64(row)
-        for column in range(np.uint64(width)):
-            level[column] = log_intensity[at, column]
-        if first < last:
-            _hear_neighbours(row, first, min(last, width), allowed, pitch, ring, level, total)
-        while met < len(unshown) and unshown[met] < (row + 1) * width:
-            place = unshown[met] - row * width
-            heard[met] = level[place]
+    places, excess, doubt = (
+        np.empty(_STRIP, np.uint64),
+        np.empty(_STRIP, np.float32),
+        np.empty(_STRIP, np.float32),
+    )
+    ends = np.searchsorted(unshown, np.arange(height + 1) * width)
+    met, met_by = ends[:-1].copy(), ends[1:]  # of every row, in strips from left to right
+    for begin in range(0, width, _STRIP):
+        end = min(begin + _STRIP, width)
+        start, size = np.uint64(begin), np.uint64(end - begin)
+        _clear(ring)
+        marks[:] = np.uint8(0)
+        for row in range(-3 * pitch if told else 0, height):
+            following = row + 3 * pitch
+            at = np.uint64(row)
+            first, last = _STRIP, 0
             if told:
-                total[row, place] = ring.doubts[row % count, place + _MARGIN]
-            met += 1
-        for column in range(np.uint64(width)):
-            marks[column] = level[column] > white
-            out[at, column] = max(exponential(level[column]) - log_offset, np.float32(0.0))
-        if scale2 > np.float32(0.0) and _any(words, 0, size):
-            _believe(level, total, at, marks, words, prior, log_offset, places, excess, doubt, out)
+                _take_row(log_intensity, variance, moving, change, hidden, row + 2 * pitch, begin, ring)
+            if hear:
+                _mark_hearing(moving, following, begin, ring)
+                for place in range(count):
+                    first, last = min(first, ring.spans[place, 0]), max(last, ring.spans[place, 1])
+            if first < last and row + pitch >= 0:
+                _compare(row, first, last, allowed, pitch, ring)
+            if row < 0:
+                continue
+            here = np.uint64(row % count) * np.uint64(2 * _ROW) + np.uint64(_MARGIN)
+            for i in range(size):
+                level[i] = log_intensity[at, start + i]
+            if first < last:
+                _hear_neighbours(row, first, last, pitch, ring, level)
+            begun = met[row]
+            while met[row] < met_by[row] and unshown[met[row]] < row * width + end:
+                heard[met[row]] = level[unshown[met[row]] - row * width - begin]
+                met[row] += 1
+            for i in range(size):
+                marks[i] = level[i] > white
+            for i in range(size):
+                out[at, start + i] = max(exponential(level[i]) - log_offset, np.float32(0.0))
+            bright = scale2 > np.float32(0.0) and _any(words, 0, _STRIP)
+            if not bright and len(total) == 0:
+                continue
+            if told:
+                for i in range(size):
+                    left[i] = ring.known[here + _DOUBT + i]
+            else:
+                for i in range(size):
+                    left[i] = variance[at, start + i]
+            if first < last:
+                _lessen(row, first, last, ring, left)
+                for k in range(begun, met[row]):
+                    bound = np.uint64(unshown[k] - row * width - begin)
+                    left[bound] = ring.known[here + _DOUBT + bound]
+            if len(total) > 0:
+                for i in range(size):
+                    total[at, start + i] = left[i]
+            if bright:
+                _believe(level, left, at, start, marks, words, prior, log_offset, places, excess, doubt, out)
 
 
 @nb.njit(cache=True, inline="always")
@@ -316,106 +382,184 @@ def _any(words, first, count):  # type: ignore[no-untyped-def]
     return found != np.uint64(0)
 
 
+@nb.njit(cache=True)
+def _clear(ring):  # type: ignore[no-untyped-def]
+    """Before the first row of a strip: nothing is known, nothing is alike, nobody hears."""
+    for place in range(len(ring.spans)):
+        first = place * 2 * _ROW
+        ring.known[first : first + _ROW] = np.float32(0.0)
+        ring.known[first + _ROW : first + 2 * _ROW] = _NOTHING
+        ring.spans[place, 0], ring.spans[place, 1] = _STRIP, 0
+    ring.least[:] = np.float32(0.0)
+    ring.unlike[:] = np.float32(0.0)
+    ring.alike[:] = np.float32(0.0)
+    ring.single[:] = np.float32(0.0)
+    ring.hears[:] = np.uint8(0)
+
+
 @nb.njit(cache=True, inline="always")
 def _take_row(  # type: ignore[no-untyped-def]
-    log_intensity, variance, moving, change, hidden, row, total, ring
+    log_intensity, variance, moving, change, hidden, row, begin, ring
 ):
     """K11 of a row, and what its neighbours need to know of it."""
-    place = row % np.uint64(len(ring.levels))
-    for column in range(np.uint64(total.shape[1])):
-        at = column + np.uint64(_MARGIN)
-        known = total_variance(variance[row, column], moving[row, column], change[row, column], hidden)
-        total[row, column] = known
-        ring.doubts[place, at] = known if known < _NOTHING else _NOTHING
-        ring.levels[place, at] = log_intensity[row, column]
+    height, width = log_intensity.shape
+    if row < 0:
+        return
+    place = np.uint64(row % len(ring.spans)) * np.uint64(2 * _ROW)
+    if row >= height:
+        for i in range(np.uint64(_ROW)):
+            ring.known[place + _DOUBT + i] = _NOTHING
+        return
+    first = max(begin - _MARGIN, 0)
+    size = np.uint64(min(begin + _STRIP + _MARGIN, width) - first)
+    at, start, into = np.uint64(row), np.uint64(first), place + np.uint64(first - begin + _MARGIN)
+    for i in range(size):
+        ring.known[into + _LEVEL + i] = log_intensity[at, start + i]
+    for i in range(size):
+        known = total_variance(variance[at, start + i], moving[at, start + i], change[at, start + i], hidden)
+        ring.known[into + _DOUBT + i] = known if known < _NOTHING else _NOTHING
 
 
 @nb.njit(cache=True)
-def _mark_hearing(moving, row, ring):  # type: ignore[no-untyped-def]
+def _mark_hearing(moving, row, begin, ring):  # type: ignore[no-untyped-def]
     """Which pixels of a row hear their neighbours, and from which block of columns to which; none outside the image."""
-    place = np.uint64(row % len(ring.levels))
-    first, last = ring.hears.shape[1], 0
+    place = np.uint64(row % len(ring.spans))
+    first, last = _STRIP, 0
     words = ring.hears[place].view(np.uint64)
     if row < len(moving):
-        at = np.uint64(row)
-        for column in range(np.uint64(moving.shape[1])):
-            ring.hears[place, column] = moving[at, column]
-        for block in range(0, ring.hears.shape[1], _BLOCK):
+        at, start = np.uint64(row), np.uint64(begin)
+        for i in range(np.uint64(min(moving.shape[1] - begin, _STRIP))):
+            ring.hears[place, i] = moving[at, start + i]
+        for block in range(0, _STRIP, _BLOCK):
             if _any(words, block, _BLOCK):
                 first, last = min(first, block), block + _BLOCK
     ring.spans[place, 0], ring.spans[place, 1] = first, last
 
 
-# Positions are counted from the first of a loop, so that none is below another: unsigned numbers that wrap around keep
-# a loop from becoming vector code.
-
-
 @nb.njit(cache=True, error_model="numpy", fastmath=FUSED)
 def _compare(row, first, last, allowed, pitch, ring):  # type: ignore[no-untyped-def]
-    """How unlike a row's pixels are to those in `_DIRECTIONS`, where columns ``first`` to ``last`` need it."""
-    count = len(ring.levels)
-    here, below = np.uint64(row % count), np.uint64((row + pitch) % count)
-    levels, doubts, single, unlike = ring.levels, ring.doubts, ring.scratch, ring.unlike
-    start, size = _MARGIN + first - 2 * pitch, np.uint64(last - first + 4 * pitch)
-    own, left, right = np.uint64(start), np.uint64(pitch), np.uint64(2 * pitch)
-    for k in range(np.uint64(4)):
-        down, across = _DIRECTIONS[k]
-        there, other = below if down == 1 else here, np.uint64(start + across * pitch)
-        slack = allowed * np.float32(pitch * pitch * (down + across * across)) * _SLACK
-        for i in range(size):
-            excess = levels[there, other + i] - levels[here, own + i]
-            single[k, i] = excess * excess / (doubts[here, own + i] + doubts[there, other + i] + slack)
-        for i in range(size - np.uint64(2 * pitch)):
-            unlike[k, here, own + left + i] = single[k, i] + single[k, left + i] + single[k, right + i]
+    """How alike a row's pixels are to those in `_DIRECTIONS`, where columns ``first`` to ``last`` need it.
+
+    Patches reach into the next row: that is compared first. Quotients share a division; those of four numbers a to d
+    are (b, a) c d / a b c d and a b (d, c) / a b c d.
+    """
+    count = len(ring.spans)
+    above, here, below, under = (
+        np.uint64((row - pitch) % count),
+        np.uint64(row % count),
+        np.uint64((row + pitch) % count),
+        np.uint64((row + 2 * pitch) % count),
+    )
+    size, step = np.uint64(last - first + 2 * _ASIDE), np.uint64(pitch)
+    begin = np.uint64(_MARGIN - _ASIDE + first)
+    one, two, three = np.uint64(_ROW), np.uint64(2 * _ROW), np.uint64(3 * _ROW)
+    known, single, unlike, alike, least = ring.known, ring.single, ring.unlike, ring.alike, ring.least
     near, far = allowed * np.float32(pitch * pitch), allowed * np.float32(2 * pitch * pitch)
+    near_slack, far_slack = max(near * _SLACK, _SURE), max(far * _SLACK, _SURE)
+    own, other = below * two + begin, under * two + begin
     for i in range(size):
-        ring.near[here, own + i] = ONE / (doubts[here, own + i] + near)
+        level, doubt = known[own + _LEVEL + i], known[own + _DOUBT + i]
+        right = known[own + _LEVEL + step + i] - level
+        left_under = known[other + _LEVEL - step + i] - level
+        straight_under = known[other + _LEVEL + i] - level
+        right_under = known[other + _LEVEL + step + i] - level
+        a = doubt + known[own + _DOUBT + step + i] + near_slack
+        b = doubt + known[other + _DOUBT - step + i] + far_slack
+        c = doubt + known[other + _DOUBT + i] + near_slack
+        d = doubt + known[other + _DOUBT + step + i] + far_slack
+        ab, cd = a * b, c * d
+        inverse = ONE / (ab * cd)
+        of_ab, of_cd = inverse * cd, inverse * ab
+        single[begin + i] = right * right * (of_ab * b)
+        single[begin + one + i] = left_under * left_under * (of_ab * a)
+        single[begin + two + i] = straight_under * straight_under * (of_cd * d)
+        single[begin + three + i] = right_under * right_under * (of_cd * c)
     for i in range(size):
-        ring.far[here, own + i] = ONE / (doubts[here, own + i] + far)
+        a, b = known[own + _DOUBT + i] + max(near, _SURE), known[own + _DOUBT + i] + max(far, _SURE)
+        inverse = ONE / (a * b)
+        least[own + _NEAR + i] = b * inverse
+        least[own + _FAR + i] = a * inverse
+    into = below * np.uint64(4 * _ROW) + begin
+    for k in range(np.uint64(4)):
+        start = begin + k * one
+        for i in range(size):
+            unlike[into + k * one + i] = (
+                single[start - step + i] + single[start + i] + single[start + step + i]
+            )
+    before, own = above * np.uint64(4 * _ROW) + begin, here * np.uint64(4 * _ROW) + begin
+    for i in range(size):
+        a = edge(unlike[before + i] + unlike[own + i] + unlike[into + i])
+        b = edge(unlike[before + one + i] + unlike[own + one + i] + unlike[into + one + i])
+        c = edge(unlike[before + two + i] + unlike[own + two + i] + unlike[into + two + i])
+        d = edge(unlike[before + three + i] + unlike[own + three + i] + unlike[into + three + i])
+        ab, cd = a * b, c * d
+        inverse = ONE / (ab * cd)
+        of_ab, of_cd = inverse * cd, inverse * ab
+        alike[own + i] = _squared(of_ab * b)
+        alike[own + one + i] = _squared(of_ab * a)
+        alike[own + two + i] = _squared(of_cd * d)
+        alike[own + three + i] = _squared(of_cd * c)
 
 
 @nb.njit(cache=True, error_model="numpy", fastmath=FUSED)
-def _hear_neighbours(row, first, last, allowed, pitch, ring, level, total):  # type: ignore[no-untyped-def]
-    """K12 of a row: L of the pixels that hear their neighbours in ``level``, their variances in ``total``."""
-    count = len(ring.levels)
-    here, above = np.uint64(row % count), np.uint64((row - pitch) % count)
-    below = np.uint64((row + pitch) % count)
-    levels, doubts, alike, unlike = ring.levels, ring.doubts, ring.alike, ring.unlike
-    information, deviation = ring.scratch[0], ring.scratch[1]
-    column, own, size = np.uint64(first), np.uint64(_MARGIN + first), np.uint64(last - first)
+def _hear_neighbours(row, first, last, pitch, ring, level):  # type: ignore[no-untyped-def]
+    """K12 of a row: L of the pixels that hear their neighbours in ``level``; ``ring.heard`` of all."""
+    count = len(ring.spans)
+    above, here, below = (
+        np.uint64((row - pitch) % count),
+        np.uint64(row % count),
+        np.uint64((row + pitch) % count),
+    )
+    size, step = np.uint64(last - first), np.uint64(pitch)
+    begin, column = np.uint64(_MARGIN + first), np.uint64(first)
+    one, two, three, four = np.uint64(_ROW), np.uint64(2 * _ROW), np.uint64(3 * _ROW), np.uint64(4 * _ROW)
+    known, least, alike, heard = ring.known, ring.least, ring.alike, ring.heard
+    up, own, down = above * two + begin, here * two + begin, below * two + begin
+    of_up, of_own = above * four + begin, here * four + begin
     for i in range(size):
-        information[i] = ONE / doubts[here, own + i]
-        deviation[i] = np.float32(0.0)
-    for k in range(np.uint64(4)):
-        down, across = _DIRECTIONS[k]
-        start = np.uint64(_MARGIN + first - pitch)
-        for i in range(size + np.uint64(2 * pitch)):
-            at = start + i
-            alike[k, here, at] = likeness(unlike[k, above, at] + unlike[k, here, at] + unlike[k, below, at])
-        least = ring.far if down * across != 0 else ring.near
-        onward, back = (below, above) if down == 1 else (here, here)
-        after = np.uint64(_MARGIN + first + across * pitch)
-        before = np.uint64(_MARGIN + first - across * pitch)
-        for i in range(size):
-            weight = alike[k, here, own + i] * least[onward, after + i]
-            other = alike[k, back, before + i] * least[back, before + i]
-            level_here = levels[here, own + i]
-            information[i] += weight + other
-            deviation[i] += weight * (levels[onward, after + i] - level_here) + other * (
-                levels[back, before + i] - level_here
-            )
+        value, doubt = known[own + _LEVEL + i], known[own + _DOUBT + i]
+        onward = alike[of_own + i] * least[own + _NEAR + step + i]
+        back = alike[of_own - step + i] * least[own + _NEAR - step + i]
+        information = onward + back
+        deviation = onward * (known[own + _LEVEL + step + i] - value) + back * (
+            known[own + _LEVEL - step + i] - value
+        )
+        onward = alike[of_own + one + i] * least[down + _FAR - step + i]
+        back = alike[of_up + one + step + i] * least[up + _FAR + step + i]
+        information += onward + back
+        deviation += onward * (known[down + _LEVEL - step + i] - value) + back * (
+            known[up + _LEVEL + step + i] - value
+        )
+        onward = alike[of_own + two + i] * least[down + _NEAR + i]
+        back = alike[of_up + two + i] * least[up + _NEAR + i]
+        information += onward + back
+        deviation += onward * (known[down + _LEVEL + i] - value) + back * (known[up + _LEVEL + i] - value)
+        onward = alike[of_own + three + i] * least[down + _FAR + step + i]
+        back = alike[of_up + three - step + i] * least[up + _FAR - step + i]
+        information += onward + back
+        deviation += onward * (known[down + _LEVEL + step + i] - value) + back * (
+            known[up + _LEVEL - step + i] - value
+        )
+        independent = doubt / (ONE + doubt * information)  # 1 / (1 / doubt + information)
+        heard[begin + i] = value + deviation * independent
+        heard[begin + one + i] = SHARED * doubt + (ONE - SHARED) * independent
     for i in range(size):
-        heard = levels[here, own + i] + deviation[i] / information[i]
-        level[column + i] = heard if ring.hears[here, column + i] else level[column + i]
-    at = np.uint64(row)
-    for i in range(size):
-        left = SHARED * doubts[here, own + i] + (ONE - SHARED) / information[i]
-        total[at, column + i] = left if ring.hears[here, column + i] else total[at, column + i]
+        alone, together = level[column + i], heard[begin + i]
+        level[column + i] = together if ring.hears[here, column + i] else alone
+
+
+@nb.njit(cache=True)
+def _lessen(row, first, last, ring, left):  # type: ignore[no-untyped-def]
+    """The variances of a row, ``left``, where pixels have heard their neighbours."""
+    here, column, two = np.uint64(row % len(ring.spans)), np.uint64(first), np.uint64(_ROW + _MARGIN + first)
+    for i in range(np.uint64(last - first)):
+        alone, together = left[column + i], ring.heard[two + i]
+        left[column + i] = together if ring.hears[here, column + i] else alone
 
 
 @nb.njit(cache=True, inline="always", error_model="numpy")
 def _believe(  # type: ignore[no-untyped-def]
-    level, variance, row, marks, words, prior, log_offset, places, excess, doubt, out
+    level, variance, row, start, marks, words, prior, log_offset, places, excess, doubt, out
 ):
     """K6 of the marked pixels of a row, brought together so that they go through vector code and others do not pay."""
     white, scale2, stretch = prior
@@ -427,9 +571,9 @@ def _believe(  # type: ignore[no-untyped-def]
                 count += np.uint64(marks[column])
     for k in range(count):
         excess[k] = level[places[k]] - white
-        doubt[k] = variance[row, places[k]]
+        doubt[k] = variance[places[k]]
     for k in range(count):
         believed = believed_highlight(excess[k], doubt[k], scale2, stretch)
         excess[k] = max(exponential(white + believed) - log_offset, np.float32(0.0))
     for k in range(count):
-        out[row, places[k]] = excess[k]
+        out[row, start + places[k]] = excess[k]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from kalux.errors import FormatError, InputError
 from kalux.readers import (
@@ -24,9 +24,12 @@ from kalux.readers import (
     rosbag,
     table,
 )
+from kalux.readers.images import SUFFIXES as _IMAGES
 from kalux.readers.source import CHUNK_EVENTS, GroundTruth, Source
 
 __all__ = ["CHUNK_EVENTS", "READERS", "GroundTruth", "Reader", "Source", "read"]
+
+_VIDEOS: Final = frozenset({".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v"})
 
 
 class Reader(NamedTuple):
@@ -74,15 +77,15 @@ def read(path: str | Path) -> Source:
         If no reader recognises it, or the one that does finds it damaged.
     """
     path, choice = _split(Path(path))
-    if not path.exists():
-        raise InputError(f"{path}: no such file or folder")
     try:
+        if not path.exists():
+            raise InputError(f"{path}: no such file or folder")
         reader = next((reader for reader in READERS if reader.recognises(path)), None)
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
     if reader is None:
         known = "; ".join(reader.description for reader in READERS)
-        raise FormatError(f"{path}: not a recording that kalux knows. It reads: {known}")
+        raise FormatError(f"{path}: {_what_it_is(path)}not a recording that kalux knows. It reads: {known}")
     if not choice:
         return reader.open(path)
     if reader.choose is None:
@@ -90,6 +93,22 @@ def read(path: str | Path) -> Source:
             f"{path}: nothing can be chosen after '?' in a recording of this format ({reader.name})"
         )
     return reader.choose(path, choice)
+
+
+def _what_it_is(path: Path) -> str:
+    """What somebody may have taken for a recording, as the beginning of a sentence; or nothing."""
+    if path.is_dir():
+        names = [file.suffix.lower() for file in path.iterdir()]
+        if not names:
+            return "an empty folder, "
+        if any(name in _IMAGES for name in names):
+            return "a folder of images, which --frames takes beside the recording of the events; "
+        return ""
+    if path.is_file() and not path.stat().st_size:
+        return "an empty file, "
+    if path.suffix.lower() in _IMAGES | _VIDEOS:
+        return "an image or a video, which --frames takes beside the recording of the events; "
+    return ""
 
 
 def _split(path: Path) -> tuple[Path, str]:

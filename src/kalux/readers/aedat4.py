@@ -8,6 +8,7 @@ https://docs.inivation.com/software/software-advanced-usage/file-formats/aedat-4
 from __future__ import annotations
 
 import dataclasses
+import os
 import struct
 import xml.etree.ElementTree as ElementTree
 from array import array
@@ -16,7 +17,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, BinaryIO, Final, TypeVar
+from typing import Any, BinaryIO, Final, NamedTuple, TypeVar
 
 import lz4.frame
 import numpy as np
@@ -25,8 +26,8 @@ import zstandard
 from kalux.errors import FormatError
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.frames import Frame, Mosaic
-from kalux.readers.source import TRIGGER_DTYPE, Source, TriggerArray, one_line, reading
-from kalux.readers.streams import in_order, rechunk
+from kalux.readers.source import CHUNK_EVENTS, TRIGGER_DTYPE, Source, TriggerArray, one_line, reading
+from kalux.readers.streams import in_order
 
 T = TypeVar("T")
 MAGIC: Final = b"#!AER-DAT4.0\r\n"
@@ -82,11 +83,16 @@ class _Container:
     def read(self, stream: _Stream, decode: Callable[[_Table], T]) -> Iterator[T]:
         """The contents of one stream, packet by packet."""
         places = self.packets.get(stream.number, array("q"))
+        identifier = stream.kind.encode()
         with reading(self.path), self.path.open("rb", buffering=0) as file:
             for offset, size in zip(places[::2], places[1::2], strict=True):
-                file.seek(offset)
                 try:
-                    content = decode(_root(self.decompress(_exactly(file, size)), stream.kind))
+                    packet = os.pread(file.fileno(), size, offset)
+                    if len(packet) != size:
+                        raise EOFError(
+                            f"{size} bytes expected, {len(packet)} found before the end of the file"
+                        )
+                    content = decode(_root(self.decompress(packet), identifier))
                 except FormatError:
                     raise
                 except _DAMAGE as error:
@@ -97,6 +103,7 @@ class _Container:
                 yield content
 
 
+_CHUNK_BYTES: Final = CHUNK_EVENTS * EVENT_DTYPE.itemsize
 _NAMES: Final = {"EVTS": "event", "FRME": "frame", "TRIG": "trigger"}
 _POLARITY: Final = EVENT_DTYPE.fields["p"][1]  # type: ignore[index]
 # Numbers of dv::TriggerType for edges of the external input; others are of the generator and of the sensor itself.
@@ -149,7 +156,7 @@ def read(path: Path) -> Source:
         missing += (_DEMOSAICED,)
 
     def read_events() -> Iterator[EventArray]:
-        return iter(()) if events is None else rechunk(container.read(events, _events))
+        return iter(()) if events is None else _joined(container.read(events, _events))
 
     def read_frames() -> Iterator[Frame]:
         if frames is None:
@@ -210,15 +217,30 @@ def _stamp_only(frame: Frame) -> Frame:
 # The contents of packets
 
 
-def _events(table: _Table) -> EventArray:
+def _events(table: _Table) -> memoryview:
+    """The bytes of a packet's events: the FlatBuffers struct (int64, int16, int16, bool, 3 bytes) is EVENT_DTYPE."""
     start, count = table.vector(0)
-    # The FlatBuffers struct (int64, int16, int16, bool, 3 bytes of padding) is EVENT_DTYPE.
-    events: EventArray = np.frombuffer(table.data, EVENT_DTYPE, count, start)
-    # By way of bytes: packets are small, and NumPy takes longer to begin than to look at them all.
-    polarities = table.data[start + _POLARITY : start + EVENT_DTYPE.itemsize * count : EVENT_DTYPE.itemsize]
-    if polarities.translate(None, b"\0\1"):
+    end = start + EVENT_DTYPE.itemsize * count
+    if end > len(table.data):
+        raise EOFError("the packet is shorter than its events")
+    if table.data[start + _POLARITY : end : EVENT_DTYPE.itemsize].translate(None, b"\0\1"):
         raise ValueError("polarity is neither 0 nor 1")
-    return events
+    return memoryview(table.data)[start:end]
+
+
+def _joined(packets: Iterator[memoryview]) -> Iterator[EventArray]:
+    """Events in chunks that are worth a loop. As bytes: packets are small, and NumPy takes long to begin."""
+    held: list[memoryview] = []
+    size = 0
+    for packet in packets:
+        while size + len(packet) > _CHUNK_BYTES:
+            part = _CHUNK_BYTES - size
+            yield np.frombuffer(bytearray().join([*held, packet[:part]]), EVENT_DTYPE)
+            held, size, packet = [], 0, packet[part:]
+        held.append(packet)
+        size += len(packet)
+    if size:
+        yield np.frombuffer(bytearray().join(held), EVENT_DTYPE)
 
 
 def _edges(table: _Table) -> TriggerArray:
@@ -274,7 +296,7 @@ def _open(path: Path, file: BinaryIO) -> _Container:
     file_size = file.tell()
     file.seek(len(MAGIC))
     prefix = _exactly(file, 4)
-    header = _root(prefix + _exactly(file, struct.unpack("<I", prefix)[0]), "IOHE")
+    header = _root(prefix + _exactly(file, struct.unpack("<I", prefix)[0]), b"IOHE")
     compression = header.scalar(0, "<i", 0)
     if compression not in _DECOMPRESS:
         raise FormatError(f"{path}: unknown compression {compression}; save it again with LZ4, ZSTD or none")
@@ -363,8 +385,7 @@ _DECOMPRESS: Final[dict[int, Callable[[bytes], bytes]]] = {
 # FlatBuffers: https://flatbuffers.dev/internals/
 
 
-@dataclass(frozen=True)
-class _Table:
+class _Table(NamedTuple):
     """A FlatBuffers table: fields found by number, each may be absent."""
 
     data: bytes
@@ -395,17 +416,22 @@ class _Table:
         return self.position + offset if offset else None
 
 
-def _root(data: bytes, identifier: str) -> _Table:
+def _root(data: bytes, identifier: bytes) -> _Table:
     """The root table of a size-prefixed buffer, whose type must be as declared."""
-    if _unpack("<I", data, 0) + 4 > len(data):
+    size, root, found = _BUFFER_HEADER.unpack_from(data)
+    if size + 4 > len(data):
         raise EOFError("the packet is shorter than it says")
-    if data[8:12] != identifier.encode():
-        raise ValueError(f"it is not of the declared type {identifier}")
-    return _Table(data, 4 + _unpack("<I", data, 4))
+    if found != identifier:
+        raise ValueError(f"it is not of the declared type {identifier.decode()}")
+    return _Table(data, 4 + root)
+
+
+_BUFFER_HEADER: Final = struct.Struct("<II4s")
+_CODES: Final = {code: struct.Struct(code).unpack_from for code in ("<b", "<h", "<H", "<i", "<I", "<q")}
 
 
 def _unpack(code: str, data: bytes, position: int) -> int:
     if position < 0:  # struct would count from the end
         raise ValueError("an offset points before the packet")
-    value: int = struct.unpack_from(code, data, position)[0]
+    value: int = _CODES[code](data, position)[0]
     return value

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import os
 from collections.abc import Iterable, Iterator
@@ -285,7 +286,8 @@ def write(
         reason = one_line(error) if error.errno is None else os.strerror(error.errno)
         raise OutputError(f"{path}: cannot be written: {reason}") from error
     finally:
-        partial.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # also of a name that is too long
+            partial.unlink(missing_ok=True)
 
 
 class _Sink(io.FileIO):

@@ -46,10 +46,11 @@ class SettingsFile:
         OSError
             It cannot be written; the old one stays.
         """
+        # Names of files that are not UTF-8 have no other form in TOML than with "?" in these places.
         lines = [FIRST_LINE, f"complete = {str(complete).lower()}", f"images = {images}"]
         if times is not None:
             lines += [f"first_t_us = {times[0]}", f"last_t_us = {times[1]}"]
-        write_whole(self.path, "\n".join([*lines, self.body]).encode())
+        write_whole(self.path, "\n".join([*lines, self.body]).encode(errors="replace"))
 
 
 def settings_file(path: Path, metadata: Mapping[str, Any], output: Mapping[str, Any]) -> SettingsFile:
