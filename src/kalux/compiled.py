@@ -88,7 +88,8 @@ _APART: Final = 7 * _LINE
 """Bytes: more than what loops take of a plane at a time, 64 float32, and lines of nine planes do not meet."""
 
 _begins: Final = itertools.count(0, 25)
-"""Lines of a page where the planes of a call of `apart` begin: far from those of the calls before. No result depends on it."""
+"""Lines of a page where the planes of a call of `apart` begin: far from those of the calls before. No
+result depends on it."""
 
 
 def packed(shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
