@@ -88,8 +88,8 @@ _APART: Final = 7 * _LINE
 """Bytes: more than what loops take of a plane at a time, 64 float32, and lines of nine planes do not meet."""
 
 _begins: Final = itertools.count(0, 25)
-"""Lines of a page where the planes of a call of `apart` begin: far from those of the calls before. No
-result depends on it."""
+"""Lines of a page where the planes of a call of `apart` begin: far from those of the calls before. No result depends on
+it."""
 
 
 def packed(shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
@@ -117,8 +117,8 @@ def apart(count: int, shape: tuple[int, ...], dtype: Any = np.float32) -> NDArra
     piece = memory.empty((count * step + 2 * _PAGE,), np.uint8)
     first = -piece.ctypes.data % _PAGE + next(_begins) * _LINE % _PAGE
     planes = piece[first : first + count * step].reshape(count, step)[:, :size]
-    laid_out: NDArray[Any] = planes.view(dtype).reshape(count, *shape)
-    return laid_out
+    apart_: NDArray[Any] = planes.view(dtype).reshape(count, *shape)
+    return apart_
 
 
 def _prefetch(typing_context: Any, array: Any, index: Any) -> Any:
@@ -396,8 +396,8 @@ INFINITE_BITS: Final = 0x7F800000
 
 def magnitude_bits(values: NDArray[np.float32]) -> int:
     """The largest bits, without signs, of some float32: tells in one pass of what kind they are. 0 of none."""
-    if not any(values.strides):  # one number, repeated
-        values = values.reshape(-1)[:1]
+    if values.size and not any(values.strides):  # one number, repeated
+        values = values.flat[:1]
     return int(_magnitude_bits(np.ascontiguousarray(values).view(np.int32).reshape(-1)))
 
 
