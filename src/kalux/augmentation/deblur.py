@@ -25,6 +25,7 @@ from kalux.compiled import (
     AHEAD,
     FUSED,
     ONE,
+    UNWEIGHED,
     WEIGHT_UNIT,
     event_column,
     event_is_on,
@@ -265,8 +266,11 @@ def _integrate(words, pixels, width, start, middle, unit):  # type: ignore[no-un
         pixel.integral += level * (now - pixel.since)
         pixel.since = now
         factor = up if event_is_on(word) else down
-        weight = event_weight(word, unit)
-        level *= factor if weight == ONE else exponential(weight * logarithm(factor))
+        weight = ONE
+        if word & ~UNWEIGHED and unit > np.float32(0.0):  # before anything is made of it: most events weigh 1
+            weight = event_weight(word, unit)
+            factor = exponential(weight * logarithm(factor))
+        level *= factor
         peak = pixel.peak
         pixel.level = level
         pixel.peak = level if level > peak else peak
