@@ -6,6 +6,7 @@ they take and return float32: a literal number would turn float32 arithmetic int
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import Any, Final
 
@@ -79,6 +80,17 @@ _LINE: Final = 64
 """Bytes that the memory hands out at a time."""
 
 
+_PAGE: Final = 4096
+"""Bytes after which addresses compete for the same places of the nearest cache."""
+
+_APART: Final = 7 * _LINE
+"""Bytes: more than what loops take of a plane at a time, 64 float32, and lines of nine planes do not meet."""
+
+_begins: Final = itertools.count(0, 25)
+"""Lines of a page where the planes of a call of `apart` begin: far from those of the calls before. No result depends on
+it."""
+
+
 def packed(shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
     """An array of records or numbers, not filled, of which none lies in two lines of the memory that holds one each.
 
@@ -96,11 +108,16 @@ def apart(count: int, shape: tuple[int, ...], dtype: Any = np.float32) -> NDArra
 
     Planes of many sensors are whole pages of memory, so that the same pixel of all of them would compete for the same
     few places of the nearest cache, and stores would wait for loads that have nothing to do with them: a loop over
-    twenty planes then takes 1.4 times as long. These lie a line of the cache further apart each.
+    twenty planes then takes 1.4 times as long. These begin `_APART` further on in a page each, and those of another
+    call elsewhere.
     """
-    size = math.prod(shape)
-    line = _LINE // np.dtype(dtype).itemsize
-    return np.empty((count, size + line), dtype)[:, :size].reshape(count, *shape)
+    size = math.prod(shape) * np.dtype(dtype).itemsize
+    step = size + (_APART - size) % _PAGE
+    piece = np.empty(count * step + 2 * _PAGE, np.uint8)
+    first = -piece.ctypes.data % _PAGE + next(_begins) * _LINE % _PAGE
+    planes = piece[first : first + count * step].reshape(count, step)[:, :size]
+    apart_: NDArray[Any] = planes.view(dtype).reshape(count, *shape)
+    return apart_
 
 
 def _prefetch(typing_context: Any, array: Any, index: Any) -> Any:

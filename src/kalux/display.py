@@ -44,9 +44,12 @@ _NO_SHOULDER: Final = 1.0 + 1e-3
 BINS = 256
 SAMPLES = 1 << 16
 
-_COARSE_BITS: Final = 19
+_COARSE_BITS: Final = 20
 """The exponent and four bits more are what is left of a positive float32 without its last ones: in the order of the
 numbers themselves, and 4096 at most."""
+
+
+_LARGEST_BITS: Final = np.float32(LARGEST).view(np.int32)
 
 
 class TimedImage(Protocol):
@@ -365,16 +368,23 @@ def tone_map_next(
 
 
 def next_state(
-    image: TimedImage, settings: DisplaySettings | None = None, state: ToneState | None = None
+    image: TimedImage,
+    settings: DisplaySettings | None = None,
+    state: ToneState | None = None,
+    *,
+    checked: bool = False,
 ) -> ToneState:
     """The part of `tone_map_next` that must go from image to image: its state. `apply` with its statistics is the rest.
+
+    What is ``checked``, float32, finite and of a shape that can be shown, is not looked through again.
 
     Raises
     ------
     InputError
         As of `tone_map_next`.
     """
-    return _next_state(_checked(_shown(image)), image.t, settings or DisplaySettings(), state)
+    shown = _shown(image)
+    return _next_state(shown if checked else _checked(shown), image.t, settings or DisplaySettings(), state)
 
 
 def measure(intensity: NDArray[Any], curve: Curve) -> Statistics:
@@ -390,7 +400,9 @@ def measure(intensity: NDArray[Any], curve: Curve) -> Statistics:
     return _measure(_checked(intensity), curve)
 
 
-def apply(intensity: NDArray[Any], settings: DisplaySettings, statistics: Statistics) -> Float32:
+def apply(
+    intensity: NDArray[Any], settings: DisplaySettings, statistics: Statistics, *, checked: bool = False
+) -> Float32:
     """Map an image by given statistics, for instance those of one image for a whole video.
 
     Parameters
@@ -401,6 +413,8 @@ def apply(intensity: NDArray[Any], settings: DisplaySettings, statistics: Statis
         Of which ``smoothing`` is not used.
     statistics
         From `measure` with the same curve.
+    checked
+        As of `next_state`.
 
     Returns
     -------
@@ -412,7 +426,40 @@ def apply(intensity: NDArray[Any], settings: DisplaySettings, statistics: Statis
     InputError
         The intensity is of another shape, is empty, or is not finite; or the statistics are of another curve.
     """
-    return _apply(_checked(intensity), settings, statistics)
+    return _apply(intensity if checked else _checked(intensity), settings, statistics)
+
+
+def fill_levels(
+    intensity: Float32,
+    settings: DisplaySettings,
+    statistics: Statistics,
+    levels: tuple[float, float],
+    plane: NDArray[np.uint8],
+) -> None:
+    """Map an image as `apply` does, and fill a plane with the ``levels`` from 0 to 1, rounded.
+
+    Parameters
+    ----------
+    intensity
+        (height, width) float32, finite: it is not checked.
+    settings, statistics
+        As of `apply`.
+    levels
+        Of black and of white.
+    plane
+        (rows, columns), no smaller; where it is larger, the last row and column are repeated.
+    """
+    offset, factor = np.float32(levels[0] + 0.5), np.float32(levels[1] - levels[0])  # cut off after the point
+    if isinstance(settings.curve, Auto) and _encoding(settings) == "none":
+        _check_statistics(settings.curve, statistics)
+        _show_levels(intensity, *_auto_tone(settings.curve, *_exp(statistics)), offset, factor, plane)
+    else:
+        _fill(_apply(intensity, settings, statistics), offset, factor, plane)
+
+
+def fill(values: Float32, zero: float, scale: float, plane: NDArray[np.uint8]) -> None:
+    """Fill a plane with ``zero + scale * values``, rounded; as of `fill_levels`."""
+    _fill(np.ascontiguousarray(values, np.float32), np.float32(zero + 0.5), np.float32(scale), plane)
 
 
 def to_uint8(mapped: NDArray[Any]) -> NDArray[np.uint8]:
@@ -525,48 +572,66 @@ def _sampled(intensity: Float32) -> Float32:
 
 
 def _percentiles(values: Float32, percents: list[float]) -> Statistics:
-    """Percentiles of values that are not negative, linear between the two nearest of them."""
-    bits = np.ascontiguousarray(values).view(np.uint32).reshape(-1)
-    positions = np.array(percents) / 100 * (len(bits) - 1)
+    """Percentiles of values, linear between the two nearest of them; those below 0 count as 0."""
+    return _percentiles_of_sample(values.reshape(1, -1), percents)
+
+
+def _percentiles_of_sample(values: Float32, percents: list[float]) -> Statistics:
+    """The same of values in rows, wherever they lie; finite, and limited to `LARGEST`."""
+    bits = np.empty(values.size + 1, np.int32)
+    positions = np.array(percents) / 100 * (values.size - 1)
     ranks = np.stack([np.floor(positions), np.ceil(positions)]).astype(np.int64)
     # Few numbers are left to be put in order: those that share their first bits with one that is looked for.
-    total = _counted(bits)
-    ends = np.cumsum(total)
-    bins = np.searchsorted(ends, ranks, side="right")
-    wanted = np.zeros(len(total), np.uint64)
-    wanted[bins] = 1
-    kept = np.empty(int(total[wanted > 0].sum()) + 1, np.int32)
-    _keep(bits, wanted, kept)
-    places = ranks - (ends - np.cumsum(total * (wanted > 0)))[bins]
-    values = np.partition(kept[:-1], places.ravel())[places].view(np.float32).astype(np.float64)
-    found: Statistics = values[0] + (positions - ranks[0]) * (values[1] - values[0])
-    return found
+    places, count = _narrowed(values.view(np.int32), ranks.reshape(-1), bits)
+    places = places.reshape(ranks.shape)
+    found = np.partition(bits[:count], places.ravel())[places].view(np.float32).astype(np.float64)
+    between: Statistics = found[0] + (positions - ranks[0]) * (found[1] - found[0])
+    return between
 
 
 @nb.njit(cache=True, nogil=True)
-def _counted(sample):  # type: ignore[no-untyped-def]
-    """How many of a sample have the same first bits."""
-    counts = np.zeros((4, 1 << (31 - _COARSE_BITS)), np.int64)  # four, so that equal neighbours need not wait
-    for i in range(np.uint64(len(sample))):
-        counts[i & np.uint64(3), np.uint64(sample[i]) >> np.uint64(_COARSE_BITS)] += 1
-    for k in range(1, 4):
-        for i in range(counts.shape[1]):
-            counts[0, i] += counts[k, i]
-    return counts[0]
+def _narrowed(rows, ranks, bits):  # type: ignore[no-untyped-def]
+    """The numbers among which those of some ranks are, in ``bits``, with room for one more; their places, and how many.
 
-
-@nb.njit(cache=True, nogil=True)
-def _keep(sample, wanted, kept):  # type: ignore[no-untyped-def]
-    """Those whose first bits are wanted; ``kept`` has room for one more."""
+    Numbers are compared by their bits: as float32 that are not negative, they are in the same order.
+    """
+    counts = np.zeros((4, 1 << (31 - _COARSE_BITS)), np.int32)  # four, so that equal neighbours need not wait
+    height, width = rows.shape
+    at = np.uint64(0)
+    for row in range(height):
+        for column in range(width):
+            value = rows[row, column]
+            value = value if value > np.int32(0) else np.int32(0)
+            value = value if value < _LARGEST_BITS else _LARGEST_BITS
+            bits[at] = value
+            counts[at & np.uint64(3), np.uint64(value) >> np.uint64(_COARSE_BITS)] += 1
+            at += np.uint64(1)
+    total = counts[0] + counts[1] + counts[2] + counts[3]
+    wanted = np.zeros(len(total), np.uint8)
+    places = np.empty(len(ranks), np.int64)
+    # From the lowest rank to the highest.
+    order = np.argsort(ranks)
+    below, kept, part = np.int64(0), np.int64(0), 0
+    for k in order:
+        while below + total[part] <= ranks[k]:
+            below += total[part]
+            kept += total[part] * np.int64(wanted[part])
+            part += 1
+        wanted[part] = 1
+        places[k] = kept + ranks[k] - below
     found = np.uint64(0)
-    for i in range(np.uint64(len(sample))):
-        kept[found] = sample[i]
-        found += wanted[np.uint64(sample[i]) >> np.uint64(_COARSE_BITS)]
+    for i in range(np.uint64(at)):
+        value = bits[i]
+        bits[found] = value  # never behind what is still to be read
+        found += np.uint64(wanted[np.uint64(value) >> np.uint64(_COARSE_BITS)])
+    return places, found
 
 
 def _measure(intensity: Float32, curve: Curve) -> Statistics:
     if isinstance(curve, Linear):
         return np.empty(0)
+    if isinstance(curve, Auto) and intensity.ndim == 2:
+        return _log(_percentiles_of_sample(_sampled(intensity), [50, curve.high]))
     values = _bounded(intensity if isinstance(curve, Clahe) else _sampled(intensity))
     if values.ndim == 3:
         values = luminance(values)
@@ -594,9 +659,7 @@ def _apply(intensity: Float32, settings: DisplaySettings, statistics: Statistics
 
 
 def _curved(intensity: Float32, curve: Curve, statistics: Statistics) -> Float32:
-    expected = {Linear: 0, Clahe: 2 + getattr(curve, "tiles", 0) ** 2 * (BINS + 1)}.get(type(curve), 2)
-    if statistics.shape != (expected,):
-        raise InputError("display: the statistics are of another curve than that of the settings")
+    _check_statistics(curve, statistics)
     match curve:
         case Linear():
             return _stretched(intensity, curve.black, curve.white)
@@ -613,10 +676,20 @@ def _curved(intensity: Float32, curve: Curve, statistics: Statistics) -> Float32
             return _clahe(intensity, curve, statistics)
 
 
+def _check_statistics(curve: Curve, statistics: Statistics) -> None:
+    expected = {Linear: 0, Clahe: 2 + getattr(curve, "tiles", 0) ** 2 * (BINS + 1)}.get(type(curve), 2)
+    if statistics.shape != (expected,):
+        raise InputError("display: the statistics are of another curve than that of the settings")
+
+
+def _encoding(settings: DisplaySettings) -> Encoding:
+    if settings.encoding == "curve":
+        return "srgb" if isinstance(settings.curve, Reinhard | Drago) else "none"
+    return settings.encoding
+
+
 def _encoded(mapped: Float32, settings: DisplaySettings) -> Float32:
-    encoding = settings.encoding
-    if encoding == "curve":
-        encoding = "srgb" if isinstance(settings.curve, Reinhard | Drago) else "none"
+    encoding = _encoding(settings)
     if encoding == "srgb":
         return encode_srgb(mapped)
     if encoding == "gamma":
@@ -641,13 +714,18 @@ def _stretched(intensity: Float32, black: float, white: float) -> Float32:
 
 
 def _auto(intensity: Float32, curve: Auto, median: float, white: float) -> Float32:
+    shown = np.empty(intensity.shape, np.float32)
+    values = np.ascontiguousarray(intensity).reshape(-1)
+    _show(values, *_auto_tone(curve, median, white), shown.reshape(-1))
+    return shown
+
+
+def _auto_tone(curve: Auto, median: float, white: float) -> tuple[_Shoulder, bool, np.float32]:
+    """The shoulder, whether there is one, and the power."""
     shoulder = _shoulder(curve.knee, white)
     middle = max(float(_rolled(np.float32(median), shoulder)), SMALLEST)
     power = min(max(math.log(min(middle, 0.99)) / math.log(MID_GREY), 1.0), curve.lift)
-    shown = np.empty(intensity.shape, np.float32)
-    values = np.ascontiguousarray(intensity).reshape(-1)
-    _show(values, shoulder, white > _NO_SHOULDER, np.float32(1 / power), shown.reshape(-1))
-    return shown
+    return shoulder, white > _NO_SHOULDER, np.float32(1 / power)
 
 
 class _Shoulder(NamedTuple):
@@ -695,6 +773,31 @@ def _show(values, shoulder, rolled, power, shown):  # type: ignore[no-untyped-de
             lifted = exponential(power * logarithm(value))
             lifted = lifted if lifted < ONE else ONE
             shown[i] = lifted if value > zero else zero
+
+
+@nb.njit(cache=True, nogil=True, fastmath=FUSED)
+def _show_levels(values, shoulder, rolled, power, offset, factor, plane):  # type: ignore[no-untyped-def]
+    """`_show` and `_fill`, a row at a time."""
+    height, width = values.shape
+    shown = np.empty((1, width), np.float32)
+    for row in range(len(plane)):
+        if row < height:
+            _show(values[row], shoulder, rolled, power, shown[0])
+        _fill_row(shown[0], offset, factor, plane[row])
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _fill(values, offset, factor, plane):  # type: ignore[no-untyped-def]
+    for row in range(len(plane)):
+        _fill_row(values[min(row, len(values) - 1)], offset, factor, plane[row])
+
+
+@nb.njit(cache=True, inline="always", error_model="numpy")
+def _fill_row(values, offset, factor, levels):  # type: ignore[no-untyped-def]
+    for column in range(len(values)):
+        levels[column] = np.uint8(np.int32(offset + factor * values[column]))
+    for column in range(len(values), len(levels)):
+        levels[column] = levels[len(values) - 1]
 
 
 def _shoulder_gain(height: float, width: float) -> float:

@@ -14,12 +14,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.ahead import ahead
-from kalux.calibration.contrast import ThresholdEstimate, Usual, estimate_thresholds
+from kalux.calibration.contrast import (
+    ROUGH_SAMPLES,
+    ThresholdEstimate,
+    Usual,
+    estimate_thresholds,
+    refine_thresholds,
+)
 from kalux.calibration.delay import DelayEstimate, estimate_delay
 from kalux.calibration.event_model import EventModel, estimate_event_model
 from kalux.calibration.frame_noise import FrameNoise, estimate_frame_noise
 from kalux.calibration.mismatch import Mismatch, estimate_mismatch
 from kalux.calibration.noise import event_noise
+from kalux.calibration.steps import MAX_SAMPLES
 from kalux.calibration.values import Calibration
 from kalux.calibration.white_balance import grey_world
 from kalux.errors import FrameError, InputError
@@ -129,10 +136,13 @@ def plan(
     chosen, delay = _with_delay(recording, chosen)
     filled, origin, estimate = _with_thresholds(recording, chosen)
     filled, model = _with_event_model(recording, filled)
-    decides = estimate is not None and (origin in ("estimate", "assumed") or estimate.refractory_period > 0)
-    if decides and chosen.camera.offset != filled.camera.offset:
-        unfilled = dataclasses.replace(chosen.events, step_variance=filled.events.step_variance)
-        filled, origin, estimate = _with_thresholds(recording, dataclasses.replace(filled, events=unfilled))
+    if estimate is not None and chosen.camera.log_offset is None:
+        estimated = origin in ("estimate", "assumed")
+        if estimated or (estimate.refractory_period > 0 and chosen.camera.offset != filled.camera.offset):
+            unfilled = dataclasses.replace(chosen.events, step_variance=filled.events.step_variance)
+            rough = estimate if estimated else None
+            filled = dataclasses.replace(filled, events=unfilled)
+            filled, origin, estimate = _with_thresholds(recording, filled, rough)
     unsure = estimate.spread if estimate is not None and origin in ("estimate", "assumed") else 0.0
     filled, mismatch = _with_mismatch(recording, filled, unsure)
     filled, background = _with_background(recording, filled, known.pixels)
@@ -269,9 +279,10 @@ def _smoothed_estimates(
             on_backward,
             trail=trail,
         )
+        on, off = engine.thresholds
         for estimate in _estimates(recording, engine, plan, on_events, read_ahead):
             ahead_of_events = None if trail is None else engine.trail(estimate.t)
-            yield combine(estimate, backward.estimate(estimate.t), ahead_of_events)
+            yield combine(estimate, backward.estimate(estimate.t), ahead_of_events, on * off)
 
 
 def _trail(plan: Plan) -> tuple[Settings, NDArray[np.bool_] | None] | None:
@@ -419,9 +430,14 @@ def _with_frame_noise(recording: Recording, settings: Settings) -> tuple[Setting
 
 
 def _with_thresholds(
-    recording: Recording, settings: Settings
+    recording: Recording,
+    settings: Settings,
+    rough: ThresholdEstimate | None = None,
 ) -> tuple[Settings, ThresholdOrigin, ThresholdEstimate | None]:
-    """Fill in thresholds and refractory period: from the settings, else the recording, else an estimate, else usual."""
+    """Fill in thresholds and refractory period: from the settings, else the recording, else an estimate, else usual.
+
+    An estimate without I_0 is rough; with I_0 it is made again, from that.
+    """
     events = settings.events
     stated = (recording.contrast_threshold or (None, None)) if not _has_thresholds(events) else (None, None)
     origin: ThresholdOrigin = "settings" if _has_thresholds(events) else "recording"
@@ -436,13 +452,27 @@ def _with_thresholds(
     usual = Usual(events.usual_threshold_on, events.usual_threshold_off, events.usual_spread)
     if known.threshold_on is not None and known.threshold_off is not None:
         usual = Usual(known.threshold_on, known.threshold_off, 0.0)
-    estimate = estimate_thresholds(
-        recording,
-        settings.camera,
-        usual,
-        of_log_offset=settings.filter.augmentation == "paper",
-        delay=events.delay or 0,
-        refractory_period=events.refractory_period if _uses_steps(settings) else 0,
+    of_log_offset = settings.filter.augmentation == "paper"
+    period = events.refractory_period if _uses_steps(settings) else 0
+    estimate = (
+        estimate_thresholds(
+            recording,
+            settings.camera,
+            usual,
+            of_log_offset=of_log_offset,
+            delay=events.delay or 0,
+            refractory_period=period,
+            most=ROUGH_SAMPLES if settings.camera.log_offset is None else MAX_SAMPLES,
+        )
+        if rough is None
+        else refine_thresholds(
+            recording,
+            settings.camera,
+            usual,
+            rough,
+            of_log_offset=of_log_offset,
+            refractory_period=period,
+        )
     )
     if finds_period:
         period = 0 if estimate is None else estimate.refractory_period

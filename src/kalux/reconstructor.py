@@ -112,6 +112,9 @@ class Estimate:
         The share of the time for which frames are exposed, where the next one is known.
     since
         Where it is not known or not used: time to the only frame, in intervals between frames; else None.
+    told
+        (H, W): variance of what frames and events have told, where that is not P; None: P. Both ways in time P counts
+        the errors as well that both directions share, which are what no event has told; these K11 adds itself.
     """
 
     t: int
@@ -127,6 +130,7 @@ class Estimate:
     around: Around | None = None
     exposed: float = 0.0
     since: float | None = None
+    told: NDArray[np.floating[Any]] | None = None
 
 
 class _Progress:
@@ -455,9 +459,12 @@ class Reconstructor:
         on, off = self.thresholds
         offset = self.settings.camera.offset
         log_intensity, variance, unshown = estimate.log_intensity, estimate.variance, estimate.unshown
+        told = estimate.told
         if unshown is not None:
             unshown = tempered(unshown, log_intensity, prior)
             log_intensity, variance = lifted(log_intensity, variance, unshown)
+            if told is not None:
+                _, told = lifted(estimate.log_intensity, told, unshown)
         moving, neighbours = estimate.moving, self.settings.filter.neighbours
         pitch = 2 if mosaic else 1  # neighbours of the same colour
         hidden = hidden_variance(estimate.between, on * off, estimate.exposed, estimate.since)
@@ -484,7 +491,8 @@ class Reconstructor:
         if not tells:
             total = np.broadcast_to(np.float32(np.inf), intensity.shape)
         elif moving is not None and change is not None:
-            total = given_variance(variance, moving, change, hidden, estimate.around)
+            known = variance if told is None else told
+            total = given_variance(known, moving, change, hidden, estimate.around)
         image = Image(estimate.t, intensity, total, offset, estimate.final)
         return (
             image

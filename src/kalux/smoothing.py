@@ -6,8 +6,8 @@ L' and P' of the backward one, the estimate is the two-filter smoother (Fraser a
 
     L_s = (L / P + L' / P') / (1 / P + 1 / P').
 
-Where one of them knows no more than a bound, it counts as one (docs/equations.md, K15). The variance is
-1 / (1 / P + 1 / P'); what both have from the frames around the image, the noise of these, K11 sees to.
+Where one of them knows no more than a bound, it counts as one (docs/equations.md, K15). Where a frame around the image
+measures the pixel, both go along the same bridge, and err alike (`shared_errors`).
 
 Memory is bounded: the recording is spilled to disk, where it can be read backward, and the backward pass is done
 twice, first to save its state before every window of images, then window by window for the images themselves.
@@ -24,7 +24,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.bridge import UNMEASURED
+from kalux.augmentation.bridge import REPEATED, UNMEASURED
 from kalux.augmentation.deblur import between
 from kalux.augmentation.refractory import EventClock
 from kalux.augmentation.trail import FrameTrail, follow, nothing_followed, trail_at
@@ -32,6 +32,7 @@ from kalux.compiled import event_words
 from kalux.errors import OutputError
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.filters.highlights import obey_bounds, smoothed_unshown
+from kalux.filters.uncertainty import Around
 from kalux.frames import Frame, Mosaic
 from kalux.reconstructor import Estimate, Reconstructor
 from kalux.recording import Recording
@@ -41,6 +42,10 @@ _WINDOW_BYTES: Final = 256 << 20
 """Estimates of the backward pass that are held in memory at a time."""
 
 _BLOCK_EVENTS: Final = 1 << 18
+
+_STANDS_STILL: Final = 0.005
+"""Mean square change of silent pixels, in c^2, up to which nothing moves there: a tenth of the least under a moving
+camera (`kalux.augmentation.unseen`)."""
 
 
 def _reason(error: OSError) -> str:
@@ -339,42 +344,94 @@ class Backward:
 
 
 def combine(
-    forward: Estimate, backward: Estimate | None, trail: NDArray[np.floating[Any]] | None = None
+    forward: Estimate,
+    backward: Estimate | None,
+    trail: NDArray[np.floating[Any]] | None = None,
+    threshold2: float = 0.0,
 ) -> Estimate:
     """The smoothed estimate of two filters, in the forward one's time; the forward one where it is alone.
 
-    ``trail`` is how far the light is ahead of its events (K14), which the backward filter's reads are without.
+    ``trail`` is how far the light is ahead of its events (K14), which the backward filter's reads are without;
+    ``threshold2`` is c^2.
     """
     if backward is None:
         return forward
     first, second = 1.0 / forward.variance, 1.0 / backward.variance
+    information = first + second
     behind = backward.log_intensity if trail is None else backward.log_intensity + trail
-    level = (first * forward.log_intensity + second * behind) / (first + second)
+    level = (first * forward.log_intensity + second * behind) / information
     directions = (
         (forward.log_intensity, forward.variance, forward.unshown),
         (behind, backward.variance, backward.unshown),
     )
     obey_bounds(level, *directions)
     obey_bounds(level, *directions[::-1])
+    variance = told = 1.0 / information
+    shared = shared_errors(forward.around, backward.around)
+    if shared is not None:
+        variance = (information + 2.0 * shared * np.sqrt(first * second)) / information**2
+        repeated = _repeated(forward.around, backward.around)
+        variance, told = np.where(repeated, told, variance), np.where(repeated, variance, told)
+    change = _mean_of_both(forward.silent_change, backward.silent_change)
     return Estimate(
         t=forward.t,
         log_intensity=level,
-        variance=1.0 / (first + second),
+        variance=variance,
         white=forward.white,
         final=forward.final,
-        moving=_either(forward.moving, backward.moving),
+        moving=_moving(forward.moving, backward.moving, change, threshold2),
         between=forward.between,
         chroma=forward.chroma,
         unshown=smoothed_unshown(forward.unshown, backward.unshown),
-        silent_change=_mean_of_both(forward.silent_change, backward.silent_change),
+        silent_change=change,
         around=None if forward.around is None else forward.around._replace(counted=UNMEASURED),
         exposed=forward.exposed,
         since=_least(forward.since, backward.since),
+        told=told,
     )
 
 
-def _either(first: NDArray[np.bool_] | None, second: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
-    return None if first is None or second is None else first | second
+def shared_errors(forward: Around | None, backward: Around | None) -> NDArray[np.floating[Any]] | None:
+    """(H, W) correlation of the errors of the two directions: how far both go by the same frames.
+
+    From the first frame around to the second both go along one bridge (K1), and each knows the one ahead of it through
+    this bridge as well as the other knows it from behind. With s the share of the way to the second frame, its
+    correlation is 1 - s where the first frame measures the pixel, and s where the second does: 1 where both do, 0 where
+    neither does and each direction comes from a frame of its own. None: not told.
+    """
+    if forward is None or backward is None:
+        return None
+    # At a frame both directions end there, each with nothing to come.
+    ahead = forward.coming + backward.coming
+    share = np.float32(1.0 if forward.coming == 0 else backward.coming / ahead)
+    first, second = forward.first < UNMEASURED, forward.second < UNMEASURED
+    return (np.float32(1.0) - share) * first + share * second
+
+
+def _repeated(forward: Around | None, backward: Around | None) -> NDArray[np.bool_]:
+    """(H, W): where a frame around is black, which tells both directions the same (K7)."""
+    assert forward is not None
+    assert backward is not None
+    ends = (around.second for around in (forward, backward))
+    first, second = ((end >= REPEATED) & (end < UNMEASURED) for end in ends)
+    return first | second
+
+
+def _moving(
+    first: NDArray[np.bool_] | None,
+    second: NDArray[np.bool_] | None,
+    change: NDArray[np.floating[Any]] | None,
+    threshold2: float,
+) -> NDArray[np.bool_] | None:
+    """Pixels that move in both directions, or in one where what is silent around them changes, too.
+
+    Where the surroundings stand still, what comes by before or after says nothing against the texture that frames show.
+    """
+    if first is None or second is None:
+        return None
+    if change is None:
+        return first | second
+    return (first & second) | ((first | second) & (change > _STANDS_STILL * threshold2))
 
 
 def _least(first: float | None, second: float | None) -> float | None:

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
-from hypothesis import strategies as st
 
 import kalux
 from kalux import Frame, Recording
-from kalux.calibration.contrast import Usual, estimate_thresholds, fit_thresholds
+from kalux.calibration.contrast import Usual, estimate_thresholds
 from kalux.datasets import SensorSettings, demo_scene, simulate, static
 from kalux.errors import ExposureError
 from kalux.events import make_events
@@ -19,56 +17,6 @@ from builders import dark_scene, events, moving_blocks, unlabelled
 
 CAMERA = CameraSettings()
 USUAL = Usual(0.25, 0.25, 0.5)
-
-
-def counts(rng, n=2000):
-    return rng.integers(0, 9, (2, n)).astype(np.float64)
-
-
-# --- the fit --------------------------------------------------------------------------------------------
-
-
-@given(on=st.floats(0.02, 1.0), off=st.floats(0.02, 1.0), seed=st.integers(0, 1000))
-@example(on=0.6342572905823858, off=0.6342572905823858, seed=42)
-@settings(max_examples=30)
-def test_fit_is_exact_without_noise(on, off, seed):
-    """Even where rounding leaves most residuals, and with them the robust scale, exactly zero."""
-    n_on, n_off = counts(np.random.default_rng(seed))
-    found = fit_thresholds(on * n_on - off * n_off, n_on, n_off)
-    assert found.on == pytest.approx(on, rel=1e-9)
-    assert found.off == pytest.approx(off, rel=1e-9)
-    assert found.residual < 1e-9
-
-
-def test_fit_stands_a_fifth_of_outliers():
-    """Huber's weights bound what an outlier can do; least squares is an order of magnitude further off."""
-    rng = np.random.default_rng(1)
-    n_on, n_off = counts(rng, 20_000)
-    difference = 0.2 * n_on - 0.3 * n_off + 0.05 * rng.standard_normal(20_000)
-    wrong = rng.random(20_000) < 0.2
-    difference[wrong] = rng.uniform(-3, 3, int(wrong.sum()))
-    found = fit_thresholds(difference, n_on, n_off)
-    assert found.on == pytest.approx(0.2, rel=0.06)
-    assert found.off == pytest.approx(0.3, rel=0.06)
-    design = np.column_stack([n_on, -n_off])
-    plain = np.linalg.lstsq(design, difference, rcond=None)[0]
-    assert abs(found.on - 0.2) < 0.5 * abs(plain[0] - 0.2)
-    assert abs(found.off - 0.3) < 0.5 * abs(plain[1] - 0.3)
-
-
-def test_residual_is_a_standard_deviation():
-    rng = np.random.default_rng(2)
-    n_on, n_off = counts(rng, 20_000)
-    found = fit_thresholds(0.2 * n_on - 0.3 * n_off + 0.05 * rng.standard_normal(20_000), n_on, n_off)
-    assert found.residual == pytest.approx(0.05, rel=0.03)
-
-
-def test_no_fit_where_a_threshold_is_not_determined():
-    n_on, n_off = counts(np.random.default_rng(3))
-    none = np.zeros_like(n_on)
-    assert fit_thresholds(0.2 * n_on, n_on, none) is None  # no off event at all
-    assert fit_thresholds(0.2 * n_on, n_on, n_on) is None  # always as many
-    assert fit_thresholds(-0.2 * n_on + 0.2 * n_off, n_on, n_off) is None  # the wrong way round
 
 
 # --- from recordings ------------------------------------------------------------------------------------

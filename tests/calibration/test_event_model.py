@@ -6,11 +6,14 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy import stats
 
+import kalux
 from kalux import PRESETS, Recording
 from kalux.calibration import event_model
-from kalux.calibration.event_model import Samples, estimate_event_model, negative_log_likelihood
+from kalux.calibration.event_model import Samples, Shown, estimate_event_model, negative_log_likelihood
 from kalux.datasets import SensorSettings, pan, photograph_scene, simulate
+from kalux.datasets.ahdr import ArtificialCamera, artificial_hdr
 from kalux.pipeline import plan
 from kalux.settings import CameraSettings
 
@@ -128,3 +131,38 @@ def test_where_it_cannot_be_told_the_usual_is_written_down(recordings):
     made = plan(silent, at="frames")
     assert made.event_model is None
     assert (made.settings.camera.log_offset, made.settings.events.step_variance) == (0.03, 0.2)
+
+
+def test_what_frames_cannot_show_says_nothing_of_the_offset():
+    """Cut at both ends, changes look smaller than events say, most of all near white: as if I_0 were small."""
+    rng = np.random.default_rng(1)
+    steps = rng.integers(-6, 7, 40_000)
+    before = np.exp(rng.uniform(np.log(0.17), np.log(0.98), 40_000))
+    after = (before + 0.12) * np.exp(0.2 * steps + 0.3 * rng.standard_normal(40_000)) - 0.12
+    kept = (after > 0.17) & (after < 0.98)
+    samples = Samples(
+        before[kept], after[kept], np.maximum(steps, 0)[kept] * 1.0, np.maximum(-steps, 0)[kept] * 1.0
+    )
+    shown = Shown(np.full(int(kept.sum()), 0.17), np.full(int(kept.sum()), 0.98))
+    found = []
+    for limits in (None, shown):
+        losses = [
+            negative_log_likelihood(samples, THRESHOLDS, offset, 0.4, (1e-3, 0.0), 0.02, 1 / 6, limits)
+            for offset in event_model.LOG_OFFSETS
+        ]
+        found.append(event_model.LOG_OFFSETS[int(np.argmin(losses))])
+    assert found[0] < found[1] == 0.12
+
+
+def test_the_share_of_students_t():
+    """Against SciPy's."""
+    t = np.array([-np.inf, -30.0, -1.3, 0.0, 0.4, 5.0, np.inf])
+    np.testing.assert_allclose(event_model._below(t), stats.t.cdf(t, 4), atol=1e-6)
+
+
+def test_dark_current_is_found_behind_a_camera_that_crushes_the_dark(shared_data):
+    """slider_depth has 0.03 of white; of a white at 60 of 255 that is 0.13, though nothing below 10 is shown."""
+    recording = kalux.open(shared_data / "slider_depth", exposure=10_000)
+    artificial = artificial_hdr(recording, ArtificialCamera(10 / 255, 60 / 255))
+    found = plan(artificial, at="frames").settings.camera.log_offset
+    assert found == pytest.approx(0.12, rel=0.3)

@@ -32,6 +32,9 @@ from 0 beside any information in use (1e-2 and more), and the formulas need no s
 UNSEEN: Final = 2.0**41
 """Variance of a pixel of which the frame says nothing (`Frame.valid`): as little weight, and no bound."""
 
+REPEATED: Final = 2.0**39
+"""Variance of a frame that measures a pixel, but tells of it only what others have told already (K11): black."""
+
 _SCALE_BOUNDS: Final = (0.3, 3.0)
 _SCALE_DRIFT: Final = 1e-5  # variance per frame: a calibration never becomes certain, temperatures drift
 

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from kalux.augmentation.deblur import between
 from kalux.calibration.registration import Registration
-from kalux.calibration.regression import HUBER, NORMAL_MAD
+from kalux.calibration.regression import huber_weights
 from kalux.errors import InputError
 from kalux.events import EventArray
 from kalux.frames import Frame
@@ -346,10 +346,12 @@ def _normal_equations(
             "alignment: less than 500 well exposed pixels are in both cameras' view; is the registration right?"
         )
     everything = np.concatenate([r for r, _, _ in rows])
-    scale = max(NORMAL_MAD * float(np.median(np.abs(everything))), 1e-6)
+    weights, _ = huber_weights(everything)
+    begin = 0
     matrices, vectors, before, after = [], [], 0.0, 0.0
     for residual, jacobian, change in rows:
-        weight = np.minimum(1.0, HUBER * scale / np.maximum(np.abs(residual), 1e-12))
+        weight = weights[begin : begin + len(residual)]
+        begin += len(residual)
         weighted = jacobian * weight[:, None]
         matrices.append(weighted.T @ jacobian)
         vectors.append(weighted.T @ residual)

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.calibration.refractory import LATE, possible_periods, shortest_interval
-from kalux.calibration.regression import HUBER, NORMAL_MAD, Fit, standard_errors, two_stage
-from kalux.calibration.steps import Steps, steps
+from kalux.calibration.regression import Fit, standard_errors, two_stage
+from kalux.calibration.steps import MAX_SAMPLES, Steps, steps
 from kalux.recording import Recording
 from kalux.settings import CameraSettings
 
@@ -29,31 +29,41 @@ _MIN_SAMPLES: Final = 200
 _SHORTEST_EVENTS: Final = 500_000
 """Of which the shortest interval is taken: its edge is then that of 10,000 pairs."""
 
-_MODEL: Final = 0.03
-"""Relative error of thresholds from the neighbours' counts, beside the statistical one: they are up to 3 % too large on
-ten of eleven simulated scenes."""
+_DELAY_SAMPLES: Final = 10_000
+"""Pixels for one delay: the best of all is then within 0.2 ms of that of more on twenty scenes and recordings."""
+
+_TRAILING: Final = (0, 2_000, 4_000)
+"""us by which events may seem later than they are: 1.4 to 4.4 ms on seventeen scenes whose events are in time, of which
+`kalux.calibration.delay` takes seven tenths."""
+
+ROUGH_SAMPLES: Final = 30_000
+"""Pixels for the refractory period, and for thresholds that I_0 is to be found with: what is not known of the excess is
+then 0.02 on scenes where something is lost."""
+
+_MODEL: Final = 0.02
+"""Relative error of thresholds from the neighbours' counts, beside the statistical one: -1.3 to 4.3 %, 1.6 % in the
+root mean square, on seventeen simulated scenes."""
 
 _SHARED: Final = 0.1
 """Share of what frames do not explain in the neighbours' counts that may be common to neighbours."""
 
-_SUBTHRESHOLD: Final = 0.2
-"""Relative error of thresholds from the neighbours' changes in frames, beside the statistical one: they are 1 to 13 %
-too large on eleven simulated scenes, and 12 to 45 % larger than those from counts on three real recordings."""
+_SUBTHRESHOLD: Final = 0.1
+"""Relative error of thresholds from the neighbours' changes in frames, beside the statistical one: they are 0 to 3 %
+larger than those from counts on seventeen simulated scenes, and 2 to 9 % on three real recordings."""
 
-_LEAST_EXCESS: Final = 0.1
-"""By how much more events that follow soon must tell than late ones, two standard errors taken off, for something to be
-lost in the refractory period. Where nothing is lost it is 0 to 0.03 on seven simulated scenes and -0.03, 0.04 and 0.14
-+- 0.05 on three recordings, with 0.5 to 2 ms 0.22 to 0.83 on four scenes."""
-
-_APART: Final = 1.2
-"""Two estimates of the refractory period that differ by more do not have the errors of estimates alone: on three scenes
-with the right delay they are 0.98, 1.05 and 1.07 of one another, with a delay that is none 1.5."""
+_LEAST_EXCESS: Final = 0.15
+"""By how much more events that follow soon must tell than late ones, three standard errors taken off, for something to
+be lost in the refractory period. Where nothing is lost it is -0.02 to 0.03 on ten simulated scenes and -0.12, 0.12 and
+-0.01 +- 0.03 to 0.08 on three recordings, with 0.5 to 2 ms 0.20 to 0.98 on nine scenes."""
 
 _USUAL_EXCESS: Final = 0.02  # where nothing is lost
 
-_LEAST_GAIN: Final = 0.02
-"""Share of the residual that the period found must take away. On the same four scenes it is 0.043 to 0.17, on edges of
-objects without texture, whose first events are late ones and tell less, 0.01 at most."""
+_THRESHOLD_OF_EXCESS: Final = 0.6
+"""Relative error of thresholds over that of the excess: what is lost makes thresholds of seven scenes by 0.3 to 0.63 of
+the excess too large."""
+
+_LARGEST_SHORTEST: Final = 5_000
+"""us: of pixels that never follow sooner little is lost in the refractory period of any sensor, some 2 ms at most."""
 
 
 class ThresholdEstimate(NamedTuple):
@@ -73,6 +83,10 @@ class ThresholdEstimate(NamedTuple):
         Share of the information that is not the recording's, but that of the usual thresholds; 0 to 1.
     refractory_period
         us; 0 where nothing is lost in it, or too little to tell.
+    delay
+        How much later than the frames' clock events were taken to be stamped, us.
+    doubt
+        Relative error of thresholds that comes from that of the refractory period; a part of ``spread``.
     """
 
     on: float
@@ -82,6 +96,8 @@ class ThresholdEstimate(NamedTuple):
     spread: float
     usual_share: float
     refractory_period: int
+    delay: int
+    doubt: float
 
 
 class Usual(NamedTuple):
@@ -100,6 +116,7 @@ def estimate_thresholds(
     of_log_offset: bool = False,
     delay: int = 0,
     refractory_period: int | None = 0,
+    most: int = MAX_SAMPLES,
 ) -> ThresholdEstimate | None:
     """Global on and off thresholds, and the refractory period, by robust regression of frame changes on event counts.
 
@@ -120,9 +137,12 @@ def estimate_thresholds(
     of_log_offset
         Steps of log(I + I_0) instead of log I, s = 1, as in the paper's model.
     delay
-        How much later than the frames' clock events are stamped, us.
+        How much later than the frames' clock events seem to be, us (`kalux.calibration.delay`): what of it is due to
+        the half threshold by which they trail the light is found and taken off.
     refractory_period
         Of the pixels, us: what is lost in it is added to the events (docs/equations.md, K13). None: to be found.
+    most
+        Pixels that are enough.
 
     Returns None where the recording has too few such pixels (200), e.g. because nothing moves.
 
@@ -131,28 +151,102 @@ def estimate_thresholds(
     ExposureError
         If the frames' exposures are not known.
     """
-    shortest = 0 if refractory_period is not None else shortest_interval(recording, _SHORTEST_EVENTS)
-    late = LATE * shortest if shortest else np.inf
-
-    def seen(*periods: int) -> _Seen:
-        found = steps(recording, camera, delay=delay, periods=periods, late=late)
-        log_offset = 0.0 if of_log_offset else camera.offset
-        return _Seen(found, found.level / np.maximum(found.level + log_offset, 1e-9), recording.sensor_size)
-
-    period = refractory_period or 0
-    samples = seen(period)
+    view = _view(recording, camera, of_log_offset, refractory_period)
+    known = refractory_period or 0
+    view = view.without_trailing(delay, known)
+    samples = view.seen(known, most=most)
     if len(samples.share) < _MIN_SAMPLES:
         return None
-    estimate = _by_information(samples, usual, period)
-    if estimate is None or refractory_period is not None or not _loses(samples):
+    estimate = _by_information(samples, usual, known, view.delay, 0.0)
+    if estimate is None or not 0 < view.shortest <= _LARGEST_SHORTEST:
         return estimate
-    periods = possible_periods(shortest)
-    period = _without_excess(periods, seen(*periods), usual)
-    if period == 0:
+    excess = _excess_of_soon(samples)
+    if not excess.value - 3 * excess.error > _LEAST_EXCESS:
         return estimate
-    lossy = _by_information(seen(period), usual, period)
-    explains = lossy is not None and lossy.residual < (1 - _LEAST_GAIN) * estimate.residual
-    return lossy if explains else estimate
+    period = 0
+    for _ in range(2):  # what is lost looks like delay, too
+        period = _without_excess(view, usual)
+        if period == 0:
+            return estimate
+        view = view.without_trailing(delay, period)
+    doubt = _THRESHOLD_OF_EXCESS * float(np.hypot(excess.error, _USUAL_EXCESS))
+    return _by_information(view.seen(period, most=most), usual, period, view.delay, doubt) or estimate
+
+
+def refine_thresholds(
+    recording: Recording,
+    camera: CameraSettings,
+    usual: Usual,
+    rough: ThresholdEstimate,
+    *,
+    of_log_offset: bool = False,
+    refractory_period: int | None = 0,
+) -> ThresholdEstimate:
+    """The thresholds with another I_0 than that of a rough estimate, whose delay is right whatever I_0 is.
+
+    Parameters are those of `estimate_thresholds`. A refractory period is found anew where the rough estimate has one.
+    """
+    view = _view(recording, camera, of_log_offset, refractory_period)._replace(delay=rough.delay)
+    period = rough.refractory_period
+    if refractory_period is None and period > 0:
+        period = _without_excess(view, usual) or period
+    samples = view.seen(period, most=MAX_SAMPLES)
+    return _by_information(samples, usual, period, view.delay, rough.doubt) or rough
+
+
+def _view(
+    recording: Recording, camera: CameraSettings, of_log_offset: bool, refractory_period: int | None
+) -> _View:
+    """A view without delay, for finding the refractory period if it is not known."""
+    shortest = 0 if refractory_period is not None else shortest_interval(recording, _SHORTEST_EVENTS)
+    return _View(recording, camera, of_log_offset, 0, shortest)
+
+
+class _View(NamedTuple):
+    """How to look at a recording: whether events are steps of log(I + I_0), their delay and shortest interval, us."""
+
+    recording: Recording
+    camera: CameraSettings
+    of_log_offset: bool
+    delay: int
+    shortest: int
+
+    def seen(self, *periods: int, most: int) -> _Seen:
+        """Samples under refractory periods, us."""
+        return self._seen((self.delay,), periods, most)[0]
+
+    def without_trailing(self, delay: int, period: int) -> _View:
+        """With the delay under which events explain the frames best when their steps are spread over time (`steps`).
+
+        Half a threshold, by which events trail the light, is a part of ``delay``; spread over time they do not trail.
+        """
+        delays = tuple(delay - trailing for trailing in _TRAILING)
+        residuals = [seen.residual() for seen in self._seen(delays, (period,), _DELAY_SAMPLES, at_least=2)]
+        if not np.isfinite(residuals).all():
+            return self
+        curvature, slope, _ = np.polyfit(_TRAILING, residuals, 2)
+        most = float(_TRAILING[-1])
+        best = float(np.clip(-0.5 * slope / curvature, 0.0, most)) if curvature > 0 else 0.0
+        return self._replace(delay=delay - round(best))
+
+    def _seen(
+        self, delays: tuple[int, ...], periods: tuple[int, ...], most: int, at_least: int = 4
+    ) -> list[_Seen]:
+        late = LATE * self.shortest if self.shortest else np.inf
+        found = steps(
+            self.recording,
+            self.camera,
+            delays=delays,
+            periods=periods,
+            late=late,
+            most=most,
+            at_least=at_least,
+        )
+        log_offset = 0.0 if self.of_log_offset else self.camera.offset
+        return [
+            _Seen(one, one.level / np.maximum(one.level + log_offset, 1e-9), self.recording.sensor_size)
+            for one in found
+        ]
 
 
 class _Seen(NamedTuple):
@@ -162,23 +256,29 @@ class _Seen(NamedTuple):
     share: Array
     sensor_size: tuple[int, int]
 
-    def columns(self, events: Array, turned: Array) -> Array:
-        """(N, 3) what explains changes: (N, 2) on and off events and the turns."""
-        return np.column_stack([events[:, 0], -events[:, 1], turned]) * self.share[:, None]
+    def columns(self, events: Array) -> Array:
+        """(N, 2) what explains changes: steps upwards and downwards."""
+        return np.column_stack([events[:, 0], -events[:, 1]]) * self.share[:, None]
+
+    def residual(self) -> float:
+        """Of the regression under the first refractory period; nan where there is none."""
+        if len(self.share) < _MIN_SAMPLES:
+            return np.nan
+        fit = two_stage(self.steps.change, self.explained(0), self.counts_around(0))
+        return np.nan if fit is None else fit.residual
 
     def explained(self, index: int) -> Array:
-        """(N, 3) what explains the pixels' own changes under a refractory period."""
-        return self.columns(self.steps.events[:, index].sum(axis=1), self.steps.turned)
+        """(N, 2) what explains the pixels' own changes under a refractory period."""
+        return self.columns(self.steps.events[:, index].sum(axis=1))
 
     def counts_around(self, index: int) -> Array:
-        """(N, 3) the same of their neighbours."""
-        return self.columns(self.steps.events_around[:, index].sum(axis=1), self.steps.turned_around)
+        """(N, 2) the same of their neighbours."""
+        return self.columns(self.steps.events_around[:, index].sum(axis=1))
 
     def changes_around(self) -> Array:
-        """(N, 3) the neighbours' changes, upwards and downwards, and turns."""
+        """(N, 2) the neighbours' changes, upwards and downwards."""
         change = self.steps.change_around
-        upwards, downwards = np.maximum(change, 0.0), np.minimum(change, 0.0)
-        return np.column_stack([upwards, downwards, self.steps.turned_around * self.share])
+        return np.column_stack([np.maximum(change, 0.0), np.minimum(change, 0.0)])
 
 
 class _Told(NamedTuple):
@@ -188,17 +288,23 @@ class _Told(NamedTuple):
     variances: Array
 
 
-def _by_information(seen: _Seen, usual: Usual, period: int) -> ThresholdEstimate | None:
-    """Thresholds from either kind of instruments and the usual ones, weighted by the inverse of their variances."""
+def _by_information(
+    seen: _Seen, usual: Usual, period: int, delay: int, doubt: float
+) -> ThresholdEstimate | None:
+    """Thresholds from either kind of instruments and the usual ones, weighted by the inverse of their variances.
+
+    ``doubt`` is the relative error of thresholds that comes from the period's.
+    """
     change, explained = seen.steps.change, seen.explained(0)
     counts, changes = seen.counts_around(0), seen.changes_around()
     by_counts, by_changes = (two_stage(change, explained, instruments) for instruments in (counts, changes))
     fits = [fit for fit in (by_counts, by_changes) if fit is not None]
     if not fits:
         return None
+    model = np.hypot(_MODEL, doubt)
     common = np.log1p(_SHARED * _unexplained(seen, by_counts, counts)) if by_counts is not None else np.inf
-    of_counts = _told(seen, by_counts, explained, counts, float(np.hypot(common, _MODEL)))
-    of_changes = _told(seen, by_changes, explained, changes, _SUBTHRESHOLD)
+    of_counts = _told(seen, by_counts, explained, counts, float(np.hypot(common, model)))
+    of_changes = _told(seen, by_changes, explained, changes, float(np.hypot(_SUBTHRESHOLD, doubt)))
     # What both cannot explain is noise that neighbours share.
     apart = (of_counts.logs - of_changes.logs) ** 2 - 4 * (of_counts.variances + of_changes.variances)
     told = [
@@ -217,6 +323,8 @@ def _by_information(seen: _Seen, usual: Usual, period: int) -> ThresholdEstimate
         spread=float(np.sqrt(np.mean(1 / total))),
         usual_share=float(np.mean(information[0] / total)),
         refractory_period=period,
+        delay=delay,
+        doubt=doubt,
     )
 
 
@@ -244,7 +352,7 @@ def _unexplained(seen: _Seen, fit: Fit, counts: Array) -> float:
 
 
 class _Parted(NamedTuple):
-    """The regression on late events, events that follow soon, and turns, both events in units of the thresholds."""
+    """The regression on late events and events that follow soon, both in units of the thresholds."""
 
     explained: Array
     instruments: Array
@@ -256,13 +364,20 @@ class _Parted(NamedTuple):
         return float(self.fit.solution[1] / self.fit.solution[0]) - 1.0
 
 
-def _loses(seen: _Seen) -> bool:
-    """Whether events that follow soon clearly tell more than late ones, if nothing is lost."""
+class _Excess(NamedTuple):
+    """By which share events that follow soon tell more than late ones, and its standard error; nan if unknown."""
+
+    value: float
+    error: float
+
+
+def _excess_of_soon(seen: _Seen) -> _Excess:
+    """If nothing is lost."""
     parted = _parted(seen, 0)
     if parted is None:
-        return False
+        return _Excess(np.nan, np.nan)
     samples = seen.steps
-    late, soon, _ = standard_errors(
+    late, soon = standard_errors(
         samples.change,
         parted.explained,
         parted.instruments,
@@ -270,8 +385,7 @@ def _loses(seen: _Seen) -> bool:
         samples.pixel,
         seen.sensor_size,
     )
-    error = float(np.hypot(late, soon) / parted.fit.solution[0])
-    return parted.excess - 2 * error > _LEAST_EXCESS
+    return _Excess(parted.excess, float(np.hypot(late, soon) / parted.fit.solution[0]))
 
 
 def _parted(seen: _Seen, index: int) -> _Parted | None:
@@ -280,88 +394,37 @@ def _parted(seen: _Seen, index: int) -> _Parted | None:
     fit = two_stage(samples.change, seen.explained(index), seen.counts_around(index))
     if fit is None:
         return None
-    on, off, _ = fit.solution
+    on, off = fit.solution
 
-    def columns(events: Array, turned: Array) -> Array:
-        both = on * events[:, index, :, 0] - off * events[:, index, :, 1]
-        return np.column_stack([both, turned]) * seen.share[:, None]
+    def columns(events: Array) -> Array:
+        steps_of = on * events[:, index, :, 0] - off * events[:, index, :, 1]
+        return np.asarray(steps_of * seen.share[:, None], np.float64)
 
-    explained = columns(samples.events, samples.turned)
-    instruments = columns(samples.events_around, samples.turned_around)
+    explained, instruments = columns(samples.events), columns(samples.events_around)
     again = two_stage(samples.change, explained, instruments)
     return None if again is None or not again.solution[0] > 0 else _Parted(explained, instruments, again)
 
 
-def _without_excess(periods: tuple[int, ...], seen: _Seen, usual: Usual) -> int:
+def _without_excess(view: _View, usual: Usual) -> int:
     """The refractory period, us, under which events that follow soon tell as much as late ones; 0 if unknown.
 
-    With known thresholds it is the one under which these explain the frames; if that is clearly longer, the geometric
-    mean of both: what is wrong with the delay makes that one too long and the first too short (by 34 and 11 % where
-    1.8 ms are taken for a delay that is none). Weights grow without bound near the period, so that a third too much
-    costs a hundred times what a third too little does (docs/equations.md, K13).
+    With known thresholds the one under which these explain the frames.
     """
-    excess = [_excess(seen, index) for index in range(len(periods))]
-    alike = _crossing(periods, excess, _USUAL_EXCESS)
-    if usual.spread > 0:
-        return 0 if alike is None else alike
-    explained = _crossing(periods, [_too_large(seen, index, usual) for index in range(len(periods))], 0.0)
-    if alike is None or explained is None:
-        return alike or explained or 0
-    return explained if explained <= _APART * alike else round(float(np.sqrt(alike * explained)))
-
-
-def _crossing(periods: tuple[int, ...], excess: list[float], left: float) -> int | None:
-    """The period at which so much is left of the excess, us; None if unknown."""
+    periods = possible_periods(view.shortest)
+    seen = view.seen(*periods, most=ROUGH_SAMPLES)
+    excess = np.array([_excess(seen, index, usual) for index in range(len(periods))])
     if not np.isfinite(excess).all():
-        return None
+        return 0
     # A longer period always explains more; what noise makes otherwise is evened out.
     falling = np.minimum.accumulate(excess)
+    left = _USUAL_EXCESS if usual.spread > 0 else 0.0
     return round(float(np.interp(-left, -falling, periods)))
 
 
-def _excess(seen: _Seen, index: int) -> float:
-    """By which share events that follow soon tell more than late ones; nan if unknown."""
-    parted = _parted(seen, index)
-    return np.nan if parted is None else parted.excess
-
-
-def _too_large(seen: _Seen, index: int, known: Usual) -> float:
-    """By which share the thresholds that explain the frames are larger than the known ones; nan if unknown."""
+def _excess(seen: _Seen, index: int, usual: Usual) -> float:
+    """What is near 0 under the right refractory period, and larger under shorter ones; nan if unknown."""
+    if usual.spread > 0:
+        parted = _parted(seen, index)
+        return np.nan if parted is None else parted.excess
     fit = two_stage(seen.steps.change, seen.explained(index), seen.counts_around(index))
-    return np.nan if fit is None else float(np.mean(fit.solution[:2] / known[:2])) - 1.0
-
-
-class PlainFit(NamedTuple):
-    """Thresholds (on, off) that fit best, log intensity, and the robust standard deviation of what they leave."""
-
-    on: float
-    off: float
-    residual: float
-
-
-def fit_thresholds(difference: Array, on: Array, off: Array) -> PlainFit | None:
-    """Thresholds by iteratively reweighted least squares; None if one is not determined.
-
-    ``difference`` (N,) log intensity; ``on``, ``off`` (N,) event counts.
-    """
-    design = np.column_stack([on, -off])
-    weights = np.ones(len(difference))
-    solution: Array = np.zeros(2)
-    scale = 0.0
-    for _ in range(20):
-        weighted = design * weights[:, None]
-        normal = weighted.T @ design
-        if np.linalg.cond(normal) > 1e8:
-            return None
-        previous = solution
-        solution = np.linalg.solve(normal, weighted.T @ difference).astype(np.float64)
-        residual = difference - design @ solution
-        scale = NORMAL_MAD * float(np.median(np.abs(residual)))
-        if scale < 1e-9:
-            break  # an exact fit: nothing to weigh down
-        weights = np.minimum(1.0, HUBER * scale / np.maximum(np.abs(residual), 1e-12))
-        if np.abs(solution - previous).max() < 1e-5:
-            break
-    if not (solution > 0).all():
-        return None
-    return PlainFit(float(solution[0]), float(solution[1]), scale)
+    return np.nan if fit is None else float(np.mean(fit.solution[:2] / usual[:2])) - 1.0

@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.deblur import between, count_chunks
-from kalux.calibration.contrast import fit_thresholds
 from kalux.calibration.intervals import intervals, spread
-from kalux.calibration.regression import NORMAL_MAD
+from kalux.calibration.regression import two_stage
 from kalux.events import EventArray
 from kalux.recording import Recording
 from kalux.settings import CameraSettings
@@ -23,6 +22,7 @@ STEP: Final = 1_000
 LARGEST: Final = 12_000
 """Largest delay that is tried, us: the photoreceptor's, in the dark, is some milliseconds (Lichtsteiner 2008)."""
 
+_COARSE: Final = 3  # delays of the grid, of which one is tried first: residuals have one valley, 4 ms wide
 _MIN_SAMPLES: Final = 500
 _MAX_SAMPLES: Final = 60_000
 _MAX_FRAMES: Final = 60
@@ -70,7 +70,13 @@ def estimate_delay(recording: Recording, camera: CameraSettings) -> DelayEstimat
     difference, nets = _samples(recording, camera)
     if len(difference) < _MIN_SAMPLES:
         return None
-    residuals = np.array([_residual(difference, on, off) for on, off in nets])
+    residuals = np.full(len(nets), np.inf)
+    coarse = range(0, len(nets), _COARSE)
+    for index in coarse:
+        residuals[index] = _residual(difference, *nets[index])
+    middle = int(np.argmin(residuals))
+    for index in range(max(middle - _COARSE + 1, 0), min(middle + _COARSE, len(nets))):
+        residuals[index] = _residual(difference, *nets[index])
     return best_delay(delays(), residuals, len(difference))
 
 
@@ -82,9 +88,9 @@ def delays() -> NDArray[np.int64]:
 def best_delay(grid: NDArray[np.int64], residuals: Array, samples: int) -> DelayEstimate | None:
     """The minimum of the residuals over the grid, refined by a parabola through its neighbours.
 
-    None where it is at an end of the grid, or where a fit failed.
+    Residuals are inf where nothing was tried. None where the minimum is at an end of the grid, or where a fit failed.
     """
-    if not np.isfinite(residuals).all():
+    if np.isnan(residuals).any():
         return None
     best = int(np.argmin(residuals))
     if best in (0, len(grid) - 1):
@@ -98,10 +104,10 @@ def best_delay(grid: NDArray[np.int64], residuals: Array, samples: int) -> Delay
 
 
 def _residual(difference: Array, on: Array, off: Array) -> float:
-    fit = fit_thresholds(difference, on, off)
-    if fit is None:
-        return float("nan")
-    return NORMAL_MAD * float(np.median(np.abs(difference - fit.on * on + fit.off * off)))
+    """Robust standard deviation of what thresholds that fit best leave; nan if one is not determined."""
+    counts = np.column_stack([on, -off])
+    fit = two_stage(difference, counts, counts)
+    return fit.residual if fit is not None and (fit.solution > 0).all() else float("nan")
 
 
 def _samples(recording: Recording, camera: CameraSettings) -> tuple[Array, list[tuple[Array, Array]]]:

@@ -18,14 +18,15 @@ from numpy.typing import NDArray
 from kalux.augmentation.deblur import between, count_events
 from kalux.augmentation.refractory import EventClock
 from kalux.calibration.intervals import intervals, spread
-from kalux.models.camera import noise_variance
+from kalux.models.camera import CRUSHED, Camera, black_ceiling, named_responses, noise_variance
 from kalux.recording import Recording
-from kalux.settings import UNKNOWN_LOG_OFFSET, CameraSettings
+from kalux.settings import UNKNOWN_LOG_OFFSET, CameraSettings, chosen_response
 
 Array = NDArray[np.float64]
 
-LOG_OFFSETS: Final = (0.004, 0.008, 0.015, 0.03, 0.06)
-"""I_0 that are tried, white = 1. Less than a level of an 8-bit frame cannot be told; more than 0.06 is not dark."""
+LOG_OFFSETS: Final = (0.004, 0.008, 0.015, 0.03, 0.06, 0.12)
+"""I_0 that are tried, white = 1. Less than a level of an 8-bit frame cannot be told; 0.12 is the usual 0.03 of frames
+that are exposed four times as long as they ought to be."""
 
 STEP_VARIANCES: Final = (0.05, 0.1, 0.2, 0.4)
 """Variances of an event's step that are tried, in units of c^2."""
@@ -69,6 +70,17 @@ class Samples(NamedTuple):
     off: Array
 
 
+class Shown(NamedTuple):
+    """Between which I the frames could show what came after: both (N,); ``least`` is 0 where black hides nothing."""
+
+    least: Array
+    most: Array
+
+
+_LEAST_SHARE: Final = 1e-3
+"""Of what the events predict, that frames could show: less is an event that is none of the pixel's."""
+
+
 class _Model(NamedTuple):
     """What the likelihood needs to know beside what is tried."""
 
@@ -77,12 +89,12 @@ class _Model(NamedTuple):
     threshold_spread: float
     quantisation_variance: float
 
-    def loss(self, samples: Samples, log_offset: float, step_variance: float) -> float:
-        return negative_log_likelihood(samples, self.thresholds, log_offset, step_variance, *self[1:])
+    def loss(self, samples: Samples, shown: Shown | None, log_offset: float, step_variance: float) -> float:
+        return negative_log_likelihood(samples, self.thresholds, log_offset, step_variance, *self[1:], shown)
 
-    def best(self, samples: Samples, log_offset: float) -> tuple[float, float]:
+    def best(self, samples: Samples, shown: Shown | None, log_offset: float) -> tuple[float, float]:
         """The least loss, and the variance of a step that has it."""
-        return min((self.loss(samples, log_offset, q), q) for q in STEP_VARIANCES)
+        return min((self.loss(samples, shown, log_offset, q), q) for q in STEP_VARIANCES)
 
 
 def estimate_event_model(
@@ -119,20 +131,25 @@ def estimate_event_model(
     ExposureError
         If the frames' exposures are not known.
     """
-    samples = _samples(recording, camera, delay, refractory_period)
-    net = np.abs(samples.on - samples.off)
-    chosen = (net >= _LEAST_NET) & (np.minimum(samples.before, samples.after) > DARKEST)
+    samples, shown = _samples(recording, camera, delay, refractory_period)
+    net, darkest = np.abs(samples.on - samples.off), np.minimum(samples.before, samples.after)
+    chosen = (net >= _LEAST_NET) & (darkest > np.maximum(shown.least, DARKEST))
     signals = Samples(*(values[chosen] for values in samples))
     if len(signals.before) < _MIN_SAMPLES:
         return None
     model = _Model(thresholds, noise_of_blurred(camera), threshold_spread, quantisation_variance)
-    log_offset = _log_offset(signals, model) if camera.log_offset is None else camera.log_offset
-    # Single events, most of them noise where nothing moves, say much of the step and nothing of I_0.
-    _, step_variance = model.best(samples, log_offset)
+    if camera.log_offset is None:
+        log_offset = _log_offset(signals, Shown(*(limit[chosen] for limit in shown)), model)
+    else:
+        log_offset = camera.log_offset
+    # Single events, most of them noise where nothing moves, say much of the step and nothing of I_0; so do those of
+    # pixels that go black, whose steps are the least sure. Without these artificial HDR of slider_depth errs a seventh
+    # more: they make up for what is not modelled of events where no frame checks them.
+    _, step_variance = model.best(samples, None, log_offset)
     return EventModel(log_offset, step_variance, len(samples.before))
 
 
-def _log_offset(samples: Samples, model: _Model) -> float:
+def _log_offset(samples: Samples, shown: Shown, model: _Model) -> float:
     """The I_0 that is likeliest, within a fifth: of those tried, then of those between the best and its neighbours.
 
     What is usual counts as far as events do not explain what changes: noise says nothing of I_0.
@@ -145,7 +162,7 @@ def _log_offset(samples: Samples, model: _Model) -> float:
 
     def loss(log_offset: float) -> float:
         prior = 0.5 * (np.log(log_offset / UNKNOWN_LOG_OFFSET) / _LOG_OFFSET_SPREAD) ** 2
-        return float(prior) + count * model.best(samples, log_offset)[0]
+        return float(prior) + count * model.best(samples, shown, log_offset)[0]
 
     losses = {offset: loss(offset) for offset in LOG_OFFSETS}
     for _ in range(2):
@@ -196,35 +213,61 @@ def negative_log_likelihood(
     noise: tuple[float, float],
     threshold_spread: float,
     quantisation_variance: float,
+    shown: Shown | None = None,
 ) -> float:
     """Mean over the samples of -log p(I after | I before, events), up to a constant.
 
     The mismatch between frames and events (docs/equations.md, K1) is Student's t with the variance that the bridge
-    takes it to have. The density is one of I, not of log(I + I_0), so that different I_0 can be compared.
+    takes it to have. The density is one of I, not of log(I + I_0), so that different I_0 can be compared. It is that of
+    what is ``shown``: pixels that became brighter than white or darker than black are not among the samples, and events
+    that took them there would seem to say too much.
     """
     mismatch, variance = mismatch_of(
         samples, thresholds, log_offset, step_variance, noise, threshold_spread, quantisation_variance
     )
     tails = (_FREEDOM + 1) / 2 * np.log1p(mismatch**2 / (_FREEDOM * variance))
-    jacobian = np.log(samples.after + log_offset)
-    return float(np.mean(0.5 * np.log(variance) + tails + jacobian))
+    after = np.log(samples.after + log_offset)
+    losses = 0.5 * np.log(variance) + tails + after
+    if shown is not None:
+        predicted, scale = after - mismatch, np.sqrt(variance)
+        share = _below((np.log(shown.most + log_offset) - predicted) / scale)
+        if shown.least.any():
+            share -= _below((np.log(shown.least + log_offset) - predicted) / scale)
+        losses += np.log(np.maximum(share, _LEAST_SHARE))
+    return float(np.mean(losses))
 
 
-def _samples(recording: Recording, camera: CameraSettings, delay: int, refractory_period: int) -> Samples:
-    """Pixels with events that no frame clips, interval by interval."""
+def _below(t: Array) -> Array:
+    """The share of Student's t of `_FREEDOM` (4) below ``t``; in closed form (Abramowitz and Stegun, 26.7.4)."""
+    sine2 = 1.0 / (1.0 + _FREEDOM / np.maximum(np.square(t), 1e-12))  # of the angle atan(t / 2)
+    half: Array = np.copysign(np.sqrt(sine2) * (1.0 + (1.0 - sine2) / 2.0) / 2.0, t)
+    return half + 0.5
+
+
+def _samples(
+    recording: Recording, camera: CameraSettings, delay: int, refractory_period: int
+) -> tuple[Samples, Shown]:
+    """Pixels with events that no frame clips at either end, interval by interval, and what their frames could show."""
     found: list[tuple[Array, ...]] = []
     count = 0
     clock = EventClock(recording.sensor_size, refractory_period)
+    response = named_responses(chosen_response(camera.response, recording.response))
+    model = Camera(response[len(response) // 2])
+    white = float(model.response.inverse(np.array(camera.saturation)))
+    black = float(black_ceiling(model, np.zeros(1), 1.0)[0])
+    black = black if black > CRUSHED else 0.0
     for interval in intervals(recording, camera, margin=abs(delay), most_frames=_MAX_FRAMES):
         inside = clock.weighed(between(interval.events, interval.start + delay, interval.end + delay))
         on, off = count_events(inside, recording.sensor_size, weighed=True)
         first, second = interval.first, interval.second
         chosen = spread(~first.clipped & ~second.clipped & (on + off > 0), MAX_SAMPLES - count)
         pixels = (first.intensity, second.intensity, on, off)
-        found.append(tuple(values.ravel()[chosen] for values in pixels))
-        count += len(chosen)
+        limits = (np.full(len(chosen), limit * second.white) for limit in (black, white))
+        found.append((*(values.ravel()[chosen] for values in pixels), *limits))
+        count += int(
+            np.count_nonzero(np.minimum(pixels[0], pixels[1]).ravel()[chosen] >= black * second.white)
+        )
         if count >= MAX_SAMPLES:
             break
-    if not found:
-        return Samples(*(np.empty(0) for _ in range(4)))
-    return Samples(*(np.concatenate(column) for column in zip(*found, strict=True)))
+    columns = [np.concatenate(column) for column in zip(*found, strict=True)] if found else [np.empty(0)] * 6
+    return Samples(*columns[:4]), Shown(*columns[4:])

@@ -12,9 +12,9 @@ from kalux.recording import Recording
 _EDGE: Final = 0.02  # of the most frequent inter-event interval: what is rarer and shorter is noise
 _EDGE_BINS: Final = np.logspace(1, 6, 51)  # us
 
-_TRIED: Final = (0.3, 0.5, 0.7, 0.9, 1.0)
-"""Refractory periods that are tried, as shares of the shortest interval, than which none is longer. Of one that is a
-fifth too short, a fifth of what was lost is still missing."""
+_TRIED: Final = (0.35, 0.6, 0.85, 1.1)
+"""Refractory periods that are tried, as shares of the shortest interval, between which the best is interpolated. None
+is longer than that, but it is only known to lie in a bin of a quarter of its size."""
 
 LATE: Final = 5.0
 """Events later than so many shortest intervals after their predecessors say little of the refractory period: at most a

@@ -14,6 +14,7 @@ HUBER: Final = 1.345  # 95 % efficiency for normal residuals (Huber 1981)
 
 _ITERATIONS: Final = 40
 _LARGEST_CONDITION: Final = 1e6
+_LEAST_SCALE: Final = 1e-9  # an exact fit: nothing to weigh down
 _TILES: Final = 8  # per side: blocks of the jackknife
 _LEAST_TILES: Final = 4
 
@@ -40,7 +41,8 @@ def two_stage(values: Array, explained: Array, instruments: Array) -> Fit | None
     """Coefficients of (N, K) ``explained`` in (N,) ``values`` by two-stage least squares with Huber's weights.
 
     The columns of ``explained`` may have errors that those of ``instruments``, as many, do not share: least squares
-    would then give too small coefficients (attenuation). None where the coefficients are not determined.
+    would then give too small coefficients (attenuation). With ``explained`` themselves for instruments this is least
+    squares. None where the coefficients are not determined.
     """
     weights = np.ones(len(values))
     solution: Array = np.zeros(explained.shape[1])
@@ -52,12 +54,17 @@ def two_stage(values: Array, explained: Array, instruments: Array) -> Fit | None
             return None
         previous = solution
         solution = np.linalg.solve(normal, weighted.T @ values).astype(np.float64)
-        residual = np.abs(values - explained @ solution)
-        scale = max(NORMAL_MAD * float(np.median(residual)), 1e-9)
-        weights = np.minimum(1.0, HUBER * scale / np.maximum(residual, 1e-12))
+        weights, scale = huber_weights(values - explained @ solution)
         if np.abs(solution - previous).max() < 1e-5:
             break
     return Fit(solution, scale, weights)
+
+
+def huber_weights(residuals: Array) -> tuple[Array, float]:
+    """Huber's weights of residuals, and their robust standard deviation."""
+    away = np.abs(residuals)
+    scale = max(NORMAL_MAD * float(np.median(away)), _LEAST_SCALE)
+    return np.minimum(1.0, HUBER * scale / np.maximum(away, 1e-3 * _LEAST_SCALE)), scale
 
 
 def parts(shape: tuple[int, int]) -> NDArray[np.int64]:

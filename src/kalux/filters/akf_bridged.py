@@ -22,6 +22,7 @@ from kalux.compiled import (
     MICROSECOND32,
     ONE,
     WEIGHT_UNIT,
+    apart,
     event_column,
     event_is_on,
     event_row,
@@ -195,7 +196,7 @@ def trail_ahead(segment: BridgedSegment, cursor: Cursor, t: int) -> FloatArray |
 def _read(segment: BridgedSegment, cursor: Cursor, t: int) -> tuple[FloatArray, FloatArray]:
     """The same with all that is known at the end of the segment."""
     shape = segment.augmented.shape
-    log_intensity, variance = np.empty((2, *shape), np.float32)
+    log_intensity, variance = apart(2, shape)
     within = min(t - cursor.origin, EPOCH)
     beyond = np.float32((t - cursor.origin - within) * 1e-6)
     since_start = np.float32((t - segment.start) * 1e-6)

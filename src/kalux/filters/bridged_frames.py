@@ -38,10 +38,7 @@ from kalux.filters.common import make_clock
 from kalux.filters.method import FAR_FUTURE, USUAL_INTERVAL, Chunks, CommonMethod, Segment
 from kalux.filters.shots import Shot
 from kalux.filters.uncertainty import WRONG_STEPS, Around
-from kalux.models.camera import (
-    frame_log_covariance,
-    log_intensity,
-)
+from kalux.models.camera import CRUSHED, frame_log_covariance, log_intensity
 from kalux.models.pixels import PixelCalibration
 from kalux.settings import Settings
 
@@ -51,9 +48,6 @@ Floats = NDArray[np.floating[Any]]
 
 _DARKEST: Final = 0.001
 """What is black is taken to be spread evenly in log I from here, white = 1, a quarter of an 8-bit level."""
-
-_CRUSHED: Final = 1.5 / 255
-"""Intensity, white = 1, that black must hide to be no measurement: three times what it hides of a linear response."""
 
 _BLACK_FRAMES: Final = 3.0
 """Black says the same in every frame: so many of them count as one, and all as no more (docs/equations.md, K7)."""
@@ -170,7 +164,7 @@ class BridgedFrames(CommonMethod):
         With a linear response 0 is a measurement like others.
         """
         black = np.isfinite(shot.level_ceiling)
-        hides = shot.level_ceiling > _CRUSHED * shot.white
+        hides = shot.level_ceiling > CRUSHED * shot.white
         return black & hides if hides[black].any() else None
 
     def black(self, ceiling: Array) -> tuple[Array, Array]:
@@ -434,9 +428,12 @@ class BridgedFrames(CommonMethod):
         assert segment.events is not None
         share = (t - segment.start) / (segment.end - segment.start)
         between = 4.0 * share * (1.0 - share)
+        second = segment.backward_variance
+        if segment.bound is not None and segment.bound.ceiling is not None:
+            second = np.where(np.isfinite(segment.bound.ceiling), np.float32(bridge.REPEATED), second)
         return Around(
             segment.forward_variance,
-            segment.backward_variance,
+            second,
             segment.events,
             coming=(1.0 - share) * self.noise.step_variance,
             counted=0.0,

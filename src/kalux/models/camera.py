@@ -316,6 +316,10 @@ def count_bright(camera: Camera, image: NDArray[Any], white: float = 1.0) -> Bri
     return BrightTail(at_half, at_white)
 
 
+CRUSHED: Final = 1.5 / 255
+"""Intensity, white = 1, that black must hide to be no measurement: three times what it hides of a linear response."""
+
+
 def black_ceiling(camera: Camera, response: Array, exposure_ratio: float) -> Array:
     """What black hides: the most that I can be, (N,); inf where the response is not black.
 

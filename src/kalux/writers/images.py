@@ -29,10 +29,12 @@ def encode_png(display: DisplaySettings, bits: Literal[8, 16]) -> Encode:
     quantise: Callable[[NDArray[Any]], NDArray[Any]] = to_uint16 if bits == 16 else to_uint8
 
     def encode(image: ImageLike, state: ToneState | None) -> tuple[Bytes, ToneState | None]:
-        following = next_state(image, display, state)
+        following = next_state(image, display, state, checked=True)
         colour = colour_of(image)
         shown = image.intensity if colour is None else colour
-        return lambda: png_bytes(quantise(apply(shown, display, following.statistics))), following
+        return lambda: png_bytes(
+            quantise(apply(shown, display, following.statistics, checked=True))
+        ), following
 
     return encode
 

@@ -13,14 +13,23 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import av
-import numba as nb
 import numpy as np
 from av.container import OutputContainer
 from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
 from kalux.ahead import InOrder
-from kalux.display import DisplaySettings, Float32, ToneState, apply, colour_of, next_state
+from kalux.display import (
+    DisplaySettings,
+    Float32,
+    Statistics,
+    ToneState,
+    apply,
+    colour_of,
+    fill,
+    fill_levels,
+    next_state,
+)
 from kalux.errors import InputError, MissingDependencyError, OutputError, SettingsError
 from kalux.models.colour import luminance
 from kalux.writers.base import ImageLike, Writer
@@ -167,13 +176,13 @@ class VideoWriter(Writer):
                 f"video: the image at {t} us is not later than the one before it; "
                 "the images of a video must be in time order"
             )
-        self._state = following = next_state(image, self._display, self._state)
+        self._state = following = next_state(image, self._display, self._state, checked=True)
         self._last = pts
         colour = colour_of(image)
         shown = image.intensity if colour is None else colour
 
         def picture() -> Picture:
-            frame = video_frame(apply(shown, self._display, following.statistics))
+            frame = video_frame(shown, self._display, following.statistics)
             frame.pts, frame.time_base = pts, self._ticks.time_base
             return Picture(t, frame)
 
@@ -324,27 +333,33 @@ def _tag_colours(target: Any) -> None:
     target.color_primaries = target.color_trc = target.colorspace = _BT709
 
 
-def video_frame(mapped: Float32) -> av.VideoFrame:
-    """A frame, yuv420p of BT.709 in the limited range, from values 0 to 1; odd sizes are padded.
+def video_frame(shown: Float32, display: DisplaySettings, statistics: Statistics) -> av.VideoFrame:
+    """A frame, yuv420p of BT.709 in the limited range, of an image as `kalux.display.apply` maps it.
 
     Parameters
     ----------
-    mapped
-        (height, width) or (height, width, 3). Where a size is odd, the last row or column is repeated.
+    shown
+        (height, width) or (height, width, 3), float32 and finite. Where a size is odd, the last row or column is
+        repeated.
+    display, statistics
+        As of `kalux.display.apply`.
     """
-    height, width = mapped.shape[:2]
+    height, width = shown.shape[:2]
     frame = av.VideoFrame(width + width % 2, height + height % 2, "yuv420p")
-    luma = mapped if mapped.ndim == 2 else luminance(mapped)
     planes = [_plane(plane) for plane in frame.planes]
-    _fill_plane(np.ascontiguousarray(luma, np.float32), 16.0, 219.0, planes[0])
-    if mapped.ndim == 2:
+    if shown.ndim == 2:
+        fill_levels(shown, display, statistics, (16.0, 235.0), planes[0])
         for plane in planes[1:]:
             plane[...] = 128
     else:
+        mapped = apply(shown, display, statistics, checked=True)
         padding = [(0, height % 2), (0, width % 2), (0, 0)]
         padded = np.pad(mapped, padding, mode="edge")
-        for plane, chroma in zip(planes[1:], _chroma(padded, luminance(padded)), strict=True):
-            _fill_plane(chroma, 128.0, 224.0, plane)
+        luma = luminance(padded)
+        for values, plane, zero, scale in zip(
+            [luma, *chroma(padded, luma)], planes, (16.0, 128.0, 128.0), (219.0, 224.0, 224.0), strict=True
+        ):
+            fill(values, zero, scale, plane)
     frame.color_range = 1
     frame.colorspace = _BT709
     return frame
@@ -355,20 +370,7 @@ def _plane(plane: Any) -> NDArray[np.uint8]:
     return np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
-def _fill_plane(values, zero, scale, plane):  # type: ignore[no-untyped-def]
-    """Round ``zero + scale * values`` into a plane; where that is larger, the last row and column are repeated."""
-    height, width = values.shape
-    offset, factor = np.float32(zero + 0.5), np.float32(scale)  # rounds what is cut off after the point
-    for row in range(plane.shape[0]):
-        source, target = values[min(row, height - 1)], plane[row]
-        for column in range(width):
-            target[column] = np.uint8(np.int32(offset + factor * source[column]))
-        for column in range(width, len(target)):
-            target[column] = target[width - 1]
-
-
-def _chroma(picture: Float32, luma: Float32) -> list[Float32]:
+def chroma(picture: Float32, luma: Float32) -> list[Float32]:
     """Cb and Cr of BT.709, -0.5 to 0.5, at half the size of an RGB picture of even size.
 
     Samples lie on even columns, between two rows, as H.264 has them by default: weights 1 2 1 along rows.
