@@ -153,3 +153,9 @@ def test_the_largest_bits_tell_infinite_from_finite_and_from_nan(numbers):
     assert (found < INFINITE_BITS) == np.isfinite(values).all()
     assert (found > INFINITE_BITS) == np.isnan(values).any()
     assert magnitude_bits(np.stack([values, -values])[:, ::2]) == magnitude_bits(values[::2])
+
+
+@given(st.floats(width=32))
+def test_a_number_that_is_repeated_is_looked_at_once(number):
+    one = np.array([number], np.float32)
+    assert magnitude_bits(np.broadcast_to(one, (3, 5))) == magnitude_bits(one)

@@ -63,6 +63,17 @@ def test_the_pipeline_is_the_engine(variant, lookahead, chunk, monkeypatch):
 
 
 @every_variant
+def test_images_without_their_variance_are_the_same(variant):
+    rec = recording(2)
+    made = plan(rec, rate_hz=200, settings=VARIANTS[variant])
+    whole, bare = list(execute(rec, made)), list(execute(rec, made, with_variance=False))
+    for a, b in zip(whole, bare, strict=True):
+        np.testing.assert_array_equal(a.intensity, b.intensity)
+        assert b.variance.shape == a.variance.shape
+        assert np.isposinf(b.variance).all()
+
+
+@every_variant
 def test_a_causal_image_is_what_a_robot_would_see(variant):
     """Cutting the recording off after an image does not change it."""
     stream = random_stream(2)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +43,10 @@ from kalux.models.colour import (
 from kalux.models.pixels import PixelCalibration, require_size
 from kalux.settings import Settings
 from kalux.settings import preset as named_preset
+
+_UNTOLD: Final = np.full(1, np.inf, np.float32)
+"""The variance of all pixels where it is not wanted."""
+_UNTOLD.flags.writeable = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -489,7 +493,7 @@ class Reconstructor:
         if unshown is not None:
             read_unshown(intensity, heard, estimate.log_intensity, unshown, offset, prior)
         if not tells:
-            total = np.broadcast_to(np.float32(np.inf), intensity.shape)
+            total = np.ndarray(intensity.shape, np.float32, _UNTOLD, strides=(0, 0))
         elif moving is not None and change is not None:
             known = variance if told is None else told
             total = given_variance(known, moving, change, hidden, estimate.around)

@@ -205,7 +205,9 @@ def test_pixels_that_no_frame_has_shown_are_told_as_they_are_read():
     assert np.count_nonzero(left == variance) == len(pixels)
 
 
-@pytest.mark.parametrize(("shape", "moves"), [((3, 5), 0.6), ((7, 100), 0.02), ((6, 64), 0.5)])
+@pytest.mark.parametrize(
+    ("shape", "moves"), [((3, 5), 0.6), ((7, 100), 0.02), ((6, 64), 0.5), ((5, 1283), 0.05)]
+)
 @pytest.mark.parametrize("pitch", [1, 2])
 def test_images_are_the_oracles(shape, moves, pitch):
     """K6, K11 and K12 pixel by pixel, over images narrower and wider than what is looked at together."""

@@ -8,7 +8,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.compiled import FUSED, ONE, exponential, logarithm, packed
+from kalux.compiled import FUSED, ONE, exponential, logarithm
 
 Array = NDArray[np.floating[Any]]
 
@@ -30,7 +30,10 @@ _MARGIN: Final = 32
 """Pixels on both sides of a row of a strip, a whole number of vectors: those of the strip beside, or, outside the
 image, such that know nothing. The border needs no special case."""
 
-_ASIDE: Final = 16
+_VECTOR: Final = 16
+"""float32 in a line of the cache, and in the widest vector."""
+
+_ASIDE: Final = _VECTOR
 """So many of these are compared, at least three times the pitch: a vector, so that all begin where the cache's lines
 do."""
 
@@ -250,7 +253,6 @@ def read_out(
         tuple(np.float32(value) for value in prior),
         np.float32(log_offset),
         unshown,
-        _ring(pitch),
         out,
         total,
         heard,
@@ -258,25 +260,29 @@ def read_out(
     return out, total, heard
 
 
-def _ring(pitch: int) -> _Ring:
+@nb.njit(cache=True)
+def _ring(pitch):  # type: ignore[no-untyped-def]
     # A row's neighbours, and the patches around them, lie in rows to twice the pitch ahead and one behind; the rows
     # that need what is made of them, in one more ahead.
     count = 4 * pitch + 1
     return _Ring(
-        known=_lines(2 * count),
-        least=_lines(2 * count),
-        unlike=_lines(4 * count),
-        alike=_lines(4 * count),
-        hears=np.empty((count, _STRIP), np.uint8),
-        spans=np.empty((count, 2), np.int64),
-        single=_lines(4),
-        heard=_lines(2),
+        _lines(2 * count),
+        _lines(2 * count),
+        _lines(4 * count),
+        _lines(4 * count),
+        np.empty((count, _STRIP), np.uint8),
+        np.empty((count, 2), np.int64),
+        _lines(4),
+        _lines(2),
     )
 
 
-def _lines(rows: int) -> NDArray[np.float32]:
-    found: NDArray[np.float32] = packed((rows * _ROW,), np.dtype(np.float32))
-    return found
+@nb.njit(cache=True)
+def _lines(rows):  # type: ignore[no-untyped-def]
+    """Memory for some rows, which begin where lines of the cache do. One piece for all would not become vector code."""
+    memory = np.empty(rows * _ROW + _VECTOR, np.float32)
+    begin = (_VECTOR - np.int64(memory.ctypes.data // 4) % _VECTOR) % _VECTOR
+    return memory[begin : begin + rows * _ROW]
 
 
 def _plane(values: Array | None, shape: tuple[int, ...]) -> NDArray[np.float32]:
@@ -300,7 +306,6 @@ def _read_out(  # type: ignore[no-untyped-def]
     prior,
     log_offset,
     unshown,
-    ring,
     out,
     total,
     heard,
@@ -309,6 +314,7 @@ def _read_out(  # type: ignore[no-untyped-def]
     height, width = log_intensity.shape
     told = moving.size > 0
     hear = told and allowed > np.float32(0.0)
+    ring = _ring(pitch)
     count = len(ring.spans)
     level, left = np.zeros(_STRIP, np.float32), np.zeros(_STRIP, np.float32)
     marks = np.zeros(_STRIP, np.uint8)

@@ -114,9 +114,10 @@ class Ticks:
         """
         if self.rate is None:
             return microseconds
-        exact = microseconds * MICROSECOND * self.rate
-        ticks = round(exact)
-        if abs(exact - ticks) > max(Fraction(1, 10), self.rate * MICROSECOND):
+        # In whole numbers, as fractions take ten times as long.
+        share, whole = self.rate.numerator, self.rate.denominator * MICROSECOND.denominator
+        ticks = (2 * microseconds * share + whole) // (2 * whole)
+        if 10 * abs(microseconds * share - ticks * whole) > max(whole, 10 * share):
             raise InputError(
                 f"video: an image {microseconds} us after the first does not fit {float(self.rate):g} images "
                 "per second; leave the rate out to keep the time stamps as they are"
