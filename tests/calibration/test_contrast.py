@@ -217,7 +217,7 @@ def test_a_refractory_period_is_found(period, known):
 
 @pytest.mark.parametrize("delay", [1_500, 3_000])
 def test_what_is_wrongly_taken_for_a_delay_makes_the_period_no_longer(delay):
-    """Known thresholds alone would make it 1.25 and 1.4 ms, and weights of events near it have no bound."""
+    """Weights of events near the period have no bound: a third too long does far more harm than a third too short."""
     known = Usual(0.2, 0.2, 0.0)
     camera = CameraSettings(log_offset=0.004)
     found = estimate_thresholds(
