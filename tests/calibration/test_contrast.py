@@ -215,6 +215,17 @@ def test_a_refractory_period_is_found(period, known):
     assert ignored.on > 1.15 * 0.2
 
 
+@pytest.mark.parametrize("delay", [1_500, 3_000])
+def test_what_is_wrongly_taken_for_a_delay_makes_the_period_no_longer(delay):
+    """Weights of events near the period have no bound: a third too long does far more harm than a third too short."""
+    known = Usual(0.2, 0.2, 0.0)
+    camera = CameraSettings(log_offset=0.004)
+    found = estimate_thresholds(
+        textured(refractory=1_000.0), camera, known, delay=delay, refractory_period=None
+    )
+    assert 500 < found.refractory_period < 1_100
+
+
 def test_no_refractory_period_is_found_where_nothing_is_lost():
     """Nor on edges of surfaces without texture, where the first event of each tells less than the others."""
     for recording in (textured(), unlabelled(moving_blocks(0.08, 0.9, size=SIZE))):
