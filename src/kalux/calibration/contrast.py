@@ -29,16 +29,16 @@ _MIN_SAMPLES: Final = 200
 _SHORTEST_EVENTS: Final = 500_000
 """Of which the shortest interval is taken: its edge is then that of 10,000 pairs."""
 
-_DELAY_SAMPLES: Final = 10_000
-"""Pixels for one delay: the best of all is then within 0.2 ms of that of more on twenty scenes and recordings."""
+ROUGH_SAMPLES: Final = 10_000
+"""Pixels for one delay, of which the best is then within 0.2 ms of that of more on twenty scenes and recordings, and
+for thresholds that I_0 is to be found with: these are then within 1 %, and two intervals have them."""
 
 _TRAILING: Final = (0, 2_000, 4_000)
 """us by which events may seem later than they are: 1.4 to 4.4 ms on seventeen scenes whose events are in time, of which
 `kalux.calibration.delay` takes seven tenths."""
 
-ROUGH_SAMPLES: Final = 30_000
-"""Pixels for the refractory period, and for thresholds that I_0 is to be found with: what is not known of the excess is
-then 0.02 on scenes where something is lost."""
+_PERIOD_SAMPLES: Final = 30_000
+"""Pixels for the refractory period: what is not known of the excess is then 0.02 on scenes where something is lost."""
 
 _MODEL: Final = 0.02
 """Relative error of thresholds from the neighbours' counts, beside the statistical one: -1.3 to 4.3 %, 1.6 % in the
@@ -47,9 +47,10 @@ root mean square, on seventeen simulated scenes."""
 _SHARED: Final = 0.1
 """Share of what frames do not explain in the neighbours' counts that may be common to neighbours."""
 
-_SUBTHRESHOLD: Final = 0.1
+_SUBTHRESHOLD: Final = 0.2
 """Relative error of thresholds from the neighbours' changes in frames, beside the statistical one: they are 0 to 3 %
-larger than those from counts on seventeen simulated scenes, and 2 to 9 % on three real recordings."""
+larger than those from counts on seventeen simulated scenes, and 2 to 9 % on three real recordings. They decide where
+nothing moves but noise, and there nothing says how wrong they are."""
 
 _LEAST_EXCESS: Final = 0.15
 """By how much more events that follow soon must tell than late ones, three standard errors taken off, for something to
@@ -202,11 +203,13 @@ def _estimate(
     samples = view.seen(period, most=most)
     if len(samples.share) < _MIN_SAMPLES:
         return None
-    estimate = _by_information(samples, usual, period, view.delay, 0.0)
-    if estimate is None or not 0 < view.shortest <= _LARGEST_SHORTEST:
-        return estimate
+    if not 0 < view.shortest <= _LARGEST_SHORTEST:
+        return _by_information(samples, usual, period, view.delay, 0.0)
     excess = _excess_of_soon(samples)
-    if not excess.value - 3 * excess.error > _LEAST_EXCESS:
+    # Where it is too uncertain to be believed, thresholds may still be as much too large.
+    maybe = _THRESHOLD_OF_EXCESS * max(excess.value - _USUAL_EXCESS, 0.0)
+    estimate = _by_information(samples, usual, period, view.delay, maybe)
+    if estimate is None or not excess.value - 3 * excess.error > _LEAST_EXCESS:
         return estimate
     for _ in range(2 if delay is not None else 1):  # what is lost looks like delay, too
         period = _without_excess(view)
@@ -245,7 +248,7 @@ class _View(NamedTuple):
         Half a threshold, by which events trail the light, is a part of ``delay``; spread over time they do not trail.
         """
         delays = tuple(delay - trailing for trailing in _TRAILING)
-        residuals = [seen.residual() for seen in self._seen(delays, (period,), _DELAY_SAMPLES, at_least=2)]
+        residuals = [seen.residual() for seen in self._seen(delays, (period,), ROUGH_SAMPLES)]
         if not np.isfinite(residuals).all():
             return self
         curvature, slope, _ = np.polyfit(_TRAILING, residuals, 2)
@@ -253,9 +256,8 @@ class _View(NamedTuple):
         best = float(np.clip(-0.5 * slope / curvature, 0.0, most)) if curvature > 0 else 0.0
         return self._replace(delay=delay - round(best))
 
-    def _seen(
-        self, delays: tuple[int, ...], periods: tuple[int, ...], most: int, at_least: int = 4
-    ) -> list[_Seen]:
+    def _seen(self, delays: tuple[int, ...], periods: tuple[int, ...], most: int) -> list[_Seen]:
+        at_least = 2 if most <= ROUGH_SAMPLES else 4
         late = LATE * self.shortest if self.shortest else np.inf
         found = steps(
             self.recording,
@@ -389,7 +391,7 @@ class _Parted(NamedTuple):
 
 
 class _Excess(NamedTuple):
-    """By which share events that follow soon tell more than late ones, its standard error; nan if unknown.
+    """By which share events that follow soon tell more than late ones, and its standard error; 0 and inf if unknown.
 
     ``soon`` is the share of the changes that these events tell.
     """
@@ -403,7 +405,7 @@ def _excess_of_soon(seen: _Seen) -> _Excess:
     """If nothing is lost."""
     parted = _parted(seen, 0)
     if parted is None:
-        return _Excess(np.nan, np.nan, 0.0)
+        return _Excess(0.0, np.inf, 0.0)
     samples = seen.steps
     late, soon = standard_errors(
         samples.change,
@@ -438,7 +440,7 @@ def _parted(seen: _Seen, index: int) -> _Parted | None:
 def _without_excess(view: _View) -> int:
     """The refractory period, us, under which events that follow soon tell as much as late ones; 0 if unknown."""
     periods = possible_periods(view.shortest)
-    seen = view.seen(*periods, most=ROUGH_SAMPLES)
+    seen = view.seen(*periods, most=_PERIOD_SAMPLES)
     parted = [_parted(seen, index) for index in range(len(periods))]
     excess = np.array([np.nan if one is None else one.excess for one in parted])
     if not np.isfinite(excess).all():
