@@ -71,7 +71,7 @@ class Samples(NamedTuple):
 
 
 class Shown(NamedTuple):
-    """Between which I the frames could show what came after: both (N,); ``least`` is 0 where black hides nothing."""
+    """Between which I the frames could show what came after: both (N,); ``least`` is 0 where black is not crushed."""
 
     least: Array
     most: Array
@@ -139,7 +139,10 @@ def estimate_event_model(
         return None
     model = _Model(thresholds, noise_of_blurred(camera), threshold_spread, quantisation_variance)
     if camera.log_offset is None:
-        log_offset = _log_offset(signals, Shown(*(limit[chosen] for limit in shown)), model)
+        # Frames that show the dark range over a hundred to one: what is beyond matters little, and lost events, of
+        # which the model knows nothing, would count for more.
+        limits = Shown(*(limit[chosen] for limit in shown)) if shown.least.any() else None
+        log_offset = _log_offset(signals, limits, model)
     else:
         log_offset = camera.log_offset
     # Single events, most of them noise where nothing moves, say much of the step and nothing of I_0; so do those of
@@ -149,7 +152,7 @@ def estimate_event_model(
     return EventModel(log_offset, step_variance, len(samples.before))
 
 
-def _log_offset(samples: Samples, shown: Shown, model: _Model) -> float:
+def _log_offset(samples: Samples, shown: Shown | None, model: _Model) -> float:
     """The I_0 that is likeliest, within a fifth: of those tried, then of those between the best and its neighbours.
 
     What is usual counts as far as events do not explain what changes: noise says nothing of I_0.
@@ -231,8 +234,7 @@ def negative_log_likelihood(
     if shown is not None:
         predicted, scale = after - mismatch, np.sqrt(variance)
         share = _below((np.log(shown.most + log_offset) - predicted) / scale)
-        if shown.least.any():
-            share -= _below((np.log(shown.least + log_offset) - predicted) / scale)
+        share -= _below((np.log(shown.least + log_offset) - predicted) / scale)
         losses += np.log(np.maximum(share, _LEAST_SHARE))
     return float(np.mean(losses))
 
