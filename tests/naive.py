@@ -241,6 +241,17 @@ def trail(pixel, t, scale, height, on, off):
     return height * (on if polarity else -off) * 2 * x / (1 + x * x)
 
 
+def hides(camera):
+    """K7: the most that black hides."""
+    response = Camera.named(chosen_response(camera.response, None), camera.saturation).response
+    return float(response.inverse(0.5 / 255))
+
+
+def is_crushed(pixel, k, camera):
+    """K7: whether black hides more than a linear response's would."""
+    return pixel.black[k] and hides(camera) > 1.5 / 255
+
+
 def bridged(pixel, settings, times, on, off, scales):
     """L(t) and P(t) of one pixel, docs/equations.md, K1 to K5, K7, K10, K13 and K14; what K15 needs."""
     c, ev = settings.camera, settings.events
@@ -251,12 +262,10 @@ def bridged(pixel, settings, times, on, off, scales):
     pixel.changes.clear()
     pixel.measured.clear()
 
-    hidden_by_black = float(
-        Camera.named(chosen_response(c.response, None), c.saturation).response.inverse(0.5 / 255)
-    )
+    hidden_by_black = hides(c)
 
     def crushed(k):  # K7
-        return pixel.black[k] and hidden_by_black > 1.5 / 255
+        return is_crushed(pixel, k, c)
 
     def ceiling(k, middle):  # K7: the most that L is at the middle of the exposure
         if not crushed(k):
@@ -532,10 +541,13 @@ def known(pixel, variance, t, settings, c2):
     share, (first, second) = (t - a) / (b - a), pixel.changes[k][3]
     events = sum(w for q, *_, w in pixel.events if a < q <= b)
     between = 4 * share * (1 - share)
+    wrong = 0.002 * c2 * between * events**2
+    if is_crushed(pixel, k + 1, settings.camera):  # says what others have said
+        return variance + wrong
     following = second + (1 - share) * events * ev.step_noise * c2
     q0 = ev.quantisation_variance * c2
     common = (q0 / (first + second + q0)) ** 2 * min(first, second) * (1 - between / 2)
-    return max(1 / (1 / variance + 1 / following), common) + 0.002 * c2 * between * events**2
+    return max(1 / (1 / variance + 1 / following), common) + wrong
 
 
 def regularised(level, variance, moving, difference):

@@ -9,7 +9,7 @@ import pytest
 
 import kalux
 from kalux import PRESETS, Frame, Recording, smoothing
-from kalux.augmentation.bridge import UNMEASURED
+from kalux.augmentation.bridge import REPEATED, UNMEASURED
 from kalux.augmentation.highlights import Unshown
 from kalux.augmentation.refractory import EventClock
 from kalux.compiled import event_words
@@ -17,7 +17,9 @@ from kalux.datasets import SensorSettings, demo_scene, simulate
 from kalux.datasets.ahdr import ArtificialCamera, artificial_hdr
 from kalux.errors import InputError, OutputError
 from kalux.events import make_events
+from kalux.filters.shots import take_shot
 from kalux.filters.uncertainty import Around
+from kalux.models.camera import Camera
 from kalux.pipeline import plan
 from kalux.reconstructor import Estimate, Reconstructor
 from kalux.smoothing import Spill, Trails, combine, reversed_settings
@@ -73,6 +75,7 @@ def test_smoothing_is_two_filters_combined_by_information():
     chosen = dataclasses.replace(STEPS, filter=dataclasses.replace(STEPS.filter, unshown_tail=0.0))
     forward, backward = (engine_over(of, chosen) for of in (source, mirrored(source)))
     times = list(range(1_000, 172_000, 7_000))
+    middles = [frame.middle for frame in source.frames()]
     seen_backward = {t: backward.estimate(-t) for t in times[::-1]}
     images = kalux.reconstruct(source, times=times, settings=chosen, smooth=True)
     for image, t in zip(images, times, strict=True):
@@ -80,12 +83,20 @@ def test_smoothing_is_two_filters_combined_by_information():
         weights = 1 / a.variance, 1 / b.variance
         level = (weights[0] * a.log_intensity + weights[1] * b.log_intensity) / (weights[0] + weights[1])
         known = [e.silent_change for e in (a, b) if e.silent_change is not None]
+        change = np.mean(known, axis=0)
+        after = min(max(int(np.searchsorted(middles, t)), 1), len(middles) - 1)
+        share = (t - middles[after - 1]) / (middles[after] - middles[after - 1])
+        correlation = 0.0
+        if a.around is not None and b.around is not None:
+            first, second = (variance < UNMEASURED for variance in a.around[:2])
+            correlation = np.where(first, 1 - share, 0) + np.where(second, share, 0)
         either = dataclasses.replace(
             a,
             log_intensity=level,
-            variance=1 / sum(weights),
-            moving=a.moving | b.moving,
-            silent_change=np.mean(known, axis=0),
+            variance=(sum(weights) + 2 * correlation * np.sqrt(weights[0] * weights[1])) / sum(weights) ** 2,
+            told=1 / sum(weights),
+            moving=np.where(change > 0.005 * 0.2 * 0.25, a.moving | b.moving, a.moving & b.moving),
+            silent_change=change,
             around=None if a.around is None else a.around._replace(counted=UNMEASURED),
             since=None if a.since is None else min(a.since, b.since),
         )
@@ -271,20 +282,68 @@ def test_where_one_filter_knows_nothing_the_other_is_taken():
     assert found.variance[0, 0] == pytest.approx(0.01, rel=1e-9)
 
 
+def estimates_around(first, second, share=0.5, ends=None):
+    """Of both directions, P = 0.01 and 0.04, at the share of the way from one frame to the next, with the variances of
+    these; ``ends`` is the second's for the forward filter, where that is another."""
+    shape = len(first), 1
+    first, second, ends = (np.reshape(v, shape) for v in (first, second, second if ends is None else ends))
+    ones, level = np.ones(shape), np.zeros(shape)
+    return tuple(
+        Estimate(t, level, p * ones, 0.0, True, around=Around(*frames, ones, coming, 0.0, 0.01, 1.0, 0.0))
+        for t, p, frames, coming in (
+            (5, 0.01, (first, ends), 0.03 * (1 - share)),
+            (-5, 0.04, (second, first), 0.03 * share),
+        )
+    )
+
+
 def test_what_two_filters_know_adds_up():
     """Information does, and the frame between them is not counted a third time."""
-    level, ones, plane = np.array([[1.0]]), np.ones((1, 1)), np.full((1, 1), 0.01, np.float32)
-    around = Around(plane, plane, plane, 0.0, 0.0, 0.01, 1.0, 0.0)
-    forward, backward = (
-        Estimate(t, level, ones * 0.01 * k, 0.0, True, around=around, since=since)
-        for t, k, since in ((5, 1, None), (-5, 3, 0.5))
-    )
-    found = combine(forward, backward)
-    assert found.variance[0, 0] == pytest.approx(0.0075)
+    forward, backward = estimates_around([0.01], [0.01])
+    late = dataclasses.replace(backward, since=0.5)
+    found = combine(forward, late)
+    assert found.told[0, 0] == pytest.approx(0.008)
     assert found.around.counted == UNMEASURED
     assert found.since is None
-    early, late = (dataclasses.replace(e, since=s) for e, s in ((forward, 0.2), (backward, 0.1)))
-    assert combine(early, late).since == 0.1
+    assert combine(dataclasses.replace(forward, since=0.2), late).since == 0.2
+
+
+@pytest.mark.parametrize("share", [0.25, 0.5, 1.0])
+def test_filters_that_go_by_the_same_frames_err_alike(share):
+    """As far as a frame around measures a pixel; where none does, each has its own."""
+    clipped = UNMEASURED
+    forward, backward = estimates_around(
+        [0.01, 0.01, clipped, clipped], [0.02, clipped, 0.02, clipped], share
+    )
+    found = combine(forward, backward).variance[:, 0]
+    errors = 0.8 * 0.1, 0.2 * 0.2  # by weights of 4 to 1
+    expected = [
+        errors[0] ** 2 + errors[1] ** 2 + 2 * correlation * errors[0] * errors[1]
+        for correlation in (1.0, 1 - share, share, 0.0)
+    ]
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
+
+
+def test_black_tells_both_filters_the_same():
+    """What it hides is the same before and after (K7), but it is not noise, which neighbours could take away."""
+    forward, backward = estimates_around([0.01, 2.0], [0.02, 2.0], ends=[0.02, REPEATED])
+    found = combine(forward, backward)
+    np.testing.assert_allclose(found.told[:, 0], [0.008, 0.0144], rtol=1e-6)
+    np.testing.assert_allclose(found.variance[:, 0], [0.0144, 0.008], rtol=1e-6)
+
+
+def test_what_moves_before_or_after_moves_where_its_surroundings_do():
+    forward, backward = (
+        dataclasses.replace(
+            e, moving=np.array(m)[:, None], silent_change=np.array([[0.0], [0.0], [0.1], [0.1]])
+        )
+        for e, m in zip(
+            estimates_around([0.01] * 4, [0.01] * 4),
+            ([True, True, True, False], [True, False, False, True]),
+            strict=True,
+        )
+    )
+    assert combine(forward, backward, None, 0.04).moving[:, 0].tolist() == [True, False, True, True]
 
 
 def test_where_one_filter_knows_only_a_bound_it_is_one():
@@ -320,3 +379,19 @@ def test_a_full_disk_is_one_line(tmp_path, monkeypatch):
     monkeypatch.setattr(np, "save", full)
     with pytest.raises(OutputError, match="backward pass: No space left"):
         Spill(recording(), tmp_path)
+
+
+def test_black_hides_as_much_of_two_filters_as_of_one():
+    """All black frames together say no more than one (K7): neither the next one nor the other filter tells anything."""
+    levels = np.full(SIZE, 120, np.uint8)
+    levels[3, 4] = 0
+    frames = [Frame(levels, t, t + 5_000) for t in range(0, 400_000, 40_000)]
+    events = make_events(np.array([1_000]), np.array([0]), np.array([0]), np.array([True]))
+    source = Recording.from_arrays(events, frames, sensor_size=SIZE, contrast_threshold=0.2)
+    black = altered(altered(PRESETS["default"], "camera", response="s-curve:0.2"), "camera", log_offset=0.03)
+    shot = take_shot(frames[0], Camera.named("s-curve:0.2", 0.99), 5_000)
+    hidden = np.log1p(shot.level_ceiling[0] / 0.03) ** 2 / 12
+    for smooth in (False, True):
+        (image,) = kalux.reconstruct(source, times=[222_500], settings=black, smooth=smooth)
+        # P falls from V/3 to V/4 within an interval, and grows by V/12 at the frame.
+        assert 0.75 * hidden < image.variance[3, 4] < 1.05 * hidden

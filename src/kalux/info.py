@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from kalux.calibration.levels import find_ceiling
 from kalux.events import EventArray
 from kalux.frames import Frame, Levels
 from kalux.recording import Recording
-from kalux.settings import AUTO, Settings
+from kalux.settings import AUTO, CameraSettings, Settings
 
 if TYPE_CHECKING:
     from kalux.pipeline import Plan
@@ -358,6 +359,9 @@ ORIGINS: Final = {
 """What to call where thresholds come from (`kalux.pipeline.ThresholdOrigin`)."""
 
 _NOTABLE_SHARE: Final = 0.05
+_ALIKE: Final = (
+    0.99  # of the level at which pixels saturate: where nearly all do from here on, it is one level
+)
 _GIVEN: Final = "given"
 _USUAL: Final = ORIGINS["assumed"]
 
@@ -432,6 +436,27 @@ def settled(recording: Recording, plan: Plan, asked: Settings) -> list[tuple[str
     return rows
 
 
+def saturation_text(recording: Recording, plan: Plan, asked: Settings) -> str:
+    """From which level on pixels count as clipped, and where the recording shows that they are.
+
+    Parameters are those of `settled`; it looks at up to 80 frames once more (`kalux.calibration.levels`).
+    """
+    used = plan.settings.camera.saturation
+    how = "the usual" if asked.camera.saturation == CameraSettings.saturation else _GIVEN
+    text = f"from {used:.2g} of white ({how}); "
+    ceiling = find_ceiling(recording, plan.settings.camera, plan.settings.events)
+    if ceiling is None:
+        return text + "events do not go on where the frames end, or too few tell"
+    level = f"{ceiling.level:.2g}"
+    if ceiling.least < _ALIKE * ceiling.level:
+        level = f"{ceiling.least:.2g} to {2 * ceiling.level - ceiling.least:.2g}"
+    text += f"frames end at {level}, where events go on"
+    if ceiling.level < used:
+        percent = 100 * np.expm1(ceiling.excess)
+        text += f" by {percent:.0f} %: --camera.saturation {_ALIKE * ceiling.least:.2g} does not take that for measured"
+    return text
+
+
 def _threshold_origin(plan: Plan) -> str:
     found = plan.estimate
     if found is None or plan.threshold_origin not in ("estimate", "assumed"):
@@ -451,7 +476,12 @@ def _threshold_origin(plan: Plan) -> str:
 def _refractory_origin(plan: Plan, asked: Settings) -> str:
     if asked.events.refractory_period is not None:
         return _GIVEN
-    return _USUAL if plan.estimate is None else f"estimated from {plan.estimate.samples:,} samples"
+    if plan.estimate is None:
+        return _USUAL
+    found = plan.estimate.refractory_period
+    hidden = found and not plan.settings.events.refractory
+    most = f"; it is {found * 1e-3:g} ms, but few events follow others so soon" if hidden else ""
+    return f"estimated from {plan.estimate.samples:,} samples{most}"
 
 
 def _delay_origin(plan: Plan, asked: Settings) -> str:

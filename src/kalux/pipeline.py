@@ -475,7 +475,7 @@ def _with_thresholds(
         )
     )
     if finds_period:
-        period = 0 if estimate is None else estimate.refractory_period
+        period = estimate.refractory_period if estimate is not None and estimate.worth_weighing else 0
         known = dataclasses.replace(known, refractory_period=period)
     if not _has_thresholds(known):
         origin = "assumed" if estimate is None or estimate.usual_share > 0.5 else "estimate"

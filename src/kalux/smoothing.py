@@ -366,12 +366,12 @@ def combine(
     )
     obey_bounds(level, *directions)
     obey_bounds(level, *directions[::-1])
-    variance = told = 1.0 / information
+    variance, told = 1.0 / information, None
     shared = shared_errors(forward.around, backward.around)
     if shared is not None:
-        variance = (information + 2.0 * shared * np.sqrt(first * second)) / information**2
-        repeated = _repeated(forward.around, backward.around)
-        variance, told = np.where(repeated, told, variance), np.where(repeated, variance, told)
+        together = (information + 2.0 * shared * np.sqrt(first * second)) / information**2
+        black = _black(forward.around, backward.around)
+        variance, told = np.where(black, variance, together), np.where(black, together, variance)
     change = _mean_of_both(forward.silent_change, backward.silent_change)
     return Estimate(
         t=forward.t,
@@ -408,8 +408,11 @@ def shared_errors(forward: Around | None, backward: Around | None) -> NDArray[np
     return (np.float32(1.0) - share) * first + share * second
 
 
-def _repeated(forward: Around | None, backward: Around | None) -> NDArray[np.bool_]:
-    """(H, W): where a frame around is black, which tells both directions the same (K7)."""
+def _black(forward: Around | None, backward: Around | None) -> NDArray[np.bool_]:
+    """(H, W): where a frame around is black, which tells both directions the same (K7).
+
+    That is no noise, which neighbours could take away (K12): it counts in the variance that is given out alone.
+    """
     assert forward is not None
     assert backward is not None
     ends = (around.second for around in (forward, backward))

@@ -235,17 +235,16 @@ def test_deblurring_gains_8_db_on_a_photograph(shared_data):
 
 
 def test_only_blocks_with_an_event_are_looked_at():
-    """Memory of an earlier exposure that is used again does not show, nor does where an event falls."""
+    """What memory held before (`kalux.memory`) does not show, nor does where an event falls."""
     rng = np.random.default_rng(3)
     shape = (9, 50)  # blocks go on over the ends of rows
     thresholds = tuple(rng.uniform(0.5, 2.0, shape).astype(np.float32) for _ in range(2))
-    spare = None
     for places in ([], [0], [63, 64, 449], rng.integers(0, 450, 200)):
         t = np.sort(rng.integers(1001, 2000, len(places)))
         row, column = np.divmod(np.asarray(places, np.int64), shape[1])
         array = make_events(t, column, row, rng.integers(0, 2, len(places)))
         array = EventClock(shape, 0).weighed(array)
-        exposure = expose([array], 1000, 2000, thresholds, (ON, OFF), weighed=True, spare=spare)
+        exposure = expose([array], 1000, 2000, thresholds, (ON, OFF), weighed=True)
         np.testing.assert_array_equal(
             np.flatnonzero(exposure.touched), np.unique(np.asarray(places, int) // EXPOSED)
         )
@@ -261,4 +260,3 @@ def test_only_blocks_with_an_event_are_looked_at():
         whole = integrate_exposure(array, 1000, 2000, *steps)
         np.testing.assert_allclose(level, -1.0 - whole.log_mean + whole.to_middle, atol=1e-6)
         np.testing.assert_allclose(variance, 0.01 + 0.001 * whole.events, rtol=1e-6)
-        spare = exposure.pixels

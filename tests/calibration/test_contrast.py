@@ -7,8 +7,9 @@ import pytest
 
 import kalux
 from kalux import Frame, Recording
-from kalux.calibration.contrast import Usual, estimate_thresholds
+from kalux.calibration.contrast import Usual, estimate_thresholds, refine_thresholds
 from kalux.datasets import SensorSettings, demo_scene, simulate, static
+from kalux.datasets.scenes import Scene
 from kalux.errors import ExposureError
 from kalux.events import make_events
 from kalux.settings import CameraSettings
@@ -220,6 +221,68 @@ def test_no_refractory_period_is_found_where_nothing_is_lost():
         assert estimate_thresholds(recording, CAMERA, USUAL, refractory_period=None).refractory_period == 0
 
 
+def test_hot_pixels_hide_no_refractory_period():
+    """Twelve of them make half of all events; each pollutes what its neighbours see."""
+    lossy, rng = textured(refractory=600.0), np.random.default_rng(0)
+    stream, (height, width) = np.concatenate([*lossy.events()]), lossy.sensor_size
+    at = rng.choice(rng.choice(height * width, 12, replace=False), len(stream))
+    t = rng.integers(stream["t"][0], stream["t"][-1], len(stream))
+    both = np.concatenate([stream, make_events(t, at % width, at // width, rng.random(len(t)) < 0.5)])
+    both = both[np.argsort(both["t"], kind="stable")]
+    hot = Recording.from_arrays(both, [*lossy.frames()], sensor_size=lossy.sensor_size)
+    camera = CameraSettings(log_offset=0.004)
+    found = estimate_thresholds(hot, camera, USUAL, delay=1_500, refractory_period=None)
+    assert found.refractory_period == pytest.approx(600, rel=0.1)
+    np.testing.assert_allclose([found.on, found.off], 0.2, rtol=0.06)
+
+
+# --- delay ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("late", [-1_000, 0, 2_000])
+def test_the_half_threshold_by_which_events_trail_is_not_taken_for_delay(late):
+    """The delay of a reconstruction has it in it; thresholds do not depend on how much of it."""
+    whole = textured()
+    moved = np.concatenate([*whole.events()])
+    moved["t"] += late
+    recording = Recording.from_arrays(moved, [*whole.frames()], sensor_size=whole.sensor_size)
+    camera = CameraSettings(log_offset=0.004)
+    for seeming in (late + 1_000, late + 2_500):
+        found = estimate_thresholds(recording, camera, USUAL, delay=seeming)
+        assert found.delay == pytest.approx(late, abs=400)
+        np.testing.assert_allclose([found.on, found.off], 0.2, rtol=0.04)
+
+
+def test_of_a_rough_estimate_delay_and_period_are_kept():
+    """With another I_0 the same is found as from the start."""
+    lossy = textured(refractory=600.0)
+    rough = estimate_thresholds(lossy, CAMERA, USUAL, delay=1_500, refractory_period=None, most=2_000)
+    camera = CameraSettings(log_offset=0.004)
+    refined = refine_thresholds(lossy, camera, USUAL, rough, refractory_period=None)
+    whole = estimate_thresholds(lossy, camera, USUAL, delay=1_500, refractory_period=None)
+    assert refined.delay == rough.delay
+    np.testing.assert_allclose([refined.on, refined.off], [whole.on, whole.off], rtol=0.02)
+    assert refined.refractory_period == pytest.approx(whole.refractory_period, rel=0.1)
+
+
+# --- lamps ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("speed", [40.0, 120.0])
+def test_a_flickering_lamp_does_not_disturb(speed):
+    """100 Hz, 30 % of the light; pixels/s of what moves."""
+    pattern = np.repeat(np.repeat(np.random.default_rng(1).uniform(0.1, 0.8, (9, 12)), 4, 0), 4, 1)
+
+    def radiance(t):
+        light = 1 + 0.3 * np.sin(2 * np.pi * 100 * t * 1e-6)
+        return np.roll(pattern * light, int(t * 1e-6 * speed), 1)
+
+    scene = Scene(radiance, pattern.shape, 0, 400_000)
+    recording = unlabelled(simulate(scene, SensorSettings(noise_rate=1.0)))
+    found = estimate_thresholds(recording, CameraSettings(log_offset=0.004), USUAL)
+    np.testing.assert_allclose([found.on, found.off], 0.2, rtol=0.05)
+
+
 # --- nothing to tell ------------------------------------------------------------------------------------
 
 
@@ -228,6 +291,17 @@ def test_a_still_scene_tells_nothing(noise_rate):
     scene = static(0.4, sensor_size=(32, 40), duration=300_000)
     recording = unlabelled(simulate(scene, SensorSettings(noise_rate=noise_rate)))
     assert estimate_thresholds(recording, CAMERA, USUAL) is None
+
+
+def test_what_clips_everywhere_and_one_sign_alone_tell_nothing():
+    """A threshold that no event tells of is not made up."""
+    recording = unlabelled(moving_blocks(0.08, 0.9, size=SIZE))
+    stream, frames = np.concatenate([*recording.events()]), [*recording.frames()]
+    white = np.full(SIZE, 255, np.uint8)
+    clipped = [Frame(white, frame.exposure_start, frame.exposure_end) for frame in frames]
+    for some, shown in ((stream, clipped), (stream[stream["p"]], frames), (stream[:10], frames)):
+        one = Recording.from_arrays(some, shown, sensor_size=SIZE)
+        assert estimate_thresholds(one, CAMERA, USUAL) is None
 
 
 def test_frames_alone_tell_nothing():

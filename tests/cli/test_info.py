@@ -19,6 +19,7 @@ def test_says_all_that_reconstruct_would_settle(cli, write_recording, tmp_path):
     """The same lines that it prints when it does."""
     path = write_recording(tmp_path / "rec.h5", contrast_threshold=None)
     said = cli("info", path).out.split("reconstruct would use, with the preset default\n")[1].splitlines()
+    assert said.pop().split(maxsplit=1)[0] == "saturation"  # which takes another look at the frames
     assert [line.split("  ")[1].strip() for line in said] == [
         "thresholds",
         "delay",
@@ -113,3 +114,13 @@ class TestRealRecordings:
             assert found.code == 2
             assert "cut short" in found.error
         assert [file.name for file in tmp_path.iterdir()] == ["cut.aedat4"]
+
+
+def test_says_where_the_sensor_saturates(cli, shared_data):
+    """slider_depth ends far below full scale, which nothing but events can tell from a white wall."""
+    said = cli("info", shared_data / "slider_depth", "--exposure", 10_000).out.splitlines()[-1]
+    assert re.search(
+        r"saturation +from 0.98 of white \(the usual\); frames end at 0.4\d to 0.\d+, where events go on",
+        said,
+    )
+    assert re.search(r"by \d\d %: --camera.saturation 0.4\d ", said)

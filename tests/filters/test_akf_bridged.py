@@ -157,17 +157,19 @@ def drifting_segment(end, shape=(1, 1)):
 
 
 def test_memory_that_is_used_again_does_not_show():
-    """A cursor in the memory of another reads as one in its own."""
+    """A cursor in the memory of another reads as one in its own (`kalux.memory`)."""
     rng = np.random.default_rng(1)
-    shape = (5, 70)
+    shape = (60, 300)
     used = akf_bridged.begin(drifting_segment(100_000, shape), random_state(rng, shape))
     times = np.arange(1, 400) * 100
     events = make_events(times, rng.integers(0, 70, 399), rng.integers(0, 5, 399), rng.integers(0, 2, 399))
     akf_bridged.advance(drifting_segment(100_000, shape), used, events, akf_bridged.Noise(3.0, 0.2, 0.04))
     start = random_state(rng, shape)
     segment = drifting_segment(100_000, shape)
-    fresh, again = akf_bridged.begin(segment, start), akf_bridged.begin(segment, start, used)
-    assert again.pixels is used.pixels
+    fresh, place = akf_bridged.begin(segment, start), used.pixels.ctypes.data
+    del used
+    again = akf_bridged.begin(segment, start)
+    assert again.pixels.ctypes.data == place
     for cursor in (fresh, again):
         akf_bridged.advance(segment, cursor, events, akf_bridged.Noise(3.0, 0.2, 0.04))
     for one, other in zip(*(akf_bridged.read(segment, c, 50_000) for c in (fresh, again)), strict=True):

@@ -248,8 +248,9 @@ def bridge(
     """
     seconds = (end - start) * 1e-6
     shape = first.value.shape
-    planes = tuple(apart(11, shape, first.value.dtype))
-    augmented, slope, step_on, step_off, events, net, floor, *factors = planes
+    planes = tuple(apart(7, shape, first.value.dtype))
+    augmented, slope, step_on, step_off, events, net, floor = planes
+    factors = tuple(apart(4, shape, first.value.dtype))  # needed for longer
     segment = BridgedSegment(
         start=start,
         end=end,
@@ -267,18 +268,18 @@ def bridge(
         net=net,
     )
     more = np.zeros(shape, first.value.dtype) if grown is None else grown
-    _bridge(*first[:2], *second[:2], on, off, more, thresholds, noise, seconds, planes)
+    _bridge(*first[:2], *second[:2], on, off, more, thresholds, noise, seconds, planes, factors)
     return segment, Thresholds(*factors)
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _bridge(  # type: ignore[no-untyped-def]
-    value, variance, next_value, next_variance, on, off, grown, thresholds, noise, seconds, planes
+    value, variance, next_value, next_variance, on, off, grown, thresholds, noise, seconds, planes, factors
 ):
-    """Fill ``planes``; in float64, whatever the arrays' type."""
+    """Fill ``planes`` and ``factors``; in float64, whatever the arrays' type."""
     low, high = _SCALE_BOUNDS
-    augmented, slope, step_on, step_off, events, net, floor = planes[:7]
-    new_on, new_off, new_on_variance, new_off_variance = planes[7:]
+    augmented, slope, step_on, step_off, events, net, floor = planes
+    new_on, new_off, new_on_variance, new_off_variance = factors
     height, width = on.shape
     told = np.empty(width)
     for row in range(height):  # three loops each: one over all these arrays is no vector code

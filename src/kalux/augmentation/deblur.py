@@ -25,6 +25,7 @@ from kalux.compiled import (
     AHEAD,
     FUSED,
     ONE,
+    UNWEIGHED,
     WEIGHT_UNIT,
     event_column,
     event_is_on,
@@ -140,7 +141,6 @@ def expose(
     nominal: tuple[float, float],
     *,
     weighed: bool,
-    spare: NDArray[np.void] | None = None,
 ) -> Exposure:
     """Take an exposure, from ``start`` to ``end`` (us), over its events.
 
@@ -152,11 +152,9 @@ def expose(
         (H, W) thresholds of an event of either polarity in units of the nominal ones, and these, log intensity.
     weighed
         Whether the events carry weights (`kalux.augmentation.refractory`).
-    spare
-        ``pixels`` of an exposure of the same size that is used no more, whose memory this one takes.
     """
     height, width = thresholds[0].shape
-    pixels = packed((height * width,), EXPOSURE_PIXEL) if spare is None else spare
+    pixels = packed((height * width,), EXPOSURE_PIXEL)
     touched = np.zeros(-(-len(pixels) // EXPOSED), np.bool_)
     inside = [event_words(events) for events in all_between(chunks, start, end)]
     for words in inside:
@@ -268,8 +266,11 @@ def _integrate(words, pixels, width, start, middle, unit):  # type: ignore[no-un
         pixel.integral += level * (now - pixel.since)
         pixel.since = now
         factor = up if event_is_on(word) else down
-        weight = event_weight(word, unit)
-        level *= factor if weight == ONE else exponential(weight * logarithm(factor))
+        weight = ONE
+        if word & ~UNWEIGHED and unit > np.float32(0.0):  # before anything is made of it: most events weigh 1
+            weight = event_weight(word, unit)
+            factor = exponential(weight * logarithm(factor))
+        level *= factor
         peak = pixel.peak
         pixel.level = level
         pixel.peak = level if level > peak else peak

@@ -11,7 +11,6 @@ the recording: 1.1 times the mean interval between two events of one polarity at
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from typing import Any, Final, NamedTuple
 
@@ -19,6 +18,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux import memory
 from kalux.compiled import (
     AHEAD,
     MICROSECOND32,
@@ -128,11 +128,7 @@ def nothing_followed(shape: tuple[int, int]) -> Followed:
 
 
 def follow(
-    chunks: Iterable[EventArray],
-    before: Followed,
-    start: int,
-    end: int,
-    spare: NDArray[np.void] | None = None,
+    chunks: Iterable[EventArray], before: Followed, start: int, end: int
 ) -> tuple[FloatArray, FloatArray, Followed]:
     """Sums of the weights of on and of off events of every pixel, (H, W) each, and what is known after them.
 
@@ -144,10 +140,8 @@ def follow(
         The events with ``start`` < t <= ``end`` (us), in time order.
     before
         What was known before them.
-    spare
-        Memory to work in: `followed_pixels` of the sensor; None: it is made.
     """
-    pixels = followed_pixels(before.newest.shape) if spare is None else spare
+    pixels = packed((before.newest.size,), FOLLOWED_PIXEL)
     _begin_following(before.newest.reshape(-1), pixels)
     codes, counts, width = pixels.view(np.int64), pixels.view(np.float32), np.uint64(before.newest.shape[1])
     span, intervals = _KEPT * before.span, _KEPT * before.intervals
@@ -156,14 +150,9 @@ def follow(
         more, number = _follow(event_words(chunk), codes, counts, width, late)
         span, intervals = span + more, intervals + number
     off, on = apart(2, before.newest.shape)
-    newest = np.empty_like(before.newest)
+    newest = memory.empty(before.newest.shape, np.int64)
     _end_following(pixels, newest.reshape(-1), off.reshape(-1), on.reshape(-1))
     return on, off, Followed(newest, span, intervals)
-
-
-def followed_pixels(shape: tuple[int, ...]) -> NDArray[np.void]:
-    """(H W) of `FOLLOWED_PIXEL`, not filled: what `follow` works in."""
-    return packed((math.prod(shape),), FOLLOWED_PIXEL)
 
 
 @nb.njit(cache=True, nogil=True)
@@ -203,7 +192,7 @@ def _follow(words, codes, counts, width, late):  # type: ignore[no-untyped-def]
 
 def trail_at(newest: NDArray[np.int64], t: int, trail: tuple[float, float, float]) -> FloatArray:
     """f at ``t`` (us), (H, W) log intensity, given the newest events there; ``trail`` is s and h c_on, h c_off."""
-    out = np.empty(newest.shape, np.float32)
+    out = memory.empty(newest.shape)
     _trail_at(newest.reshape(-1), t, tuple(np.float32(value) for value in trail), out.reshape(-1))
     return out
 
@@ -226,7 +215,7 @@ def trail_between(
 
 def polarity_of(newest: NDArray[np.int64]) -> NDArray[np.int8]:
     """1 and -1 of the newest event; 0 where there was none."""
-    polarity = np.empty(newest.shape, np.int8)
+    polarity = memory.empty(newest.shape, np.int8)
     _polarity_of(newest.reshape(-1), polarity.reshape(-1))
     return polarity
 

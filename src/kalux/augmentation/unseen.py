@@ -9,6 +9,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux import memory
 from kalux.augmentation.bridge import UNMEASURED, BridgedSegment, Latent
 from kalux.compiled import apart
 
@@ -50,8 +51,7 @@ def silent_change(segment: BridgedSegment, quantisation_variance: float, thresho
     assert segment.events is not None
     shape = segment.slope.shape
     change, untold = apart(2, shape)
-    mean = np.empty(shape, np.float32)
-    silent = np.empty(shape, np.uint8)
+    mean, silent = memory.empty(shape), memory.empty(shape, np.uint8)
     seconds = np.float32((segment.end - segment.start) * 1e-6)
     q0, most = np.float32(quantisation_variance), np.float32(threshold2)
     variances = segment.forward_variance, segment.backward_variance
@@ -160,4 +160,5 @@ def _mean(total, count, forward, backward, unknown, unmeasured_change, mean):  #
 def _sum_around(values: NDArray[Any]) -> NDArray[Any]:
     """Over 5 x 5 pixels, in the same type; beyond the border there is nothing."""
     size = (_WINDOW, _WINDOW)
-    return np.asarray(cv2.boxFilter(values, -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT))
+    sums = memory.empty(values.shape, values.dtype)
+    return np.asarray(cv2.boxFilter(values, -1, size, sums, normalize=False, borderType=cv2.BORDER_CONSTANT))

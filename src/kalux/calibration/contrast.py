@@ -62,6 +62,10 @@ _THRESHOLD_OF_EXCESS: Final = 0.6
 """Relative error of thresholds over that of the excess: what is lost makes thresholds of seven scenes by 0.3 to 0.63 of
 the excess too large."""
 
+_LEAST_SOON: Final = 0.15
+"""Share of the changes that events tell that follow others soon. On a scene where it is 0.1 the filter does better
+without weighing events (a relative MSE of 0.156 instead of 0.193); on six others, of 0.25 to 0.6, far worse."""
+
 _LARGEST_SHORTEST: Final = 5_000
 """us: of pixels that never follow sooner little is lost in the refractory period of any sensor, some 2 ms at most."""
 
@@ -87,6 +91,8 @@ class ThresholdEstimate(NamedTuple):
         How much later than the frames' clock events were taken to be stamped, us.
     doubt
         Relative error of thresholds that comes from that of the refractory period; a part of ``spread``.
+    soon
+        Where there is a refractory period, share of the changes that events tell that follow others soon; 0 to 1.
     """
 
     on: float
@@ -98,6 +104,12 @@ class ThresholdEstimate(NamedTuple):
     refractory_period: int
     delay: int
     doubt: float
+    soon: float = 0.0
+
+    @property
+    def worth_weighing(self) -> bool:
+        """Whether so much is lost in the refractory period that it is better to add it to events, noise among them."""
+        return self.soon >= _LEAST_SOON
 
 
 class Usual(NamedTuple):
@@ -152,25 +164,8 @@ def estimate_thresholds(
         If the frames' exposures are not known.
     """
     view = _view(recording, camera, of_log_offset, refractory_period)
-    known = refractory_period or 0
-    view = view.without_trailing(delay, known)
-    samples = view.seen(known, most=most)
-    if len(samples.share) < _MIN_SAMPLES:
-        return None
-    estimate = _by_information(samples, usual, known, view.delay, 0.0)
-    if estimate is None or not 0 < view.shortest <= _LARGEST_SHORTEST:
-        return estimate
-    excess = _excess_of_soon(samples)
-    if not excess.value - 3 * excess.error > _LEAST_EXCESS:
-        return estimate
-    period = 0
-    for _ in range(2):  # what is lost looks like delay, too
-        period = _without_excess(view, usual)
-        if period == 0:
-            return estimate
-        view = view.without_trailing(delay, period)
-    doubt = _THRESHOLD_OF_EXCESS * float(np.hypot(excess.error, _USUAL_EXCESS))
-    return _by_information(view.seen(period, most=most), usual, period, view.delay, doubt) or estimate
+    view = view.without_trailing(delay, refractory_period or 0)
+    return _estimate(view, usual, refractory_period, most, delay)
 
 
 def refine_thresholds(
@@ -184,14 +179,43 @@ def refine_thresholds(
 ) -> ThresholdEstimate:
     """The thresholds with another I_0 than that of a rough estimate, whose delay is right whatever I_0 is.
 
-    Parameters are those of `estimate_thresholds`. A refractory period is found anew where the rough estimate has one.
+    Parameters are those of `estimate_thresholds`.
     """
     view = _view(recording, camera, of_log_offset, refractory_period)._replace(delay=rough.delay)
     period = rough.refractory_period
-    if refractory_period is None and period > 0:
-        period = _without_excess(view, usual) or period
-    samples = view.seen(period, most=MAX_SAMPLES)
-    return _by_information(samples, usual, period, view.delay, rough.doubt) or rough
+    if refractory_period is not None or period == 0:
+        return _estimate(view, usual, refractory_period, MAX_SAMPLES, None) or rough
+    period = _without_excess(view) or period
+    found = _by_information(view.seen(period, most=MAX_SAMPLES), usual, period, view.delay, rough.doubt)
+    return rough if found is None else found._replace(soon=rough.soon)
+
+
+def _estimate(
+    view: _View, usual: Usual, refractory_period: int | None, most: int, delay: int | None
+) -> ThresholdEstimate | None:
+    """Thresholds, and the refractory period if it is not given; None where there are too few pixels.
+
+    ``delay`` is what events seem to be late, us, of which the part that is due to what is lost is looked for. None:
+    that of the view is right.
+    """
+    period = refractory_period or 0
+    samples = view.seen(period, most=most)
+    if len(samples.share) < _MIN_SAMPLES:
+        return None
+    estimate = _by_information(samples, usual, period, view.delay, 0.0)
+    if estimate is None or not 0 < view.shortest <= _LARGEST_SHORTEST:
+        return estimate
+    excess = _excess_of_soon(samples)
+    if not excess.value - 3 * excess.error > _LEAST_EXCESS:
+        return estimate
+    for _ in range(2 if delay is not None else 1):  # what is lost looks like delay, too
+        period = _without_excess(view)
+        if period == 0:
+            return estimate
+        view = view if delay is None else view.without_trailing(delay, period)
+    doubt = _THRESHOLD_OF_EXCESS * float(np.hypot(excess.error, _USUAL_EXCESS))
+    lossy = _by_information(view.seen(period, most=most), usual, period, view.delay, doubt)
+    return estimate if lossy is None else lossy._replace(soon=excess.soon)
 
 
 def _view(
@@ -365,17 +389,21 @@ class _Parted(NamedTuple):
 
 
 class _Excess(NamedTuple):
-    """By which share events that follow soon tell more than late ones, and its standard error; nan if unknown."""
+    """By which share events that follow soon tell more than late ones, its standard error; nan if unknown.
+
+    ``soon`` is the share of the changes that these events tell.
+    """
 
     value: float
     error: float
+    soon: float
 
 
 def _excess_of_soon(seen: _Seen) -> _Excess:
     """If nothing is lost."""
     parted = _parted(seen, 0)
     if parted is None:
-        return _Excess(np.nan, np.nan)
+        return _Excess(np.nan, np.nan, 0.0)
     samples = seen.steps
     late, soon = standard_errors(
         samples.change,
@@ -385,7 +413,9 @@ def _excess_of_soon(seen: _Seen) -> _Excess:
         samples.pixel,
         seen.sensor_size,
     )
-    return _Excess(parted.excess, float(np.hypot(late, soon) / parted.fit.solution[0]))
+    told = np.abs(parted.explained).sum(axis=0)
+    error = float(np.hypot(late, soon) / parted.fit.solution[0])
+    return _Excess(parted.excess, error, float(told[1] / told.sum()))
 
 
 def _parted(seen: _Seen, index: int) -> _Parted | None:
@@ -405,26 +435,14 @@ def _parted(seen: _Seen, index: int) -> _Parted | None:
     return None if again is None or not again.solution[0] > 0 else _Parted(explained, instruments, again)
 
 
-def _without_excess(view: _View, usual: Usual) -> int:
-    """The refractory period, us, under which events that follow soon tell as much as late ones; 0 if unknown.
-
-    With known thresholds the one under which these explain the frames.
-    """
+def _without_excess(view: _View) -> int:
+    """The refractory period, us, under which events that follow soon tell as much as late ones; 0 if unknown."""
     periods = possible_periods(view.shortest)
     seen = view.seen(*periods, most=ROUGH_SAMPLES)
-    excess = np.array([_excess(seen, index, usual) for index in range(len(periods))])
+    parted = [_parted(seen, index) for index in range(len(periods))]
+    excess = np.array([np.nan if one is None else one.excess for one in parted])
     if not np.isfinite(excess).all():
         return 0
     # A longer period always explains more; what noise makes otherwise is evened out.
     falling = np.minimum.accumulate(excess)
-    left = _USUAL_EXCESS if usual.spread > 0 else 0.0
-    return round(float(np.interp(-left, -falling, periods)))
-
-
-def _excess(seen: _Seen, index: int, usual: Usual) -> float:
-    """What is near 0 under the right refractory period, and larger under shorter ones; nan if unknown."""
-    if usual.spread > 0:
-        parted = _parted(seen, index)
-        return np.nan if parted is None else parted.excess
-    fit = two_stage(seen.steps.change, seen.explained(index), seen.counts_around(index))
-    return np.nan if fit is None else float(np.mean(fit.solution[:2] / usual[:2])) - 1.0
+    return round(float(np.interp(-_USUAL_EXCESS, -falling, periods)))

@@ -37,6 +37,10 @@ _MAX_FRAMES: Final = 200
 _LEAST_AROUND: Final = 8  # events of the eight neighbours: where less happens it may be noise
 _LEAST_NEIGHBOURS: Final = 4  # that frames show well
 
+_HOT_LEAST: Final = 10
+_HOT_FACTOR: Final = 4
+"""Pixels with more events between two frames than ten and four times as many as any neighbour are hot."""
+
 _ALIKE: Final = 0.3
 """Log intensity by which the changes of neighbours that see the same edge differ: others are weighed down. A slow edge
 is at one pixel after the other; without, it makes thresholds a quarter too large."""
@@ -167,7 +171,7 @@ class _Passing:
         passed = event_words(between(interval.events, self._seen_until, begin))
         _pass(passed, np.uint64(width), self._latest, self._sign)
         self._seen_until = begin
-        chosen = self._chosen(interval)
+        chosen, usable = self._chosen(interval)
         words = event_words(between(interval.events, begin, end))
         order, starts = _by_pixel(words, np.uint64(width), _with_neighbours(chosen, height, width))
         exposures = tuple(
@@ -179,7 +183,7 @@ class _Passing:
         _count(words, order, starts, self._latest, self._sign, exposures, self._periods, self._late, counts)
         shape = len(chosen), len(self._periods), 2, 2
         own, around, change_around = _looked_at(
-            counts.reshape(height, width, 4 * len(self._periods)), interval.change, interval.usable, chosen
+            counts.reshape(height, width, 4 * len(self._periods)), interval.change, usable, chosen
         )
         return Steps(
             interval.change.ravel()[chosen],
@@ -190,13 +194,17 @@ class _Passing:
             chosen,
         )
 
-    def _chosen(self, interval: Interval) -> NDArray[np.int64]:
-        """Indices of well exposed pixels around which something happens, spread evenly."""
+    def _chosen(self, interval: Interval) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """Indices of well exposed pixels around which something happens, spread evenly; (H, W) all well exposed ones.
+
+        Hot pixels are none of either.
+        """
         start, end = interval.start + self._delay, interval.end + self._delay
         happened = np.zeros(self._shape, np.int32)
         _add(event_words(between(interval.events, start, end)), happened)
-        candidates = np.flatnonzero(_something_happens(happened, interval.usable))
-        return candidates[:: max(-(-len(candidates) // self._most), 1)]
+        usable = interval.usable & ~_hot(happened)
+        candidates = np.flatnonzero(_something_happens(happened, usable))
+        return candidates[:: max(-(-len(candidates) // self._most), 1)], usable
 
 
 @nb.njit(cache=True, nogil=True)
@@ -316,6 +324,23 @@ def _count(words, order, starts, latest, sign, exposures, periods, late, counts)
         step = 0.5 * _shown(exposures, before, before + 0.5 * pace_before)
         for k in range(len(periods)):
             counts[at, k, 0, np.uint64(sign_before < 0)] += step
+
+
+@nb.njit(cache=True, nogil=True)
+def _hot(happened):  # type: ignore[no-untyped-def]
+    """(H, W): pixels with far more events than any of their neighbours."""
+    height, width = happened.shape
+    found = np.zeros((height, width), np.bool_)
+    for row in range(height):
+        for column in range(width):
+            if happened[row, column] > _HOT_LEAST:
+                most = 0
+                for i in range(max(row - 1, 0), min(row + 2, height)):
+                    for j in range(max(column - 1, 0), min(column + 2, width)):
+                        if not (i == row and j == column):
+                            most = max(most, happened[i, j])
+                found[row, column] = happened[row, column] > _HOT_LEAST + _HOT_FACTOR * most
+    return found
 
 
 @nb.njit(cache=True, nogil=True)

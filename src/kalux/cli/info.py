@@ -138,7 +138,7 @@ def settled_lines(
     name: str,
 ) -> list[str]:
     """What a reconstruction would settle, a line each; why it could not, if it could not."""
-    from kalux.info import settled
+    from kalux.info import saturation_text, settled
     from kalux.pipeline import plan
 
     title = f"reconstruct would use, with the preset {name}"
@@ -147,6 +147,7 @@ def settled_lines(
     if not recording.exposure_known:
         return [title, "  nothing can be estimated without exposure times; give --exposure"]
     asked = settings if calibration is None else calibration.apply(settings)
-    rows = settled(recording, plan(recording, at="frames", settings=asked, calibration=calibration), asked)
+    made = plan(recording, at="frames", settings=asked, calibration=calibration)
+    rows = [*settled(recording, made, asked), ("saturation", saturation_text(recording, made, asked))]
     width = max(len(label) for label, _ in rows)
     return [title, *(f"  {label:<{width}}  {text}" for label, text in rows)]

@@ -13,6 +13,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux import memory
 from kalux.augmentation.bridge import UNMEASURED, BridgedSegment, lift, lower
 from kalux.augmentation.deblur import events_until
 from kalux.augmentation.trail import NO_HEIGHTS, add_trail, ahead_of_event, no_trail
@@ -131,17 +132,13 @@ class _Scalars(NamedTuple):
     threshold2: np.float32
 
 
-def begin(segment: BridgedSegment, state: State, spare: Cursor | None = None) -> Cursor:
-    """The cursor at the start of a segment: L stays, L^A is the segment's. The clock's origin is the start.
-
-    ``spare`` is a cursor of the same size that is used no more, whose memory the new one takes.
-    """
-    clock: Clock = state.newest.astype(np.int32)
-    if spare is None:
-        pixels, steps = packed(clock.shape, STATE_PIXEL), packed(clock.shape, STEP_PIXEL)
-        polarity = np.zeros(clock.shape, np.int8)
-    else:
-        pixels, steps, polarity = spare.pixels, spare.steps, spare.polarity
+def begin(segment: BridgedSegment, state: State) -> Cursor:
+    """The cursor at the start of a segment: L stays, L^A is the segment's. The clock's origin is the start."""
+    clock: Clock = memory.empty(state.newest.shape, np.int32)
+    clock[:] = state.newest
+    pixels, steps = packed(clock.shape, STATE_PIXEL), packed(clock.shape, STEP_PIXEL)
+    polarity = memory.empty(clock.shape, np.int8)
+    polarity[:] = 0
     floor = state.log_intensity if segment.floor is None else segment.floor
     scalars = np.float32(segment.rate), np.float32(segment.step_variance)
     variances = segment.forward_variance, segment.backward_variance

@@ -22,7 +22,6 @@ from kalux.augmentation.trail import (
     Followed,
     Trail,
     follow,
-    followed_pixels,
     given_trail,
     nothing_followed,
     polarity_of,
@@ -90,10 +89,6 @@ class BridgedFrames(CommonMethod):
         pixels: PixelCalibration | None,
     ) -> None:
         super().__init__(settings, thresholds, lookahead, shape)
-        # Fresh memory costs as much as filling it.
-        self._spare: akf_bridged.Cursor | None = None
-        self._spare_exposure: NDArray[np.void] | None = None
-        self._spare_followed: NDArray[np.void] | None = None
         self._prior = (
             bridge.nominal_thresholds(shape, settings.events.mismatch, np.float32)
             if pixels is None
@@ -104,10 +99,6 @@ class BridgedFrames(CommonMethod):
                 )
             )
         )
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Pickled without the free memory."""
-        return {**self.__dict__, "_spare": None, "_spare_exposure": None, "_spare_followed": None}
 
     def node(self, shot: Shot) -> int:
         return shot.middle if self.lookahead else shot.end
@@ -132,9 +123,7 @@ class BridgedFrames(CommonMethod):
             (thresholds.on, thresholds.off),
             (self.on, self.off),
             weighed=True,
-            spare=self._spare_exposure,
         )
-        self._spare_exposure = exposure.pixels
         level_variance = frame_log_covariance(
             shot.level_intensity, shot.level_weight, self.settings.camera.noise, shot.white, self.offset
         )
@@ -334,9 +323,7 @@ class BridgedFrames(CommonMethod):
         self, events: Chunks, start: int, end: int, before: Followed
     ) -> tuple[Floats, Floats, Followed]:
         """`counts`, and what is known of the pixels' newest events at ``end`` (K14)."""
-        if self._spare_followed is None:
-            self._spare_followed = followed_pixels(self.shape)
-        return follow(all_between(events, start, end), before, start, end, self._spare_followed)
+        return follow(all_between(events, start, end), before, start, end)
 
     def _trail(self, followed: Followed, start: int, scale: float) -> Trail:
         """By how much events trail the light in the segment from ``start`` on (K14)."""
@@ -394,8 +381,7 @@ class BridgedFrames(CommonMethod):
         )
 
     def begin(self, segment: Any, state: State) -> akf_bridged.Cursor:
-        spare, self._spare = self._spare, None
-        return akf_bridged.begin(segment, state, spare)
+        return akf_bridged.begin(segment, state)
 
     def advance(self, segment: Any, cursor: akf_bridged.Cursor, events: EventArray) -> None:
         settings = self.settings.events
@@ -406,9 +392,7 @@ class BridgedFrames(CommonMethod):
         return akf_bridged.read(segment, cursor, t)
 
     def end(self, segment: Any, cursor: akf_bridged.Cursor) -> State:
-        state = akf_bridged.end(segment, cursor)
-        self._spare = cursor
-        return state
+        return akf_bridged.end(segment, cursor)
 
     def moving(self, segment: Any, cursor: akf_bridged.Cursor) -> NDArray[np.bool_]:
         return akf_bridged.moving_pixels(segment, cursor)

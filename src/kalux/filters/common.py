@@ -8,6 +8,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux import memory
 from kalux.compiled import largest_around
 
 MICROSECOND = 1e-6
@@ -33,7 +34,7 @@ def make_clock(shape: tuple[int, int], since: int) -> Clock:
 
 def moved_clock(clock: Clock, span: int) -> Clock:
     """The clock with its origin ``span`` us later."""
-    moved = np.empty_like(clock)
+    moved: Clock = memory.empty(clock.shape, np.int32)
     _move(clock.reshape(-1), span, moved.reshape(-1))
     return moved
 

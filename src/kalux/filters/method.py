@@ -82,7 +82,7 @@ class Method(Protocol):
         """L and P at ``t``; P is infinite where the method has none."""
 
     def end(self, segment: Any, cursor: Any) -> State:
-        """The state at the end of the segment. The cursor must not be used after it: its memory is."""
+        """The state at the end of the segment. The cursor must not be used after it."""
 
     def moving(self, segment: Any, cursor: Any) -> NDArray[np.bool_] | None:
         """(H, W): pixels with an event in this frame interval, also one to come, or the one before, or unmeasured."""

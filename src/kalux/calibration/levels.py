@@ -1,0 +1,144 @@
+"""At which level a sensor's pixels saturate, by what events say: light goes on where the level of the frames ends.
+
+A pile at the end of a histogram may be a bright sky. Where pixels become as bright as the brightest, what events say of
+the change is compared with what frames show of it: of a sky as at other levels, of clipped pixels more, since events do
+not clip. Comparing with other levels makes up for thresholds that are a little wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux.augmentation.deblur import between, count_events
+from kalux.augmentation.refractory import EventClock
+from kalux.calibration.intervals import intervals
+from kalux.recording import Recording
+from kalux.settings import CameraSettings, EventSettings
+
+Array = NDArray[np.float64]
+
+_BRIGHTEST: Final = 1e-3
+"""Share of pixels that are at the brightest level or above: fewer are broken ones, or glints."""
+
+_AT_TOP: Final = 0.9
+"""Of the brightest level: sensors whose pixels clip unevenly do so within 5 % (slider_depth)."""
+
+_BELOW: Final = (0.6, 0.85)
+"""Of the brightest level: those that are compared."""
+
+_LEAST_NET: Final = 2  # as for the thresholds: a net count of one may be noise
+_LEAST_PIXELS: Final = 100
+_MAX_FRAMES: Final = 80
+_FINE: Final = 4096  # levels of the histogram
+
+_EXCESS: Final = 0.15
+"""By how much more events must say than at other levels, log intensity. slider_depth has 0.2, street 0.3, simulated
+scenes 0.26 to 0.7; eight that frames show wholly, of which two have thresholds a third too large, -0.2 to 0.07."""
+
+_EXPLAINED: Final = 0.5
+"""By how much events may say more or less than frames at other levels: beyond that they do not explain the frames."""
+
+_ALIKE: Final = 0.1
+"""Between the quartiles of the brightest levels over their median, at most: sensors that end at one level have 0 to
+0.05, newton, whose highlights are thin, 0.2."""
+
+
+class Ceiling(NamedTuple):
+    """Where a sensor's pixels saturate.
+
+    Attributes
+    ----------
+    level
+        Response at which the middle one of the pixels does, white = 1.
+    least
+        Response from which on nearly all that is seen is clipped: as far below ``level`` as a twentieth lies above.
+    excess
+        How much brighter than the level pixels become there by their events, median, log intensity.
+    pixels
+        How many, in all frame intervals, say so.
+    """
+
+    level: float
+    least: float
+    excess: float
+    pixels: int
+
+
+def find_ceiling(recording: Recording, camera: CameraSettings, events: EventSettings) -> Ceiling | None:
+    """The level at which pixels of the first 80 frames end while their events go on.
+
+    Parameters
+    ----------
+    recording
+        With frames, in grey or a mosaic, and exposures.
+    camera
+        Response and I_0.
+    events
+        With both thresholds, the delay and the refractory period.
+
+    Returns None where events do not go on, or too few pixels tell, or the brightest end at different levels, or frames
+    are in RGB.
+
+    Raises
+    ------
+    ExposureError
+        If the frames' exposures are not known.
+    """
+    brightest = _brightest(recording)
+    if brightest is None:
+        return None
+    found = [*_changes(recording, camera, events, _BELOW[0] * brightest)]
+    if not found:
+        return None
+    ends, mismatches = np.concatenate(found, axis=1)
+    top, below = ends >= _AT_TOP * brightest, ends < _BELOW[1] * brightest
+    if min(np.count_nonzero(top), np.count_nonzero(below)) < _LEAST_PIXELS:
+        return None
+    usual = float(np.median(mismatches[below]))
+    excess = float(np.median(mismatches[top])) - usual
+    low, level, high, most = (float(value) for value in np.quantile(ends[top], [0.25, 0.5, 0.75, 0.95]))
+    if excess < _EXCESS or abs(usual) > _EXPLAINED or high - low > _ALIKE * level:
+        return None
+    return Ceiling(level, 2 * level - most, excess, int(np.count_nonzero(top)))
+
+
+def _brightest(recording: Recording) -> float | None:
+    """The response that a thousandth of the pixels of the first frames reach; None: frames are in RGB or all black."""
+    histogram = np.zeros(_FINE, np.int64)
+    for index, frame in enumerate(recording.frames()):
+        if frame.image.ndim == 3:
+            return None
+        if index == _MAX_FRAMES:
+            break
+        values = np.rint((_FINE - 1) * np.clip(frame.normalised(), 0, 1)).astype(np.int64)
+        histogram += np.bincount(values.ravel(), minlength=_FINE)
+    reached = np.cumsum(histogram[::-1])[::-1] >= max(_BRIGHTEST * histogram.sum(), 1)
+    brightest = int(np.flatnonzero(reached)[-1]) if reached.any() else 0
+    return brightest / (_FINE - 1) if brightest > 0 else None
+
+
+def _changes(
+    recording: Recording, camera: CameraSettings, events: EventSettings, least: float
+) -> Iterator[Array]:
+    """(2, N) of pixels that become brighter from one frame of an interval to the other, forward or backward in time.
+
+    First the response at the bright end, where that is ``least`` or more, then by how much more than the frames events
+    say that it changed, log(I + I_0).
+    """
+    assert events.threshold_on is not None
+    assert events.threshold_off is not None
+    clock, delay = EventClock(recording.sensor_size, events.refractory), events.lateness
+    for interval in intervals(recording, camera, margin=abs(delay), most_frames=_MAX_FRAMES):
+        inside = clock.weighed(between(interval.events, interval.start + delay, interval.end + delay))
+        on, off = count_events(inside, recording.sensor_size, weighed=True)
+        told = events.threshold_on * on - events.threshold_off * off - interval.change
+        for sign, frame in zip((-1, 1), interval.frames, strict=True):
+            ends = frame.normalised()
+            chosen = (sign * (on - off) >= _LEAST_NET) & (ends >= least)
+            for each in interval.frames:
+                chosen &= True if each.valid is None else each.valid
+            yield np.stack([ends[chosen], sign * told[chosen]])

@@ -1,0 +1,80 @@
+"""Large arrays whose memory is used again: fresh pages cost about as much as filling them.
+
+The engine makes and drops the same planes frame after frame. Whether the system's allocator keeps such memory depends
+on the system, the thread, and what else it holds at that moment.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+_SMALL: Final = 1 << 16
+"""Bytes below which the usual allocator is as good."""
+
+MOST_FREE: Final = 1 << 27
+"""Bytes that are kept at most while nobody uses them: at 640x480 a segment ends with 50 MB of it."""
+
+
+class _Free:
+    """Pieces of memory that nobody uses, by their sizes in bytes, of which there are eight between powers of two."""
+
+    def __init__(self) -> None:
+        # A thread may take it twice: Python may collect an array, whose memory then comes back, at any moment.
+        self._lock = threading.RLock()
+        self._pieces: dict[int, list[NDArray[np.uint8]]] = {}
+        self.total = 0
+
+    def take(self, least: int) -> NDArray[np.uint8]:
+        """A piece of ``least`` bytes or up to an eighth more, the rest of which is never touched."""
+        step = 1 << (least.bit_length() - 4)
+        size = -(-least // step) * step
+        with self._lock:
+            pieces = self._pieces.get(size)
+            if pieces:
+                self.total -= size
+                return pieces.pop()
+        return np.empty(size, np.uint8)
+
+    def give(self, piece: NDArray[np.uint8]) -> None:
+        with self._lock:
+            if self.total + piece.size > MOST_FREE:  # of another sensor, most likely
+                self._pieces.clear()
+                self.total = 0
+            if piece.size <= MOST_FREE:
+                self._pieces.setdefault(piece.size, []).append(piece)
+                self.total += piece.size
+
+
+_free: Final = _Free()
+
+
+class _Lent:
+    """What arrays over a piece of memory hold on to, so that it comes back with the last of them."""
+
+    def __init__(self, piece: NDArray[np.uint8]) -> None:
+        self._piece, self._give = piece, _free.give
+        self.__array_interface__ = piece.__array_interface__
+
+    def __del__(self) -> None:
+        self._give(self._piece)
+
+
+def empty(shape: tuple[int, ...], dtype: Any = np.float32) -> NDArray[Any]:
+    """As ``numpy.empty``, in memory that an array of about the same size may have used before. For any thread."""
+    kind = np.dtype(dtype)
+    size = math.prod(shape) * kind.itemsize
+    if size < _SMALL:
+        return np.empty(shape, kind)
+    piece: NDArray[np.uint8] = np.asarray(_Lent(_free.take(size)))
+    array: NDArray[Any] = piece[:size].view(kind).reshape(shape)
+    return array
+
+
+def free_bytes() -> int:
+    """Bytes that are kept and not used."""
+    return _free.total

@@ -1,0 +1,75 @@
+"""Memory that is used again: never while an array over it is alive, and within bounds."""
+
+from __future__ import annotations
+
+import gc
+import pickle
+import threading
+
+import numpy as np
+import pytest
+
+from kalux import memory
+
+SHAPE = (480, 641)
+
+
+@pytest.mark.parametrize("shape", [(), (3,), (0, 5), (64, 256), SHAPE, (2, 3, 100_000)])
+@pytest.mark.parametrize("dtype", [np.float32, np.int8, np.int64])
+def test_arrays_are_as_asked_for(shape, dtype):
+    array = memory.empty(shape, dtype)
+    assert array.shape == shape
+    assert array.dtype == dtype
+    assert array.flags.c_contiguous
+    assert array.flags.writeable
+    assert array.flags.aligned
+    array[...] = 7
+    assert (array == 7).all()
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(array)), array)
+
+
+def test_memory_comes_back_with_the_last_array_over_it():
+    first = memory.empty(SHAPE)
+    place, part = first.ctypes.data, first[100:, 3:].T
+    del first
+    gc.collect()
+    other = memory.empty(SHAPE)
+    assert other.ctypes.data != place  # a part of the first is still in use
+    del part
+    gc.collect()
+    assert memory.empty(SHAPE).ctypes.data == place
+
+
+def test_arrays_that_are_alive_share_nothing():
+    arrays = [memory.empty((100_000 + k,)) for k in range(10)]
+    for k, array in enumerate(arrays):
+        array[:] = k
+    assert all((array == k).all() for k, array in enumerate(arrays))
+
+
+def test_what_is_kept_is_bounded():
+    pieces = [memory.empty((memory.MOST_FREE // 5,), np.uint8) for _ in range(12)]
+    assert memory.free_bytes() <= memory.MOST_FREE
+    del pieces
+    gc.collect()
+    assert memory.free_bytes() <= memory.MOST_FREE
+    memory.empty((2 * memory.MOST_FREE,), np.uint8)  # larger than all that is kept
+    assert memory.free_bytes() <= memory.MOST_FREE
+
+
+def test_threads_get_memory_of_their_own():
+    wrong = []
+
+    def work(number: int) -> None:
+        for k in range(200):
+            array = memory.empty(SHAPE, np.int32)
+            array[::97] = 1000 * number + k
+            if not (array[::97] == 1000 * number + k).all():
+                wrong.append(number)
+
+    threads = [threading.Thread(target=work, args=(number,)) for number in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not wrong
