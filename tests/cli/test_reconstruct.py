@@ -531,10 +531,10 @@ class TestThreads:
     def test_an_interrupt_in_the_filter(self, cli, recording, tmp_path, monkeypatch, threads, name):
         image = kalux.Reconstructor.image
 
-        def interrupted(self, estimate):
+        def interrupted(self, estimate, **options):
             if estimate.t > first + 100_000:
                 raise KeyboardInterrupt
-            return image(self, estimate)
+            return image(self, estimate, **options)
 
         first = next(iter(kalux.open(recording).frames())).exposure_start
         monkeypatch.setattr(kalux.Reconstructor, "image", interrupted)

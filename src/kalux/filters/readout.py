@@ -241,7 +241,7 @@ def read_out(
     heard = np.empty(len(unshown), np.float32)
     known = variance.astype(np.float32, copy=False)
     out = np.empty(log_intensity.shape, np.float32)
-    total = np.empty(out.shape if with_variance else (0, 0), np.float32)
+    total = np.empty(out.shape if with_variance and moving is not None else (0, 0), np.float32)
     _read_out(
         log_intensity.astype(np.float32, copy=False),
         known,
@@ -257,7 +257,7 @@ def read_out(
         total,
         heard,
     )
-    return out, total, heard
+    return out, known if with_variance and moving is None else total, heard
 
 
 @nb.njit(cache=True)
@@ -314,7 +314,7 @@ def _read_out(  # type: ignore[no-untyped-def]
     height, width = log_intensity.shape
     told = moving.size > 0
     hear = told and allowed > np.float32(0.0)
-    ring = _ring(pitch)
+    ring = _ring(pitch if told else 0)
     count = len(ring.spans)
     level, left = np.zeros(_STRIP, np.float32), np.zeros(_STRIP, np.float32)
     marks = np.zeros(_STRIP, np.uint8)
