@@ -478,10 +478,7 @@ def _refractory_origin(plan: Plan, asked: Settings) -> str:
         return _GIVEN
     if plan.estimate is None:
         return _USUAL
-    found = plan.estimate.refractory_period
-    hidden = found and not plan.settings.events.refractory
-    most = f"; it is {found * 1e-3:g} ms, but few events follow others so soon" if hidden else ""
-    return f"estimated from {plan.estimate.samples:,} samples{most}"
+    return f"estimated from {plan.estimate.samples:,} samples"
 
 
 def _delay_origin(plan: Plan, asked: Settings) -> str:

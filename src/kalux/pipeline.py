@@ -138,7 +138,7 @@ def plan(
     filled, model = _with_event_model(recording, filled)
     if estimate is not None and chosen.camera.log_offset is None:
         estimated = origin in ("estimate", "assumed")
-        if estimated or (estimate.refractory_period > 0 and chosen.camera.offset != filled.camera.offset):
+        if estimated or (estimate.may_lose and chosen.camera.offset != filled.camera.offset):
             unfilled = dataclasses.replace(chosen.events, step_variance=filled.events.step_variance)
             rough = estimate if estimated else None
             filled = dataclasses.replace(filled, events=unfilled)
@@ -475,7 +475,7 @@ def _with_thresholds(
         )
     )
     if finds_period:
-        period = estimate.refractory_period if estimate is not None and estimate.worth_weighing else 0
+        period = 0 if estimate is None else estimate.refractory_period
         known = dataclasses.replace(known, refractory_period=period)
     if not _has_thresholds(known):
         origin = "assumed" if estimate is None or estimate.usual_share > 0.5 else "estimate"

@@ -82,3 +82,12 @@ def test_weights_count_only_where_they_are_asked_for():
     assert weighed == pytest.approx(weights(events).sum())
     steps = np.full(SIZE, 0.2)
     assert integrate_exposure(events, -1, 20_000, steps, steps).events.sum() == 100
+
+
+def test_nothing_is_added_where_the_direction_turns():
+    """Up, up, down, down, up: only a second event of the same polarity says at what pace the light went on."""
+    t = 1_500 * np.arange(5)
+    zeros = np.zeros(5, np.int64)
+    events = make_events(t, zeros, zeros, np.array([1, 1, 0, 0, 1], bool))
+    found = weights(EventClock((1, 1), 1_000).weighed(events))
+    np.testing.assert_allclose(found, [1, 3, 1, 3, 1])

@@ -7,8 +7,9 @@ the threshold times
 
     w = Delta / (Delta - refractory period)                                                (docs/equations.md, K13)
 
-with Delta the time since the pixel's previous event. Every event is given its weight once, when it arrives, in the
-bytes that `kalux.events.EVENT_DTYPE` leaves unused; all that adds up steps multiplies by it.
+with Delta the time since the pixel's previous event, if that has the same polarity. Where the direction turns, the
+light may have moved either way meanwhile, and nothing is added: w = 1. Every event is given its weight once, when it
+arrives, in the bytes that `kalux.events.EVENT_DTYPE` leaves unused; all that adds up steps multiplies by it.
 """
 
 from __future__ import annotations
@@ -19,7 +20,17 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.compiled import AHEAD, ONE, WEIGHT_UNIT, event_column, event_row, event_words, prefetch, weighed
+from kalux.compiled import (
+    AHEAD,
+    ONE,
+    WEIGHT_UNIT,
+    event_column,
+    event_is_on,
+    event_row,
+    event_words,
+    prefetch,
+    weighed,
+)
 from kalux.events import EVENT_DTYPE, EventArray
 
 MOST: Final = np.float32(6.0)
@@ -47,7 +58,9 @@ class EventClock:
     def __init__(self, sensor_size: tuple[int, int], refractory_period: float) -> None:
         self._sensor_size = sensor_size
         self._refractory_period = np.float32(refractory_period)
-        self._latest: NDArray[np.int64] | None = None  # once it is needed
+        self._latest: NDArray[np.int64] | None = (
+            None  # twice its time, plus 1 if it was on; once it is needed
+        )
 
     @property
     def weighs(self) -> bool:
@@ -88,8 +101,10 @@ def _weigh(words, latest, width, refractory_period):  # type: ignore[no-untyped-
         prefetch(latest, event_row(ahead) * width + event_column(ahead))
         t, word = words[i, 0], words[i, 1]
         at = event_row(word) * width + event_column(word)
-        weight = step_weight(np.float32(t - latest[at]), refractory_period)
-        latest[at] = t
+        code = t * 2 + np.int64(event_is_on(word))
+        goes_on = (code ^ latest[at]) & 1 == 0
+        weight = step_weight(np.float32(t - (latest[at] >> 1)), refractory_period) if goes_on else ONE
+        latest[at] = code
         words[i, 1] = weighed(word, np.int32((weight - ONE) / WEIGHT_UNIT + np.float32(0.5)))
 
 
