@@ -212,69 +212,75 @@ class BridgedFrames(CommonMethod):
     def segment(
         self, memory: BridgeMemory, shot: Shot, following: Shot | None, events: Chunks
     ) -> tuple[Segment, BridgeMemory]:
-        start = self.node(shot)
         if following is None:
-            seconds = memory.interval or USUAL_INTERVAL * 1e-6
-            latent = memory.latent
-            if not self.lookahead:
-                latent = self._carried(memory, shot)
-            alone = bridge.extend(latent, memory.thresholds, self.noise, start, FAR_FUTURE, seconds, None)
-            if shot.trail is None:
-                trail = self._trail(memory.followed, start, memory.followed.scale)
-            else:
-                trail = given_trail(shot.trail.before, np.zeros(self.shape, np.float32))
-            alone = alone._replace(
-                still_since=_still_since(memory, start, seconds),
-                trail=trail,
-                unshown=memory.unshown,
-                silent_change=memory.silent_change,
-            )
-            return alone, memory
-        interval = (following.middle - shot.middle) * 1e-6
+            return self._alone(memory, shot), memory
         second = self.latent(following, events, memory.thresholds)
+        join = self._joined if self.lookahead else self._causal
+        return join(memory, shot, following, second, events)
+
+    def _alone(self, memory: BridgeMemory, shot: Shot) -> BridgedSegment:
+        """From the latest frame on, without a next one."""
+        start, seconds = self.node(shot), memory.interval or USUAL_INTERVAL * 1e-6
+        latent = memory.latent if self.lookahead else self._carried(memory, shot)
+        alone = bridge.extend(latent, memory.thresholds, self.noise, start, FAR_FUTURE, seconds, None)
+        if shot.trail is None:
+            trail = self._trail(memory.followed, start, memory.followed.scale)
+        else:
+            trail = given_trail(shot.trail.before, np.zeros(self.shape, np.float32))
+        return alone._replace(
+            still_since=_still_since(memory, start, seconds),
+            trail=trail,
+            unshown=memory.unshown,
+            silent_change=memory.silent_change,
+        )
+
+    def _joined(
+        self, memory: BridgeMemory, shot: Shot, following: Shot, second: Latent, events: Chunks
+    ) -> tuple[BridgedSegment, BridgeMemory]:
+        """From the middle of one exposure to that of the next."""
+        start, end = shot.middle, following.middle
+        on, off, at_middle = self.follow(events, start, end, memory.followed)
+        scale = at_middle.scale
+        if shot.trail is not None and following.trail is not None:
+            trail = given_trail(shot.trail.before, following.trail.after)
+            grown = following.trail.after - trail.start
+        else:
+            at_start, grown = trail_between(
+                memory.followed.newest, at_middle.newest, (start, end), (scale, *self._trail_heights)
+            )
+            trail = Trail(at_start, polarity_of(memory.followed.newest), scale, *self._trail_heights)
+        joined, learned = bridge.bridge(
+            memory.latent, second, on, off, memory.thresholds, self.noise, start, end, grown
+        )
+        change = self._silent_change(joined)
+        joined = joined._replace(trail=trail, silent_change=change)
+        joined, far_on, far_off = self._drifting(joined, memory, second, on, off)
+        assert joined.net is not None
+        unshown = follow_unshown(memory.unshown, second, joined.net)
+        after = memory._replace(
+            latent=second,
+            thresholds=learned,
+            interval=(end - start) * 1e-6,
+            on=on,
+            off=off,
+            far_on=far_on,
+            far_off=far_off,
+            followed=at_middle,
+            at_middle=at_middle,
+            unshown=unshown,
+            silent_change=change,
+        )
+        return joined._replace(unshown=unshown), after
+
+    def _causal(
+        self, memory: BridgeMemory, shot: Shot, following: Shot, second: Latent, events: Chunks
+    ) -> tuple[BridgedSegment, BridgeMemory]:
+        """From the end of one exposure to that of the next, with what came before the first.
+
+        What the segment holds is still to come when it is read.
+        """
+        start = shot.end
         on, off, at_middle = self.follow(events, start, following.middle, memory.followed)
-        if self.lookahead:
-            scale = at_middle.scale
-            if shot.trail is not None and following.trail is not None:
-                trail = given_trail(shot.trail.before, following.trail.after)
-                grown = following.trail.after - trail.start
-            else:
-                span = start, following.middle
-                at_start, grown = trail_between(
-                    memory.followed.newest, at_middle.newest, span, (scale, *self._trail_heights)
-                )
-                trail = Trail(at_start, polarity_of(memory.followed.newest), scale, *self._trail_heights)
-            joined, learned = bridge.bridge(
-                memory.latent,
-                second,
-                on,
-                off,
-                memory.thresholds,
-                self.noise,
-                start,
-                following.middle,
-                grown,
-            )
-            change = self._silent_change(joined)
-            joined = joined._replace(trail=trail, silent_change=change)
-            joined, far_on, far_off = self._drifting(joined, memory, second, on, off)
-            assert joined.net is not None
-            unshown = follow_unshown(memory.unshown, second, joined.net)
-            after = memory._replace(
-                latent=second,
-                thresholds=learned,
-                interval=interval,
-                on=on,
-                off=off,
-                far_on=far_on,
-                far_off=far_off,
-                followed=at_middle,
-                at_middle=at_middle,
-                unshown=unshown,
-                silent_change=change,
-            )
-            return joined._replace(unshown=unshown), after
-        # Of what came before: what the segment holds is still to come when it is read.
         scale = memory.followed.scale
         grown = self._trail_at(at_middle, following.middle, scale)
         grown -= self._trail_at(memory.at_middle, shot.middle, scale)
@@ -294,7 +300,7 @@ class BridgedFrames(CommonMethod):
         after = memory._replace(
             latent=second,
             thresholds=learned,
-            interval=interval,
+            interval=(following.middle - shot.middle) * 1e-6,
             on=tail_on,
             off=tail_off,
             followed=followed,
