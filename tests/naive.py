@@ -66,8 +66,9 @@ def pixels(events, frames, sensor_size, settings, begin):
                     q["t"] for q in earlier if abs(int(q["y"]) - row) <= 1 and abs(int(q["x"]) - column) <= 1
                 ]
                 same = [q["t"] for q in earlier if (q["y"], q["x"]) == (row, column)]
-                previous = [q["t"] for q in events[:i] if (q["y"], q["x"]) == (row, column)]
-                weight = event_weight(e["t"] - previous[-1], settings) if previous else 1.0
+                previous = [q for q in events[:i] if (q["y"], q["x"]) == (row, column)]
+                goes_on = bool(previous) and bool(previous[-1]["p"]) == bool(e["p"])
+                weight = event_weight(e["t"] - previous[-1]["t"], settings) if goes_on else 1.0
                 own.append(
                     (
                         int(e["t"]),
@@ -92,7 +93,7 @@ def pixels(events, frames, sensor_size, settings, begin):
 
 
 def event_weight(since, settings):
-    """K13: how many thresholds an event tells of that comes ``since`` us after the pixel's previous one."""
+    """K13: how many thresholds an event tells of that comes ``since`` us after the pixel's previous one, of its polarity."""
     period = settings.events.refractory
     if period == 0 or since <= 0.95 * period:
         return 1.0
