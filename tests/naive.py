@@ -93,7 +93,7 @@ def pixels(events, frames, sensor_size, settings, begin):
 
 
 def event_weight(since, settings):
-    """K13: how many thresholds an event tells of that comes ``since`` us after the pixel's previous one, of its polarity."""
+    """K13: how many thresholds an event tells of that comes ``since`` us after one of its polarity."""
     period = settings.events.refractory
     if period == 0 or since <= 0.95 * period:
         return 1.0
