@@ -131,10 +131,10 @@ def estimate_thresholds(
 ) -> ThresholdEstimate | None:
     """Global on and off thresholds, and the refractory period, by robust regression of frame changes on event counts.
 
-    For pixels that are well exposed in two successive frames: log(I' + I_0) - log(I + I_0) = s (c_on n_on - c_off n_off
-    + h turned), with s = I / (I + I_0) the share of a step of log I that shows in log(I + I_0), n the weighted counts
-    of `kalux.calibration.steps`, and h what is not reported where the direction turns
-    (`kalux.calibration.thresholds`). Looks at the first 200 frames, or at fewer when those give enough pixels.
+    For pixels that are well exposed in two successive frames: log(I' + I_0) - log(I + I_0) = s (c_on n_on - c_off
+    n_off), with s = I / (I + I_0) the share of a step of log I that shows in log(I + I_0), and n the steps up and down
+    that lie between the frames, spread over time and weighted (`kalux.calibration.steps`). Looks at the
+    first 200 frames, or at fewer when those give enough pixels.
 
     Parameters
     ----------
