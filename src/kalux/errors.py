@@ -18,6 +18,9 @@ Messages are one line. The command line prints them as they are and exits with c
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Iterable
+
 
 class KaluxError(Exception):
     """Base of all errors that kalux raises on purpose."""
@@ -57,3 +60,9 @@ class MissingDependencyError(KaluxError, ImportError):
 
 class InternalError(KaluxError, RuntimeError):
     """A result of kalux is not what it must be: an error in kalux, not in what it was given."""
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """End of a message about an unknown name: ``", did you mean ...?"`` with the nearest of those known, or nothing."""
+    near = difflib.get_close_matches(name, known, 1)
+    return f", did you mean {near[0]}?" if near else ""

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, Literal
 
 import numpy as np
 
-from kalux.errors import InputError, KaluxError, SettingsError
+from kalux.errors import InputError, KaluxError, SettingsError, did_you_mean
 
 FilterName = Literal["akf", "cf"]
 AugmentationName = Literal["bridge", "paper"]
@@ -286,7 +285,7 @@ def preset(name: str) -> Settings:
         return PRESETS[name]
     except KeyError:
         raise SettingsError(
-            f"preset: unknown preset {name!r}{_nearest(name, PRESETS)}; known are {', '.join(PRESETS)}"
+            f"preset: unknown preset {name!r}{did_you_mean(name, PRESETS)}; known are {', '.join(PRESETS)}"
         ) from None
 
 
@@ -317,7 +316,7 @@ def from_dict(values: Mapping[str, Any], base: Settings) -> Settings:
         for name in entries:
             if name not in known:
                 raise SettingsError(
-                    f"settings: unknown setting {group}.{name}{_nearest(name, known)}; known are "
+                    f"settings: unknown setting {group}.{name}{did_you_mean(name.replace('-', '_'), known)}; known are "
                     f"{', '.join(sorted(known))}"
                 )
         optional = {entry.name for entry in dataclasses.fields(current) if entry.default is None}
@@ -335,13 +334,7 @@ def _unknown_group(name: str, base: Settings) -> str:
             return f"{name} is a setting of [{group}] and has to follow that line"
     if name == "preset":
         return "a preset is given by --preset (preset=), not in the file"
-    return f"unknown group [{name}]{_nearest(name, ('camera', 'events', 'filter'))}"
-
-
-def _nearest(name: str, known: Iterable[str]) -> str:
-    """``", did you mean ...?"``, or nothing."""
-    near = difflib.get_close_matches(name.replace("-", "_"), known, 1)
-    return f", did you mean {near[0]}?" if near else ""
+    return f"unknown group [{name}]{did_you_mean(name, ('camera', 'events', 'filter'))}"
 
 
 def read_toml(

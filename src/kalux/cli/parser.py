@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import difflib
 import re
 import textwrap
 from collections.abc import Callable, Sequence
@@ -11,7 +10,7 @@ from itertools import groupby
 from typing import Any, Never
 
 from kalux.cli.terminal import say
-from kalux.errors import InputError
+from kalux.errors import InputError, did_you_mean
 
 
 class UsageError(InputError):
@@ -126,19 +125,14 @@ def plainer(message: str) -> str:
 
 def _no_such_choice(found: re.Match[str]) -> str:
     known = [choice.strip(" '") for choice in found[2].split(",")]
-    return f"there is no {found[1]!r}{_nearest(found[1], known)} (choose from {', '.join(known)})"
-
-
-def _nearest(word: str, known: list[str]) -> str:
-    near = difflib.get_close_matches(word, known, 1)
-    return f", did you mean {near[0]}?" if near else ""
+    return f"there is no {found[1]!r}{did_you_mean(found[1], known)} (choose from {', '.join(known)})"
 
 
 def _unknown(argument: str, known: list[str]) -> str:
     flag = argument.partition("=")[0]
     if not flag.startswith("-"):
         return f"{argument}: one argument too many"
-    return f"unknown flag {flag}{_nearest(flag, known)}"
+    return f"unknown flag {flag}{did_you_mean(flag, known)}"
 
 
 # Types of arguments: their names stand in messages ("'x' is not a number").
