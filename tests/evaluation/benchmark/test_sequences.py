@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 import kalux
@@ -53,6 +54,7 @@ def test_a_toml_file_lists_sequences_relative_to_itself(small_set):
         ("[[sequence]]\npath = 'x'\nexposur = 3", "unknown key 'exposur'; known are path"),
         ("[[sequence]]\npath = 'x'\nexposure = '3'", "exposure is '3'; int is needed"),
         ("[[sequence]]\npath = 'x'\nexposure = true", "int is needed"),
+        ("[[sequence]]\npath = 'x'\nwhite = '4095'", "white is '4095'; int or float is needed"),
         ("[[sequence]]\npath = 'x'\ntruth = 'y'\nhold_out_frames = 2", "exclude each other"),
         ("[[sequence]]\npath = 'x'\nahdr = {cut = 30, low = 3}", "cut is for both ends"),
         ("[[sequence]]\npath = 'x'\nahdr = {low = 90, high = 10}", "black < white"),
@@ -105,6 +107,29 @@ def test_an_exposure_is_for_recordings_that_store_none(small_set, simulation):
     assert next(iter(given.open().frames())).exposure == 7
     with pytest.raises(ExposureError):
         gather([path]).sequences[0].open().frames()
+
+
+@pytest.mark.parametrize("exposure_known", [True, False])
+def test_a_toml_file_says_which_value_is_white(small_set, simulation, exposure_known):
+    frames = [
+        type(f)(
+            f.image.astype(np.uint16),
+            f.exposure_start,
+            f.exposure_end if exposure_known else f.exposure_start,
+        )
+        for f in simulation.frames
+    ]
+    hdf5.write(
+        small_set.folder / "deep.h5",
+        sensor_size=simulation.scene.sensor_size,
+        events=[simulation.events],
+        frames=frames,
+        exposure_known=exposure_known,
+    )
+    path = small_set.folder / "bench.toml"
+    path.write_text('[[sequence]]\npath = "deep.h5"\nexposure = 7\nwhite = 255\n')
+    (found,) = gather([path]).sequences
+    assert {frame.white_value for frame in found.open().frames()} == {255.0}
 
 
 def test_a_toml_file_makes_artificial_hdr_of_a_recording(small_set):
