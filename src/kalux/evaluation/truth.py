@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from kalux.errors import FormatError, FrameError, InputError
 from kalux.evaluation.baselines import Method
 from kalux.evaluation.lpips import LpipsWeights
-from kalux.evaluation.scores import Pair, Scores, score
+from kalux.evaluation.pairs import Pair
+from kalux.evaluation.scores import Scores, score
 from kalux.readers import GroundTruth
 from kalux.recording import Recording
 

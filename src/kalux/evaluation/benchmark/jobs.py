@@ -23,7 +23,8 @@ from kalux.evaluation.benchmark.sequences import EVERY, Options, Sequence, files
 from kalux.evaluation.exposures import linear_frame, reference_exposure
 from kalux.evaluation.held_out import held_out_pairs, hold_out_frames
 from kalux.evaluation.lpips import load_lpips
-from kalux.evaluation.scores import Pair, Scores, finite_or_none, score
+from kalux.evaluation.pairs import Pair
+from kalux.evaluation.scores import Scores, finite_or_none, score
 from kalux.evaluation.specs import relocated, spec_path
 from kalux.evaluation.truth import find_truth, prepare_reference, truth_pairs
 from kalux.models.camera import Camera, Response
