@@ -210,7 +210,7 @@ class Benchmark:
     sequences
         In the order of the columns; names differ.
     methods
-        Names as `kalux.evaluation.baselines.chosen_methods` takes them; None: all that are compared by default.
+        Names as `kalux.evaluation.specs.chosen_methods` takes them; None: all that are compared by default.
     folder
         That files and folders in the names of methods are relative to.
     """
