@@ -37,7 +37,7 @@ from kalux.errors import FormatError
 from kalux.events import EventArray
 from kalux.frames import Frame, Mosaic
 from kalux.readers import evt
-from kalux.readers.source import Source, TriggerArray, reading
+from kalux.readers.source import Source, TriggerArray, begins_with, reading
 
 _MAGIC: Final = b"#!AER-DAT2."
 _WORD: Final = np.dtype(">u8")  # address and time
@@ -87,10 +87,7 @@ class _Survey:
 
 def recognises(path: Path) -> bool:
     """Whether the file begins like AEDAT 2."""
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return file.read(len(_MAGIC)) == _MAGIC
+    return begins_with(path, _MAGIC)
 
 
 def read(path: Path) -> Source:
