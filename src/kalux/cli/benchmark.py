@@ -215,15 +215,14 @@ def _some(names: Iterable[str]) -> str:
 def _write(out: Path, results: Results, store: Store) -> None:
     from kalux.evaluation.benchmark.report import make_report
     from kalux.evaluation.benchmark.results import as_csv, as_json
-    from kalux.writers.files import output_errors, write_whole
+    from kalux.writers.files import save
 
     for name, text in (
         (CSV, as_csv(results)),
         (JSON, as_json(results)),
         (REPORT, make_report(results, store)),
     ):
-        with output_errors(out / name):
-            write_whole(out / name, text.encode(errors="replace"))
+        save(out / name, text)
 
 
 def _raise_failures(results: Results, out: Path) -> None:

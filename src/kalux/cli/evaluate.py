@@ -264,13 +264,10 @@ def write(
     OutputError
         The file cannot be written.
     """
-    from kalux.writers.files import output_errors, write_whole
+    from kalux.writers.files import save
 
     as_text = as_csv if out.suffix.lower() == ".csv" else as_json
-    with output_errors(out):
-        write_whole(
-            out, as_text(str(recording.source.path), protocol, found, consistent).encode(errors="replace")
-        )
+    save(out, as_text(str(recording.source.path), protocol, found, consistent))
 
 
 def as_csv(path: str, protocol: str, found: list[Scores], consistent: list[BlurConsistency | None]) -> str:

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 import kalux
-from kalux.calibration.values import Calibration, to_files
+from kalux.calibration.values import Calibration
 from kalux.errors import ExposureError, InputError
 from kalux.evaluation.benchmark.sequences import ArtificialHdr, Options, gather, load
 from kalux.evaluation.truth import truth_beside
 from kalux.models.camera import Response
 from kalux.readers import hdf5
+from kalux.writers.calibration import save_calibration
 
 
 def test_a_folder_gives_its_recordings_and_their_truth_but_not_the_truth_as_a_recording(small_set):
@@ -151,8 +152,7 @@ def test_a_toml_file_makes_artificial_hdr_of_a_recording(small_set):
 
 def test_what_a_calibration_says_of_the_camera_is_not_taken_for_an_artificial_one(small_set):
     settings = {"camera": {"response": "srgb"}, "events": {"threshold_on": 0.2}}
-    for file, data in to_files(Calibration(settings), small_set.folder / "cal.toml").items():
-        file.write_bytes(data)
+    save_calibration(Calibration(settings), small_set.folder / "cal.toml")
     path = small_set.folder / "bench.toml"
     path.write_text(
         '[[sequence]]\npath = "a.h5"\ncalibration = "cal.toml"\n'
