@@ -121,6 +121,8 @@ def _calibrated(options: argparse.Namespace) -> Stated:
     UsageError
         If there is nothing of it, or the output is AEDAT 4.
     """
+    from kalux.settings import AUTO, preset
+
     calibration = given_calibration(options)
     if calibration is None:
         return Stated()
@@ -129,12 +131,11 @@ def _calibrated(options: argparse.Namespace) -> Stated:
             "--calibration: AEDAT 4 has no place for what was measured; write kalux HDF5 (.h5), or give the "
             "calibration to reconstruct"
         )
-    events = calibration.settings.get("events", {})
-    thresholds = tuple(float(events[name]) for name in _THRESHOLDS if events.get(name) is not None)
-    response = calibration.settings.get("camera", {}).get("response")
+    settings = calibration.apply(preset("default"))
+    on, off = settings.events.threshold_on, settings.events.threshold_off
+    response = settings.camera.response
     found = Stated(
-        (thresholds[0], thresholds[1]) if len(thresholds) == 2 else None,
-        None if response in (None, "auto") else response,
+        None if on is None or off is None else (float(on), float(off)), None if response == AUTO else response
     )
     if found == Stated():
         raise UsageError(
