@@ -27,7 +27,7 @@ from kalux.readers.source import CHUNK_EVENTS, SIZE_UNKNOWN, Source, begins_with
 _NPY: Final = b"\x93NUMPY"
 _ZIP: Final = b"PK\x03\x04"
 _LARGEST_ITEM: Final = 256  # bytes per event; more is damage, and would need much memory
-_DAMAGE: Final = (
+DAMAGE: Final = (
     zipfile.BadZipFile,
     zlib.error,
     EOFError,
@@ -42,6 +42,8 @@ _DAMAGE: Final = (
     RecursionError,
     UnicodeError,
 )
+"""What damaged files, or others under such a name, can lead to in NumPy and zipfile."""
+
 _WANTED: Final = "an array for each of t, x, y and p, or one structured array with these fields"
 
 
@@ -72,7 +74,7 @@ def recognises(path: Path) -> bool:
     try:
         with zipfile.ZipFile(path) as archive:
             return any(name.endswith(".npy") and "/" not in name for name in archive.namelist())
-    except _DAMAGE:
+    except DAMAGE:
         return False
 
 
@@ -121,7 +123,7 @@ def _opened(path: Path, member: str | None) -> Iterator[IO[bytes]]:
 
 
 def _list_arrays(path: Path) -> list[_Array]:
-    with reading(path, *_DAMAGE):
+    with reading(path, *DAMAGE):
         if begins_with(path, _NPY):
             sizes: dict[str | None, int] = {None: path.stat().st_size}
         else:
@@ -201,13 +203,13 @@ def _stated_size(path: Path, arrays: list[_Array]) -> tuple[int, int] | None:
 
 
 def _read_number(path: Path, array: _Array) -> int:
-    with reading(path, *_DAMAGE), _opened(path, array.member) as file:
+    with reading(path, *DAMAGE), _opened(path, array.member) as file:
         _read_header(file)
         return int(np.frombuffer(_exactly(file, array.dtype.itemsize), array.dtype)[0])
 
 
 def _events(path: Path, layout: _Layout) -> Iterator[EventArray]:
-    with reading(path, *_DAMAGE), contextlib.ExitStack() as stack:
+    with reading(path, *DAMAGE), contextlib.ExitStack() as stack:
         files = [stack.enter_context(_opened(path, array.member)) for array in layout.arrays]
         for file in files:
             _read_header(file)
