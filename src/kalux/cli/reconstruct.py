@@ -350,6 +350,8 @@ def metadata(
             "frames": options.frames,
             "frames_start": options.frames_start,
             "frames_rate": options.frames_rate,
+            "replace_frames": options.replace_frames or None,
+            "white": options.white,
             "bayer": options.bayer,
         },
         "images_wanted": {

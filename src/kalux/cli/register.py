@@ -245,6 +245,7 @@ def _write(
             frames=counted(frames(), lambda _: progress.add(images=1)),
             exposure_known=exposure_known,
             contrast_threshold=events.contrast_threshold,
+            response=None if options.response == "linear" else options.response,
         )
     if not options.quiet:
         say(f"wrote {progress.events:,} events and {progress.images:,} frames to {options.out}")
