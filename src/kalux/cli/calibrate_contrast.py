@@ -38,7 +38,11 @@ def add_command(commands: Any) -> None:
     )
     add_recording(parser)
     group = parser.add_argument_group("what is known")
-    group.add_argument("--response", default="linear", help="of the camera, as in --camera.response")
+    group.add_argument(
+        "--response",
+        default="auto",
+        help="of the camera, as in --camera.response (default: what the recording states, else linear)",
+    )
     group.add_argument(
         "--delay", type=whole, metavar="US", help="how late the events are (default: from the recording)"
     )

@@ -31,7 +31,10 @@ def add_command(commands: Any) -> None:
     )
     add_recording(parser)
     group = parser.add_argument_group("what is known")
-    group.add_argument("--response", help="of the camera, as in --camera.response (default linear)")
+    group.add_argument(
+        "--response",
+        help="of the camera, as in --camera.response (default: what the recording states, else linear)",
+    )
     add_calibration(group)
     group = parser.add_argument_group("fit")
     group.add_argument("--fit", action="store_true", help="fit the rest to held-out frames")
