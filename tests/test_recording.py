@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import os
 
 import numpy as np
@@ -130,6 +131,9 @@ def test_impossible_sensor_sizes_are_refused(size):
         (lambda path: path.touch(), "an empty file, not a recording"),
         (lambda path: path.mkdir(), "an empty folder, not a recording"),
         (lambda path: (path.mkdir(), (path / "0.png").touch()), "a folder of images, which --frames takes"),
+        (lambda path: path.write_text("version https://git-lfs.github.com/spec/v1\n"), "a pointer of Git LFS"),
+        (lambda path: path.write_text("\n<!DOCTYPE html>\n<html></html>"), "a web page, perhaps what a download"),
+        (lambda path: path.write_bytes(gzip.compress(b"0 1 2 1")), "compressed by gzip, which has to be unpacked"),
     ],
 )
 def test_what_is_no_recording_is_named(tmp_path, make, told):

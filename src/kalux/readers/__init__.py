@@ -31,6 +31,18 @@ __all__ = ["CHUNK_EVENTS", "READERS", "GroundTruth", "Reader", "Source", "read"]
 
 _VIDEOS: Final = frozenset({".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v"})
 
+# What may lie where a recording should, by the first bytes, and what to do about it.
+_NOT_RECORDINGS: Final = (
+    (b"version https://git-lfs", "a pointer of Git LFS to the file, not the file (fetch it by 'git lfs pull'); "),
+    (b"<!doctype html", "a web page, perhaps what a download gave instead of the file; "),
+    (b"<html", "a web page, perhaps what a download gave instead of the file; "),
+    (b"\x1f\x8b", "compressed by gzip, which has to be unpacked first; "),
+    (b"BZh", "compressed by bzip2, which has to be unpacked first; "),
+    (b"\xfd7zXZ", "compressed by xz, which has to be unpacked first; "),
+    (b"7z\xbc\xaf\x27\x1c", "a 7z archive, which has to be unpacked first; "),
+    (b"Rar!", "a RAR archive, which has to be unpacked first; "),
+)
+
 
 class Reader(NamedTuple):
     """One format: its name, a one-line description, how to recognise it and how to open it.
@@ -104,8 +116,15 @@ def _what_it_is(path: Path) -> str:
         if any(name in _IMAGES for name in names):
             return "a folder of images, which --frames takes beside the recording of the events; "
         return ""
-    if path.is_file() and not path.stat().st_size:
+    if not path.is_file():
+        return ""
+    if not path.stat().st_size:
         return "an empty file, "
+    with path.open("rb") as file:
+        beginning = file.read(64).lstrip().lower()
+    for signature, meaning in _NOT_RECORDINGS:
+        if beginning.startswith(signature.lower()):
+            return meaning
     if path.suffix.lower() in _IMAGES | _VIDEOS:
         return "an image or a video, which --frames takes beside the recording of the events; "
     return ""
