@@ -33,7 +33,10 @@ _VIDEOS: Final = frozenset({".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v"})
 
 # What may lie where a recording should, by the first bytes, and what to do about it.
 _NOT_RECORDINGS: Final = (
-    (b"version https://git-lfs", "a pointer of Git LFS to the file, not the file (fetch it by 'git lfs pull'); "),
+    (
+        b"version https://git-lfs",
+        "a pointer of Git LFS to the file, not the file (fetch it by 'git lfs pull'); ",
+    ),
     (b"<!doctype html", "a web page, perhaps what a download gave instead of the file; "),
     (b"<html", "a web page, perhaps what a download gave instead of the file; "),
     (b"\x1f\x8b", "compressed by gzip, which has to be unpacked first; "),
