@@ -377,7 +377,10 @@ def test_white_is_the_median_exposure_unless_set():
 
 def test_a_recording_without_frames():
     rec = Recording.from_arrays(events((1, 0, 0, 1)), [], sensor_size=(1, 1), name="dark.aedat4")
-    with pytest.raises(FrameError, match=r"dark\.aedat4: no frames; kalux needs frames"):
+    with pytest.raises(
+        FrameError,
+        match=r"dark\.aedat4: no frames; kalux needs frames .* join images or a video with --frames",
+    ):
         reconstruct(rec, rate_hz=10)
 
 

@@ -134,12 +134,17 @@ def test_impossible_sensor_sizes_are_refused(size):
         recording.Recording.from_arrays([], [], sensor_size=size)
 
 
+def small_file(path):
+    hdf5.write(path, sensor_size=SIZE, events=[small_events()], frames=[])
+
+
 @pytest.mark.parametrize(
     ("make", "told"),
     [
         (lambda path: path.touch(), "an empty file, not a recording"),
         (lambda path: path.mkdir(), "an empty folder, not a recording"),
         (lambda path: (path.mkdir(), (path / "0.png").touch()), "a folder of images, which --frames takes"),
+        (lambda path: (path.mkdir(), small_file(path / "a.h5")), r"a folder of recordings \(a\.h5\)"),
         (
             lambda path: path.write_text("version https://git-lfs.github.com/spec/v1\n"),
             "a pointer of Git LFS",

@@ -29,14 +29,14 @@ from kalux.calibration.noise import event_noise
 from kalux.calibration.steps import MAX_SAMPLES
 from kalux.calibration.values import Calibration
 from kalux.calibration.white_balance import grey_world
-from kalux.errors import FrameError, InputError
+from kalux.errors import InputError
 from kalux.events import EventArray
 from kalux.frames import Frame
 from kalux.models.camera import BrightTail, Camera, count_bright
 from kalux.models.colour import white_balance
 from kalux.models.pixels import PixelCalibration, require_size
 from kalux.reconstructor import Estimate, Image, Reconstructor
-from kalux.recording import Recording
+from kalux.recording import Recording, no_frames
 from kalux.settings import EventSettings, Settings, chosen_response
 from kalux.settings import preset as named_preset
 from kalux.smoothing import Backward, combine, reversed_settings
@@ -384,7 +384,7 @@ def _exposures(recording: Recording) -> NDArray[np.int64]:
     """(K, 2) exposure starts and ends, us."""
     exposures = [(frame.exposure_start, frame.exposure_end) for frame in recording.frames()]
     if not exposures:
-        raise FrameError(f"{recording.source.path}: no frames; kalux needs frames as well as events")
+        raise no_frames(recording)
     return np.array(exposures, np.int64)
 
 

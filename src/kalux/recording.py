@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from kalux import readers
 from kalux.compiled import event_column, event_row, event_words
-from kalux.errors import ExposureError, InputError
+from kalux.errors import ExposureError, FrameError, InputError
 from kalux.events import EventArray, as_events, check_events, checked_size
 from kalux.frames import MOSAICS, Frame, Mosaic, Stamp, check_frame, place_exposure, require_frame
 from kalux.models.colour import sample_mosaic
@@ -47,6 +47,14 @@ class FrameStream:
 
     def __len__(self) -> int:
         return self._count()
+
+
+def no_frames(recording: Recording) -> FrameError:
+    """What to raise where a recording without frames cannot be used."""
+    return FrameError(
+        f"{recording.source.path}: no frames; kalux needs frames as well as events; join images or a video with "
+        "--frames (frames=)"
+    )
 
 
 class Recording:
