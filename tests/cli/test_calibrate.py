@@ -9,9 +9,9 @@ import pytest
 from kalux import load_calibration
 from kalux.models.camera import Response
 from kalux.readers import hdf5
+from recordings import SIZE, small_events
 
 from builders import blocks
-from recordings import SIZE, small_events
 
 
 @pytest.fixture
