@@ -8,6 +8,7 @@ events were split into pushes.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from typing import Any
 
@@ -297,9 +298,9 @@ class Reconstructor:
         Raises
         ------
         InputError
-            If no frame has been pushed, or ``t`` lies before what can still be read.
+            If ``t`` is not a whole number, no frame has been pushed, or ``t`` lies before what can still be read.
         """
-        t = int(t)
+        t = _whole(t)
         if not self._shots:
             raise InputError("read: no frame has been pushed yet; events alone say nothing of the intensity")
         begin = self.begin_time
@@ -537,6 +538,14 @@ class Reconstructor:
             progress.latest = int(events["t"][-1])
             taken += len(events)
         progress.taken = taken
+
+
+def _whole(t: Any) -> int:
+    """A time as an int. Fractions are refused, not cut off: they may be seconds."""
+    with contextlib.suppress(TypeError, ValueError, OverflowError):
+        if int(t) == t:
+            return int(t)
+    raise InputError(f"read: the time is {t!r}; whole microseconds are needed")
 
 
 def _between(progress: _Progress, t: int) -> float:

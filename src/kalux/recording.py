@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterable, Iterator
+from numbers import Real
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -13,9 +14,9 @@ from numpy.typing import NDArray
 
 from kalux import readers
 from kalux.compiled import event_column, event_row, event_words
-from kalux.errors import ExposureError, FormatError, InputError
+from kalux.errors import ExposureError, FormatError, FrameError, InputError
 from kalux.events import EventArray, as_events, check_events, checked_size
-from kalux.frames import MOSAICS, Frame, Mosaic, Stamp, check_frame, place_exposure
+from kalux.frames import MOSAICS, Frame, Mosaic, Stamp, check_frame, place_exposure, require_frame
 from kalux.models.colour import sample_mosaic
 from kalux.readers import CHUNK_EVENTS, GroundTruth, Source, joined
 
@@ -49,6 +50,14 @@ class FrameStream:
         return self._count()
 
 
+def no_frames(recording: Recording) -> FrameError:
+    """What to raise where a recording without frames cannot be used."""
+    return FrameError(
+        f"{recording.source.path}: no frames; kalux needs frames as well as events; join images or a video with "
+        "--frames (frames=)"
+    )
+
+
 class Recording:
     """A hybrid recording, opened with `kalux.open` or made with `Recording.from_arrays`.
 
@@ -78,7 +87,9 @@ class Recording:
         mosaic: Mosaic | Literal["none"] | None = None,
         white: float | None = None,
     ) -> None:
-        if exposure is not None and (exposure <= 0 or exposure != int(exposure)):
+        if exposure is not None and not (
+            isinstance(exposure, Real) and exposure > 0 and float(exposure).is_integer()
+        ):
             raise ExposureError(f"exposure is {exposure} us; it must be positive and whole")
         if white is not None and not (np.isfinite(white) and white > 0):
             raise InputError(f"white is {white}; the value of a saturated pixel is needed")
@@ -140,6 +151,8 @@ class Recording:
         size = checked_size(sensor_size)
         array = as_events(events, columns=columns, time_unit=time_unit)
         frame_list = list(frames)
+        for index, frame in enumerate(frame_list):
+            require_frame(frame, where=name, index=index)
         if isinstance(contrast_threshold, (int, float)):
             contrast_threshold = (float(contrast_threshold), float(contrast_threshold))
 
@@ -167,6 +180,10 @@ class Recording:
         for _ in recording.frames():
             pass
         return recording
+
+    def __repr__(self) -> str:
+        height, width = self.sensor_size
+        return f"<kalux.Recording {str(self.source.path)!r}: {self.source.format}, {width} x {height} pixels>"
 
     @property
     def contrast_threshold(self) -> tuple[float, float] | None:

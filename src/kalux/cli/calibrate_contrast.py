@@ -69,10 +69,13 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     """Run the command."""
     from kalux.calibration.thresholds import calibrate_contrast
     from kalux.errors import InputError
+    from kalux.recording import no_frames
     from kalux.settings import CameraSettings
 
     check_result(options)
     recording = open_recording(options)
+    if not len(recording.frames()):
+        raise no_frames(recording)
     found = calibrate_contrast(
         recording,
         CameraSettings(response=options.response),

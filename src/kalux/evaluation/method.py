@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.errors import InputError
 from kalux.recording import Recording
 from kalux.settings import Settings
 
@@ -66,8 +67,26 @@ class Method:
     notes: tuple[str, ...] = ()
 
     def estimated(self, recording: Recording, times: Times) -> Iterator[Estimated]:
-        """The images at ascending times (us), with their variances where the method has them."""
+        """The images at ascending times (us), with their variances where the method has them.
+
+        Raises
+        ------
+        InputError
+            If the method yields anything but one array per time.
+        """
         if self.estimates is not None:
-            yield from self.estimates(recording, times)
+            made = iter(self.estimates(recording, times))
         else:
-            yield from (Estimated(image, None) for image in self.images(recording, times))
+            made = (Estimated(image, None) for image in self.images(recording, times))
+        count = 0
+        for count, one in enumerate(made, 1):
+            if count > len(times):
+                raise InputError(f"{self.label}: more images than the {len(times)} times it was given")
+            if not isinstance(one.intensity, np.ndarray):
+                kind = type(one.intensity).__name__
+                raise InputError(
+                    f"{self.label}: image {count - 1} is of type {kind}; a NumPy array is needed"
+                )
+            yield one
+        if count < len(times):
+            raise InputError(f"{self.label}: {count} images for {len(times)} times; one for each is needed")

@@ -84,9 +84,8 @@ def _read_header(path: Path) -> _Header:
         raise FormatError(f"{path}: is Event Stream {version}; kalux reads version 2, so convert it")
     if len(fields) >= 4 and fields[3] != _DVS:
         kind = _TYPES.get(fields[3], f"unknown ({fields[3]})")
-        raise FormatError(
-            f"{path}: holds events of type {kind}; kalux reads DVS events, so convert it (atis_to_dvs)"
-        )
+        remedy = ", so convert it (atis_to_dvs)" if kind == "ATIS" else " only"
+        raise FormatError(f"{path}: holds events of type {kind}; kalux reads DVS events{remedy}")
     if len(fields) < 8:
         raise FormatError(f"{path}: is cut short within its header; copy or download it again")
     width, height = _SIZE.unpack(fields[4:8])
