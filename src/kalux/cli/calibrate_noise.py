@@ -5,8 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from kalux.cli.calibrate_contrast import add_result, check_result, finish
-from kalux.cli.calibrations import add_calibration, given_calibration
+from kalux.cli.calibrations import add_calibration, add_result, check_result, finish, given_calibration
 from kalux.cli.info import add_recording, open_recording
 from kalux.cli.parser import Parser, whole
 from kalux.cli.terminal import say

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from kalux.cli.calibrate_contrast import add_result, check_result, finish
+from kalux.cli.calibrations import add_result, check_result, finish
 from kalux.cli.parser import Parser, UsageError
 from kalux.cli.terminal import say
 
