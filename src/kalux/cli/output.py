@@ -54,9 +54,10 @@ class Output:
     @property
     def settings_path(self) -> Path:
         """Where the settings are written."""
-        if self.format == "mp4":
-            return self.path.with_name(f"{self.path.name}.kalux.toml")
-        return self.path / "kalux.toml"
+        from kalux.writers.folder import SETTINGS
+        from kalux.writers.settings_file import beside
+
+        return beside(self.path) if self.format == "mp4" else self.path / SETTINGS
 
     @property
     def has_variance(self) -> bool:

@@ -78,6 +78,11 @@ def settings_file(path: Path, metadata: Mapping[str, Any], output: Mapping[str, 
     return SettingsFile(path, tomli_w.dumps(plain(tables, "metadata")))
 
 
+def beside(path: Path) -> Path:
+    """Where the settings of an output that is one file are."""
+    return path.with_name(f"{path.name}.kalux.toml")
+
+
 def require_ours(path: Path) -> None:
     """Check that a settings file, if there is one, was written by kalux and may be replaced.
 
