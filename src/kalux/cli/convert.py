@@ -220,12 +220,13 @@ def _streams(
 ) -> tuple[Iterator[EventArray], Iterator[Frame]]:
     """Events and frames as stored, with progress."""
     return (
-        _counted(recording.events(), lambda chunk: progress.add(events=len(chunk)), let_through),
-        _counted(recording.stored_frames(), lambda _: progress.add(images=1), let_through),
+        counted(recording.events(), lambda chunk: progress.add(events=len(chunk)), let_through),
+        counted(recording.stored_frames(), lambda _: progress.add(images=1), let_through),
     )
 
 
-def _counted(items: Iterable[T], count: Callable[[T], None], let_through: Callable[[], None]) -> Iterator[T]:
+def counted(items: Iterable[T], count: Callable[[T], None], let_through: Callable[[], None]) -> Iterator[T]:
+    """The same items; interrupts are let through before each, and each is counted when it has been used."""
     for item in items:
         let_through()
         yield item
