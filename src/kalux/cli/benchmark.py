@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import os
 import sys
 from collections.abc import Iterable
 from pathlib import Path
@@ -180,11 +179,12 @@ def _work(plan: Plan, store: Store, jobs: list[Job], options: argparse.Namespace
 
 
 def _outcomes(jobs: list[Job], options: argparse.Namespace) -> Outcomes:
+    from kalux.ahead import cores
     from kalux.evaluation.benchmark import runners
 
     if options.dask is not None:
         return runners.on_dask(jobs, options.dask)
-    return runners.in_processes(jobs, options.processes or len(os.sched_getaffinity(0)))
+    return runners.in_processes(jobs, options.processes or cores())
 
 
 def _tell(number: int, total: int, seconds: float, job: Job, outcome: Outcome) -> None:

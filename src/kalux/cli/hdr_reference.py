@@ -165,7 +165,7 @@ def _times(text: str | None) -> Path | list[float] | None:
         return Path(text)
     try:
         return [parse_seconds(part) for part in text.split(",")]
-    except (ValueError, ZeroDivisionError):
+    except ValueError:
         raise UsageError(f"--times {text}: seconds with commas, as 2,1/2,1/8, or a .csv file") from None
 
 
