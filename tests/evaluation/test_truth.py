@@ -9,7 +9,8 @@ import pytest
 
 import kalux
 from kalux.errors import FormatError, InputError
-from kalux.evaluation.baselines import Method, methods
+from kalux.evaluation.baselines import methods
+from kalux.evaluation.method import Method
 from kalux.evaluation.truth import evaluate_truth, load_truth, prepare_reference
 from kalux.readers import GroundTruth
 

@@ -160,6 +160,32 @@ def check_file(path: Path, *, overwrite: bool) -> None:
         _check_writable(folder)
 
 
+def check_picture(path: Path | None, *, overwrite: bool) -> None:
+    """As `check_file`, for a picture, if one is asked for.
+
+    Raises
+    ------
+    UsageError
+        Its name is not that of a PNG.
+    OutputError
+        As of `check_file`.
+    """
+    if path is None:
+        return
+    if path.suffix.lower() != ".png":
+        raise UsageError(f"{path}: pictures are PNG; give a name that ends in .png")
+    check_file(path, overwrite=overwrite)
+
+
+def write_picture(path: Path, picture: Any) -> None:
+    """Write a picture, uint8, (H, W, 3) in OpenCV's order of colours, as PNG, whole or not at all."""
+    import cv2
+
+    from kalux.writers.files import save
+
+    save(path, cv2.imencode(".png", picture)[1].tobytes())
+
+
 def _check_writable(folder: Path) -> None:
     existing = next(place for place in (folder, *folder.parents) if place.exists())
     if not existing.is_dir():

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from kalux.cli.calibrate_offset import add_range, checked_range, read_offset
-from kalux.cli.calibrate_rig import add_frames, write_picture
+from kalux.cli.calibrate_rig import add_frames
 from kalux.cli.parser import Parser, UsageError, number, whole
 from kalux.cli.terminal import say, warn
 
@@ -101,15 +101,15 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     from kalux.calibration.rig import load_rig
     from kalux.calibration.two_cameras import open_frames, register
     from kalux.cli.convert import check_name
-    from kalux.cli.output import check_file
+    from kalux.cli.output import check_file, check_picture, write_picture
     from kalux.settings import CameraSettings
 
     timing = _timing(options)
     centre, reach = checked_range(options)
     check_name(options.out, options.events)
-    for path in (options.out, options.overlay, options.plot):
-        if path is not None:
-            check_file(path, overwrite=options.overwrite)
+    check_file(options.out, overwrite=options.overwrite)
+    for path in (options.overlay, options.plot):
+        check_picture(path, overwrite=options.overwrite)
     rig = None if options.rig is None else load_rig(options.rig)
     events = kalux.open(options.events)
     by_trigger = timing == "triggers"

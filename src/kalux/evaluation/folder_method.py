@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.errors import FormatError, FrameError, InputError
-from kalux.evaluation.baselines import Image, Times
+from kalux.evaluation.method import Image, Times
 from kalux.readers.images import read_image
 from kalux.readers.joined import read_image_list
 from kalux.readers.source import reading

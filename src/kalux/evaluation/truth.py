@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.errors import FormatError, FrameError, InputError
-from kalux.evaluation.baselines import Method
 from kalux.evaluation.lpips import LpipsWeights
-from kalux.evaluation.scores import Pair, Scores, score
+from kalux.evaluation.method import Method
+from kalux.evaluation.pairs import Pair
+from kalux.evaluation.scores import Scores, score
 from kalux.readers import GroundTruth
 from kalux.recording import Recording
 

@@ -22,7 +22,7 @@ from numpy.lib import format as npy
 from kalux.errors import FormatError
 from kalux.events import EventArray
 from kalux.readers.columns import UNIT_ASSUMED, Columns, find_columns, join
-from kalux.readers.source import CHUNK_EVENTS, SIZE_UNKNOWN, Source, reading, smallest_size
+from kalux.readers.source import CHUNK_EVENTS, SIZE_UNKNOWN, Source, begins_with, reading, smallest_size
 
 _NPY: Final = b"\x93NUMPY"
 _ZIP: Final = b"PK\x03\x04"
@@ -65,13 +65,9 @@ class _Layout(NamedTuple):
 
 def recognises(path: Path) -> bool:
     """Whether it is an ``.npy``, or a zip that holds one at its root."""
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        beginning = file.read(len(_NPY))
-    if beginning == _NPY:
+    if begins_with(path, _NPY):
         return True
-    if not beginning.startswith(_ZIP):
+    if not begins_with(path, _ZIP):
         return False
     try:
         with zipfile.ZipFile(path) as archive:
@@ -126,9 +122,7 @@ def _opened(path: Path, member: str | None) -> Iterator[IO[bytes]]:
 
 def _list_arrays(path: Path) -> list[_Array]:
     with reading(path, *_DAMAGE):
-        with path.open("rb") as file:
-            is_npy = file.read(len(_NPY)) == _NPY
-        if is_npy:
+        if begins_with(path, _NPY):
             sizes: dict[str | None, int] = {None: path.stat().st_size}
         else:
             with zipfile.ZipFile(path) as archive:
