@@ -17,6 +17,9 @@ True where the pixel became brighter. 16 bytes, aligned."""
 EventArray = NDArray[np.void]
 """A 1-D array of `EVENT_DTYPE`, sorted by ``t``."""
 
+NEVER: Final = -(1 << 60)
+"""us: the time of an event that has not been. Times of recordings may be negative, but are never that early."""
+
 # The names under which peers store each field: tonic and Prophesee (t, x, y, p), dv-processing
 # (timestamp, x, y, polarity), Metavision CSV, event_stream, DSEC and IJRR tables.
 _FIELD_NAMES: Final = {

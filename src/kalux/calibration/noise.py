@@ -20,7 +20,7 @@ from kalux.calibration.delay import estimate_delay
 from kalux.calibration.frame_noise import FrameNoise, estimate_frame_noise
 from kalux.calibration.refractory import shortest_interval
 from kalux.calibration.values import Calibration
-from kalux.events import EventArray
+from kalux.events import NEVER, EventArray
 from kalux.recording import Recording
 from kalux.settings import CameraSettings
 
@@ -230,7 +230,9 @@ def _tallied(chunks: Iterator[EventArray], first: int, last: int, ignored: NDArr
     quiet = np.zeros((windows, height, width), np.int64)
     total = np.zeros((height, width), np.int64)
     busy_until = np.full((height, width), first, np.int64)  # silence before the first event is not known
-    pending = np.full((height, width), -1, np.int64)  # an event in quiet time, until its future is quiet, too
+    pending = np.full(
+        (height, width), NEVER, np.int64
+    )  # an event in quiet time, until its future is quiet, too
     for chunk in chunks:
         t, x, y = (chunk[name] for name in ("t", "x", "y"))
         _tally(t, x, y, first, length, QUIET, ignored, busy_until, pending, counts, quiet, total)
@@ -257,11 +259,11 @@ def _tally(t, x, y, first, length, gap, ignored, busy_until, pending, counts, qu
         total[row, column] += 1
         # The pixel's own event is noise if it is in quiet time before, and no neighbour follows (decided later).
         if now >= busy_until[row, column]:
-            if pending[row, column] >= 0 and now - pending[row, column] >= gap:
+            if pending[row, column] != NEVER and now - pending[row, column] >= gap:
                 window = min(int((pending[row, column] - first) / length), counts.shape[0] - 1)
                 counts[window, row, column] += 1
                 pending[row, column] = now
-            elif pending[row, column] < 0:
+            elif pending[row, column] == NEVER:
                 pending[row, column] = now
             else:  # a second one shortly after: both are counted, the first now
                 window = min(int((pending[row, column] - first) / length), counts.shape[0] - 1)
@@ -277,11 +279,11 @@ def _tally(t, x, y, first, length, gap, ignored, busy_until, pending, counts, qu
                 end = now - gap
                 if end > busy_until[r, c]:
                     _add_quiet(busy_until[r, c], end, first, length, r, c, quiet)
-                if pending[r, c] >= 0:
+                if pending[r, c] != NEVER:
                     if pending[r, c] <= end:
                         window = min(int((pending[r, c] - first) / length), counts.shape[0] - 1)
                         counts[window, r, c] += 1
-                    pending[r, c] = -1
+                    pending[r, c] = NEVER
                 busy_until[r, c] = max(busy_until[r, c], now + gap)
 
 
@@ -293,7 +295,7 @@ def _close(last, first, length, gap, busy_until, pending, counts, quiet):  # typ
         for column in range(busy_until.shape[1]):
             if end > busy_until[row, column]:
                 _add_quiet(busy_until[row, column], end, first, length, row, column, quiet)
-            if 0 <= pending[row, column] <= end:
+            if NEVER < pending[row, column] <= end:
                 window = min(int((pending[row, column] - first) / length), counts.shape[0] - 1)
                 counts[window, row, column] += 1
 
