@@ -112,7 +112,9 @@ def test_held_out_frames_in_colour_are_clipped_where_one_colour_is():
     image = np.full((12, 12, 3), 100, np.uint8)
     image[:, :3, 2] = 255
     frames = [kalux.Frame(image, 100 * i, 100 * i + 10) for i in range(9)]
-    recording = Recording.from_arrays(pixel_events([], []), frames, sensor_size=(12, 12), contrast_threshold=0.2)
+    recording = Recording.from_arrays(
+        pixel_events([], []), frames, sensor_size=(12, 12), contrast_threshold=0.2
+    )
     pair = next(held_out_pairs(hold_out_frames(recording), constant(0.4)))
     np.testing.assert_array_equal(pair.clipped, np.arange(12)[None] + np.zeros((12, 1)) < 3)
 

@@ -227,7 +227,7 @@ def held_out_pairs(held: HeldOut, method: Method, *, clip: bool = False) -> Iter
             shot.intensity,
             frame.valid,
             variance=variance,
-            clipped=clipped if clipped.ndim == 2 else clipped.any(axis=-1),
+            clipped=clipped if clipped.ndim == 2 else np.asarray(clipped.any(axis=-1)),
             log_offset=offset,
             noise=None
             if variance is None
