@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import gzip
 import os
 
@@ -202,3 +203,13 @@ def test_real_recordings_pass_every_check(shared_data, name):
 def test_real_files_that_are_no_recordings_are_refused(shared_data, name):
     with pytest.raises(FormatError, match="not a recording that kalux knows"):
         recording.open(shared_data / name)
+
+
+@pytest.mark.parametrize("size", [(0, 4), (4, 70_000), (10**20, 4)])
+def test_a_sensor_that_no_event_could_address_is_refused(tmp_path, size):
+    path = tmp_path / "events.npz"
+    columns = {name: np.zeros(1, int) for name in "txyp"}
+    np.savez(path, **columns, height=np.array(4), width=np.array(5))
+    source = dataclasses.replace(readers.read(path), sensor_size=size)
+    with pytest.raises(FormatError, match="states a sensor of"):
+        recording.Recording(source)

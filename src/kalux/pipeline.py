@@ -32,10 +32,11 @@ from kalux.calibration.white_balance import grey_world
 from kalux.errors import InputError
 from kalux.events import EventArray
 from kalux.frames import Frame
+from kalux.images import Estimate, Image
 from kalux.models.camera import BrightTail, Camera, count_bright
 from kalux.models.colour import white_balance
 from kalux.models.pixels import PixelCalibration, require_size
-from kalux.reconstructor import Estimate, Image, Reconstructor
+from kalux.reconstructor import Reconstructor
 from kalux.recording import Recording, no_frames
 from kalux.settings import EventSettings, Settings, chosen_response
 from kalux.settings import preset as named_preset

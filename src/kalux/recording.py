@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 
 from kalux import readers
 from kalux.compiled import event_column, event_row, event_words
-from kalux.errors import ExposureError, FrameError, InputError
+from kalux.errors import ExposureError, FormatError, FrameError, InputError
 from kalux.events import EventArray, as_events, check_events, checked_size
 from kalux.frames import MOSAICS, Frame, Mosaic, Stamp, check_frame, place_exposure, require_frame
 from kalux.models.colour import sample_mosaic
 from kalux.readers import CHUNK_EVENTS, GroundTruth, Source, joined
 
 _FIRST: Final = np.iinfo(np.int64).min
+_LARGEST_SIDE: Final = 1 << 16  # coordinates of events have 16 bits
 
 
 class EventStream:
@@ -96,6 +97,11 @@ class Recording:
             raise InputError(f"stamp is {stamp!r}; it must be 'start', 'middle' or 'end'")
         if mosaic not in (None, "none", *MOSAICS):
             raise InputError(f"mosaic is {mosaic!r}; it must be one of {', '.join(MOSAICS)}, or 'none'")
+        if not all(0 < n <= _LARGEST_SIDE for n in source.sensor_size):
+            height, width = source.sensor_size
+            raise FormatError(
+                f"{source.path}: states a sensor of {width}x{height} pixels; 1 to {_LARGEST_SIDE} a side are possible"
+            )
         self.source = source
         self.mosaic: Mosaic | None = source.mosaic if mosaic is None else None if mosaic == "none" else mosaic
         self.sensor_size = source.sensor_size

@@ -9,7 +9,7 @@ import kalux
 from kalux import Recording
 from kalux.datasets import SensorSettings
 from kalux.errors import FrameError, InputError
-from kalux.evaluation.baselines import Estimated, Method, methods
+from kalux.evaluation.baselines import methods
 from kalux.evaluation.consistency import blur_consistency, valid_pixels
 from kalux.evaluation.held_out import (
     clipped_as,
@@ -19,6 +19,7 @@ from kalux.evaluation.held_out import (
     intensity_percentile,
     percentile_of_counts,
 )
+from kalux.evaluation.method import Estimated, Method
 
 from builders import frame, moving_blocks, pixel_events
 

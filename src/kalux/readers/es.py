@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from kalux.errors import FormatError
 from kalux.events import EVENT_DTYPE, EventArray
-from kalux.readers.source import CHUNK_EVENTS, Source, reading
+from kalux.readers.source import CHUNK_EVENTS, Source, begins_with, reading
 
 _SIGNATURE: Final = b"Event Stream"
 _TYPES: Final = {0: "generic", 1: "DVS", 2: "ATIS", 3: "display", 4: "colour"}
@@ -41,10 +41,7 @@ class _Header(NamedTuple):
 
 def recognises(path: Path) -> bool:
     """Whether the file begins with ``Event Stream``."""
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return file.read(len(_SIGNATURE)) == _SIGNATURE
+    return begins_with(path, _SIGNATURE)
 
 
 def read(path: Path) -> Source:
