@@ -43,12 +43,13 @@ class _Free:
                 return pieces.pop()
         return _fresh(size)
 
-    def give(self, piece: NDArray[np.uint8]) -> None:
+    def give(self, piece: NDArray[np.uint8], most: int = MOST_FREE) -> None:
+        """``most`` is no name of the module's: when Python ends, arrays come back after those are gone."""
         with self._lock:
-            if self.total + piece.size > MOST_FREE:  # of another sensor, most likely
+            if self.total + piece.size > most:  # of another sensor, most likely
                 self._pieces.clear()
                 self.total = 0
-            if piece.size <= MOST_FREE:
+            if piece.size <= most:
                 self._pieces.setdefault(piece.size, []).append(piece)
                 self.total += piece.size
 

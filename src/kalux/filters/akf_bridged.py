@@ -101,8 +101,6 @@ class Cursor:
         us: the segment's start, then a whole number of epochs later.
     moving
         `moving_pixels`, once it has been asked for, where it is the same throughout the segment.
-    unmeasured
-        `unmeasured_pixels`, once it has been asked for.
     """
 
     pixels: NDArray[np.void]
@@ -111,7 +109,6 @@ class Cursor:
     polarity: NDArray[np.int8]
     origin: int
     moving: NDArray[np.bool_] | None = None
-    unmeasured: NDArray[np.bool_] | None = None
 
 
 class Noise(NamedTuple):
@@ -219,21 +216,28 @@ def moving_pixels(segment: BridgedSegment, cursor: Cursor) -> NDArray[np.bool_]:
     """
     if cursor.moving is not None:
         return cursor.moving
-    inside = cursor.clock[1:-1, 1:-1]
-    moving: NDArray[np.bool_] = inside > np.int32(max(segment.still_since - cursor.origin, -EPOCH))
-    moving |= unmeasured_pixels(segment, cursor)
+    still_since = np.int32(max(segment.still_since - cursor.origin, -EPOCH))
+    variances = segment.forward_variance, segment.backward_variance
+    moving: NDArray[np.bool_] = np.empty(segment.augmented.shape, np.bool_)
+    coming = segment.augmented if segment.events is None else segment.events
+    _moving(cursor.clock, still_since, *variances, coming, segment.events is not None, moving)
     if segment.events is not None:  # all events of the segment are among them, whenever this is asked for
-        moving |= segment.events > 0
         cursor.moving = moving
     return moving
 
 
-def unmeasured_pixels(segment: BridgedSegment, cursor: Cursor) -> NDArray[np.bool_]:
-    """(H, W): pixels that neither of the segment's frames measures; not to be changed."""
-    if cursor.unmeasured is None:
-        variances = segment.forward_variance, segment.backward_variance
-        cursor.unmeasured = np.minimum(*variances) >= UNMEASURED
-    return cursor.unmeasured
+@nb.njit(cache=True, nogil=True)
+def _moving(clock, still_since, forward, backward, coming, knows_coming, moving):  # type: ignore[no-untyped-def]
+    height, width = moving.shape
+    for row in range(height):
+        times, out = clock[row + 1, 1 : width + 1], moving[row]
+        first, last, events = forward[row], backward[row], coming[row]
+        for i in range(np.uint64(width)):
+            unmeasured = (first[i] >= UNMEASURED) & (last[i] >= UNMEASURED)
+            out[i] = (times[i] > still_since) | unmeasured
+        if knows_coming:
+            for i in range(np.uint64(width)):
+                out[i] |= events[i] > 0
 
 
 def end(segment: BridgedSegment, cursor: Cursor) -> State:
