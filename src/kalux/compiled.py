@@ -62,6 +62,12 @@ def event_is_on(word):  # type: ignore[no-untyped-def]
     return ((np.uint64(word) >> np.uint64(32)) & np.uint64(0xFF)) != np.uint64(0)
 
 
+@nb.njit(cache=True, inline="always")
+def flat(array):  # type: ignore[no-untyped-def]
+    """A whole array as one row."""
+    return array.reshape(array.size)
+
+
 UNWEIGHED: Final = np.int64(0xFF_FFFF_FFFF)
 """The bits of an event's second word without its weight; by themselves they have the weight 1."""
 

@@ -29,6 +29,7 @@ from kalux.compiled import (
     event_row,
     event_weight,
     event_words,
+    flat,
     pack,
     packed,
     prefetch,
@@ -308,11 +309,6 @@ def _copy(plane, row, first, count, out):  # type: ignore[no-untyped-def]
         out[i] = np.float32(plane[row, first + i])
 
 
-@nb.njit(cache=True, inline="always")
-def _flat(array):  # type: ignore[no-untyped-def]
-    return array.reshape(array.size)
-
-
 @nb.njit(cache=True, nogil=True, error_model="numpy", fastmath=FUSED)
 def _advance_bridged(words, pixels, steps, clock, polarity, origin, rate, step_variance, noise):  # type: ignore[no-untyped-def]
     scalars = _Scalars(
@@ -323,7 +319,7 @@ def _advance_bridged(words, pixels, steps, clock, polarity, origin, rate, step_v
         np.float32(noise.threshold2),
     )
     stride = np.uint64(clock.shape[1])
-    pixels, steps, clock, polarity = _flat(pixels), _flat(steps), _flat(clock), _flat(polarity)
+    pixels, steps, clock, polarity = flat(pixels), flat(steps), flat(clock), flat(polarity)
     # Each event's clock is looked at while the one before is filtered, so that neither waits for the other.
     last = len(words) - 1
     event = _meet(words[0, 0], words[0, 1], clock, polarity, stride, origin, scalars)
@@ -370,7 +366,7 @@ def _read_bridged(  # type: ignore[no-untyped-def]
     pixels, clock, polarity, slope, heights, moment, log_intensity, variance
 ):
     height, width = variance.shape
-    pixels, clock, polarity = _flat(pixels), _flat(clock), _flat(polarity)
+    pixels, clock, polarity = flat(pixels), flat(clock), flat(polarity)
     size = min(width, _BLOCK)
     planes, ahead = np.empty((_STATE_FIELDS, size), np.float32), np.empty(size, np.float32)
     for row in range(height):
