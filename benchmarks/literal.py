@@ -2,8 +2,8 @@
 
 One float64 array per quantity, P rather than its inverse, a branch per polarity, loops over the neighbourhood, an
 exponential per event: docs/equations.md, K1, K4 and K5, and equations (17), (20) and (21) for the default filter, (2),
-(7), (9), (10), (11), (13), (15), (17), (20) and (21) for the paper's, as `tests/naive.py` has them, only event by event.
-The functions can be compiled by numba, and run as plain Python too.
+(7), (9), (10), (11), (13), (15), (17), (20) and (21) for the paper's, as `tests/naive.py` has them, only event by
+event. The functions can be compiled by numba, and run as plain Python too.
 """
 
 from __future__ import annotations

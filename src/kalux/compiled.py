@@ -18,8 +18,8 @@ from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from kalux import memory
-from kalux.memory import PAGE
 from kalux.events import EventArray
+from kalux.memory import PAGE
 
 MICROSECOND32: Final = np.float32(1e-6)
 """Seconds."""
