@@ -156,10 +156,9 @@ class _Passing:
         self._shape = sensor_size
         self._periods, self._late = np.array(periods, np.float32), float(late)
         self._delay, self._most = delay, most
-        self._latest = np.full(
-            height * width, _NEVER, np.int64
-        )  # time of the event before the interval's first
-        self._sign = np.zeros(height * width, np.int8)  # 1: it was on, -1: off, 0: there was none
+        # Of the event before the interval's first: its time, and its sign, 0 if there was none.
+        self._latest = np.full(height * width, _NEVER, np.int64)
+        self._sign = np.zeros(height * width, np.int8)
         self._seen_until = _NEVER
 
     def of(self, interval: Interval) -> Steps:
