@@ -19,9 +19,10 @@ from kalux.errors import InputError, OutputError
 from kalux.events import make_events
 from kalux.filters.shots import take_shot
 from kalux.filters.uncertainty import Around
+from kalux.images import Estimate
 from kalux.models.camera import Camera
 from kalux.pipeline import plan
-from kalux.reconstructor import Estimate, Reconstructor
+from kalux.reconstructor import Reconstructor
 from kalux.smoothing import Spill, Trails, combine, reversed_settings
 
 from builders import altered

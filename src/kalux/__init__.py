@@ -10,8 +10,9 @@ if TYPE_CHECKING:
     from kalux.errors import KaluxError
     from kalux.events import EVENT_DTYPE, as_events
     from kalux.frames import Frame
+    from kalux.images import Image
     from kalux.pipeline import reconstruct
-    from kalux.reconstructor import Image, Reconstructor
+    from kalux.reconstructor import Reconstructor
     from kalux.recording import Recording, open
     from kalux.settings import PRESETS, Settings, preset
 
@@ -43,7 +44,7 @@ if not TYPE_CHECKING:
         "Calibration": "calibration.values",
         "EVENT_DTYPE": "events",
         "Frame": "frames",
-        "Image": "reconstructor",
+        "Image": "images",
         "KaluxError": "errors",
         "PRESETS": "settings",
         "Reconstructor": "reconstructor",
@@ -61,6 +62,7 @@ if not TYPE_CHECKING:
         "errors",
         "events",
         "frames",
+        "images",
         "pipeline",
         "reconstructor",
         "recording",

@@ -16,9 +16,9 @@ from kalux.datasets import DEMO_SENSOR, Scene, Simulation, demo_scene, simulate
 from kalux.display import DisplaySettings, Reinhard, apply, measure, to_uint8
 from kalux.errors import InputError, OutputError
 from kalux.frames import Frame
+from kalux.images import Image
 from kalux.pipeline import reconstruct
 from kalux.readers import hdf5
-from kalux.reconstructor import Image
 from kalux.recording import Recording
 from kalux.writers import Panel, VideoSettings, colour_map, contact_sheet, open_writer, variance_limits
 from kalux.writers.files import output_errors, write_whole

@@ -73,8 +73,3 @@ def empty(shape: tuple[int, ...], dtype: Any = np.float32) -> NDArray[Any]:
     piece: NDArray[np.uint8] = np.asarray(_Lent(_free.take(size)))
     array: NDArray[Any] = piece[:size].view(kind).reshape(shape)
     return array
-
-
-def free_bytes() -> int:
-    """Bytes that are kept and not used."""
-    return _free.total

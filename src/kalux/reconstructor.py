@@ -8,9 +8,9 @@ events were split into pushes.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,123 +18,21 @@ from numpy.typing import NDArray
 from kalux.augmentation.highlights import Unshown
 from kalux.augmentation.refractory import EventClock
 from kalux.augmentation.trail import FrameTrail
-from kalux.augmentation.unseen import UNKNOWN_CHANGE
 from kalux.compiled import event_words
 from kalux.errors import InputError, SettingsError
 from kalux.events import EVENT_DTYPE, EventArray, as_events, check_events, checked_size
 from kalux.filters.akf import State
 from kalux.filters.buffer import EventBuffer
-from kalux.filters.highlights import lifted, read_unshown, tempered
 from kalux.filters.method import USUAL_INTERVAL, Method, Segment
 from kalux.filters.methods import make_method
-from kalux.filters.readout import HighlightPrior, read_out
 from kalux.filters.shots import Shot, take_shot
-from kalux.filters.uncertainty import Around, alone, given_variance, hidden_variance
 from kalux.frames import Frame, check_frame
+from kalux.images import Estimate, Image, View, make_image
 from kalux.models.camera import Camera, beyond_white, count_bright
-from kalux.models.colour import (
-    Gains,
-    calm_highlights,
-    demosaic,
-    joined_chromaticity,
-    luminance,
-    white_balance,
-)
+from kalux.models.colour import Gains, joined_chromaticity, white_balance
 from kalux.models.pixels import PixelCalibration, require_size
 from kalux.settings import Settings
 from kalux.settings import preset as named_preset
-
-_UNTOLD: Final = np.full(1, np.inf, np.float32)
-"""The variance of all pixels where it is not wanted."""
-_UNTOLD.flags.writeable = False
-
-
-@dataclass(frozen=True, eq=False)
-class Image:
-    """One reconstructed image.
-
-    Attributes
-    ----------
-    t
-        Its time, int us.
-    intensity
-        float32 (H, W), linear: 1.0 = a saturated frame pixel at the reference exposure; more in highlights.
-    variance
-        float32 (H, W), P: the variance of log(intensity + log_offset) (20); infinite for the complementary filter,
-        which knows none.
-    log_offset
-        I_0 of equation (8).
-    final
-        Whether more data can no longer change it. With lookahead an image is final one frame later.
-    colour
-        float32 (H, W, 3), linear red, green, blue with the scale of ``intensity``, which of a Bayer sensor holds each
-        pixel's own channel before white balance, and of frames in RGB the luminance. None: the frames are grey.
-    """
-
-    t: int
-    intensity: NDArray[np.float32]
-    variance: NDArray[np.float32]
-    log_offset: float
-    final: bool
-    colour: NDArray[np.float32] | None = None
-
-    def grey(self) -> Image:
-        """The same image without colours: its intensity is the luminance of ``colour``."""
-        if self.colour is None:
-            return self
-        return dataclasses.replace(self, intensity=luminance(self.colour), colour=None)
-
-
-@dataclass(frozen=True, eq=False)
-class Estimate:
-    """The filter's raw estimate at one moment, before what is known of highlights is applied.
-
-    Attributes
-    ----------
-    t
-        Its time, int us.
-    log_intensity, variance
-        (H, W): L = log(I + I_0), and P. float32; float64 with augmentation "paper".
-    white
-        log(1 + I_0) of the brightest level that frames show there.
-    final
-        As of `Image`.
-    moving
-        (H, W) bool: pixels with an event in this frame interval, also one to come, or the one before, and those that
-        neither frame measures; None: not told.
-    between
-        0 at a frame, 1 half-way between two, and where the next one is not known or not used.
-    chroma
-        Of frames in RGB: float32 (H, W, 3), the ratios of the channels to the luminance; else None.
-    unshown
-        Pixels that no frame has measured until then, of which L is a bound; None: there are none.
-    silent_change
-        (H, W): mean square change of silent pixels around each, from one frame to the next; None: not told.
-    around
-        What the frames around say of the pixels (K11); None: not told, or there is only one.
-    exposed
-        The share of the time for which frames are exposed, where the next one is known.
-    since
-        Where it is not known or not used: time to the only frame, in intervals between frames; else None.
-    told
-        (H, W): variance of what frames and events have told, where that is not P; None: P. Both ways in time P counts
-        the errors as well that both directions share, which are what no event has told; these K11 adds itself.
-    """
-
-    t: int
-    log_intensity: NDArray[np.floating[Any]]
-    variance: NDArray[np.floating[Any]]
-    white: float
-    final: bool
-    moving: NDArray[np.bool_] | None = None
-    between: float = 0.0
-    chroma: NDArray[np.float32] | None = None
-    unshown: Unshown | None = None
-    silent_change: NDArray[np.floating[Any]] | None = None
-    around: Around | None = None
-    exposed: float = 0.0
-    since: float | None = None
-    told: NDArray[np.floating[Any]] | None = None
 
 
 class _Progress:
@@ -400,9 +298,9 @@ class Reconstructor:
         Raises
         ------
         InputError
-            If no frame has been pushed, or ``t`` lies before what can still be read.
+            If ``t`` is not a whole number, no frame has been pushed, or ``t`` lies before what can still be read.
         """
-        t = int(t)
+        t = _whole(t)
         if not self._shots:
             raise InputError("read: no frame has been pushed yet; events alone say nothing of the intensity")
         begin = self.begin_time
@@ -447,61 +345,29 @@ class Reconstructor:
 
         Where its variance is not wanted it is infinite: to tell it (K11) takes a seventh of the time.
         """
-        # The prior needs a variance, which the complementary filter has not.
+        return make_image(estimate, self._view(), with_variance=with_variance)
+
+    def _view(self) -> View:
+        """What images need of the camera, the settings, and the first frame."""
         filtered, events = self.settings.filter, self.settings.events
+        # The prior on highlights needs a variance, which the complementary filter has not.
         scale = filtered.highlight_scale if filtered.kind == "akf" else 0.0
         spread = events.mismatch
         if self._estimated:
-            scale, spread = (
-                min(scale, filtered.highlight_tail * self._tail_beyond),
-                events.extrapolation_spread,
-            )
-        prior = HighlightPrior(
-            white=estimate.white, scale2=scale**2, stretch=spread**2 / scale if scale > 0 else 0.0
-        )
-        mosaic = self._last_frame is not None and self._last_frame.mosaic is not None
+            scale = min(scale, filtered.highlight_tail * self._tail_beyond)
+            spread = events.extrapolation_spread
         on, off = self.thresholds
-        offset = self.settings.camera.offset
-        log_intensity, variance, unshown = estimate.log_intensity, estimate.variance, estimate.unshown
-        told = estimate.told
-        if unshown is not None:
-            unshown = tempered(unshown, log_intensity, prior)
-            log_intensity, variance = lifted(log_intensity, variance, unshown)
-            if told is not None:
-                _, told = lifted(estimate.log_intensity, told, unshown)
-        moving, neighbours = estimate.moving, self.settings.filter.neighbours
-        pitch = 2 if mosaic else 1  # neighbours of the same colour
-        hidden = hidden_variance(estimate.between, on * off, estimate.exposed, estimate.since)
-        change = estimate.silent_change
-        if change is None and moving is not None:  # K11 needs it only there
-            change = np.full(log_intensity.shape, UNKNOWN_CHANGE * on * off, np.float32)
-        pixels = None if unshown is None else unshown.pixels
-        tells = with_variance or mosaic  # the colours of a mosaic's highlights depend on it
-        intensity, total, heard = read_out(
-            log_intensity,
-            variance,
-            offset,
-            prior,
-            moving,
-            alone(hidden),
-            change,
-            neighbours,
-            pitch,
-            pixels,
-            with_variance=tells and moving is None,
-        )
-        if unshown is not None:
-            read_unshown(intensity, heard, estimate.log_intensity, unshown, offset, prior)
-        if not tells:
-            total = np.ndarray(intensity.shape, np.float32, _UNTOLD, strides=(0, 0))
-        elif moving is not None and change is not None:
-            known = variance if told is None else told
-            total = given_variance(known, moving, change, hidden, estimate.around)
-        image = Image(estimate.t, intensity, total, offset, estimate.final)
-        return (
-            image
-            if self._colours == "grey"
-            else dataclasses.replace(image, colour=self._coloured(image, estimate))
+        frame = self._last_frame
+        mosaic = None if frame is None else frame.mosaic
+        return View(
+            log_offset=self.settings.camera.offset,
+            threshold2=on * off,
+            neighbours=filtered.neighbours,
+            highlight_scale=scale,
+            highlight_spread=spread,
+            unknown_variance=filtered.initial_variance,
+            mosaic=mosaic,
+            gains=(1.0, 1.0, 1.0) if frame is None or mosaic is None else self._gains_of(frame),
         )
 
     def _unshown(self, progress: _Progress, variance: NDArray[np.floating[Any]]) -> Unshown | None:
@@ -517,25 +383,6 @@ class Reconstructor:
         tail = self.settings.filter.bright_tail or self._tail
         assert tail is not None
         return beyond_white(tail)
-
-    @property
-    def _colours(self) -> str:
-        return "grey" if self._last_frame is None else self._last_frame.colours
-
-    def _coloured(self, image: Image, estimate: Estimate) -> NDArray[np.float32]:
-        """The image's colours: the mosaic's, or those that the frames lend to the luminance."""
-        if estimate.chroma is not None:
-            return estimate.chroma * image.intensity[..., None]
-        frame = self._last_frame
-        assert frame is not None
-        assert frame.mosaic is not None
-        gains = self._gains_of(frame)
-        colour = demosaic(image.intensity, frame.mosaic, self.settings.camera.offset, gains)
-        # The complementary filter knows no variance: its highlights are taken as any are that were never seen.
-        # What is expected above a bound (K15) is no knowledge of its colour: there, P counts.
-        known = np.maximum(image.variance, estimate.variance)
-        variance = np.minimum(known, np.float32(self.settings.filter.initial_variance))
-        return calm_highlights(colour, variance, gains)
 
     def _chroma(self, progress: _Progress, t: int) -> NDArray[np.float32] | None:
         """What RGB frames say of the chromaticity at ``t``: those before and after, by their distance in time."""
@@ -691,6 +538,14 @@ class Reconstructor:
             progress.latest = int(events["t"][-1])
             taken += len(events)
         progress.taken = taken
+
+
+def _whole(t: Any) -> int:
+    """A time as an int. Fractions are refused, not cut off: they may be seconds."""
+    with contextlib.suppress(TypeError, ValueError, OverflowError):
+        if int(t) == t:
+            return int(t)
+    raise InputError(f"read: the time is {t!r}; whole microseconds are needed")
 
 
 def _between(progress: _Progress, t: int) -> float:

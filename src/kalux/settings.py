@@ -273,6 +273,9 @@ class Settings:
         _check(self)
 
 
+_GROUPS: Final = tuple(entry.name for entry in dataclasses.fields(Settings))
+
+
 def preset(name: str) -> Settings:
     """The settings of a preset.
 
@@ -307,8 +310,8 @@ def from_dict(values: Mapping[str, Any], base: Settings) -> Settings:
     """
     groups = {}
     for group, entries in values.items():
-        if group not in ("camera", "events", "filter"):
-            raise SettingsError(f"settings: {_unknown_group(group, base)}; known are camera, events, filter")
+        if group not in _GROUPS:
+            raise SettingsError(f"settings: {_unknown_group(group, base)}; known are {', '.join(_GROUPS)}")
         current = getattr(base, group)
         known = {entry.name for entry in dataclasses.fields(current)}
         if not isinstance(entries, Mapping):
@@ -329,12 +332,12 @@ def from_dict(values: Mapping[str, Any], base: Settings) -> Settings:
 
 def _unknown_group(name: str, base: Settings) -> str:
     """What is wrong with a table of this name, which may be a setting or a table without its group."""
-    for group in ("camera", "events", "filter"):
+    for group in _GROUPS:
         if name in {entry.name for entry in dataclasses.fields(getattr(base, group))}:
             return f"{name} is a setting of [{group}] and has to follow that line"
     if name == "preset":
         return "a preset is given by --preset (preset=), not in the file"
-    return f"unknown group [{name}]{did_you_mean(name, ('camera', 'events', 'filter'))}"
+    return f"unknown group [{name}]{did_you_mean(name, _GROUPS)}"
 
 
 def read_toml(
@@ -403,7 +406,7 @@ _CHOICES: Final = {
 
 
 def _check(settings: Settings) -> None:
-    for group in ("camera", "events", "filter"):
+    for group in _GROUPS:
         values = getattr(settings, group)
         for entry in dataclasses.fields(values):
             _check_value(f"{group}.{entry.name}", entry.name, getattr(values, entry.name), entry.default)

@@ -34,7 +34,8 @@ from kalux.events import EVENT_DTYPE, EventArray
 from kalux.filters.highlights import obey_bounds, smoothed_unshown
 from kalux.filters.uncertainty import Around
 from kalux.frames import Frame, Mosaic
-from kalux.reconstructor import Estimate, Reconstructor
+from kalux.images import Estimate
+from kalux.reconstructor import Reconstructor
 from kalux.recording import Recording
 from kalux.settings import Settings
 

@@ -135,6 +135,11 @@ def test_thresholds_of_pixels_are_the_priors():
     assert np.abs(np.delete(moved.ravel(), 4)).max() < 1e-6
 
 
+def test_a_spread_that_is_left_open_is_the_usual():
+    known = Calibration({"events": {"threshold_spread": "auto"}}, maps={"hot": np.zeros((4, 3), bool)})
+    assert (known.pixels.on_variance == PRESETS["default"].events.usual_threshold_spread ** 2).all()
+
+
 def test_calibrated_thresholds_count_as_measured_not_as_given():
     rows = pixel_events([10_000], [1])
     known = Calibration({"events": {"threshold_on": 0.3, "threshold_off": 0.25}})

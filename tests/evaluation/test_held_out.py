@@ -9,7 +9,7 @@ import kalux
 from kalux import Recording
 from kalux.datasets import SensorSettings
 from kalux.errors import FrameError, InputError
-from kalux.evaluation.baselines import Estimated, Method, methods
+from kalux.evaluation.baselines import methods
 from kalux.evaluation.consistency import blur_consistency, valid_pixels
 from kalux.evaluation.held_out import (
     clipped_as,
@@ -18,6 +18,7 @@ from kalux.evaluation.held_out import (
     intensity_percentile,
     percentile_of_counts,
 )
+from kalux.evaluation.method import Estimated, Method
 
 from builders import frame, moving_blocks, pixel_events
 
@@ -34,6 +35,23 @@ def still(levels, exposures=None, size=(12, 12)):
 
 def constant(value):
     return Method("constant", lambda recording, times: (np.full(recording.sensor_size, value) for _ in times))
+
+
+@pytest.mark.parametrize(
+    ("images", "told"),
+    [
+        (lambda rec, ts: [np.zeros(rec.sensor_size)], r"odd: 1 images for \d+ times"),
+        (lambda rec, ts: [np.zeros(rec.sensor_size)] * (len(ts) + 1), r"odd: more images than the \d+ times"),
+        (
+            lambda rec, ts: kalux.reconstruct(rec, times=ts),
+            "odd: image 0 is of type Image; a NumPy array is needed",
+        ),
+    ],
+)
+def test_a_method_yields_one_array_per_time(images, told):
+    held = hold_out_frames(still(range(100, 112)))
+    with pytest.raises(InputError, match=told):
+        evaluate_held_out(held, Method("odd", images))
 
 
 def test_every_nth_frame_is_dropped_and_compared_if_three_from_either_end():

@@ -97,16 +97,25 @@ def _guarded(arguments: list[str]) -> int:
     except KeyboardInterrupt as interrupt:
         error_line("interrupted", *(_notes(interrupt) or ["nothing was written"]))
         return INTERRUPTED
+    except OSError as error:
+        if error.filename is None:
+            return _bug(error)
+        error_line(f"error: {error.filename}: {error.strerror or error}", *_notes(error))
+        return BAD_INPUT
     except Exception as error:
         if _is_interrupt(error):
             error_line("interrupted", *(_notes(error) or ["what is finished is whole"]))
             return INTERRUPTED
-        traceback.print_exc()
-        error_line(
-            f"error: {type(error).__name__} inside kalux; this is an error in kalux, please report it with the "
-            "lines above and the command"
-        )
-        return BUG
+        return _bug(error)
+
+
+def _bug(error: Exception) -> int:
+    traceback.print_exception(error)
+    error_line(
+        f"error: {type(error).__name__} inside kalux; this is an error in kalux, please report it with the "
+        "lines above and the command"
+    )
+    return BUG
 
 
 def _is_interrupt(error: Exception) -> bool:

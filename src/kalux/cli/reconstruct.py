@@ -25,11 +25,11 @@ from kalux.cli.terminal import say, warn
 from kalux.cli.times import load_times
 from kalux.display import CURVES
 from kalux.errors import InputError
-from kalux.info import ORIGINS, settled
 from kalux.pipeline import Plan, execute, plan
 from kalux.reconstructor import Reconstructor
 from kalux.recording import Recording
 from kalux.settings import PRESETS, Settings, from_dict, load, preset, read_toml, to_dict
+from kalux.settled import ORIGINS, settled
 
 if TYPE_CHECKING:
     from kalux.calibration.contrast import ThresholdEstimate
@@ -350,6 +350,8 @@ def metadata(
             "frames": options.frames,
             "frames_start": options.frames_start,
             "frames_rate": options.frames_rate,
+            "replace_frames": options.replace_frames or None,
+            "white": options.white,
             "bayer": options.bayer,
         },
         "images_wanted": {

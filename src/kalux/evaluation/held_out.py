@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 
 from kalux.calibration.frame_noise import estimate_frame_noise
 from kalux.errors import FrameError, InputError
-from kalux.evaluation.baselines import Method
 from kalux.evaluation.exposures import exposure_times, linear_frame, means_of, reference_exposure
 from kalux.evaluation.lpips import LpipsWeights
-from kalux.evaluation.pairs import Array
-from kalux.evaluation.scores import Pair, Scores, score
+from kalux.evaluation.method import Method
+from kalux.evaluation.pairs import Array, Pair
+from kalux.evaluation.scores import Scores, score
 from kalux.filters.shots import take_shot
 from kalux.frames import Frame
 from kalux.models.camera import Camera, frame_log_covariance

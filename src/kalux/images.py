@@ -1,0 +1,212 @@
+"""Images: what the filter says at one moment, and the picture of intensities that is made of it.
+
+`Estimate` is the filter's raw state, `Image` what users are given. Between them lie the prior on highlights (K6, K15),
+the neighbours (K12), the variance that is given out (K11), and the colours of a Bayer sensor or of frames in RGB.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux.augmentation.highlights import Unshown
+from kalux.augmentation.unseen import UNKNOWN_CHANGE
+from kalux.filters.highlights import lifted, read_unshown, tempered
+from kalux.filters.readout import HighlightPrior, read_out
+from kalux.filters.uncertainty import Around, alone, given_variance, hidden_variance
+from kalux.frames import Mosaic
+from kalux.models.colour import Gains, calm_highlights, demosaic, luminance
+
+_UNTOLD: Final = np.full(1, np.inf, np.float32)
+"""The variance of all pixels where it is not wanted."""
+_UNTOLD.flags.writeable = False
+
+
+@dataclass(frozen=True, eq=False)
+class Image:
+    """One reconstructed image.
+
+    Attributes
+    ----------
+    t
+        Its time, int us.
+    intensity
+        float32 (H, W), linear: 1.0 = a saturated frame pixel at the reference exposure; more in highlights.
+    variance
+        float32 (H, W), P: the variance of log(intensity + log_offset) (20); infinite for the complementary filter,
+        which knows none.
+    log_offset
+        I_0 of equation (8).
+    final
+        Whether more data can no longer change it. With lookahead an image is final one frame later.
+    colour
+        float32 (H, W, 3), linear red, green, blue with the scale of ``intensity``, which of a Bayer sensor holds each
+        pixel's own channel before white balance, and of frames in RGB the luminance. None: the frames are grey.
+    """
+
+    t: int
+    intensity: NDArray[np.float32]
+    variance: NDArray[np.float32]
+    log_offset: float
+    final: bool
+    colour: NDArray[np.float32] | None = None
+
+    def grey(self) -> Image:
+        """The same image without colours: its intensity is the luminance of ``colour``."""
+        if self.colour is None:
+            return self
+        return dataclasses.replace(self, intensity=luminance(self.colour), colour=None)
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """The filter's raw estimate at one moment, before what is known of highlights is applied.
+
+    Attributes
+    ----------
+    t
+        Its time, int us.
+    log_intensity, variance
+        (H, W): L = log(I + I_0), and P. float32; float64 with augmentation "paper".
+    white
+        log(1 + I_0) of the brightest level that frames show there.
+    final
+        As of `Image`.
+    moving
+        (H, W) bool: pixels with an event in this frame interval, also one to come, or the one before, and those that
+        neither frame measures; None: not told.
+    between
+        0 at a frame, 1 half-way between two, and where the next one is not known or not used.
+    chroma
+        Of frames in RGB: float32 (H, W, 3), the ratios of the channels to the luminance; else None.
+    unshown
+        Pixels that no frame has measured until then, of which L is a bound; None: there are none.
+    silent_change
+        (H, W): mean square change of silent pixels around each, from one frame to the next; None: not told.
+    around
+        What the frames around say of the pixels (K11); None: not told, or there is only one.
+    exposed
+        The share of the time for which frames are exposed, where the next one is known.
+    since
+        Where it is not known or not used: time to the only frame, in intervals between frames; else None.
+    told
+        (H, W): variance of what frames and events have told, where that is not P; None: P. Both ways in time P counts
+        the errors as well that both directions share, which are what no event has told; these K11 adds itself.
+    """
+
+    t: int
+    log_intensity: NDArray[np.floating[Any]]
+    variance: NDArray[np.floating[Any]]
+    white: float
+    final: bool
+    moving: NDArray[np.bool_] | None = None
+    between: float = 0.0
+    chroma: NDArray[np.float32] | None = None
+    unshown: Unshown | None = None
+    silent_change: NDArray[np.floating[Any]] | None = None
+    around: Around | None = None
+    exposed: float = 0.0
+    since: float | None = None
+    told: NDArray[np.floating[Any]] | None = None
+
+
+@dataclass(frozen=True)
+class View:
+    """What images of an engine's estimates need to know of its camera and settings.
+
+    Attributes
+    ----------
+    log_offset
+        I_0 of equation (8).
+    threshold2
+        c^2, of the thresholds on and off: their product.
+    neighbours
+        The share of what neighbours know (K12).
+    highlight_scale, highlight_spread
+        Of the prior on what lies beyond white (K6): its standard deviation in log intensity, 0 for none, and how far
+        off thresholds are where no frame checks them.
+    unknown_variance
+        P of a pixel of which nothing is known.
+    mosaic, gains
+        Pattern of a Bayer sensor, None of others, and its white balance.
+    """
+
+    log_offset: float
+    threshold2: float
+    neighbours: float
+    highlight_scale: float
+    highlight_spread: float
+    unknown_variance: float
+    mosaic: Mosaic | None
+    gains: Gains
+
+    def prior(self, white: float) -> HighlightPrior:
+        """The prior on highlights (K6) beyond ``white``, a log intensity."""
+        scale = self.highlight_scale
+        stretch = self.highlight_spread**2 / scale if scale > 0 else 0.0
+        return HighlightPrior(white=white, scale2=scale**2, stretch=stretch)
+
+
+def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) -> Image:
+    """The image of an estimate: highlights as far as they are believed (K6), with what neighbours know (K12).
+
+    Where its variance is not wanted it is infinite: to tell it (K11) takes a seventh of the time.
+    """
+    prior = view.prior(estimate.white)
+    log_intensity, variance, told, unshown = _above_bounds(estimate, prior)
+    moving, change = estimate.moving, estimate.silent_change
+    if change is None and moving is not None:  # K11 needs it only there
+        change = np.full(log_intensity.shape, UNKNOWN_CHANGE * view.threshold2, np.float32)
+    hidden = hidden_variance(estimate.between, view.threshold2, estimate.exposed, estimate.since)
+    tells = with_variance or view.mosaic is not None  # the colours of a mosaic's highlights depend on it
+    intensity, total, heard = read_out(
+        log_intensity,
+        variance,
+        view.log_offset,
+        prior,
+        moving,
+        alone(hidden),
+        change,
+        view.neighbours,
+        1 if view.mosaic is None else 2,  # to neighbours of the same colour
+        None if unshown is None else unshown.pixels,
+        with_variance=tells and moving is None,
+    )
+    if unshown is not None:
+        read_unshown(intensity, heard, estimate.log_intensity, unshown, view.log_offset, prior)
+    if not tells:
+        total = np.ndarray(intensity.shape, np.float32, _UNTOLD, strides=(0, 0))
+    elif moving is not None and change is not None:
+        total = given_variance(told, moving, change, hidden, estimate.around)
+    image = Image(estimate.t, intensity, total, view.log_offset, estimate.final)
+    return dataclasses.replace(image, colour=_coloured(image, estimate, view))
+
+
+def _above_bounds(
+    estimate: Estimate, prior: HighlightPrior
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], Unshown | None]:
+    """L, P and what of it was told, with pixels that no frame has shown where they are expected (K15); and these."""
+    if estimate.unshown is None:
+        variance = estimate.variance
+        return estimate.log_intensity, variance, variance if estimate.told is None else estimate.told, None
+    unshown = tempered(estimate.unshown, estimate.log_intensity, prior)
+    level, variance = lifted(estimate.log_intensity, estimate.variance, unshown)
+    told = variance if estimate.told is None else lifted(estimate.log_intensity, estimate.told, unshown)[1]
+    return level, variance, told, unshown
+
+
+def _coloured(image: Image, estimate: Estimate, view: View) -> NDArray[np.float32] | None:
+    """The image's colours: the mosaic's, or those that the frames lend to the luminance; None where frames are grey."""
+    if estimate.chroma is not None:
+        return estimate.chroma * image.intensity[..., None]
+    if view.mosaic is None:
+        return None
+    colour = demosaic(image.intensity, view.mosaic, view.log_offset, view.gains)
+    # The complementary filter knows no variance: its highlights are taken as any are that were never seen.
+    # What is expected above a bound (K15) is no knowledge of its colour: there, P counts.
+    known = np.maximum(image.variance, estimate.variance)
+    return calm_highlights(colour, np.minimum(known, np.float32(view.unknown_variance)), view.gains)

@@ -1,0 +1,80 @@
+"""From an estimate to an image: what is believed of highlights, what stands in for a variance, and colours."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from kalux.augmentation.highlights import Unshown
+from kalux.images import Estimate, View, make_image
+
+GREY = View(
+    log_offset=0.05,
+    threshold2=0.04,
+    neighbours=0.0,
+    highlight_scale=1.0,
+    highlight_spread=0.1,
+    unknown_variance=9.0,
+    mosaic=None,
+    gains=(1.0, 1.0, 1.0),
+)
+WHITE = float(np.log(1.05))
+
+
+def estimate(levels, variance=1e-4, **fields):
+    """An estimate of linear ``levels``, all known alike."""
+    level = np.log(np.asarray(levels, np.float32) + np.float32(0.05))
+    return Estimate(7, level, np.full(level.shape, variance, np.float32), WHITE, True, **fields)
+
+
+def test_what_is_known_well_is_shown_as_it_is():
+    levels = [[0.0, 0.25, 1.0]]
+    image = make_image(estimate(levels), GREY)
+    np.testing.assert_allclose(image.intensity, levels, rtol=1e-3, atol=1e-6)
+    np.testing.assert_allclose(image.variance, 1e-4, rtol=1e-3)
+    assert (image.t, image.final, image.log_offset, image.colour) == (7, True, 0.05, None)
+
+
+def test_a_doubtful_highlight_is_drawn_towards_white_and_no_other_pixel():
+    image = make_image(estimate([[0.5, 3.0]], variance=1.0), GREY)
+    assert image.intensity[0, 0] == pytest.approx(0.5, rel=1e-4)
+    assert 1.0 < image.intensity[0, 1] < 2.5
+    free = make_image(estimate([[0.5, 3.0]], variance=1.0), dataclasses.replace(GREY, highlight_scale=0.0))
+    np.testing.assert_allclose(free.intensity, [[0.5, 3.0]], rtol=1e-4)
+
+
+def test_an_intensity_is_never_negative():
+    assert make_image(estimate([[-0.04]]), GREY).intensity[0, 0] == 0.0
+
+
+def test_a_variance_that_is_not_wanted_changes_no_intensity():
+    moving = np.array([[True, False, True]])
+    told = estimate([[0.1, 0.5, 2.0]], 0.1, moving=moving, between=0.5)
+    with_it, without = make_image(told, GREY), make_image(told, GREY, with_variance=False)
+    np.testing.assert_array_equal(with_it.intensity, without.intensity)
+    assert np.isfinite(with_it.variance).all()
+    assert np.isinf(without.variance).all()
+
+
+def test_a_pixel_that_no_frame_has_shown_is_above_its_bound_and_doubtful():
+    unshown = Unshown(np.array([1]), np.array([0.7], np.float32), np.array([0.01], np.float32))
+    plain, lifted = (make_image(estimate([[0.5, 1.0]], unshown=u), GREY) for u in (None, unshown))
+    assert lifted.intensity[0, 0] == plain.intensity[0, 0]
+    assert lifted.intensity[0, 1] > 1.2
+    assert lifted.variance[0, 1] > 100 * plain.variance[0, 1]
+
+
+def test_frames_in_rgb_lend_their_ratios_to_the_intensity():
+    chroma = np.array([[[2.0, 1.0, 0.5]]], np.float32)
+    image = make_image(estimate([[0.3]], chroma=chroma), GREY)
+    np.testing.assert_array_equal(image.colour, chroma * image.intensity[..., None])
+
+
+def test_a_mosaic_has_colours_also_where_no_variance_is_wanted():
+    view = dataclasses.replace(GREY, mosaic="RGGB", gains=(2.0, 1.0, 1.5))
+    both = [
+        make_image(estimate(np.full((4, 4), 0.2)), view, with_variance=wanted) for wanted in (True, False)
+    ]
+    np.testing.assert_array_equal(both[0].colour, both[1].colour)
+    np.testing.assert_allclose(both[0].colour[2, 2], [0.4, 0.2, 0.3], rtol=1e-3)
+    assert both[0].grey().colour is None
