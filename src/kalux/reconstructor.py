@@ -283,8 +283,10 @@ class Reconstructor:
             # A frame that is still to come ends after the last one, and changes images from there on.
             until = self._complete_until
             return None if until is None else min(until, self._shots[-1].end)
-        complete = [shot for shot in self._shots if self._is_complete(shot)]
-        return self._method.node(complete[-1]) if complete else self._start_time()
+        for shot in reversed(self._shots):
+            if self._is_complete(shot):
+                return self._method.node(shot)
+        return self._start_time()
 
     def read(self, t: int) -> Image:
         """The image at time ``t`` (us). Never changes the result of any other read. See `estimate`."""
@@ -535,7 +537,7 @@ class Reconstructor:
         taken = max(progress.taken, self._events.first)
         for events in self._events.after(taken, t):
             self._method.advance(progress.segment, progress.cursor, events)
-            progress.latest = int(events["t"][-1])
+            progress.latest = int(event_words(events)[-1, 0])
             taken += len(events)
         progress.taken = taken
 
