@@ -136,14 +136,15 @@ def plan(
     if known.pixels is not None:
         require_size(known.pixels, recording.sensor_size)
     response = chosen_response(chosen.camera.response, recording.response)
-    exposures = _exposures(recording)
+    camera = Camera.named(response, chosen.camera.saturation)
+    exposures, tail = _survey(recording, camera)
     wanted = _times(recording, exposures, rate_hz, times, at, chosen, lookahead)
     reference = chosen.camera.reference_exposure or round(float(np.median(exposures[:, 1] - exposures[:, 0])))
     chosen = dataclasses.replace(
         chosen, camera=dataclasses.replace(chosen.camera, reference_exposure=reference, response=response)
     )
     chosen = _with_white_balance(recording, chosen)
-    chosen, noise = _with_frame_noise(recording, chosen)
+    chosen, noise = _with_frame_noise(recording, chosen, int((exposures[:, 1] - exposures[:, 0]).max()))
     chosen, delay = _with_delay(recording, chosen)
     filled, origin, estimate = _with_thresholds(recording, chosen)
     filled, model = _with_event_model(recording, filled)
@@ -159,8 +160,11 @@ def plan(
     filled, background = _with_background(recording, filled, known.pixels)
     if origin == "settings" and _are_calibrated(filled, known):
         origin = "calibration"
-    if origin in _DOUBTED or (_uses_steps(filled) and filled.filter.unshown_tail > 0):
-        filled = _with_bright_tail(recording, filled)
+    doubted = origin in _DOUBTED or (_uses_steps(filled) and filled.filter.unshown_tail > 0)
+    if doubted and filled.filter.bright_tail is None:
+        filled = dataclasses.replace(
+            filled, filter=dataclasses.replace(filled.filter, bright_tail=tail.scale)
+        )
     return Plan(
         filled,
         origin,
@@ -381,23 +385,15 @@ def _push_next(
     return True
 
 
-def _exposures(recording: Recording) -> NDArray[np.int64]:
-    """(K, 2) exposure starts and ends, us."""
-    exposures = [(frame.exposure_start, frame.exposure_end) for frame in recording.frames()]
+def _survey(recording: Recording, camera: Camera) -> tuple[NDArray[np.int64], BrightTail]:
+    """(K, 2) exposure starts and ends, us, and how the brightness of pixels falls off towards white; of all frames."""
+    exposures, tail = [], BrightTail()
+    for frame in recording.frames():
+        exposures.append((frame.exposure_start, frame.exposure_end))
+        tail = tail.joined(count_bright(camera, frame.image, frame.white_value))
     if not exposures:
         raise no_frames(recording)
-    return np.array(exposures, np.int64)
-
-
-def _with_bright_tail(recording: Recording, settings: Settings) -> Settings:
-    """Fill in how fast the brightness of the frames' pixels falls off towards white."""
-    if settings.filter.bright_tail is not None:
-        return settings
-    camera = Camera.named(settings.camera.response, settings.camera.saturation)
-    tail = BrightTail()
-    for frame in recording.frames():
-        tail = tail.joined(count_bright(camera, frame.image, frame.white_value))
-    return dataclasses.replace(settings, filter=dataclasses.replace(settings.filter, bright_tail=tail.scale))
+    return np.array(exposures, np.int64), tail
 
 
 def _with_white_balance(recording: Recording, settings: Settings) -> Settings:
@@ -425,12 +421,17 @@ def _with_delay(recording: Recording, settings: Settings) -> tuple[Settings, Del
     return dataclasses.replace(settings, events=dataclasses.replace(settings.events, delay=delay)), estimate
 
 
-def _with_frame_noise(recording: Recording, settings: Settings) -> tuple[Settings, FrameNoise | None]:
-    """Fill in the frames' noise, where the filter uses it: from the settings, else an estimate, else the usual."""
+def _with_frame_noise(
+    recording: Recording, settings: Settings, longest: int
+) -> tuple[Settings, FrameNoise | None]:
+    """Fill in the frames' noise, where the filter uses it: from the settings, else an estimate, else the usual.
+
+    ``longest`` is the longest exposure, us.
+    """
     camera = settings.camera
     if camera.frame_noise is not None or not _uses_steps(settings):
         return settings, None
-    found = estimate_frame_noise(recording, camera)
+    found = estimate_frame_noise(recording, camera, longest=longest)
     if found is not None and not found.believed:
         found = None
     read, shot = camera.noise if found is None else (found.read, found.shot)

@@ -39,6 +39,21 @@ def test_garbage_is_collected_again_after_imports(monkeypatch):
     assert gc.isenabled()
 
 
+def test_loops_are_made_ready_without_what_they_do_not_need():
+    code = """if True:
+        import sys
+        from kalux.cli.app import _imported, _ready_loops
+        _imported("kalux.cli.reconstruct")
+        _ready_loops()
+        assert "numba.np.arraymath" in sys.modules  # what numba imports for the first loop
+        assert "scipy.linalg" not in sys.modules
+        import scipy.linalg.cython_blas
+        _ready_loops()
+        assert sys.modules["scipy.linalg.cython_blas"] is not None
+    """
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
 def test_help_names_every_command(cli):
     found = cli("--help").out
     for command in ("info", "reconstruct", "convert", "evaluate", "demo"):

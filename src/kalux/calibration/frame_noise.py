@@ -75,7 +75,11 @@ class FrameNoise(NamedTuple):
 
 
 def estimate_frame_noise(
-    recording: Recording, camera: CameraSettings, *, most_frames: int | None = None
+    recording: Recording,
+    camera: CameraSettings,
+    *,
+    most_frames: int | None = None,
+    longest: int | None = None,
 ) -> FrameNoise | None:
     """Photon transfer curve of pixels without events nearby from one exposure's start to the next one's end.
 
@@ -91,6 +95,8 @@ def estimate_frame_noise(
         Response and saturation.
     most_frames
         Only so many frames from the start are looked at. Default: as many as it takes, at most 80.
+    longest
+        The longest exposure, us. Default: all frames are read for it.
 
     Raises
     ------
@@ -98,7 +104,9 @@ def estimate_frame_noise(
         If the frames' exposures are not known.
     """
     # Where noise leaves no pixel without events in 5x5 around it, 3x3 must do; it lets more faint motion in.
-    points = _points(recording, camera, most_frames or _enough_frames(recording.sensor_size))
+    if longest is None:
+        longest = max((frame.exposure for frame in recording.frames()), default=0)
+    points = _points(recording, camera, most_frames or _enough_frames(recording.sensor_size), longest)
     chosen = next((found for found in points if _is_curve(found)), None)
     if chosen is None:
         return None
@@ -132,14 +140,15 @@ def _is_curve(points: _Points) -> bool:
     return sum(map(bool, points)) >= 2
 
 
-def _points(recording: Recording, camera: CameraSettings, most_frames: int) -> tuple[_Points, _Points]:
+def _points(
+    recording: Recording, camera: CameraSettings, most_frames: int, margin: int
+) -> tuple[_Points, _Points]:
     """By bins of the level: level, variance and number of pixels of every frame pair; for 5x5 and 3x3 pixels.
 
     Those of 3x3 end where 5x5 are enough.
     """
     found: tuple[_Points, _Points] = ([[] for _ in range(_BINS)], [[] for _ in range(_BINS)])
-    longest = max((frame.exposure for frame in recording.frames()), default=0)
-    for interval in intervals(recording, camera, margin=longest, most_frames=most_frames):
+    for interval in intervals(recording, camera, margin=margin, most_frames=most_frames):
         if not 0.9 < interval.first.white / interval.second.white < 1.1:
             continue
         level, difference, usable = _beyond_neighbours(interval)

@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux import memory
 from kalux.augmentation.deblur import all_between
 from kalux.compiled import event_words
 from kalux.events import EVENT_DTYPE, EventArray
@@ -123,7 +124,9 @@ def _joined(chunks: list[EventArray]) -> EventArray:
     if len(chunks) == 1:
         return chunks[0]
     words = [np.empty((0, 2), np.int64), *map(event_words, chunks)]
-    return np.concatenate(words).reshape(-1).view(EVENT_DTYPE)
+    joined: EventArray = memory.empty((sum(map(len, words)),), EVENT_DTYPE)
+    np.concatenate(words, out=event_words(joined))
+    return joined
 
 
 def spread(chosen: NDArray[np.bool_], most: int) -> NDArray[np.int64]:

@@ -15,11 +15,13 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux import memory
 from kalux.compiled import event_words
 from kalux.errors import FormatError, FrameError, OutputError
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.frames import MOSAICS, Frame, Mosaic
 from kalux.readers.hdf5_layout import DAMAGE, SIGNATURE
+from kalux.readers.packed_columns import PackedColumns
 from kalux.readers.source import CHUNK_EVENTS, GroundTruth, Source, begins_with, one_line, reading
 
 T = TypeVar("T")
@@ -136,15 +138,19 @@ def _events(path: Path) -> Iterator[EventArray]:
         step = max(CHUNK_EVENTS // stored, 1) * stored
         buffers = [np.empty(min(stored, len(column)), column.dtype) for column in columns]
         spaces = [column.id.get_space() for column in columns]
+        kinds = [column.id.get_type() for column in columns]
+        packed = PackedColumns.of(columns)
         for start in range(0, len(columns[0]), step):
-            events: EventArray = np.empty(min(step, len(columns[0]) - start), EVENT_DTYPE)
+            events: EventArray = memory.empty((min(step, len(columns[0]) - start),), EVENT_DTYPE)
             # One by one: other threads that read HDF5 wait meanwhile.
             for first in range(0, len(events), stored):
                 part = events[first : first + stored]
-                memory = h5py.h5s.create_simple((len(part),))
-                for column, space, buffer in zip(columns, spaces, buffers, strict=True):
+                if packed is not None and packed.unpack(start + first, event_words(part)):
+                    continue
+                here = h5py.h5s.create_simple((len(part),))
+                for column, space, kind, buffer in zip(columns, spaces, kinds, buffers, strict=True):
                     space.select_hyperslab((start + first,), (len(part),))
-                    column.id.read(memory, space, buffer)
+                    column.id.read(here, space, buffer, kind)
                 t, x, y, p = (
                     buffer.astype(EVENT_DTYPE[name], copy=False)
                     for name, buffer in zip(_COLUMNS, buffers, strict=True)
