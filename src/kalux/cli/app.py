@@ -9,7 +9,6 @@ import sys
 import traceback
 from collections.abc import Iterator, Sequence
 from types import ModuleType
-from typing import Final
 
 from kalux.cli.parser import Parser, UsageError, normalised
 from kalux.cli.signals import termination_as_interrupt
@@ -52,8 +51,6 @@ commands:
   datasets       published sets: licence, page, layout; checks a folder
 
 kalux COMMAND --help says more."""
-
-_UNUSED: Final = "scipy.linalg.cython_blas"
 
 _EXAMPLES = """\
 examples:
@@ -175,16 +172,7 @@ def _uncollected() -> Iterator[None]:
 
 
 def _ready_loops() -> None:
-    """Make numba ready for compiled loops, where a command has imported it, in half the time that the first would take.
-
-    For products of matrices, which kalux's loops do not have, numba imports scipy.linalg, if it can: 0.15 s.
-    """
-    if "numba" not in sys.modules or _UNUSED in sys.modules:
-        return
-    compiled = importlib.import_module("kalux.compiled")
-    sys.modules[_UNUSED] = None  # type: ignore[assignment]  # what makes an import fail
-    try:
+    """Make numba ready for compiled loops, where a command has imported it, without looking for garbage meanwhile."""
+    if "numba" in sys.modules:
         with _uncollected():
-            compiled.ready()
-    finally:
-        del sys.modules[_UNUSED]
+            importlib.import_module("kalux.compiled").ready()

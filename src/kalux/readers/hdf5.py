@@ -21,7 +21,6 @@ from kalux.errors import FormatError, FrameError, OutputError
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.frames import MOSAICS, Frame, Mosaic
 from kalux.readers.hdf5_layout import DAMAGE, SIGNATURE
-from kalux.readers.packed_columns import PackedColumns
 from kalux.readers.source import CHUNK_EVENTS, GroundTruth, Source, begins_with, one_line, reading
 
 T = TypeVar("T")
@@ -139,14 +138,11 @@ def _events(path: Path) -> Iterator[EventArray]:
         buffers = [np.empty(min(stored, len(column)), column.dtype) for column in columns]
         spaces = [column.id.get_space() for column in columns]
         kinds = [column.id.get_type() for column in columns]
-        packed = PackedColumns.of(columns)
         for start in range(0, len(columns[0]), step):
             events: EventArray = memory.empty((min(step, len(columns[0]) - start),), EVENT_DTYPE)
             # One by one: other threads that read HDF5 wait meanwhile.
             for first in range(0, len(events), stored):
                 part = events[first : first + stored]
-                if packed is not None and packed.unpack(start + first, event_words(part)):
-                    continue
                 here = h5py.h5s.create_simple((len(part),))
                 for column, space, kind, buffer in zip(columns, spaces, kinds, buffers, strict=True):
                     space.select_hyperslab((start + first,), (len(part),))
