@@ -144,6 +144,7 @@ def small_file(path):
     [
         (lambda path: path.touch(), "an empty file, not a recording"),
         (lambda path: path.mkdir(), "an empty folder, not a recording"),
+        (os.mkfifo, "a pipe or a device, of which nothing can be read twice"),
         (lambda path: (path.mkdir(), (path / "0.png").touch()), "a folder of images, which --frames takes"),
         (lambda path: (path.mkdir(), small_file(path / "a.h5")), r"a folder of recordings \(a\.h5\)"),
         (

@@ -17,6 +17,9 @@ True where the pixel became brighter. 16 bytes, aligned."""
 EventArray = NDArray[np.void]
 """A 1-D array of `EVENT_DTYPE`, sorted by ``t``."""
 
+NEVER: Final = -(1 << 60)
+"""us: the time of an event that has not been. Times of recordings may be negative, but are never that early."""
+
 FIELD_NAMES: Final = {
     "t": ("t", "ts", "timestamp", "timestamps", "time", "times"),
     "x": ("x", "xs"),

@@ -9,8 +9,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, Literal
 
-import numpy as np
-
 from kalux.errors import InputError, KaluxError, SettingsError, did_you_mean
 
 FilterName = Literal["akf", "cf"]
@@ -397,6 +395,7 @@ _POSITIVE: Final = {
     "cutoff",
 }
 _WHOLE: Final = {"delay", "usual_delay", "reference_exposure", "refractory_period"}
+_LARGEST: Final = 10**18  # fits int64, and is more than any value can mean
 _SIGNED: Final = {"delay", "usual_delay"}
 _CHOICES: Final = {
     "kind": ("akf", "cf"),
@@ -428,8 +427,8 @@ def _check_value(label: str, name: str, value: Any, default: Any) -> None:
             raise SettingsError(f"settings: {label} needs a number")
     elif name in _WHOLE and not (isinstance(value, int) and not isinstance(value, bool)):
         raise SettingsError(f"settings: {label} is {value!r}; whole microseconds are needed")
-    elif isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
-        raise SettingsError(f"settings: {label} is {value!r}; a finite number is needed")
+    elif isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= _LARGEST:
+        raise SettingsError(f"settings: {label} is {value!r}; a finite number is needed, at most 1e18")
     elif (value < 0 and name not in _SIGNED) or (name in _POSITIVE and value == 0):
         raise SettingsError(
             f"settings: {label} is {value}; it must be {'positive' if name in _POSITIVE else '0 or more'}"

@@ -68,10 +68,15 @@ def test_the_file_says_units_and_is_a_settings_file_too(tmp_path):
             SettingsError,
             "nonsense",
         ),
-        (
-            lambda p: p.write_text('kalux_calibration = 1\n[maps]\nfile = "../c.npz"\nsha256 = ""'),
-            FormatError,
-            "beside it",
+        *(
+            (
+                lambda p, name=name: p.write_text(
+                    f'kalux_calibration = 1\n[maps]\nfile = "{name}"\nsha256 = ""'
+                ),
+                FormatError,
+                "beside it",
+            )
+            for name in ("../c.npz", "..", "", r"\u0000")
         ),
     ],
 )

@@ -95,6 +95,13 @@ def test_usage_errors_are_one_line(cli, arguments, told):
     assert "--help" in found.error
 
 
+def test_an_empty_argument_is_not_the_current_folder(cli):
+    """What a shell makes of a variable that is not set."""
+    found = cli("reconstruct", "x", "-o", "")
+    assert found.code == 2
+    assert "an argument is empty" in found.error
+
+
 def test_an_error_of_ours_shows_the_traceback_and_asks_for_a_report(cli, recording, monkeypatch):
     def broken(options):
         raise ZeroDivisionError("ours")

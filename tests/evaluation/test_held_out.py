@@ -14,6 +14,7 @@ from kalux.evaluation.consistency import blur_consistency, valid_pixels
 from kalux.evaluation.held_out import (
     clipped_as,
     evaluate_held_out,
+    held_out_pairs,
     hold_out_frames,
     intensity_percentile,
     percentile_of_counts,
@@ -106,6 +107,17 @@ def test_pixels_that_are_not_valid_do_not_count():
     assert scores.mse == pytest.approx(0, abs=1e-12)
     assert scores.images[0].pixels == mask.sum()
     np.testing.assert_array_equal(valid_pixels(frames[0]), mask)
+
+
+def test_held_out_frames_in_colour_are_clipped_where_one_colour_is():
+    image = np.full((12, 12, 3), 100, np.uint8)
+    image[:, :3, 2] = 255
+    frames = [kalux.Frame(image, 100 * i, 100 * i + 10) for i in range(9)]
+    recording = Recording.from_arrays(
+        pixel_events([], []), frames, sensor_size=(12, 12), contrast_threshold=0.2
+    )
+    pair = next(held_out_pairs(hold_out_frames(recording), constant(0.4)))
+    np.testing.assert_array_equal(pair.clipped, np.arange(12)[None] + np.zeros((12, 1)) < 3)
 
 
 def test_a_held_out_frames_own_noise_is_no_error_of_the_method():

@@ -21,7 +21,7 @@ from kalux.calibration.delay import estimate_delay
 from kalux.calibration.frame_noise import FrameNoise, estimate_frame_noise
 from kalux.calibration.refractory import shortest_interval
 from kalux.calibration.values import Calibration
-from kalux.events import EventArray
+from kalux.events import NEVER, EventArray
 from kalux.recording import Recording
 from kalux.settings import CameraSettings
 
@@ -231,7 +231,8 @@ def _tallied(chunks: Iterator[EventArray], first: int, last: int, ignored: NDArr
     quiet = np.zeros((windows, height, width), np.int64)
     total = np.zeros((height, width), np.int64)
     busy_until = np.full((height, width), first, np.int64)  # silence before the first event is not known
-    pending = np.full((height, width), -1, np.int64)  # an event in quiet time, until its future is quiet, too
+    # An event in quiet time, until its future is quiet, too.
+    pending = np.full((height, width), NEVER, np.int64)
     for chunk in chunks:
         t, x, y = (chunk[name] for name in ("t", "x", "y"))
         _tally(t, x, y, first, length, QUIET, ignored, busy_until, pending, counts, quiet, total)
@@ -253,7 +254,7 @@ def _add_quiet(start, end, first, length, row, column, quiet):  # type: ignore[n
 @nb.njit(cache=True, nogil=True, inline="always")
 def _count_pending(pending, row, column, first, length, counts):  # type: ignore[no-untyped-def]
     """Count a pixel's event that waits, if one does, in the window of its time."""
-    if pending[row, column] >= 0:
+    if pending[row, column] != NEVER:
         window = min(int((pending[row, column] - first) / length), counts.shape[0] - 1)
         counts[window, row, column] += 1
 
@@ -281,7 +282,7 @@ def _tally(t, x, y, first, length, gap, ignored, busy_until, pending, counts, qu
                     _add_quiet(busy_until[r, c], end, first, length, r, c, quiet)
                 if pending[r, c] <= end:
                     _count_pending(pending, r, c, first, length, counts)
-                pending[r, c] = -1
+                pending[r, c] = NEVER
                 busy_until[r, c] = max(busy_until[r, c], now + gap)
 
 

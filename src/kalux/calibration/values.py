@@ -182,7 +182,7 @@ def _load(path: Path) -> Calibration:
 
 def _maps(path: Path, entry: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
     name = entry.get("file")
-    if not isinstance(name, str) or Path(name).name != name:
+    if not isinstance(name, str) or name in ("", "..") or "\0" in name or Path(name).name != name:
         raise FormatError(f"{path}: maps.file is {name!r}; the name of a file beside it is needed")
     beside = path.with_name(name)
     try:

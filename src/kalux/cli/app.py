@@ -38,7 +38,7 @@ HDR video with per-pixel uncertainty from cameras that give events and frames.
 commands:
   info           what is in a recording, and what kalux would use of it
   reconstruct    make images or a video from a recording
-  convert        copy a recording of any format into one kalux HDF5 file
+  convert        copy a recording of any format into one file, kalux HDF5 or AEDAT 4
   register       make one recording of an event camera's events and another camera's frames
   calibrate      measure cameras: thresholds, noise, response, two-camera rigs, clock offsets
   evaluate       compare methods with ground truth, or with frames held out

@@ -245,6 +245,10 @@ def part_of(made: Plan, contents: Contents, options: argparse.Namespace) -> Plan
     first = -np.inf if options.start is None else contents.start + 1e6 * options.start
     last = np.inf if options.end is None else contents.start + 1e6 * options.end
     kept = made.times[(made.times >= first) & (made.times <= last)]
+    if len(made.times) == 0:
+        raise UsageError(
+            "--at frames --causal: no exposure has its middle after the end of the first, where images begin"
+        )
     if len(kept) == 0:
         raise UsageError(
             "no image lies in the part that --start and --end leave of the recording's "

@@ -418,7 +418,7 @@ def _duration(options: argparse.Namespace, default: float) -> int:
     """us."""
     seconds = _or(options.duration, default)
     if not 0 < seconds < 1e6:
-        raise UsageError(f"--duration {seconds:g}: it must be positive, in seconds")
+        raise UsageError(f"--duration {seconds:g}: it must be positive and less than 1e6, in seconds")
     return round(seconds * 1e6)
 
 

@@ -220,13 +220,14 @@ def held_out_pairs(held: HeldOut, method: Method, *, clip: bool = False) -> Iter
         image = clipped_as(means[0], frame, held.reference_exposure) if clip else means[0]
         shot = take_shot(frame, camera, held.reference_exposure)
         variance = means[1] if len(means) == 2 else None
+        clipped = frame.normalised() >= CameraSettings().saturation
         yield Pair(
             frame.middle,
             image,
             shot.intensity,
             frame.valid,
             variance=variance,
-            clipped=frame.normalised() >= CameraSettings().saturation,
+            clipped=clipped if clipped.ndim == 2 else np.asarray(clipped.any(axis=-1)),
             log_offset=offset,
             noise=None
             if variance is None

@@ -127,7 +127,9 @@ def _what_it_is(path: Path) -> str:
             else ""
         )
     if not path.is_file():
-        return ""
+        return (
+            "a pipe or a device, of which nothing can be read twice, so that it has to be copied to a file; "
+        )
     if not path.stat().st_size:
         return "an empty file, "
     with path.open("rb") as file:
