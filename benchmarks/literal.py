@@ -1,8 +1,9 @@
-"""The default filter's event loop and EDI as the equations are printed: what `speed.py` compares kalux with.
+"""The filters' event loops and EDI as the equations are printed: what `speed.py` compares kalux with.
 
 One float64 array per quantity, P rather than its inverse, a branch per polarity, loops over the neighbourhood, an
-exponential per event: docs/equations.md, K1, K4 and K5, and equations (17), (20) and (21), as
-`tests/naive.py` has them, only event by event. The functions can be compiled by numba, and run as plain Python too.
+exponential per event: docs/equations.md, K1, K4 and K5, and equations (17), (20) and (21) for the default filter, (2),
+(7), (9), (10), (11), (13), (15), (17), (20) and (21) for the paper's, as `tests/naive.py` has them, only event by
+event. The functions can be compiled by numba, and run as plain Python too.
 """
 
 from __future__ import annotations
@@ -55,6 +56,84 @@ def advance(events, state, rate, step_variance, noise_rate, event_variance, thre
         state.augmented[y, x] = augmented + step
         state.forward[y, x] += step_variance
         state.backward[y, x] -= step_variance
+        state.since[y, x] = t
+        state.newest[y, x] = t
+
+
+class PaperState(NamedTuple):
+    """(H, W) arrays of the paper's filter: the state, L^A of (10) and (11) with their c_p, R, and times in us.
+
+    R (9) at the middles of the frames before and at the exposure, with the intensity of the frame before it, and at
+    those of this frame and the next, with that of this one.
+    """
+
+    value: np.ndarray
+    variance: np.ndarray
+    forward: np.ndarray
+    backward: np.ndarray
+    scale_before: np.ndarray
+    scale_after: np.ndarray
+    r_before: np.ndarray
+    r_at: np.ndarray
+    r_from: np.ndarray
+    r_after: np.ndarray
+    since: np.ndarray
+    newest: np.ndarray
+
+
+class PaperScalars(NamedTuple):
+    """Times in us (an exposure, and the middles around it), thresholds, and the noise of (2)."""
+
+    start: int
+    exposure_end: int
+    previous_middle: int
+    middle: int
+    next_middle: int
+    step_on: float
+    step_off: float
+    sigma_proc2: float
+    sigma_iso2: float
+    sigma_ref2: float
+    refractory_bound: float
+
+
+def advance_paper(events, state, scalars):
+    """Take every event in turn through the paper's filter, from the start of one exposure to that of the next."""
+    height, width = state.value.shape
+    exposure = scalars.exposure_end - scalars.start
+    for i in range(len(events)):
+        event = events[i]
+        t, x, y = event["t"], np.int64(event["x"]), np.int64(event["y"])
+        since = state.since[y, x]
+        seconds = (t - since) * US
+        if t >= scalars.middle:  # (7), (9)
+            u = (t - scalars.middle) / (scalars.next_middle - scalars.middle)
+            covariance = (1.0 - u) * state.r_from[y, x] + u * state.r_after[y, x]
+        else:
+            u = (t - scalars.previous_middle) / (scalars.middle - scalars.previous_middle)
+            covariance = (1.0 - u) * state.r_before[y, x] + u * state.r_at[y, x]
+        variance = 1.0 / (1.0 / state.variance[y, x] + seconds / covariance)  # (20)
+        u = min((since - scalars.start) / exposure, 1.0)
+        deviation = state.value[y, x] - ((1.0 - u) * state.forward[y, x] + u * state.backward[y, x])  # (13)
+        deviation = deviation / state.variance[y, x] * variance  # (17)
+        u = min((t - scalars.start) / exposure, 1.0)
+        augmented = (1.0 - u) * state.forward[y, x] + u * state.backward[y, x]
+        newest = state.newest[y, x]
+        noise = scalars.sigma_proc2 * (t - newest) * US  # (2)
+        if (t - newest) * US <= scalars.refractory_bound:
+            noise += scalars.sigma_ref2
+        for row in range(max(y - 1, 0), min(y + 2, height)):
+            for column in range(max(x - 1, 0), min(x + 2, width)):
+                newest = max(newest, state.newest[row, column])
+        noise += scalars.sigma_iso2 * (t - newest) * US
+        if event["p"]:
+            step = scalars.step_on
+        else:
+            step = -scalars.step_off
+        state.value[y, x] = augmented + deviation + step  # (15)
+        state.variance[y, x] = variance + noise  # (21)
+        state.forward[y, x] += state.scale_before[y, x] * step  # (10)
+        state.backward[y, x] += state.scale_after[y, x] * step  # (11)
         state.since[y, x] = t
         state.newest[y, x] = t
 

@@ -25,9 +25,10 @@ from numpy.typing import NDArray
 import kalux
 from kalux.datasets import DEMO_SENSOR, demo_scene, simulate
 from kalux.display import DisplaySettings, Reinhard, apply, measure, to_uint8
-from kalux.evaluation.baselines import Method, filter_method
+from kalux.evaluation.baselines import filter_method
 from kalux.evaluation.held_out import held_out_pairs, hold_out_frames
-from kalux.evaluation.scores import Pair
+from kalux.evaluation.method import Method
+from kalux.evaluation.pairs import Pair
 from kalux.evaluation.truth import load_truth, prepare_reference, truth_pairs
 from kalux.settings import PRESETS
 from kalux.writers import contact_sheet

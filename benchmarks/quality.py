@@ -19,8 +19,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import kalux
-from kalux.evaluation.baselines import Method, filter_method, methods
+from kalux.evaluation.baselines import filter_method, methods
 from kalux.evaluation.held_out import evaluate_held_out, hold_out_frames
+from kalux.evaluation.method import Method
 from kalux.evaluation.scores import Scores
 from kalux.evaluation.truth import evaluate_truth, load_truth, prepare_reference
 from kalux.settings import PRESETS, Settings

@@ -49,12 +49,12 @@ def test_arrays_that_are_alive_share_nothing():
 
 def test_what_is_kept_is_bounded():
     pieces = [memory.empty((memory.MOST_FREE // 5,), np.uint8) for _ in range(12)]
-    assert memory.free_bytes() <= memory.MOST_FREE
+    assert memory._free.total <= memory.MOST_FREE
     del pieces
     gc.collect()
-    assert memory.free_bytes() <= memory.MOST_FREE
+    assert memory._free.total <= memory.MOST_FREE
     memory.empty((2 * memory.MOST_FREE,), np.uint8)  # larger than all that is kept
-    assert memory.free_bytes() <= memory.MOST_FREE
+    assert memory._free.total <= memory.MOST_FREE
 
 
 def test_threads_get_memory_of_their_own():

@@ -230,7 +230,8 @@ def test_given_times_may_repeat_and_reach_to_the_last_event():
         ({"times": []}, "at least one"),
         ({"times": 30_000}, "times must be a list"),
         ({"times": [30_000.5]}, "whole microseconds"),
-        ({"times": [40_000, 39_999]}, "times must increase"),
+        ({"times": [30_000, np.nan]}, r"times\[1\] is nan; whole microseconds"),
+        ({"times": [40_000, 39_999]}, r"times\[1\] is 39999 us, before 40000 us.*; times must increase"),
         ({"times": [19_999]}, "19999 us lies before 20000 us"),
         ({"times": [30_000, 10**9]}, "1000000000 us lies after the recording's end"),
     ],
@@ -239,6 +240,29 @@ def test_times_that_cannot_be(options, message):
     """Before the first image, not while iterating."""
     with pytest.raises(InputError, match=message):
         reconstruct(recording(), **options)
+
+
+def test_times_may_be_floats_that_are_whole():
+    times = np.linspace(30_000, 50_000, 3)
+    assert [image.t for image in reconstruct(recording(), times=times)] == [30_000, 40_000, 50_000]
+
+
+@pytest.mark.parametrize(
+    ("first", "options", "message"),
+    [
+        ("night.aedat4", {}, "recording is a str; a kalux.Recording is needed, from kalux.open"),
+        (None, {}, "recording is a NoneType; a kalux.Recording is needed"),
+        (
+            recording,
+            {"settings": {"filter": {"kind": "cf"}}},
+            "settings is a dict; a kalux.Settings is needed",
+        ),
+        (recording, {"calibration": "c.toml"}, "calibration is a str; a kalux.Calibration is needed"),
+    ],
+)
+def test_arguments_of_the_wrong_type_are_named(first, options, message):
+    with pytest.raises(InputError, match=message):
+        reconstruct(first() if callable(first) else first, rate_hz=10, **options)
 
 
 @every_variant
@@ -353,7 +377,10 @@ def test_white_is_the_median_exposure_unless_set():
 
 def test_a_recording_without_frames():
     rec = Recording.from_arrays(events((1, 0, 0, 1)), [], sensor_size=(1, 1), name="dark.aedat4")
-    with pytest.raises(FrameError, match=r"dark\.aedat4: no frames; kalux needs frames"):
+    with pytest.raises(
+        FrameError,
+        match=r"dark\.aedat4: no frames; kalux needs frames .* join images or a video with --frames",
+    ):
         reconstruct(rec, rate_hz=10)
 
 

@@ -643,6 +643,12 @@ def test_what_later_reads_have_passed_cannot_be_read_again():
     live.read(nodes[2])
 
 
+@pytest.mark.parametrize("t", [0.5, np.nan, np.inf, "1", None])
+def test_a_time_that_is_no_whole_number_cannot_be_read(t):
+    with pytest.raises(InputError, match=r"the time is .*; whole microseconds"):
+        filled(random_stream(0)).read(t)
+
+
 def test_memory_is_bounded_when_one_reads_along():
     live, held = engine((4, 4)), []
     rng = np.random.default_rng(0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import gzip
 import os
 
 import numpy as np
@@ -63,6 +65,14 @@ def test_a_bad_recording_is_refused_at_once():
         in_memory(events=small_events()[::-1])
     with pytest.raises(FrameError, match="time order"):
         in_memory(frames=small_frames()[::-1])
+    with pytest.raises(
+        FrameError, match=r"frame 0 is a ndarray; a kalux\.Frame with a NumPy array is needed"
+    ):
+        in_memory(frames=[np.zeros(SIZE, np.uint8)])
+
+
+def test_a_recording_says_what_it_is():
+    assert repr(in_memory()) == f"<kalux.Recording 'arrays': arrays, {SIZE[1]} x {SIZE[0]} pixels>"
 
 
 def test_order_is_checked_across_chunks(tmp_path):
@@ -90,8 +100,9 @@ def test_exposures_given(stamped, stamp, start):
 
 
 def test_impossible_exposures_are_refused(stamped):
-    with pytest.raises(ExposureError, match="must be positive"):
-        recording.open(stamped, exposure=0)
+    for exposure in (0, 0.5, np.nan, np.inf, "10 ms"):
+        with pytest.raises(ExposureError, match="must be positive and whole"):
+            recording.open(stamped, exposure=exposure)
     with pytest.raises(InputError, match="stamp is 'centre'"):
         recording.open(stamped, exposure=10, stamp="centre")
     with pytest.raises(ExposureError, match="is the exposure time too long"):
@@ -124,12 +135,30 @@ def test_impossible_sensor_sizes_are_refused(size):
         recording.Recording.from_arrays([], [], sensor_size=size)
 
 
+def small_file(path):
+    hdf5.write(path, sensor_size=SIZE, events=[small_events()], frames=[])
+
+
 @pytest.mark.parametrize(
     ("make", "told"),
     [
         (lambda path: path.touch(), "an empty file, not a recording"),
         (lambda path: path.mkdir(), "an empty folder, not a recording"),
+        (os.mkfifo, "a pipe or a device, of which nothing can be read twice"),
         (lambda path: (path.mkdir(), (path / "0.png").touch()), "a folder of images, which --frames takes"),
+        (lambda path: (path.mkdir(), small_file(path / "a.h5")), r"a folder of recordings \(a\.h5\)"),
+        (
+            lambda path: path.write_text("version https://git-lfs.github.com/spec/v1\n"),
+            "a pointer of Git LFS",
+        ),
+        (
+            lambda path: path.write_text("\n<!DOCTYPE html>\n<html></html>"),
+            "a web page, perhaps what a download",
+        ),
+        (
+            lambda path: path.write_bytes(gzip.compress(b"0 1 2 1")),
+            "compressed by gzip, which has to be unpacked",
+        ),
     ],
 )
 def test_what_is_no_recording_is_named(tmp_path, make, told):
@@ -174,3 +203,13 @@ def test_real_recordings_pass_every_check(shared_data, name):
 def test_real_files_that_are_no_recordings_are_refused(shared_data, name):
     with pytest.raises(FormatError, match="not a recording that kalux knows"):
         recording.open(shared_data / name)
+
+
+@pytest.mark.parametrize("size", [(0, 4), (4, 70_000), (10**20, 4)])
+def test_a_sensor_that_no_event_could_address_is_refused(tmp_path, size):
+    path = tmp_path / "events.npz"
+    columns = {name: np.zeros(1, int) for name in "txyp"}
+    np.savez(path, **columns, height=np.array(4), width=np.array(5))
+    source = dataclasses.replace(readers.read(path), sensor_size=size)
+    with pytest.raises(FormatError, match="states a sensor of"):
+        recording.Recording(source)

@@ -211,6 +211,8 @@ def test_none_is_auto_in_files():
         ("[camera]\nlog_offset = true", "camera.log_offset is True; a finite number is needed"),
         ("[camera]\nlog_offset = nan", "camera.log_offset is nan; a finite number is needed"),
         ("[camera]\nlog_offset = inf", "finite number is needed"),
+        (f"[camera]\nlog_offset = {2**70}", "finite number is needed, at most 1e18"),
+        (f"[events]\ndelay = {-(2**63)}", "finite number is needed, at most 1e18"),
         ("[camera]\nlog_offset = 0", "camera.log_offset is 0; it must be positive"),
         ("[camera]\nlog_offset = -1", "camera.log_offset is -1; it must be positive"),
         ("[camera]\nresponse = 2.2", "camera.response is 2.2; str is needed"),

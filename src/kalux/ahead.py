@@ -18,13 +18,17 @@ MOST_THREADS: Final = 8
 """Used where nothing is said, at most: one filters, and even EXR images, the slowest to encode, are done by seven."""
 
 
+def cores() -> int:
+    """How many processor cores this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # not on macOS and Windows
+        return os.cpu_count() or 1
+
+
 def default_threads() -> int:
     """As many as this process has processor cores, up to `MOST_THREADS`."""
-    try:
-        cores = len(os.sched_getaffinity(0))
-    except AttributeError:  # not on macOS and Windows
-        cores = os.cpu_count() or 1
-    return min(cores, MOST_THREADS)
+    return min(cores(), MOST_THREADS)
 
 
 def ahead(items: Iterable[T], depth: int = 2, name: str = "ahead") -> Generator[T, None, None]:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from kalux import memory
 from kalux.events import EventArray
+from kalux.memory import PAGE
 
 MICROSECOND32: Final = np.float32(1e-6)
 """Seconds."""
@@ -61,6 +62,12 @@ def event_is_on(word):  # type: ignore[no-untyped-def]
     return ((np.uint64(word) >> np.uint64(32)) & np.uint64(0xFF)) != np.uint64(0)
 
 
+@nb.njit(cache=True, inline="always")
+def flat(array):  # type: ignore[no-untyped-def]
+    """A whole array as one row."""
+    return array.reshape(array.size)
+
+
 UNWEIGHED: Final = np.int64(0xFF_FFFF_FFFF)
 """The bits of an event's second word without its weight; by themselves they have the weight 1."""
 
@@ -80,10 +87,6 @@ def event_weight(word, unit):  # type: ignore[no-untyped-def]
 _LINE: Final = 64
 """Bytes that the memory hands out at a time."""
 
-
-_PAGE: Final = 4096
-"""Bytes after which addresses compete for the same places of the nearest cache."""
-
 _APART: Final = 7 * _LINE
 """Bytes: more than what loops take of a plane at a time, 64 float32, and lines of nine planes do not meet."""
 
@@ -98,24 +101,21 @@ def packed(shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
     NumPy's arrays commonly begin 16 bytes behind a line, so that every other record of 32 bytes lies in two: the filter
     then takes 1.35 times as long, and EDI 1.8 times.
     """
-    size = math.prod(shape) * dtype.itemsize
-    piece = memory.empty((size + _LINE,), np.uint8)
-    first = -piece.ctypes.data % _LINE
-    return piece[first : first + size].view(dtype).reshape(shape)
+    return memory.empty(shape, dtype)  # which begins with a page
 
 
 def apart(count: int, shape: tuple[int, ...], dtype: Any = np.float32) -> NDArray[Any]:
     """``count`` arrays, not filled, for loops over all of them at once: (count, *shape).
 
-    Planes of many sensors are whole pages of memory, so that the same pixel of all of them would compete for the same
-    few places of the nearest cache, and stores would wait for loads that have nothing to do with them: a loop over
-    twenty planes then takes 1.4 times as long. These begin `_APART` further on in a page each, and those of another
-    call elsewhere.
+    Planes of many sensors are whole pages of memory, and addresses that are whole pages apart compete for the same few
+    places of the nearest cache: the same pixel of all planes would, and stores would wait for loads that have nothing
+    to do with them. A loop over twenty planes then takes 1.4 times as long. These begin `_APART` further on in a page
+    each, and those of another call elsewhere.
     """
     size = math.prod(shape) * np.dtype(dtype).itemsize
-    step = size + (_APART - size) % _PAGE
-    piece = memory.empty((count * step + 2 * _PAGE,), np.uint8)
-    first = -piece.ctypes.data % _PAGE + next(_begins) * _LINE % _PAGE
+    step = size + (_APART - size) % PAGE
+    piece = memory.empty((count * step + PAGE,), np.uint8)
+    first = next(_begins) * _LINE % PAGE
     planes = piece[first : first + count * step].reshape(count, step)[:, :size]
     apart_: NDArray[Any] = planes.view(dtype).reshape(count, *shape)
     return apart_

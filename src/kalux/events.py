@@ -17,14 +17,18 @@ True where the pixel became brighter. 16 bytes, aligned."""
 EventArray = NDArray[np.void]
 """A 1-D array of `EVENT_DTYPE`, sorted by ``t``."""
 
-# The names under which peers store each field: tonic and Prophesee (t, x, y, p), dv-processing
-# (timestamp, x, y, polarity), Metavision CSV, event_stream, DSEC and IJRR tables.
-_FIELD_NAMES: Final = {
+NEVER: Final = -(1 << 60)
+"""us: the time of an event that has not been. Times of recordings may be negative, but are never that early."""
+
+FIELD_NAMES: Final = {
     "t": ("t", "ts", "timestamp", "timestamps", "time", "times"),
     "x": ("x", "xs"),
     "y": ("y", "ys"),
     "p": ("p", "ps", "pol", "polarity", "polarities", "on"),
 }
+"""The names under which peers store each field, in small letters: tonic and Prophesee (t, x, y, p), dv-processing
+(timestamp, x, y, polarity), Metavision CSV, event_stream, DSEC and IJRR tables."""
+
 _TIME_UNITS: Final = {"us": 1.0, "s": 1e6, "ms": 1e3, "ns": 1e-3}
 _UINT16_MAX: Final = np.iinfo(np.uint16).max
 
@@ -216,7 +220,7 @@ def _integers(data: NDArray[Any], order: str) -> dict[str, NDArray[Any]]:
 def _named(data: Any, names: list[str]) -> dict[str, NDArray[Any]]:
     lower = {name.lower(): name for name in names}
     found = {}
-    for field, aliases in _FIELD_NAMES.items():
+    for field, aliases in FIELD_NAMES.items():
         match = next((lower[alias] for alias in aliases if alias in lower), None)
         if match is None:
             raise EventError(

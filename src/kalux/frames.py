@@ -104,6 +104,19 @@ def place_exposure(frame: Frame, exposure: int, stamp: Stamp) -> Frame:
     return dataclasses.replace(frame, exposure_start=start, exposure_end=start + exposure)
 
 
+def require_frame(frame: Any, *, where: str = "frames", index: int = 0) -> None:
+    """Require a `Frame` with an array.
+
+    Raises
+    ------
+    FrameError
+        If it is something else.
+    """
+    if not isinstance(frame, Frame) or not isinstance(frame.image, np.ndarray):
+        got = type(frame.image if isinstance(frame, Frame) else frame).__name__
+        raise FrameError(f"{where}: frame {index} is a {got}; a kalux.Frame with a NumPy array is needed")
+
+
 def check_frame(
     frame: Frame,
     sensor_size: tuple[int, int],
@@ -122,9 +135,7 @@ def check_frame(
     ExposureError
         An exposure that is empty, or that begins before the previous one has ended.
     """
-    if not isinstance(frame, Frame) or not isinstance(frame.image, np.ndarray):
-        got = type(frame.image if isinstance(frame, Frame) else frame).__name__
-        raise FrameError(f"{where}: frame {index} is a {got}; a kalux.Frame with a NumPy array is needed")
+    require_frame(frame, where=where, index=index)
     image = frame.image
     _check_times(frame, where, index)
     if frame.white is not None and not (np.isfinite(frame.white) and frame.white > 0):

@@ -4,18 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
-from kalux.calibration.levels import find_ceiling
 from kalux.events import EventArray
 from kalux.frames import Frame, Levels
 from kalux.recording import Recording
-from kalux.settings import AUTO, CameraSettings, Settings
-
-if TYPE_CHECKING:
-    from kalux.pipeline import Plan
+from kalux.settled import response_text
 
 _RATE_BIN: Final = 10_000  # us, over which the peak event rate is taken
 _SATURATED: Final = 0.99  # of white: DAVIS frames clip a few values below it
@@ -108,8 +104,6 @@ class Description:
         Whether the frames have exposure times.
     contrast_threshold
         (on, off), log intensity, as the recording states it; None if it does not.
-    estimated_threshold
-        (on, off), as given to `describe`.
     has_ground_truth
         Whether reference images come with the recording.
     missing
@@ -132,7 +126,6 @@ class Description:
     overlap: int | None
     exposure_known: bool
     contrast_threshold: tuple[float, float] | None
-    estimated_threshold: tuple[float, float] | None
     has_ground_truth: bool
     missing: tuple[str, ...]
     colours: str | None = None
@@ -141,15 +134,13 @@ class Description:
     doubt: str | None = None
 
 
-def describe(recording: Recording, *, estimated_threshold: tuple[float, float] | None = None) -> Description:
-    """Read through a recording once and describe it, in bounded memory.
+def describe(recording: Recording) -> Description:
+    """Read through a recording and describe it, in bounded memory.
 
     Parameters
     ----------
     recording
         Any recording; events or frames may be absent, exposures unknown.
-    estimated_threshold
-        (on, off) contrast thresholds estimated elsewhere, to be reported with the rest.
 
     Raises
     ------
@@ -173,7 +164,6 @@ def describe(recording: Recording, *, estimated_threshold: tuple[float, float] |
         overlap=_overlap(events, frames),
         exposure_known=recording.exposure_known,
         contrast_threshold=source.contrast_threshold,
-        estimated_threshold=estimated_threshold,
         has_ground_truth=source.ground_truth is not None,
         missing=source.missing,
         colours=None if first is None else first.colours,
@@ -271,9 +261,17 @@ def format_description(description: Description) -> str:
     if description.overlap is not None:
         overlap = "none: events and frames do not overlap in time" if not description.overlap else None
         rows.append(("overlap", overlap or f"{_time(description.overlap)} covered by both events and frames"))
-    rows.append(("threshold", _threshold_text(description)))
+    threshold = description.contrast_threshold
+    rows.append(
+        (
+            "threshold",
+            "not recorded"
+            if threshold is None
+            else f"ON {threshold[0]:.3g}, OFF {threshold[1]:.3g} as recorded",
+        )
+    )
     if description.response is not None:
-        rows.append(("response", f"{_response_text(description.response)}, as recorded"))
+        rows.append(("response", f"{response_text(description.response)}, as recorded"))
     if description.has_ground_truth:
         rows.append(("reference", "ground truth images are included"))
     rows += [("note", sentence) for sentence in description.missing]
@@ -333,181 +331,6 @@ def _exposure_text(frames: FrameSummary) -> str:
     if frames.exposure_min == frames.exposure_max:
         return _time(frames.exposure_min)
     return f"{_time(frames.exposure_min)} to {_time(frames.exposure_max)}, median {_time(frames.exposure_median)}"
-
-
-def _threshold_text(description: Description) -> str:
-    texts = [
-        f"ON {threshold[0]:.3g}, OFF {threshold[1]:.3g} {origin}"
-        for threshold, origin in (
-            (description.contrast_threshold, "as recorded"),
-            (description.estimated_threshold, "estimated"),
-        )
-        if threshold is not None
-    ]
-    return "; ".join(texts) or "not recorded"
-
-
-# What a reconstruction settles
-
-ORIGINS: Final = {
-    "settings": "given",
-    "recording": "from the recording",
-    "calibration": "calibrated",
-    "estimate": "estimated",
-    "assumed": "usual of the preset, the recording does not tell",
-}
-"""What to call where thresholds come from (`kalux.pipeline.ThresholdOrigin`)."""
-
-_NOTABLE_SHARE: Final = 0.05
-_ALIKE: Final = (
-    0.99  # of the level at which pixels saturate: where nearly all do from here on, it is one level
-)
-_GIVEN: Final = "given"
-_USUAL: Final = ORIGINS["assumed"]
-
-
-def settled(recording: Recording, plan: Plan, asked: Settings) -> list[tuple[str, str]]:
-    """What the settings left to the recording: name, value with its unit and where that comes from.
-
-    Parameters
-    ----------
-    recording, plan
-        From `kalux.pipeline.plan`.
-    asked
-        The settings before the plan filled in what was missing; what they state is said to be given.
-    """
-    camera, events = plan.settings.camera, plan.settings.events
-    rows = [
-        (
-            "thresholds",
-            f"on {events.threshold_on:.3f}, off {events.threshold_off:.3f} log intensity ({_threshold_origin(plan)})",
-        ),
-        ("delay", f"events {events.lateness * 1e-3:g} ms late ({_delay_origin(plan, asked)})"),
-        (
-            "I_0",
-            f"{camera.offset:g} of white, events are steps of log(I + I_0) "
-            f"({_model_origin(plan, asked.camera.log_offset)})",
-        ),
-    ]
-    if events.step_variance is not None:
-        rows.append(
-            (
-                "step",
-                f"variance of one event {events.step_variance:g} c^2, c its threshold "
-                f"({_model_origin(plan, asked.events.step_variance)})",
-            )
-        )
-    if events.refractory_period is not None:
-        what = (
-            f"{events.refractory_period * 1e-3:g} ms" if events.refractory_period else "nothing is lost in it"
-        )
-        rows.append(("refractory", f"{what} ({_refractory_origin(plan, asked)})"))
-    if events.threshold_spread is not None:
-        how = _estimated(asked.events.threshold_spread, plan.mismatch is not None)
-        rows.append(
-            ("spread", f"{100 * events.threshold_spread:.1f} % between the pixels' thresholds ({how})")
-        )
-    if events.noise_rate is not None:
-        how = _estimated(asked.events.noise_rate, plan.background_rate == events.noise_rate)
-        if plan.background_rate is not None and plan.background_rate < events.noise_rate:
-            how = f"the usual, which is the least; measured {plan.background_rate:.2g}"
-        rows.append(("background", f"{events.noise_rate:.2g} Hz per pixel of events without reason ({how})"))
-    given = asked.camera.reference_exposure is not None
-    rows.append(
-        (
-            "exposure",
-            f"{(camera.reference_exposure or 0) * 1e-3:g} ms makes a saturated pixel 1.0 "
-            f"({_GIVEN if given else 'median of the frames'})",
-        )
-    )
-    if camera.frame_noise is not None:
-        read, shot = camera.noise
-        how = _GIVEN if asked.camera.frame_noise is not None else "estimated" if plan.frame_noise else _USUAL
-        half = np.sqrt(read**2 + shot / 2)
-        rows.append(("noise", f"of frames {read:.2g} of white in the dark, {half:.2g} at half of it ({how})"))
-    if plan.settings.filter.bright_tail is not None and plan.settings.filter.highlight_scale > 0:
-        how = "measured" if asked.filter.bright_tail is None else _GIVEN
-        rows.append(("bright tail", f"{plan.settings.filter.bright_tail:.2f} log intensity ({how})"))
-    stated = "usual, the recording does not state it" if recording.response is None else "as recorded"
-    how = stated if asked.camera.response == AUTO else _GIVEN
-    rows.append(("response", f"{_response_text(camera.response)} ({how})"))
-    if camera.white_balance != asked.camera.white_balance:
-        rows.append(("white balance", f"{camera.white_balance} for red, green, blue (measured)"))
-    return rows
-
-
-def saturation_text(recording: Recording, plan: Plan, asked: Settings) -> str:
-    """From which level on pixels count as clipped, and where the recording shows that they are.
-
-    Parameters are those of `settled`; it looks at up to 80 frames once more (`kalux.calibration.levels`).
-    """
-    used = plan.settings.camera.saturation
-    how = "the usual" if asked.camera.saturation == CameraSettings.saturation else _GIVEN
-    text = f"from {used:.2g} of white ({how}); "
-    ceiling = find_ceiling(recording, plan.settings.camera, plan.settings.events)
-    if ceiling is None:
-        return text + "events do not go on where the frames end, or too few tell"
-    level = f"{ceiling.level:.2g}"
-    if ceiling.least < _ALIKE * ceiling.level:
-        level = f"{ceiling.least:.2g} to {2 * ceiling.level - ceiling.least:.2g}"
-    text += f"frames end at {level}, where events go on"
-    if ceiling.level < used:
-        percent = 100 * np.expm1(ceiling.excess)
-        text += f" by {percent:.0f} %: --camera.saturation {_ALIKE * ceiling.least:.2g} does not take that for measured"
-    return text
-
-
-def _threshold_origin(plan: Plan) -> str:
-    found = plan.estimate
-    if found is None or plan.threshold_origin not in ("estimate", "assumed"):
-        return ORIGINS[plan.threshold_origin]
-    if plan.threshold_origin == "assumed":
-        return (
-            f"{100 * found.usual_share:.0f} % usual of the preset, as the recording hardly tells: +- "
-            f"{100 * found.spread:.0f} %"
-        )
-    text = f"{ORIGINS['estimate']} from {found.samples:,} samples, residual {found.residual:.2f}"
-    text += f": +- {100 * found.spread:.0f} %"
-    if found.usual_share > _NOTABLE_SHARE:
-        text += f"; {100 * found.usual_share:.0f} % is the usual of the preset, as little moves"
-    return text
-
-
-def _refractory_origin(plan: Plan, asked: Settings) -> str:
-    if asked.events.refractory_period is not None:
-        return _GIVEN
-    if plan.estimate is None:
-        return _USUAL
-    return f"estimated from {plan.estimate.samples:,} samples"
-
-
-def _delay_origin(plan: Plan, asked: Settings) -> str:
-    found = plan.delay_estimate
-    if found is None:
-        return _USUAL if asked.events.delay is None else _GIVEN
-    return (
-        f"estimated: {found.apparent * 1e-3:.1f} ms explain the frames {100 * found.improvement:.0f} % better"
-    )
-
-
-def _model_origin(plan: Plan, asked: float | None) -> str:
-    if asked is not None:
-        return _GIVEN
-    return _USUAL if plan.event_model is None else f"estimated from {plan.event_model.samples:,} samples"
-
-
-def _estimated(asked: float | None, found: bool) -> str:
-    if asked is not None:
-        return _GIVEN
-    return "measured" if found else _USUAL
-
-
-def _response_text(response: str) -> str:
-    """A response's name, without all values of a measured curve."""
-    return "; ".join(
-        f"curve of {len(part.split())} knots" if part.startswith("curve:") else part
-        for part in response.split(";")
-    )
 
 
 def _span(first: int, last: int) -> str:

@@ -13,6 +13,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+PAGE: Final = 4096
+"""Bytes of a page of memory: all arrays begin with one."""
+
 _SMALL: Final = 1 << 16
 """Bytes below which the usual allocator is as good."""
 
@@ -38,16 +41,23 @@ class _Free:
             if pieces:
                 self.total -= size
                 return pieces.pop()
-        return np.empty(size, np.uint8)
+        return _fresh(size)
 
-    def give(self, piece: NDArray[np.uint8]) -> None:
+    def give(self, piece: NDArray[np.uint8], most: int = MOST_FREE) -> None:
+        """``most`` is no name of the module's: when Python ends, arrays come back after those are gone."""
         with self._lock:
-            if self.total + piece.size > MOST_FREE:  # of another sensor, most likely
+            if self.total + piece.size > most:  # of another sensor, most likely
                 self._pieces.clear()
                 self.total = 0
-            if piece.size <= MOST_FREE:
+            if piece.size <= most:
                 self._pieces.setdefault(piece.size, []).append(piece)
                 self.total += piece.size
+
+
+def _fresh(size: int) -> NDArray[np.uint8]:
+    piece = np.empty(size + PAGE, np.uint8)
+    first = -piece.ctypes.data % PAGE
+    return piece[first : first + size]
 
 
 _free: Final = _Free()
@@ -68,13 +78,6 @@ def empty(shape: tuple[int, ...], dtype: Any = np.float32) -> NDArray[Any]:
     """As ``numpy.empty``, in memory that an array of about the same size may have used before. For any thread."""
     kind = np.dtype(dtype)
     size = math.prod(shape) * kind.itemsize
-    if size < _SMALL:
-        return np.empty(shape, kind)
-    piece: NDArray[np.uint8] = np.asarray(_Lent(_free.take(size)))
+    piece = _fresh(size) if size < _SMALL else np.asarray(_Lent(_free.take(size)))
     array: NDArray[Any] = piece[:size].view(kind).reshape(shape)
     return array
-
-
-def free_bytes() -> int:
-    """Bytes that are kept and not used."""
-    return _free.total

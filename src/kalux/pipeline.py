@@ -29,7 +29,7 @@ from kalux.calibration.noise import event_noise
 from kalux.calibration.steps import MAX_SAMPLES
 from kalux.calibration.values import Calibration
 from kalux.calibration.white_balance import grey_world
-from kalux.errors import FrameError, InputError
+from kalux.errors import InputError
 from kalux.events import EventArray
 from kalux.frames import Frame
 from kalux.images import Estimate, Image
@@ -37,7 +37,7 @@ from kalux.models.camera import BrightTail, Camera, count_bright
 from kalux.models.colour import white_balance
 from kalux.models.pixels import PixelCalibration, require_size
 from kalux.reconstructor import Reconstructor
-from kalux.recording import Recording
+from kalux.recording import Recording, no_frames
 from kalux.settings import EventSettings, Settings, chosen_response
 from kalux.settings import preset as named_preset
 from kalux.smoothing import Backward, combine, reversed_settings
@@ -112,6 +112,15 @@ def plan(
     smooth: bool = False,
 ) -> Plan:
     """Decide what a reconstruction will do. See `reconstruct` for the parameters and errors."""
+    for name, given, kind, source in (
+        ("recording", recording, Recording, "kalux.open or Recording.from_arrays"),
+        ("settings", settings, Settings, "kalux.preset"),
+        ("calibration", calibration, Calibration, "kalux.load_calibration"),
+    ):
+        if not isinstance(given, kind) and (given is not None or name == "recording"):
+            raise InputError(
+                f"reconstruct: {name} is a {type(given).__name__}; a kalux.{kind.__name__} is needed, from {source}"
+            )
     known = Calibration() if calibration is None else calibration
     chosen = settings if settings is not None else known.apply(named_preset(preset))
     if sum(choice is not None for choice in (rate_hz, times, at)) != 1:
@@ -128,6 +137,7 @@ def plan(
         require_size(known.pixels, recording.sensor_size)
     response = chosen_response(chosen.camera.response, recording.response)
     exposures = _exposures(recording)
+    wanted = _times(recording, exposures, rate_hz, times, at, chosen, lookahead)
     reference = chosen.camera.reference_exposure or round(float(np.median(exposures[:, 1] - exposures[:, 0])))
     chosen = dataclasses.replace(
         chosen, camera=dataclasses.replace(chosen.camera, reference_exposure=reference, response=response)
@@ -151,7 +161,6 @@ def plan(
         origin = "calibration"
     if origin in _DOUBTED or (_uses_steps(filled) and filled.filter.unshown_tail > 0):
         filled = _with_bright_tail(recording, filled)
-    wanted = _times(recording, exposures, rate_hz, times, at, filled, lookahead)
     return Plan(
         filled,
         origin,
@@ -376,7 +385,7 @@ def _exposures(recording: Recording) -> NDArray[np.int64]:
     """(K, 2) exposure starts and ends, us."""
     exposures = [(frame.exposure_start, frame.exposure_end) for frame in recording.frames()]
     if not exposures:
-        raise FrameError(f"{recording.source.path}: no frames; kalux needs frames as well as events")
+        raise no_frames(recording)
     return np.array(exposures, np.int64)
 
 
@@ -582,12 +591,14 @@ def _times(
         count = int(np.floor((end - begin) * 1e-6 * rate_hz + 1e-9)) + 1
         grid: NDArray[np.int64] = np.rint(np.arange(count) * (1e6 / rate_hz)).astype(np.int64)
         return begin + grid
-    wanted = np.asarray(times)
-    if wanted.ndim != 1 or len(wanted) == 0 or wanted.dtype.kind not in "iu":
-        raise InputError("reconstruct: times must be a list of whole microseconds, with at least one entry")
-    wanted = wanted.astype(np.int64)
-    if (np.diff(wanted) < 0).any():
-        raise InputError("reconstruct: times must increase")
+    wanted = _whole_microseconds(times)
+    backward = np.flatnonzero(np.diff(wanted) < 0)
+    if len(backward):
+        index = int(backward[0]) + 1
+        raise InputError(
+            f"reconstruct: times[{index}] is {wanted[index]} us, before {wanted[index - 1]} us, the one before it; "
+            "times must increase"
+        )
     if wanted[0] < begin:
         raise InputError(
             f"reconstruct: {wanted[0]} us lies before {begin} us, the earliest time the recording's frames allow"
@@ -599,6 +610,20 @@ def _times(
                 f"reconstruct: {wanted[-1]} us lies after the recording's end at {max(last, end)} us"
             )
     return wanted
+
+
+def _whole_microseconds(times: Any) -> NDArray[np.int64]:
+    """The times to read as integers. Fractions are refused, not rounded: they may be seconds."""
+    given = np.asarray(times)
+    if given.ndim != 1 or len(given) == 0 or given.dtype.kind not in "iuf":
+        raise InputError("reconstruct: times must be a list of whole microseconds, with at least one entry")
+    fractional = np.flatnonzero(~np.isfinite(given) | (given != np.rint(given)))
+    if len(fractional):
+        index = int(fractional[0])
+        raise InputError(
+            f"reconstruct: times[{index}] is {given[index]}; whole microseconds are needed, such as np.rint gives"
+        )
+    return given.astype(np.int64)
 
 
 def _begin_time(first: Frame, settings: Settings, lookahead: bool) -> int:

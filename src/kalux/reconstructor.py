@@ -8,6 +8,7 @@ events were split into pushes.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from typing import Any
 
@@ -282,8 +283,10 @@ class Reconstructor:
             # A frame that is still to come ends after the last one, and changes images from there on.
             until = self._complete_until
             return None if until is None else min(until, self._shots[-1].end)
-        complete = [shot for shot in self._shots if self._is_complete(shot)]
-        return self._method.node(complete[-1]) if complete else self._start_time()
+        for shot in reversed(self._shots):
+            if self._is_complete(shot):
+                return self._method.node(shot)
+        return self._start_time()
 
     def read(self, t: int) -> Image:
         """The image at time ``t`` (us). Never changes the result of any other read. See `estimate`."""
@@ -297,9 +300,9 @@ class Reconstructor:
         Raises
         ------
         InputError
-            If no frame has been pushed, or ``t`` lies before what can still be read.
+            If ``t`` is not a whole number, no frame has been pushed, or ``t`` lies before what can still be read.
         """
-        t = int(t)
+        t = _whole(t)
         if not self._shots:
             raise InputError("read: no frame has been pushed yet; events alone say nothing of the intensity")
         begin = self.begin_time
@@ -534,9 +537,17 @@ class Reconstructor:
         taken = max(progress.taken, self._events.first)
         for events in self._events.after(taken, t):
             self._method.advance(progress.segment, progress.cursor, events)
-            progress.latest = int(events["t"][-1])
+            progress.latest = int(event_words(events)[-1, 0])
             taken += len(events)
         progress.taken = taken
+
+
+def _whole(t: Any) -> int:
+    """A time as an int. Fractions are refused, not cut off: they may be seconds."""
+    with contextlib.suppress(TypeError, ValueError, OverflowError):
+        if int(t) == t:
+            return int(t)
+    raise InputError(f"read: the time is {t!r}; whole microseconds are needed")
 
 
 def _between(progress: _Progress, t: int) -> float:

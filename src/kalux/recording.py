@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterable, Iterator
+from numbers import Real
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -13,13 +14,14 @@ from numpy.typing import NDArray
 
 from kalux import readers
 from kalux.compiled import event_column, event_row, event_words
-from kalux.errors import ExposureError, InputError
+from kalux.errors import ExposureError, FormatError, FrameError, InputError
 from kalux.events import EventArray, as_events, check_events, checked_size
-from kalux.frames import MOSAICS, Frame, Mosaic, Stamp, check_frame, place_exposure
+from kalux.frames import MOSAICS, Frame, Mosaic, Stamp, check_frame, place_exposure, require_frame
 from kalux.models.colour import sample_mosaic
 from kalux.readers import CHUNK_EVENTS, GroundTruth, Source, joined
 
 _FIRST: Final = np.iinfo(np.int64).min
+_LARGEST_SIDE: Final = 1 << 16  # coordinates of events have 16 bits
 
 
 class EventStream:
@@ -46,6 +48,14 @@ class FrameStream:
 
     def __len__(self) -> int:
         return self._count()
+
+
+def no_frames(recording: Recording) -> FrameError:
+    """What to raise where a recording without frames cannot be used."""
+    return FrameError(
+        f"{recording.source.path}: no frames; kalux needs frames as well as events; join images or a video with "
+        "--frames (frames=)"
+    )
 
 
 class Recording:
@@ -77,7 +87,9 @@ class Recording:
         mosaic: Mosaic | Literal["none"] | None = None,
         white: float | None = None,
     ) -> None:
-        if exposure is not None and (exposure <= 0 or exposure != int(exposure)):
+        if exposure is not None and not (
+            isinstance(exposure, Real) and exposure > 0 and float(exposure).is_integer()
+        ):
             raise ExposureError(f"exposure is {exposure} us; it must be positive and whole")
         if white is not None and not (np.isfinite(white) and white > 0):
             raise InputError(f"white is {white}; the value of a saturated pixel is needed")
@@ -85,6 +97,11 @@ class Recording:
             raise InputError(f"stamp is {stamp!r}; it must be 'start', 'middle' or 'end'")
         if mosaic not in (None, "none", *MOSAICS):
             raise InputError(f"mosaic is {mosaic!r}; it must be one of {', '.join(MOSAICS)}, or 'none'")
+        if not all(0 < n <= _LARGEST_SIDE for n in source.sensor_size):
+            height, width = source.sensor_size
+            raise FormatError(
+                f"{source.path}: states a sensor of {width}x{height} pixels; 1 to {_LARGEST_SIDE} a side are possible"
+            )
         self.source = source
         self.mosaic: Mosaic | None = source.mosaic if mosaic is None else None if mosaic == "none" else mosaic
         self.sensor_size = source.sensor_size
@@ -134,6 +151,8 @@ class Recording:
         size = checked_size(sensor_size)
         array = as_events(events, columns=columns, time_unit=time_unit)
         frame_list = list(frames)
+        for index, frame in enumerate(frame_list):
+            require_frame(frame, where=name, index=index)
         if isinstance(contrast_threshold, (int, float)):
             contrast_threshold = (float(contrast_threshold), float(contrast_threshold))
 
@@ -161,6 +180,10 @@ class Recording:
         for _ in recording.frames():
             pass
         return recording
+
+    def __repr__(self) -> str:
+        height, width = self.sensor_size
+        return f"<kalux.Recording {str(self.source.path)!r}: {self.source.format}, {width} x {height} pixels>"
 
     @property
     def contrast_threshold(self) -> tuple[float, float] | None:

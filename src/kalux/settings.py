@@ -9,8 +9,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, Literal
 
-import numpy as np
-
 from kalux.errors import InputError, KaluxError, SettingsError, did_you_mean
 
 FilterName = Literal["akf", "cf"]
@@ -273,6 +271,9 @@ class Settings:
         _check(self)
 
 
+_GROUPS: Final = tuple(entry.name for entry in dataclasses.fields(Settings))
+
+
 def preset(name: str) -> Settings:
     """The settings of a preset.
 
@@ -307,8 +308,8 @@ def from_dict(values: Mapping[str, Any], base: Settings) -> Settings:
     """
     groups = {}
     for group, entries in values.items():
-        if group not in ("camera", "events", "filter"):
-            raise SettingsError(f"settings: {_unknown_group(group, base)}; known are camera, events, filter")
+        if group not in _GROUPS:
+            raise SettingsError(f"settings: {_unknown_group(group, base)}; known are {', '.join(_GROUPS)}")
         current = getattr(base, group)
         known = {entry.name for entry in dataclasses.fields(current)}
         if not isinstance(entries, Mapping):
@@ -329,12 +330,12 @@ def from_dict(values: Mapping[str, Any], base: Settings) -> Settings:
 
 def _unknown_group(name: str, base: Settings) -> str:
     """What is wrong with a table of this name, which may be a setting or a table without its group."""
-    for group in ("camera", "events", "filter"):
+    for group in _GROUPS:
         if name in {entry.name for entry in dataclasses.fields(getattr(base, group))}:
             return f"{name} is a setting of [{group}] and has to follow that line"
     if name == "preset":
         return "a preset is given by --preset (preset=), not in the file"
-    return f"unknown group [{name}]{did_you_mean(name, ('camera', 'events', 'filter'))}"
+    return f"unknown group [{name}]{did_you_mean(name, _GROUPS)}"
 
 
 def read_toml(
@@ -394,6 +395,7 @@ _POSITIVE: Final = {
     "cutoff",
 }
 _WHOLE: Final = {"delay", "usual_delay", "reference_exposure", "refractory_period"}
+_LARGEST: Final = 10**18  # fits int64, and is more than any value can mean
 _SIGNED: Final = {"delay", "usual_delay"}
 _CHOICES: Final = {
     "kind": ("akf", "cf"),
@@ -403,7 +405,7 @@ _CHOICES: Final = {
 
 
 def _check(settings: Settings) -> None:
-    for group in ("camera", "events", "filter"):
+    for group in _GROUPS:
         values = getattr(settings, group)
         for entry in dataclasses.fields(values):
             _check_value(f"{group}.{entry.name}", entry.name, getattr(values, entry.name), entry.default)
@@ -425,8 +427,8 @@ def _check_value(label: str, name: str, value: Any, default: Any) -> None:
             raise SettingsError(f"settings: {label} needs a number")
     elif name in _WHOLE and not (isinstance(value, int) and not isinstance(value, bool)):
         raise SettingsError(f"settings: {label} is {value!r}; whole microseconds are needed")
-    elif isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
-        raise SettingsError(f"settings: {label} is {value!r}; a finite number is needed")
+    elif isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= _LARGEST:
+        raise SettingsError(f"settings: {label} is {value!r}; a finite number is needed, at most 1e18")
     elif (value < 0 and name not in _SIGNED) or (name in _POSITIVE and value == 0):
         raise SettingsError(
             f"settings: {label} is {value}; it must be {'positive' if name in _POSITIVE else '0 or more'}"

@@ -264,13 +264,15 @@ def test_the_half_threshold_by_which_events_trail_is_not_taken_for_delay(late):
         np.testing.assert_allclose([found.on, found.off], 0.2, rtol=0.04)
 
 
-def test_of_a_rough_estimate_delay_and_period_are_kept():
-    """With another I_0 the same is found as from the start."""
+def test_of_a_rough_estimate_delay_and_period_are_kept(monkeypatch):
+    """With another I_0 the same is found as from the start, without looking for the shortest interval again."""
     lossy = textured(refractory=600.0)
     rough = estimate_thresholds(lossy, CAMERA, USUAL, delay=1_500, refractory_period=None, most=2_000)
     camera = CameraSettings(log_offset=0.004)
-    refined = refine_thresholds(lossy, camera, USUAL, rough, refractory_period=None)
     whole = estimate_thresholds(lossy, camera, USUAL, delay=1_500, refractory_period=None)
+    monkeypatch.delattr("kalux.calibration.contrast.shortest_interval")
+    refined = refine_thresholds(lossy, camera, USUAL, rough, refractory_period=None)
+    assert refined.shortest_interval == whole.shortest_interval > 0
     assert refined.delay == rough.delay
     np.testing.assert_allclose([refined.on, refined.off], [whole.on, whole.off], rtol=0.02)
     assert refined.refractory_period == pytest.approx(whole.refractory_period, rel=0.1)

@@ -11,7 +11,13 @@ from scipy import stats
 import kalux
 from kalux import PRESETS, Recording
 from kalux.calibration import event_model
-from kalux.calibration.event_model import Samples, Shown, estimate_event_model, negative_log_likelihood
+from kalux.calibration.event_model import (
+    ErrorModel,
+    Samples,
+    Shown,
+    estimate_event_model,
+    negative_log_likelihood,
+)
 from kalux.datasets import SensorSettings, pan, photograph_scene, simulate
 from kalux.datasets.ahdr import ArtificialCamera, artificial_hdr
 from kalux.pipeline import plan
@@ -20,6 +26,7 @@ from kalux.settings import CameraSettings
 from builders import dark_scene
 
 THRESHOLDS = (0.2, 0.2)
+MODEL = ErrorModel(THRESHOLDS, (1e-3, 0.0), 0.02, 1 / 6)
 
 
 def recorded(**sensor):
@@ -98,10 +105,7 @@ def test_likelihood_compares_densities_of_the_intensity():
     samples = Samples(
         before[kept], after[kept], np.maximum(steps, 0)[kept] * 1.0, np.maximum(-steps, 0)[kept] * 1.0
     )
-    losses = [
-        negative_log_likelihood(samples, THRESHOLDS, offset, 0.05, (1e-3, 0.0), 0.02, 1 / 6)
-        for offset in event_model.LOG_OFFSETS
-    ]
+    losses = [negative_log_likelihood(samples, MODEL, offset, 0.05) for offset in event_model.LOG_OFFSETS]
     assert event_model.LOG_OFFSETS[int(np.argmin(losses))] == 0.03
 
 
@@ -147,8 +151,7 @@ def test_what_frames_cannot_show_says_nothing_of_the_offset():
     found = []
     for limits in (None, shown):
         losses = [
-            negative_log_likelihood(samples, THRESHOLDS, offset, 0.4, (1e-3, 0.0), 0.02, 1 / 6, limits)
-            for offset in event_model.LOG_OFFSETS
+            negative_log_likelihood(samples, MODEL, offset, 0.4, limits) for offset in event_model.LOG_OFFSETS
         ]
         found.append(event_model.LOG_OFFSETS[int(np.argmin(losses))])
     assert found[0] < found[1] == 0.12

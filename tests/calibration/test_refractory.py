@@ -20,6 +20,14 @@ def test_the_shortest_interval_is_not_that_of_noise():
     assert shortest_interval(recording, most_events=20_000) >= 400
 
 
+def test_times_may_be_negative():
+    """Of a clock that is set to zero later, as that of the frames may be."""
+    t, pixel = np.arange(0, 400_000, 500), np.arange(800) % 4
+    made = [make_events(t - shift, pixel, pixel, pixel % 2 == 0) for shift in (0, 10**9)]
+    found = [shortest_interval(Recording.from_arrays(events, [], sensor_size=SIZE)) for events in made]
+    assert found[0] == found[1] > 0
+
+
 def test_events_that_nothing_follows_have_no_shortest_interval():
     lonely = make_events(np.arange(5), np.arange(5), np.zeros(5, int), np.ones(5, bool))
     assert shortest_interval(Recording.from_arrays(lonely, [], sensor_size=SIZE)) == 0

@@ -15,7 +15,7 @@ from kalux.calibration.response import (
     smooth_knots,
     still_pixels,
 )
-from kalux.errors import FrameError, InputError, MissingDependencyError
+from kalux.errors import FormatError, FrameError, InputError, MissingDependencyError
 from kalux.models.camera import Response
 
 from builders import blocks, events
@@ -133,6 +133,22 @@ def test_a_photograph_without_exposure_time(tmp_path):
     cv2.imwrite(str(tmp_path / "a.png"), np.zeros((4, 4), np.uint8))
     with pytest.raises(InputError, match="no exposure time"):
         read_exposure(tmp_path / "a.png")
+
+
+def test_a_photograph_with_damaged_exif(shared_data, tmp_path):
+    pytest.importorskip("PIL")
+    data = min((shared_data / "exposures").glob("*.jpg")).read_bytes()
+    (tmp_path / "a.jpg").write_bytes(data.replace(b"Exif\0\0MM\0*", b"Exif\0\0MM7*", 1))
+    with pytest.raises(FormatError, match=r"a\.jpg: not an image, or damaged"):
+        read_exposure(tmp_path / "a.jpg")
+
+
+def test_a_shutter_speed_beyond_numbers_is_left_aside(tmp_path):
+    pillow = pytest.importorskip("PIL.Image")
+    exif = pillow.Exif()
+    exif[0x8769] = {0x829A: 0.125, 0x9201: -5000.0}  # ExposureTime, ShutterSpeedValue
+    pillow.new("L", (4, 4)).save(tmp_path / "a.jpg", exif=exif)
+    assert read_exposure(tmp_path / "a.jpg").seconds == 0.125
 
 
 def test_the_figure_needs_matplotlib_and_says_so(monkeypatch):

@@ -89,6 +89,7 @@ def test_the_file_gives_the_rig_back(rig, tmp_path):
         (lambda text: text.replace("kalux_rig = 1", "kalux_rig = 9"), "version 9"),
         (lambda text: text.replace("translation_m", "translation"), "translation_m' is missing"),
         (lambda text: text.replace("distortion", "d", 1), "distortion' is missing"),
+        (lambda text: text.replace("sensor_size = [\n    240", "sensor_size = [\n    inf", 1), "infinity"),
         (lambda text: text.replace("sensor_size = [\n    240", "sensor_size = [\n    0", 1), "lens: size"),
     ],
 )

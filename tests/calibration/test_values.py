@@ -68,10 +68,15 @@ def test_the_file_says_units_and_is_a_settings_file_too(tmp_path):
             SettingsError,
             "nonsense",
         ),
-        (
-            lambda p: p.write_text('kalux_calibration = 1\n[maps]\nfile = "../c.npz"\nsha256 = ""'),
-            FormatError,
-            "beside it",
+        *(
+            (
+                lambda p, name=name: p.write_text(
+                    f'kalux_calibration = 1\n[maps]\nfile = "{name}"\nsha256 = ""'
+                ),
+                FormatError,
+                "beside it",
+            )
+            for name in ("../c.npz", "..", "", r"\u0000")
         ),
     ],
 )
@@ -133,6 +138,11 @@ def test_thresholds_of_pixels_are_the_priors():
     moved = np.log((images[1].intensity + 0.03) / (images[0].intensity + 0.03))
     assert moved[1, 0] == pytest.approx(0.3 * maps["threshold_on"][1, 0], rel=0.02)
     assert np.abs(np.delete(moved.ravel(), 4)).max() < 1e-6
+
+
+def test_a_spread_that_is_left_open_is_the_usual():
+    known = Calibration({"events": {"threshold_spread": "auto"}}, maps={"hot": np.zeros((4, 3), bool)})
+    assert (known.pixels.on_variance == PRESETS["default"].events.usual_threshold_spread ** 2).all()
 
 
 def test_calibrated_thresholds_count_as_measured_not_as_given():

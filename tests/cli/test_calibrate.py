@@ -8,6 +8,8 @@ import pytest
 
 from kalux import load_calibration
 from kalux.models.camera import Response
+from kalux.readers import hdf5
+from recordings import SIZE, small_events
 
 from builders import blocks
 
@@ -43,6 +45,15 @@ def test_contrast_is_measured_written_and_used(cli, unlabelled_file, tmp_path):
         *("-o", tmp_path / "p", "--format", "npy", "--calibration", out, "--events.threshold-on", 0.3),
     )
     assert "on 0.300" in flagged.out
+
+
+def test_thresholds_need_frames(cli, tmp_path):
+    path = tmp_path / "events.h5"
+    hdf5.write(path, sensor_size=SIZE, events=[small_events()], frames=[])
+    done = cli("calibrate", "contrast", path, "-o", tmp_path / "c.toml")
+    assert done.code == 2
+    assert "no frames" in done.error
+    assert "--frames" in done.error
 
 
 def test_a_calibration_is_not_overwritten(cli, unlabelled_file, tmp_path):

@@ -276,8 +276,12 @@ class TestCalibration:
         assert copy.contrast_threshold == kalux.open(recording).contrast_threshold
         assert copy.response == "srgb"
 
-    def test_one_that_says_neither_is_refused(self, cli, recording, tmp_path):
-        save_calibration(Calibration({"camera": {"frame_noise": 0.01}}), tmp_path / "noise.toml")
+    @pytest.mark.parametrize(
+        "settings",
+        [{"camera": {"frame_noise": 0.01}}, {"events": {"threshold_on": "auto", "threshold_off": 0.2}}],
+    )
+    def test_one_that_says_neither_is_refused(self, cli, recording, tmp_path, settings):
+        save_calibration(Calibration(settings), tmp_path / "noise.toml")
         found = cli("convert", recording, tmp_path / "copy.h5", "--calibration", tmp_path / "noise.toml")
         assert found.code == 2
         assert "neither contrast thresholds nor a response" in found.error

@@ -50,13 +50,14 @@ def test_reconstruct_gives_the_same_images_and_notes_the_frames(
 ):
     flags = ("--at", "frames", "--format", "npy")
     assert cli("reconstruct", recording, "-o", tmp_path / "whole", *flags).code == 0
-    assert cli("reconstruct", events_only, "-o", tmp_path / "joined", *flags, "--frames", folder).code == 0
+    joined = (*flags, "--frames", folder, "--white", 255)
+    assert cli("reconstruct", events_only, "-o", tmp_path / "joined", *joined).code == 0
     names = sorted(file.name for file in (tmp_path / "whole").glob("*.npy"))
     assert names
     for name in names:
         np.testing.assert_array_equal(np.load(tmp_path / "joined" / name), np.load(tmp_path / "whole" / name))
     told = tomllib.loads((tmp_path / "joined" / "kalux.toml").read_text())
-    assert told["input"]["frames"] == str(folder)
+    assert (told["input"]["frames"], told["input"]["white"]) == (str(folder), 255)
 
 
 @pytest.mark.parametrize(

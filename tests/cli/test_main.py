@@ -95,6 +95,13 @@ def test_usage_errors_are_one_line(cli, arguments, told):
     assert "--help" in found.error
 
 
+def test_an_empty_argument_is_not_the_current_folder(cli):
+    """What a shell makes of a variable that is not set."""
+    found = cli("reconstruct", "x", "-o", "")
+    assert found.code == 2
+    assert "an argument is empty" in found.error
+
+
 def test_an_error_of_ours_shows_the_traceback_and_asks_for_a_report(cli, recording, monkeypatch):
     def broken(options):
         raise ZeroDivisionError("ours")
@@ -104,6 +111,23 @@ def test_an_error_of_ours_shows_the_traceback_and_asks_for_a_report(cli, recordi
     assert found.code == 1
     assert found.err.startswith("Traceback")
     assert "please report" in found.err.splitlines()[-1]
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("info", "REC", "--frames", "LONG"),
+        ("reconstruct", "LONG", "-o", "out"),
+        ("benchmark", "LONG", "-o", "out"),
+        ("simulate", "LONG", "-o", "out.h5"),
+    ],
+)
+def test_what_the_system_refuses_is_told_with_the_name(cli, recording, arguments):
+    """A name that is longer than it allows."""
+    found = cli(*({"REC": recording, "LONG": "x" * 300}.get(word, word) for word in arguments))
+    assert found.code == 2
+    assert "xxx: " in found.error
+    assert "File name too long" in found.error
 
 
 HEAVY = {"numpy", "numba", "cv2", "h5py", "scipy", "av", "skimage", "OpenEXR", "kalux.writers"}

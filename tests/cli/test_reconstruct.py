@@ -146,6 +146,23 @@ class TestOutput:
             assert cli("reconstruct", recording, "-o", tmp_path / name, "--times", tmp_path / file).code == 0
             assert times_in(tmp_path / name) == wanted
 
+    @pytest.mark.parametrize(
+        ("name", "content", "told"),
+        [
+            ("t.csv", b"index,t_us,file\n5\n", "line 2: '' is not a whole number"),
+            ("t.npy", b"PK\x03\x04", "not a NumPy array"),
+            ("t.npy", np.array([1 << 63], np.uint64), "out of range"),
+        ],
+    )
+    def test_times_that_are_none_are_refused(self, cli, recording, tmp_path, name, content, told):
+        if isinstance(content, bytes):
+            (tmp_path / name).write_bytes(content)
+        else:
+            np.save(tmp_path / name, content)
+        found = cli("reconstruct", recording, "-o", tmp_path / "out", "--times", tmp_path / name)
+        assert found.code == 2
+        assert told in found.error
+
     def test_a_part_has_the_same_images_as_the_whole(self, cli, recording, simulation, tmp_path):
         flags = ("--format", "npy", "--rate", 50)
         cli("reconstruct", recording, "-o", tmp_path / "whole", *flags)

@@ -61,10 +61,13 @@ def test_an_offset_file_is_taken(cli, files, tmp_path):
         out = tmp_path / "both.h5"
         done = cli(
             "register", files / "scene.h5", "--frames", files / "scene_frames.h5", "--rig", files / "true.toml",
-            "--homography", "rig", "--distance", DISTANCE, "--offset", offset, "-o", out, "--overwrite", "--quiet",
+            "--homography", "rig", "--distance", DISTANCE, "--offset", offset, "--response", "srgb",
+            "-o", out, "--overwrite", "--quiet",
         )  # fmt: skip
         assert (done.code, done.out) == (0, "")
-        frame = next(iter(kalux.open(out).frames()))
+        recording = kalux.open(out)
+        assert recording.response == "srgb"
+        frame = next(iter(recording.frames()))
         expected = Registration.of_rig(small_rig(), DISTANCE).frame(distant_recording().frames[0])
         np.testing.assert_array_equal(frame.image, expected.image)
         np.testing.assert_array_equal(frame.valid, expected.valid)

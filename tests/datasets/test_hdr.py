@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 
 import cv2
 import numpy as np
@@ -243,6 +244,37 @@ def test_damaged_and_unequal_photographs(scene, tmp_path):
         hdr.read_bracket(folder, TIMES)
     with pytest.raises(InputError, match="no such folder"):
         hdr.read_bracket(tmp_path / "none")
+
+
+@pytest.mark.parametrize("listed", ["1/0", "two", "", '"'])
+def test_a_list_of_exposures_that_is_none(scene, tmp_path, listed):
+    folder = write(tmp_path / "b", photographs(scene))
+    times = tmp_path / "times.csv"
+    times.write_text(f"file,exposure_s\n0.png,{listed}\n")
+    with pytest.raises(FormatError, match=r"times\.csv: not a CSV"):
+        hdr.read_bracket(folder, times)
+
+
+def _zip_of(at, value):
+    """The bytes of an .npz of 20 x 30, one of them replaced."""
+    file = io.BytesIO()
+    np.savez_compressed(file, radiance=np.arange(600.0).reshape(20, 30))
+    data = bytearray(file.getvalue())
+    data[at] = value
+    return bytes(data)
+
+
+@pytest.mark.parametrize("data", [b"PK\x03\x04 cut off", _zip_of(70, 255), _zip_of(-6, 255)])
+def test_damaged_radiance(tmp_path, data):
+    (tmp_path / "r.npz").write_bytes(data)
+    with pytest.raises(FormatError, match=r"r\.npz: not an \.npz with the array radiance, or damaged"):
+        hdr.read_radiance(tmp_path / "r.npz")
+
+
+def test_validity_must_fit_the_radiance(tmp_path):
+    np.savez(tmp_path / "r.npz", radiance=np.ones((20, 30)), valid=np.ones((20, 31), bool))
+    with pytest.raises(FormatError, match=r"valid is \(20, 31\), the radiance \(20, 30\)"):
+        hdr.read_radiance(tmp_path / "r.npz")
 
 
 def test_the_exposures_of_a_real_bracket(shared_data):

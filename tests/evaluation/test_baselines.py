@@ -5,12 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kalux import PRESETS, Frame, Recording, reconstruct
+from kalux import Frame, Recording, reconstruct
 from kalux.datasets import SensorSettings
-from kalux.errors import InputError
 from kalux.evaluation.baselines import (
     EventWindow,
-    chosen_methods,
     edi_video,
     hold_last_frame,
     mean_of_neighbours,
@@ -104,22 +102,3 @@ def test_kalux_itself_is_among_them_unchanged():
     own = reconstruct(simulation.recording(), times=times)
     for image, expected in zip(methods()["default"].images(simulation.recording(), times), own, strict=True):
         assert np.array_equal(image, expected.intensity)
-
-
-def test_choice_by_name():
-    assert [m.label for m in chosen_methods(["cf", "hold"])] == ["CF", "hold the last frame"]
-    assert "mean of the neighbours" not in [m.label for m in chosen_methods()]
-    assert "mean of the neighbours" in [m.label for m in chosen_methods(held_out=True)]
-    with pytest.raises(InputError, match=r"no method 'e3vid'; known are hold.*NETWORK:WEIGHTS"):
-        chosen_methods(["e3vid"])
-    with pytest.raises(InputError, match="held out"):
-        chosen_methods(["mean"])
-    with pytest.raises(InputError, match="no method is given"):
-        chosen_methods([])
-
-
-@pytest.mark.parametrize("name", ["davis240c", "davis346", "prophesee-flir"])
-def test_presets_of_sensors_are_methods_if_they_are_named(name):
-    (method,) = chosen_methods([name])
-    assert method.settings == PRESETS[name]
-    assert method.label not in [m.label for m in chosen_methods(held_out=True)]

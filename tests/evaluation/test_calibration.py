@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from kalux.evaluation.calibration import LEVELS, ONE_SIGMA, Calibration, Calibrations
-from kalux.evaluation.scores import Pair
+from kalux.evaluation.pairs import Pair
 
 OFFSET = 0.03
 

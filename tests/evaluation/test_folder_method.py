@@ -81,9 +81,10 @@ def test_errors(tmp_path):
     folder = write(tmp_path / "a", [np.zeros((4, 5))], [0])
     with pytest.raises(FrameError, match=r"0\.npy: has 5x4 pixels, but the sensor 3x2"):
         values(folder, [0])
-    (folder / "0.npy").write_bytes(b"nothing")
-    with pytest.raises(FormatError, match=r"0\.npy: not an \.npy"):
-        values(folder, [0])
+    for content in (b"nothing", b"PK\x05\x06" + bytes(18)):  # an empty .npz
+        (folder / "0.npy").write_bytes(content)
+        with pytest.raises(FormatError, match=r"0\.npy: not an \.npy"):
+            values(folder, [0])
     (folder / "0.npy").unlink()
     with pytest.raises(FormatError, match="1 of 1 images are missing"):
         listed(folder)

@@ -9,15 +9,17 @@ import kalux
 from kalux import Recording
 from kalux.datasets import SensorSettings
 from kalux.errors import FrameError, InputError
-from kalux.evaluation.baselines import Estimated, Method, methods
+from kalux.evaluation.baselines import methods
 from kalux.evaluation.consistency import blur_consistency, valid_pixels
 from kalux.evaluation.held_out import (
     clipped_as,
     evaluate_held_out,
+    held_out_pairs,
     hold_out_frames,
     intensity_percentile,
     percentile_of_counts,
 )
+from kalux.evaluation.method import Estimated, Method
 
 from builders import frame, moving_blocks, pixel_events
 
@@ -34,6 +36,23 @@ def still(levels, exposures=None, size=(12, 12)):
 
 def constant(value):
     return Method("constant", lambda recording, times: (np.full(recording.sensor_size, value) for _ in times))
+
+
+@pytest.mark.parametrize(
+    ("images", "told"),
+    [
+        (lambda rec, ts: [np.zeros(rec.sensor_size)], r"odd: 1 images for \d+ times"),
+        (lambda rec, ts: [np.zeros(rec.sensor_size)] * (len(ts) + 1), r"odd: more images than the \d+ times"),
+        (
+            lambda rec, ts: kalux.reconstruct(rec, times=ts),
+            "odd: image 0 is of type Image; a NumPy array is needed",
+        ),
+    ],
+)
+def test_a_method_yields_one_array_per_time(images, told):
+    held = hold_out_frames(still(range(100, 112)))
+    with pytest.raises(InputError, match=told):
+        evaluate_held_out(held, Method("odd", images))
 
 
 def test_every_nth_frame_is_dropped_and_compared_if_three_from_either_end():
@@ -88,6 +107,17 @@ def test_pixels_that_are_not_valid_do_not_count():
     assert scores.mse == pytest.approx(0, abs=1e-12)
     assert scores.images[0].pixels == mask.sum()
     np.testing.assert_array_equal(valid_pixels(frames[0]), mask)
+
+
+def test_held_out_frames_in_colour_are_clipped_where_one_colour_is():
+    image = np.full((12, 12, 3), 100, np.uint8)
+    image[:, :3, 2] = 255
+    frames = [kalux.Frame(image, 100 * i, 100 * i + 10) for i in range(9)]
+    recording = Recording.from_arrays(
+        pixel_events([], []), frames, sensor_size=(12, 12), contrast_threshold=0.2
+    )
+    pair = next(held_out_pairs(hold_out_frames(recording), constant(0.4)))
+    np.testing.assert_array_equal(pair.clipped, np.arange(12)[None] + np.zeros((12, 1)) < 3)
 
 
 def test_a_held_out_frames_own_noise_is_no_error_of_the_method():

@@ -1,4 +1,4 @@
-"""Methods by a text: networks and folders."""
+"""Methods by a text: names, networks and folders."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import importlib.util
 import numpy as np
 import pytest
 
+from kalux import PRESETS
 from kalux.errors import InputError, MissingDependencyError
-from kalux.evaluation.baselines import chosen_methods
 from kalux.evaluation.learned.catalogue import NETWORKS
-from kalux.evaluation.specs import outside_method
+from kalux.evaluation.specs import chosen_methods, outside_method
 from kalux.evaluation.truth import evaluate_truth, prepare_reference
 
 from builders import moving_blocks
@@ -97,3 +97,22 @@ def test_real_weights_are_recognised_and_not_mixed_up(shared_data):
     assert "as EVREAL distributes them" in outside_method(f"firenet:{path}").notes[1]
     with pytest.raises(InputError, match="these are the weights of FireNet; give firenet:"):
         outside_method(f"firenet+:{path}")
+
+
+def test_choice_by_name():
+    assert [m.label for m in chosen_methods(["cf", "hold"])] == ["CF", "hold the last frame"]
+    assert "mean of the neighbours" not in [m.label for m in chosen_methods()]
+    assert "mean of the neighbours" in [m.label for m in chosen_methods(held_out=True)]
+    with pytest.raises(InputError, match=r"no method 'e3vid'; known are hold.*NETWORK:WEIGHTS"):
+        chosen_methods(["e3vid"])
+    with pytest.raises(InputError, match="held out"):
+        chosen_methods(["mean"])
+    with pytest.raises(InputError, match="no method is given"):
+        chosen_methods([])
+
+
+@pytest.mark.parametrize("name", ["davis240c", "davis346", "prophesee-flir"])
+def test_presets_of_sensors_are_methods_if_they_are_named(name):
+    (method,) = chosen_methods([name])
+    assert method.settings == PRESETS[name]
+    assert method.label not in [m.label for m in chosen_methods(held_out=True)]

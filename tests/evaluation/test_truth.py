@@ -9,7 +9,8 @@ import pytest
 
 import kalux
 from kalux.errors import FormatError, InputError
-from kalux.evaluation.baselines import Estimated, Method, methods
+from kalux.evaluation.baselines import methods
+from kalux.evaluation.method import Estimated, Method
 from kalux.evaluation.truth import evaluate_truth, load_truth, prepare_reference
 from kalux.readers import GroundTruth
 
@@ -150,7 +151,10 @@ class TestFiles:
         path = tmp_path / "t.npz"
         with pytest.raises(InputError, match=r"t\.npz: cannot be read"):
             load_truth(path)
-        for content in (b"", b"text", b"PK\x03\x04 cut"):
+        np.savez_compressed(path, times=np.arange(2), images=np.random.default_rng(0).random((2, 30, 30)))
+        damaged = bytearray(path.read_bytes())
+        damaged[len(damaged) // 2 : len(damaged) // 2 + 200] = bytes(200)
+        for content in (b"", b"text", b"PK\x03\x04 cut", damaged):
             path.write_bytes(content)
             with pytest.raises(FormatError, match=r"t\.npz: not an \.npz file"):
                 load_truth(path)

@@ -182,7 +182,7 @@ def test_without_images(folder):
 def test_nothing_at_all(folder):
     (folder / "events.txt").write_bytes(b"")
     (folder / "images.txt").write_bytes(b"")
-    with pytest.raises(FormatError, match="neither events nor images"):
+    with pytest.raises(FormatError, match="has no events, and does not say"):
         readers.read(folder)
 
 

@@ -35,6 +35,9 @@ UNSEEN: Final = 2.0**41
 REPEATED: Final = 2.0**39
 """Variance of a frame that measures a pixel, but tells of it only what others have told already (K11): black."""
 
+_BLOCK: Final = 64
+"""Pixels that are looked at together: parts of the image that frames measure are left out where they may be."""
+
 _SCALE_BOUNDS: Final = (0.3, 3.0)
 _SCALE_DRIFT: Final = 1e-5  # variance per frame: a calibration never becomes certain, temperatures drift
 
@@ -180,15 +183,38 @@ def _drift(  # type: ignore[no-untyped-def]
     new_on,
     new_off,
 ):
-    unmeasured, two = np.float32(UNMEASURED), np.float32(2.0)
-    for i in range(len(grown)):
-        grown[i] = new_on[i] = new_off[i] = np.float32(0.0)
-        if after[i] < unmeasured:
+    unmeasured, two, zero = np.float32(UNMEASURED), np.float32(2.0), np.float32(0.0)
+    drifted = np.empty(_BLOCK, np.float32)
+    for first in range(np.uint64(0), np.uint64(len(grown)), np.uint64(_BLOCK)):
+        pixels = range(first, min(np.uint64(len(grown)), first + np.uint64(_BLOCK)))
+        if not _any_from(after, pixels, unmeasured):
+            for i in pixels:  # few arrays a loop: vector code
+                grown[i] = zero
+            for i in pixels:
+                new_on[i] = zero
+            for i in pixels:
+                new_off[i] = zero
             continue
-        drifted = on_variance[i] * of_on * on[i] * (two * far_on[i] + on[i])
-        drifted += off_variance[i] * of_off * off[i] * (two * far_off[i] + off[i])
-        grown[i] = drifted + untold if before[i] < unmeasured else drifted
-        new_on[i], new_off[i] = far_on[i] + on[i], far_off[i] + off[i]
+        for i in pixels:
+            drifted[i - first] = on_variance[i] * of_on * on[i] * (two * far_on[i] + on[i])
+        for i in pixels:
+            drifted[i - first] += off_variance[i] * of_off * off[i] * (two * far_off[i] + off[i])
+        for i in pixels:
+            more = untold if before[i] < unmeasured else zero
+            grown[i] = drifted[i - first] + more if after[i] >= unmeasured else zero
+        for i in pixels:
+            new_on[i] = far_on[i] + on[i] if after[i] >= unmeasured else zero
+        for i in pixels:
+            new_off[i] = far_off[i] + off[i] if after[i] >= unmeasured else zero
+
+
+@nb.njit(cache=True, inline="always")
+def _any_from(values, places, least):  # type: ignore[no-untyped-def]
+    """Whether a value at one of the places is ``least`` or more; counted, which is vector code."""
+    count = np.int32(0)
+    for i in places:
+        count += np.int32(values[i] >= least)
+    return count > 0
 
 
 def lift(log_intensity: Array, frame: Latent) -> None:

@@ -209,11 +209,12 @@ def all_between(chunks: Sequence[EventArray], start: int, end: int) -> list[Even
 
 def events_until(events: EventArray, t: int) -> int:
     """Number of events up to and at ``t`` (us). NumPy's search would copy the whole column first."""
-    return int(_events_until(event_words(events), t))
+    return int(words_until(event_words(events), t))
 
 
 @nb.njit(cache=True, nogil=True)
-def _events_until(words, t):  # type: ignore[no-untyped-def]
+def words_until(words, t):  # type: ignore[no-untyped-def]
+    """The same of events as machine words (`kalux.compiled.event_words`)."""
     first, last = 0, len(words)
     while first < last:
         middle = (first + last) // 2

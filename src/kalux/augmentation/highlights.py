@@ -7,6 +7,7 @@ recording goes on, and for every part of the image, since a window is brighter t
 
 from __future__ import annotations
 
+import functools
 from typing import Any, Final, NamedTuple
 
 import numba as nb
@@ -134,8 +135,9 @@ def _at_pixels(pixels, width, mean, variance, initial_variance, excess, noise): 
         noise[i] = max(np.float32(variance[pixels[i]]) - initial_variance, zero)
 
 
+@functools.cache
 def _nearness(parts: int) -> Floats:
-    """(parts, parts): weights of parts for each other along one side."""
+    """(parts, parts): weights of parts for each other along one side. Not to be changed."""
     distance = _PART * np.subtract.outer(np.arange(parts), np.arange(parts))
     nearness: Floats = np.exp(-0.5 * (distance / _RANGE) ** 2)
     return nearness

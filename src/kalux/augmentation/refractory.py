@@ -31,7 +31,7 @@ from kalux.compiled import (
     prefetch,
     weighed,
 )
-from kalux.events import EVENT_DTYPE, EventArray
+from kalux.events import EVENT_DTYPE, NEVER, EventArray
 
 MOST: Final = np.float32(6.0)
 """Largest weight. Near the refractory period the formula has no end; 4 to 6 do best where 2 ms are lost of edges that
@@ -40,8 +40,6 @@ take as long (docs/equations.md, K13)."""
 _EARLY: Final = np.float32(0.95)
 """Shares of the refractory period from which on an event counts as one that came at its end: pixels differ. What comes
 earlier is noise, of which no light was missed."""
-
-_NEVER: Final = -(1 << 60)
 
 
 class EventClock:
@@ -74,7 +72,7 @@ class EventClock:
             return
         height, width = self._sensor_size
         if self._latest is None:
-            self._latest = np.full(height * width, _NEVER, np.int64)
+            self._latest = np.full(height * width, NEVER, np.int64)
         _weigh(words, self._latest, np.uint64(width), self._refractory_period)
 
     def weighed(self, events: EventArray) -> EventArray:

@@ -59,8 +59,7 @@ def silent_change(segment: BridgedSegment, quantisation_variance: float, thresho
     told_of = tuple(plane.reshape(-1) for plane in (change, untold, silent))
     of_all, told = _told(given, seconds, q0, most, told_of)
     whole = max(of_all, 0.0) / told if told > _ENOUGH else UNKNOWN_CHANGE * threshold2
-    untold *= np.float32(whole)
-    change += untold
+    _add_share(change.reshape(-1), untold.reshape(-1), np.float32(whole))
     unknown, unmeasured = (np.float32(u * threshold2) for u in (UNKNOWN_CHANGE, _UNMEASURED_CHANGE))
     _mean(_sum_around(change), _sum_around(silent), *variances, unknown, unmeasured, mean)
     return mean
@@ -143,6 +142,12 @@ def _told(given, seconds, q0, most, told_of):  # type: ignore[no-untyped-def]
         for k in pixels:
             sum_share[k] += is_silent[k] * share[k]
     return sum_change.sum(), sum_share.sum()
+
+
+@nb.njit(cache=True, nogil=True)
+def _add_share(change, untold, whole):  # type: ignore[no-untyped-def]
+    for i in range(np.uint64(len(change))):
+        change[i] += untold[i] * whole
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")

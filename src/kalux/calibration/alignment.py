@@ -384,7 +384,7 @@ def _scaling(size: tuple[int, int]) -> Array:
 def _coordinates(registration: Registration) -> Floats:
     """(H, W, 2): the undistorted pixels of the event camera, scaled."""
     height, width = registration.events.sensor_size
-    points = np.column_stack([registration._undistorted, np.ones(height * width)])
+    points = np.column_stack([registration.undistorted, np.ones(height * width)])
     scaled = points @ _scaling((height, width)).T
     return np.nan_to_num(scaled[:, :2]).reshape(height, width, 2).astype(np.float32)
 

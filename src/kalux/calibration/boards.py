@@ -3,9 +3,8 @@
 Where a screen switches a board on and off, its white squares make events at every switch and its black ones none: an
 image of the number of events in some time shows the board. The number grows with the logarithm of the brightness; it is
 exponentiated, or white squares would look too large (corners, symmetric under a turn by 180 degrees, would stay where
-they are even so). The rig is held
-still before the board, moved, held still again: in every pause both cameras see the board in one pose, and no common
-clock finer than a pause is needed.
+they are even so). The rig is held still before the board, moved, held still again: in every pause both cameras see the
+board in one pose, and no common clock finer than a pause is needed.
 """
 
 from __future__ import annotations

@@ -93,6 +93,9 @@ class ThresholdEstimate(NamedTuple):
         How much later than the frames' clock events were taken to be stamped, us.
     doubt
         Relative error of thresholds that comes from that of the refractory period; a part of ``spread``.
+    shortest_interval
+        How soon a pixel can follow one event by another, us (`kalux.calibration.refractory`); 0: not known, or not
+        looked for, as where the refractory period is given.
     """
 
     on: float
@@ -104,6 +107,7 @@ class ThresholdEstimate(NamedTuple):
     refractory_period: int
     delay: int
     doubt: float
+    shortest_interval: int
 
     @property
     def may_lose(self) -> bool:
@@ -162,7 +166,8 @@ def estimate_thresholds(
     ExposureError
         If the frames' exposures are not known.
     """
-    view = _view(recording, camera, of_log_offset, refractory_period)
+    shortest = 0 if refractory_period is not None else shortest_interval(recording, _SHORTEST_EVENTS)
+    view = _View(recording, camera, of_log_offset, 0, shortest)
     view = view.without_trailing(delay, refractory_period or 0)
     return _estimate(view, usual, refractory_period, most, delay)
 
@@ -178,16 +183,14 @@ def refine_thresholds(
 ) -> ThresholdEstimate:
     """The thresholds with another I_0 than that of a rough estimate, whose delay is right whatever I_0 is.
 
-    Parameters are those of `estimate_thresholds`.
+    Parameters are those of `estimate_thresholds`, by which ``rough`` was made with the same ``refractory_period``.
     """
-    view = _view(recording, camera, of_log_offset, refractory_period)._replace(delay=rough.delay)
+    view = _View(recording, camera, of_log_offset, rough.delay, rough.shortest_interval)
     period = rough.refractory_period
     if refractory_period is not None or period == 0:
         return _estimate(view, usual, refractory_period, MAX_SAMPLES, None) or rough
     period = _without_excess(view) or period
-    return (
-        _by_information(view.seen(period, most=MAX_SAMPLES), usual, period, view.delay, rough.doubt) or rough
-    )
+    return _by_information(view.seen(period, most=MAX_SAMPLES), usual, period, view, rough.doubt) or rough
 
 
 def _estimate(
@@ -203,11 +206,11 @@ def _estimate(
     if len(samples.share) < _MIN_SAMPLES:
         return None
     if not 0 < view.shortest <= _LARGEST_SHORTEST:
-        return _by_information(samples, usual, period, view.delay, 0.0)
+        return _by_information(samples, usual, period, view, 0.0)
     excess = _excess_of_soon(samples)
     # Where it is too uncertain to be believed, thresholds may still be as much too large.
     maybe = _THRESHOLD_OF_EXCESS * max(excess.value - _USUAL_EXCESS, 0.0)
-    estimate = _by_information(samples, usual, period, view.delay, maybe)
+    estimate = _by_information(samples, usual, period, view, maybe)
     if estimate is None or not excess.value - 2 * excess.error > _LEAST_EXCESS:
         return estimate
     for _ in range(2 if delay is not None else 1):  # what is lost looks like delay, too
@@ -216,19 +219,14 @@ def _estimate(
             return estimate
         view = view if delay is None else view.without_trailing(delay, period)
     doubt = _THRESHOLD_OF_EXCESS * float(np.hypot(excess.error, _USUAL_EXCESS))
-    return _by_information(view.seen(period, most=most), usual, period, view.delay, doubt) or estimate
-
-
-def _view(
-    recording: Recording, camera: CameraSettings, of_log_offset: bool, refractory_period: int | None
-) -> _View:
-    """A view without delay, for finding the refractory period if it is not known."""
-    shortest = 0 if refractory_period is not None else shortest_interval(recording, _SHORTEST_EVENTS)
-    return _View(recording, camera, of_log_offset, 0, shortest)
+    return _by_information(view.seen(period, most=most), usual, period, view, doubt) or estimate
 
 
 class _View(NamedTuple):
-    """How to look at a recording: whether events are steps of log(I + I_0), their delay and shortest interval, us."""
+    """How to look at a recording: whether events are steps of log(I + I_0), their delay and shortest interval, us.
+
+    The latter is 0 where the refractory period is not to be found.
+    """
 
     recording: Recording
     camera: CameraSettings
@@ -313,7 +311,7 @@ class _Told(NamedTuple):
 
 
 def _by_information(
-    seen: _Seen, usual: Usual, period: int, delay: int, doubt: float
+    seen: _Seen, usual: Usual, period: int, view: _View, doubt: float
 ) -> ThresholdEstimate | None:
     """Thresholds from either kind of instruments and the usual ones, weighted by the inverse of their variances.
 
@@ -347,8 +345,9 @@ def _by_information(
         spread=float(np.sqrt(np.mean(1 / total))),
         usual_share=float(np.mean(information[0] / total)),
         refractory_period=period,
-        delay=delay,
+        delay=view.delay,
         doubt=doubt,
+        shortest_interval=view.shortest,
     )
 
 

@@ -81,20 +81,32 @@ _LEAST_SHARE: Final = 1e-3
 """Of what the events predict, that frames could show: less is an event that is none of the pixel's."""
 
 
-class _Model(NamedTuple):
-    """What the likelihood needs to know beside what is tried."""
+class ErrorModel(NamedTuple):
+    """What is known of the events and frames of an interval, and of how wrong either is.
+
+    Attributes
+    ----------
+    thresholds
+        (on, off), log intensity.
+    frame_noise
+        Frame and shot noise, as of `kalux.settings.CameraSettings.noise`.
+    threshold_spread, quantisation_variance
+        As of `kalux.settings.EventSettings`.
+    """
 
     thresholds: tuple[float, float]
     frame_noise: tuple[float, float]
     threshold_spread: float
     quantisation_variance: float
 
-    def loss(self, samples: Samples, shown: Shown | None, log_offset: float, step_variance: float) -> float:
-        return negative_log_likelihood(samples, self.thresholds, log_offset, step_variance, *self[1:], shown)
+    def told(self, samples: Samples) -> Array:
+        """(N,) by how much the log intensity changed as the events say."""
+        on, off = self.thresholds
+        return on * samples.on - off * samples.off
 
     def best(self, samples: Samples, shown: Shown | None, log_offset: float) -> tuple[float, float]:
         """The least loss, and the variance of a step that has it."""
-        return min((self.loss(samples, shown, log_offset, q), q) for q in STEP_VARIANCES)
+        return min((negative_log_likelihood(samples, self, log_offset, q, shown), q) for q in STEP_VARIANCES)
 
 
 def estimate_event_model(
@@ -137,7 +149,7 @@ def estimate_event_model(
     signals = Samples(*(values[chosen] for values in samples))
     if len(signals.before) < _MIN_SAMPLES:
         return None
-    model = _Model(thresholds, noise_of_blurred(camera), threshold_spread, quantisation_variance)
+    model = ErrorModel(thresholds, noise_of_blurred(camera), threshold_spread, quantisation_variance)
     if camera.log_offset is None:
         # Frames that show the dark range over a hundred to one: what is beyond matters little, and lost events, of
         # which the model knows nothing, would count for more.
@@ -152,13 +164,13 @@ def estimate_event_model(
     return EventModel(log_offset, step_variance, len(samples.before))
 
 
-def _log_offset(samples: Samples, shown: Shown | None, model: _Model) -> float:
+def _log_offset(samples: Samples, shown: Shown | None, model: ErrorModel) -> float:
     """The I_0 that is likeliest, within a fifth: of those tried, then of those between the best and its neighbours.
 
     What is usual counts as far as events do not explain what changes: noise says nothing of I_0.
     """
     change = np.log(samples.after + UNKNOWN_LOG_OFFSET) - np.log(samples.before + UNKNOWN_LOG_OFFSET)
-    predicted = model.thresholds[0] * samples.on - model.thresholds[1] * samples.off
+    predicted = model.told(samples)
     squares = float(predicted @ predicted) * float(change @ change)
     told = max(float(predicted @ change), 0.0) ** 2 / max(squares, 1e-12)
     count = len(change) * told / _ALIKE
@@ -187,35 +199,25 @@ def noise_of_blurred(camera: CameraSettings) -> tuple[float, float]:
 
 
 def mismatch_of(
-    samples: Samples,
-    thresholds: tuple[float, float],
-    log_offset: float,
-    step_variance: float,
-    noise: tuple[float, float],
-    threshold_spread: float,
-    quantisation_variance: float,
+    samples: Samples, model: ErrorModel, log_offset: float, step_variance: float
 ) -> tuple[Array, Array]:
     """What the frames changed beyond what events tell, and the variance that the bridge takes it to have (K1)."""
-    on, off = thresholds
+    on, off = model.thresholds
     change = np.log(samples.after + log_offset) - np.log(samples.before + log_offset)
-    mismatch = change - (on * samples.on - off * samples.off)
     variance = (
-        noise_variance(samples.before, noise, 1.0) / (samples.before + log_offset) ** 2
-        + noise_variance(samples.after, noise, 1.0) / (samples.after + log_offset) ** 2
-        + threshold_spread**2 * ((on * samples.on) ** 2 + (off * samples.off) ** 2)
-        + on * off * (step_variance * (samples.on + samples.off) + quantisation_variance)
+        noise_variance(samples.before, model.frame_noise, 1.0) / (samples.before + log_offset) ** 2
+        + noise_variance(samples.after, model.frame_noise, 1.0) / (samples.after + log_offset) ** 2
+        + model.threshold_spread**2 * ((on * samples.on) ** 2 + (off * samples.off) ** 2)
+        + on * off * (step_variance * (samples.on + samples.off) + model.quantisation_variance)
     )
-    return mismatch, variance
+    return change - model.told(samples), variance
 
 
 def negative_log_likelihood(
     samples: Samples,
-    thresholds: tuple[float, float],
+    model: ErrorModel,
     log_offset: float,
     step_variance: float,
-    noise: tuple[float, float],
-    threshold_spread: float,
-    quantisation_variance: float,
     shown: Shown | None = None,
 ) -> float:
     """Mean over the samples of -log p(I after | I before, events), up to a constant.
@@ -225,9 +227,7 @@ def negative_log_likelihood(
     what is ``shown``: pixels that became brighter than white or darker than black are not among the samples, and events
     that took them there would seem to say too much.
     """
-    mismatch, variance = mismatch_of(
-        samples, thresholds, log_offset, step_variance, noise, threshold_spread, quantisation_variance
-    )
+    mismatch, variance = mismatch_of(samples, model, log_offset, step_variance)
     tails = (_FREEDOM + 1) / 2 * np.log1p(mismatch**2 / (_FREEDOM * variance))
     after = np.log(samples.after + log_offset)
     losses = 0.5 * np.log(variance) + tails + after

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import islice
 from typing import Final
 
 import numpy as np
@@ -87,9 +88,7 @@ def intervals(
     held: list[EventArray] = []
     previous: tuple[Frame, Shot] | None = None
     reference = float(camera.reference_exposure or 0)
-    for index, frame in enumerate(recording.frames()):
-        if index == most_frames:
-            return
+    for frame in islice(recording.frames(), most_frames):
         reference = reference or float(frame.exposure)
         shot = take_shot(frame, model, reference)
         while not held or held[-1]["t"][-1] <= shot.middle + margin:

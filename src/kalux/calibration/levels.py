@@ -8,6 +8,7 @@ not clip. Comparing with other levels makes up for thresholds that are a little 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import islice
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -109,11 +110,9 @@ def find_ceiling(recording: Recording, camera: CameraSettings, events: EventSett
 def _brightest(recording: Recording) -> float | None:
     """The response that a thousandth of the pixels of the first frames reach; None: frames are in RGB or all black."""
     histogram = np.zeros(_FINE, np.int64)
-    for index, frame in enumerate(recording.frames()):
+    for frame in islice(recording.frames(), _MAX_FRAMES):
         if frame.image.ndim == 3:
             return None
-        if index == _MAX_FRAMES:
-            break
         values = np.rint((_FINE - 1) * np.clip(frame.normalised(), 0, 1)).astype(np.int64)
         histogram += np.bincount(values.ravel(), minlength=_FINE)
     reached = np.cumsum(histogram[::-1])[::-1] >= max(_BRIGHTEST * histogram.sum(), 1)

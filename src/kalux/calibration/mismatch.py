@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from kalux.augmentation.deblur import between, count_events
 from kalux.augmentation.refractory import EventClock
-from kalux.calibration.event_model import DARKEST, Samples, mismatch_of, noise_of_blurred
+from kalux.calibration.event_model import DARKEST, ErrorModel, Samples, mismatch_of, noise_of_blurred
 from kalux.calibration.intervals import intervals
 from kalux.calibration.regression import parts
 from kalux.recording import Recording
@@ -79,8 +79,12 @@ def estimate_mismatch(recording: Recording, camera: CameraSettings, events: Even
     """
     assert events.threshold_on is not None
     assert events.threshold_off is not None
-    thresholds = events.threshold_on, events.threshold_off
-    noise = noise_of_blurred(camera)
+    model = ErrorModel(
+        (events.threshold_on, events.threshold_off),
+        noise_of_blurred(camera),
+        events.usual_threshold_spread,
+        events.quantisation_variance,
+    )
     clock = EventClock(recording.sensor_size, events.refractory)
     delay = events.lateness
     products: Array = np.zeros((*recording.sensor_size, *_PRODUCTS))
@@ -92,16 +96,8 @@ def estimate_mismatch(recording: Recording, camera: CameraSettings, events: Even
         seen = Samples(first.intensity, second.intensity, on, off)
         bright = np.minimum(seen.before, seen.after) > DARKEST
         told = ~first.clipped & ~second.clipped & bright & (on + off > 0)
-        mismatch, variance = mismatch_of(
-            seen,
-            thresholds,
-            camera.offset,
-            events.step_noise,
-            noise,
-            events.usual_threshold_spread,
-            events.quantisation_variance,
-        )
-        _add(mismatch, variance, told, thresholds[0] * on, thresholds[1] * off, products)
+        mismatch, variance = mismatch_of(seen, model, camera.offset, events.step_noise)
+        _add(mismatch, variance, told, events.threshold_on * on, events.threshold_off * off, products)
         samples += int(np.count_nonzero(told))
         if samples >= MAX_SAMPLES:
             break

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 from typing import Final, NamedTuple
 
 import cv2
@@ -20,7 +21,7 @@ from kalux.calibration.delay import estimate_delay
 from kalux.calibration.frame_noise import FrameNoise, estimate_frame_noise
 from kalux.calibration.refractory import shortest_interval
 from kalux.calibration.values import Calibration
-from kalux.events import EventArray
+from kalux.events import NEVER, EventArray
 from kalux.recording import Recording
 from kalux.settings import CameraSettings
 
@@ -230,7 +231,8 @@ def _tallied(chunks: Iterator[EventArray], first: int, last: int, ignored: NDArr
     quiet = np.zeros((windows, height, width), np.int64)
     total = np.zeros((height, width), np.int64)
     busy_until = np.full((height, width), first, np.int64)  # silence before the first event is not known
-    pending = np.full((height, width), -1, np.int64)  # an event in quiet time, until its future is quiet, too
+    # An event in quiet time, until its future is quiet, too.
+    pending = np.full((height, width), NEVER, np.int64)
     for chunk in chunks:
         t, x, y = (chunk[name] for name in ("t", "x", "y"))
         _tally(t, x, y, first, length, QUIET, ignored, busy_until, pending, counts, quiet, total)
@@ -249,24 +251,25 @@ def _add_quiet(start, end, first, length, row, column, quiet):  # type: ignore[n
         start = stop
 
 
+@nb.njit(cache=True, nogil=True, inline="always")
+def _count_pending(pending, row, column, first, length, counts):  # type: ignore[no-untyped-def]
+    """Count a pixel's event that waits, if one does, in the window of its time."""
+    if pending[row, column] != NEVER:
+        window = min(int((pending[row, column] - first) / length), counts.shape[0] - 1)
+        counts[window, row, column] += 1
+
+
 @nb.njit(cache=True, nogil=True)
 def _tally(t, x, y, first, length, gap, ignored, busy_until, pending, counts, quiet, total):  # type: ignore[no-untyped-def]
     height, width = total.shape
     for i in range(len(t)):
         now, row, column = t[i], y[i], x[i]
         total[row, column] += 1
-        # The pixel's own event is noise if it is in quiet time before, and no neighbour follows (decided later).
+        # The pixel's own event is noise if it is in quiet time before, and no neighbour follows: of one that waits for
+        # that it is known now.
         if now >= busy_until[row, column]:
-            if pending[row, column] >= 0 and now - pending[row, column] >= gap:
-                window = min(int((pending[row, column] - first) / length), counts.shape[0] - 1)
-                counts[window, row, column] += 1
-                pending[row, column] = now
-            elif pending[row, column] < 0:
-                pending[row, column] = now
-            else:  # a second one shortly after: both are counted, the first now
-                window = min(int((pending[row, column] - first) / length), counts.shape[0] - 1)
-                counts[window, row, column] += 1
-                pending[row, column] = now
+            _count_pending(pending, row, column, first, length, counts)
+            pending[row, column] = now
         if ignored[row, column]:
             continue
         for r in range(max(0, row - 1), min(height, row + 2)):
@@ -277,11 +280,9 @@ def _tally(t, x, y, first, length, gap, ignored, busy_until, pending, counts, qu
                 end = now - gap
                 if end > busy_until[r, c]:
                     _add_quiet(busy_until[r, c], end, first, length, r, c, quiet)
-                if pending[r, c] >= 0:
-                    if pending[r, c] <= end:
-                        window = min(int((pending[r, c] - first) / length), counts.shape[0] - 1)
-                        counts[window, r, c] += 1
-                    pending[r, c] = -1
+                if pending[r, c] <= end:
+                    _count_pending(pending, r, c, first, length, counts)
+                pending[r, c] = NEVER
                 busy_until[r, c] = max(busy_until[r, c], now + gap)
 
 
@@ -293,9 +294,8 @@ def _close(last, first, length, gap, busy_until, pending, counts, quiet):  # typ
         for column in range(busy_until.shape[1]):
             if end > busy_until[row, column]:
                 _add_quiet(busy_until[row, column], end, first, length, row, column, quiet)
-            if 0 <= pending[row, column] <= end:
-                window = min(int((pending[row, column] - first) / length), counts.shape[0] - 1)
-                counts[window, row, column] += 1
+            if pending[row, column] <= end:
+                _count_pending(pending, row, column, first, length, counts)
 
 
 def _hot_pixels(tally: _Tally) -> NDArray[np.bool_]:
@@ -384,9 +384,7 @@ def clipping_levels(recording: Recording) -> Levels:
     inside it. Where the sensor has fixed pattern noise it spreads over some levels.
     """
     histogram = np.zeros(256)
-    for index, frame in enumerate(recording.frames()):
-        if index == MAX_FRAMES:
-            break
+    for frame in islice(recording.frames(), MAX_FRAMES):
         values = np.rint(255 * np.clip(frame.normalised(), 0, 1)).astype(np.int64)
         histogram += np.bincount(values.ravel(), minlength=256)
     if not histogram.any():

@@ -8,6 +8,7 @@ pixel by pixel.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
+from itertools import islice
 from typing import Any, Final, NamedTuple
 
 import cv2
@@ -118,9 +119,7 @@ def frame_changes(
     middles: list[int] = []
     rows: list[Array] = []
     before: tuple[NDArray[Any], NDArray[Any]] | None = None
-    for index, frame in enumerate(frames):
-        if index == _COARSE_FRAMES:
-            break
+    for frame in islice(frames, _COARSE_FRAMES):
         log, good = _one(frame, camera)
         now: tuple[NDArray[Any], NDArray[Any]]
         if registration is None:
@@ -260,11 +259,7 @@ def busiest(changes: Changes, most: int = MOST_FRAMES) -> slice:
 
 def some_frames(frames: Iterable[Frame], chosen: slice) -> Iterator[Frame]:
     """Those of a stretch."""
-    for index, frame in enumerate(frames):
-        if index >= chosen.stop:
-            return
-        if index >= chosen.start:
-            yield frame
+    return islice(frames, chosen.start, chosen.stop)
 
 
 def some_events(chunks: Iterable[EventArray], start: float, end: float) -> EventArray:

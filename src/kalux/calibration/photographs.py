@@ -47,7 +47,7 @@ def read_exposure(path: Path) -> Exposure:
     InputError
         If there is no exposure time.
     FormatError
-        If the file is no image.
+        If the file is no image, or its EXIF data damaged.
     MissingDependencyError
         If Pillow is not installed.
     """
@@ -62,11 +62,10 @@ def read_exposure(path: Path) -> Exposure:
     try:
         with Pillow.open(path) as file:
             tags = file.getexif().get_ifd(ExifTags.IFD.Exif)
-    except OSError as error:
+    except (OSError, SyntaxError) as error:  # Pillow's word for EXIF data without a TIFF header
         raise FormatError(f"{path}: not an image, or damaged; copy it again") from error
     seconds = _positive(tags.get(ExifTags.Base.ExposureTime))
-    apex = tags.get(ExifTags.Base.ShutterSpeedValue)
-    exact = None if apex is None else _positive(2.0 ** -float(apex))
+    exact = _from_apex(tags.get(ExifTags.Base.ShutterSpeedValue))
     if seconds is None or (exact is not None and abs(np.log2(exact / seconds)) < 0.25):
         seconds = exact
     if seconds is None:
@@ -74,6 +73,13 @@ def read_exposure(path: Path) -> Exposure:
     iso = _positive(tags.get(ExifTags.Base.ISOSpeedRatings)) or 100.0
     aperture = _positive(tags.get(ExifTags.Base.FNumber)) or 1.0
     return Exposure(seconds, iso / 100, aperture)
+
+
+def _from_apex(value: Any) -> float | None:
+    try:
+        return _positive(2.0 ** -float(value))
+    except (TypeError, ValueError, ZeroDivisionError, OverflowError):
+        return None
 
 
 def _positive(value: Any) -> float | None:

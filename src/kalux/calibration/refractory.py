@@ -7,6 +7,7 @@ from typing import Final
 import numba as nb
 import numpy as np
 
+from kalux.events import NEVER
 from kalux.recording import Recording
 
 _EDGE: Final = 0.02  # of the most frequent inter-event interval: what is rarer and shorter is noise
@@ -29,7 +30,7 @@ def shortest_interval(recording: Recording, most_events: int = 3_000_000) -> int
     others at any time. Of the first ``most_events``, and the first 200 of each pixel, so that hot pixels, which keep no
     period that others have, do not decide; 0 without events that follow one another.
     """
-    last = np.full(recording.sensor_size, -1, np.int64)
+    last = np.full(recording.sensor_size, NEVER, np.int64)
     seen = np.zeros(recording.sensor_size, np.int32)
     histogram = np.zeros(len(_EDGE_BINS) - 1, np.int64)
     count = 0
@@ -55,7 +56,7 @@ def _intervals_of(t, x, y, last, seen):  # type: ignore[no-untyped-def]
     n = 0
     for i in range(len(t)):
         before = last[y[i], x[i]]
-        if before >= 0 and seen[y[i], x[i]] < _MOST_OF_PIXEL:
+        if before != NEVER and seen[y[i], x[i]] < _MOST_OF_PIXEL:
             found[n] = t[i] - before
             n += 1
             seen[y[i], x[i]] += 1

@@ -66,7 +66,7 @@ class Registration:
     def maps(self) -> Maps:
         """Where each pixel of the event camera lies in the frame."""
         height, width = self.events.sensor_size
-        x, y = self.places(self._undistorted).T.reshape(2, height, width)
+        x, y = self.places(self.undistorted).T.reshape(2, height, width)
         rows, columns = self.frames.sensor_size
         with np.errstate(invalid="ignore"):
             inside = (x >= -_EDGE) & (x <= columns - 1 + _EDGE) & (y >= -_EDGE) & (y <= rows - 1 + _EDGE)
@@ -78,7 +78,7 @@ class Registration:
         )
 
     @property
-    def _undistorted(self) -> Array:
+    def undistorted(self) -> Array:
         """Undistorted pixels of the event camera, (H * W, 2)."""
         rays = self.events.rays
         return rays @ self.events.matrix[:2, :2].T + self.events.matrix[:2, 2]
@@ -146,7 +146,7 @@ class Registration:
                 f"frame {index} is {width}x{height} pixels, the frame camera {self.frames.sensor_size[1]}x"
                 f"{self.frames.sensor_size[0]}; the rig must be calibrated with frames of the same size"
             )
-        if getattr(frame, "mosaic", None) is not None:
+        if frame.mosaic is not None:
             raise FrameError(
                 f"frame {index} is a raw mosaic, which cannot be resampled; demosaic the frames first"
             )

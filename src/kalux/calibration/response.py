@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any, Final, Literal, NamedTuple
 
 import cv2
@@ -391,11 +392,7 @@ def still_pixels(recording: Recording, most_frames: int = 400) -> tuple[list[Ima
     InputError
         If no run has three exposure times, e.g. because the exposure is fixed.
     """
-    frames = []
-    for frame in recording.frames():
-        frames.append(frame)
-        if len(frames) == most_frames:
-            break
+    frames = list(islice(recording.frames(), most_frames))
     best: tuple[list[Frame], NDArray[np.bool_]] | None = None
     for run, still in _still_runs(recording, frames):
         chosen = _distinct(run)

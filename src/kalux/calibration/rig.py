@@ -224,7 +224,7 @@ def load_rig(path: Path) -> Rig:
         )
     except KeyError as error:
         raise FormatError(f"{path}: {error} is missing; see docs/rig.md for what a rig file holds") from error
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise FormatError(f"{path}: {error}") from error
 
 

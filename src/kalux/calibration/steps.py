@@ -25,6 +25,7 @@ from kalux.augmentation.deblur import between
 from kalux.augmentation.refractory import step_weight
 from kalux.calibration.intervals import Interval, intervals
 from kalux.compiled import event_column, event_is_on, event_row, event_words
+from kalux.events import NEVER
 from kalux.recording import Recording
 from kalux.settings import CameraSettings
 
@@ -51,8 +52,6 @@ the pace; with 20 and 50 ms thresholds are 0.4 % apart."""
 
 _PEAK: Final = 0.5
 """Thresholds by which the light goes on before it turns, on average."""
-
-_NEVER: Final = -(1 << 60)
 
 
 class Steps(NamedTuple):
@@ -156,11 +155,10 @@ class _Passing:
         self._shape = sensor_size
         self._periods, self._late = np.array(periods, np.float32), float(late)
         self._delay, self._most = delay, most
-        self._latest = np.full(
-            height * width, _NEVER, np.int64
-        )  # time of the event before the interval's first
-        self._sign = np.zeros(height * width, np.int8)  # 1: it was on, -1: off, 0: there was none
-        self._seen_until = _NEVER
+        # Of the event before the interval's first: its time, and its sign, 0 if there was none.
+        self._latest = np.full(height * width, NEVER, np.int64)
+        self._sign = np.zeros(height * width, np.int8)
+        self._seen_until = NEVER
 
     def of(self, interval: Interval) -> Steps:
         """The pixels of the next interval."""

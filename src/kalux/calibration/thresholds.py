@@ -34,7 +34,7 @@ from kalux.calibration.intervals import Interval, intervals
 from kalux.calibration.refractory import shortest_interval
 from kalux.calibration.regression import HUBER, NORMAL_MAD, standard_errors, two_stage
 from kalux.calibration.values import Calibration
-from kalux.events import EVENT_DTYPE, EventArray
+from kalux.events import EventArray
 from kalux.filters.shots import Shot
 from kalux.recording import Recording
 from kalux.settings import CameraSettings, EventSettings
@@ -226,7 +226,7 @@ class _History:
         self._view, self._shape = view, shape
         self._last = np.full(shape, -(1 << 60), np.int64)
         self.sign = np.zeros(shape)
-        self.until: int | None = None
+        self.begun = False
 
     def counts(self, events: EventArray) -> tuple[Array, Array, NDArray[np.bool_]]:
         """On and off counts of events, and which pixels had some that follow too fast."""
@@ -258,14 +258,13 @@ def _count(t, x, y, p, last, sign, least, refractory, on, off, crowded):  # type
 def _of_interval(
     interval: Interval, history: _History, camera: CameraSettings, view: _View, delay: int
 ) -> _Samples:
-    events = np.empty(len(interval.events), EVENT_DTYPE)
-    events[:] = interval.events
+    events = interval.events.copy()
     events["t"] -= delay
-    if history.until is None:
+    if not history.begun:
         history.counts(between(events, -(1 << 60), interval.start))
+        history.begun = True
     before = history.sign.copy()
     on, off, crowded = history.counts(between(events, interval.start, interval.end))
-    history.until = interval.end
     turned = (history.sign - before) / 2.0
     (first, first_good), (second, second_good) = (
         _latent(shot, events, camera, view.thresholds) for shot in (interval.first, interval.second)

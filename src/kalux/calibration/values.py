@@ -7,7 +7,6 @@ the maps, named with its checksum (docs/calibration.md).
 from __future__ import annotations
 
 import hashlib
-import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from io import BytesIO
@@ -15,7 +14,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import tomli_w
 from numpy.typing import NDArray
 
 from kalux.errors import FormatError, SettingsError
@@ -24,10 +22,6 @@ from kalux.settings import Settings, from_dict, preset, read_toml
 
 VERSION: Final = 1
 """Of the file format."""
-
-FIRST_LINE: Final = (
-    "# A calibration by kalux: docs/calibration.md. Can be given to --calibration and to --settings."
-)
 
 _MAPS: Final = ("threshold_on", "threshold_off", "threshold_on_variance", "threshold_off_variance")
 _FACTORS: Final = {"threshold_on": 1.0, "threshold_off": 1.0}
@@ -109,7 +103,7 @@ class Calibration:
         if not known:
             return None
         shape = self.maps[known[0]].shape
-        spread = float(self.settings.get("events", {}).get("threshold_spread", _prior_spread()))
+        spread = self.apply(preset("default")).events.mismatch
         filled = {
             name: np.asarray(
                 self.maps.get(name, np.full(shape, _FACTORS.get(name, spread**2))), dtype=np.float64
@@ -133,52 +127,7 @@ class Calibration:
         )
 
 
-def _prior_spread() -> float:
-    return preset("default").events.mismatch
-
-
 # --- files ----------------------------------------------------------------------------------------------------
-
-
-def to_files(calibration: Calibration, path: str | Path) -> dict[Path, bytes]:
-    """The files of a calibration, by path: the TOML text last, so that it never names maps that are not there."""
-    path = Path(path)
-    body: dict[str, Any] = {
-        "kalux_calibration": VERSION,
-        "provenance": dict(calibration.provenance),
-        "settings": {group: dict(values) for group, values in calibration.settings.items()},
-        "standard_errors": dict(calibration.errors),
-        "measured": dict(calibration.measured),
-    }
-    files: dict[Path, bytes] = {}
-    if calibration.maps:
-        maps = path.with_suffix(".npz")
-        files[maps] = _npz(calibration.maps)
-        body["maps"] = {
-            "file": maps.name,
-            "sha256": hashlib.sha256(files[maps]).hexdigest(),
-            "names": sorted(calibration.maps),
-        }
-    lines = [_with_unit(line) for line in tomli_w.dumps(body).splitlines()]
-    files[path] = "\n".join([FIRST_LINE, *lines, ""]).encode(errors="replace")
-    return files
-
-
-def _with_unit(line: str) -> str:
-    name, equals, _ = line.partition(" = ")
-    return f"{line}  # {UNITS[name]}" if equals and name in UNITS else line
-
-
-def _npz(maps: Mapping[str, NDArray[Any]]) -> bytes:
-    """As `numpy.savez_compressed`, but the same bytes every time: no time stamps."""
-    out = BytesIO()
-    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name in sorted(maps):
-            values = np.asarray(maps[name])
-            data = BytesIO()
-            np.save(data, values.astype(np.float32) if values.dtype.kind == "f" else values)
-            archive.writestr(zipfile.ZipInfo(f"{name}.npy"), data.getvalue(), zipfile.ZIP_DEFLATED)
-    return out.getvalue()
 
 
 def load_calibration(path: str | Path, *more: str | Path) -> Calibration:
@@ -233,7 +182,7 @@ def _load(path: Path) -> Calibration:
 
 def _maps(path: Path, entry: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
     name = entry.get("file")
-    if not isinstance(name, str) or Path(name).name != name:
+    if not isinstance(name, str) or name in ("", "..") or "\0" in name or Path(name).name != name:
         raise FormatError(f"{path}: maps.file is {name!r}; the name of a file beside it is needed")
     beside = path.with_name(name)
     try:

@@ -38,7 +38,7 @@ HDR video with per-pixel uncertainty from cameras that give events and frames.
 commands:
   info           what is in a recording, and what kalux would use of it
   reconstruct    make images or a video from a recording
-  convert        copy a recording of any format into one kalux HDF5 file
+  convert        copy a recording of any format into one file, kalux HDF5 or AEDAT 4
   register       make one recording of an event camera's events and another camera's frames
   calibrate      measure cameras: thresholds, noise, response, two-camera rigs, clock offsets
   evaluate       compare methods with ground truth, or with frames held out
@@ -93,16 +93,25 @@ def _guarded(arguments: list[str]) -> int:
     except KeyboardInterrupt as interrupt:
         error_line("interrupted", *(_notes(interrupt) or ["nothing was written"]))
         return INTERRUPTED
+    except OSError as error:
+        if error.filename is None:
+            return _bug(error)
+        error_line(f"error: {error.filename}: {error.strerror or error}", *_notes(error))
+        return BAD_INPUT
     except Exception as error:
         if _is_interrupt(error):
             error_line("interrupted", *(_notes(error) or ["what is finished is whole"]))
             return INTERRUPTED
-        traceback.print_exc()
-        error_line(
-            f"error: {type(error).__name__} inside kalux; this is an error in kalux, please report it with the "
-            "lines above and the command"
-        )
-        return BUG
+        return _bug(error)
+
+
+def _bug(error: Exception) -> int:
+    traceback.print_exception(error)
+    error_line(
+        f"error: {type(error).__name__} inside kalux; this is an error in kalux, please report it with the "
+        "lines above and the command"
+    )
+    return BUG
 
 
 def _is_interrupt(error: Exception) -> bool:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import os
 import sys
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from kalux.cli.metrics import add_metrics, lpips_files, lpips_weights, named_methods
-from kalux.cli.parser import Parser, UsageError, whole
+from kalux.cli.parser import Parser, UsageError, number, whole
 from kalux.cli.terminal import error_line, say
 
 if TYPE_CHECKING:
@@ -40,7 +39,7 @@ a TOML file:
   title = "My sequences"
   [[sequence]]
   path = "slider_depth"                # relative to the file
-  exposure = 10000                     # us; also: name, title, group, stamp, response, calibration
+  exposure = 10000                     # us; also: name, title, group, stamp, white, response, calibration
   [[sequence]]
   path = "pan.mat"
   truth = "pan_hdr.npz"                # or hold_out_frames = 2, or ahdr = {low = 10, high = 90}"""
@@ -66,6 +65,9 @@ def add_command(commands: Any) -> None:
         "--stamp",
         choices=("start", "middle", "end"),
         help="with --exposure: what a frame's time stamp marks (default start)",
+    )
+    group.add_argument(
+        "--white", type=number, metavar="LEVEL", help="value of a saturated pixel, if not stored"
     )
     group.add_argument(
         "--response",
@@ -110,6 +112,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     common = Options(
         exposure=options.exposure,
         stamp=options.stamp or "start",
+        white=options.white,
         response=options.response,
         hold_out_frames=options.hold_out_frames,
     )
@@ -176,11 +179,12 @@ def _work(plan: Plan, store: Store, jobs: list[Job], options: argparse.Namespace
 
 
 def _outcomes(jobs: list[Job], options: argparse.Namespace) -> Outcomes:
+    from kalux.ahead import cores
     from kalux.evaluation.benchmark import runners
 
     if options.dask is not None:
         return runners.on_dask(jobs, options.dask)
-    return runners.in_processes(jobs, options.processes or len(os.sched_getaffinity(0)))
+    return runners.in_processes(jobs, options.processes or cores())
 
 
 def _tell(number: int, total: int, seconds: float, job: Job, outcome: Outcome) -> None:
@@ -211,15 +215,14 @@ def _some(names: Iterable[str]) -> str:
 def _write(out: Path, results: Results, store: Store) -> None:
     from kalux.evaluation.benchmark.report import make_report
     from kalux.evaluation.benchmark.results import as_csv, as_json
-    from kalux.writers.files import output_errors, write_whole
+    from kalux.writers.files import save
 
     for name, text in (
         (CSV, as_csv(results)),
         (JSON, as_json(results)),
         (REPORT, make_report(results, store)),
     ):
-        with output_errors(out / name):
-            write_whole(out / name, text.encode(errors="replace"))
+        save(out / name, text)
 
 
 def _raise_failures(results: Results, out: Path) -> None:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from kalux.cli.calibrate_contrast import add_result, check_result, finish
-from kalux.cli.calibrations import add_calibration, given_calibration
+from kalux.cli.calibrations import add_calibration, add_result, check_result, finish, given_calibration
 from kalux.cli.info import add_recording, open_recording
 from kalux.cli.parser import Parser, whole
 from kalux.cli.terminal import say
@@ -31,7 +30,10 @@ def add_command(commands: Any) -> None:
     )
     add_recording(parser)
     group = parser.add_argument_group("what is known")
-    group.add_argument("--response", help="of the camera, as in --camera.response (default linear)")
+    group.add_argument(
+        "--response",
+        help="of the camera, as in --camera.response (default: what the recording states, else linear)",
+    )
     add_calibration(group)
     group = parser.add_argument_group("fit")
     group.add_argument("--fit", action="store_true", help="fit the rest to held-out frames")

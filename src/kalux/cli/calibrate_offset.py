@@ -6,7 +6,6 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from kalux.cli.calibrate_rig import write_picture, write_text
 from kalux.cli.info import add_recording, open_recording
 from kalux.cli.parser import Parser, UsageError, number
 from kalux.cli.terminal import say, warn
@@ -64,12 +63,13 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     from kalux.calibration.pictures import correlation_plot
     from kalux.calibration.registration import Registration
     from kalux.calibration.rig import Lens
-    from kalux.cli.output import check_file
+    from kalux.cli.output import check_file, check_picture, write_picture
+    from kalux.writers.files import save
 
     centre, reach = checked_range(options)
-    for path in (options.out, options.plot):
-        if path is not None:
-            check_file(path, overwrite=options.overwrite)
+    if options.out is not None:
+        check_file(options.out, overwrite=options.overwrite)
+    check_picture(options.plot, overwrite=options.overwrite)
     recording = open_recording(options)
     lens = Lens.pinhole(recording.sensor_size)
     same = Registration(lens, lens, np.eye(3))
@@ -96,7 +96,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
             correlation_plot(found.coarse, offset=found.offset, standard_error=found.standard_error),
         )
     if options.out is not None:
-        write_text(options.out, offset_toml(found))
+        save(options.out, offset_toml(found))
 
 
 def offset_toml(found: Any) -> str:

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from kalux.cli.calibrate_contrast import add_result, check_result, finish
+from kalux.cli.calibrations import add_result, check_result, finish
 from kalux.cli.parser import Parser, UsageError
 from kalux.cli.terminal import say
 
@@ -62,10 +62,10 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     check_result(options)
     if options.plot is not None:
         from kalux.calibration.figures import require_matplotlib
-        from kalux.cli.output import check_file
+        from kalux.cli.output import check_picture
 
         require_matplotlib()
-        check_file(options.plot, overwrite=options.overwrite)
+        check_picture(options.plot, overwrite=options.overwrite)
     images, times, recording = _inputs(options)
     found = calibrate_response(images, times, per_channel=options.per_channel, method=options.method)
     finish(found.calibration(), recording, options, command)
@@ -73,10 +73,9 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
         say("\n".join(report(found)))
     if options.plot is not None:
         from kalux.calibration.figures import response_figure
-        from kalux.writers.files import output_errors, write_whole
+        from kalux.writers.files import save
 
-        with output_errors(options.plot):
-            write_whole(options.plot, response_figure(found.curves))
+        save(options.plot, response_figure(found.curves))
 
 
 def report(found: ResponseCalibration) -> list[str]:

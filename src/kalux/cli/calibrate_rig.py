@@ -78,15 +78,15 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     )
     from kalux.calibration.rig import rig_toml
     from kalux.calibration.two_cameras import open_frames
-    from kalux.cli.output import check_file
+    from kalux.cli.output import check_file, check_picture, write_picture
     from kalux.cli.progress import Progress
+    from kalux.writers.files import save
 
     columns, rows = board_size(options.board)
     marker = None if options.marker is None else options.marker * 1e-3
     board = Board(columns, rows, options.square * 1e-3, options.charuco, marker)
-    for path in (options.out, options.sheet):
-        if path is not None:
-            check_file(path, overwrite=options.overwrite)
+    check_file(options.out, overwrite=options.overwrite)
+    check_picture(options.sheet, overwrite=options.overwrite)
     if options.window <= 0:
         raise UsageError(f"--window is {options.window} ms; it must be positive")
     events = kalux.open(options.events)
@@ -104,7 +104,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
             views.append(view)
             progress.add(images=1)
     found = calibrate_rig(board, views, events_size=events.sensor_size, frames_size=frames.sensor_size)
-    write_text(options.out, rig_toml(found.rig))
+    save(options.out, rig_toml(found.rig))
     if options.sheet is not None:
         write_picture(options.sheet, contact_sheet(found.views))
     about = found.rig.about
@@ -136,23 +136,3 @@ def board_size(text: str) -> tuple[int, int]:
     if match is None:
         raise UsageError(f"--board {text}: COLUMNSxROWS of inner corners is needed, such as 9x6")
     return int(match[1]), int(match[2])
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a file, whole or not at all."""
-    from kalux.writers.files import output_errors, write_whole
-
-    with output_errors(path):
-        write_whole(path, text.encode(errors="replace"))
-
-
-def write_picture(path: Path, picture: Any) -> None:
-    """Write a PNG, whole or not at all."""
-    import cv2
-
-    from kalux.writers.files import output_errors, write_whole
-
-    if path.suffix.lower() != ".png":
-        raise UsageError(f"{path}: pictures are PNG; give a name that ends in .png")
-    with output_errors(path):
-        write_whole(path, cv2.imencode(".png", picture)[1].tobytes())

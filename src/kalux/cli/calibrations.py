@@ -1,13 +1,19 @@
-"""``--calibration``: what was measured of a sensor, for every command that uses it."""
+"""Calibrations on the command line: ``--calibration`` of every command that uses one, and the result of `calibrate`."""
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from kalux.cli.parser import Parser, UsageError
+from kalux.cli.terminal import say
+
 if TYPE_CHECKING:
     from kalux.calibration.values import Calibration
+    from kalux.recording import Recording
 
 
 def add_calibration(group: Any) -> None:
@@ -40,3 +46,57 @@ def calibration_lines(calibration: Calibration) -> list[str]:
         rows.append(("made by", str(made)))
     width = max((len(name) for name, _ in rows), default=0)
     return ["calibration", *(f"  {name:<{width}}  {text}" for name, text in rows)]
+
+
+# The result of a calibration.
+
+
+def add_result(parser: Parser) -> None:
+    """Add where the result goes."""
+    group = parser.add_argument_group("output")
+    group.add_argument("-o", "--out", type=Path, metavar="FILE", help="TOML; maps of pixels beside it, .npz")
+    group.add_argument("--overwrite", action="store_true", help="replace the files if they are there")
+    group.add_argument("--quiet", action="store_true", help="print warnings and errors only")
+
+
+def check_result(options: argparse.Namespace) -> None:
+    """Check that the result can be written, before the work.
+
+    Raises
+    ------
+    UsageError, OutputError
+        It is no TOML file, is there already, or its folder cannot be written.
+    """
+    from kalux.cli.output import check_file
+
+    if options.out is None:
+        return
+    if options.out.suffix.lower() != ".toml":
+        raise UsageError(f"{options.out}: a calibration is a TOML file; give a name that ends in .toml")
+    for path in (options.out, options.out.with_suffix(".npz")):
+        check_file(path, overwrite=options.overwrite)
+
+
+def finish(
+    calibration: Calibration, recording: Recording | None, options: argparse.Namespace, command: list[str]
+) -> None:
+    """Print the result and write it."""
+    import kalux
+    from kalux.writers.calibration import save_calibration
+
+    provenance: dict[str, Any] = {"command": shlex.join(command), "kalux": kalux.__version__}
+    if recording is not None:
+        height, width = recording.sensor_size
+        provenance |= {
+            "recording": str(recording.source.path),
+            "format": recording.source.format,
+            "width": width,
+            "height": height,
+        }
+    made = dataclasses.replace(calibration, provenance=provenance)
+    if not options.quiet:
+        say("\n".join(calibration_lines(dataclasses.replace(made, provenance={}))))
+    if options.out is not None:
+        written = save_calibration(made, options.out)
+        if not options.quiet:
+            say("wrote " + " and ".join(str(path) for path in written[::-1]))

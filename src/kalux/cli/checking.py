@@ -8,9 +8,8 @@ from concurrent.futures import CancelledError, ThreadPoolExecutor
 from typing import Final, NamedTuple, TypeVar
 
 from kalux.augmentation.deblur import between
-from kalux.errors import FrameError
 from kalux.frames import Levels
-from kalux.recording import Recording
+from kalux.recording import Recording, no_frames
 
 T = TypeVar("T")
 
@@ -87,7 +86,7 @@ def check_recording(recording: Recording, on_events: Callable[[int], None]) -> C
         exposures.append((frame.exposure_start, frame.exposure_end))
         colours = frame.colours
     if not exposures:
-        raise FrameError(f"{recording.source.path}: no frames; kalux needs frames as well as events")
+        raise no_frames(recording)
     start, end = exposures[0][0], exposures[-1][1]
     count = events_between = 0
     for chunk in recording.events():

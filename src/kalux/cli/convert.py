@@ -121,6 +121,8 @@ def _calibrated(options: argparse.Namespace) -> Stated:
     UsageError
         If there is nothing of it, or the output is AEDAT 4.
     """
+    from kalux.settings import AUTO, preset
+
     calibration = given_calibration(options)
     if calibration is None:
         return Stated()
@@ -129,12 +131,11 @@ def _calibrated(options: argparse.Namespace) -> Stated:
             "--calibration: AEDAT 4 has no place for what was measured; write kalux HDF5 (.h5), or give the "
             "calibration to reconstruct"
         )
-    events = calibration.settings.get("events", {})
-    thresholds = tuple(float(events[name]) for name in _THRESHOLDS if events.get(name) is not None)
-    response = calibration.settings.get("camera", {}).get("response")
+    settings = calibration.apply(preset("default"))
+    on, off = settings.events.threshold_on, settings.events.threshold_off
+    response = settings.camera.response
     found = Stated(
-        (thresholds[0], thresholds[1]) if len(thresholds) == 2 else None,
-        None if response in (None, "auto") else response,
+        None if on is None or off is None else (float(on), float(off)), None if response == AUTO else response
     )
     if found == Stated():
         raise UsageError(
@@ -219,12 +220,13 @@ def _streams(
 ) -> tuple[Iterator[EventArray], Iterator[Frame]]:
     """Events and frames as stored, with progress."""
     return (
-        _counted(recording.events(), lambda chunk: progress.add(events=len(chunk)), let_through),
-        _counted(recording.stored_frames(), lambda _: progress.add(images=1), let_through),
+        counted(recording.events(), lambda chunk: progress.add(events=len(chunk)), let_through),
+        counted(recording.stored_frames(), lambda _: progress.add(images=1), let_through),
     )
 
 
-def _counted(items: Iterable[T], count: Callable[[T], None], let_through: Callable[[], None]) -> Iterator[T]:
+def counted(items: Iterable[T], count: Callable[[T], None], let_through: Callable[[], None]) -> Iterator[T]:
+    """The same items; interrupts are let through before each, and each is counted when it has been used."""
     for item in items:
         let_through()
         yield item

@@ -19,8 +19,8 @@ from kalux.cli.parser import Parser, UsageError, whole
 from kalux.cli.terminal import say, warn
 
 if TYPE_CHECKING:
-    from kalux.evaluation.baselines import Method
     from kalux.evaluation.consistency import BlurConsistency
+    from kalux.evaluation.method import Method
     from kalux.evaluation.scores import Scores
     from kalux.recording import Recording
 
@@ -138,7 +138,7 @@ class Protocol:
     """
 
     def __init__(self, recording: Recording, options: argparse.Namespace) -> None:
-        from kalux.evaluation import baselines, held_out, truth
+        from kalux.evaluation import held_out, specs, truth
 
         self._recording, self._options = recording, options
         self._score: Callable[[Method, Callable[[], None]], Scores]
@@ -161,7 +161,7 @@ class Protocol:
             self._score = lambda method, count: truth.evaluate_truth(
                 recording, reference, method, hdr_vdp=options.hdrvdp, lpips=weights, on_image=count
             )
-        self.methods = baselines.chosen_methods(
+        self.methods = specs.chosen_methods(
             named_methods(options),
             response=options.response,
             held_out=reference is None,
@@ -264,13 +264,10 @@ def write(
     OutputError
         The file cannot be written.
     """
-    from kalux.writers.files import output_errors, write_whole
+    from kalux.writers.files import save
 
     as_text = as_csv if out.suffix.lower() == ".csv" else as_json
-    with output_errors(out):
-        write_whole(
-            out, as_text(str(recording.source.path), protocol, found, consistent).encode(errors="replace")
-        )
+    save(out, as_text(str(recording.source.path), protocol, found, consistent))
 
 
 def as_csv(path: str, protocol: str, found: list[Scores], consistent: list[BlurConsistency | None]) -> str:

@@ -94,31 +94,27 @@ def add_command(commands: Any) -> None:
 
 def run(options: argparse.Namespace, command: list[str]) -> None:
     """Run the command."""
-    from kalux.cli.output import check_file
-    from kalux.writers.files import output_errors, write_whole
+    from kalux.cli.output import check_file, check_picture, write_picture
+    from kalux.datasets.hdr import encode_radiance, response_plot
+    from kalux.writers.files import save
 
     _check_flags(options)
     is_image = options.photos.suffix.lower() in _RADIANCE_INPUT
     plot = None if is_image else options.plot or options.out.with_name(f"{options.out.stem}_response.png")
-    for path in (options.out, plot):
-        if path is not None:
-            check_file(path, overwrite=options.overwrite)
+    check_file(options.out, overwrite=options.overwrite)
+    check_picture(plot, overwrite=options.overwrite)
     reference = _reference(options, is_image)
     for line in reference.said:
         say(line)
     say(f"{100 * reference.valid.mean():.2f} % of {_by(reference)} pixels measured; {_range(reference)}")
     if options.register is None:
-        from kalux.datasets.hdr import encode_radiance
-
         data = encode_radiance(reference, options.out.suffix.lower())
     else:
         data = _truth(options, reference)
-    with output_errors(options.out):
-        write_whole(options.out, data)
+    save(options.out, data)
     say(f"wrote {options.out}")
     if plot is not None and reference.response is not None:
-        with output_errors(plot):
-            write_whole(plot, _plot(reference))
+        write_picture(plot, response_plot(reference.pictures, reference.response)[..., ::-1])
         say(f"wrote {plot}")
 
 
@@ -169,7 +165,7 @@ def _times(text: str | None) -> Path | list[float] | None:
         return Path(text)
     try:
         return [parse_seconds(part) for part in text.split(",")]
-    except (ValueError, ZeroDivisionError):
+    except ValueError:
         raise UsageError(f"--times {text}: seconds with commas, as 2,1/2,1/8, or a .csv file") from None
 
 
@@ -228,13 +224,3 @@ def _truth(options: argparse.Namespace, reference: HdrReference) -> bytes:
 
 def _told(found: RegisteredTruth) -> list[str]:
     return [f"frame {f.number} ({f.time} us) is left out: {f.failure}" for f in found.frames if f.failure]
-
-
-def _plot(reference: HdrReference) -> bytes:
-    import cv2
-
-    from kalux.datasets.hdr import response_plot
-
-    assert reference.response is not None
-    picture = response_plot(reference.pictures, reference.response)
-    return bytes(cv2.imencode(".png", picture[..., ::-1])[1])

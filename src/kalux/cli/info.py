@@ -138,8 +138,8 @@ def settled_lines(
     name: str,
 ) -> list[str]:
     """What a reconstruction would settle, a line each; why it could not, if it could not."""
-    from kalux.info import saturation_text, settled
     from kalux.pipeline import plan
+    from kalux.settled import saturation_text, settled
 
     title = f"reconstruct would use, with the preset {name}"
     if not description.frames.count:

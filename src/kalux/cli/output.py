@@ -54,9 +54,10 @@ class Output:
     @property
     def settings_path(self) -> Path:
         """Where the settings are written."""
-        if self.format == "mp4":
-            return self.path.with_name(f"{self.path.name}.kalux.toml")
-        return self.path / "kalux.toml"
+        from kalux.writers.folder import SETTINGS
+        from kalux.writers.settings_file import beside
+
+        return beside(self.path) if self.format == "mp4" else self.path / SETTINGS
 
     @property
     def has_variance(self) -> bool:
@@ -158,6 +159,32 @@ def check_file(path: Path, *, overwrite: bool) -> None:
         if not folder.exists():
             raise OutputError(f"{folder}: no such folder; make it, or choose another place for the output")
         _check_writable(folder)
+
+
+def check_picture(path: Path | None, *, overwrite: bool) -> None:
+    """As `check_file`, for a picture, if one is asked for.
+
+    Raises
+    ------
+    UsageError
+        Its name is not that of a PNG.
+    OutputError
+        As of `check_file`.
+    """
+    if path is None:
+        return
+    if path.suffix.lower() != ".png":
+        raise UsageError(f"{path}: pictures are PNG; give a name that ends in .png")
+    check_file(path, overwrite=overwrite)
+
+
+def write_picture(path: Path, picture: Any) -> None:
+    """Write a picture, uint8, (H, W, 3) in OpenCV's order of colours, as PNG, whole or not at all."""
+    import cv2
+
+    from kalux.writers.files import save
+
+    save(path, cv2.imencode(".png", picture)[1].tobytes())
 
 
 def _check_writable(folder: Path) -> None:

@@ -104,7 +104,15 @@ class _Version(argparse.Action):
 
 
 def normalised(arguments: Sequence[str]) -> list[str]:
-    """Arguments with dashes in flags, so that ``--camera.log_offset`` is understood, too."""
+    """Arguments with dashes in flags, so that ``--camera.log_offset`` is understood, too.
+
+    Raises
+    ------
+    UsageError
+        If one is empty, which as a path would mean the current folder.
+    """
+    if "" in arguments:
+        raise UsageError("an argument is empty; is a variable of the shell not set?")
     return [_normalised(argument) for argument in arguments]
 
 

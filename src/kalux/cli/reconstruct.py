@@ -25,11 +25,11 @@ from kalux.cli.terminal import say, warn
 from kalux.cli.times import load_times
 from kalux.display import CURVES
 from kalux.errors import InputError
-from kalux.info import ORIGINS, settled
 from kalux.pipeline import Plan, execute, plan
 from kalux.reconstructor import Reconstructor
 from kalux.recording import Recording
 from kalux.settings import PRESETS, Settings, from_dict, load, preset, read_toml, to_dict
+from kalux.settled import ORIGINS, settled
 
 if TYPE_CHECKING:
     from kalux.calibration.contrast import ThresholdEstimate
@@ -245,6 +245,10 @@ def part_of(made: Plan, contents: Contents, options: argparse.Namespace) -> Plan
     first = -np.inf if options.start is None else contents.start + 1e6 * options.start
     last = np.inf if options.end is None else contents.start + 1e6 * options.end
     kept = made.times[(made.times >= first) & (made.times <= last)]
+    if len(made.times) == 0:
+        raise UsageError(
+            "--at frames --causal: no exposure has its middle after the end of the first, where images begin"
+        )
     if len(kept) == 0:
         raise UsageError(
             "no image lies in the part that --start and --end leave of the recording's "
@@ -350,6 +354,8 @@ def metadata(
             "frames": options.frames,
             "frames_start": options.frames_start,
             "frames_rate": options.frames_rate,
+            "replace_frames": options.replace_frames or None,
+            "white": options.white,
             "bayer": options.bayer,
         },
         "images_wanted": {

@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 from kalux.cli.calibrate_offset import add_range, checked_range, read_offset
-from kalux.cli.calibrate_rig import add_frames, write_picture
+from kalux.cli.calibrate_rig import add_frames
 from kalux.cli.parser import Parser, UsageError, number, whole
 from kalux.cli.terminal import say, warn
 
@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from kalux.calibration.two_cameras import Registered
     from kalux.frames import Frame
     from kalux.recording import Recording
-
-T = TypeVar("T")
 
 _DESCRIPTION = """\
 Make one recording of an event camera's events and another camera's frames: the frames are undistorted, warped
@@ -101,15 +99,15 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     from kalux.calibration.rig import load_rig
     from kalux.calibration.two_cameras import open_frames, register
     from kalux.cli.convert import check_name
-    from kalux.cli.output import check_file
+    from kalux.cli.output import check_file, check_picture, write_picture
     from kalux.settings import CameraSettings
 
     timing = _timing(options)
     centre, reach = checked_range(options)
     check_name(options.out, options.events)
-    for path in (options.out, options.overlay, options.plot):
-        if path is not None:
-            check_file(path, overwrite=options.overwrite)
+    check_file(options.out, overwrite=options.overwrite)
+    for path in (options.overlay, options.plot):
+        check_picture(path, overwrite=options.overwrite)
     rig = None if options.rig is None else load_rig(options.rig)
     events = kalux.open(options.events)
     by_trigger = timing == "triggers"
@@ -226,25 +224,20 @@ def _write(
     frames: Callable[[], Iterable[Frame]],
     exposure_known: bool,
 ) -> None:
+    from kalux.cli.convert import counted
     from kalux.cli.progress import Progress
     from kalux.cli.signals import interrupts_held
     from kalux.readers import hdf5
 
     with Progress("registering", quiet=options.quiet) as progress, interrupts_held() as let_through:
-
-        def counted(items: Iterable[T], count: Callable[[T], None]) -> Iterator[T]:
-            for item in items:
-                let_through()
-                yield item
-                count(item)
-
         hdf5.write(
             options.out,
             sensor_size=size,
-            events=counted(events.events(), lambda chunk: progress.add(events=len(chunk))),
-            frames=counted(frames(), lambda _: progress.add(images=1)),
+            events=counted(events.events(), lambda chunk: progress.add(events=len(chunk)), let_through),
+            frames=counted(frames(), lambda _: progress.add(images=1), let_through),
             exposure_known=exposure_known,
             contrast_threshold=events.contrast_threshold,
+            response=None if options.response == "linear" else options.response,
         )
     if not options.quiet:
         say(f"wrote {progress.events:,} events and {progress.images:,} frames to {options.out}")

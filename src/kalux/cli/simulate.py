@@ -9,7 +9,7 @@ import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from kalux.cli.parser import Parser, UsageError, number, whole
+from kalux.cli.parser import Parser, UsageError, number, true_or_false, whole
 from kalux.cli.terminal import say, warn
 
 if TYPE_CHECKING:
@@ -167,19 +167,11 @@ def _add_foreground(parser: Parser) -> None:
 def _sensor_fields() -> dict[str, Any]:
     """Fields of the sensor and the types of their flags, without the imports that describe them."""
     return {
-        name: {"f": number, "i": whole, "b": _boolean, "s": str}[kind]
+        name: {"f": number, "i": whole, "b": true_or_false, "s": str}[kind]
         for kind, names in _FIELDS.items()
         for name in names.split()
     }
 
-
-def _boolean(text: str) -> bool:
-    from kalux.cli.parser import true_or_false
-
-    return true_or_false(text)
-
-
-_boolean.__name__ = "true or false"
 
 # Written out, because reading them off `SensorSettings` would make every command load the simulator; a test compares.
 _FIELDS: Final = {
@@ -264,16 +256,16 @@ def _size(text: str) -> tuple[int, int]:
 
 def run(options: argparse.Namespace, command: list[str]) -> None:
     """Run the command."""
+    from kalux.cli.convert import check_name
     from kalux.cli.output import check_file
     from kalux.cli.progress import Progress
     from kalux.cli.signals import interrupts_held
     from kalux.datasets.record import Watch, record
-    from kalux.writers.settings_file import require_ours
+    from kalux.writers.settings_file import beside, require_ours
 
-    if options.out.suffix.lower() not in (".h5", ".hdf5"):
-        raise UsageError(f"{options.out}: the output is a kalux HDF5 file; give a name that ends in .h5")
+    check_name(options.out, options.source)
     check_file(options.out, overwrite=options.overwrite)
-    require_ours(settings_path(options.out))
+    require_ours(beside(options.out))
     settings, size = chosen_sensor(options)
     scene, white = chosen_scene(options, size)
     total = scene.duration // 1000
@@ -300,11 +292,6 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
         say(summary(options.out, scene, recorded, white, progress.seconds))
 
 
-def settings_path(out: Path) -> Path:
-    """Where the settings of a simulation are written: beside it."""
-    return out.with_name(f"{out.name}.kalux.toml")
-
-
 def write_settings(
     options: argparse.Namespace,
     command: list[str],
@@ -321,9 +308,9 @@ def write_settings(
         If the file cannot be written; the recording is whole.
     """
     from kalux.writers.files import output_errors
-    from kalux.writers.settings_file import settings_file
+    from kalux.writers.settings_file import beside, settings_file
 
-    path = settings_path(options.out)
+    path = beside(options.out)
     metadata = {
         "command": shlex.join(command),
         "simulation": {
@@ -431,7 +418,7 @@ def _duration(options: argparse.Namespace, default: float) -> int:
     """us."""
     seconds = _or(options.duration, default)
     if not 0 < seconds < 1e6:
-        raise UsageError(f"--duration {seconds:g}: it must be positive, in seconds")
+        raise UsageError(f"--duration {seconds:g}: it must be positive and less than 1e6, in seconds")
     return round(seconds * 1e6)
 
 

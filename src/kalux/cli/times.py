@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from numpy.lib.format import read_array
 from numpy.typing import NDArray
 
 from kalux.cli.parser import UsageError
@@ -44,15 +45,16 @@ def load_times(path: Path) -> Times:
 
 def _from_numpy(path: Path) -> Times:
     try:
-        values = np.load(path, allow_pickle=False)
+        with path.open("rb") as file:
+            values = read_array(file, allow_pickle=False)
     except (ValueError, EOFError) as error:
         raise UsageError(f"{path}: not a NumPy array of numbers") from error
     if values.ndim != 1 or values.dtype.kind not in "iuf":
         raise UsageError(
             f"{path}: an array of shape {values.shape} and type {values.dtype}; (N,) us is needed"
         )
-    if values.dtype.kind == "f" and not (np.abs(values) < 2**62).all():
-        raise UsageError(f"{path}: a time is not finite; whole us are needed")
+    if not (np.abs(values.astype(np.float64)) < 2**62).all():  # also refuses NaN
+        raise UsageError(f"{path}: a time is not finite, or out of range; whole us are needed")
     if (values != np.rint(values)).any():
         raise UsageError(f"{path}: times are not whole; us are needed, not seconds")
     times: Times = values.astype(np.int64)
@@ -68,11 +70,16 @@ def _from_text(path: Path) -> Times:
     if lines and lines[0].startswith("index,t_us"):
         lines[0], column = "", 1
     times = [
-        _whole(line.split(",")[column], path, number)
+        _whole(_field(line, column), path, number)
         for number, line in enumerate((line.partition("#")[0] for line in lines), start=1)
         if line.strip()
     ]
     return np.array(times, np.int64)
+
+
+def _field(line: str, column: int) -> str:
+    """Empty where a line has too few."""
+    return next(iter(line.split(",")[column:]), "")
 
 
 def _whole(text: str, path: Path, line: int) -> int:

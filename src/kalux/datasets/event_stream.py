@@ -79,7 +79,7 @@ def event_chunks(
     """
     width, resolution = scene.sensor_size[1], settings.timestamp_resolution
     pixels = _pixels(scene, settings, seed)
-    buffer, count = empty_buffer(max(_CHUNK, 1024)), 0
+    buffer, count = empty_buffer(_CHUNK), 0
     for segment in _segments(scene, settings, sampling):
         buffer, count = advance(segment, pixels, buffer, count)
         if count >= chunk:

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from kalux.calibration.debevec import CLIPPED_HIGH, CLIPPED_LOW, LEAST_SHARED, LEAST_SPREAD
 from kalux.calibration.homography import find_features
 from kalux.calibration.photographs import read_exposure, read_photograph
+from kalux.calibration.regression import NORMAL_MAD
 from kalux.calibration.response import CalibrationName, fit_response, side_by_side
 from kalux.datasets.registration import (
     Match,
@@ -40,6 +41,7 @@ from kalux.datasets.registration import (
 )
 from kalux.errors import FormatError, InputError
 from kalux.models.camera import Response
+from kalux.readers.numpy_files import DAMAGE
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -49,9 +51,7 @@ SUFFIXES: Final = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
 LUMINANCE: Final = np.array([0.2126, 0.7152, 0.0722])
 """Of linear red, green and blue, ITU-R BT.709, the primaries of sRGB."""
 
-_TAPER: Final = (
-    10 / 255
-)  # levels over which a weight rises from 0 at a clipped end, so that merging has no seams
+_TAPER: Final = 10 / 255  # levels over which a weight rises from 0 at a clipped end: merging has no seams
 _LEVEL_NOISE: Final = 1 / 255  # standard deviation of a level: quantisation, and the losses of JPEG
 _INCONSISTENT: Final = 4.0  # standard deviations
 _ALIGNED: Final = 0.3  # pixels: less is not worth the blur of resampling, and features know it no better
@@ -164,21 +164,27 @@ def _listed_exposures(path: Path) -> dict[str, float]:
     try:
         with path.open(newline="") as file:
             rows = list(csv.DictReader(line for line in file if line.strip() and not line.startswith("#")))
-            return {row["file"].strip(): _seconds(row["exposure_s"]) for row in rows}
+            return {row["file"].strip(): parse_seconds(row["exposure_s"]) for row in rows}
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except (KeyError, ValueError, AttributeError, TypeError, UnicodeDecodeError) as error:
+    except (KeyError, ValueError, AttributeError, TypeError, csv.Error) as error:
         raise FormatError(
             f"{path}: not a CSV with the columns file and exposure_s (seconds, or 1/30)"
         ) from error
 
 
-def _seconds(text: str) -> float:
+def parse_seconds(text: str) -> float:
+    """An exposure time in seconds, as ``2``, ``0.125`` or ``1/8``.
+
+    Raises
+    ------
+    ValueError
+        If it is neither a number nor a fraction.
+    """
     over, slash, under = text.partition("/")
+    if slash and float(under) == 0:
+        raise ValueError(f"{text} has no value")
     return float(over) / float(under) if slash else float(over)
-
-
-parse_seconds = _seconds
 
 
 # --- alignment --------------------------------------------------------------------------------------------
@@ -489,7 +495,7 @@ def relative_spread(pictures: Sequence[Picture], response: Response, covered: Se
     for k in range(len(pictures) - 1):
         logs = _log_ratio(pictures[k], pictures[k + 1], response, covered[k] & covered[k + 1], _QUIET)
         if len(logs) >= LEAST_SHARED:
-            spreads.append(1.4826 * float(np.median(np.abs(logs - np.median(logs)))))
+            spreads.append(NORMAL_MAD * float(np.median(np.abs(logs - np.median(logs)))))
             counts.append(len(logs))
     if not spreads:
         return LEAST_SPREAD
@@ -660,6 +666,8 @@ def read_radiance(path: Path) -> HdrReference:
     radiance, valid = readers[path.suffix.lower()](path)
     if radiance.ndim not in (2, 3) or min(radiance.shape[:2]) < 16:
         raise InputError(f"{path}: an image of {radiance.shape} is no radiance of a scene")
+    if valid.shape != radiance.shape[:2]:
+        raise FormatError(f"{path}: valid is {valid.shape}, the radiance {radiance.shape}")
     finite = np.isfinite(radiance) & (radiance >= 0)
     valid = valid & (finite if finite.ndim == 2 else finite.all(axis=2))
     return HdrReference(np.where(finite, radiance, 0).astype(np.float32), valid, 1.0, None)
@@ -695,7 +703,7 @@ def _read_npz(path: Path) -> tuple[NDArray[Any], Mask]:
         with np.load(path, allow_pickle=False) as file:
             radiance = np.asarray(file["radiance"], np.float32)
             valid = np.asarray(file["valid"], bool) if "valid" in file else np.ones(radiance.shape[:2], bool)
-    except (ValueError, TypeError, EOFError, KeyError, OSError) as error:
+    except (*DAMAGE, OSError) as error:
         raise FormatError(f"{path}: not an .npz with the array radiance, or damaged") from error
     return radiance, valid
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from kalux.errors import InputError, KaluxError
+from kalux.errors import InputError, KaluxError, did_you_mean
 from kalux.frames import Stamp
 from kalux.recording import Recording
 from kalux.recording import open as open_recording
@@ -182,7 +182,8 @@ def published_set(name: str) -> PublishedSet:
     for one in SETS:
         if one.name == name.lower():
             return one
-    raise InputError(f"there is no set {name!r}; known are {', '.join(one.name for one in SETS)}")
+    known = [one.name for one in SETS]
+    raise InputError(f"there is no set {name!r}{did_you_mean(name, known)}; known are {', '.join(known)}")
 
 
 @dataclass(frozen=True)

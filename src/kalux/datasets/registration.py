@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.calibration.homography import Features, agreed_homography, alike, find_features
+from kalux.calibration.regression import HUBER, NORMAL_MAD
 from kalux.errors import InputError
 from kalux.frames import Frame
 from kalux.models.camera import Camera, Response, inverse_response
@@ -41,7 +42,6 @@ _ITERATIONS: Final = 20
 _UNSMOOTHED: Final = 1.2  # pixels per pixel: bilinear sampling alone smooths as much
 _CONVERGED: Final = 0.002  # pixels
 _LEAP: Final = 5.0  # pixels: a step that is no refinement any more
-_HUBER: Final = 1.345  # standard deviations; 95 % efficient for Gaussian errors
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,8 +216,8 @@ def refined(
         jacobian = np.stack([column[inside] for column in columns_of], axis=1)
         residual = (target - image)[inside]
         offset = np.median(residual)
-        deviation = 1.4826 * float(np.median(np.abs(residual - offset))) + 1e-9
-        weight = np.minimum(1.0, _HUBER * deviation / np.maximum(np.abs(residual - offset), 1e-12))
+        deviation = NORMAL_MAD * float(np.median(np.abs(residual - offset))) + 1e-9
+        weight = np.minimum(1.0, HUBER * deviation / np.maximum(np.abs(residual - offset), 1e-12))
         normal = jacobian.T @ (weight[:, None] * jacobian)
         step = np.linalg.lstsq(normal, jacobian.T @ (weight * residual), rcond=1e-10)[0]
         update = np.eye(3) + np.append(step[:8], 0.0).reshape(3, 3)
@@ -288,9 +288,7 @@ class RegisteredTruth:
 
 _LOG_OFFSET: Final = 0.02  # white = 1; the noise of dark pixels must not be magnified by the logarithm
 _EXPOSED: Final = (0.03, 0.96)  # of the frame's response
-_LEAST_CORRELATION: Final = (
-    0.7  # of log intensities: blur and noise lower it to about 0.9, a wrong place below 0.5
-)
+_LEAST_CORRELATION: Final = 0.7  # of log intensities: blur and noise lower it to 0.9, a wrong place below 0.5
 _LEAST_MEASURED: Final = 0.02  # share of the frame's pixels that must be comparable
 _SCALE_TOLERANCE: Final = 0.15  # relative; more is another exposure or another light
 

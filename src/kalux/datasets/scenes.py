@@ -163,6 +163,7 @@ def camera_matrix(
 
 
 def blurred(image: Image, sigma: float) -> Image:
+    """Smoothed by a Gaussian of the standard deviation ``sigma``, pixels; from 0 down, the image itself."""
     if sigma <= 0:
         return image
     return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_REFLECT_101), np.float32)

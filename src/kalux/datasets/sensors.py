@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.datasets.scenes import LOG_OFFSET
-from kalux.errors import SettingsError
+from kalux.errors import SettingsError, did_you_mean
 from kalux.models.camera import Response
 
 FloatArray = NDArray[np.float64]
@@ -367,7 +367,9 @@ def sensor_preset(name: str) -> SensorPreset:
     try:
         return PRESETS[name]
     except KeyError:
-        raise SettingsError(f"sensor: there is no preset {name!r}; known are {', '.join(PRESETS)}") from None
+        raise SettingsError(
+            f"sensor: there is no preset {name!r}{did_you_mean(name, PRESETS)}; known are {', '.join(PRESETS)}"
+        ) from None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -196,7 +196,7 @@ def _folder(path: Path) -> ImageSequence:
 def _natural(file: Path) -> list[tuple[int, str]]:
     """Sorts 2.png before 10.png."""
     return [
-        (int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", file.name) if part
+        (int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", file.name) if part
     ]
 
 

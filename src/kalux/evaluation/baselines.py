@@ -1,87 +1,26 @@
-"""What reconstructions are compared with, and kalux's own, all of one kind: (recording, times) to images.
-
-A `Method` is given a recording and ascending times, us, and yields one image per time: (H, W) float32, linear,
-1 = a saturated frame pixel at the recording's median exposure.
-"""
+"""What reconstructions are compared with, and kalux's own, as `kalux.evaluation.method.Method`."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
 from functools import partial
 from itertools import chain, pairwise
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.deblur import between, count_events, integrate_exposure, latent_middle
 from kalux.calibration.values import Calibration
-from kalux.errors import InputError
 from kalux.evaluation.exposures import linear_frame, reference_exposure
+from kalux.evaluation.method import Estimated, Image, Method, Times
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.frames import Frame
 from kalux.models.camera import log_intensity
 from kalux.pipeline import plan, reconstruct
 from kalux.recording import Recording
 from kalux.settings import AUTO, PRESETS, Settings, chosen_response
-
-Image = NDArray[np.float32]
-Times = NDArray[np.int64]
-
-
-class Estimated(NamedTuple):
-    """An image, and how sure a method is of it.
-
-    Attributes
-    ----------
-    intensity
-        (H, W), linear.
-    variance
-        (H, W), of log(intensity + log_offset); None: the method does not say.
-    log_offset
-        I_0.
-    """
-
-    intensity: Image
-    variance: Image | None
-    log_offset: float = 0.0
-
-
-@dataclass(frozen=True)
-class Method:
-    """A way to make images.
-
-    Attributes
-    ----------
-    label
-        For tables.
-    images
-        From a recording and ascending times (N,) int64, us, to N images.
-    needs_held_out
-        Whether it looks at the frames before and after, which would be unfair where they are not held out.
-    estimates
-        As ``images``, with the variance of every image; None: the method has none.
-    settings
-        Of `kalux.reconstruct`, where that makes the images.
-    notes
-        What a reader of its scores has to know.
-    """
-
-    label: str
-    images: Callable[[Recording, Times], Iterable[Image]]
-    needs_held_out: bool = False
-    estimates: Callable[[Recording, Times], Iterable[Estimated]] | None = None
-    settings: Settings | None = None
-    notes: tuple[str, ...] = ()
-
-    def estimated(self, recording: Recording, times: Times) -> Iterator[Estimated]:
-        """The images at ascending times (us), with their variances where the method has them."""
-        if self.estimates is not None:
-            yield from self.estimates(recording, times)
-        else:
-            yield from (Estimated(image, None) for image in self.images(recording, times))
 
 
 def hold_last_frame(recording: Recording, times: Times, *, response: str = AUTO) -> Iterator[Image]:
@@ -187,56 +126,6 @@ def filter_method(
         estimates=None if settings.filter.kind == "cf" else with_variance,
         settings=settings,
     )
-
-
-def chosen_methods(
-    names: Iterable[str] | None = None,
-    *,
-    response: str = AUTO,
-    held_out: bool = False,
-    calibration: Calibration | None = None,
-) -> list[Method]:
-    """Methods by name, in that order.
-
-    Parameters
-    ----------
-    names
-        Of `methods`, or a text as in `kalux.evaluation.specs`: a network with its weights, a folder of images. Default:
-        all of `methods` that can be compared, without `OPTIONAL`.
-    response
-        Of the camera, as in `kalux.settings.CameraSettings`.
-    held_out
-        Whether frames are held out.
-    calibration
-        What was measured of the sensor, for all filters.
-
-    Raises
-    ------
-    InputError
-        If a name is unknown, the method needs frames to be held out, or its weights or images are missing.
-    MissingDependencyError
-        If the method is a network, and PyTorch is not installed.
-    """
-    # These methods are of the kind that this module defines, so it can be imported only now.
-    from kalux.evaluation.specs import FORMS, outside_method
-
-    known = methods(response, calibration)
-    if names is None:
-        names = [n for n, m in known.items() if n not in OPTIONAL and (held_out or not m.needs_held_out)]
-    chosen = []
-    for name in names:
-        method = known.get(name) or outside_method(name, response=response)
-        if method is None:
-            raise InputError(f"there is no method {name!r}; known are {', '.join(known)}, and {FORMS}")
-        if method.needs_held_out and not held_out:
-            raise InputError(
-                f"method {name!r} looks at the frames around an image, which is a comparison only where frames "
-                "are held out"
-            )
-        chosen.append(method)
-    if not chosen:
-        raise InputError(f"no method is given; known are {', '.join(known)}")
-    return chosen
 
 
 def frames_around(frames: Iterable[Frame], times: Times) -> Iterator[tuple[Frame | None, Frame | None, int]]:

@@ -7,14 +7,13 @@ has, its variance is added to that which the method gives: e is the error of bot
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-if TYPE_CHECKING:
-    from kalux.evaluation.scores import Pair
+from kalux.evaluation.pairs import Pair
 
 LEVELS: Final = np.array([*np.arange(0.05, 0.96, 0.05), 0.99])
 """Shares of errors that bands around the estimate are to hold."""

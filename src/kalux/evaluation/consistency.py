@@ -13,8 +13,8 @@ from typing import Final
 import numpy as np
 
 from kalux.errors import FrameError, InputError
-from kalux.evaluation.baselines import Method
 from kalux.evaluation.exposures import exposure_times, linear_frame, means_of, reference_exposure
+from kalux.evaluation.method import Method
 from kalux.evaluation.metrics import psnr
 from kalux.frames import Frame
 from kalux.recording import Recording

@@ -13,10 +13,11 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from numpy.lib.format import read_array
 from numpy.typing import NDArray
 
 from kalux.errors import FormatError, FrameError, InputError
-from kalux.evaluation.baselines import Image, Times
+from kalux.evaluation.method import Image, Times
 from kalux.readers.images import read_image
 from kalux.readers.joined import read_image_list
 from kalux.readers.source import reading
@@ -132,8 +133,8 @@ def _display(folder: Path, file: Path, data: bytes) -> NDArray[Any]:
 
 def _npy(folder: Path, file: Path, data: bytes) -> NDArray[Any]:
     try:
-        image: NDArray[Any] = np.load(io.BytesIO(data), allow_pickle=False)
-    except (ValueError, EOFError, OSError) as error:
+        image: NDArray[Any] = read_array(io.BytesIO(data), allow_pickle=False)
+    except (ValueError, EOFError) as error:
         raise FormatError(f"{file}: not an .npy file of plain numbers, or damaged") from error
     if image.dtype.kind not in "fiu":
         raise FormatError(f"{file}: holds {image.dtype}; linear intensity is needed")

@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 
 from kalux.calibration.frame_noise import estimate_frame_noise
 from kalux.errors import FrameError, InputError
-from kalux.evaluation.baselines import Method
 from kalux.evaluation.exposures import exposure_times, linear_frame, means_of, reference_exposure
 from kalux.evaluation.lpips import LpipsWeights
-from kalux.evaluation.pairs import Array
-from kalux.evaluation.scores import Pair, Scores, score
+from kalux.evaluation.method import Method
+from kalux.evaluation.pairs import Array, Pair
+from kalux.evaluation.scores import Scores, score
 from kalux.filters.shots import take_shot
 from kalux.frames import Frame
 from kalux.models.camera import Camera, frame_log_covariance
@@ -220,13 +220,14 @@ def held_out_pairs(held: HeldOut, method: Method, *, clip: bool = False) -> Iter
         image = clipped_as(means[0], frame, held.reference_exposure) if clip else means[0]
         shot = take_shot(frame, camera, held.reference_exposure)
         variance = means[1] if len(means) == 2 else None
+        clipped = frame.normalised() >= CameraSettings().saturation
         yield Pair(
             frame.middle,
             image,
             shot.intensity,
             frame.valid,
             variance=variance,
-            clipped=frame.normalised() >= CameraSettings().saturation,
+            clipped=clipped if clipped.ndim == 2 else np.asarray(clipped.any(axis=-1)),
             log_offset=offset,
             noise=None
             if variance is None

@@ -1,6 +1,8 @@
-"""Checks that every metric makes of the two images it is given."""
+"""An image and what it is compared with, and the checks that every metric makes of the two."""
 
 from __future__ import annotations
+
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -9,6 +11,41 @@ from kalux.errors import InputError
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+
+
+class Pair(NamedTuple):
+    """An image and what it is compared with.
+
+    Attributes
+    ----------
+    t
+        Of the reference, us.
+    test, reference
+        (H, W) linear intensity.
+    mask
+        (H, W) bool, True = compared; None: all.
+    variance
+        (H, W), what the method says of its log(intensity + log_offset); None: nothing.
+    clipped
+        (H, W) bool, True where the reference itself is clipped; None: nowhere.
+    log_offset
+        I_0 of the variance.
+    given
+        (H, W) bool, True where the method was given the reference itself, noise and all; None: nowhere.
+    noise
+        (H, W), variance of log(reference + log_offset) by the noise of the reference itself; None: it has none, or
+        none that is known.
+    """
+
+    t: int
+    test: NDArray[Any]
+    reference: NDArray[Any]
+    mask: NDArray[np.bool_] | None = None
+    variance: NDArray[Any] | None = None
+    clipped: NDArray[np.bool_] | None = None
+    log_offset: float = 0.0
+    noise: NDArray[Any] | None = None
+    given: NDArray[np.bool_] | None = None
 
 
 def checked_pair(

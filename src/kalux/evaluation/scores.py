@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,7 +17,7 @@ from kalux.evaluation.hdr_vdp import hdrvdp
 from kalux.evaluation.lpips import LpipsWeights
 from kalux.evaluation.lpips import lpips as lpips_distance
 from kalux.evaluation.metrics import log_mse, mse, psnr, ssim
-from kalux.evaluation.pairs import Array
+from kalux.evaluation.pairs import Array, Pair
 
 LOG_OFFSET: Final = 0.02
 """Of the log-MSE, in units of white."""
@@ -153,41 +153,6 @@ class Scores:
 
     def _mean(self, name: str) -> float:
         return float(np.mean([getattr(image, name) for image in self.images]))
-
-
-class Pair(NamedTuple):
-    """An image and what it is compared with.
-
-    Attributes
-    ----------
-    t
-        Of the reference, us.
-    test, reference
-        (H, W) linear intensity.
-    mask
-        (H, W) bool, True = compared; None: all.
-    variance
-        (H, W), what the method says of its log(intensity + log_offset); None: nothing.
-    clipped
-        (H, W) bool, True where the reference itself is clipped; None: nowhere.
-    log_offset
-        I_0 of the variance.
-    given
-        (H, W) bool, True where the method was given the reference itself, noise and all; None: nowhere.
-    noise
-        (H, W), variance of log(reference + log_offset) by the noise of the reference itself; None: it has none, or
-        none that is known.
-    """
-
-    t: int
-    test: NDArray[Any]
-    reference: NDArray[Any]
-    mask: NDArray[np.bool_] | None = None
-    variance: NDArray[Any] | None = None
-    clipped: NDArray[np.bool_] | None = None
-    log_offset: float = 0.0
-    noise: NDArray[Any] | None = None
-    given: NDArray[np.bool_] | None = None
 
 
 def score(

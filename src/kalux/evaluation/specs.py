@@ -1,4 +1,6 @@
-"""Methods from outside, by a text that any process can read: networks with their weights, folders of images.
+"""Methods by a text that any process can read: a name of `kalux.evaluation.baselines`, or one from outside.
+
+From outside are networks with their weights, and folders of images.
 
 ::
 
@@ -14,16 +16,19 @@ from __future__ import annotations
 
 import importlib.util
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
+from kalux.calibration.values import Calibration
 from kalux.errors import InputError, MissingDependencyError
 from kalux.evaluation import folder_method
-from kalux.evaluation.baselines import Image, Method, Times
+from kalux.evaluation.baselines import OPTIONAL, methods
 from kalux.evaluation.learned.catalogue import NETWORKS, checksums
+from kalux.evaluation.method import Image, Method, Times
 from kalux.recording import Recording
+from kalux.settings import AUTO
 
 FORMS: Final = "NETWORK:WEIGHTS (" + ", ".join(NETWORKS) + "), NAME=FOLDER or folder:FOLDER of images"
 """For messages."""
@@ -32,6 +37,53 @@ _OPTION: Final = r"[a-z]+(?:=\d+)?"
 _SPEC: Final = re.compile(
     rf"(?P<name>[^:=?]+)(?P<kind>[:=])(?P<path>.+?)(?:\?(?P<options>{_OPTION}(?:&{_OPTION})*))?"
 )
+
+
+def chosen_methods(
+    names: Iterable[str] | None = None,
+    *,
+    response: str = AUTO,
+    held_out: bool = False,
+    calibration: Calibration | None = None,
+) -> list[Method]:
+    """Methods by name, in that order.
+
+    Parameters
+    ----------
+    names
+        Of `kalux.evaluation.baselines.methods`, or a text as above: a network with its weights, a folder of images.
+        Default: all of the former that can be compared, without `OPTIONAL`.
+    response
+        Of the camera, as in `kalux.settings.CameraSettings`.
+    held_out
+        Whether frames are held out.
+    calibration
+        What was measured of the sensor, for all filters.
+
+    Raises
+    ------
+    InputError
+        If a name is unknown, the method needs frames to be held out, or its weights or images are missing.
+    MissingDependencyError
+        If the method is a network, and PyTorch is not installed.
+    """
+    known = methods(response, calibration)
+    if names is None:
+        names = [n for n, m in known.items() if n not in OPTIONAL and (held_out or not m.needs_held_out)]
+    chosen = []
+    for name in names:
+        method = known.get(name) or outside_method(name, response=response)
+        if method is None:
+            raise InputError(f"there is no method {name!r}; known are {', '.join(known)}, and {FORMS}")
+        if method.needs_held_out and not held_out:
+            raise InputError(
+                f"method {name!r} looks at the frames around an image, which is a comparison only where frames "
+                "are held out"
+            )
+        chosen.append(method)
+    if not chosen:
+        raise InputError(f"no method is given; known are {', '.join(known)}")
+    return chosen
 
 
 def spec_path(spec: str) -> Path | None:

@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 import itertools
-import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kalux.errors import FormatError, FrameError, InputError
-from kalux.evaluation.baselines import Method
 from kalux.evaluation.lpips import LpipsWeights
-from kalux.evaluation.scores import Pair, Scores, score
+from kalux.evaluation.method import Method
+from kalux.evaluation.pairs import Pair
+from kalux.evaluation.scores import Scores, score
 from kalux.filters.shots import take_shot
 from kalux.models.camera import Camera, noise_variance
 from kalux.readers import GroundTruth
+from kalux.readers.numpy_files import DAMAGE
 from kalux.recording import Recording
 from kalux.settings import AUTO, CameraSettings, chosen_response
 
@@ -254,7 +255,7 @@ def load_truth(path: Path) -> tuple[GroundTruth, NDArray[np.bool_] | None]:
             arrays = {name: file[name] for name in file.files if name in _KEYS}
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or 'not an .npz file'}") from error
-    except (ValueError, TypeError, EOFError, AttributeError, zipfile.BadZipFile) as error:
+    except (AttributeError, *DAMAGE) as error:
         raise FormatError(f"{path}: not an .npz file of plain arrays, or damaged") from error
     times, images = _array(path, arrays, "times_us", "times"), _array(path, arrays, "gt", "images")
     if times.ndim != 1 or times.dtype.kind not in "iu":
@@ -264,7 +265,7 @@ def load_truth(path: Path) -> tuple[GroundTruth, NDArray[np.bool_] | None]:
     return GroundTruth(times.astype(np.int64), images.astype(np.float32)), arrays.get("mask")
 
 
-_KEYS = ("times_us", "times", "gt", "images", "mask")
+_KEYS: Final = ("times_us", "times", "gt", "images", "mask")
 
 
 def _array(path: Path, arrays: dict[str, NDArray[Any]], *names: str) -> NDArray[Any]:

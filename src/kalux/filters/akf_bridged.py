@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from kalux import memory
 from kalux.augmentation.bridge import UNMEASURED, BridgedSegment, lift, lower
-from kalux.augmentation.deblur import events_until
+from kalux.augmentation.deblur import words_until
 from kalux.augmentation.trail import NO_HEIGHTS, add_trail, ahead_of_event, no_trail
 from kalux.compiled import (
     AHEAD,
@@ -29,6 +29,7 @@ from kalux.compiled import (
     event_row,
     event_weight,
     event_words,
+    flat,
     pack,
     packed,
     prefetch,
@@ -101,8 +102,6 @@ class Cursor:
         us: the segment's start, then a whole number of epochs later.
     moving
         `moving_pixels`, once it has been asked for, where it is the same throughout the segment.
-    unmeasured
-        `unmeasured_pixels`, once it has been asked for.
     """
 
     pixels: NDArray[np.void]
@@ -111,7 +110,6 @@ class Cursor:
     polarity: NDArray[np.int8]
     origin: int
     moving: NDArray[np.bool_] | None = None
-    unmeasured: NDArray[np.bool_] | None = None
 
 
 class Noise(NamedTuple):
@@ -153,17 +151,17 @@ def begin(segment: BridgedSegment, state: State) -> Cursor:
 
 def advance(segment: BridgedSegment, cursor: Cursor, events: EventArray, noise: Noise) -> None:
     """Take the cursor over events of the segment, which carry weights (`kalux.augmentation.refractory`), in place."""
-    scalars = _Scalars(*(np.float32(value) for value in (segment.rate, segment.step_variance, *noise)))
-    stride = np.uint64(cursor.clock.shape[1])
-    while len(events):
-        pixels, steps = cursor.pixels.reshape(-1), cursor.steps.reshape(-1)
-        clock, polarity = cursor.clock.reshape(-1), cursor.polarity.reshape(-1)
-        count = events_until(events, cursor.origin + EPOCH)
-        words = event_words(events[:count])
-        _advance_bridged(words, pixels, steps, clock, polarity, stride, cursor.origin, scalars)
-        events = events[count:]
-        if len(events):
-            epochs = (int(events["t"][0]) - 1 - segment.start) // EPOCH
+    words = event_words(events)
+    while len(words):
+        within = words
+        if words[-1, 0] > cursor.origin + EPOCH:
+            within = words[: words_until(words, cursor.origin + EPOCH)]
+        if len(within):
+            arrays = cursor.pixels, cursor.steps, cursor.clock, cursor.polarity
+            _advance_bridged(within, *arrays, cursor.origin, segment.rate, segment.step_variance, noise)
+        words = words[len(within) :]
+        if len(words):
+            epochs = (int(words[0, 0]) - 1 - segment.start) // EPOCH
             _move_origin(cursor, segment.start + epochs * EPOCH)
 
 
@@ -197,10 +195,9 @@ def _read(segment: BridgedSegment, cursor: Cursor, t: int) -> tuple[FloatArray, 
     within = min(t - cursor.origin, EPOCH)
     beyond = np.float32((t - cursor.origin - within) * 1e-6)
     since_start = np.float32((t - segment.start) * 1e-6)
-    pixels, clock, polarity = (p.reshape(-1) for p in (cursor.pixels, cursor.clock, cursor.polarity))
+    arrays = cursor.pixels, cursor.clock, cursor.polarity, segment.slope
     heights = NO_HEIGHTS if segment.trail is None else segment.trail.heights
-    moment, out = (within, beyond, since_start), (log_intensity, variance)
-    _read_bridged(pixels, clock, polarity, segment.slope, heights, moment, *out)
+    _read_bridged(*arrays, heights, (within, beyond, since_start), log_intensity, variance)
     if t == segment.end:
         if segment.trail is not None and segment.trail.end is not None:
             log_intensity += segment.trail.end
@@ -220,21 +217,28 @@ def moving_pixels(segment: BridgedSegment, cursor: Cursor) -> NDArray[np.bool_]:
     """
     if cursor.moving is not None:
         return cursor.moving
-    inside = cursor.clock[1:-1, 1:-1]
-    moving: NDArray[np.bool_] = inside > np.int32(max(segment.still_since - cursor.origin, -EPOCH))
-    moving |= unmeasured_pixels(segment, cursor)
+    still_since = np.int32(max(segment.still_since - cursor.origin, -EPOCH))
+    variances = segment.forward_variance, segment.backward_variance
+    moving: NDArray[np.bool_] = np.empty(segment.augmented.shape, np.bool_)
+    coming = segment.augmented if segment.events is None else segment.events
+    _moving(cursor.clock, still_since, *variances, coming, segment.events is not None, moving)
     if segment.events is not None:  # all events of the segment are among them, whenever this is asked for
-        moving |= segment.events > 0
         cursor.moving = moving
     return moving
 
 
-def unmeasured_pixels(segment: BridgedSegment, cursor: Cursor) -> NDArray[np.bool_]:
-    """(H, W): pixels that neither of the segment's frames measures; not to be changed."""
-    if cursor.unmeasured is None:
-        variances = segment.forward_variance, segment.backward_variance
-        cursor.unmeasured = np.minimum(*variances) >= UNMEASURED
-    return cursor.unmeasured
+@nb.njit(cache=True, nogil=True)
+def _moving(clock, still_since, forward, backward, coming, knows_coming, moving):  # type: ignore[no-untyped-def]
+    height, width = moving.shape
+    for row in range(height):
+        times, out = clock[row + 1, 1 : width + 1], moving[row]
+        first, last, events = forward[row], backward[row], coming[row]
+        for i in range(np.uint64(width)):
+            unmeasured = (first[i] >= UNMEASURED) & (last[i] >= UNMEASURED)
+            out[i] = (times[i] > still_since) | unmeasured
+        if knows_coming:
+            for i in range(np.uint64(width)):
+                out[i] |= events[i] > 0
 
 
 def end(segment: BridgedSegment, cursor: Cursor) -> State:
@@ -306,7 +310,16 @@ def _copy(plane, row, first, count, out):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy", fastmath=FUSED)
-def _advance_bridged(words, pixels, steps, clock, polarity, stride, origin, scalars):  # type: ignore[no-untyped-def]
+def _advance_bridged(words, pixels, steps, clock, polarity, origin, rate, step_variance, noise):  # type: ignore[no-untyped-def]
+    scalars = _Scalars(
+        np.float32(rate),
+        np.float32(step_variance),
+        np.float32(noise.noise_rate),
+        np.float32(noise.step_variance),
+        np.float32(noise.threshold2),
+    )
+    stride = np.uint64(clock.shape[1])
+    pixels, steps, clock, polarity = flat(pixels), flat(steps), flat(clock), flat(polarity)
     # Each event's clock is looked at while the one before is filtered, so that neither waits for the other.
     last = len(words) - 1
     event = _meet(words[0, 0], words[0, 1], clock, polarity, stride, origin, scalars)
@@ -315,12 +328,12 @@ def _advance_bridged(words, pixels, steps, clock, polarity, stride, origin, scal
         place = event_row(ahead) * stride + event_column(ahead) + stride + np.uint64(1)
         prefetch(pixels, place)
         prefetch(steps, place)
-        at, seconds, weight, is_on, unsure, noise = event
+        at, seconds, weight, is_on, unsure, unsaid = event
         pixel, known = pixels[at], steps[at]
         information = predicted_information(pixel.information, pixel.rate, seconds)
         step_on, step_off = known.step_on, known.step_off
         step = weight * (step_on if is_on else -step_off)
-        kept = information_kept(information, noise)
+        kept = information_kept(information, unsaid)
         # The state moves by the expected step, L^A by the whole one: the frames have told which it was.
         pixel.weighted = (pixel.weighted - information * unsure * step) * kept
         pixel.information = information * kept
@@ -353,6 +366,7 @@ def _read_bridged(  # type: ignore[no-untyped-def]
     pixels, clock, polarity, slope, heights, moment, log_intensity, variance
 ):
     height, width = variance.shape
+    pixels, clock, polarity = flat(pixels), flat(clock), flat(polarity)
     size = min(width, _BLOCK)
     planes, ahead = np.empty((_STATE_FIELDS, size), np.float32), np.empty(size, np.float32)
     for row in range(height):

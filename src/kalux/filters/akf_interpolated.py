@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.interpolation import InterpolatedSegment
+from kalux.compiled import apart
 from kalux.events import EventArray
 from kalux.filters.akf import (
     State,
@@ -67,9 +68,9 @@ def advance(segment: InterpolatedSegment, cursor: Cursor, events: EventArray, no
 
 def read(segment: InterpolatedSegment, cursor: Cursor, t: int, noise: Noise) -> tuple[Array, Array]:
     """L and P at ``t`` (us), which must not lie before an event the cursor has taken. Changes nothing."""
-    out = np.empty_like(cursor.variance), np.empty_like(cursor.variance)
-    _read_interpolated(segment, cursor, t, noise.printed, *out)
-    return out
+    out = apart(2, cursor.variance.shape, np.float64)
+    (_read_printed if noise.printed else _read_exact)(segment, cursor, t, *out)
+    return out[0], out[1]
 
 
 @nb.njit(cache=True, inline="always")
@@ -88,14 +89,21 @@ def _blended(segment, forward, backward, t):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, inline="always")
-def _covariance(segment, row, column, t, after):  # type: ignore[no-untyped-def]
-    """R(t), equations (7) and (9); ``after`` picks the interval that follows tau^k."""
+def _covariance_fraction(segment, t, after):  # type: ignore[no-untyped-def]
+    """How far ``t`` is between the two middles; ``after`` picks the interval that follows tau^k."""
     if after:
-        fraction = (t - segment.middle) / (segment.next_middle - segment.middle)
+        return (t - segment.middle) / (segment.next_middle - segment.middle)
+    return (t - segment.previous_middle) / (segment.middle - segment.previous_middle)
+
+
+@nb.njit(cache=True, inline="always")
+def _covariance(segment, row, column, t, after):  # type: ignore[no-untyped-def]
+    """R(t), equations (7) and (9)."""
+    fraction = _covariance_fraction(segment, t, after)
+    if after:
         return interpolated_covariance(
             segment.covariance_from[row, column], segment.covariance_after[row, column], fraction
         )
-    fraction = (t - segment.previous_middle) / (segment.middle - segment.previous_middle)
     return interpolated_covariance(
         segment.covariance_before[row, column], segment.covariance_at[row, column], fraction
     )
@@ -170,13 +178,43 @@ def _advance_interpolated(segment, cursor, t, x, y, p, noise):  # type: ignore[n
         cursor.newest[row, column] = now
 
 
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _read_printed(segment, cursor, t, log_intensity, variance):  # type: ignore[no-untyped-def]
+    """`_predict_printed` of all pixels, a row at a time and few arrays a loop: vector code."""
+    height, width = variance.shape
+    fraction, deviation, rate, seconds = np.empty((4, width))
+    after, now = t >= segment.middle, _exposure_fraction(segment, t)
+    share = _covariance_fraction(segment, t, after)
+    start, exposure = segment.start, segment.exposure_end - segment.start
+    if exposure <= 0:  # causal mode begins at its end
+        start, exposure = start - 1, 1
+    for row in range(height):
+        first = segment.covariance_from[row] if after else segment.covariance_before[row]
+        second = segment.covariance_after[row] if after else segment.covariance_at[row]
+        since, value, known = cursor.since[row], cursor.log_intensity[row], cursor.variance[row]
+        forward, backward = cursor.forward[row], cursor.backward[row]
+        out, spread = log_intensity[row], variance[row]
+        for i in range(np.uint64(width)):  # `_exposure_fraction` without branches
+            fraction[i] = min((since[i] - start) / exposure, 1.0)
+        for i in range(np.uint64(width)):
+            seconds[i] = (t - since[i]) * MICROSECOND
+        for i in range(np.uint64(width)):
+            deviation[i] = value[i] - ((1.0 - fraction[i]) * forward[i] + fraction[i] * backward[i])
+        for i in range(np.uint64(width)):
+            rate[i] = 1.0 / interpolated_covariance(first[i], second[i], share)
+        for i in range(np.uint64(width)):
+            information = 1.0 / known[i]
+            predicted = predicted_information(information, rate[i], seconds[i])
+            deviation[i] = predicted_deviation(deviation[i], information, predicted)
+            spread[i] = 1.0 / predicted
+        for i in range(np.uint64(width)):
+            out[i] = deviation[i] + ((1.0 - now) * forward[i] + now * backward[i])
+
+
 @nb.njit(cache=True, nogil=True)
-def _read_interpolated(segment, cursor, t, printed, log_intensity, variance):  # type: ignore[no-untyped-def]
+def _read_exact(segment, cursor, t, log_intensity, variance):  # type: ignore[no-untyped-def]
     height, width = variance.shape
     for row in range(height):
         for column in range(width):
-            if printed:
-                value = _predict_printed(segment, cursor, row, column, t)
-            else:
-                value = _predict_exact(segment, cursor, row, column, t)
+            value = _predict_exact(segment, cursor, row, column, t)
             log_intensity[row, column], variance[row, column] = value

@@ -89,6 +89,9 @@ class BridgedFrames(CommonMethod):
         pixels: PixelCalibration | None,
     ) -> None:
         super().__init__(settings, thresholds, lookahead, shape)
+        events, c2 = settings.events, self.on * self.off
+        self.noise = BridgeNoise(self.on, self.off, events.step_noise * c2, events.quantisation_variance * c2)
+        self._event_noise = akf_bridged.Noise(events.background_rate, events.step_noise, c2)
         self._prior = (
             bridge.nominal_thresholds(shape, settings.events.mismatch, np.float32)
             if pixels is None
@@ -108,11 +111,6 @@ class BridgedFrames(CommonMethod):
 
     def needed_until(self, shot: Shot) -> int:
         return shot.end
-
-    @property
-    def noise(self) -> BridgeNoise:
-        events, c2 = self.settings.events, self.on * self.off
-        return BridgeNoise(self.on, self.off, events.step_noise * c2, events.quantisation_variance * c2)
 
     def latent(self, shot: Shot, events: Chunks, thresholds: Thresholds) -> Latent:
         """The frame without blur at the middle of its exposure, and its variance (K3)."""
@@ -394,9 +392,7 @@ class BridgedFrames(CommonMethod):
         return akf_bridged.begin(segment, state)
 
     def advance(self, segment: Any, cursor: akf_bridged.Cursor, events: EventArray) -> None:
-        settings = self.settings.events
-        noise = akf_bridged.Noise(settings.background_rate, settings.step_noise, self.on * self.off)
-        akf_bridged.advance(segment, cursor, events, noise)
+        akf_bridged.advance(segment, cursor, events, self._event_noise)
 
     def read(self, segment: Any, cursor: akf_bridged.Cursor, t: int) -> tuple[Floats, Floats]:
         return akf_bridged.read(segment, cursor, t)

@@ -153,17 +153,28 @@ def _copied(events: EventArray) -> EventArray:
     return event_words(events).copy().reshape(-1).view(EVENT_DTYPE)
 
 
+@nb.njit(cache=True, inline="always")
+def _outside(word, height, width):  # type: ignore[no-untyped-def]
+    return (event_column(word) >= width) | (event_row(word) >= height)
+
+
 @nb.njit(cache=True, nogil=True)
 def _copy_checked(words, copy, earliest, delay, height, width, kept):  # type: ignore[no-untyped-def]
-    """Copy event words with their times moved; False if an event is out of order or outside the sensor.
+    """Copy event words, one or more, with their times moved; False if an event is out of order or outside the sensor.
 
-    ``kept`` are the bits of the second word that are copied.
+    ``kept`` are the bits of the second word that are copied. Each event is compared with the next one, in flat arrays:
+    vector code.
     """
-    wrong = False
-    for i in range(len(words)):
-        t, word = words[i, 0], words[i, 1]
-        wrong |= (t < earliest) | (event_column(word) >= width) | (event_row(word) >= height)
-        earliest = t
-        copy[i, 0] = t - delay
-        copy[i, 1] = word & kept
+    given, taken = words.reshape(-1), copy.reshape(-1)
+    one, two = np.uint64(1), np.uint64(2)
+    last = np.uint64(2 * len(words) - 2)
+    wrong = (given[0] < earliest) | _outside(given[last + one], height, width)
+    for i in range(np.uint64(len(words) - 1)):
+        at = two * i
+        word = given[at + one]
+        wrong |= (given[at + two] < given[at]) | _outside(word, height, width)
+        taken[at] = given[at] - delay
+        taken[at + one] = word & kept
+    taken[last] = given[last] - delay
+    taken[last + one] = given[last + one] & kept
     return not wrong

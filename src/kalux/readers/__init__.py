@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -30,6 +31,22 @@ from kalux.readers.source import CHUNK_EVENTS, GroundTruth, Source
 __all__ = ["CHUNK_EVENTS", "READERS", "GroundTruth", "Reader", "Source", "read"]
 
 _VIDEOS: Final = frozenset({".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v"})
+_RADIANCE: Final = frozenset({".hdr", ".exr"})
+
+# What may lie where a recording should, by the first bytes, and what to do about it.
+_NOT_RECORDINGS: Final = (
+    (
+        b"version https://git-lfs",
+        "a pointer of Git LFS to the file, not the file (fetch it by 'git lfs pull'); ",
+    ),
+    (b"<!doctype html", "a web page, perhaps what a download gave instead of the file; "),
+    (b"<html", "a web page, perhaps what a download gave instead of the file; "),
+    (b"\x1f\x8b", "compressed by gzip, which has to be unpacked first; "),
+    (b"BZh", "compressed by bzip2, which has to be unpacked first; "),
+    (b"\xfd7zXZ", "compressed by xz, which has to be unpacked first; "),
+    (b"7z\xbc\xaf\x27\x1c", "a 7z archive, which has to be unpacked first; "),
+    (b"Rar!", "a RAR archive, which has to be unpacked first; "),
+)
 
 
 class Reader(NamedTuple):
@@ -103,12 +120,34 @@ def _what_it_is(path: Path) -> str:
             return "an empty folder, "
         if any(name in _IMAGES for name in names):
             return "a folder of images, which --frames takes beside the recording of the events; "
-        return ""
-    if path.is_file() and not path.stat().st_size:
+        recordings = _recordings_in(path)
+        return (
+            f"a folder of recordings ({', '.join(recordings)}), of which one can be opened; "
+            if recordings
+            else ""
+        )
+    if not path.is_file():
+        return (
+            "a pipe or a device, of which nothing can be read twice, so that it has to be copied to a file; "
+        )
+    if not path.stat().st_size:
         return "an empty file, "
+    with path.open("rb") as file:
+        beginning = file.read(64).lstrip().lower()
+    for signature, meaning in _NOT_RECORDINGS:
+        if beginning.startswith(signature.lower()):
+            return meaning
+    if path.suffix.lower() in _RADIANCE:
+        return "a radiance image, which kalux simulate makes a recording from; "
     if path.suffix.lower() in _IMAGES | _VIDEOS:
         return "an image or a video, which --frames takes beside the recording of the events; "
     return ""
+
+
+def _recordings_in(folder: Path, most: int = 3) -> list[str]:
+    """The names of the first recordings in a folder."""
+    found = (path.name for path in sorted(folder.iterdir()) if any(r.recognises(path) for r in READERS))
+    return list(itertools.islice(found, most))
 
 
 def _split(path: Path) -> tuple[Path, str]:

@@ -37,7 +37,8 @@ from kalux.errors import FormatError
 from kalux.events import EventArray
 from kalux.frames import Frame, Mosaic
 from kalux.readers import evt
-from kalux.readers.source import Source, TriggerArray, reading
+from kalux.readers.evt import BACKWARDS_US, ERROR, HIGH, NOW, ROOM, STARTED, place, put_trigger
+from kalux.readers.source import Source, TriggerArray, begins_with, reading
 
 _MAGIC: Final = b"#!AER-DAT2."
 _WORD: Final = np.dtype(">u8")  # address and time
@@ -87,10 +88,7 @@ class _Survey:
 
 def recognises(path: Path) -> bool:
     """Whether the file begins like AEDAT 2."""
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return file.read(len(_MAGIC)) == _MAGIC
+    return begins_with(path, _MAGIC)
 
 
 def read(path: Path) -> Source:
@@ -235,7 +233,7 @@ def _sensor_size(path: Path, chip: str) -> tuple[int, int]:
         raise FormatError(
             f"{path}: the sensor {chip[:40]} has colour pixels in no known Bayer mosaic; kalux does not read them"
         )
-    model = re.match(r"davi(?:s)?(\d{3})", name)
+    model = re.match(r"davis?(\d{3})", name)
     if model is None or model[1] not in _SIZES:
         raise FormatError(
             f"{path}: words of the sensor {chip[:40]} cannot be read; known are DAVIS128, DAVIS240, DAVIS346 "
@@ -302,10 +300,6 @@ _ACTIVE, _SIGNALS, _FIRST_RESET, _LAST_RESET, _FIRST_SIGNAL, _INTERLEAVED, _DONE
 _EVENTS, _INCOMPLETE = range(11, 13)
 _STATE_SIZE: Final = 13
 
-_STARTED, _HIGH, _NOW, _ERROR = evt._STARTED, evt._HIGH, evt._NOW, evt._ERROR
-_ROOM: Final = evt._ROOM
-_BACKWARDS_US: Final = evt._BACKWARDS_US
-
 
 @njit(cache=True, nogil=True, inline="always")
 def _tick(clock, stamp):  # type: ignore[no-untyped-def]
@@ -319,19 +313,19 @@ def _read_word(word, begun, clock, now):  # type: ignore[no-untyped-def]
     """Address; clock and time, us, of which the latter never decreases; whether the clock goes back too far."""
     clock = _tick(clock, np.int64(word & np.uint64(0xFFFFFFFF)))
     last = now if begun else clock
-    return np.int64(word >> np.uint64(32)), clock, max(last, clock), clock + _BACKWARDS_US < last
+    return np.int64(word >> np.uint64(32)), clock, max(last, clock), clock + BACKWARDS_US < last
 
 
 @njit(cache=True, nogil=True)
 def _decode_events(words, state, events, triggers, height, width):  # type: ignore[no-untyped-def]
-    started, clock, now = state[_STARTED], state[_HIGH], state[_NOW]
-    capacity, trigger_capacity = len(events) - _ROOM, len(triggers)
+    started, clock, now = state[STARTED], state[HIGH], state[NOW]
+    capacity, trigger_capacity = len(events) - ROOM, len(triggers)
     count, count_triggers, i = 0, 0, 0
     while i < len(words) and count < capacity and count_triggers < trigger_capacity:
         address, clock, now, back = _read_word(words[i], started, clock, now)
         started = 1
         if back:
-            state[_ERROR] = 1
+            state[ERROR] = 1
             break
         i += 1
         if address & 0x80000400 == 0:
@@ -341,11 +335,11 @@ def _decode_events(words, state, events, triggers, height, width):  # type: igno
             x = width - 1 - x if x < width else x
             y = height - 1 - y if y < height else y
             events[count, 0] = now
-            events[count, 1] = evt._place(x, y, address >> 11 & 1)
+            events[count, 1] = place(x, y, address >> 11 & 1)
             count += 1
         elif address & 0x80000C06 == 0x402:
-            count_triggers = evt._put_trigger(triggers, count_triggers, now, 0, address & 1)
-    state[_STARTED], state[_HIGH], state[_NOW] = started, clock, now
+            count_triggers = put_trigger(triggers, count_triggers, now, 0, address & 1)
+    state[STARTED], state[HIGH], state[NOW] = started, clock, now
     return i, count, count_triggers
 
 

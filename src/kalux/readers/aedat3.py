@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from kalux.errors import FormatError
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.frames import Frame, Mosaic
-from kalux.readers.source import SIZE_UNKNOWN, Source, reading, smallest_size
+from kalux.readers.source import SIZE_UNKNOWN, Source, begins_with, reading, smallest_size
 from kalux.readers.streams import in_order, rechunk
 
 _MAGIC: Final = b"#!AER-DAT3."
@@ -114,10 +114,7 @@ class _Packets:
 
 def recognises(path: Path) -> bool:
     """Whether the file begins like AEDAT 3."""
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return file.read(len(_MAGIC)) == _MAGIC
+    return begins_with(path, _MAGIC)
 
 
 def read(path: Path) -> Source:

@@ -26,7 +26,15 @@ import zstandard
 from kalux.errors import FormatError
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.frames import Frame, Mosaic
-from kalux.readers.source import CHUNK_EVENTS, TRIGGER_DTYPE, Source, TriggerArray, one_line, reading
+from kalux.readers.source import (
+    CHUNK_EVENTS,
+    TRIGGER_DTYPE,
+    Source,
+    TriggerArray,
+    begins_with,
+    one_line,
+    reading,
+)
 from kalux.readers.streams import in_order
 
 T = TypeVar("T")
@@ -112,10 +120,7 @@ _EDGES: Final = {1: True, 2: False}
 
 def recognises(path: Path) -> bool:
     """Whether the file begins like AEDAT 4."""
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return file.read(len(MAGIC)) == MAGIC
+    return begins_with(path, MAGIC)
 
 
 def read(path: Path) -> Source:

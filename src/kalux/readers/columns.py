@@ -10,15 +10,7 @@ from typing import Any, Final, NamedTuple
 from numpy.typing import NDArray
 
 from kalux.errors import EventError, FormatError
-from kalux.events import EventArray, as_events
-
-ALIASES: Final = {
-    "t": ("t", "ts", "timestamp", "timestamps", "time", "times"),
-    "x": ("x", "xs"),
-    "y": ("y", "ys"),
-    "p": ("p", "ps", "pol", "polarity", "polarities", "on"),
-}
-"""The names of each field that `kalux.events.as_events` knows, too."""
+from kalux.events import FIELD_NAMES, EventArray, as_events
 
 UNIT_ASSUMED: Final = "The unit of time is not stated; its integers are taken as microseconds."
 """For `Source.missing`, where `Columns.unit` is None."""
@@ -48,8 +40,8 @@ class Columns(NamedTuple):
 
 def find_columns(names: Sequence[str]) -> Columns | None:
     """Which of the names are the four fields of an event; None if one of them is missing."""
-    found = {field: find_name(names, aliases) for field, aliases in ALIASES.items() if field != "t"}
-    time = find_time(names, ALIASES["t"])
+    found = {field: find_name(names, aliases) for field, aliases in FIELD_NAMES.items() if field != "t"}
+    time = find_time(names, FIELD_NAMES["t"])
     if time is None or None in found.values():
         return None
     return Columns(t=time[0], **{field: str(name) for field, name in found.items()}, unit=time[1])

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from kalux.errors import FormatError
 from kalux.events import EVENT_DTYPE, EventArray
-from kalux.readers.source import CHUNK_EVENTS, Source, reading
+from kalux.readers.source import CHUNK_EVENTS, Source, begins_with, reading
 
 _SIGNATURE: Final = b"Event Stream"
 _TYPES: Final = {0: "generic", 1: "DVS", 2: "ATIS", 3: "display", 4: "colour"}
@@ -41,10 +41,7 @@ class _Header(NamedTuple):
 
 def recognises(path: Path) -> bool:
     """Whether the file begins with ``Event Stream``."""
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return file.read(len(_SIGNATURE)) == _SIGNATURE
+    return begins_with(path, _SIGNATURE)
 
 
 def read(path: Path) -> Source:
@@ -87,9 +84,8 @@ def _read_header(path: Path) -> _Header:
         raise FormatError(f"{path}: is Event Stream {version}; kalux reads version 2, so convert it")
     if len(fields) >= 4 and fields[3] != _DVS:
         kind = _TYPES.get(fields[3], f"unknown ({fields[3]})")
-        raise FormatError(
-            f"{path}: holds events of type {kind}; kalux reads DVS events, so convert it (atis_to_dvs)"
-        )
+        remedy = ", so convert it (atis_to_dvs)" if kind == "ATIS" else " only"
+        raise FormatError(f"{path}: holds events of type {kind}; kalux reads DVS events{remedy}")
     if len(fields) < 8:
         raise FormatError(f"{path}: is cut short within its header; copy or download it again")
     width, height = _SIZE.unpack(fields[4:8])

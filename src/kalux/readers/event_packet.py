@@ -16,8 +16,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from kalux.events import EVENT_DTYPE, EventArray
+from kalux.events import EventArray
 from kalux.readers import evt
+from kalux.readers.evt import BACKWARDS_US, rows_as_events
 from kalux.readers.source import TriggerArray
 from kalux.readers.streams import rechunk
 
@@ -27,7 +28,6 @@ EVENT_PACKETS: Final = ("event_camera_msgs/EventPacket", "event_array_msgs/Event
 _RECORD: Final = 13  # bytes of an event of an EventArray in ROS 1: x, y, secs, nsecs, polarity
 _CDR_RECORD: Final = 16  # ... in ROS 2, aligned; the last one is 13
 _JOINED_WORDS: Final = 1 << 16
-_BACKWARDS_US: Final = 10 << 12  # as in evt
 
 
 @cache
@@ -167,7 +167,7 @@ def _array_events(message: Message) -> EventArray:
     out = np.empty((count, 2), np.uint64)
     data = np.frombuffer(message.data, np.uint8)
     _decode_array(data[start:], count, message.cdr, out)
-    return _as_events(out)
+    return rows_as_events(out)
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -307,14 +307,14 @@ def _decoded(decode: _Decoder, packets: Iterator[_Packet], first: _Packet) -> It
             now = _make_ordered(rows.view(np.int64), now)
             if now < 0:
                 raise evt.ClockError("the sensor's clock goes back by more than 41 ms")
-        yield _as_events(rows)
+        yield rows_as_events(rows)
 
 
 @njit(cache=True, nogil=True)
 def _make_ordered(rows, now):  # type: ignore[no-untyped-def]
     """Let times that go back a little stand still; the last time, or -1 where they go back too far."""
     for i in range(len(rows)):
-        if rows[i, 0] + _BACKWARDS_US < now:
+        if rows[i, 0] + BACKWARDS_US < now:
             return -1
         now = max(now, rows[i, 0])
         rows[i, 0] = now
@@ -395,10 +395,6 @@ def _decode_libcaer_compressed(words, base, height, width, out):  # type: ignore
                     count += 1
             y += 8
     return count
-
-
-def _as_events(rows: NDArray[np.uint64]) -> EventArray:
-    return rows.view(EVENT_DTYPE)[:, 0]
 
 
 _Decoder = Callable[[_Packet, int], tuple[NDArray[np.uint64], int]]

@@ -30,15 +30,14 @@ from numpy.typing import NDArray
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.readers.source import CHUNK_EVENTS, TRIGGER_DTYPE, TriggerArray
 
-# What a decoder remembers from word to word, int64. Times are in us, without wrap-around.
-_STARTED, _HIGH, _LOW, _NOW, _Y, _X, _POLARITY, _ERROR = range(8)
+# What a decoder remembers from word to word, int64: the places of it. Times are in us, without wrap-around.
+STARTED, HIGH, _LOW, NOW, _Y, _X, _POLARITY, ERROR = range(8)
 _STATE_SIZE: Final = 8
 
 _NO_ROW: Final = 0xFFFF
-_ROOM: Final = 32  # events of one word, at most
+ROOM: Final = 32  # events of one word, at most
 _TRIGGERS: Final = 4096  # room for trigger events
-_BACKWARDS_STEPS: Final = 10  # high times of EVT3 that the clock may go back
-_BACKWARDS_US: Final = _BACKWARDS_STEPS << 12
+BACKWARDS_US: Final = 10 << 12  # that the clock may go back: ten high times of EVT3
 
 
 class ClockError(ValueError):
@@ -106,10 +105,10 @@ def decode_events(
             count += len(part)
             found = found[len(part) :]
             if count == CHUNK_EVENTS:
-                yield _as_events(out)
+                yield rows_as_events(out)
                 out, count = _event_buffer(), 0
     if count:
-        yield _as_events(out[:count])
+        yield rows_as_events(out[:count])
 
 
 def decode_triggers(
@@ -135,16 +134,16 @@ def _run(
     triggers: NDArray[np.uint64],
 ) -> Iterator[tuple[NDArray[np.uint64], NDArray[np.uint64]]]:
     """Events and triggers of as many words as the buffers hold, which are used again and again."""
-    events = np.empty((_WORK_EVENTS + _ROOM, 2), np.uint64)
+    events = np.empty((_WORK_EVENTS + ROOM, 2), np.uint64)
     state = _new_state()
     height, width = sensor_size
     position = 0
     for words in blocks:
         while len(words):
             used, count, count_triggers = encoding.kernel(words, state, events, triggers, height, width)
-            if state[_ERROR]:
+            if state[ERROR]:
                 raise ClockError(
-                    f"the sensor's clock goes back from {state[_NOW]} to {state[_HIGH]} us at word {position + used}"
+                    f"the sensor's clock goes back from {state[NOW]} to {state[HIGH]} us at word {position + used}"
                 )
             yield events[:count], triggers[:count_triggers]
             position += used
@@ -158,7 +157,7 @@ def _event_buffer() -> NDArray[np.uint64]:
     return np.empty((CHUNK_EVENTS, 2), np.uint64)
 
 
-def _as_events(rows: NDArray[np.uint64]) -> EventArray:
+def rows_as_events(rows: NDArray[np.uint64]) -> EventArray:
     return rows.view(EVENT_DTYPE)[:, 0]
 
 
@@ -174,12 +173,12 @@ def _as_triggers(rows: NDArray[np.uint64]) -> TriggerArray:
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _place(x, y, polarity):  # type: ignore[no-untyped-def]
+def place(x, y, polarity):  # type: ignore[no-untyped-def]
     return np.uint64(x) | np.uint64(y) << np.uint64(16) | np.uint64(polarity) << np.uint64(32)
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _put_trigger(triggers, count, t, pin, edge):  # type: ignore[no-untyped-def]
+def put_trigger(triggers, count, t, pin, edge):  # type: ignore[no-untyped-def]
     """How many triggers there are with this one."""
     triggers[count, 0] = t
     triggers[count, 1] = pin << 1 | edge
@@ -204,9 +203,9 @@ def _unwrap(high, new, wrap, backwards):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _decode_evt3(words, state, events, triggers, height, width):  # type: ignore[no-untyped-def]
-    started, high, low, now = state[_STARTED], state[_HIGH], state[_LOW], state[_NOW]
+    started, high, low, now = state[STARTED], state[HIGH], state[_LOW], state[NOW]
     y, x, polarity = state[_Y], state[_X], state[_POLARITY]
-    capacity, trigger_capacity = len(events) - _ROOM, len(triggers)
+    capacity, trigger_capacity = len(events) - ROOM, len(triggers)
     count, count_triggers, i = 0, 0, 0
     while not started and i < len(words):
         started = np.int64(words[i] >> 12 == 0x8)
@@ -230,12 +229,12 @@ def _decode_evt3(words, state, events, triggers, height, width):  # type: ignore
             # ADDR_X
             column = word & 0x7FF
             events[count, 0] = now
-            events[count, 1] = _place(column, y, word >> 11 & 1)
+            events[count, 1] = place(column, y, word >> 11 & 1)
             count += (kind == 0x2) & (y < height) & (column < width)
         elif kind == 0x8:  # TIME_HIGH
-            high, low = _unwrap(high, (word & 0xFFF) << 12, 1 << 24, _BACKWARDS_US), 0
-            if high + _BACKWARDS_US < now:
-                state[_ERROR] = 1
+            high, low = _unwrap(high, (word & 0xFFF) << 12, 1 << 24, BACKWARDS_US), 0
+            if high + BACKWARDS_US < now:
+                state[ERROR] = 1
                 i -= 1
                 break
             now = max(now, high)
@@ -246,7 +245,7 @@ def _decode_evt3(words, state, events, triggers, height, width):  # type: ignore
             length = 12 if kind == 0x4 else 8
             if y < height:
                 valid = word & ((1 << length) - 1)
-                rest = _place(0, y, polarity)
+                rest = place(0, y, polarity)
                 column = x
                 while valid:
                     if valid & 1 and column < width:
@@ -257,10 +256,10 @@ def _decode_evt3(words, state, events, triggers, height, width):  # type: ignore
                     column += 1
             x += length
         elif kind == 0xA:  # EXT_TRIGGER
-            count_triggers = _put_trigger(triggers, count_triggers, now, word >> 8 & 0xF, word & 1)
+            count_triggers = put_trigger(triggers, count_triggers, now, word >> 8 & 0xF, word & 1)
         elif kind == 0x1:  # rows of events that are not changes of brightness, in old cameras
             y = _NO_ROW
-    state[_STARTED], state[_HIGH], state[_LOW], state[_NOW] = started, high, low, now
+    state[STARTED], state[HIGH], state[_LOW], state[NOW] = started, high, low, now
     state[_Y], state[_X], state[_POLARITY] = y, x, polarity
     return i, count, count_triggers
 
@@ -268,9 +267,9 @@ def _decode_evt3(words, state, events, triggers, height, width):  # type: ignore
 @njit(cache=True, nogil=True, inline="always")
 def _evt2_high(state, started, high, now, new):  # type: ignore[no-untyped-def]
     """The next high time of EVT2 and 2.1, us; the state's error is set where it goes back too far."""
-    high = _unwrap(high, new, 1 << 34, _BACKWARDS_US) if started else new
-    if high + _BACKWARDS_US < now:
-        state[_ERROR] = 1
+    high = _unwrap(high, new, 1 << 34, BACKWARDS_US) if started else new
+    if high + BACKWARDS_US < now:
+        state[ERROR] = 1
     return high
 
 
@@ -282,13 +281,13 @@ def _evt2_now(now, high, head):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, inline="always")
 def _evt2_trigger(triggers, count, now, head):  # type: ignore[no-untyped-def]
-    return _put_trigger(triggers, count, now, head >> 8 & 0x1F, head & 1)
+    return put_trigger(triggers, count, now, head >> 8 & 0x1F, head & 1)
 
 
 @njit(cache=True, nogil=True)
 def _decode_evt2(words, state, events, triggers, height, width):  # type: ignore[no-untyped-def]
-    started, high, now = state[_STARTED], state[_HIGH], state[_NOW]
-    capacity, trigger_capacity = len(events) - _ROOM, len(triggers)
+    started, high, now = state[STARTED], state[HIGH], state[NOW]
+    capacity, trigger_capacity = len(events) - ROOM, len(triggers)
     count, count_triggers, i = 0, 0, 0
     while i < len(words) and count < capacity and count_triggers < trigger_capacity:
         word = np.int64(words[i])
@@ -297,7 +296,7 @@ def _decode_evt2(words, state, events, triggers, height, width):  # type: ignore
         if kind == 0x8:  # TIME_HIGH
             high = _evt2_high(state, started, high, now, (word & 0xFFFFFFF) << 6)
             started = 1
-            if state[_ERROR]:
+            if state[ERROR]:
                 i -= 1
                 break
         elif not started:
@@ -305,20 +304,20 @@ def _decode_evt2(words, state, events, triggers, height, width):  # type: ignore
         elif kind <= 0x1:  # CD_OFF, CD_ON
             now = _evt2_now(now, high, word)
             events[count, 0] = now
-            events[count, 1] = _place(word >> 11 & 0x7FF, word & 0x7FF, kind)
+            events[count, 1] = place(word >> 11 & 0x7FF, word & 0x7FF, kind)
             count += 1
         elif kind == 0xA:  # EXT_TRIGGER
             now = _evt2_now(now, high, word)
             count_triggers = _evt2_trigger(triggers, count_triggers, now, word)
-    state[_STARTED], state[_HIGH], state[_NOW] = started, high, now
+    state[STARTED], state[HIGH], state[NOW] = started, high, now
     return i, count, count_triggers
 
 
 @njit(cache=True, nogil=True)
 def _decode_evt21(words, state, events, triggers, height, width, head_shift):  # type: ignore[no-untyped-def]
     """``head_shift``: where the half with type, time and place lies, 32, or 0 in the legacy order of the halves."""
-    started, high, now = state[_STARTED], state[_HIGH], state[_NOW]
-    capacity, trigger_capacity = len(events) - _ROOM, len(triggers)
+    started, high, now = state[STARTED], state[HIGH], state[NOW]
+    capacity, trigger_capacity = len(events) - ROOM, len(triggers)
     count, count_triggers, i = 0, 0, 0
     while i < len(words) and count < capacity and count_triggers < trigger_capacity:
         head = np.int64(words[i] >> np.uint64(head_shift) & np.uint64(0xFFFFFFFF))
@@ -328,7 +327,7 @@ def _decode_evt21(words, state, events, triggers, height, width, head_shift):  #
         if kind == 0x8:  # TIME_HIGH
             high = _evt2_high(state, started, high, now, (head & 0xFFFFFFF) << 6)
             started = 1
-            if state[_ERROR]:
+            if state[ERROR]:
                 i -= 1
                 break
         elif not started:
@@ -336,7 +335,7 @@ def _decode_evt21(words, state, events, triggers, height, width, head_shift):  #
         elif kind <= 0x1:  # NEG, POS: a bit for each of 32 columns
             now = _evt2_now(now, high, head)
             column = head >> 11 & 0x7FF
-            rest = _place(0, head & 0x7FF, kind)
+            rest = place(0, head & 0x7FF, kind)
             while valid:
                 if valid & 1:
                     events[count, 0] = now
@@ -347,7 +346,7 @@ def _decode_evt21(words, state, events, triggers, height, width, head_shift):  #
         elif kind == 0xA:  # EXT_TRIGGER
             now = _evt2_now(now, high, head)
             count_triggers = _evt2_trigger(triggers, count_triggers, now, head)
-    state[_STARTED], state[_HIGH], state[_NOW] = started, high, now
+    state[STARTED], state[HIGH], state[NOW] = started, high, now
     return i, count, count_triggers
 
 
@@ -363,21 +362,21 @@ def _decode_evt21_legacy(words, state, events, triggers, height, width):  # type
 
 @njit(cache=True, nogil=True)
 def _decode_dat(words, state, events, triggers, height, width):  # type: ignore[no-untyped-def]
-    started, high, now = state[_STARTED], state[_HIGH], state[_NOW]
+    started, high, now = state[STARTED], state[HIGH], state[NOW]
     count = min(len(words), len(events))
     for i in range(count):
         word = np.int64(words[i] & np.uint64(0x1FFFFFFFFFFFFFFF))
         new = word & 0xFFFFFFFF
-        high = _unwrap(high, new, 1 << 32, _BACKWARDS_US) if started else new
+        high = _unwrap(high, new, 1 << 32, BACKWARDS_US) if started else new
         started = 1
-        if high + _BACKWARDS_US < now:
-            state[_ERROR] = 1
+        if high + BACKWARDS_US < now:
+            state[ERROR] = 1
             count = i
             break
         now = max(now, high)
         events[i, 0] = now
-        events[i, 1] = _place(word >> 32 & 0x3FFF, word >> 46 & 0x3FFF, word >> 60)
-    state[_STARTED], state[_HIGH], state[_NOW] = started, high, now
+        events[i, 1] = place(word >> 32 & 0x3FFF, word >> 46 & 0x3FFF, word >> 60)
+    state[STARTED], state[HIGH], state[NOW] = started, high, now
     return count, count, 0
 
 

@@ -19,30 +19,26 @@ from kalux.compiled import event_words
 from kalux.errors import FormatError, FrameError, OutputError
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.frames import MOSAICS, Frame, Mosaic
-from kalux.readers.source import CHUNK_EVENTS, GroundTruth, Source, one_line, reading
+from kalux.readers.hdf5_layout import DAMAGE, SIGNATURE
+from kalux.readers.source import CHUNK_EVENTS, GroundTruth, Source, begins_with, one_line, reading
 
 T = TypeVar("T")
 MAJOR_VERSION: Final = 1
 """Files with a greater major version are refused; a minor version only adds."""
 
 _VERSION: Final = f"{MAJOR_VERSION}.1"
-_SIGNATURE: Final = b"\x89HDF\r\n\x1a\n"
 _EVENTS_PER_CHUNK: Final = 1 << 17
 _COLUMNS: Final = ("t", "x", "y", "p")
-_DAMAGE: Final = (KeyError, ValueError, TypeError, RuntimeError, AttributeError, IndexError, MemoryError)
 
 
 def recognises(path: Path) -> bool:
     """Whether it is an HDF5 file that says it is kalux's, or one too damaged to say."""
-    if not path.is_file():
+    if not begins_with(path, SIGNATURE):
         return False
-    with path.open("rb") as file:
-        if file.read(len(_SIGNATURE)) != _SIGNATURE:
-            return False
     try:
         with h5py.File(path, "r") as file:
             return _text(file.attrs.get("format", "")) == "kalux"
-    except (OSError, *_DAMAGE):
+    except (OSError, *DAMAGE):
         return True
 
 
@@ -56,7 +52,7 @@ def read(path: Path) -> Source:
     InputError
         If it cannot be read.
     """
-    with reading(path, *_DAMAGE), h5py.File(path, "r") as file:
+    with reading(path, *DAMAGE), h5py.File(path, "r") as file:
         _check_version(path, _text(file.attrs.get("version", "")))
         event_count = _common_length(path, file, "events", _COLUMNS)
         frame_count = _common_length(path, file, "frames", _frame_columns(file))
@@ -133,7 +129,7 @@ def _common_length(path: Path, file: Any, group: str, names: tuple[str, ...]) ->
 
 
 def _events(path: Path) -> Iterator[EventArray]:
-    with reading(path, *_DAMAGE), h5py.File(path, "r") as file:
+    with reading(path, *DAMAGE), h5py.File(path, "r") as file:
         columns = [file["events"][name] for name in _COLUMNS]
         # Whole chunks of the file: reading across their borders decompresses each twice.
         stored = (columns[0].chunks or (CHUNK_EVENTS,))[0]
@@ -166,7 +162,7 @@ def _join(t, x, y, p, words):  # type: ignore[no-untyped-def]
 
 
 def _frames(path: Path) -> Iterator[Frame]:
-    with reading(path, *_DAMAGE), h5py.File(path, "r") as file:
+    with reading(path, *DAMAGE), h5py.File(path, "r") as file:
         group = file["frames"]
         white = float(group.attrs["white"]) if "white" in group.attrs else None
         starts, ends = group["exposure_start"][...], group["exposure_end"][...]
@@ -177,7 +173,7 @@ def _frames(path: Path) -> Iterator[Frame]:
 
 
 def _ground_truth(path: Path) -> GroundTruth:
-    with reading(path, *_DAMAGE), h5py.File(path, "r") as file:
+    with reading(path, *DAMAGE), h5py.File(path, "r") as file:
         group = file["ground_truth"]
         times, images = group["times"][...].astype(np.int64), group["images"][...].astype(np.float32)
         masks = group["masks"][...].astype(bool) if "masks" in group else None

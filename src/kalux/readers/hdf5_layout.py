@@ -1,4 +1,4 @@
-"""What the readers of other people's HDF5 layouts share: opening, checking, reading whole chunks of the file."""
+"""What the readers of HDF5 layouts share: opening, checking, reading whole chunks of the file."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from kalux.errors import EventError, FormatError
 from kalux.events import EventArray, make_events
-from kalux.readers.source import CHUNK_EVENTS, reading
+from kalux.readers.source import CHUNK_EVENTS, begins_with, reading
 
 DAMAGE: Final = (KeyError, ValueError, TypeError, RuntimeError, AttributeError, IndexError, MemoryError)
 """What h5py raises for damaged files, besides OSError."""
@@ -26,7 +26,9 @@ LARGEST_IMAGE: Final = 1 << 28
 LARGEST_CHUNK: Final = 1 << 29
 """Bytes of a chunk of the file, which HDF5 unpacks as a whole; more is damage."""
 
-_SIGNATURE: Final = b"\x89HDF\r\n\x1a\n"
+SIGNATURE: Final = b"\x89HDF\r\n\x1a\n"
+"""How HDF5 files begin."""
+
 _ECF: Final = 0x8ECF
 
 
@@ -39,11 +41,8 @@ def opened(path: Path) -> Iterator[Any]:
 
 def holds(path: Path, names: tuple[str, ...]) -> bool:
     """Whether it is an HDF5 file with datasets of all these names."""
-    if not path.is_file():
+    if not begins_with(path, SIGNATURE):
         return False
-    with path.open("rb") as file:
-        if file.read(len(_SIGNATURE)) != _SIGNATURE:
-            return False
     try:
         with h5py.File(path, "r") as file:
             return all(isinstance(file.get(name), h5py.Dataset) for name in names)

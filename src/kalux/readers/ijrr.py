@@ -24,7 +24,7 @@ from kalux.events import EVENT_DTYPE, EventArray
 from kalux.frames import Frame
 from kalux.readers.characters import DOT, FIVE, NEWLINE, NINE, ONE, SPACE, ZERO, parsed_blocks, skip_blanks
 from kalux.readers.images import in_colour, read_image
-from kalux.readers.source import CHUNK_EVENTS, SIZE_UNKNOWN, Source, reading
+from kalux.readers.source import CHUNK_EVENTS, SIZE_UNKNOWN, Source, begins_with, reading, smallest_size
 
 _EVENTS: Final = "events.txt"
 _IMAGES: Final = "images.txt"
@@ -50,11 +50,8 @@ def recognises(path: Path) -> bool:
     """Whether the folder or zip has ``events.txt``, at its root or in its one folder; or is a broken zip."""
     if path.is_dir():
         return (path / _EVENTS).is_file()
-    if not path.is_file():
+    if not begins_with(path, _ZIP_SIGNATURE):
         return False
-    with path.open("rb") as file:
-        if file.read(len(_ZIP_SIGNATURE)) != _ZIP_SIGNATURE:
-            return False
     try:
         return _root(path) is not None
     except _DAMAGE:
@@ -90,7 +87,7 @@ def read(path: Path) -> Source:
     elif declared_size is not None:
         sensor_size = declared_size
     else:
-        sensor_size = _extent(path)
+        sensor_size = smallest_size(path, _read_events(path))
         missing += (SIZE_UNKNOWN,)
 
     @cache
@@ -190,16 +187,6 @@ def _bad_line(path: Path, number: int, line: bytes, fault: str) -> FormatError:
         f"{path}: {_EVENTS}, line {number}: {fault}: {shown!r}; a line is 't x y p', t in seconds as a plain "
         "decimal, x and y from 0, p 0 or 1"
     )
-
-
-def _extent(path: Path) -> tuple[int, int]:
-    height = width = 0
-    for chunk in _read_events(path):
-        height = max(height, int(chunk["y"].max(initial=0)) + 1)
-        width = max(width, int(chunk["x"].max(initial=0)) + 1)
-    if not height:
-        raise FormatError(f"{path}: {_EVENTS} and {_IMAGES} hold neither events nor images")
-    return height, width
 
 
 _FAULTS: Final = {

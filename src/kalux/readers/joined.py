@@ -21,8 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.errors import FormatError, FrameError, InputError
+from kalux.events import FIELD_NAMES
 from kalux.frames import Frame
-from kalux.readers.columns import ALIASES, find_name, find_time
+from kalux.readers.columns import find_name, find_time
 from kalux.readers.images import SUFFIXES, in_colour, read_image
 from kalux.readers.source import SIZE_UNKNOWN, Source, reading
 
@@ -185,7 +186,7 @@ def read_image_list(path: Path, text: str) -> tuple[list[Listed], bool]:
         raise FormatError(f"{path}: is empty, or no text; {_WANTED} is needed")
     separator = next((c for c in ",;\t" if c in lines[0][1]), ",")
     header = [name.strip() for name in next(csv.reader([lines[0][1].lstrip("# ")], delimiter=separator))]
-    time, exposure = find_time(header, ALIASES["t"]), find_time(header, _EXPOSURE)
+    time, exposure = find_time(header, FIELD_NAMES["t"]), find_time(header, _EXPOSURE)
     name = find_name(header, _FILE)
     if time is None:
         raise FormatError(f"{path}: has the columns {', '.join(header)[:80]}; {_WANTED} is needed")

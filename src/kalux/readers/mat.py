@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from kalux.errors import EventError, FormatError
 from kalux.events import EventArray, make_events
 from kalux.frames import Frame
-from kalux.readers.source import CHUNK_EVENTS, GroundTruth, Source, reading
+from kalux.readers.source import CHUNK_EVENTS, GroundTruth, Source, begins_with, reading
 
 _MAGIC_5: Final = b"MATLAB 5.0 MAT-file"
 _MAGIC_73: Final = b"MATLAB 7.3 MAT-file"
@@ -50,10 +50,7 @@ _Shape = tuple[int, ...]
 
 def recognises(path: Path) -> bool:
     """Whether the file begins like a MATLAB file of version 5 or 7.3."""
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return file.read(len(_MAGIC_5)) in (_MAGIC_5, _MAGIC_73)
+    return begins_with(path, _MAGIC_5, _MAGIC_73)
 
 
 def read(path: Path) -> Source:
@@ -308,9 +305,8 @@ class _Variables(Protocol):
 
 
 def _open(path: Path) -> _Variables:
-    with reading(path), path.open("rb") as file:
-        is_73 = file.read(len(_MAGIC_73)) == _MAGIC_73
-    return _Version73(path) if is_73 else _Version5(path)
+    with reading(path):
+        return _Version73(path) if begins_with(path, _MAGIC_73) else _Version5(path)
 
 
 @dataclass(frozen=True)

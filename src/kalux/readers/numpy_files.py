@@ -22,12 +22,12 @@ from numpy.lib import format as npy
 from kalux.errors import FormatError
 from kalux.events import EventArray
 from kalux.readers.columns import UNIT_ASSUMED, Columns, find_columns, join
-from kalux.readers.source import CHUNK_EVENTS, SIZE_UNKNOWN, Source, reading, smallest_size
+from kalux.readers.source import CHUNK_EVENTS, SIZE_UNKNOWN, Source, begins_with, reading, smallest_size
 
 _NPY: Final = b"\x93NUMPY"
 _ZIP: Final = b"PK\x03\x04"
 _LARGEST_ITEM: Final = 256  # bytes per event; more is damage, and would need much memory
-_DAMAGE: Final = (
+DAMAGE: Final = (
     zipfile.BadZipFile,
     zlib.error,
     EOFError,
@@ -42,6 +42,8 @@ _DAMAGE: Final = (
     RecursionError,
     UnicodeError,
 )
+"""What damaged files, or others under such a name, can lead to in NumPy and zipfile."""
+
 _WANTED: Final = "an array for each of t, x, y and p, or one structured array with these fields"
 
 
@@ -65,18 +67,14 @@ class _Layout(NamedTuple):
 
 def recognises(path: Path) -> bool:
     """Whether it is an ``.npy``, or a zip that holds one at its root."""
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        beginning = file.read(len(_NPY))
-    if beginning == _NPY:
+    if begins_with(path, _NPY):
         return True
-    if not beginning.startswith(_ZIP):
+    if not begins_with(path, _ZIP):
         return False
     try:
         with zipfile.ZipFile(path) as archive:
             return any(name.endswith(".npy") and "/" not in name for name in archive.namelist())
-    except _DAMAGE:
+    except DAMAGE:
         return False
 
 
@@ -125,10 +123,8 @@ def _opened(path: Path, member: str | None) -> Iterator[IO[bytes]]:
 
 
 def _list_arrays(path: Path) -> list[_Array]:
-    with reading(path, *_DAMAGE):
-        with path.open("rb") as file:
-            is_npy = file.read(len(_NPY)) == _NPY
-        if is_npy:
+    with reading(path, *DAMAGE):
+        if begins_with(path, _NPY):
             sizes: dict[str | None, int] = {None: path.stat().st_size}
         else:
             with zipfile.ZipFile(path) as archive:
@@ -207,13 +203,13 @@ def _stated_size(path: Path, arrays: list[_Array]) -> tuple[int, int] | None:
 
 
 def _read_number(path: Path, array: _Array) -> int:
-    with reading(path, *_DAMAGE), _opened(path, array.member) as file:
+    with reading(path, *DAMAGE), _opened(path, array.member) as file:
         _read_header(file)
         return int(np.frombuffer(_exactly(file, array.dtype.itemsize), array.dtype)[0])
 
 
 def _events(path: Path, layout: _Layout) -> Iterator[EventArray]:
-    with reading(path, *_DAMAGE), contextlib.ExitStack() as stack:
+    with reading(path, *DAMAGE), contextlib.ExitStack() as stack:
         files = [stack.enter_context(_opened(path, array.member)) for array in layout.arrays]
         for file in files:
             _read_header(file)

@@ -128,6 +128,14 @@ def smallest_size(path: Path, chunks: Iterable[EventArray]) -> tuple[int, int]:
     return height, width
 
 
+def begins_with(path: Path, *beginnings: bytes) -> bool:
+    """Whether it is a file, and one of these, equally long, is how it begins."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(len(beginnings[0])) in beginnings
+
+
 def one_line(error: BaseException) -> str:
     """What another library's error says, on one line of printable characters."""
     text = " ".join(str(error).split()) or type(error).__name__

@@ -85,6 +85,23 @@ def write_whole(path: Path, data: bytes) -> None:
         raise
 
 
+def save(path: Path, content: bytes | str) -> None:
+    """As `write_whole`, of bytes or of text.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be written.
+    """
+    with output_errors(path):
+        write_whole(path, content if isinstance(content, bytes) else utf8(content))
+
+
+def utf8(text: str) -> bytes:
+    """Text in UTF-8. Names of files that are not UTF-8 have "?" in these places: there is no other form of them."""
+    return text.encode(errors="replace")
+
+
 def remove_quietly(path: Path) -> None:
     """Remove a file if that is possible; for cleaning up while another error is on its way."""
     with contextlib.suppress(OSError):

@@ -105,9 +105,8 @@ class FolderWriter(Writer):
         try:
             self._store(0)
         except BaseException:
-            with contextlib.suppress(
-                OutputError
-            ):  # the settings on disk are those of an incomplete output already
+            # If this fails too, the settings on disk are those of an incomplete output already.
+            with contextlib.suppress(OutputError):
                 self._end_files(complete=False)
             raise
         self._end_files(complete=complete)

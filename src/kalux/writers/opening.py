@@ -11,7 +11,7 @@ from kalux.errors import SettingsError
 from kalux.writers.base import Writer
 from kalux.writers.folder import SETTINGS, FolderWriter
 from kalux.writers.images import encode_exr, encode_npy, encode_png
-from kalux.writers.settings_file import plain, settings_file
+from kalux.writers.settings_file import beside, plain, settings_file
 from kalux.writers.video import VideoSettings, VideoWriter, make_ticks
 
 FORMATS = ("png", "exr", "npy", "mp4")
@@ -85,8 +85,8 @@ def open_writer(
         described["bits"] = png_bits
     if chosen == "mp4":
         described["video"] = plain(video, "video")
-        beside = settings_file(path.with_name(f"{path.name}.{SETTINGS}"), metadata or {}, described)
-        return VideoWriter(path, display, video, ticks, beside, overwrite=overwrite, threads=threads)
+        settings = settings_file(beside(path), metadata or {}, described)
+        return VideoWriter(path, display, video, ticks, settings, overwrite=overwrite, threads=threads)
     inside = settings_file(path / SETTINGS, metadata or {}, described)
     encode = {"png": encode_png(display, png_bits), "exr": encode_exr, "npy": encode_npy}[chosen]
     return FolderWriter(path, encode, f".{chosen}", inside, overwrite=overwrite, encoders=threads)

@@ -15,7 +15,7 @@ import numpy as np
 import tomli_w
 
 from kalux.errors import OutputError, SettingsError
-from kalux.writers.files import write_whole
+from kalux.writers.files import utf8, write_whole
 
 FIRST_LINE = (
     "# Written by kalux: the settings of this output. complete = false: it was interrupted or failed."
@@ -46,11 +46,10 @@ class SettingsFile:
         OSError
             It cannot be written; the old one stays.
         """
-        # Names of files that are not UTF-8 have no other form in TOML than with "?" in these places.
         lines = [FIRST_LINE, f"complete = {str(complete).lower()}", f"images = {images}"]
         if times is not None:
             lines += [f"first_t_us = {times[0]}", f"last_t_us = {times[1]}"]
-        write_whole(self.path, "\n".join([*lines, self.body]).encode(errors="replace"))
+        write_whole(self.path, utf8("\n".join([*lines, self.body])))
 
 
 def settings_file(path: Path, metadata: Mapping[str, Any], output: Mapping[str, Any]) -> SettingsFile:
@@ -77,6 +76,11 @@ def settings_file(path: Path, metadata: Mapping[str, Any], output: Mapping[str, 
     given = {name: value for name, value in metadata.items() if name != "versions"}
     tables = {**given, "output": output, "versions": {**versions(), **metadata.get("versions", {})}}
     return SettingsFile(path, tomli_w.dumps(plain(tables, "metadata")))
+
+
+def beside(path: Path) -> Path:
+    """Where the settings of an output that is one file are."""
+    return path.with_name(f"{path.name}.kalux.toml")
 
 
 def require_ours(path: Path) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 import kalux
 from kalux.calibration.event_model import LOG_OFFSETS
-from kalux.calibration.values import Calibration, to_files
+from kalux.calibration.values import Calibration
 from kalux.datasets.ahdr import ArtificialCamera, artificial_hdr
 from kalux.errors import InputError
 from kalux.evaluation.baselines import methods
@@ -21,6 +21,7 @@ from kalux.evaluation.held_out import evaluate_held_out, hold_out_frames
 from kalux.evaluation.lpips import load_lpips
 from kalux.evaluation.truth import evaluate_truth, load_truth, prepare_reference
 from kalux.readers import hdf5
+from kalux.writers.calibration import save_calibration
 
 from builders import moving_blocks
 
@@ -144,10 +145,7 @@ def test_artificial_hdr_is_what_the_library_makes_of_it(small_set):
 
 
 def test_a_calibration_changes_filters_and_the_key(small_set):
-    for file, data in to_files(
-        Calibration({"events": {"threshold_on": 0.35}}), small_set.folder / "cal.toml"
-    ).items():
-        file.write_bytes(data)
+    save_calibration(Calibration({"events": {"threshold_on": 0.35}}), small_set.folder / "cal.toml")
     options = Options(calibration=(small_set.folder / "cal.toml",))
     sequence = dataclasses.replace(small_set.without, options=options)
     jobs_made = [make_job(sequence, "default", held_out=True, hdr_vdp=False)]

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 import kalux
-from kalux.calibration.values import Calibration, to_files
+from kalux.calibration.values import Calibration
 from kalux.errors import ExposureError, InputError
 from kalux.evaluation.benchmark.sequences import ArtificialHdr, Options, gather, load
 from kalux.evaluation.truth import truth_beside
 from kalux.models.camera import Response
 from kalux.readers import hdf5
+from kalux.writers.calibration import save_calibration
 
 
 def test_a_folder_gives_its_recordings_and_their_truth_but_not_the_truth_as_a_recording(small_set):
@@ -53,6 +55,7 @@ def test_a_toml_file_lists_sequences_relative_to_itself(small_set):
         ("[[sequence]]\npath = 'x'\nexposur = 3", "unknown key 'exposur'; known are path"),
         ("[[sequence]]\npath = 'x'\nexposure = '3'", "exposure is '3'; int is needed"),
         ("[[sequence]]\npath = 'x'\nexposure = true", "int is needed"),
+        ("[[sequence]]\npath = 'x'\nwhite = '4095'", "white is '4095'; int or float is needed"),
         ("[[sequence]]\npath = 'x'\ntruth = 'y'\nhold_out_frames = 2", "exclude each other"),
         ("[[sequence]]\npath = 'x'\nahdr = {cut = 30, low = 3}", "cut is for both ends"),
         ("[[sequence]]\npath = 'x'\nahdr = {low = 90, high = 10}", "black < white"),
@@ -107,6 +110,29 @@ def test_an_exposure_is_for_recordings_that_store_none(small_set, simulation):
         gather([path]).sequences[0].open().frames()
 
 
+@pytest.mark.parametrize("exposure_known", [True, False])
+def test_a_toml_file_says_which_value_is_white(small_set, simulation, exposure_known):
+    frames = [
+        type(f)(
+            f.image.astype(np.uint16),
+            f.exposure_start,
+            f.exposure_end if exposure_known else f.exposure_start,
+        )
+        for f in simulation.frames
+    ]
+    hdf5.write(
+        small_set.folder / "deep.h5",
+        sensor_size=simulation.scene.sensor_size,
+        events=[simulation.events],
+        frames=frames,
+        exposure_known=exposure_known,
+    )
+    path = small_set.folder / "bench.toml"
+    path.write_text('[[sequence]]\npath = "deep.h5"\nexposure = 7\nwhite = 255\n')
+    (found,) = gather([path]).sequences
+    assert {frame.white_value for frame in found.open().frames()} == {255.0}
+
+
 def test_a_toml_file_makes_artificial_hdr_of_a_recording(small_set):
     path = small_set.folder / "bench.toml"
     path.write_text(
@@ -126,8 +152,7 @@ def test_a_toml_file_makes_artificial_hdr_of_a_recording(small_set):
 
 def test_what_a_calibration_says_of_the_camera_is_not_taken_for_an_artificial_one(small_set):
     settings = {"camera": {"response": "srgb"}, "events": {"threshold_on": 0.2}}
-    for file, data in to_files(Calibration(settings), small_set.folder / "cal.toml").items():
-        file.write_bytes(data)
+    save_calibration(Calibration(settings), small_set.folder / "cal.toml")
     path = small_set.folder / "bench.toml"
     path.write_text(
         '[[sequence]]\npath = "a.h5"\ncalibration = "cal.toml"\n'

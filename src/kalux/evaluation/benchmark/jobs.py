@@ -18,13 +18,15 @@ from numpy.typing import NDArray
 
 import kalux
 from kalux.errors import InputError, KaluxError
-from kalux.evaluation.baselines import Method, chosen_methods, frames_around
+from kalux.evaluation.baselines import frames_around
 from kalux.evaluation.benchmark.sequences import EVERY, Options, Sequence, files_under
 from kalux.evaluation.exposures import linear_frame, reference_exposure
 from kalux.evaluation.held_out import held_out_pairs, hold_out_frames
 from kalux.evaluation.lpips import load_lpips
-from kalux.evaluation.scores import Pair, Scores, finite_or_none, score
-from kalux.evaluation.specs import relocated, spec_path
+from kalux.evaluation.method import Method
+from kalux.evaluation.pairs import Pair
+from kalux.evaluation.scores import Scores, finite_or_none, score
+from kalux.evaluation.specs import chosen_methods, relocated, spec_path
 from kalux.evaluation.truth import find_truth, prepare_reference, truth_pairs
 from kalux.models.camera import Camera, Response
 from kalux.recording import Recording
@@ -50,7 +52,7 @@ class Job:
     sequence
         The sequence.
     method
-        Name, as `kalux.evaluation.baselines.chosen_methods` takes it.
+        Name, as `kalux.evaluation.specs.chosen_methods` takes it.
     held_out
         Whether frames are held out; else it is compared with ground truth.
     hdr_vdp

@@ -14,11 +14,10 @@ import numpy as np
 
 import kalux
 from kalux.errors import KaluxError
-from kalux.evaluation.baselines import chosen_methods
 from kalux.evaluation.benchmark.jobs import GROUPS, Failed, Job, make_job, uses_held_out
 from kalux.evaluation.benchmark.sequences import Benchmark, Sequence
 from kalux.evaluation.scores import METRICS, UNCERTAINTY
-from kalux.evaluation.specs import relocated
+from kalux.evaluation.specs import chosen_methods, relocated
 
 DEFAULT_METHODS: Final = ("hold", "mean", "edi", "cf", "iccv2021", "default", "smooth")
 """Two that use frames only, two that use events as well, the paper, and kalux."""

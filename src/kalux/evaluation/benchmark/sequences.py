@@ -72,6 +72,8 @@ class Options:
         us, of recordings that store none.
     stamp
         What a frame's time marks, with ``exposure``.
+    white
+        The value of a saturated pixel, where the recording does not state it, as of `kalux.open`.
     response
         Of the camera, as in `kalux.settings.CameraSettings`.
     truth
@@ -87,6 +89,7 @@ class Options:
 
     exposure: int | None = None
     stamp: Stamp = "start"
+    white: float | None = None
     response: str = AUTO
     truth: Path | None = None
     hold_out_frames: int | None = None
@@ -127,9 +130,11 @@ class Sequence:
             As of `kalux.open`.
         """
         options = self.options
-        recording = kalux.open(self.path)
+        recording = kalux.open(self.path, white=options.white)
         if not recording.exposure_known and options.exposure is not None:
-            recording = kalux.open(self.path, exposure=options.exposure, stamp=options.stamp)
+            recording = kalux.open(
+                self.path, exposure=options.exposure, stamp=options.stamp, white=options.white
+            )
         if options.ahdr is None:
             return recording
         return artificial_hdr(
@@ -205,7 +210,7 @@ class Benchmark:
     sequences
         In the order of the columns; names differ.
     methods
-        Names as `kalux.evaluation.baselines.chosen_methods` takes them; None: all that are compared by default.
+        Names as `kalux.evaluation.specs.chosen_methods` takes them; None: all that are compared by default.
     folder
         That files and folders in the names of methods are relative to.
     """
@@ -285,6 +290,7 @@ _SEQUENCE_KEYS: Final[_Kinds] = {
     "group": (str,),
     "exposure": (int,),
     "stamp": (str,),
+    "white": _NUMBER,
     "response": (str,),
     "truth": (str,),
     "hold_out_frames": (int,),

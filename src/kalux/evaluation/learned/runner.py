@@ -20,12 +20,13 @@ import torch
 from numpy.typing import NDArray
 
 from kalux.errors import InputError
-from kalux.evaluation.baselines import EventWindow, Image, Times
+from kalux.evaluation.baselines import EventWindow
 from kalux.evaluation.exposures import linear_frame, reference_exposure
 from kalux.evaluation.learned.catalogue import NETWORKS, Tone
 from kalux.evaluation.learned.networks import Network
 from kalux.evaluation.learned.voxels import normalise, voxel_grid
 from kalux.evaluation.learned.weights import load_network
+from kalux.evaluation.method import Image, Times
 from kalux.recording import Recording
 
 SHARE_OF_WINDOW: Final = 3

@@ -1,0 +1,92 @@
+"""What evaluations compare: a method, which makes images of a recording at given times.
+
+It is given a recording and ascending times, us, and yields one image per time: (H, W) float32, linear, 1 = a saturated
+frame pixel at the recording's median exposure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux.errors import InputError
+from kalux.recording import Recording
+from kalux.settings import Settings
+
+Image = NDArray[np.float32]
+Times = NDArray[np.int64]
+
+
+class Estimated(NamedTuple):
+    """An image, and how sure a method is of it.
+
+    Attributes
+    ----------
+    intensity
+        (H, W), linear.
+    variance
+        (H, W), of log(intensity + log_offset); None: the method does not say.
+    log_offset
+        I_0.
+    """
+
+    intensity: Image
+    variance: Image | None
+    log_offset: float = 0.0
+
+
+@dataclass(frozen=True)
+class Method:
+    """A way to make images.
+
+    Attributes
+    ----------
+    label
+        For tables.
+    images
+        From a recording and ascending times (N,) int64, us, to N images.
+    needs_held_out
+        Whether it looks at the frames before and after, which would be unfair where they are not held out.
+    estimates
+        As ``images``, with the variance of every image; None: the method has none.
+    settings
+        Of `kalux.reconstruct`, where that makes the images.
+    notes
+        What a reader of its scores has to know.
+    """
+
+    label: str
+    images: Callable[[Recording, Times], Iterable[Image]]
+    needs_held_out: bool = False
+    estimates: Callable[[Recording, Times], Iterable[Estimated]] | None = None
+    settings: Settings | None = None
+    notes: tuple[str, ...] = ()
+
+    def estimated(self, recording: Recording, times: Times) -> Iterator[Estimated]:
+        """The images at ascending times (us), with their variances where the method has them.
+
+        Raises
+        ------
+        InputError
+            If the method yields anything but one array per time.
+        """
+        if self.estimates is not None:
+            made = iter(self.estimates(recording, times))
+        else:
+            made = (Estimated(image, None) for image in self.images(recording, times))
+        count = 0
+        for count, one in enumerate(made, 1):
+            if count > len(times):
+                raise InputError(f"{self.label}: more images than the {len(times)} times it was given")
+            if not isinstance(one.intensity, np.ndarray):
+                kind = type(one.intensity).__name__
+                raise InputError(
+                    f"{self.label}: image {count - 1} is of type {kind}; a NumPy array is needed"
+                )
+            yield one
+        if count < len(times):
+            raise InputError(f"{self.label}: {count} images for {len(times)} times; one for each is needed")

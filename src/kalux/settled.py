@@ -1,0 +1,174 @@
+"""What a reconstruction settles before it begins, for people: values with their units, and where they come from."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from kalux.calibration.levels import find_ceiling
+from kalux.recording import Recording
+from kalux.settings import AUTO, CameraSettings, Settings
+
+if TYPE_CHECKING:
+    from kalux.pipeline import Plan
+
+ORIGINS: Final = {
+    "settings": "given",
+    "recording": "from the recording",
+    "calibration": "calibrated",
+    "estimate": "estimated",
+    "assumed": "usual of the preset, the recording does not tell",
+}
+"""What to call where thresholds come from (`kalux.pipeline.ThresholdOrigin`)."""
+
+_NOTABLE_SHARE: Final = 0.05
+_ALIKE: Final = (
+    0.99  # of the level at which pixels saturate: where nearly all do from here on, it is one level
+)
+_GIVEN: Final = "given"
+_USUAL: Final = ORIGINS["assumed"]
+
+
+def settled(recording: Recording, plan: Plan, asked: Settings) -> list[tuple[str, str]]:
+    """What the settings left to the recording: name, value with its unit and where that comes from.
+
+    Parameters
+    ----------
+    recording, plan
+        From `kalux.pipeline.plan`.
+    asked
+        The settings before the plan filled in what was missing; what they state is said to be given.
+    """
+    camera, events = plan.settings.camera, plan.settings.events
+    rows = [
+        (
+            "thresholds",
+            f"on {events.threshold_on:.3f}, off {events.threshold_off:.3f} log intensity ({_threshold_origin(plan)})",
+        ),
+        ("delay", f"events {events.lateness * 1e-3:g} ms late ({_delay_origin(plan, asked)})"),
+        (
+            "I_0",
+            f"{camera.offset:g} of white, events are steps of log(I + I_0) "
+            f"({_model_origin(plan, asked.camera.log_offset)})",
+        ),
+    ]
+    if events.step_variance is not None:
+        rows.append(
+            (
+                "step",
+                f"variance of one event {events.step_variance:g} c^2, c its threshold "
+                f"({_model_origin(plan, asked.events.step_variance)})",
+            )
+        )
+    if events.refractory_period is not None:
+        what = (
+            f"{events.refractory_period * 1e-3:g} ms" if events.refractory_period else "nothing is lost in it"
+        )
+        rows.append(("refractory", f"{what} ({_refractory_origin(plan, asked)})"))
+    if events.threshold_spread is not None:
+        how = _estimated(asked.events.threshold_spread, plan.mismatch is not None)
+        rows.append(
+            ("spread", f"{100 * events.threshold_spread:.1f} % between the pixels' thresholds ({how})")
+        )
+    if events.noise_rate is not None:
+        how = _estimated(asked.events.noise_rate, plan.background_rate == events.noise_rate)
+        if plan.background_rate is not None and plan.background_rate < events.noise_rate:
+            how = f"the usual, which is the least; measured {plan.background_rate:.2g}"
+        rows.append(("background", f"{events.noise_rate:.2g} Hz per pixel of events without reason ({how})"))
+    given = asked.camera.reference_exposure is not None
+    rows.append(
+        (
+            "exposure",
+            f"{(camera.reference_exposure or 0) * 1e-3:g} ms makes a saturated pixel 1.0 "
+            f"({_GIVEN if given else 'median of the frames'})",
+        )
+    )
+    if camera.frame_noise is not None:
+        read, shot = camera.noise
+        how = _GIVEN if asked.camera.frame_noise is not None else "estimated" if plan.frame_noise else _USUAL
+        half = np.sqrt(read**2 + shot / 2)
+        rows.append(("noise", f"of frames {read:.2g} of white in the dark, {half:.2g} at half of it ({how})"))
+    if plan.settings.filter.bright_tail is not None and plan.settings.filter.highlight_scale > 0:
+        how = "measured" if asked.filter.bright_tail is None else _GIVEN
+        rows.append(("bright tail", f"{plan.settings.filter.bright_tail:.2f} log intensity ({how})"))
+    stated = "usual, the recording does not state it" if recording.response is None else "as recorded"
+    how = stated if asked.camera.response == AUTO else _GIVEN
+    rows.append(("response", f"{response_text(camera.response)} ({how})"))
+    if camera.white_balance != asked.camera.white_balance:
+        rows.append(("white balance", f"{camera.white_balance} for red, green, blue (measured)"))
+    return rows
+
+
+def saturation_text(recording: Recording, plan: Plan, asked: Settings) -> str:
+    """From which level on pixels count as clipped, and where the recording shows that they are.
+
+    Parameters are those of `settled`; it looks at up to 80 frames once more (`kalux.calibration.levels`).
+    """
+    used = plan.settings.camera.saturation
+    how = "the usual" if asked.camera.saturation == CameraSettings.saturation else _GIVEN
+    text = f"from {used:.2g} of white ({how}); "
+    ceiling = find_ceiling(recording, plan.settings.camera, plan.settings.events)
+    if ceiling is None:
+        return text + "events do not go on where the frames end, or too few tell"
+    level = f"{ceiling.level:.2g}"
+    if ceiling.least < _ALIKE * ceiling.level:
+        level = f"{ceiling.least:.2g} to {2 * ceiling.level - ceiling.least:.2g}"
+    text += f"frames end at {level}, where events go on"
+    if ceiling.level < used:
+        percent = 100 * np.expm1(ceiling.excess)
+        text += f" by {percent:.0f} %: --camera.saturation {_ALIKE * ceiling.least:.2g} does not take that for measured"
+    return text
+
+
+def _threshold_origin(plan: Plan) -> str:
+    found = plan.estimate
+    if found is None or plan.threshold_origin not in ("estimate", "assumed"):
+        return ORIGINS[plan.threshold_origin]
+    if plan.threshold_origin == "assumed":
+        return (
+            f"{100 * found.usual_share:.0f} % usual of the preset, as the recording hardly tells: +- "
+            f"{100 * found.spread:.0f} %"
+        )
+    text = f"{ORIGINS['estimate']} from {found.samples:,} samples, residual {found.residual:.2f}"
+    text += f": +- {100 * found.spread:.0f} %"
+    if found.usual_share > _NOTABLE_SHARE:
+        text += f"; {100 * found.usual_share:.0f} % is the usual of the preset, as little moves"
+    return text
+
+
+def _refractory_origin(plan: Plan, asked: Settings) -> str:
+    if asked.events.refractory_period is not None:
+        return _GIVEN
+    if plan.estimate is None:
+        return _USUAL
+    return f"estimated from {plan.estimate.samples:,} samples"
+
+
+def _delay_origin(plan: Plan, asked: Settings) -> str:
+    found = plan.delay_estimate
+    if found is None:
+        return _USUAL if asked.events.delay is None else _GIVEN
+    return (
+        f"estimated: {found.apparent * 1e-3:.1f} ms explain the frames {100 * found.improvement:.0f} % better"
+    )
+
+
+def _model_origin(plan: Plan, asked: float | None) -> str:
+    if asked is not None:
+        return _GIVEN
+    return _USUAL if plan.event_model is None else f"estimated from {plan.event_model.samples:,} samples"
+
+
+def _estimated(asked: float | None, found: bool) -> str:
+    if asked is not None:
+        return _GIVEN
+    return "measured" if found else _USUAL
+
+
+def response_text(response: str) -> str:
+    """A response's name, without all values of a measured curve."""
+    return "; ".join(
+        f"curve of {len(part.split())} knots" if part.startswith("curve:") else part
+        for part in response.split(";")
+    )
