@@ -39,6 +39,7 @@ class Pixel:
     clipped: list[bool]
     weight: list[float]
     black: list[bool]
+    dark: list[float]
     events: list[tuple[int, bool, int, int, float]]
     shown: int = 0
     excess: float = 0.0
@@ -87,6 +88,7 @@ def pixels(events, frames, sensor_size, settings, begin):
                 [r >= settings.camera.saturation for r in response],
                 [float(camera.weight(r)) for r in response],
                 [r == 0 for r in response],
+                [dark_scale(f, settings.camera) for f in frames],
                 own,
             )
     return out
@@ -248,6 +250,18 @@ def hides(camera):
     return float(response.inverse(0.5 / 255))
 
 
+def dark_scale(frame, camera):
+    """K7: how the log intensity of what is black is distributed, by the share of black among what is hardly more."""
+    response = Camera.named(chosen_response(camera.response, None), camera.saturation).response
+    most = hides(camera)
+    values = response.inverse(frame.image.ravel() / 255)
+    near = max(min(1.5 * most, 0.95), 1.1 * most)
+    black, dark = np.sum(values <= most), np.sum(values <= near)
+    if black == 0:
+        return 0.3
+    return float(np.clip(np.log(near / most) / max(np.log(dark / black), 1e-3), 0.3, 2.0))
+
+
 def is_crushed(pixel, k, camera):
     """K7: whether black hides more than a linear response's would."""
     return pixel.black[k] and hides(camera) > 1.5 / 255
@@ -272,13 +286,13 @@ def bridged(pixel, settings, times, on, off, scales):
         if not crushed(k):
             return np.inf
         most = hidden_by_black * pixel.white[k]
-        return middle + np.log(most + i0) - np.log(np.sqrt(0.001 * most) + i0)
+        return middle + np.log(most + i0) - np.log(most * np.exp(-pixel.dark[k]) + i0)
 
     def latent(k):  # K3
         log_frame = np.log(pixel.intensity[k] + i0)
         if crushed(k):
             most = hidden_by_black * pixel.white[k]
-            log_frame = np.log(np.sqrt(0.001 * most) + i0)
+            log_frame = black = np.log(most * np.exp(-pixel.dark[k]) + i0)
         a, b = on * scale_on, off * scale_off
         middle = edi(pixel, k, log_frame, a, b) if settings.filter.deblur else log_frame
         inside = 0
@@ -290,7 +304,8 @@ def bridged(pixel, settings, times, on, off, scales):
         variance /= (max(pixel.intensity[k], 1.5 * read * pixel.white[k]) + i0) ** 2
         variance /= max(pixel.weight[k], 1e-6)
         if crushed(k):
-            variance = 3 * np.log((most + i0) / i0) ** 2 / 12
+            shares = (np.arange(64) + 0.5) / 64
+            variance = 3 * np.mean((np.log(most * shares ** pixel.dark[k] + i0) - black) ** 2)
         variance += ev.deblur_variance * c2 * inside
         return middle, UNMEASURED if pixel.clipped[k] else variance
 
@@ -532,14 +547,16 @@ def hidden(pixels, place, moving, t, on, off):
     return min(abs(t - middles[max(k, 0)]) / gap, 1) * change
 
 
-def known(pixel, variance, t, settings, c2):
-    """K11: P with what the frames around say, of a pixel between two frames."""
+def known(pixel, variance, t, settings, c2, left):
+    """K11: P with what the frames around say, of a pixel between two frames; ``left`` is the share that K12 leaves."""
     ev, middles = settings.events, pixel.middles
     k = sum(m < t for m in middles) - 1
     if not 0 <= k < len(middles) - 1:
         return variance
     a, b = middles[k], middles[k + 1]
     share, (first, second) = (t - a) / (b - a), pixel.changes[k][3]
+    if min(first, second) >= UNMEASURED:
+        variance *= 1 - 0.6 * (1 - left) / 0.3
     events = sum(w for q, *_, w in pixel.events if a < q <= b)
     between = 4 * share * (1 - share)
     wrong = 0.002 * c2 * between * events**2

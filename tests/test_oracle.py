@@ -99,12 +99,12 @@ def test_engine_agrees_with_the_oracle(name, data):
             value, total, beyond, noise = naive.lifted(value, total, excess[i], chosen, top)
         given = total
         if chosen.filter.neighbours > 0:
-            given = hidden[i].copy()
-            for place, pixel in pixels.items():
-                given[place] += naive.known(pixel, total[place], t, chosen, 0.21 * 0.17)
-            known = total + 1.6 * hidden[i]  # before neighbours are heard
+            known, told = total + 1.6 * hidden[i], total  # before neighbours are heard
             value, total = naive.regularised(value, known, moving[i], chosen.filter.neighbours)
             total = np.where(unshown, known, total)
+            given, left = hidden[i].copy(), total / known
+            for place, pixel in pixels.items():
+                given[place] += naive.known(pixel, told[place], t, chosen, 0.21 * 0.17, left[place])
         value = np.where(unshown, np.maximum(value, bound) + beyond**2 / 2, value)
         level = np.vectorize(lambda v, p: naive.intensity(v, p, chosen, white, stretch))(  # noqa: B023
             value, np.where(unshown, noise, total)

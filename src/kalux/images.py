@@ -163,6 +163,7 @@ def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) ->
         change = np.full(log_intensity.shape, UNKNOWN_CHANGE * view.threshold2, np.float32)
     hidden = hidden_variance(estimate.between, view.threshold2, estimate.exposed, estimate.since)
     tells = with_variance or view.mosaic is not None  # the colours of a mosaic's highlights depend on it
+    left = tells and (moving is None or (estimate.around is not None and estimate.around.misses_some))
     intensity, total, heard = read_out(
         log_intensity,
         variance,
@@ -174,14 +175,14 @@ def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) ->
         view.neighbours,
         1 if view.mosaic is None else 2,  # to neighbours of the same colour
         None if unshown is None else unshown.pixels,
-        with_variance=tells and moving is None,
+        with_variance=left,
     )
     if unshown is not None:
         read_unshown(intensity, heard, estimate.log_intensity, unshown, view.log_offset, prior)
     if not tells:
         total = np.ndarray(intensity.shape, np.float32, _UNTOLD, strides=(0, 0))
     elif moving is not None and change is not None:
-        total = given_variance(told, moving, change, hidden, estimate.around)
+        total = given_variance(told, moving, change, hidden, estimate.around, total if left else None)
     image = Image(estimate.t, intensity, total, view.log_offset, estimate.final)
     return dataclasses.replace(image, colour=_coloured(image, estimate, view))
 

@@ -118,3 +118,13 @@ def test_what_cannot_be():
         artificial_hdr(recording_of([LEVELS * 0] * 3), camera)
     with pytest.raises(SettingsError, match="s-curve is black up to 1"):
         Response.s_curve(1.0)
+
+
+def test_the_truth_has_the_noise_of_the_original_in_its_units():
+    rng = np.random.default_rng(0)
+    clean = np.broadcast_to(np.linspace(40, 120, 160), (120, 160))
+    images = [np.rint(clean + 2 * rng.standard_normal(clean.shape)).astype(np.uint8) for _ in range(24)]
+    camera = ArtificialCamera(20 / 255, 100 / 255)
+    read, shot = artificial_hdr(recording_of(images), camera).ground_truth().noise
+    assert np.sqrt(read**2 + shot * 0.8) == pytest.approx(2 / 100, rel=0.1)
+    assert artificial_hdr(recording_of(images), camera, response="gamma:2").ground_truth().noise is None

@@ -10,7 +10,7 @@ import pytest
 import kalux
 from kalux.errors import FormatError, InputError
 from kalux.evaluation.baselines import methods
-from kalux.evaluation.method import Method
+from kalux.evaluation.method import Estimated, Method
 from kalux.evaluation.truth import evaluate_truth, load_truth, prepare_reference
 from kalux.readers import GroundTruth
 
@@ -49,6 +49,28 @@ def test_scores_are_means_over_images(simulation, recording):
     held = np.stack(list(methods()["hold"].images(recording, truth.times)))
     assert scores.mse == pytest.approx(np.mean((held.astype(float) - truth.images) ** 2))
     assert [image.t for image in scores.images] == truth.times.tolist()
+
+
+def test_the_noise_of_a_truth_that_a_camera_took_is_no_error_and_what_was_given_is_not_counted(recording):
+    """z is 1 with the noise of both; where the recording's own frame measures the truth, nothing is counted."""
+    rng = np.random.default_rng(0)
+    frames = list(recording.frames())
+    times = np.array([frames[2].middle, frames[2].middle + 1, frames[3].middle], np.int64)
+    size = recording.sensor_size
+    shown = 0.5 + 0.02 * rng.standard_normal((3, *size))
+    truth = GroundTruth(times, shown.astype(np.float32), noise=(0.02, 0.0))
+
+    def estimates(_, times):
+        for _ in times:
+            made = 0.5 + 0.01 * rng.standard_normal(size)
+            yield Estimated(made, np.full(size, (0.01 / 0.6) ** 2), 0.1)
+
+    method = Method("knows", lambda recording, times: iter(()), estimates=estimates)
+    found = evaluate_truth(recording, prepare_reference(recording, truth), method)
+    assert found.uncertainty()["rms_z"] == pytest.approx(1.0, abs=0.06)
+    clipped = sum(np.count_nonzero(frames[k].normalised() >= 0.98) for k in (2, 3))
+    assert found.calibration["all"]["pixels"] == size[0] * size[1] + clipped
+    assert found.pixels == 3 * size[0] * size[1]
 
 
 def test_images_may_come_in_any_order(simulation, recording):

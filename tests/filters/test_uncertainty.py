@@ -8,8 +8,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kalux.augmentation.bridge import UNMEASURED
-from kalux.filters.readout import Hidden
-from kalux.filters.uncertainty import ALONE, Around, alone, given_variance, hidden_variance, known_variance
+from kalux.filters.readout import SHARED, Hidden
+from kalux.filters.uncertainty import (
+    ALIKE,
+    ALONE,
+    Around,
+    alone,
+    given_variance,
+    hidden_variance,
+    known_variance,
+)
 
 C2 = 0.04
 STILL = np.zeros((1, 2), bool)
@@ -96,3 +104,18 @@ def test_without_a_next_frame_nothing_holds_the_other_end():
 
 def test_neighbours_that_are_heard_take_a_part_of_it():
     assert alone(Hidden(0.1, 0.2)) == pytest.approx((0.1 * ALONE, 0.2 * ALONE))
+
+
+def test_what_neighbours_take_of_a_pixel_that_neither_frame_measures_is_not_given():
+    """Errors of neighbours are less alike than highlights are doubted by."""
+    p, mean = 0.2, 0.05  # of neighbours and pixel together
+    left = plane(SHARED * p + (1 - SHARED) * mean)
+    heard = given_variance(plane(p), STILL, NO_CHANGE, NOTHING, around(), left)
+    np.testing.assert_allclose(heard, ALIKE * p + (1 - ALIKE) * mean, rtol=1e-5)
+    for frames in ((0.01, UNMEASURED), (UNMEASURED, 0.01)):
+        measured = around(*frames, counted=UNMEASURED)
+        np.testing.assert_allclose(
+            given_variance(plane(p), STILL, NO_CHANGE, NOTHING, measured, left), p, rtol=1e-5
+        )
+        assert not measured.misses_some
+    assert around().misses_some

@@ -15,6 +15,7 @@ from kalux.models.camera import (
     black_ceiling,
     count_bright,
     covariance,
+    dark_scale,
     frame_log_covariance,
     inverse_response,
     log_bias,
@@ -371,3 +372,17 @@ def test_black_hides_the_irradiance_of_half_a_level():
     crushed = black_ceiling(Camera.named("s-curve:0.3", 0.98), response, 1.0)
     assert 0.3 < crushed[0] < 0.33
     assert np.isinf(crushed[2:]).all()
+
+
+@pytest.mark.parametrize("scale", [0.4, 1.0, 1.8])
+def test_the_scale_of_what_is_black_is_found_from_what_is_hardly_more(scale):
+    intensity = np.linspace(0.0, 1.0, 2001)
+    counts = np.diff(1e6 * intensity ** (1 / scale), prepend=0.0).astype(np.int64)
+    assert dark_scale(intensity, counts, 0.2, 1.0) == pytest.approx(scale, rel=0.03)
+
+
+def test_the_scale_of_what_is_black_has_bounds():
+    """Where nothing is black, and where nothing else is."""
+    intensity = np.array([0.0, 0.3, 0.5])
+    assert dark_scale(intensity, np.array([0, 9, 9]), 0.25, 1.0) == 0.3
+    assert dark_scale(intensity, np.array([9, 0, 0]), 0.25, 1.0) == 2.0

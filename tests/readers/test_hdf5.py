@@ -241,7 +241,7 @@ def test_a_real_recording_comes_back(shared_data, path):
 def test_masks_of_the_truth_and_the_response(tmp_path):
     rng = np.random.default_rng(0)
     images = rng.random((2, *SIZE)).astype(np.float32)
-    truth = GroundTruth(np.array([5, 9]), images, images > 0.5)
+    truth = GroundTruth(np.array([5, 9]), images, images > 0.5, (0.01, 0.002))
     hdf5.write(
         tmp_path / "a.h5",
         sensor_size=SIZE,
@@ -253,6 +253,7 @@ def test_masks_of_the_truth_and_the_response(tmp_path):
     found = hdf5.read(tmp_path / "a.h5")
     assert found.response == "gamma:2.2"
     assert np.array_equal(found.ground_truth().masks, truth.masks)
+    assert found.ground_truth().noise == (0.01, 0.002)
 
 
 @pytest.mark.parametrize("masked", [(0, 1, 2, 3), (0,), (2,), (3,), ()])

@@ -22,6 +22,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.calibration.frame_noise import estimate_frame_noise
 from kalux.errors import FrameError, InputError
 from kalux.frames import Frame
 from kalux.models.camera import Camera, Response, inverse_response
@@ -146,7 +147,12 @@ def artificial_hdr(
                 images.append(np.maximum(image, 0.0).astype(np.float32))
                 masks.append(frame.normalised() < saturation)
         whole = np.stack(masks)
-        return GroundTruth(np.array(times, np.int64), np.stack(images), None if whole.all() else whole)
+        return GroundTruth(
+            np.array(times, np.int64),
+            np.stack(images),
+            None if whole.all() else whole,
+            _noise(recording, response, black, camera.high),
+        )
 
     if recording.source.count_frames() and not any(f.image.any() for f in recording.frames()):
         raise FrameError(f"{recording.source.path}: all frames are black; there is nothing to cut")
@@ -162,6 +168,18 @@ def artificial_hdr(
             response=camera.response,
         )
     )
+
+
+def _noise(recording: Recording, response: str, black: float, high: float) -> tuple[float, float] | None:
+    """Read and shot noise of the original frames, 1 = ``high``; None: not linear, or they do not tell."""
+    name = chosen_response(response, recording.response)
+    if name not in ("auto", "linear"):
+        return None
+    found = estimate_frame_noise(recording, CameraSettings(response=name))
+    if found is None or not found.believed:
+        return None
+    scale = high * (1.0 - black)
+    return found.read / scale, found.shot / scale
 
 
 def _intensity(frame: Frame, camera: Camera, black: float, exposure_ratio: float) -> NDArray[np.float64]:

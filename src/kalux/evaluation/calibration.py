@@ -122,7 +122,7 @@ class Calibrations:
         self._parts: dict[str, Calibration] = {}
 
     def add(self, pair: Pair) -> None:
-        """Add an image; pixels whose reference is itself clipped are left out, others are all in."""
+        """Add an image; pixels whose reference is itself clipped, or was given to the method, are left out."""
         if pair.variance is None:
             return
         if not self._parts:
@@ -133,6 +133,8 @@ class Calibrations:
         counted = np.ones(np.shape(pair.test), bool) if pair.mask is None else pair.mask
         if pair.clipped is not None:
             counted = counted & ~pair.clipped
+        if pair.given is not None:
+            counted = counted & ~pair.given
         variance = np.asarray(pair.variance, np.float64)
         if pair.noise is not None:
             variance = variance + np.where(variance > 0, pair.noise, 0.0)

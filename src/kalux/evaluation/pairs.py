@@ -30,6 +30,8 @@ class Pair(NamedTuple):
         (H, W) bool, True where the reference itself is clipped; None: nowhere.
     log_offset
         I_0 of the variance.
+    given
+        (H, W) bool, True where the method was given the reference itself, noise and all; None: nowhere.
     noise
         (H, W), variance of log(reference + log_offset) by the noise of the reference itself; None: it has none, or
         none that is known.
@@ -43,6 +45,7 @@ class Pair(NamedTuple):
     clipped: NDArray[np.bool_] | None = None
     log_offset: float = 0.0
     noise: NDArray[Any] | None = None
+    given: NDArray[np.bool_] | None = None
 
 
 def checked_pair(

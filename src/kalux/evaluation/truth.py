@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,9 +16,12 @@ from kalux.evaluation.lpips import LpipsWeights
 from kalux.evaluation.method import Method
 from kalux.evaluation.pairs import Pair
 from kalux.evaluation.scores import Scores, score
+from kalux.filters.shots import take_shot
+from kalux.models.camera import Camera, noise_variance
 from kalux.readers import GroundTruth
 from kalux.readers.numpy_files import DAMAGE
 from kalux.recording import Recording
+from kalux.settings import AUTO, CameraSettings, chosen_response
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +40,8 @@ class Reference:
         How many images lie outside the time from the middle of the first exposure to the end of the last.
     data_range
         The largest compared value: the data range of PSNR and SSIM.
+    noise
+        As of `kalux.readers.GroundTruth`.
     """
 
     times: NDArray[np.int64]
@@ -43,6 +49,7 @@ class Reference:
     masks: NDArray[np.bool_] | None
     left_out: int
     data_range: float
+    noise: tuple[float, float] | None = None
 
     def described(self, origin: str = "") -> str:
         """The protocol in words; ``origin``, such as " of FILE", says whose truth it is."""
@@ -106,7 +113,9 @@ def prepare_reference(
     if compared.size == 0 or not compared.max() > 0:
         raise InputError("ground truth: nothing to compare, all of it is black or masked")
     left_out = len(times) - len(chosen)
-    return Reference(times[chosen].astype(np.int64), images, masks, left_out, float(compared.max()))
+    return Reference(
+        times[chosen].astype(np.int64), images, masks, left_out, float(compared.max()), truth.noise
+    )
 
 
 def evaluate_truth(
@@ -153,7 +162,13 @@ def evaluate_truth(
 
 
 def truth_pairs(recording: Recording, reference: Reference, method: Method) -> Iterator[Pair]:
-    """A method's images with the reference images, and with its variances where it has them."""
+    """A method's images with the reference images, and with its variances where it has them.
+
+    Images of a camera have noise, which counts as an error of theirs. Where a frame of the recording has the same
+    middle, it is that frame as the camera saw it (`kalux.datasets.ahdr`): pixels that this frame measures are the
+    reference itself, of which a variance says nothing.
+    """
+    given = _given(recording, reference)
     for i, made in enumerate(method.estimated(recording, reference.times)):
         mask = None if reference.masks is None else reference.masks[i]
         yield Pair(
@@ -163,7 +178,35 @@ def truth_pairs(recording: Recording, reference: Reference, method: Method) -> I
             mask,
             made.variance,
             log_offset=made.log_offset,
+            noise=None
+            if reference.noise is None
+            else _noise(reference.images[i], reference.noise, made.log_offset),
+            given=next(given),
         )
+
+
+def _noise(image: NDArray[np.float32], noise: tuple[float, float], log_offset: float) -> NDArray[np.float64]:
+    """Variance of log(I + I_0) of an image, of its read and shot noise."""
+    intensity = np.asarray(image, np.float64)
+    return noise_variance(intensity, noise, 1.0) / np.square(np.maximum(intensity, 0.0) + log_offset)
+
+
+def _given(recording: Recording, reference: Reference) -> Iterator[NDArray[np.bool_] | None]:
+    """Of every reference image, where a frame of the same moment measures it; None: there is none."""
+    if reference.noise is None:
+        yield from itertools.repeat(None)
+        return
+    camera = Camera.named(chosen_response(AUTO, recording.response), CameraSettings.saturation)
+    frames = iter(recording.frames())
+    frame = next(frames)
+    for t in reference.times:
+        while frame.middle < t and (following := next(frames, None)) is not None:
+            frame = following
+        if frame.middle == t:
+            shot = take_shot(frame, camera, frame.exposure)
+            yield ~(shot.clipped | np.isfinite(shot.level_ceiling)[shot.levels])
+        else:
+            yield None
 
 
 def truth_beside(path: Path) -> Path:

@@ -37,7 +37,7 @@ from kalux.filters.common import make_clock
 from kalux.filters.method import FAR_FUTURE, USUAL_INTERVAL, Chunks, CommonMethod, Segment
 from kalux.filters.shots import Shot
 from kalux.filters.uncertainty import WRONG_STEPS, Around
-from kalux.models.camera import CRUSHED, frame_log_covariance, log_intensity
+from kalux.models.camera import CRUSHED, dark_scale, frame_log_covariance, log_intensity
 from kalux.models.pixels import PixelCalibration
 from kalux.settings import Settings
 
@@ -45,8 +45,8 @@ Array = NDArray[np.float64]
 Floats = NDArray[np.floating[Any]]
 
 
-_DARKEST: Final = 0.001
-"""What is black is taken to be spread evenly in log I from here, white = 1, a quarter of an 8-bit level."""
+_SHARES: Final = (np.arange(64) + 0.5) / 64
+"""Of the pixels that are black, those at which their distribution is looked at."""
 
 _BLACK_FRAMES: Final = 3.0
 """Black says the same in every frame: so many of them count as one, and all as no more (docs/equations.md, K7)."""
@@ -129,7 +129,7 @@ class BridgedFrames(CommonMethod):
         level_log = log_intensity(shot.level_intensity, self.offset)
         crushed = self.crushed(shot)
         if crushed is not None:
-            level_log[crushed], level_variance[crushed] = self.black(shot.level_ceiling[crushed])
+            level_log[crushed], level_variance[crushed] = self.black(shot, crushed)
         latent = latent_frame(
             shot.levels,
             level_log,
@@ -154,11 +154,15 @@ class BridgedFrames(CommonMethod):
         hides = shot.level_ceiling > CRUSHED * shot.white
         return black & hides if hides[black].any() else None
 
-    def black(self, ceiling: Array) -> tuple[Array, Array]:
-        """What I up to ``ceiling`` says of log(I + I_0): its middle, and its variance (K7)."""
-        middle = np.sqrt(_DARKEST * ceiling)
-        range_ = np.log1p(ceiling / self.offset)
-        return np.log(middle + self.offset), _BLACK_FRAMES * np.square(range_) / 12
+    def black(self, shot: Shot, crushed: NDArray[np.bool_]) -> tuple[Array, Array]:
+        """What black levels say of log(I + I_0): its mean, and its variance (K7)."""
+        seen = shot.levels if shot.valid is None else shot.levels[shot.valid]
+        counts = np.bincount(seen.ravel(), minlength=len(shot.level_intensity))
+        ceilings, place = np.unique(shot.level_ceiling[crushed], return_inverse=True)
+        scale = dark_scale(shot.level_intensity, counts, float(ceilings[-1]), shot.white)
+        middle = np.log(ceilings * np.exp(-scale) + self.offset)
+        away = np.log(ceilings[:, None] * _SHARES**scale + self.offset) - middle[:, None]
+        return middle[place], _BLACK_FRAMES * np.square(away).mean(axis=1)[place]
 
     def start(self, shot: Shot, events: Chunks) -> tuple[BridgeMemory, Segment | None, State]:
         thresholds = self._prior

@@ -12,8 +12,9 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.augmentation.bridge import UNMEASURED
 from kalux.compiled import FUSED
-from kalux.filters.readout import Hidden, total_variance
+from kalux.filters.readout import SHARED, Hidden, total_variance
 
 Array = NDArray[np.floating[Any]]
 
@@ -37,6 +38,12 @@ same scenes. A fifth of what thresholds that are 10 % off amount to (K10) where 
 ALONE: Final = 1.6
 """What is hidden of a pixel before its neighbours are heard (K12), in units of what is after it. Their mean takes a
 fifth to a third of the squared errors."""
+
+ALIKE: Final = 0.4
+"""Part of P that its neighbours leave of a pixel that neither frame around measures: there, errors of neighbours have
+correlations of 0.1 to 0.5 (K12). `kalux.filters.readout.SHARED`, by which highlights are doubted, is more."""
+
+_HEARD: Final = np.float32((1.0 - ALIKE) / (1.0 - SHARED))
 
 
 class Around(NamedTuple):
@@ -68,6 +75,11 @@ class Around(NamedTuple):
     quantisation_variance: float
     repeated: float
     wrong: float
+
+    @property
+    def misses_some(self) -> bool:
+        """Whether there are pixels that neither frame measures."""
+        return bool((np.minimum(self.first, self.second) >= UNMEASURED).any())
 
 
 def hidden_variance(
@@ -103,7 +115,12 @@ def known_variance(variance, first, second, events, around):  # type: ignore[no-
 
 
 def given_variance(
-    variance: Array, moving: NDArray[np.bool_], silent_change: Array, hidden: Hidden, around: Around | None
+    variance: Array,
+    moving: NDArray[np.bool_],
+    silent_change: Array,
+    hidden: Hidden,
+    around: Around | None,
+    left: Array | None = None,
 ) -> NDArray[np.float32]:
     """(H, W) the variance of log(I + I_0) that an image is given.
 
@@ -119,6 +136,8 @@ def given_variance(
         From `hidden_variance`.
     around
         None: nothing is said, P is what is known.
+    left
+        (H, W): what neighbours leave of P and what is hidden (`kalux.filters.readout.read_out`); None: all of it.
     """
     planes = (variance,) if around is None else (variance, *around[:3])
     known, *frames = (np.ascontiguousarray(plane, np.float32) for plane in planes)
@@ -126,6 +145,9 @@ def given_variance(
     if around is not None:
         scalars = tuple(np.float32(value) for value in around[3:])
         first, second, events = (plane.reshape(-1) for plane in frames)
+        if left is not None:
+            _hear(known.reshape(-1), left.reshape(-1), first, second, alone(hidden).moving, given.reshape(-1))
+            known = given
         _know(known.reshape(-1), first, second, events, scalars, given.reshape(-1))
         known = given
     change = np.ascontiguousarray(silent_change, np.float32)
@@ -138,6 +160,19 @@ def given_variance(
 def _know(variance, first, second, events, around, known):  # type: ignore[no-untyped-def]
     for i in range(np.uint64(len(known))):
         known[i] = known_variance(variance[i], first[i], second[i], events[i], around)
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy", fastmath=FUSED)
+def _hear(variance, left, first, second, hidden, heard):  # type: ignore[no-untyped-def]
+    """P of pixels that neither frame measures, after their neighbours are heard.
+
+    By `SHARED` they leave ``left`` of P and what is ``hidden``: they take more of P, as much as `ALIKE` is less.
+    """
+    one, unmeasured, hidden = np.float32(1.0), np.float32(UNMEASURED), np.float32(hidden)
+    for i in range(np.uint64(len(heard))):
+        lost = one - np.float32(left[i]) / (variance[i] + hidden)
+        neither = min(first[i], second[i]) >= unmeasured
+        heard[i] = variance[i] * (one - _HEARD * max(lost, np.float32(0.0)) if neither else one)
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy", fastmath=FUSED)

@@ -316,6 +316,29 @@ def count_bright(camera: Camera, image: NDArray[Any], white: float = 1.0) -> Bri
     return BrightTail(at_half, at_white)
 
 
+def dark_scale(intensity: Array, counts: NDArray[np.integer[Any]], ceiling: float, white: float) -> float:
+    """Scale of an exponential distribution of the log intensity, falling from what black hides towards the dark.
+
+    `BrightTail.scale` at the other end: of the pixels up to half as bright again as the brightest that is black, as
+    many are black as such a distribution has. Bounded as there.
+
+    Parameters
+    ----------
+    intensity, counts
+        (N,) levels of I, and how many pixels have each.
+    ceiling
+        The most that I can be where it is black.
+    white
+        I of a saturated pixel.
+    """
+    near = max(min(1.5 * ceiling, ABOUT_WHITE * white), 1.1 * ceiling)
+    black, dark = (int(counts[intensity <= most].sum()) for most in (ceiling, near))
+    low, high = _TAIL_BOUNDS
+    if black == 0:
+        return low
+    return float(np.clip(np.log(near / ceiling) / max(np.log(dark / black), 1e-3), low, high))
+
+
 CRUSHED: Final = 1.5 / 255
 """Intensity, white = 1, that black must hide to be no measurement: three times what it hides of a linear response."""
 

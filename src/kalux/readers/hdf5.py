@@ -179,6 +179,7 @@ def _ground_truth(path: Path) -> GroundTruth:
         group = file["ground_truth"]
         times, images = group["times"][...].astype(np.int64), group["images"][...].astype(np.float32)
         masks = group["masks"][...].astype(bool) if "masks" in group else None
+        noise = [float(value) for value in np.ravel(group.attrs.get("noise", ()))]
     if images.ndim != 3 or len(times) != len(images):
         raise FormatError(
             f"{path}: ground truth has {len(times)} times for {images.shape} images; write it again"
@@ -187,7 +188,9 @@ def _ground_truth(path: Path) -> GroundTruth:
         raise FormatError(
             f"{path}: ground truth has {masks.shape} masks for {images.shape} images; write it again"
         )
-    return GroundTruth(times, images, masks)
+    if len(noise) not in (0, 2):
+        raise FormatError(f"{path}: ground truth has a noise of {len(noise)} numbers, not 2; write it again")
+    return GroundTruth(times, images, masks, (noise[0], noise[1]) if noise else None)
 
 
 class TruthStream(NamedTuple):
@@ -270,8 +273,11 @@ def write(
                     images = sink.checked(iter(ground_truth.images))
                     group = file.create_group("ground_truth")
                     _write_ground_truth(group, ground_truth.times, images, sensor_size)
-                    if isinstance(ground_truth, GroundTruth) and ground_truth.masks is not None:
-                        _write_masks(group, ground_truth.masks)
+                    if isinstance(ground_truth, GroundTruth):
+                        if ground_truth.masks is not None:
+                            _write_masks(group, ground_truth.masks)
+                        if ground_truth.noise is not None:
+                            group.attrs["noise"] = ground_truth.noise
                 _write_events(file.create_group("events"), sink.checked(events))
                 if response is not None:
                     file.create_group("frames").attrs["response"] = np.bytes_(response)

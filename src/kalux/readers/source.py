@@ -38,11 +38,15 @@ class GroundTruth:
         (T, height, width) float32, linear, 1.0 = a saturated frame pixel.
     masks
         (T, height, width) bool, True where an image is the truth, if that is not everywhere.
+    noise
+        (read, shot) of images that a camera made: the variance of I is read^2 + shot I, in their unit. None: they have
+        none, or none that is known.
     """
 
     times: NDArray[np.int64]
     images: NDArray[np.float32]
     masks: NDArray[np.bool_] | None = None
+    noise: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
