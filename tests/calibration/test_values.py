@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+
 import numpy as np
 import pytest
 
@@ -52,6 +54,17 @@ def test_the_file_says_units_and_is_a_settings_file_too(tmp_path):
     save_calibration(full(), tmp_path / "c.toml")
     assert "threshold_on = 0.3  # log intensity" in (tmp_path / "c.toml").read_text()
     assert settings.load(tmp_path / "c.toml", PRESETS["default"]).events.threshold_on == 0.3
+
+
+@pytest.mark.parametrize("data", [b"", b"x", b"PK\x03\x04 no archive", b"\x93NUMPY\x01\x00"])
+def test_maps_that_fit_their_checksum_but_are_none(tmp_path, data):
+    path = tmp_path / "c.toml"
+    path.with_suffix(".npz").write_bytes(data)
+    path.write_text(
+        f'kalux_calibration = 1\n[maps]\nfile = "c.npz"\nsha256 = "{hashlib.sha256(data).hexdigest()}"'
+    )
+    with pytest.raises(FormatError, match="no maps as kalux writes them"):
+        load_calibration(path)
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ the maps, named with its checksum (docs/calibration.md).
 from __future__ import annotations
 
 import hashlib
+import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from io import BytesIO
@@ -193,8 +194,11 @@ def _maps(path: Path, entry: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
         raise FormatError(
             f"{beside}: not the maps that {path.name} was written with (checksum); calibrate again"
         )
-    with np.load(BytesIO(data), allow_pickle=False) as archive:
-        maps = {key: archive[key] for key in archive.files}
+    try:
+        with np.load(BytesIO(data), allow_pickle=False) as archive:
+            maps = {key: archive[key] for key in archive.files}
+    except (ValueError, EOFError, AttributeError, zipfile.BadZipFile) as error:
+        raise FormatError(f"{beside}: no maps as kalux writes them; calibrate again") from error
     shapes = {values.shape for values in maps.values()}
     if len(shapes) > 1:
         raise FormatError(f"{beside}: maps of different sizes: {sorted(shapes)}")
