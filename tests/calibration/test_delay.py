@@ -61,6 +61,15 @@ def test_a_parabola_finds_the_minimum_between_points():
     assert found.improvement == pytest.approx(1 - 0.2 / (0.2 + 1e-9 * 2_300**2), abs=1e-3)
 
 
+@pytest.mark.parametrize(("depth", "apparent"), [(0.97, 1_000), (0.8, -9_000)])
+def test_of_valleys_about_as_deep_the_nearest_to_no_delay(depth, apparent):
+    """As at a lamp that flickers 100 times a second; one that is clearly deeper counts wherever it is."""
+    grid = delays()
+    ripple = 0.25 - 0.05 * np.cos(2 * np.pi * (grid - 1_000) / 10_000)
+    far = np.where(grid < -4_000, depth, 1.0)
+    assert best_delay(grid, far * ripple, 1_000).apparent == pytest.approx(apparent, abs=300)
+
+
 @pytest.mark.parametrize("residuals", [np.arange(25.0) + 1, np.arange(25.0, 0, -1), np.full(25, np.nan)])
 def test_no_minimum_inside_is_no_delay(residuals):
     assert best_delay(delays(), residuals, 1_000) is None
