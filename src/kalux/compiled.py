@@ -408,8 +408,3 @@ def _magnitude_bits(bits):  # type: ignore[no-untyped-def]
         magnitude = np.int32(bits[i] & np.int32(0x7FFFFFFF))
         largest = magnitude if magnitude > largest else largest
     return largest
-
-
-def ready() -> None:
-    """Run a loop: the first of a process takes 0.3 s, for what numba prepares."""
-    magnitude_bits(np.ones(1, np.float32))

@@ -39,20 +39,6 @@ def test_garbage_is_collected_again_after_imports(monkeypatch):
     assert gc.isenabled()
 
 
-def test_loops_are_made_ready_by_the_commands_that_have_them():
-    code = """if True:
-        import gc, sys
-        from kalux.cli.app import _imported, _ready_loops
-        _ready_loops()
-        assert "numba" not in sys.modules
-        _imported("kalux.cli.reconstruct")
-        _ready_loops()
-        assert "numba.np.arraymath" in sys.modules  # what numba imports for the first loop
-        assert gc.isenabled()
-    """
-    subprocess.run([sys.executable, "-c", code], check=True)
-
-
 def test_help_names_every_command(cli):
     found = cli("--help").out
     for command in ("info", "reconstruct", "convert", "evaluate", "demo"):

@@ -18,7 +18,14 @@ from numpy.typing import NDArray
 from kalux.augmentation.deblur import between, count_events
 from kalux.augmentation.refractory import EventClock
 from kalux.calibration.intervals import intervals, spread
-from kalux.models.camera import CRUSHED, Camera, black_ceiling, named_responses, noise_variance
+from kalux.models.camera import (
+    CRUSHED,
+    Camera,
+    black_ceiling,
+    log_covariance,
+    named_responses,
+    noise_variance,
+)
 from kalux.recording import Recording
 from kalux.settings import UNKNOWN_LOG_OFFSET, CameraSettings, chosen_response
 
@@ -205,8 +212,8 @@ def mismatch_of(
     on, off = model.thresholds
     change = np.log(samples.after + log_offset) - np.log(samples.before + log_offset)
     variance = (
-        noise_variance(samples.before, model.frame_noise, 1.0) / (samples.before + log_offset) ** 2
-        + noise_variance(samples.after, model.frame_noise, 1.0) / (samples.after + log_offset) ** 2
+        log_covariance(samples.before, noise_variance(samples.before, model.frame_noise, 1.0), log_offset)
+        + log_covariance(samples.after, noise_variance(samples.after, model.frame_noise, 1.0), log_offset)
         + model.threshold_spread**2 * ((on * samples.on) ** 2 + (off * samples.off) ** 2)
         + on * off * (step_variance * (samples.on + samples.off) + model.quantisation_variance)
     )

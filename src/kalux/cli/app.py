@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import gc
 import importlib
 import sys
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from types import ModuleType
 
 from kalux.cli.parser import Parser, UsageError, normalised
@@ -132,7 +131,6 @@ def _run(arguments: list[str]) -> int:
         return int(done.code or 0)
     if options.command is None:
         raise UsageError("no command is given; kalux --help lists them, kalux demo shows what kalux does")
-    _ready_loops()
     options.run(options, ["kalux", *arguments])
     return DONE
 
@@ -154,25 +152,11 @@ def _imported(name: str) -> ModuleType:
     """A module. What imports make stays: looking for garbage in it takes 0.1 s of 0.5, and later as long again."""
     if name in sys.modules:
         return sys.modules[name]
-    with _uncollected():
-        return importlib.import_module(name)
-
-
-@contextlib.contextmanager
-def _uncollected() -> Iterator[None]:
-    """What is made inside the block is never looked at for garbage."""
     collects = gc.isenabled()
     gc.disable()
     try:
-        yield
+        return importlib.import_module(name)
     finally:
         gc.freeze()
         if collects:
             gc.enable()
-
-
-def _ready_loops() -> None:
-    """Make numba ready for compiled loops, where a command has imported it, without looking for garbage meanwhile."""
-    if "numba" in sys.modules:
-        with _uncollected():
-            importlib.import_module("kalux.compiled").ready()

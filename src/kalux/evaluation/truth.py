@@ -17,7 +17,7 @@ from kalux.evaluation.method import Method
 from kalux.evaluation.pairs import Pair
 from kalux.evaluation.scores import Scores, score
 from kalux.filters.shots import take_shot
-from kalux.models.camera import Camera, noise_variance
+from kalux.models.camera import Camera, log_covariance, noise_variance
 from kalux.readers import GroundTruth
 from kalux.readers.numpy_files import DAMAGE
 from kalux.recording import Recording
@@ -188,7 +188,7 @@ def truth_pairs(recording: Recording, reference: Reference, method: Method) -> I
 def _noise(image: NDArray[np.float32], noise: tuple[float, float], log_offset: float) -> NDArray[np.float64]:
     """Variance of log(I + I_0) of an image, of its read and shot noise."""
     intensity = np.asarray(image, np.float64)
-    return noise_variance(intensity, noise, 1.0) / np.square(np.maximum(intensity, 0.0) + log_offset)
+    return log_covariance(intensity, noise_variance(intensity, noise, 1.0), log_offset)
 
 
 def _given(recording: Recording, reference: Reference) -> Iterator[NDArray[np.bool_] | None]:

@@ -74,18 +74,28 @@ def read(segment: InterpolatedSegment, cursor: Cursor, t: int, noise: Noise) -> 
 
 
 @nb.njit(cache=True, inline="always")
-def _exposure_fraction(segment, t):  # type: ignore[no-untyped-def]
+def _exposure(segment):  # type: ignore[no-untyped-def]
+    """Start and length of the exposure, us; of one that has ended when the segment begins, the us before."""
+    length = segment.exposure_end - segment.start
+    return (segment.start, length) if length > 0 else (segment.start - 1, 1)
+
+
+@nb.njit(cache=True, inline="always")
+def _exposure_fraction(exposure, t):  # type: ignore[no-untyped-def]
     """The weight of L^{A+} in equation (13): 0 at the start of the exposure, 1 from its end."""
-    if t >= segment.exposure_end:
-        return 1.0
-    return (t - segment.start) / (segment.exposure_end - segment.start)
+    start, length = exposure
+    return min((t - start) / length, 1.0)
+
+
+@nb.njit(cache=True, inline="always")
+def _blend(forward, backward, fraction):  # type: ignore[no-untyped-def]
+    return (1.0 - fraction) * forward + fraction * backward
 
 
 @nb.njit(cache=True, inline="always")
 def _blended(segment, forward, backward, t):  # type: ignore[no-untyped-def]
     """L^A(t) of equation (13)."""
-    fraction = _exposure_fraction(segment, t)
-    return (1.0 - fraction) * forward + fraction * backward
+    return _blend(forward, backward, _exposure_fraction(_exposure(segment), t))
 
 
 @nb.njit(cache=True, inline="always")
@@ -183,23 +193,20 @@ def _read_printed(segment, cursor, t, log_intensity, variance):  # type: ignore[
     """`_predict_printed` of all pixels, a row at a time and few arrays a loop: vector code."""
     height, width = variance.shape
     fraction, deviation, rate, seconds = np.empty((4, width))
-    after, now = t >= segment.middle, _exposure_fraction(segment, t)
-    share = _covariance_fraction(segment, t, after)
-    start, exposure = segment.start, segment.exposure_end - segment.start
-    if exposure <= 0:  # causal mode begins at its end
-        start, exposure = start - 1, 1
+    after, exposure = t >= segment.middle, _exposure(segment)
+    now, share = _exposure_fraction(exposure, t), _covariance_fraction(segment, t, after)
     for row in range(height):
         first = segment.covariance_from[row] if after else segment.covariance_before[row]
         second = segment.covariance_after[row] if after else segment.covariance_at[row]
         since, value, known = cursor.since[row], cursor.log_intensity[row], cursor.variance[row]
         forward, backward = cursor.forward[row], cursor.backward[row]
         out, spread = log_intensity[row], variance[row]
-        for i in range(np.uint64(width)):  # `_exposure_fraction` without branches
-            fraction[i] = min((since[i] - start) / exposure, 1.0)
+        for i in range(np.uint64(width)):
+            fraction[i] = _exposure_fraction(exposure, since[i])
         for i in range(np.uint64(width)):
             seconds[i] = (t - since[i]) * MICROSECOND
         for i in range(np.uint64(width)):
-            deviation[i] = value[i] - ((1.0 - fraction[i]) * forward[i] + fraction[i] * backward[i])
+            deviation[i] = value[i] - _blend(forward[i], backward[i], fraction[i])
         for i in range(np.uint64(width)):
             rate[i] = 1.0 / interpolated_covariance(first[i], second[i], share)
         for i in range(np.uint64(width)):
@@ -208,7 +215,7 @@ def _read_printed(segment, cursor, t, log_intensity, variance):  # type: ignore[
             deviation[i] = predicted_deviation(deviation[i], information, predicted)
             spread[i] = 1.0 / predicted
         for i in range(np.uint64(width)):
-            out[i] = deviation[i] + ((1.0 - now) * forward[i] + now * backward[i])
+            out[i] = deviation[i] + _blend(forward[i], backward[i], now)
 
 
 @nb.njit(cache=True, nogil=True)
