@@ -16,9 +16,18 @@ from kalux import readers
 from kalux.compiled import event_column, event_row, event_words
 from kalux.errors import ExposureError, FormatError, FrameError, InputError
 from kalux.events import EventArray, as_events, check_events, checked_size
-from kalux.frames import MOSAICS, Frame, Mosaic, Stamp, check_frame, place_exposure, require_frame
+from kalux.frames import (
+    MOSAICS,
+    Frame,
+    GroundTruth,
+    Mosaic,
+    Stamp,
+    check_frame,
+    place_exposure,
+    require_frame,
+)
 from kalux.models.colour import sample_mosaic
-from kalux.readers import CHUNK_EVENTS, GroundTruth, Source, joined
+from kalux.readers import CHUNK_EVENTS, Source, joined
 
 _FIRST: Final = np.iinfo(np.int64).min
 _LARGEST_SIDE: Final = 1 << 16  # coordinates of events have 16 bits

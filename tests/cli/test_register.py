@@ -11,7 +11,7 @@ import pytest
 import kalux
 from kalux.calibration.registration import Registration
 from kalux.calibration.rig import load_rig, rig_toml
-from kalux.readers import hdf5
+from kalux.writers import hdf5
 from rigs import DISTANCE, OFFSET, board_recording, distant_recording, misplaced, small_rig
 
 

@@ -10,7 +10,7 @@ import pytest
 import kalux
 from kalux.errors import ExposureError, FormatError, FrameError, InputError
 from kalux.frames import Frame
-from kalux.readers import hdf5
+from kalux.writers import hdf5
 from recordings import SIZE, damaged, same_frames, small_events, small_frames
 
 EVENTS = small_events()

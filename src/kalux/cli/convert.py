@@ -195,7 +195,7 @@ def write_copy(recording: Recording, out: Path, progress: Any, stated: Stated | 
         If the file cannot be written.
     """
     from kalux.cli.signals import interrupts_held
-    from kalux.readers import hdf5
+    from kalux.writers import hdf5
 
     # An interrupt inside HDF5 would crash it: it waits for the next chunk or frame.
     stated = stated or Stated()

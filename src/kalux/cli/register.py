@@ -227,7 +227,7 @@ def _write(
     from kalux.cli.convert import counted
     from kalux.cli.progress import Progress
     from kalux.cli.signals import interrupts_held
-    from kalux.readers import hdf5
+    from kalux.writers import hdf5
 
     with Progress("registering", quiet=options.quiet) as progress, interrupts_held() as let_through:
         hdf5.write(

@@ -24,9 +24,8 @@ from numpy.typing import NDArray
 
 from kalux.calibration.frame_noise import estimate_frame_noise
 from kalux.errors import FrameError, InputError
-from kalux.frames import Frame
+from kalux.frames import Frame, GroundTruth
 from kalux.models.camera import Camera, Response, inverse_response
-from kalux.readers import GroundTruth
 from kalux.recording import Recording
 from kalux.settings import CameraSettings, chosen_response
 

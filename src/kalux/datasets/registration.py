@@ -24,9 +24,8 @@ from numpy.typing import NDArray
 from kalux.calibration.homography import Features, agreed_homography, alike, find_features
 from kalux.calibration.regression import HUBER, NORMAL_MAD
 from kalux.errors import InputError
-from kalux.frames import Frame
+from kalux.frames import Frame, GroundTruth
 from kalux.models.camera import Camera, Response, inverse_response
-from kalux.readers import GroundTruth
 from kalux.recording import Recording
 
 Array = NDArray[np.float64]

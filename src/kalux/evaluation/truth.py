@@ -17,8 +17,8 @@ from kalux.evaluation.method import Method
 from kalux.evaluation.pairs import Pair
 from kalux.evaluation.scores import Scores, score
 from kalux.filters.shots import take_shot
+from kalux.frames import GroundTruth
 from kalux.models.camera import Camera, log_covariance, noise_variance
-from kalux.readers import GroundTruth
 from kalux.readers.numpy_files import DAMAGE
 from kalux.recording import Recording
 from kalux.settings import AUTO, CameraSettings, chosen_response

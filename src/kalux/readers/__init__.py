@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from kalux.errors import FormatError, InputError
+from kalux.frames import GroundTruth
 from kalux.readers import (
     aedat2,
     aedat3,
@@ -26,7 +27,7 @@ from kalux.readers import (
     table,
 )
 from kalux.readers.images import SUFFIXES as _IMAGES
-from kalux.readers.source import CHUNK_EVENTS, GroundTruth, Source
+from kalux.readers.source import CHUNK_EVENTS, Source
 
 __all__ = ["CHUNK_EVENTS", "READERS", "GroundTruth", "Reader", "Source", "read"]
 

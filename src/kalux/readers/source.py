@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from kalux.errors import FormatError, InputError, KaluxError
 from kalux.events import EventArray
-from kalux.frames import Frame, Mosaic
+from kalux.frames import Frame, GroundTruth, Mosaic
 
 CHUNK_EVENTS: Final = 1 << 19
 """Events in a chunk, at most, where a format leaves the choice to the reader: 8 MiB, of which threads hold a few."""
@@ -24,29 +24,6 @@ TRIGGER_DTYPE: Final = np.dtype([("t", "<i8"), ("id", "u1"), ("rising", "?")], a
 
 TriggerArray = NDArray[np.void]
 """A 1-D array of `TRIGGER_DTYPE`, sorted by ``t``."""
-
-
-@dataclass(frozen=True)
-class GroundTruth:
-    """Reference images that came with a recording.
-
-    Attributes
-    ----------
-    times
-        (T,) int64, us.
-    images
-        (T, height, width) float32, linear, 1.0 = a saturated frame pixel.
-    masks
-        (T, height, width) bool, True where an image is the truth, if that is not everywhere.
-    noise
-        (read, shot) of images that a camera made: the variance of I is read^2 + shot I, in their unit. None: they have
-        none, or none that is known.
-    """
-
-    times: NDArray[np.int64]
-    images: NDArray[np.float32]
-    masks: NDArray[np.bool_] | None = None
-    noise: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -56,7 +56,8 @@ def output_errors(path: Path, consequence: str = "") -> Iterator[None]:
     except OutputError:
         raise
     except OSError as error:
-        reason = _REASONS.get(error.errno or 0) or error.strerror or str(error)
+        # Other libraries may say it on several lines.
+        reason = _REASONS.get(error.errno or 0) or error.strerror or " ".join(str(error).split())
         translated = OutputError(f"{path}: {reason}" + (f"; {consequence}" if consequence else ""))
         translated.errno = error.errno
         raise translated from error
