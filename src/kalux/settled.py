@@ -11,7 +11,7 @@ from kalux.recording import Recording
 from kalux.settings import AUTO, CameraSettings, Settings
 
 if TYPE_CHECKING:
-    from kalux.pipeline import Plan
+    from kalux.planning import Plan
 
 ORIGINS: Final = {
     "settings": "given",
@@ -20,7 +20,7 @@ ORIGINS: Final = {
     "estimate": "estimated",
     "assumed": "usual of the preset, the recording does not tell",
 }
-"""What to call where thresholds come from (`kalux.pipeline.ThresholdOrigin`)."""
+"""What to call where thresholds come from (`kalux.planning.ThresholdOrigin`)."""
 
 _NOTABLE_SHARE: Final = 0.05
 _ALIKE: Final = (
@@ -36,7 +36,7 @@ def settled(recording: Recording, plan: Plan, asked: Settings) -> list[tuple[str
     Parameters
     ----------
     recording, plan
-        From `kalux.pipeline.plan`.
+        From `kalux.planning.plan`.
     asked
         The settings before the plan filled in what was missing; what they state is said to be given.
     """

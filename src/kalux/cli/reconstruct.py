@@ -25,7 +25,8 @@ from kalux.cli.terminal import say, warn
 from kalux.cli.times import load_times
 from kalux.display import CURVES
 from kalux.errors import InputError
-from kalux.pipeline import Plan, execute, plan
+from kalux.pipeline import execute
+from kalux.planning import Plan, plan
 from kalux.reconstructor import Reconstructor
 from kalux.recording import Recording
 from kalux.settings import PRESETS, Settings, from_dict, load, preset, read_toml, to_dict
@@ -215,7 +216,7 @@ def make_plan(recording: Recording, settings: Settings, times: Any, options: arg
     Raises
     ------
     InputError
-        As of `kalux.pipeline.plan`.
+        As of `kalux.planning.plan`.
     """
     rate = None if times is not None or options.at is not None else options.rate or DEFAULT_RATE
     made = plan(
