@@ -751,7 +751,7 @@ def test_a_sensor_without_pixels(size):
         Reconstructor(size)
 
 
-@pytest.mark.parametrize("threshold", [0.0, -0.2, float("nan"), float("inf"), (0.2, 0.0)])
+@pytest.mark.parametrize("threshold", [0.0, -0.2, float("nan"), float("inf"), (0.2, 0.0), "high", (1, 2, 3)])
 def test_a_threshold_that_is_none(threshold):
     with pytest.raises(InputError, match="must be positive"):
         Reconstructor((1, 1), contrast_threshold=threshold)

@@ -20,7 +20,14 @@ from kalux.augmentation.refractory import EventClock
 from kalux.augmentation.trail import FrameTrail
 from kalux.compiled import event_words
 from kalux.errors import InputError, SettingsError
-from kalux.events import EVENT_DTYPE, EventArray, as_events, check_events, checked_size
+from kalux.events import (
+    EVENT_DTYPE,
+    EventArray,
+    as_events,
+    check_events,
+    checked_size,
+    checked_thresholds,
+)
 from kalux.filters.akf import State
 from kalux.filters.buffer import EventBuffer
 from kalux.filters.method import USUAL_INTERVAL, Method, Segment
@@ -99,7 +106,7 @@ class Reconstructor:
         self.sensor_size = checked_size(sensor_size)
         self.settings = settings if settings is not None else named_preset(preset)
         self.lookahead = lookahead
-        on, off = _pair(contrast_threshold)
+        on, off = checked_thresholds(contrast_threshold) or (None, None)
         chosen = self.settings.events
         unknown = on is None and chosen.threshold_on is None
         self._estimated = threshold_is_estimate or unknown
@@ -557,13 +564,3 @@ def _between(progress: _Progress, t: int) -> float:
         return 1.0
     share = (t - segment.start) / (segment.end - segment.start)
     return 4.0 * share * (1.0 - share)
-
-
-def _pair(threshold: float | tuple[float, float] | None) -> tuple[float | None, float | None]:
-    if threshold is None:
-        return None, None
-    on, off = (float(value) for value in np.broadcast_to(np.asarray(threshold, np.float64), 2))
-    for value in (on, off):
-        if not (np.isfinite(value) and value > 0):
-            raise InputError(f"contrast threshold is {value}; it must be positive (log intensity, e.g. 0.2)")
-    return on, off
