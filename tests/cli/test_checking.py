@@ -11,7 +11,7 @@ from kalux import Recording
 from kalux.cli.checking import check_beside, check_recording
 from kalux.errors import EventError, InputError
 
-from builders import random_stream
+from builders import events, frame, random_stream
 
 STREAM = random_stream(5)
 WHOLE = Recording.from_arrays(STREAM.events, STREAM.frames, sensor_size=STREAM.sensor_size)
@@ -47,6 +47,21 @@ def test_events_in_another_unit_are_doubted():
     assert 0 < found.events_between < 0.1 * found.events
     assert any("same unit and clock" in text for text in found.warnings())
     assert not list(check_recording(WHOLE, lambda count: None).warnings())
+
+
+def test_a_long_time_without_a_frame_is_told():
+    def frames(*starts):
+        return Recording.from_arrays(
+            events(), [frame(9, t, t + 1000) for t in starts], sensor_size=(1, 1), contrast_threshold=0.2
+        )
+
+    usual = range(0, 200_000, 40_000)
+    found = check_recording(frames(*usual, 20_000_000), lambda _: None)
+    assert found.gap == (161_000, 20_000_000)
+    assert check_recording(frames(*usual, 5_000_000), lambda _: None).gap is None
+    slow = (0, 60_000_000, 120_000_000, 300_000_000)  # a picture a minute, two missed
+    assert check_recording(frames(*slow), lambda _: None).gap is None
+    assert check_recording(frames(0), lambda _: None).gap is None
 
 
 @pytest.mark.parametrize("threads", [1, 2])

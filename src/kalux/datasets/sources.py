@@ -20,7 +20,8 @@ from kalux.datasets.motion import Motion
 from kalux.datasets.scenes import Image, Scene, blurred, camera_matrix, sample
 from kalux.errors import FormatError, InputError
 from kalux.models.camera import Response
-from kalux.readers.source import one_line, reading
+from kalux.readers.source import reading
+from kalux.wording import how_many, one_line
 
 HDR_SUFFIXES: Final = frozenset({".hdr", ".pic", ".exr"})
 LDR_SUFFIXES: Final = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp"})
@@ -175,7 +176,7 @@ def _folder(path: Path) -> ImageSequence:
     with reading(path):
         files = sorted((f for f in path.iterdir() if f.suffix.lower() in IMAGE_SUFFIXES), key=_natural)
     if len(files) < 2:
-        raise FormatError(f"{path}: has {len(files)} images; a sequence needs two or more")
+        raise FormatError(f"{path}: has {how_many(len(files), 'image')}; a sequence needs two or more")
     kinds = {file.suffix.lower() in HDR_SUFFIXES for file in files}
     if len(kinds) > 1:
         raise FormatError(f"{path}: has HDR and ordinary images; keep one kind of them")

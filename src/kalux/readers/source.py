@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from kalux.errors import FormatError, InputError, KaluxError
 from kalux.events import EventArray
 from kalux.frames import Frame, GroundTruth, Mosaic
+from kalux.wording import one_line
 
 CHUNK_EVENTS: Final = 1 << 19
 """Events in a chunk, at most, where a format leaves the choice to the reader: 8 MiB, of which threads hold a few."""
@@ -111,13 +112,6 @@ def begins_with(path: Path, *beginnings: bytes) -> bool:
         return False
     with path.open("rb") as file:
         return file.read(len(beginnings[0])) in beginnings
-
-
-def one_line(error: BaseException) -> str:
-    """What another library's error says, on one line of printable characters."""
-    text = " ".join(str(error).split()) or type(error).__name__
-    text = "".join(c if c.isprintable() else "?" for c in text)
-    return text if len(text) <= 200 else text[:200] + "..."
 
 
 @contextmanager
