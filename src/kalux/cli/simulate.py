@@ -355,10 +355,11 @@ def chosen_scene(options: argparse.Namespace, size: tuple[int, int]) -> tuple[Sc
     InputError
         The source cannot be read or used.
     """
-    from kalux.datasets.sources import IMAGE_SUFFIXES, exposed, open_sequence, read_photograph, white_for
+    from kalux.datasets.sources import exposed, open_sequence, read_photograph, white_for
+    from kalux.readers.images import IMAGES, RADIANCE
 
     source: Path = options.source
-    if source.is_file() and source.suffix.lower() in IMAGE_SUFFIXES:
+    if source.is_file() and source.suffix.lower() in IMAGES | RADIANCE:
         photograph = read_photograph(source)
         is_hdr, scene = photograph.is_hdr, _photograph_scene(options, photograph, size)
     else:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -112,6 +113,13 @@ def begins_with(path: Path, *beginnings: bytes) -> bool:
         return False
     with path.open("rb") as file:
         return file.read(len(beginnings[0])) in beginnings
+
+
+def natural_order(path: Path) -> list[tuple[int, str]]:
+    """A key for sorting that puts 2.png before 10.png."""
+    return [
+        (int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name) if part
+    ]
 
 
 @contextmanager
