@@ -25,6 +25,7 @@ from kalux.readers.source import reading
 from kalux.wording import how_many, one_line
 
 _KEPT: Final = 4  # decoded images
+_MOMENTS: Final = 16  # of a scene, by which white is chosen
 _DARKEST: Final = 1e-4
 """Added before the logarithm of interpolation, as part of white: black pixels have one, too."""
 
@@ -344,7 +345,7 @@ def exposed(scene: Scene, white: float) -> Scene:
     return Scene(lambda t: scene.radiance(t) * scale, scene.sensor_size, scene.start, scene.end, scene.name)
 
 
-def white_for(scene: Scene, saturated: float, *, moments: int = 16) -> float:
+def white_for(scene: Scene, saturated: float) -> float:
     """The radiance above which a fraction ``saturated`` of a scene's pixels lies, over evenly spaced moments.
 
     Raises
@@ -356,7 +357,7 @@ def white_for(scene: Scene, saturated: float, *, moments: int = 16) -> float:
         raise InputError(
             f"{scene.name}: a fraction of {saturated} saturated pixels; it must be between 0 and 1"
         )
-    times = scene.start + (np.arange(moments) + 0.5) / moments * scene.duration
+    times = scene.start + (np.arange(_MOMENTS) + 0.5) / _MOMENTS * scene.duration
     seen = np.concatenate([np.asarray(scene.at(float(t)), np.float32).ravel() for t in times])
     white = float(np.quantile(seen, 1.0 - saturated))
     if not white > 0:

@@ -33,6 +33,8 @@ __all__ = ["CHUNK_EVENTS", "READERS", "GroundTruth", "Reader", "Source", "read"]
 
 _VIDEOS: Final = frozenset({".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v"})
 
+_NAMED: Final = 3  # recordings in a folder, of more
+
 # What may lie where a recording should, by the first bytes, and what to do about it.
 _NOT_RECORDINGS: Final = (
     (
@@ -144,10 +146,10 @@ def _what_it_is(path: Path) -> str:
     return ""
 
 
-def _recordings_in(folder: Path, most: int = 3) -> list[str]:
+def _recordings_in(folder: Path) -> list[str]:
     """The names of the first recordings in a folder."""
     found = (path.name for path in sorted(folder.iterdir()) if any(r.recognises(path) for r in READERS))
-    return list(itertools.islice(found, most))
+    return list(itertools.islice(found, _NAMED))
 
 
 def _split(path: Path) -> tuple[Path, str]:
