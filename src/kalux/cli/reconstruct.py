@@ -31,6 +31,7 @@ from kalux.reconstructor import Reconstructor
 from kalux.recording import Recording
 from kalux.settings import PRESETS, Settings, from_dict, load, preset, read_toml, to_dict
 from kalux.settled import ORIGINS, settled
+from kalux.wording import how_many
 
 if TYPE_CHECKING:
     from kalux.calibration.contrast import ThresholdEstimate
@@ -167,6 +168,9 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     for text in contents.warnings():
         warn(text)
     made = part_of(made, contents, options)
+    gap = gap_warning(made, contents)
+    if gap is not None:
+        warn(gap)
     if made.threshold_origin in ("estimate", "assumed"):
         warn(threshold_warning(made, options.preset))
     if made.threshold_origin == "assumed" and made.estimate is not None and contradicts(made.estimate):
@@ -181,7 +185,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     )
     if not options.quiet:
         say(
-            f"wrote       {images:,} images to {output.path} in {seconds:.1f} s "
+            f"wrote       {how_many(images, 'image')} to {output.path} in {seconds:.1f} s "
             f"({short_number(images / seconds)} images/s), settings in {output.settings_path}"
         )
 
@@ -287,6 +291,21 @@ def threshold_warning(made: Plan, name: str) -> str:
     )
 
 
+def gap_warning(made: Plan, contents: Contents) -> str | None:
+    """How many images lie where there is no frame for long; None where there is no such time, or no image in it."""
+    if contents.gap is None:
+        return None
+    begin, end = contents.gap
+    images = int(np.count_nonzero((made.times > begin) & (made.times < end)))
+    if not images:
+        return None
+    first, last = ((t - contents.start) * 1e-6 for t in contents.gap)
+    return (
+        f"there is no frame for {(end - begin) * 1e-6:,.0f} s, from {first:.3f} to {last:.3f} s: {images:,} of "
+        f"{how_many(len(made.times), 'image')} lie there; are the times right? --start and --end choose a part"
+    )
+
+
 def contradicts(estimate: ThresholdEstimate) -> bool:
     """Whether many samples say next to nothing of the thresholds."""
     return estimate.samples >= _MANY_SAMPLES and estimate.usual_share > _NEARLY_ALL
@@ -311,7 +330,8 @@ def decided(
     colours = [] if contents.colours == "grey" else [f"colour      {_colour_line(contents, made, options)}"]
     return [
         f"recording   {source.path}: {source.format}, {width}x{height} pixels, {contents.seconds:.3f} s, "
-        f"{contents.frames:,} frames, {'' if contents.complete else 'more than '}{contents.events:,} events",
+        f"{how_many(contents.frames, 'frame')}, "
+        f"{'' if contents.complete else 'more than '}{how_many(contents.events, 'event')}",
         *(
             f"{label:<11} {text}"
             for label, text in settled(recording, made, asked)
@@ -409,4 +429,4 @@ def write_images(
 def _what_is_left(writer: Writer, output: Output) -> str:
     if writer.images == 0 or (output.format == "mp4" and not output.path.exists()):
         return f"no image was finished in {output.path}"
-    return f"{writer.images:,} images are finished and valid in {output.path}"
+    return f"{how_many(writer.images, 'image')} finished and valid in {output.path}"
