@@ -30,7 +30,7 @@ from kalux.calibration.noise import event_noise
 from kalux.calibration.steps import MAX_SAMPLES
 from kalux.calibration.values import Calibration
 from kalux.calibration.white_balance import grey_world
-from kalux.errors import InputError
+from kalux.errors import InputError, require_type
 from kalux.events import EventArray
 from kalux.frames import Frame
 from kalux.images import Estimate, Image
@@ -118,10 +118,8 @@ def plan(
         ("settings", settings, Settings, "kalux.preset"),
         ("calibration", calibration, Calibration, "kalux.load_calibration"),
     ):
-        if not isinstance(given, kind) and (given is not None or name == "recording"):
-            raise InputError(
-                f"reconstruct: {name} is a {type(given).__name__}; a kalux.{kind.__name__} is needed, from {source}"
-            )
+        if given is not None or name == "recording":
+            require_type(f"reconstruct: {name}", given, kind, source)
     known = Calibration() if calibration is None else calibration
     chosen = settings if settings is not None else known.apply(named_preset(preset))
     if sum(choice is not None for choice in (rate_hz, times, at)) != 1:
