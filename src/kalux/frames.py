@@ -58,6 +58,11 @@ class Frame:
     mosaic: Mosaic | None = None
     valid: NDArray[np.bool_] | None = None
 
+    def __repr__(self) -> str:
+        image = self.image
+        kind = f"{image.dtype} {image.shape}" if isinstance(image, np.ndarray) else type(image).__name__
+        return f"<kalux.Frame {kind}, {self.colours}, exposed from {self.exposure_start} to {self.exposure_end} us>"
+
     @property
     def colours(self) -> str:
         """``"grey"``, ``"RGB"``, or the pattern of the mosaic."""
