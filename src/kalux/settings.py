@@ -284,10 +284,22 @@ def preset(name: str) -> Settings:
     """
     try:
         return PRESETS[name]
-    except KeyError:
+    except (KeyError, TypeError):
         raise SettingsError(
-            f"preset: unknown preset {name!r}{did_you_mean(name, PRESETS)}; known are {', '.join(PRESETS)}"
+            f"preset: unknown preset {name!r}{did_you_mean(str(name), PRESETS)}; known are {', '.join(PRESETS)}"
         ) from None
+
+
+def altered(settings: Settings, group: Literal["camera", "events", "filter"], **values: Any) -> Settings:
+    """The settings with some values of one group changed.
+
+    Raises
+    ------
+    SettingsError
+        If a value is out of range.
+    """
+    changed: Any = {group: dataclasses.replace(getattr(settings, group), **values)}
+    return dataclasses.replace(settings, **changed)
 
 
 def to_dict(settings: Settings) -> dict[str, dict[str, Any]]:
@@ -508,7 +520,7 @@ PRESETS: Final[Mapping[str, Settings]] = {
     "davis346": Settings(events=_DAVIS346),
     "prophesee-flir": _PROPHESEE_FLIR,
     "iccv2021": _PAPER,
-    "iccv2021-flir": dataclasses.replace(_PAPER, camera=dataclasses.replace(_PAPER.camera, confidence=7e7)),
+    "iccv2021-flir": altered(_PAPER, "camera", confidence=7e7),
     "cf": Settings(filter=FilterSettings(kind="cf", deblur=False, highlight_scale=0.0, neighbours=0.0)),
 }
 """``default``: best on ground truth; what is not known is estimated from the recording. ``davis240c``, ``davis346``,

@@ -53,6 +53,8 @@ def test_from_the_board_to_the_reconstruction(cli, files, tmp_path):
     assert (
         abs(tomllib.loads((tmp_path / "offset.toml").read_text())["offset_us"]) < 500
     )  # nothing is left of it
+    silent = cli("calibrate", "offset", out, "--range", "0.2", "--quiet")
+    assert (silent.code, silent.out, silent.err) == (0, "", "")
 
 
 def test_an_offset_file_is_taken(cli, files, tmp_path):

@@ -13,8 +13,9 @@ from kalux.datasets import SensorSettings
 from kalux.errors import InputError
 from kalux.evaluation.fit import READS, fit_settings, score_settings
 from kalux.evaluation.held_out import hold_out_frames
+from kalux.settings import altered
 
-from builders import altered, moving_blocks, unlabelled
+from builders import moving_blocks, unlabelled
 
 SENSOR = SensorSettings(threshold_on=0.2, threshold_off=0.2, read_noise=0.01, threshold_mismatch=0.05)
 WRONG = Calibration({"events": {"threshold_on": 0.3, "threshold_off": 0.3, "delay": 0}})

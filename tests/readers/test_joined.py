@@ -75,6 +75,14 @@ def test_files_are_taken_in_the_order_of_the_list(events_only, tmp_path):
     assert same_frames(kalux.open(events_only, frames=folder).frames(), small_frames())
 
 
+def test_images_that_no_list_names_are_in_the_order_of_their_numbers(events_only, tmp_path):
+    """9.png before 10.png; what other systems leave beside them (._9.png) is no image."""
+    header, row = LISTS["exposures in us"]
+    folder = write_list(tmp_path / "images", header, row, names=["8.png", "9.png", "10.png", "11.png"])
+    (folder / "._9.png").write_bytes(b"Mac OS X")
+    assert same_frames(kalux.open(events_only, frames=folder).frames(), small_frames())
+
+
 @pytest.mark.parametrize("name", ["frames.csv", "timestamps.csv", "mine.csv"])
 @pytest.mark.parametrize("given", ["folder", "file"])
 def test_lists_have_other_names_and_can_be_given(events_only, tmp_path, name, given):

@@ -32,6 +32,7 @@ from kalux.events import EventArray
 from kalux.frames import Frame
 from kalux.models.camera import Response
 from kalux.settings import CameraSettings
+from kalux.wording import how_many
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -113,7 +114,9 @@ def take_shots(frames: Iterable[Frame], camera: CameraSettings) -> Shots:
         shares.append((linear / (linear + camera.offset)).astype(np.float32))
         usable.append(good)
     if len(middles) < 3:
-        raise InputError(f"alignment: {len(middles)} frames are too few; three at least, thirty are good")
+        raise InputError(
+            f"alignment: {how_many(len(middles), 'frame')}, too few; three at least, thirty are good"
+        )
     return Shots(np.array(middles, np.int64), np.stack(logs), np.stack(shares), np.stack(usable))
 
 

@@ -13,6 +13,7 @@ from kalux.cli.calibrations import add_calibration, given_calibration
 from kalux.cli.info import add_recording, open_recording
 from kalux.cli.parser import Parser, UsageError
 from kalux.cli.terminal import say, warn
+from kalux.wording import how_many
 
 if TYPE_CHECKING:
     from kalux.events import EventArray
@@ -86,8 +87,8 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     if not options.quiet:
         seconds = max(progress.seconds, 1e-3)
         say(
-            f"wrote {progress.events:,} events and {progress.images:,} frames to {options.out} in {seconds:.1f} s "
-            f"({short_number(progress.events / seconds)} events/s)"
+            f"wrote {how_many(progress.events, 'event')} and {how_many(progress.images, 'frame')} to {options.out} "
+            f"in {seconds:.1f} s ({short_number(progress.events / seconds)} events/s)"
         )
 
 

@@ -17,6 +17,7 @@ from kalux.cli.info import add_recording, open_recording
 from kalux.cli.metrics import add_metrics, lpips_weights, named_methods
 from kalux.cli.parser import Parser, UsageError, whole
 from kalux.cli.terminal import say, warn
+from kalux.wording import how_many
 
 if TYPE_CHECKING:
     from kalux.evaluation.consistency import BlurConsistency
@@ -241,7 +242,8 @@ def notes(found: list[Scores]) -> list[str]:
     first = found[0]
     everywhere = [text for text in first.adjustments() if all(text in s.adjustments() for s in found)]
     return [
-        f"{len(first.images):,} images, {first.pixels:,} pixels compared; data range {first.data_range:.4g}",
+        f"{how_many(len(first.images), 'image')}, {how_many(first.pixels, 'pixel')} compared; "
+        f"data range {first.data_range:.4g}",
         *(f"all: {text}" for text in everywhere),
         *(f"{s.method}: {text}" for s in found for text in s.adjustments() if text not in everywhere),
     ]

@@ -138,7 +138,7 @@ def settled_lines(
     name: str,
 ) -> list[str]:
     """What a reconstruction would settle, a line each; why it could not, if it could not."""
-    from kalux.pipeline import plan
+    from kalux.planning import plan
     from kalux.settled import saturation_text, settled
 
     title = f"reconstruct would use, with the preset {name}"

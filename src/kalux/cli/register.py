@@ -11,6 +11,7 @@ from kalux.cli.calibrate_offset import add_range, checked_range, read_offset
 from kalux.cli.calibrate_rig import add_frames
 from kalux.cli.parser import Parser, UsageError, number, whole
 from kalux.cli.terminal import say, warn
+from kalux.wording import how_many
 
 if TYPE_CHECKING:
     from kalux.calibration.two_cameras import Registered
@@ -240,7 +241,9 @@ def _write(
             response=None if options.response == "linear" else options.response,
         )
     if not options.quiet:
-        say(f"wrote {progress.events:,} events and {progress.images:,} frames to {options.out}")
+        say(
+            f"wrote {how_many(progress.events, 'event')} and {how_many(progress.images, 'frame')} to {options.out}"
+        )
 
 
 def _overlay(found: Registered, frames: Callable[[], Iterable[Frame]], events: Recording) -> Any:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterable, Iterator
 from functools import partial
 from itertools import chain, pairwise
@@ -18,9 +17,10 @@ from kalux.evaluation.method import Estimated, Image, Method, Times
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.frames import Frame
 from kalux.models.camera import log_intensity
-from kalux.pipeline import plan, reconstruct
+from kalux.pipeline import reconstruct
+from kalux.planning import plan
 from kalux.recording import Recording
-from kalux.settings import AUTO, PRESETS, Settings, chosen_response
+from kalux.settings import AUTO, PRESETS, Settings, altered, chosen_response
 
 
 def hold_last_frame(recording: Recording, times: Times, *, response: str = AUTO) -> Iterator[Image]:
@@ -179,4 +179,4 @@ def _change(
 
 
 def _with_response(settings: Settings, response: str) -> Settings:
-    return dataclasses.replace(settings, camera=dataclasses.replace(settings.camera, response=response))
+    return altered(settings, "camera", response=response)

@@ -26,7 +26,8 @@ from kalux.errors import InputError
 from kalux.evaluation.held_out import HeldOut, hold_out_frames, with_frames
 from kalux.frames import Frame
 from kalux.models.camera import Camera, Response, frame_log_covariance, inverse_response
-from kalux.pipeline import plan, reconstruct
+from kalux.pipeline import reconstruct
+from kalux.planning import plan
 from kalux.recording import Recording
 from kalux.settings import Settings, from_dict, preset
 

@@ -33,10 +33,10 @@ from kalux.readers.source import (
     Source,
     TriggerArray,
     begins_with,
-    one_line,
     reading,
 )
 from kalux.readers.streams import in_order
+from kalux.wording import one_line
 
 T = TypeVar("T")
 _DAVIS_FILTER: Final[Mosaic] = "RGGB"

@@ -24,7 +24,7 @@ from kalux.errors import FormatError, FrameError, InputError
 from kalux.events import FIELD_NAMES
 from kalux.frames import Frame
 from kalux.readers.columns import find_name, find_time
-from kalux.readers.images import SUFFIXES, in_colour, read_image
+from kalux.readers.images import images_in, in_colour, read_image
 from kalux.readers.source import SIZE_UNKNOWN, Source, reading
 
 _LISTS: Final = ("frames.csv", "timestamps.csv", "images.txt")
@@ -200,9 +200,7 @@ def read_image_list(path: Path, text: str) -> tuple[list[Listed], bool]:
                 f"{path}: line {number}: {line[:60]!r} has {len(fields)} columns, not {len(header)}"
             )
         rows.append((number, dict(zip(header, fields, strict=True))))
-    files = (
-        _sorted_images(path.parent) if name is None else [path.parent / row[name].strip() for _, row in rows]
-    )
+    files = images_in(path.parent) if name is None else [path.parent / row[name].strip() for _, row in rows]
     if len(files) != len(rows):
         raise FormatError(
             f"{path}: lists {len(rows)} times, but there are {len(files)} images beside it; add a column file"
@@ -226,11 +224,6 @@ def _read_ijrr(path: Path, text: str) -> tuple[list[Listed], bool]:
         stamp = _microseconds(path, number, fields[0], "s")
         listed.append(Listed(path.parent / fields[1].strip(), stamp, stamp))
     return listed, False
-
-
-def _sorted_images(folder: Path) -> list[Path]:
-    with reading(folder):
-        return sorted(file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES)
 
 
 def _microseconds(path: Path, number: int, text: str, unit: str | None) -> int:

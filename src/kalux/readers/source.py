@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from kalux.errors import FormatError, InputError, KaluxError
 from kalux.events import EventArray
 from kalux.frames import Frame, GroundTruth, Mosaic
+from kalux.wording import one_line
 
 CHUNK_EVENTS: Final = 1 << 19
 """Events in a chunk, at most, where a format leaves the choice to the reader: 8 MiB, of which threads hold a few."""
@@ -113,11 +115,11 @@ def begins_with(path: Path, *beginnings: bytes) -> bool:
         return file.read(len(beginnings[0])) in beginnings
 
 
-def one_line(error: BaseException) -> str:
-    """What another library's error says, on one line of printable characters."""
-    text = " ".join(str(error).split()) or type(error).__name__
-    text = "".join(c if c.isprintable() else "?" for c in text)
-    return text if len(text) <= 200 else text[:200] + "..."
+def natural_order(path: Path) -> list[tuple[int, str]]:
+    """A key for sorting that puts 2.png before 10.png."""
+    return [
+        (int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name) if part
+    ]
 
 
 @contextmanager
