@@ -114,6 +114,9 @@ def test_unknown_preset():
         match=r"'iccv2022', did you mean iccv2021.; known are default, davis240c, .*, iccv2021, iccv2021-flir, cf",
     ):
         preset("iccv2022")
+    for name in (None, 3, ["cf"]):
+        with pytest.raises(SettingsError, match="unknown preset"):
+            preset(name)
 
 
 def test_a_preset_that_is_nearly_right_is_named():

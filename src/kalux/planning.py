@@ -24,7 +24,7 @@ from kalux.calibration.noise import event_noise
 from kalux.calibration.steps import MAX_SAMPLES
 from kalux.calibration.values import Calibration
 from kalux.calibration.white_balance import grey_world
-from kalux.errors import InputError
+from kalux.errors import InputError, require_type
 from kalux.models.camera import BrightTail, Camera, count_bright
 from kalux.models.colour import white_balance
 from kalux.models.pixels import PixelCalibration, require_size
@@ -107,10 +107,8 @@ def plan(
         ("settings", settings, Settings, "kalux.preset"),
         ("calibration", calibration, Calibration, "kalux.load_calibration"),
     ):
-        if not isinstance(given, kind) and (given is not None or name == "recording"):
-            raise InputError(
-                f"reconstruct: {name} is a {type(given).__name__}; a kalux.{kind.__name__} is needed, from {source}"
-            )
+        if given is not None or name == "recording":
+            require_type(f"reconstruct: {name}", given, kind, source)
     known = Calibration() if calibration is None else calibration
     chosen = settings if settings is not None else known.apply(named_preset(preset))
     if sum(choice is not None for choice in (rate_hz, times, at)) != 1:

@@ -284,9 +284,9 @@ def preset(name: str) -> Settings:
     """
     try:
         return PRESETS[name]
-    except KeyError:
+    except (KeyError, TypeError):
         raise SettingsError(
-            f"preset: unknown preset {name!r}{did_you_mean(name, PRESETS)}; known are {', '.join(PRESETS)}"
+            f"preset: unknown preset {name!r}{did_you_mean(str(name), PRESETS)}; known are {', '.join(PRESETS)}"
         ) from None
 
 

@@ -42,8 +42,8 @@ _NEARLY_ALL: Final = 0.95
 """Of many samples, whose thresholds are nearly all the usual ones: the events contradict the frames, or are noise."""
 
 _DESCRIPTION = """\
-Reconstruct HDR images, at any rate, from a recording of events and frames. The whole recording is checked
-before anything is written."""
+Reconstruct HDR images, at any rate, from a recording of events and frames. All frames and the first 16 million events
+are checked before anything is written, later events as they are used."""
 
 _EXAMPLES = """\
 examples:
@@ -330,7 +330,8 @@ def decided(
     colours = [] if contents.colours == "grey" else [f"colour      {_colour_line(contents, made, options)}"]
     return [
         f"recording   {source.path}: {source.format}, {width}x{height} pixels, {contents.seconds:.3f} s, "
-        f"{how_many(contents.frames, 'frame')}, {how_many(contents.events, 'event')}",
+        f"{how_many(contents.frames, 'frame')}, "
+        f"{'' if contents.complete else 'more than '}{how_many(contents.events, 'event')}",
         *(
             f"{label:<11} {text}"
             for label, text in settled(recording, made, asked)
