@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from kalux.calibration.homography import Features, agreed_homography, alike, find_features
 from kalux.calibration.regression import HUBER, robust_deviation
 from kalux.errors import InputError
-from kalux.frames import Frame, GroundTruth
+from kalux.frames import Frame, GroundTruth, median_exposure
 from kalux.models.camera import Camera, Response, inverse_response
 from kalux.recording import Recording
 
@@ -373,7 +373,7 @@ def _median_exposure(recording: Recording) -> int:
     exposures = [frame.exposure for frame in recording.frames()]
     if not exposures:
         raise InputError(f"{recording.source.path}: no frames to register a reference to")
-    return round(float(np.median(exposures)))
+    return median_exposure(exposures)
 
 
 def _register(
