@@ -115,6 +115,11 @@ class GroundTruth:
     noise: tuple[float, float] | None = None
 
 
+def median_exposure(exposures: Iterable[int]) -> int:
+    """us: the exposure at which a saturated pixel is 1, where nothing else is said, of one or more exposures."""
+    return round(float(np.median([*exposures])))
+
+
 def place_exposure(frame: Frame, exposure: int, stamp: Stamp) -> Frame:
     """Give a frame that has only a stamp its exposure interval.
 
