@@ -90,7 +90,10 @@ def test_the_unit_of_time_is_in_the_name(tmp_path, name, times, assumed):
         ({"t": np.arange(3), "x": np.arange(3)}, r"holds t \(3,\), x \(3,\); an array for each"),
         ({"t": np.arange(3), "x": np.arange(3), "y": np.arange(3), "p": np.ones(2, int)}, "p 2"),
         ({"t": np.arange(3.0), "x": np.arange(3), "y": np.arange(3), "p": np.ones(3, int)}, "as t_s, t_ms"),
-        ({"t": np.arange(3), "x": np.arange(3.0), "y": np.arange(3), "p": np.ones(3, int)}, "x is float64"),
+        (
+            {"t": np.arange(3), "x": np.arange(3) + 0.5, "y": np.arange(3), "p": np.ones(3, int)},
+            "x of event 0 is 0.5",
+        ),
         (
             {"t": np.arange(3), "x": np.arange(3), "y": np.arange(3), "p": np.full(3, 7)},
             "polarity of event 0",

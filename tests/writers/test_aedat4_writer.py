@@ -55,7 +55,7 @@ def test_big_endian_pixels(path):
 
 @settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
-    times=st.lists(st.integers(-(2**62), 2**62), max_size=8),
+    times=st.lists(st.integers(-(10**18), 10**18), max_size=8),
     shots=st.lists(st.integers(-(10**15), 10**15), max_size=5, unique=True),
     exposure=st.integers(1, 10**6),
     splits=st.integers(1, 4),
