@@ -433,7 +433,9 @@ def _check_value(label: str, name: str, value: Any, default: Any) -> None:
     elif isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= most:
         raise SettingsError(f"settings: {label} is {value!r}; a finite number is needed, at most {most:.0e}")
     elif 0 < abs(value) < _LEAST:
-        raise SettingsError(f"settings: {label} is {value!r}; {_LEAST:g} is the least above 0 that is possible")
+        raise SettingsError(
+            f"settings: {label} is {value!r}; {_LEAST:g} is the least above 0 that is possible"
+        )
     elif (value < 0 and name not in _SIGNED) or (name in _POSITIVE and value == 0):
         raise SettingsError(
             f"settings: {label} is {value}; it must be {'positive' if name in _POSITIVE else '0 or more'}"
