@@ -228,7 +228,7 @@ class DeadTerminal(io.StringIO):
     def fileno(self):
         return self.number
 
-    def write(self, text):
+    def write(self, text=""):
         raise OSError(errno.EIO, "Input/output error")
 
     flush = write

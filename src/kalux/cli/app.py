@@ -115,7 +115,7 @@ def _bug(error: Exception) -> int:
 
 
 def _is_interrupt(error: BaseException) -> bool:
-    """Whether Ctrl-C came while a compiled loop was being loaded or called: of it SystemErrors are made, one of another."""
+    """Whether Ctrl-C came while numba loaded a compiled loop: it becomes the cause of a SystemError, or of two."""
     cause: BaseException | None = error
     while isinstance(cause, SystemError):
         cause = cause.__cause__
