@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 import kalux
-from kalux.readers import hdf5
+from kalux.writers import hdf5
 
 from builders import moving_blocks
 

@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 from kalux import PRESETS, Frame, Reconstructor
 from kalux.errors import EventError, ExposureError, FrameError, InputError, KaluxError, SettingsError
 from kalux.filters import bridged_frames
+from kalux.settings import altered
 
-from builders import VARIANTS, Stream, altered, events, frame, pixel_events, random_stream
+from builders import VARIANTS, Stream, events, frame, pixel_events, random_stream
 
 HOUR = 3_600_000_000
 THRESHOLD = (0.25, 0.2)

@@ -12,8 +12,8 @@ import pytest
 from kalux import readers, recording
 from kalux.errors import EventError, ExposureError, FormatError, FrameError, InputError
 from kalux.frames import Frame
-from kalux.readers import hdf5
 from kalux.recording import Recording
+from kalux.writers import hdf5
 from recordings import SIZE, same_frames, small_events, small_frames
 
 

@@ -13,9 +13,7 @@ from hypothesis import strategies as st
 
 from kalux import PRESETS, Reconstructor, Settings, preset
 from kalux.errors import InputError, KaluxError, SettingsError
-from kalux.settings import CameraSettings, EventSettings, FilterSettings, from_dict, load, to_dict
-
-from builders import altered
+from kalux.settings import CameraSettings, EventSettings, FilterSettings, altered, from_dict, load, to_dict
 
 DEFAULT = PRESETS["default"]
 GROUPS = {"camera": CameraSettings, "events": EventSettings, "filter": FilterSettings}

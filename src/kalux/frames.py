@@ -1,4 +1,4 @@
-"""Frames: an image with the start and end of its exposure."""
+"""Frames, an image with the start and end of its exposure; and reference images."""
 
 from __future__ import annotations
 
@@ -90,6 +90,34 @@ class Frame:
     def normalised(self) -> NDArray[np.float64]:
         """The camera response as float64, 0 to 1 = saturated (a float image may exceed 1)."""
         return np.maximum(self.image.astype(np.float64) / self.white_value, 0.0)
+
+
+@dataclass(frozen=True)
+class GroundTruth:
+    """Reference images that came with a recording.
+
+    Attributes
+    ----------
+    times
+        (T,) int64, us.
+    images
+        (T, height, width) float32, linear, 1.0 = a saturated frame pixel.
+    masks
+        (T, height, width) bool, True where an image is the truth, if that is not everywhere.
+    noise
+        (read, shot) of images that a camera made: the variance of I is read^2 + shot I, in their unit. None: they have
+        none, or none that is known.
+    """
+
+    times: NDArray[np.int64]
+    images: NDArray[np.float32]
+    masks: NDArray[np.bool_] | None = None
+    noise: tuple[float, float] | None = None
+
+
+def median_exposure(exposures: Iterable[int]) -> int:
+    """us: the exposure at which a saturated pixel is 1, where nothing else is said, of one or more exposures."""
+    return round(float(np.median([*exposures])))
 
 
 def place_exposure(frame: Frame, exposure: int, stamp: Stamp) -> Frame:

@@ -37,8 +37,9 @@ from kalux.filters.shots import Shot, take_shot
 from kalux.frames import Frame, check_frame
 from kalux.images import Estimate, Image, View, make_image
 from kalux.models.camera import Camera, beyond_white, count_bright
-from kalux.models.colour import Gains, joined_chromaticity, white_balance
+from kalux.models.colour import Gains, white_balance
 from kalux.models.pixels import PixelCalibration, require_size
+from kalux.moments import Moment
 from kalux.settings import Settings
 from kalux.settings import preset as named_preset
 
@@ -348,20 +349,21 @@ class Reconstructor:
         log_intensity, variance = self._method.read(progress.segment, progress.cursor, t)
         final_until = self.final_until
         final = final_until is not None and t <= final_until
+        moment = self._moment(progress, t)
         return Estimate(
             t,
             log_intensity,
             variance,
-            self._white(progress, t),
-            final,
-            self._method.moving(progress.segment, progress.cursor),
-            _between(progress, t) if self.lookahead else 1.0,
-            self._chroma(progress, t),
-            self._unshown(progress, variance),
-            self._method.silent_change(progress.segment),
-            self._method.around(progress.segment, t) if self._joins(progress) else None,
-            self._exposed(progress),
-            self._since(progress, t),
+            white=moment.white(self.settings.camera.offset),
+            final=final,
+            moving=self._method.moving(progress.segment, progress.cursor),
+            between=moment.between,
+            chroma=moment.chroma(),
+            unshown=self._unshown(progress, variance),
+            silent_change=self._method.silent_change(progress.segment),
+            around=None if moment.after is None else self._method.around(progress.segment, t),
+            exposed=moment.exposed,
+            since=moment.since(self._interval),
         )
 
     def trail(self, t: int) -> NDArray[np.floating[Any]] | None:
@@ -417,50 +419,13 @@ class Reconstructor:
         assert tail is not None
         return beyond_white(tail)
 
-    def _chroma(self, progress: _Progress, t: int) -> NDArray[np.float32] | None:
-        """What RGB frames say of the chromaticity at ``t``: those before and after, by their distance in time."""
-        first = self._shots[0]
-        if first.chroma is None:
-            return None
-        fraction = 0.0
-        shots = [first]
-        if self._joins(progress):
-            second = self._shots[1]
-            shots.append(second)
-            fraction = min(max((t - first.middle) / (second.middle - first.middle), 0.0), 1.0)
-        weights = (1.0 - fraction, fraction)
-        parts = [
-            (weight, shot.chroma, shot.chroma_weight)
-            for weight, shot in zip(weights, shots, strict=False)
-            if shot.chroma is not None and shot.chroma_weight is not None
-        ]
-        return joined_chromaticity(parts)
-
-    def _joins(self, progress: _Progress) -> bool:
-        """Whether the segment uses the frames at both its ends."""
-        return self.lookahead and progress.ready and progress.starts_frame
-
-    def _exposed(self, progress: _Progress) -> float:
-        """The share of the time for which frames are exposed, by those around; 0 where there is only one."""
-        if not self._joins(progress):
-            return 0.0
-        first, second = self._shots[:2]
-        exposures = first.end - first.start + second.end - second.start
-        return min(exposures / 2 / (second.middle - first.middle), 1.0)
-
-    def _since(self, progress: _Progress, t: int) -> float | None:
-        """Time to the only frame, in intervals; None where there are two."""
-        return None if self._joins(progress) else abs(t - self._shots[0].middle) / self._interval
-
-    def _white(self, progress: _Progress, t: int) -> float:
-        """log(I + I_0) of the brightest level that frames show at ``t``: from one frame's to the next's."""
-        offset = self.settings.camera.offset
-        white = float(np.log(self._shots[0].white + offset))
-        if not self._joins(progress):
-            return white
+    def _moment(self, progress: _Progress, t: int) -> Moment:
+        """The time ``t`` in a segment under way, with the frames at both its ends where it uses both."""
         segment = progress.segment
-        fraction = (t - segment.start) / (segment.end - segment.start)
-        return white + fraction * (float(np.log(self._shots[1].white + offset)) - white)
+        if not (self.lookahead and progress.ready and progress.starts_frame):
+            return Moment(t, self._shots[0], None, 0.0)
+        share = (t - segment.start) / (segment.end - segment.start)
+        return Moment(t, self._shots[0], self._shots[1], share)
 
     # Segments.
 
@@ -579,12 +544,3 @@ def _whole(t: Any, what: str) -> int:
         if int(t) == t and NEVER < t < -NEVER:  # room for times of frames and events, with their delay
             return int(t)
     raise InputError(f"{what} is {t!r}; whole microseconds, at most 10^18, are needed")
-
-
-def _between(progress: _Progress, t: int) -> float:
-    """4 s (1 - s) at the share s of the way from one frame to the next; 1 where there is only one of them."""
-    segment = progress.segment
-    if not (progress.ready and progress.starts_frame):
-        return 1.0
-    share = (t - segment.start) / (segment.end - segment.start)
-    return 4.0 * share * (1.0 - share)

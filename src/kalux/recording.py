@@ -27,6 +27,7 @@ from kalux.events import (
 from kalux.frames import (
     MOSAICS,
     Frame,
+    GroundTruth,
     Levels,
     Mosaic,
     Stamp,
@@ -36,7 +37,7 @@ from kalux.frames import (
     require_frame,
 )
 from kalux.models.colour import sample_mosaic
-from kalux.readers import CHUNK_EVENTS, GroundTruth, Source, joined
+from kalux.readers import CHUNK_EVENTS, Source, joined
 
 _LARGEST_SIDE: Final = 1 << 16  # coordinates of events have 16 bits
 

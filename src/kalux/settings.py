@@ -290,6 +290,18 @@ def preset(name: str) -> Settings:
         ) from None
 
 
+def altered(settings: Settings, group: Literal["camera", "events", "filter"], **values: Any) -> Settings:
+    """The settings with some values of one group changed.
+
+    Raises
+    ------
+    SettingsError
+        If a value is out of range.
+    """
+    changed: Any = {group: dataclasses.replace(getattr(settings, group), **values)}
+    return dataclasses.replace(settings, **changed)
+
+
 def to_dict(settings: Settings) -> dict[str, dict[str, Any]]:
     """As nested plain values, for TOML; None, which TOML has not, is ``"auto"``."""
     return {
@@ -515,7 +527,7 @@ PRESETS: Final[Mapping[str, Settings]] = {
     "davis346": Settings(events=_DAVIS346),
     "prophesee-flir": _PROPHESEE_FLIR,
     "iccv2021": _PAPER,
-    "iccv2021-flir": dataclasses.replace(_PAPER, camera=dataclasses.replace(_PAPER.camera, confidence=7e7)),
+    "iccv2021-flir": altered(_PAPER, "camera", confidence=7e7),
     "cf": Settings(filter=FilterSettings(kind="cf", deblur=False, highlight_scale=0.0, neighbours=0.0)),
 }
 """``default``: best on ground truth; what is not known is estimated from the recording. ``davis240c``, ``davis346``,

@@ -5,13 +5,14 @@ from __future__ import annotations
 import dataclasses
 import threading
 
+import numpy as np
 import pytest
 
 from kalux import Recording
 from kalux.cli.checking import check_beside, check_recording
 from kalux.errors import EventError, InputError
 
-from builders import random_stream
+from builders import events, frame, random_stream
 
 STREAM = random_stream(5)
 WHOLE = Recording.from_arrays(STREAM.events, STREAM.frames, sensor_size=STREAM.sensor_size)
@@ -47,6 +48,37 @@ def test_events_in_another_unit_are_doubted():
     assert 0 < found.events_between < 0.1 * found.events
     assert any("same unit and clock" in text for text in found.warnings())
     assert not list(check_recording(WHOLE, lambda count: None).warnings())
+
+
+def test_enough_are_those_after_the_first_frame_begins():
+    first = STREAM.frames[0].exposure_start
+    early = STREAM.events[:60].copy()
+    early["t"] = np.arange(first - 60, first)
+    later = STREAM.events[STREAM.events["t"] >= first]
+    wrong = STREAM.events[:1]
+    parts = [early, later[:100], later[100:130], later[130:140], wrong]
+    found = check_recording(in_parts(parts), lambda count: None, 101)
+    assert (found.events, found.complete) == (190, False)
+    assert found.events_between == (later["t"][:130] <= STREAM.frames[-1].exposure_end).sum()
+    assert not list(found.warnings())
+    with pytest.raises(EventError, match="event 200"):
+        check_recording(in_parts(parts), lambda count: None, 131)
+    assert check_recording(in_parts(parts[:4]), lambda count: None, 131).complete
+
+
+def test_a_long_time_without_a_frame_is_told():
+    def frames(*starts):
+        return Recording.from_arrays(
+            events(), [frame(9, t, t + 1000) for t in starts], sensor_size=(1, 1), contrast_threshold=0.2
+        )
+
+    usual = range(0, 200_000, 40_000)
+    found = check_recording(frames(*usual, 20_000_000), lambda _: None)
+    assert found.gap == (161_000, 20_000_000)
+    assert check_recording(frames(*usual, 5_000_000), lambda _: None).gap is None
+    slow = (0, 60_000_000, 120_000_000, 300_000_000)  # a picture a minute, two missed
+    assert check_recording(frames(*slow), lambda _: None).gap is None
+    assert check_recording(frames(0), lambda _: None).gap is None
 
 
 @pytest.mark.parametrize("threads", [1, 2])

@@ -1,4 +1,4 @@
-"""One pass over a recording before anything is written, so that bad input leaves nothing half-done behind."""
+"""A look at a recording before anything is written, so that bad input leaves nothing half-done behind."""
 
 from __future__ import annotations
 
@@ -7,14 +7,27 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from typing import Final, NamedTuple, TypeVar
 
-from kalux.augmentation.deblur import between
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux.augmentation.deblur import between, events_until
 from kalux.frames import Levels
 from kalux.recording import Recording, no_frames
 
 T = TypeVar("T")
 
+CHECKED_FIRST: Final = 1 << 24
+"""Events that are looked at before anything is made of a recording: 0.2 s, less than planning takes, beside which they
+are read. Those of a longer one are checked as they are used: its file is then decoded once, not twice."""
+
 _FEW: Final = 0.1
 """Of the events: a camera that records both has fewer of them between its frames only if it was started wrongly."""
+
+_LONG_GAP: Final = 10_000_000
+"""us without a frame that somebody should hear of: at 100 images/s there are a thousand of them."""
+
+_MANY_INTERVALS: Final = 100
+"""As many times longer than usual: pictures of a slow series are not missed."""
 
 
 class Contents(NamedTuple):
@@ -23,15 +36,19 @@ class Contents(NamedTuple):
     Attributes
     ----------
     frames, events
-        Their numbers.
+        The numbers of those that were checked.
     start, end
         Start of the first exposure and end of the last, us.
     events_between
-        The events from start to end.
+        The events from start to end, of those.
     colours
         As of `kalux.Frame`: ``"grey"``, ``"RGB"`` or the pattern of a mosaic.
     doubt
         What makes the frames' white value doubtful, if anything does.
+    complete
+        Whether these are all events, or only the first ones.
+    gap
+        (start, end) us of the longest time without a frame, where it is far longer than usual.
     """
 
     frames: int
@@ -41,6 +58,8 @@ class Contents(NamedTuple):
     events_between: int
     colours: str
     doubt: str | None = None
+    complete: bool = True
+    gap: tuple[int, int] | None = None
 
     @property
     def seconds(self) -> float:
@@ -58,15 +77,17 @@ class Contents(NamedTuple):
                 f"none of the {self.events:,} events lies between the first and the last frame; do events and "
                 "frames have the same clock?"
             )
-        elif self.events_between < _FEW * self.events:
+        elif self.events_between < min(_FEW * self.events, CHECKED_FIRST):
             yield (
                 f"only {self.events_between:,} of the {self.events:,} events lie between the first and the last frame; "
                 "are times of events and frames in the same unit and clock?"
             )
 
 
-def check_recording(recording: Recording, on_events: Callable[[int], None]) -> Contents:
-    """Read all frames and events once, with all checks.
+def check_recording(
+    recording: Recording, on_events: Callable[[int], None], most: int | None = None
+) -> Contents:
+    """Read all frames and the first or all events once, with all checks.
 
     Parameters
     ----------
@@ -74,6 +95,8 @@ def check_recording(recording: Recording, on_events: Callable[[int], None]) -> C
         Any.
     on_events
         Told the number of events of every chunk, for progress.
+    most
+        Events from the first frame on that are enough; None: all.
 
     Raises
     ------
@@ -88,18 +111,35 @@ def check_recording(recording: Recording, on_events: Callable[[int], None]) -> C
     if not exposures:
         raise no_frames(recording)
     start, end = exposures[0][0], exposures[-1][1]
-    count = events_between = 0
+    count = events_between = events_from = 0
+    complete = True
     for chunk in recording.events():
+        if most is not None and events_from >= most:
+            complete = False
+            break
         count += len(chunk)
         events_between += len(between(chunk, start - 1, end))
+        events_from += len(chunk) - events_until(chunk, start - 1)
         on_events(len(chunk))
-    return Contents(len(exposures), count, start, end, events_between, colours, levels.doubt())
+    gap = _gap(np.array(exposures, np.int64))
+    return Contents(len(exposures), count, start, end, events_between, colours, levels.doubt(), complete, gap)
+
+
+def _gap(exposures: NDArray[np.int64]) -> tuple[int, int] | None:
+    """The longest time between two of (K, 2) exposures, where it is far longer than usual."""
+    lengths = exposures[1:, 0] - exposures[:-1, 1]
+    if not len(lengths):
+        return None
+    after = int(np.argmax(lengths))
+    if lengths[after] <= max(_LONG_GAP, _MANY_INTERVALS * float(np.median(lengths))):
+        return None
+    return int(exposures[after, 1]), int(exposures[after + 1, 0])
 
 
 def check_beside(
     recording: Recording, on_events: Callable[[int], None], work: Callable[[], T], threads: int
 ) -> tuple[Contents, T]:
-    """Check a recording, with several ``threads`` while something else is made of it; both results.
+    """Check the first of a recording, with several ``threads`` while something else is made of it; both results.
 
     What is wrong with the recording is raised rather than what ``work`` raises, which may be because of it.
 
@@ -113,7 +153,7 @@ def check_beside(
         How many may be used.
     """
     if threads == 1:
-        return check_recording(recording, on_events), work()
+        return check_recording(recording, on_events, CHECKED_FIRST), work()
     stopped = threading.Event()
 
     def counted(events: int) -> None:
@@ -122,7 +162,7 @@ def check_beside(
         on_events(events)
 
     with ThreadPoolExecutor(1, "kalux-check") as pool:
-        checked = pool.submit(check_recording, recording, counted)
+        checked = pool.submit(check_recording, recording, counted, CHECKED_FIRST)
         try:
             try:
                 made = work()
