@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import gc
 import io
 import os
@@ -16,7 +17,10 @@ import pytest
 import kalux
 from kalux.cli.app import COMMANDS, _imported
 from kalux.cli.flags import setting_flags
+from kalux.cli.progress import Progress
 from kalux.cli.signals import termination_as_interrupt
+from kalux.cli.terminal import say
+from kalux.errors import OutputError
 from kalux.settings import Settings, to_dict
 
 
@@ -201,13 +205,48 @@ def test_standard_output_that_is_full_is_told(recording):
     assert done.stderr == "kalux: error: standard output: No space left on device\n"
 
 
-def test_an_interrupt_within_numba_is_an_interrupt(cli, recording, monkeypatch):
+@pytest.mark.parametrize("twice", [False, True])
+def test_an_interrupt_within_numba_is_an_interrupt(cli, recording, monkeypatch, twice):
     def interrupted(*arguments, **options):
-        raise SystemError("returned a result with an exception set") from KeyboardInterrupt()
+        inner = SystemError("returned a result with an exception set")
+        inner.__cause__ = KeyboardInterrupt()
+        raise SystemError("returned a result with an exception set") from (
+            inner if twice else inner.__cause__
+        )
 
     monkeypatch.setattr(kalux, "open", interrupted)
     found = cli("info", recording)
     assert (found.code, found.err) == (130, "kalux: interrupted; what is finished is whole\n")
+
+
+class DeadTerminal(io.StringIO):
+    """As a terminal that was closed."""
+
+    def isatty(self):
+        return True
+
+    def fileno(self):
+        return self.number
+
+    def write(self, text=""):
+        raise OSError(errno.EIO, "Input/output error")
+
+    flush = write
+
+
+def test_the_work_goes_on_where_the_terminal_was_closed(monkeypatch, tmp_path):
+    """Ignored SIGHUP, as of a shell's ``disown``, is followed by errors of writing."""
+    monkeypatch.setenv("TERM", "xterm")
+    for name in ("stdout", "stderr"):
+        monkeypatch.setattr(sys, name, DeadTerminal())
+    with open(os.devnull) as device, open(tmp_path / "full", "w") as file:
+        sys.stdout.number = device.fileno()
+        say("one")
+        with Progress("working", images=2) as shown:
+            shown.add(images=1)
+        sys.stdout.number = file.fileno()
+        with pytest.raises(OutputError, match="Input/output error"):
+            say("two")
 
 
 class TestSignals:
@@ -221,6 +260,19 @@ class TestSignals:
             assert signal.getsignal(signal.SIGINT) == signal.SIG_IGN
         finally:
             signal.signal(signal.SIGINT, previous)
+
+    def test_a_closed_terminal_is_an_interrupt_unless_it_is_ignored(self):
+        before = signal.getsignal(signal.SIGHUP)
+        try:
+            signal.signal(signal.SIGHUP, signal.SIG_DFL)
+            with termination_as_interrupt(), pytest.raises(KeyboardInterrupt):
+                os.kill(os.getpid(), signal.SIGHUP)
+            assert signal.getsignal(signal.SIGHUP) == signal.SIG_DFL
+            signal.signal(signal.SIGHUP, signal.SIG_IGN)  # nohup
+            with termination_as_interrupt():
+                os.kill(os.getpid(), signal.SIGHUP)
+        finally:
+            signal.signal(signal.SIGHUP, before)
 
     def test_handlers_are_put_back(self):
         before = signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT)

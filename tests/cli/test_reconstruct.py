@@ -596,7 +596,7 @@ def told_when_planned(monkeypatch):
 
 
 class TestInterrupt:
-    @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+    @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
     @pytest.mark.parametrize("threads", [1, 4])
     def test_what_is_finished_stays_valid(self, start_cli, recording, tmp_path, number, threads):
         out = tmp_path / "out"

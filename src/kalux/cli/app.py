@@ -114,9 +114,12 @@ def _bug(error: Exception) -> int:
     return BUG
 
 
-def _is_interrupt(error: Exception) -> bool:
-    """Whether Ctrl-C came while a compiled loop was being loaded: numba makes a SystemError of it."""
-    return isinstance(error, SystemError) and isinstance(error.__cause__, KeyboardInterrupt)
+def _is_interrupt(error: BaseException) -> bool:
+    """Whether Ctrl-C came while numba loaded a compiled loop: it becomes the cause of a SystemError, or of two."""
+    cause: BaseException | None = error
+    while isinstance(cause, SystemError):
+        cause = cause.__cause__
+    return cause is not error and isinstance(cause, KeyboardInterrupt)
 
 
 def _notes(error: BaseException) -> list[str]:

@@ -55,9 +55,14 @@ def add_range(group: Any) -> None:
 
 def checked_range(options: argparse.Namespace) -> tuple[float, int]:
     """Middle and reach, us."""
+    from kalux.events import LATEST
+
     if not 0.01 <= options.range <= 600:
         raise UsageError(f"--range is {options.range:g} s; 0.01 to 600 is possible")
-    return options.around * 1e3, round(options.range * 1e6)
+    centre = options.around * 1e3
+    if not abs(centre) <= LATEST:
+        raise UsageError(f"--around is {options.around:g} ms; at most 1e15 is possible")
+    return centre, round(options.range * 1e6)
 
 
 def run(options: argparse.Namespace, command: list[str]) -> None:
@@ -140,17 +145,20 @@ def read_offset(text: str) -> float:
     Raises
     ------
     UsageError
-        If it is neither.
+        If it is neither, or no time that is possible.
     """
+    from kalux.events import LATEST
     from kalux.settings import read_toml
 
     try:
-        return float(text)
+        offset = float(text)
     except ValueError:
-        pass
-    try:
-        return float(read_toml(Path(text))["offset_us"])
-    except InputError as error:
-        raise UsageError(f"--offset: neither a number of us nor a file: {error}") from error
-    except (ValueError, KeyError, TypeError) as error:
-        raise UsageError(f"--offset {text}: not an offset file of kalux calibrate offset") from error
+        try:
+            offset = float(read_toml(Path(text))["offset_us"])
+        except InputError as error:
+            raise UsageError(f"--offset: neither a number of us nor a file: {error}") from error
+        except (ValueError, KeyError, TypeError, OverflowError) as error:
+            raise UsageError(f"--offset {text}: not an offset file of kalux calibrate offset") from error
+    if not abs(offset) <= LATEST:
+        raise UsageError(f"--offset {text}: {offset:g} us; at most 1e18 is possible")
+    return offset

@@ -1,4 +1,4 @@
-"""SIGTERM as Ctrl-C."""
+"""SIGTERM, and SIGHUP of a terminal that is closed, as Ctrl-C."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from types import FrameType
 
 @contextlib.contextmanager
 def termination_as_interrupt() -> Iterator[None]:
-    """Inside the block, SIGTERM does what Ctrl-C does: it raises KeyboardInterrupt, held back during a write.
+    """Inside the block, SIGTERM and SIGHUP do what Ctrl-C does: KeyboardInterrupt is raised, held back during a write.
 
-    Where Ctrl-C is ignored, as in a shell's background jobs, it stays ignored, and SIGTERM still works.
+    Where Ctrl-C is ignored, as in a shell's background jobs, it stays ignored, and SIGTERM still works. Where SIGHUP is
+    ignored, as by nohup, it stays so, too.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -30,11 +31,14 @@ def termination_as_interrupt() -> Iterator[None]:
         if terminated or not ignores_interrupt:
             raise KeyboardInterrupt
 
-    previous = signal.signal(signal.SIGTERM, terminate), signal.signal(signal.SIGINT, interrupt)
+    handlers = {signal.SIGTERM: terminate, signal.SIGINT: interrupt}
+    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
+        handlers[signal.SIGHUP] = terminate
+    previous = {number: signal.signal(number, handler) for number, handler in handlers.items()}
     try:
         yield
     finally:
-        for number, handler in zip((signal.SIGTERM, signal.SIGINT), previous, strict=True):
+        for number, handler in previous.items():
             signal.signal(number, handler if handler is not None else signal.SIG_DFL)
 
 

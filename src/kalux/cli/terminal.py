@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
+import stat
 import sys
 
 from kalux.errors import OutputError
 
 
 def say(text: str = "") -> None:
-    """Print to stdout. A reader that has gone away (``| head``) is no error: the work goes on in silence.
+    """Print to stdout. A reader that has gone away (``| head``, a closed terminal) is no error: work goes on silently.
 
     Raises
     ------
@@ -20,11 +22,20 @@ def say(text: str = "") -> None:
     encoding = sys.stdout.encoding or "utf-8"  # which names of files may not fit
     try:
         print(text.encode(encoding, "backslashreplace").decode(encoding), flush=True)
-    except BrokenPipeError:
-        _discard_output()
     except OSError as error:
+        nobody_reads = isinstance(error, BrokenPipeError) or (error.errno == errno.EIO and _is_device())
         _discard_output()
+        if nobody_reads:
+            return
         raise OutputError(f"standard output: {error.strerror or error}") from error
+
+
+def _is_device() -> bool:
+    """Whether stdout is a device: of a terminal that is closed nothing else can be told any more."""
+    try:
+        return stat.S_ISCHR(os.fstat(sys.stdout.fileno()).st_mode)
+    except (OSError, ValueError):
+        return False
 
 
 def warn(text: str) -> None:
