@@ -156,8 +156,8 @@ def _is_plain(array: Any) -> bool:
 
 
 def is_white(value: Any) -> bool:
-    """Whether a value can be that of a saturated pixel."""
-    return isinstance(value, Real) and 0 < float(value) < np.inf
+    """Whether a value can be that of a saturated pixel, in any unit."""
+    return isinstance(value, Real) and 1e-12 <= float(value) <= 1e12
 
 
 def check_frame(
