@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -11,9 +13,11 @@ from kalux.errors import FrameError, InputError, SettingsError
 from kalux.evaluation.baselines import methods
 from kalux.evaluation.truth import evaluate_truth, prepare_reference
 from kalux.models.camera import Response
+from kalux.models.colour import luminance
+from kalux.recording import Recording
 from kalux.writers import hdf5
 
-from builders import frame, moving_blocks
+from builders import colour_blocks, frame, moving_blocks
 
 LEVELS = np.arange(256, dtype=np.uint8).reshape(16, 16)
 
@@ -98,6 +102,37 @@ def test_held_frames_are_perfect_where_they_are_not_clipped(simulation):
     found = artificial_hdr(simulation.recording(), ArtificialCamera(0.0, 1.0))
     scores = evaluate_truth(found, prepare_reference(found, found.ground_truth()), methods()["hold"])
     assert scores.mse < 2e-4  # its S is flat at both ends: quantisation
+
+
+@pytest.mark.parametrize("mosaic", [None, "RGGB"])
+def test_colours_stay_and_the_truth_of_rgb_is_its_luminance(mosaic):
+    _, made = colour_blocks(mosaic)
+    found = artificial_hdr(made.recording(), ArtificialCamera(0.0, 0.5))
+    assert [f.image.shape for f in found.frames()] == [f.image.shape for f in made.frames]
+    assert {f.mosaic for f in found.frames()} == {found.mosaic} == {mosaic}
+    truth, original = found.ground_truth(), made.frames[0].normalised()
+    shown = original if mosaic else luminance(original)
+    np.testing.assert_allclose(truth.images[0], shown / 0.5, rtol=1e-5)
+
+
+def test_what_is_said_of_the_mosaic_is_kept():
+    """Where the recording itself says nothing, or something else."""
+    _, made = colour_blocks("RGGB")
+    silent = [dataclasses.replace(frame, mosaic=None) for frame in made.frames]
+    source = Recording.from_arrays(made.events, silent, sensor_size=made.scene.sensor_size).source
+    found = artificial_hdr(Recording(source, mosaic="RGGB"), ArtificialCamera.with_cut(30))
+    assert next(iter(found.frames())).mosaic == found.mosaic == "RGGB"
+
+
+def test_what_a_frame_does_not_measure_is_no_truth():
+    valid = np.ones(LEVELS.shape, bool)
+    valid[0] = False
+    recording = recording_of([LEVELS] * 3)
+    frames = [dataclasses.replace(frame, valid=valid) for frame in recording.frames()]
+    masked = Recording.from_arrays(np.empty(0, kalux.EVENT_DTYPE), frames, sensor_size=valid.shape)
+    found = artificial_hdr(masked, ArtificialCamera.with_cut(30))
+    assert not found.ground_truth().masks[:, 0].any()
+    assert all((frame.valid == valid).all() for frame in found.frames())
 
 
 def test_what_cannot_be():

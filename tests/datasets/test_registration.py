@@ -112,6 +112,23 @@ def test_frames_that_show_something_else_are_left_out_and_told(simulation, photo
     assert len(found.truth.times) == len(found.masks) == 4
 
 
+def test_frames_in_rgb_are_registered_by_their_luminance(simulation, photograph):
+    """And only where they measure anything: a quarter of each is a guess here."""
+    valid = np.ones(SIZE, bool)
+    valid[:, : SIZE[1] // 4] = False
+    frames = [
+        dataclasses.replace(f, image=np.stack([np.where(valid, f.image, 200)] * 3, axis=-1), valid=valid)
+        for f in simulation.frames
+    ]
+    recording = kalux.Recording.from_arrays(simulation.events, frames, sensor_size=SIZE)
+    everywhere = np.ones(photograph.shape, bool)
+    found = register_frames(photograph, everywhere, recording)
+    grey = register_frames(photograph, everywhere, simulation.recording())
+    for one, other in zip(found.frames, grey.frames, strict=True):
+        assert not one.failure
+        assert displacement(one.matrix, other.matrix, SIZE) < 0.5
+
+
 def test_another_scene_is_an_error(simulation):
     other = blocks(0.02, 6.0, shape=(260, 340), seed=5)
     with pytest.raises(InputError, match="cannot be registered to any of 7 frames"):

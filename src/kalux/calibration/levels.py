@@ -114,6 +114,7 @@ def _brightest(recording: Recording) -> float | None:
         if frame.image.ndim == 3:
             return None
         values = np.rint((_FINE - 1) * np.clip(frame.normalised(), 0, 1)).astype(np.int64)
+        values = values if frame.valid is None else values[frame.valid]
         histogram += np.bincount(values.ravel(), minlength=_FINE)
     reached = np.cumsum(histogram[::-1])[::-1] >= max(_BRIGHTEST * histogram.sum(), 1)
     brightest = int(np.flatnonzero(reached)[-1]) if reached.any() else 0

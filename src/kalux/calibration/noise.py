@@ -386,6 +386,7 @@ def clipping_levels(recording: Recording) -> Levels:
     histogram = np.zeros(256)
     for frame in islice(recording.frames(), MAX_FRAMES):
         values = np.rint(255 * np.clip(frame.normalised(), 0, 1)).astype(np.int64)
+        values = values if frame.valid is None else values[frame.valid]
         histogram += np.bincount(values.ravel(), minlength=256)
     if not histogram.any():
         return Levels(None, None)

@@ -24,8 +24,9 @@ from numpy.typing import NDArray
 
 from kalux.calibration.frame_noise import estimate_frame_noise
 from kalux.errors import FrameError, InputError
-from kalux.frames import Frame, GroundTruth
+from kalux.frames import Frame, GroundTruth, median_exposure
 from kalux.models.camera import Camera, Response, inverse_response
+from kalux.models.colour import luminance
 from kalux.recording import Recording
 from kalux.settings import CameraSettings, chosen_response
 from kalux.wording import how_many
@@ -87,7 +88,8 @@ def artificial_hdr(
     """A recording as an artificial camera would have made it, with the original frames as ground truth.
 
     Events are untouched. Frames keep their exposures, and have 8 bits. The truth is at the middle of exposures, 1 = the
-    white of the artificial camera at the recording's median exposure; masked where the original was saturated itself.
+    white of the artificial camera at the recording's median exposure, of frames in RGB the luminance; masked where the
+    original was saturated itself, or measured nothing (`Frame.valid`).
 
     Parameters
     ----------
@@ -136,9 +138,9 @@ def artificial_hdr(
                 intensity = _intensity(frame, real, black, 1.0)
                 level = artificial(np.minimum(intensity / camera.high, 1.0))
                 levels = np.rint(255 * level).astype(np.uint8)
-                yield Frame(levels, frame.exposure_start, frame.exposure_end)
+                yield dataclasses.replace(frame, image=levels, white=None)
 
-    reference = round(float(np.median(kept)))
+    reference = median_exposure(kept)
 
     def truth() -> GroundTruth:
         times, images, masks = [], [], []
@@ -146,8 +148,9 @@ def artificial_hdr(
             if every is None or index % every == every - 1:
                 image = _intensity(frame, real, black, reference / frame.exposure) / camera.high
                 times.append(frame.middle)
-                images.append(np.maximum(image, 0.0).astype(np.float32))
-                masks.append(frame.normalised() < saturation)
+                grey = image if image.ndim == 2 else luminance(image)
+                images.append(np.maximum(grey, 0.0).astype(np.float32))
+                masks.append(_measured(frame, saturation))
         whole = np.stack(masks)
         return GroundTruth(
             np.array(times, np.int64),
@@ -168,8 +171,16 @@ def artificial_hdr(
             inverse_covariance=None,  # of the real camera
             ground_truth=truth,
             response=camera.response,
+            mosaic=recording.mosaic,
         )
     )
+
+
+def _measured(frame: Frame, saturation: float) -> NDArray[np.bool_]:
+    """(H, W) where a frame says what light there was, in all of its colours."""
+    below = np.asarray(frame.normalised() < saturation)
+    measured = below if below.ndim == 2 else below.all(axis=-1)
+    return np.asarray(measured if frame.valid is None else measured & frame.valid)
 
 
 def _noise(recording: Recording, response: str, black: float, high: float) -> tuple[float, float] | None:

@@ -26,6 +26,7 @@ from kalux.calibration.regression import HUBER, robust_deviation
 from kalux.errors import InputError
 from kalux.frames import Frame, GroundTruth, median_exposure
 from kalux.models.camera import Camera, Response, inverse_response
+from kalux.models.colour import luminance as luminance_of
 from kalux.recording import Recording
 
 Array = NDArray[np.float64]
@@ -387,9 +388,7 @@ def _register(
     guess: float | None,
 ) -> RegisteredFrame:
     size = (frame.image.shape[0], frame.image.shape[1])
-    level = frame.normalised()
-    intensity = inverse_response(camera, level, exposure / frame.exposure)
-    exposed = (level > _EXPOSED[0]) & (level < _EXPOSED[1])
+    intensity, exposed = _seen(frame, camera, exposure)
 
     def failed(why: str, inliers: int = 0) -> RegisteredFrame:
         return RegisteredFrame(index, frame.middle, None, inliers, np.inf, np.nan, why)
@@ -418,6 +417,16 @@ def _register(
     return RegisteredFrame(index, frame.middle, matrix, match.inliers, deviation, scale, "")
 
 
+def _seen(frame: Frame, camera: Camera, exposure: int) -> tuple[Array, Mask]:
+    """(H, W) intensity of a frame, of RGB the luminance, at an exposure, us; where it is measured and exposed well."""
+    level = frame.normalised()
+    intensity = inverse_response(camera, level, exposure / frame.exposure)
+    exposed = (level > _EXPOSED[0]) & (level < _EXPOSED[1])
+    if level.ndim == 3:
+        intensity, exposed = luminance_of(intensity), np.asarray(exposed.all(axis=2))
+    return intensity, exposed if frame.valid is None else exposed & frame.valid
+
+
 def _reference_features(
     luminance: NDArray[Any],
     valid: Mask,
@@ -427,7 +436,7 @@ def _reference_features(
     known_scales: list[float],
 ) -> Features:
     """Features of the reference, shown with the tones of a frame."""
-    intensity = inverse_response(camera, frame.normalised(), exposure / frame.exposure)
+    intensity, _ = _seen(frame, camera, exposure)
     scale = known_scales[0] if known_scales else _guessed_scale(luminance, valid, intensity)
     seen = np.log(np.maximum(intensity, 0.0) + _LOG_OFFSET)
     return find_features(tone_compressed(np.log(scale * luminance + _LOG_OFFSET), *_tone_range(seen)), valid)
