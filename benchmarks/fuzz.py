@@ -100,7 +100,6 @@ def built_seeds(folder: Path) -> Iterator[Seed]:
     import test_aedat3
     import test_aedat4
     import test_es
-    import test_hdf5
     import test_hdf5_layouts
     import test_ijrr
     import test_mat
@@ -108,7 +107,7 @@ def built_seeds(folder: Path) -> Iterator[Seed]:
     import test_rosbag
     import test_table
 
-    from recordings import SIZE, colour_frames, small_events, small_frames
+    from recordings import SIZE, colour_frames, small_events, small_frames, write_kalux
 
     events, frames = small_events(), small_frames()
 
@@ -132,7 +131,7 @@ def built_seeds(folder: Path) -> Iterator[Seed]:
     packets = [test_aedat3.polarity(part) for part in np.array_split(events, 5)]
     packets += [test_aedat3.frame(frame) for frame in test_aedat3.wide(frames)]
     yield put("aedat3", "caer.aedat", lambda p: p.write_bytes(test_aedat3.header() + b"".join(packets)))
-    yield put("kalux", "kalux.h5", test_hdf5.write)
+    yield put("kalux", "kalux.h5", write_kalux)
     for name, save in (
         ("5", test_mat.save_5),
         ("5_plain", test_mat.save_5_plain),

@@ -69,7 +69,7 @@ def frames(count: int) -> Iterator[Frame]:
 
 
 def write_kalux(path: Path, count: int) -> None:
-    from kalux.readers import hdf5
+    from kalux.writers import hdf5
 
     hdf5.write(path, sensor_size=SIZE, events=blocks(count), frames=frames(count))
 

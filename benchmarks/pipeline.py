@@ -51,8 +51,7 @@ GIVEN = (
 
 def write_recording(path, size, rate, seconds):
     """A recording of the sweeping edge, in the format of the file's name."""
-    from kalux.readers import hdf5
-    from kalux.writers import aedat4
+    from kalux.writers import aedat4, hdf5
 
     from speed import EXPOSURE, FRAME, THRESHOLD, picture, stream
 

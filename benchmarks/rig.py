@@ -37,7 +37,7 @@ from kalux.datasets.rig_scene import (
     patchwork,
     record,
 )
-from kalux.readers import hdf5
+from kalux.writers import hdf5
 
 OFFSET = 7_300
 DISTANCE = 20.0

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 import threading
 from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
-from kalux import EVENT_DTYPE, PRESETS, Frame, Recording, Settings
+from kalux import EVENT_DTYPE, PRESETS, Frame, Recording
 from kalux.datasets import (
     ColourScene,
     SensorSettings,
@@ -21,6 +20,7 @@ from kalux.datasets import (
     simulate_colour,
 )
 from kalux.events import make_events
+from kalux.settings import altered
 
 
 def own_threads() -> list[str]:
@@ -42,11 +42,6 @@ def pixel_events(times, polarities, x=0, y=0):
 def frame(value, start, end, size=(1, 1), dtype=np.uint8):
     """A frame of one value, or of an array."""
     return Frame(np.broadcast_to(np.asarray(value, dtype), np.shape(value) or size).copy(), start, end)
-
-
-def altered(settings: Settings, group: str, **values) -> Settings:
-    """Settings with some values of one group changed."""
-    return dataclasses.replace(settings, **{group: dataclasses.replace(getattr(settings, group), **values)})
 
 
 VARIANTS = {
@@ -86,6 +81,15 @@ def random_stream(seed: int, *, frames: int = 4, count: int = 150, shift: int = 
     out["x"], out["y"] = rng.integers(0, width, count), rng.integers(0, height, count)
     out["p"] = rng.random(count) < 0.5
     return Stream((height, width), out, shots)
+
+
+@lru_cache(maxsize=16)
+def recording(seed=0, threshold=(0.25, 0.2), shift=0):
+    """Of `random_stream`."""
+    stream = random_stream(seed, shift=shift)
+    return Recording.from_arrays(
+        stream.events, stream.frames, sensor_size=stream.sensor_size, contrast_threshold=threshold
+    )
 
 
 def blocks(low=0.02, high=0.6, *, shape=(300, 300), seed=0, count=400):

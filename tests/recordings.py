@@ -11,10 +11,14 @@ import numpy as np
 from kalux import readers
 from kalux.errors import KaluxError
 from kalux.events import EVENT_DTYPE, make_events
-from kalux.frames import Frame
+from kalux.frames import Frame, GroundTruth
 from kalux.recording import Recording
+from kalux.writers import hdf5
 
 SIZE = (30, 40)
+REFERENCE = GroundTruth(
+    np.array([10, 20, 30]), np.random.default_rng(0).uniform(0, 9, (3, *SIZE)).astype(np.float32)
+)
 
 
 def small_events(count: int = 500, seed: int = 0) -> np.ndarray:
@@ -43,6 +47,19 @@ def colour_frames(count: int = 4, seed: int = 0, dtype: type = np.uint8) -> list
         Frame(rng.integers(0, top, (*SIZE, 3), dtype, endpoint=True), 20_000 * i, 20_000 * i + 3_000 + i)
         for i in range(count)
     ]
+
+
+def write_kalux(path: Path, **changes) -> None:
+    """Of all that kalux HDF5 can hold, most."""
+    found = {
+        "sensor_size": SIZE,
+        "events": [small_events()],
+        "frames": small_frames(),
+        "contrast_threshold": (0.1, 0.2),
+        "inverse_covariance": np.linspace(1, 2, 256),
+        "ground_truth": REFERENCE,
+    }
+    hdf5.write(path, **(found | changes))
 
 
 def all_events(source) -> np.ndarray:

@@ -15,9 +15,9 @@ from kalux.frames import MOSAICS, Frame
 from kalux.models.colour import LUMINANCE, demosaic, luminance, sample_mosaic
 from kalux.reconstructor import Reconstructor
 from kalux.recording import Recording
-from kalux.settings import PRESETS
+from kalux.settings import PRESETS, altered
 
-from builders import altered, colour_blocks
+from builders import colour_blocks
 
 DEFAULT = kalux.PRESETS["default"]
 

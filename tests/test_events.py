@@ -68,11 +68,49 @@ def test_a_data_frame():
 
     expected = make_events(*columns([(1, 2, 3, True)]))
     assert np.array_equal(as_events(DataFrame(timestamp=[1], x=[2], y=[3], polarity=[1])), expected)
+    floats = DataFrame(timestamp=[1e-6], x=[2.0], y=[3.0], polarity=[1.0])
+    assert np.array_equal(as_events(floats, time_unit="s"), expected)
 
 
 def test_events_of_the_dtype_are_not_copied():
     events = make_events(*columns([(1, 2, 3, True)]))
     assert as_events(events) is events
+
+
+def test_arrays_of_other_shapes_and_orders_of_bytes():
+    events = make_events(*columns([(10, 2, 3, True), (20, 4, 5, False), (30, 6, 7, True)]))
+    assert np.array_equal(as_events(events.reshape(1, 3)), events)
+    assert np.array_equal(
+        as_events(structured(*columns(events.tolist()), dtypes=(">i8", ">u2", ">u2", "?"))), events
+    )
+    assert len(as_events({"t": [], "x": [], "y": [], "p": []})) == 0
+
+
+@pytest.mark.parametrize("t", [np.array([1, 2], "m8[ms]"), np.array([1_000_000, 2_000_999], "M8[ns]")])
+def test_times_that_have_a_unit_of_their_own(t):
+    found = as_events({"t": t, "x": [0, 1], "y": [0, 1], "p": [0, 1]})
+    assert found["t"].tolist() == [1000, 2000]
+
+
+def test_seconds_in_single_precision_are_multiplied_in_double():
+    t = np.array([1000.0001], np.float32)
+    found = as_events({"t": t, "x": [0], "y": [0], "p": [0]}, time_unit="s")
+    assert found["t"].tolist() == [round(float(t[0]) * 1e6)]
+
+
+@pytest.mark.parametrize(
+    ("t", "unit"),
+    [
+        (np.array([0, -(2**63)]), None),
+        (np.array([0, 2**63 + 5], np.uint64), None),
+        (np.array([0, 10**15]), "s"),
+        (np.array([0, 1e300]), "s"),
+        (np.array([0, "NaT"], "m8[us]"), None),
+    ],
+)
+def test_times_that_nothing_could_be_added_to_are_refused(t, unit):
+    with pytest.raises(EventError, match=r"events: event 1 is at .* us; at most 10\^18 us is possible"):
+        as_events({"t": t, "x": [0, 1], "y": [0, 1], "p": [0, 1]}, time_unit=unit)
 
 
 @pytest.mark.parametrize(
@@ -97,9 +135,12 @@ def test_units_of_time(t, unit, expected):
         ({"t": [0.1, 0.2]}, "time_unit='s'"),
         ({"x": [-1, 0]}, "x of event 0 is -1"),
         ({"y": [0, 70_000]}, "y of event 1 is 70000"),
-        ({"x": [0.5, 1.0]}, "not an integer"),
+        ({"x": [0.5, 1.0]}, "x of event 0 is 0.5, not a whole number"),
+        ({"x": [0.0, np.inf]}, "x of event 1 is inf, not a whole number"),
+        ({"y": ["0", "1"]}, "not an integer"),
         ({"p": [0, 2]}, "polarity of event 1 is 2"),
-        ({"p": [0.0, 1.0]}, "polarity is float64"),
+        ({"p": [0.0, 0.5]}, "polarity of event 1 is 0.5, not a whole number"),
+        ({"p": ["on", "off"]}, "polarity is <U3"),
     ],
 )
 def test_unusable_columns_are_refused(changes, message):
@@ -132,12 +173,13 @@ def test_unknown_layouts_are_refused(data, options, message):
     [
         ([(5, 0, 0, True), (4, 0, 0, True)], None, r"event 11 at 4 us comes after one at 5 us"),
         ([(5, 0, 0, True)], 6, r"event 10 at 5 us comes after one at 6 us"),
+        ([(2 * 10**18, 0, 0, True)], None, r"event 10 is at 2000000000000000000 us; at most 10\^18"),
         ([(5, 4, 0, True)], None, r"event 10 at x=4, y=0 is outside the sensor of 4x3"),
         ([(5, 0, 0, True), (5, 0, 3, True)], None, r"event 11 at x=0, y=3 is outside"),
     ],
 )
 def test_checks_name_the_event(values, previous_t, message):
-    events = make_events(*columns(values))
+    events = np.array(values, EVENT_DTYPE)
     with pytest.raises(EventError, match="here: " + message):
         check_events(events, (3, 4), where="here", first_index=10, previous_t=previous_t)
 

@@ -30,6 +30,11 @@ def test_white(dtype, white, expected):
     assert one.normalised().dtype == np.float64
 
 
+def test_frames_less_a_dark_frame_are_black_where_they_are_negative():
+    one = Frame(np.array([[-0.2, 0.0, 0.5]], np.float32), 0, 1)
+    assert one.normalised().tolist() == [[0.0, 0.0, 0.5]]
+
+
 def test_exposure_and_middle():
     one = frame(100, 205)
     assert (one.exposure, one.middle) == (105, 152)
@@ -46,6 +51,11 @@ def test_placing_an_exposure_keeps_the_rest():
     assert (placed.white, placed.mosaic) == (1023, "GBRG")
 
 
+def test_a_frame_tells_itself_in_a_line():
+    assert repr(frame()) == "<kalux.Frame uint8 (3, 4), grey, exposed from 100 to 200 us>"
+    assert repr(Frame([[1]], 0, 1, mosaic="RGGB")) == "<kalux.Frame list, RGGB, exposed from 0 to 1 us>"
+
+
 def test_colours():
     assert frame().colours == "grey"
     assert frame(shape=(3, 4, 3)).colours == "RGB"
@@ -56,7 +66,7 @@ def check(one, **options):
     check_frame(one, (3, 4), where="here", index=7, **options)
 
 
-@pytest.mark.parametrize("white", [0, -1.0, np.nan, np.inf])
+@pytest.mark.parametrize("white", [0, -1.0, np.nan, np.inf, 1e-320, 1e24, "255", [255]])
 def test_a_white_value_is_positive(white):
     with pytest.raises(FrameError, match="frame 7 has the white value"):
         check(frame(white=white))
@@ -71,7 +81,15 @@ def test_times_are_whole_microseconds(times):
         check(frame(*times))
 
 
-@pytest.mark.parametrize("what", [np.ones((3, 4), np.uint8), Frame([[1, 2]], 0, 1), None])
+@pytest.mark.parametrize(
+    "what",
+    [
+        np.ones((3, 4), np.uint8),
+        Frame([[1, 2]], 0, 1),
+        Frame(np.ma.masked_equal(np.ones((3, 4), np.uint8), 1), 0, 1),
+        None,
+    ],
+)
 def test_what_is_no_frame_is_told(what):
     with pytest.raises(FrameError, match=r"frame 7 is a .*; a kalux.Frame with a NumPy array is needed"):
         check(what)
@@ -129,6 +147,7 @@ def not_finite():
         ),
         (frame(shape=(3, 4, 3)), {"previous": frame(0, 50)}, FrameError, "is RGB, those before it are grey"),
         (frame(dtype=np.int16), {}, FrameError, "dtype int16"),
+        (frame(dtype=">u2"), {}, FrameError, "dtype >u2; .*in this machine's order of bytes"),
         (not_finite(), {}, FrameError, "not finite .* at x=2, y=1"),
         (frame(100, 100), {}, ExposureError, "exposure of 0 us"),
         (frame(100, 90), {}, ExposureError, "exposure of -10 us"),
@@ -141,7 +160,7 @@ def test_bad_frames_are_named(one, options, kind, message):
         check(one, **options)
 
 
-@pytest.mark.parametrize("valid", [np.ones((3, 5), bool), np.ones((3, 4), np.uint8)])
+@pytest.mark.parametrize("valid", [np.ones((3, 5), bool), np.ones((3, 4), np.uint8), [[True] * 4] * 3])
 def test_a_mask_of_another_size_or_type_is_refused(valid):
     masked = Frame(np.ones((3, 4), np.uint8), 100, 200, valid=valid)
     with pytest.raises(FrameError, match=r"mask of valid pixels of .*bool \(3, 4\) is needed"):

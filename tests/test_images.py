@@ -43,6 +43,11 @@ def test_a_doubtful_highlight_is_drawn_towards_white_and_no_other_pixel():
     np.testing.assert_allclose(free.intensity, [[0.5, 3.0]], rtol=1e-4)
 
 
+def test_an_image_tells_itself_in_a_line():
+    image = make_image(estimate([[0.25, 0.5]]), GREY)
+    assert repr(image) == "<kalux.Image at 7 us: 2 x 1 pixels, grey, intensity 0.25 to 0.5, final>"
+
+
 def test_an_intensity_is_never_negative():
     assert make_image(estimate([[-0.04]]), GREY).intensity[0, 0] == 0.0
 

@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 
 from kalux import recording
 from kalux.events import EVENT_DTYPE, make_events
-from kalux.frames import Frame
+from kalux.frames import Frame, GroundTruth
 from kalux.info import describe, format_description, summarise_events, summarise_frames
-from kalux.readers import GroundTruth, hdf5
 from kalux.recording import Recording
+from kalux.writers import hdf5
 from recordings import SIZE, small_events, small_frames
 
 

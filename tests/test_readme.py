@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 import kalux
-from kalux.readers import hdf5
+from kalux.writers import hdf5
 
 from builders import moving_blocks
 
@@ -37,6 +37,27 @@ def test_the_python_example_runs(tmp_path, monkeypatch):
     exec(code, names)
     assert isinstance(names["image"], kalux.Image)
     assert names["image"].intensity.shape == (260, 346)
+
+
+def test_the_example_with_arrays_runs(tmp_path, monkeypatch):
+    simulation = moving_blocks(0.05, 0.4, size=(24, 32))
+    events = simulation.events
+    page = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    names = {
+        "images": [frame.image for frame in simulation.frames],
+        "starts": [frame.exposure_start for frame in simulation.frames],
+        "t": events["t"] * 1e-6,
+        "x": events["x"].astype(np.float64),
+        "y": events["y"],
+        "p": np.where(events["p"], 1, -1),
+        "truth_times": np.array([100_000]),
+        "truth": np.full((1, 24, 32), 0.5, np.float32),
+    }
+    exec(re.search(r"```python\n(.*?)```", page, re.DOTALL).group(1), names)
+    assert names["scores"]["default"] > 0
+    assert len(list((tmp_path / "made").glob("*.exr"))) == len(names["made"])
+    assert np.array_equal(np.concatenate(list(kalux.open(tmp_path / "mine.h5").events())), events)
 
 
 def test_its_links_lead_somewhere():

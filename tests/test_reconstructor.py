@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 from kalux import PRESETS, Frame, Reconstructor
 from kalux.errors import EventError, ExposureError, FrameError, InputError, KaluxError, SettingsError
 from kalux.filters import bridged_frames
+from kalux.settings import altered
 
-from builders import VARIANTS, Stream, altered, events, frame, pixel_events, random_stream
+from builders import VARIANTS, Stream, events, frame, pixel_events, random_stream
 
 HOUR = 3_600_000_000
 THRESHOLD = (0.25, 0.2)
@@ -643,12 +644,6 @@ def test_what_later_reads_have_passed_cannot_be_read_again():
     live.read(nodes[2])
 
 
-@pytest.mark.parametrize("t", [0.5, np.nan, np.inf, "1", None])
-def test_a_time_that_is_no_whole_number_cannot_be_read(t):
-    with pytest.raises(InputError, match=r"the time is .*; whole microseconds"):
-        filled(random_stream(0)).read(t)
-
-
 def test_memory_is_bounded_when_one_reads_along():
     live, held = engine((4, 4)), []
     rng = np.random.default_rng(0)
@@ -744,13 +739,64 @@ def test_events_of_an_unknown_layout():
         engine((1, 1)).push_events([1, 2, 3])
 
 
+def test_events_that_were_refused_leave_the_engine_as_it_was():
+    live = engine((1, 1))
+    live.push_frame(Frame(np.full((1, 1), 100, np.uint8), 0, 10_000))
+    live.push_events({"t": [20_000], "x": [0], "y": [0], "p": [1]})
+    before = live.read(30_000)
+    for t in ([19_999], [21_000, 20_500], [2**62]):
+        with pytest.raises(EventError, match="event"):
+            live.push_events({"t": t, "x": [0] * len(t), "y": [0] * len(t), "p": [1] * len(t)})
+        assert np.array_equal(live.read(30_000).intensity, before.intensity)
+    live.push_events({"t": [20_000], "x": [0], "y": [0], "p": [1]})
+    assert live.read(30_000).intensity > before.intensity
+
+
+def test_no_frame_may_come_after_the_last():
+    """Its events may have been freed, and images that it would change have been final."""
+    live = engine((1, 1))
+    live.push_frame(Frame(np.full((1, 1), 100, np.uint8), 0, 10_000))
+    live.end_frames()
+    with pytest.raises(InputError, match=r"end_frames\(\) was called, .* a new Reconstructor"):
+        live.push_frame(Frame(np.full((1, 1), 100, np.uint8), 20_000, 30_000))
+    live.push_events({"t": [20_000], "x": [0], "y": [0], "p": [1]})
+
+
+@pytest.mark.parametrize("t", ["1", None, np.nan, np.inf, 0.5, 10**30])
+def test_times_that_are_none_are_refused_everywhere(t):
+    live = engine((1, 1))
+    live.push_frame(Frame(np.full((1, 1), 100, np.uint8), 0, 10_000))
+    live.advance(30_000)
+    before = live.read(20_000)
+    for call, name in ((live.advance, "advance"), (live.forget, "forget"), (live.read, "read")):
+        with pytest.raises(InputError, match=f"{name}: the time is .*; whole microseconds"):
+            call(t)
+    assert np.array_equal(live.read(20_000).intensity, before.intensity)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"settings": {}}, "settings is a dict; a kalux.Settings is needed, from kalux.preset"),
+        ({"settings": "cf"}, "settings is a str; a kalux.Settings"),
+        ({"pixels": np.ones((1, 1))}, "pixels is a ndarray; a kalux.PixelCalibration is needed"),
+        ({"reference_exposure": -1}, "reference_exposure is -1 us; it must be positive"),
+        ({"reference_exposure": 0}, "reference_exposure is 0 us"),
+        ({"reference_exposure": np.nan}, "reference_exposure is nan; whole microseconds"),
+    ],
+)
+def test_arguments_that_cannot_be(arguments, message):
+    with pytest.raises(InputError, match=message):
+        Reconstructor((1, 1), **arguments)
+
+
 @pytest.mark.parametrize("size", [(0, 3), (3, 0), (-1, 3)])
 def test_a_sensor_without_pixels(size):
     with pytest.raises(InputError, match="sensor_size"):
         Reconstructor(size)
 
 
-@pytest.mark.parametrize("threshold", [0.0, -0.2, float("nan"), float("inf"), (0.2, 0.0)])
+@pytest.mark.parametrize("threshold", [0.0, -0.2, float("nan"), float("inf"), (0.2, 0.0), "high", (1, 2, 3)])
 def test_a_threshold_that_is_none(threshold):
     with pytest.raises(InputError, match="must be positive"):
         Reconstructor((1, 1), contrast_threshold=threshold)

@@ -12,8 +12,8 @@ import pytest
 from kalux import readers, recording
 from kalux.errors import EventError, ExposureError, FormatError, FrameError, InputError
 from kalux.frames import Frame
-from kalux.readers import hdf5
 from kalux.recording import Recording, remembering
+from kalux.writers import hdf5
 from recordings import SIZE, same_frames, small_events, small_frames
 
 
@@ -69,6 +69,41 @@ def test_a_bad_recording_is_refused_at_once():
         FrameError, match=r"frame 0 is a ndarray; a kalux\.Frame with a NumPy array is needed"
     ):
         in_memory(frames=[np.zeros(SIZE, np.uint8)])
+
+
+@pytest.mark.parametrize("threshold", [-0.2, float("nan"), (0.2, 0.0), "0.2 log", (0.1, 0.2, 0.3)])
+def test_thresholds_that_are_none_are_refused(threshold):
+    with pytest.raises(InputError, match=r"contrast threshold is .*must be positive"):
+        in_memory(contrast_threshold=threshold)
+
+
+def test_thresholds_of_numpy():
+    assert in_memory(contrast_threshold=np.float64(0.2)).contrast_threshold == (0.2, 0.2)
+    assert in_memory(contrast_threshold=np.array([0.1, 0.2])).contrast_threshold == (0.1, 0.2)
+
+
+@pytest.mark.parametrize("t", [-(2**63), 2**62])
+def test_times_that_nothing_could_be_added_to_are_refused(t):
+    events = small_events()
+    events["t"][0 if t < 0 else -1] = t
+    with pytest.raises(EventError, match=r"event (0|499) is at .* us; at most 10\^18 us is possible"):
+        in_memory(events=events)
+
+
+def test_frames_in_memory_with_one_stamp_each():
+    stamps = [Frame(frame.image, frame.exposure_start, frame.exposure_start) for frame in small_frames()]
+    with pytest.raises(ExposureError, match="exposure="):
+        in_memory(frames=stamps)
+    rec = in_memory(frames=stamps, exposure=1_000, stamp="middle")
+    starts = [frame.exposure_start for frame in rec.frames()]
+    assert starts == [frame.exposure_start - 500 for frame in small_frames()]
+    assert {frame.exposure for frame in rec.frames()} == {1_000}
+
+
+def test_a_white_value_that_can_hardly_be_right_is_warned_of():
+    dark = [dataclasses.replace(f, image=f.image.astype(np.uint16)) for f in small_frames()]
+    with pytest.warns(UserWarning, match=r"arrays: no pixel .*white=1023"):
+        in_memory(frames=dark)
 
 
 def test_a_recording_says_what_it_is():

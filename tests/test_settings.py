@@ -13,9 +13,7 @@ from hypothesis import strategies as st
 
 from kalux import PRESETS, Reconstructor, Settings, preset
 from kalux.errors import InputError, KaluxError, SettingsError
-from kalux.settings import CameraSettings, EventSettings, FilterSettings, from_dict, load, to_dict
-
-from builders import altered
+from kalux.settings import CameraSettings, EventSettings, FilterSettings, altered, from_dict, load, to_dict
 
 DEFAULT = PRESETS["default"]
 GROUPS = {"camera": CameraSettings, "events": EventSettings, "filter": FilterSettings}
@@ -116,6 +114,9 @@ def test_unknown_preset():
         match=r"'iccv2022', did you mean iccv2021.; known are default, davis240c, .*, iccv2021, iccv2021-flir, cf",
     ):
         preset("iccv2022")
+    for name in (None, 3, ["cf"]):
+        with pytest.raises(SettingsError, match="unknown preset"):
+            preset(name)
 
 
 def test_a_preset_that_is_nearly_right_is_named():
@@ -211,8 +212,9 @@ def test_none_is_auto_in_files():
         ("[camera]\nlog_offset = true", "camera.log_offset is True; a finite number is needed"),
         ("[camera]\nlog_offset = nan", "camera.log_offset is nan; a finite number is needed"),
         ("[camera]\nlog_offset = inf", "finite number is needed"),
-        (f"[camera]\nlog_offset = {2**70}", "finite number is needed, at most 1e18"),
-        (f"[events]\ndelay = {-(2**63)}", "finite number is needed, at most 1e18"),
+        (f"[camera]\nlog_offset = {2**70}", "finite number is needed, at most 1e[+]10"),
+        ("[filter]\nhighlight_tail = 1e-300", "highlight_tail is 1e-300; 1e-12 is the least above 0"),
+        (f"[events]\ndelay = {-(2**63)}", "finite number is needed, at most 1e[+]18"),
         ("[camera]\nlog_offset = 0", "camera.log_offset is 0; it must be positive"),
         ("[camera]\nlog_offset = -1", "camera.log_offset is -1; it must be positive"),
         ("[camera]\nresponse = 2.2", "camera.response is 2.2; str is needed"),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from kalux import PRESETS, Recording
-from kalux.pipeline import plan
+from kalux.planning import plan
 from kalux.settings import from_dict
 from kalux.settled import settled
 

@@ -21,11 +21,10 @@ from kalux.filters.shots import take_shot
 from kalux.filters.uncertainty import Around
 from kalux.images import Estimate
 from kalux.models.camera import Camera
-from kalux.pipeline import plan
+from kalux.planning import plan
 from kalux.reconstructor import Reconstructor
+from kalux.settings import altered
 from kalux.smoothing import Spill, Trails, combine, reversed_settings
-
-from builders import altered
 
 SIZE = (6, 8)
 

@@ -159,12 +159,10 @@ def _largest_around(typing_context: Any, plane: Any, at: Any, stride: Any) -> An
         def larger(one: Any, other: Any) -> Any:
             return builder.select(builder.icmp_signed(">", one, other), one, other)
 
-        # Four are loaded where three are meant: the fourth lies behind them, or before those of the last row.
-        upper = larger(four(builder.sub(at, stride), -1), four(at, -1))
-        lower = four(builder.add(at, stride), -2)
-        largest = larger(chosen(upper, [0, 1, 2, 2]), chosen(lower, [1, 2, 3, 3]))
-        largest = larger(largest, chosen(largest, [2, 3, 0, 1]))
-        largest = larger(largest, chosen(largest, [1, 0, 3, 2]))
+        # Four are loaded where three are meant: the fourth lies behind those of the upper row, before the others.
+        lower = larger(four(at, -2), four(builder.add(at, stride), -2))
+        largest = larger(chosen(lower, [1, 2, 3, 3]), four(builder.sub(at, stride), -1))
+        largest = larger(larger(largest, chosen(largest, [1] * 4)), chosen(largest, [2] * 4))
         return builder.extract_element(largest, i32(0))
 
     return types.int32(plane, at, stride), generate

@@ -18,9 +18,8 @@ from kalux.errors import InputError, OutputError
 from kalux.frames import Frame
 from kalux.images import Image
 from kalux.pipeline import reconstruct
-from kalux.readers import hdf5
 from kalux.recording import Recording
-from kalux.writers import Panel, VideoSettings, colour_map, contact_sheet, open_writer, variance_limits
+from kalux.writers import Panel, VideoSettings, colour_map, contact_sheet, hdf5, open_writer, variance_limits
 from kalux.writers.files import output_errors, write_whole
 
 Float32 = NDArray[np.float32]

@@ -62,6 +62,20 @@ class InternalError(KaluxError, RuntimeError):
     """A result of kalux is not what it must be: an error in kalux, not in what it was given."""
 
 
+def require_type(what: str, given: object, kind: type, source: str) -> None:
+    """Require an object of a class of kalux.
+
+    Raises
+    ------
+    InputError
+        If it is something else, with where one comes from.
+    """
+    if not isinstance(given, kind):
+        raise InputError(
+            f"{what} is a {type(given).__name__}; a kalux.{kind.__name__} is needed, from {source}"
+        )
+
+
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """End of a message about an unknown name: ``", did you mean ...?"`` with the nearest of those known, or nothing."""
     near = difflib.get_close_matches(name, known, 1)

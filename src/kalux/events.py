@@ -17,6 +17,9 @@ True where the pixel became brighter. 16 bytes, aligned."""
 EventArray = NDArray[np.void]
 """A 1-D array of `EVENT_DTYPE`, sorted by ``t``."""
 
+LATEST: Final = 10**18
+"""us, 32 000 years: of times, what later sums have still room for in an int64."""
+
 NEVER: Final = -(1 << 60)
 """us: the time of an event that has not been. Times of recordings may be negative, but are never that early."""
 
@@ -42,8 +45,8 @@ def make_events(t: Any, x: Any, y: Any, p: Any) -> EventArray:
     Raises
     ------
     EventError
-        If lengths differ, a coordinate is negative or beyond 65535, times are not integers, or polarity has
-        other values.
+        If lengths differ, a coordinate is no whole number from 0 to 65535, times are not integers or beyond 10^18, or
+        polarity has other values.
     """
     t, x, y, p = (np.asarray(column) for column in (t, x, y, p))
     if t.ndim != 1 or not t.shape == x.shape == y.shape == p.shape:
@@ -55,6 +58,7 @@ def make_events(t: Any, x: Any, y: Any, p: Any) -> EventArray:
         raise EventError(
             f"events: times are {t.dtype}, not integer microseconds; convert them or name time_unit='s'"
         )
+    _check_times(t)
     events = np.empty(t.shape, EVENT_DTYPE)
     events["t"] = t
     events["x"] = _coordinate("x", x)
@@ -70,12 +74,13 @@ def as_events(data: Any, *, columns: str | None = None, time_unit: str | None = 
     ----------
     data
         A structured array (tonic, Metavision, dv-processing), a dv-processing ``EventStore``, a pandas
-        ``DataFrame``, a mapping of columns, or an (N, 4) array. Not copied when already of `EVENT_DTYPE`.
+        ``DataFrame``, a mapping of columns, or an (N, 4) array. Not copied when already 1-D and of `EVENT_DTYPE`.
+        Coordinates and polarities may be floats that are whole numbers.
     columns
         For an (N, 4) array: the order of its columns, a permutation of ``"txyp"``.
     time_unit
         ``"s"``, ``"ms"``, ``"us"`` or ``"ns"``. Integer times are microseconds unless said otherwise; for
-        floating-point times it must be given.
+        floating-point times it must be given. ``timedelta64`` and ``datetime64`` have their own.
 
     Raises
     ------
@@ -83,13 +88,15 @@ def as_events(data: Any, *, columns: str | None = None, time_unit: str | None = 
         If the layout is not recognised or a column has unusable values.
     """
     if isinstance(data, np.ndarray) and data.dtype == EVENT_DTYPE and time_unit in (None, "us"):
-        return data
+        return data if data.ndim == 1 else data.ravel()
     found = _columns(data, columns)
     t = found["t"]
     if time_unit is not None and time_unit not in _TIME_UNITS:
         raise EventError(f"events: unknown time_unit {time_unit!r}; known are {', '.join(_TIME_UNITS)}")
-    if t.dtype.kind == "f":
-        if time_unit is None:
+    if t.dtype.kind in "mM":
+        t = t.astype(f"{t.dtype.kind}8[us]").astype(np.int64)
+    elif t.dtype.kind == "f":
+        if time_unit is None and len(t):
             raise EventError(
                 "events: times are floating point, so their unit cannot be known; "
                 "give time_unit='s' (or 'ms', 'us', 'ns')"
@@ -97,9 +104,12 @@ def as_events(data: Any, *, columns: str | None = None, time_unit: str | None = 
         if not np.isfinite(t).all():
             index = int(np.flatnonzero(~np.isfinite(t))[0])
             raise EventError(f"events: time of event {index} is not finite")
-        t = np.rint(t * _TIME_UNITS[time_unit]).astype(np.int64)
+        microseconds = np.rint(t.astype(np.float64) * _TIME_UNITS[time_unit or "us"])
+        _check_times(microseconds)
+        t = microseconds.astype(np.int64)
     elif time_unit not in (None, "us"):
         scale = _TIME_UNITS[time_unit]
+        _check_times(t * scale)
         t = t.astype(np.int64) * int(scale) if scale >= 1 else t.astype(np.int64) // round(1 / scale)
     return make_events(t, found["x"], found["y"], found["p"])
 
@@ -123,6 +133,28 @@ def checked_size(sensor_size: tuple[int, int]) -> tuple[int, int]:
     return whole
 
 
+def checked_thresholds(threshold: Any) -> tuple[float, float] | None:
+    """Contrast thresholds (on, off) of a number, or of two; None of None.
+
+    Raises
+    ------
+    InputError
+        If they are anything else, or not positive.
+    """
+    if threshold is None:
+        return None
+    try:
+        on, off = (float(value) for value in np.broadcast_to(np.asarray(threshold, np.float64), 2))
+        fine = 0 < on < np.inf and 0 < off < np.inf
+    except (TypeError, ValueError):
+        fine = False
+    if not fine:
+        raise InputError(
+            f"contrast threshold is {threshold!r}; it must be positive (log intensity, e.g. 0.2), or (on, off)"
+        )
+    return on, off
+
+
 def check_events(
     events: EventArray,
     sensor_size: tuple[int, int],
@@ -131,7 +163,7 @@ def check_events(
     first_index: int = 0,
     previous_t: int | None = None,
 ) -> None:
-    """Check one chunk of a stream: sorted in time, and inside the sensor.
+    """Check one chunk of a stream: sorted in time, at times that are possible, and inside the sensor.
 
     Parameters
     ----------
@@ -159,6 +191,7 @@ def check_events(
             f"{where}: event {first_index} at {t[0]} us comes after one at {previous_t} us; "
             "sort the events by time"
         )
+    _check_times(t, where, first_index)
     backwards = t[1:] < t[:-1]
     if backwards.any():
         i = int(np.argmax(backwards)) + 1
@@ -188,7 +221,7 @@ def _columns(data: Any, order: str | None) -> dict[str, NDArray[Any]]:
                     "events: an (N, 4) array needs the order of its columns, e.g. columns='txyp' or 'xytp'; "
                     f"got {order!r}"
                 )
-            return {name: data[:, order.index(name)] for name in "txyp"} | _integers(data, order)
+            return {name: data[:, order.index(name)] for name in "txyp"}
         raise EventError(
             f"events: cannot read an array of shape {data.shape} and dtype {data.dtype}; "
             "expected a structured array with t, x, y, p or an (N, 4) array"
@@ -200,21 +233,6 @@ def _columns(data: Any, order: str | None) -> dict[str, NDArray[Any]]:
     raise EventError(
         f"events: cannot read a {type(data).__name__}; expected an array, a mapping or a table with t, x, y, p"
     )
-
-
-def _integers(data: NDArray[Any], order: str) -> dict[str, NDArray[Any]]:
-    """Coordinates and polarity of a floating-point (N, 4) table as integers, if they are whole numbers."""
-    if data.dtype.kind != "f":
-        return {}
-    out = {}
-    for name in "xyp":
-        column = data[:, order.index(name)]
-        whole = np.rint(column)
-        if not np.array_equal(whole, column):
-            index = int(np.flatnonzero(whole != column)[0])
-            raise EventError(f"events: {name} of event {index} is {column[index]}, not a whole number")
-        out[name] = whole.astype(np.int64)
-    return out
 
 
 def _named(data: Any, names: list[str]) -> dict[str, NDArray[Any]]:
@@ -231,9 +249,26 @@ def _named(data: Any, names: list[str]) -> dict[str, NDArray[Any]]:
     return found
 
 
+def _check_times(t: NDArray[Any], where: str = "events", first_index: int = 0) -> None:
+    """Refuse times, us, that nothing could be added to."""
+    if len(t) and (t.min() < -LATEST or t.max() > LATEST):
+        i = int(np.flatnonzero((t < -LATEST) | (t > LATEST))[0])
+        raise EventError(f"{where}: event {first_index + i} is at {t[i]} us; at most 10^18 us is possible")
+
+
+def _require_whole(name: str, values: NDArray[Any]) -> None:
+    """Refuse floats that are no whole numbers."""
+    whole = np.isfinite(values) & (np.rint(values) == values)
+    if not whole.all():
+        index = int(np.flatnonzero(~whole)[0])
+        raise EventError(f"events: {name} of event {index} is {values[index]}, not a whole number")
+
+
 def _coordinate(name: str, values: NDArray[Any]) -> NDArray[Any]:
-    if values.dtype.kind not in "iu":
+    if values.dtype.kind not in "iuf":
         raise EventError(f"events: {name} is {values.dtype}, not an integer pixel coordinate")
+    if values.dtype.kind == "f":
+        _require_whole(name, values)
     if values.dtype != np.uint16 and len(values) and (values.min() < 0 or values.max() > _UINT16_MAX):
         index = int(np.flatnonzero((values < 0) | (values > _UINT16_MAX))[0])
         raise EventError(
@@ -245,8 +280,10 @@ def _coordinate(name: str, values: NDArray[Any]) -> NDArray[Any]:
 def _polarity(values: NDArray[Any]) -> NDArray[np.bool_]:
     if values.dtype == np.bool_:
         return values
-    if values.dtype.kind not in "iu":
+    if values.dtype.kind not in "iuf":
         raise EventError(f"events: polarity is {values.dtype}; bool, 0/1 or -1/+1 is needed")
+    if values.dtype.kind == "f":
+        _require_whole("polarity", values)
     if len(values) and (values.min() < -1 or values.max() > 1):
         index = int(np.flatnonzero((values < -1) | (values > 1))[0])
         raise EventError(

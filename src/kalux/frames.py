@@ -1,16 +1,18 @@
-"""Frames: an image with the start and end of its exposure."""
+"""Frames, an image with the start and end of its exposure; and reference images."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any, Final, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kalux.errors import ExposureError, FrameError
+from kalux.events import LATEST
 
 Stamp = Literal["start", "middle", "end"]
 """Which moment of the exposure a frame's single time stamp marks."""
@@ -20,9 +22,6 @@ Mosaic = Literal["RGGB", "BGGR", "GRBG", "GBRG"]
 
 MOSAICS: Final[tuple[Mosaic, ...]] = get_args(Mosaic)
 
-
-_LATEST: Final = 10**18
-"""us, 32 000 years: what later sums of times still have room for in an int64."""
 
 _LARGE_FLOAT: Final = 16.0
 """Of frames in floats: more than a camera's highlights in units of white can be expected to have."""
@@ -36,7 +35,8 @@ class Frame:
     ----------
     image
         The raw camera response I^F, uint8, uint16, float32 or float64: (height, width), grey or a Bayer mosaic; or
-        (height, width, 3), red, green, blue of a camera whose events see all colours.
+        (height, width, 3), red, green, blue of a camera whose events see all colours. Values below 0, as of frames less
+        a dark one, count as 0.
     exposure_start, exposure_end
         First and last moment of the exposure, int microseconds, in the clock of the events. Equal where a
         recording stores only one stamp per frame (see `Recording.exposure_known`).
@@ -57,6 +57,11 @@ class Frame:
     white: float | None = None
     mosaic: Mosaic | None = None
     valid: NDArray[np.bool_] | None = None
+
+    def __repr__(self) -> str:
+        image = self.image
+        kind = f"{image.dtype} {image.shape}" if isinstance(image, np.ndarray) else type(image).__name__
+        return f"<kalux.Frame {kind}, {self.colours}, exposed from {self.exposure_start} to {self.exposure_end} us>"
 
     @property
     def colours(self) -> str:
@@ -84,7 +89,35 @@ class Frame:
 
     def normalised(self) -> NDArray[np.float64]:
         """The camera response as float64, 0 to 1 = saturated (a float image may exceed 1)."""
-        return self.image.astype(np.float64) / self.white_value
+        return np.maximum(self.image.astype(np.float64) / self.white_value, 0.0)
+
+
+@dataclass(frozen=True)
+class GroundTruth:
+    """Reference images that came with a recording.
+
+    Attributes
+    ----------
+    times
+        (T,) int64, us.
+    images
+        (T, height, width) float32, linear, 1.0 = a saturated frame pixel.
+    masks
+        (T, height, width) bool, True where an image is the truth, if that is not everywhere.
+    noise
+        (read, shot) of images that a camera made: the variance of I is read^2 + shot I, in their unit. None: they have
+        none, or none that is known.
+    """
+
+    times: NDArray[np.int64]
+    images: NDArray[np.float32]
+    masks: NDArray[np.bool_] | None = None
+    noise: tuple[float, float] | None = None
+
+
+def median_exposure(exposures: Iterable[int]) -> int:
+    """us: the exposure at which a saturated pixel is 1, where nothing else is said, of one or more exposures."""
+    return round(float(np.median([*exposures])))
 
 
 def place_exposure(frame: Frame, exposure: int, stamp: Stamp) -> Frame:
@@ -112,9 +145,19 @@ def require_frame(frame: Any, *, where: str = "frames", index: int = 0) -> None:
     FrameError
         If it is something else.
     """
-    if not isinstance(frame, Frame) or not isinstance(frame.image, np.ndarray):
+    if not isinstance(frame, Frame) or not _is_plain(frame.image):
         got = type(frame.image if isinstance(frame, Frame) else frame).__name__
         raise FrameError(f"{where}: frame {index} is a {got}; a kalux.Frame with a NumPy array is needed")
+
+
+def _is_plain(array: Any) -> bool:
+    """Whether it is an array whose functions are those of NumPy arrays."""
+    return isinstance(array, np.ndarray) and not isinstance(array, (np.ma.MaskedArray, np.matrix))
+
+
+def is_white(value: Any) -> bool:
+    """Whether a value can be that of a saturated pixel, in any unit."""
+    return isinstance(value, Real) and 1e-12 <= float(value) <= 1e12
 
 
 def check_frame(
@@ -138,9 +181,9 @@ def check_frame(
     require_frame(frame, where=where, index=index)
     image = frame.image
     _check_times(frame, where, index)
-    if frame.white is not None and not (np.isfinite(frame.white) and frame.white > 0):
+    if frame.white is not None and not is_white(frame.white):
         raise FrameError(
-            f"{where}: frame {index} has the white value {frame.white}; the value of a saturated pixel is needed"
+            f"{where}: frame {index} has the white value {frame.white!r}; the value of a saturated pixel is needed"
         )
     if image.shape not in (sensor_size, (*sensor_size, 3)):
         size = "x".join(str(n) for n in (*image.shape[:2][::-1], *image.shape[2:]))
@@ -151,21 +194,22 @@ def check_frame(
     _check_colours(frame, where, index, previous)
     if image.dtype not in (np.uint8, np.uint16, np.float32, np.float64):
         raise FrameError(
-            f"{where}: frame {index} has dtype {image.dtype}; uint8, uint16, float32 or float64 is needed"
+            f"{where}: frame {index} has dtype {image.dtype}; uint8, uint16, float32 or float64 in this "
+            "machine's order of bytes is needed"
         )
     if image.dtype.kind == "f" and not np.isfinite(image).all():
         y, x = (int(i[0]) for i in np.nonzero(~np.isfinite(image))[:2])
         raise FrameError(f"{where}: frame {index} is not finite (NaN or infinite) at x={x}, y={y}")
     valid = frame.valid
-    if valid is not None and (valid.shape != sensor_size or valid.dtype != bool):
+    if valid is not None and not (_is_plain(valid) and valid.shape == sensor_size and valid.dtype == bool):
+        got = f"{valid.dtype} {valid.shape}" if _is_plain(valid) else type(valid).__name__
         raise FrameError(
-            f"{where}: frame {index} has a mask of valid pixels of {valid.dtype} {valid.shape}; "
-            f"bool {sensor_size} is needed"
+            f"{where}: frame {index} has a mask of valid pixels of {got}; an array of bool {sensor_size} is needed"
         )
     if exposure_known and frame.exposure <= 0:
         raise ExposureError(
             f"{where}: frame {index} has an exposure of {frame.exposure} us; give the real exposure time "
-            "(--exposure, in us)"
+            "(--exposure or exposure=, in us)"
         )
     if previous is not None and frame.exposure_start < previous.exposure_end:
         if frame.exposure_start <= previous.exposure_start:
@@ -184,7 +228,7 @@ def _check_times(frame: Frame, where: str, index: int) -> None:
         whole = isinstance(time, (int, np.integer)) or (
             isinstance(time, (float, np.floating)) and float(time).is_integer()
         )
-        if not whole or not -_LATEST <= time <= _LATEST:
+        if not whole or not -LATEST <= time <= LATEST:
             raise FrameError(
                 f"{where}: frame {index} has an exposure from {frame.exposure_start} to {frame.exposure_end}; whole "
                 "microseconds, at most 10^18, are needed"

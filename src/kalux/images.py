@@ -55,6 +55,14 @@ class Image:
     final: bool
     colour: NDArray[np.float32] | None = None
 
+    def __repr__(self) -> str:
+        height, width = self.intensity.shape
+        least, most = (f"{limit(self.intensity):.4g}" for limit in (np.min, np.max))
+        return (
+            f"<kalux.Image at {self.t} us: {width} x {height} pixels, {'grey' if self.colour is None else 'colour'}, "
+            f"intensity {least} to {most}, {'final' if self.final else 'not final'}>"
+        )
+
     def grey(self) -> Image:
         """The same image without colours: its intensity is the luminance of ``colour``."""
         if self.colour is None:

@@ -19,8 +19,16 @@ from kalux.augmentation.highlights import Unshown
 from kalux.augmentation.refractory import EventClock
 from kalux.augmentation.trail import FrameTrail
 from kalux.compiled import event_words
-from kalux.errors import InputError, SettingsError
-from kalux.events import EVENT_DTYPE, EventArray, as_events, check_events, checked_size
+from kalux.errors import InputError, SettingsError, require_type
+from kalux.events import (
+    EVENT_DTYPE,
+    NEVER,
+    EventArray,
+    as_events,
+    check_events,
+    checked_size,
+    checked_thresholds,
+)
 from kalux.filters.akf import State
 from kalux.filters.buffer import EventBuffer
 from kalux.filters.method import USUAL_INTERVAL, Method, Segment
@@ -29,8 +37,9 @@ from kalux.filters.shots import Shot, take_shot
 from kalux.frames import Frame, check_frame
 from kalux.images import Estimate, Image, View, make_image
 from kalux.models.camera import Camera, beyond_white, count_bright
-from kalux.models.colour import Gains, joined_chromaticity, white_balance
+from kalux.models.colour import Gains, white_balance
 from kalux.models.pixels import PixelCalibration, require_size
+from kalux.moments import Moment
 from kalux.settings import Settings
 from kalux.settings import preset as named_preset
 
@@ -80,7 +89,7 @@ class Reconstructor:
     SettingsError
         If a setting or preset is unknown or out of range.
     InputError
-        If ``pixels`` are of a sensor of another size.
+        If ``pixels`` are of a sensor of another size, or an argument has a value or a type that cannot be.
     """
 
     def __init__(
@@ -97,9 +106,13 @@ class Reconstructor:
         pixels: PixelCalibration | None = None,
     ) -> None:
         self.sensor_size = checked_size(sensor_size)
+        if settings is not None:
+            require_type("settings", settings, Settings, "kalux.preset")
+        if reference_exposure is not None and _whole(reference_exposure, "reference_exposure") <= 0:
+            raise InputError(f"reference_exposure is {reference_exposure} us; it must be positive")
         self.settings = settings if settings is not None else named_preset(preset)
         self.lookahead = lookahead
-        on, off = _pair(contrast_threshold)
+        on, off = checked_thresholds(contrast_threshold) or (None, None)
         chosen = self.settings.events
         unknown = on is None and chosen.threshold_on is None
         self._estimated = threshold_is_estimate or unknown
@@ -120,6 +133,7 @@ class Reconstructor:
         self._reference = camera.reference_exposure or reference_exposure
         used = dataclasses.replace(self.settings, events=assumed)
         if pixels is not None:
+            require_type("pixels", pixels, PixelCalibration, "kalux.load_calibration(...).pixels")
             require_size(pixels, self.sensor_size)
         self._ignored = pixels.hot if pixels is not None and pixels.hot.any() else None
         self._method: Method = make_method(used, self.thresholds, lookahead, self.sensor_size, pixels)
@@ -151,8 +165,14 @@ class Reconstructor:
         ------
         FrameError, ExposureError
             Wrong size, not finite, out of order, empty exposure.
+        InputError
+            If no more frames were to come: images that they would change have been final.
         """
         self._require_open()
+        if self._frames_ended:
+            raise InputError(
+                "push: end_frames() was called, no frame can be pushed after it; a new Reconstructor can begin with it"
+            )
         check_frame(frame, self.sensor_size, index=self._frame_count, previous=self._last_frame)
         self._reference = self._reference or frame.exposure
         if self._tail is None:
@@ -217,8 +237,14 @@ class Reconstructor:
             self._events.drop(self._needed_from)
 
     def advance(self, t: int) -> None:
-        """Declare that all events stamped up to ``t`` (us) have been pushed: silence is information too."""
-        t -= self._delay
+        """Declare that all events stamped up to ``t`` (us) have been pushed: silence is information too.
+
+        Raises
+        ------
+        InputError
+            If ``t`` is not a whole number.
+        """
+        t = _whole(t, "advance: the time") - self._delay
         self._complete_until = t if self._complete_until is None else max(t, self._complete_until)
 
     @property
@@ -231,7 +257,7 @@ class Reconstructor:
         return self._finished or (self._complete_until is not None and self._complete_until >= t)
 
     def end_frames(self) -> None:
-        """Declare that no more frames come."""
+        """Declare that no more frames come: without one, images after the last are final, and memory can be freed."""
         self._frames_ended = True
 
     def finish(self) -> None:
@@ -242,7 +268,13 @@ class Reconstructor:
         """Promise not to read before ``t`` (us), so that the memory of what led there can be freed.
 
         Frees what is final; reading frees in the same way, but only up to the segment that is read.
+
+        Raises
+        ------
+        InputError
+            If ``t`` is not a whole number.
         """
+        t = _whole(t, "forget: the time")
         final_until = self.final_until
         if (
             not self._shots
@@ -302,7 +334,7 @@ class Reconstructor:
         InputError
             If ``t`` is not a whole number, no frame has been pushed, or ``t`` lies before what can still be read.
         """
-        t = _whole(t)
+        t = _whole(t, "read: the time")
         if not self._shots:
             raise InputError("read: no frame has been pushed yet; events alone say nothing of the intensity")
         begin = self.begin_time
@@ -317,20 +349,21 @@ class Reconstructor:
         log_intensity, variance = self._method.read(progress.segment, progress.cursor, t)
         final_until = self.final_until
         final = final_until is not None and t <= final_until
+        moment = self._moment(progress, t)
         return Estimate(
             t,
             log_intensity,
             variance,
-            self._white(progress, t),
-            final,
-            self._method.moving(progress.segment, progress.cursor),
-            _between(progress, t) if self.lookahead else 1.0,
-            self._chroma(progress, t),
-            self._unshown(progress, variance),
-            self._method.silent_change(progress.segment),
-            self._method.around(progress.segment, t) if self._joins(progress) else None,
-            self._exposed(progress),
-            self._since(progress, t),
+            white=moment.white(self.settings.camera.offset),
+            final=final,
+            moving=self._method.moving(progress.segment, progress.cursor),
+            between=moment.between,
+            chroma=moment.chroma(),
+            unshown=self._unshown(progress, variance),
+            silent_change=self._method.silent_change(progress.segment),
+            around=None if moment.after is None else self._method.around(progress.segment, t),
+            exposed=moment.exposed,
+            since=moment.since(self._interval),
         )
 
     def trail(self, t: int) -> NDArray[np.floating[Any]] | None:
@@ -386,50 +419,13 @@ class Reconstructor:
         assert tail is not None
         return beyond_white(tail)
 
-    def _chroma(self, progress: _Progress, t: int) -> NDArray[np.float32] | None:
-        """What RGB frames say of the chromaticity at ``t``: those before and after, by their distance in time."""
-        first = self._shots[0]
-        if first.chroma is None:
-            return None
-        fraction = 0.0
-        shots = [first]
-        if self._joins(progress):
-            second = self._shots[1]
-            shots.append(second)
-            fraction = min(max((t - first.middle) / (second.middle - first.middle), 0.0), 1.0)
-        weights = (1.0 - fraction, fraction)
-        parts = [
-            (weight, shot.chroma, shot.chroma_weight)
-            for weight, shot in zip(weights, shots, strict=False)
-            if shot.chroma is not None and shot.chroma_weight is not None
-        ]
-        return joined_chromaticity(parts)
-
-    def _joins(self, progress: _Progress) -> bool:
-        """Whether the segment uses the frames at both its ends."""
-        return self.lookahead and progress.ready and progress.starts_frame
-
-    def _exposed(self, progress: _Progress) -> float:
-        """The share of the time for which frames are exposed, by those around; 0 where there is only one."""
-        if not self._joins(progress):
-            return 0.0
-        first, second = self._shots[:2]
-        exposures = first.end - first.start + second.end - second.start
-        return min(exposures / 2 / (second.middle - first.middle), 1.0)
-
-    def _since(self, progress: _Progress, t: int) -> float | None:
-        """Time to the only frame, in intervals; None where there are two."""
-        return None if self._joins(progress) else abs(t - self._shots[0].middle) / self._interval
-
-    def _white(self, progress: _Progress, t: int) -> float:
-        """log(I + I_0) of the brightest level that frames show at ``t``: from one frame's to the next's."""
-        offset = self.settings.camera.offset
-        white = float(np.log(self._shots[0].white + offset))
-        if not self._joins(progress):
-            return white
+    def _moment(self, progress: _Progress, t: int) -> Moment:
+        """The time ``t`` in a segment under way, with the frames at both its ends where it uses both."""
         segment = progress.segment
-        fraction = (t - segment.start) / (segment.end - segment.start)
-        return white + fraction * (float(np.log(self._shots[1].white + offset)) - white)
+        if not (self.lookahead and progress.ready and progress.starts_frame):
+            return Moment(t, self._shots[0], None, 0.0)
+        share = (t - segment.start) / (segment.end - segment.start)
+        return Moment(t, self._shots[0], self._shots[1], share)
 
     # Segments.
 
@@ -542,28 +538,9 @@ class Reconstructor:
         progress.taken = taken
 
 
-def _whole(t: Any) -> int:
+def _whole(t: Any, what: str) -> int:
     """A time as an int. Fractions are refused, not cut off: they may be seconds."""
     with contextlib.suppress(TypeError, ValueError, OverflowError):
-        if int(t) == t:
+        if int(t) == t and NEVER < t < -NEVER:  # room for times of frames and events, with their delay
             return int(t)
-    raise InputError(f"read: the time is {t!r}; whole microseconds are needed")
-
-
-def _between(progress: _Progress, t: int) -> float:
-    """4 s (1 - s) at the share s of the way from one frame to the next; 1 where there is only one of them."""
-    segment = progress.segment
-    if not (progress.ready and progress.starts_frame):
-        return 1.0
-    share = (t - segment.start) / (segment.end - segment.start)
-    return 4.0 * share * (1.0 - share)
-
-
-def _pair(threshold: float | tuple[float, float] | None) -> tuple[float | None, float | None]:
-    if threshold is None:
-        return None, None
-    on, off = (float(value) for value in np.broadcast_to(np.asarray(threshold, np.float64), 2))
-    for value in (on, off):
-        if not (np.isfinite(value) and value > 0):
-            raise InputError(f"contrast threshold is {value}; it must be positive (log intensity, e.g. 0.2)")
-    return on, off
+    raise InputError(f"{what} is {t!r}; whole microseconds, at most 10^18, are needed")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import warnings
 from collections.abc import Callable, Iterable, Iterator
 from itertools import islice
 from numbers import Real
@@ -17,14 +18,31 @@ from numpy.typing import NDArray
 from kalux import readers
 from kalux.compiled import event_column, event_row, event_words
 from kalux.errors import ExposureError, FormatError, FrameError, InputError
-from kalux.events import EventArray, as_events, check_events, checked_size
-from kalux.frames import MOSAICS, Frame, Mosaic, Stamp, check_frame, place_exposure, require_frame
+from kalux.events import (
+    LATEST,
+    EventArray,
+    as_events,
+    check_events,
+    checked_size,
+    checked_thresholds,
+)
+from kalux.frames import (
+    MOSAICS,
+    Frame,
+    GroundTruth,
+    Levels,
+    Mosaic,
+    Stamp,
+    check_frame,
+    is_white,
+    place_exposure,
+    require_frame,
+)
 from kalux.models.colour import sample_mosaic
-from kalux.readers import CHUNK_EVENTS, GroundTruth, Source, joined
+from kalux.readers import CHUNK_EVENTS, Source, joined
 
 T = TypeVar("T")
 
-_FIRST: Final = np.iinfo(np.int64).min
 _LARGEST_SIDE: Final = 1 << 16  # coordinates of events have 16 bits
 
 
@@ -133,8 +151,8 @@ class Recording:
             isinstance(exposure, Real) and exposure > 0 and float(exposure).is_integer()
         ):
             raise ExposureError(f"exposure is {exposure} us; it must be positive and whole")
-        if white is not None and not (np.isfinite(white) and white > 0):
-            raise InputError(f"white is {white}; the value of a saturated pixel is needed")
+        if white is not None and not is_white(white):
+            raise InputError(f"white is {white!r}; the value of a saturated pixel is needed")
         if stamp not in ("start", "middle", "end"):
             raise InputError(f"stamp is {stamp!r}; it must be 'start', 'middle' or 'end'")
         if mosaic not in (None, "none", *MOSAICS):
@@ -162,6 +180,8 @@ class Recording:
         sensor_size: tuple[int, int],
         columns: str | None = None,
         time_unit: str | None = None,
+        exposure: int | None = None,
+        stamp: Stamp = "start",
         contrast_threshold: float | tuple[float, float] | None = None,
         inverse_covariance: NDArray[np.float64] | None = None,
         ground_truth: GroundTruth | None = None,
@@ -177,6 +197,8 @@ class Recording:
             `Frame` objects in time order.
         sensor_size
             (height, width), pixels.
+        exposure, stamp
+            Of frames that have one time stamp each, which is then their ``exposure_start``: as of `kalux.open`.
         contrast_threshold
             Log-intensity step of an event, or (on, off), if known.
         inverse_covariance
@@ -190,14 +212,17 @@ class Recording:
         ------
         EventError, FrameError, ExposureError, InputError
             At once, not only when iterated.
+
+        Warns
+        -----
+        UserWarning
+            If what is taken for white can hardly be right.
         """
         size = checked_size(sensor_size)
         array = as_events(events, columns=columns, time_unit=time_unit)
         frame_list = list(frames)
         for index, frame in enumerate(frame_list):
             require_frame(frame, where=name, index=index)
-        if isinstance(contrast_threshold, (int, float)):
-            contrast_threshold = (float(contrast_threshold), float(contrast_threshold))
 
         def chunks() -> Iterator[EventArray]:
             for start in range(0, len(array), CHUNK_EVENTS):
@@ -212,16 +237,22 @@ class Recording:
                 frames=lambda: iter(frame_list),
                 count_events=lambda: len(array),
                 count_frames=lambda: len(frame_list),
-                contrast_threshold=contrast_threshold,
+                contrast_threshold=checked_thresholds(contrast_threshold),
                 inverse_covariance=inverse_covariance,
                 ground_truth=None if ground_truth is None else lambda: ground_truth,
                 mosaic=frame_list[0].mosaic if frame_list else None,
-            )
+            ),
+            exposure=exposure,
+            stamp=stamp,
         )
         for _ in recording.events():
             pass
-        for _ in recording.frames():
+        levels = Levels()
+        for _ in levels.watched(recording.frames()):
             pass
+        doubt = levels.doubt()
+        if doubt is not None:
+            warnings.warn(f"{name}: {doubt}", stacklevel=2)
         return recording
 
     def __repr__(self) -> str:
@@ -281,14 +312,16 @@ class Recording:
         count, previous_t = 0, None
         height, width = self.sensor_size
         for chunk in self.source.events():
-            earliest = _FIRST if previous_t is None else previous_t
-            if not _are_fine(event_words(chunk), earliest, np.uint64(height), np.uint64(width)):
+            if len(chunk) == 0:
+                continue
+            earliest, latest = -LATEST if previous_t is None else previous_t, int(chunk["t"][-1])
+            fine = _are_fine(event_words(chunk), earliest, np.uint64(height), np.uint64(width))
+            if not fine or latest > LATEST:
                 where = str(self.source.path)
                 check_events(chunk, self.sensor_size, where=where, first_index=count, previous_t=previous_t)
-            if len(chunk):
-                count += len(chunk)
-                previous_t = int(chunk["t"][-1])
-                yield chunk
+            count += len(chunk)
+            previous_t = latest
+            yield chunk
 
     def _checked_frames(self, *, as_stored: bool = False) -> Iterator[Frame]:
         previous, longest = None, 0

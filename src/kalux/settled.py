@@ -9,9 +9,10 @@ import numpy as np
 from kalux.calibration.levels import find_ceiling
 from kalux.recording import Recording
 from kalux.settings import AUTO, CameraSettings, Settings
+from kalux.wording import how_many
 
 if TYPE_CHECKING:
-    from kalux.pipeline import Plan
+    from kalux.planning import Plan
 
 ORIGINS: Final = {
     "settings": "given",
@@ -20,7 +21,7 @@ ORIGINS: Final = {
     "estimate": "estimated",
     "assumed": "usual of the preset, the recording does not tell",
 }
-"""What to call where thresholds come from (`kalux.pipeline.ThresholdOrigin`)."""
+"""What to call where thresholds come from (`kalux.planning.ThresholdOrigin`)."""
 
 _NOTABLE_SHARE: Final = 0.05
 _ALIKE: Final = (
@@ -36,7 +37,7 @@ def settled(recording: Recording, plan: Plan, asked: Settings) -> list[tuple[str
     Parameters
     ----------
     recording, plan
-        From `kalux.pipeline.plan`.
+        From `kalux.planning.plan`.
     asked
         The settings before the plan filled in what was missing; what they state is said to be given.
     """
@@ -130,7 +131,7 @@ def _threshold_origin(plan: Plan) -> str:
             f"{100 * found.usual_share:.0f} % usual of the preset, as the recording hardly tells: +- "
             f"{100 * found.spread:.0f} %"
         )
-    text = f"{ORIGINS['estimate']} from {found.samples:,} samples, residual {found.residual:.2f}"
+    text = f"{ORIGINS['estimate']} from {how_many(found.samples, 'sample')}, residual {found.residual:.2f}"
     text += f": +- {100 * found.spread:.0f} %"
     if found.usual_share > _NOTABLE_SHARE:
         text += f"; {100 * found.usual_share:.0f} % is the usual of the preset, as little moves"
@@ -142,7 +143,7 @@ def _refractory_origin(plan: Plan, asked: Settings) -> str:
         return _GIVEN
     if plan.estimate is None:
         return _USUAL
-    return f"estimated from {plan.estimate.samples:,} samples"
+    return f"estimated from {how_many(plan.estimate.samples, 'sample')}"
 
 
 def _delay_origin(plan: Plan, asked: Settings) -> str:
@@ -157,7 +158,11 @@ def _delay_origin(plan: Plan, asked: Settings) -> str:
 def _model_origin(plan: Plan, asked: float | None) -> str:
     if asked is not None:
         return _GIVEN
-    return _USUAL if plan.event_model is None else f"estimated from {plan.event_model.samples:,} samples"
+    return (
+        _USUAL
+        if plan.event_model is None
+        else f"estimated from {how_many(plan.event_model.samples, 'sample')}"
+    )
 
 
 def _estimated(asked: float | None, found: bool) -> str:

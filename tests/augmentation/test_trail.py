@@ -12,8 +12,7 @@ from kalux.augmentation import trail
 from kalux.augmentation.deblur import count_chunks
 from kalux.augmentation.refractory import EventClock
 from kalux.events import make_events
-
-from builders import altered
+from kalux.settings import altered
 
 SHAPE = (3, 4)
 

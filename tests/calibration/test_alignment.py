@@ -99,7 +99,7 @@ def test_events_of_another_scene_are_refused(shots):
 
 
 def test_what_is_too_little():
-    with pytest.raises(InputError, match="2 frames are too few"):
+    with pytest.raises(InputError, match="2 frames, too few"):
         take_shots([frame(5, 0, 1), frame(5, 2, 3)], CAMERA)
     dark = [Frame(np.zeros((240, 320), np.uint8), t, t + 1) for t in (0, 10, 20)]
     begin = Registration.of_rig(small_rig())

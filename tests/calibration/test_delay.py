@@ -11,10 +11,10 @@ from kalux import PRESETS, Recording, reconstruct
 from kalux.calibration import delay
 from kalux.calibration.delay import best_delay, delays, estimate_delay
 from kalux.datasets import SensorSettings
-from kalux.pipeline import plan
-from kalux.settings import CameraSettings
+from kalux.planning import plan
+from kalux.settings import CameraSettings, altered
 
-from builders import altered, moving_blocks
+from builders import moving_blocks
 
 CAMERA = CameraSettings()
 

@@ -20,7 +20,7 @@ from kalux.calibration.event_model import (
 )
 from kalux.datasets import SensorSettings, pan, photograph_scene, simulate
 from kalux.datasets.ahdr import ArtificialCamera, artificial_hdr
-from kalux.pipeline import plan
+from kalux.planning import plan
 from kalux.settings import CameraSettings
 
 from builders import dark_scene

@@ -10,7 +10,7 @@ import pytest
 from kalux import PRESETS, Recording
 from kalux.calibration.mismatch import SPREADS, estimate_mismatch
 from kalux.datasets import SensorSettings, pan, photograph_scene, simulate
-from kalux.pipeline import plan
+from kalux.planning import plan
 from kalux.settings import CameraSettings
 
 CAMERA = CameraSettings(log_offset=0.02)

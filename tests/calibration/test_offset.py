@@ -102,7 +102,7 @@ def test_the_busiest_stretch():
 
 def test_what_cannot_be_told():
     seen = distant_recording()
-    with pytest.raises(InputError, match="frames are too few"):
+    with pytest.raises(InputError, match="frames, too few"):
         frame_changes(seen.frames[:4], None, CAMERA)
     changes = frame_changes(seen.frames, None, CAMERA)
     with pytest.raises(InputError, match="no events from"):

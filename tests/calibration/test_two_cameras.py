@@ -14,8 +14,8 @@ from kalux.calibration.two_cameras import open_frames, register, triggered
 from kalux.datasets import Sampling
 from kalux.datasets.exposure import frame_stream, plan_exposures
 from kalux.errors import ExposureError, InputError
-from kalux.readers import hdf5
 from kalux.readers.source import TRIGGER_DTYPE
+from kalux.writers import hdf5
 from rigs import DISTANCE, OFFSET, SENSOR, distant_recording, misplaced, small_rig
 
 SIZES = {"events_size": (120, 160), "frames_size": (240, 320)}

@@ -11,10 +11,11 @@ import kalux
 from kalux import PRESETS, Frame, Recording, load_calibration, settings
 from kalux.calibration.values import Calibration, describe_calibration
 from kalux.errors import FormatError, InputError, SettingsError
-from kalux.pipeline import plan
+from kalux.planning import plan
+from kalux.settings import altered
 from kalux.writers.calibration import save_calibration
 
-from builders import altered, events, pixel_events
+from builders import events, pixel_events
 
 SHAPE = (3, 4)
 

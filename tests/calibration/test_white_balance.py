@@ -12,6 +12,7 @@ from kalux.calibration.white_balance import grey_world
 from kalux.errors import FrameError
 from kalux.frames import Frame
 from kalux.models.colour import sample_mosaic, scaled_gains
+from kalux.planning import plan
 from kalux.recording import Recording
 from kalux.settings import CameraSettings
 
@@ -48,6 +49,6 @@ def test_nothing_well_exposed_is_said():
 def test_a_plan_has_the_gains_that_were_measured():
     _, made = colour_blocks("RGGB")
     wanted = dataclasses.replace(kalux.PRESETS["default"], camera=CameraSettings(white_balance="grey-world"))
-    plan = kalux.pipeline.plan(made.recording(), at="frames", settings=wanted)
-    gains = [float(g) for g in plan.settings.camera.white_balance.split(";")]
+    planned = plan(made.recording(), at="frames", settings=wanted)
+    gains = [float(g) for g in planned.settings.camera.white_balance.split(";")]
     assert gains == pytest.approx(grey_world(made.recording(), CameraSettings()), abs=1e-4)

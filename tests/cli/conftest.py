@@ -17,7 +17,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import kalux
 from kalux.cli import main
 from kalux.datasets import SensorSettings, pan, photograph_scene, simulate
-from kalux.readers import hdf5
+from kalux.writers import hdf5
 
 SOURCE = Path(kalux.__file__).resolve().parent.parent
 

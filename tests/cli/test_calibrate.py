@@ -8,7 +8,7 @@ import pytest
 
 from kalux import load_calibration
 from kalux.models.camera import Response
-from kalux.readers import hdf5
+from kalux.writers import hdf5
 from recordings import SIZE, small_events
 
 from builders import blocks

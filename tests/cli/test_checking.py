@@ -12,7 +12,7 @@ from kalux import Recording
 from kalux.cli.checking import check_beside, check_recording
 from kalux.errors import EventError, InputError
 
-from builders import random_stream
+from builders import events, frame, random_stream
 
 STREAM = random_stream(5)
 WHOLE = Recording.from_arrays(STREAM.events, STREAM.frames, sensor_size=STREAM.sensor_size)
@@ -64,6 +64,21 @@ def test_enough_are_those_after_the_first_frame_begins():
     with pytest.raises(EventError, match="event 200"):
         check_recording(in_parts(parts), lambda count: None, 131)
     assert check_recording(in_parts(parts[:4]), lambda count: None, 131).complete
+
+
+def test_a_long_time_without_a_frame_is_told():
+    def frames(*starts):
+        return Recording.from_arrays(
+            events(), [frame(9, t, t + 1000) for t in starts], sensor_size=(1, 1), contrast_threshold=0.2
+        )
+
+    usual = range(0, 200_000, 40_000)
+    found = check_recording(frames(*usual, 20_000_000), lambda _: None)
+    assert found.gap == (161_000, 20_000_000)
+    assert check_recording(frames(*usual, 5_000_000), lambda _: None).gap is None
+    slow = (0, 60_000_000, 120_000_000, 300_000_000)  # a picture a minute, two missed
+    assert check_recording(frames(*slow), lambda _: None).gap is None
+    assert check_recording(frames(0), lambda _: None).gap is None
 
 
 @pytest.mark.parametrize("threads", [1, 2])

@@ -12,8 +12,8 @@ import pytest
 
 from kalux.evaluation.baselines import OPTIONAL, methods
 from kalux.evaluation.held_out import evaluate_held_out, hold_out_frames
-from kalux.readers import hdf5
 from kalux.recording import open as open_recording
+from kalux.writers import hdf5
 
 from builders import moving_blocks
 

@@ -8,7 +8,7 @@ import pytest
 
 from kalux.datasets import SensorSettings, hdr, pan, photograph_scene, simulate
 from kalux.models.camera import Response
-from kalux.readers import hdf5
+from kalux.writers import hdf5
 
 from builders import blocks
 

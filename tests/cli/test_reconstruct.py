@@ -290,6 +290,24 @@ class TestWhatIsSaid:
         assert "thresholds are unknown and assumed" in found.err
         assert ("or the sensor's --preset" in found.err) == hinted
 
+    def test_images_where_there_is_no_frame_for_long_are_a_warning(
+        self, cli, simulation, write_recording, tmp_path
+    ):
+        """A clock that leaps: nobody wants to wait for the images of an hour without a frame."""
+        *others, last = simulation.frames
+        late = dataclasses.replace(
+            last,
+            exposure_start=last.exposure_start + 3_600_000_000,
+            exposure_end=last.exposure_end + 3_600_000_000,
+        )
+        path = write_recording(tmp_path / "leap.h5", frames=[*others, late])
+        found = cli("reconstruct", path, "-o", tmp_path / "o", "--format", "npy", "--rate", 0.01)
+        assert found.code == 0, found.err
+        assert "there is no frame for 3,600 s" in found.err
+        assert "36 of 37 images lie there" in found.err
+        part = cli("reconstruct", path, "-o", tmp_path / "p", "--format", "npy", "--end", 0.2, "--quiet")
+        assert "no frame" not in part.err
+
     @pytest.mark.parametrize("shift", [None, 10**9])
     def test_events_that_say_nothing_of_the_frames_are_a_warning(
         self, cli, write_recording, simulation, tmp_path, shift
@@ -520,7 +538,7 @@ class TestThreads:
         assert found.code == 2
         assert "the file has changed" in found.err
         assert len(images_in(out)) == len(times_in(out)) > 5
-        assert f"{len(images_in(out))} images are finished and valid in {out}" in found.err
+        assert f"{len(images_in(out))} images finished and valid in {out}" in found.err
         assert tomllib.loads((out / "kalux.toml").read_text())["complete"] is False
         assert not own_threads()
 
@@ -559,7 +577,7 @@ class TestThreads:
         flags = () if name == "v.mp4" else ("--format", "npy")
         found = cli("reconstruct", recording, "-o", out, "--rate", 200, "--threads", threads, *flags)
         assert found.code == 130
-        assert f"interrupted; 21 images are finished and valid in {out}" in found.err
+        assert f"interrupted; 21 images finished and valid in {out}" in found.err
         assert not own_threads()
 
 
@@ -591,7 +609,7 @@ class TestInterrupt:
         assert process.returncode == 130
         finished = len(times_in(out))
         assert stderr.splitlines()[-1] == (
-            f"kalux: interrupted; {finished:,} images are finished and valid in {out}"
+            f"kalux: interrupted; {finished:,} images finished and valid in {out}"
         )
         assert "Traceback" not in stderr
         assert len(images_in(out)) == finished >= 20
@@ -607,7 +625,7 @@ class TestInterrupt:
         _, stderr = process.communicate(timeout=30)
         assert process.returncode == 130
         with av.open(str(out)) as video:
-            assert f"{video.streams.video[0].frames:,} images are finished and valid in {out}" in stderr
+            assert f"{video.streams.video[0].frames:,} images finished and valid in {out}" in stderr
 
     @pytest.mark.parametrize("threads", [1, 4])
     def test_before_the_first_image(self, cli, recording, tmp_path, monkeypatch, threads):

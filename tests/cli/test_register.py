@@ -11,7 +11,7 @@ import pytest
 import kalux
 from kalux.calibration.registration import Registration
 from kalux.calibration.rig import load_rig, rig_toml
-from kalux.readers import hdf5
+from kalux.writers import hdf5
 from rigs import DISTANCE, OFFSET, board_recording, distant_recording, misplaced, small_rig
 
 
@@ -53,6 +53,8 @@ def test_from_the_board_to_the_reconstruction(cli, files, tmp_path):
     assert (
         abs(tomllib.loads((tmp_path / "offset.toml").read_text())["offset_us"]) < 500
     )  # nothing is left of it
+    silent = cli("calibrate", "offset", out, "--range", "0.2", "--quiet")
+    assert (silent.code, silent.out, silent.err) == (0, "", "")
 
 
 def test_an_offset_file_is_taken(cli, files, tmp_path):

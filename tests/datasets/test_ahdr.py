@@ -11,7 +11,7 @@ from kalux.errors import FrameError, InputError, SettingsError
 from kalux.evaluation.baselines import methods
 from kalux.evaluation.truth import evaluate_truth, prepare_reference
 from kalux.models.camera import Response
-from kalux.readers import hdf5
+from kalux.writers import hdf5
 
 from builders import frame, moving_blocks
 

@@ -14,6 +14,7 @@ from kalux.datasets import hdr
 from kalux.datasets.registration import warped
 from kalux.errors import FormatError, InputError
 from kalux.models.camera import Response
+from kalux.models.colour import LUMINANCE
 
 from builders import blocks
 
@@ -43,7 +44,7 @@ def photographs(radiance, *, response=None, times=TIMES, change=None, seed=0):
 def relative_error(reference, radiance):
     """Robust standard deviation and 99th percentile of the log ratio, the scale taken off."""
     compared = reference.valid & (radiance.mean(axis=2) > 0.02)
-    logs = np.log(reference.luminance[compared] / (radiance @ hdr.LUMINANCE)[compared])
+    logs = np.log(reference.luminance[compared] / (radiance @ LUMINANCE)[compared])
     logs -= np.median(logs)
     return 1.4826 * np.median(np.abs(logs)), np.percentile(np.abs(logs), 99)
 
@@ -116,10 +117,10 @@ def test_what_moved_is_left_out(scene, exposure):
         return changed
 
     pictures = photographs(scene, change=box)
-    truth = scene[60:110, 80:150] @ hdr.LUMINANCE
+    truth = scene[60:110, 80:150] @ LUMINANCE
     found, kept = (hdr.hdr_reference(pictures, aligned=False, ghosts=g) for g in (True, False))
     still = hdr.hdr_reference(photographs(scene), aligned=False)
-    scale = np.median((still.luminance / (scene @ hdr.LUMINANCE))[still.valid])
+    scale = np.median((still.luminance / (scene @ LUMINANCE))[still.valid])
 
     def wrong(reference):
         seen = np.maximum(reference.luminance[60:110, 80:150], 1e-6)
@@ -168,7 +169,7 @@ def test_photographs_are_aligned(scene):
     still = np.linalg.matrix_power(turn, best)
     truth = np.nan_to_num(warped(scene, still, SHAPE))
     reference = hdr.hdr_reference(pictures, response=Response.srgb())
-    light = np.maximum(reference.luminance, 1e-6) / (truth @ hdr.LUMINANCE + 1e-6)
+    light = np.maximum(reference.luminance, 1e-6) / (truth @ LUMINANCE + 1e-6)
     ratio = np.log(light)[inside][reference.valid[inside]]
     assert 1.4826 * np.median(np.abs(ratio - np.median(ratio))) < 0.04
 

@@ -12,7 +12,7 @@ from kalux.errors import FormatError, InputError
 from kalux.evaluation.baselines import methods
 from kalux.evaluation.method import Estimated, Method
 from kalux.evaluation.truth import evaluate_truth, load_truth, prepare_reference
-from kalux.readers import GroundTruth
+from kalux.frames import GroundTruth
 
 from builders import moving_blocks
 

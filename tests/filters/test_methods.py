@@ -21,8 +21,9 @@ from kalux.events import make_events
 from kalux.filters.methods import make_method
 from kalux.filters.shots import take_shot
 from kalux.models.camera import Camera, Response
+from kalux.settings import altered
 
-from builders import VARIANTS, altered, events, random_stream
+from builders import VARIANTS, events, random_stream
 
 THRESHOLD = 0.2
 MODES = pytest.mark.parametrize("lookahead", [True, False], ids=["lookahead", "causal"])

@@ -10,7 +10,7 @@ import pytest
 import kalux
 from kalux.errors import ExposureError, FormatError, FrameError, InputError
 from kalux.frames import Frame
-from kalux.readers import hdf5
+from kalux.writers import hdf5
 from recordings import SIZE, damaged, same_frames, small_events, small_frames
 
 EVENTS = small_events()
@@ -72,6 +72,14 @@ def test_files_are_taken_in_the_order_of_the_list(events_only, tmp_path):
     names = ["d.png", "c.png", "b.png", "a.png"]
     row = LISTS["files"][1]
     folder = write_list(tmp_path / "images", LISTS["files"][0], row, names=names)
+    assert same_frames(kalux.open(events_only, frames=folder).frames(), small_frames())
+
+
+def test_images_that_no_list_names_are_in_the_order_of_their_numbers(events_only, tmp_path):
+    """9.png before 10.png; what other systems leave beside them (._9.png) is no image."""
+    header, row = LISTS["exposures in us"]
+    folder = write_list(tmp_path / "images", header, row, names=["8.png", "9.png", "10.png", "11.png"])
+    (folder / "._9.png").write_bytes(b"Mac OS X")
     assert same_frames(kalux.open(events_only, frames=folder).frames(), small_frames())
 
 

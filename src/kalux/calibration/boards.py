@@ -21,6 +21,7 @@ from kalux.calibration.rig import Lens, Rig
 from kalux.errors import InputError
 from kalux.events import EventArray
 from kalux.frames import Frame
+from kalux.wording import how_many
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
@@ -337,8 +338,9 @@ def calibrate_rig(
 def _require(views: list[View]) -> None:
     if len(views) < LEAST_VIEWS:
         raise InputError(
-            f"both cameras saw the whole board, still, in {len(views)} places only; {LEAST_VIEWS} are the least, 15 to "
-            "30 are good: hold the rig still for a second in each, tilt the board, fill both images"
+            f"both cameras saw the whole board, still, in {how_many(len(views), 'place')} only; "
+            f"{LEAST_VIEWS} are the least, 15 to 30 are good: hold the rig still for a second in each, tilt the board, "
+            "fill both images"
         )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from io import BytesIO
+from typing import Final
 
 import numpy as np
 
@@ -25,15 +26,17 @@ def require_matplotlib() -> None:
         raise MissingDependencyError("pictures need matplotlib; pip install 'kalux[plots]'") from error
 
 
-def response_figure(curves: Sequence[Response], *, floor: float = 0.02) -> bytes:
+_FLOOR: Final = 0.02
+"""Least f^w, which caps the covariance shown."""
+
+
+def response_figure(curves: Sequence[Response]) -> bytes:
     """A PNG like Figure 2 of the paper: response, certainty (4), weighting (5), and covariance (6) with sigma_im = 1.
 
     Parameters
     ----------
     curves
         One, or one per colour channel (red, green, blue).
-    floor
-        Least f^w, which caps the covariance shown.
 
     Raises
     ------
@@ -52,7 +55,7 @@ def response_figure(curves: Sequence[Response], *, floor: float = 0.02) -> bytes
         axes[0, 0].plot(irradiance, level, color=colour)
         axes[0, 1].plot(level, curve.certainty(level), color=colour)
         axes[1, 0].plot(level, curve.weight(level), color=colour)
-        axes[1, 1].plot(level, 1 / np.maximum(curve.weight(level), floor), color=colour)
+        axes[1, 1].plot(level, 1 / np.maximum(curve.weight(level), _FLOOR), color=colour)
     texts = (
         ("response (3)", "irradiance", "response"),
         ("certainty (4)", "irradiance", "f^c"),

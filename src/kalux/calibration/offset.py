@@ -22,6 +22,7 @@ from kalux.errors import InputError
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.frames import Frame
 from kalux.settings import CameraSettings
+from kalux.wording import how_many
 
 Array = NDArray[np.float64]
 
@@ -144,7 +145,7 @@ def frame_changes(
         middles.append(frame.middle)
     if len(middles) < _LEAST_FRAMES:
         raise InputError(
-            f"offset: {len(middles)} frames are too few; {_LEAST_FRAMES} at least, fifty are good"
+            f"offset: {how_many(len(middles), 'frame')}, too few; {_LEAST_FRAMES} at least, fifty are good"
         )
     return Changes(np.array(middles, np.int64), np.array(rows), registration is not None)
 

@@ -29,6 +29,7 @@ in before it is resampled, so that fine detail does not alias."""
 
 _EDGE: Final = 0.01  # pixels that count as inside beyond the outermost centres: rounding
 
+_LEAST_OVERLAP: Final = 0.05
 _PART: Final = 0.02
 """Share of clipped frame pixels from which a resampled one is no measurement; from 1 less it, it is clipped."""
 
@@ -173,15 +174,15 @@ def undistortion_maps(lens: Lens) -> Maps:
     return straight.maps
 
 
-def require_overlap(registration: Registration, least: float = 0.05) -> None:
+def require_overlap(registration: Registration) -> None:
     """Refuse a registration by which the cameras hardly see anything in common.
 
     Raises
     ------
     InputError
-        If less than ``least`` of the event camera's pixels lie in the frame.
+        If less than a twentieth of the event camera's pixels lie in the frame.
     """
-    if registration.overlap < least:
+    if registration.overlap < _LEAST_OVERLAP:
         raise InputError(
             f"registration: {100 * registration.overlap:.1f} % of the event camera's pixels lie in the frames; do the "
             "cameras look the same way, and is the rig file theirs?"

@@ -377,7 +377,7 @@ def prediction_residuals(
 # --- images of a recording -----------------------------------------------------------------------------------
 
 
-def still_pixels(recording: Recording, most_frames: int = 400) -> tuple[list[ImageArray], list[float]]:
+def still_pixels(recording: Recording) -> tuple[list[ImageArray], list[float]]:
     """Pixels of one recording under auto-exposure that see no events, as images at several exposure times.
 
     Looks for the longest run of frames that keeps enough pixels (2000) without an event in their 3x3
@@ -392,7 +392,7 @@ def still_pixels(recording: Recording, most_frames: int = 400) -> tuple[list[Ima
     InputError
         If no run has three exposure times, e.g. because the exposure is fixed.
     """
-    frames = list(islice(recording.frames(), most_frames))
+    frames = list(islice(recording.frames(), _MOST_FRAMES))
     best: tuple[list[Frame], NDArray[np.bool_]] | None = None
     for run, still in _still_runs(recording, frames):
         chosen = _distinct(run)
@@ -411,6 +411,7 @@ def still_pixels(recording: Recording, most_frames: int = 400) -> tuple[list[Ima
 
 
 _STILL_PIXELS: Final = 2_000
+_MOST_FRAMES: Final = 400
 
 
 def _still_runs(recording: Recording, frames: list[Frame]) -> Iterator[tuple[list[Frame], NDArray[np.bool_]]]:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from kalux.errors import ExposureError, InputError
 from kalux.readers.source import TRIGGER_DTYPE, TriggerArray
+from kalux.wording import how_many
 
 Times = NDArray[np.int64]
 Edge = Literal["both", "rising", "falling"]
@@ -152,7 +153,7 @@ def match(
         raise InputError("triggers: a number to skip is negative")
     starts, ends = starts[skip_triggers:], ends[skip_triggers:]
     frames = count - skip_frames
-    said = f"{len(starts)} trigger exposures and {frames} frames"
+    said = f"{how_many(len(starts), 'trigger exposure')} and {how_many(frames, 'frame')}"
     if len(starts) == 0 or frames <= 0:
         raise ExposureError(f"triggers: there are {said}")
     missing = len(starts) - frames

@@ -6,9 +6,10 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from kalux.cli.info import add_recording, open_recording
 from kalux.cli.parser import Parser, UsageError, number, whole
+from kalux.cli.recordings import add_recording, open_recording
 from kalux.cli.terminal import say, warn
+from kalux.wording import how_many
 
 _DESCRIPTION = """\
 Make an artificial HDR recording of a real one, as the paper's AHDR data: an artificial camera response makes
@@ -66,9 +67,9 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     """Run the command."""
     import numpy as np
 
-    from kalux.cli.convert import check_name, write_copy
     from kalux.cli.output import check_file
     from kalux.cli.progress import Progress
+    from kalux.cli.recordings import check_name, write_copy
     from kalux.datasets.ahdr import artificial_hdr
     from kalux.settings import CameraSettings
 
@@ -102,7 +103,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
             f"{100 * white / pixels:.1f} % of pixels white, {100 * black / pixels:.1f} % black; "
             f"truth up to {known.max(initial=0.0):.2f} x white, of {share:.1f} % of pixels"
         )
-        say(f"wrote {progress.images:,} frames, {len(truth.times):,} of truth, to {options.out}")
+        say(f"wrote {how_many(progress.images, 'frame')}, {len(truth.times):,} of truth, to {options.out}")
 
 
 def _camera(options: argparse.Namespace) -> Any:

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from kalux.cli.info import add_recording, open_recording
 from kalux.cli.parser import Parser, UsageError, number
+from kalux.cli.recordings import add_recording, open_recording
 from kalux.cli.terminal import say, warn
 from kalux.errors import InputError
+
+if TYPE_CHECKING:
+    from kalux.calibration.offset import OffsetEstimate
 
 _DESCRIPTION = """\
 Estimate what has to be added to the frames' times to have those of the events, where no trigger tells it: by
@@ -35,6 +39,7 @@ def add_command(subparsers: Any) -> None:
     )
     group.add_argument("--plot", type=Path, metavar="FILE.png", help="the correlation over the offset")
     group.add_argument("--overwrite", action="store_true", help="replace files that are there")
+    group.add_argument("--quiet", action="store_true", help="print warnings and errors only")
     parser.set_defaults(run=run)
 
 
@@ -64,6 +69,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     from kalux.calibration.registration import Registration
     from kalux.calibration.rig import Lens
     from kalux.cli.output import check_file, check_picture, write_picture
+    from kalux.cli.progress import Progress, counted
     from kalux.writers.files import save
 
     centre, reach = checked_range(options)
@@ -73,7 +79,14 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     recording = open_recording(options)
     lens = Lens.pinhole(recording.sensor_size)
     same = Registration(lens, lens, np.eye(3))
-    found = estimate_offset(recording.stamped_frames, recording.events, same, centre=centre, reach=reach)
+    with Progress("correlating", quiet=options.quiet) as progress:
+        found = estimate_offset(
+            recording.stamped_frames,
+            lambda: counted(recording.events(), lambda chunk: progress.add(events=len(chunk))),
+            same,
+            centre=centre,
+            reach=reach,
+        )
     if not found.coarse.sure:
         warn(
             f"the correlation is {found.coarse.peak:.2f}, {found.coarse.ratio:.2f} times the next peak: the offset "
@@ -81,15 +94,9 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
         )
     if not recording.exposure_known:
         warn("exposures are unknown: the offset is from the frames' stamps to the middle of their exposures")
-    say(
-        f"offset {found.offset * 1e-3:.2f} ms, standard error {found.standard_error * 1e-3:.2f} ms: "
-        "to be added to the frames' times"
-    )
-    if found.apparent is not None:
-        say(
-            f"with events taken as whole steps, half a threshold late as they come: {found.apparent * 1e-3:.2f} ms"
-        )
-    say(f"correlation {found.coarse.peak:.2f}, {found.coarse.ratio:.2f} times the next peak")
+    if not options.quiet:
+        for line in described(found):
+            say(line)
     if options.plot is not None:
         write_picture(
             options.plot,
@@ -99,7 +106,20 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
         save(options.out, offset_toml(found))
 
 
-def offset_toml(found: Any) -> str:
+def described(found: OffsetEstimate) -> Iterator[str]:
+    """What was found, a line each."""
+    yield (
+        f"offset {found.offset * 1e-3:.2f} ms, standard error {found.standard_error * 1e-3:.2f} ms: "
+        "to be added to the frames' times"
+    )
+    if found.apparent is not None:
+        yield (
+            f"with events taken as whole steps, half a threshold late as they come: {found.apparent * 1e-3:.2f} ms"
+        )
+    yield f"correlation {found.coarse.peak:.2f}, {found.coarse.ratio:.2f} times the next peak"
+
+
+def offset_toml(found: OffsetEstimate) -> str:
     """An offset as the text of its file."""
     import tomli_w
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from kalux.cli.calibrations import add_result, check_result, finish
 from kalux.cli.parser import Parser, UsageError
@@ -24,8 +24,6 @@ examples:
   kalux calibrate response room_*.jpg -o response.toml --plot response.png
   kalux calibrate response a.png b.png c.png --times 0.001,0.004,0.016 -o response.toml
   kalux calibrate response auto_exposure.aedat4 -o response.toml"""
-
-_IMAGES: Final = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm")
 
 
 def add_command(commands: Any) -> None:
@@ -90,9 +88,10 @@ def report(found: ResponseCalibration) -> list[str]:
 def _inputs(options: argparse.Namespace) -> tuple[Any, list[float], Recording | None]:
     from kalux.calibration.photographs import read_exposure, read_photograph
     from kalux.calibration.response import still_pixels
+    from kalux.readers.images import IMAGES
 
     paths = [Path(name) for name in options.inputs]
-    if len(paths) == 1 and paths[0].suffix.lower() not in _IMAGES:
+    if len(paths) == 1 and paths[0].suffix.lower() not in IMAGES:
         import kalux
 
         if options.times is not None:

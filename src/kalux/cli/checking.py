@@ -7,6 +7,9 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from typing import Final, NamedTuple, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from kalux.augmentation.deblur import between, events_until
 from kalux.frames import Levels
 from kalux.recording import Recording, no_frames
@@ -19,6 +22,12 @@ are read. Those of a longer one are checked as they are used: its file is then d
 
 _FEW: Final = 0.1
 """Of the events: a camera that records both has fewer of them between its frames only if it was started wrongly."""
+
+_LONG_GAP: Final = 10_000_000
+"""us without a frame that somebody should hear of: at 100 images/s there are a thousand of them."""
+
+_MANY_INTERVALS: Final = 100
+"""As many times longer than usual: pictures of a slow series are not missed."""
 
 
 class Contents(NamedTuple):
@@ -38,6 +47,8 @@ class Contents(NamedTuple):
         What makes the frames' white value doubtful, if anything does.
     complete
         Whether these are all events, or only the first ones.
+    gap
+        (start, end) us of the longest time without a frame, where it is far longer than usual.
     """
 
     frames: int
@@ -48,6 +59,7 @@ class Contents(NamedTuple):
     colours: str
     doubt: str | None = None
     complete: bool = True
+    gap: tuple[int, int] | None = None
 
     @property
     def seconds(self) -> float:
@@ -109,7 +121,19 @@ def check_recording(
         events_between += len(between(chunk, start - 1, end))
         events_from += len(chunk) - events_until(chunk, start - 1)
         on_events(len(chunk))
-    return Contents(len(exposures), count, start, end, events_between, colours, levels.doubt(), complete)
+    gap = _gap(np.array(exposures, np.int64))
+    return Contents(len(exposures), count, start, end, events_between, colours, levels.doubt(), complete, gap)
+
+
+def _gap(exposures: NDArray[np.int64]) -> tuple[int, int] | None:
+    """The longest time between two of (K, 2) exposures, where it is far longer than usual."""
+    lengths = exposures[1:, 0] - exposures[:-1, 1]
+    if not len(lengths):
+        return None
+    after = int(np.argmax(lengths))
+    if lengths[after] <= max(_LONG_GAP, _MANY_INTERVALS * float(np.median(lengths))):
+        return None
+    return int(exposures[after, 1]), int(exposures[after + 1, 0])
 
 
 def check_beside(

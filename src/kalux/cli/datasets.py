@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 from kalux.cli.parser import Parser, UsageError
 from kalux.cli.terminal import say
 from kalux.errors import InputError
+from kalux.wording import how_many
 
 if TYPE_CHECKING:
     from kalux.datasets.published import PublishedSet, SequenceCheck
@@ -119,5 +120,6 @@ def row(found: SequenceCheck) -> str:
     else:
         height, width = found.sensor_size or (0, 0)
         truth = f", {found.truth:,} of truth" if found.truth else ""
-        lines = [f"{found.name}: {width}x{height}, {found.events:,} events, {found.frames:,} frames{truth}"]
+        held = f"{how_many(found.events, 'event')}, {how_many(found.frames, 'frame')}"
+        lines = [f"{found.name}: {width}x{height}, {held}{truth}"]
     return "\n".join([*lines, *(f"  {text}" for text in found.lacks)])

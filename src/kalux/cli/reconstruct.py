@@ -17,19 +17,21 @@ from kalux.ahead import default_threads
 from kalux.cli.calibrations import add_calibration, given_calibration
 from kalux.cli.checking import Contents, check_beside
 from kalux.cli.flags import HelpSettings, add_display, add_settings, given_settings
-from kalux.cli.info import add_recording, open_recording
 from kalux.cli.output import DEFAULT_RATE, FOLDER_FORMATS, Output, check_output, chosen_output
 from kalux.cli.parser import Parser, UsageError, number, whole
 from kalux.cli.progress import Progress, short_number
+from kalux.cli.recordings import add_recording, open_recording
 from kalux.cli.terminal import say, warn
 from kalux.cli.times import load_times
 from kalux.display import CURVES
 from kalux.errors import InputError
-from kalux.pipeline import Plan, execute, plan
+from kalux.pipeline import execute
+from kalux.planning import Plan, plan
 from kalux.reconstructor import Reconstructor
 from kalux.recording import Recording
 from kalux.settings import PRESETS, Settings, from_dict, load, preset, read_toml, to_dict
 from kalux.settled import ORIGINS, settled
+from kalux.wording import how_many
 
 if TYPE_CHECKING:
     from kalux.calibration.contrast import ThresholdEstimate
@@ -166,6 +168,9 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     for text in contents.warnings():
         warn(text)
     made = part_of(made, contents, options)
+    gap = gap_warning(made, contents)
+    if gap is not None:
+        warn(gap)
     if made.threshold_origin in ("estimate", "assumed"):
         warn(threshold_warning(made, options.preset))
     if made.threshold_origin == "assumed" and made.estimate is not None and contradicts(made.estimate):
@@ -180,7 +185,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     )
     if not options.quiet:
         say(
-            f"wrote       {images:,} images to {output.path} in {seconds:.1f} s "
+            f"wrote       {how_many(images, 'image')} to {output.path} in {seconds:.1f} s "
             f"({short_number(images / seconds)} images/s), settings in {output.settings_path}"
         )
 
@@ -215,7 +220,7 @@ def make_plan(recording: Recording, settings: Settings, times: Any, options: arg
     Raises
     ------
     InputError
-        As of `kalux.pipeline.plan`.
+        As of `kalux.planning.plan`.
     """
     rate = None if times is not None or options.at is not None else options.rate or DEFAULT_RATE
     made = plan(
@@ -286,6 +291,21 @@ def threshold_warning(made: Plan, name: str) -> str:
     )
 
 
+def gap_warning(made: Plan, contents: Contents) -> str | None:
+    """How many images lie where there is no frame for long; None where there is no such time, or no image in it."""
+    if contents.gap is None:
+        return None
+    begin, end = contents.gap
+    images = int(np.count_nonzero((made.times > begin) & (made.times < end)))
+    if not images:
+        return None
+    first, last = ((t - contents.start) * 1e-6 for t in contents.gap)
+    return (
+        f"there is no frame for {(end - begin) * 1e-6:,.0f} s, from {first:.3f} to {last:.3f} s: {images:,} of "
+        f"{how_many(len(made.times), 'image')} lie there; are the times right? --start and --end choose a part"
+    )
+
+
 def contradicts(estimate: ThresholdEstimate) -> bool:
     """Whether many samples say next to nothing of the thresholds."""
     return estimate.samples >= _MANY_SAMPLES and estimate.usual_share > _NEARLY_ALL
@@ -310,7 +330,8 @@ def decided(
     colours = [] if contents.colours == "grey" else [f"colour      {_colour_line(contents, made, options)}"]
     return [
         f"recording   {source.path}: {source.format}, {width}x{height} pixels, {contents.seconds:.3f} s, "
-        f"{contents.frames:,} frames, {'' if contents.complete else 'more than '}{contents.events:,} events",
+        f"{how_many(contents.frames, 'frame')}, "
+        f"{'' if contents.complete else 'more than '}{how_many(contents.events, 'event')}",
         *(
             f"{label:<11} {text}"
             for label, text in settled(recording, made, asked)
@@ -408,4 +429,4 @@ def write_images(
 def _what_is_left(writer: Writer, output: Output) -> str:
     if writer.images == 0 or (output.format == "mp4" and not output.path.exists()):
         return f"no image was finished in {output.path}"
-    return f"{writer.images:,} images are finished and valid in {output.path}"
+    return f"{how_many(writer.images, 'image')} finished and valid in {output.path}"

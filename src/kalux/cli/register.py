@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Any
 from kalux.cli.calibrate_offset import add_range, checked_range, read_offset
 from kalux.cli.calibrate_rig import add_frames
 from kalux.cli.parser import Parser, UsageError, number, whole
+from kalux.cli.recordings import check_stamp
 from kalux.cli.terminal import say, warn
+from kalux.wording import how_many
 
 if TYPE_CHECKING:
     from kalux.calibration.two_cameras import Registered
@@ -98,8 +100,8 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     import kalux
     from kalux.calibration.rig import load_rig
     from kalux.calibration.two_cameras import open_frames, register
-    from kalux.cli.convert import check_name
     from kalux.cli.output import check_file, check_picture, write_picture
+    from kalux.cli.recordings import check_name
     from kalux.settings import CameraSettings
 
     timing = _timing(options)
@@ -163,8 +165,7 @@ def _timing(options: argparse.Namespace) -> str:
         for name in ("trigger_edge", "trigger_input", "skip_triggers", "skip_frames"):
             if getattr(options, name) is not None:
                 raise UsageError(f"--{name.replace('_', '-')} is for --timing triggers")
-        if options.stamp is not None and options.exposure is None:
-            raise UsageError("--stamp says what a frame's time marks for --exposure; give --exposure, too")
+        check_stamp(options)
     elif options.stamp is not None:
         raise UsageError(
             "--stamp is for frames with times of their own; --trigger-edge says what triggers mark"
@@ -224,10 +225,9 @@ def _write(
     frames: Callable[[], Iterable[Frame]],
     exposure_known: bool,
 ) -> None:
-    from kalux.cli.convert import counted
-    from kalux.cli.progress import Progress
+    from kalux.cli.progress import Progress, counted
     from kalux.cli.signals import interrupts_held
-    from kalux.readers import hdf5
+    from kalux.writers import hdf5
 
     with Progress("registering", quiet=options.quiet) as progress, interrupts_held() as let_through:
         hdf5.write(
@@ -240,7 +240,9 @@ def _write(
             response=None if options.response == "linear" else options.response,
         )
     if not options.quiet:
-        say(f"wrote {progress.events:,} events and {progress.images:,} frames to {options.out}")
+        say(
+            f"wrote {how_many(progress.events, 'event')} and {how_many(progress.images, 'frame')} to {options.out}"
+        )
 
 
 def _overlay(found: Registered, frames: Callable[[], Iterable[Frame]], events: Recording) -> Any:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from kalux.cli.parser import Parser, UsageError, number, true_or_false, whole
 from kalux.cli.terminal import say, warn
+from kalux.wording import how_many
 
 if TYPE_CHECKING:
     from kalux.datasets import Motion, Scene, SensorSettings
@@ -256,9 +257,9 @@ def _size(text: str) -> tuple[int, int]:
 
 def run(options: argparse.Namespace, command: list[str]) -> None:
     """Run the command."""
-    from kalux.cli.convert import check_name
     from kalux.cli.output import check_file
     from kalux.cli.progress import Progress
+    from kalux.cli.recordings import check_name
     from kalux.cli.signals import interrupts_held
     from kalux.datasets.record import Watch, record
     from kalux.writers.settings_file import beside, require_ours
@@ -338,8 +339,8 @@ def summary(out: Path, scene: Scene, recorded: Recorded, white: float, seconds: 
     exposures = f"{shortest}" if shortest == longest else f"{shortest} to {longest}"
     on = 100 * recorded.on_events / max(recorded.events, 1)
     return (
-        f"wrote {out}: {width}x{height}, {scene.duration * 1e-6:g} s, {recorded.events:,} events, "
-        f"{recorded.frames} frames, {recorded.truth} images of truth, in {seconds:.1f} s\n"
+        f"wrote {out}: {width}x{height}, {scene.duration * 1e-6:g} s, {how_many(recorded.events, 'event')}, "
+        f"{how_many(recorded.frames, 'frame')}, {how_many(recorded.truth, 'image')} of truth, in {seconds:.1f} s\n"
         f"events: {rate:.2f} Hz per pixel, {on:.0f} % ON; exposures {exposures} us; white is a radiance of {white:.4g}"
     )
 
@@ -354,10 +355,11 @@ def chosen_scene(options: argparse.Namespace, size: tuple[int, int]) -> tuple[Sc
     InputError
         The source cannot be read or used.
     """
-    from kalux.datasets.sources import IMAGE_SUFFIXES, exposed, open_sequence, read_photograph, white_for
+    from kalux.datasets.sources import exposed, open_sequence, read_photograph, white_for
+    from kalux.readers.images import IMAGES, RADIANCE
 
     source: Path = options.source
-    if source.is_file() and source.suffix.lower() in IMAGE_SUFFIXES:
+    if source.is_file() and source.suffix.lower() in IMAGES | RADIANCE:
         photograph = read_photograph(source)
         is_hdr, scene = photograph.is_hdr, _photograph_scene(options, photograph, size)
     else:

@@ -24,11 +24,11 @@ from numpy.typing import NDArray
 
 from kalux.calibration.frame_noise import estimate_frame_noise
 from kalux.errors import FrameError, InputError
-from kalux.frames import Frame
+from kalux.frames import Frame, GroundTruth
 from kalux.models.camera import Camera, Response, inverse_response
-from kalux.readers import GroundTruth
 from kalux.recording import Recording
 from kalux.settings import CameraSettings, chosen_response
+from kalux.wording import how_many
 
 CUTS: Final = (30, 50, 80, 100, 115)
 """Those of the published data, of 255."""
@@ -126,7 +126,9 @@ def artificial_hdr(
     artificial = Response.named(camera.response)
     kept = [f.exposure for i, f in enumerate(recording.frames()) if every is None or i % every != every - 1]
     if len(kept) < 2:
-        raise FrameError(f"{recording.source.path}: {len(kept)} frames are too few for artificial HDR")
+        raise FrameError(
+            f"{recording.source.path}: {how_many(len(kept), 'frame')}, too few for artificial HDR"
+        )
 
     def frames() -> Iterator[Frame]:
         for index, frame in enumerate(recording.frames()):

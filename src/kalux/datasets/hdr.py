@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from kalux.calibration.debevec import CLIPPED_HIGH, CLIPPED_LOW, LEAST_SHARED, LEAST_SPREAD
 from kalux.calibration.homography import find_features
 from kalux.calibration.photographs import read_exposure, read_photograph
-from kalux.calibration.regression import NORMAL_MAD
+from kalux.calibration.regression import robust_deviation
 from kalux.calibration.response import CalibrationName, fit_response, side_by_side
 from kalux.datasets.registration import (
     Match,
@@ -41,15 +41,13 @@ from kalux.datasets.registration import (
 )
 from kalux.errors import FormatError, InputError
 from kalux.models.camera import Response
+from kalux.models.colour import LUMINANCE
+from kalux.readers.images import images_in
 from kalux.readers.numpy_files import DAMAGE
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
-
-SUFFIXES: Final = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
-LUMINANCE: Final = np.array([0.2126, 0.7152, 0.0722])
-"""Of linear red, green and blue, ITU-R BT.709, the primaries of sRGB."""
 
 _TAPER: Final = 10 / 255  # levels over which a weight rises from 0 at a clipped end: merging has no seams
 _LEVEL_NOISE: Final = 1 / 255  # standard deviation of a level: quantisation, and the losses of JPEG
@@ -99,7 +97,7 @@ def read_bracket(folder: Path, exposures: Path | Sequence[float] | None = None) 
         Of images, all of one size.
     exposures
         A CSV with the columns ``file`` and ``exposure_s`` (seconds; other images are left out), or seconds for the
-        images in the order of their names. None: from the images' EXIF data.
+        images in the order of the numbers in their names. None: from the images' EXIF data.
 
     Raises
     ------
@@ -112,7 +110,7 @@ def read_bracket(folder: Path, exposures: Path | Sequence[float] | None = None) 
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; give a folder of photographs")
-    paths = sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith("."))
+    paths = images_in(folder)
     if isinstance(exposures, Path):
         seconds = _listed_exposures(exposures)
         missing = sorted(set(seconds) - {path.name for path in paths})
@@ -495,7 +493,7 @@ def relative_spread(pictures: Sequence[Picture], response: Response, covered: Se
     for k in range(len(pictures) - 1):
         logs = _log_ratio(pictures[k], pictures[k + 1], response, covered[k] & covered[k + 1], _QUIET)
         if len(logs) >= LEAST_SHARED:
-            spreads.append(NORMAL_MAD * float(np.median(np.abs(logs - np.median(logs)))))
+            spreads.append(robust_deviation(logs - np.median(logs)))
             counts.append(len(logs))
     if not spreads:
         return LEAST_SPREAD

@@ -13,7 +13,7 @@ from kalux.datasets.sensors import Sampling, SensorSettings
 from kalux.datasets.simulate import check_seed, truth_images, truth_times
 from kalux.errors import InputError
 from kalux.events import EventArray
-from kalux.readers import hdf5
+from kalux.writers import hdf5
 
 T = TypeVar("T")
 

@@ -27,6 +27,7 @@ from kalux.frames import Frame
 
 Array = NDArray[np.float64]
 
+_RAYS: Final = 3  # either way through a pixel: edges of the board have more than two levels
 _APERTURE: Final = 0.5  # sigma of lens and pixel, in pixels, as in `photograph_scene`
 
 
@@ -267,11 +268,11 @@ def board_scenes(
     )
 
 
-def _fine_rays(lens: Lens, samples: int = 3) -> list[Array]:
-    """Rays through ``samples`` squared points of every pixel."""
+def _fine_rays(lens: Lens) -> list[Array]:
+    """Rays through `_RAYS` x `_RAYS` points of every pixel."""
     height, width = lens.sensor_size
     y, x = np.mgrid[:height, :width].astype(np.float64)
-    steps = (np.arange(samples) + 0.5) / samples - 0.5
+    steps = (np.arange(_RAYS) + 0.5) / _RAYS - 0.5
     return [lens.normalised(np.stack([x.ravel() + j, y.ravel() + i], axis=1)) for i in steps for j in steps]
 
 

@@ -37,8 +37,7 @@ from kalux.datasets.scenes import Scene
 from kalux.datasets.sensors import FloatArray, Sampling, SensorSettings
 from kalux.errors import InputError, SettingsError
 from kalux.events import EventArray
-from kalux.frames import Frame
-from kalux.readers import GroundTruth
+from kalux.frames import Frame, GroundTruth
 from kalux.recording import Recording
 
 

@@ -6,7 +6,6 @@ are decoded as sRGB, 1.0 = their white, above which they know nothing. Colour be
 
 from __future__ import annotations
 
-import re
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -20,14 +19,13 @@ from kalux.datasets.motion import Motion
 from kalux.datasets.scenes import Image, Scene, blurred, camera_matrix, sample
 from kalux.errors import FormatError, InputError
 from kalux.models.camera import Response
-from kalux.readers.source import one_line, reading
+from kalux.models.colour import LUMINANCE
+from kalux.readers.images import IMAGES, RADIANCE, images_in
+from kalux.readers.source import reading
+from kalux.wording import how_many, one_line
 
-HDR_SUFFIXES: Final = frozenset({".hdr", ".pic", ".exr"})
-LDR_SUFFIXES: Final = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp"})
-IMAGE_SUFFIXES: Final = HDR_SUFFIXES | LDR_SUFFIXES
-
-_LUMINANCE: Final = np.array([0.2126, 0.7152, 0.0722])  # of linear R, G, B: ITU-R BT.709
 _KEPT: Final = 4  # decoded images
+_MOMENTS: Final = 16  # of a scene, by which white is chosen
 _DARKEST: Final = 1e-4
 """Added before the logarithm of interpolation, as part of white: black pixels have one, too."""
 
@@ -99,7 +97,7 @@ def read_photograph(path: Path) -> Photograph:
         colour, alpha = _split_alpha(pixels)
     is_hdr = colour.dtype.kind == "f"
     linear = colour.astype(np.float32) if is_hdr else _from_srgb(colour)
-    radiance = linear if linear.ndim == 2 else np.asarray(linear @ _LUMINANCE, np.float32)
+    radiance = linear if linear.ndim == 2 else np.asarray(linear @ LUMINANCE, np.float32)
     if min(radiance.shape) < 2 or not (radiance.min() >= 0 and radiance.max() < np.inf):
         raise FormatError(
             f"{path}: {radiance.shape[1]}x{radiance.shape[0]} pixels, some of them negative or not finite; linear "
@@ -172,11 +170,10 @@ def open_sequence(path: Path) -> ImageSequence:
 
 
 def _folder(path: Path) -> ImageSequence:
-    with reading(path):
-        files = sorted((f for f in path.iterdir() if f.suffix.lower() in IMAGE_SUFFIXES), key=_natural)
+    files = images_in(path, IMAGES | RADIANCE)
     if len(files) < 2:
-        raise FormatError(f"{path}: has {len(files)} images; a sequence needs two or more")
-    kinds = {file.suffix.lower() in HDR_SUFFIXES for file in files}
+        raise FormatError(f"{path}: has {how_many(len(files), 'image')}; a sequence needs two or more")
+    kinds = {file.suffix.lower() in RADIANCE for file in files}
     if len(kinds) > 1:
         raise FormatError(f"{path}: has HDR and ordinary images; keep one kind of them")
     first = read_photograph(files[0])
@@ -191,13 +188,6 @@ def _folder(path: Path) -> ImageSequence:
         return found
 
     return ImageSequence(path, len(files), first.radiance.shape, image, first.is_hdr, None)
-
-
-def _natural(file: Path) -> list[tuple[int, str]]:
-    """Sorts 2.png before 10.png."""
-    return [
-        (int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", file.name) if part
-    ]
 
 
 def _video(path: Path) -> ImageSequence:
@@ -241,7 +231,7 @@ def _decoded_video(path: Path) -> Iterator[Image]:
         for picture in container.decode(container.streams.video[0]):
             deep = picture.format.components[0].bits > 8
             colour = picture.to_ndarray(format="rgb48le" if deep else "rgb24")
-            yield np.asarray(_from_srgb(colour) @ _LUMINANCE, np.float32)
+            yield np.asarray(_from_srgb(colour) @ LUMINANCE, np.float32)
 
 
 def interpolated(sequence: ImageSequence, rate_hz: float) -> Callable[[float], Image]:
@@ -355,7 +345,7 @@ def exposed(scene: Scene, white: float) -> Scene:
     return Scene(lambda t: scene.radiance(t) * scale, scene.sensor_size, scene.start, scene.end, scene.name)
 
 
-def white_for(scene: Scene, saturated: float, *, moments: int = 16) -> float:
+def white_for(scene: Scene, saturated: float) -> float:
     """The radiance above which a fraction ``saturated`` of a scene's pixels lies, over evenly spaced moments.
 
     Raises
@@ -367,7 +357,7 @@ def white_for(scene: Scene, saturated: float, *, moments: int = 16) -> float:
         raise InputError(
             f"{scene.name}: a fraction of {saturated} saturated pixels; it must be between 0 and 1"
         )
-    times = scene.start + (np.arange(moments) + 0.5) / moments * scene.duration
+    times = scene.start + (np.arange(_MOMENTS) + 0.5) / _MOMENTS * scene.duration
     seen = np.concatenate([np.asarray(scene.at(float(t)), np.float32).ravel() for t in times])
     white = float(np.quantile(seen, 1.0 - saturated))
     if not white > 0:

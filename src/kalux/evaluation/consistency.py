@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from kalux.errors import FrameError, InputError
+from kalux.errors import FrameError
 from kalux.evaluation.exposures import exposure_times, linear_frame, means_of, reference_exposure
 from kalux.evaluation.method import Method
 from kalux.evaluation.metrics import psnr
@@ -61,7 +61,6 @@ def blur_consistency(
     recording: Recording,
     method: Method,
     *,
-    reads: int = READS,
     response: str = AUTO,
     on_image: Callable[[], None] = lambda: None,
 ) -> BlurConsistency:
@@ -73,8 +72,6 @@ def blur_consistency(
         With known exposures.
     method
         From `kalux.evaluation.baselines`, or one's own.
-    reads
-        Images per exposure, at least 2.
     response
         Of the camera, as in `kalux.settings.CameraSettings`.
     on_image
@@ -87,14 +84,12 @@ def blur_consistency(
     KaluxError
         Whatever the method says.
     """
-    if reads < 2:
-        raise InputError(f"blur consistency: reads are {reads}; at least 2 are needed")
     reference = reference_exposure(recording)
     response = chosen_response(response, recording.response)
-    inner = [exposure_times(frame, reads) for frame in recording.frames()][1:-1]
+    inner = [exposure_times(frame, READS) for frame in recording.frames()][1:-1]
     if not inner:
         raise FrameError(f"{recording.source.path}: blur consistency needs at least three frames")
-    images = means_of(method.images(recording, np.concatenate(inner)), reads)
+    images = means_of(method.images(recording, np.concatenate(inner)), READS)
     found, skipped = [], 0
     frames = iter(recording.frames())
     next(frames)
@@ -110,7 +105,7 @@ def blur_consistency(
         on_image()
     if not found:
         raise FrameError(f"{recording.source.path}: all frames are clipped or black everywhere")
-    return BlurConsistency(method.label, reads, tuple(found), skipped)
+    return BlurConsistency(method.label, READS, tuple(found), skipped)
 
 
 def valid_pixels(frame: Frame) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:

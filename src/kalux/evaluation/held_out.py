@@ -28,6 +28,7 @@ from kalux.frames import Frame
 from kalux.models.camera import Camera, frame_log_covariance
 from kalux.recording import Recording
 from kalux.settings import AUTO, CameraSettings, chosen_response
+from kalux.wording import how_many
 
 READS: Final = 5
 """Reads across the exposure of a held-out frame."""
@@ -116,7 +117,7 @@ def hold_out_frames(
     compared = compared[compared % every == every - 1]
     if len(compared) == 0:
         raise FrameError(
-            f"{recording.source.path}: {count} frames are too few to hold out every {_ordinal(every)}: "
+            f"{recording.source.path}: {how_many(count, 'frame')}, too few to hold out every {_ordinal(every)}: "
             f"a frame that is compared needs {MARGIN} before and {MARGIN} after it"
         )
     kept = without_frames(recording, every)

@@ -29,6 +29,7 @@ from kalux.evaluation.learned.catalogue import NETWORKS, checksums
 from kalux.evaluation.method import Image, Method, Times
 from kalux.recording import Recording
 from kalux.settings import AUTO
+from kalux.wording import how_many
 
 FORMS: Final = "NETWORK:WEIGHTS (" + ", ".join(NETWORKS) + "), NAME=FOLDER or folder:FOLDER of images"
 """For messages."""
@@ -187,5 +188,7 @@ def _folder(label: str, folder: Path, tolerance: int = folder_method.TOLERANCE) 
     taken = "linear" if linear else "display values 0 to 1 taken as intensity"
     images = partial(folder_method.images, folder=folder, tolerance=tolerance)
     return Method(
-        label, images, notes=(f"{len(files)} images of {folder}, {taken}; up to {tolerance} us away",)
+        label,
+        images,
+        notes=(f"{how_many(len(files), 'image')} of {folder}, {taken}; up to {tolerance} us away",),
     )

@@ -17,11 +17,12 @@ from kalux.evaluation.method import Method
 from kalux.evaluation.pairs import Pair
 from kalux.evaluation.scores import Scores, score
 from kalux.filters.shots import take_shot
+from kalux.frames import GroundTruth
 from kalux.models.camera import Camera, log_covariance, noise_variance
-from kalux.readers import GroundTruth
 from kalux.readers.numpy_files import DAMAGE
 from kalux.recording import Recording
 from kalux.settings import AUTO, CameraSettings, chosen_response
+from kalux.wording import how_many
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +42,7 @@ class Reference:
     data_range
         The largest compared value: the data range of PSNR and SSIM.
     noise
-        As of `kalux.readers.GroundTruth`.
+        As of `kalux.frames.GroundTruth`.
     """
 
     times: NDArray[np.int64]
@@ -53,7 +54,7 @@ class Reference:
 
     def described(self, origin: str = "") -> str:
         """The protocol in words; ``origin``, such as " of FILE", says whose truth it is."""
-        said = f"ground truth{origin}: {len(self.times)} images"
+        said = f"ground truth{origin}: {how_many(len(self.times), 'image')}"
         if self.masks is not None:
             said += ", masked pixels and those that no frame sees not compared"
         if self.left_out:

@@ -256,8 +256,8 @@ def _move_origin(cursor: Cursor, origin: int) -> None:
 
 @nb.njit(cache=True, inline="always")
 def _since(clock, now):  # type: ignore[no-untyped-def]
-    """Seconds from the time for which a pixel's state holds until ``now``; both us after the origin."""
-    return np.float32(np.int32(now - max(clock, np.int32(0)))) * MICROSECOND32
+    """us from the time for which a pixel's state holds until ``now``; both us after the origin."""
+    return np.int32(now - max(clock, np.int32(0)))
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
@@ -318,14 +318,22 @@ def _advance_bridged(words, pixels, steps, clock, polarity, origin, rate, step_v
         np.float32(noise.step_variance),
         np.float32(noise.threshold2),
     )
-    stride = np.uint64(clock.shape[1])
-    pixels, steps, clock, polarity = flat(pixels), flat(steps), flat(clock), flat(polarity)
-    # Each event's clock is looked at while the one before is filtered, so that neither waits for the other.
-    last = len(words) - 1
-    event = _meet(words[0, 0], words[0, 1], clock, polarity, stride, origin, scalars)
-    for i in range(len(words)):
-        ahead = words[min(i + AHEAD, last), 1]
-        place = event_row(ahead) * stride + event_column(ahead) + stride + np.uint64(1)
+    stride, one, two = np.uint64(clock.shape[1]), np.uint64(1), np.uint64(2)
+    words, pixels, steps, clock, polarity = (
+        flat(words),
+        flat(pixels),
+        flat(steps),
+        flat(clock),
+        flat(polarity),
+    )
+    last = np.uint64(len(words)) - two
+    # While an event is filtered, the next one is weighed, and the clock is looked at for the one after: none waits for
+    # another, and the processor works at all of them at a time.
+    event = _weighed(_met(words, np.uint64(0), clock, polarity, stride, origin), scalars)
+    following = _met(words, min(two, last), clock, polarity, stride, origin)
+    for i in range(np.uint64(0), last + one, two):
+        ahead = words[min(i + two * np.uint64(AHEAD), last) + one]
+        place = event_row(ahead) * stride + event_column(ahead) + stride + one
         prefetch(pixels, place)
         prefetch(steps, place)
         at, seconds, weight, is_on, unsure, unsaid = event
@@ -341,24 +349,31 @@ def _advance_bridged(words, pixels, steps, clock, polarity, origin, rate, step_v
         forward, coming = known.forward + weight * scalars.step_variance, known.coming - weight
         pixel.rate = measurement_rate(scalars.rate, forward, known.backward + coming * scalars.step_variance)
         known.forward, known.coming = forward, coming
-        following = min(i + 1, last)
-        event = _meet(words[following, 0], words[following, 1], clock, polarity, stride, origin, scalars)
+        event = _weighed(following, scalars)
+        following = _met(words, min(i + two + two, last), clock, polarity, stride, origin)
+
+
+@nb.njit(cache=True, inline="always")
+def _met(words, i, clock, polarity, stride, origin):  # type: ignore[no-untyped-def]
+    """An event, by the index of its first word: its pixel's place, us since that's state holds and since the newest
+    event around, and its second word. Sets the clock; the same event may be met again."""
+    now, word = np.int32(words[i] - origin), words[i + np.uint64(1)]
+    at = event_row(word) * stride + event_column(word) + stride + np.uint64(1)
+    since, age = _since(clock[at], now), np.int32(now - newest_around_inside(clock, at, stride))
+    clock[at] = now
+    polarity[at] = np.int8(2) * np.int8(event_is_on(word)) - np.int8(1)
+    return at, since, age, word
 
 
 @nb.njit(cache=True, inline="always", error_model="numpy")
-def _meet(t, word, clock, polarity, stride, origin, scalars):  # type: ignore[no-untyped-def]
-    """What an event is worth: its pixel's place, the seconds since that's state holds, its weight and polarity, the
-    probability that it is noise, and Q. Sets the clock; the same event may be met twice."""
-    at = event_row(word) * stride + event_column(word) + stride + np.uint64(1)
-    now = np.int32(t - origin)
-    seconds = _since(clock[at], now)
-    age = np.float32(np.int32(now - newest_around_inside(clock, at, stride))) * MICROSECOND32
-    signal = signal_probability(scalars.noise_rate, age)
+def _weighed(met, scalars):  # type: ignore[no-untyped-def]
+    """What an event is worth, after `_met`: its pixel's place, the seconds since that's state holds, its weight and
+    polarity, the probability that it is noise, and Q."""
+    at, since, age, word = met
+    signal = signal_probability(scalars.noise_rate, np.float32(age) * MICROSECOND32)
     weight, is_on = event_weight(word, WEIGHT_UNIT), event_is_on(word)
-    clock[at] = now
-    polarity[at] = np.int8(2) * np.int8(is_on) - np.int8(1)
     noise = weight * threshold_noise(scalars.event_variance, scalars.threshold2, signal)
-    return at, seconds, weight, is_on, ONE - signal, noise
+    return at, np.float32(since) * MICROSECOND32, weight, is_on, ONE - signal, noise
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
@@ -397,7 +412,7 @@ def _read_block(planes, first, count, newest, heights, moment, rows, ahead):  # 
         ahead[i] = ahead_of_event(signs[column], age, heights)  # K14
     for i in range(count):
         column = np.uint64(first) + np.uint64(i)
-        seconds = _since(times[column], now) + beyond
+        seconds = np.float32(_since(times[column], now)) * MICROSECOND32 + beyond
         inverse = ONE / predicted_information(information[i], rate[i], seconds)
         moved = augmented[i] + np.float32(slope[column]) * since_start
         log_intensity[column] = moved + weighted[i] * inverse + ahead[i]

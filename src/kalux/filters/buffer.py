@@ -11,7 +11,7 @@ import numpy as np
 from kalux.augmentation.deblur import events_until
 from kalux.augmentation.refractory import EventClock
 from kalux.compiled import UNWEIGHED, event_column, event_row, event_words
-from kalux.events import EVENT_DTYPE, EventArray
+from kalux.events import EVENT_DTYPE, LATEST, EventArray
 
 _BLOCK: Final = 1 << 16
 """Events that a block of memory holds at least: 1 MB, so that single events cost no allocation each."""
@@ -76,8 +76,8 @@ class EventBuffer:
     ) -> bool:
         """Copy events to the end, ``delay`` us earlier than stamped; ``weighed`` ones carry their weights already.
 
-        False, and nothing is appended, unless they are in time order, none is stamped before ``earliest`` (us), and all
-        lie inside the sensor, (height, width).
+        False, and nothing is appended, unless they are in time order, none is stamped before ``earliest`` (us) or
+        beyond what is possible, and all lie inside the sensor, (height, width).
         """
         count = len(events)
         if count == 0:
@@ -90,10 +90,11 @@ class EventBuffer:
         else:
             block = self._blocks[-1]
         height, width = (np.uint64(n) for n in sensor_size)
-        least = np.iinfo(np.int64).min if earliest is None else earliest
+        least = -LATEST if earliest is None else earliest
         free = event_words(block.memory[block.stop : block.stop + count])
         kept = np.int64(-1) if weighed else UNWEIGHED
-        if not _copy_checked(event_words(events), free, least, delay, height, width, kept):
+        fine = _copy_checked(event_words(events), free, least, delay, height, width, kept)
+        if not fine or events["t"][-1] > LATEST:
             return False
         if not weighed and self._clock.weighs:
             self._clock.weigh(free)

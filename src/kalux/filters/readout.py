@@ -292,8 +292,8 @@ def _plane(values: Array | None, shape: tuple[int, ...]) -> NDArray[np.float32]:
 # The loops below take whole arrays and places in them: a view of a row costs more than a part of what is done with it.
 # Positions are counted from the first of a loop, so that none is below another: unsigned numbers that wrap around keep
 # a loop from becoming vector code. So do many arrays, and loops that write to an array of which they read another row.
-# Arrays are given one by one: taking one out of a tuple counts a reference, in an atomic operation. For every row that
-# would be 4 % of an image.
+# Arrays are given one by one: taking one out of a tuple counts a reference, in an atomic operation; for every row,
+# these are 4 % of an image.
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy", fastmath=FUSED)

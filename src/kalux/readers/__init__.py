@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from kalux.errors import FormatError, InputError
+from kalux.frames import GroundTruth
 from kalux.readers import (
     aedat2,
     aedat3,
@@ -25,13 +26,14 @@ from kalux.readers import (
     rosbag,
     table,
 )
-from kalux.readers.images import SUFFIXES as _IMAGES
-from kalux.readers.source import CHUNK_EVENTS, GroundTruth, Source
+from kalux.readers.images import IMAGES, RADIANCE
+from kalux.readers.source import CHUNK_EVENTS, Source
 
 __all__ = ["CHUNK_EVENTS", "READERS", "GroundTruth", "Reader", "Source", "read"]
 
 _VIDEOS: Final = frozenset({".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v"})
-_RADIANCE: Final = frozenset({".hdr", ".exr"})
+
+_NAMED: Final = 3  # recordings in a folder, of more
 
 # What may lie where a recording should, by the first bytes, and what to do about it.
 _NOT_RECORDINGS: Final = (
@@ -118,7 +120,7 @@ def _what_it_is(path: Path) -> str:
         names = [file.suffix.lower() for file in path.iterdir()]
         if not names:
             return "an empty folder, "
-        if any(name in _IMAGES for name in names):
+        if any(name in IMAGES for name in names):
             return "a folder of images, which --frames takes beside the recording of the events; "
         recordings = _recordings_in(path)
         return (
@@ -137,17 +139,17 @@ def _what_it_is(path: Path) -> str:
     for signature, meaning in _NOT_RECORDINGS:
         if beginning.startswith(signature.lower()):
             return meaning
-    if path.suffix.lower() in _RADIANCE:
+    if path.suffix.lower() in RADIANCE:
         return "a radiance image, which kalux simulate makes a recording from; "
-    if path.suffix.lower() in _IMAGES | _VIDEOS:
+    if path.suffix.lower() in IMAGES | _VIDEOS:
         return "an image or a video, which --frames takes beside the recording of the events; "
     return ""
 
 
-def _recordings_in(folder: Path, most: int = 3) -> list[str]:
+def _recordings_in(folder: Path) -> list[str]:
     """The names of the first recordings in a folder."""
     found = (path.name for path in sorted(folder.iterdir()) if any(r.recognises(path) for r in READERS))
-    return list(itertools.islice(found, most))
+    return list(itertools.islice(found, _NAMED))
 
 
 def _split(path: Path) -> tuple[Path, str]:

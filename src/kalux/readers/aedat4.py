@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, BinaryIO, Final, NamedTuple, TypeVar
+from typing import BinaryIO, Final, NamedTuple, TypeVar
 
 import lz4.frame
 import numpy as np
@@ -26,34 +26,20 @@ import zstandard
 from kalux.errors import FormatError
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.frames import Frame, Mosaic
+from kalux.layouts import AEDAT4_MAGIC, AEDAT4_PACKET, AEDAT4_PIXELS
 from kalux.readers.source import (
     CHUNK_EVENTS,
+    EXPOSURE_UNKNOWN,
     TRIGGER_DTYPE,
     Source,
     TriggerArray,
     begins_with,
-    one_line,
     reading,
 )
 from kalux.readers.streams import in_order
+from kalux.wording import one_line
 
 T = TypeVar("T")
-MAGIC: Final = b"#!AER-DAT4.0\r\n"
-"""The first bytes of a file."""
-
-PACKET_HEADER: Final = struct.Struct("<ii")
-"""Before every packet: stream, size in bytes."""
-
-PIXELS: Final[dict[int, tuple[np.dtype[Any], int]]] = {
-    0: (np.dtype("u1"), 1),
-    2: (np.dtype("<u2"), 1),
-    16: (np.dtype("u1"), 3),
-    18: (np.dtype("<u2"), 3),
-    24: (np.dtype("u1"), 4),
-    26: (np.dtype("<u2"), 4),
-}
-"""OpenCV's numbers of pixel types: 8 or 16 bits, one channel, BGR or BGRA."""
-
 _DAVIS_FILTER: Final[Mosaic] = "RGGB"
 _DEMOSAICED: Final = (
     f"The frames were made RGB from the Bayer mosaic of a DAVIS, taken as {_DAVIS_FILTER}; every pixel gets its own "
@@ -120,7 +106,7 @@ _EDGES: Final = {1: True, 2: False}
 
 def recognises(path: Path) -> bool:
     """Whether the file begins like AEDAT 4."""
-    return begins_with(path, MAGIC)
+    return begins_with(path, AEDAT4_MAGIC)
 
 
 def read(path: Path) -> Source:
@@ -154,7 +140,7 @@ def read(path: Path) -> Source:
     first = None if frames is None else next(_stored_frames(container, frames), None)
     if first is not None and first.exposure <= 0:
         exposure_known = False
-        missing += ("The exposure times of the frames are not recorded.",)
+        missing += (EXPOSURE_UNKNOWN,)
     # Only those cameras have colour filters over pixels of events and frames alike.
     is_colour_davis = first is not None and first.image.ndim == 3 and "DAVIS" in frames.camera.upper()  # type: ignore[union-attr]
     if is_colour_davis:
@@ -272,12 +258,12 @@ def _stored_frames(container: _Container, stream: _Stream) -> Iterator[Frame]:
 
 def _frame(table: _Table, where: str) -> Frame:
     kind = table.scalar(5, "<b", 0)
-    if kind not in PIXELS:
+    if kind not in AEDAT4_PIXELS:
         raise FormatError(
             f"{where}: its frames have the unknown pixel type {kind}; 8 or 16 bits, grey or BGR, are needed"
         )
     width, height = table.scalar(6, "<h", 0), table.scalar(7, "<h", 0)
-    dtype, channels = PIXELS[kind]
+    dtype, channels = AEDAT4_PIXELS[kind]
     start, size = table.vector(10)
     if width <= 0 or height <= 0 or size != width * height * channels * dtype.itemsize:
         raise ValueError(f"{size} bytes of pixels for {width}x{height}")
@@ -299,7 +285,7 @@ def _open(path: Path, file: BinaryIO) -> _Container:
     """Read the header and find all packets, without decompressing any."""
     file.seek(0, 2)
     file_size = file.tell()
-    file.seek(len(MAGIC))
+    file.seek(len(AEDAT4_MAGIC))
     prefix = _exactly(file, 4)
     header = _root(prefix + _exactly(file, struct.unpack("<I", prefix)[0]), b"IOHE")
     compression = header.scalar(0, "<i", 0)
@@ -339,8 +325,8 @@ def _packets(path: Path, file: BinaryIO, position: int, end: int) -> dict[int, a
     found: Counter[int] = Counter()
     while position < end:
         file.seek(position)
-        number, size = PACKET_HEADER.unpack(file.read(PACKET_HEADER.size).ljust(PACKET_HEADER.size, b"\xff"))
-        start = position + PACKET_HEADER.size
+        number, size = AEDAT4_PACKET.unpack(file.read(AEDAT4_PACKET.size).ljust(AEDAT4_PACKET.size, b"\xff"))
+        start = position + AEDAT4_PACKET.size
         if size < 0 or start + size > end:
             raise FormatError(
                 f"{path}: cut short or damaged: the packet at byte {position} (number {found.total()}) does "

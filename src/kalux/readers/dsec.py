@@ -25,7 +25,7 @@ from kalux.errors import FormatError
 from kalux.events import EventArray
 from kalux.frames import Frame
 from kalux.readers import hdf5_layout
-from kalux.readers.images import SUFFIXES, in_colour, read_image
+from kalux.readers.images import images_in, in_colour, read_image
 from kalux.readers.source import Source, reading
 
 _COLUMNS: Final = ("events/t", "events/x", "events/y", "events/p")
@@ -131,9 +131,7 @@ def _sensor_size(events_path: Path, offset: int) -> tuple[int, int]:
 def _find_images(folder: Path) -> _Images:
     with reading(folder):
         place = _first(folder, _IMAGES)
-        files = (
-            () if place is None else tuple(sorted(f for f in place.iterdir() if f.suffix.lower() in SUFFIXES))
-        )
+        files = () if place is None else tuple(images_in(place))
         if not files:
             return _Images()
         exposures = _first(folder, _EXPOSURES, _EXPOSURES_PATTERN)

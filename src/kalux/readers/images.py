@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
@@ -12,15 +12,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.errors import FormatError
+from kalux.readers.source import natural_order, reading
 
-SUFFIXES: Final = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm"})
-"""Of the files that count as images where nothing lists them."""
+IMAGES: Final = frozenset({".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp"})
+"""Suffixes of the files that count as images where nothing lists them."""
+
+RADIANCE: Final = frozenset({".hdr", ".pic", ".exr"})
+"""Of radiance images."""
 
 _PNG_SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
 _JPEG_START, _JPEG_END = b"\xff\xd8\xff", b"\xff\xd9"
 
 
 T = TypeVar("T")
+
+
+def images_in(folder: Path, suffixes: Collection[str] = IMAGES) -> list[Path]:
+    """The images in a folder, in the order of the numbers in their names; not those that are hidden.
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be read.
+    """
+    with reading(folder):
+        found = [f for f in folder.iterdir() if f.suffix.lower() in suffixes and not f.name.startswith(".")]
+    return sorted(found, key=natural_order)
 
 
 def read_image(path: Path, name: str, data: bytes, *, colour: bool) -> NDArray[Any]:

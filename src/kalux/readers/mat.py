@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from kalux.errors import EventError, FormatError
 from kalux.events import EventArray, make_events
-from kalux.frames import Frame
-from kalux.readers.source import CHUNK_EVENTS, GroundTruth, Source, begins_with, reading
+from kalux.frames import Frame, GroundTruth
+from kalux.readers.source import CHUNK_EVENTS, Source, begins_with, reading
 
 _MAGIC_5: Final = b"MATLAB 5.0 MAT-file"
 _MAGIC_73: Final = b"MATLAB 7.3 MAT-file"

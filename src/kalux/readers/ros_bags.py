@@ -7,7 +7,6 @@ often wrong, so it is not read.
 
 from __future__ import annotations
 
-import re
 import sqlite3
 import struct
 from collections.abc import Iterator
@@ -20,7 +19,7 @@ from typing import Any, Final, NamedTuple, Protocol
 import zstandard
 
 from kalux.errors import FormatError, MissingDependencyError
-from kalux.readers.source import reading
+from kalux.readers.source import natural_order, reading
 
 BAG_MAGIC: Final = b"#ROSBAG V"
 MCAP_MAGIC: Final = b"\x89MCAP0\r\n"
@@ -102,18 +101,13 @@ def container(path: Path) -> str | None:
 def parts(folder: Path) -> list[Path]:
     """The files of a ROS 2 recording, in order."""
     found = [path for path in folder.iterdir() if path.is_file() and _is_part(path)]
-    return sorted(found, key=_natural)
+    return sorted(found, key=natural_order)
 
 
 def _is_part(path: Path) -> bool:
     if path.name.endswith((".db3.zstd", ".mcap.zstd")):
         return True
     return path.suffix in (".db3", ".mcap") and container(path) in ("db3", "mcap")
-
-
-def _natural(path: Path) -> list[tuple[int, str]]:
-    """Key that puts part 10 after part 9."""
-    return [(int(part), "") if part.isdecimal() else (0, part) for part in re.split(r"(\d+)", path.name)]
 
 
 def _open_file(path: Path) -> Bag:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -14,7 +15,8 @@ from numpy.typing import NDArray
 
 from kalux.errors import FormatError, InputError, KaluxError
 from kalux.events import EventArray
-from kalux.frames import Frame, Mosaic
+from kalux.frames import Frame, GroundTruth, Mosaic
+from kalux.wording import one_line
 
 CHUNK_EVENTS: Final = 1 << 19
 """Events in a chunk, at most, where a format leaves the choice to the reader: 8 MiB, of which threads hold a few."""
@@ -24,29 +26,6 @@ TRIGGER_DTYPE: Final = np.dtype([("t", "<i8"), ("id", "u1"), ("rising", "?")], a
 
 TriggerArray = NDArray[np.void]
 """A 1-D array of `TRIGGER_DTYPE`, sorted by ``t``."""
-
-
-@dataclass(frozen=True)
-class GroundTruth:
-    """Reference images that came with a recording.
-
-    Attributes
-    ----------
-    times
-        (T,) int64, us.
-    images
-        (T, height, width) float32, linear, 1.0 = a saturated frame pixel.
-    masks
-        (T, height, width) bool, True where an image is the truth, if that is not everywhere.
-    noise
-        (read, shot) of images that a camera made: the variance of I is read^2 + shot I, in their unit. None: they have
-        none, or none that is known.
-    """
-
-    times: NDArray[np.int64]
-    images: NDArray[np.float32]
-    masks: NDArray[np.bool_] | None = None
-    noise: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,6 +86,9 @@ class Source:
     mosaic: Mosaic | None = None
 
 
+EXPOSURE_UNKNOWN: Final = "The exposure times of the frames are not recorded."
+"""For `Source.missing`, where `Source.exposure_known` is False."""
+
 SIZE_UNKNOWN: Final = "The sensor size is not recorded; the smallest that holds all events is taken."
 """For `Source.missing`, where the size comes from `smallest_size`."""
 
@@ -136,11 +118,11 @@ def begins_with(path: Path, *beginnings: bytes) -> bool:
         return file.read(len(beginnings[0])) in beginnings
 
 
-def one_line(error: BaseException) -> str:
-    """What another library's error says, on one line of printable characters."""
-    text = " ".join(str(error).split()) or type(error).__name__
-    text = "".join(c if c.isprintable() else "?" for c in text)
-    return text if len(text) <= 200 else text[:200] + "..."
+def natural_order(path: Path) -> list[tuple[int, str]]:
+    """A key for sorting that puts 2.png before 10.png."""
+    return [
+        (int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name) if part
+    ]
 
 
 @contextmanager

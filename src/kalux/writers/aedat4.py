@@ -22,7 +22,7 @@ import zstandard
 from kalux.errors import FrameError, OutputError
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.frames import Frame
-from kalux.readers.aedat4 import MAGIC, PACKET_HEADER, PIXELS
+from kalux.layouts import AEDAT4_MAGIC, AEDAT4_PACKET, AEDAT4_PIXELS
 from kalux.writers.files import output_errors, remove_quietly, temporary_path
 
 T = TypeVar("T")
@@ -33,7 +33,9 @@ EVENTS_PER_PACKET: Final = 8192
 
 _LARGEST_SIDE: Final = 2**15 - 1  # coordinates are int16
 _EVENTS, _FRAMES = 0, 1  # numbers of the streams
-_KINDS: Final = {(dtype, channels): number for number, (dtype, channels) in PIXELS.items() if channels < 4}
+_KINDS: Final = {
+    (dtype, channels): number for number, (dtype, channels) in AEDAT4_PIXELS.items() if channels < 4
+}
 _COMPRESSIONS: Final[dict[Compression, tuple[int, Callable[[bytes], bytes]]]] = {
     "none": (0, lambda data: data),
     "lz4": (1, lambda data: lz4.frame.compress(data, content_checksum=True)),
@@ -118,17 +120,17 @@ def _write(
     kinds |= {_FRAMES: "FRME"} if has_frames else {}
     number, compress = _COMPRESSIONS[compression]
     info = _streams(kinds, sensor_size, compression)
-    file.write(MAGIC + _header(number, -1, info))  # -1: not closed
+    file.write(AEDAT4_MAGIC + _header(number, -1, info))  # -1: not closed
     table = array("q")
     position = file.tell()
     for packet in _packets(path, events, frames, exposure_known):
         packed = compress(packet.data)
-        file.write(PACKET_HEADER.pack(packet.stream, len(packed)) + packed)
-        position += PACKET_HEADER.size
+        file.write(AEDAT4_PACKET.pack(packet.stream, len(packed)) + packed)
+        position += AEDAT4_PACKET.size
         table.extend((position, packet.stream, len(packed), packet.elements, packet.first, packet.last))
         position += len(packed)
     file.write(compress(_data_table(table)))
-    file.seek(len(MAGIC))
+    file.seek(len(AEDAT4_MAGIC))
     file.write(_header(number, position, info))
 
 

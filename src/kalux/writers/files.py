@@ -12,6 +12,7 @@ from pathlib import Path
 from types import FrameType
 
 from kalux.errors import OutputError
+from kalux.wording import one_line
 
 _REASONS = {
     errno.ENOSPC: "no space is left on the disk",
@@ -56,7 +57,7 @@ def output_errors(path: Path, consequence: str = "") -> Iterator[None]:
     except OutputError:
         raise
     except OSError as error:
-        reason = _REASONS.get(error.errno or 0) or error.strerror or str(error)
+        reason = _REASONS.get(error.errno or 0) or error.strerror or one_line(error)
         translated = OutputError(f"{path}: {reason}" + (f"; {consequence}" if consequence else ""))
         translated.errno = error.errno
         raise translated from error

@@ -9,7 +9,7 @@ import pytest
 
 from kalux.evaluation.benchmark.jobs import Job, make_job
 from kalux.evaluation.benchmark.sequences import Options, Sequence
-from kalux.readers import hdf5
+from kalux.writers import hdf5
 
 from builders import moving_blocks
 

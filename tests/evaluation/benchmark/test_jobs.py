@@ -20,7 +20,7 @@ from kalux.evaluation.benchmark.sequences import ArtificialHdr, Options, Sequenc
 from kalux.evaluation.held_out import evaluate_held_out, hold_out_frames
 from kalux.evaluation.lpips import load_lpips
 from kalux.evaluation.truth import evaluate_truth, load_truth, prepare_reference
-from kalux.readers import hdf5
+from kalux.writers import hdf5
 from kalux.writers.calibration import save_calibration
 
 from builders import moving_blocks

@@ -11,7 +11,7 @@ from kalux.errors import ExposureError, InputError
 from kalux.evaluation.benchmark.sequences import ArtificialHdr, Options, gather, load
 from kalux.evaluation.truth import truth_beside
 from kalux.models.camera import Response
-from kalux.readers import hdf5
+from kalux.writers import hdf5
 from kalux.writers.calibration import save_calibration
 
 

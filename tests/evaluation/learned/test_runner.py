@@ -55,7 +55,7 @@ def test_windows_begin_just_before_the_first_event():
 def test_windows_need_events_and_two_frames_or_a_length():
     with pytest.raises(InputError, match="has no events"):
         edges(recording_of([100, 200], []), 1)
-    with pytest.raises(InputError, match=r"has 1 frames.*window=40000"):
+    with pytest.raises(InputError, match=r"has 1 frame,.*window=40000"):
         edges(recording_of([100], [5]), 1)
     assert edges(recording_of([100], [5]), 2, window=10) == [4, 14]
 

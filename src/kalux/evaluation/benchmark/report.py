@@ -19,6 +19,7 @@ from kalux.evaluation.benchmark.sequences import Sequence as Recorded
 from kalux.evaluation.benchmark.store import Store
 from kalux.evaluation.benchmark.svg import Axis, Series
 from kalux.evaluation.calibration import ONE_SIGMA
+from kalux.wording import how_many
 
 _FRAME, _REFERENCE = "frame", "reference"
 _SMALL: Final = 320
@@ -52,8 +53,9 @@ def make_report(results: Results, store: Store) -> str:
         f"<title>{escape(plan.title)}</title>",
         f"<style>{page.STYLE}{page.STYLE_OF_PICTURES}</style>{page.WITHOUT_SCRIPT}</head><body>",
         f"<header><h1>{escape(plan.title)}</h1>",
-        f'<p class="soft">kalux benchmark, version {escape(kalux.__version__)}: {len(plan.sequences)} sequences, '
-        f"{len(plan.methods)} methods, {_images(results):,} images compared.</p>",
+        f'<p class="soft">kalux benchmark, version {escape(kalux.__version__)}: '
+        f"{how_many(len(plan.sequences), 'sequence')}, "
+        f"{how_many(len(plan.methods), 'method')}, {how_many(_images(results), 'image')} compared.</p>",
         "<nav>"
         + "".join(f'<a href="#{escape(i)}">{escape(text)}</a>' for i, text in links)
         + "</nav></header><main>",
@@ -352,7 +354,8 @@ def _scores(results: Results, records: dict[str, dict[str, Any]]) -> str:
     head = "".join(f'<th scope="col">{_metric_head(metric)}</th>' for metric in metrics)
     first = next(iter(records.values()))["scores"]
     said = [
-        f"{len(first['per_image'])} images, {first['pixels']:,} pixels; data range {first['data_range']:.4g}"
+        f"{how_many(len(first['per_image']), 'image')}, {how_many(first['pixels'], 'pixel')}; "
+        f"data range {first['data_range']:.4g}"
     ]
     everywhere = [
         text

@@ -28,6 +28,7 @@ from kalux.evaluation.learned.voxels import normalise, voxel_grid
 from kalux.evaluation.learned.weights import load_network
 from kalux.evaluation.method import Image, Times
 from kalux.recording import Recording
+from kalux.wording import how_many
 
 SHARE_OF_WINDOW: Final = 3
 """An image comes from at least one third of a window. At a half, the reads across the exposure of a frame that is held
@@ -174,8 +175,8 @@ def window_edges(recording: Recording, window: int | None = None) -> Iterator[in
     middles = [frame.middle for frame in recording.frames()]
     if len(middles) < 2:
         raise InputError(
-            f"{recording.source.path}: has {len(middles)} frames, so there is no window of events from frame to "
-            "frame; give one in us: NAME:FILE?window=40000"
+            f"{recording.source.path}: has {how_many(len(middles), 'frame')}, so there is no window of events "
+            "from frame to frame; give one in us: NAME:FILE?window=40000"
         )
     distance = round(float(np.median(np.diff(middles))))
     passed = bisect_left(middles, first)

@@ -1,0 +1,367 @@
+"""What a reconstruction will do: what the settings leave open is found in the recording, and the images are chosen."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux.calibration.contrast import (
+    ROUGH_SAMPLES,
+    ThresholdEstimate,
+    Usual,
+    estimate_thresholds,
+    refine_thresholds,
+)
+from kalux.calibration.delay import DelayEstimate, estimate_delay
+from kalux.calibration.event_model import EventModel, estimate_event_model
+from kalux.calibration.frame_noise import FrameNoise, estimate_frame_noise
+from kalux.calibration.mismatch import Mismatch, estimate_mismatch
+from kalux.calibration.noise import event_noise
+from kalux.calibration.steps import MAX_SAMPLES
+from kalux.calibration.values import Calibration
+from kalux.calibration.white_balance import grey_world
+from kalux.errors import InputError, require_type
+from kalux.frames import median_exposure
+from kalux.models.camera import BrightTail, Camera, count_bright
+from kalux.models.colour import white_balance
+from kalux.models.pixels import PixelCalibration, require_size
+from kalux.recording import Recording, no_frames, remembering
+from kalux.schedule import image_times
+from kalux.settings import EventSettings, Settings, altered, chosen_response
+from kalux.settings import preset as named_preset
+
+ThresholdOrigin = Literal["settings", "recording", "calibration", "estimate", "assumed"]
+
+DOUBTED: Final[tuple[ThresholdOrigin, ...]] = ("calibration", "estimate", "assumed")
+"""Thresholds of these origins are not quite the pixels' own: highlights are then believed less."""
+
+_NOISE_EVENTS: Final = 1_000_000
+"""Of which the background noise is taken: at 15 million events/s the quiet time of 300,000 pixels in 70 ms."""
+
+_REMEMBERED_EVENTS: Final = 1 << 22
+_REMEMBERED_FRAMES: Final = 1 << 25
+"""Events (64 MB) and bytes of frames at the beginning that are read once for all estimates, which take most of their
+samples from there."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Everything that a reconstruction will use, decided before it starts.
+
+    Attributes
+    ----------
+    settings
+        With thresholds, refractory period, delay, frame noise, I_0, step variance, reference exposure and white balance
+        filled in.
+    threshold_origin
+        Whether the thresholds come from the settings, the recording, a calibration, an estimate, or are assumed.
+    estimate
+        The fit of the thresholds and the refractory period, where there was one.
+    delay_estimate
+        The fit of the events' delay, where there was one.
+    event_model
+        The fit of I_0 and the variance of an event's step, where there was one.
+    times
+        (N,) int64 us, increasing: the images to make.
+    lookahead
+        Whether images use the frame after them.
+    smooth
+        Whether images use all of the recording after them.
+    pixels
+        What a calibration says of single pixels.
+    frame_noise
+        The fit of the frames' noise, where there was one.
+    mismatch
+        The fit of the thresholds' spread between pixels, where there was one.
+    background_rate
+        The measured noise of events, Hz per pixel, where it was.
+    """
+
+    settings: Settings
+    threshold_origin: ThresholdOrigin
+    estimate: ThresholdEstimate | None
+    delay_estimate: DelayEstimate | None
+    event_model: EventModel | None
+    times: NDArray[np.int64]
+    lookahead: bool
+    smooth: bool
+    pixels: PixelCalibration | None = None
+    frame_noise: FrameNoise | None = None
+    mismatch: Mismatch | None = None
+    background_rate: float | None = None
+
+
+def plan(
+    recording: Recording,
+    *,
+    rate_hz: float | None = None,
+    times: Any = None,
+    at: Literal["frames"] | None = None,
+    preset: str = "default",
+    settings: Settings | None = None,
+    calibration: Calibration | None = None,
+    lookahead: bool = True,
+    smooth: bool = False,
+) -> Plan:
+    """Decide what a reconstruction will do. See `reconstruct` for the parameters and errors."""
+    for name, given, kind, source in (
+        ("recording", recording, Recording, "kalux.open or Recording.from_arrays"),
+        ("settings", settings, Settings, "kalux.preset"),
+        ("calibration", calibration, Calibration, "kalux.load_calibration"),
+    ):
+        if given is not None or name == "recording":
+            require_type(f"reconstruct: {name}", given, kind, source)
+    known = Calibration() if calibration is None else calibration
+    chosen = settings if settings is not None else known.apply(named_preset(preset))
+    if sum(choice is not None for choice in (rate_hz, times, at)) != 1:
+        raise InputError("reconstruct: give exactly one of rate_hz, times and at")
+    if smooth and not lookahead:
+        raise InputError(
+            "reconstruct: smooth uses the future, lookahead=False (causal) forbids it; choose one"
+        )
+    if smooth and chosen.filter.kind == "cf":
+        raise InputError(
+            "reconstruct: the complementary filter has no variance, so that it cannot be smoothed"
+        )
+    if known.pixels is not None:
+        require_size(known.pixels, recording.sensor_size)
+    recording = remembering(recording, _REMEMBERED_EVENTS, _REMEMBERED_FRAMES)
+    response = chosen_response(chosen.camera.response, recording.response)
+    camera = Camera.named(response, chosen.camera.saturation)
+    exposures, tail = _survey(recording, camera if _measures_tail(chosen) else None)
+    begin = _begin_time(exposures[0], chosen, lookahead)
+    wanted = image_times(recording, exposures, begin, rate_hz=rate_hz, times=times, at=at)
+    lengths = exposures[:, 1] - exposures[:, 0]
+    reference = chosen.camera.reference_exposure or median_exposure(lengths)
+    chosen = altered(chosen, "camera", reference_exposure=reference, response=response)
+    chosen = _with_white_balance(recording, chosen)
+    chosen, noise = _with_frame_noise(recording, chosen)
+    chosen, delay = _with_delay(recording, chosen)
+    filled, origin, estimate = _with_thresholds(recording, chosen)
+    filled, model = _with_event_model(recording, filled)
+    if estimate is not None and chosen.camera.log_offset is None:
+        estimated = origin in ("estimate", "assumed")
+        if estimated or (estimate.may_lose and chosen.camera.offset != filled.camera.offset):
+            unfilled = dataclasses.replace(chosen.events, step_variance=filled.events.step_variance)
+            rough = estimate if estimated else None
+            filled, origin, estimate = _with_thresholds(
+                recording, dataclasses.replace(filled, events=unfilled), rough
+            )
+    unsure = estimate.spread if estimate is not None and origin in ("estimate", "assumed") else 0.0
+    filled, mismatch = _with_mismatch(recording, filled, unsure)
+    filled, background = _with_background(recording, filled, known.pixels)
+    if origin == "settings" and _are_calibrated(filled, known):
+        origin = "calibration"
+    doubted = origin in DOUBTED or (_uses_steps(filled) and filled.filter.unshown_tail > 0)
+    if doubted and tail is not None:
+        filled = altered(filled, "filter", bright_tail=tail.scale)
+    return Plan(
+        filled,
+        origin,
+        estimate,
+        delay,
+        model,
+        wanted,
+        lookahead,
+        smooth,
+        known.pixels,
+        noise,
+        mismatch,
+        background,
+    )
+
+
+def _survey(recording: Recording, camera: Camera | None) -> tuple[NDArray[np.int64], BrightTail | None]:
+    """(K, 2) exposure starts and ends, us, and how the brightness of pixels falls off towards white; of all frames.
+
+    Without a camera, the brightness is not looked at.
+    """
+    exposures, tail = [], BrightTail()
+    for frame in recording.frames():
+        exposures.append((frame.exposure_start, frame.exposure_end))
+        if camera is not None:
+            tail = tail.joined(count_bright(camera, frame.image, frame.white_value))
+    if not exposures:
+        raise no_frames(recording)
+    return np.array(exposures, np.int64), None if camera is None else tail
+
+
+def _measures_tail(settings: Settings) -> bool:
+    """Whether the bright tail of the frames may be of use: where highlights are looked at, and it is not given."""
+    filtered = settings.filter
+    return filtered.kind == "akf" and filtered.highlight_scale > 0 and filtered.bright_tail is None
+
+
+def _begin_time(first: NDArray[np.int64], settings: Settings, lookahead: bool) -> int:
+    """The first time that can be read, us, as the engine says, by the ``first`` exposure."""
+    start, end = (int(t) for t in first)
+    if not lookahead:
+        return end
+    return start + (end - start) // 2 if settings.filter.kind == "cf" else start
+
+
+def _with_white_balance(recording: Recording, settings: Settings) -> Settings:
+    """Measure the gains of a white balance that has none, where frames are in colour."""
+    first = next(iter(recording.frames()))
+    if first.colours == "grey" or white_balance(settings.camera.white_balance) is not None:
+        return settings
+    gains = ";".join(f"{gain:.4f}" for gain in grey_world(recording, settings.camera))
+    return altered(settings, "camera", white_balance=gains)
+
+
+def _are_calibrated(settings: Settings, calibration: Calibration) -> bool:
+    """Whether the thresholds are those of the calibration."""
+    found = calibration.settings.get("events", {})
+    names = ("threshold_on", "threshold_off")
+    return all(name in found and found[name] == getattr(settings.events, name) for name in names)
+
+
+def _with_delay(recording: Recording, settings: Settings) -> tuple[Settings, DelayEstimate | None]:
+    """Fill in the events' delay: from the settings, else an estimate, else the usual."""
+    if settings.events.delay is not None:
+        return settings, None
+    estimate = estimate_delay(recording, settings.camera)
+    delay = settings.events.usual_delay if estimate is None else estimate.delay
+    return altered(settings, "events", delay=delay), estimate
+
+
+def _with_frame_noise(recording: Recording, settings: Settings) -> tuple[Settings, FrameNoise | None]:
+    """Fill in the frames' noise, where the filter uses it: from the settings, else an estimate, else the usual."""
+    camera = settings.camera
+    if camera.frame_noise is not None or not _uses_steps(settings):
+        return settings, None
+    found = estimate_frame_noise(recording, camera)
+    if found is not None and not found.believed:
+        found = None
+    read, shot = camera.noise if found is None else (found.read, found.shot)
+    shot = shot if camera.shot_noise is None else camera.shot_noise
+    return altered(settings, "camera", frame_noise=read, shot_noise=shot), found
+
+
+def _with_thresholds(
+    recording: Recording,
+    settings: Settings,
+    rough: ThresholdEstimate | None = None,
+) -> tuple[Settings, ThresholdOrigin, ThresholdEstimate | None]:
+    """Fill in thresholds and refractory period: from the settings, else the recording, else an estimate, else usual.
+
+    An estimate without I_0 is rough; with I_0 it is made again, from that.
+    """
+    events = settings.events
+    stated = (recording.contrast_threshold or (None, None)) if not _has_thresholds(events) else (None, None)
+    origin: ThresholdOrigin = "settings" if _has_thresholds(events) else "recording"
+    known = dataclasses.replace(
+        events,
+        threshold_on=stated[0] if events.threshold_on is None else events.threshold_on,
+        threshold_off=stated[1] if events.threshold_off is None else events.threshold_off,
+    )
+    finds_period = _uses_steps(settings) and events.refractory_period is None
+    if _has_thresholds(known) and not finds_period:
+        return dataclasses.replace(settings, events=known), origin, None
+    usual = Usual(events.usual_threshold_on, events.usual_threshold_off, events.usual_spread)
+    if known.threshold_on is not None and known.threshold_off is not None:
+        usual = Usual(known.threshold_on, known.threshold_off, 0.0)
+    of_log_offset = settings.filter.augmentation == "paper"
+    period = events.refractory_period if _uses_steps(settings) else 0
+    estimate = (
+        estimate_thresholds(
+            recording,
+            settings.camera,
+            usual,
+            of_log_offset=of_log_offset,
+            delay=events.delay or 0,
+            refractory_period=period,
+            most=ROUGH_SAMPLES if settings.camera.log_offset is None else MAX_SAMPLES,
+        )
+        if rough is None
+        else refine_thresholds(
+            recording,
+            settings.camera,
+            usual,
+            rough,
+            of_log_offset=of_log_offset,
+            refractory_period=period,
+        )
+    )
+    if finds_period:
+        period = 0 if estimate is None else estimate.refractory_period
+        known = dataclasses.replace(known, refractory_period=period)
+    if not _has_thresholds(known):
+        origin = "assumed" if estimate is None or estimate.usual_share > 0.5 else "estimate"
+        known = known.assuming() if estimate is None else _estimated(known, estimate)
+    return dataclasses.replace(settings, events=known), origin, estimate
+
+
+def _has_thresholds(events: EventSettings) -> bool:
+    return events.threshold_on is not None and events.threshold_off is not None
+
+
+def _estimated(events: EventSettings, estimate: ThresholdEstimate) -> EventSettings:
+    """With the estimated thresholds where none is set."""
+    return dataclasses.replace(
+        events,
+        threshold_on=estimate.on if events.threshold_on is None else events.threshold_on,
+        threshold_off=estimate.off if events.threshold_off is None else events.threshold_off,
+    )
+
+
+def _with_event_model(recording: Recording, settings: Settings) -> tuple[Settings, EventModel | None]:
+    """Fill in I_0 and the variance of steps: from the settings, else an estimate, else the usual."""
+    camera, events = settings.camera, settings.events
+    if camera.log_offset is not None and (events.step_variance is not None or not _uses_steps(settings)):
+        return settings, None
+    assert events.threshold_on is not None
+    assert events.threshold_off is not None
+    model = estimate_event_model(
+        recording,
+        camera,
+        (events.threshold_on, events.threshold_off),
+        delay=events.delay or 0,
+        threshold_spread=events.mismatch,
+        quantisation_variance=events.quantisation_variance,
+        refractory_period=events.refractory if _uses_steps(settings) else 0,
+    )
+    if model is not None:
+        if camera.log_offset is None:
+            camera = dataclasses.replace(camera, log_offset=model.log_offset)
+        if events.step_variance is None:
+            events = dataclasses.replace(events, step_variance=model.step_variance)
+    # What could not be estimated is written down as it will be used.
+    camera = dataclasses.replace(camera, log_offset=camera.offset)
+    events = dataclasses.replace(events, step_variance=events.step_noise)
+    return dataclasses.replace(settings, camera=camera, events=events), model
+
+
+def _with_mismatch(
+    recording: Recording, settings: Settings, unsure: float
+) -> tuple[Settings, Mismatch | None]:
+    """Fill in the thresholds' spread between pixels: from the settings, else an estimate, else the usual.
+
+    Where the thresholds themselves are estimated, with the relative error ``unsure``, that is a part of it.
+    """
+    events = settings.events
+    if events.threshold_spread is not None or not _uses_steps(settings):
+        return settings, None
+    found = estimate_mismatch(recording, settings.camera, events)
+    spread = float(np.hypot(events.mismatch if found is None else found.spread, unsure))
+    return altered(settings, "events", threshold_spread=spread), found
+
+
+def _with_background(
+    recording: Recording, settings: Settings, pixels: PixelCalibration | None
+) -> tuple[Settings, float | None]:
+    """Fill in the background noise: from the settings, else the usual, or what is measured where that is more."""
+    events = settings.events
+    if events.noise_rate is not None or not _uses_steps(settings):
+        return settings, None
+    found = event_noise(recording, _NOISE_EVENTS, None if pixels is None else pixels.hot)
+    rate = events.background_rate if found is None else max(found.rate, events.usual_noise_rate)
+    return altered(settings, "events", noise_rate=rate), None if found is None else found.rate
+
+
+def _uses_steps(settings: Settings) -> bool:
+    return settings.filter.kind == "akf" and settings.filter.augmentation == "bridge"

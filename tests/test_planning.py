@@ -1,0 +1,215 @@
+"""What is settled before a reconstruction begins, and from where."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import reduce
+
+import numpy as np
+import pytest
+
+import kalux
+from kalux import PRESETS, Frame, Recording, reconstruct
+from kalux.errors import FrameError, InputError, SettingsError
+from kalux.events import EVENT_DTYPE
+from kalux.models.camera import BrightTail, Camera, count_bright
+from kalux.pipeline import execute
+from kalux.planning import plan
+from kalux.settings import altered
+
+from builders import events, frame, moving_blocks, recording, unlabelled
+
+
+@pytest.mark.parametrize(
+    ("first", "options", "message"),
+    [
+        ("night.aedat4", {}, "recording is a str; a kalux.Recording is needed, from kalux.open"),
+        (None, {}, "recording is a NoneType; a kalux.Recording is needed"),
+        (
+            recording,
+            {"settings": {"filter": {"kind": "cf"}}},
+            "settings is a dict; a kalux.Settings is needed",
+        ),
+        (recording, {"calibration": "c.toml"}, "calibration is a str; a kalux.Calibration is needed"),
+    ],
+)
+def test_arguments_of_the_wrong_type_are_named(first, options, message):
+    with pytest.raises(InputError, match=message):
+        reconstruct(first() if callable(first) else first, rate_hz=10, **options)
+
+
+def test_thresholds_of_the_settings_come_first():
+    chosen = altered(PRESETS["default"], "events", threshold_on=0.31, threshold_off=0.32)
+    made = plan(recording(), rate_hz=10, settings=chosen, preset="cf")
+    assert made.threshold_origin == "settings"
+    assert made.estimate is None
+    assert (made.settings.events.threshold_on, made.settings.events.threshold_off) == (0.31, 0.32)
+    assert made.settings.filter.kind == "akf"
+
+
+def test_then_those_of_the_recording():
+    made = plan(recording(), rate_hz=10)
+    assert made.threshold_origin == "recording"
+    assert (made.settings.events.threshold_on, made.settings.events.threshold_off) == (0.25, 0.2)
+    half = plan(recording(), rate_hz=10, settings=altered(PRESETS["default"], "events", threshold_on=0.4))
+    assert (half.settings.events.threshold_on, half.settings.events.threshold_off) == (0.4, 0.2)
+
+
+def test_then_an_estimate():
+    made = plan(unlabelled(moving_blocks(0.08, 0.9)), rate_hz=10)
+    assert made.threshold_origin == "estimate"
+    assert made.settings.events.threshold_on == made.estimate.on == pytest.approx(0.2, rel=0.12)
+    assert made.settings.events.threshold_off == made.estimate.off == pytest.approx(0.2, rel=0.12)
+
+
+def test_and_last_an_assumption():
+    made = plan(recording(0, None), rate_hz=10)
+    assert made.threshold_origin == "assumed"
+    assert made.estimate is None
+    assert made.settings.events.threshold_on == made.settings.events.threshold_off == 0.25
+    assert (made.settings.events.threshold_spread, made.settings.events.delay) == (0.5, 0)
+
+
+def test_of_a_sensor_the_usual_is_assumed():
+    """One frame tells no threshold, no delay and no step."""
+    frames = [frame(100, 0, 10_000)]
+    alone = Recording.from_arrays(events(), frames, sensor_size=(1, 1))
+    made = plan(alone, at="frames", preset="davis346")
+    usual = PRESETS["davis346"].events
+    found = made.settings.events
+    assert made.threshold_origin == "assumed"
+    assert (found.threshold_on, found.threshold_off) == (usual.usual_threshold_on, usual.usual_threshold_off)
+    assert (found.delay, found.step_variance) == (usual.usual_delay, usual.usual_step_variance)
+    assert found.threshold_spread == 0.2
+
+
+def test_a_sensors_usual_thresholds_give_way_to_the_recordings():
+    known = plan(recording(), at="frames", preset="davis346")
+    assert known.threshold_origin == "recording"
+    assert (known.settings.events.threshold_on, known.settings.events.threshold_off) == (0.25, 0.2)
+    told = plan(unlabelled(moving_blocks(0.08, 0.9)), at="frames", preset="davis240c")
+    assert told.threshold_origin == "estimate"
+    assert told.settings.events.threshold_on == pytest.approx(0.2, rel=0.12)
+
+
+@pytest.mark.parametrize(
+    ("name", "preset", "part"),
+    [("newton_davis346.aedat4", "davis346", 0.6), ("slider_depth", "davis240c", 1.05)],
+)
+def test_a_sensors_preset_helps_where_there_is_one_frame(shared_data, name, preset, part):
+    """The next frame is nearer to what is made of the frame before it and of the events."""
+    unknown = {} if "aedat4" in name else {"exposure": 10_000}
+    whole = kalux.open(shared_data / name, **unknown)
+    shown, wanted = list(whole.frames())[2:4]
+    near = [e[(e["t"] >= shown.exposure_start) & (e["t"] <= wanted.exposure_end)] for e in whole.events()]
+    alone = Recording.from_arrays(np.concatenate(near), [shown], sensor_size=whole.sensor_size)
+
+    def error(preset: str) -> float:
+        (image,) = reconstruct(alone, times=[wanted.middle], preset=preset)
+        return float(np.mean((image.intensity - wanted.normalised()) ** 2))
+
+    assert error(preset) < part * error("default")
+
+
+def test_highlights_are_believed_less_where_the_threshold_is_an_estimate():
+    """The same numbers, known and estimated."""
+    simulation = moving_blocks(0.1, 4.0)
+    guessed = plan(unlabelled(simulation), at="frames")
+    known = plan(unlabelled(simulation), at="frames", settings=guessed.settings)
+    assert (guessed.threshold_origin, known.threshold_origin) == ("estimate", "settings")
+    sums = []
+    for made in (guessed, known):
+        images = [image.intensity for image in execute(unlabelled(simulation), made)]
+        sums.append(sum(image[image > 1].sum() for image in images))
+    assert sums[0] < sums[1]
+
+
+def test_white_is_the_median_exposure_unless_set():
+    frames = [frame(100, 40_000 * k, 40_000 * k + e) for k, e in enumerate((2_000, 8_000, 4_000))]
+    rec = Recording.from_arrays(events(), frames, sensor_size=(1, 1), contrast_threshold=0.2)
+    assert plan(rec, at="frames").settings.camera.reference_exposure == 4_000
+    images = list(reconstruct(rec, at="frames"))
+    found = [image.intensity[0, 0] for image in images]
+    np.testing.assert_allclose(found, np.array([2.0, 0.5, 1.0]) * 100 / 255, rtol=0.1)
+    doubled = altered(PRESETS["default"], "camera", reference_exposure=8_000)
+    twice = [image.intensity[0, 0] for image in reconstruct(rec, at="frames", settings=doubled)]
+    assert twice[1] == pytest.approx(100 / 255, rel=0.1)
+
+
+def test_a_recording_without_frames():
+    rec = Recording.from_arrays(events((1, 0, 0, 1)), [], sensor_size=(1, 1), name="dark.aedat4")
+    with pytest.raises(
+        FrameError,
+        match=r"dark\.aedat4: no frames; kalux needs frames .* join images or a video with --frames",
+    ):
+        reconstruct(rec, rate_hz=10)
+
+
+def test_a_recording_without_events():
+    frames = [frame(100, 40_000 * k, 40_000 * k + 4_000) for k in range(3)]
+    rec = Recording.from_arrays(events(), frames, sensor_size=(1, 1))
+    for image in reconstruct(rec, rate_hz=100):
+        assert image.intensity[0, 0] == pytest.approx(100 / 255, rel=1e-4)
+
+
+def test_unknown_preset():
+    with pytest.raises(SettingsError, match="unknown preset 'iccv'"):
+        reconstruct(recording(), rate_hz=10, preset="iccv")
+
+
+def test_the_frame_noise_comes_from_the_frames_and_can_be_given():
+    rng = np.random.default_rng(0)
+    ramp = np.broadcast_to(np.linspace(20, 200, 80), (60, 80))
+    frames = [
+        Frame((ramp + rng.normal(0, 2, ramp.shape)).round().astype(np.uint8), t, t + 1000)
+        for t in range(0, 400_000, 50_000)
+    ]
+    source = Recording.from_arrays(np.empty(0, EVENT_DTYPE), frames, sensor_size=ramp.shape)
+    made = plan(source, at="frames")
+    assert made.frame_noise.read == made.settings.camera.frame_noise == pytest.approx(2 / 255, rel=0.1)
+    assert made.frame_noise.shot == made.settings.camera.shot_noise
+    for given, expected in (
+        ({"frame_noise": 0.004}, (0.004, 0.0)),
+        ({"frame_noise": 0.004, "shot_noise": 1e-4}, (0.004, 1e-4)),
+        ({"shot_noise": 1e-4}, (made.frame_noise.read, 1e-4)),
+    ):
+        settings = altered(PRESETS["default"], "camera", **given)
+        assert plan(source, at="frames", settings=settings).settings.camera.noise == expected
+    unknown = plan(recording(), at="frames")  # its pixels are too few to tell
+    assert unknown.frame_noise is None
+    assert unknown.settings.camera.noise == (unknown.settings.camera.usual_frame_noise, 0.0)
+    paper = plan(source, at="frames", preset="iccv2021").settings
+    assert paper.camera.frame_noise is None  # it has a confidence instead
+
+
+def test_the_bright_tail_comes_from_the_frames_and_can_be_given():
+    doubted = recording(0, None)
+    made = plan(doubted, at="frames").settings
+    counts = [count_bright(Camera.named("linear", 0.98), f.normalised()) for f in doubted.frames()]
+    expected = reduce(BrightTail.joined, counts).scale
+    assert made.filter.bright_tail == expected
+    given = altered(PRESETS["default"], "filter", bright_tail=0.7)
+    assert plan(doubted, at="frames", settings=given).settings.filter.bright_tail == 0.7
+
+
+def test_the_bright_tail_is_not_looked_for_where_nothing_asks_for_it():
+    """Thresholds are stated, and no highlight is expected above its bound."""
+    chosen = altered(PRESETS["default"], "filter", unshown_tail=0.0)
+    assert plan(recording(), at="frames", settings=chosen).settings.filter.bright_tail is None
+    assert plan(recording(), at="frames").settings.filter.bright_tail is not None
+    assert plan(recording(), at="frames", preset="iccv2021").settings.filter.bright_tail is None
+
+
+def test_highlights_are_believed_less_where_thresholds_are_estimated():
+    """A pixel that events take beyond white: by a prior of the tail's scale, rather than 1.5."""
+    frames = [Frame(np.full((4, 4), 200, np.uint8), t, t + 1000) for t in (0, 50_000)]
+    rise = np.zeros(8, EVENT_DTYPE)
+    rise["t"], rise["p"] = np.arange(60_000, 68_000, 1000), True
+    source = Recording.from_arrays(rise, frames, sensor_size=(4, 4))
+    stated = altered(PRESETS["default"], "events", threshold_on=0.2, threshold_off=0.2)
+    seen = []
+    for origin in ("settings", "estimate"):
+        chosen = dataclasses.replace(plan(source, times=[67_000], settings=stated), threshold_origin=origin)
+        (image,) = execute(source, chosen)
+        seen.append(image.intensity[0, 0])
+    assert seen[0] > seen[1] > 1
