@@ -12,7 +12,7 @@ import pytest
 from kalux import readers, recording
 from kalux.errors import EventError, ExposureError, FormatError, FrameError, InputError
 from kalux.frames import Frame
-from kalux.recording import Recording
+from kalux.recording import Recording, remembering
 from kalux.writers import hdf5
 from recordings import SIZE, same_frames, small_events, small_frames
 
@@ -248,3 +248,44 @@ def test_a_sensor_that_no_event_could_address_is_refused(tmp_path, size):
     source = dataclasses.replace(readers.read(path), sensor_size=size)
     with pytest.raises(FormatError, match="states a sensor of"):
         recording.Recording(source)
+
+
+def counted(made):
+    """A recording in ten chunks that adds to ``made`` whatever is read of it."""
+    events, frames = np.array_split(small_events(), 10), small_frames()
+
+    def parts(name, items):
+        for item in items:
+            made.append(name)
+            yield item
+
+    source = dataclasses.replace(
+        in_memory().source, events=lambda: parts("chunk", events), frames=lambda: parts("frame", frames)
+    )
+    return Recording(source)
+
+
+@pytest.mark.parametrize("events", [0, len(small_events()) // 3, len(small_events())])
+def test_what_is_remembered_is_the_same(events):
+    remembered = remembering(counted([]), events, small_frames()[0].image.nbytes)
+    next(iter(remembered.events()))
+    for _ in range(2):
+        assert np.array_equal(np.concatenate(list(remembered.events())), small_events())
+        assert same_frames(list(remembered.frames()), small_frames())
+
+
+def test_what_is_remembered_is_read_once():
+    made = []
+    remembered = remembering(counted(made), len(small_events()), 1 << 20)
+    for _ in range(3):
+        list(remembered.events())
+        list(remembered.frames())
+    assert (made.count("chunk"), made.count("frame")) == (10, len(small_frames()))
+
+
+def test_the_longest_exposure_is_known_once_all_frames_are_read():
+    made = []
+    rec = counted(made)
+    for _ in range(2):
+        assert rec.longest_exposure == max(frame.exposure for frame in small_frames())
+    assert len(made) == len(small_frames())

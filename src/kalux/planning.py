@@ -29,7 +29,7 @@ from kalux.frames import median_exposure
 from kalux.models.camera import BrightTail, Camera, count_bright
 from kalux.models.colour import white_balance
 from kalux.models.pixels import PixelCalibration, require_size
-from kalux.recording import Recording, no_frames
+from kalux.recording import Recording, no_frames, remembering
 from kalux.schedule import image_times
 from kalux.settings import EventSettings, Settings, altered, chosen_response
 from kalux.settings import preset as named_preset
@@ -41,6 +41,11 @@ DOUBTED: Final[tuple[ThresholdOrigin, ...]] = ("calibration", "estimate", "assum
 
 _NOISE_EVENTS: Final = 1_000_000
 """Of which the background noise is taken: at 15 million events/s the quiet time of 300,000 pixels in 70 ms."""
+
+_REMEMBERED_EVENTS: Final = 1 << 22
+_REMEMBERED_FRAMES: Final = 1 << 25
+"""Events (64 MB) and bytes of frames at the beginning that are read once for all estimates, which take most of their
+samples from there."""
 
 
 @dataclass(frozen=True)
@@ -124,6 +129,7 @@ def plan(
         )
     if known.pixels is not None:
         require_size(known.pixels, recording.sensor_size)
+    recording = remembering(recording, _REMEMBERED_EVENTS, _REMEMBERED_FRAMES)
     response = chosen_response(chosen.camera.response, recording.response)
     camera = Camera.named(response, chosen.camera.saturation)
     exposures, tail = _survey(recording, camera if _measures_tail(chosen) else None)
@@ -133,7 +139,7 @@ def plan(
     reference = chosen.camera.reference_exposure or median_exposure(lengths)
     chosen = altered(chosen, "camera", reference_exposure=reference, response=response)
     chosen = _with_white_balance(recording, chosen)
-    chosen, noise = _with_frame_noise(recording, chosen, int(lengths.max()))
+    chosen, noise = _with_frame_noise(recording, chosen)
     chosen, delay = _with_delay(recording, chosen)
     filled, origin, estimate = _with_thresholds(recording, chosen)
     filled, model = _with_event_model(recording, filled)
@@ -223,17 +229,12 @@ def _with_delay(recording: Recording, settings: Settings) -> tuple[Settings, Del
     return altered(settings, "events", delay=delay), estimate
 
 
-def _with_frame_noise(
-    recording: Recording, settings: Settings, longest: int
-) -> tuple[Settings, FrameNoise | None]:
-    """Fill in the frames' noise, where the filter uses it: from the settings, else an estimate, else the usual.
-
-    ``longest`` is the longest exposure, us.
-    """
+def _with_frame_noise(recording: Recording, settings: Settings) -> tuple[Settings, FrameNoise | None]:
+    """Fill in the frames' noise, where the filter uses it: from the settings, else an estimate, else the usual."""
     camera = settings.camera
     if camera.frame_noise is not None or not _uses_steps(settings):
         return settings, None
-    found = estimate_frame_noise(recording, camera, longest=longest)
+    found = estimate_frame_noise(recording, camera)
     if found is not None and not found.believed:
         found = None
     read, shot = camera.noise if found is None else (found.read, found.shot)

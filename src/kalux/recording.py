@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import warnings
 from collections.abc import Callable, Iterable, Iterator
+from itertools import islice
 from numbers import Real
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final, Generic, Literal, TypeVar
 
 import numba as nb
 import numpy as np
@@ -39,6 +41,8 @@ from kalux.frames import (
 from kalux.models.colour import sample_mosaic
 from kalux.readers import CHUNK_EVENTS, Source, joined
 
+T = TypeVar("T")
+
 _LARGEST_SIDE: Final = 1 << 16  # coordinates of events have 16 bits
 
 
@@ -66,6 +70,44 @@ class FrameStream:
 
     def __len__(self) -> int:
         return self._count()
+
+
+class _Remembered(Generic[T]):
+    """Items that are gone through several times, the first of which stay in memory; others are made anew each time."""
+
+    def __init__(self, make: Callable[[], Iterator[T]], size: Callable[[T], int], room: int) -> None:
+        self._make, self._size, self._room = make, size, room
+        self._kept: list[T] = []
+        self._all = False
+
+    def __call__(self) -> Iterator[T]:
+        given = 0
+        for item in self._kept:
+            given += 1
+            yield item
+        if self._all:
+            return
+        for item in islice(self._make(), given, None):
+            if given == len(self._kept) and self._size(item) <= self._room:
+                self._room -= self._size(item)
+                self._kept.append(item)
+            given += 1
+            yield item
+        self._all = given == len(self._kept)
+
+
+def remembering(recording: Recording, events: int, frame_bytes: int) -> Recording:
+    """The same recording, whose first ``events`` and ``frame_bytes`` of frames are read once for all who look at them.
+
+    They stay in memory as long as it is held; nobody may change them.
+    """
+    remembered = copy.copy(recording)
+    remembered.source = dataclasses.replace(
+        recording.source,
+        events=_Remembered(recording.source.events, len, events),
+        frames=_Remembered(recording.source.frames, lambda frame: frame.image.nbytes, frame_bytes),
+    )
+    return remembered
 
 
 def no_frames(recording: Recording) -> FrameError:
@@ -127,6 +169,7 @@ class Recording:
         self.white = white
         self._exposure = exposure
         self._stamp: Stamp = stamp
+        self._longest: int | None = None
 
     @classmethod
     def from_arrays(
@@ -226,6 +269,14 @@ class Recording:
         """The frame camera's response that the recording states, as in `kalux.settings.CameraSettings`, or None."""
         return self.source.response
 
+    @property
+    def longest_exposure(self) -> int:
+        """Of all frames, us; 0 without frames. They are read for it if nobody has read them all before."""
+        if self._longest is None:
+            for _ in self.frames():
+                pass
+        return self._longest or 0
+
     def ground_truth(self) -> GroundTruth | None:
         """Reference images that came with the recording, or None."""
         return None if self.source.ground_truth is None else self.source.ground_truth()
@@ -273,7 +324,7 @@ class Recording:
             yield chunk
 
     def _checked_frames(self, *, as_stored: bool = False) -> Iterator[Frame]:
-        previous = None
+        previous, longest = None, 0
         for index, frame in enumerate(self.source.frames()):
             if self.white is not None:
                 frame = dataclasses.replace(frame, white=self.white)
@@ -289,8 +340,9 @@ class Recording:
                 previous=previous,
                 exposure_known=self.exposure_known,
             )
-            previous = frame
+            previous, longest = frame, max(frame.exposure, longest)
             yield frame
+        self._longest = longest
 
 
 @nb.njit(cache=True, nogil=True)

@@ -79,7 +79,6 @@ def estimate_frame_noise(
     camera: CameraSettings,
     *,
     most_frames: int | None = None,
-    longest: int | None = None,
 ) -> FrameNoise | None:
     """Photon transfer curve of pixels without events nearby from one exposure's start to the next one's end.
 
@@ -95,18 +94,15 @@ def estimate_frame_noise(
         Response and saturation.
     most_frames
         Only so many frames from the start are looked at. Default: as many as it takes, at most 80.
-    longest
-        The longest exposure, us. Default: all frames are read for it.
 
     Raises
     ------
     ExposureError
         If the frames' exposures are not known.
     """
+    most_frames = most_frames or _enough_frames(recording.sensor_size)
     # Where noise leaves no pixel without events in 5x5 around it, 3x3 must do; it lets more faint motion in.
-    if longest is None:
-        longest = max((frame.exposure for frame in recording.frames()), default=0)
-    points = _points(recording, camera, most_frames or _enough_frames(recording.sensor_size), longest)
+    points = _points(recording, camera, most_frames, recording.longest_exposure)
     chosen = next((found for found in points if _is_curve(found)), None)
     if chosen is None:
         return None

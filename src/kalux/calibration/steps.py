@@ -116,8 +116,7 @@ def steps(
     ExposureError
         If the frames' exposures are not known.
     """
-    longest = max((frame.exposure for frame in recording.frames()), default=0)
-    margin = longest + max(abs(delay) for delay in delays) + round(_REACH)
+    margin = recording.longest_exposure + max(abs(delay) for delay in delays) + round(_REACH)
     passings = [
         _Passing(recording.sensor_size, periods, late, delay, -(-most // at_least)) for delay in delays
     ]

@@ -209,8 +209,7 @@ def _samples(
     most_frames: int,
 ) -> Iterator[tuple[_Samples, ...]]:
     """The usable pixels of every frame interval, once for every delay."""
-    longest = max((frame.exposure for frame in recording.frames()), default=0)
-    margin = longest + max(abs(d) for d in delays)
+    margin = recording.longest_exposure + max(abs(d) for d in delays)
     histories = [_History(recording.sensor_size, view) for _ in delays]
     for interval in intervals(recording, camera, margin=margin, most_frames=most_frames):
         yield tuple(
