@@ -62,11 +62,13 @@ def read_unshown(
     heard
         (N,) L of these pixels of `lifted`, after their neighbours are heard (K12).
     bound
-        (H, W) L: what neighbours say of a pixel does not take it below.
+        (H, W) L: what neighbours say of a pixel does not take it below, nor below white; what it is above white itself
+        is what events say, who are not exact.
     log_offset, prior
         I_0, and the prior on highlights (K6), which is to doubt what events say of them, not that they are bright.
     """
-    mean = np.maximum(heard, bound.reshape(-1)[unshown.pixels]).astype(np.float32)
+    least = np.minimum(bound.reshape(-1)[unshown.pixels], np.float32(prior.white))
+    mean = np.maximum(heard, least).astype(np.float32)
     white, scale2, stretch = (np.float32(value) for value in prior)
     _take_mean(unshown.excess, unshown.noise, np.float32(log_offset), white, scale2, stretch, mean)
     image.reshape(-1)[unshown.pixels] = mean
