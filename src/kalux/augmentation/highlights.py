@@ -48,6 +48,9 @@ _PRIOR_TOLD: Final = 5.0
 _NOISE: Final = 3.0
 """Standard deviations of a frame's noise below its bound from which a pixel has left saturation by more than noise."""
 
+_RAISED: Final = np.float32(1e-4)
+"""By more than this, log intensity, and not by rounding, a frame raises a bound."""
+
 _AROUND: Final = np.ones((3, 3), np.uint8)
 
 
@@ -141,7 +144,7 @@ def follow_unshown(
     )
     unknown = pixels[~measured]
     excess = beyond_rims(shown, unknown, near / max(clipped, 1), tail)
-    before, raised = memory.excess[~measured], (bounded > predicted)[~measured]
+    before, raised = memory.excess[~measured], (bounded > predicted + _RAISED)[~measured]
     excess = np.where(raised, np.minimum(excess, before), before)
     return memory._replace(
         pixels=unknown,
@@ -178,7 +181,8 @@ def beyond_rims(shown: Shown, pixels: NDArray[np.int64], near: float, tail: Tail
     hard = np.where(rims > 0.0, hard / np.maximum(rims, 1e-300), 1.0)
     level = tail.most * -np.expm1(-tail.share * scale / tail.most) * hard
     inside = -np.expm1(-distance.reshape(-1)[pixels])
-    return _between(level.astype(np.float32), pixels, shown.darker.shape[1]) * inside
+    excess: NDArray[np.float32] = _between(level.astype(np.float32), pixels, shown.darker.shape[1]) * inside
+    return excess
 
 
 def _counts(shown: Shown) -> tuple[int, int]:
@@ -236,7 +240,8 @@ def _as_told(
     factor = (here + _PRIOR_TOLD * of_all) / (foretold + _PRIOR_TOLD)
     more = np.maximum(here - foretold, 0.0) / (tellers + _PRIOR_PIXELS)
     times, plus = (_between(values.astype(np.float32), pixels, width) for values in (factor, more))
-    return np.minimum(times * excess, excess + plus)
+    confirmed: NDArray[np.float32] = np.minimum(times * excess, excess + plus)
+    return confirmed
 
 
 def expected_excess(memory: UnshownMemory, variance: Floats, initial_variance: float) -> Unshown | None:
