@@ -598,6 +598,14 @@ def regularised(level, variance, moving, difference):
     return out, doubt
 
 
+def steps(rows, columns):
+    """Distance in steps to neighbours, diagonal ones, and knight's moves, as long as OpenCV's 5x5 mask has them."""
+    less, more = sorted((abs(rows), abs(columns)))
+    if more >= 2 * less:
+        return 2.1969 * less + more - 2 * less
+    return 2.1969 * (more - less) + 1.4 * (2 * less - more)
+
+
 def beyond_rims(split, settings, frames, k):
     """K15: how far above white pixels are that frame ``k`` clips, from those around. Of a sensor of one part."""
     camera = Camera.named(chosen_response(settings.camera.response, None), settings.camera.saturation)
@@ -630,7 +638,7 @@ def beyond_rims(split, settings, frames, k):
     level = (
         most * (1 - np.exp(-settings.filter.unshown_tail * scale / most)) * (np.mean(hard) if hard else 1.0)
     )
-    far = {p: min((np.hypot(p[0] - q[0], p[1] - q[1]) for q in darker), default=np.inf) for p in found}
+    far = {p: min((steps(p[0] - q[0], p[1] - q[1]) for q in darker), default=np.inf) for p in found}
     return {p: level * (1 - np.exp(-distance)) for p, distance in far.items()}
 
 

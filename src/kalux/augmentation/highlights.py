@@ -142,10 +142,11 @@ def follow_unshown(
     near, clipped = (
         old + new for old, new in zip((memory.near, memory.clipped), _counts(shown), strict=True)
     )
-    unknown = pixels[~measured]
-    excess = beyond_rims(shown, unknown, near / max(clipped, 1), tail)
-    before, raised = memory.excess[~measured], (bounded > predicted + _RAISED)[~measured]
-    excess = np.where(raised, np.minimum(excess, before), before)
+    unknown, excess = pixels[~measured], memory.excess[~measured]
+    raised = (bounded > predicted + _RAISED)[~measured]
+    if raised.any():
+        around = beyond_rims(shown, unknown[raised], near / max(clipped, 1), tail)
+        excess[raised] = np.minimum(excess[raised], around)
     return memory._replace(
         pixels=unknown,
         bound=bounded[~measured],
@@ -174,9 +175,9 @@ def beyond_rims(shown: Shown, pixels: NDArray[np.int64], near: float, tail: Tail
     """
     just_below = shown.measured & (shown.darker < _NEAR)
     distance, rim, hardness = _rims(shown)
-    whole = np.ones(rim.shape, np.bool_)
-    of_parts = (_around(_sums(plane)) for plane in (shown.clipped, just_below, whole, rim, hardness))
-    clipped, below, area, rims, hard = of_parts
+    of_parts = (_around(_sums(plane)) for plane in (shown.clipped, just_below, rim, hardness))
+    clipped, below, rims, hard = of_parts
+    area = _area(shown.darker.shape)
     scale = _NEAR * (clipped + _WHOLE * area) / (below + (_WHOLE * near + _LEAST) * area)
     hard = np.where(rims > 0.0, hard / np.maximum(rims, 1e-300), 1.0)
     level = tail.most * -np.expm1(-tail.share * scale / tail.most) * hard
@@ -192,19 +193,21 @@ def _counts(shown: Shown) -> tuple[int, int]:
 
 
 def _rims(shown: Shown) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.float32]]:
-    """(H, W) each: the distance to the nearest pixel that is not clipped, which pixels border on clipped ones, and how
-    hard these borders are, 0 to 1."""
+    """(H, W) each: distances to the nearest pixels that are not clipped, which pixels border on clipped ones, how hard.
+
+    Distances are right to 2 %, hardness is 0 to 1.
+    """
     shape, pitch = shown.clipped.shape, shown.pitch
     distance, hardness = np.empty(shape, np.float32), np.zeros(shape, np.float32)
     rim = np.zeros(shape, np.bool_)
     for row, column in np.ndindex(pitch, pitch):
         of_colour = np.s_[row::pitch, column::pitch]
         clipped = np.ascontiguousarray(shown.clipped[of_colour], np.uint8)
-        distance[of_colour] = pitch * cv2.distanceTransform(clipped, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-        beside = cv2.dilate(clipped, _AROUND).astype(np.bool_) & shown.measured[of_colour]
-        darkest = cv2.dilate(np.ascontiguousarray(shown.darker[of_colour]), _AROUND)
+        distance[of_colour] = pitch * cv2.distanceTransform(clipped, cv2.DIST_L2, cv2.DIST_MASK_5)
+        beside = cv2.dilate(clipped, _AROUND).view(np.bool_) & shown.measured[of_colour]
+        darkest = cv2.dilate(np.ascontiguousarray(shown.darker[of_colour]), _AROUND)[beside]
         rim[of_colour] = beside
-        hardness[of_colour] = np.where(beside, darkest / (darkest + np.float32(_SOFT)), np.float32(0.0))
+        hardness[of_colour][beside] = darkest / (darkest + np.float32(_SOFT))
     return distance, rim, hardness
 
 
@@ -294,8 +297,19 @@ def _at_pixels(pixels, width, parts, values):  # type: ignore[no-untyped-def]
 def _sums(values: NDArray[Any]) -> Floats:
     """Over the pixels of every part."""
     height, width = values.shape
-    by_row = np.add.reduceat(values, np.arange(0, height, _PART), axis=0, dtype=np.float32)
-    return np.add.reduceat(by_row, np.arange(0, width, _PART), axis=1, dtype=np.float64)
+    below, right = -height % _PART, -width % _PART
+    plane: NDArray[Any] = values.astype(np.float32, copy=False)
+    if below or right:
+        plane = cv2.copyMakeBorder(plane, 0, below, 0, right, cv2.BORDER_CONSTANT, value=0.0)
+    size = (plane.shape[1] // _PART, plane.shape[0] // _PART)
+    means = cv2.resize(plane, size, interpolation=cv2.INTER_AREA)
+    return np.asarray(means, np.float64) * (_PART * _PART)
+
+
+@functools.cache
+def _area(shape: tuple[int, int]) -> Floats:
+    """Of every part, the pixels around. Not to be changed."""
+    return _around(_sums(np.ones(shape, np.float32)))
 
 
 def _around(parts: Floats) -> Floats:
