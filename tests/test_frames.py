@@ -66,7 +66,7 @@ def check(one, **options):
     check_frame(one, (3, 4), where="here", index=7, **options)
 
 
-@pytest.mark.parametrize("white", [0, -1.0, np.nan, np.inf, "255", [255]])
+@pytest.mark.parametrize("white", [0, -1.0, np.nan, np.inf, 1e-320, 1e24, "255", [255]])
 def test_a_white_value_is_positive(white):
     with pytest.raises(FrameError, match="frame 7 has the white value"):
         check(frame(white=white))

@@ -61,6 +61,7 @@ def test_given_times_may_repeat_and_reach_to_the_last_event():
         ({"rate_hz": float("nan")}, "rate is nan Hz"),
         ({"rate_hz": float("inf")}, "rate is inf Hz"),
         ({"rate_hz": 2e6}, "at most 1e6"),
+        ({"rate_hz": 1e-320}, "at least 1e-6"),
         ({"rate_hz": "100"}, "rate is '100' Hz"),
         ({"times": []}, "at least one"),
         ({"times": 30_000}, "times must be a list"),

@@ -115,6 +115,11 @@ class GroundTruth:
     noise: tuple[float, float] | None = None
 
 
+def median_exposure(exposures: Iterable[int]) -> int:
+    """us: the exposure at which a saturated pixel is 1, where nothing else is said, of one or more exposures."""
+    return round(float(np.median([*exposures])))
+
+
 def place_exposure(frame: Frame, exposure: int, stamp: Stamp) -> Frame:
     """Give a frame that has only a stamp its exposure interval.
 
@@ -151,8 +156,8 @@ def _is_plain(array: Any) -> bool:
 
 
 def is_white(value: Any) -> bool:
-    """Whether a value can be that of a saturated pixel."""
-    return isinstance(value, Real) and 0 < float(value) < np.inf
+    """Whether a value can be that of a saturated pixel, in any unit."""
+    return isinstance(value, Real) and 1e-12 <= float(value) <= 1e12
 
 
 def check_frame(

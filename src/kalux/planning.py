@@ -25,6 +25,7 @@ from kalux.calibration.steps import MAX_SAMPLES
 from kalux.calibration.values import Calibration
 from kalux.calibration.white_balance import grey_world
 from kalux.errors import InputError, require_type
+from kalux.frames import median_exposure
 from kalux.models.camera import BrightTail, Camera, count_bright
 from kalux.models.colour import white_balance
 from kalux.models.pixels import PixelCalibration, require_size
@@ -129,7 +130,7 @@ def plan(
     begin = _begin_time(exposures[0], chosen, lookahead)
     wanted = image_times(recording, exposures, begin, rate_hz=rate_hz, times=times, at=at)
     lengths = exposures[:, 1] - exposures[:, 0]
-    reference = chosen.camera.reference_exposure or round(float(np.median(lengths)))
+    reference = chosen.camera.reference_exposure or median_exposure(lengths)
     chosen = altered(chosen, "camera", reference_exposure=reference, response=response)
     chosen = _with_white_balance(recording, chosen)
     chosen, noise = _with_frame_noise(recording, chosen, int(lengths.max()))

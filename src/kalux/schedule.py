@@ -75,9 +75,9 @@ def image_times(
 
 def _grid(begin: int, end: int, rate_hz: float) -> NDArray[np.int64]:
     """From ``begin`` to ``end`` at most, without drift."""
-    if not (isinstance(rate_hz, Real) and 0 < rate_hz <= 1e6):
+    if not (isinstance(rate_hz, Real) and 1e-6 <= rate_hz <= 1e6):
         raise InputError(
-            f"reconstruct: the image rate is {rate_hz!r} Hz; more than 0 and at most 1e6 is possible"
+            f"reconstruct: the image rate is {rate_hz!r} Hz; at least 1e-6 and at most 1e6 is possible"
         )
     count = int(np.floor((end - begin) * 1e-6 * rate_hz + 1e-9)) + 1
     grid: NDArray[np.int64] = np.rint(np.arange(count) * (1e6 / rate_hz)).astype(np.int64)

@@ -408,7 +408,9 @@ _POSITIVE: Final = {
     "cutoff",
 }
 _WHOLE: Final = {"delay", "usual_delay", "reference_exposure", "refractory_period"}
-_LARGEST: Final = 10**18  # fits int64, and is more than any value can mean
+_LARGEST_WHOLE: Final = 10**18  # fits int64
+_LARGEST: Final = 1e10  # more than any value can mean, and its square is a number in single precision
+_LEAST: Final = 1e-12  # but 0: less than any value can mean, and so is its square
 _SIGNED: Final = {"delay", "usual_delay"}
 _CHOICES: Final = {
     "kind": ("akf", "cf"),
@@ -427,6 +429,7 @@ def _check(settings: Settings) -> None:
 
 
 def _check_value(label: str, name: str, value: Any, default: Any) -> None:
+    most = _LARGEST_WHOLE if name in _WHOLE else _LARGEST
     if name in _CHOICES:
         if value not in _CHOICES[name]:
             raise SettingsError(
@@ -440,8 +443,12 @@ def _check_value(label: str, name: str, value: Any, default: Any) -> None:
             raise SettingsError(f"settings: {label} needs a number")
     elif name in _WHOLE and not (isinstance(value, int) and not isinstance(value, bool)):
         raise SettingsError(f"settings: {label} is {value!r}; whole microseconds are needed")
-    elif isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= _LARGEST:
-        raise SettingsError(f"settings: {label} is {value!r}; a finite number is needed, at most 1e18")
+    elif isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= most:
+        raise SettingsError(f"settings: {label} is {value!r}; a finite number is needed, at most {most:.0e}")
+    elif 0 < abs(value) < _LEAST:
+        raise SettingsError(
+            f"settings: {label} is {value!r}; {_LEAST:g} is the least above 0 that is possible"
+        )
     elif (value < 0 and name not in _SIGNED) or (name in _POSITIVE and value == 0):
         raise SettingsError(
             f"settings: {label} is {value}; it must be {'positive' if name in _POSITIVE else '0 or more'}"

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from kalux import PRESETS
+from kalux import PRESETS, Recording
 from kalux.calibration.values import Calibration
 from kalux.datasets import SensorSettings
 from kalux.errors import InputError
@@ -15,7 +15,7 @@ from kalux.evaluation.fit import READS, fit_settings, score_settings
 from kalux.evaluation.held_out import hold_out_frames
 from kalux.settings import altered
 
-from builders import moving_blocks, unlabelled
+from builders import colour_blocks, moving_blocks, unlabelled
 
 SENSOR = SensorSettings(threshold_on=0.2, threshold_off=0.2, read_noise=0.01, threshold_mismatch=0.05)
 WRONG = Calibration({"events": {"threshold_on": 0.3, "threshold_off": 0.3, "delay": 0}})
@@ -63,6 +63,35 @@ def test_a_variance_that_is_far_off_is_less_likely(recording):
     timid = altered(good, "events", step_variance=20.0)
     assert score_settings(held, good).nll < score_settings(held, timid).nll
     assert np.isfinite(score_settings(held, timid).mse)
+
+
+def test_frames_in_colour_are_scored_by_their_luminance():
+    _, made = colour_blocks()
+    found = score_settings(hold_out_frames(made.recording(), reads=READS), PRESETS["default"])
+    assert np.isfinite(found.nll)
+    assert found.mse < 0.01
+
+
+def test_pixels_that_a_frame_does_not_measure_are_not_compared():
+    """Whatever stands there in the frames that are held out."""
+    made = moving_blocks(0.05, 0.8, sensor=SENSOR)
+    valid = np.ones(made.scene.sensor_size, bool)
+    valid[:, :9] = False
+    frames = [dataclasses.replace(frame, valid=valid) for frame in made.frames]
+    wrong = [dataclasses.replace(f, image=np.where(valid, f.image, 7)) for f in frames]
+    scores = [
+        score_settings(
+            hold_out_frames(
+                Recording.from_arrays(
+                    made.events, shown, sensor_size=made.scene.sensor_size, contrast_threshold=0.2
+                ),
+                reads=READS,
+            ),
+            PRESETS["default"],
+        )
+        for shown in (frames, [b if i % 2 else a for i, (a, b) in enumerate(zip(frames, wrong, strict=True))])
+    ]
+    assert scores[0] == scores[1]
 
 
 def test_no_evaluation_is_refused(recording):

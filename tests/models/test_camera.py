@@ -364,6 +364,13 @@ def test_the_tail_is_one_of_light_not_of_response():
     assert count_bright(gamma, levels ** (1 / 2.2)) == count_bright(linear, levels)
 
 
+def test_a_white_value_beyond_the_type_is_one_that_no_pixel_has():
+    image = np.arange(256, dtype=np.uint8).reshape(16, 16)
+    linear = Camera.named("linear", 0.98)
+    for white in (300.0, 512.0, 1e12):
+        assert count_bright(linear, image, white) == count_bright(linear, image / white)
+
+
 def test_black_hides_the_irradiance_of_half_a_level():
     """Of a linear response half a level; of an s-curve its toe; nothing of what is not black; by the exposure."""
     response = np.array([0.0, 0.4 / 255, 1 / 255, 1.0])

@@ -27,6 +27,7 @@ from kalux.compiled import (
     ONE,
     UNWEIGHED,
     WEIGHT_UNIT,
+    apart,
     event_column,
     event_is_on,
     event_row,
@@ -108,8 +109,8 @@ def integrate_exposure(
     """
     chunks = [events] if isinstance(events, np.ndarray) else events
     exposure = expose(chunks, start, end, (step_on, step_off), (1.0, 1.0), weighed=False)
-    integrals = np.zeros((5, *step_on.shape), np.float32)
-    _finish_exposure(*exposure, end - start, *integrals.reshape(5, -1))
+    integrals = apart(5, step_on.shape)
+    _finish_exposure(*exposure, end - start, *(plane.reshape(-1) for plane in integrals))
     return ExposureIntegrals(*integrals)
 
 
@@ -312,15 +313,18 @@ def relative_levels(exposure, block, duration, fields, middle, events):  # type:
 def _finish_exposure(  # type: ignore[no-untyped-def]
     pixels, touched, exposure, log_mean, to_middle, to_end, largest, count_of
 ):
-    """Fill the planes of `ExposureIntegrals`, which are 0 where nothing has moved."""
+    """Fill the planes of `ExposureIntegrals`: 0 where nothing has moved."""
     duration = np.float32(exposure)
     fields = np.empty((EXPOSURE_FIELDS, EXPOSED), np.float32)
     level, integral, since = fields[_LEVEL], fields[_INTEGRAL], fields[_SINCE]
     at_middle, peak, events = fields[_AT_MIDDLE], fields[_PEAK], fields[_EVENTS]
     for block in range(np.uint64(len(touched))):
-        if touched[block]:
-            first = block * np.uint64(EXPOSED)
-            count = min(np.uint64(len(pixels)) - first, np.uint64(EXPOSED))
+        first = block * np.uint64(EXPOSED)
+        count = min(np.uint64(len(pixels)) - first, np.uint64(EXPOSED))
+        if not touched[block]:
+            for plane in (log_mean, to_middle, to_end, largest, count_of):
+                plane[first : first + count] = np.float32(0.0)
+        else:
             unpack(pixels, np.int64(first), np.int64(count), fields)
             for i in range(count):  # a loop each: each is vector code then
                 log_mean[first + i] = logarithm(mean_level(level[i], integral[i], since[i], duration))

@@ -28,7 +28,7 @@ from kalux.augmentation.deblur import between
 from kalux.calibration.registration import Registration
 from kalux.calibration.regression import huber_weights
 from kalux.errors import InputError
-from kalux.events import EventArray
+from kalux.events import NEVER, EventArray
 from kalux.frames import Frame
 from kalux.models.camera import Response
 from kalux.settings import CameraSettings
@@ -154,14 +154,14 @@ def _levels(t, x, y, p, times, spread, longest, on, off):  # type: ignore[no-unt
     queries, height, width = on.shape
     # Of every pixel: the event that waits for the one after it, the one before it, and the next time to be told.
     waiting = np.full((height, width), -1, np.int64)
-    before = np.full((height, width), -(1 << 60), np.int64)
+    before = np.full((height, width), NEVER, np.int64)
     upcoming = np.zeros((height, width), np.int64)
     level = np.zeros((2, height, width), np.float32)
     for i in range(len(t) + height * width):
         if i < len(t):
             row, column, now = y[i], x[i], t[i]
         else:  # the last events have none after them
-            row, column, now = (i - len(t)) // width, (i - len(t)) % width, 1 << 60
+            row, column, now = (i - len(t)) // width, (i - len(t)) % width, -NEVER
         w = waiting[row, column]
         k = upcoming[row, column]
         if w >= 0:

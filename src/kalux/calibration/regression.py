@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,3 +103,8 @@ def standard_errors(
         return np.full(count, np.inf)
     spread: Array = np.sqrt((len(without) - 1) * np.var(np.array(without), axis=0))
     return spread
+
+
+def robust_deviation(residuals: NDArray[np.floating[Any]]) -> float:
+    """Standard deviation about 0, from the median absolute value, as normal residuals have it."""
+    return NORMAL_MAD * float(np.median(np.abs(residuals)))

@@ -32,9 +32,9 @@ from kalux.augmentation.refractory import step_weight
 from kalux.calibration.contrast import Usual, estimate_thresholds
 from kalux.calibration.intervals import Interval, intervals
 from kalux.calibration.refractory import shortest_interval
-from kalux.calibration.regression import HUBER, NORMAL_MAD, standard_errors, two_stage
+from kalux.calibration.regression import HUBER, robust_deviation, standard_errors, two_stage
 from kalux.calibration.values import Calibration
-from kalux.events import EventArray
+from kalux.events import NEVER, EventArray
 from kalux.filters.shots import Shot
 from kalux.recording import Recording
 from kalux.settings import CameraSettings, EventSettings
@@ -224,7 +224,7 @@ class _History:
 
     def __init__(self, shape: tuple[int, int], view: _View) -> None:
         self._view, self._shape = view, shape
-        self._last = np.full(shape, -(1 << 60), np.int64)
+        self._last = np.full(shape, NEVER, np.int64)
         self.sign = np.zeros(shape)
         self.begun = False
 
@@ -261,7 +261,7 @@ def _of_interval(
     events = interval.events.copy()
     events["t"] -= delay
     if not history.begun:
-        history.counts(between(events, -(1 << 60), interval.start))
+        history.counts(between(events, NEVER, interval.start))
         history.begun = True
     before = history.sign.copy()
     on, off, crowded = history.counts(between(events, interval.start, interval.end))
@@ -367,13 +367,13 @@ def _residual_variance(data: _Samples, solution: Array) -> _Variance:
     residual = data.change - data.explained @ solution
     numbers, variances, sizes = [], [], []
     for n in range(1, 9):
-        inside = np.abs(residual[events == n])
+        inside = residual[events == n]
         if len(inside) >= 100:
             numbers.append(n)
-            variances.append((NORMAL_MAD * float(np.median(inside))) ** 2)
+            variances.append(robust_deviation(inside) ** 2)
             sizes.append(len(inside))
     if len(numbers) < 2:
-        scale = NORMAL_MAD * float(np.median(np.abs(residual)))
+        scale = robust_deviation(residual)
         return _Variance(max(scale**2, 1e-8), 0.0)
     per_event, still = np.polyfit(numbers, variances, 1, w=np.sqrt(sizes))
     per_event = max(float(per_event), 0.0)

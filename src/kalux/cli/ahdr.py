@@ -6,8 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from kalux.cli.info import add_recording, open_recording
 from kalux.cli.parser import Parser, UsageError, number, whole
+from kalux.cli.recordings import add_recording, open_recording
 from kalux.cli.terminal import say, warn
 from kalux.wording import how_many
 
@@ -67,9 +67,9 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     """Run the command."""
     import numpy as np
 
-    from kalux.cli.convert import check_name, write_copy
     from kalux.cli.output import check_file
     from kalux.cli.progress import Progress
+    from kalux.cli.recordings import check_name, write_copy
     from kalux.datasets.ahdr import artificial_hdr
     from kalux.settings import CameraSettings
 

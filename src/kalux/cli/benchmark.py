@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from kalux.cli.metrics import add_metrics, lpips_files, lpips_weights, named_methods
 from kalux.cli.parser import Parser, UsageError, number, whole
+from kalux.cli.recordings import check_stamp
 from kalux.cli.terminal import error_line, say
 
 if TYPE_CHECKING:
@@ -104,8 +105,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     from kalux.evaluation.benchmark.sequences import Options, gather
     from kalux.evaluation.scores import require_dependencies
 
-    if options.stamp is not None and options.exposure is None:
-        raise UsageError("--stamp says what a frame's time marks for --exposure; give --exposure, too")
+    check_stamp(options)
     if options.processes is not None and options.processes < 1:
         raise UsageError(f"--processes {options.processes}: at least 1 is needed")
     require_dependencies()

@@ -6,8 +6,8 @@ import argparse
 from typing import Any
 
 from kalux.cli.calibrations import add_result, check_result, finish
-from kalux.cli.info import add_recording, open_recording
 from kalux.cli.parser import Parser, whole
+from kalux.cli.recordings import add_recording, open_recording
 
 _DESCRIPTION = """\
 Measure the contrast thresholds, ON and OFF, on average and of every pixel, with their spread and standard errors,

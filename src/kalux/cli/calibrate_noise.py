@@ -6,8 +6,8 @@ import argparse
 from typing import Any
 
 from kalux.cli.calibrations import add_calibration, add_result, check_result, finish, given_calibration
-from kalux.cli.info import add_recording, open_recording
 from kalux.cli.parser import Parser, whole
+from kalux.cli.recordings import add_recording, open_recording
 from kalux.cli.terminal import say
 
 _DESCRIPTION = """\

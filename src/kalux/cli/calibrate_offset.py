@@ -7,14 +7,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from kalux.cli.info import add_recording, open_recording
 from kalux.cli.parser import Parser, UsageError, number
+from kalux.cli.recordings import add_recording, open_recording
 from kalux.cli.terminal import say, warn
 from kalux.errors import InputError
 
 if TYPE_CHECKING:
     from kalux.calibration.offset import OffsetEstimate
-    from kalux.events import EventArray
 
 _DESCRIPTION = """\
 Estimate what has to be added to the frames' times to have those of the events, where no trigger tells it: by
@@ -70,7 +69,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     from kalux.calibration.registration import Registration
     from kalux.calibration.rig import Lens
     from kalux.cli.output import check_file, check_picture, write_picture
-    from kalux.cli.progress import Progress
+    from kalux.cli.progress import Progress, counted
     from kalux.writers.files import save
 
     centre, reach = checked_range(options)
@@ -81,13 +80,13 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     lens = Lens.pinhole(recording.sensor_size)
     same = Registration(lens, lens, np.eye(3))
     with Progress("correlating", quiet=options.quiet) as progress:
-
-        def events() -> Iterator[EventArray]:
-            for chunk in recording.events():
-                yield chunk
-                progress.add(events=len(chunk))
-
-        found = estimate_offset(recording.stamped_frames, events, same, centre=centre, reach=reach)
+        found = estimate_offset(
+            recording.stamped_frames,
+            lambda: counted(recording.events(), lambda chunk: progress.add(events=len(chunk))),
+            same,
+            centre=centre,
+            reach=reach,
+        )
     if not found.coarse.sure:
         warn(
             f"the correlation is {found.coarse.peak:.2f}, {found.coarse.ratio:.2f} times the next peak: the offset "

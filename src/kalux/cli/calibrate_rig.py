@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import argparse
 import re
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from kalux.cli.parser import Parser, UsageError, number, whole
 from kalux.cli.terminal import say, warn
+
+if TYPE_CHECKING:
+    from kalux.calibration.boards import RigCalibration
 
 _DESCRIPTION = """\
 Calibrate an event camera and a frame camera side by side: focal length, principal point and distortion of
@@ -79,7 +83,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     from kalux.calibration.rig import rig_toml
     from kalux.calibration.two_cameras import open_frames
     from kalux.cli.output import check_file, check_picture, write_picture
-    from kalux.cli.progress import Progress
+    from kalux.cli.progress import Progress, counted
     from kalux.writers.files import save
 
     columns, rows = board_size(options.board)
@@ -93,13 +97,8 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     frames = open_frames(options.frames, start=options.frames_start, rate_hz=options.frames_rate)
     views = []
     with Progress("looking for the board", quiet=options.quiet) as progress:
-
-        def counted() -> Any:
-            for chunk in events.events():
-                yield chunk
-                progress.add(events=len(chunk))
-
-        images = event_images(counted(), events.sensor_size, options.window * 1000)
+        chunks = counted(events.events(), lambda chunk: progress.add(events=len(chunk)))
+        images = event_images(chunks, events.sensor_size, options.window * 1000)
         for view in find_views(board, images, frames.stamped_frames()):
             views.append(view)
             progress.add(images=1)
@@ -113,21 +112,27 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
             f"the board covered {100 * about['coverage_events']:.0f} % of the event image and "
             f"{100 * about['coverage_frames']:.0f} % of the frames; distortion is a guess where it never was"
         )
-    if options.quiet:
-        return
-    say(f"views        {about['views']} used, {found.dropped} dropped because they did not agree")
+    if not options.quiet:
+        for line in described(found):
+            say(line)
+        say(f"wrote {options.out}")
+
+
+def described(found: RigCalibration) -> Iterator[str]:
+    """What was found, a line each."""
+    about = found.rig.about
+    yield f"views        {about['views']} used, {found.dropped} dropped because they did not agree"
     for name, lens in (("events", found.rig.events), ("frames", found.rig.frames)):
         f = lens.matrix
-        say(
+        yield (
             f"{name:<12} focal length {f[0, 0]:.1f} and {f[1, 1]:.1f} px, centre ({f[0, 2]:.1f}, {f[1, 2]:.1f}), "
             f"k1 {lens.distortion[0]:.3f}; error {about[f'rms_{name}_px']:.2f} px, "
             f"board seen in {100 * about[f'coverage_{name}']:.0f} % of the image"
         )
-    say(
+    yield (
         f"pose         {found.rig.angle:.2f} degrees, {1e3 * found.rig.baseline:.1f} mm apart; "
         f"error of both together {about['rms_rig_px']:.2f} px"
     )
-    say(f"wrote {options.out}")
 
 
 def board_size(text: str) -> tuple[int, int]:

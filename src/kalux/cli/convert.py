@@ -4,20 +4,16 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import os
-from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from kalux.cli.calibrations import add_calibration, given_calibration
-from kalux.cli.info import add_recording, open_recording
 from kalux.cli.parser import Parser, UsageError
+from kalux.cli.recordings import HDF5, Stated, add_recording, check_name, open_recording, streams, write_copy
 from kalux.cli.terminal import say, warn
 from kalux.wording import how_many
 
 if TYPE_CHECKING:
-    from kalux.events import EventArray
-    from kalux.frames import Frame
     from kalux.recording import Recording
 
 T = TypeVar("T")
@@ -34,7 +30,6 @@ examples:
   kalux convert night_drive.bag night_drive.aedat4
   kalux convert slider_depth slider.h5 --exposure 10000 --stamp start"""
 
-_HDF5 = (".h5", ".hdf5")
 _AEDAT4 = (".aedat4",)
 _THRESHOLDS = ("threshold_on", "threshold_off")
 
@@ -61,7 +56,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     from kalux.cli.output import check_file
     from kalux.cli.progress import Progress, short_number
 
-    check_name(options.out, Path(options.recording), (*_HDF5, *_AEDAT4))
+    check_name(options.out, Path(options.recording), (*HDF5, *_AEDAT4))
     check_file(options.out, overwrite=options.overwrite)
     stated = _calibrated(options)
     recording = open_recording(options)
@@ -90,28 +85,6 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
             f"wrote {how_many(progress.events, 'event')} and {how_many(progress.images, 'frame')} to {options.out} "
             f"in {seconds:.1f} s ({short_number(progress.events / seconds)} events/s)"
         )
-
-
-def check_name(out: Path, recording: Path, suffixes: tuple[str, ...] = _HDF5) -> None:
-    """Refuse names that say another format than is written, and the recording's own.
-
-    Raises
-    ------
-    UsageError
-        With what to do instead.
-    """
-    if out.suffix.lower() not in suffixes:
-        also = ", or in .aedat4 for AEDAT 4" if ".aedat4" in suffixes else ""
-        raise UsageError(f"{out}: the output is a kalux HDF5 file; give a name that ends in .h5{also}")
-    if os.path.exists(out) and os.path.exists(recording) and out.samefile(recording):
-        raise UsageError(f"{out}: this is the recording itself; choose another name for the copy")
-
-
-class Stated(NamedTuple):
-    """What a copy says of the sensor in place of the recording; None: what the recording says."""
-
-    contrast_threshold: tuple[float, float] | None = None
-    response: str | None = None
 
 
 def _calibrated(options: argparse.Namespace) -> Stated:
@@ -175,7 +148,7 @@ def _write_aedat4(recording: Recording, out: Path, progress: Any) -> None:
     from kalux.writers import aedat4
 
     with interrupts_held() as let_through:
-        events, frames = _streams(recording, progress, let_through)
+        events, frames = streams(recording, progress, let_through)
         aedat4.write(
             out,
             sensor_size=recording.sensor_size,
@@ -183,52 +156,3 @@ def _write_aedat4(recording: Recording, out: Path, progress: Any) -> None:
             frames=frames,
             exposure_known=recording.exposure_known,
         )
-
-
-def write_copy(recording: Recording, out: Path, progress: Any, stated: Stated | None = None) -> None:
-    """Write all that a recording holds as kalux HDF5; the file appears when it is complete.
-
-    Raises
-    ------
-    InputError
-        Whatever is wrong with the recording; nothing is left of the copy.
-    OutputError
-        If the file cannot be written.
-    """
-    from kalux.cli.signals import interrupts_held
-    from kalux.writers import hdf5
-
-    # An interrupt inside HDF5 would crash it: it waits for the next chunk or frame.
-    stated = stated or Stated()
-    with interrupts_held() as let_through:
-        events, frames = _streams(recording, progress, let_through)
-        hdf5.write(
-            out,
-            sensor_size=recording.sensor_size,
-            events=events,
-            frames=frames,
-            exposure_known=recording.exposure_known,
-            contrast_threshold=stated.contrast_threshold or recording.contrast_threshold,
-            inverse_covariance=recording.source.inverse_covariance,
-            ground_truth=recording.ground_truth(),
-            mosaic=recording.mosaic,
-            response=stated.response or recording.response,
-        )
-
-
-def _streams(
-    recording: Recording, progress: Any, let_through: Callable[[], None]
-) -> tuple[Iterator[EventArray], Iterator[Frame]]:
-    """Events and frames as stored, with progress."""
-    return (
-        counted(recording.events(), lambda chunk: progress.add(events=len(chunk)), let_through),
-        counted(recording.stored_frames(), lambda _: progress.add(images=1), let_through),
-    )
-
-
-def counted(items: Iterable[T], count: Callable[[T], None], let_through: Callable[[], None]) -> Iterator[T]:
-    """The same items; interrupts are let through before each, and each is counted when it has been used."""
-    for item in items:
-        let_through()
-        yield item
-        count(item)

@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING, Any, Final
 
 from kalux.cli.calibrations import add_calibration, given_calibration
 from kalux.cli.checking import check_recording
-from kalux.cli.info import add_recording, open_recording
 from kalux.cli.metrics import add_metrics, lpips_weights, named_methods
 from kalux.cli.parser import Parser, UsageError, whole
+from kalux.cli.recordings import add_recording, open_recording
 from kalux.cli.terminal import say, warn
+from kalux.settings import AUTO
 from kalux.wording import how_many
 
 if TYPE_CHECKING:
@@ -69,7 +70,7 @@ def add_command(commands: Any) -> None:
     group.add_argument("--clip", action="store_true", help="held-out: clip images where the camera clips")
     group.add_argument(
         "--response",
-        default="auto",
+        default=AUTO,
         help="of the camera: linear, srgb, gamma:EXPONENT (default: what the recording states, else linear)",
     )
     add_calibration(group)
@@ -144,15 +145,16 @@ class Protocol:
         self._recording, self._options = recording, options
         self._score: Callable[[Method, Callable[[], None]], Scores]
         calibration = given_calibration(options)
-        if calibration is not None and options.response == "auto":
-            options.response = calibration.settings.get("camera", {}).get("response", options.response)
+        self._response: str = options.response
+        if calibration is not None and self._response == AUTO:
+            self._response = calibration.settings.get("camera", {}).get("response", AUTO)
         weights = lpips_weights(options)
         reference = None
         if options.hold_out_frames is None:
             reference, origin = _reference(recording, options)
         if reference is None:
             every = 2 if options.hold_out_frames is None else options.hold_out_frames
-            held = held_out.hold_out_frames(recording, every, response=options.response)
+            held = held_out.hold_out_frames(recording, every, response=self._response)
             self.described, self._images = held.described(), len(held.compared)
             self._score = lambda method, count: held_out.evaluate_held_out(
                 held, method, clip=options.clip, hdr_vdp=options.hdrvdp, lpips=weights, on_image=count
@@ -164,7 +166,7 @@ class Protocol:
             )
         self.methods = specs.chosen_methods(
             named_methods(options),
-            response=options.response,
+            response=self._response,
             held_out=reference is None,
             calibration=calibration,
         )
@@ -189,7 +191,7 @@ class Protocol:
             return blur_consistency(
                 self._recording,
                 method,
-                response=self._options.response,
+                response=self._response,
                 on_image=lambda: progress.add(images=1),
             )
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from kalux.cli.parser import Parser, UsageError, number, whole
+from kalux.cli.recordings import check_stamp
 from kalux.cli.terminal import say, warn
 
 if TYPE_CHECKING:
@@ -191,8 +192,7 @@ def _truth(options: argparse.Namespace, reference: HdrReference) -> bytes:
     from kalux.cli.progress import Progress
     from kalux.datasets.registration import register_frames
 
-    if options.stamp is not None and options.exposure is None:
-        raise UsageError("--stamp says what a frame's time marks for --exposure; give --exposure, too")
+    check_stamp(options)
     recording = kalux.open(options.register, exposure=options.exposure, stamp=options.stamp or "start")
     with Progress("registering", images=len(recording.frames()), quiet=options.quiet) as progress:
         found = register_frames(

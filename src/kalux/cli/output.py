@@ -99,6 +99,8 @@ def chosen_output(options: argparse.Namespace) -> Output:
         )
     if not is_video and path.suffix.lower() in _NOT_FOLDERS and not path.is_dir():
         raise UsageError(f"{path}: give a name that ends in .mp4 for a video, or the name of a folder")
+    if path.name.lower() == ".mp4":
+        raise UsageError(f"{path}: only the ending of a name; is a variable of the shell not set?")
     format = "mp4" if is_video else options.format or "png"
     _check_flags(options, format)
     rate = None if options.times is not None or options.at is not None else options.rate or DEFAULT_RATE

@@ -6,11 +6,14 @@ import contextlib
 import sys
 import threading
 import time
+from collections.abc import Callable, Iterable, Iterator
 from types import TracebackType
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Self, TypeVar
 
 if TYPE_CHECKING:
     from rich.progress import Progress as Bar
+
+T = TypeVar("T")
 
 LINE_EVERY = 5.0
 """Seconds between lines where stderr is not a terminal."""
@@ -99,6 +102,16 @@ class Progress:
             return
         with contextlib.suppress(OSError):
             print(f"kalux: {self._title}: {text}", file=sys.stderr, flush=True)
+
+
+def counted(
+    items: Iterable[T], count: Callable[[T], None], let_through: Callable[[], None] = lambda: None
+) -> Iterator[T]:
+    """The same items; interrupts are let through before each, and each is counted when it has been used."""
+    for item in items:
+        let_through()
+        yield item
+        count(item)
 
 
 def _bar() -> Bar:

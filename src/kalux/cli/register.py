@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from kalux.cli.calibrate_offset import add_range, checked_range, read_offset
 from kalux.cli.calibrate_rig import add_frames
 from kalux.cli.parser import Parser, UsageError, number, whole
+from kalux.cli.recordings import check_stamp
 from kalux.cli.terminal import say, warn
 from kalux.wording import how_many
 
@@ -99,8 +100,8 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     import kalux
     from kalux.calibration.rig import load_rig
     from kalux.calibration.two_cameras import open_frames, register
-    from kalux.cli.convert import check_name
     from kalux.cli.output import check_file, check_picture, write_picture
+    from kalux.cli.recordings import check_name
     from kalux.settings import CameraSettings
 
     timing = _timing(options)
@@ -164,8 +165,7 @@ def _timing(options: argparse.Namespace) -> str:
         for name in ("trigger_edge", "trigger_input", "skip_triggers", "skip_frames"):
             if getattr(options, name) is not None:
                 raise UsageError(f"--{name.replace('_', '-')} is for --timing triggers")
-        if options.stamp is not None and options.exposure is None:
-            raise UsageError("--stamp says what a frame's time marks for --exposure; give --exposure, too")
+        check_stamp(options)
     elif options.stamp is not None:
         raise UsageError(
             "--stamp is for frames with times of their own; --trigger-edge says what triggers mark"
@@ -225,8 +225,7 @@ def _write(
     frames: Callable[[], Iterable[Frame]],
     exposure_known: bool,
 ) -> None:
-    from kalux.cli.convert import counted
-    from kalux.cli.progress import Progress
+    from kalux.cli.progress import Progress, counted
     from kalux.cli.signals import interrupts_held
     from kalux.writers import hdf5
 

@@ -257,9 +257,9 @@ def _size(text: str) -> tuple[int, int]:
 
 def run(options: argparse.Namespace, command: list[str]) -> None:
     """Run the command."""
-    from kalux.cli.convert import check_name
     from kalux.cli.output import check_file
     from kalux.cli.progress import Progress
+    from kalux.cli.recordings import check_name
     from kalux.cli.signals import interrupts_held
     from kalux.datasets.record import Watch, record
     from kalux.writers.settings_file import beside, require_ours

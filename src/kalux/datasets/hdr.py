@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from kalux.calibration.debevec import CLIPPED_HIGH, CLIPPED_LOW, LEAST_SHARED, LEAST_SPREAD
 from kalux.calibration.homography import find_features
 from kalux.calibration.photographs import read_exposure, read_photograph
-from kalux.calibration.regression import NORMAL_MAD
+from kalux.calibration.regression import robust_deviation
 from kalux.calibration.response import CalibrationName, fit_response, side_by_side
 from kalux.datasets.registration import (
     Match,
@@ -493,7 +493,7 @@ def relative_spread(pictures: Sequence[Picture], response: Response, covered: Se
     for k in range(len(pictures) - 1):
         logs = _log_ratio(pictures[k], pictures[k + 1], response, covered[k] & covered[k + 1], _QUIET)
         if len(logs) >= LEAST_SHARED:
-            spreads.append(NORMAL_MAD * float(np.median(np.abs(logs - np.median(logs)))))
+            spreads.append(robust_deviation(logs - np.median(logs)))
             counts.append(len(logs))
     if not spreads:
         return LEAST_SPREAD

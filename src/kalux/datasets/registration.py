@@ -22,9 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.calibration.homography import Features, agreed_homography, alike, find_features
-from kalux.calibration.regression import HUBER, NORMAL_MAD
+from kalux.calibration.regression import HUBER, robust_deviation
 from kalux.errors import InputError
-from kalux.frames import Frame, GroundTruth
+from kalux.frames import Frame, GroundTruth, median_exposure
 from kalux.models.camera import Camera, Response, inverse_response
 from kalux.recording import Recording
 
@@ -215,7 +215,7 @@ def refined(
         jacobian = np.stack([column[inside] for column in columns_of], axis=1)
         residual = (target - image)[inside]
         offset = np.median(residual)
-        deviation = NORMAL_MAD * float(np.median(np.abs(residual - offset))) + 1e-9
+        deviation = robust_deviation(residual - offset) + 1e-9
         weight = np.minimum(1.0, HUBER * deviation / np.maximum(np.abs(residual - offset), 1e-12))
         normal = jacobian.T @ (weight[:, None] * jacobian)
         step = np.linalg.lstsq(normal, jacobian.T @ (weight * residual), rcond=1e-10)[0]
@@ -373,7 +373,7 @@ def _median_exposure(recording: Recording) -> int:
     exposures = [frame.exposure for frame in recording.frames()]
     if not exposures:
         raise InputError(f"{recording.source.path}: no frames to register a reference to")
-    return round(float(np.median(exposures)))
+    return median_exposure(exposures)
 
 
 def _register(

@@ -30,7 +30,7 @@ from kalux.display.settings import (
     settings_table,
 )
 from kalux.display.srgb import decode_srgb, encode_srgb
-from kalux.display.video import TimedImage, ToneState, colour_of, next_state, tone_map_next
+from kalux.display.video import TimedImage, ToneState, colour_of, next_state, shown_of, tone_map_next
 
 __all__ = [
     "CURVES",
@@ -58,6 +58,7 @@ __all__ = [
     "measure",
     "next_state",
     "settings_table",
+    "shown_of",
     "to_uint8",
     "to_uint16",
     "tone_map",

@@ -78,7 +78,7 @@ def tone_map_next(
         The intensity is not two-dimensional, is empty, or is not finite; or the state is of other settings.
     """
     settings = settings or DisplaySettings()
-    intensity = checked_image(_shown(image))
+    intensity = checked_image(shown_of(image))
     following = _following(intensity, image.t, settings, state)
     return apply(intensity, settings, following.statistics, checked=True), following
 
@@ -99,7 +99,7 @@ def next_state(
     InputError
         As of `tone_map_next`.
     """
-    shown = _shown(image)
+    shown = shown_of(image)
     return _following(
         shown if checked else checked_image(shown), image.t, settings or DisplaySettings(), state
     )
@@ -121,6 +121,7 @@ def _smoothed(state: ToneState, statistics: Statistics, t: int, smoothing: float
     return state.statistics - math.expm1(-seconds / smoothing) * (statistics - state.statistics)
 
 
-def _shown(image: TimedImage) -> Float32:
+def shown_of(image: TimedImage) -> Float32:
+    """What of an image is shown: its colour, or else its intensity."""
     colour = colour_of(image)
     return image.intensity if colour is None else colour

@@ -105,7 +105,7 @@ def methods(response: str = AUTO, calibration: Calibration | None = None) -> dic
     A calibration changes the settings of all filters.
     """
     known = Calibration() if calibration is None else calibration
-    presets = {name: known.apply(_with_response(PRESETS[name], response)) for name in _FILTERS}
+    presets = {name: known.apply(altered(PRESETS[name], "camera", response=response)) for name in _FILTERS}
     return {
         "hold": Method("hold the last frame", partial(hold_last_frame, response=response)),
         "mean": Method("mean of the neighbours", partial(mean_of_neighbours, response=response), True),
@@ -176,7 +176,3 @@ def _change(
     rises, falls = count_events(between(events, min(start, end), max(start, end)), on.shape)
     change = on * rises - off * falls
     return change if end >= start else -change
-
-
-def _with_response(settings: Settings, response: str) -> Settings:
-    return altered(settings, "camera", response=response)

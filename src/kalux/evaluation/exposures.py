@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from kalux.errors import FrameError
 from kalux.evaluation.pairs import Array
 from kalux.filters.shots import take_shot
-from kalux.frames import Frame
+from kalux.frames import Frame, median_exposure
 from kalux.models.camera import Camera
 from kalux.recording import Recording
 from kalux.settings import CameraSettings
 
 
 def reference_exposure(recording: Recording) -> int:
-    """The exposure, us, at which a saturated pixel is 1: the median, as `kalux.reconstruct` takes it.
+    """The exposure, us, at which a saturated pixel is 1: as `kalux.reconstruct` takes it.
 
     Raises
     ------
@@ -28,7 +28,7 @@ def reference_exposure(recording: Recording) -> int:
     exposures = [frame.exposure for frame in recording.frames()]
     if not exposures:
         raise FrameError(f"{recording.source.path}: no frames; an evaluation needs frames")
-    return round(float(np.median(exposures)))
+    return median_exposure(exposures)
 
 
 def linear_frame(frame: Frame, reference: int, response: str) -> Array:

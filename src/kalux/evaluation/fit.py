@@ -24,8 +24,8 @@ from scipy.special import log_ndtr
 from kalux.calibration.values import Calibration
 from kalux.errors import InputError
 from kalux.evaluation.held_out import HeldOut, hold_out_frames, with_frames
-from kalux.frames import Frame
-from kalux.models.camera import Camera, Response, frame_log_covariance, inverse_response
+from kalux.filters.shots import Shot, take_shot
+from kalux.models.camera import Camera, frame_log_covariance
 from kalux.pipeline import reconstruct
 from kalux.planning import plan
 from kalux.recording import Recording
@@ -218,28 +218,25 @@ def score_settings(held: HeldOut, settings: Settings, calibration: Calibration |
     frames = (frame for i, frame in enumerate(held.whole.frames()) if i in chosen)
     reads = held.times.shape[1]
     nll, errors, pixels = 0.0, 0.0, 0
-    camera = Camera(Response.named(settings.camera.response), None, settings.camera.saturation)
+    camera = Camera.named(settings.camera.response, settings.camera.saturation)
     for frame in frames:
         group = [next(images) for _ in range(reads)]
         mean: Array = np.stack([image.intensity for image in group]).mean(axis=0, dtype=np.float64)
         variance = group[reads // 2].variance.astype(np.float64)
-        ratio = held.reference_exposure / frame.exposure
-        nll += float(_negative_log_density(mean, variance, frame, camera, settings, ratio).sum())
-        observed = inverse_response(camera, frame.normalised(), ratio)
-        errors += float((((mean - observed) / held.scale) ** 2).sum())
-        pixels += mean.size
+        shot = take_shot(frame, camera, held.reference_exposure)
+        counted = ... if shot.valid is None else shot.valid
+        squared = ((mean - shot.intensity) / held.scale) ** 2
+        nll += float(_negative_log_density(mean, variance, shot, settings)[counted].sum())
+        errors += float(squared[counted].sum())
+        pixels += squared[counted].size
     return Score(nll / pixels, errors / pixels)
 
 
-def _negative_log_density(
-    mean: Array, variance: Array, frame: Frame, camera: Camera, settings: Settings, ratio: float
-) -> Array:
+def _negative_log_density(mean: Array, variance: Array, shot: Shot, settings: Settings) -> Array:
     """(H, W) of every pixel of a frame, or the negative log probability of being clipped."""
     offset = settings.camera.offset
-    response = frame.normalised()
-    observed = np.maximum(inverse_response(camera, response, ratio), 0.0)
-    weight = camera.weight(np.clip(response, 0, 1))
-    total = variance + frame_log_covariance(observed, weight, settings.camera.noise, ratio, offset)
+    observed = np.maximum(shot.intensity, 0.0)
+    total = variance + frame_log_covariance(observed, shot.weight, settings.camera.noise, shot.white, offset)
     away = (np.log(observed + offset) - np.log(np.maximum(mean, 0.0) + offset)) / np.sqrt(total)
     narrow = np.log(1 - _OUTLIERS) - 0.5 * away**2
     wide = np.log(_OUTLIERS / _OUTLIER_SCALE) - 0.5 * (away / _OUTLIER_SCALE) ** 2
@@ -247,4 +244,4 @@ def _negative_log_density(
     above = np.logaddexp(
         np.log(1 - _OUTLIERS) + log_ndtr(-away), np.log(_OUTLIERS) + log_ndtr(-away / _OUTLIER_SCALE)
     )
-    return np.asarray(-np.where(response >= camera.saturation, above, density), np.float64)
+    return np.asarray(-np.where(shot.clipped, above, density), np.float64)

@@ -42,7 +42,7 @@ class Reference:
     data_range
         The largest compared value: the data range of PSNR and SSIM.
     noise
-        As of `kalux.readers.GroundTruth`.
+        As of `kalux.frames.GroundTruth`.
     """
 
     times: NDArray[np.int64]

@@ -292,6 +292,8 @@ def _plane(values: Array | None, shape: tuple[int, ...]) -> NDArray[np.float32]:
 # The loops below take whole arrays and places in them: a view of a row costs more than a part of what is done with it.
 # Positions are counted from the first of a loop, so that none is below another: unsigned numbers that wrap around keep
 # a loop from becoming vector code. So do many arrays, and loops that write to an array of which they read another row.
+# Arrays are given one by one: taking one out of a tuple counts a reference, in an atomic operation; for every row,
+# these are 4 % of an image.
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy", fastmath=FUSED)
@@ -315,7 +317,9 @@ def _read_out(  # type: ignore[no-untyped-def]
     told = moving.size > 0
     hear = told and allowed > np.float32(0.0)
     ring = _ring(pitch if told else 0)
-    count = len(ring.spans)
+    known, least, unlike, alike, single = ring.known, ring.least, ring.unlike, ring.alike, ring.single
+    hears, spans, changed = ring.hears, ring.spans, ring.heard
+    count = len(spans)
     level, left = np.zeros(_STRIP, np.float32), np.zeros(_STRIP, np.float32)
     marks = np.zeros(_STRIP, np.uint8)
     words = marks.view(np.uint64)
@@ -336,20 +340,22 @@ def _read_out(  # type: ignore[no-untyped-def]
             at = np.uint64(row)
             first, last = _STRIP, 0
             if told:
-                _take_row(log_intensity, variance, moving, change, hidden, row + 2 * pitch, begin, ring)
+                _take_row(
+                    log_intensity, variance, moving, change, hidden, row + 2 * pitch, begin, count, known
+                )
             if hear:
-                _mark_hearing(moving, following, begin, ring)
+                _mark_hearing(moving, following, begin, hears, spans)
                 for place in range(count):
-                    first, last = min(first, ring.spans[place, 0]), max(last, ring.spans[place, 1])
+                    first, last = min(first, spans[place, 0]), max(last, spans[place, 1])
             if first < last and row + pitch >= 0:
-                _compare(row, first, last, allowed, pitch, ring)
+                _compare(row, first, last, allowed, pitch, known, least, unlike, alike, single)
             if row < 0:
                 continue
             here = np.uint64(row % count) * np.uint64(2 * _ROW) + np.uint64(_MARGIN)
             for i in range(size):
                 level[i] = log_intensity[at, start + i]
             if first < last:
-                _hear_neighbours(row, first, last, pitch, ring, level)
+                _hear_neighbours(row, first, last, pitch, known, least, alike, hears, changed, level)
             begun = met[row]
             while met[row] < met_by[row] and unshown[met[row]] < row * width + end:
                 heard[met[row]] = level[unshown[met[row]] - row * width - begin]
@@ -363,7 +369,7 @@ def _read_out(  # type: ignore[no-untyped-def]
                 continue
             if told:
                 for i in range(size):
-                    left[i] = ring.known[here + _DOUBT + i]
+                    left[i] = known[here + _DOUBT + i]
             else:
                 for i in range(size):
                     left[i] = variance[at, start + i]
@@ -371,7 +377,7 @@ def _read_out(  # type: ignore[no-untyped-def]
                 _lessen(row, first, last, ring, left)
                 for k in range(begun, met[row]):
                     bound = np.uint64(unshown[k] - row * width - begin)
-                    left[bound] = ring.known[here + _DOUBT + bound]
+                    left[bound] = known[here + _DOUBT + bound]
             if len(total) > 0:
                 for i in range(size):
                     total[at, start + i] = left[i]
@@ -405,51 +411,53 @@ def _clear(ring):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, inline="always")
 def _take_row(  # type: ignore[no-untyped-def]
-    log_intensity, variance, moving, change, hidden, row, begin, ring
+    log_intensity, variance, moving, change, hidden, row, begin, count, known
 ):
     """K11 of a row, and what its neighbours need to know of it."""
     height, width = log_intensity.shape
     if row < 0:
         return
-    place = np.uint64(row % len(ring.spans)) * np.uint64(2 * _ROW)
+    place = np.uint64(row % count) * np.uint64(2 * _ROW)
     if row >= height:
         for i in range(np.uint64(_ROW)):
-            ring.known[place + _DOUBT + i] = _NOTHING
+            known[place + _DOUBT + i] = _NOTHING
         return
     first = max(begin - _MARGIN, 0)
     size = np.uint64(min(begin + _STRIP + _MARGIN, width) - first)
     at, start, into = np.uint64(row), np.uint64(first), place + np.uint64(first - begin + _MARGIN)
     for i in range(size):
-        ring.known[into + _LEVEL + i] = log_intensity[at, start + i]
+        known[into + _LEVEL + i] = log_intensity[at, start + i]
     for i in range(size):
-        known = total_variance(variance[at, start + i], moving[at, start + i], change[at, start + i], hidden)
-        ring.known[into + _DOUBT + i] = known if known < _NOTHING else _NOTHING
+        doubt = total_variance(variance[at, start + i], moving[at, start + i], change[at, start + i], hidden)
+        known[into + _DOUBT + i] = doubt if doubt < _NOTHING else _NOTHING
 
 
 @nb.njit(cache=True)
-def _mark_hearing(moving, row, begin, ring):  # type: ignore[no-untyped-def]
+def _mark_hearing(moving, row, begin, hears, spans):  # type: ignore[no-untyped-def]
     """Which pixels of a row hear their neighbours, and from which block of columns to which; none outside the image."""
-    place = np.uint64(row % len(ring.spans))
+    place = np.uint64(row % len(spans))
     first, last = _STRIP, 0
-    words = ring.hears[place].view(np.uint64)
     if row < len(moving):
         at, start = np.uint64(row), np.uint64(begin)
         for i in range(np.uint64(min(moving.shape[1] - begin, _STRIP))):
-            ring.hears[place, i] = moving[at, start + i]
+            hears[place, i] = moving[at, start + i]
+        words = hears[place].view(np.uint64)
         for block in range(0, _STRIP, _BLOCK):
             if _any(words, block, _BLOCK):
                 first, last = min(first, block), block + _BLOCK
-    ring.spans[place, 0], ring.spans[place, 1] = first, last
+    spans[place, 0], spans[place, 1] = first, last
 
 
 @nb.njit(cache=True, error_model="numpy", fastmath=FUSED)
-def _compare(row, first, last, allowed, pitch, ring):  # type: ignore[no-untyped-def]
+def _compare(  # type: ignore[no-untyped-def]
+    row, first, last, allowed, pitch, known, least, unlike, alike, single
+):
     """How alike a row's pixels are to those in `_DIRECTIONS`, where columns ``first`` to ``last`` need it.
 
     Patches reach into the next row: that is compared first. Quotients share a division; those of four numbers a to d
     are (b, a) c d / a b c d and a b (d, c) / a b c d.
     """
-    count = len(ring.spans)
+    count = 4 * pitch + 1
     above, here, below, under = (
         np.uint64((row - pitch) % count),
         np.uint64(row % count),
@@ -459,7 +467,6 @@ def _compare(row, first, last, allowed, pitch, ring):  # type: ignore[no-untyped
     size, step = np.uint64(last - first + 2 * _ASIDE), np.uint64(pitch)
     begin = np.uint64(_MARGIN - _ASIDE + first)
     one, two, three = np.uint64(_ROW), np.uint64(2 * _ROW), np.uint64(3 * _ROW)
-    known, single, unlike, alike, least = ring.known, ring.single, ring.unlike, ring.alike, ring.least
     near, far = allowed * np.float32(pitch * pitch), allowed * np.float32(2 * pitch * pitch)
     near_slack, far_slack = max(near * _SLACK, _SURE), max(far * _SLACK, _SURE)
     own, other = below * two + begin, under * two + begin
@@ -508,9 +515,11 @@ def _compare(row, first, last, allowed, pitch, ring):  # type: ignore[no-untyped
 
 
 @nb.njit(cache=True, error_model="numpy", fastmath=FUSED)
-def _hear_neighbours(row, first, last, pitch, ring, level):  # type: ignore[no-untyped-def]
+def _hear_neighbours(  # type: ignore[no-untyped-def]
+    row, first, last, pitch, known, least, alike, hears, heard, level
+):
     """K12 of a row: L of the pixels that hear their neighbours in ``level``; ``ring.heard`` of all."""
-    count = len(ring.spans)
+    count = 4 * pitch + 1
     above, here, below = (
         np.uint64((row - pitch) % count),
         np.uint64(row % count),
@@ -519,7 +528,6 @@ def _hear_neighbours(row, first, last, pitch, ring, level):  # type: ignore[no-u
     size, step = np.uint64(last - first), np.uint64(pitch)
     begin, column = np.uint64(_MARGIN + first), np.uint64(first)
     one, two, three, four = np.uint64(_ROW), np.uint64(2 * _ROW), np.uint64(3 * _ROW), np.uint64(4 * _ROW)
-    known, least, alike, heard = ring.known, ring.least, ring.alike, ring.heard
     up, own, down = above * two + begin, here * two + begin, below * two + begin
     of_up, of_own = above * four + begin, here * four + begin
     for i in range(size):
@@ -551,7 +559,7 @@ def _hear_neighbours(row, first, last, pitch, ring, level):  # type: ignore[no-u
         heard[begin + one + i] = SHARED * doubt + (ONE - SHARED) * independent
     for i in range(size):
         alone, together = level[column + i], heard[begin + i]
-        level[column + i] = together if ring.hears[here, column + i] else alone
+        level[column + i] = together if hears[here, column + i] else alone
 
 
 @nb.njit(cache=True)

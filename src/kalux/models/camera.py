@@ -311,6 +311,8 @@ def count_bright(camera: Camera, image: NDArray[Any], white: float = 1.0) -> Bri
     grey = image if image.ndim == 2 else image.mean(axis=-1)
     edges = camera.response(np.array([ABOUT_WHITE / 2, ABOUT_WHITE])) * white
     if grey.dtype.kind in "iu":
+        if edges[1] > np.iinfo(grey.dtype).max:  # white that no pixel can have
+            return BrightTail(int(np.count_nonzero(grey >= edges[0])), 0)
         edges = np.ceil(edges).astype(grey.dtype)  # compares as it is
     at_half, at_white = (int(np.count_nonzero(grey >= edge)) for edge in edges)
     return BrightTail(at_half, at_white)

@@ -29,6 +29,7 @@ from kalux.frames import Frame, Mosaic
 from kalux.layouts import AEDAT4_MAGIC, AEDAT4_PACKET, AEDAT4_PIXELS
 from kalux.readers.source import (
     CHUNK_EVENTS,
+    EXPOSURE_UNKNOWN,
     TRIGGER_DTYPE,
     Source,
     TriggerArray,
@@ -139,7 +140,7 @@ def read(path: Path) -> Source:
     first = None if frames is None else next(_stored_frames(container, frames), None)
     if first is not None and first.exposure <= 0:
         exposure_known = False
-        missing += ("The exposure times of the frames are not recorded.",)
+        missing += (EXPOSURE_UNKNOWN,)
     # Only those cameras have colour filters over pixels of events and frames alike.
     is_colour_davis = first is not None and first.image.ndim == 3 and "DAVIS" in frames.camera.upper()  # type: ignore[union-attr]
     if is_colour_davis:

@@ -77,13 +77,13 @@ class Message:
         start, length = self.sequence()
         return self.data[start : start + length].rstrip(b"\0").decode()
 
-    def sequence(self, item: int = 1) -> tuple[int, int]:
-        """Offset and length of a sequence of items of ``item`` bytes, which is skipped."""
+    def sequence(self) -> tuple[int, int]:
+        """Offset and length of a sequence of bytes, which is skipped."""
         length = self.number("I")
         start = self.position
-        if start + length * item > len(self.data):
-            raise EOFError(f"{length * item} bytes expected, {len(self.data) - start} found")
-        self.position += length * item
+        if start + length > len(self.data):
+            raise EOFError(f"{length} bytes expected, {len(self.data) - start} found")
+        self.position += length
         return start, length
 
     def stamp(self) -> int:

@@ -17,7 +17,7 @@ from kalux.events import EVENT_DTYPE, EventArray
 from kalux.frames import MOSAICS, Frame, GroundTruth, Mosaic
 from kalux.layouts import HDF5_COLUMNS, HDF5_MAJOR_VERSION
 from kalux.readers.hdf5_layout import DAMAGE, SIGNATURE
-from kalux.readers.source import CHUNK_EVENTS, Source, begins_with, reading
+from kalux.readers.source import CHUNK_EVENTS, EXPOSURE_UNKNOWN, Source, begins_with, reading
 
 
 def recognises(path: Path) -> bool:
@@ -59,7 +59,7 @@ def read(path: Path) -> Source:
     if not frame_count:
         missing += ("The file has no frames.",)
     elif not exposure_known:
-        missing += ("The exposure times of the frames are not recorded.",)
+        missing += (EXPOSURE_UNKNOWN,)
     return Source(
         path=path,
         format="kalux",

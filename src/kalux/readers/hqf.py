@@ -18,7 +18,7 @@ from kalux.errors import FormatError
 from kalux.events import EventArray
 from kalux.frames import Frame
 from kalux.readers import hdf5_layout
-from kalux.readers.source import SIZE_UNKNOWN, Source, smallest_size
+from kalux.readers.source import EXPOSURE_UNKNOWN, SIZE_UNKNOWN, Source, smallest_size
 
 _COLUMNS: Final = ("events/ts", "events/xs", "events/ys", "events/ps")
 
@@ -47,9 +47,7 @@ def read(path: Path) -> Source:
         stamps = [_stamp(path, file["images"][name]) for name in names]
         size = hdf5_layout.size_of(path, file["images"][names[0]].shape) if names else None
         stated = [int(n) for n in np.ravel(file.attrs.get("sensor_resolution", ()))[:2]]
-    missing: tuple[str, ...] = (
-        ("The exposure times of the frames are not recorded.",) if names else ("The file has no images.",)
-    )
+    missing: tuple[str, ...] = (EXPOSURE_UNKNOWN,) if names else ("The file has no images.",)
     size_known = size is not None or len(stated) == 2
     if size is None:
         size = _without_images(smallest_size(path, _events(path)), stated)

@@ -24,7 +24,15 @@ from kalux.events import EVENT_DTYPE, EventArray
 from kalux.frames import Frame
 from kalux.readers.characters import DOT, FIVE, NEWLINE, NINE, ONE, SPACE, ZERO, parsed_blocks, skip_blanks
 from kalux.readers.images import in_colour, read_image
-from kalux.readers.source import CHUNK_EVENTS, SIZE_UNKNOWN, Source, begins_with, reading, smallest_size
+from kalux.readers.source import (
+    CHUNK_EVENTS,
+    EXPOSURE_UNKNOWN,
+    SIZE_UNKNOWN,
+    Source,
+    begins_with,
+    reading,
+    smallest_size,
+)
 
 _EVENTS: Final = "events.txt"
 _IMAGES: Final = "images.txt"
@@ -83,7 +91,7 @@ def read(path: Path) -> Source:
         colour = in_colour(path, [name for _, name in images], lambda name: (name, _bytes(path, root, name)))
         size = _load(path, root, images[0][1], colour).shape
         sensor_size = (int(size[0]), int(size[1]))
-        missing += ("The exposure times of the frames are not recorded.",)
+        missing += (EXPOSURE_UNKNOWN,)
     elif declared_size is not None:
         sensor_size = declared_size
     else:

@@ -25,7 +25,8 @@ from kalux.events import FIELD_NAMES
 from kalux.frames import Frame
 from kalux.readers.columns import find_name, find_time
 from kalux.readers.images import images_in, in_colour, read_image
-from kalux.readers.source import SIZE_UNKNOWN, Source, reading
+from kalux.readers.source import EXPOSURE_UNKNOWN, SIZE_UNKNOWN, Source, reading
+from kalux.wording import how_many
 
 _LISTS: Final = ("frames.csv", "timestamps.csv", "images.txt")
 _EXPOSURE: Final = ("exposure", "exposure_time")
@@ -77,8 +78,8 @@ def join(source: Source, frames: Path, *, start: int | None, rate_hz: float | No
         raise InputError(f"{frames}: no such file or folder")
     if not replace and source.count_frames():
         raise InputError(
-            f"{source.path}: has {source.count_frames()} frames of its own; leave --frames out, or replace them with "
-            "--replace-frames (replace_frames=True)"
+            f"{source.path}: has {how_many(source.count_frames(), 'frame')} of its own; leave --frames out, "
+            "or replace them with --replace-frames (replace_frames=True)"
         )
     joined = open_frames(frames, start=start, rate_hz=rate_hz)
     size = _joint_size(source, frames, joined)
@@ -157,7 +158,7 @@ def _images(frames: Path, start: int | None, rate_hz: float | None) -> Source:
         frames=lambda: (Frame(_load(frames, image.file, colour), image.start, image.end) for image in listed),
         count_frames=lambda: len(listed),
         exposure_known=exposure_known,
-        missing=() if exposure_known else ("The exposure times of the frames are not recorded.",),
+        missing=() if exposure_known else (EXPOSURE_UNKNOWN,),
     )
 
 
@@ -281,7 +282,7 @@ def _video(path: Path, start: int | None, rate_hz: float | None) -> Source:
         count_frames=count_frames,
         exposure_known=False,
         missing=(
-            "The exposure times of the frames are not recorded.",
+            EXPOSURE_UNKNOWN,
             f"The frames are the {'colours' if colour else 'luma'} of a video, with whatever its encoder did to them.",
         ),
     )

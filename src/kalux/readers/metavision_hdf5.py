@@ -16,6 +16,7 @@ from kalux.errors import FormatError
 from kalux.events import EventArray
 from kalux.readers import hdf5_layout
 from kalux.readers.source import SIZE_UNKNOWN, Source, smallest_size
+from kalux.wording import how_many
 
 _EVENTS: Final = "CD/events"
 _TRIGGERS: Final = "EXT_TRIGGER/events"
@@ -47,7 +48,7 @@ def read(path: Path) -> Source:
         triggers = file[_TRIGGERS].shape[0] if _TRIGGERS in file else 0
     missing: tuple[str, ...] = ("The format has no frames.",)
     if triggers:
-        missing += (f"Its {triggers:,} external trigger events are not read.",)
+        missing += (f"Not read: {how_many(triggers, 'external trigger event')}.",)
     if size is None:
         missing += (SIZE_UNKNOWN,)
     return Source(

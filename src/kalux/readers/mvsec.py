@@ -18,7 +18,7 @@ from kalux.errors import FormatError
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.frames import Frame
 from kalux.readers import hdf5_layout
-from kalux.readers.source import SIZE_UNKNOWN, Source, smallest_size
+from kalux.readers.source import EXPOSURE_UNKNOWN, SIZE_UNKNOWN, Source, smallest_size
 
 _EVENTS: Final = "davis/left/events"
 _IMAGES: Final = "davis/left/image_raw"
@@ -54,11 +54,7 @@ def read(path: Path) -> Source:
         has_images = _IMAGES in file
         stamps, size = _images(path, file) if has_images else (np.empty(0, np.int64), None)
         has_right = _RIGHT in file
-    missing: tuple[str, ...] = (
-        ("The exposure times of the frames are not recorded.",)
-        if len(stamps)
-        else ("The file has no images.",)
-    )
+    missing: tuple[str, ...] = (EXPOSURE_UNKNOWN,) if len(stamps) else ("The file has no images.",)
     if has_right:
         missing += ("The left camera is read.",)
     if size is None:

@@ -24,7 +24,7 @@ from kalux.readers import event_packet
 from kalux.readers.event_packet import EVENT_ARRAYS, EVENT_PACKETS, EventTopic, Message
 from kalux.readers.images import in_colour, read_image
 from kalux.readers.ros_bags import BAG_MAGIC, DAMAGE, Bag, Topic, container, open_bag, parts
-from kalux.readers.source import Source, TriggerArray, reading
+from kalux.readers.source import EXPOSURE_UNKNOWN, Source, TriggerArray, reading
 from kalux.readers.streams import in_order
 
 
@@ -54,7 +54,6 @@ _ENCODINGS: Final = {
 }
 _CHOICES: Final = ("events", "frames", "exposure")
 _FIRST_IMAGES: Final = 10
-_NO_EXPOSURE: Final = "The exposure times of the frames are not recorded."
 
 
 def recognises(path: Path) -> bool:
@@ -366,7 +365,7 @@ def _source(
     if images is None:
         missing += ("The recording has no frames.",)
     elif exposures is None:
-        missing += (_NO_EXPOSURE,)
+        missing += (EXPOSURE_UNKNOWN,)
     found = events or images
     assert found is not None
     return Source(

@@ -86,6 +86,9 @@ class Source:
     mosaic: Mosaic | None = None
 
 
+EXPOSURE_UNKNOWN: Final = "The exposure times of the frames are not recorded."
+"""For `Source.missing`, where `Source.exposure_known` is False."""
+
 SIZE_UNKNOWN: Final = "The sensor size is not recorded; the smallest that holds all events is taken."
 """For `Source.missing`, where the size comes from `smallest_size`."""
 

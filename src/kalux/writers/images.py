@@ -12,7 +12,16 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.display import DisplaySettings, ToneState, apply, colour_of, next_state, to_uint8, to_uint16
+from kalux.display import (
+    DisplaySettings,
+    ToneState,
+    apply,
+    colour_of,
+    next_state,
+    shown_of,
+    to_uint8,
+    to_uint16,
+)
 from kalux.writers.base import ImageLike
 from kalux.writers.exr import exr_file
 from kalux.writers.png import png_bytes
@@ -30,8 +39,7 @@ def encode_png(display: DisplaySettings, bits: Literal[8, 16]) -> Encode:
 
     def encode(image: ImageLike, state: ToneState | None) -> tuple[Bytes, ToneState | None]:
         following = next_state(image, display, state, checked=True)
-        colour = colour_of(image)
-        shown = image.intensity if colour is None else colour
+        shown = shown_of(image)
         return lambda: png_bytes(
             quantise(apply(shown, display, following.statistics, checked=True))
         ), following

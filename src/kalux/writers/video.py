@@ -25,13 +25,13 @@ from kalux.display import (
     Statistics,
     ToneState,
     apply,
-    colour_of,
     fill,
     fill_levels,
     next_state,
+    shown_of,
 )
 from kalux.errors import InputError, MissingDependencyError, OutputError, SettingsError
-from kalux.models.colour import luminance
+from kalux.models.colour import LUMINANCE, luminance
 from kalux.writers.base import ImageLike, Writer
 from kalux.writers.files import output_errors, remove_quietly, temporary_path
 from kalux.writers.settings_file import SettingsFile, require_ours
@@ -179,8 +179,7 @@ class VideoWriter(Writer):
             )
         self._state = following = next_state(image, self._display, self._state, checked=True)
         self._last = pts
-        colour = colour_of(image)
-        shown = image.intensity if colour is None else colour
+        shown = shown_of(image)
 
         def picture() -> Picture:
             frame = video_frame(shown, self._display, following.statistics)
@@ -377,7 +376,8 @@ def chroma(picture: Float32, luma: Float32) -> list[Float32]:
     Samples lie on even columns, between two rows, as H.264 has them by default: weights 1 2 1 along rows.
     """
     planes = []
-    for channel, largest in ((2, 1.8556), (0, 1.5748)):  # 2 (1 - 0.0722), 2 (1 - 0.2126)
+    for channel in (2, 0):
+        largest = 2 * (1 - LUMINANCE[channel])
         difference = (picture[..., channel] - luma) / np.float32(largest)
         rows = (difference[::2] + difference[1::2]) / 2
         before = np.concatenate([rows[:, :1], rows[:, 1:-1:2]], axis=1)
