@@ -43,6 +43,9 @@ class Pixel:
     events: list[tuple[int, bool, int, int, float]]
     shown: int = 0
     excess: float = 0.0
+    raised: list[bool] = field(default_factory=list)
+    left: bool = False
+    gone: bool = False
     changes: list[tuple[bool, bool, float, tuple[float, float]]] = field(default_factory=list)
     forgotten: list[float] = field(default_factory=list)
     measured: list[bool] = field(default_factory=list)
@@ -342,17 +345,20 @@ def bridged(pixel, settings, times, on, off, scales):
         var_off += 1e-5 - gain_off**2 * total
         learned.append((scale_on, scale_off))
         first = second
-    pixel.shown, bound = (
-        0,
-        intervals[0][3][0],
-    )  # K15: from which frame on it is known, and how far it was then
+    # K15: from which frame on it is known, and how far above its bound it was then; which clipped frames raise that;
+    # whether it is clearly below what it was at least, by the frame, and by its events.
+    pixel.shown, bound, pixel.raised = 0, intervals[0][3][0], []
     if intervals[0][3][1] >= UNMEASURED:
         pixel.shown = count
         for k, (a, b, _, right, s_on, s_off, *_) in enumerate(intervals[1:], 1):
+            before = bound
             bound += event_sum(pixel, a, b, on * s_on, off * s_off) + grown(k, b)
             if right[1] < UNMEASURED:
                 pixel.shown, pixel.excess = k, max(right[0] - bound, 0.0)
+                pixel.left = right[0] < before - 3 * np.sqrt(right[1])
+                pixel.gone = bound < before - off / 2
                 break
+            pixel.raised.append(right[0] > bound + 1e-4)
             bound = max(bound, right[0])
     last = (pixel.middles[-1], None, first, None, scale_on, scale_off, var_on, var_off, 0.0)
     intervals.append(last)
@@ -592,23 +598,70 @@ def regularised(level, variance, moving, difference):
     return out, doubt
 
 
+def steps(rows, columns):
+    """Distance in steps to neighbours, diagonal ones, and knight's moves, as long as OpenCV's 5x5 mask has them."""
+    less, more = sorted((abs(rows), abs(columns)))
+    if more >= 2 * less:
+        return 2.1969 * less + more - 2 * less
+    return 2.1969 * (more - less) + 1.4 * (2 * less - more)
+
+
+def beyond_rims(split, settings, frames, k):
+    """K15: how far above white pixels are that frame ``k`` clips, from those around. Of a sensor of one part."""
+    camera = Camera.named(chosen_response(settings.camera.response, None), settings.camera.saturation)
+    edges = camera.response(np.array([0.475, 0.95]))
+    half, white = (np.count_nonzero(frames[0].image / 255 >= edge) for edge in edges)
+    fall = np.log(max(half, white) / white) if white else np.inf
+    most = min(min(max(np.log(2) / max(fall, 1e-3), 0.3), 2.0) - 0.25, 0.5)
+    near = clipped = 0
+    for j in range(k + 1):
+        first = np.ceil(settings.camera.saturation * 255) / 255
+        found = {place for place, pixel in split.items() if pixel.clipped[j]}
+        top = next(iter(split.values())).white[j]
+        if found:
+            top *= camera.response.inverse(np.array(first))
+        darker = {
+            q: np.log(top) - np.log(max(p.intensity[j], 1e-30)) for q, p in split.items() if q not in found
+        }
+        darker = {q: min(max(value, 0.0), 10.0) for q, value in darker.items()}
+        below = sum(value < 0.2 for value in darker.values())
+        near, clipped = near + below, clipped + len(found)
+    area = len(split)
+    share = 0.1 * near / max(clipped, 1) + 1e-4
+    scale = 0.2 * (len(found) + 0.1 * area) / (below + share * area)
+    hard = []
+    for row, column in darker:
+        around = {(row + i, column + j) for i in (-1, 0, 1) for j in (-1, 0, 1)}
+        if around & found:
+            darkest = max(darker.get(q, 0.0) for q in around)
+            hard.append(darkest / (darkest + 0.05))
+    level = (
+        most * (1 - np.exp(-settings.filter.unshown_tail * scale / most)) * (np.mean(hard) if hard else 1.0)
+    )
+    far = {p: min((steps(p[0] - q[0], p[1] - q[1]) for q in darker), default=np.inf) for p in found}
+    return {p: level * (1 - np.exp(-distance)) for p, distance in far.items()}
+
+
 def unshown(split, settings, frames, t):
     """K15: (H, W) how far above their bounds pixels are expected that no frame has shown; nan where one has.
 
     Of a sensor no larger than one part.
     """
     looked = min(sum(f.middle < t for f in frames), len(frames) - 1)  # the newest frame that is used
-    response = Camera.named(chosen_response(settings.camera.response, None), 0.98).response
-    levels = response(np.array([0.475, 0.95]))
-    half, white = (np.count_nonzero(frames[0].image / 255 >= level) for level in levels)
-    fall = np.log(max(half, white) / white) if white else np.inf
-    tail = min(max(np.log(2) / max(fall, 1e-3), 0.3), 2.0)
-    told = [p.excess for p in split.values() if 0 < p.shown <= looked]
-    mean = (sum(told) + 10 * settings.filter.unshown_tail * min(tail - 0.25, 0.5)) / (len(told) + 10)
+    excess = {}
+    for k in range(looked + 1):
+        for place, level in beyond_rims(split, settings, frames, k).items():
+            if split[place].shown > k and (k == 0 or split[place].raised[k - 1]):
+                excess[place] = min(excess.get(place, np.inf), level)
+    told = [(p, excess[place]) for place, p in split.items() if 0 < p.shown <= looked]
+    of_all = (5 + sum(p.excess for p, _ in told if p.gone)) / (5 + sum(e for p, e in told if p.gone))
+    left = [(p.excess, e) for p, e in told if p.left]
+    total, foretold = sum(p for p, _ in left), sum(e for _, e in left)
     out = np.full(frames[0].image.shape, np.nan)
     for place, pixel in split.items():
         if pixel.shown > looked:
-            out[place] = mean
+            scaled = excess[place] * (total + 5 * min(of_all, 1.0)) / (foretold + 5)
+            out[place] = min(scaled, excess[place] + max(total - foretold, 0.0) / (len(left) + 10))
     return out
 
 

@@ -105,7 +105,8 @@ def test_engine_agrees_with_the_oracle(name, data):
             given, left = hidden[i].copy(), total / known
             for place, pixel in pixels.items():
                 given[place] += naive.known(pixel, told[place], t, chosen, 0.21 * 0.17, left[place])
-        value = np.where(unshown, np.maximum(value, bound) + beyond**2 / 2, value)
+        least = np.minimum(bound, np.maximum(bound - 2 * np.sqrt(noise), top))
+        value = np.where(unshown, np.maximum(value, least) + beyond**2 / 2, value)
         level = np.vectorize(lambda v, p: naive.intensity(v, p, chosen, white, stretch))(  # noqa: B023
             value, np.where(unshown, noise, total)
         )

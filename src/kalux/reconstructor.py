@@ -410,7 +410,7 @@ class Reconstructor:
         filtered = self.settings.filter
         if filtered.highlight_scale == 0 or filtered.unshown_tail == 0:
             return None
-        return self._method.unshown(progress.segment, variance, filtered.unshown_tail * self._tail_beyond)
+        return self._method.unshown(progress.segment, variance)
 
     @property
     def _tail_beyond(self) -> float:

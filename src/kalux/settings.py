@@ -235,10 +235,11 @@ class FilterSettings:
         (`kalux.models.camera.beyond_white`), but no more than highlight_scale: scenes of which little saturates do
         not go far beyond white. 3 (docs/tuning.md).
     unshown_tail
-        How far above their bounds pixels are taken to lie that every frame so far has clipped, where none around has
-        told (docs/equations.md, K15): a multiple of the same. 0 leaves them at their bounds. 0.5 (docs/tuning.md).
+        How far above their bounds pixels are taken to lie that every frame so far has clipped, as a share of the scale
+        that pixels just below white around them have (docs/equations.md, K15). 0 leaves them at their bounds. 0.5
+        (docs/tuning.md).
     bright_tail
-        That scale; None: from the recording's frames, in a live stream from the first.
+        Scale of the frames' bright tail; None: from the recording's frames, in a live stream from the first.
     neighbours
         Standard deviation, in log intensity, by which neighbouring pixels of a surface differ: moving pixels are
         given what their eight neighbours know (docs/equations.md, K12). 0 turns it off. 0.2 (docs/tuning.md).

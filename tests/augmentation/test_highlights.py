@@ -1,4 +1,4 @@
-"""What pixels that leave saturation tell of those that no frame has shown yet."""
+"""What the pixels around tell of those that no frame has shown yet, and what those that leave saturation tell."""
 
 from __future__ import annotations
 
@@ -6,88 +6,219 @@ import numpy as np
 import pytest
 
 from kalux.augmentation.bridge import UNMEASURED, UNSEEN, Latent
-from kalux.augmentation.highlights import begin_unshown, expected_excess, follow_unshown
+from kalux.augmentation.highlights import (
+    Shown,
+    Tail,
+    begin_unshown,
+    beyond_rims,
+    expected_excess,
+    follow_unshown,
+)
 
 SIZE = (40, 48)
+TAIL = Tail(0.5, 0.5)
+EVERYWHERE = np.ones(SIZE, bool)
+STILL = np.zeros(SIZE, np.float32)
+MOVED = 0.1
 
 
 def latent(clipped, value=0.0):
     """A frame that shows ``value`` where it is not clipped, and its bound, 0, elsewhere."""
     level = np.where(clipped, 0.0, value).astype(np.float32)
-    return Latent(level, np.where(clipped, UNMEASURED, 1e-3).astype(np.float32))
+    return Latent(level, np.where(clipped, UNMEASURED, 1e-4).astype(np.float32))
 
 
-def excess_at(memory, prior=0.2):
-    found = expected_excess(memory, np.ones(SIZE, np.float32), 1.0, prior)
+def shown(clipped, darker=1.0, pitch=1):
+    below = np.where(clipped, 0.0, darker).astype(np.float32)
+    return Shown(clipped, below, ~clipped, pitch)
+
+
+def begun(clipped, darker=1.0):
+    return begin_unshown(latent(clipped), shown(clipped, darker), TAIL)
+
+
+def followed(memory, clipped, value, net):
+    """The next frame, which is ``value`` where it is not ``clipped``."""
+    return follow_unshown(memory, latent(clipped, value), shown(clipped, -value), net, MOVED, TAIL)
+
+
+def excess_at(memory):
+    found = expected_excess(memory, np.ones(SIZE, np.float32), 1.0)
     out = np.full(SIZE, np.nan)
     out.reshape(-1)[found.pixels] = found.excess
     return out
 
 
+def around(seen, tail=TAIL):
+    """`beyond_rims` as an image; nan where nothing is clipped."""
+    pixels = np.flatnonzero(seen.clipped)
+    out = np.full(seen.clipped.shape, np.nan)
+    near = (seen.measured & (seen.darker < 0.2)).sum() / max(len(pixels), 1)
+    out.reshape(-1)[pixels] = beyond_rims(seen, pixels, near, tail)
+    return out
+
+
+def window(shape=SIZE, sides=np.s_[12:28, 14:34]):
+    clipped = np.zeros(shape, bool)
+    clipped[sides] = True
+    return clipped
+
+
 def test_where_nothing_is_clipped_nothing_is_expected():
-    memory = begin_unshown(latent(np.zeros(SIZE, bool)))
-    assert expected_excess(memory, np.ones(SIZE), 1.0, 0.2) is None
+    assert expected_excess(begun(np.zeros(SIZE, bool)), np.ones(SIZE), 1.0) is None
 
 
 def test_masked_pixels_have_no_bound():
-    first = latent(np.ones(SIZE, bool))
+    first = latent(EVERYWHERE)
     first.variance[:, 5] = UNSEEN
-    assert not np.isin(np.arange(40) * 48 + 5, begin_unshown(first).pixels).any()
+    memory = begin_unshown(first, shown(EVERYWHERE), TAIL)
+    assert not np.isin(np.arange(40) * 48 + 5, memory.pixels).any()
 
 
-def test_without_pixels_that_tell_the_prior_holds():
-    memory = begin_unshown(latent(np.ones(SIZE, bool)))
-    np.testing.assert_allclose(excess_at(memory, 0.37), 0.37, rtol=1e-6)
+def test_where_all_is_white_it_is_the_most():
+    np.testing.assert_allclose(excess_at(begun(EVERYWHERE)), 0.5, rtol=1e-6)
+
+
+def test_a_tail_of_pixels_just_below_white_goes_on():
+    """Half of every part is clipped, half just below: the scale is 0.2, of which half is expected, softly bounded."""
+    clipped = np.zeros(SIZE, bool)
+    clipped[:, ::2] = True
+    found = around(shown(clipped, 0.1), Tail(0.5, 0.5))
+    hard, inside = 0.1 / (0.1 + 0.05), 1 - np.exp(-1)
+    expected = 0.5 * (1 - np.exp(-0.1 / 0.5)) * hard * inside
+    np.testing.assert_allclose(found[:, ::2], expected, rtol=2e-3)
+
+
+def test_the_share_and_the_most_that_are_expected():
+    clipped = np.zeros(SIZE, bool)
+    clipped[:, ::2] = True
+    seen = shown(clipped, 0.1)
+    doubled, wide = around(seen, Tail(1.0, 1.0)), around(seen, Tail(0.5, 0.5))
+    np.testing.assert_allclose(doubled[clipped], 2 * wide[clipped], rtol=1e-5)
+    assert np.nanmax(around(shown(window(), 3.0), Tail(0.5, 0.05))) == pytest.approx(0.05, rel=0.02)
+
+
+def test_beyond_a_soft_border_less_is_expected_than_beyond_a_hard_one():
+    soft, hard = (around(shown(window(), darker))[20, 24] for darker in (0.02, 2.0))
+    assert 0 < soft < 0.1 * hard
+
+
+def test_at_the_border_less_is_expected_than_inside():
+    found = around(shown(window(), 2.0))[20, 14:24]
+    assert (np.diff(found) > -1e-3).all()
+    assert found[0] == pytest.approx(found[-1] * (1 - np.exp(-1)), rel=0.05)
+
+
+def test_two_windows_of_their_own():
+    """One in the dark, one on a bright wall."""
+    clipped = window(sides=np.s_[14:26, 4:16]) | window(sides=np.s_[14:26, 32:44])
+    darker = np.where(np.arange(48) < 24, 2.0, 0.05) * np.ones(SIZE)
+    found = around(shown(clipped, darker))
+    assert found[20, 10] > 3 * found[20, 38]
+
+
+def test_pixels_of_a_mosaic_have_neighbours_of_their_colour():
+    """Only one colour is clipped: its borders are with its own pixels, two apart."""
+    clipped = np.zeros(SIZE, bool)
+    clipped[12:28:2, 14:34:2] = True
+    found = around(shown(clipped, 2.0, pitch=2))
+    assert found[12, 14] == pytest.approx(found[18, 22] * (1 - np.exp(-2)), rel=0.05)
+    assert found[18, 22] > 1.3 * around(shown(clipped, 2.0))[18, 22]
+
+
+def test_masked_pixels_are_no_border():
+    clipped = window()
+    seen = shown(clipped, 0.01)
+    masked = np.zeros(SIZE, bool)
+    masked[:, 34] = True
+    darker = np.where(masked, 0.0, seen.darker).astype(np.float32)
+    without = around(Shown(clipped, darker, ~clipped & ~masked))
+    assert np.nanmax(without) < 0.2
 
 
 def test_pixels_around_tell_and_far_ones_do_not():
-    """Half of a block leaves saturation by events of -1, and is measured at -0.4: it was 0.6 above its bound."""
+    """Half of a block leaves saturation by events of -1, and is measured at -0.7: it was 0.3 above its bound."""
     left = np.zeros(SIZE, bool)
     left[:16, :8] = True
-    memory = begin_unshown(latent(np.ones(SIZE, bool)))
-    memory = follow_unshown(memory, latent(~left, -0.4), np.where(left, np.float32(-1.0), np.float32(0.0)))
+    memory = begun(EVERYWHERE)
+    memory = followed(memory, ~left, -0.7, np.where(left, np.float32(-1.0), np.float32(0.0)))
     found = excess_at(memory)
     np.testing.assert_array_equal(np.isnan(found), left)
-    assert found[4, 8] == pytest.approx(0.6, abs=0.05)
-    assert found[-1, -1] == pytest.approx(0.2, abs=1e-3)
-    assert (np.diff(found[4, 8:]) <= 1e-6).all()
+    of_all = (128 * 0.3 + 5) / (128 * 0.5 + 5)
+    assert found[4, 8] == pytest.approx(0.3, abs=0.02)
+    assert found[-1, -1] == pytest.approx(0.5 * of_all, abs=1e-3)
+    assert (np.diff(found[4, 8:]) >= -1e-6).all()
 
 
-def test_the_mean_of_a_part_is_that_of_its_pixels_and_of_ten_of_the_prior():
-    """Every part alike, so that only the sums matter: weights of parts around, 64 pixels that tell 0.5 each."""
+def alternating():
     told = np.zeros(SIZE, bool)
     told[::2] = True
-    memory = begin_unshown(latent(np.ones(SIZE, bool)))
-    memory = follow_unshown(memory, latent(~told, -0.5), np.where(told, np.float32(-1.0), np.float32(0.0)))
-    near = (
-        np.exp(-0.5 * np.subtract.outer(np.arange(5), np.arange(5)) ** 2),
-        np.exp(-0.5 * np.subtract.outer(np.arange(6), np.arange(6)) ** 2),
-    )
-    count = 32 * near[0].sum(0)[2] * near[1].sum(0)[3]
-    assert excess_at(memory)[2 * 8 + 3, 3 * 8 + 3] == pytest.approx(
-        (0.5 * count + 10 * 0.2) / (count + 10), rel=2e-3
-    )
+    weights = (np.exp(-0.5 * np.subtract.outer(np.arange(n), np.arange(n)) ** 2).sum(0) for n in (5, 6))
+    rows, columns = weights
+    return told, 32 * rows[2] * columns[3]
+
+
+def test_less_than_expected_scales_what_is_expected():
+    """Every second row: 0.2 told of 0.5."""
+    told, count = alternating()
+    memory = followed(begun(EVERYWHERE), ~told, -0.8, np.where(told, np.float32(-1.0), np.float32(0.0)))
+    of_all = (960 * 0.2 + 5) / (960 * 0.5 + 5)
+    scaled = 0.5 * (0.2 * count + 5 * of_all) / (0.5 * count + 5)
+    assert excess_at(memory)[2 * 8 + 3, 3 * 8 + 3] == pytest.approx(scaled, rel=2e-3)
+
+
+def test_more_than_expected_is_added():
+    """Every second row: 0.9 told of 0.5, against ten pixels that tell nothing more."""
+    told, count = alternating()
+    memory = followed(begun(EVERYWHERE), ~told, -0.1, np.where(told, np.float32(-1.0), np.float32(0.0)))
+    added = min(0.5 + 0.4 * count / (count + 10), 0.5 * (0.9 * count + 5) / (0.5 * count + 5))
+    assert excess_at(memory)[2 * 8 + 3, 3 * 8 + 3] == pytest.approx(added, rel=2e-3)
+
+
+def test_pixels_that_noise_takes_out_of_saturation_tell_nothing():
+    """2 standard deviations below their bound, and no event: they were at white; those beside need not be."""
+    told, _ = alternating()
+    memory = followed(begun(EVERYWHERE), ~told, -0.02, STILL)
+    assert memory.told.tellers.sum() == 0
+    assert len(memory.pixels) == 40 * 48 / 2
+    np.testing.assert_allclose(memory.expected, 0.5, rtol=1e-6)
+
+
+def test_silent_pixels_that_leave_saturation_tell_those_near():
+    left = np.zeros(SIZE, bool)
+    left[:16, :8] = True
+    found = excess_at(followed(begun(EVERYWHERE), ~left, -0.08, STILL))
+    assert found[4, 8] < 0.1
+    assert found[-1, -1] == pytest.approx(0.5, abs=1e-3)
+
+
+def test_a_clipped_frame_that_raises_the_bound_tells_of_its_surroundings():
+    """The window comes to lie beside pixels just below white. Where it raises no bound that tells nothing."""
+    down = np.where(np.arange(48) < 24, np.float32(-0.3), np.float32(0.0)) * np.ones(SIZE, np.float32)
+    first = begun(window(), 2.0)
+    second = followed(first, window(), -0.02, down)
+    before, after = excess_at(first), excess_at(second)
+    assert (after[window()][down[window()] < 0] < 0.2 * before[window()][down[window()] < 0]).all()
+    np.testing.assert_array_equal(after[:, 24:], before[:, 24:])
 
 
 def test_a_bound_rises_with_events_and_never_falls_below_a_clipped_frame():
     """Up by 2 and down by 2: where a frame was clipped in between, the level was 0 at least, and 2 at the top."""
     one = np.zeros(SIZE, bool)
     one[0, 0] = True
-    memory = begin_unshown(latent(one))
     step = np.zeros(SIZE, np.float32)
     step[0, 0] = -2.0
-    memory = follow_unshown(memory, latent(one), step)
+    memory = followed(begun(one), one, -1.0, step)
     assert memory.bound[0] == 0.0
-    memory = follow_unshown(memory, latent(one), -step)
+    memory = followed(memory, one, -1.0, -step)
     assert memory.bound[0] == 2.0
-    memory = follow_unshown(memory, latent(~np.ones(SIZE, bool), -1.0), 1.5 * step)
+    memory = followed(memory, np.zeros(SIZE, bool), -1.0, 1.5 * step)
     assert len(memory.pixels) == 0
-    assert (memory.told.sum(), memory.tellers.sum()) == (0.0, 1.0)  # -1, as its bound had said
+    assert (memory.told.told.sum(), memory.told.tellers.sum()) == (0.0, 1.0)  # -1, as its bound had said
 
 
 def test_what_came_to_the_variance_is_noise():
-    memory = begin_unshown(latent(np.ones(SIZE, bool)))
     variance = np.full(SIZE, 1.25, np.float32)
     variance[0, 0] = 0.5
-    noise = expected_excess(memory, variance, 1.0, 0.2).noise
+    noise = expected_excess(begun(EVERYWHERE), variance, 1.0).noise
     assert (noise[0], noise[1]) == (0.0, 0.25)

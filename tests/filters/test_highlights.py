@@ -87,6 +87,16 @@ def test_dark_neighbours_do_not_take_a_pixel_below_its_bound():
     assert image[1, 1] >= 1.0
 
 
+def test_neighbours_take_a_bound_of_noisy_events_down_to_two_standard_deviations():
+    level = np.full((3, 3), WHITE, np.float32)
+    level[1, 1] += 0.4
+    heard, where = np.full(1, WHITE + 0.1, np.float32), unshown([4], 0.0, 0.01)
+    for noise, least in ((0.0, 0.4), (0.01, 0.2), (0.04, 0.1)):
+        image = np.zeros((3, 3), np.float32)
+        read_unshown(image, heard, level, where._replace(noise=np.full(1, noise, np.float32)), OFFSET, OFF)
+        assert image[1, 1] == pytest.approx(1.03 * np.exp(least) - 0.03, rel=1e-5)
+
+
 def test_far_beyond_white_less_is_expected_above():
     bound = np.array([[WHITE - 1, WHITE, WHITE + 2.25]], np.float32)
     found = tempered(unshown([0, 1, 2], 0.5), bound, PRIOR)

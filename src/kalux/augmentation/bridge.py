@@ -54,8 +54,27 @@ class Latent(NamedTuple):
     ceiling: Array | None = None
 
 
+class Told(NamedTuple):
+    """What pixels that have left saturation tell of those that have not (K15).
+
+    Attributes
+    ----------
+    told, foretold, tellers
+        Of every part of the image: sum of the distances of pixels from their bounds, the same as it had been expected,
+        and the number of these pixels.
+    gone, gone_foretold
+        Both sums over the whole image, of pixels that events have taken out of saturation.
+    """
+
+    told: Array
+    foretold: Array
+    tellers: Array
+    gone: float
+    gone_foretold: float
+
+
 class UnshownMemory(NamedTuple):
-    """At a node: pixels that no frame has measured yet, and what others have told since (K15).
+    """At a node: pixels that no frame has measured yet, and what is expected of them (K15).
 
     Attributes
     ----------
@@ -65,15 +84,23 @@ class UnshownMemory(NamedTuple):
         (N,) float32, the least that L can be.
     shape
         (H, W).
-    told, tellers
-        Of every part of the image: sum of the distances of pixels from their bounds, and the number of these pixels.
+    excess, expected
+        (N,) float32: how far above it L is expected to be from what frames show around the pixels, and from what
+        others have told besides.
+    told
+        By others.
+    near, clipped
+        Pixels just below white and clipped ones, in all frames until now.
     """
 
     pixels: NDArray[np.int64]
     bound: NDArray[np.float32]
-    shape: tuple[int, int]
-    told: Array
-    tellers: Array
+    shape: tuple[int, ...]
+    excess: NDArray[np.float32]
+    expected: NDArray[np.float32]
+    told: Told
+    near: int
+    clipped: int
 
 
 class Thresholds(NamedTuple):

@@ -17,7 +17,14 @@ from kalux.augmentation.deblur import (
     all_between,
     relative_levels,
 )
-from kalux.augmentation.highlights import Unshown, begin_unshown, expected_excess, follow_unshown
+from kalux.augmentation.highlights import (
+    Shown,
+    Tail,
+    Unshown,
+    begin_unshown,
+    expected_excess,
+    follow_unshown,
+)
 from kalux.augmentation.trail import (
     Followed,
     Trail,
@@ -37,7 +44,15 @@ from kalux.filters.common import make_clock
 from kalux.filters.method import FAR_FUTURE, USUAL_INTERVAL, Chunks, CommonMethod, Segment
 from kalux.filters.shots import Shot
 from kalux.filters.uncertainty import WRONG_STEPS, Around
-from kalux.models.camera import CRUSHED, dark_scale, frame_log_covariance, log_intensity
+from kalux.models.camera import (
+    ABOUT_WHITE,
+    CRUSHED,
+    BrightTail,
+    beyond_white,
+    dark_scale,
+    frame_log_covariance,
+    log_intensity,
+)
 from kalux.models.pixels import PixelCalibration
 from kalux.settings import Settings
 
@@ -52,12 +67,16 @@ _BLACK_FRAMES: Final = 3.0
 """Black says the same in every frame: so many of them count as one, and all as no more (docs/equations.md, K7)."""
 
 
+_DARKEST: Final = 10.0
+"""Below white, log intensity: black."""
+
+
 class BridgeMemory(NamedTuple):
     """The latest frame, deblurred; the pixels' thresholds; the frame interval in s (0: not known yet).
 
     In causal mode also the counts of events between the middle and the end of the latest exposure. Of pixels that the
     latest frames did not measure, the counts since one did (to the latest node); 0 elsewhere. ``since`` is the start of
-    the first exposure, us. ``unshown`` is of the pixels that no frame has measured yet.
+    the first exposure, us. ``unshown`` is of the pixels that no frame has measured yet, ``tail`` how far highlights go.
     """
 
     latent: Latent
@@ -71,6 +90,7 @@ class BridgeMemory(NamedTuple):
     followed: Followed
     at_middle: Followed
     unshown: UnshownMemory
+    tail: Tail
     silent_change: Floats
 
 
@@ -171,6 +191,7 @@ class BridgedFrames(CommonMethod):
         newest = make_clock(self.shape, begin - shot.start)
         lead_in, nothing = None, nothing_followed(self.shape)
         far = np.zeros(self.shape, np.float32)
+        tail = self._tail(shot)
         unknown = np.full(self.shape, UNKNOWN_CHANGE * self.on * self.off, np.float32)
         if self.lookahead:
             on, off, followed = self.follow(events, begin, shot.middle, nothing)
@@ -188,7 +209,8 @@ class BridgedFrames(CommonMethod):
             since=shot.start,
             followed=followed,
             at_middle=followed,
-            unshown=begin_unshown(latent),
+            unshown=begin_unshown(latent, shown(shot), tail),
+            tail=tail,
             silent_change=unknown,
         )
         if self.lookahead:
@@ -219,6 +241,24 @@ class BridgedFrames(CommonMethod):
         second = self.latent(following, events, memory.thresholds)
         join = self._joined if self.lookahead else self._causal
         return join(memory, shot, following, second, events)
+
+    def _tail(self, first: Shot) -> Tail:
+        """How far highlights go beyond white (K15); where the settings do not say, by the ``first`` frame."""
+        filtered = self.settings.filter
+        scale = filtered.bright_tail
+        if scale is None:
+            levels = first.level_intensity / first.white
+            half, white = (
+                int((levels >= edge)[first.levels].sum()) for edge in (ABOUT_WHITE / 2, ABOUT_WHITE)
+            )
+            scale = BrightTail(half, white).scale
+        return Tail(filtered.unshown_tail, beyond_white(scale))
+
+    def _follow_unshown(
+        self, memory: BridgeMemory, second: Latent, following: Shot, net: Floats
+    ) -> UnshownMemory:
+        moved = self.off / 2
+        return follow_unshown(memory.unshown, second, shown(following), net, moved, memory.tail)
 
     def _alone(self, memory: BridgeMemory, shot: Shot) -> BridgedSegment:
         """From the latest frame on, without a next one."""
@@ -258,7 +298,7 @@ class BridgedFrames(CommonMethod):
         joined = joined._replace(trail=trail, silent_change=change)
         joined, far_on, far_off = self._drifting(joined, memory, second, on, off)
         assert joined.net is not None
-        unshown = follow_unshown(memory.unshown, second, joined.net)
+        unshown = self._follow_unshown(memory, second, following, joined.net)
         after = memory._replace(
             latent=second,
             thresholds=learned,
@@ -307,7 +347,7 @@ class BridgedFrames(CommonMethod):
             off=tail_off,
             followed=followed,
             at_middle=at_middle,
-            unshown=follow_unshown(memory.unshown, second, behind.net),
+            unshown=self._follow_unshown(memory, second, following, behind.net),
             silent_change=self._silent_change(behind),
         )
         forward = bridge.extend(
@@ -406,10 +446,10 @@ class BridgedFrames(CommonMethod):
     def trail(self, segment: Any, cursor: akf_bridged.Cursor, t: int) -> NDArray[np.float32] | None:
         return akf_bridged.trail_ahead(segment, cursor, t)
 
-    def unshown(self, segment: BridgedSegment, variance: Floats, prior: float) -> Unshown | None:
+    def unshown(self, segment: BridgedSegment, variance: Floats) -> Unshown | None:
         if segment.unshown is None:
             return None
-        return expected_excess(segment.unshown, variance, self.settings.filter.initial_variance, prior)
+        return expected_excess(segment.unshown, variance, self.settings.filter.initial_variance)
 
     def silent_change(self, segment: BridgedSegment) -> Floats | None:
         return segment.silent_change
@@ -431,6 +471,21 @@ class BridgedFrames(CommonMethod):
             repeated=1.0 - between / 2.0,
             wrong=WRONG_STEPS * between * self.on * self.off,
         )
+
+
+def shown(shot: Shot) -> Shown:
+    """What a frame shows of highlights."""
+    clipped = shot.level_clipped
+    white = shot.level_intensity[clipped].min() if clipped.any() else shot.white
+    with np.errstate(divide="ignore"):
+        darker = np.log(white) - np.log(shot.level_intensity)
+    darker[clipped] = 0.0
+    of_levels = np.clip(darker, 0.0, _DARKEST).astype(np.float32)
+    saturated, far = shot.clipped, of_levels[shot.levels]
+    if shot.valid is None:
+        return Shown(saturated, far, ~saturated, shot.pitch)
+    far[~shot.valid] = 0.0
+    return Shown(saturated & shot.valid, far, ~saturated & shot.valid, shot.pitch)
 
 
 def _still_since(memory: BridgeMemory, start: int, seconds: float) -> int:

@@ -14,6 +14,9 @@ from kalux.filters.readout import HighlightPrior, believed_highlight
 
 Floats = NDArray[np.floating[Any]]
 
+_LIKELY: Final = np.float32(2.0)
+"""Standard deviations of its events by which a bound may be too high."""
+
 _LEAST_SPREAD: Final = np.float32(0.3)
 """Standard deviation that is left where pixels around say that all lie just above their bounds."""
 
@@ -62,11 +65,13 @@ def read_unshown(
     heard
         (N,) L of these pixels of `lifted`, after their neighbours are heard (K12).
     bound
-        (H, W) L: what neighbours say of a pixel does not take it below.
+        (H, W) L: what neighbours say of a pixel takes it no farther below than its noise makes likely, nor below white.
     log_offset, prior
         I_0, and the prior on highlights (K6), which is to doubt what events say of them, not that they are bright.
     """
-    mean = np.maximum(heard, bound.reshape(-1)[unshown.pixels]).astype(np.float32)
+    least = bound.reshape(-1)[unshown.pixels]
+    likely = np.maximum(least - _LIKELY * np.sqrt(unshown.noise), np.float32(prior.white))
+    mean = np.maximum(heard, np.minimum(least, likely)).astype(np.float32)
     white, scale2, stretch = (np.float32(value) for value in prior)
     _take_mean(unshown.excess, unshown.noise, np.float32(log_offset), white, scale2, stretch, mean)
     image.reshape(-1)[unshown.pixels] = mean

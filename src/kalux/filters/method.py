@@ -96,11 +96,8 @@ class Method(Protocol):
     def trail(self, segment: Any, cursor: Any, t: int) -> Floats | None:
         """(H, W): how far the light is ahead of its events at ``t`` (K14); None: the method does not tell."""
 
-    def unshown(self, segment: Any, variance: Floats, prior: float) -> Unshown | None:
-        """Pixels that no frame has measured until then (K15), given P there; None: the method knows none.
-
-        ``prior`` is how far above their bounds they are expected where none around has told.
-        """
+    def unshown(self, segment: Any, variance: Floats) -> Unshown | None:
+        """Pixels that no frame has measured until then (K15), given P there; None: the method knows none."""
 
 
 class CommonMethod:
@@ -123,7 +120,7 @@ class CommonMethod:
     def around(self, segment: Any, t: int) -> Around | None:
         return None
 
-    def unshown(self, segment: Any, variance: Floats, prior: float) -> Unshown | None:
+    def unshown(self, segment: Any, variance: Floats) -> Unshown | None:
         return None
 
     def log_frame(self, shot: Shot) -> Array:

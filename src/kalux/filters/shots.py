@@ -49,6 +49,8 @@ class Shot(NamedTuple):
         (H, W) bool: where the frame says anything at all; None: everywhere.
     trail
         Backward in time: how far the light is ahead of its events at the middle (K14).
+    pitch
+        Distance of pixels of one colour: 2 in a Bayer mosaic.
     """
 
     start: int
@@ -64,6 +66,7 @@ class Shot(NamedTuple):
     chroma_weight: NDArray[np.float32] | None = None
     valid: NDArray[np.bool_] | None = None
     trail: FrameTrail | None = None
+    pitch: int = 1
 
     @property
     def intensity(self) -> Array:
@@ -119,6 +122,7 @@ def take_shot(
         white=ratio,
         level_ceiling=ceiling,
         valid=frame.valid,
+        pitch=1 if frame.mosaic is None else 2,
     )
 
 
