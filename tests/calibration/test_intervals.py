@@ -47,6 +47,15 @@ def test_change_level_and_what_is_usable():
     assert interval.level[0, 0] == pytest.approx(0.3)
 
 
+def test_what_a_stated_saturation_clips_is_not_usable():
+    """A sensor that ends at 112 of 255 stays there however bright it is: its events seem to change nothing."""
+    frames = [frame([[51, 112, 90]], 0, 10_000), frame([[102, 112, 120]], 40_000, 50_000)]
+    rec = Recording.from_arrays(pixel_events([20_000], [1]), frames, sensor_size=(1, 3))
+    camera = dataclasses.replace(CAMERA, saturation=0.43)
+    (interval,) = intervals(rec, camera, margin=0, most_frames=2)
+    assert interval.usable.tolist() == [[True, False, False]]
+
+
 def test_no_more_frames_than_asked_for():
     assert len(list(intervals(recording(random_stream(4), 50), CAMERA, margin=0, most_frames=2))) == 1
 

@@ -67,15 +67,15 @@ class Interval:
     def usable(self) -> NDArray[np.bool_]:
         """(H, W): valid and well exposed at both ends."""
         first, second = self.frames
-        return _is_usable(first) & _is_usable(second)
+        return _is_usable(first, self.first) & _is_usable(second, self.second)
 
 
-def _is_usable(frame: Frame) -> NDArray[np.bool_]:
-    """(H, W): valid and well exposed."""
+def _is_usable(frame: Frame, shot: Shot) -> NDArray[np.bool_]:
+    """(H, W): valid and well exposed, also where a stated saturation lies below what that usually is."""
     low, high = _WELL_EXPOSED
     level = frame.normalised()
     inside = (level > low) & (level < high)
-    usable = np.asarray(inside.all(axis=-1) if inside.ndim == 3 else inside, np.bool_)
+    usable = np.asarray(inside.all(axis=-1) if inside.ndim == 3 else inside, np.bool_) & ~shot.clipped
     return usable if frame.valid is None else usable & frame.valid
 
 
