@@ -129,8 +129,6 @@ def follow_unshown(
         By so much, log intensity, a pixel gets darker if it is by more than a wrong event.
     """
     pixels = memory.pixels
-    if len(pixels) == 0:
-        return memory
     predicted = memory.bound + net.reshape(-1)[pixels].astype(np.float32)
     value, variance = following.value.reshape(-1)[pixels], following.variance.reshape(-1)[pixels]
     measured = variance < UNMEASURED

@@ -257,6 +257,8 @@ class BridgedFrames(CommonMethod):
     def _follow_unshown(
         self, memory: BridgeMemory, second: Latent, following: Shot, net: Floats
     ) -> UnshownMemory:
+        if len(memory.unshown.pixels) == 0:
+            return memory.unshown
         moved = self.off / 2
         return follow_unshown(memory.unshown, second, shown(following), net, moved, memory.tail)
 
