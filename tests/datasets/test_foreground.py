@@ -64,6 +64,8 @@ def test_the_ball_is_round() -> None:
         (Sprite(-np.ones((4, 4)), np.ones((4, 4))), 5.0, "negative"),
         (Sprite(np.ones((4, 4)), 2 * np.ones((4, 4))), 5.0, "alpha"),
         (SQUARE, 0.0, "size is 0"),
+        (SQUARE, float("nan"), "size is nan"),
+        (SQUARE, 1e300, "size is 1e"),
     ],
 )
 def test_sprites_that_cannot_be_used(sprite: Sprite, size: float, told: str) -> None:

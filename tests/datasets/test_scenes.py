@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -67,6 +68,29 @@ def test_the_image_continues_mirrored() -> None:
 def test_photographs_must_be_grey_radiance(image: NDArray[Any]) -> None:
     with pytest.raises(InputError):
         photograph_scene(image, still(), sensor_size=SIZE, duration=1000)
+
+
+@pytest.mark.parametrize("scale", [0.0, -1.0, 1e-300, 1e300, math.inf, math.nan])
+def test_scales_without_a_view_are_refused(scale: float) -> None:
+    with pytest.raises(InputError, match=r"scale is .* must be positive, 1e-06 to 50"):
+        photograph_scene(np.ones((40, 50)), still(), sensor_size=SIZE, duration=1000, scale=scale)
+
+
+@pytest.mark.parametrize(
+    "pose",
+    [
+        Pose(x=1e300),
+        Pose(y=math.nan),
+        Pose(angle=math.nan),
+        Pose(angle=math.inf),
+        Pose(zoom=0.0),
+        Pose(zoom=1e300),
+    ],
+)
+def test_poses_without_a_view_are_refused(pose: Pose) -> None:
+    scene = photograph_scene(np.ones((40, 50)), lambda t: pose, sensor_size=SIZE, duration=1000)
+    with pytest.raises(InputError, match="camera: its motion leads to"):
+        scene.at(0.0)
 
 
 def test_an_empty_scene_is_refused() -> None:

@@ -240,5 +240,6 @@ def test_levels_that_cannot_be() -> None:
         white_for(scene, 0.1)
     with pytest.raises(InputError, match="between 0 and 1"):
         white_for(scene, 1.5)
-    with pytest.raises(InputError, match="must be positive"):
-        exposed(scene, 0.0)
+    for white in (0.0, 1e-300, 1e300, float("nan")):
+        with pytest.raises(InputError, match="must be positive"):
+            exposed(scene, white)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import math
 import re
 import shlex
 from pathlib import Path
@@ -419,8 +420,10 @@ def _sequence_scene(options: argparse.Namespace, sequence: ImageSequence, size: 
 def _duration(options: argparse.Namespace, default: float) -> int:
     """us."""
     seconds = _or(options.duration, default)
-    if not 0 < seconds < 1e6:
-        raise UsageError(f"--duration {seconds:g}: it must be positive and less than 1e6, in seconds")
+    if not 1e-6 <= seconds < 1e6:
+        raise UsageError(
+            f"--duration {seconds:g}: it must be positive, 1e-6 or more, and less than 1e6, in seconds"
+        )
     return round(seconds * 1e6)
 
 
@@ -452,6 +455,7 @@ def chosen_motion(options: argparse.Namespace, default: str) -> Motion:
         "amplitude": ("shake", "handheld"),
     }
     for flag, users in uses.items():
+        check_finite(options, flag)
         if getattr(options, flag) is not None and not set(users) & set(names):
             raise UsageError(
                 f"--{flag} is for the motion {' or '.join(users)}; the motion is {'+'.join(names)}"
@@ -467,6 +471,19 @@ def chosen_motion(options: argparse.Namespace, default: str) -> Motion:
         "handheld": handheld(seed, sway=_or(options.amplitude, 6.0)),
     }
     return combine(*(motions[name] for name in names))
+
+
+def check_finite(options: argparse.Namespace, name: str) -> None:
+    """Refuse infinite numbers and NaN.
+
+    Raises
+    ------
+    UsageError
+        That names the flag.
+    """
+    value = getattr(options, name)
+    if value is not None and not math.isfinite(value):
+        raise UsageError(f"--{name.replace('_', '-')} {value}: a finite number is needed")
 
 
 def _with_foreground(options: argparse.Namespace, scene: Scene) -> Scene:
@@ -487,6 +504,8 @@ def _with_foreground(options: argparse.Namespace, scene: Scene) -> Scene:
                 f"--{given[0].replace('_', '-')} is for a foreground; give --foreground ball or an image"
             )
         return scene
+    for name in ("foreground_size", "foreground_speed", "foreground_turn", "foreground_level"):
+        check_finite(options, name)
     if options.foreground == "ball":
         sprite = ball()
     else:

@@ -17,6 +17,9 @@ from kalux.frames import Frame
 _LEAST_SAMPLES: Final = 8
 """Samples of an exposure, at least."""
 
+_BRIGHTEST: Final = 1e6
+"""Irradiance, white = 1, up to which photons are counted."""
+
 _LONGEST: Final = 0.95
 """Longest automatic exposure, of the frame interval: a sensor needs time to read out."""
 
@@ -203,7 +206,9 @@ def respond(irradiance: FloatArray, camera: Camera, rng: np.random.Generator) ->
     settings = camera.settings
     irradiance = irradiance * camera.gain
     if settings.full_well is not None:
-        irradiance = rng.poisson(irradiance * settings.full_well) / settings.full_well
+        # What is far beyond white is clipped below, and numbers of electrons have to fit into int64.
+        expected = np.minimum(irradiance, _BRIGHTEST) * settings.full_well
+        irradiance = rng.poisson(expected) / settings.full_well
     response = camera.response(np.minimum(irradiance, 1.0))
     # What exceeds white is kept until the noise is in, or noise would lift half of the saturated pixels
     # out of saturation.

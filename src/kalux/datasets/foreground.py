@@ -8,10 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.datasets.motion import Motion, Pose
-from kalux.datasets.scenes import Image, Scene, blurred, overlay
+from kalux.datasets.scenes import Image, Scene, blurred, checked_pose, overlay
 from kalux.errors import InputError
 
 _BALL: Final = 129  # pixels
+
+# Of a sprite: what can be told from nothing and still be a thing before a scene.
+_LEAST_SIZE: Final = 0.5
+_LARGEST_SIZE: Final = 1e5
+_BRIGHTEST: Final = 1e9
 
 
 class Sprite(NamedTuple):
@@ -85,7 +90,8 @@ def with_foreground(scene: Scene, sprite: Sprite, path: Motion, *, size: float, 
     Raises
     ------
     InputError
-        If the sprite is not two equal grey images, is negative or not finite, or its size is not positive.
+        If the sprite is not two equal grey images, or is negative or not finite; if its size or level is out of range,
+        or as of `kalux.datasets.scenes.checked_pose`.
     """
     radiance, alpha = np.asarray(sprite.radiance, np.float32), np.asarray(sprite.alpha, np.float32)
     if radiance.ndim != 2 or radiance.shape != alpha.shape or min(radiance.shape) < 2:
@@ -94,8 +100,12 @@ def with_foreground(scene: Scene, sprite: Sprite, path: Motion, *, size: float, 
         )
     if not (radiance.min() >= 0 and radiance.max() < np.inf and alpha.min() >= 0 and alpha.max() <= 1):
         raise InputError("foreground: radiance is negative or not finite, or alpha is not from 0 to 1")
-    if not size > 0 or not level >= 0:
-        raise InputError(f"foreground: size is {size} and level {level}; they must be positive")
+    if not _LEAST_SIZE <= size <= _LARGEST_SIZE:
+        raise InputError(
+            f"foreground: size is {size}; it must be {_LEAST_SIZE:g} to {_LARGEST_SIZE:g} sensor pixels"
+        )
+    if not 0 <= level <= _BRIGHTEST:
+        raise InputError(f"foreground: level is {level}; it must be 0 to {_BRIGHTEST:g}, white = 1")
     scale = radiance.shape[0] / size
     # Premultiplied, so that smoothing and interpolation keep the edge's colour.
     paint = blurred(_padded(radiance * alpha * np.float32(level)), 0.5 * scale)
@@ -104,7 +114,7 @@ def with_foreground(scene: Scene, sprite: Sprite, path: Motion, *, size: float, 
 
     def view(t: float) -> Image:
         out = np.array(scene.radiance(t), np.float32)
-        x, y, angle, zoom = path(t)
+        x, y, angle, zoom = checked_pose("foreground", path(t))
         step = scale / zoom
         cos, sin = step * np.cos(angle), step * np.sin(angle)
         rotation = np.array([[cos, sin], [-sin, cos]])

@@ -39,7 +39,8 @@ def spin(rate: float) -> Motion:
 
 def dolly(rate: float) -> Motion:
     """Exponential zoom, ``exp(rate * t)``: natural logarithms per second, positive moves closer."""
-    return lambda t: Pose(zoom=float(np.exp(rate * t * 1e-6)))
+    # exp(700) is the largest that double precision holds, and no camera zooms so far.
+    return lambda t: Pose(zoom=float(np.exp(min(rate * t * 1e-6, 700.0))))
 
 
 def shake(

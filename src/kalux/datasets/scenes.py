@@ -26,6 +26,15 @@ LOG_OFFSET: Final = 0.004
 of a black pixel finite. 0.4 % of white gives a sensor that still resolves 48 dB below the frames' white."""
 
 
+_LEAST_SCALE: Final = 1e-6
+"""Image pixels per sensor pixel: with less, neighbouring sensor pixels see the same in single precision."""
+
+_FARTHEST: Final = 1e9
+"""Sensor pixels, and radians: as far as double precision keeps a millionth of a pixel apart."""
+
+_LARGEST_ZOOM: Final = 1e6
+
+
 @dataclass(frozen=True, eq=False)
 class Scene:
     """What the sensor looks at.
@@ -125,15 +134,14 @@ def photograph_scene(
     Raises
     ------
     InputError
-        If the image is not 2-D, too small, negative or not finite, or the scale is not positive.
+        If the image is not 2-D, too small, negative or not finite, or as of `check_scale`.
     """
     image = np.asarray(image)
     if image.ndim != 2 or min(image.shape) < 2:
         raise InputError(f"{name}: image has shape {image.shape}; a grey image (height, width) is needed")
     if not (image.min() >= 0 and image.max() < np.inf):
         raise InputError(f"{name}: image is negative or not finite somewhere; it must be linear radiance")
-    if scale <= 0:
-        raise InputError(f"{name}: scale is {scale}; it must be positive, in image pixels per sensor pixel")
+    check_scale(name, scale, image.shape)
     canvas = blurred(np.ascontiguousarray(image, dtype=np.float32), blur * scale)
     if center is None:
         center = ((image.shape[1] - 1) / 2, (image.shape[0] - 1) / 2)
@@ -146,11 +154,33 @@ def photograph_scene(
     return Scene(radiance, sensor_size, 0, duration, name)
 
 
+def check_scale(name: str, scale: float, image_size: tuple[int, ...]) -> None:
+    """Refuse scales with which a sensor pixel sees all of the image, or no part of it.
+
+    Raises
+    ------
+    InputError
+        If it is outside of 1e-6 to the image's longer side.
+    """
+    if not _LEAST_SCALE <= scale <= max(image_size):
+        raise InputError(
+            f"{name}: scale is {scale}; it must be positive, {_LEAST_SCALE:g} to {max(image_size)}, in image "
+            "pixels per sensor pixel"
+        )
+
+
 def camera_matrix(
     pose: Pose, sensor_size: tuple[int, int], scale: float, center: tuple[float, float]
 ) -> NDArray[np.float64]:
-    """(2, 3) affine map from sensor coordinates (column, row, 1) to image coordinates (x, y)."""
+    """(2, 3) affine map from sensor coordinates (column, row, 1) to image coordinates (x, y).
+
+    Raises
+    ------
+    InputError
+        As of `checked_pose`.
+    """
     height, width = sensor_size
+    pose = checked_pose("camera", pose)
     step = scale / pose.zoom
     cos, sin = step * np.cos(pose.angle), step * np.sin(pose.angle)
     u, v = (width - 1) / 2, (height - 1) / 2
@@ -160,6 +190,24 @@ def camera_matrix(
             [sin, cos, center[1] + scale * pose.y - sin * u - cos * v],
         ]
     )
+
+
+def checked_pose(what: str, pose: Pose) -> Pose:
+    """The pose of ``what``, if positions in an image can still be told apart there.
+
+    Raises
+    ------
+    InputError
+        If it is not finite, further away than 1e9 sensor pixels, turned by more than 1e9 radians, or its zoom is not
+        1e-6 to 1e6.
+    """
+    near = all(abs(value) <= _FARTHEST for value in (pose.x, pose.y, pose.angle))  # not NaN either
+    if not near or not 1 / _LARGEST_ZOOM <= pose.zoom <= _LARGEST_ZOOM:
+        raise InputError(
+            f"{what}: its motion leads to x {pose.x:g}, y {pose.y:g}, angle {pose.angle:g}, zoom {pose.zoom:g}, too "
+            "far to see anything; make the motion slower or the duration shorter"
+        )
+    return pose
 
 
 def blurred(image: Image, sigma: float) -> Image:

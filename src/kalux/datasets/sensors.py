@@ -142,17 +142,11 @@ class SensorSettings:
     bits: int = 8
 
     def __post_init__(self) -> None:
-        for name in _POSITIVE:
-            require(self, name, 0 < getattr(self, name) < np.inf, "must be positive")
-        for name in _NOT_NEGATIVE:
-            require(self, name, 0 <= getattr(self, name) < np.inf, "must not be negative")
-        for name in ("reference_exposure", "full_well"):
+        for name, (least, most, unit) in _RANGES.items():
             value = getattr(self, name)
-            require(self, name, value is None or value > 0, "must be positive, or None")
-        for name in ("hot_pixels", "auto_exposure"):
-            require(self, name, 0 <= getattr(self, name) < 1, "must be 0 or more, and less than 1")
-        require(self, "timestamp_resolution", self.timestamp_resolution >= 1, "must be 1 us or more")
-        require(self, "bits", 1 <= self.bits <= 16, "must be 1 to 16")
+            inside = isinstance(value, (int, float, np.integer, np.floating)) and least <= value <= most
+            absent = (value is None and name in _NONE) or (value == 0 and name in _ZERO)
+            require(self, name, bool(inside or absent), f"must be {least:g} to {most:g}{unit}")
         self.response_function()
 
     def response_function(self) -> Callable[[FloatArray], FloatArray]:
@@ -166,22 +160,43 @@ class SensorSettings:
         return Response.named(self.response) if isinstance(self.response, str) else self.response
 
 
-_POSITIVE: Final = ("threshold_on", "threshold_off", "log_offset", "frame_rate", "exposure")
-_NOT_NEGATIVE: Final = (
-    "threshold_mismatch",
-    "cutoff",
-    "latency",
-    "refractory",
-    "leak_rate",
-    "noise_rate",
-    "noise_at_white",
-    "noise_spread",
-    "hot_rate",
-    "row_time",
-    "read_noise",
-    "fixed_offset",
-    "fixed_gain",
-)
+_RANGES: Final[Mapping[str, tuple[float, float, str]]] = {
+    # Below a thousandth a pixel would have events without end; no scene changes by a factor of exp(100).
+    "threshold_on": (1e-3, 100, ", log intensity"),
+    "threshold_off": (1e-3, 100, ", log intensity"),
+    "threshold_mismatch": (0, 10, ", relative"),
+    # The logarithm of black is then within 28 of white's; beside a larger one single precision loses white.
+    "log_offset": (1e-12, 1e6, ", white = 1"),
+    "cutoff": (1e-6, 1e9, " Hz, or 0"),
+    # The longest times are those of hours of recording, in us; the highest rates give an event in each us.
+    "latency": (0, 1e10, " us"),
+    "refractory": (0, 1e10, " us"),
+    "leak_rate": (0, 1e6, " Hz"),
+    "noise_rate": (0, 1e6, " Hz"),
+    "hot_rate": (0, 1e6, " Hz"),
+    "noise_at_white": (0, 1e3, ", relative"),
+    # One pixel of a million is five deviations off: a hundred thousand times the rate.
+    "noise_spread": (0, 1, " decades"),
+    "hot_pixels": (0, 0.999, ", a part of all"),
+    "timestamp_resolution": (1, 1e6, " us"),
+    # Exposures are whole us, so that a frame cannot be shorter.
+    "frame_rate": (1e-6, 1e6, " Hz"),
+    "exposure": (1, 1e10, " us"),
+    "reference_exposure": (1, 1e10, " us, or None"),
+    "auto_exposure": (0, 0.999, " of white"),
+    "row_time": (0, 1e6, " us"),
+    # With ten times white nothing is left of the image.
+    "read_noise": (0, 10, ", white = 1"),
+    "fixed_offset": (0, 10, ", white = 1"),
+    "fixed_gain": (0, 10, ", relative"),
+    # Pixels hold thousands to millions of electrons.
+    "full_well": (1e-3, 1e9, " electrons, or None"),
+    "bits": (1, 16, ""),
+}
+"""Of every number: the least and the largest that can be meant, and in what unit."""
+
+_ZERO: Final = ("cutoff",)
+_NONE: Final = ("reference_exposure", "full_well")
 
 
 def require(settings: Any, name: str, good: bool, what: str) -> None:

@@ -172,16 +172,14 @@ def truth_times(exposures: Exposures, rate_hz: float | None = None) -> NDArray[n
     Raises
     ------
     InputError
-        If the rate is not between 0 and 1 MHz.
+        If the rate is not 1 uHz to 1 MHz.
     """
     middles: NDArray[np.int64] = exposures.intervals[:, 0] + exposures.lengths // 2
     if rate_hz is None:
         inner = middles[1:-1] if len(middles) > 3 else middles
         return np.sort(np.concatenate([inner, (inner[1:] + inner[:-1]) // 2]))
-    if not 0 < rate_hz <= 1e6:
-        raise InputError(
-            f"simulate: {rate_hz} images of truth per second; it must be above 0, 1000000 at most"
-        )
+    if not 1e-6 <= rate_hz <= 1e6:
+        raise InputError(f"simulate: {rate_hz} images of truth per second; it must be 0.000001 to 1000000")
     if not len(middles):
         return np.empty(0, np.int64)
     count = int((exposures.intervals[-1, 1] - middles[0]) * rate_hz / 1e6 + 1e-9) + 1

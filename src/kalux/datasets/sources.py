@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.datasets.motion import Motion
-from kalux.datasets.scenes import Image, Scene, blurred, camera_matrix, sample
+from kalux.datasets.scenes import Image, Scene, blurred, camera_matrix, check_scale, sample
 from kalux.errors import FormatError, InputError
 from kalux.models.camera import Response
 from kalux.models.colour import LUMINANCE
@@ -28,6 +28,9 @@ _KEPT: Final = 4  # decoded images
 _MOMENTS: Final = 16  # of a scene, by which white is chosen
 _DARKEST: Final = 1e-4
 """Added before the logarithm of interpolation, as part of white: black pixels have one, too."""
+
+_LEAST_WHITE: Final = 1e-30
+_LARGEST_WHITE: Final = 1e30
 
 
 class Photograph(NamedTuple):
@@ -296,10 +299,12 @@ def sequence_scene(
     Raises
     ------
     InputError
-        If the rate or the scale is not positive, or the sequence is shorter than the duration.
+        If the rate is not 1 uHz to 1 MHz, or the sequence is shorter than the duration; or as of `check_scale`.
     """
-    if not 0 < rate_hz < 1e6:  # also refuses NaN
-        raise InputError(f"{sequence.path}: the rate is {rate_hz} Hz; it must be above 0, less than 1 MHz")
+    if not 1e-6 <= rate_hz < 1e6:  # also refuses NaN
+        raise InputError(
+            f"{sequence.path}: the rate is {rate_hz} Hz; it must be 0.000001 Hz or more, less than 1 MHz"
+        )
     lasts = int((sequence.length - 1) / rate_hz * 1e6)
     if duration is not None and duration > lasts:
         raise InputError(
@@ -307,10 +312,7 @@ def sequence_scene(
             f"{duration * 1e-6:g} s are wanted; give a shorter duration or a lower rate"
         )
     step = fitting_scale(sequence.size, sensor_size) if scale is None else scale
-    if not step > 0:
-        raise InputError(
-            f"{sequence.path}: scale is {step}; it must be positive, in image pixels per sensor pixel"
-        )
+    check_scale(str(sequence.path), step, sequence.size)
     center = ((sequence.size[1] - 1) / 2, (sequence.size[0] - 1) / 2)
     source = interpolated(sequence, rate_hz)
 
@@ -337,10 +339,13 @@ def exposed(scene: Scene, white: float) -> Scene:
     Raises
     ------
     InputError
-        If white is not positive.
+        If white is not 1e-30 to 1e30: single precision holds no more.
     """
-    if not 0 < white < np.inf:
-        raise InputError(f"{scene.name}: white is a radiance of {white}; it must be positive")
+    if not _LEAST_WHITE <= white <= _LARGEST_WHITE:
+        raise InputError(
+            f"{scene.name}: white is a radiance of {white}; it must be positive, {_LEAST_WHITE:g} to "
+            f"{_LARGEST_WHITE:g}"
+        )
     scale = np.float32(1.0 / white)
     return Scene(lambda t: scene.radiance(t) * scale, scene.sensor_size, scene.start, scene.end, scene.name)
 
