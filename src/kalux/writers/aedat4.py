@@ -23,7 +23,7 @@ from kalux.errors import FrameError, OutputError
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.frames import Frame
 from kalux.layouts import AEDAT4_MAGIC, AEDAT4_PACKET, AEDAT4_PIXELS
-from kalux.writers.files import output_errors, remove_quietly, temporary_path
+from kalux.writers.files import Claim, output_errors
 
 T = TypeVar("T")
 Compression = Literal["lz4", "zstd", "none"]
@@ -94,14 +94,10 @@ def write(
             f"{path}: AEDAT 4 holds sensors of up to {_LARGEST_SIDE} pixels a side, this one has {width}x{height}; "
             "write kalux HDF5"
         )
-    temporary = temporary_path(path)
-    try:
-        with output_errors(path), temporary.open("wb") as file:
+    with output_errors(path), Claim(path) as temporary:
+        with temporary.open("wb") as file:
             _write(file, path, sensor_size, events, frames, exposure_known, compression)
-        with output_errors(path):
-            os.replace(temporary, path)
-    finally:
-        remove_quietly(temporary)
+        os.replace(temporary, path)
 
 
 def _write(

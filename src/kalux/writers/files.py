@@ -14,6 +14,11 @@ from types import FrameType
 from kalux.errors import OutputError
 from kalux.wording import one_line
 
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
 _REASONS = {
     errno.ENOSPC: "no space is left on the disk",
     errno.EDQUOT: "the disk quota is used up",
@@ -68,22 +73,101 @@ def temporary_path(path: Path) -> Path:
     return path.with_name(f".{path.name}.part")
 
 
+class Claim:
+    """The right to write an output, which one writer has at a time; the system ends it with the process.
+
+    Of a file it is a lock on its temporary file, which is created or, if a process was killed, left from it; of a
+    folder a lock on the folder. Where the system has no such locks, nothing is locked.
+
+    Parameters
+    ----------
+    path
+        The output.
+    is_folder
+        Whether it is a folder, which is there.
+
+    Raises
+    ------
+    OutputError
+        If another writer has it.
+    OSError
+        As of the operating system.
+    """
+
+    def __init__(self, path: Path, *, is_folder: bool = False) -> None:
+        self._descriptor = -1
+        self._is_folder = is_folder
+        self.temporary = path if is_folder else temporary_path(path)
+        self._descriptor = self._locked(path)
+
+    def _locked(self, path: Path) -> int:
+        flags = os.O_RDONLY if self._is_folder else os.O_RDWR | os.O_CREAT
+        while True:
+            descriptor = os.open(self.temporary, flags, 0o666)
+            try:
+                if not _lock(descriptor):
+                    raise OutputError(
+                        f"{path}: it is being written already; wait until that has ended, or choose another name"
+                    )
+                # The writer before may have renamed or removed the file since it was opened.
+                if self._is_folder or _is_open_as(descriptor, self.temporary):
+                    return descriptor
+            except BaseException:
+                os.close(descriptor)
+                raise
+            os.close(descriptor)
+
+    def release(self) -> None:
+        """Give it up, and remove the temporary file if it has not got the output's name. Twice is once."""
+        descriptor, self._descriptor = self._descriptor, -1
+        if descriptor < 0:
+            return
+        if not self._is_folder and _is_open_as(descriptor, self.temporary):
+            remove_quietly(self.temporary)
+        os.close(descriptor)
+
+    def __enter__(self) -> Path:
+        return self.temporary
+
+    def __exit__(self, *error: object) -> None:
+        self.release()
+
+    def __del__(self) -> None:
+        self.release()  # of a writer that nobody has closed
+
+
+def _lock(descriptor: int) -> bool:
+    """Whether a file or folder is now locked, or cannot be: some file systems, and Windows, have no such locks."""
+    if fcntl is None:
+        return True
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return True
+    return True
+
+
+def _is_open_as(descriptor: int, path: Path) -> bool:
+    """Whether the open file has this name."""
+    with contextlib.suppress(FileNotFoundError):
+        return os.path.samestat(os.fstat(descriptor), os.stat(path))
+    return False
+
+
 def write_whole(path: Path, data: bytes) -> None:
     """Write a file so that it is whole under its name, or not there (or as it was before).
 
     Raises
     ------
     OSError
-        As of the operating system; the temporary file is removed.
+        As of the operating system, or of `Claim`; the temporary file is removed.
     """
-    temporary = temporary_path(path)
-    try:
+    with Claim(path) as temporary:
         with open(temporary, "wb") as file:
             file.write(data)
         os.replace(temporary, path)
-    except BaseException:
-        remove_quietly(temporary)
-        raise
 
 
 def save(path: Path, content: bytes | str) -> None:

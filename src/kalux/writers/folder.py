@@ -14,7 +14,7 @@ from kalux.ahead import InOrder
 from kalux.display import ToneState
 from kalux.errors import OutputError
 from kalux.writers.base import ImageLike, Writer
-from kalux.writers.files import output_errors, remove_quietly, write_whole
+from kalux.writers.files import Claim, output_errors, remove_quietly, write_whole
 from kalux.writers.images import Encode
 from kalux.writers.settings_file import SettingsFile, require_ours
 
@@ -62,11 +62,17 @@ class FolderWriter(Writer):
         self._encoders = encoders
         self._pending: InOrder[Encoded] = InOrder(encoders, "encode")
         with output_errors(path, "the output folder cannot be used"):
-            prepare_folder(path, overwrite=overwrite)
-            settings.write(complete=False, images=0, times=None)
-            self._told = time.monotonic()
-            write_whole(path / LISTING, f"{HEADER}\n".encode())
-            self._listing = FileIO(path / LISTING, "a")
+            make_folder(path)
+            self._claim = Claim(path, is_folder=True)
+            try:
+                prepare_folder(path, overwrite=overwrite)
+                settings.write(complete=False, images=0, times=None)
+                self._told = time.monotonic()
+                write_whole(path / LISTING, f"{HEADER}\n".encode())
+                self._listing = FileIO(path / LISTING, "a")
+            except BaseException:
+                self._claim.release()
+                raise
 
     def _write(self, image: ImageLike) -> None:
         data, self._state = self._encode(image, self._state)
@@ -109,7 +115,10 @@ class FolderWriter(Writer):
             with contextlib.suppress(OutputError):
                 self._end_files(complete=False)
             raise
-        self._end_files(complete=complete)
+        else:
+            self._end_files(complete=complete)
+        finally:
+            self._claim.release()
 
     def _end_files(self, *, complete: bool) -> None:
         self._pending.end()
@@ -146,8 +155,23 @@ def append_line(file: FileIO, line: str) -> None:
         raise
 
 
+def make_folder(path: Path) -> None:
+    """Create a folder, if it is not there.
+
+    Raises
+    ------
+    OutputError
+        A file has its name.
+    OSError
+        It cannot be created.
+    """
+    if os.path.lexists(path) and not path.is_dir():
+        raise OutputError(f"{path}: a file of this name is there; choose another name for the folder")
+    path.mkdir(parents=True, exist_ok=True)
+
+
 def prepare_folder(path: Path, *, overwrite: bool) -> None:
-    """Create a folder, or check that an existing one may be used, and remove old outputs from it.
+    """Check that a folder may be used, and remove old outputs from it.
 
     With ``overwrite``, what an old `timestamps.csv` of kalux lists is removed, and nothing else.
 
@@ -157,11 +181,8 @@ def prepare_folder(path: Path, *, overwrite: bool) -> None:
         The folder is not empty and ``overwrite`` is False, or it has a `timestamps.csv` or `kalux.toml` that
         is not of kalux.
     OSError
-        The folder cannot be created or read.
+        The folder cannot be read.
     """
-    if os.path.lexists(path) and not path.is_dir():
-        raise OutputError(f"{path}: a file of this name is there; choose another name for the folder")
-    path.mkdir(parents=True, exist_ok=True)
     if not any(path.iterdir()):
         return
     if not overwrite:

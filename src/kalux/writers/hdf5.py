@@ -17,7 +17,7 @@ from kalux.errors import FrameError
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.frames import Frame, GroundTruth, Mosaic
 from kalux.layouts import HDF5_COLUMNS, HDF5_VERSION
-from kalux.writers.files import output_errors, remove_quietly, temporary_path
+from kalux.writers.files import Claim, output_errors
 
 T = TypeVar("T")
 
@@ -87,9 +87,8 @@ def write(
         If the file cannot be written.
     """
     path = Path(path)
-    temporary = temporary_path(path)
-    try:
-        with output_errors(path), _Sink(temporary) as sink:
+    with output_errors(path), Claim(path) as temporary:
+        with _Sink(temporary) as sink:
             # Of all layouts of HDF5, this one has a checksum on every piece of metadata, except on strings of
             # variable length: damage is then reported, where HDF5 otherwise may crash or never return.
             with h5py.File(sink, "w", libver=("v110", "v110")) as file:
@@ -109,10 +108,7 @@ def write(
                     group.attrs["response"] = np.bytes_(response)
                 _write_frames(group, sink.checked(frames), sensor_size, exposure_known, mosaic)
             sink.check()
-        with output_errors(path):
-            os.replace(temporary, path)
-    finally:
-        remove_quietly(temporary)
+        os.replace(temporary, path)
 
 
 class _Sink(io.FileIO):

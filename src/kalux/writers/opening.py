@@ -67,7 +67,7 @@ def open_writer(
         The format is unknown or does not fit the name, a setting or ``threads`` is out of its range, or the
         metadata has no TOML form.
     OutputError
-        The output exists and ``overwrite`` is False, or it cannot be created.
+        The output exists and ``overwrite`` is False, is being written by another writer, or cannot be created.
     """
     path = Path(out)
     chosen = choose_format(path, format)

@@ -33,7 +33,7 @@ from kalux.display import (
 from kalux.errors import InputError, MissingDependencyError, OutputError, SettingsError
 from kalux.models.colour import LUMINANCE, luminance
 from kalux.writers.base import ImageLike, Writer
-from kalux.writers.files import output_errors, remove_quietly, temporary_path
+from kalux.writers.files import Claim, output_errors
 from kalux.writers.settings_file import SettingsFile, require_ours
 
 PRESETS = (
@@ -159,14 +159,14 @@ class VideoWriter(Writer):
         self._settings = settings
         self._state: ToneState | None = None
         self._open: tuple[OutputContainer, VideoStream] | None = None
-        self._temporary = temporary_path(path)
         self._first: int | None = None
         self._last = -1
         self._whole = True
         with output_errors(path, "the video cannot be written"):
             check_replaceable(path, settings.path, overwrite=overwrite)
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._temporary.touch()
+            self._claim = Claim(path)
+        self._temporary = self._claim.temporary
 
     def _write(self, image: ImageLike) -> None:
         t = int(image.t)
@@ -235,7 +235,7 @@ class VideoWriter(Writer):
             if self._open is not None:
                 with contextlib.suppress(OSError, av.FFmpegError):
                     self._open[0].close()
-            remove_quietly(self._temporary)
+            self._claim.release()
 
     def _finish_container(self, container: OutputContainer, stream: VideoStream) -> None:
         with encoder_errors(self.path, "the video cannot be finished and is removed"):
