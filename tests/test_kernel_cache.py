@@ -11,7 +11,9 @@ from pathlib import Path
 import pytest
 
 from kalux import kernel_cache
-from kalux.kernel_cache import VARIABLE, ensure_writable
+from kalux.cli.app import main
+from kalux.errors import SettingsError
+from kalux.kernel_cache import VARIABLE, check_variables, ensure_writable
 
 
 @pytest.fixture
@@ -91,3 +93,32 @@ def test_a_read_only_install_works(tmp_path, home):
     place = Path(done.stdout.strip())
     assert (place == tmp_path / "home/.cache/kalux") == (home == "writable")
     assert place.exists() == (home == "writable")
+
+
+@pytest.mark.parametrize(
+    "said", ["NUMBA_NUM_THREADS=0", "NUMBA_NUM_THREADS=-3", "NUMBA_DISABLE_JIT=1", "NUMBA_DISABLE_JIT=2"]
+)
+def test_variables_with_which_nothing_runs_are_named(said, monkeypatch, capsys):
+    monkeypatch.setenv(*said.split("="))
+    with pytest.raises(SettingsError, match=f"{said}: .*unset it"):
+        check_variables()
+    assert main(["info", "none.h5"]) == 2
+    assert said in capsys.readouterr().err
+    assert main(["--version"]) == 0
+
+
+@pytest.mark.parametrize("said", ["NUMBA_NUM_THREADS=1", "NUMBA_NUM_THREADS=", "NUMBA_DISABLE_JIT=0"])
+def test_other_values_are_left_to_numba(said, monkeypatch):
+    monkeypatch.setenv(*said.split("="))
+    check_variables()
+
+
+def test_without_compilation_the_library_says_so():
+    process = subprocess.run(
+        [sys.executable, "-c", "import kalux; kalux.reconstruct"],
+        env={**os.environ, "NUMBA_DISABLE_JIT": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert process.stderr.splitlines()[-1].startswith("kalux.errors.SettingsError: NUMBA_DISABLE_JIT=1")

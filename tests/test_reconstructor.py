@@ -779,7 +779,10 @@ def test_times_that_are_none_are_refused_everywhere(t):
     [
         ({"settings": {}}, "settings is a dict; a kalux.Settings is needed, from kalux.preset"),
         ({"settings": "cf"}, "settings is a str; a kalux.Settings"),
-        ({"pixels": np.ones((1, 1))}, "pixels is a ndarray; a kalux.PixelCalibration is needed"),
+        (
+            {"pixels": np.ones((1, 1))},
+            "pixels is a ndarray; a kalux.models.pixels.PixelCalibration is needed",
+        ),
         ({"reference_exposure": -1}, "reference_exposure is -1 us; it must be positive"),
         ({"reference_exposure": 0}, "reference_exposure is 0 us"),
         ({"reference_exposure": np.nan}, "reference_exposure is nan; whole microseconds"),

@@ -289,3 +289,11 @@ def test_the_longest_exposure_is_known_once_all_frames_are_read():
     for _ in range(2):
         assert rec.longest_exposure == max(frame.exposure for frame in small_frames())
     assert len(made) == len(small_frames())
+
+
+def test_a_ground_truth_that_is_none():
+    truth = (np.zeros(1, np.int64), np.zeros((1, 4, 5), np.float32))
+    with pytest.raises(
+        InputError, match=r"ground_truth is a tuple; a kalux\.frames\.GroundTruth is needed, from"
+    ):
+        recording.Recording.from_arrays([], [], sensor_size=(4, 5), ground_truth=truth)

@@ -19,7 +19,10 @@ from numpy.typing import NDArray
 
 from kalux import memory
 from kalux.events import EventArray
+from kalux.kernel_cache import check_variables
 from kalux.memory import PAGE
+
+check_variables()
 
 MICROSECOND32: Final = np.float32(1e-6)
 """Seconds."""

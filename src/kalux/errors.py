@@ -71,8 +71,11 @@ def require_type(what: str, given: object, kind: type, source: str) -> None:
         If it is something else, with where one comes from.
     """
     if not isinstance(given, kind):
+        import kalux  # its public names are known when all of it is imported
+
+        module = "kalux" if kind.__name__ in kalux.__all__ else kind.__module__
         raise InputError(
-            f"{what} is a {type(given).__name__}; a kalux.{kind.__name__} is needed, from {source}"
+            f"{what} is a {type(given).__name__}; a {module}.{kind.__name__} is needed, from {source}"
         )
 
 

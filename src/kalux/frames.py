@@ -92,6 +92,10 @@ class Frame:
         return np.maximum(self.image.astype(np.float64) / self.white_value, 0.0)
 
 
+GROUND_TRUTH_SOURCE: Final = "GroundTruth(times, images) or Recording.ground_truth()"
+"""Where a `GroundTruth` comes from, for messages."""
+
+
 @dataclass(frozen=True)
 class GroundTruth:
     """Reference images that came with a recording.

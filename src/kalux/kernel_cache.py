@@ -1,8 +1,10 @@
-"""Where compiled loops are kept: beside the package, or elsewhere where that cannot be written.
+"""What numba's environment variables say; where compiled loops are kept.
+
+That is beside the package, or elsewhere where that cannot be written.
 
 numba keeps them in ``__pycache__`` beside the source. Of a package that is installed read-only, and without a home
-folder that can be written, it refuses even to be told of a function that shall be cached. Standard library only:
-this runs whenever kalux is imported.
+folder that can be written, it refuses even to be told of a function that shall be cached. No large imports: this
+runs whenever kalux is imported.
 """
 
 from __future__ import annotations
@@ -14,6 +16,8 @@ import sys
 import tempfile
 from pathlib import Path
 from typing import Final
+
+from kalux.errors import SettingsError
 
 VARIABLE: Final = "NUMBA_CACHE_DIR"
 """The environment variable of numba that says where; kalux sets it only where nobody has and it is needed."""
@@ -30,6 +34,32 @@ def ensure_writable(package: Path) -> None:
     os.environ[VARIABLE] = str(place)
     if "numba" in sys.modules:  # it has read its environment already
         sys.modules["numba"].config.CACHE_DIR = str(place)
+
+
+def check_variables() -> None:
+    """Refuse variables with which numba does not start, or does not compile.
+
+    Raises
+    ------
+    SettingsError
+        That names the variable.
+    """
+    threads = _number("NUMBA_NUM_THREADS")
+    if threads is not None and threads < 1:
+        raise SettingsError(f"NUMBA_NUM_THREADS={threads}: it must be 1 or more; change it, or unset it")
+    interpreted = _number("NUMBA_DISABLE_JIT")
+    if interpreted:
+        raise SettingsError(
+            f"NUMBA_DISABLE_JIT={interpreted}: kalux's loops use machine instructions and have to be compiled; unset it"
+        )
+
+
+def _number(variable: str) -> int | None:
+    """A variable as numba reads it: None where it is not set or no whole number."""
+    try:
+        return int(os.environ.get(variable, ""))
+    except ValueError:
+        return None
 
 
 def _is_writable(package: Path) -> bool:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from kalux import readers
 from kalux.compiled import event_column, event_row, event_words
-from kalux.errors import ExposureError, FormatError, FrameError, InputError
+from kalux.errors import ExposureError, FormatError, FrameError, InputError, require_type
 from kalux.events import (
     LATEST,
     EventArray,
@@ -27,6 +27,7 @@ from kalux.events import (
     checked_thresholds,
 )
 from kalux.frames import (
+    GROUND_TRUTH_SOURCE,
     MOSAICS,
     Frame,
     GroundTruth,
@@ -219,6 +220,8 @@ class Recording:
             If what is taken for white can hardly be right.
         """
         size = checked_size(sensor_size)
+        if ground_truth is not None:
+            require_type(f"{name}: ground_truth", ground_truth, GroundTruth, GROUND_TRUTH_SOURCE)
         array = as_events(events, columns=columns, time_unit=time_unit)
         frame_list = list(frames)
         for index, frame in enumerate(frame_list):

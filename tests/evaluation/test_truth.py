@@ -136,6 +136,17 @@ def test_what_does_not_fit_is_refused(simulation, recording):
             prepare_reference(recording, bad, mask)
 
 
+def test_what_is_no_truth_is_named(simulation, recording):
+    truth = simulation.truth()
+    for given in ((truth.times, truth.images), None, truth.images):
+        with pytest.raises(InputError, match=r"truth is a .*; a kalux\.frames\.GroundTruth is needed"):
+            prepare_reference(recording, given)
+    with pytest.raises(InputError, match=r"recording is a GroundTruth; a kalux\.Recording is needed"):
+        prepare_reference(truth, recording)
+    with pytest.raises(InputError, match=r"reference is a GroundTruth; .*Reference is needed, from prepare_"):
+        evaluate_truth(recording, truth, methods()["hold"])
+
+
 class TestFiles:
     @pytest.mark.parametrize("names", [("times_us", "gt"), ("times", "images")])
     def test_both_names(self, tmp_path, simulation, names):

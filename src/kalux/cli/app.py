@@ -13,6 +13,7 @@ from kalux.cli.parser import Parser, UsageError, normalised
 from kalux.cli.signals import termination_as_interrupt
 from kalux.cli.terminal import close_output, error_line, hold_closed_streams
 from kalux.errors import InternalError, KaluxError
+from kalux.kernel_cache import check_variables
 
 DONE, BUG, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 
@@ -127,7 +128,10 @@ def _notes(error: BaseException) -> list[str]:
 
 
 def _run(arguments: list[str]) -> int:
-    parser = make_parser(next((word for word in arguments if word in COMMANDS), None))
+    command = next((word for word in arguments if word in COMMANDS), None)
+    if command is not None:
+        check_variables()  # the command's flags are made with what imports numba
+    parser = make_parser(command)
     try:
         options = parser.parse_args(normalised(arguments))
     except SystemExit as done:  # --help and --version have printed what was asked for

@@ -11,13 +11,13 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.errors import FormatError, FrameError, InputError
+from kalux.errors import FormatError, FrameError, InputError, require_type
 from kalux.evaluation.lpips import LpipsWeights
 from kalux.evaluation.method import Method
 from kalux.evaluation.pairs import Pair
 from kalux.evaluation.scores import Scores, score
 from kalux.filters.shots import take_shot
-from kalux.frames import GroundTruth
+from kalux.frames import GROUND_TRUTH_SOURCE, GroundTruth
 from kalux.models.camera import Camera, log_covariance, noise_variance
 from kalux.readers.numpy_files import DAMAGE
 from kalux.recording import Recording
@@ -80,11 +80,13 @@ def prepare_reference(
     Raises
     ------
     InputError
-        If images, times, mask and sensor do not fit together, a compared value is not finite or negative, or no
-        image lies within the frames.
+        If the truth is not a `GroundTruth`; if images, times, mask and sensor do not fit together, a compared value is
+        not finite or negative, or no image lies within the frames.
     FrameError
         If the recording has no frames.
     """
+    require_type("prepare_reference: recording", recording, Recording, "kalux.open or Recording.from_arrays")
+    require_type("prepare_reference: truth", truth, GroundTruth, GROUND_TRUTH_SOURCE)
     times, images = np.asarray(truth.times), np.asarray(truth.images)
     if images.ndim != 3 or images.shape[1:] != recording.sensor_size or times.shape != images.shape[:1]:
         raise InputError(
@@ -147,9 +149,12 @@ def evaluate_truth(
 
     Raises
     ------
+    InputError
+        If the reference is not one of `prepare_reference`.
     KaluxError
         Whatever the method or the metrics say.
     """
+    require_type("evaluate_truth: reference", reference, Reference, "prepare_reference")
     return score(
         truth_pairs(recording, reference, method),
         method=method.label,
