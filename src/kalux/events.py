@@ -32,6 +32,9 @@ FIELD_NAMES: Final = {
 """The names under which peers store each field, in small letters: tonic and Prophesee (t, x, y, p), dv-processing
 (timestamp, x, y, polarity), Metavision CSV, event_stream, DSEC and IJRR tables."""
 
+_LEAST_THRESHOLD: Final = 1e-12
+_LARGEST_THRESHOLD: Final = 100.0
+
 _TIME_UNITS: Final = {"us": 1.0, "s": 1e6, "ms": 1e3, "ns": 1e-3}
 _UINT16_MAX: Final = np.iinfo(np.uint16).max
 
@@ -139,13 +142,13 @@ def checked_thresholds(threshold: Any) -> tuple[float, float] | None:
     Raises
     ------
     InputError
-        If they are anything else, or not positive.
+        If they are anything else, or not positive (1e-12 to 100, as in settings).
     """
     if threshold is None:
         return None
     try:
         on, off = (float(value) for value in np.broadcast_to(np.asarray(threshold, np.float64), 2))
-        fine = 0 < on < np.inf and 0 < off < np.inf
+        fine = all(_LEAST_THRESHOLD <= value <= _LARGEST_THRESHOLD for value in (on, off))
     except (TypeError, ValueError):
         fine = False
     if not fine:

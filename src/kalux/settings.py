@@ -411,6 +411,30 @@ _WHOLE: Final = {"delay", "usual_delay", "reference_exposure", "refractory_perio
 _LARGEST_WHOLE: Final = 10**18  # fits int64
 _LARGEST: Final = 1e10  # more than any value can mean, and its square is a number in single precision
 _LEAST: Final = 1e-12  # but 0: less than any value can mean, and so is its square
+_LARGEST_OF: Final[Mapping[str, float]] = {
+    **dict.fromkeys(("saturation", "weight_floor"), 1.0),
+    "log_offset": 1e3,  # of white: its logarithm is then the same as its radiance
+    **dict.fromkeys(
+        ("frame_noise", "usual_frame_noise", "shot_noise"), 10.0
+    ),  # of white: nothing is left of a frame
+    # Log intensity: exp(100) is more than single precision holds.
+    **dict.fromkeys(("threshold_on", "threshold_off", "usual_threshold_on", "usual_threshold_off"), 100.0),
+    **dict.fromkeys(("highlight_scale", "bright_tail", "neighbours"), 100.0),
+    "initial_variance": 1e4,  # the square of that
+    # Shares: at ten times a value nothing is known of it.
+    **dict.fromkeys(
+        ("threshold_spread", "usual_spread", "usual_threshold_spread", "extrapolation_spread"), 10.0
+    ),
+    "trail": 10.0,  # c: a pixel one threshold beyond its newest event has another
+    **dict.fromkeys(
+        ("step_variance", "usual_step_variance", "quantisation_variance", "deblur_variance"), 100.0
+    ),  # c^2
+    **dict.fromkeys(("highlight_tail", "unshown_tail"), 100.0),  # multiples of a log intensity
+}
+_LEAST_OF: Final[Mapping[str, float]] = {
+    # The square of a frame's weight, 1 / noise^2, is still a number in single precision.
+    **dict.fromkeys(("frame_noise", "usual_frame_noise"), 1e-9),
+}
 _SIGNED: Final = {"delay", "usual_delay"}
 _CHOICES: Final = {
     "kind": ("akf", "cf"),
@@ -424,12 +448,11 @@ def _check(settings: Settings) -> None:
         values = getattr(settings, group)
         for entry in dataclasses.fields(values):
             _check_value(f"{group}.{entry.name}", entry.name, getattr(values, entry.name), entry.default)
-    if settings.camera.saturation > 1 or settings.camera.weight_floor > 1:
-        raise SettingsError("settings: camera.saturation and camera.weight_floor must be at most 1")
 
 
 def _check_value(label: str, name: str, value: Any, default: Any) -> None:
-    most = _LARGEST_WHOLE if name in _WHOLE else _LARGEST
+    most = _LARGEST_WHOLE if name in _WHOLE else _LARGEST_OF.get(name, _LARGEST)
+    least = _LEAST_OF.get(name, _LEAST)
     if name in _CHOICES:
         if value not in _CHOICES[name]:
             raise SettingsError(
@@ -444,10 +467,10 @@ def _check_value(label: str, name: str, value: Any, default: Any) -> None:
     elif name in _WHOLE and not (isinstance(value, int) and not isinstance(value, bool)):
         raise SettingsError(f"settings: {label} is {value!r}; whole microseconds are needed")
     elif isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= most:
-        raise SettingsError(f"settings: {label} is {value!r}; a finite number is needed, at most {most:.0e}")
-    elif 0 < abs(value) < _LEAST:
+        raise SettingsError(f"settings: {label} is {value!r}; a finite number is needed, at most {most:g}")
+    elif 0 < abs(value) < least:
         raise SettingsError(
-            f"settings: {label} is {value!r}; {_LEAST:g} is the least above 0 that is possible"
+            f"settings: {label} is {value!r}; {least:g} is the least above 0 that is possible"
         )
     elif (value < 0 and name not in _SIGNED) or (name in _POSITIVE and value == 0):
         raise SettingsError(

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import nnls
 
-from kalux import EVENT_DTYPE, Frame, Recording
+from kalux import EVENT_DTYPE, Frame, Recording, reconstruct
 from kalux.calibration.frame_noise import (
     _enough_frames,
     _not_negative,
@@ -126,6 +126,23 @@ def test_nothing_to_be_told():
     assert estimate_frame_noise(still(flat, 0.002, 0.0), CAMERA) is None  # a single level
     assert estimate_frame_noise(still(RAMP[:60, :80], 0.002, 0.0, events=busy), CAMERA) is None
     assert estimate_frame_noise(still(RAMP, 0.01, 0.0, frames=1), CAMERA) is None
+
+
+@pytest.mark.parametrize("electrons", [0, 5000], ids=["no noise", "shot noise only"])
+def test_frames_in_floats_without_read_noise_can_be_reconstructed(electrons):
+    """Simulated frames can have none; settings need some."""
+    rng = np.random.default_rng(1)
+    frames = [
+        Frame(rng.poisson(RAMP * electrons) / electrons if electrons else RAMP + 0.0, t, t + 10_000)
+        for t in range(0, 480_000, 40_000)
+    ]
+    recording = Recording.from_arrays(NOTHING, frames, sensor_size=RAMP.shape)
+    found = estimate_frame_noise(recording, CAMERA)
+    assert 0.5 / 65535 <= found.read < (5e-4 if electrons else 1e-5)
+    assert found.shot == pytest.approx(1 / electrons if electrons else 0.0, rel=0.05)
+    images = list(reconstruct(recording, at="frames"))
+    assert len(images) == len(frames)
+    assert all(np.isfinite(image.intensity).all() for image in images)
 
 
 def test_rounding():

@@ -38,6 +38,9 @@ _LEAST: Final = 200  # pixels of a frame pair in a bin
 _DARKEST: Final = 0.01  # two to three levels of 8 bits: below, black cuts the noise off
 
 
+_LEAST_READ: Final = 0.5 / 65535
+"""Read noise, white = 1, of frames in floats that have less or none: the rounding of 16 bits, finer than any camera."""
+
 _SPAN: Final = 3.0
 _BELIEVED: Final = 0.3
 
@@ -83,8 +86,8 @@ def estimate_frame_noise(
     """Photon transfer curve of pixels without events nearby from one exposure's start to the next one's end.
 
     In units of the intensity of a saturated pixel of the frames, by levels; the median over frame pairs, so that pairs
-    with faint motion do not count. Read noise is no less than `rounding_error`. None where fewer than two
-    levels are seen, each by 200 pixels of a frame pair.
+    with faint motion do not count. Read noise is no less than `rounding_error`, or that of 16 bits. None where fewer
+    than two levels are seen, each by 200 pixels of a frame pair.
 
     Parameters
     ----------
@@ -111,7 +114,8 @@ def estimate_frame_noise(
     weights = np.array([np.sqrt(found[:, 2].sum()) for found in seen])
     found = photon_transfer(levels, variances, weights)
     first = next(iter(recording.frames()))
-    return found._replace(read=max(found.read, rounding_error(first)))
+    read = max(found.read, rounding_error(first), _LEAST_READ)
+    return found._replace(read=read, shot=found.shot if found.shot > _LEAST_READ**2 else 0.0)
 
 
 def rounding_error(frame: Frame) -> float:
