@@ -19,6 +19,7 @@ Messages are one line. The command line prints them as they are and exits with c
 from __future__ import annotations
 
 import difflib
+import sys
 from collections.abc import Iterable
 
 
@@ -71,9 +72,8 @@ def require_type(what: str, given: object, kind: type, source: str) -> None:
         If it is something else, with where one comes from.
     """
     if not isinstance(given, kind):
-        import kalux  # its public names are known when all of it is imported
-
-        module = "kalux" if kind.__name__ in kalux.__all__ else kind.__module__
+        public = sys.modules["kalux"].__all__  # not imported: this module is below all others
+        module = "kalux" if kind.__name__ in public else kind.__module__
         raise InputError(
             f"{what} is a {type(given).__name__}; a {module}.{kind.__name__} is needed, from {source}"
         )
