@@ -9,9 +9,9 @@ import kalux
 
 def test_from_a_recording_to_scores(cli, recording, tmp_path):
     out = tmp_path / "a.h5"
-    made = cli("ahdr", recording, "-o", out, "--cut-low", 10, "--cut-high", 80)
+    made = cli("ahdr", recording, "-o", out, "--cut-low", 10, "--cut-high", 120)
     assert made.code == 0, made.err
-    assert "black up to 10 and white from 80 of 255" in made.out
+    assert "black up to 10 and white from 120 of 255" in made.out
     assert made.err == ""
     found = cli("evaluate", out, "--methods", "hold,default")
     assert found.out.splitlines()[0].startswith(f"{out}: ground truth: ")

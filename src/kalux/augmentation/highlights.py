@@ -201,7 +201,10 @@ def _rims(shown: Shown) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray
     for row, column in np.ndindex(pitch, pitch):
         of_colour = np.s_[row::pitch, column::pitch]
         clipped = np.ascontiguousarray(shown.clipped[of_colour], np.uint8)
-        distance[of_colour] = pitch * cv2.distanceTransform(clipped, cv2.DIST_L2, cv2.DIST_MASK_5)
+        steps = cv2.distanceTransform(clipped, cv2.DIST_L2, cv2.DIST_MASK_5)
+        distance[of_colour] = pitch * np.minimum(
+            steps, np.float32(sum(shape))
+        )  # where all is clipped, it is anything
         beside = cv2.dilate(clipped, _AROUND).view(np.bool_) & shown.measured[of_colour]
         darkest = cv2.dilate(np.ascontiguousarray(shown.darker[of_colour]), _AROUND)[beside]
         rim[of_colour] = beside
