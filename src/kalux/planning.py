@@ -42,9 +42,9 @@ DOUBTED: Final[tuple[ThresholdOrigin, ...]] = ("calibration", "estimate", "assum
 _NOISE_EVENTS: Final = 1_000_000
 """Of which the background noise is taken: at 15 million events/s the quiet time of 300,000 pixels in 70 ms."""
 
-_REMEMBERED_EVENTS: Final = 1 << 22
+_REMEMBERED_EVENTS: Final = 1 << 21
 _REMEMBERED_FRAMES: Final = 1 << 25
-"""Events (64 MB) and bytes of frames at the beginning that are read once for all estimates, which take most of their
+"""Events (32 MB) and bytes of frames at the beginning that are read once for all estimates, which take most of their
 samples from there."""
 
 
