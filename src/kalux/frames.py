@@ -89,7 +89,8 @@ class Frame:
 
     def normalised(self) -> NDArray[np.float64]:
         """The camera response as float64, 0 to 1 = saturated (a float image may exceed 1)."""
-        return np.maximum(self.image.astype(np.float64) / self.white_value, 0.0)
+        response = self.image.astype(np.float64) / self.white_value
+        return np.maximum(response, 0.0) if self.image.dtype.kind == "f" else response
 
 
 GROUND_TRUTH_SOURCE: Final = "GroundTruth(times, images) or Recording.ground_truth()"

@@ -74,6 +74,11 @@ class Shown(NamedTuple):
     measured: NDArray[np.bool_]
     pitch: int = 1
 
+    @property
+    def just_below(self) -> NDArray[np.bool_]:
+        """(H, W) pixels just below white."""
+        return self.measured & (self.darker < _NEAR)
+
 
 class Tail(NamedTuple):
     """How far highlights go on beyond white: ``share`` of what pixels just below it say, ``most`` at most (K15)."""
@@ -171,9 +176,8 @@ def beyond_rims(shown: Shown, pixels: NDArray[np.int64], near: float, tail: Tail
     near
         Pixels just below white over clipped ones, of the whole recording until now.
     """
-    just_below = shown.measured & (shown.darker < _NEAR)
     distance, rim, hardness = _rims(shown)
-    of_parts = (_around(_sums(plane)) for plane in (shown.clipped, just_below, rim, hardness))
+    of_parts = (_around(_sums(plane)) for plane in (shown.clipped, shown.just_below, rim, hardness))
     clipped, below, rims, hard = of_parts
     area = _area(shown.darker.shape)
     scale = _NEAR * (clipped + _WHOLE * area) / (below + (_WHOLE * near + _LEAST) * area)
@@ -186,8 +190,7 @@ def beyond_rims(shown: Shown, pixels: NDArray[np.int64], near: float, tail: Tail
 
 def _counts(shown: Shown) -> tuple[int, int]:
     """Pixels just below white, and clipped ones."""
-    below = shown.measured & (shown.darker < _NEAR)
-    return int(np.count_nonzero(below)), int(np.count_nonzero(shown.clipped))
+    return int(np.count_nonzero(shown.just_below)), int(np.count_nonzero(shown.clipped))
 
 
 def _rims(shown: Shown) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.float32]]:

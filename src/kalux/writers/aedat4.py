@@ -7,7 +7,6 @@ which every byte but the contents is known before, so that no builder is needed
 
 from __future__ import annotations
 
-import os
 import struct
 from array import array
 from collections.abc import Callable, Iterable, Iterator
@@ -23,7 +22,7 @@ from kalux.errors import FrameError, OutputError
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.frames import Frame
 from kalux.layouts import AEDAT4_MAGIC, AEDAT4_PACKET, AEDAT4_PIXELS
-from kalux.writers.files import Claim, output_errors
+from kalux.writers.files import output_errors, replacing
 
 T = TypeVar("T")
 Compression = Literal["lz4", "zstd", "none"]
@@ -94,10 +93,8 @@ def write(
             f"{path}: AEDAT 4 holds sensors of up to {_LARGEST_SIDE} pixels a side, this one has {width}x{height}; "
             "write kalux HDF5"
         )
-    with output_errors(path), Claim(path) as temporary:
-        with temporary.open("wb") as file:
-            _write(file, path, sensor_size, events, frames, exposure_known, compression)
-        os.replace(temporary, path)
+    with output_errors(path), replacing(path) as temporary, temporary.open("wb") as file:
+        _write(file, path, sensor_size, events, frames, exposure_known, compression)
 
 
 def _write(

@@ -156,8 +156,9 @@ def _is_open_as(descriptor: int, path: Path) -> bool:
     return False
 
 
-def write_whole(path: Path, data: bytes) -> None:
-    """Write a file so that it is whole under its name, or not there (or as it was before).
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A temporary name to write a file under, which gets its own name at the end, unless something fails.
 
     Raises
     ------
@@ -165,9 +166,20 @@ def write_whole(path: Path, data: bytes) -> None:
         As of the operating system, or of `Claim`; the temporary file is removed.
     """
     with Claim(path) as temporary:
-        with open(temporary, "wb") as file:
-            file.write(data)
+        yield temporary
         os.replace(temporary, path)
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Write a file so that it is whole under its name, or not there (or as it was before).
+
+    Raises
+    ------
+    OSError
+        As of `replacing`.
+    """
+    with replacing(path) as temporary, open(temporary, "wb") as file:
+        file.write(data)
 
 
 def save(path: Path, content: bytes | str) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple, TypeVar
@@ -17,7 +16,7 @@ from kalux.errors import FrameError
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.frames import Frame, GroundTruth, Mosaic
 from kalux.layouts import HDF5_COLUMNS, HDF5_VERSION
-from kalux.writers.files import Claim, output_errors
+from kalux.writers.files import output_errors, replacing
 
 T = TypeVar("T")
 
@@ -87,28 +86,26 @@ def write(
         If the file cannot be written.
     """
     path = Path(path)
-    with output_errors(path), Claim(path) as temporary:
-        with _Sink(temporary) as sink:
-            # Of all layouts of HDF5, this one has a checksum on every piece of metadata, except on strings of
-            # variable length: damage is then reported, where HDF5 otherwise may crash or never return.
-            with h5py.File(sink, "w", libver=("v110", "v110")) as file:
-                file.attrs["format"] = np.bytes_("kalux")
-                file.attrs["version"] = np.bytes_(HDF5_VERSION)
-                file.attrs["sensor_size"] = sensor_size
-                if contrast_threshold is not None:
-                    file.attrs["contrast_threshold"] = contrast_threshold
-                if inverse_covariance is not None:
-                    file["inverse_covariance"] = np.asarray(inverse_covariance, np.float64)
-                if ground_truth is not None:
-                    images = sink.checked(ground_truth.images)
-                    _write_ground_truth(file.create_group("ground_truth"), ground_truth, images, sensor_size)
-                _write_events(file.create_group("events"), sink.checked(events))
-                group = file.create_group("frames")
-                if response is not None:
-                    group.attrs["response"] = np.bytes_(response)
-                _write_frames(group, sink.checked(frames), sensor_size, exposure_known, mosaic)
-            sink.check()
-        os.replace(temporary, path)
+    with output_errors(path), replacing(path) as temporary, _Sink(temporary) as sink:
+        # Of all layouts of HDF5, this one has a checksum on every piece of metadata, except on strings of
+        # variable length: damage is then reported, where HDF5 otherwise may crash or never return.
+        with h5py.File(sink, "w", libver=("v110", "v110")) as file:
+            file.attrs["format"] = np.bytes_("kalux")
+            file.attrs["version"] = np.bytes_(HDF5_VERSION)
+            file.attrs["sensor_size"] = sensor_size
+            if contrast_threshold is not None:
+                file.attrs["contrast_threshold"] = contrast_threshold
+            if inverse_covariance is not None:
+                file["inverse_covariance"] = np.asarray(inverse_covariance, np.float64)
+            if ground_truth is not None:
+                images = sink.checked(ground_truth.images)
+                _write_ground_truth(file.create_group("ground_truth"), ground_truth, images, sensor_size)
+            _write_events(file.create_group("events"), sink.checked(events))
+            group = file.create_group("frames")
+            if response is not None:
+                group.attrs["response"] = np.bytes_(response)
+            _write_frames(group, sink.checked(frames), sensor_size, exposure_known, mosaic)
+        sink.check()
 
 
 class _Sink(io.FileIO):
