@@ -110,7 +110,14 @@ class BridgedFrames(CommonMethod):
     ) -> None:
         super().__init__(settings, thresholds, lookahead, shape)
         events, c2 = settings.events, self.on * self.off
-        self.noise = BridgeNoise(self.on, self.off, events.step_noise * c2, events.quantisation_variance * c2)
+        scale2 = 2.0 * settings.filter.highlight_scale**2  # of the difference of two highlights
+        self.noise = BridgeNoise(
+            self.on,
+            self.off,
+            events.step_noise * c2,
+            events.quantisation_variance * c2,
+            scale2 if scale2 > 0 else bridge.UNMEASURED,
+        )
         self._event_noise = akf_bridged.Noise(events.background_rate, events.step_noise, c2)
         self._prior = (
             bridge.nominal_thresholds(shape, settings.events.mismatch, np.float32)
