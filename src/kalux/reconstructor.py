@@ -146,7 +146,7 @@ class Reconstructor:
         self._last_frame: Frame | None = None
         self._frame_count = 0
         self._interval = USUAL_INTERVAL  # between the latest two frames whose segment is committed, us
-        self._tail: float | None = None  # of the first frame
+        self._bright_tail = self.settings.filter.bright_tail  # None: that of the first frame
         self._event_count = 0
         self._last_event: int | None = None
         self._complete_until: int | None = None
@@ -175,10 +175,10 @@ class Reconstructor:
             )
         check_frame(frame, self.sensor_size, index=self._frame_count, previous=self._last_frame)
         self._reference = self._reference or frame.exposure
-        if self._tail is None:
-            self._tail = count_bright(self._camera, frame.image, frame.white_value).scale
+        if self._bright_tail is None:
+            self._bright_tail = count_bright(self._camera, frame.image, frame.white_value).scale
         shot = take_shot(frame, self._camera, self._reference, self._gains_of(frame))
-        self._shots.append(shot if trail is None else shot._replace(trail=trail))
+        self._shots.append(shot._replace(trail=trail, bright_tail=self._bright_tail))
         self._last_frame = frame
         self._frame_count += 1
 
@@ -389,7 +389,8 @@ class Reconstructor:
         scale = filtered.highlight_scale if filtered.kind == "akf" else 0.0
         spread = events.mismatch
         if self._estimated:
-            scale = min(scale, filtered.highlight_tail * self._tail_beyond)
+            assert self._bright_tail is not None  # a frame has been pushed
+            scale = min(scale, filtered.highlight_tail * beyond_white(self._bright_tail))
             spread = events.extrapolation_spread
         on, off = self.thresholds
         frame = self._last_frame
@@ -411,13 +412,6 @@ class Reconstructor:
         if filtered.highlight_scale == 0 or filtered.unshown_tail == 0:
             return None
         return self._method.unshown(progress.segment, variance)
-
-    @property
-    def _tail_beyond(self) -> float:
-        """How far the frames' bright tail goes on beyond white."""
-        tail = self.settings.filter.bright_tail or self._tail
-        assert tail is not None
-        return beyond_white(tail)
 
     def _moment(self, progress: _Progress, t: int) -> Moment:
         """The time ``t`` in a segment under way, with the frames at both its ends where it uses both."""
