@@ -29,15 +29,17 @@ from kalux.frames import median_exposure
 from kalux.models.camera import BrightTail, Camera, count_bright
 from kalux.models.colour import white_balance
 from kalux.models.pixels import PixelCalibration, require_size
-from kalux.recording import Recording, no_frames, remembering
+from kalux.recording import RECORDING_NEEDED, Recording, no_frames, remembering
 from kalux.schedule import image_times
-from kalux.settings import EventSettings, Settings, altered, chosen_response
+from kalux.settings import SETTINGS_NEEDED, EventSettings, Settings, altered, chosen_response
 from kalux.settings import preset as named_preset
 
 ThresholdOrigin = Literal["settings", "recording", "calibration", "estimate", "assumed"]
 
 DOUBTED: Final[tuple[ThresholdOrigin, ...]] = ("calibration", "estimate", "assumed")
 """Thresholds of these origins are not quite the pixels' own: highlights are then believed less."""
+
+_CALIBRATION_NEEDED: Final = "a kalux.Calibration is needed, from kalux.load_calibration"
 
 _NOISE_EVENTS: Final = 1_000_000
 """Of which the background noise is taken: at 15 million events/s the quiet time of 300,000 pixels in 70 ms."""
@@ -108,13 +110,11 @@ def plan(
     smooth: bool = False,
 ) -> Plan:
     """Decide what a reconstruction will do. See `reconstruct` for the parameters and errors."""
-    for name, given, kind, source in (
-        ("recording", recording, Recording, "kalux.open or Recording.from_arrays"),
-        ("settings", settings, Settings, "kalux.preset"),
-        ("calibration", calibration, Calibration, "kalux.load_calibration"),
-    ):
-        if given is not None or name == "recording":
-            require_type(f"reconstruct: {name}", given, kind, source)
+    require_type("reconstruct: recording", recording, Recording, RECORDING_NEEDED)
+    if settings is not None:
+        require_type("reconstruct: settings", settings, Settings, SETTINGS_NEEDED)
+    if calibration is not None:
+        require_type("reconstruct: calibration", calibration, Calibration, _CALIBRATION_NEEDED)
     known = Calibration() if calibration is None else calibration
     chosen = settings if settings is not None else known.apply(named_preset(preset))
     if sum(choice is not None for choice in (rate_hz, times, at)) != 1:

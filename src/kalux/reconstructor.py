@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,8 +40,12 @@ from kalux.models.camera import Camera, beyond_white, count_bright
 from kalux.models.colour import Gains, white_balance
 from kalux.models.pixels import PixelCalibration, require_size
 from kalux.moments import Moment
-from kalux.settings import Settings
+from kalux.settings import SETTINGS_NEEDED, Settings
 from kalux.settings import preset as named_preset
+
+_PIXELS_NEEDED: Final = (
+    "a kalux.models.pixels.PixelCalibration is needed, from kalux.load_calibration(...).pixels"
+)
 
 
 class _Progress:
@@ -107,7 +111,7 @@ class Reconstructor:
     ) -> None:
         self.sensor_size = checked_size(sensor_size)
         if settings is not None:
-            require_type("settings", settings, Settings, "kalux.preset")
+            require_type("settings", settings, Settings, SETTINGS_NEEDED)
         if reference_exposure is not None and _whole(reference_exposure, "reference_exposure") <= 0:
             raise InputError(f"reference_exposure is {reference_exposure} us; it must be positive")
         self.settings = settings if settings is not None else named_preset(preset)
@@ -133,7 +137,7 @@ class Reconstructor:
         self._reference = camera.reference_exposure or reference_exposure
         used = dataclasses.replace(self.settings, events=assumed)
         if pixels is not None:
-            require_type("pixels", pixels, PixelCalibration, "kalux.load_calibration(...).pixels")
+            require_type("pixels", pixels, PixelCalibration, _PIXELS_NEEDED)
             require_size(pixels, self.sensor_size)
         self._ignored = pixels.hot if pixels is not None and pixels.hot.any() else None
         self._method: Method = make_method(used, self.thresholds, lookahead, self.sensor_size, pixels)
