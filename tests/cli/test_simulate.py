@@ -238,6 +238,7 @@ def test_every_setting_of_the_sensor_is_a_flag(cli):
         (("--duration", "1e-300"), "must be positive"),
         (("--frame-rate", "1e300"), "frame_rate is 1e+300"),
         (("--motion", "rotate", "--turn", "nan"), "--turn nan: a finite number is needed"),
+        (("--motion", "shake", "--amplitude", "-1"), "--amplitude -1: 0 or more is needed"),
         (("--direction", "inf"), "--direction inf: a finite number is needed"),
         (("--motion", "dolly", "--closer", "1e300"), "its motion leads to"),
         (("--foreground", "ball", "--foreground-speed", "inf"), "--foreground-speed inf: a finite"),

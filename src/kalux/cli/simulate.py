@@ -460,6 +460,8 @@ def chosen_motion(options: argparse.Namespace, default: str) -> Motion:
             raise UsageError(
                 f"--{flag} is for the motion {' or '.join(users)}; the motion is {'+'.join(names)}"
             )
+    if _or(options.amplitude, 0.0) < 0:
+        raise UsageError(f"--amplitude {options.amplitude:g}: 0 or more is needed")
     speed, angle = _or(options.speed, 60.0), np.deg2rad(_or(options.direction, 0.0))
     seed = max(options.seed, 0)
     motions: dict[str, Motion] = {
