@@ -41,7 +41,7 @@ STEP_VARIANCES: Final = (0.05, 0.1, 0.2, 0.4)
 MAX_SAMPLES: Final = 100_000
 _MIN_SAMPLES: Final = 1_000
 _MAX_FRAMES: Final = 80
-_LEAST_NET: Final = 2  # as for the thresholds: a net count of one may be noise
+_LEAST_NET: Final = 2  # a net count of one may be noise
 DARKEST: Final = 0.01  # two to three levels of 8 bits: below, a frame's log is rounding
 _ALIKE: Final = 50.0
 """Samples that say what one says, if all that changes is explained: those of one edge in one interval."""
