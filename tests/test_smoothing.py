@@ -289,11 +289,8 @@ def estimates_around(first, second, share=0.5, ends=None):
     first, second, ends = (np.reshape(v, shape) for v in (first, second, second if ends is None else ends))
     ones, level = np.ones(shape), np.zeros(shape)
     return tuple(
-        Estimate(t, level, p * ones, 0.0, True, around=Around(*frames, ones, coming, 0.0, 0.01, 1.0, 0.0))
-        for t, p, frames, coming in (
-            (5, 0.01, (first, ends), 0.03 * (1 - share)),
-            (-5, 0.04, (second, first), 0.03 * share),
-        )
+        Estimate(t, level, p * ones, 0.0, True, around=Around(*frames, ones, 0.0, 0.0, 0.01, 1.0, 0.0, way))
+        for t, p, frames, way in ((5, 0.01, (first, ends), share), (-5, 0.04, (second, first), 1 - share))
     )
 
 

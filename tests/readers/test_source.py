@@ -16,15 +16,15 @@ FILE = Path("night.h5")
 
 @pytest.mark.parametrize("error", [ValueError("truncated\nfile"), OSError("unable to open")])
 def test_damage_is_told_on_one_line(error):
-    with pytest.raises(FormatError, match=r"night.h5: damaged or incomplete \((truncated f|unable to open)"):
-        with reading(FILE, ValueError):
-            raise error
+    told = r"night.h5: damaged or incomplete \((truncated f|unable to open)"
+    with pytest.raises(FormatError, match=told), reading(FILE, ValueError):
+        raise error
 
 
 def test_what_the_system_refuses_is_no_damage():
-    with pytest.raises(InputError, match=r"night.h5: cannot be read: Permission denied") as caught:
-        with reading(FILE, ValueError):
-            raise PermissionError(errno.EACCES, "")
+    told = "night.h5: cannot be read: Permission denied"
+    with pytest.raises(InputError, match=told) as caught, reading(FILE, ValueError):
+        raise PermissionError(errno.EACCES, "")
     assert not isinstance(caught.value, FormatError)
 
 

@@ -458,6 +458,7 @@ class BridgedFrames(CommonMethod):
             quantisation_variance=self.noise.quantisation_variance,
             repeated=1.0 - between / 2.0,
             wrong=WRONG_STEPS * between * self.on * self.off,
+            share=share,
         )
 
 
