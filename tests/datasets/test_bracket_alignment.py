@@ -8,7 +8,7 @@ import pytest
 from kalux.datasets.bracket_alignment import align
 from kalux.datasets.brackets import Picture, best_exposed
 from kalux.datasets.hdr import hdr_reference
-from kalux.datasets.registration import warped
+from kalux.datasets.warping import warped
 from kalux.models.camera import Response
 from kalux.models.colour import LUMINANCE
 from photographs import SHAPE, photographs, scene_radiance
