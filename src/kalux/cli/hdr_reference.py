@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 from kalux.cli.parser import Parser, UsageError, number, whole
 from kalux.cli.recordings import check_stamp
 from kalux.cli.terminal import say, warn
+from kalux.cli.times import exposure_times
 
 if TYPE_CHECKING:
     from kalux.datasets.radiance import HdrReference
@@ -161,16 +162,11 @@ def _reference(options: argparse.Namespace, is_image: bool) -> HdrReference:
 
 
 def _times(text: str | None) -> Path | list[float] | None:
-    from kalux.datasets.brackets import parse_seconds
-
     if text is None:
         return None
     if Path(text).suffix.lower() == ".csv":
         return Path(text)
-    try:
-        return [parse_seconds(part) for part in text.split(",")]
-    except ValueError:
-        raise UsageError(f"--times {text}: seconds with commas, as 2,1/2,1/8, or a .csv file") from None
+    return exposure_times(text)
 
 
 def _by(reference: HdrReference) -> str:

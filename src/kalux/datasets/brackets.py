@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.calibration.debevec import CLIPPED_HIGH, CLIPPED_LOW
-from kalux.calibration.photographs import read_exposure, read_photograph
+from kalux.calibration.photographs import parse_seconds, read_exposure, read_photograph
 from kalux.errors import FormatError, InputError
 from kalux.models.camera import Response
 from kalux.readers.images import images_in
@@ -140,20 +140,6 @@ def _listed_exposures(path: Path) -> dict[str, float]:
         raise FormatError(
             f"{path}: not a CSV with the columns file and exposure_s (seconds, or 1/30)"
         ) from error
-
-
-def parse_seconds(text: str) -> float:
-    """An exposure time in seconds, as ``2``, ``0.125`` or ``1/8``.
-
-    Raises
-    ------
-    ValueError
-        If it is neither a number nor a fraction.
-    """
-    over, slash, under = text.partition("/")
-    if slash and float(under) == 0:
-        raise ValueError(f"{text} has no value")
-    return float(over) / float(under) if slash else float(over)
 
 
 def best_exposed(pictures: Sequence[Picture]) -> int:
