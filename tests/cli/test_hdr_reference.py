@@ -65,7 +65,7 @@ def test_from_photographs_to_scores(cli, data, tmp_path):
         (["photos", "-o", "x.png"], "written as .exr or .npz"),
         (["photos", "-o", "x.exr"], "no exposure time in its EXIF"),
         (["photos", "-o", "x.exr", "--times", "1,2"], "2 exposure times for 3 images"),
-        (["photos", "-o", "x.exr", "--times", "1,x,3"], "seconds with commas"),
+        (["photos", "-o", "x.exr", "--times", "1,x,3"], "seconds are needed, numbers with commas"),
         (["photos", "-o", "x.exr", "--times", "t.csv"], "t.csv: cannot be read"),
         (["photos", "-o", "x.exr", "--times", TIMES, "--response", "log"], "unknown response"),
         (["photos", "-o", "x.exr", "--times", TIMES, "--exposure", "5"], "give --register REC"),

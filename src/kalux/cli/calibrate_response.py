@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 from kalux.cli.calibrations import add_result, check_result, finish
 from kalux.cli.parser import Parser, UsageError
 from kalux.cli.terminal import say
-from kalux.cli.times import exposure_times
 
 if TYPE_CHECKING:
     from kalux.calibration.response import ResponseCalibration
@@ -91,6 +90,7 @@ def report(found: ResponseCalibration) -> list[str]:
 def _inputs(options: argparse.Namespace) -> tuple[Any, list[float], Recording | None]:
     from kalux.calibration.photographs import read_exposure, read_photograph
     from kalux.calibration.still_pixels import still_pixels
+    from kalux.cli.times import exposure_times
     from kalux.readers.images import IMAGES
 
     paths = [Path(name) for name in options.inputs]

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, Final
 from kalux.cli.parser import Parser, UsageError, number, whole
 from kalux.cli.recordings import check_stamp
 from kalux.cli.terminal import say, warn
-from kalux.cli.times import exposure_times
 
 if TYPE_CHECKING:
     from kalux.datasets.radiance import HdrReference
@@ -162,6 +161,8 @@ def _reference(options: argparse.Namespace, is_image: bool) -> HdrReference:
 
 
 def _times(text: str | None) -> Path | list[float] | None:
+    from kalux.cli.times import exposure_times
+
     if text is None:
         return None
     if Path(text).suffix.lower() == ".csv":
