@@ -594,8 +594,10 @@ def told_when_planned(monkeypatch):
 
 
 class TestInterrupt:
-    @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-    @pytest.mark.parametrize("threads", [1, 4])
+    @pytest.mark.parametrize(
+        ("number", "threads"),
+        [(signal.SIGINT, 1), (signal.SIGINT, 4), (signal.SIGTERM, 4), (signal.SIGHUP, 4)],
+    )
     def test_what_is_finished_stays_valid(self, start_cli, recording, tmp_path, number, threads):
         out = tmp_path / "out"
         process = start_cli(
