@@ -17,7 +17,7 @@ from kalux.models.camera import Camera
 from kalux.settings import chosen_response
 
 US = 1e-6
-NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)
+NODES, WEIGHTS = np.polynomial.legendre.leggauss(24)
 UNMEASURED = 1e12
 USUAL_INTERVAL = 40_000
 
