@@ -1,4 +1,4 @@
-"""The slow oracle: float64, one pixel at a time, the paper's equations (and docs/equations.md, K1 to K13) as written.
+"""The slow oracle: float64, one pixel at a time, the paper's equations (and docs/equations.md, K1 to K15) as written.
 
 Nothing here is incremental: L^A(t) is summed from the events anew at every t, integrals are taken by Gauss-Legendre
 quadrature where a closed form would repeat the code under test. Lookahead mode only; 8-bit frames. The paper's

@@ -272,6 +272,8 @@ class Settings:
         _check(self)
 
 
+SETTINGS_NEEDED: Final = "a kalux.Settings is needed, from kalux.preset"
+
 _GROUPS: Final = tuple(entry.name for entry in dataclasses.fields(Settings))
 
 

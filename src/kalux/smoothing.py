@@ -403,9 +403,7 @@ def shared_errors(forward: Around | None, backward: Around | None) -> NDArray[np
     """
     if forward is None or backward is None:
         return None
-    # At a frame both directions end there, each with nothing to come.
-    ahead = forward.coming + backward.coming
-    share = np.float32(1.0 if forward.coming == 0 else backward.coming / ahead)
+    share = np.float32(forward.share)
     first, second = forward.first < UNMEASURED, forward.second < UNMEASURED
     return (np.float32(1.0) - share) * first + share * second
 

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux import memory
-from kalux.augmentation.deblur import all_between
+from kalux.augmentation.deblur import all_between, between, count_events
+from kalux.augmentation.refractory import EventClock
 from kalux.compiled import event_words
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.filters.shots import Shot, take_shot
@@ -112,6 +113,20 @@ def intervals(
             )
         held = _later(held, shot.middle - margin)
         previous = frame, shot
+
+
+def counted_intervals(
+    recording: Recording, camera: CameraSettings, *, delay: int, refractory_period: int, most_frames: int
+) -> Iterator[tuple[Interval, Array, Array]]:
+    """As `intervals`, with the weighed (K13) on and off events of every pixel between the frames, (H, W) each.
+
+    Events are stamped ``delay`` us late; the refractory period is in us.
+    """
+    clock = EventClock(recording.sensor_size, refractory_period)
+    for interval in intervals(recording, camera, margin=abs(delay), most_frames=most_frames):
+        inside = clock.weighed(between(interval.events, interval.start + delay, interval.end + delay))
+        on, off = count_events(inside, recording.sensor_size, weighed=True)
+        yield interval, on, off
 
 
 def _later(chunks: list[EventArray], t: int) -> list[EventArray]:
