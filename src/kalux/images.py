@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from kalux.augmentation.highlights import Unshown
 from kalux.augmentation.unseen import UNKNOWN_CHANGE
-from kalux.filters.highlights import lifted, read_unshown, tempered
+from kalux.filters.highlights import keep_white, lifted, read_unshown, tempered
 from kalux.filters.readout import HighlightPrior, read_out
 from kalux.filters.uncertainty import Around, alone, given_variance, hidden_variance
 from kalux.frames import Mosaic
@@ -187,6 +187,8 @@ def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) ->
     )
     if unshown is not None:
         read_unshown(intensity, heard, estimate.log_intensity, unshown, view.log_offset, prior)
+    if estimate.around is not None:
+        keep_white(intensity, estimate.log_intensity, estimate.around, view.log_offset, prior)
     if not tells:
         total = np.ndarray(intensity.shape, np.float32, _UNTOLD, strides=(0, 0))
     elif moving is not None and change is not None:

@@ -8,9 +8,11 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.augmentation.bridge import UNMEASURED
 from kalux.augmentation.highlights import Unshown
 from kalux.compiled import exponential
 from kalux.filters.readout import HighlightPrior, believed_highlight
+from kalux.filters.uncertainty import Around
 
 Floats = NDArray[np.floating[Any]]
 
@@ -75,6 +77,26 @@ def read_unshown(
     white, scale2, stretch = (np.float32(value) for value in prior)
     _take_mean(unshown.excess, unshown.noise, np.float32(log_offset), white, scale2, stretch, mean)
     image.reshape(-1)[unshown.pixels] = mean
+
+
+def keep_white(
+    image: NDArray[np.float32],
+    log_intensity: Floats,
+    around: Around,
+    log_offset: float,
+    prior: HighlightPrior,
+) -> None:
+    """Pixels that both frames around clip, and of which L has not gone below white since, stay white. In place."""
+    least = np.float32(np.exp(prior.white) - log_offset)
+    planes = (log_intensity, around.first, around.second)
+    _keep(*(plane.reshape(-1) for plane in planes), np.float32(prior.white), least, image.reshape(-1))
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _keep(log_intensity, first, second, white, least, image):  # type: ignore[no-untyped-def]
+    for i in range(len(image)):
+        if log_intensity[i] >= white and first[i] >= UNMEASURED and second[i] >= UNMEASURED:
+            image[i] = max(image[i], least)
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
