@@ -88,8 +88,8 @@ def keep_white(
 ) -> None:
     """Pixels that both frames around clip, and of which L has not gone below white since, stay white. In place."""
     least = np.float32(np.exp(prior.white) - log_offset)
-    planes = (log_intensity, around.first, around.second)
-    _keep(*(plane.reshape(-1) for plane in planes), np.float32(prior.white), least, image.reshape(-1))
+    level, first, second = (plane.reshape(-1) for plane in (log_intensity, around.first, around.second))
+    _keep(level, first, second, np.float32(prior.white), least, image.reshape(-1))
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
