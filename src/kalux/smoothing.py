@@ -386,6 +386,7 @@ def combine(
         unshown=smoothed_unshown(forward.unshown, backward.unshown),
         silent_change=change,
         around=None if forward.around is None else forward.around._replace(counted=UNMEASURED),
+        measured=forward.measured,
         exposed=forward.exposed,
         since=_least(forward.since, backward.since),
         told=told,

@@ -12,12 +12,14 @@ from kalux.augmentation.bridge import UNMEASURED
 from kalux.augmentation.highlights import Unshown
 from kalux.compiled import exponential
 from kalux.filters.readout import HighlightPrior, believed_highlight
-from kalux.filters.uncertainty import Around
 
 Floats = NDArray[np.floating[Any]]
 
 _LIKELY: Final = np.float32(2.0)
 """Standard deviations of its events by which a bound may be too high."""
+
+_ABOUT_WHITE: Final = np.float32(0.05)
+"""How far below white, log intensity, a pixel may lie that frames have lifted there: they clip from 0.98 of it on."""
 
 _LEAST_SPREAD: Final = np.float32(0.3)
 """Standard deviation that is left where pixels around say that all lie just above their bounds."""
@@ -82,21 +84,25 @@ def read_unshown(
 def keep_white(
     image: NDArray[np.float32],
     log_intensity: Floats,
-    around: Around,
+    measured: tuple[Floats, Floats],
     log_offset: float,
     prior: HighlightPrior,
 ) -> None:
-    """Pixels that both frames around clip, and of which L has not gone below white since, stay white. In place."""
-    least = np.float32(np.exp(prior.white) - log_offset)
-    level, first, second = (plane.reshape(-1) for plane in (log_intensity, around.first, around.second))
-    _keep(level, first, second, np.float32(prior.white), least, image.reshape(-1))
+    """Pixels that no frame around measures, and of which L is white at least, stay as bright as that. In place.
+
+    The frames have clipped them then, and no event has taken them down since.
+    """
+    offset = np.float32(log_offset)
+    level, first, second = (plane.reshape(-1) for plane in (log_intensity, *measured))
+    _keep(level, first, second, np.float32(prior.white), offset, image.reshape(-1))
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _keep(log_intensity, first, second, white, least, image):  # type: ignore[no-untyped-def]
+def _keep(log_intensity, first, second, white, log_offset, image):  # type: ignore[no-untyped-def]
     for i in range(len(image)):
-        if log_intensity[i] >= white and first[i] >= UNMEASURED and second[i] >= UNMEASURED:
-            image[i] = max(image[i], least)
+        level = np.float32(log_intensity[i])
+        if level >= white - _ABOUT_WHITE and first[i] >= UNMEASURED and second[i] >= UNMEASURED:
+            image[i] = max(image[i], exponential(min(level, white)) - log_offset)
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
