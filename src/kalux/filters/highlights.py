@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from kalux.augmentation.bridge import UNMEASURED
 from kalux.augmentation.highlights import Unshown
-from kalux.compiled import exponential
+from kalux.compiled import ONE, exponential
 from kalux.filters.readout import HighlightPrior, believed_highlight
 
 Floats = NDArray[np.floating[Any]]
@@ -18,8 +18,9 @@ Floats = NDArray[np.floating[Any]]
 _LIKELY: Final = np.float32(2.0)
 """Standard deviations of its events by which a bound may be too high."""
 
-_ABOUT_WHITE: Final = np.float32(0.05)
-"""How far below white, log intensity, a pixel may lie that frames have lifted there: they clip from 0.98 of it on."""
+_ABOUT_WHITE: Final = np.float32(0.1)
+"""How far below white, log intensity, pixels lie whom neighbours may take as far again: the least threshold of sensors.
+Those that frames have lifted lie up to 0.05 below it until the next frame."""
 
 _LEAST_SPREAD: Final = np.float32(0.3)
 """Standard deviation that is left where pixels around say that all lie just above their bounds."""
@@ -88,9 +89,10 @@ def keep_white(
     log_offset: float,
     prior: HighlightPrior,
 ) -> None:
-    """Pixels that no frame around measures, and of which L is white at least, stay as bright as that. In place.
+    """Pixels that no frame around measures, and of which L is about white or more, stay about white. In place.
 
-    The frames have clipped them then, and no event has taken them down since.
+    The frames have clipped them then, and no event has taken them down since. The farther they are below white all the
+    same, the farther neighbours may take them.
     """
     offset = np.float32(log_offset)
     level, first, second = (plane.reshape(-1) for plane in (log_intensity, *measured))
@@ -101,8 +103,9 @@ def keep_white(
 def _keep(log_intensity, first, second, white, log_offset, image):  # type: ignore[no-untyped-def]
     for i in range(len(image)):
         level = np.float32(log_intensity[i])
-        if level >= white - _ABOUT_WHITE and first[i] >= UNMEASURED and second[i] >= UNMEASURED:
-            image[i] = max(image[i], exponential(min(level, white)) - log_offset)
+        if level > white - ONE and first[i] >= UNMEASURED and second[i] >= UNMEASURED:
+            below = max(white - level, np.float32(0.0))
+            image[i] = max(image[i], exponential(white - below - below * below / _ABOUT_WHITE) - log_offset)
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
