@@ -189,7 +189,7 @@ def _about_frames(arrays: list[_Array]) -> str:
     if not images:
         return "The file has no frames."
     return (
-        f"The frames ({', '.join(images[:4])}) are not read, since the layout has no exposure times; make the "
+        f"The arrays of frames ({', '.join(images[:4])}) are not read, as nothing states their exposures; make the "
         "recording with kalux.Recording.from_arrays, or save images and join them with --frames."
     )
 
