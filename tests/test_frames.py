@@ -72,6 +72,12 @@ def test_a_white_value_is_positive(white):
         check(frame(white=white))
 
 
+def test_a_white_value_that_no_pixel_can_have_is_refused():
+    with pytest.raises(FrameError, match="white value 256, but no pixel of uint8 is above 255"):
+        check(frame(white=256))
+    check(frame(white=256.0, dtype=np.uint16))
+
+
 @pytest.mark.parametrize(
     "times", [(0.01, 0.02), (100, np.nan), (100.5, 200), (100, None), (2 * 10**18, 3 * 10**18)]
 )

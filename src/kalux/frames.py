@@ -204,6 +204,11 @@ def check_frame(
             f"{where}: frame {index} has dtype {image.dtype}; uint8, uint16, float32 or float64 in this "
             "machine's order of bytes is needed"
         )
+    if image.dtype.kind == "u" and frame.white is not None and frame.white > np.iinfo(image.dtype).max:
+        raise FrameError(
+            f"{where}: frame {index} has the white value {frame.white:g}, but no pixel of {image.dtype} is above "
+            f"{np.iinfo(image.dtype).max}; the value of a saturated pixel is needed"
+        )
     if image.dtype.kind == "f" and not np.isfinite(image).all():
         y, x = (int(i[0]) for i in np.nonzero(~np.isfinite(image))[:2])
         raise FrameError(f"{where}: frame {index} is not finite (NaN or infinite) at x={x}, y={y}")

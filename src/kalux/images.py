@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from kalux.augmentation.highlights import Unshown
 from kalux.augmentation.unseen import UNKNOWN_CHANGE
-from kalux.filters.highlights import lifted, read_unshown, tempered
+from kalux.filters.highlights import keep_white, lifted, read_unshown, tempered
 from kalux.filters.readout import HighlightPrior, read_out
 from kalux.filters.uncertainty import Around, alone, given_variance, hidden_variance
 from kalux.frames import Mosaic
@@ -97,6 +97,9 @@ class Estimate:
         (H, W): mean square change of silent pixels around each, from one frame to the next; None: not told.
     around
         What the frames around say of the pixels (K11); None: not told, or there is only one.
+    measured
+        (H, W) variances of the frames around, or of the only one known, `UNMEASURED` where there is nothing measured;
+        None: not told.
     exposed
         The share of the time for which frames are exposed, where the next one is known.
     since
@@ -117,6 +120,7 @@ class Estimate:
     unshown: Unshown | None = None
     silent_change: NDArray[np.floating[Any]] | None = None
     around: Around | None = None
+    measured: tuple[NDArray[np.floating[Any]], NDArray[np.floating[Any]]] | None = None
     exposed: float = 0.0
     since: float | None = None
     told: NDArray[np.floating[Any]] | None = None
@@ -187,6 +191,8 @@ def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) ->
     )
     if unshown is not None:
         read_unshown(intensity, heard, estimate.log_intensity, unshown, view.log_offset, prior)
+    if estimate.measured is not None:
+        keep_white(intensity, estimate.log_intensity, estimate.measured, view.log_offset, prior)
     if not tells:
         total = np.ndarray(intensity.shape, np.float32, _UNTOLD, strides=(0, 0))
     elif moving is not None and change is not None:

@@ -270,7 +270,7 @@ def test_of_a_rough_estimate_delay_and_period_are_kept(monkeypatch):
     rough = estimate_thresholds(lossy, CAMERA, USUAL, delay=1_500, refractory_period=None, most=2_000)
     camera = CameraSettings(log_offset=0.004)
     whole = estimate_thresholds(lossy, camera, USUAL, delay=1_500, refractory_period=None)
-    monkeypatch.delattr("kalux.calibration.contrast.shortest_interval")
+    monkeypatch.delattr("kalux.calibration.contrast.intervals")
     refined = refine_thresholds(lossy, camera, USUAL, rough, refractory_period=None)
     assert refined.shortest_interval == whole.shortest_interval > 0
     assert refined.delay == rough.delay

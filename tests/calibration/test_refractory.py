@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
-from kalux.calibration.refractory import possible_periods, shortest_interval
+from kalux.calibration.refractory import intervals, possible_periods, shortest_interval
 from kalux.datasets import SensorSettings, demo_scene, simulate
 from kalux.events import make_events
 from kalux.recording import Recording
@@ -26,6 +27,35 @@ def test_times_may_be_negative():
     made = [make_events(t - shift, pixel, pixel, pixel % 2 == 0) for shift in (0, 10**9)]
     found = [shortest_interval(Recording.from_arrays(events, [], sensor_size=SIZE)) for events in made]
     assert found[0] == found[1] > 0
+
+
+def alternating(gaps):
+    """Events of 100 pixels that follow one another after these times, us."""
+    rng = np.random.default_rng(0)
+    t = np.cumsum(rng.permuted(np.tile(gaps, (100, 1)), axis=1), axis=1)
+    pixel = np.broadcast_to(np.arange(100)[:, None], t.shape).ravel()
+    order = np.argsort(t.ravel(), kind="stable")
+    events = make_events(t.ravel()[order], pixel[order] % 10, pixel[order] // 10, np.ones(t.size, bool))
+    return Recording.from_arrays(events, [], sensor_size=(10, 10))
+
+
+SMOOTH = np.arange(500, 4_000, 7)
+
+
+@pytest.mark.parametrize(
+    ("gaps", "pile_up"),
+    [
+        (SMOOTH, False),
+        (np.concatenate([SMOOTH, np.full(100, 503)]), True),
+        (np.concatenate([SMOOTH, np.full(100, 900)]), False),
+        (np.arange(1, 9).repeat(60) * 500, False),
+    ],
+    ids=["after a reset", "waiting", "flicker", "coarse times"],
+)
+def test_events_that_wait_pile_up_at_the_shortest_interval(gaps, pile_up):
+    found = intervals(alternating(gaps))
+    assert found.pile_up == pile_up
+    assert 390 <= found.shortest <= 510
 
 
 def test_events_that_nothing_follows_have_no_shortest_interval():

@@ -362,6 +362,7 @@ class TestBadInput:
             (["--stamp", "end"], "--exposure"),
             (["--rate", "fast"], "'fast' is not a number"),
             (["--rate", "-3"], "rate is -3"),
+            (["--rate", "0"], "rate is 0"),
             (["--rate", "nan"], "rate is nan"),
             (["--rate", "10", "--at", "frames"], "not allowed with"),
             (["--start", "100"], "no image"),

@@ -5,8 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+import kalux
+from kalux.augmentation.bridge import UNMEASURED
 from kalux.augmentation.highlights import Unshown
-from kalux.filters.highlights import lifted, obey_bounds, read_unshown, smoothed_unshown, tempered
+from kalux.events import make_events
+from kalux.filters.highlights import keep_white, lifted, obey_bounds, read_unshown, smoothed_unshown, tempered
 from kalux.filters.readout import Hidden, HighlightPrior, read_out
 
 OFFSET = 0.03
@@ -85,6 +88,27 @@ def test_dark_neighbours_do_not_take_a_pixel_below_its_bound():
     level[1, 1] = WHITE
     image = read(level, unshown([4], 0.01), 0.3, np.ones((3, 3), bool))
     assert image[1, 1] >= 1.0
+
+
+@pytest.mark.parametrize("how", [{}, {"lookahead": False}, {"smooth": True}], ids=["", "causal", "both ways"])
+def test_a_lamp_that_every_frame_clips_stays_white(how):
+    """It goes on with too few events, among grey pixels with whom it is compared."""
+    frames = [kalux.Frame(np.full((9, 9), 128, np.uint8), k * 40_000, k * 40_000 + 10_000) for k in range(6)]
+    for frame, lamp in zip(frames, (100, 100, 255, 255, 255, 255), strict=True):
+        frame.image[4, 4] = lamp
+    events = make_events([60_000, 70_000, 75_000], [4] * 3, [4] * 3, [True] * 3)
+    recording = kalux.Recording.from_arrays(events, frames, sensor_size=(9, 9), contrast_threshold=(0.3, 0.3))
+    late = [image.intensity for image in kalux.reconstruct(recording, rate_hz=50, **how) if image.t > 100_000]
+    assert min(image[4, 4] for image in late) == pytest.approx(1.0, abs=0.08)
+    assert max(image[4, 3] for image in late) < 0.52
+
+
+def test_a_clipped_pixel_that_went_dark_between_the_frames_is_dark():
+    first, second = np.full((2, 1, 3), UNMEASURED)
+    second[0, 2] = 1.0
+    image = np.full((1, 3), 0.5, np.float32)
+    keep_white(image, np.array([[WHITE + 0.2, WHITE - 0.9, WHITE]]), (first, second), OFFSET, PRIOR)
+    np.testing.assert_allclose(image, [[1.0, 0.5, 0.5]], rtol=1e-6)
 
 
 def test_neighbours_take_a_bound_of_noisy_events_down_to_two_standard_deviations():

@@ -210,3 +210,58 @@ def test_masks_of_another_number_are_refused(path):
         file["frames/valid"].resize(3, axis=0)
     with pytest.raises(FormatError, match="different lengths"):
         readers.read(path)
+
+
+def rewritten(path, name, change):
+    """With one dataset of the file replaced, as by another program."""
+    write_kalux(path)
+    with h5py.File(path, "r+") as file:
+        values = change(file[name][...])
+        del file[name]
+        file[name] = values
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("events/p", lambda p: np.where(p, 1, -1).astype(np.int8)),
+        ("events/p", lambda p: p.astype(np.uint8)),
+        ("events/x", lambda x: x.astype(np.int64)),
+        ("events/t", lambda t: t.astype(">u8")),
+    ],
+    ids=["signs", "numbers", "wider", "other order of bytes"],
+)
+def test_integers_of_any_type_are_read(path, name, change):
+    assert np.array_equal(all_events(readers.read(rewritten(path, name, change))), small_events())
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "told"),
+    [
+        ("events/t", lambda t: t * 1e-6, "events/t is float64; int64 is needed, in whole microseconds"),
+        ("events/p", lambda p: p.astype(np.float32), "events/p is float32; bool is needed"),
+        ("events/x", lambda x: x.astype(np.int32) + 65536, "values from 65536 .*; uint16 is needed"),
+        ("events/y", lambda y: y.astype(np.int16) - 1, "values from -1 .*; uint16 is needed"),
+    ],
+)
+def test_columns_that_would_be_other_events_are_refused(path, name, change, told):
+    with pytest.raises(FormatError, match=told):
+        all_events(readers.read(rewritten(path, name, change)))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "told"),
+    [
+        ("contrast_threshold", [0.0, 0.2], "contrast threshold is .*must be positive"),
+        ("contrast_threshold", [0.1, 0.2, 0.3], "contrast threshold is"),
+        ("sensor_size", [24.5, 32.0], "sensor size .*24.5.*whole numbers, height and width"),
+        ("sensor_size", [1, 24, 32], "whole numbers, height and width"),
+    ],
+)
+def test_attributes_that_cannot_be_are_refused(path, name, value, told):
+    write_kalux(path)
+    with h5py.File(path, "r+") as file:
+        file.attrs[name] = value
+    with pytest.raises(FormatError, match=told):
+        readers.read(path)

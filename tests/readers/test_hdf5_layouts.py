@@ -11,8 +11,9 @@ import hdf5plugin
 import numpy as np
 import pytest
 
+import kalux
 from kalux import readers
-from kalux.errors import FormatError
+from kalux.errors import FormatError, FrameError
 from kalux.readers import hdf5_layout
 from recordings import SIZE, all_events, colour_frames, complaint, damaged, small_events, small_frames
 
@@ -255,6 +256,21 @@ class TestDsec:
         path.with_name("rectify_map.h5").unlink()
         assert readers.read(path).sensor_size == (480, 1280)
 
+    def test_joined_frames_know_the_size_better(self, tmp_path):
+        """As other devices record in this layout; a size that is stated stays."""
+        path = write(tmp_path, "dsec")
+        rectify_map = path.with_name("rectify_map.h5")
+        frames = tmp_path / "frames"
+        frames.mkdir()
+        cv2.imwrite(str(frames / "0.png"), np.zeros((SIZE[0] + 1, SIZE[1]), np.uint8))
+        (frames / "frames.csv").write_text("t_us\n0\n")
+        with pytest.raises(FrameError, match="but the sensor"):
+            kalux.open(path, frames=frames)
+        rectify_map.unlink()
+        source = kalux.open(path, frames=frames).source
+        assert source.sensor_size == (SIZE[0] + 1, SIZE[1])
+        assert not any("sensor size" in sentence for sentence in source.missing)
+
     def test_a_folder_has_exposures(self, tmp_path):
         folder = write_dsec_folder(tmp_path / "interlaken_00_c", small_events(), small_frames(), SIZE)
         source = readers.read(folder)
@@ -278,7 +294,8 @@ class TestDsec:
     def test_events_alone(self, tmp_path):
         write_dsec_events(tmp_path / "events/left/events.h5", small_events())
         source = readers.read(tmp_path)
-        assert (source.count_frames(), source.missing) == (0, ("There are no images.",))
+        assert source.count_frames() == 0
+        assert source.missing[0] == "There are no images."
 
     def test_images_in_colour(self, tmp_path):
         folder = write_dsec_folder(tmp_path / "s", small_events(), small_frames(), SIZE)

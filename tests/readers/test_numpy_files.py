@@ -83,6 +83,14 @@ def test_the_unit_of_time_is_in_the_name(tmp_path, name, times, assumed):
     assert any("unit of time" in sentence for sentence in source.missing) == assumed
 
 
+def test_frames_that_are_not_read_are_named(tmp_path):
+    columns = {name: EVENTS[name] for name in "txyp"}
+    np.savez(tmp_path / "e.npz", **columns, times=np.arange(2), images=np.zeros((2, 30, 40), np.uint8))
+    (about,) = (sentence for sentence in readers.read(tmp_path / "e.npz").missing if "frames" in sentence)
+    assert "images (2, 30, 40)" in about
+    assert "from_arrays" in about
+
+
 @pytest.mark.parametrize(
     ("arrays", "told"),
     [

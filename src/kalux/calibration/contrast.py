@@ -17,7 +17,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.calibration.refractory import LATE, possible_periods, shortest_interval
+from kalux.calibration.refractory import LATE, intervals, possible_periods
 from kalux.calibration.regression import Fit, standard_errors, two_stage
 from kalux.calibration.steps import MAX_SAMPLES, Steps, steps
 from kalux.recording import Recording
@@ -95,7 +95,7 @@ class ThresholdEstimate(NamedTuple):
         Relative error of thresholds that comes from that of the refractory period; a part of ``spread``.
     shortest_interval
         How soon a pixel can follow one event by another, us (`kalux.calibration.refractory`); 0: not known, or not
-        looked for, as where the refractory period is given.
+        looked for, as where the refractory period is given or events pile up at its end.
     """
 
     on: float
@@ -166,10 +166,16 @@ def estimate_thresholds(
     ExposureError
         If the frames' exposures are not known.
     """
-    shortest = 0 if refractory_period is not None else shortest_interval(recording, _SHORTEST_EVENTS)
+    shortest = 0 if refractory_period is not None else _reset_after(recording)
     view = _View(recording, camera, of_log_offset, 0, shortest)
     view = view.without_trailing(delay, refractory_period or 0)
     return _estimate(view, usual, refractory_period, most, delay)
+
+
+def _reset_after(recording: Recording) -> int:
+    """Shortest interval, us, up to which a refractory period may hide something; 0 where events wait for its end."""
+    found = intervals(recording, _SHORTEST_EVENTS)
+    return 0 if found.pile_up else found.shortest
 
 
 def refine_thresholds(

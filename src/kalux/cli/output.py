@@ -81,6 +81,13 @@ class Output:
         )
 
 
+def image_rate(options: argparse.Namespace) -> float | None:
+    """Images per second; None where other flags say which images."""
+    if options.times is not None or options.at is not None:
+        return None
+    return DEFAULT_RATE if options.rate is None else float(options.rate)
+
+
 def chosen_output(options: argparse.Namespace) -> Output:
     """What the flags say of the output.
 
@@ -103,7 +110,7 @@ def chosen_output(options: argparse.Namespace) -> Output:
         raise UsageError(f"{path}: only the ending of a name; is a variable of the shell not set?")
     format = "mp4" if is_video else options.format or "png"
     _check_flags(options, format)
-    rate = None if options.times is not None or options.at is not None else options.rate or DEFAULT_RATE
+    rate = image_rate(options)
     video = VideoSettings(
         crf=18.0 if options.crf is None else options.crf,
         slow_motion=1.0 if options.slow_motion is None else options.slow_motion,

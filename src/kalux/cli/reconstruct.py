@@ -17,7 +17,7 @@ from kalux.ahead import default_threads
 from kalux.cli.calibrations import add_calibration, given_calibration
 from kalux.cli.checking import Contents, check_beside
 from kalux.cli.flags import HelpSettings, add_display, add_settings, given_settings
-from kalux.cli.output import DEFAULT_RATE, FOLDER_FORMATS, Output, check_output, chosen_output
+from kalux.cli.output import DEFAULT_RATE, FOLDER_FORMATS, Output, check_output, chosen_output, image_rate
 from kalux.cli.parser import Parser, UsageError, number, whole
 from kalux.cli.progress import Progress, short_number
 from kalux.cli.recordings import add_recording, open_recording
@@ -222,10 +222,9 @@ def make_plan(recording: Recording, settings: Settings, times: Any, options: arg
     InputError
         As of `kalux.planning.plan`.
     """
-    rate = None if times is not None or options.at is not None else options.rate or DEFAULT_RATE
     made = plan(
         recording,
-        rate_hz=rate,
+        rate_hz=image_rate(options),
         times=times,
         at=options.at,
         settings=settings,

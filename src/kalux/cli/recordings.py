@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from kalux.cli.parser import Parser, UsageError, number, whole
 from kalux.cli.progress import counted
+from kalux.cli.terminal import warn
 from kalux.frames import MOSAICS
 
 if TYPE_CHECKING:
@@ -105,7 +106,7 @@ def open_recording(options: argparse.Namespace) -> Recording:
                 raise UsageError(
                     f"--{name.replace('_', '-')} is for frames from elsewhere; give --frames, too"
                 )
-    return kalux.open(
+    recording = kalux.open(
         Path(options.recording),
         exposure=options.exposure,
         stamp=options.stamp or "start",
@@ -116,6 +117,9 @@ def open_recording(options: argparse.Namespace) -> Recording:
         mosaic=options.bayer,
         white=options.white,
     )
+    if options.exposure is not None and recording.source.exposure_known:
+        warn(f"the recording states its exposure times; --exposure {options.exposure} replaces them")
+    return recording
 
 
 # Copies.

@@ -449,6 +449,9 @@ class BridgedFrames(CommonMethod):
     def silent_change(self, segment: BridgedSegment) -> Floats | None:
         return segment.silent_change
 
+    def measured(self, segment: BridgedSegment) -> tuple[Floats, Floats]:
+        return segment.forward_variance, segment.backward_variance
+
     def around(self, segment: BridgedSegment, t: int) -> Around:
         assert segment.events is not None
         share = (t - segment.start) / (segment.end - segment.start)

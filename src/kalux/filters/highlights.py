@@ -8,14 +8,19 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.augmentation.bridge import UNMEASURED
 from kalux.augmentation.highlights import Unshown
-from kalux.compiled import exponential
+from kalux.compiled import ONE, exponential
 from kalux.filters.readout import HighlightPrior, believed_highlight
 
 Floats = NDArray[np.floating[Any]]
 
 _LIKELY: Final = np.float32(2.0)
 """Standard deviations of its events by which a bound may be too high."""
+
+_ABOUT_WHITE: Final = np.float32(0.1)
+"""How far below white, log intensity, pixels lie whom neighbours may take as far again: the least threshold of sensors.
+Those that frames have lifted lie up to 0.05 below it until the next frame."""
 
 _LEAST_SPREAD: Final = np.float32(0.3)
 """Standard deviation that is left where pixels around say that all lie just above their bounds."""
@@ -78,6 +83,32 @@ def read_unshown(
     white, scale2, stretch = (np.float32(value) for value in prior)
     _take_mean(unshown.excess, unshown.noise, np.float32(log_offset), white, scale2, stretch, mean)
     image.reshape(-1)[unshown.pixels] = mean
+
+
+def keep_white(
+    image: NDArray[np.float32],
+    log_intensity: Floats,
+    measured: tuple[Floats, Floats],
+    log_offset: float,
+    prior: HighlightPrior,
+) -> None:
+    """Pixels that no frame around measures, and of which L is about white or more, stay about white. In place.
+
+    The frames have clipped them then, and no event has taken them down since. The farther they are below white all the
+    same, the farther neighbours may take them.
+    """
+    offset = np.float32(log_offset)
+    level, first, second = (plane.reshape(-1) for plane in (log_intensity, *measured))
+    _keep(level, first, second, np.float32(prior.white), offset, image.reshape(-1))
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _keep(log_intensity, first, second, white, log_offset, image):  # type: ignore[no-untyped-def]
+    for i in range(len(image)):
+        level = np.float32(log_intensity[i])
+        if level > white - ONE and first[i] >= UNMEASURED and second[i] >= UNMEASURED:
+            below = max(white - level, np.float32(0.0))
+            image[i] = max(image[i], exponential(white - below - below * below / _ABOUT_WHITE) - log_offset)
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")

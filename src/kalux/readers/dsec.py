@@ -26,10 +26,13 @@ from kalux.events import EventArray
 from kalux.frames import Frame
 from kalux.readers import hdf5_layout
 from kalux.readers.images import images_in, in_colour, read_image
-from kalux.readers.source import Source, reading
+from kalux.readers.source import SIZE_NOT_STATED, Source, reading
 
 _COLUMNS: Final = ("events/t", "events/x", "events/y", "events/p")
 _PUBLISHED_SIZE: Final = (480, 640)
+_SIZE_ASSUMED: Final = (
+    SIZE_NOT_STATED + "that of the published sequences, or the smallest that holds all events, is taken."
+)
 _EVENTS: Final = ("events/left/events.h5", "events_left/events.h5", "events.h5")
 _IMAGES: Final = ("images/left/rectified", "images_rectified_left", "images/left")
 _EXPOSURES: Final = ("images/left/exposure_timestamps.txt", "images/exposure_timestamps_left.txt")
@@ -78,8 +81,9 @@ def read(path: Path) -> Source:
         count = hdf5_layout.common_length(events_path, file, _COLUMNS)
         offset = int(file["t_offset"][()]) if "t_offset" in file else 0
     images = _Images() if path.is_file() else _find_images(path)
-    size = _sensor_size(events_path, offset)
-    missing = images.missing
+    stated_size = _stated_size(events_path)
+    size = stated_size or _assumed_size(events_path, offset)
+    missing = images.missing + (() if stated_size else (_SIZE_ASSUMED,))
     if images.files:
         _check_first(path, images, size)
     if (path / "events/right").is_dir():
@@ -94,6 +98,7 @@ def read(path: Path) -> Source:
         count_frames=lambda: len(images.files),
         exposure_known=images.exposure_known,
         missing=missing,
+        sensor_size_known=stated_size is not None,
     )
 
 
@@ -113,11 +118,15 @@ def _events(path: Path, offset: int) -> Iterator[EventArray]:
     return hdf5_layout.column_events(path, _COLUMNS, convert)
 
 
-def _sensor_size(events_path: Path, offset: int) -> tuple[int, int]:
+def _stated_size(events_path: Path) -> tuple[int, int] | None:
     rectify = events_path.with_name("rectify_map.h5")
-    if rectify.is_file():
-        with hdf5_layout.opened(rectify) as file:
-            return hdf5_layout.size_of(rectify, file["rectify_map"].shape[:2])
+    if not rectify.is_file():
+        return None
+    with hdf5_layout.opened(rectify) as file:
+        return hdf5_layout.size_of(rectify, file["rectify_map"].shape[:2])
+
+
+def _assumed_size(events_path: Path, offset: int) -> tuple[int, int]:
     height, width = _PUBLISHED_SIZE
     for chunk in _events(events_path, offset):
         height = max(height, int(chunk["y"].max(initial=0)) + 1)

@@ -4,20 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import h5py
 import numba as nb
 import numpy as np
+from numpy.typing import NDArray
 
 from kalux import memory
 from kalux.compiled import event_words
-from kalux.errors import FormatError
-from kalux.events import EVENT_DTYPE, EventArray
+from kalux.errors import FormatError, InputError
+from kalux.events import EVENT_DTYPE, EventArray, checked_thresholds
 from kalux.frames import MOSAICS, Frame, GroundTruth, Mosaic
 from kalux.layouts import HDF5_COLUMNS, HDF5_MAJOR_VERSION
 from kalux.readers.hdf5_layout import DAMAGE, SIGNATURE
 from kalux.readers.source import CHUNK_EVENTS, EXPOSURE_UNKNOWN, Source, begins_with, reading
+
+_UNITS: Final = {"t": ", in whole microseconds"}
 
 
 def recognises(path: Path) -> bool:
@@ -46,13 +49,15 @@ def read(path: Path) -> Source:
         event_count = _common_length(path, file, "events", HDF5_COLUMNS)
         frame_count = _common_length(path, file, "frames", _frame_columns(file))
         exposure_known = bool(file["frames"].attrs["exposure_known"])
-        height, width = (int(n) for n in file.attrs["sensor_size"])
+        sensor_size = _sensor_size(path, file.attrs["sensor_size"])
         mosaic = _mosaic(path, file["frames"].attrs.get("mosaic"))
         threshold = file.attrs.get("contrast_threshold")
         inverse_covariance = file["inverse_covariance"][...] if "inverse_covariance" in file else None
         has_ground_truth = "ground_truth" in file
         response = _text(file["frames"].attrs["response"]) if "response" in file["frames"].attrs else None
-        contrast_threshold = None if threshold is None else (float(threshold[0]), float(threshold[1]))
+        contrast_threshold = _thresholds(path, threshold)
+        for name in HDF5_COLUMNS:
+            _check_column(path, name, file["events"][name].dtype)
     missing: tuple[str, ...] = ()
     if not event_count:
         missing += ("The file has no events.",)
@@ -63,7 +68,7 @@ def read(path: Path) -> Source:
     return Source(
         path=path,
         format="kalux",
-        sensor_size=(height, width),
+        sensor_size=sensor_size,
         events=lambda: _events(path),
         frames=lambda: _frames(path),
         count_events=lambda: event_count,
@@ -76,6 +81,45 @@ def read(path: Path) -> Source:
         missing=missing,
         mosaic=mosaic,
     )
+
+
+def _sensor_size(path: Path, value: Any) -> tuple[int, int]:
+    sides = np.ravel(value).tolist()
+    if len(sides) != 2 or not all(isinstance(side, (int, float)) and side == side // 1 for side in sides):
+        raise FormatError(
+            f"{path}: states the sensor size {sides}; whole numbers, height and width, are needed"
+        )
+    return int(sides[0]), int(sides[1])
+
+
+def _thresholds(path: Path, value: Any) -> tuple[float, float] | None:
+    try:
+        return checked_thresholds(value)
+    except InputError as error:
+        raise FormatError(f"{path}: {error}") from error
+
+
+def _check_column(path: Path, name: str, found: np.dtype[Any]) -> None:
+    """What other programs write may be of any type of integers; `_as_stated` then looks at the values."""
+    if found.kind not in ("biu" if name == "p" else "iu"):
+        raise FormatError(
+            f"{path}: events/{name} is {found}; {EVENT_DTYPE[name]} is needed{_UNITS.get(name, '')}"
+        )
+
+
+def _as_stated(path: Path, name: str, values: NDArray[Any]) -> NDArray[Any]:
+    """A column of events in the type of the layout."""
+    wanted = EVENT_DTYPE[name]
+    if values.dtype == wanted:
+        return values
+    if name == "p":
+        return values > 0  # 0 and 1, or -1 and 1
+    limits = np.iinfo(wanted)
+    if len(values) and not limits.min <= int(values.min()) <= int(values.max()) <= limits.max:
+        raise FormatError(
+            f"{path}: events/{name} has values from {values.min()} to {values.max()}; {wanted} is needed"
+        )
+    return values.astype(wanted)
 
 
 def _mosaic(path: Path, value: Any) -> Mosaic | None:
@@ -136,7 +180,7 @@ def _events(path: Path) -> Iterator[EventArray]:
                     space.select_hyperslab((start + first,), (len(part),))
                     column.id.read(here, space, buffer, kind)
                 t, x, y, p = (
-                    buffer.astype(EVENT_DTYPE[name], copy=False)
+                    _as_stated(path, name, buffer[: len(part)])
                     for name, buffer in zip(HDF5_COLUMNS, buffers, strict=True)
                 )
                 _join(t, x, y, p, event_words(part))

@@ -22,7 +22,7 @@ from kalux.errors import FormatError, FrameError, InputError
 from kalux.frames import Frame
 from kalux.readers.image_lists import WANTED, Listed, read_csv, read_ijrr
 from kalux.readers.images import in_colour, read_image
-from kalux.readers.source import EXPOSURE_UNKNOWN, SIZE_UNKNOWN, Source, reading
+from kalux.readers.source import EXPOSURE_UNKNOWN, SIZE_NOT_STATED, Source, reading, smallest_size
 from kalux.wording import how_many
 
 _LISTS: Final = ("frames.csv", "timestamps.csv", "images.txt")
@@ -75,7 +75,10 @@ def join(source: Source, frames: Path, *, start: int | None, rate_hz: float | No
         count_events=source.count_events,
         contrast_threshold=source.contrast_threshold,
         ground_truth=source.ground_truth,
-        missing=(*(text for text in kept if not (adopted and text == SIZE_UNKNOWN)), *joined.missing),
+        missing=(
+            *(text for text in kept if not (adopted and text.startswith(SIZE_NOT_STATED))),
+            *joined.missing,
+        ),
     )
 
 
@@ -90,8 +93,15 @@ def _joint_size(source: Source, frames: Path, joined: Source) -> tuple[int, int]
     """The size of the frames, which must be that of the sensor; or hold all events, if that is not known."""
     height, width = source.sensor_size
     size = joined.sensor_size
-    if size == (height, width) or (not source.sensor_size_known and size[0] >= height and size[1] >= width):
+    if size == (height, width):
         return size
+    if not source.sensor_size_known:
+        if (
+            size[0] < height or size[1] < width
+        ):  # of DSEC's layout what was assumed may be more than the events need
+            height, width = smallest_size(source.path, source.events())
+        if size[0] >= height and size[1] >= width:
+            return size
     needed = "is" if source.sensor_size_known else "is at least"
     raise FrameError(
         f"{frames}: its frames have {size[1]}x{size[0]} pixels, but the sensor of {source.path} {needed} "

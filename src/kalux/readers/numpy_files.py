@@ -94,7 +94,7 @@ def read(path: Path) -> Source:
     arrays = _list_arrays(path)
     layout = _find_layout(path, arrays)
     size = _stated_size(path, arrays)
-    missing: tuple[str, ...] = ("The file has no frames.",)
+    missing: tuple[str, ...] = (_about_frames(arrays),)
     if layout.columns.unit is None:
         missing += (UNIT_ASSUMED,)
     if size is None:
@@ -181,6 +181,17 @@ def _no_events(path: Path, arrays: list[_Array]) -> FormatError:
         )
     found = ", ".join(_described(array) for array in arrays[:8]) or "nothing"
     return FormatError(f"{path}: holds {found}; {_WANTED} are needed")
+
+
+def _about_frames(arrays: list[_Array]) -> str:
+    """That no frames are read, and which arrays look as if they were."""
+    images = [_described(array) for array in arrays if len(array.shape) in (3, 4)]
+    if not images:
+        return "The file has no frames."
+    return (
+        f"The arrays of frames ({', '.join(images[:4])}) are not read, as nothing states their exposures; make the "
+        "recording with kalux.Recording.from_arrays, or save images and join them with --frames."
+    )
 
 
 def _described(array: _Array) -> str:

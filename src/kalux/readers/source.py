@@ -62,7 +62,7 @@ class Source:
     missing
         What the recording lacks, one sentence each, for the user.
     sensor_size_known
-        Whether the recording states its sensor size; otherwise it is the smallest that holds all events.
+        Whether the recording states its sensor size; otherwise it is one that holds all events.
     mosaic
         The Bayer pattern of the sensor, if the recording states one. Frames are given as stored all the same: a mosaic,
         or RGB that was made of it.
@@ -89,7 +89,10 @@ class Source:
 EXPOSURE_UNKNOWN: Final = "The exposure times of the frames are not recorded."
 """For `Source.missing`, where `Source.exposure_known` is False."""
 
-SIZE_UNKNOWN: Final = "The sensor size is not recorded; the smallest that holds all events is taken."
+SIZE_NOT_STATED: Final = "The sensor size is not recorded; "
+"""How every sentence of ``missing`` begins that says what size is taken instead."""
+
+SIZE_UNKNOWN: Final = SIZE_NOT_STATED + "the smallest that holds all events is taken."
 """For `Source.missing`, where the size comes from `smallest_size`."""
 
 
