@@ -104,10 +104,12 @@ def empty(shape: tuple[int, ...], dtype: Any = np.float32) -> NDArray[Any]:
     """As ``numpy.empty``, in memory that an array of about the same size may have used before. For any thread."""
     kind = np.dtype(dtype)
     size = math.prod(shape) * kind.itemsize
+    lent: Any
     if size < _SMALL:
-        return _fresh(size, PAGE).view(kind).reshape(shape)
-    piece = _free.take(size)
-    lent = _lent_bytes(len(piece)).from_buffer(piece)
-    lent.piece, lent.give = piece, _free.give
+        lent = _fresh(size, PAGE)
+    else:
+        piece = _free.take(size)
+        lent = _lent_bytes(len(piece)).from_buffer(piece)
+        lent.piece, lent.give = piece, _free.give
     array: NDArray[Any] = np.ndarray(shape, kind, lent)
     return array
