@@ -215,7 +215,8 @@ def _driven(
 
 
 def _is_final(engine: Reconstructor, t: int) -> bool:
-    return engine.final_until is not None and t <= engine.final_until
+    until = engine.final_until
+    return until is not None and t <= until
 
 
 def _push_next(
