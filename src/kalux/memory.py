@@ -6,7 +6,9 @@ on the system, the thread, and what else it holds at that moment.
 
 from __future__ import annotations
 
+import ctypes
 import math
+import sys
 import threading
 from typing import Any, Final
 
@@ -82,3 +84,14 @@ def empty(shape: tuple[int, ...], dtype: Any = np.float32) -> NDArray[Any]:
     piece = _fresh(size) if size < _SMALL else np.asarray(_Lent(_free.take(size)))
     array: NDArray[Any] = piece[:size].view(kind).reshape(shape)
     return array
+
+
+def give_back() -> None:
+    """Have the system's allocator give back the memory that it holds and nobody uses.
+
+    glibc's keeps what lies below something that is still used: after planning that is 90 MB of a run at 640x480, in 12
+    ms. Elsewhere nothing is done.
+    """
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
+    if trim is not None:
+        trim(0)
