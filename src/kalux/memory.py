@@ -11,6 +11,7 @@ from __future__ import annotations
 import ctypes
 import functools
 import math
+import sys
 import threading
 from collections.abc import Callable
 from typing import Any, Final
@@ -113,3 +114,14 @@ def empty(shape: tuple[int, ...], dtype: Any = np.float32) -> NDArray[Any]:
         lent.piece, lent.give = piece, _free.give
     array: NDArray[Any] = np.ndarray(shape, kind, lent)
     return array
+
+
+def give_back() -> None:
+    """Have the system's allocator give back the memory that it holds and nobody uses.
+
+    glibc's keeps what lies below something that is still used: after planning that is 90 MB of a run at 640x480, in 12
+    ms. Elsewhere nothing is done.
+    """
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
+    if trim is not None:
+        trim(0)

@@ -459,14 +459,14 @@ class TestBadOutput:
 
     def test_a_full_disk(self, cli, recording, tmp_path, monkeypatch):
         """The images before it stay, and one line says so."""
-        whole = folder.write_whole
+        whole = folder.write_within
 
         def full(path, data):
             if path.name == "000003.png":
                 raise OSError(errno.ENOSPC, "No space left on device")
             whole(path, data)
 
-        monkeypatch.setattr(folder, "write_whole", full)
+        monkeypatch.setattr(folder, "write_within", full)
         found = cli("reconstruct", recording, "-o", tmp_path / "out", "--quiet")
         assert found.code == 2
         assert "no space is left" in found.error
@@ -543,14 +543,14 @@ class TestThreads:
 
     @pytest.mark.parametrize("threads", [1, 2, 4])
     def test_a_writer_that_fails_ends_the_filter(self, cli, recording, tmp_path, monkeypatch, threads):
-        whole = folder.write_whole
+        whole = folder.write_within
 
         def full(path, data):
             if path.name == "000003.npy":
                 raise OSError(errno.ENOSPC, "No space left on device")
             whole(path, data)
 
-        monkeypatch.setattr(folder, "write_whole", full)
+        monkeypatch.setattr(folder, "write_within", full)
         out = tmp_path / "out"
         found = cli(
             "reconstruct", recording, "-o", out, "--rate", 5000, "--format", "npy", "--threads", threads

@@ -16,7 +16,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.deblur import between
+from kalux.augmentation.deblur import all_between
 from kalux.calibration.intervals import Interval, intervals
 from kalux.compiled import event_column, event_row, event_words
 from kalux.events import EventArray
@@ -185,7 +185,7 @@ def _points(
         if not 0.9 < interval.first.white / interval.second.white < 1.1:
             continue
         level, difference, usable, dark = _beyond_neighbours(interval)
-        busy = _busy(between(interval.events, interval.first.start, interval.second.end), level.shape)
+        busy = _busy(all_between(interval.chunks, interval.first.start, interval.second.end), level.shape)
         near_dark = cv2.dilate(dark.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
         for points, around in zip(found, _SURROUNDINGS, strict=True):
             still = cv2.dilate(busy, around.shape) == 0
@@ -196,10 +196,11 @@ def _points(
     return found
 
 
-def _busy(events: EventArray, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+def _busy(chunks: list[EventArray], shape: tuple[int, ...]) -> NDArray[np.uint8]:
     """(H, W): 1 where there is an event."""
     busy = np.zeros(shape, np.uint8)
-    _mark(event_words(events), busy)
+    for events in chunks:
+        _mark(event_words(events), busy)
     return busy
 
 

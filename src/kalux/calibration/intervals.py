@@ -35,8 +35,8 @@ class Interval:
     ----------
     start, end
         The two middles, us.
-    events
-        Those between ``start`` and ``end``, and those of the margin before and after.
+    chunks
+        The events between ``start`` and ``end``, and those of the margin before and after, in a few arrays.
     first, second
         The frames at both ends, as the filters see them.
     frames
@@ -47,11 +47,16 @@ class Interval:
 
     start: int
     end: int
-    events: EventArray
+    chunks: list[EventArray]
     first: Shot
     second: Shot
     frames: tuple[Frame, Frame]
     log_offset: float
+
+    @cached_property
+    def events(self) -> EventArray:
+        """Those of ``chunks`` in one array."""
+        return _joined(self.chunks)
 
     @cached_property
     def change(self) -> Array:
@@ -105,7 +110,7 @@ def intervals(
             yield Interval(
                 start=first.middle,
                 end=shot.middle,
-                events=_joined(all_between(held, first.middle - margin, shot.middle + margin)),
+                chunks=all_between(held, first.middle - margin, shot.middle + margin),
                 first=first,
                 second=shot,
                 frames=(before, frame),
