@@ -133,11 +133,11 @@ class BridgedSegment(NamedTuple):
     the way to the end to the way from the start. The covariance of L^A as a measurement is
     R = 1 / (rate (1/forward + 1/backward)), ``rate`` in 1/s, where ``forward`` is ``forward_variance`` and
     ``step_variance`` for each event since the start, and ``backward`` is ``backward_variance`` and ``step_variance``
-    for each of the ``events`` still to come, and no others come (None: not known, and none are counted). ``net`` is
-    what all events add to the level, and what the light grows by besides (None: not known). At ``start`` the level is
-    ``floor`` or more where that is known (K7; None: nowhere): of what no frame measures then, but a clipped one bounds
-    at the end. At ``end`` the pixel obeys the frame ``bound`` (`lift`), and its variance grows by ``drift``, what its
-    thresholds may have been wrong by (`drift`; None: nothing). Pixels without an event after ``still_since`` are still.
+    for each of the ``events`` still to come (None: not known, and none are counted). ``net`` is what all events add to
+    the level, and what the light grows by besides (None: not known). At ``start`` the level is ``floor`` or more where
+    that is known (K7; None: nowhere): of what no frame measures then, but a clipped one bounds at the end. At ``end``
+    the pixel obeys the frame ``bound`` (`lift`), and its variance grows by ``drift``, what its thresholds may have been
+    wrong by (`drift`; None: nothing). Pixels without an event after ``still_since`` are still.
     Beyond what L^A and the state say here, the level is ahead of its newest event by ``trail`` (K14; None: it is not).
     ``unshown`` is of the pixels that no frame has measured until ``end``, or ``start`` in causal mode.
     ``silent_change`` is what silent pixels around each change from one frame to the next (`unseen`; None: not known).
