@@ -1,4 +1,4 @@
-"""The slow oracle: float64, one pixel at a time, the paper's equations (and docs/equations.md, K1 to K13) as written.
+"""The slow oracle: float64, one pixel at a time, the paper's equations (and docs/equations.md, K1 to K15) as written.
 
 Nothing here is incremental: L^A(t) is summed from the events anew at every t, integrals are taken by Gauss-Legendre
 quadrature where a closed form would repeat the code under test. Lookahead mode only; 8-bit frames. The paper's
@@ -331,7 +331,9 @@ def bridged(pixel, settings, times, on, off, scales):
         a, b = pixel.middles[k], pixel.middles[k + 1]
         n_on, n_off = counts(a, b)
         mismatch = second[0] - first[0] - (on * scale_on * n_on - off * scale_off * n_off) - grown(k + 1, b)
-        total = first[1] + second[1] + var_on * (on * n_on) ** 2 + var_off * (off * n_off) ** 2
+        saturated = first[1] >= UNMEASURED and second[1] >= UNMEASURED and settings.filter.highlight_scale > 0
+        total = 2 * settings.filter.highlight_scale**2 if saturated else first[1] + second[1]
+        total += var_on * (on * n_on) ** 2 + var_off * (off * n_off) ** 2
         total += ev.step_noise * c2 * (n_on + n_off) + ev.quantisation_variance * c2
         intervals.append((a, b, first, second, scale_on, scale_off, var_on, var_off, mismatch / total))
         q0, noise = ev.quantisation_variance * c2, first[1] + second[1]

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from kalux import readers
 from kalux.errors import KaluxError
@@ -112,3 +113,16 @@ def assert_only_clear_errors(path: Path, variants: Iterator[bytes]) -> None:
         assert not message or str(path) in message
         assert "\n" not in message
         assert len(message) < 600 + len(str(path))
+
+
+def read_by_dv_processing(path):
+    """Events and frames of an AEDAT 4 file, as iniVation's own library reads them; skips where it is not installed."""
+    dv = pytest.importorskip("dv_processing")
+    other = dv.io.MonoCameraRecording(str(path))
+    batches, images = [], []
+    while (batch := other.getNextEventBatch()) is not None:
+        batches.append(batch.numpy())
+    while (image := other.getNextFrame()) is not None:
+        images.append(image)
+    found = np.concatenate(batches)
+    return make_events(*(found[name] for name in ("timestamp", "x", "y", "polarity"))), images

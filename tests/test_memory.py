@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import gc
+import os
 import pickle
+import sys
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -73,3 +76,19 @@ def test_threads_get_memory_of_their_own():
     for thread in threads:
         thread.join()
     assert not wrong
+
+
+def resident_bytes():
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+@pytest.mark.skipif(
+    sys.platform != "linux" or "CS_GNU_LIBC_VERSION" not in os.confstr_names, reason="of glibc's allocator"
+)
+def test_what_lies_below_something_in_use_is_given_back():
+    pieces = [np.ones(1 << 16, np.uint8) for _ in range(1000)]
+    last, held = pieces[-1], resident_bytes()
+    del pieces
+    memory.give_back()
+    assert resident_bytes() < held - 40e6
+    assert last.sum() == 1 << 16

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from kalux import PRESETS, Frame, Reconstructor
 from kalux.errors import EventError, ExposureError, FrameError, InputError, KaluxError, SettingsError
 from kalux.filters import bridged_frames
+from kalux.models.camera import Camera, count_bright
 from kalux.settings import altered
 
 from builders import VARIANTS, Stream, events, frame, pixel_events, random_stream
@@ -557,6 +558,25 @@ def test_highlights_beyond_white_come_from_events():
         live.finish()
         believed.append(live.read(30_000).intensity[0, 0])
     assert 1.0 < believed[1] < believed[0] <= 1.03 * np.exp(5 * 0.25)
+
+
+@pytest.mark.parametrize("channels", [(), (3,)])
+def test_a_live_stream_takes_the_bright_tail_of_its_first_frame(channels):
+    """As if it were stated; of colour, the mean of the channels counts, of which few are white here."""
+    first = np.random.default_rng(0).integers(0, 240, (12, 14, *channels)).astype(np.uint8)
+    first[3:9, 4:10] = 255
+    tail = count_bright(Camera.named("linear", 0.98), first, 255.0).scale
+    images = []
+    for stated in (None, tail, 1.2 * tail):
+        settings = altered(PRESETS["default"], "filter", bright_tail=stated)
+        live = Reconstructor((12, 14), settings=settings)
+        live.push_frame(Frame(first, 0, 10_000))
+        live.push_events(pixel_events([20_000, 21_000], [1, 1], x=6, y=6))
+        live.push_frame(Frame(first, 40_000, 50_000))
+        live.finish()
+        images.append(live.read(30_000).intensity)
+    np.testing.assert_array_equal(images[0], images[1])
+    assert not np.array_equal(images[0], images[2])
 
 
 @both_modes

@@ -177,6 +177,23 @@ def test_smoothing_follows_a_steady_change_between_its_events():
     assert error(0.4) < 0.8 * error(0.0)
 
 
+def test_steps_without_variance_are_the_limit_of_sure_ones():
+    """Pixels that only the first or the second frame measures, a quarter of the way between them."""
+    levels = np.full(SIZE, 120, np.uint8)
+    first, second = levels.copy(), levels.copy()
+    first[:2], second[-2:] = 255, 255
+    frames = [Frame(first, 0, 4_000), Frame(second, 40_000, 44_000)]
+    events = np.concatenate(list(recording(events=200).events()))
+    source = Recording.from_arrays(events, frames, sensor_size=SIZE, contrast_threshold=0.2)
+    images = []
+    for variance in (1e-7, 0.0):
+        chosen = altered(
+            altered(PRESETS["default"], "events", step_variance=variance), "camera", log_offset=0.03
+        )
+        images += kalux.reconstruct(source, times=[12_000], settings=chosen, smooth=True)
+    np.testing.assert_allclose(images[1].intensity, images[0].intensity, rtol=1e-3)
+
+
 def test_after_the_last_frame_the_forward_pass_is_alone():
     source = recording(3)
     times = [171_000, 190_000, 199_000]
@@ -289,11 +306,8 @@ def estimates_around(first, second, share=0.5, ends=None):
     first, second, ends = (np.reshape(v, shape) for v in (first, second, second if ends is None else ends))
     ones, level = np.ones(shape), np.zeros(shape)
     return tuple(
-        Estimate(t, level, p * ones, 0.0, True, around=Around(*frames, ones, coming, 0.0, 0.01, 1.0, 0.0))
-        for t, p, frames, coming in (
-            (5, 0.01, (first, ends), 0.03 * (1 - share)),
-            (-5, 0.04, (second, first), 0.03 * share),
-        )
+        Estimate(t, level, p * ones, 0.0, True, around=Around(*frames, ones, 0.0, 0.0, 0.01, 1.0, 0.0, way))
+        for t, p, frames, way in ((5, 0.01, (first, ends), share), (-5, 0.04, (second, first), 1 - share))
     )
 
 

@@ -19,7 +19,6 @@ Messages are one line. The command line prints them as they are and exits with c
 from __future__ import annotations
 
 import difflib
-import sys
 from collections.abc import Iterable
 
 
@@ -63,20 +62,16 @@ class InternalError(KaluxError, RuntimeError):
     """A result of kalux is not what it must be: an error in kalux, not in what it was given."""
 
 
-def require_type(what: str, given: object, kind: type, source: str) -> None:
-    """Require an object of a class of kalux.
+def require_type(what: str, given: object, kind: type, needed: str) -> None:
+    """Require an object of a class of kalux; ``needed`` says which, by its public name, and where one comes from.
 
     Raises
     ------
     InputError
-        If it is something else, with where one comes from.
+        If it is something else.
     """
     if not isinstance(given, kind):
-        public = sys.modules["kalux"].__all__  # not imported: this module is below all others
-        module = "kalux" if kind.__name__ in public else kind.__module__
-        raise InputError(
-            f"{what} is a {type(given).__name__}; a {module}.{kind.__name__} is needed, from {source}"
-        )
+        raise InputError(f"{what} is a {type(given).__name__}; {needed}")
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

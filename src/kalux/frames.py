@@ -93,7 +93,9 @@ class Frame:
         return np.maximum(response, 0.0) if self.image.dtype.kind == "f" else response
 
 
-GROUND_TRUTH_SOURCE: Final = "GroundTruth(times, images) or Recording.ground_truth()"
+GROUND_TRUTH_NEEDED: Final = (
+    "a kalux.frames.GroundTruth is needed, from GroundTruth(times, images) or Recording.ground_truth()"
+)
 """Where a `GroundTruth` comes from, for messages."""
 
 

@@ -11,6 +11,7 @@ from typing import Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux import memory
 from kalux.ahead import ahead
 from kalux.calibration.values import Calibration
 from kalux.events import EventArray
@@ -102,6 +103,7 @@ def execute(
     while the caller uses the images before; the callbacks are then called in the second. The images are the same.
     Not ``with_variance`` is faster; grey images then have an infinite one.
     """
+    memory.give_back()  # what planning and checking have used
     engine = _engine(recording, plan, plan.settings)
     several = threads > 1
     estimates = _smoothed_estimates(recording, engine, plan, on_events, on_backward, several)
@@ -215,7 +217,8 @@ def _driven(
 
 
 def _is_final(engine: Reconstructor, t: int) -> bool:
-    return engine.final_until is not None and t <= engine.final_until
+    until = engine.final_until
+    return until is not None and t <= until
 
 
 def _push_next(

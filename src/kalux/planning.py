@@ -29,15 +29,19 @@ from kalux.frames import median_exposure
 from kalux.models.camera import BrightTail, Camera, count_bright
 from kalux.models.colour import white_balance
 from kalux.models.pixels import PixelCalibration, require_size
-from kalux.recording import Recording, no_frames, remembering
+from kalux.recording import RECORDING_NEEDED, Recording, no_frames, remembering
 from kalux.schedule import image_times
-from kalux.settings import EventSettings, Settings, altered, chosen_response
+from kalux.settings import SETTINGS_NEEDED, EventSettings, Settings, altered, chosen_response
 from kalux.settings import preset as named_preset
 
 ThresholdOrigin = Literal["settings", "recording", "calibration", "estimate", "assumed"]
 
-DOUBTED: Final[tuple[ThresholdOrigin, ...]] = ("calibration", "estimate", "assumed")
+_FOUND: Final[tuple[ThresholdOrigin, ...]] = ("estimate", "assumed")
+
+DOUBTED: Final[tuple[ThresholdOrigin, ...]] = ("calibration", *_FOUND)
 """Thresholds of these origins are not quite the pixels' own: highlights are then believed less."""
+
+_CALIBRATION_NEEDED: Final = "a kalux.Calibration is needed, from kalux.load_calibration"
 
 _NOISE_EVENTS: Final = 1_000_000
 """Of which the background noise is taken: at 15 million events/s the quiet time of 300,000 pixels in 70 ms."""
@@ -108,25 +112,17 @@ def plan(
     smooth: bool = False,
 ) -> Plan:
     """Decide what a reconstruction will do. See `reconstruct` for the parameters and errors."""
-    for name, given, kind, source in (
-        ("recording", recording, Recording, "kalux.open or Recording.from_arrays"),
-        ("settings", settings, Settings, "kalux.preset"),
-        ("calibration", calibration, Calibration, "kalux.load_calibration"),
-    ):
-        if given is not None or name == "recording":
-            require_type(f"reconstruct: {name}", given, kind, source)
+    require_type("reconstruct: recording", recording, Recording, RECORDING_NEEDED)
+    if settings is not None:
+        require_type("reconstruct: settings", settings, Settings, SETTINGS_NEEDED)
+    if calibration is not None:
+        require_type("reconstruct: calibration", calibration, Calibration, _CALIBRATION_NEEDED)
     known = Calibration() if calibration is None else calibration
     chosen = settings if settings is not None else known.apply(named_preset(preset))
     if sum(choice is not None for choice in (rate_hz, times, at)) != 1:
         raise InputError("reconstruct: give exactly one of rate_hz, times and at")
-    if smooth and not lookahead:
-        raise InputError(
-            "reconstruct: smooth uses the future, lookahead=False (causal) forbids it; choose one"
-        )
-    if smooth and chosen.filter.kind == "cf":
-        raise InputError(
-            "reconstruct: the complementary filter has no variance, so that it cannot be smoothed"
-        )
+    if smooth:
+        _check_smooth(chosen, lookahead)
     if known.pixels is not None:
         require_size(known.pixels, recording.sensor_size)
     recording = remembering(recording, _REMEMBERED_EVENTS, _REMEMBERED_FRAMES)
@@ -141,17 +137,8 @@ def plan(
     chosen = _with_white_balance(recording, chosen)
     chosen, noise = _with_frame_noise(recording, chosen)
     chosen, delay = _with_delay(recording, chosen)
-    filled, origin, estimate = _with_thresholds(recording, chosen)
-    filled, model = _with_event_model(recording, filled)
-    if estimate is not None and chosen.camera.log_offset is None:
-        estimated = origin in ("estimate", "assumed")
-        if estimated or (estimate.may_lose and chosen.camera.offset != filled.camera.offset):
-            unfilled = dataclasses.replace(chosen.events, step_variance=filled.events.step_variance)
-            rough = estimate if estimated else None
-            filled, origin, estimate = _with_thresholds(
-                recording, dataclasses.replace(filled, events=unfilled), rough
-            )
-    unsure = estimate.spread if estimate is not None and origin in ("estimate", "assumed") else 0.0
+    filled, origin, estimate, model = _with_event_steps(recording, chosen)
+    unsure = estimate.spread if estimate is not None and origin in _FOUND else 0.0
     filled, mismatch = _with_mismatch(recording, filled, unsure)
     filled, background = _with_background(recording, filled, known.pixels)
     if origin == "settings" and _are_calibrated(filled, known):
@@ -160,19 +147,30 @@ def plan(
     if doubted and tail is not None:
         filled = altered(filled, "filter", bright_tail=tail.scale)
     return Plan(
-        filled,
-        origin,
-        estimate,
-        delay,
-        model,
-        wanted,
-        lookahead,
-        smooth,
-        known.pixels,
-        noise,
-        mismatch,
-        background,
+        settings=filled,
+        threshold_origin=origin,
+        estimate=estimate,
+        delay_estimate=delay,
+        event_model=model,
+        times=wanted,
+        lookahead=lookahead,
+        smooth=smooth,
+        pixels=known.pixels,
+        frame_noise=noise,
+        mismatch=mismatch,
+        background_rate=background,
     )
+
+
+def _check_smooth(settings: Settings, lookahead: bool) -> None:
+    if not lookahead:
+        raise InputError(
+            "reconstruct: smooth uses the future, lookahead=False (causal) forbids it; choose one"
+        )
+    if settings.filter.kind == "cf":
+        raise InputError(
+            "reconstruct: the complementary filter has no variance, so that it cannot be smoothed"
+        )
 
 
 def _survey(recording: Recording, camera: Camera | None) -> tuple[NDArray[np.int64], BrightTail | None]:
@@ -242,6 +240,25 @@ def _with_frame_noise(recording: Recording, settings: Settings) -> tuple[Setting
     return altered(settings, "camera", frame_noise=read, shot_noise=shot), found
 
 
+def _with_event_steps(
+    recording: Recording, settings: Settings
+) -> tuple[Settings, ThresholdOrigin, ThresholdEstimate | None, EventModel | None]:
+    """Fill in what an event's step is: thresholds and refractory period, then I_0 and the step's variance.
+
+    Thresholds depend on I_0 a little, and it on them: they are estimated once more with the I_0 that is found.
+    """
+    filled, origin, estimate = _with_thresholds(recording, settings)
+    filled, model = _with_event_model(recording, filled)
+    if estimate is not None and settings.camera.log_offset is None:
+        estimated = origin in _FOUND
+        if estimated or (estimate.may_lose and settings.camera.offset != filled.camera.offset):
+            unfilled = dataclasses.replace(settings.events, step_variance=filled.events.step_variance)
+            filled, origin, estimate = _with_thresholds(
+                recording, dataclasses.replace(filled, events=unfilled), estimate if estimated else None
+            )
+    return filled, origin, estimate, model
+
+
 def _with_thresholds(
     recording: Recording,
     settings: Settings,
@@ -267,8 +284,9 @@ def _with_thresholds(
         usual = Usual(known.threshold_on, known.threshold_off, 0.0)
     of_log_offset = settings.filter.augmentation == "paper"
     period = events.refractory_period if _uses_steps(settings) else 0
-    estimate = (
-        estimate_thresholds(
+    estimate: ThresholdEstimate | None
+    if rough is None:
+        estimate = estimate_thresholds(
             recording,
             settings.camera,
             usual,
@@ -277,8 +295,8 @@ def _with_thresholds(
             refractory_period=period,
             most=ROUGH_SAMPLES if settings.camera.log_offset is None else MAX_SAMPLES,
         )
-        if rough is None
-        else refine_thresholds(
+    else:
+        estimate = refine_thresholds(
             recording,
             settings.camera,
             usual,
@@ -286,7 +304,6 @@ def _with_thresholds(
             of_log_offset=of_log_offset,
             refractory_period=period,
         )
-    )
     if finds_period:
         period = 0 if estimate is None else estimate.refractory_period
         known = dataclasses.replace(known, refractory_period=period)

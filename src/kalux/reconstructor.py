@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,8 +40,12 @@ from kalux.models.camera import Camera, beyond_white, count_bright
 from kalux.models.colour import Gains, white_balance
 from kalux.models.pixels import PixelCalibration, require_size
 from kalux.moments import Moment
-from kalux.settings import Settings
+from kalux.settings import SETTINGS_NEEDED, Settings
 from kalux.settings import preset as named_preset
+
+_PIXELS_NEEDED: Final = (
+    "a kalux.models.pixels.PixelCalibration is needed, from kalux.load_calibration(...).pixels"
+)
 
 
 class _Progress:
@@ -107,7 +111,7 @@ class Reconstructor:
     ) -> None:
         self.sensor_size = checked_size(sensor_size)
         if settings is not None:
-            require_type("settings", settings, Settings, "kalux.preset")
+            require_type("settings", settings, Settings, SETTINGS_NEEDED)
         if reference_exposure is not None and _whole(reference_exposure, "reference_exposure") <= 0:
             raise InputError(f"reference_exposure is {reference_exposure} us; it must be positive")
         self.settings = settings if settings is not None else named_preset(preset)
@@ -133,7 +137,7 @@ class Reconstructor:
         self._reference = camera.reference_exposure or reference_exposure
         used = dataclasses.replace(self.settings, events=assumed)
         if pixels is not None:
-            require_type("pixels", pixels, PixelCalibration, "kalux.load_calibration(...).pixels")
+            require_type("pixels", pixels, PixelCalibration, _PIXELS_NEEDED)
             require_size(pixels, self.sensor_size)
         self._ignored = pixels.hot if pixels is not None and pixels.hot.any() else None
         self._method: Method = make_method(used, self.thresholds, lookahead, self.sensor_size, pixels)
@@ -146,7 +150,7 @@ class Reconstructor:
         self._last_frame: Frame | None = None
         self._frame_count = 0
         self._interval = USUAL_INTERVAL  # between the latest two frames whose segment is committed, us
-        self._tail: float | None = None  # of the first frame
+        self._bright_tail = self.settings.filter.bright_tail  # None: that of the first frame
         self._event_count = 0
         self._last_event: int | None = None
         self._complete_until: int | None = None
@@ -175,10 +179,10 @@ class Reconstructor:
             )
         check_frame(frame, self.sensor_size, index=self._frame_count, previous=self._last_frame)
         self._reference = self._reference or frame.exposure
-        if self._tail is None:
-            self._tail = count_bright(self._camera, frame.image, frame.white_value).scale
+        if self._bright_tail is None:
+            self._bright_tail = count_bright(self._camera, frame.image, frame.white_value).scale
         shot = take_shot(frame, self._camera, self._reference, self._gains_of(frame))
-        self._shots.append(shot if trail is None else shot._replace(trail=trail))
+        self._shots.append(shot._replace(trail=trail, bright_tail=self._bright_tail))
         self._last_frame = frame
         self._frame_count += 1
 
@@ -390,7 +394,8 @@ class Reconstructor:
         scale = filtered.highlight_scale if filtered.kind == "akf" else 0.0
         spread = events.mismatch
         if self._estimated:
-            scale = min(scale, filtered.highlight_tail * self._tail_beyond)
+            assert self._bright_tail is not None  # a frame has been pushed
+            scale = min(scale, filtered.highlight_tail * beyond_white(self._bright_tail))
             spread = events.extrapolation_spread
         on, off = self.thresholds
         frame = self._last_frame
@@ -412,13 +417,6 @@ class Reconstructor:
         if filtered.highlight_scale == 0 or filtered.unshown_tail == 0:
             return None
         return self._method.unshown(progress.segment, variance)
-
-    @property
-    def _tail_beyond(self) -> float:
-        """How far the frames' bright tail goes on beyond white."""
-        tail = self.settings.filter.bright_tail or self._tail
-        assert tail is not None
-        return beyond_white(tail)
 
     def _moment(self, progress: _Progress, t: int) -> Moment:
         """The time ``t`` in a segment under way, with the frames at both its ends where it uses both."""

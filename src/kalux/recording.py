@@ -27,7 +27,7 @@ from kalux.events import (
     checked_thresholds,
 )
 from kalux.frames import (
-    GROUND_TRUTH_SOURCE,
+    GROUND_TRUTH_NEEDED,
     MOSAICS,
     Frame,
     GroundTruth,
@@ -117,6 +117,9 @@ def no_frames(recording: Recording) -> FrameError:
         f"{recording.source.path}: no frames; kalux needs frames as well as events; join images or a video with "
         "--frames (frames=)"
     )
+
+
+RECORDING_NEEDED: Final = "a kalux.Recording is needed, from kalux.open or Recording.from_arrays"
 
 
 class Recording:
@@ -221,7 +224,7 @@ class Recording:
         """
         size = checked_size(sensor_size)
         if ground_truth is not None:
-            require_type(f"{name}: ground_truth", ground_truth, GroundTruth, GROUND_TRUTH_SOURCE)
+            require_type(f"{name}: ground_truth", ground_truth, GroundTruth, GROUND_TRUTH_NEEDED)
         array = as_events(events, columns=columns, time_unit=time_unit)
         frame_list = list(frames)
         for index, frame in enumerate(frame_list):

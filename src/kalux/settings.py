@@ -229,7 +229,7 @@ class FilterSettings:
         the released code). 1.0: a clipped pixel is white or up to a few times brighter.
     highlight_scale
         Standard deviation, in log intensity, of how far scenes go beyond white: what is not known of a
-        highlight is drawn towards white by it. 0 turns it off. 1.5 (docs/tuning.md).
+        highlight is drawn towards white by it. 0 turns it off. 2 (docs/tuning.md).
     highlight_tail
         The same where thresholds are only an estimate, as a multiple of how far the frames' bright tail goes on
         (`kalux.models.camera.beyond_white`), but no more than highlight_scale: scenes of which little saturates do
@@ -252,7 +252,7 @@ class FilterSettings:
     solution: SolutionName = "exact"
     deblur: bool = True
     initial_variance: float = 1.0
-    highlight_scale: float = 1.5
+    highlight_scale: float = 2.0
     highlight_tail: float = 3.0
     unshown_tail: float = 0.5
     bright_tail: float | None = None
@@ -271,6 +271,8 @@ class Settings:
     def __post_init__(self) -> None:
         _check(self)
 
+
+SETTINGS_NEEDED: Final = "a kalux.Settings is needed, from kalux.preset"
 
 _GROUPS: Final = tuple(entry.name for entry in dataclasses.fields(Settings))
 

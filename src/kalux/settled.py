@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -24,9 +25,9 @@ ORIGINS: Final = {
 """What to call where thresholds come from (`kalux.planning.ThresholdOrigin`)."""
 
 _NOTABLE_SHARE: Final = 0.05
-_ALIKE: Final = (
-    0.99  # of the level at which pixels saturate: where nearly all do from here on, it is one level
-)
+_ALIKE: Final = 0.99
+"""Of the level at which pixels saturate: where nearly all do from here on, it is one level."""
+
 _GIVEN: Final = "given"
 _USUAL: Final = ORIGINS["assumed"]
 
@@ -41,64 +42,56 @@ def settled(recording: Recording, plan: Plan, asked: Settings) -> list[tuple[str
     asked
         The settings before the plan filled in what was missing; what they state is said to be given.
     """
+    return [*_of_events(plan, asked), *_of_frames(recording, plan, asked)]
+
+
+def _of_events(plan: Plan, asked: Settings) -> Iterator[tuple[str, str]]:
     camera, events = plan.settings.camera, plan.settings.events
-    rows = [
-        (
-            "thresholds",
-            f"on {events.threshold_on:.3f}, off {events.threshold_off:.3f} log intensity ({_threshold_origin(plan)})",
-        ),
-        ("delay", f"events {events.lateness * 1e-3:g} ms late ({_delay_origin(plan, asked)})"),
-        (
-            "I_0",
-            f"{camera.offset:g} of white, events are steps of log(I + I_0) "
-            f"({_model_origin(plan, asked.camera.log_offset)})",
-        ),
-    ]
+    yield (
+        "thresholds",
+        f"on {events.threshold_on:.3f}, off {events.threshold_off:.3f} log intensity ({_threshold_origin(plan)})",
+    )
+    yield "delay", f"events {events.lateness * 1e-3:g} ms late ({_delay_origin(plan, asked)})"
+    yield (
+        "I_0",
+        f"{camera.offset:g} of white, events are steps of log(I + I_0) "
+        f"({_model_origin(plan, asked.camera.log_offset)})",
+    )
     if events.step_variance is not None:
-        rows.append(
-            (
-                "step",
-                f"variance of one event {events.step_variance:g} c^2, c its threshold "
-                f"({_model_origin(plan, asked.events.step_variance)})",
-            )
-        )
+        how = _model_origin(plan, asked.events.step_variance)
+        yield "step", f"variance of one event {events.step_variance:g} c^2, c its threshold ({how})"
     if events.refractory_period is not None:
         what = (
             f"{events.refractory_period * 1e-3:g} ms" if events.refractory_period else "nothing is lost in it"
         )
-        rows.append(("refractory", f"{what} ({_refractory_origin(plan, asked)})"))
+        yield "refractory", f"{what} ({_refractory_origin(plan, asked)})"
     if events.threshold_spread is not None:
         how = _estimated(asked.events.threshold_spread, plan.mismatch is not None)
-        rows.append(
-            ("spread", f"{100 * events.threshold_spread:.1f} % between the pixels' thresholds ({how})")
-        )
+        yield "spread", f"{100 * events.threshold_spread:.1f} % between the pixels' thresholds ({how})"
     if events.noise_rate is not None:
         how = _estimated(asked.events.noise_rate, plan.background_rate == events.noise_rate)
         if plan.background_rate is not None and plan.background_rate < events.noise_rate:
             how = f"the usual, which is the least; measured {plan.background_rate:.2g}"
-        rows.append(("background", f"{events.noise_rate:.2g} Hz per pixel of events without reason ({how})"))
-    given = asked.camera.reference_exposure is not None
-    rows.append(
-        (
-            "exposure",
-            f"{(camera.reference_exposure or 0) * 1e-3:g} ms makes a saturated pixel 1.0 "
-            f"({_GIVEN if given else 'median of the frames'})",
-        )
-    )
+        yield "background", f"{events.noise_rate:.2g} Hz per pixel of events without reason ({how})"
+
+
+def _of_frames(recording: Recording, plan: Plan, asked: Settings) -> Iterator[tuple[str, str]]:
+    camera = plan.settings.camera
+    how = "median of the frames" if asked.camera.reference_exposure is None else _GIVEN
+    yield "exposure", f"{(camera.reference_exposure or 0) * 1e-3:g} ms makes a saturated pixel 1.0 ({how})"
     if camera.frame_noise is not None:
         read, shot = camera.noise
         how = _GIVEN if asked.camera.frame_noise is not None else "estimated" if plan.frame_noise else _USUAL
         half = np.sqrt(read**2 + shot / 2)
-        rows.append(("noise", f"of frames {read:.2g} of white in the dark, {half:.2g} at half of it ({how})"))
+        yield "noise", f"of frames {read:.2g} of white in the dark, {half:.2g} at half of it ({how})"
     if plan.settings.filter.bright_tail is not None and plan.settings.filter.highlight_scale > 0:
         how = "measured" if asked.filter.bright_tail is None else _GIVEN
-        rows.append(("bright tail", f"{plan.settings.filter.bright_tail:.2f} log intensity ({how})"))
+        yield "bright tail", f"{plan.settings.filter.bright_tail:.2f} log intensity ({how})"
     stated = "usual, the recording does not state it" if recording.response is None else "as recorded"
     how = stated if asked.camera.response == AUTO else _GIVEN
-    rows.append(("response", f"{response_text(camera.response)} ({how})"))
+    yield "response", f"{response_text(camera.response)} ({how})"
     if camera.white_balance != asked.camera.white_balance:
-        rows.append(("white balance", f"{camera.white_balance} for red, green, blue (measured)"))
-    return rows
+        yield "white balance", f"{camera.white_balance} for red, green, blue (measured)"
 
 
 def saturation_text(recording: Recording, plan: Plan, asked: Settings) -> str:

@@ -367,6 +367,7 @@ def combine(
     )
     obey_bounds(level, *directions)
     obey_bounds(level, *directions[::-1])
+    unshown = smoothed_unshown(level, *directions)
     variance, told = 1.0 / information, None
     shared = shared_errors(forward.around, backward.around)
     if shared is not None:
@@ -383,7 +384,7 @@ def combine(
         moving=_moving(forward.moving, backward.moving, change, threshold2),
         between=forward.between,
         chroma=forward.chroma,
-        unshown=smoothed_unshown(forward.unshown, backward.unshown),
+        unshown=unshown,
         silent_change=change,
         around=None if forward.around is None else forward.around._replace(counted=UNMEASURED),
         measured=forward.measured,
@@ -403,9 +404,7 @@ def shared_errors(forward: Around | None, backward: Around | None) -> NDArray[np
     """
     if forward is None or backward is None:
         return None
-    # At a frame both directions end there, each with nothing to come.
-    ahead = forward.coming + backward.coming
-    share = np.float32(1.0 if forward.coming == 0 else backward.coming / ahead)
+    share = np.float32(forward.share)
     first, second = forward.first < UNMEASURED, forward.second < UNMEASURED
     return (np.float32(1.0) - share) * first + share * second
 

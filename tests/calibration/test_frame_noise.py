@@ -77,6 +77,26 @@ def test_pixels_with_events_around_do_not_count():
     assert found.read == pytest.approx(np.hypot(0.01, LEVEL), rel=0.1)
 
 
+def test_where_noise_leaves_no_pixel_alone_those_beside_one_must_do():
+    """Two events in five of the pixels and intervals: 3x3 without any are one in a hundred."""
+    rng = np.random.default_rng(4)
+    there = rng.random((12, *RAMP.shape)) < 0.4
+    k, y, x = np.nonzero(there)
+    events = make_events(40_000 * k + 20_000, x, y, np.ones(len(k), np.int64))
+    found = estimate_frame_noise(still(RAMP, 0.02, 1 / 800, events=events), CAMERA)
+    assert found.believed
+    assert found.read == pytest.approx(0.02, rel=0.15)
+    assert found.shot == pytest.approx(1 / 800, rel=0.2)
+
+
+def test_unseen_motion_is_a_share_of_the_light():
+    levels = np.linspace(0.02, 0.9, 12)
+    moved = photon_transfer(levels, 1e-4 + 2e-4 * levels + 4e-3 * levels**2, np.ones(12), motion=True)
+    assert moved.read == pytest.approx(0.01, rel=1e-6)
+    assert moved.shot == pytest.approx(2e-4, rel=1e-6)
+    assert moved.error < 1e-6
+
+
 def test_a_response_that_is_not_linear():
     """What (6) makes of it, sigma_im^2 / f^w, is the variance of the intensity; here 0.01^2 everywhere."""
     camera = CameraSettings(response="gamma:1.5")

@@ -1,4 +1,4 @@
-"""Where sensors saturate: cameras that clip below white, and scenes that merely end below it."""
+"""Where sensors saturate: cameras that clip below white, scenes that merely end below it, and piles of a histogram."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import kalux
-from kalux import Recording
-from kalux.calibration.levels import find_ceiling
+from kalux import EVENT_DTYPE, Frame, Recording
+from kalux.calibration.levels import clipping_levels, find_ceiling
 from kalux.datasets import SensorSettings, pan, photograph_scene, simulate
 from kalux.settings import PRESETS
 
@@ -82,3 +82,26 @@ def test_slider_depth_ends_at_110_to_124(shared_data):
     assert found is not None
     assert 114 <= 255 * found.level <= 120
     assert 107 <= 255 * found.least <= 114
+
+
+def with_levels(values):
+    frames = [Frame(values.astype(np.uint8).reshape(100, 200), 0, 5_000)]
+    return Recording.from_arrays(np.empty(0, EVENT_DTYPE), frames, sensor_size=(100, 200))
+
+
+def test_piles_at_both_ends_are_clipping():
+    rng = np.random.default_rng(2)
+    values = rng.integers(0, 256, 20_000)
+    values[:2000] = rng.integers(250, 254, 2000)  # fixed pattern noise spreads the top
+    values[values > 253] = 100
+    values[2000:5000] = 0
+    found = clipping_levels(with_levels(values), 400)
+    assert found.saturation == pytest.approx(249.5 / 255)
+    assert found.black == pytest.approx(0.5 / 255)
+
+
+def test_a_bright_wall_in_a_dark_picture_is_not_clipping():
+    rng = np.random.default_rng(2)
+    values = rng.integers(20, 90, 20_000)
+    values[:5000] = 100
+    assert clipping_levels(with_levels(values), 400) == (None, None)

@@ -1,14 +1,13 @@
-"""Noise, hot pixels and clipping levels, of sensors where they are known."""
+"""Noise and hot pixels of sensors where they are known."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from kalux import EVENT_DTYPE, Frame, Recording
+from kalux import EVENT_DTYPE, Recording
 from kalux.calibration.noise import (
     calibrate_noise,
-    clipping_levels,
     event_noise,
     shrunk_rates,
 )
@@ -100,32 +99,6 @@ def test_rates_of_pixels_that_are_seldom_quiet_are_the_typical_one():
     counts = np.zeros((4, 50))
     quiet = np.full((4, 50), 1e-6)
     np.testing.assert_allclose(shrunk_rates(counts, quiet, 2.0, np.zeros((4, 50), bool)), 2.0, rtol=1e-3)
-
-
-# --- levels ---------------------------------------------------------------------------------------------------
-
-
-def with_levels(values):
-    frames = [Frame(values.astype(np.uint8).reshape(100, 200), 0, 5_000)]
-    return Recording.from_arrays(NOTHING, frames, sensor_size=(100, 200))
-
-
-def test_piles_at_both_ends_are_clipping():
-    rng = np.random.default_rng(2)
-    values = rng.integers(0, 256, 20_000)
-    values[:2000] = rng.integers(250, 254, 2000)  # fixed pattern noise spreads the top
-    values[values > 253] = 100
-    values[2000:5000] = 0
-    found = clipping_levels(with_levels(values))
-    assert found.saturation == pytest.approx(249.5 / 255)
-    assert found.black == pytest.approx(0.5 / 255)
-
-
-def test_a_bright_wall_in_a_dark_picture_is_not_clipping():
-    rng = np.random.default_rng(2)
-    values = rng.integers(20, 90, 20_000)
-    values[:5000] = 100
-    assert clipping_levels(with_levels(values)) == (None, None)
 
 
 # --- all of it ------------------------------------------------------------------------------------------------

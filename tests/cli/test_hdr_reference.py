@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from kalux.datasets import SensorSettings, hdr, pan, photograph_scene, simulate
+from kalux.datasets import SensorSettings, pan, photograph_scene, simulate
+from kalux.datasets.radiance import read_radiance
 from kalux.models.camera import Response
 from kalux.writers import hdf5
 
@@ -43,7 +44,7 @@ def test_from_photographs_to_scores(cli, data, tmp_path):
     assert made.code == 0, made.err
     assert ": the reference of the alignment" in made.out
     assert "220 pixels measured" in made.out
-    assert hdr.read_radiance(out).valid.mean() > 0.95
+    assert read_radiance(out).valid.mean() > 0.95
     assert cv2.imread(str(tmp_path / "scene_response.png")).shape == (480, 640, 3)
     placed = cli("hdr-reference", out, "--register", folder / "rec.h5", "-o", truth, "--blur", "0.5")
     assert placed.code == 0, placed.err
@@ -64,7 +65,7 @@ def test_from_photographs_to_scores(cli, data, tmp_path):
         (["photos", "-o", "x.png"], "written as .exr or .npz"),
         (["photos", "-o", "x.exr"], "no exposure time in its EXIF"),
         (["photos", "-o", "x.exr", "--times", "1,2"], "2 exposure times for 3 images"),
-        (["photos", "-o", "x.exr", "--times", "1,x,3"], "seconds with commas"),
+        (["photos", "-o", "x.exr", "--times", "1,x,3"], "seconds are needed, numbers with commas"),
         (["photos", "-o", "x.exr", "--times", "t.csv"], "t.csv: cannot be read"),
         (["photos", "-o", "x.exr", "--times", TIMES, "--response", "log"], "unknown response"),
         (["photos", "-o", "x.exr", "--times", TIMES, "--exposure", "5"], "give --register REC"),

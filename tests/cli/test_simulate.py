@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import kalux
-from kalux.cli.simulate import _sensor_fields
+from kalux.cli.simulated_sensors import sensor_fields
 from kalux.datasets import SensorSettings, sensor_preset
 
 
@@ -190,7 +190,7 @@ def test_frame_flags(cli, photograph, tmp_path):
 
 def test_every_setting_of_the_sensor_is_a_flag(cli):
     fields = {field.name: field for field in dataclasses.fields(SensorSettings)}
-    flags = _sensor_fields()
+    flags = sensor_fields()
     assert flags.keys() == fields.keys()
     names = {
         "float": "a number",
@@ -238,6 +238,7 @@ def test_every_setting_of_the_sensor_is_a_flag(cli):
         (("--duration", "1e-300"), "must be positive"),
         (("--frame-rate", "1e300"), "frame_rate is 1e+300"),
         (("--motion", "rotate", "--turn", "nan"), "--turn nan: a finite number is needed"),
+        (("--motion", "shake", "--amplitude", "-1"), "--amplitude -1: 0 or more is needed"),
         (("--direction", "inf"), "--direction inf: a finite number is needed"),
         (("--motion", "dolly", "--closer", "1e300"), "its motion leads to"),
         (("--foreground", "ball", "--foreground-speed", "inf"), "--foreground-speed inf: a finite"),

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from kalux.datasets import Pose, combine, dolly, handheld, pan, shake, spin
+from kalux.errors import InputError
 
 
 def test_motions_combine() -> None:
@@ -27,3 +28,10 @@ def test_shake_has_its_amplitude() -> None:
     poses = np.array([motion(t) for t in np.linspace(0, 60e6, 6000)])
     assert poses[:, :2].std(axis=0) == pytest.approx(2.0, rel=0.05)
     assert poses[:, 2].std() == pytest.approx(0.01, rel=0.05)
+
+
+def test_a_negative_displacement_is_refused() -> None:
+    with pytest.raises(InputError, match=r"shake: amplitude -1.*0 or more"):
+        shake(0, amplitude=-1.0)
+    with pytest.raises(InputError, match="shake: amplitude -6"):
+        handheld(0, sway=-6.0)

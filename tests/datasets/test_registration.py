@@ -9,21 +9,14 @@ import numpy as np
 import pytest
 
 import kalux
-from kalux.calibration.homography import find_features
 from kalux.datasets import SensorSettings, combine, handheld, pan, photograph_scene, simulate, spin
-from kalux.datasets.registration import (
+from kalux.datasets.registration import register_frames
+from kalux.datasets.scenes import camera_matrix
+from kalux.datasets.warping import (
     displacement,
-    is_plausible,
-    match_features,
-    refined,
-    register_frames,
-    resampled,
-    tone_compressed,
     transformed,
-    warped,
     warped_mask,
 )
-from kalux.datasets.scenes import camera_matrix
 from kalux.errors import InputError
 
 from builders import blocks
@@ -133,46 +126,3 @@ def test_another_scene_is_an_error(simulation):
     other = blocks(0.02, 6.0, shape=(260, 340), seed=5)
     with pytest.raises(InputError, match="cannot be registered to any of 7 frames"):
         register_frames(other, np.ones(other.shape, bool), simulation.recording())
-
-
-def test_a_perspective_is_found(photograph):
-    truth = np.array([[1.9, 0.06, 20.0], [-0.04, 1.95, 15.0], [2e-4, -1e-4, 1.0]])
-    log = np.log(photograph + 0.02)
-    fixed = np.log(warped(photograph, truth, SIZE) + 0.02)
-    mask, everywhere = np.isfinite(fixed), np.ones(log.shape, bool)
-    fixed = np.where(mask, fixed, 0)
-    low, high = np.percentile(log, (1, 99))
-    pictures = [tone_compressed(image, low, high) for image in (fixed, log)]
-    match = match_features(find_features(pictures[0], mask), find_features(pictures[1], everywhere))
-    assert displacement(match.matrix, truth, SIZE) < 3.0
-    better, deviation = refined(fixed + 0.4, log, mask, everywhere, match.matrix)
-    assert displacement(better, truth, SIZE) < 0.2
-    assert deviation < 0.02
-
-
-def test_pictures_without_features_do_not_match():
-    blank, mask = np.full(SIZE, 80, np.uint8), np.ones(SIZE, bool)
-    match = match_features(find_features(blank, mask), find_features(blank, mask))
-    assert (match.matrix, match.inliers) == (None, 0)
-
-
-def test_a_larger_image_is_smoothed_before_it_is_made_smaller():
-    fine = np.indices((300, 300)).sum(axis=0) % 2 * 1.0  # a chess board of pixels
-    shrink = np.diag([3.0, 3.0, 1.0])
-    seen = warped(fine, shrink, (90, 90))[5:-5, 5:-5]
-    assert np.abs(seen - 0.5).max() < 0.05
-    assert np.isnan(warped(fine, shrink, (120, 120))[-1, -1])
-    assert np.ptp(resampled(fine.astype(np.float32), shrink, (90, 90), 0.0)) == 1.0
-
-
-@pytest.mark.parametrize(
-    ("matrix", "plausible"),
-    [
-        (np.eye(3), True),
-        (np.diag([-1.0, 1.0, 1.0]), False),  # mirrored
-        (np.diag([1e-3, 1e-3, 1.0]), False),
-        (np.array([[1, 0, 0], [0, 1, 0], [-0.02, 0, 1.0]]), False),  # through infinity
-    ],
-)
-def test_plausible_homographies(matrix, plausible):
-    assert is_plausible(matrix, SIZE) == plausible

@@ -9,7 +9,19 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from curves import ALL
-from kalux.display import Clahe, DisplaySettings, Linear, Reinhard, encode_srgb, tone_map
+from kalux.display import (
+    Clahe,
+    DisplaySettings,
+    Linear,
+    Reinhard,
+    apply,
+    encode_srgb,
+    measure,
+    quantised,
+    to_uint8,
+    to_uint16,
+    tone_map,
+)
 from kalux.errors import InputError
 
 INTENSITIES = hnp.arrays(
@@ -68,3 +80,17 @@ def test_values_that_are_not_finite_are_refused(bad):
 def test_other_shapes_are_refused(shape):
     with pytest.raises(InputError, match="shape"):
         tone_map(np.zeros(shape, np.float32))
+
+
+@pytest.mark.parametrize("curve", ALL, ids=str)
+@pytest.mark.parametrize("shape", [(7, 9), (7, 9, 3)])
+def test_whole_numbers_are_those_of_the_mapped_values(curve, shape):
+    """Also where the curve goes straight to them."""
+    intensity = np.random.default_rng(0).gamma(1.0, 0.7, shape).astype(np.float32)
+    for display in (DisplaySettings(curve), DisplaySettings(curve, encoding="srgb")):
+        statistics = measure(intensity, curve)
+        mapped = apply(intensity, display, statistics)
+        np.testing.assert_array_equal(quantised(intensity, display, statistics, np.uint8), to_uint8(mapped))
+        found = quantised(intensity, display, statistics, np.uint16)
+        np.testing.assert_array_equal(found, to_uint16(mapped))
+        assert found.dtype == np.uint16

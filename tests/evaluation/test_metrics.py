@@ -106,7 +106,9 @@ def test_shapes_and_types(metric, options, pair):
         metric(test[:0], reference[:0], **options)
     with pytest.raises(InputError, match="real numbers"):
         metric(test.astype(complex), reference, **options)
-    assert metric(*((255 * image).astype(np.uint8) for image in pair), **options) is not None
+    whole = [(255 * image.clip(0, 1)).astype(np.uint8) for image in pair]
+    of_floats = metric(*(image.astype(np.float64) for image in whole), **options)
+    assert metric(*whole, **options) == pytest.approx(of_floats, rel=1e-6)
 
 
 @pytest.mark.parametrize(("metric", "options"), MASKED)

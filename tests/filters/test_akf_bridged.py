@@ -152,9 +152,9 @@ def test_clocks_of_32_bits_last_for_days(gaps):
 
 
 def drifting_segment(end, shape=(1, 1)):
-    """Nothing is known of L^A, so that only events move the state."""
+    """Nothing is known of L^A, so that only events move the state; nor of how many come."""
     zero, step, unknown = np.zeros(shape), np.full(shape, 0.4), np.full(shape, UNMEASURED)
-    return BridgedSegment(0, end, zero, zero, step, step, unknown, unknown, zero, 0.0, 1.0, None)
+    return BridgedSegment(0, end, zero, zero, step, step, unknown, unknown, None, 0.0, 1.0, None)
 
 
 def test_memory_that_is_used_again_does_not_show(monkeypatch):

@@ -127,12 +127,36 @@ def test_far_beyond_white_less_is_expected_above():
     np.testing.assert_allclose(found.excess, [0.5, 0.5, 1 / 3], rtol=1e-6)
 
 
+def both(smoothed, first, second):
+    """What `smoothed_unshown` finds, and the level afterwards, of bounds and `unshown` pixels of both directions."""
+    level = np.array([smoothed])
+    directions = ((np.array([bounds]), np.ones((1, len(bounds))), where) for bounds, where in (first, second))
+    return smoothed_unshown(level, *directions), level[0]
+
+
 def test_of_both_directions_only_what_neither_has_seen_is_left():
-    found = smoothed_unshown(unshown([1, 4, 7], 0.2, 0.3), unshown([4, 7, 9], 0.4, 0.1))
+    alike = np.full(10, 1.0)
+    found, level = both(alike, (alike, unshown([1, 4, 7], 0.2, 0.3)), (alike, unshown([4, 7, 9], 0.4, 0.1)))
     np.testing.assert_array_equal(found.pixels, [4, 7])
     np.testing.assert_allclose(found.excess, 0.3, rtol=1e-6)
     np.testing.assert_allclose(found.noise, 0.1, rtol=1e-6)
-    assert smoothed_unshown(found, None) is None
+    np.testing.assert_array_equal(level, alike)
+    assert both(alike, (alike, found), (alike, None))[0] is None
+
+
+@pytest.mark.parametrize(
+    ("noise", "rise"),
+    [(0.0, 0.6), (0.1, 0.4), (0.3, 0.0), (5.0, 0.0)],
+    ids=["exact", "known", "as much as both differ", "anything"],
+)
+def test_the_higher_of_two_bounds_holds_as_far_as_its_events_are_exact(noise, rise):
+    """Half of what is above white is expected to be less than 0.35: noise of variance v takes off v / 0.5."""
+    low, high = (np.array([1.0]), unshown([0], 0.2, 0.01)), (np.array([2.2]), unshown([0], 0.4, noise))
+    for first, second in ((low, high), (high, low)):
+        found, level = both(np.array([1.6]), first, second)
+        assert level[0] == pytest.approx(1.6 + rise, abs=1e-6)
+        assert found.excess[0] == pytest.approx(0.3 / (1 + rise / 0.3), rel=1e-5)
+        assert found.noise[0] == pytest.approx(noise if rise else min(noise, 0.01))
 
 
 def obeyed(bound, noise, level, doubt, other=None):

@@ -32,6 +32,7 @@ def plane(value):
 
 def around(first=UNMEASURED, second=UNMEASURED, events=0.0, **changes):
     scalars = {"coming": 0.0, "counted": 0.0, "quantisation_variance": C2 / 6, "repeated": 1.0, "wrong": 0.0}
+    scalars["share"] = 0.5
     return Around(plane(first), plane(second), plane(events), **{**scalars, **changes})
 
 

@@ -194,7 +194,7 @@ def test_missing_image(folder):
 
 def test_malformed_image_list(folder):
     (folder / "images.txt").write_text("0.1 images/frame_00000000.png\nimages/frame_00000001.png\n")
-    with pytest.raises(FormatError, match=r"images\.txt, line 2"):
+    with pytest.raises(FormatError, match=r"images\.txt: line 2"):
         readers.read(folder)
 
 

@@ -112,14 +112,6 @@ def test_the_list_of_ijrr(events_only, tmp_path):
     ]
 
 
-def test_times_are_rounded_from_their_digits(events_only, tmp_path):
-    folder = tmp_path / "images"
-    write_images(folder, small_frames(1))
-    (folder / "frames.csv").write_text("t_s\n123456789012.0000005\n")
-    rec = kalux.open(events_only, frames=folder)
-    assert next(iter(rec.stamped_frames())).exposure_start == 123_456_789_012_000_001
-
-
 class TestSize:
     def test_another_size_is_refused(self, events_only, tmp_path):
         folder = tmp_path / "images"

@@ -87,3 +87,13 @@ def test_the_chunks_are_those_of_the_specification():
 def test_the_same_picture_is_the_same_file():
     picture = random_picture(np.random.default_rng(2), (50, 60), np.uint16)
     assert png_bytes(picture) == png_bytes(picture.copy())
+
+
+def test_what_deflate_does_not_shorten_is_stored_as_it_is():
+    """16 bits of noise: the file is the picture's bytes and little else, and zlib reads it; a smooth one is shorter."""
+    rng = np.random.default_rng(3)
+    noise = random_picture(rng, (260, 346), np.uint16)
+    assert noise.nbytes < len(png_bytes(noise)) < 1.005 * noise.nbytes
+    smooth = (noise & 0x3FF) + np.uint16(20_000)
+    assert len(png_bytes(smooth)) < 0.9 * smooth.nbytes
+    np.testing.assert_array_equal(decoded(png_bytes(smooth)), smooth)

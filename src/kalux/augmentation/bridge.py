@@ -113,12 +113,16 @@ class Thresholds(NamedTuple):
 
 
 class BridgeNoise(NamedTuple):
-    """The scalars of the noise model: nominal thresholds (log intensity), and variances in log intensity^2."""
+    """The scalars of the noise model: nominal thresholds (log intensity), and variances in log intensity^2.
+
+    ``saturated_variance`` is that of the change of a pixel that two successive frames clip.
+    """
 
     threshold_on: float
     threshold_off: float
     step_variance: float
     quantisation_variance: float
+    saturated_variance: float = UNMEASURED
 
 
 class BridgedSegment(NamedTuple):
@@ -129,11 +133,11 @@ class BridgedSegment(NamedTuple):
     the way to the end to the way from the start. The covariance of L^A as a measurement is
     R = 1 / (rate (1/forward + 1/backward)), ``rate`` in 1/s, where ``forward`` is ``forward_variance`` and
     ``step_variance`` for each event since the start, and ``backward`` is ``backward_variance`` and ``step_variance``
-    for each of the ``events`` still to come (None: not known, and none are counted). ``net`` is what all events add to
-    the level, and what the light grows by besides (None: not known). At ``start`` the level is ``floor`` or more where
-    that is known (K7; None: nowhere): of what no frame measures then, but a clipped one bounds at the end. At ``end``
-    the pixel obeys the frame ``bound`` (`lift`), and its variance grows by ``drift``, what its thresholds may have been
-    wrong by (`drift`; None: nothing). Pixels without an event after ``still_since`` are still.
+    for each of the ``events`` still to come, and no others come (None: not known, and none are counted). ``net`` is
+    what all events add to the level, and what the light grows by besides (None: not known). At ``start`` the level is
+    ``floor`` or more where that is known (K7; None: nowhere): of what no frame measures then, but a clipped one bounds
+    at the end. At ``end`` the pixel obeys the frame ``bound`` (`lift`), and its variance grows by ``drift``, what its
+    thresholds may have been wrong by (`drift`; None: nothing). Pixels without an event after ``still_since`` are still.
     Beyond what L^A and the state say here, the level is ahead of its newest event by ``trail`` (K14; None: it is not).
     ``unshown`` is of the pixels that no frame has measured until ``end``, or ``start`` in causal mode.
     ``silent_change`` is what silent pixels around each change from one frame to the next (`unseen`; None: not known).
@@ -340,6 +344,11 @@ def _bridge(  # type: ignore[no-untyped-def]
             told[column] = np.float64(next_value[row, column]) - np.float64(grown[row, column])
         for column in range(width):
             i = row, column
+            # Both frames are bounds: all that they say of the change is that it hardly goes on and on.
+            saturated = (
+                min(variance[i], next_variance[i]) >= UNMEASURED
+                and max(variance[i], next_variance[i]) < UNSEEN
+            )
             n_on, n_off = np.float64(on[i]), np.float64(off[i])
             scale_on, scale_off = np.float64(thresholds.on[i]), np.float64(thresholds.off[i])
             nominal_on, nominal_off = noise.threshold_on * scale_on, noise.threshold_off * scale_off
@@ -351,9 +360,11 @@ def _bridge(  # type: ignore[no-untyped-def]
             )
             on_covariance = on_variance * noise.threshold_on * n_on
             off_covariance = -off_variance * noise.threshold_off * n_off
+            both = np.float64(variance[i]) + np.float64(next_variance[i])
+            if saturated:
+                both = noise.saturated_variance
             total = (
-                np.float64(variance[i])
-                + np.float64(next_variance[i])
+                both
                 + on_covariance * noise.threshold_on * n_on
                 - off_covariance * noise.threshold_off * n_off
                 + noise.step_variance * (n_on + n_off)
@@ -361,7 +372,7 @@ def _bridge(  # type: ignore[no-untyped-def]
             )
             inverse = 1.0 / total
             gain = mismatch * inverse
-            augmented[i] = value[i] + gain * variance[i]
+            augmented[i] = value[i] if saturated else value[i] + gain * variance[i]
             slope[i] = gain * noise.quantisation_variance / seconds
             step_on[i] = nominal_on + gain * (noise.threshold_on * on_covariance + noise.step_variance)
             step_off[i] = nominal_off + gain * (noise.threshold_off * off_covariance - noise.step_variance)

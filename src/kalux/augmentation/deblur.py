@@ -199,7 +199,8 @@ def latent_peak(log_frame: Array, integrals: ExposureIntegrals) -> Array:
 
 def between(events: EventArray, start: int, end: int) -> EventArray:
     """The events with start < t <= end."""
-    return events[events_until(events, start) : events_until(events, end)]
+    words = event_words(events)
+    return events[words_until(words, start) : words_until(words, end)]
 
 
 def all_between(chunks: Sequence[EventArray], start: int, end: int) -> list[EventArray]:

@@ -29,6 +29,7 @@ from kalux.compiled import (
     event_row,
     event_weight,
     event_words,
+    flat,
     packed,
     prefetch,
 )
@@ -172,15 +173,16 @@ def _end_following(pixels, newest, off, on):  # type: ignore[no-untyped-def]
 def _follow(words, codes, counts, width, late):  # type: ignore[no-untyped-def]
     """``codes`` and ``counts`` are the memory of `FOLLOWED_PIXEL`, as int64 and as float32."""
     span, count = np.int64(0), np.int64(0)
-    two, last = np.uint64(2), len(words) - 1
-    for i in range(len(words)):
-        ahead = words[min(i + AHEAD, last), 1]
+    words, one, two = flat(words), np.uint64(1), np.uint64(2)
+    last = np.uint64(len(words)) - two
+    for i in range(np.uint64(0), last + one, two):
+        ahead = words[min(i + two * np.uint64(AHEAD), last) + one]
         prefetch(codes, (event_row(ahead) * width + event_column(ahead)) * two)
-        word = words[i, 1]
+        t, word = words[i], words[i + one]
         at = (event_row(word) * width + event_column(word)) * two
         is_on = np.uint64(event_is_on(word))
-        code = 2 * words[i, 0] + np.int64(is_on)
-        if words[i, 0] > late:
+        code = 2 * t + np.int64(is_on)
+        if t > late:
             difference = code - codes[at]  # even where the polarities are the same
             counted = np.int64((difference & 1 == 0) & (difference < 2 * LONGEST))
             span += (difference >> 1) * counted

@@ -16,7 +16,7 @@ trail away: the offset is that of the clocks, to the pixels' own latency. The me
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Any, Final, NamedTuple
 
 import cv2
@@ -293,9 +293,43 @@ def _distance(one: Registration, other: Registration) -> float:
     return float(np.hypot(a.x - b.x, a.y - b.y)[both].mean() / other.scale)
 
 
+class _Interval(NamedTuple):
+    """Of the chosen pixels of a frame interval: what is left (N,), its derivatives (N, 11), and the change (N,)."""
+
+    residual: Floats
+    jacobian: Floats
+    change: Floats
+
+
 def _normal_equations(
     shots: Shots, events: EventArray, registration: Registration, now: _Parameters, blur: float, spread: bool
 ) -> _Normal:
+    rows = [*_linearised(shots, events, registration, now, blur, spread)]
+    if not rows or sum(len(row.residual) for row in rows) < 500:
+        raise InputError(
+            "alignment: less than 500 well exposed pixels are in both cameras' view; is the registration right?"
+        )
+    everything = np.concatenate([row.residual for row in rows])
+    weights, _ = huber_weights(everything)
+    begin = 0
+    matrices, vectors, before, after = [], [], 0.0, 0.0
+    for residual, jacobian, change in rows:
+        weight = weights[begin : begin + len(residual)]
+        begin += len(residual)
+        weighted = jacobian * weight[:, None]
+        matrices.append(weighted.T @ jacobian)
+        vectors.append(weighted.T @ residual)
+        before += float((weight * change**2).sum())
+        after += float((weight * residual**2).sum())
+    return _Normal(
+        np.array(matrices, np.float64), np.array(vectors, np.float64), before, after, len(everything)
+    )
+
+
+def _linearised(
+    shots: Shots, events: EventArray, registration: Registration, now: _Parameters, blur: float, spread: bool
+) -> Iterator[_Interval]:
+    """What the events leave unexplained in every frame interval, and how it depends on the parameters."""
     size = registration.events.sensor_size
     count = len(shots.middles)
     times = np.rint(shots.middles[:, None] + now.offset + np.array([-1, 0, 1]) * _HALF_STEP).astype(np.int64)
@@ -313,7 +347,6 @@ def _normal_equations(
     stride = max(int(np.sqrt(size[0] * size[1] * (count - 1) / _MOST_SAMPLES)), 1)
     lattice = np.zeros(size, bool)
     lattice[stride // 2 :: stride, stride // 2 :: stride] = True
-    rows: list[tuple[Floats, Floats, Floats]] = []
     for k in range(count - 1):
         following = _warp(shots, registration, k + 1)
         good = (warped[2] & following[2]).astype(np.uint8)
@@ -343,26 +376,7 @@ def _normal_equations(
                 _homography_columns(gx[good], gy[good], coordinates[good]),
             ]
         )
-        rows.append((residual, jacobian, change[good]))
-    if not rows or sum(len(r) for r, _, _ in rows) < 500:
-        raise InputError(
-            "alignment: less than 500 well exposed pixels are in both cameras' view; is the registration right?"
-        )
-    everything = np.concatenate([r for r, _, _ in rows])
-    weights, _ = huber_weights(everything)
-    begin = 0
-    matrices, vectors, before, after = [], [], 0.0, 0.0
-    for residual, jacobian, change in rows:
-        weight = weights[begin : begin + len(residual)]
-        begin += len(residual)
-        weighted = jacobian * weight[:, None]
-        matrices.append(weighted.T @ jacobian)
-        vectors.append(weighted.T @ residual)
-        before += float((weight * change**2).sum())
-        after += float((weight * residual**2).sum())
-    return _Normal(
-        np.array(matrices, np.float64), np.array(vectors, np.float64), before, after, len(everything)
-    )
+        yield _Interval(residual, jacobian, change[good])
 
 
 def _warp(shots: Shots, registration: Registration, k: int) -> tuple[Floats, Floats, NDArray[np.bool_]]:

@@ -63,7 +63,7 @@ def estimate_delay(recording: Recording, camera: CameraSettings) -> DelayEstimat
     """The delay of the events against the frames, by fitting log frame differences with event counts.
 
     For every delay of a grid the events between the middles of two exposures, shifted by it, are fitted to the
-    change between the frames as in `estimate_thresholds`; the delay with the smallest residual wins. Latency of the
+    change between the frames by robust least squares; the delay with the smallest residual wins. Latency of the
     event pixels (which grows in the dark), a wrong stamp or a guessed exposure time all look alike, and are all
     mended by it. Looks at the first 60 frames.
 

@@ -15,9 +15,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.deblur import between, count_events
-from kalux.augmentation.refractory import EventClock
-from kalux.calibration.intervals import intervals, spread
+from kalux.calibration.intervals import counted_intervals, spread
 from kalux.models.camera import (
     CRUSHED,
     Camera,
@@ -41,7 +39,7 @@ STEP_VARIANCES: Final = (0.05, 0.1, 0.2, 0.4)
 MAX_SAMPLES: Final = 100_000
 _MIN_SAMPLES: Final = 1_000
 _MAX_FRAMES: Final = 80
-_LEAST_NET: Final = 2  # as for the thresholds: a net count of one may be noise
+_LEAST_NET: Final = 2  # a net count of one may be noise
 DARKEST: Final = 0.01  # two to three levels of 8 bits: below, a frame's log is rounding
 _ALIKE: Final = 50.0
 """Samples that say what one says, if all that changes is explained: those of one edge in one interval."""
@@ -259,15 +257,14 @@ def _samples(
     """Pixels with events that no frame clips at either end, interval by interval, and what their frames could show."""
     found: list[tuple[Array, ...]] = []
     count = 0
-    clock = EventClock(recording.sensor_size, refractory_period)
     response = named_responses(chosen_response(camera.response, recording.response))
     model = Camera(response[len(response) // 2])
     white = float(model.response.inverse(np.array(camera.saturation)))
     black = float(black_ceiling(model, np.zeros(1), 1.0)[0])
     black = black if black > CRUSHED else 0.0
-    for interval in intervals(recording, camera, margin=abs(delay), most_frames=_MAX_FRAMES):
-        inside = clock.weighed(between(interval.events, interval.start + delay, interval.end + delay))
-        on, off = count_events(inside, recording.sensor_size, weighed=True)
+    for interval, on, off in counted_intervals(
+        recording, camera, delay=delay, refractory_period=refractory_period, most_frames=_MAX_FRAMES
+    ):
         first, second = interval.first, interval.second
         chosen = spread(~first.clipped & ~second.clipped & (on + off > 0), MAX_SAMPLES - count)
         pixels = (first.intensity, second.intensity, on, off)

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux import memory
-from kalux.augmentation.deblur import all_between
+from kalux.augmentation.deblur import all_between, between, count_events
+from kalux.augmentation.refractory import EventClock
 from kalux.compiled import event_words
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.filters.shots import Shot, take_shot
@@ -34,8 +35,8 @@ class Interval:
     ----------
     start, end
         The two middles, us.
-    events
-        Those between ``start`` and ``end``, and those of the margin before and after.
+    chunks
+        The events between ``start`` and ``end``, and those of the margin before and after, in a few arrays.
     first, second
         The frames at both ends, as the filters see them.
     frames
@@ -46,11 +47,16 @@ class Interval:
 
     start: int
     end: int
-    events: EventArray
+    chunks: list[EventArray]
     first: Shot
     second: Shot
     frames: tuple[Frame, Frame]
     log_offset: float
+
+    @cached_property
+    def events(self) -> EventArray:
+        """Those of ``chunks`` in one array."""
+        return _joined(self.chunks)
 
     @cached_property
     def change(self) -> Array:
@@ -104,7 +110,7 @@ def intervals(
             yield Interval(
                 start=first.middle,
                 end=shot.middle,
-                events=_joined(all_between(held, first.middle - margin, shot.middle + margin)),
+                chunks=all_between(held, first.middle - margin, shot.middle + margin),
                 first=first,
                 second=shot,
                 frames=(before, frame),
@@ -112,6 +118,20 @@ def intervals(
             )
         held = _later(held, shot.middle - margin)
         previous = frame, shot
+
+
+def counted_intervals(
+    recording: Recording, camera: CameraSettings, *, delay: int, refractory_period: int, most_frames: int
+) -> Iterator[tuple[Interval, Array, Array]]:
+    """As `intervals`, with the weighed (K13) on and off events of every pixel between the frames, (H, W) each.
+
+    Events are stamped ``delay`` us late; the refractory period is in us.
+    """
+    clock = EventClock(recording.sensor_size, refractory_period)
+    for interval in intervals(recording, camera, margin=abs(delay), most_frames=most_frames):
+        inside = clock.weighed(between(interval.events, interval.start + delay, interval.end + delay))
+        on, off = count_events(inside, recording.sensor_size, weighed=True)
+        yield interval, on, off
 
 
 def _later(chunks: list[EventArray], t: int) -> list[EventArray]:

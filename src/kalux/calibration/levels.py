@@ -1,4 +1,4 @@
-"""At which level a sensor's pixels saturate, by what events say: light goes on where the level of the frames ends.
+"""At which levels a sensor's pixels end: where they pile up, and where events say that the light goes on.
 
 A pile at the end of a histogram may be a bright sky. Where pixels become as bright as the brightest, what events say of
 the change is compared with what frames show of it: of a sky as at other levels, of clipped pixels more, since events do
@@ -7,16 +7,15 @@ not clip. Comparing with other levels makes up for thresholds that are a little 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from itertools import islice
 from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.deblur import between, count_events
-from kalux.augmentation.refractory import EventClock
-from kalux.calibration.intervals import intervals
+from kalux.calibration.intervals import counted_intervals
+from kalux.frames import Frame
 from kalux.recording import Recording
 from kalux.settings import CameraSettings, EventSettings
 
@@ -31,7 +30,7 @@ _AT_TOP: Final = 0.9
 _BELOW: Final = (0.6, 0.85)
 """Of the brightest level: those that are compared."""
 
-_LEAST_NET: Final = 2  # as for the thresholds: a net count of one may be noise
+_LEAST_NET: Final = 2  # a net count of one may be noise
 _LEAST_PIXELS: Final = 100
 _MAX_FRAMES: Final = 80
 _FINE: Final = 4096  # levels of the histogram
@@ -109,13 +108,10 @@ def find_ceiling(recording: Recording, camera: CameraSettings, events: EventSett
 
 def _brightest(recording: Recording) -> float | None:
     """The response that a thousandth of the pixels of the first frames reach; None: frames are in RGB or all black."""
-    histogram = np.zeros(_FINE, np.int64)
-    for frame in islice(recording.frames(), _MAX_FRAMES):
-        if frame.image.ndim == 3:
-            return None
-        values = np.rint((_FINE - 1) * np.clip(frame.normalised(), 0, 1)).astype(np.int64)
-        values = values if frame.valid is None else values[frame.valid]
-        histogram += np.bincount(values.ravel(), minlength=_FINE)
+    first = next(iter(recording.frames()), None)
+    if first is None or first.image.ndim == 3:
+        return None
+    histogram = _histogram(islice(recording.frames(), _MAX_FRAMES), _FINE)
     reached = np.cumsum(histogram[::-1])[::-1] >= max(_BRIGHTEST * histogram.sum(), 1)
     brightest = int(np.flatnonzero(reached)[-1]) if reached.any() else 0
     return brightest / (_FINE - 1) if brightest > 0 else None
@@ -131,10 +127,13 @@ def _changes(
     """
     assert events.threshold_on is not None
     assert events.threshold_off is not None
-    clock, delay = EventClock(recording.sensor_size, events.refractory), events.lateness
-    for interval in intervals(recording, camera, margin=abs(delay), most_frames=_MAX_FRAMES):
-        inside = clock.weighed(between(interval.events, interval.start + delay, interval.end + delay))
-        on, off = count_events(inside, recording.sensor_size, weighed=True)
+    for interval, on, off in counted_intervals(
+        recording,
+        camera,
+        delay=events.lateness,
+        refractory_period=events.refractory,
+        most_frames=_MAX_FRAMES,
+    ):
         told = events.threshold_on * on - events.threshold_off * off - interval.change
         for sign, frame in zip((-1, 1), interval.frames, strict=True):
             ends = frame.normalised()
@@ -142,3 +141,58 @@ def _changes(
             for each in interval.frames:
                 chosen &= True if each.valid is None else each.valid
             yield np.stack([ends[chosen], sign * told[chosen]])
+
+
+class ClippingLevels(NamedTuple):
+    """Where the frames clip, share of white; None where no pile of pixels is seen."""
+
+    black: float | None
+    saturation: float | None
+
+
+_PILE: Final = 4.0  # times as many pixels as in the levels beside it
+
+
+def clipping_levels(recording: Recording, most_frames: int) -> ClippingLevels:
+    """Where pixels of the first ``most_frames`` pile up at either end of their histogram: the inner edge of the pile.
+
+    A pile ends the histogram in its upper (lower) quarter and is at least four times as frequent as the levels
+    inside it. Where the sensor has fixed pattern noise it spreads over some levels.
+    """
+    histogram = _histogram(islice(recording.frames(), most_frames), 256)
+    if not histogram.any():
+        return ClippingLevels(None, None)
+    bottom, top = (_pile(values) for values in (histogram[::-1], histogram))
+    return ClippingLevels(
+        None if bottom is None else (255 - bottom + 0.5) / 255, None if top is None else (top - 0.5) / 255
+    )
+
+
+_PILE_REACH: Final = 64  # levels: a quarter
+_BESIDE: Final = 20  # levels, just inside a pile
+
+
+def _pile(histogram: NDArray[np.int64]) -> int | None:
+    """The innermost level of a pile at the upper end; None where there is none."""
+    present = np.flatnonzero(np.cumsum(histogram[::-1])[::-1] > 1e-4 * histogram.sum())
+    end = int(present[-1])
+    if end < len(histogram) - _PILE_REACH:
+        return None
+    edge = end
+    while edge > _BESIDE:
+        beside = max(float(np.median(histogram[edge - _BESIDE : edge])), 1.0)
+        if histogram[edge] < 1.5 * beside:
+            break
+        edge -= 1
+    inside = max(float(np.median(histogram[max(edge - _BESIDE, 0) : edge + 1])), 1.0)
+    return edge + 1 if edge < end and histogram[edge + 1 :].max() >= _PILE * inside else None
+
+
+def _histogram(frames: Iterable[Frame], levels: int) -> NDArray[np.int64]:
+    """(levels,) how many valid pixels have each response from 0 to 1."""
+    histogram = np.zeros(levels, np.int64)
+    for frame in frames:
+        values = np.rint((levels - 1) * np.clip(frame.normalised(), 0, 1)).astype(np.int64)
+        values = values if frame.valid is None else values[frame.valid]
+        histogram += np.bincount(values.ravel(), minlength=levels)
+    return histogram

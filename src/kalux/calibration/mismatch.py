@@ -14,10 +14,8 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.deblur import between, count_events
-from kalux.augmentation.refractory import EventClock
 from kalux.calibration.event_model import DARKEST, ErrorModel, Samples, mismatch_of, noise_of_blurred
-from kalux.calibration.intervals import intervals
+from kalux.calibration.intervals import counted_intervals
 from kalux.calibration.regression import parts
 from kalux.recording import Recording
 from kalux.settings import CameraSettings, EventSettings
@@ -85,13 +83,15 @@ def estimate_mismatch(recording: Recording, camera: CameraSettings, events: Even
         events.usual_threshold_spread,
         events.quantisation_variance,
     )
-    clock = EventClock(recording.sensor_size, events.refractory)
-    delay = events.lateness
     products: Array = np.zeros((*recording.sensor_size, *_PRODUCTS))
     samples = 0
-    for interval in intervals(recording, camera, margin=abs(delay), most_frames=_MAX_FRAMES):
-        inside = clock.weighed(between(interval.events, interval.start + delay, interval.end + delay))
-        on, off = count_events(inside, recording.sensor_size, weighed=True)
+    for interval, on, off in counted_intervals(
+        recording,
+        camera,
+        delay=events.lateness,
+        refractory_period=events.refractory,
+        most_frames=_MAX_FRAMES,
+    ):
         first, second = interval.first, interval.second
         seen = Samples(first.intensity, second.intensity, on, off)
         bright = np.minimum(seen.before, seen.after) > DARKEST

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import islice
 from typing import Final, NamedTuple
 
 import cv2
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 
 from kalux.calibration.delay import estimate_delay
 from kalux.calibration.frame_noise import FrameNoise, estimate_frame_noise
+from kalux.calibration.levels import ClippingLevels, clipping_levels
 from kalux.calibration.refractory import shortest_interval
 from kalux.calibration.values import Calibration
 from kalux.events import NEVER, EventArray
@@ -38,7 +38,6 @@ _HOT_FACTOR: Final = 10.0  # times the typical rate
 _HOT_SIGNIFICANCE: Final = 8.0  # standard deviations above the typical count
 _HOT_LEAST: Final = 5  # events
 _DEAD_EXPECTED: Final = 25.0  # events of the neighbours' median, of a pixel that says nothing
-_PILE: Final = 4.0  # times as many pixels as in the levels beside it
 
 
 class EventNoise(NamedTuple):
@@ -66,13 +65,6 @@ class EventNoise(NamedTuple):
     quiet_share: float
 
 
-class Levels(NamedTuple):
-    """Where the frames clip, share of white; None where no pile of pixels is seen."""
-
-    black: float | None
-    saturation: float | None
-
-
 @dataclass(frozen=True, eq=False)
 class NoiseCalibration:
     """All of it; None what the recording does not tell.
@@ -89,7 +81,7 @@ class NoiseCalibration:
 
     events: EventNoise | None
     frames: FrameNoise | None
-    levels: Levels
+    levels: ClippingLevels
     delay: int | None
     apparent_delay: int | None
     refractory_at_most: int | None
@@ -151,7 +143,7 @@ def calibrate_noise(recording: Recording, camera: CameraSettings) -> NoiseCalibr
     return NoiseCalibration(
         events=event_noise(recording),
         frames=estimate_frame_noise(recording, camera, most_frames=MAX_FRAMES),
-        levels=clipping_levels(recording),
+        levels=clipping_levels(recording, MAX_FRAMES),
         delay=None if delay is None else delay.delay,
         apparent_delay=None if delay is None else delay.apparent,
         refractory_at_most=shortest_interval(recording) or None,
@@ -372,45 +364,3 @@ def shrunk_rates(counts: Array, quiet: Array, rate: float, hot: NDArray[np.bool_
 def _dead_pixels(total: NDArray[np.int64]) -> NDArray[np.bool_]:
     around = cv2.medianBlur(total.clip(0, 65535).astype(np.uint16), 5)
     return np.asarray((total == 0) & (around >= _DEAD_EXPECTED), np.bool_)
-
-
-# --- frames ---------------------------------------------------------------------------------------------------
-
-
-def clipping_levels(recording: Recording) -> Levels:
-    """Where pixels pile up at either end of the frames' histogram: the inner edge of the pile.
-
-    A pile ends the histogram in its upper (lower) quarter and is at least four times as frequent as the levels
-    inside it. Where the sensor has fixed pattern noise it spreads over some levels.
-    """
-    histogram = np.zeros(256)
-    for frame in islice(recording.frames(), MAX_FRAMES):
-        values = np.rint(255 * np.clip(frame.normalised(), 0, 1)).astype(np.int64)
-        values = values if frame.valid is None else values[frame.valid]
-        histogram += np.bincount(values.ravel(), minlength=256)
-    if not histogram.any():
-        return Levels(None, None)
-    bottom, top = (_pile(values) for values in (histogram[::-1], histogram))
-    return Levels(
-        None if bottom is None else (255 - bottom + 0.5) / 255, None if top is None else (top - 0.5) / 255
-    )
-
-
-_PILE_REACH: Final = 64  # levels: a quarter
-_BESIDE: Final = 20  # levels, just inside a pile
-
-
-def _pile(histogram: Array) -> int | None:
-    """The innermost level of a pile at the upper end; None where there is none."""
-    present = np.flatnonzero(np.cumsum(histogram[::-1])[::-1] > 1e-4 * histogram.sum())
-    end = int(present[-1])
-    if end < len(histogram) - _PILE_REACH:
-        return None
-    edge = end
-    while edge > _BESIDE:
-        beside = max(float(np.median(histogram[edge - _BESIDE : edge])), 1.0)
-        if histogram[edge] < 1.5 * beside:
-            break
-        edge -= 1
-    inside = max(float(np.median(histogram[max(edge - _BESIDE, 0) : edge + 1])), 1.0)
-    return edge + 1 if edge < end and histogram[edge + 1 :].max() >= _PILE * inside else None

@@ -177,28 +177,14 @@ def correlate(
     middles = changes.middles
     shift = round(centre)
     first, last = int(middles[0]) + shift - reach - _BIN, int(middles[-1]) + shift + reach + _BIN
-    cells = _CELLS if changes.signed else (1, 1)
-    counts = np.zeros(((last - first) // _BIN + 2, cells[0] * cells[1]))
-    total = 0
-    for chunk in chunks:
-        inside = between(chunk, first, last)
-        if len(inside):
-            row = inside["y"].astype(np.int64) * cells[0] // sensor_size[0]
-            column = inside["x"].astype(np.int64) * cells[1] // sensor_size[1]
-            place = (inside["t"] - first) // _BIN * counts.shape[1] + row * cells[1] + column
-            weight = np.where(inside["p"], 1.0, -1.0) if changes.signed else None
-            counts += np.bincount(place, weight, counts.size).reshape(counts.shape)
-            total += len(inside)
-        if len(chunk) and chunk["t"][-1] > last:
-            break
-    if total == 0:
+    level = _levels(chunks, sensor_size, first, last, signed=changes.signed)
+    if level is None:
         raise InputError(
             f"offset: no events from {reach * 1e-6:g} s before the first frame to {reach * 1e-6:g} s after the last; "
             "are the clocks further apart? A larger range can be given"
         )
-    level = np.concatenate([np.zeros((1, counts.shape[1])), np.cumsum(counts, axis=0)])
     grid = np.arange(-reach, reach + 1, _BIN, dtype=np.int64) + shift
-    curve, found = np.empty(len(grid)), np.empty((len(grid), len(middles) - 1, 3))
+    found = np.empty((len(grid), len(middles) - 1, 3))
     target = changes.changes - changes.changes.mean(axis=0)
     for i, offset in enumerate(grid.tolist()):
         at = (middles + offset - first) // _BIN
@@ -207,7 +193,7 @@ def correlate(
         found[i] = np.stack(
             [(events * target).sum(1), (events * events).sum(1), (target * target).sum(1)], axis=1
         )
-    curve[:] = _correlation(found.sum(axis=1))
+    curve = _correlation(found.sum(axis=1))
     best = int(np.argmax(curve))
     if not curve[best] > 0:
         raise InputError(
@@ -217,19 +203,46 @@ def correlate(
     away = np.abs(grid - grid[best]) > 1.5 * interval
     other = float(curve[away].max()) if away.any() else 0.0
     near = slice(max(best - 40, 0), best + 41)
-    left_out = _correlation(found[near].sum(axis=1, keepdims=True) - found[near])
-    peaks = np.array([_peak(grid[near], left_out[:, k], interval) for k in range(left_out.shape[1])])
-    n = len(peaks)
-    error = float(np.sqrt((n - 1) / n * np.sum((peaks - np.mean(peaks)) ** 2)))
     return Correlation(
         offset=_peak(grid, curve, interval),
-        standard_error=max(error, _BIN / np.sqrt(12)),
+        standard_error=max(_jackknifed(grid[near], found[near], interval), _BIN / np.sqrt(12)),
         peak=float(curve[best]),
         ratio=float(curve[best]) / other if other > 0 else float("inf"),
         grid=grid,
         curve=curve,
         per_pixel=changes.signed,
     )
+
+
+def _levels(
+    chunks: Iterable[EventArray], sensor_size: tuple[int, int], first: int, last: int, *, signed: bool
+) -> Array | None:
+    """Sums of the events of every cell, or of the whole image without a sign, up to every ms; None without events."""
+    cells = _CELLS if signed else (1, 1)
+    counts = np.zeros(((last - first) // _BIN + 2, cells[0] * cells[1]))
+    total = 0
+    for chunk in chunks:
+        inside = between(chunk, first, last)
+        if len(inside):
+            row = inside["y"].astype(np.int64) * cells[0] // sensor_size[0]
+            column = inside["x"].astype(np.int64) * cells[1] // sensor_size[1]
+            place = (inside["t"] - first) // _BIN * counts.shape[1] + row * cells[1] + column
+            weight = np.where(inside["p"], 1.0, -1.0) if signed else None
+            counts += np.bincount(place, weight, counts.size).reshape(counts.shape)
+            total += len(inside)
+        if len(chunk) and chunk["t"][-1] > last:
+            break
+    if total == 0:
+        return None
+    return np.concatenate([np.zeros((1, counts.shape[1])), np.cumsum(counts, axis=0)])
+
+
+def _jackknifed(grid: NDArray[np.int64], found: Array, interval: float) -> float:
+    """Standard error of the peak, us: its spread where one frame interval at a time is left out."""
+    left_out = _correlation(found.sum(axis=1, keepdims=True) - found)
+    peaks = np.array([_peak(grid, left_out[:, k], interval) for k in range(left_out.shape[1])])
+    n = len(peaks)
+    return float(np.sqrt((n - 1) / n * np.sum((peaks - np.mean(peaks)) ** 2)))
 
 
 def _correlation(sums: Array) -> Array:

@@ -105,3 +105,17 @@ def read_photograph(path: Path) -> NDArray[Any]:
     if image is None or image.dtype not in (np.uint8, np.uint16) or image.ndim not in (2, 3):
         raise FormatError(f"{path}: not an image of 8 or 16 bits, or damaged; copy it again")
     return np.asarray(image) if image.ndim == 2 else np.ascontiguousarray(image[..., 2::-1])
+
+
+def parse_seconds(text: str) -> float:
+    """An exposure time in seconds, as ``2``, ``0.125`` or ``1/8``.
+
+    Raises
+    ------
+    ValueError
+        If it is neither a number nor a fraction.
+    """
+    over, slash, under = text.partition("/")
+    if slash and float(under) == 0:
+        raise ValueError(f"{text} has no value")
+    return float(over) / float(under) if slash else float(over)

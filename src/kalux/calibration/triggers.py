@@ -69,8 +69,24 @@ def exposures(
     ExposureError
         If there are no such edges, or they cannot be paired.
     """
+    edges = _edges_of(chunks, input_id)
+    rising, times = edges["rising"], edges["t"].astype(np.int64)
+    if edge == "both":
+        if exposure is not None:
+            raise ExposureError("triggers: both edges tell the exposure; give an exposure with one edge only")
+        return _paired(rising, times)
+    if exposure is None or exposure <= 0:
+        raise ExposureError("triggers: with one edge per frame the exposure time is needed, in us")
+    starts = times[rising == (edge == "rising")]
+    if not len(starts):
+        raise ExposureError(f"triggers: there are no {edge} edges; use the other one, or both")
+    return starts, starts + exposure, ()
+
+
+def _edges_of(chunks: Iterable[TriggerArray], input_id: int | None) -> TriggerArray:
+    """The edges of one input; of the only one that has any, if it is not said which."""
     held = [chunk for chunk in chunks if len(chunk)]
-    edges = np.concatenate(held) if held else np.empty(0, TRIGGER_DTYPE)
+    edges: TriggerArray = np.concatenate(held) if held else np.empty(0, TRIGGER_DTYPE)
     ids = np.unique(edges["id"])
     if input_id is not None:
         edges = edges[edges["id"] == input_id]
@@ -79,25 +95,20 @@ def exposures(
             f"triggers: inputs {', '.join(map(str, ids))} have edges; say which is the frame camera's (--trigger-input)"
         )
     if not len(edges):
-        raise ExposureError(
-            "triggers: the recording has no edges on "
-            + (
-                "its trigger inputs"
-                if input_id is None
-                else f"input {input_id} (there are some on {ids.tolist()})"
-            )
-            + "; is the wire connected, and the input enabled when recording?"
+        where = (
+            "its trigger inputs"
+            if input_id is None
+            else f"input {input_id} (there are some on {ids.tolist()})"
         )
-    rising, times = edges["rising"], edges["t"].astype(np.int64)
-    if edge != "both":
-        if exposure is None or exposure <= 0:
-            raise ExposureError("triggers: with one edge per frame the exposure time is needed, in us")
-        starts = times[rising == (edge == "rising")]
-        if not len(starts):
-            raise ExposureError(f"triggers: there are no {edge} edges; use the other one, or both")
-        return starts, starts + exposure, ()
-    if exposure is not None:
-        raise ExposureError("triggers: both edges tell the exposure; give an exposure with one edge only")
+        raise ExposureError(
+            f"triggers: the recording has no edges on {where}; is the wire connected, and the input enabled when "
+            "recording?"
+        )
+    return edges
+
+
+def _paired(rising: NDArray[np.bool_], times: Times) -> tuple[Times, Times, tuple[str, ...]]:
+    """Exposures from each rising edge to the falling one after it, and what was assumed."""
     if rising.all() or not rising.any():
         only = "rising" if rising.all() else "falling"
         raise ExposureError(

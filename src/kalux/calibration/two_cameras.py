@@ -183,12 +183,8 @@ def register(
     first: Registration | None = None
     if rig is not None:
         lenses = rig.events, rig.frames
-        for lens, size, name in zip(lenses, (events_size, frames_size), ("event", "frame"), strict=True):
-            if lens.sensor_size != size:
-                raise InputError(
-                    f"register: the rig's {name} camera has {lens.sensor_size[1]}x{lens.sensor_size[0]} pixels, the "
-                    f"recording's {size[1]}x{size[0]}"
-                )
+        _check_size(rig.events, events_size, "event")
+        _check_size(rig.frames, frames_size, "frame")
         if chosen != "auto":
             first = Registration.of_rig(rig, distance)
             require_overlap(first)
@@ -199,12 +195,7 @@ def register(
     coarse = None
     if offset is None:
         coarse = correlate(changes, events(), events_size, centre=centre, reach=reach)
-        if not coarse.sure:
-            raise InputError(
-                "register: the frames' clock cannot be told from the recording: the correlation is "
-                f"{coarse.peak:.2f} at {coarse.offset * 1e-3:.1f} ms, {coarse.ratio:.2f} times the next "
-                f"peak ({SURE} is needed); shake the rig unevenly, narrow the search (--range), or give --offset"
-            )
+        _require_sure(coarse)
     begin = offset if coarse is None else coarse.offset
     assert begin is not None
     shots, inside = aligned_stretch(frames, events, changes, events_size, begin, camera)
@@ -221,3 +212,20 @@ def register(
     )
     require_overlap(found.registration)
     return Registered(found.registration, found.offset, found.standard_error, coarse, matched, found)
+
+
+def _check_size(lens: Lens, size: tuple[int, int], name: str) -> None:
+    if lens.sensor_size != size:
+        raise InputError(
+            f"register: the rig's {name} camera has {lens.sensor_size[1]}x{lens.sensor_size[0]} pixels, the "
+            f"recording's {size[1]}x{size[0]}"
+        )
+
+
+def _require_sure(found: Correlation) -> None:
+    if not found.sure:
+        raise InputError(
+            "register: the frames' clock cannot be told from the recording: the correlation is "
+            f"{found.peak:.2f} at {found.offset * 1e-3:.1f} ms, {found.ratio:.2f} times the next "
+            f"peak ({SURE} is needed); shake the rig unevenly, narrow the search (--range), or give --offset"
+        )

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from kalux.cli.metrics import add_metrics, lpips_files, lpips_weights, named_methods
 from kalux.cli.parser import Parser, UsageError, number, whole
-from kalux.cli.recordings import check_stamp
+from kalux.cli.recordings import add_exposure, check_stamp
 from kalux.cli.terminal import error_line, say
 
 if TYPE_CHECKING:
@@ -59,14 +59,7 @@ def add_command(commands: Any) -> None:
     )
     group = parser.add_argument_group("sequences")
     group.add_argument("sets", nargs="+", metavar="SET", help="recordings, folders of them, TOML files")
-    group.add_argument(
-        "--exposure", type=whole, metavar="US", help="exposure time, us, of recordings that store none"
-    )
-    group.add_argument(
-        "--stamp",
-        choices=("start", "middle", "end"),
-        help="with --exposure: what a frame's time stamp marks (default start)",
-    )
+    add_exposure(group)
     group.add_argument(
         "--white", type=number, metavar="LEVEL", help="value of a saturated pixel, if not stored"
     )

@@ -36,7 +36,9 @@ def add_command(commands: Any) -> None:
     )
     group = parser.add_argument_group("what to look at")
     group.add_argument("inputs", nargs="+", metavar="IMAGE|REC", help="images, or one recording")
-    group.add_argument("--times", metavar="S,S,..", help="exposure times of the images, s, in their order")
+    group.add_argument(
+        "--times", metavar="S,S,..", help="exposure times of the images, s, in their order, as 2,0.5,1/8"
+    )
     group.add_argument(
         "--per-channel", action="store_true", help="a curve for each colour (default: one for all)"
     )
@@ -87,7 +89,8 @@ def report(found: ResponseCalibration) -> list[str]:
 
 def _inputs(options: argparse.Namespace) -> tuple[Any, list[float], Recording | None]:
     from kalux.calibration.photographs import read_exposure, read_photograph
-    from kalux.calibration.response import still_pixels
+    from kalux.calibration.still_pixels import still_pixels
+    from kalux.cli.times import exposure_times
     from kalux.readers.images import IMAGES
 
     paths = [Path(name) for name in options.inputs]
@@ -103,8 +106,5 @@ def _inputs(options: argparse.Namespace) -> tuple[Any, list[float], Recording | 
         # Seconds at the sensitivity and aperture of the first, where these differ.
         times = [one.seconds * one.gain / stated[0].gain for one in stated]
     else:
-        try:
-            times = [float(word) for word in options.times.split(",")]
-        except ValueError:
-            raise UsageError(f"--times is {options.times!r}; numbers with commas are needed") from None
+        times = exposure_times(options.times)
     return [read_photograph(path) for path in paths], times, None

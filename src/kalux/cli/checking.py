@@ -16,9 +16,10 @@ from kalux.recording import Recording, no_frames
 
 T = TypeVar("T")
 
-CHECKED_FIRST: Final = 1 << 24
-"""Events that are looked at before anything is made of a recording: 0.2 s, less than planning takes, beside which they
-are read. Those of a longer one are checked as they are used: its file is then decoded once, not twice."""
+CHECKED_FIRST: Final = 1 << 22
+"""Events that are looked at before anything is made of a recording, 4 million: 0.05 s, and what is wrong with a file
+mostly begins with its first event. Those of a longer one are checked as they are used: its file is then decoded once,
+not twice."""
 
 _FEW: Final = 0.1
 """Of the events: a camera that records both has fewer of them between its frames only if it was started wrongly."""

@@ -4,12 +4,21 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from kalux.cli.calibrations import add_calibration, given_calibration
 from kalux.cli.parser import Parser, UsageError
-from kalux.cli.recordings import HDF5, Stated, add_recording, check_name, open_recording, streams, write_copy
+from kalux.cli.recordings import (
+    HDF5,
+    Stated,
+    add_recording,
+    check_name,
+    open_recording,
+    write_copy,
+    write_streams,
+)
 from kalux.cli.terminal import say, warn
 from kalux.wording import how_many
 
@@ -144,15 +153,9 @@ def _not_in_aedat4(recording: Recording) -> list[str]:
 
 
 def _write_aedat4(recording: Recording, out: Path, progress: Any) -> None:
-    from kalux.cli.signals import interrupts_held
     from kalux.writers import aedat4
 
-    with interrupts_held() as let_through:
-        events, frames = streams(recording, progress, let_through)
-        aedat4.write(
-            out,
-            sensor_size=recording.sensor_size,
-            events=events,
-            frames=frames,
-            exposure_known=recording.exposure_known,
-        )
+    write = partial(
+        aedat4.write, out, sensor_size=recording.sensor_size, exposure_known=recording.exposure_known
+    )
+    write_streams(write, recording.events(), recording.stored_frames(), progress)

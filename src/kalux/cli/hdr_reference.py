@@ -12,7 +12,7 @@ from kalux.cli.recordings import check_stamp
 from kalux.cli.terminal import say, warn
 
 if TYPE_CHECKING:
-    from kalux.datasets.hdr import HdrReference
+    from kalux.datasets.radiance import HdrReference
     from kalux.datasets.registration import RegisteredTruth
 
 _DESCRIPTION = """\
@@ -96,7 +96,8 @@ def add_command(commands: Any) -> None:
 def run(options: argparse.Namespace, command: list[str]) -> None:
     """Run the command."""
     from kalux.cli.output import check_file, check_picture, write_picture
-    from kalux.datasets.hdr import encode_radiance, response_plot
+    from kalux.datasets.hdr_plot import response_plot
+    from kalux.datasets.radiance import encode_radiance
     from kalux.writers.files import save
 
     _check_flags(options)
@@ -144,30 +145,29 @@ def _check_flags(options: argparse.Namespace) -> None:
 
 
 def _reference(options: argparse.Namespace, is_image: bool) -> HdrReference:
-    from kalux.datasets import hdr
+    from kalux.datasets.brackets import read_bracket
+    from kalux.datasets.hdr import hdr_reference
+    from kalux.datasets.radiance import read_radiance
     from kalux.models.camera import Response
 
     if is_image:
-        return hdr.read_radiance(options.photos)
+        return read_radiance(options.photos)
     recovered = options.response in ("auto", "debevec", "robertson")
     response = options.response if recovered else Response.named(options.response)
-    pictures = hdr.read_bracket(options.photos, _times(options.times))
-    return hdr.hdr_reference(
+    pictures = read_bracket(options.photos, _times(options.times))
+    return hdr_reference(
         pictures, response=response, aligned=options.align != "none", ghosts=not options.keep_moving
     )
 
 
 def _times(text: str | None) -> Path | list[float] | None:
-    from kalux.datasets.hdr import parse_seconds
+    from kalux.cli.times import exposure_times
 
     if text is None:
         return None
     if Path(text).suffix.lower() == ".csv":
         return Path(text)
-    try:
-        return [parse_seconds(part) for part in text.split(",")]
-    except ValueError:
-        raise UsageError(f"--times {text}: seconds with commas, as 2,1/2,1/8, or a .csv file") from None
+    return exposure_times(text)
 
 
 def _by(reference: HdrReference) -> str:

@@ -17,6 +17,7 @@ from kalux.ahead import default_threads
 from kalux.cli.calibrations import add_calibration, given_calibration
 from kalux.cli.checking import Contents, check_beside
 from kalux.cli.flags import HelpSettings, add_display, add_settings, given_settings
+from kalux.cli.loops import prepare_loops
 from kalux.cli.output import DEFAULT_RATE, FOLDER_FORMATS, Output, check_output, chosen_output, image_rate
 from kalux.cli.parser import Parser, UsageError, number, whole
 from kalux.cli.progress import Progress, short_number
@@ -42,7 +43,7 @@ _NEARLY_ALL: Final = 0.95
 """Of many samples, whose thresholds are nearly all the usual ones: the events contradict the frames, or are noise."""
 
 _DESCRIPTION = """\
-Reconstruct HDR images, at any rate, from a recording of events and frames. All frames and the first 16 million events
+Reconstruct HDR images, at any rate, from a recording of events and frames. All frames and the first 4 million events
 are checked before anything is written, later events as they are used."""
 
 _EXAMPLES = """\
@@ -156,6 +157,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     check_output(output)
     _check_apart(output, Path(options.recording))
     times = None if options.times is None else load_times(options.times)
+    prepare_loops()
     recording = open_recording(options)
     threads = options.threads or default_threads()
     with Progress("checking", quiet=options.quiet) as progress:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -26,17 +27,7 @@ def add_recording(parser: Parser) -> None:
     """Add what says which recording it is, and what it does not say itself."""
     group = parser.add_argument_group("recording")
     group.add_argument("recording", metavar="REC", help="file or folder, of any format that kalux reads")
-    group.add_argument(
-        "--exposure",
-        type=whole,
-        metavar="US",
-        help="exposure time of all frames, us; needed where the recording has none",
-    )
-    group.add_argument(
-        "--stamp",
-        choices=("start", "middle", "end"),
-        help="with --exposure: what a frame's time stamp marks (default start)",
-    )
+    add_exposure(group)
     group.add_argument(
         "--frames",
         type=Path,
@@ -62,6 +53,21 @@ def add_recording(parser: Parser) -> None:
         choices=(*MOSAICS, "none"),
         metavar="PATTERN",
         help=f"the sensor's Bayer pattern, where the recording does not state it: {', '.join(MOSAICS)}, none",
+    )
+
+
+def add_exposure(group: Any) -> None:
+    """Add what says when frames are exposed whose times do not say it."""
+    group.add_argument(
+        "--exposure",
+        type=whole,
+        metavar="US",
+        help="exposure time of all frames, us; needed where none are stored",
+    )
+    group.add_argument(
+        "--stamp",
+        choices=("start", "middle", "end"),
+        help="with --exposure: what a frame's time stamp marks (default start)",
     )
 
 
@@ -151,32 +157,34 @@ def write_copy(recording: Recording, out: Path, progress: Any, stated: Stated | 
     OutputError
         If the file cannot be written.
     """
-    from kalux.cli.signals import interrupts_held
     from kalux.writers import hdf5
 
-    # An interrupt inside HDF5 would crash it: it waits for the next chunk or frame.
     stated = stated or Stated()
-    with interrupts_held() as let_through:
-        events, frames = streams(recording, progress, let_through)
-        hdf5.write(
-            out,
-            sensor_size=recording.sensor_size,
-            events=events,
-            frames=frames,
-            exposure_known=recording.exposure_known,
-            contrast_threshold=stated.contrast_threshold or recording.contrast_threshold,
-            inverse_covariance=recording.source.inverse_covariance,
-            ground_truth=recording.ground_truth(),
-            mosaic=recording.mosaic,
-            response=stated.response or recording.response,
-        )
-
-
-def streams(
-    recording: Recording, progress: Any, let_through: Callable[[], None]
-) -> tuple[Iterator[EventArray], Iterator[Frame]]:
-    """Events and frames as stored, with progress."""
-    return (
-        counted(recording.events(), lambda chunk: progress.add(events=len(chunk)), let_through),
-        counted(recording.stored_frames(), lambda _: progress.add(images=1), let_through),
+    write = partial(
+        hdf5.write,
+        out,
+        sensor_size=recording.sensor_size,
+        exposure_known=recording.exposure_known,
+        contrast_threshold=stated.contrast_threshold or recording.contrast_threshold,
+        inverse_covariance=recording.source.inverse_covariance,
+        ground_truth=recording.ground_truth(),
+        mosaic=recording.mosaic,
+        response=stated.response or recording.response,
     )
+    write_streams(write, recording.events(), recording.stored_frames(), progress)
+
+
+def write_streams(
+    write: Callable[..., None], events: Iterable[EventArray], frames: Iterable[Frame], progress: Any
+) -> None:
+    """Have a writer, which takes ``events`` and ``frames``, write them, with progress.
+
+    An interrupt inside HDF5 would crash it: it waits for the next chunk or frame.
+    """
+    from kalux.cli.signals import interrupts_held
+
+    with interrupts_held() as let_through:
+        write(
+            events=counted(events, lambda chunk: progress.add(events=len(chunk)), let_through),
+            frames=counted(frames, lambda _: progress.add(images=1), let_through),
+        )

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from kalux.cli.calibrate_offset import add_range, checked_range, read_offset
 from kalux.cli.calibrate_rig import add_frames
 from kalux.cli.parser import Parser, UsageError, number, whole
-from kalux.cli.recordings import check_stamp
+from kalux.cli.recordings import add_exposure, check_stamp, write_streams
 from kalux.cli.terminal import say, warn
 from kalux.wording import how_many
 
@@ -43,12 +44,7 @@ def add_command(commands: Any) -> None:
     group = parser.add_argument_group("recording")
     group.add_argument("events", metavar="EVENTS", type=Path, help="recording of the event camera")
     add_frames(group, positional=False)
-    group.add_argument("--exposure", type=whole, metavar="US", help="exposure time of all frames, us")
-    group.add_argument(
-        "--stamp",
-        choices=("start", "middle", "end"),
-        help="with --exposure: what a frame's time marks (start)",
-    )
+    add_exposure(group)
     group.add_argument(
         "--response",
         default="linear",
@@ -147,7 +143,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
             say(line)
     if not exposure_known:
         warn("the frames have no exposure times; --exposure and --stamp would put them in")
-    _write(options, events, size, lambda: found.frames(frames()), exposure_known)
+    _write(options, events, size, found.frames(frames()), exposure_known)
     if options.plot is not None and found.coarse is not None:
         from kalux.calibration.pictures import correlation_plot
 
@@ -222,23 +218,22 @@ def _write(
     options: argparse.Namespace,
     events: Recording,
     size: tuple[int, int],
-    frames: Callable[[], Iterable[Frame]],
+    frames: Iterable[Frame],
     exposure_known: bool,
 ) -> None:
-    from kalux.cli.progress import Progress, counted
-    from kalux.cli.signals import interrupts_held
+    from kalux.cli.progress import Progress
     from kalux.writers import hdf5
 
-    with Progress("registering", quiet=options.quiet) as progress, interrupts_held() as let_through:
-        hdf5.write(
-            options.out,
-            sensor_size=size,
-            events=counted(events.events(), lambda chunk: progress.add(events=len(chunk)), let_through),
-            frames=counted(frames(), lambda _: progress.add(images=1), let_through),
-            exposure_known=exposure_known,
-            contrast_threshold=events.contrast_threshold,
-            response=None if options.response == "linear" else options.response,
-        )
+    write = partial(
+        hdf5.write,
+        options.out,
+        sensor_size=size,
+        exposure_known=exposure_known,
+        contrast_threshold=events.contrast_threshold,
+        response=None if options.response == "linear" else options.response,
+    )
+    with Progress("registering", quiet=options.quiet) as progress:
+        write_streams(write, events.events(), frames, progress)
     if not options.quiet:
         say(
             f"wrote {how_many(progress.events, 'event')} and {how_many(progress.images, 'frame')} to {options.out}"

@@ -1,4 +1,4 @@
-"""The times of images from a file: text or NumPy, in us."""
+"""Times on the command line: of images, from a file, text or NumPy, in us; of exposures, in s."""
 
 from __future__ import annotations
 
@@ -11,6 +11,22 @@ from numpy.typing import NDArray
 from kalux.cli.parser import UsageError
 
 Times = NDArray[np.int64]
+
+
+def exposure_times(text: str) -> list[float]:
+    """The seconds of ``--times``, with commas between.
+
+    Raises
+    ------
+    UsageError
+        If it has something else.
+    """
+    from kalux.calibration.photographs import parse_seconds
+
+    try:
+        return [parse_seconds(part) for part in text.split(",")]
+    except ValueError:
+        raise UsageError(f"--times {text}: seconds are needed, numbers with commas, as 2,0.5,1/8") from None
 
 
 def load_times(path: Path) -> Times:

@@ -115,42 +115,32 @@ def artificial_hdr(
     FrameError
         If there are too few frames, or all are black.
     """
-    if every is not None and every < 2:
-        raise InputError(f"artificial HDR: every is {every}; at least 2 is needed")
-    if not 0 <= black < 1:
-        raise InputError(f"artificial HDR: black is {black}; 0 to less than 1 is possible")
-    if not camera.low < saturation <= 1:
-        raise InputError(
-            f"artificial HDR: the original saturates at {saturation:g}; more than the artificial camera's black, "
-            f"{camera.low:g}, and at most 1 is possible"
-        )
+    _check(camera, black, saturation, every)
     real = Camera(Response.named(chosen_response(response, recording.response)))
     artificial = Response.named(camera.response)
-    kept = [f.exposure for i, f in enumerate(recording.frames()) if every is None or i % every != every - 1]
+    kept = [frame.exposure for frame in _kept(recording, every)]
     if len(kept) < 2:
         raise FrameError(
             f"{recording.source.path}: {how_many(len(kept), 'frame')}, too few for artificial HDR"
         )
 
     def frames() -> Iterator[Frame]:
-        for index, frame in enumerate(recording.frames()):
-            if every is None or index % every != every - 1:
-                intensity = _intensity(frame, real, black, 1.0)
-                level = artificial(np.minimum(intensity / camera.high, 1.0))
-                levels = np.rint(255 * level).astype(np.uint8)
-                yield dataclasses.replace(frame, image=levels, white=None)
+        for frame in _kept(recording, every):
+            intensity = _intensity(frame, real, black, 1.0)
+            level = artificial(np.minimum(intensity / camera.high, 1.0))
+            levels = np.rint(255 * level).astype(np.uint8)
+            yield dataclasses.replace(frame, image=levels, white=None)
 
     reference = median_exposure(kept)
 
     def truth() -> GroundTruth:
         times, images, masks = [], [], []
-        for index, frame in enumerate(recording.frames()):
-            if every is None or index % every == every - 1:
-                image = _intensity(frame, real, black, reference / frame.exposure) / camera.high
-                times.append(frame.middle)
-                grey = image if image.ndim == 2 else luminance(image)
-                images.append(np.maximum(grey, 0.0).astype(np.float32))
-                masks.append(_measured(frame, saturation))
+        for frame in _told(recording, every):
+            image = _intensity(frame, real, black, reference / frame.exposure) / camera.high
+            times.append(frame.middle)
+            grey = image if image.ndim == 2 else luminance(image)
+            images.append(np.maximum(grey, 0.0).astype(np.float32))
+            masks.append(_measured(frame, saturation))
         whole = np.stack(masks)
         return GroundTruth(
             np.array(times, np.int64),
@@ -174,6 +164,28 @@ def artificial_hdr(
             mosaic=recording.mosaic,
         )
     )
+
+
+def _check(camera: ArtificialCamera, black: float, saturation: float, every: int | None) -> None:
+    if every is not None and every < 2:
+        raise InputError(f"artificial HDR: every is {every}; at least 2 is needed")
+    if not 0 <= black < 1:
+        raise InputError(f"artificial HDR: black is {black}; 0 to less than 1 is possible")
+    if not camera.low < saturation <= 1:
+        raise InputError(
+            f"artificial HDR: the original saturates at {saturation:g}; more than the artificial camera's black, "
+            f"{camera.low:g}, and at most 1 is possible"
+        )
+
+
+def _kept(recording: Recording, every: int | None) -> Iterator[Frame]:
+    """The frames that the artificial camera takes."""
+    return (f for i, f in enumerate(recording.frames()) if every is None or i % every != every - 1)
+
+
+def _told(recording: Recording, every: int | None) -> Iterator[Frame]:
+    """The frames that are truth."""
+    return (f for i, f in enumerate(recording.frames()) if every is None or i % every == every - 1)
 
 
 def _measured(frame: Frame, saturation: float) -> NDArray[np.bool_]:

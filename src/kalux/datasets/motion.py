@@ -7,6 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from kalux.errors import InputError
+
 
 class Pose(NamedTuple):
     """Where the camera looks: ``x`` right and ``y`` down in sensor pixels, ``angle`` in radians clockwise,
@@ -62,7 +64,14 @@ def shake(
         Root-mean-square rotation, radians.
     band
         Lowest and highest frequency, Hz. The default is the band of physiological hand tremor.
+
+    Raises
+    ------
+    InputError
+        If a root mean square is negative.
     """
+    if not (amplitude >= 0 and roll >= 0):
+        raise InputError(f"shake: amplitude {amplitude} and roll {roll}; 0 or more are needed")
     rng = np.random.default_rng(seed)
     count = 5
     frequency = rng.uniform(*band, (3, count)) * 2e-6 * np.pi
@@ -88,6 +97,11 @@ def handheld(seed: int, *, sway: float = 6.0, tremor: float = 0.4, roll: float =
         Root-mean-square displacements per axis, sensor pixels.
     roll
         Root-mean-square rotation of the sway, radians.
+
+    Raises
+    ------
+    InputError
+        As of `shake`.
     """
     # Two streams of one seed, so that neither repeats the other's phases.
     slow, fast = (int(s) for s in np.random.default_rng(seed).integers(2**32, size=2))

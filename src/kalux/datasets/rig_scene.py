@@ -20,7 +20,7 @@ from kalux.datasets.event_stream import all_events, event_chunks
 from kalux.datasets.exposure import frame_stream, plan_exposures
 from kalux.datasets.motion import Motion
 from kalux.datasets.room import pink_noise
-from kalux.datasets.scenes import Image, Scene, _bilinear, _mirrored, blurred
+from kalux.datasets.scenes import Image, Scene, bilinear, blurred, mirrored
 from kalux.datasets.sensors import Sampling, SensorSettings
 from kalux.events import EventArray
 from kalux.frames import Frame
@@ -158,9 +158,9 @@ def _sample_rays(image: Image, rays: Array, matrix: Array, out: Image) -> None:
         for u in range(out.shape[1]):
             a, b = rays[v, u, 0], rays[v, u, 1]
             z = matrix[2, 0] * a + matrix[2, 1] * b + matrix[2, 2]
-            x = _mirrored((matrix[0, 0] * a + matrix[0, 1] * b + matrix[0, 2]) / z, width - 1.0)
-            y = _mirrored((matrix[1, 0] * a + matrix[1, 1] * b + matrix[1, 2]) / z, height - 1.0)
-            out[v, u] = _bilinear(image, x, y)
+            x = mirrored((matrix[0, 0] * a + matrix[0, 1] * b + matrix[0, 2]) / z, width - 1.0)
+            y = mirrored((matrix[1, 0] * a + matrix[1, 1] * b + matrix[1, 2]) / z, height - 1.0)
+            out[v, u] = bilinear(image, x, y)
 
 
 def record(

@@ -224,13 +224,14 @@ def sample(image: Image, matrix: NDArray[np.float64], out: Image) -> None:
     height, width = image.shape
     for v in range(out.shape[0]):
         for u in range(out.shape[1]):
-            x = _mirrored(matrix[0, 0] * u + matrix[0, 1] * v + matrix[0, 2], width - 1.0)
-            y = _mirrored(matrix[1, 0] * u + matrix[1, 1] * v + matrix[1, 2], height - 1.0)
-            out[v, u] = _bilinear(image, x, y)
+            x = mirrored(matrix[0, 0] * u + matrix[0, 1] * v + matrix[0, 2], width - 1.0)
+            y = mirrored(matrix[1, 0] * u + matrix[1, 1] * v + matrix[1, 2], height - 1.0)
+            out[v, u] = bilinear(image, x, y)
 
 
 @numba.njit(cache=True)
-def _mirrored(position: float, last: float) -> float:
+def mirrored(position: float, last: float) -> float:
+    """A place beyond 0 or ``last``, mirrored there."""
     if 0.0 <= position <= last:
         return position
     position = abs(position) % (2.0 * last)
@@ -238,7 +239,7 @@ def _mirrored(position: float, last: float) -> float:
 
 
 @numba.njit(cache=True)
-def _bilinear(image: Image, x: float, y: float) -> float:
+def bilinear(image: Image, x: float, y: float) -> float:
     """Value at (x, y), 0 <= x <= width - 1 and 0 <= y <= height - 1."""
     i, j = min(int(y), image.shape[0] - 2), min(int(x), image.shape[1] - 2)
     fy, fx = y - i, x - j
@@ -256,7 +257,7 @@ def overlay(sprite: Image, alpha: Image, matrix: NDArray[np.float64], out: Image
             x = matrix[0, 0] * u + matrix[0, 1] * v + matrix[0, 2]
             y = matrix[1, 0] * u + matrix[1, 1] * v + matrix[1, 2]
             if 0.0 <= x <= width - 1 and 0.0 <= y <= height - 1:
-                out[v, u] = out[v, u] * (1.0 - _bilinear(alpha, x, y)) + _bilinear(sprite, x, y)
+                out[v, u] = out[v, u] * (1.0 - bilinear(alpha, x, y)) + bilinear(sprite, x, y)
 
 
 # --- scenes that can be worked out by hand ----------------------------------------------------------------

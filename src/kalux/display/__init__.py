@@ -13,7 +13,7 @@ on an sRGB display, and goes towards white where the display has no such colour 
 
 from kalux.display.integers import fill, to_uint8, to_uint16
 from kalux.display.intensities import Float32, Statistics
-from kalux.display.mapping import apply, fill_levels, measure, tone_map
+from kalux.display.mapping import apply, fill_levels, measure, quantised, tone_map
 from kalux.display.percentiles import SAMPLES
 from kalux.display.settings import (
     CURVES,
@@ -57,6 +57,7 @@ __all__ = [
     "fill_levels",
     "measure",
     "next_state",
+    "quantised",
     "settings_table",
     "shown_of",
     "to_uint8",

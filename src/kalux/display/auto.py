@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
 from kalux.compiled import FUSED, ONE, exponential, logarithm
-from kalux.display.integers import fill_row
+from kalux.display.integers import fill_row, quantise
 from kalux.display.intensities import LARGEST, SMALLEST, Float32
 from kalux.display.settings import MID_GREY, Auto
 
@@ -37,6 +37,15 @@ def fill_auto(
     """`map_auto` and `kalux.display.fill` in one go, of levels as of `kalux.display.fill_levels`."""
     offset, factor = np.float32(levels[0] + 0.5), np.float32(levels[1] - levels[0])  # cut off after the point
     _show_levels(intensity, *_tone(curve, median, white), offset, factor, plane)
+
+
+def quantise_auto(
+    intensity: Float32, curve: Auto, median: float, white: float, integers: NDArray[Any]
+) -> None:
+    """`map_auto` and `kalux.display.to_uint8` or `to_uint16` in one go, as the integers are."""
+    _show_integers(
+        intensity, *_tone(curve, median, white), np.float32(np.iinfo(integers.dtype).max), integers
+    )
 
 
 def _tone(curve: Auto, median: float, white: float) -> tuple[_Shoulder, bool, np.float32]:
@@ -115,3 +124,12 @@ def _show_levels(values, shoulder, rolled, power, offset, factor, plane):  # typ
         if row < height:
             _show(values[row], shoulder, rolled, power, shown[0])
         fill_row(shown[0], offset, factor, plane[row])
+
+
+@nb.njit(cache=True, nogil=True, fastmath=FUSED)
+def _show_integers(values, shoulder, rolled, power, top, integers):  # type: ignore[no-untyped-def]
+    """`_show` and `quantise`, a row at a time."""
+    shown = np.empty(values.shape[1], np.float32)
+    for row in range(len(values)):
+        _show(values[row], shoulder, rolled, power, shown)
+        quantise(shown, top, integers[row])

@@ -29,12 +29,12 @@ def fill(values: Float32, zero: float, scale: float, plane: NDArray[np.uint8]) -
 
 def _to_integer(mapped: NDArray[Any], integers: NDArray[Any], top: int) -> NDArray[Any]:
     values = np.ascontiguousarray(mapped, np.float32)
-    _quantise(values.reshape(-1), np.float32(top), integers.reshape(-1))
+    quantise(values.reshape(-1), np.float32(top), integers.reshape(-1))
     return integers
 
 
 @nb.njit(cache=True, nogil=True)
-def _quantise(values, top, integers):  # type: ignore[no-untyped-def]
+def quantise(values, top, integers):  # type: ignore[no-untyped-def]
     # Added and taken away again, it rounds to a whole number, halves to even ones.
     rounding = np.float32(1.5 * 2**23)
     for i in range(len(values)):

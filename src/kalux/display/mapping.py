@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.display.auto import fill_auto, map_auto
+from kalux.display.auto import fill_auto, map_auto, quantise_auto
 from kalux.display.clahe import map_clahe, measure_clahe
-from kalux.display.integers import fill
+from kalux.display.integers import fill, to_uint8, to_uint16
 from kalux.display.intensities import Float32, Statistics, bounded, checked_image, intensities_of, log_of
 from kalux.display.operators import map_drago, map_linear, map_reinhard
 from kalux.display.percentiles import percentiles, sampled
@@ -118,11 +118,38 @@ def fill_levels(
     plane
         (rows, columns), no smaller; where it is larger, the last row and column are repeated.
     """
-    if isinstance(settings.curve, Auto) and encoding_of(settings) == "none":
+    if _is_auto_alone(settings.curve, settings):
         _check_statistics(settings.curve, statistics)
         fill_auto(intensity, settings.curve, *intensities_of(statistics), levels, plane)
     else:
         fill(_apply(intensity, settings, statistics), levels[0], levels[1] - levels[0], plane)
+
+
+def quantised(
+    intensity: Float32, settings: DisplaySettings, statistics: Statistics, kind: type[np.uint8 | np.uint16]
+) -> NDArray[Any]:
+    """Map an image as `apply` does, as the whole numbers of `kalux.display.to_uint8` or `to_uint16`.
+
+    Parameters
+    ----------
+    intensity
+        (height, width) or (height, width, 3) float32, finite: it is not checked.
+    settings, statistics
+        As of `apply`.
+    kind
+        numpy.uint8 or numpy.uint16.
+    """
+    if intensity.ndim == 2 and _is_auto_alone(settings.curve, settings):
+        _check_statistics(settings.curve, statistics)
+        integers = np.empty(intensity.shape, kind)
+        quantise_auto(intensity, settings.curve, *intensities_of(statistics), integers)
+        return integers
+    return (to_uint8 if kind is np.uint8 else to_uint16)(_apply(intensity, settings, statistics))
+
+
+def _is_auto_alone(curve: Curve, settings: DisplaySettings) -> TypeGuard[Auto]:
+    """Whether all that is done to intensities is the curve `Auto`, which goes straight to whole numbers."""
+    return isinstance(curve, Auto) and encoding_of(settings) == "none"
 
 
 def statistics_of(intensity: Float32, curve: Curve) -> Statistics:

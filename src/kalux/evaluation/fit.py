@@ -214,12 +214,10 @@ def _fitted_values(settings: Settings) -> dict[str, dict[str, float | int]]:
 def score_settings(held: HeldOut, settings: Settings, calibration: Calibration | None = None) -> Score:
     """How likely settings make the held-out frames; of the calibration only the maps of pixels are used."""
     images = reconstruct(held.kept, times=held.times.ravel(), settings=settings, calibration=calibration)
-    chosen = {*held.compared.tolist()}
-    frames = (frame for i, frame in enumerate(held.whole.frames()) if i in chosen)
     reads = held.times.shape[1]
     nll, errors, pixels = 0.0, 0.0, 0
     camera = Camera.named(settings.camera.response, settings.camera.saturation)
-    for frame in frames:
+    for frame in held.frames():
         group = [next(images) for _ in range(reads)]
         mean: Array = np.stack([image.intensity for image in group]).mean(axis=0, dtype=np.float64)
         variance = group[reads // 2].variance.astype(np.float64)

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from kalux.errors import FormatError, FrameError, InputError
 from kalux.evaluation.method import Image, Times
+from kalux.readers.image_lists import read_csv
 from kalux.readers.images import read_image
-from kalux.readers.joined import read_image_list
 from kalux.readers.source import reading
 from kalux.recording import Recording
 
@@ -89,7 +89,7 @@ def listed(folder: Path) -> tuple[Times, list[Path]]:
             "t_us and file"
         )
     with reading(listing, UnicodeError):
-        rows, _ = read_image_list(listing, listing.read_text("utf-8-sig"))
+        rows, _ = read_csv(listing, listing.read_text("utf-8-sig"))
     if not rows:
         raise FormatError(f"{listing}: lists no images")
     rows.sort(key=lambda row: row.start)

@@ -78,6 +78,11 @@ class HeldOut:
         found = estimate_frame_noise(self.whole, settings)
         return (found.read, found.shot) if found is not None and found.believed else settings.noise
 
+    def frames(self) -> Iterator[Frame]:
+        """The frames that are compared."""
+        chosen = {*self.compared.tolist()}
+        return (frame for i, frame in enumerate(self.whole.frames()) if i in chosen)
+
     def described(self) -> str:
         """The protocol in words."""
         return (
@@ -214,10 +219,8 @@ def held_out_pairs(held: HeldOut, method: Method, *, clip: bool = False) -> Iter
             offset = made.log_offset
             yield np.stack([part for part in (made.intensity, made.variance) if part is not None])
 
-    chosen = {*held.compared.tolist()}
-    frames = (frame for i, frame in enumerate(held.whole.frames()) if i in chosen)
     camera = Camera.named(held.response, CameraSettings().saturation)
-    for frame, means in zip(frames, means_of(read(), held.times.shape[1]), strict=True):
+    for frame, means in zip(held.frames(), means_of(read(), held.times.shape[1]), strict=True):
         image = clipped_as(means[0], frame, held.reference_exposure) if clip else means[0]
         shot = take_shot(frame, camera, held.reference_exposure)
         variance = means[1] if len(means) == 2 else None

@@ -17,10 +17,10 @@ from kalux.evaluation.method import Method
 from kalux.evaluation.pairs import Pair
 from kalux.evaluation.scores import Scores, score
 from kalux.filters.shots import take_shot
-from kalux.frames import GROUND_TRUTH_SOURCE, GroundTruth
+from kalux.frames import GROUND_TRUTH_NEEDED, GroundTruth
 from kalux.models.camera import Camera, log_covariance, noise_variance
 from kalux.readers.numpy_files import DAMAGE
-from kalux.recording import Recording
+from kalux.recording import RECORDING_NEEDED, Recording
 from kalux.settings import AUTO, CameraSettings, chosen_response
 from kalux.wording import how_many
 
@@ -85,8 +85,8 @@ def prepare_reference(
     FrameError
         If the recording has no frames.
     """
-    require_type("prepare_reference: recording", recording, Recording, "kalux.open or Recording.from_arrays")
-    require_type("prepare_reference: truth", truth, GroundTruth, GROUND_TRUTH_SOURCE)
+    require_type("prepare_reference: recording", recording, Recording, RECORDING_NEEDED)
+    require_type("prepare_reference: truth", truth, GroundTruth, GROUND_TRUTH_NEEDED)
     times, images = np.asarray(truth.times), np.asarray(truth.images)
     if images.ndim != 3 or images.shape[1:] != recording.sensor_size or times.shape != images.shape[:1]:
         raise InputError(
@@ -154,7 +154,9 @@ def evaluate_truth(
     KaluxError
         Whatever the method or the metrics say.
     """
-    require_type("evaluate_truth: reference", reference, Reference, "prepare_reference")
+    require_type(
+        "evaluate_truth: reference", reference, Reference, "a Reference is needed, from prepare_reference"
+    )
     return score(
         truth_pairs(recording, reference, method),
         method=method.label,

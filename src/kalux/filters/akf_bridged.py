@@ -144,7 +144,8 @@ def begin(segment: BridgedSegment, state: State) -> Cursor:
     trail = no_trail(coming.shape) if segment.trail is None else segment.trail
     given = segment.augmented, segment.step_on, segment.step_off, *variances, coming, trail.start
     before = state.log_intensity, floor, state.variance
-    _begin_bridged(given, scalars, before, pixels.reshape(-1), steps.reshape(-1))
+    knows_coming = segment.events is not None
+    _begin_bridged(given, scalars, before, knows_coming, pixels.reshape(-1), steps.reshape(-1))
     polarity[1:-1, 1:-1] = trail.polarity
     return Cursor(pixels, steps, clock, polarity, segment.start)
 
@@ -261,13 +262,15 @@ def _since(clock, now):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _begin_bridged(given, scalars, before, pixels, steps):  # type: ignore[no-untyped-def]
+def _begin_bridged(given, scalars, before, knows_coming, pixels, steps):  # type: ignore[no-untyped-def]
+    """Fill ``pixels``, and ``steps`` where events are to come: elsewhere nothing looks at them."""
     rate, step_variance = scalars
     log_intensity, floor, variance = before
     augmented, step_on, step_off, forward, backward, events, trail = given
     height, width = log_intensity.shape
-    states = np.empty((_STATE_FIELDS, _BEGUN), np.float32)
-    known = np.zeros((_STEP_FIELDS, _BEGUN), np.float32)
+    size = min(width, _BEGUN)
+    states = np.empty((_STATE_FIELDS, size), np.float32)
+    known = np.zeros((_STEP_FIELDS, size), np.float32)
     information, weighted, level, rates = (
         states[_INFORMATION],
         states[_WEIGHTED],
@@ -275,37 +278,51 @@ def _begin_bridged(given, scalars, before, pixels, steps):  # type: ignore[no-un
         states[_RATE],
     )
     first_variance, last_variance, coming = known[_FORWARD], known[_BACKWARD], known[_COMING]
-    for row in range(np.uint64(height)):
-        at = (row + np.uint64(1)) * np.uint64(width + 2) + np.uint64(1)
-        for first in range(np.uint64(0), np.uint64(width), np.uint64(_BEGUN)):
-            count = min(np.uint64(width) - first, np.uint64(_BEGUN))
-            _copy(step_on, row, first, count, known[_STEP_ON])
-            _copy(step_off, row, first, count, known[_STEP_OFF])
-            _copy(forward, row, first, count, first_variance)
-            _copy(backward, row, first, count, last_variance)
-            _copy(events, row, first, count, coming)
-            _copy(augmented, row, first, count, level)
-            for i in range(count):
-                information[i] = ONE / np.float32(variance[row, first + i])
-            for i in range(count):
-                known_before = max(
-                    np.float32(log_intensity[row, first + i]), np.float32(floor[row, first + i])
-                )  # K7
-                weighted[i] = information[i] * (known_before - level[i])
-            for i in range(count):
+    for row in range(height):
+        at = (row + 1) * (width + 2) + 1
+        for first in range(0, width, size):  # the last block begins where it ends with the row
+            first = min(first, width - size)
+            start, block = np.uint64(first), range(np.uint64(size))
+            _copy(forward, row, start, first_variance)
+            _copy(backward, row, start, last_variance)
+            _copy(events, row, start, coming)
+            _copy(augmented, row, start, level)
+            for i in block:
+                information[i] = ONE / np.float32(variance[row, start + i])
+            for i in block:
+                before_events, bound = (
+                    np.float32(log_intensity[row, start + i]),
+                    np.float32(floor[row, start + i]),
+                )
+                weighted[i] = bound if bound > before_events else before_events  # K7
+            for i in block:
+                weighted[i] = information[i] * (weighted[i] - level[i])
+            for i in block:
                 rates[i] = measurement_rate(
                     rate, first_variance[i], last_variance[i] + coming[i] * step_variance
                 )
-            for i in range(count):
-                level[i] -= np.float32(trail[row, first + i])
-            pack(states, pixels, np.int64(at + first), np.int64(count))
-            pack(known, steps, np.int64(at + first), np.int64(count))
+            for i in block:
+                level[i] -= np.float32(trail[row, start + i])
+            pack(states, pixels, at + first, size)
+            if not knows_coming or _any_above(coming, np.float32(0.0)):
+                _copy(step_on, row, start, known[_STEP_ON])
+                _copy(step_off, row, start, known[_STEP_OFF])
+                pack(known, steps, at + first, size)
 
 
 @nb.njit(cache=True, inline="always")
-def _copy(plane, row, first, count, out):  # type: ignore[no-untyped-def]
+def _any_above(values, least):  # type: ignore[no-untyped-def]
+    """Whether a value is larger than ``least``; counted, which is vector code."""
+    count = np.int32(0)
+    for i in range(np.uint64(len(values))):
+        count += np.int32(values[i] > least)
+    return count > 0
+
+
+@nb.njit(cache=True, inline="always")
+def _copy(plane, row, first, out):  # type: ignore[no-untyped-def]
     """A part of a row as float32; vector code, as loops over many arrays at once are not."""
-    for i in range(count):
+    for i in range(np.uint64(len(out))):
         out[i] = np.float32(plane[row, first + i])
 
 

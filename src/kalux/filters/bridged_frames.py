@@ -45,9 +45,7 @@ from kalux.filters.method import FAR_FUTURE, USUAL_INTERVAL, Chunks, CommonMetho
 from kalux.filters.shots import Shot
 from kalux.filters.uncertainty import WRONG_STEPS, Around
 from kalux.models.camera import (
-    ABOUT_WHITE,
     CRUSHED,
-    BrightTail,
     beyond_white,
     dark_scale,
     frame_log_covariance,
@@ -110,7 +108,14 @@ class BridgedFrames(CommonMethod):
     ) -> None:
         super().__init__(settings, thresholds, lookahead, shape)
         events, c2 = settings.events, self.on * self.off
-        self.noise = BridgeNoise(self.on, self.off, events.step_noise * c2, events.quantisation_variance * c2)
+        scale2 = 2.0 * settings.filter.highlight_scale**2  # of the difference of two highlights
+        self.noise = BridgeNoise(
+            self.on,
+            self.off,
+            events.step_noise * c2,
+            events.quantisation_variance * c2,
+            scale2 if scale2 > 0 else bridge.UNMEASURED,
+        )
         self._event_noise = akf_bridged.Noise(events.background_rate, events.step_noise, c2)
         self._prior = (
             bridge.nominal_thresholds(shape, settings.events.mismatch, np.float32)
@@ -191,7 +196,7 @@ class BridgedFrames(CommonMethod):
         newest = make_clock(self.shape, begin - shot.start)
         lead_in, nothing = None, nothing_followed(self.shape)
         far = np.zeros(self.shape, np.float32)
-        tail = self._tail(shot)
+        tail = Tail(self.settings.filter.unshown_tail, beyond_white(shot.bright_tail))
         unknown = np.full(self.shape, UNKNOWN_CHANGE * self.on * self.off, np.float32)
         if self.lookahead:
             on, off, followed = self.follow(events, begin, shot.middle, nothing)
@@ -241,18 +246,6 @@ class BridgedFrames(CommonMethod):
         second = self.latent(following, events, memory.thresholds)
         join = self._joined if self.lookahead else self._causal
         return join(memory, shot, following, second, events)
-
-    def _tail(self, first: Shot) -> Tail:
-        """How far highlights go beyond white (K15); where the settings do not say, by the ``first`` frame."""
-        filtered = self.settings.filter
-        scale = filtered.bright_tail
-        if scale is None:
-            levels = first.level_intensity / first.white
-            half, white = (
-                int((levels >= edge)[first.levels].sum()) for edge in (ABOUT_WHITE / 2, ABOUT_WHITE)
-            )
-            scale = BrightTail(half, white).scale
-        return Tail(filtered.unshown_tail, beyond_white(scale))
 
     def _follow_unshown(
         self, memory: BridgeMemory, second: Latent, following: Shot, net: Floats
@@ -475,6 +468,7 @@ class BridgedFrames(CommonMethod):
             quantisation_variance=self.noise.quantisation_variance,
             repeated=1.0 - between / 2.0,
             wrong=WRONG_STEPS * between * self.on * self.off,
+            share=share,
         )
 
 

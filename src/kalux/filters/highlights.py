@@ -25,6 +25,9 @@ Those that frames have lifted lie up to 0.05 below it until the next frame."""
 _LEAST_SPREAD: Final = np.float32(0.3)
 """Standard deviation that is left where pixels around say that all lie just above their bounds."""
 
+_USUAL: Final = np.float32(0.5)
+"""How far above white clipped pixels are (docs/equations.md, K15), log intensity."""
+
 
 def tempered(unshown: Unshown, bound: Floats, prior: HighlightPrior) -> Unshown:
     """What is expected above a bound that is beyond white itself: highlights end somewhere.
@@ -119,15 +122,35 @@ def _take_mean(excess, noise, log_offset, white, scale2, stretch, mean):  # type
         mean[i] = max(exponential(believed if doubted and level > white else level) - log_offset, zero)
 
 
-def smoothed_unshown(forward: Unshown | None, backward: Unshown | None) -> Unshown | None:
-    """Pixels that no frame of the recording measures; of what both directions expect, the mean."""
-    if forward is None or backward is None:
+def smoothed_unshown(
+    smoothed: Floats,
+    forward: tuple[Floats, Floats, Unshown | None],
+    backward: tuple[Floats, Floats, Unshown | None],
+) -> Unshown | None:
+    """Pixels that no frame of the recording measures: both bounds hold. Raises ``smoothed``, (H, W) L, in place.
+
+    Both directions are L, P and the pixels that no frame has measured in that direction. The level is the mean of
+    both, but no less than either bound where its events can be trusted: if highlights fall off exponentially, as far
+    as they usually go, a bound with noise is believed to be lower by the noise over that. What the level rises by is no
+    more to be expected above it, as in `tempered`.
+    """
+    if forward[2] is None or backward[2] is None:
         return None
-    pixels, first, second = np.intersect1d(
-        forward.pixels, backward.pixels, assume_unique=True, return_indices=True
+    pixels, *places = np.intersect1d(
+        forward[2].pixels, backward[2].pixels, assume_unique=True, return_indices=True
     )
-    excess = (forward.excess[first] + backward.excess[second]) / np.float32(2.0)
-    return Unshown(pixels, excess, np.minimum(forward.noise[first], backward.noise[second]))
+    excesses, noises, bounds = [], [], []
+    for (level, _, unshown), place in zip((forward, backward), places, strict=True):
+        assert unshown is not None
+        excesses.append(unshown.excess[place])
+        noises.append(unshown.noise[place])
+        bounds.append(level.reshape(-1)[pixels] - unshown.noise[place] / _USUAL)
+    mean = smoothed.reshape(-1)[pixels]
+    rise = np.maximum(np.maximum(*bounds) - mean, np.float32(0.0)).astype(np.float32)
+    smoothed.reshape(-1)[pixels] = mean + rise
+    excess = (excesses[0] + excesses[1]) / np.float32(2.0)
+    noise = np.where(rise > 0, np.where(bounds[0] > bounds[1], *noises), np.minimum(*noises))
+    return Unshown(pixels, excess * excess / np.maximum(excess + rise, np.float32(1e-6)), noise)
 
 
 def obey_bounds(

@@ -15,6 +15,7 @@ from kalux.errors import SettingsError
 from kalux.frames import Frame
 from kalux.models import colour
 from kalux.models.camera import (
+    BrightTail,
     Camera,
     black_ceiling,
     inverse_response,
@@ -49,6 +50,8 @@ class Shot(NamedTuple):
         (H, W) bool: where the frame says anything at all; None: everywhere.
     trail
         Backward in time: how far the light is ahead of its events at the middle (K14).
+    bright_tail
+        `BrightTail.scale` of the recording's frames, in a live stream of the first; by default that without white.
     pitch
         Distance of pixels of one colour: 2 in a Bayer mosaic.
     """
@@ -66,6 +69,7 @@ class Shot(NamedTuple):
     chroma_weight: NDArray[np.float32] | None = None
     valid: NDArray[np.bool_] | None = None
     trail: FrameTrail | None = None
+    bright_tail: float = BrightTail().scale
     pitch: int = 1
 
     @property

@@ -65,6 +65,8 @@ class Around(NamedTuple):
         What share of the variance of the frames' noise is in the image: 1 at a frame, 1/2 half-way between two.
     wrong
         Variance of steps that are all wrong alike, per squared number of events.
+    share
+        Of the way from the frame before to the one after.
     """
 
     first: Array
@@ -75,6 +77,7 @@ class Around(NamedTuple):
     quantisation_variance: float
     repeated: float
     wrong: float
+    share: float
 
     @property
     def misses_some(self) -> bool:
@@ -143,7 +146,7 @@ def given_variance(
     known, *frames = (np.ascontiguousarray(plane, np.float32) for plane in planes)
     given = np.empty_like(known)
     if around is not None:
-        scalars = tuple(np.float32(value) for value in around[3:])
+        scalars = tuple(np.float32(value) for value in around[3:-1])
         first, second, events = (plane.reshape(-1) for plane in frames)
         if left is not None:
             _hear(known.reshape(-1), left.reshape(-1), first, second, alone(hidden).moving, given.reshape(-1))

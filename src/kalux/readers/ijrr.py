@@ -6,11 +6,9 @@ seconds, ``x`` and ``y`` 0-based, ``p`` 0 or 1. See https://rpg.ifi.uzh.ch/davis
 
 from __future__ import annotations
 
-import re
 import zipfile
 import zlib
 from collections.abc import Iterator
-from decimal import ROUND_HALF_UP, Decimal
 from functools import cache
 from pathlib import Path
 from typing import Any, Final
@@ -23,6 +21,7 @@ from kalux.errors import FormatError
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.frames import Frame
 from kalux.readers.characters import DOT, FIVE, NEWLINE, NINE, ONE, SPACE, ZERO, parsed_blocks, skip_blanks
+from kalux.readers.image_lists import read_ijrr
 from kalux.readers.images import in_colour, read_image
 from kalux.readers.source import (
     CHUNK_EVENTS,
@@ -40,7 +39,6 @@ _ZIP_SIGNATURE: Final = b"PK\x03\x04"
 # The shortest line, "0 0 0 0\n", has 8 bytes: a block holds at most CHUNK_EVENTS events.
 _BLOCK_BYTES: Final = 8 * CHUNK_EVENTS
 _LONGEST_LINE: Final = 4096
-_PLAIN_DECIMAL: Final = re.compile(r"\d{1,12}(\.\d*)?|\.\d+")
 _DAMAGE: Final = (
     zipfile.BadZipFile,
     zlib.error,
@@ -330,16 +328,7 @@ def _image_list(path: Path, root: _Place) -> tuple[list[tuple[int, str]], tuple[
     """(stamp in us, file name) of each frame, and what is missing."""
     if not (root / _IMAGES).is_file():
         return [], (f"There is no {_IMAGES}, so there are no frames.",)
-    images = []
-    for number, line in enumerate((root / _IMAGES).read_bytes().decode("utf-8").splitlines(), 1):
-        fields = line.split(maxsplit=1)
-        if not fields or fields[0].startswith("#"):
-            continue
-        if len(fields) != 2 or not _PLAIN_DECIMAL.fullmatch(fields[0]):
-            raise FormatError(
-                f"{path}: {_IMAGES}, line {number}: {line[:60]!r} is not 't file' with t in seconds as a plain decimal"
-            )
-        images.append((_microseconds(fields[0]), fields[1].strip()))
+    images = list(read_ijrr(root / _IMAGES, (root / _IMAGES).read_bytes().decode("utf-8-sig")))
     absent = [name for _, name in images if not (root / name).is_file()]
     if absent:
         raise FormatError(
@@ -347,10 +336,6 @@ def _image_list(path: Path, root: _Place) -> tuple[list[tuple[int, str]], tuple[
             f"{absent[0][:60]!r}; copy or download the recording again"
         )
     return images, () if images else (f"{_IMAGES} is empty, so there are no frames.",)
-
-
-def _microseconds(seconds: str) -> int:
-    return int((Decimal(seconds) * 1_000_000).to_integral_value(ROUND_HALF_UP))
 
 
 def _load(path: Path, root: _Place, name: str, colour: bool) -> NDArray[Any]:

@@ -1,8 +1,7 @@
 """Frames from elsewhere, joined to the events of a recording: an image folder with times, or a video.
 
-Times are in the clock of the events. A folder has a CSV with a line per image, or the ``images.txt`` of the IJRR
-layout; a video has a start and a rate, which the user gives, because the times that a video states are rarely those of
-a camera.
+Times are in the clock of the events. A folder has a list of them (`kalux.readers.image_lists`); a video has a start and
+a rate, which the user gives, because the times that a video states are rarely those of a camera.
 """
 
 from __future__ import annotations
@@ -11,44 +10,26 @@ import csv
 import dataclasses
 import re
 from collections.abc import Iterator
-from decimal import ROUND_HALF_UP, Decimal
 from functools import cache
 from itertools import islice
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kalux.errors import FormatError, FrameError, InputError
-from kalux.events import FIELD_NAMES
 from kalux.frames import Frame
-from kalux.readers.columns import find_name, find_time
-from kalux.readers.images import images_in, in_colour, read_image
+from kalux.readers.image_lists import WANTED, Listed, read_csv, read_ijrr
+from kalux.readers.images import in_colour, read_image
 from kalux.readers.source import EXPOSURE_UNKNOWN, SIZE_NOT_STATED, Source, reading, smallest_size
 from kalux.wording import how_many
 
 _LISTS: Final = ("frames.csv", "timestamps.csv", "images.txt")
-_EXPOSURE: Final = ("exposure", "exposure_time")
-_FILE: Final = ("file", "filename", "file_name", "image", "name", "path")
 _LARGEST_LIST: Final = 1 << 27  # bytes; it is read as a whole
-_NUMBER: Final = re.compile(r"\d{1,18}(\.\d{0,12})?")
-_PER_UNIT: Final = {"s": Decimal(10**6), "ms": Decimal(1000), "us": Decimal(1), "ns": Decimal("0.001")}
-_WANTED: Final = (
-    "a CSV named frames.csv with a line per image and the columns timestamp_us, perhaps exposure_us and file, or the "
-    "images.txt of the IJRR layout"
-)
 _FIRST_PICTURES: Final = 10  # of a video, which tell whether it is in colour
 _GREY_ROUNDING: Final = 0.03
 _ABOUT_FRAMES: Final = re.compile(r"\b(frames?|images?)\b")
-
-
-class Listed(NamedTuple):
-    """An image file and its exposure, us; start and end are both the stamp where that is all that is known."""
-
-    file: Path
-    start: int
-    end: int
 
 
 def join(source: Source, frames: Path, *, start: int | None, rate_hz: float | None, replace: bool) -> Source:
@@ -148,12 +129,15 @@ def _images(frames: Path, start: int | None, rate_hz: float | None) -> Source:
     path = _list_file(frames) if frames.is_dir() else frames
     with reading(path, UnicodeError, csv.Error):
         if path.stat().st_size > _LARGEST_LIST:
-            raise FormatError(f"{path}: is too large for a list of images; {_WANTED} is needed")
+            raise FormatError(f"{path}: is too large for a list of images; {WANTED} is needed")
         text = path.read_text("utf-8-sig")
-        read = _read_ijrr if path.suffix.lower() == ".txt" else read_image_list
-        listed, exposure_known = read(path, text)
+        if path.suffix.lower() == ".txt":
+            listed = [Listed(path.parent / name, stamp, stamp) for stamp, name in read_ijrr(path, text)]
+            exposure_known = False
+        else:
+            listed, exposure_known = read_csv(path, text)
     if not listed:
-        raise FormatError(f"{path}: lists no images; {_WANTED} is needed")
+        raise FormatError(f"{path}: lists no images; {WANTED} is needed")
     absent = [image.file for image in listed if not image.file.is_file()]
     if absent:
         raise FormatError(
@@ -180,73 +164,8 @@ def _list_file(folder: Path) -> Path:
         return named
     if len(others) != 1:
         found = f"{len(others)} CSV files" if others else "no list of times"
-        raise FormatError(f"{folder}: has {found}; {_WANTED} is needed")
+        raise FormatError(f"{folder}: has {found}; {WANTED} is needed")
     return others[0]
-
-
-def read_image_list(path: Path, text: str) -> tuple[list[Listed], bool]:
-    """The images that a CSV lists, and whether it states their exposures.
-
-    Raises
-    ------
-    FormatError
-        If it has no column of times, or a line cannot be read.
-    """
-    lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
-    if not lines or "\0" in text:
-        raise FormatError(f"{path}: is empty, or no text; {_WANTED} is needed")
-    separator = next((c for c in ",;\t" if c in lines[0][1]), ",")
-    header = [name.strip() for name in next(csv.reader([lines[0][1].lstrip("# ")], delimiter=separator))]
-    time, exposure = find_time(header, FIELD_NAMES["t"]), find_time(header, _EXPOSURE)
-    name = find_name(header, _FILE)
-    if time is None:
-        raise FormatError(f"{path}: has the columns {', '.join(header)[:80]}; {_WANTED} is needed")
-    rows = []
-    for number, line in lines[1:]:
-        if line.lstrip().startswith("#"):
-            continue
-        fields = next(csv.reader([line], delimiter=separator, skipinitialspace=True))
-        if len(fields) != len(header):
-            raise FormatError(
-                f"{path}: line {number}: {line[:60]!r} has {len(fields)} columns, not {len(header)}"
-            )
-        rows.append((number, dict(zip(header, fields, strict=True))))
-    files = images_in(path.parent) if name is None else [path.parent / row[name].strip() for _, row in rows]
-    if len(files) != len(rows):
-        raise FormatError(
-            f"{path}: lists {len(rows)} times, but there are {len(files)} images beside it; add a column file"
-        )
-    listed = []
-    for (number, row), file in zip(rows, files, strict=True):
-        stamp = _microseconds(path, number, row[time[0]], time[1])
-        length = 0 if exposure is None else _microseconds(path, number, row[exposure[0]], exposure[1])
-        listed.append(Listed(file, stamp, stamp + length))
-    return listed, exposure is not None
-
-
-def _read_ijrr(path: Path, text: str) -> tuple[list[Listed], bool]:
-    listed = []
-    for number, line in enumerate(text.splitlines(), 1):
-        fields = line.split(maxsplit=1)
-        if not fields or fields[0].startswith("#"):
-            continue
-        if len(fields) != 2:
-            raise FormatError(f"{path}: line {number}: {line[:60]!r} is not 't file' with t in seconds")
-        stamp = _microseconds(path, number, fields[0], "s")
-        listed.append(Listed(path.parent / fields[1].strip(), stamp, stamp))
-    return listed, False
-
-
-def _microseconds(path: Path, number: int, text: str, unit: str | None) -> int:
-    """A time, rounded to the nearest microsecond from its digits."""
-    text = text.strip()
-    if not _NUMBER.fullmatch(text):
-        raise FormatError(f"{path}: line {number}: {text[:40]!r} is not a plain number that can be a time")
-    if unit is None and "." in text:
-        raise FormatError(
-            f"{path}: line {number}: {text[:40]!r} has decimals, but no unit; name it in the column, as timestamp_s"
-        )
-    return int((Decimal(text) * _PER_UNIT[unit or "us"]).to_integral_value(ROUND_HALF_UP))
 
 
 def _load(frames: Path, file: Path, colour: bool) -> NDArray[Any]:
@@ -312,7 +231,7 @@ def _pictures(path: Path, *, colour: bool) -> Iterator[NDArray[Any]]:
 
     with reading(path, av.FFmpegError, ValueError, IndexError), av.open(str(path)) as container:
         if not container.streams.video:
-            raise FormatError(f"{path}: neither an image folder nor a video; {_WANTED}, or a video is needed")
+            raise FormatError(f"{path}: neither an image folder nor a video; {WANTED}, or a video is needed")
         stream = container.streams.video[0]
         count = 0
         for picture in container.decode(stream):

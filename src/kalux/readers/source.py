@@ -160,4 +160,9 @@ def reading(path: Path, *damage: type[Exception]) -> Iterator[None]:
 
 
 def _damaged(path: Path, error: Exception) -> FormatError:
+    if isinstance(error, MemoryError):  # a damaged size, or a limit such as of `ulimit -v`
+        return FormatError(
+            f"{path}: needs more memory than there is ({one_line(error)}); allow more, or, if it should need little, "
+            "copy or download it again"
+        )
     return FormatError(f"{path}: damaged or incomplete ({one_line(error)}); copy or download it again")

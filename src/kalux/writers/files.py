@@ -182,6 +182,25 @@ def write_whole(path: Path, data: bytes) -> None:
         file.write(data)
 
 
+def write_within(path: Path, data: bytes) -> None:
+    """As `write_whole`, in a folder that the writer has claimed: the file needs no lock of its own, which takes as long
+    as all else but the data.
+
+    Raises
+    ------
+    OSError
+        As of the operating system; the temporary file is removed.
+    """
+    temporary = temporary_path(path)
+    try:
+        with open(temporary, "wb") as file:
+            file.write(data)
+        os.replace(temporary, path)
+    except BaseException:
+        remove_quietly(temporary)
+        raise
+
+
 def save(path: Path, content: bytes | str) -> None:
     """As `write_whole`, of bytes or of text.
 

@@ -14,7 +14,7 @@ from kalux.ahead import InOrder
 from kalux.display import ToneState
 from kalux.errors import OutputError
 from kalux.writers.base import ImageLike, Writer
-from kalux.writers.files import Claim, output_errors, remove_quietly, write_whole
+from kalux.writers.files import Claim, output_errors, remove_quietly, write_within
 from kalux.writers.images import Encode
 from kalux.writers.settings_file import SettingsFile, require_ours
 
@@ -68,7 +68,7 @@ class FolderWriter(Writer):
                 prepare_folder(path, overwrite=overwrite)
                 settings.write(complete=False, images=0, times=None)
                 self._told = time.monotonic()
-                write_whole(path / LISTING, f"{HEADER}\n".encode())
+                write_within(path / LISTING, f"{HEADER}\n".encode())
                 self._listing = FileIO(path / LISTING, "a")
             except BaseException:
                 self._claim.release()
@@ -97,7 +97,7 @@ class FolderWriter(Writer):
                 raise OutputError(
                     f"{file}: there already, and not an output of kalux; move it or write to another folder"
                 )
-            write_whole(file, image.data)
+            write_within(file, image.data)
             try:
                 append_line(self._listing, f"{self._images},{image.t},{name}\n")
             except BaseException:

@@ -7,20 +7,17 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kalux.display import (
     DisplaySettings,
     ToneState,
-    apply,
     colour_of,
     next_state,
+    quantised,
     shown_of,
-    to_uint8,
-    to_uint16,
 )
 from kalux.writers.base import ImageLike
 from kalux.writers.exr import exr_file
@@ -35,14 +32,12 @@ Encode = Callable[[ImageLike, ToneState | None], tuple[Bytes, ToneState | None]]
 
 def encode_png(display: DisplaySettings, bits: Literal[8, 16]) -> Encode:
     """PNGs of the display-mapped intensity or colour, 0 to 1 as 0 to 65535 (or 255), rounded to nearest."""
-    quantise: Callable[[NDArray[Any]], NDArray[Any]] = to_uint16 if bits == 16 else to_uint8
+    kind = np.uint16 if bits == 16 else np.uint8
 
     def encode(image: ImageLike, state: ToneState | None) -> tuple[Bytes, ToneState | None]:
         following = next_state(image, display, state, checked=True)
         shown = shown_of(image)
-        return lambda: png_bytes(
-            quantise(apply(shown, display, following.statistics, checked=True))
-        ), following
+        return lambda: png_bytes(quantised(shown, display, following.statistics, kind)), following
 
     return encode
 

@@ -7,9 +7,9 @@ import datetime
 import enum
 import importlib.metadata
 import platform
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path, PurePath
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import tomli_w
@@ -20,6 +20,9 @@ from kalux.writers.files import utf8, write_whole
 FIRST_LINE = (
     "# Written by kalux: the settings of this output. complete = false: it was interrupted or failed."
 )
+_PACKAGES: Final = ("kalux", "numpy", "opencv-python-headless", "av", "isal")
+"""With which outputs are written."""
+
 RESERVED = ("complete", "images", "first_t_us", "last_t_us", "output")
 
 
@@ -74,7 +77,8 @@ def settings_file(path: Path, metadata: Mapping[str, Any], output: Mapping[str, 
     if taken:
         raise SettingsError(f"metadata: {taken[0]!r} is set by the writer itself; choose another name")
     given = {name: value for name, value in metadata.items() if name != "versions"}
-    tables = {**given, "output": output, "versions": {**versions(), **metadata.get("versions", {})}}
+    used = {**versions(_PACKAGES), **metadata.get("versions", {})}
+    tables = {**given, "output": output, "versions": used}
     return SettingsFile(path, tomli_w.dumps(plain(tables, "metadata")))
 
 
@@ -99,11 +103,9 @@ def require_ours(path: Path) -> None:
         )
 
 
-def versions() -> dict[str, str]:
-    """The versions of kalux, Python and the libraries that writing uses."""
-    packages = {"kalux": "kalux", "numpy": "numpy", "opencv": "opencv-python-headless", "av": "av"}
-    found = {name: _version(package) for name, package in {**packages, "isal": "isal"}.items()}
-    return {"python": platform.python_version(), **{n: v for n, v in found.items() if v}}
+def versions(packages: Iterable[str]) -> dict[str, str]:
+    """The versions of Python and of packages, or that they are not installed."""
+    return {"python": platform.python_version(), **{package: _version(package) for package in packages}}
 
 
 def plain(value: Any, where: str) -> Any:
@@ -132,8 +134,8 @@ def plain(value: Any, where: str) -> Any:
     raise SettingsError(f"{where}: {value!r} cannot be written to a settings file")
 
 
-def _version(package: str) -> str | None:
+def _version(package: str) -> str:
     try:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
-        return None
+        return "not installed"

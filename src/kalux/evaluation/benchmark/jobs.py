@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import importlib.metadata
 import json
-import platform
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -31,6 +29,7 @@ from kalux.evaluation.truth import find_truth, prepare_reference, truth_pairs
 from kalux.models.camera import Camera, Response
 from kalux.recording import Recording
 from kalux.settings import chosen_response, to_dict
+from kalux.writers.settings_file import versions
 
 LAYOUT: Final = 3
 """Of the files of jobs; part of every key, so that others are not taken for one's own."""
@@ -243,7 +242,7 @@ def _run(job: Job) -> Finished:
         "calibration": scores.calibration,
         "camera": camera_curves(recording, method),
         "seconds": {"images": clock.seconds, "all": time.perf_counter() - started},
-        "versions": versions(),
+        "versions": {"kalux": kalux.__version__, **versions(_LIBRARIES)},
     }
     inputs = comparison.given
     return Finished(
@@ -286,17 +285,6 @@ def _scored(scores: Scores) -> dict[str, Any]:
         "means": scores.means(),
         "per_image": [dataclasses.asdict(image) for image in scores.images],
     }
-
-
-def versions() -> dict[str, str]:
-    """Of Python, kalux, and the libraries that numbers can depend on."""
-    found = {"python": platform.python_version(), "kalux": kalux.__version__}
-    for name in _LIBRARIES:
-        try:
-            found[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            found[name] = "not installed"
-    return found
 
 
 # What is compared with what.

@@ -1,0 +1,105 @@
+"""Lists of images with their times: a CSV with a line per image, or the ``images.txt`` of the IJRR layout."""
+
+from __future__ import annotations
+
+import csv
+import re
+import zipfile
+from collections.abc import Iterator
+from decimal import ROUND_HALF_UP, Decimal
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from kalux.errors import FormatError
+from kalux.events import FIELD_NAMES, LATEST
+from kalux.readers.columns import find_name, find_time
+from kalux.readers.images import images_in
+
+_EXPOSURE: Final = ("exposure", "exposure_time")
+_FILE: Final = ("file", "filename", "file_name", "image", "name", "path")
+_NUMBER: Final = re.compile(r"\d{1,18}(\.\d*)?|\.\d+")
+_PER_UNIT: Final = {"s": Decimal(10**6), "ms": Decimal(1000), "us": Decimal(1), "ns": Decimal("0.001")}
+
+WANTED: Final = (
+    "a CSV named frames.csv with a line per image and the columns timestamp_us, perhaps exposure_us and file, or the "
+    "images.txt of the IJRR layout"
+)
+"""What a list of images may be, for messages."""
+
+
+class Listed(NamedTuple):
+    """An image file and its exposure, us; start and end are both the stamp where that is all that is known."""
+
+    file: Path
+    start: int
+    end: int
+
+
+def read_csv(path: Path, text: str) -> tuple[list[Listed], bool]:
+    """The images that a CSV lists, and whether it states their exposures.
+
+    Raises
+    ------
+    FormatError
+        If it has no column of times, or a line cannot be read.
+    """
+    lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
+    if not lines or "\0" in text:
+        raise FormatError(f"{path}: is empty, or no text; {WANTED} is needed")
+    separator = next((c for c in ",;\t" if c in lines[0][1]), ",")
+    header = [name.strip() for name in next(csv.reader([lines[0][1].lstrip("# ")], delimiter=separator))]
+    time, exposure = find_time(header, FIELD_NAMES["t"]), find_time(header, _EXPOSURE)
+    name = find_name(header, _FILE)
+    if time is None:
+        raise FormatError(f"{path}: has the columns {', '.join(header)[:80]}; {WANTED} is needed")
+    rows = []
+    for number, line in lines[1:]:
+        if line.lstrip().startswith("#"):
+            continue
+        fields = next(csv.reader([line], delimiter=separator, skipinitialspace=True))
+        if len(fields) != len(header):
+            raise FormatError(
+                f"{path}: line {number}: {line[:60]!r} has {len(fields)} columns, not {len(header)}"
+            )
+        rows.append((number, dict(zip(header, fields, strict=True))))
+    files = images_in(path.parent) if name is None else [path.parent / row[name].strip() for _, row in rows]
+    if len(files) != len(rows):
+        raise FormatError(
+            f"{path}: lists {len(rows)} times, but there are {len(files)} images beside it; add a column file"
+        )
+    listed = []
+    for (number, row), file in zip(rows, files, strict=True):
+        stamp = _microseconds(path, number, row[time[0]], time[1])
+        length = 0 if exposure is None else _microseconds(path, number, row[exposure[0]], exposure[1])
+        listed.append(Listed(file, stamp, stamp + length))
+    return listed, exposure is not None
+
+
+def read_ijrr(path: Path | zipfile.Path, text: str) -> Iterator[tuple[int, str]]:
+    """The times, us, and names of the images of an ``images.txt``: a line ``t file`` for each, t in seconds.
+
+    Raises
+    ------
+    FormatError
+        If a line cannot be read.
+    """
+    for number, line in enumerate(text.splitlines(), 1):
+        fields = line.split(maxsplit=1)
+        if not fields or fields[0].startswith("#"):
+            continue
+        if len(fields) != 2:
+            raise FormatError(f"{path}: line {number}: {line[:60]!r} is not 't file' with t in seconds")
+        yield _microseconds(path, number, fields[0], "s"), fields[1].strip()
+
+
+def _microseconds(path: Path | zipfile.Path, number: int, text: str, unit: str | None) -> int:
+    """A time, rounded to the nearest microsecond from its digits."""
+    text = text.strip()
+    time = Decimal(text) * _PER_UNIT[unit or "us"] if _NUMBER.fullmatch(text) else None
+    if time is None or time >= LATEST:
+        raise FormatError(f"{path}: line {number}: {text[:40]!r} is not a plain number that can be a time")
+    if unit is None and "." in text:
+        raise FormatError(
+            f"{path}: line {number}: {text[:40]!r} has decimals, but no unit; name it in the column, as timestamp_s"
+        )
+    return int(time.to_integral_value(ROUND_HALF_UP))
