@@ -64,6 +64,11 @@ def test_a_recording_without_exposures_is_described(cli, damaged):
     assert found.out.splitlines()[-1].endswith("give --exposure")
 
 
+def test_exposures_that_are_replaced_are_told(cli, recording):
+    found = cli("info", recording, "--no-estimate", "--exposure", 3000)
+    assert (found.code, "--exposure 3000 replaces them" in found.err) == (0, True)
+
+
 def test_exposures_can_be_given(cli, damaged):
     found = cli("info", damaged("no exposure times"), "--exposure", 8000, "--stamp", "middle")
     assert found.code == 0
