@@ -510,8 +510,22 @@ def is_moving(pixel, t):
         since = max(middles[k] - round(seconds), first)
     if k + 1 < len(middles):
         until = middles[k + 1]
-    unmeasured = not any(pixel.measured[max(k, 0) : k + 2])
-    return unmeasured or any(since < q <= until for q, *_ in pixel.events)
+    return is_unmeasured(pixel, t) or any(since < q <= until for q, *_ in pixel.events)
+
+
+def is_unmeasured(pixel, t):
+    """Whether neither frame around measures the pixel."""
+    k = sum(m < t for m in pixel.middles) - 1
+    return not any(pixel.measured[max(k, 0) : k + 2])
+
+
+def kept_white(value, pixel, t, white, offset):
+    """K12: the least intensity of a pixel that the frames around clip, given its L."""
+    top = np.log(white + offset)
+    if value <= top - 1 or not is_unmeasured(pixel, t):
+        return 0.0
+    below = max(top - value, 0.0)
+    return np.exp(top - below - below**2 / 0.1) - offset
 
 
 def silent_change(pixels, place, interval, c2):

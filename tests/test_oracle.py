@@ -111,6 +111,10 @@ def test_engine_agrees_with_the_oracle(name, data):
             value, np.where(unshown, noise, total)
         )
         offset = chosen.camera.offset
+        if name.startswith("default"):
+            for place, pixel in pixels.items():
+                least = naive.kept_white(expected[i][place], pixel, t, white, offset)
+                level[place] = max(level[place], least)
         np.testing.assert_allclose(np.log(image.intensity + offset), np.log(level + offset), atol=1e-4)
         if name != "cf":
             np.testing.assert_allclose(image.variance, given, rtol=1e-4)
