@@ -330,8 +330,9 @@ def bridged(pixel, settings, times, on, off, scales):
         pixel.measured.append(second[1] < UNMEASURED)
         a, b = pixel.middles[k], pixel.middles[k + 1]
         n_on, n_off = counts(a, b)
-        mismatch = second[0] - first[0] - (on * scale_on * n_on - off * scale_off * n_off) - grown(k + 1, b)
         saturated = first[1] >= UNMEASURED and second[1] >= UNMEASURED and settings.filter.highlight_scale > 0
+        mismatch = 0.0 if saturated else second[0] - first[0]
+        mismatch -= on * scale_on * n_on - off * scale_off * n_off + grown(k + 1, b)
         total = 2 * settings.filter.highlight_scale**2 if saturated else first[1] + second[1]
         total += var_on * (on * n_on) ** 2 + var_off * (off * n_off) ** 2
         total += ev.step_noise * c2 * (n_on + n_off) + ev.quantisation_variance * c2
@@ -390,7 +391,8 @@ def bridged(pixel, settings, times, on, off, scales):
         if right is None:
             return prior
         (t_on, t_off), (n_on, n_off) = counts(a, known_until), counts(a, b)
-        shared = left[1] + v_on * on**2 * t_on * n_on + v_off * off**2 * t_off * n_off
+        shared = left[1] if min(left[1], right[1]) < UNMEASURED else 0.0  # two bounds measure nothing
+        shared += v_on * on**2 * t_on * n_on + v_off * off**2 * t_off * n_off
         shared += ev.step_noise * c2 * (t_on + t_off) + ev.quantisation_variance * c2 * (t - a) / (b - a)
         return prior + shared * gain
 

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from kalux.augmentation.bridge import (
     UNMEASURED,
+    UNSEEN,
     BridgeNoise,
     Latent,
     Thresholds,
@@ -252,3 +253,26 @@ def test_the_learned_variance_tells_the_error():
         _, thresholds = bridge(latent(none, 1e-3), second, on, none, thresholds, noise, START, END)
     z2 = (thresholds.on - true_on) ** 2 / thresholds.on_variance
     assert 0.85 < z2.mean() < 1.15
+
+
+def test_thresholds_of_saturated_pixels_let_their_events_cancel():
+    """A pixel that goes up and down above white for ten frames: its events bring it back after they are learned."""
+    saturated, none = latent(0.0, UNMEASURED), nominal_thresholds((1, 1), 0.1)
+    noise = NOISE._replace(saturated_variance=8.0)
+    on, off = counts(40.0), counts(66.0)  # 12 and 13.2 of nominal thresholds
+    thresholds, drifts = none, []
+    for _ in range(10):
+        segment, thresholds = join(saturated, saturated, on, off, thresholds, noise)
+        drifts.append(abs(float((segment.step_on * on - segment.step_off * off)[0, 0])))
+        assert segment.augmented[0, 0] == 0.0
+    assert drifts[0] < 1.2
+    assert drifts[-1] < 0.4
+    # One frame that says nothing of the pixel, or a prior that is turned off, teach nothing.
+    masked = latent(0.0, UNSEEN)
+    for first, second, chosen in (
+        (masked, saturated, noise),
+        (saturated, masked, noise),
+        (saturated,) * 2 + (NOISE,),
+    ):
+        _, learned = join(first, second, on, off, none, chosen)
+        assert learned.on[0, 0] == pytest.approx(1.0, abs=1e-6)

@@ -344,7 +344,6 @@ def _bridge(  # type: ignore[no-untyped-def]
             told[column] = np.float64(next_value[row, column]) - np.float64(grown[row, column])
         for column in range(width):
             i = row, column
-            # Both frames are bounds: all that they say of the change is that it hardly goes on and on.
             saturated = (
                 min(variance[i], next_variance[i]) >= UNMEASURED
                 and max(variance[i], next_variance[i]) < UNSEEN
@@ -353,6 +352,9 @@ def _bridge(  # type: ignore[no-untyped-def]
             scale_on, scale_off = np.float64(thresholds.on[i]), np.float64(thresholds.off[i])
             nominal_on, nominal_off = noise.threshold_on * scale_on, noise.threshold_off * scale_off
             change = told[column] - np.float64(value[i])
+            both = np.float64(variance[i]) + np.float64(next_variance[i])
+            if saturated:  # two bounds: all that they say of the change is that it does not go on and on
+                change, both = -np.float64(grown[i]), noise.saturated_variance
             mismatch = change - (nominal_on * n_on - nominal_off * n_off)
             on_variance, off_variance = (
                 np.float64(thresholds.on_variance[i]),
@@ -360,9 +362,6 @@ def _bridge(  # type: ignore[no-untyped-def]
             )
             on_covariance = on_variance * noise.threshold_on * n_on
             off_covariance = -off_variance * noise.threshold_off * n_off
-            both = np.float64(variance[i]) + np.float64(next_variance[i])
-            if saturated:
-                both = noise.saturated_variance
             total = (
                 both
                 + on_covariance * noise.threshold_on * n_on

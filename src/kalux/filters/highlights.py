@@ -22,6 +22,9 @@ _ABOUT_WHITE: Final = np.float32(0.1)
 """How far below white, log intensity, pixels lie whom neighbours may take as far again: the least threshold of sensors.
 Those that frames have lifted lie up to 0.05 below it until the next frame."""
 
+_BLOCK: Final = 64
+"""Pixels that are looked at together."""
+
 _LEAST_SPREAD: Final = np.float32(0.3)
 """Standard deviation that is left where pixels around say that all lie just above their bounds."""
 
@@ -104,11 +107,20 @@ def keep_white(
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _keep(log_intensity, first, second, white, log_offset, image):  # type: ignore[no-untyped-def]
-    for i in range(len(image)):
-        level = np.float32(log_intensity[i])
-        if level > white - ONE and first[i] >= UNMEASURED and second[i] >= UNMEASURED:
-            below = max(white - level, np.float32(0.0))
-            image[i] = max(image[i], exponential(white - below - below * below / _ABOUT_WHITE) - log_offset)
+    unmeasured, size = np.float32(UNMEASURED), np.uint64(len(image))
+    for start in range(np.uint64(0), size, np.uint64(_BLOCK)):
+        pixels = range(start, min(size, start + np.uint64(_BLOCK)))
+        clipped = np.int32(0)
+        for i in pixels:  # vector code; of most of an image there is no more to do
+            clipped += np.int32(first[i] >= unmeasured)
+        if clipped == 0:
+            continue
+        for i in pixels:
+            level = np.float32(log_intensity[i])
+            if level > white - ONE and min(first[i], second[i]) >= unmeasured:
+                below = max(white - level, np.float32(0.0))
+                least = exponential(white - below - below * below / _ABOUT_WHITE) - log_offset
+                image[i] = max(image[i], least)
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
