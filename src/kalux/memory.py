@@ -1,9 +1,7 @@
 """Large arrays whose memory is used again: fresh pages cost about as much as filling them.
 
 The engine makes and drops the same planes frame after frame. Whether the system's allocator keeps such memory depends
-on the system, the thread, and what else it holds at that moment. Pieces of memory lie next to each other in stretches
-that the system can give in large pages: loops over events, which look at pixels all over the sensor, then need a few
-entries of the processor's table of pages rather than thousands, and take a twentieth to a seventh less time.
+on the system, the thread, and what else it holds at that moment.
 """
 
 from __future__ import annotations
@@ -22,13 +20,6 @@ from numpy.typing import NDArray
 PAGE: Final = 4096
 """Bytes of a page of memory: all arrays begin with one."""
 
-_LARGE_PAGE: Final = 1 << 21
-"""Bytes of a large page of common processors. NumPy asks Linux for such in arrays of 4 MB and more; where there are
-none, all is as it would be without."""
-
-_STRETCH: Final = 1 << 24
-"""Bytes that are asked of the system at a time, or more where a piece is larger."""
-
 _SMALL: Final = 1 << 16
 """Bytes below which the usual allocator is as good."""
 
@@ -44,7 +35,6 @@ class _Free:
         # A thread may take it twice: Python may collect an array, whose memory then comes back, at any moment.
         self._lock = threading.RLock()
         self._pieces: dict[int, list[NDArray[np.uint8]]] = {}
-        self._rest = np.empty(0, np.uint8)  # of the newest stretch
         self.total = 0
 
     def take(self, least: int) -> NDArray[np.uint8]:
@@ -56,10 +46,7 @@ class _Free:
             if pieces:
                 self.total -= size
                 return pieces.pop()
-            if len(self._rest) < size:
-                self._rest = _fresh(max(size, _STRETCH), _LARGE_PAGE)
-            piece, self._rest = self._rest[:size], self._rest[size:]
-            return piece
+        return _fresh(size)
 
     def give(self, piece: NDArray[np.uint8], most: int = MOST_FREE) -> None:
         """``most`` is no name of the module's: when Python ends, arrays come back after those are gone."""
@@ -72,10 +59,10 @@ class _Free:
                 self.total += piece.size
 
 
-def _fresh(size: int, page: int) -> NDArray[np.uint8]:
-    """Memory that begins with a page of so many bytes."""
-    piece = np.empty(size + page, np.uint8)
-    first = -piece.ctypes.data % page
+def _fresh(size: int) -> NDArray[np.uint8]:
+    """Memory that begins with a page."""
+    piece = np.empty(size + PAGE, np.uint8)
+    first = -piece.ctypes.data % PAGE
     return piece[first : first + size]
 
 
@@ -107,7 +94,7 @@ def empty(shape: tuple[int, ...], dtype: Any = np.float32) -> NDArray[Any]:
     size = math.prod(shape) * kind.itemsize
     lent: Any
     if size < _SMALL:
-        lent = _fresh(size, PAGE)
+        lent = _fresh(size)
     else:
         piece = _free.take(size)
         lent = _lent_bytes(len(piece)).from_buffer(piece)
