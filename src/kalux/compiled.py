@@ -354,6 +354,15 @@ _LOG: Final = tuple(
 _SQRT_HALF_BITS: Final = np.int32(0x3F3504F3)
 
 
+@nb.njit(cache=True, inline="always")
+def any_from(values, places, least):  # type: ignore[no-untyped-def]
+    """Whether a value at one of the places is ``least`` or more; counted, which is vector code."""
+    count = np.int32(0)
+    for i in places:
+        count += np.int32(values[i] >= least)
+    return count > 0
+
+
 @nb.njit(cache=True, inline="always", error_model="numpy")
 def exponential(x):  # type: ignore[no-untyped-def]
     """e^x in float32, to 2e-7 of itself; x is taken into [-87, 88]."""

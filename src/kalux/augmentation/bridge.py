@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.trail import Trail
-from kalux.compiled import apart
+from kalux.compiled import any_from, apart
 
 Array = NDArray[np.floating[Any]]
 
@@ -218,7 +218,7 @@ def _drift(  # type: ignore[no-untyped-def]
     drifted = np.empty(_BLOCK, np.float32)
     for first in range(np.uint64(0), np.uint64(len(grown)), np.uint64(_BLOCK)):
         pixels = range(first, min(np.uint64(len(grown)), first + np.uint64(_BLOCK)))
-        if not _any_from(after, pixels, unmeasured):
+        if not any_from(after, pixels, unmeasured):
             for i in pixels:  # few arrays a loop: vector code
                 grown[i] = zero
             for i in pixels:
@@ -237,15 +237,6 @@ def _drift(  # type: ignore[no-untyped-def]
             new_on[i] = far_on[i] + on[i] if after[i] >= unmeasured else zero
         for i in pixels:
             new_off[i] = far_off[i] + off[i] if after[i] >= unmeasured else zero
-
-
-@nb.njit(cache=True, inline="always")
-def _any_from(values, places, least):  # type: ignore[no-untyped-def]
-    """Whether a value at one of the places is ``least`` or more; counted, which is vector code."""
-    count = np.int32(0)
-    for i in places:
-        count += np.int32(values[i] >= least)
-    return count > 0
 
 
 def lift(log_intensity: Array, frame: Latent) -> None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from kalux.augmentation.bridge import UNMEASURED
 from kalux.augmentation.highlights import Unshown
-from kalux.compiled import ONE, exponential
+from kalux.compiled import ONE, any_from, exponential
 from kalux.filters.readout import HighlightPrior, believed_highlight
 
 Floats = NDArray[np.floating[Any]]
@@ -110,10 +110,7 @@ def _keep(log_intensity, first, second, white, log_offset, image):  # type: igno
     unmeasured, size = np.float32(UNMEASURED), np.uint64(len(image))
     for start in range(np.uint64(0), size, np.uint64(_BLOCK)):
         pixels = range(start, min(size, start + np.uint64(_BLOCK)))
-        clipped = np.int32(0)
-        for i in pixels:  # vector code; of most of an image there is no more to do
-            clipped += np.int32(first[i] >= unmeasured)
-        if clipped == 0:
+        if not any_from(first, pixels, unmeasured):  # as in most of an image
             continue
         for i in pixels:
             level = np.float32(log_intensity[i])

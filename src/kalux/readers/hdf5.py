@@ -85,7 +85,9 @@ def read(path: Path) -> Source:
 
 def _sensor_size(path: Path, value: Any) -> tuple[int, int]:
     sides = np.ravel(value).tolist()
-    if len(sides) != 2 or not all(isinstance(side, (int, float)) and side == side // 1 for side in sides):
+    if len(sides) != 2 or not all(
+        isinstance(side, (int, float)) and float(side).is_integer() for side in sides
+    ):
         raise FormatError(
             f"{path}: states the sensor size {sides}; whole numbers, height and width, are needed"
         )

@@ -96,17 +96,20 @@ def _joint_size(source: Source, frames: Path, joined: Source) -> tuple[int, int]
     if size == (height, width):
         return size
     if not source.sensor_size_known:
-        if (
-            size[0] < height or size[1] < width
-        ):  # of DSEC's layout what was assumed may be more than the events need
+        if not _holds(size, (height, width)):
+            # What was assumed, as of DSEC's layout, may be more than the events need.
             height, width = smallest_size(source.path, source.events())
-        if size[0] >= height and size[1] >= width:
+        if _holds(size, (height, width)):
             return size
     needed = "is" if source.sensor_size_known else "is at least"
     raise FrameError(
         f"{frames}: its frames have {size[1]}x{size[0]} pixels, but the sensor of {source.path} {needed} "
         f"{width}x{height}; resize, crop or warp them to the events' pixels first"
     )
+
+
+def _holds(size: tuple[int, int], least: tuple[int, int]) -> bool:
+    return size[0] >= least[0] and size[1] >= least[1]
 
 
 def _frames_only(place: Path, format: str, **found: Any) -> Source:
