@@ -56,8 +56,11 @@ class CameraSettings:
         Smallest f^w, which caps R_bar. 0.09 is the released code's; for augmentation "paper" only, since
         the other gives clipped pixels no weight at all.
     saturation
-        Response, 0 to 1, from which a pixel counts as clipped. 0.98: a few levels below 255, for sensors with
-        fixed pattern noise at the top.
+        Response, 0 to 1, from which a pixel counts as clipped. None: where the recording's frames all end at one level
+        while events go on (`kalux.calibration.levels`), else the usual one.
+    usual_saturation
+        The same where the recording does not tell it; of frames that end lower, the share of their end. 0.98: a few
+        levels below 255, for sensors with fixed pattern noise at the top.
     reference_exposure
         Exposure time, us, at which a saturated pixel has intensity 1; None: the recording's median.
     white_balance
@@ -73,7 +76,8 @@ class CameraSettings:
     usual_frame_noise: float = 0.006
     confidence: float = 7e5
     weight_floor: float = 0.09
-    saturation: float = 0.98
+    saturation: float | None = None
+    usual_saturation: float = 0.98
     reference_exposure: int | None = None
     white_balance: str = "as-recorded"
 
@@ -87,6 +91,11 @@ class CameraSettings:
         """Frame noise and shot noise, also where nobody has said or estimated them."""
         read = self.usual_frame_noise if self.frame_noise is None else self.frame_noise
         return read, self.shot_noise or 0.0
+
+    @property
+    def clipped_from(self) -> float:
+        """Response from which a pixel counts as clipped, also where nobody has said or found it."""
+        return self.usual_saturation if self.saturation is None else self.saturation
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -400,6 +409,7 @@ _POSITIVE: Final = {
     "confidence",
     "weight_floor",
     "saturation",
+    "usual_saturation",
     "reference_exposure",
     "threshold_on",
     "threshold_off",
@@ -414,7 +424,7 @@ _LARGEST_WHOLE: Final = 10**18  # fits int64
 _LARGEST: Final = 1e10  # more than any value can mean, and its square is a number in single precision
 _LEAST: Final = 1e-12  # but 0: less than any value can mean, and so is its square
 _LARGEST_OF: Final[Mapping[str, float]] = {
-    **dict.fromkeys(("saturation", "weight_floor"), 1.0),
+    **dict.fromkeys(("saturation", "usual_saturation", "weight_floor"), 1.0),
     "log_offset": 1e3,  # of white: its logarithm is then the same as its radiance
     **dict.fromkeys(
         ("frame_noise", "usual_frame_noise", "shot_noise"), 10.0
