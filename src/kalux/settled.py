@@ -87,6 +87,8 @@ def _of_frames(recording: Recording, plan: Plan, asked: Settings) -> Iterator[tu
     stated = "usual, the recording does not state it" if recording.response is None else "as recorded"
     how = stated if asked.camera.response == AUTO else _GIVEN
     yield "response", f"{response_text(camera.response)} ({how})"
+    if recording.found_white is not None:
+        yield "white", f"{recording.found_white}, where the 16-bit frames end"
     if plan.ceiling is not None:
         how = f"frames end at {plan.ceiling.level:.2g}, {_going_on(plan.ceiling)}"
         yield "saturation", f"from {camera.clipped_from:.2g} of white ({how})"

@@ -114,7 +114,7 @@ def test_long_recordings_are_not_read_to_the_end(simulation, monkeypatch):
 
 
 def test_a_valley_that_is_found_late_is_looked_at_on_both_sides(monkeypatch):
-    """What is tried first is least at 6 ms, its rivals near no delay are less at -3 ms, and the valley goes on to -5."""
+    """What is tried first is least at 6 ms, what is tried for rivals at -3 ms, in a valley that goes on to -5."""
     grid = delays().tolist()
     valley = {-6_000: 0.9, -5_000: 0.3, -4_000: 0.4, -3_000: 0.5, 6_000: 0.8, 5_000: 0.85, 7_000: 0.85}
     monkeypatch.setattr(
