@@ -442,6 +442,8 @@ _LARGEST_OF: Final[Mapping[str, float]] = {
         ("step_variance", "usual_step_variance", "quantisation_variance", "deblur_variance"), 100.0
     ),  # c^2
     **dict.fromkeys(("highlight_tail", "unshown_tail"), 100.0),  # multiples of a log intensity
+    # us: pixels in the dark are late by tens of milliseconds, guessed stamps by an exposure, at most seconds.
+    **dict.fromkeys(("delay", "usual_delay", "refractory_period"), 10_000_000),
 }
 _LEAST_OF: Final[Mapping[str, float]] = {
     # The square of a frame's weight, 1 / noise^2, is still a number in single precision.
@@ -463,7 +465,7 @@ def _check(settings: Settings) -> None:
 
 
 def _check_value(label: str, name: str, value: Any, default: Any) -> None:
-    most = _LARGEST_WHOLE if name in _WHOLE else _LARGEST_OF.get(name, _LARGEST)
+    most = _LARGEST_OF.get(name, _LARGEST_WHOLE if name in _WHOLE else _LARGEST)
     least = _LEAST_OF.get(name, _LEAST)
     if name in _CHOICES:
         if value not in _CHOICES[name]:
@@ -479,7 +481,10 @@ def _check_value(label: str, name: str, value: Any, default: Any) -> None:
     elif name in _WHOLE and not (isinstance(value, int) and not isinstance(value, bool)):
         raise SettingsError(f"settings: {label} is {value!r}; whole microseconds are needed")
     elif isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= most:
-        raise SettingsError(f"settings: {label} is {value!r}; a finite number is needed, at most {most:g}")
+        hint = " us; kalux register brings clocks together that differ by more" if name in _SIGNED else ""
+        raise SettingsError(
+            f"settings: {label} is {value!r}; a finite number is needed, at most {most:g}{hint}"
+        )
     elif 0 < abs(value) < least:
         raise SettingsError(
             f"settings: {label} is {value!r}; {least:g} is the least above 0 that is possible"
