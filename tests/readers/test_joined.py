@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import av
 import cv2
 import numpy as np
 import pytest
 
 import kalux
+from kalux import readers
 from kalux.errors import ExposureError, FormatError, FrameError, InputError
 from kalux.frames import Frame
+from kalux.readers import joined
 from kalux.writers import hdf5
 from recordings import SIZE, damaged, same_frames, small_events, small_frames
 
@@ -66,6 +70,12 @@ def test_a_folder_with_exposures(events_only, tmp_path, kind):
     for _ in range(2):
         assert same_frames(rec.frames(), small_frames())
         assert np.array_equal(np.concatenate(list(rec.events())), EVENTS)
+
+
+def test_trigger_edges_of_the_events_are_kept(events_only, tmp_path):
+    source = dataclasses.replace(readers.read(events_only), triggers=lambda: iter(()))
+    folder = write_list(tmp_path / "images", *LISTS["exposures in us"])
+    assert joined.join(source, folder, start=None, rate_hz=None, replace=False).triggers is source.triggers
 
 
 def test_files_are_taken_in_the_order_of_the_list(events_only, tmp_path):

@@ -23,7 +23,16 @@ from numpy.typing import NDArray
 from kalux.errors import FormatError
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.frames import Frame, Mosaic
-from kalux.readers.source import SIZE_UNKNOWN, Source, begins_with, reading, smallest_size
+from kalux.readers.source import (
+    NO_EVENTS,
+    NO_FRAMES,
+    SIZE_UNKNOWN,
+    Source,
+    begins_with,
+    counted,
+    reading,
+    smallest_size,
+)
 from kalux.readers.streams import in_order, rechunk
 
 _MAGIC: Final = b"#!AER-DAT3."
@@ -46,8 +55,6 @@ _SIZES: Final = {
 }
 # The colour filters of libcaer's frame.h by its numbers, and what their names mean: the pixels of 2x2, by rows.
 _FILTERS: Final[dict[int, Mosaic]] = {1: "RGGB", 2: "GRBG", 3: "GBRG", 4: "BGGR"}
-_NO_EVENTS: Final = "The file has no events."
-_NO_FRAMES: Final = "The file has no frames."
 
 
 class _Damage(ValueError):
@@ -146,10 +153,6 @@ def read(path: Path) -> Source:
     source = choices[0]
 
     @cache
-    def count_events() -> int:
-        return sum(len(chunk) for chunk in packets.events(source))
-
-    @cache
     def count_frames() -> int:
         return sum(1 for _ in packets.frames(source))
 
@@ -163,10 +166,10 @@ def read(path: Path) -> Source:
         sensor_size=size or smallest_size(path, packets.events(source)),
         events=lambda: packets.events(source),
         frames=lambda: packets.frames(source),
-        count_events=count_events,
+        count_events=counted(lambda: packets.events(source)),
         count_frames=count_frames,
-        missing=(() if source in with_events else (_NO_EVENTS,))
-        + (() if first is not None else (_NO_FRAMES,))
+        missing=(() if source in with_events else (NO_EVENTS,))
+        + (() if first is not None else (NO_FRAMES,))
         + ((f"The file has {len(others) + 1} sources; only source {source} is read.",) if others else ())
         + (() if size else (SIZE_UNKNOWN,)),
         sensor_size_known=size is not None,

@@ -30,6 +30,7 @@ from kalux.layouts import AEDAT4_MAGIC, AEDAT4_PACKET, AEDAT4_PIXELS
 from kalux.readers.source import (
     CHUNK_EVENTS,
     EXPOSURE_UNKNOWN,
+    NO_FRAMES,
     TRIGGER_DTYPE,
     Source,
     TriggerArray,
@@ -134,7 +135,7 @@ def read(path: Path) -> Source:
     if events is None:
         missing += ("The file has no event stream.",)
     if frames is None:
-        missing += ("The file has no frames.",)
+        missing += (NO_FRAMES,)
 
     exposure_known = True
     first = None if frames is None else next(_stored_frames(container, frames), None)

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
-from functools import cache
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -22,7 +21,7 @@ from numpy.typing import NDArray
 
 from kalux.errors import FormatError
 from kalux.events import EVENT_DTYPE, EventArray
-from kalux.readers.source import CHUNK_EVENTS, Source, begins_with, reading
+from kalux.readers.source import CHUNK_EVENTS, Source, begins_with, counted, reading
 
 _SIGNATURE: Final = b"Event Stream"
 _TYPES: Final = {0: "generic", 1: "DVS", 2: "ATIS", 3: "display", 4: "colour"}
@@ -55,19 +54,12 @@ def read(path: Path) -> Source:
         If it cannot be read.
     """
     header = _read_header(path)
-
-    @cache
-    def count_events() -> int:
-        return sum(len(chunk) for chunk in _events(path, header))
-
     return Source(
         path=path,
         format="es",
         sensor_size=(header.height, header.width),
         events=lambda: _events(path, header),
-        frames=lambda: iter(()),
-        count_events=count_events,
-        count_frames=lambda: 0,
+        count_events=counted(lambda: _events(path, header)),
         missing=(
             "The format has no frames.",
             "Rows are counted from the bottom, as the authors' own tools do.",

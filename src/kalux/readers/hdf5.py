@@ -21,6 +21,8 @@ from kalux.readers.hdf5_layout import DAMAGE, SIGNATURE, check_dataset, common_l
 from kalux.readers.source import (
     CHUNK_EVENTS,
     EXPOSURE_UNKNOWN,
+    NO_EVENTS,
+    NO_FRAMES,
     Source,
     begins_with,
     checked_inverse_covariance,
@@ -72,9 +74,9 @@ def read(path: Path) -> Source:
         contrast_threshold = _thresholds(path, file.attrs.get("contrast_threshold"))
     missing: tuple[str, ...] = ()
     if not event_count:
-        missing += ("The file has no events.",)
+        missing += (NO_EVENTS,)
     if not frame_count:
-        missing += ("The file has no frames.",)
+        missing += (NO_FRAMES,)
     elif not exposure_known:
         missing += (EXPOSURE_UNKNOWN,)
     return Source(

@@ -9,7 +9,6 @@ from __future__ import annotations
 import zipfile
 import zlib
 from collections.abc import Iterator
-from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
@@ -29,6 +28,7 @@ from kalux.readers.source import (
     SIZE_UNKNOWN,
     Source,
     begins_with,
+    counted,
     reading,
     smallest_size,
 )
@@ -96,10 +96,6 @@ def read(path: Path) -> Source:
         sensor_size = smallest_size(path, _read_events(path))
         missing += (SIZE_UNKNOWN,)
 
-    @cache
-    def count_events() -> int:
-        return sum(len(chunk) for chunk in _read_events(path))
-
     def read_frames() -> Iterator[Frame]:
         place = _root_again(path)
         for stamp, name in images:
@@ -111,7 +107,7 @@ def read(path: Path) -> Source:
         sensor_size=sensor_size,
         events=lambda: _read_events(path),
         frames=read_frames,
-        count_events=count_events,
+        count_events=counted(lambda: _read_events(path)),
         count_frames=lambda: len(images),
         exposure_known=not images,
         missing=missing,

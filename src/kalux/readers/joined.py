@@ -75,6 +75,7 @@ def join(source: Source, frames: Path, *, start: int | None, rate_hz: float | No
         count_events=source.count_events,
         contrast_threshold=source.contrast_threshold,
         ground_truth=source.ground_truth,
+        triggers=source.triggers,
         missing=(
             *(text for text in kept if not (adopted and text.startswith(SIZE_NOT_STATED))),
             *joined.missing,

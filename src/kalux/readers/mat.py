@@ -24,7 +24,15 @@ from numpy.typing import NDArray
 from kalux.errors import EventError, FormatError
 from kalux.events import EventArray, make_events
 from kalux.frames import Frame, GroundTruth
-from kalux.readers.source import CHUNK_EVENTS, Source, begins_with, checked_inverse_covariance, reading
+from kalux.readers.source import (
+    CHUNK_EVENTS,
+    NO_EVENTS,
+    NO_FRAMES,
+    Source,
+    begins_with,
+    checked_inverse_covariance,
+    reading,
+)
 
 _MAGIC_5: Final = b"MATLAB 5.0 MAT-file"
 _MAGIC_73: Final = b"MATLAB 7.3 MAT-file"
@@ -77,7 +85,7 @@ def read(path: Path) -> Source:
     frame_count = _count_frames(path, shapes)
     starts, ends, missing = _exposures(path, variables, shapes, frame_count)
     if not event_count:
-        missing += ("The file has no events.",)
+        missing += (NO_EVENTS,)
 
     def read_frames() -> Iterator[Frame]:
         images = variables.images("image") if frame_count else iter(())
@@ -148,7 +156,7 @@ def _exposures(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], tuple[str, ...]]:
     """Start and end of each frame's exposure, us; and what is missing."""
     if not frame_count:
-        return np.empty(0, np.int64), np.empty(0, np.int64), ("The file has no frames.",)
+        return np.empty(0, np.int64), np.empty(0, np.int64), (NO_FRAMES,)
     if "time_image" not in shapes:
         raise FormatError(f"{path}: has no variable 'time_image', the middle of each frame's exposure in us")
     middles = _numbers(path, variables, "time_image")

@@ -56,9 +56,7 @@ def read(path: Path) -> Source:
         format="metavision hdf5",
         sensor_size=size or smallest_size(path, _read_events(path)),
         events=lambda: _read_events(path),
-        frames=lambda: iter(()),
         count_events=lambda: count,
-        count_frames=lambda: 0,
         missing=missing,
         sensor_size_known=size is not None,
     )

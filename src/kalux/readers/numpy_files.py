@@ -22,7 +22,15 @@ from numpy.lib import format as npy
 from kalux.errors import FormatError
 from kalux.events import EventArray
 from kalux.readers.columns import UNIT_ASSUMED, Columns, find_columns, join
-from kalux.readers.source import CHUNK_EVENTS, SIZE_UNKNOWN, Source, begins_with, reading, smallest_size
+from kalux.readers.source import (
+    CHUNK_EVENTS,
+    NO_FRAMES,
+    SIZE_UNKNOWN,
+    Source,
+    begins_with,
+    reading,
+    smallest_size,
+)
 
 _NPY: Final = b"\x93NUMPY"
 _ZIP: Final = b"PK\x03\x04"
@@ -104,9 +112,7 @@ def read(path: Path) -> Source:
         format="npy" if arrays[0].member is None else "npz",
         sensor_size=size or smallest_size(path, _events(path, layout)),
         events=lambda: _events(path, layout),
-        frames=lambda: iter(()),
         count_events=lambda: layout.length,
-        count_frames=lambda: 0,
         missing=missing,
         sensor_size_known=size is not None,
     )
@@ -187,7 +193,7 @@ def _about_frames(arrays: list[_Array]) -> str:
     """That no frames are read, and which arrays look as if they were."""
     images = [_described(array) for array in arrays if len(array.shape) in (3, 4)]
     if not images:
-        return "The file has no frames."
+        return NO_FRAMES
     return (
         f"The arrays of frames ({', '.join(images[:4])}) are not read, as nothing states their exposures; make the "
         "recording with kalux.Recording.from_arrays, or save images and join them with --frames."

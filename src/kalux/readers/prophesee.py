@@ -8,7 +8,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 from kalux.errors import FormatError
 from kalux.events import EventArray
 from kalux.readers import evt
-from kalux.readers.source import SIZE_UNKNOWN, Source, TriggerArray, reading, smallest_size
+from kalux.readers.source import SIZE_UNKNOWN, Source, TriggerArray, counted, reading, smallest_size
 
 _HEADER_BYTES: Final = 1 << 16
 _BLOCK_BYTES: Final = 1 << 19
@@ -169,19 +168,12 @@ def _source(path: Path, name: str, words: _Words, stated_size: tuple[int, int] |
     with reading(path):
         words.check()
     size = stated_size or smallest_size(path, words.events(_LARGEST))
-
-    @cache
-    def count_events() -> int:
-        return sum(len(chunk) for chunk in words.events(size))
-
     return Source(
         path=path,
         format=name,
         sensor_size=size,
         events=lambda: words.events(size),
-        frames=lambda: iter(()),
-        count_events=count_events,
-        count_frames=lambda: 0,
+        count_events=counted(lambda: words.events(size)),
         triggers=None if words.encoding is evt.DAT else lambda: words.triggers(size),
         missing=(_NO_FRAMES,) + (() if stated_size else (SIZE_UNKNOWN,)),
         sensor_size_known=stated_size is not None,

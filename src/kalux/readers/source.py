@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
@@ -42,11 +43,11 @@ class Source:
         (height, width), pixels.
     events
         Called for a fresh iterator over time-ordered, bounded chunks of `EVENT_DTYPE`.
-    frames
-        Called for a fresh iterator over frames. Where ``exposure_known`` is False, start and end of the
-        exposure both hold the frame's stamp.
     count_events, count_frames
         Number of events and frames; may read through the file.
+    frames
+        Called for a fresh iterator over frames; by default there are none. Where ``exposure_known`` is False, start and
+        end of the exposure both hold the frame's stamp.
     exposure_known
         Whether the recording stores the exposure times of its frames.
     contrast_threshold
@@ -72,9 +73,9 @@ class Source:
     format: str
     sensor_size: tuple[int, int]
     events: Callable[[], Iterator[EventArray]]
-    frames: Callable[[], Iterator[Frame]]
     count_events: Callable[[], int]
-    count_frames: Callable[[], int]
+    frames: Callable[[], Iterator[Frame]] = lambda: iter(())
+    count_frames: Callable[[], int] = lambda: 0
     exposure_known: bool = True
     contrast_threshold: tuple[float, float] | None = None
     inverse_covariance: NDArray[np.float64] | None = None
@@ -86,6 +87,8 @@ class Source:
     mosaic: Mosaic | None = None
 
 
+NO_EVENTS: Final = "The file has no events."
+NO_FRAMES: Final = "The file has no frames."
 EXPOSURE_UNKNOWN: Final = "The exposure times of the frames are not recorded."
 """For `Source.missing`, where `Source.exposure_known` is False."""
 
@@ -94,6 +97,11 @@ SIZE_NOT_STATED: Final = "The sensor size is not recorded; "
 
 SIZE_UNKNOWN: Final = SIZE_NOT_STATED + "the smallest that holds all events is taken."
 """For `Source.missing`, where the size comes from `smallest_size`."""
+
+
+def counted(events: Callable[[], Iterable[EventArray]]) -> Callable[[], int]:
+    """For `Source.count_events`: counts by reading through the chunks, once."""
+    return cache(lambda: sum(len(chunk) for chunk in events()))
 
 
 def smallest_size(path: Path, chunks: Iterable[EventArray]) -> tuple[int, int]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from functools import cache
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -31,7 +30,15 @@ from kalux.readers.characters import (
     skip_blanks,
 )
 from kalux.readers.columns import RENAME, UNIT_ASSUMED, Columns, find_columns
-from kalux.readers.source import CHUNK_EVENTS, SIZE_UNKNOWN, Source, reading, smallest_size
+from kalux.readers.source import (
+    CHUNK_EVENTS,
+    NO_FRAMES,
+    SIZE_UNKNOWN,
+    Source,
+    counted,
+    reading,
+    smallest_size,
+)
 
 # The shortest line, "0,0,0,0\n", has 8 bytes: a block holds at most CHUNK_EVENTS events.
 _BLOCK_BYTES: Final = 8 * CHUNK_EVENTS
@@ -78,21 +85,14 @@ def read(path: Path) -> Source:
     """
     with reading(path), path.open("rb") as file:
         header = _read_header(path, file.read(_LONGEST_LINE))
-
-    @cache
-    def count_events() -> int:
-        return sum(len(chunk) for chunk in _events(path, header))
-
     return Source(
         path=path,
         format="table",
         sensor_size=smallest_size(path, _events(path, header)),
         events=lambda: _events(path, header),
-        frames=lambda: iter(()),
-        count_events=count_events,
-        count_frames=lambda: 0,
+        count_events=counted(lambda: _events(path, header)),
         missing=(
-            "The file has no frames.",
+            NO_FRAMES,
             *(() if header.unit else (UNIT_ASSUMED,)),
             SIZE_UNKNOWN,
         ),
