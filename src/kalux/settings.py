@@ -34,8 +34,8 @@ class CameraSettings:
     Attributes
     ----------
     response
-        ``"linear"`` (raw sensor values: DAVIS, machine vision), ``"srgb"``, ``"gamma:EXPONENT"``, ``"s-curve:BLACK"``,
-        or a measured ``"curve:0 0.0012 ... 1"``: the irradiance at equally spaced response levels
+        ``"linear"`` (raw sensor values: DAVIS, machine vision), ``"srgb"``, ``"bt709"`` (video), ``"gamma:EXPONENT"``,
+        ``"s-curve:BLACK"``, or a measured ``"curve:0 0.0012 ... 1"``: the irradiance at equally spaced response levels
         (`kalux calibrate response`). Three with ";" between them are those of red, green and blue. ``"auto"``: what
         the recording states, else linear.
     log_offset
