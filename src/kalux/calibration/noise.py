@@ -117,7 +117,7 @@ class NoiseCalibration:
             measured["noise_at_half"] = self.frames.at_half
         if self.levels.saturation is not None:
             measured["white_level"] = self.levels.saturation
-            camera["saturation"] = min(self.levels.saturation, CameraSettings().saturation)
+            camera["saturation"] = min(self.levels.saturation, CameraSettings.usual_saturation)
         if self.levels.black is not None:
             measured["black_level"] = self.levels.black
         settings = {"camera": camera, "events": events}
