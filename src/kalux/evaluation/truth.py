@@ -173,8 +173,8 @@ def truth_pairs(recording: Recording, reference: Reference, method: Method) -> I
     """A method's images with the reference images, and with its variances where it has them.
 
     Images of a camera have noise, which counts as an error of theirs, and the recording's fixed pattern. Where a frame
-    of the recording has the same middle, it is that frame as the camera saw it (`kalux.datasets.ahdr`): pixels that this frame measures are the
-    reference itself, of which a variance says nothing.
+    of the recording has the same middle, it is that frame as the camera saw it (`kalux.datasets.ahdr`): pixels that
+    this frame measures are the reference itself, of which a variance says nothing.
     """
     given = _given(recording, reference)
     for i, made in enumerate(method.estimated(recording, reference.times)):
