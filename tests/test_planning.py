@@ -203,6 +203,26 @@ def test_a_scene_that_ends_below_white_does_not_saturate(picture):
     assert (paper.settings.camera.saturation, paper.ceiling) == (0.98, None)
 
 
+def test_the_fixed_pattern_comes_from_the_frames_and_can_be_given():
+    rng = np.random.default_rng(0)
+    ramp, offset = np.linspace(20, 150, 60), rng.normal(0, 2, (60, 80))
+    frames = [
+        Frame(
+            (np.roll(ramp, 9 * k)[:, None] + offset).round().astype(np.uint8), 50_000 * k, 50_000 * k + 1000
+        )
+        for k in range(10)
+    ]
+    source = Recording.from_arrays(np.empty(0, EVENT_DTYPE), frames, sensor_size=offset.shape)
+    made = plan(source, at="frames")
+    assert (
+        made.settings.camera.fixed_pattern == made.fixed_pattern.deviation == pytest.approx(2 / 255, rel=0.1)
+    )
+    none = altered(PRESETS["default"], "camera", fixed_pattern=0.0)
+    assert plan(source, at="frames", settings=none).settings.camera.fixed_pattern == 0
+    assert plan(recording(), at="frames").settings.camera.fixed_pattern == 0  # its pixels are too few to tell
+    assert plan(source, at="frames", preset="iccv2021").settings.camera.fixed_pattern is None
+
+
 def test_the_bright_tail_comes_from_the_frames_and_can_be_given():
     doubted = recording(0, None)
     made = plan(doubted, at="frames").settings

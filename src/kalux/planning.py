@@ -18,6 +18,7 @@ from kalux.calibration.contrast import (
 )
 from kalux.calibration.delay import DelayEstimate, estimate_delay
 from kalux.calibration.event_model import EventModel, estimate_event_model
+from kalux.calibration.fixed_pattern import FixedPattern, estimate_fixed_pattern
 from kalux.calibration.frame_noise import FrameNoise, estimate_frame_noise
 from kalux.calibration.levels import Ceiling, exact_end, find_ceiling
 from kalux.calibration.mismatch import Mismatch, estimate_mismatch
@@ -60,8 +61,8 @@ class Plan:
     Attributes
     ----------
     settings
-        With thresholds, refractory period, delay, frame noise, I_0, step variance, saturation, reference exposure and
-        white balance filled in.
+        With thresholds, refractory period, delay, frame noise, fixed pattern, I_0, step variance, saturation, reference
+        exposure and white balance filled in.
     threshold_origin
         Whether the thresholds come from the settings, the recording, a calibration, an estimate, or are assumed.
     estimate
@@ -80,6 +81,8 @@ class Plan:
         What a calibration says of single pixels.
     frame_noise
         The fit of the frames' noise, where there was one.
+    fixed_pattern
+        The fit of the frames' fixed pattern, where there was one.
     mismatch
         The fit of the thresholds' spread between pixels, where there was one.
     background_rate
@@ -98,6 +101,7 @@ class Plan:
     smooth: bool
     pixels: PixelCalibration | None = None
     frame_noise: FrameNoise | None = None
+    fixed_pattern: FixedPattern | None = None
     mismatch: Mismatch | None = None
     background_rate: float | None = None
     ceiling: Ceiling | None = None
@@ -141,6 +145,7 @@ def plan(
     chosen = altered(chosen, "camera", reference_exposure=reference, response=response)
     chosen = _with_white_balance(recording, chosen)
     chosen, noise = _with_frame_noise(recording, chosen)
+    chosen, pattern = _with_fixed_pattern(recording, chosen)
     chosen, delay = _with_delay(recording, chosen)
     filled, origin, estimate, model = _with_event_steps(recording, chosen)
     unsure = estimate.spread if estimate is not None and origin in _FOUND else 0.0
@@ -162,6 +167,7 @@ def plan(
         smooth=smooth,
         pixels=known.pixels,
         frame_noise=noise,
+        fixed_pattern=pattern,
         mismatch=mismatch,
         background_rate=background,
         ceiling=ceiling,
@@ -266,6 +272,14 @@ def _with_frame_noise(recording: Recording, settings: Settings) -> tuple[Setting
     read, shot = camera.noise if found is None else (found.read, found.shot)
     shot = shot if camera.shot_noise is None else camera.shot_noise
     return altered(settings, "camera", frame_noise=read, shot_noise=shot), found
+
+
+def _with_fixed_pattern(recording: Recording, settings: Settings) -> tuple[Settings, FixedPattern | None]:
+    """Fill in the frames' fixed pattern, where the variance counts it: from the settings, else an estimate, else 0."""
+    if settings.camera.fixed_pattern is not None or not _uses_steps(settings):
+        return settings, None
+    found = estimate_fixed_pattern(recording, settings.camera)
+    return altered(settings, "camera", fixed_pattern=0.0 if found is None else found.deviation), found
 
 
 def _with_event_steps(

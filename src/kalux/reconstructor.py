@@ -407,6 +407,7 @@ class Reconstructor:
             highlight_scale=scale,
             highlight_spread=spread,
             unknown_variance=filtered.initial_variance,
+            fixed_pattern=self.settings.camera.fixed_pattern or 0.0,
             mosaic=mosaic,
             gains=(1.0, 1.0, 1.0) if frame is None or mosaic is None else self._gains_of(frame),
         )

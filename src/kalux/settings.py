@@ -34,8 +34,8 @@ class CameraSettings:
     Attributes
     ----------
     response
-        ``"linear"`` (raw sensor values: DAVIS, machine vision), ``"srgb"``, ``"gamma:EXPONENT"``, ``"s-curve:BLACK"``,
-        or a measured ``"curve:0 0.0012 ... 1"``: the irradiance at equally spaced response levels
+        ``"linear"`` (raw sensor values: DAVIS, machine vision), ``"srgb"``, ``"bt709"`` (video), ``"gamma:EXPONENT"``,
+        ``"s-curve:BLACK"``, or a measured ``"curve:0 0.0012 ... 1"``: the irradiance at equally spaced response levels
         (`kalux calibrate response`). Three with ";" between them are those of red, green and blue. ``"auto"``: what
         the recording states, else linear.
     log_offset
@@ -49,6 +49,10 @@ class CameraSettings:
     usual_frame_noise
         The frame noise where the recording does not tell it, without shot noise. 0.006 is what the paper's 7e5 1/s
         amounts to at 25 frames/s.
+    fixed_pattern
+        Standard deviation of the offsets that pixels of frames keep from frame to frame, white = 1: the images have
+        them, too, and their variance counts them (docs/equations.md, K11). None: an estimate from the recording
+        (`kalux.calibration.fixed_pattern`), 0 where it does not tell.
     confidence
         1 / sigma_im^2 of equation (6) as the paper uses it, a rate in 1/s: 7e5 (DAVIS), 7e7 (FLIR). For
         augmentation "paper" only.
@@ -74,6 +78,7 @@ class CameraSettings:
     frame_noise: float | None = None
     shot_noise: float | None = None
     usual_frame_noise: float = 0.006
+    fixed_pattern: float | None = None
     confidence: float = 7e5
     weight_floor: float = 0.09
     saturation: float | None = None
@@ -427,7 +432,7 @@ _LARGEST_OF: Final[Mapping[str, float]] = {
     **dict.fromkeys(("saturation", "usual_saturation", "weight_floor"), 1.0),
     "log_offset": 1e3,  # of white: its logarithm is then the same as its radiance
     **dict.fromkeys(
-        ("frame_noise", "usual_frame_noise", "shot_noise"), 10.0
+        ("frame_noise", "usual_frame_noise", "shot_noise", "fixed_pattern"), 10.0
     ),  # of white: nothing is left of a frame
     # Log intensity: exp(100) is more than single precision holds.
     **dict.fromkeys(("threshold_on", "threshold_off", "usual_threshold_on", "usual_threshold_off"), 100.0),

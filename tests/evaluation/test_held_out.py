@@ -144,6 +144,14 @@ def test_a_held_out_frames_own_noise_is_no_error_of_the_method():
     assert found.uncertainty()["rms_z"] == pytest.approx(1.0, abs=0.06)
 
 
+def test_a_pattern_that_the_held_out_frames_share_is_no_error_between_them():
+    intensity, own = np.array([[0.1, 0.4]]), np.array([[0.01, 0.02]])
+    made = Estimated(intensity, own + (0.05 / (intensity + 0.1)) ** 2, 0.1, 0.05)
+    np.testing.assert_allclose(made.variance_of_frames, own)
+    assert Estimated(intensity, own, 0.1).variance_of_frames is own
+    assert Estimated(intensity, None, 0.1, 0.05).variance_of_frames is None
+
+
 def test_nothing_is_clipped_unless_asked_for():
     held = hold_out_frames(still([255] * 8))
     assert evaluate_held_out(held, constant(3.0)).mse == pytest.approx(4.0)

@@ -150,6 +150,24 @@ def test_an_endless_line_is_refused(path):
         parse(path, "t,x,y,p\n" + "1,1,1,1\n" * 2 + "7" * 20_000)
 
 
+@pytest.mark.parametrize(
+    "header",
+    [
+        "",
+        "#!events.txt\n# Format is time (float s), x, y, polarity (0=off, 1=on) as specified at http://rpg\n",
+    ],
+    ids=["IJRR", "v2e"],
+)
+def test_lines_of_events_txt_need_no_names(path, header):
+    path.write_text(header + "0.1 2 3 1\n0.2500005 4 5 0\n")
+    source = readers.read(path)
+    assert all_events(source).tolist() == [(100_000, 2, 3, True), (250_001, 4, 5, False)]
+    assert any("taken as t (s), x, y, p" in text for text in source.missing)
+    path.write_text(header + "0.1 2 3 1\n0.2 1\n")
+    with pytest.raises(FormatError, match=rf"line {header.count(chr(10)) + 2}: it has fewer columns"):
+        all_events(readers.read(path))
+
+
 def test_numbers_without_names_are_refused_with_a_hint(path):
     with pytest.raises(FormatError, match="put a line such as 't_us,x,y,p'"):
         parse(path, "1,2,3,1\n5,2,3,1\n")

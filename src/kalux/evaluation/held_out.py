@@ -220,7 +220,8 @@ def held_out_pairs(held: HeldOut, method: Method, *, clip: bool = False) -> Iter
     """A method's images with the frames that were held out; ``clip`` as in `evaluate_held_out`.
 
     The variance of the mean of the reads of an exposure is taken as the mean of theirs: reads a few milliseconds apart
-    share their errors. The noise of the frame itself is that of `HeldOut.noise`.
+    share their errors. The noise of the frame itself is that of `HeldOut.noise`; its fixed
+    pattern is the method's, too.
     """
     offset = 0.0
 
@@ -228,7 +229,7 @@ def held_out_pairs(held: HeldOut, method: Method, *, clip: bool = False) -> Iter
         nonlocal offset
         for made in method.estimated(held.kept, held.times.ravel()):
             offset = made.log_offset
-            yield np.stack([part for part in (made.intensity, made.variance) if part is not None])
+            yield np.stack([part for part in (made.intensity, made.variance_of_frames) if part is not None])
 
     camera = Camera.named(held.response, held.end.clipped_from)
     for frame, means in zip(held.frames(), means_of(read(), held.times.shape[1]), strict=True):

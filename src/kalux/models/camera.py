@@ -70,6 +70,18 @@ class Response:
         return cls(linear, response)
 
     @classmethod
+    def bt709(cls) -> Response:
+        """The transfer function of video cameras (ITU-R BT.709-6, item 1.2; that of BT.601 and BT.2020, too).
+
+        Both parts meet in value and slope with the numbers that BT.2020-2, table 4, rounds to 1.0993 and 0.0181.
+        """
+        alpha, beta = 1.09929682680944, 0.018053968510807
+        response = np.linspace(0.0, 1.0, _LEVELS)
+        curved = ((response + (alpha - 1.0)) / alpha) ** (1 / 0.45)
+        linear = np.where(response < 4.5 * beta, response / 4.5, curved)
+        return cls(linear, response)
+
+    @classmethod
     def tabulated(cls, irradiance: Any) -> Response:
         """From the irradiance of equally spaced response levels, e.g. 256 values of a measured inverse CRF.
 
@@ -130,11 +142,19 @@ class Response:
 
     @classmethod
     def named(cls, name: str) -> Response:
-        """``"linear"`` or ``"auto"``, ``"srgb"``, ``"gamma:2.2"``, ``"s-curve:0.4"``, or ``"curve:0 0.2 1"``."""
+        """A name of `kalux.settings.CameraSettings`, as ``"gamma:2.2"``; ``"auto"`` is linear.
+
+        Raises
+        ------
+        SettingsError
+            If there is none of that name, or its numbers do not make a response.
+        """
         if name in ("linear", "auto"):
             return cls.linear()
         if name == "srgb":
             return cls.srgb()
+        if name == "bt709":
+            return cls.bt709()
         kind, _, exponent = name.partition(":")
         if kind == "curve":
             try:
@@ -151,8 +171,8 @@ class Response:
         if kind == "s-curve":
             return cls.s_curve(value)
         raise SettingsError(
-            f"response: unknown response {name!r}; known are linear, srgb, gamma:EXPONENT, s-curve:BLACK and "
-            "curve:NUMBERS"
+            f"response: unknown response {name!r}; known are linear, srgb, bt709, gamma:EXPONENT, s-curve:BLACK "
+            "and curve:NUMBERS"
         )
 
     def __call__(self, irradiance: Array) -> Array:
