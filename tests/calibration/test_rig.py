@@ -89,7 +89,14 @@ def test_the_file_gives_the_rig_back(rig, tmp_path):
         (lambda text: text.replace("kalux_rig = 1", "kalux_rig = 9"), "version 9"),
         (lambda text: text.replace("translation_m", "translation"), "translation_m' is missing"),
         (lambda text: text.replace("distortion", "d", 1), "distortion' is missing"),
-        (lambda text: text.replace("sensor_size = [\n    240", "sensor_size = [\n    inf", 1), "infinity"),
+        (
+            lambda text: text.replace("sensor_size = [\n    240", "sensor_size = [\n    inf", 1),
+            "sensor_size is .inf",
+        ),
+        (
+            lambda text: text.replace("sensor_size = [\n    240", "sensor_size = [\n    9000000", 1),
+            "at most 65536",
+        ),
         (lambda text: text.replace("sensor_size = [\n    240", "sensor_size = [\n    0", 1), "lens: size"),
     ],
 )
@@ -113,6 +120,8 @@ def test_a_missing_file(tmp_path):
         (np.eye(3), np.zeros(4)),
         (-np.eye(3), np.zeros(5)),
         (np.eye(3), np.full(5, np.nan)),
+        (np.diag([9.0, 9.0, 0.0]), np.zeros(5)),  # of which there is no inverse
+        (np.eye(3) + np.eye(3, k=-1), np.zeros(5)),
     ],
 )
 def test_what_is_no_lens(matrix, distortion):

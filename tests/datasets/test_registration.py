@@ -105,6 +105,15 @@ def test_frames_that_show_something_else_are_left_out_and_told(simulation, photo
     assert len(found.truth.times) == len(found.masks) == 4
 
 
+def test_frames_of_which_none_is_as_bright_as_the_others_are_an_error(simulation, photograph):
+    """Of two, one half as bright: neither is near their median."""
+    frames = list(simulation.frames[:2])
+    frames[1] = dataclasses.replace(frames[1], image=(frames[1].image // 2).astype(np.uint8))
+    recording = kalux.Recording.from_arrays(simulation.events, frames, sensor_size=SIZE)
+    with pytest.raises(InputError, match=r"any of 2 frames \(0.6. times as bright as the other frames; 1.3"):
+        register_frames(photograph, np.ones(photograph.shape, bool), recording)
+
+
 def test_frames_in_rgb_are_registered_by_their_luminance(simulation, photograph):
     """And only where they measure anything: a quarter of each is a guess here."""
     valid = np.ones(SIZE, bool)

@@ -127,9 +127,7 @@ class Registration:
         """An image (H', W') or (H', W', channels) of the frame camera at the event camera's pixels, float32."""
         return self.sampled(self.filtered(image))
 
-    def frame(
-        self, frame: Frame, *, index: int = 0, saturation: float = CameraSettings.usual_saturation
-    ) -> Frame:
+    def frame(self, frame: Frame, *, index: int = 0) -> Frame:
         """A frame in the event camera's pixels, with the mask of those that are measured.
 
         Integer images become uint16 with white at 65535, because the mean of several pixels has more levels than they;
@@ -153,7 +151,7 @@ class Registration:
             )
         response = frame.normalised()
         values = self.resampled(response)
-        clipped = np.asarray(response >= saturation)
+        clipped = np.asarray(response >= CameraSettings.usual_saturation)
         if clipped.ndim == 3:
             clipped = np.asarray(clipped.any(axis=2))
         share = self.resampled(clipped)

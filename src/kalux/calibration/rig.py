@@ -23,6 +23,7 @@ Array = NDArray[np.float64]
 VERSION: Final = 1
 """Of the rig file. Files of a greater version are refused."""
 
+_LARGEST_SIDE: Final = 1 << 16  # as of a recording's sensor
 _ROUNDS: Final = 60  # of the fixed point in `Lens.normalised`; 20 are enough at 0.01 pixel for a strong lens
 _CONVERGED: Final = 0.01  # pixel
 
@@ -56,10 +57,16 @@ class Lens:
                 f"lens: size {self.sensor_size}, matrix {self.matrix.shape}, distortion {self.distortion.shape}; "
                 "(height, width), (3, 3) and (5,) are needed"
             )
+        if max(self.sensor_size) > _LARGEST_SIDE:
+            raise InputError(
+                f"lens: size {self.sensor_size}; at most {_LARGEST_SIDE} pixels a side are possible"
+            )
         if not (np.isfinite(self.matrix).all() and np.isfinite(self.distortion).all()):
             raise InputError("lens: the camera matrix or the distortion is not finite")
         if min(self.matrix[0, 0], self.matrix[1, 1]) <= 0:
             raise InputError("lens: the focal lengths must be positive, in pixels")
+        if self.matrix[1, 0] != 0 or self.matrix[2].tolist() != [0, 0, 1]:
+            raise InputError("lens: below its diagonal the camera matrix must be 0, and its last number 1")
 
     @classmethod
     def pinhole(cls, sensor_size: tuple[int, int], focal: float | None = None) -> Lens:
@@ -229,6 +236,8 @@ def load_rig(path: Path) -> Rig:
 
 
 def _lens(table: dict[str, Any]) -> Lens:
-    height, width = (int(n) for n in table["sensor_size"])
+    height, width = table["sensor_size"]
+    if not (isinstance(height, int) and isinstance(width, int)):
+        raise ValueError(f"sensor_size is {[height, width]}; whole numbers, height and width, are needed")
     matrix = np.array(table["camera_matrix"], np.float64)
     return Lens((height, width), matrix, np.array(table["distortion"], np.float64))

@@ -113,7 +113,7 @@ def register_frames(
     Raises
     ------
     InputError
-        If no frame can be registered.
+        If no frame can be registered, or each is of another brightness.
     """
     camera = Camera(Response.named(response))
     exposure = _median_exposure(recording)
@@ -126,15 +126,10 @@ def register_frames(
         guess = float(np.median(known)) if known else None
         found.append(_register(luminance, valid, features, frame, index, camera, exposure, guess))
         on_frame()
-    scales = [f.scale for f in found if not f.failure]
-    if not scales:
-        reasons = {f.failure for f in found}
-        raise InputError(
-            f"{recording.source.path}: the reference cannot be registered to any of {len(found)} frames "
-            f"({'; '.join(sorted(reasons)[:3])}); do they show the same scene?"
-        )
-    scale = float(np.median(scales))
+    _require_any(recording, found)
+    scale = float(np.median([f.scale for f in found if not f.failure]))
     found = [_checked_scale(f, scale) for f in found]
+    _require_any(recording, found)
     size = recording.sensor_size
     images, masks, times = [], [], []
     for placed in found:
@@ -147,6 +142,15 @@ def register_frames(
             times.append(placed.time)
     truth = GroundTruth(np.array(times, np.int64), np.stack(images))
     return RegisteredTruth(found, scale, truth, np.stack(masks))
+
+
+def _require_any(recording: Recording, found: list[RegisteredFrame]) -> None:
+    reasons = {f.failure for f in found}
+    if "" not in reasons:
+        raise InputError(
+            f"{recording.source.path}: the reference cannot be registered to any of {len(found)} frames "
+            f"({'; '.join(sorted(reasons)[:3])}); do they show the same scene?"
+        )
 
 
 def _blurred(image: Image, mask: Mask, sigma: float) -> Image:
