@@ -54,7 +54,7 @@ def correlation_plot(
         (0, x, found.curve, "whole range, ms"),
         (half, x[near], found.curve[near], "around the peak, ms"),
     ):
-        _axes(picture, left + 60, 80, half - 90, height - 150, xs, ys, offset * 1e-3, title)
+        _axes(picture, (left + 60, 80, half - 90, height - 150), xs, ys, offset * 1e-3, title)
     return picture
 
 
@@ -64,15 +64,14 @@ def _write(picture: NDArray[Any], text: str, x: int, y: int, size: float) -> Non
 
 def _axes(
     picture: NDArray[Any],
-    left: int,
-    top: int,
-    width: int,
-    height: int,
+    box: tuple[int, int, int, int],
     x: NDArray[np.float64],
     y: NDArray[np.float64],
     mark: float,
     title: str,
 ) -> None:
+    """Draw y over x, and a ``mark`` on x, into a box of the picture: left, top, width, height, pixels."""
+    left, top, width, height = box
     low, high = min(float(y.min()), 0.0), max(float(y.max()), 0.1) * 1.05
     span = max(float(x[-1] - x[0]), 1e-9)
 

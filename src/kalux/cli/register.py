@@ -95,6 +95,7 @@ def add_command(commands: Any) -> None:
 def run(options: argparse.Namespace, command: list[str]) -> None:
     """Run the command."""
     import kalux
+    from kalux.calibration.pictures import correlation_plot
     from kalux.calibration.rig import load_rig
     from kalux.calibration.two_cameras import open_frames, register
     from kalux.cli.output import check_file, check_picture, write_picture
@@ -119,11 +120,6 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     )
     response = chosen_response(options.response, other.response)
     frames, exposure_known = _timed_frames(options, events, other, by_trigger)
-    offset = None
-    if options.offset is not None:
-        offset = read_offset(options.offset)
-    elif timing != "auto":
-        offset = 0.0
     size = events.sensor_size
     if rig is not None and not events.source.sensor_size_known:
         size = rig.events.sensor_size  # of which the recording knows no more than which pixels had events
@@ -135,7 +131,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
         rig=rig,
         distance=options.distance,
         homography=options.homography,
-        offset=offset,
+        offset=_known_offset(options, timing),
         centre=centre,
         reach=reach,
         camera=CameraSettings(response=response),
@@ -147,12 +143,19 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
         warn("the frames have no exposure times; --exposure and --stamp would put them in")
     _write(options, events, size, found.frames(frames()), exposure_known, response)
     if options.plot is not None and found.coarse is not None:
-        from kalux.calibration.pictures import correlation_plot
-
-        picture = correlation_plot(found.coarse, offset=found.offset, standard_error=found.standard_error)
-        write_picture(options.plot, picture)
+        write_picture(
+            options.plot,
+            correlation_plot(found.coarse, offset=found.offset, standard_error=found.standard_error),
+        )
     if options.overlay is not None:
         write_picture(options.overlay, _overlay(found, frames, events))
+
+
+def _known_offset(options: argparse.Namespace, timing: str) -> float | None:
+    """us, that of a file, or 0 where both have one clock; None: it is to be found."""
+    if options.offset is not None:
+        return read_offset(options.offset)
+    return None if timing == "auto" else 0.0
 
 
 def _timing(options: argparse.Namespace) -> str:
