@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
+import re
+
+import numpy as np
+
 from kalux import PRESETS, Recording
 from kalux.planning import plan
 from kalux.settings import from_dict
 from kalux.settled import settled
 
-from builders import moving_blocks
+from builders import moving_blocks, passing_by, textured
 
 
 def rows_of(recording, **groups):
@@ -24,6 +29,22 @@ def test_what_the_settings_state_is_given():
     for label in ("thresholds", "delay", "I_0", "step", "exposure", "noise", "response"):
         assert rows[label].endswith("(given)"), label
     assert rows["delay"].startswith("events 0.7 ms late")
+
+
+def test_says_where_frames_end():
+    rows = rows_of(passing_by(textured(1.2), 102))
+    told = r"from 0.39 of white \(frames end at 0.4, where events go on by \d+ %\)"
+    assert re.fullmatch(told, rows["saturation"])
+    deep = passing_by(textured(1.2), 255)
+    frames = [
+        dataclasses.replace(frame, image=np.minimum(frame.image.astype(np.uint16) * 17, 4095))
+        for frame in deep.frames()
+    ]
+    rows = rows_of(
+        Recording.from_arrays(np.concatenate(list(deep.events())), frames, sensor_size=deep.sensor_size)
+    )
+    assert rows["white"] == "4095, where the 16-bit frames end"
+    assert "saturation" not in rows
 
 
 def test_what_a_recording_without_events_does_not_tell_is_the_usual():
