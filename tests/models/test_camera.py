@@ -377,6 +377,18 @@ def test_the_tail_is_one_of_light_not_of_response():
     assert count_bright(gamma, levels ** (1 / 2.2)) == count_bright(linear, levels)
 
 
+def test_what_counts_as_white_lies_below_where_pixels_clip():
+    """The same light, of a camera that clips at half of full scale; one that clips from 1 on is not brighter."""
+    levels = np.minimum(np.random.default_rng(2).exponential(0.4, (30, 40)), 1.0)
+    for response in ("linear", "gamma:2.2"):
+        whole = Camera.named(response, 0.98)
+        half = Camera.named(response, float(whole.response(0.5 * whole.response.inverse(np.array(0.98)))))
+        assert count_bright(half, whole.response(0.5 * levels)) == count_bright(whole, whole.response(levels))
+    assert count_bright(Camera.named("linear", 1.0), levels) == count_bright(
+        Camera.named("linear", 0.98), levels
+    )
+
+
 def test_a_white_value_beyond_the_type_is_one_that_no_pixel_has():
     image = np.arange(256, dtype=np.uint8).reshape(16, 16)
     linear = Camera.named("linear", 0.98)

@@ -61,6 +61,7 @@ def test_blocks_of_text_join_without_a_seam(path, monkeypatch):
         '\ufeff"t_us";"x";"y";"p"\r\n1000000; 2; 3; 1\r\n1500000;4 ;5;-1\r\n',
         "# t_s x y p\n1.0 2 3 1\n\n# comment\n 1.500000\t4  5 0 \n",
         "# a recording\n# t_s x y p\n1 2 3 1\n1.5 4 5 0\n",
+        "# a line\u2028\n# t_s x y p\n1 2 3 1\n1.5 4 5 0\n",  # ends no line of the table
         "x y pol time(ms)\n2 3 true 1e3\n4 5 False 1.5E+3\n",
         "t_ns\tx\ty\tp\n1000000000\t2\t3\t+1\n1500000000\t4\t5\t0\n",
         "id,t_us,note,x,y,p,t_us\n7,1000000,abc,2,3,1,9\n8,1500000,,4,5,0,9\n",

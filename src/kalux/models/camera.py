@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.errors import SettingsError
+from kalux.settings import CameraSettings
 
 Array = NDArray[np.float64]
 
@@ -234,7 +235,7 @@ class Camera:
 
     response: Response
     weight_table: Array | None = None
-    saturation: float = 0.98
+    saturation: float = CameraSettings.usual_saturation
     colours: tuple[Response, ...] | None = None
 
     @classmethod
@@ -327,9 +328,14 @@ ABOUT_WHITE: Final = 0.95
 
 
 def count_bright(camera: Camera, image: NDArray[Any], white: float = 1.0) -> BrightTail:
-    """`BrightTail` of one frame: (H, W), or (H, W, 3) of which the mean counts; a saturated pixel is ``white``."""
+    """`BrightTail` of one frame: (H, W), or (H, W, 3) of which the mean counts; full scale is ``white``.
+
+    Where pixels count as clipped from lower on than usual, that far below lies what counts as white.
+    """
     grey = image if image.ndim == 2 else image.mean(axis=-1)
-    edges = camera.response(np.array([ABOUT_WHITE / 2, ABOUT_WHITE])) * white
+    ends = (camera.saturation, CameraSettings.usual_saturation)
+    end, usual = (float(camera.response.inverse(np.array(value))) for value in ends)
+    edges = camera.response(min(end / usual, 1.0) * np.array([ABOUT_WHITE / 2, ABOUT_WHITE])) * white
     if grey.dtype.kind in "iu":
         if edges[1] > np.iinfo(grey.dtype).max:  # white that no pixel can have
             return BrightTail(int(np.count_nonzero(grey >= edges[0])), 0)

@@ -124,7 +124,8 @@ def _first_lines(data: bytes) -> list[str]:
         text = data[: error.start].decode("utf-8-sig")
         if len(data) - error.start >= 4:  # more than a character that is cut off
             return []
-    whole = text.splitlines()
+    # Not splitlines, which also ends lines where the parser does not.
+    whole = text.removesuffix("\n").split("\n")
     if len(data) == _LONGEST_LINE:
         whole = whole[:-1]
     lines: list[str] = []
