@@ -89,7 +89,8 @@ def test_smoothing_is_two_filters_combined_by_information():
         correlation = 0.0
         if a.around is not None and b.around is not None:
             first, second = (variance < UNMEASURED for variance in a.around[:2])
-            correlation = np.where(first, 1 - share, 0) + np.where(second, share, 0)
+            same = np.where(first, 1 - share, 0) + np.where(second, share, 0)
+            correlation = 0.2 + 0.8 * same
         either = dataclasses.replace(
             a,
             log_intensity=level,
@@ -324,7 +325,7 @@ def test_what_two_filters_know_adds_up():
 
 @pytest.mark.parametrize("share", [0.25, 0.5, 1.0])
 def test_filters_that_go_by_the_same_frames_err_alike(share):
-    """As far as a frame around measures a pixel; where none does, each has its own."""
+    """As far as a frame around measures a pixel; where none does, a fifth of their errors is that of thresholds."""
     clipped = UNMEASURED
     forward, backward = estimates_around(
         [0.01, 0.01, clipped, clipped], [0.02, clipped, 0.02, clipped], share
@@ -332,8 +333,8 @@ def test_filters_that_go_by_the_same_frames_err_alike(share):
     found = combine(forward, backward).variance[:, 0]
     errors = 0.8 * 0.1, 0.2 * 0.2  # by weights of 4 to 1
     expected = [
-        errors[0] ** 2 + errors[1] ** 2 + 2 * correlation * errors[0] * errors[1]
-        for correlation in (1.0, 1 - share, share, 0.0)
+        errors[0] ** 2 + errors[1] ** 2 + 2 * (0.2 + 0.8 * same) * errors[0] * errors[1]
+        for same in (1.0, 1 - share, share, 0.0)
     ]
     np.testing.assert_allclose(found, expected, rtol=1e-6)
 

@@ -396,7 +396,7 @@ class Reconstructor:
         if self._estimated:
             assert self._bright_tail is not None  # a frame has been pushed
             scale = min(scale, filtered.highlight_tail * beyond_white(self._bright_tail))
-            spread = events.extrapolation_spread
+            spread = events.believed_extrapolation
         on, off = self.thresholds
         frame = self._last_frame
         mosaic = None if frame is None else frame.mosaic

@@ -134,8 +134,9 @@ class EventSettings:
         the recording (`kalux.calibration.noise`) where that is more.
     extrapolation_spread
         Standard deviation of the log of the scale of what events say of highlights beyond white, where no
-        frame can check it, when the threshold is only an estimate. 0.15: how well large steps between well
-        exposed frames agree with estimated thresholds, on three real and eleven simulated recordings.
+        frame can check it, when the threshold is only an estimate; or threshold_spread, if a recording has told it and
+        it is less. 0.15: how well large steps between well exposed frames agree with estimated thresholds, on three
+        real and eleven simulated recordings.
     trail
         By how much, in c, a pixel is on average beyond the level of its newest event, at most (docs/equations.md,
         K14): events trail the light. 0 turns it off. 0.4 (docs/tuning.md).
@@ -195,6 +196,15 @@ class EventSettings:
     def mismatch(self) -> float:
         """Spread of the threshold between pixels, also where nobody has said or estimated it."""
         return self.usual_threshold_spread if self.threshold_spread is None else self.threshold_spread
+
+    @property
+    def believed_extrapolation(self) -> float:
+        """Spread of the scale of events beyond white where thresholds are estimated.
+
+        A spread that a recording tells counts what is not known of its thresholds; more than usual is in P (K10).
+        """
+        told = self.threshold_spread
+        return self.extrapolation_spread if told is None else min(told, self.extrapolation_spread)
 
     @property
     def background_rate(self) -> float:

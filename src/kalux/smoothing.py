@@ -44,6 +44,10 @@ _WINDOW_BYTES: Final = 256 << 20
 
 _BLOCK_EVENTS: Final = 1 << 18
 
+_ALIKE: Final = 0.2
+"""Correlation of the errors of the two directions where each goes by events of its own, from a frame of its own: the
+thresholds are the same ones. -0.1 to 0.1 on noisy scenes, 0.3 to 0.6 on clean ones (docs/equations.md)."""
+
 _STANDS_STILL: Final = 0.005
 """Mean square change of silent pixels, in c^2, up to which nothing moves there: a tenth of the least under a moving
 camera (`kalux.augmentation.unseen`)."""
@@ -399,15 +403,17 @@ def shared_errors(forward: Around | None, backward: Around | None) -> NDArray[np
     """(H, W) correlation of the errors of the two directions: how far both go by the same frames.
 
     From the first frame around to the second both go along one bridge (K1), and each knows the one ahead of it through
-    this bridge as well as the other knows it from behind. With s the share of the way to the second frame, its
-    correlation is 1 - s where the first frame measures the pixel, and s where the second does: 1 where both do, 0 where
-    neither does and each direction comes from a frame of its own. None: not told.
+    this bridge as well as the other knows it from behind. With s the share of the way to the second frame, their
+    errors are the same by 1 - s where the first frame measures the pixel, and by s where the second does: all where
+    both do, and none where neither does and each direction comes from a frame of its own. The rest is alike as far as
+    the thresholds are wrong. None: not told.
     """
     if forward is None or backward is None:
         return None
     share = np.float32(forward.share)
     first, second = forward.first < UNMEASURED, forward.second < UNMEASURED
-    return (np.float32(1.0) - share) * first + share * second
+    same = (np.float32(1.0) - share) * first + share * second
+    return np.float32(_ALIKE) + np.float32(1.0 - _ALIKE) * same
 
 
 def _black(forward: Around | None, backward: Around | None) -> NDArray[np.bool_]:
