@@ -291,6 +291,13 @@ def bridged(pixel, settings, times, on, off, scales):
         most = hidden_by_black * pixel.white[k]
         return middle + np.log(most + i0) - np.log(most * np.exp(-pixel.dark[k]) + i0)
 
+    def frame_variance(k):  # K3, by the noise of the frame alone
+        read, shot = c.noise
+        variance = (read * pixel.white[k]) ** 2 + shot * pixel.white[k] * pixel.intensity[k]
+        variance /= (max(pixel.intensity[k], 1.5 * read * pixel.white[k]) + i0) ** 2
+        variance /= max(pixel.weight[k], 1e-6)
+        return variance
+
     def latent(k):  # K3
         log_frame = np.log(pixel.intensity[k] + i0)
         if crushed(k):
@@ -302,10 +309,7 @@ def bridged(pixel, settings, times, on, off, scales):
         if settings.filter.deblur:
             middle += event_sum(pixel, pixel.starts[k], pixel.middles[k], a, b)
             inside = sum(w for t, *_, w in pixel.events if pixel.starts[k] < t <= pixel.ends[k])
-        read, shot = c.noise
-        variance = (read * pixel.white[k]) ** 2 + shot * pixel.white[k] * pixel.intensity[k]
-        variance /= (max(pixel.intensity[k], 1.5 * read * pixel.white[k]) + i0) ** 2
-        variance /= max(pixel.weight[k], 1e-6)
+        variance = frame_variance(k)
         if crushed(k):
             shares = (np.arange(64) + 0.5) / 64
             variance = 3 * np.mean((np.log(most * shares ** pixel.dark[k] + i0) - black) ** 2)
@@ -358,7 +362,7 @@ def bridged(pixel, settings, times, on, off, scales):
             bound += event_sum(pixel, a, b, on * s_on, off * s_off) + grown(k, b)
             if right[1] < UNMEASURED:
                 pixel.shown, pixel.excess = k, max(right[0] - bound, 0.0)
-                pixel.left = right[0] < before - 3 * np.sqrt(right[1])
+                pixel.left = right[0] < before - 3 * np.sqrt(frame_variance(k))
                 pixel.gone = bound < before - off / 2
                 break
             pixel.raised.append(right[0] > bound + 1e-4)

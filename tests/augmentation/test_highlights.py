@@ -20,12 +20,13 @@ TAIL = Tail(0.5, 0.5)
 EVERYWHERE = np.ones(SIZE, bool)
 STILL = np.zeros(SIZE, np.float32)
 MOVED = 0.1
+NOISE = 1e-4
 
 
 def latent(clipped, value=0.0):
     """A frame that shows ``value`` where it is not clipped, and its bound, 0, elsewhere."""
     level = np.where(clipped, 0.0, value).astype(np.float32)
-    return Latent(level, np.where(clipped, UNMEASURED, 1e-4).astype(np.float32))
+    return Latent(level, np.where(clipped, UNMEASURED, NOISE).astype(np.float32))
 
 
 def shown(clipped, darker=1.0, pitch=1):
@@ -39,7 +40,8 @@ def begun(clipped, darker=1.0):
 
 def followed(memory, clipped, value, net):
     """The next frame, which is ``value`` where it is not ``clipped``."""
-    return follow_unshown(memory, latent(clipped, value), shown(clipped, -value), net, MOVED, TAIL)
+    noise = np.full(len(memory.pixels), NOISE, np.float32)
+    return follow_unshown(memory, latent(clipped, value), shown(clipped, -value), noise, net, MOVED, TAIL)
 
 
 def excess_at(memory):
@@ -182,6 +184,17 @@ def test_pixels_that_noise_takes_out_of_saturation_tell_nothing():
     assert memory.told.tellers.sum() == 0
     assert len(memory.pixels) == 40 * 48 / 2
     np.testing.assert_allclose(memory.expected, 0.5, rtol=1e-6)
+
+
+def test_what_deblurring_adds_to_the_variance_silences_nobody():
+    """Only pixels that move have it."""
+    told, _ = alternating()
+    memory, net = begun(EVERYWHERE), np.where(told, np.float32(-1.0), np.float32(0.0))
+    frame = latent(~told, -0.08)
+    moving = frame._replace(variance=np.where(told, np.float32(0.01), frame.variance))
+    noise = np.full(len(memory.pixels), NOISE, np.float32)
+    memory = follow_unshown(memory, moving, shown(~told, 0.08), noise, net, MOVED, TAIL)
+    assert memory.told.tellers.sum() == told.sum()
 
 
 def test_silent_pixels_that_leave_saturation_tell_those_near():

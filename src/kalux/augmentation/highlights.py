@@ -118,7 +118,13 @@ def begin_unshown(first: Latent, shown: Shown, tail: Tail) -> UnshownMemory:
 
 
 def follow_unshown(
-    memory: UnshownMemory, following: Latent, shown: Shown, net: Floats, moved: float, tail: Tail
+    memory: UnshownMemory,
+    following: Latent,
+    shown: Shown,
+    noise: Floats,
+    net: Floats,
+    moved: float,
+    tail: Tail,
 ) -> UnshownMemory:
     """After the next frame.
 
@@ -128,6 +134,9 @@ def follow_unshown(
     ----------
     following, shown
         The next frame.
+    noise
+        (N,) variance of what it shows of the pixels, by its own noise. Noise is what takes a pixel that does not move
+        out of saturation; what deblurring adds is of pixels that do.
     net
         (H, W) what events add to L between the two.
     moved
@@ -138,7 +147,7 @@ def follow_unshown(
     value, variance = following.value.reshape(-1)[pixels], following.variance.reshape(-1)[pixels]
     measured = variance < UNMEASURED
     bounded = np.where(variance < UNSEEN, np.maximum(predicted, value), predicted)
-    left = measured & (value < memory.bound - _NOISE * np.sqrt(variance))
+    left = measured & (value < memory.bound - _NOISE * np.sqrt(noise))
     gone = measured & (predicted < memory.bound - moved)
     distance = np.maximum(value - predicted, np.float32(0.0))
     told = _with_told(memory, left, gone, distance)

@@ -147,9 +147,7 @@ class BridgedFrames(CommonMethod):
             (self.on, self.off),
             weighed=True,
         )
-        level_variance = frame_log_covariance(
-            shot.level_intensity, shot.level_weight, self.settings.camera.noise, shot.white, self.offset
-        )
+        level_variance = self.level_variance(shot)
         level_variance[shot.level_clipped] = bridge.UNMEASURED
         level_log = log_intensity(shot.level_intensity, self.offset)
         crushed = self.crushed(shot)
@@ -169,6 +167,12 @@ class BridgedFrames(CommonMethod):
             return latent
         room = np.where(crushed, np.log(shot.level_ceiling + self.offset) - level_log, np.inf)
         return latent._replace(ceiling=latent.value + room.astype(np.float32)[shot.levels])
+
+    def level_variance(self, shot: Shot) -> Array:
+        """(N,) variance of log(I + I_0) of each level, by the noise of the frame alone."""
+        return frame_log_covariance(
+            shot.level_intensity, shot.level_weight, self.settings.camera.noise, shot.white, self.offset
+        )
 
     def crushed(self, shot: Shot) -> NDArray[np.bool_] | None:
         """(N,) levels that are black and hide more than a linear response's would; None where black does not.
@@ -252,8 +256,10 @@ class BridgedFrames(CommonMethod):
     ) -> UnshownMemory:
         if len(memory.unshown.pixels) == 0:
             return memory.unshown
+        levels = following.levels.reshape(-1)[memory.unshown.pixels]
+        noise = self.level_variance(following)[levels]
         moved = self.off / 2
-        return follow_unshown(memory.unshown, second, shown(following), net, moved, memory.tail)
+        return follow_unshown(memory.unshown, second, shown(following), noise, net, moved, memory.tail)
 
     def _alone(self, memory: BridgeMemory, shot: Shot) -> BridgedSegment:
         """From the latest frame on, without a next one."""
