@@ -18,7 +18,7 @@ Array = NDArray[np.floating[Any]]
 UNKNOWN_CHANGE: Final = 0.1
 """Mean square, in c^2, where nothing tells it: that of eleven simulated scenes under a moving camera."""
 
-_UNMEASURED_CHANGE: Final = 0.4
+UNMEASURED_CHANGE: Final = 0.4
 """The same where a frame does not measure the pixel, so that none says that it has changed little: the variance
 half-way to such a frame is then that of a moving pixel, as on the same scenes."""
 
@@ -60,7 +60,7 @@ def silent_change(segment: BridgedSegment, quantisation_variance: float, thresho
     of_all, told = _told(given, seconds, q0, most, told_of)
     whole = max(of_all, 0.0) / told if told > _ENOUGH else UNKNOWN_CHANGE * threshold2
     _add_share(change.reshape(-1), untold.reshape(-1), np.float32(whole))
-    unknown, unmeasured = (np.float32(u * threshold2) for u in (UNKNOWN_CHANGE, _UNMEASURED_CHANGE))
+    unknown, unmeasured = (np.float32(u * threshold2) for u in (UNKNOWN_CHANGE, UNMEASURED_CHANGE))
     _mean(_sum_around(change), _sum_around(silent), *variances, unknown, unmeasured, mean)
     return mean
 

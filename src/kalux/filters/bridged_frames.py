@@ -35,7 +35,7 @@ from kalux.augmentation.trail import (
     trail_at,
     trail_between,
 )
-from kalux.augmentation.unseen import UNKNOWN_CHANGE, forget_silence, silent_change
+from kalux.augmentation.unseen import UNKNOWN_CHANGE, UNMEASURED_CHANGE, forget_silence, silent_change
 from kalux.compiled import apart
 from kalux.events import EventArray
 from kalux.filters import akf_bridged
@@ -292,6 +292,8 @@ class BridgedFrames(CommonMethod):
         change = self._silent_change(joined)
         joined = joined._replace(trail=trail, silent_change=change)
         joined, far_on, far_off = self._drifting(joined, memory, second, on, off)
+        change = self._of_black(change, memory.latent, second)
+        joined = joined._replace(silent_change=change)
         assert joined.net is not None
         unshown = self._follow_unshown(memory, second, following, joined.net)
         after = memory._replace(
@@ -390,6 +392,14 @@ class BridgedFrames(CommonMethod):
 
     def _silent_change(self, segment: BridgedSegment) -> Floats:
         return silent_change(segment, self.noise.quantisation_variance, self.on * self.off)
+
+    def _of_black(self, change: Floats, *frames: Latent) -> Floats:
+        """What silent pixels change, where one of the frames is black: no frame says that it is little (K11)."""
+        for frame in frames:
+            if frame.ceiling is not None:
+                unmeasured = np.float32(UNMEASURED_CHANGE * self.on * self.off)
+                change = np.where(np.isfinite(frame.ceiling), unmeasured, change)
+        return change
 
     def _drifting(
         self, segment: BridgedSegment, memory: BridgeMemory, second: Latent, on: Floats, off: Floats
