@@ -65,6 +65,27 @@ def silent_change(segment: BridgedSegment, quantisation_variance: float, thresho
     return mean
 
 
+def turns(on: Array, off: Array) -> float:
+    """How often a pixel with events turns between two frames, on average: twice for every event and one against it.
+
+    Parameters
+    ----------
+    on, off
+        (H, W) events between them.
+    """
+    pairs, events = _pairs(on.reshape(-1), off.reshape(-1))
+    return float(2.0 * pairs / max(events, 1))
+
+
+@nb.njit(cache=True, nogil=True)
+def _pairs(on, off):  # type: ignore[no-untyped-def]
+    pairs, active = 0.0, 0
+    for i in range(np.uint64(len(on))):
+        pairs += min(on[i], off[i])
+        active += on[i] + off[i] > 0
+    return pairs, active
+
+
 def forget_silence(
     grown: Array,
     segment: BridgedSegment,

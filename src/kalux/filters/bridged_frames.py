@@ -35,7 +35,13 @@ from kalux.augmentation.trail import (
     trail_at,
     trail_between,
 )
-from kalux.augmentation.unseen import UNKNOWN_CHANGE, UNMEASURED_CHANGE, forget_silence, silent_change
+from kalux.augmentation.unseen import (
+    UNKNOWN_CHANGE,
+    UNMEASURED_CHANGE,
+    forget_silence,
+    silent_change,
+    turns,
+)
 from kalux.compiled import apart
 from kalux.events import EventArray
 from kalux.filters import akf_bridged
@@ -290,7 +296,7 @@ class BridgedFrames(CommonMethod):
             memory.latent, second, on, off, memory.thresholds, self.noise, start, end, grown
         )
         change = self._silent_change(joined)
-        joined = joined._replace(trail=trail, silent_change=change)
+        joined = joined._replace(trail=trail, silent_change=change, turns=turns(on, off))
         joined, far_on, far_off = self._drifting(joined, memory, second, on, off)
         change = self._of_black(change, memory.latent, second)
         joined = joined._replace(silent_change=change)
@@ -461,6 +467,9 @@ class BridgedFrames(CommonMethod):
 
     def measured(self, segment: BridgedSegment) -> tuple[Floats, Floats]:
         return segment.forward_variance, segment.backward_variance
+
+    def turns(self, segment: BridgedSegment) -> float:
+        return segment.turns
 
     def around(self, segment: BridgedSegment, t: int) -> Around:
         assert segment.events is not None
