@@ -20,6 +20,7 @@ from kalux.calibration.delay import DelayEstimate, estimate_delay
 from kalux.calibration.event_model import EventModel, estimate_event_model
 from kalux.calibration.fixed_pattern import FixedPattern, estimate_fixed_pattern
 from kalux.calibration.frame_noise import FrameNoise, estimate_frame_noise
+from kalux.calibration.levels import Ceiling, exact_end, find_ceiling
 from kalux.calibration.mismatch import Mismatch, estimate_mismatch
 from kalux.calibration.noise import event_noise
 from kalux.calibration.steps import MAX_SAMPLES
@@ -60,8 +61,8 @@ class Plan:
     Attributes
     ----------
     settings
-        With thresholds, refractory period, delay, frame noise, fixed pattern, I_0, step variance, reference exposure
-        and white balance filled in.
+        With thresholds, refractory period, delay, frame noise, fixed pattern, I_0, step variance, saturation, reference
+        exposure and white balance filled in.
     threshold_origin
         Whether the thresholds come from the settings, the recording, a calibration, an estimate, or are assumed.
     estimate
@@ -86,6 +87,8 @@ class Plan:
         The fit of the thresholds' spread between pixels, where there was one.
     background_rate
         The measured noise of events, Hz per pixel, where it was.
+    ceiling
+        Where the frames end at one level below the usual saturation while events go on.
     """
 
     settings: Settings
@@ -101,6 +104,7 @@ class Plan:
     fixed_pattern: FixedPattern | None = None
     mismatch: Mismatch | None = None
     background_rate: float | None = None
+    ceiling: Ceiling | None = None
 
 
 def plan(
@@ -130,8 +134,9 @@ def plan(
     if known.pixels is not None:
         require_size(known.pixels, recording.sensor_size)
     recording = remembering(recording, _REMEMBERED_EVENTS, _REMEMBERED_FRAMES)
+    chosen, ceiling = with_saturation(recording, chosen)
     response = chosen_response(chosen.camera.response, recording.response)
-    camera = Camera.named(response, chosen.camera.saturation)
+    camera = Camera.named(response, chosen.camera.clipped_from)
     exposures, tail = _survey(recording, camera if _measures_tail(chosen) else None)
     begin = _begin_time(exposures[0], chosen, lookahead)
     wanted = image_times(recording, exposures, begin, rate_hz=rate_hz, times=times, at=at)
@@ -165,6 +170,7 @@ def plan(
         fixed_pattern=pattern,
         mismatch=mismatch,
         background_rate=background,
+        ceiling=ceiling,
     )
 
 
@@ -177,6 +183,28 @@ def _check_smooth(settings: Settings, lookahead: bool) -> None:
         raise InputError(
             "reconstruct: the complementary filter has no variance, so that it cannot be smoothed"
         )
+
+
+def with_saturation(recording: Recording, settings: Settings) -> tuple[Settings, Ceiling | None]:
+    """Fill in the saturation: from the settings, else where frames end at one level and events go on, else the usual.
+
+    Frames may end with the scene: events decide, by thresholds that are estimated as if the frames were clipped there.
+
+    Returns
+    -------
+    The settings, and where the frames end, if that was found.
+    """
+    camera = settings.camera
+    usual = altered(settings, "camera", saturation=camera.clipped_from)
+    if camera.saturation is not None or not _uses_steps(settings):
+        return usual, None
+    end = exact_end(recording, camera.usual_saturation)
+    if end is None:
+        return usual, None
+    clipped = altered(settings, "camera", saturation=camera.usual_saturation * end)
+    known, *_ = _with_event_steps(recording, _with_delay(recording, clipped)[0])
+    found = find_ceiling(recording, known.camera, known.events)
+    return (clipped, found) if found is not None and found.is_at(end) else (usual, None)
 
 
 def _survey(recording: Recording, camera: Camera | None) -> tuple[NDArray[np.int64], BrightTail | None]:

@@ -85,7 +85,7 @@ def estimate_fixed_pattern(recording: Recording, camera: CameraSettings) -> Fixe
         return None
     height, width = recording.sensor_size
     step = int(np.ceil(np.sqrt(height * width / _MOST_PIXELS)))
-    model = Camera.named(response, camera.saturation)
+    model = Camera.named(response, camera.clipped_from)
     seen = []
     for frame in islice(recording.frames(), MAX_FRAMES):
         if frame.image.ndim == 3:

@@ -220,7 +220,7 @@ def score_settings(held: HeldOut, settings: Settings, calibration: Calibration |
     images = reconstruct(held.kept, times=held.times.ravel(), settings=settings, calibration=calibration)
     reads = held.times.shape[1]
     nll, errors, pixels = 0.0, 0.0, 0
-    camera = Camera.named(settings.camera.response, settings.camera.saturation)
+    camera = Camera.named(settings.camera.response, settings.camera.clipped_from)
     for frame in held.frames():
         group = [next(images) for _ in range(reads)]
         mean: Array = np.stack([image.intensity for image in group]).mean(axis=0, dtype=np.float64)

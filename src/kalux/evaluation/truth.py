@@ -204,7 +204,7 @@ def _given(recording: Recording, reference: Reference) -> Iterator[NDArray[np.bo
     if reference.noise is None:
         yield from itertools.repeat(None)
         return
-    camera = Camera.named(chosen_response(AUTO, recording.response), CameraSettings.saturation)
+    camera = Camera.named(chosen_response(AUTO, recording.response), CameraSettings.usual_saturation)
     frames = iter(recording.frames())
     frame = next(frames)
     for t in reference.times:
