@@ -554,7 +554,29 @@ def forgotten(pixels, place, c2, q0):
         yield silent_change(pixels, place, k, c2) * missed**2 if measured and silent else 0.0
 
 
-def hidden(pixels, place, moving, t, on, off):
+def exposed_as(pixels, start, end, exposed):
+    """K11: the share of the time between frames that counts as exposed, E'."""
+    pairs, active = 0.0, 0
+    for q in pixels.values():
+        counts = [
+            sum(w for t, p, *_, w in q.events if start < t <= end and p == sign) for sign in (True, False)
+        ]
+        pairs, active = pairs + min(counts), active + (sum(counts) > 0)
+    n = 2 * pairs / max(active, 1)
+    x = n * exposed
+    if x < 0.01:
+        return exposed
+    off = 1 + 2 * (x - 1 + np.exp(-x)) / x**2 - 4 * (1 - np.exp(-x / 2)) / x
+    return 12 * off / (2 * (1 - np.exp(-n)))
+
+
+def shown_change(pixels, place, interval, c2, camera):
+    """K11: the same for images: of a pixel that one of the frames shows black, no frame says that it changes little."""
+    black = any(is_crushed(pixels[place], k, camera) for k in (interval, interval + 1))
+    return 0.4 * c2 if black else silent_change(pixels, place, interval, c2)
+
+
+def hidden(pixels, place, moving, t, on, off, camera):
     """K11: the variance of what no event has told."""
     pixel, c2 = pixels[place], on * off
     middles = pixel.middles
@@ -564,14 +586,15 @@ def hidden(pixels, place, moving, t, on, off):
         share = (t - middles[k]) / gap
         exposures = [pixel.ends[i] - pixel.starts[i] for i in (k, k + 1)]
         between = 4 * share * (1 - share)
-        between += (1 - between) * 0.09 * min(sum(exposures) / 2 / gap, 1)
+        exposed = exposed_as(pixels, middles[k], middles[k + 1], min(sum(exposures) / 2 / gap, 1))
+        between += (1 - between) * 0.09 * exposed
         if moving:
             return 0.08 * c2 * between
-        return 0.22 * between * silent_change(pixels, place, k, c2)
+        return 0.22 * between * shown_change(pixels, place, k, c2, camera)
     if moving:
         return 0.08 * c2
     gap = middles[-1] - middles[-2] if k > 0 else USUAL_INTERVAL
-    change = silent_change(pixels, place, k - 1, c2) if k > 0 else 0.1 * c2
+    change = shown_change(pixels, place, k - 1, c2, camera) if k > 0 else 0.1 * c2
     return min(abs(t - middles[max(k, 0)]) / gap, 1) * change
 
 
@@ -736,6 +759,8 @@ def reconstruct(events, frames, sensor_size, settings, times):
     for (row, column), pixel in every.items():
         for i, t in enumerate(times):
             out[3, i, row, column] = is_moving(pixel, t)
-            out[2, i, row, column] = hidden(every, (row, column), out[3, i, row, column], t, on, off)
+            out[2, i, row, column] = hidden(
+                every, (row, column), out[3, i, row, column], t, on, off, settings.camera
+            )
     expected = np.array([unshown(every, settings, frames, t) for t in times])
     return every, out[0], out[1], out[2], out[3].astype(bool), expected

@@ -104,7 +104,8 @@ class Estimate:
         (H, W) variances of the frames around, or of the only one known, `UNMEASURED` where there is nothing measured;
         None: not told.
     exposed
-        The share of the time for which frames are exposed, where the next one is known.
+        The share of the time for which frames are exposed, where the next one is known; more where the light turns more
+        often (`kalux.filters.uncertainty.changed_within`).
     since
         Where it is not known or not used: time to the only frame, in intervals between frames; else None.
     told

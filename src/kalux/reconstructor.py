@@ -34,6 +34,7 @@ from kalux.filters.buffer import EventBuffer
 from kalux.filters.method import USUAL_INTERVAL, Method, Segment
 from kalux.filters.methods import make_method
 from kalux.filters.shots import Shot, take_shot
+from kalux.filters.uncertainty import changed_within
 from kalux.frames import Frame, check_frame
 from kalux.images import Estimate, Image, View, make_image
 from kalux.models.camera import Camera, beyond_white, count_bright
@@ -367,7 +368,7 @@ class Reconstructor:
             silent_change=self._method.silent_change(progress.segment),
             around=None if moment.after is None else self._method.around(progress.segment, t),
             measured=self._method.measured(progress.segment),
-            exposed=moment.exposed,
+            exposed=changed_within(moment.exposed, self._method.turns(progress.segment)),
             since=moment.since(self._interval),
         )
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kalux.augmentation.bridge import UNMEASURED, BridgeNoise, Latent, bridge, nominal_thresholds
-from kalux.augmentation.unseen import UNKNOWN_CHANGE, forget_silence, silent_change
+from kalux.augmentation.unseen import UNKNOWN_CHANGE, forget_silence, silent_change, turns
 
 SHAPE = (40, 60)
 C2 = 0.04
@@ -114,3 +114,10 @@ def test_a_silent_pixel_forgets_what_the_slope_does_not_take():
     alike = forgotten(NOISE.quantisation_variance / 2, 0.01, on)  # half of the mismatch is the slope's
     np.testing.assert_allclose(alike[:, :30], 0.01 / 4, rtol=1e-5)
     assert (forgotten(100.0, 0.01, on, np.full(SHAPE, UNMEASURED, np.float32)) == 0).all()
+
+
+def test_light_turns_where_events_of_both_signs_come():
+    """Pixels with 3 and 1, 2 and 2, 4 and 0 events of either sign, and one without: six turns in three pixels."""
+    on, off = np.array([[3.0, 2.0, 4.0, 0.0]], np.float32), np.array([[1.0, 2.0, 0.0, 0.0]], np.float32)
+    assert turns(on, off) == pytest.approx(2.0)
+    assert turns(0 * on, 0 * off) == 0

@@ -15,6 +15,7 @@ from kalux.filters.uncertainty import (
     Around,
     add_pattern,
     alone,
+    changed_within,
     given_variance,
     hidden_variance,
     known_variance,
@@ -41,6 +42,22 @@ def test_without_frames_and_events_p_is_given():
     p = np.array([[0.01, 3.0]], np.float32)
     np.testing.assert_array_equal(given_variance(p, STILL, NO_CHANGE, NOTHING, None), p)
     np.testing.assert_allclose(given_variance(p, STILL, NO_CHANGE, NOTHING, around()), p, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("exposed", "turns"), [(0.2, 8.0), (0.7, 1.0), (0.5, 0.05)])
+def test_what_an_exposure_hides_of_light_that_turns(exposed, turns):
+    """By the covariances of its samples: 12 times how far the mean is off the middle, over the change of frames."""
+    t = (np.arange(2001) / 2000 - 0.5) * exposed
+    to_middle, to_all = np.exp(-turns * np.abs(t)), np.exp(-turns * np.abs(t[:, None] - t))
+    off = 1.0 + to_all.mean() - 2.0 * to_middle.mean()
+    expected = 12.0 * off / (2.0 * (1.0 - np.exp(-turns)))
+    assert changed_within(exposed, turns) == pytest.approx(expected, rel=5e-3)
+
+
+def test_light_that_does_not_turn_is_a_random_walk():
+    assert changed_within(0.3, 0.0) == 0.3
+    assert changed_within(0.3, 0.04) == pytest.approx(0.3, rel=0.03)
+    assert changed_within(0.0, 5.0) == 0.0
 
 
 def test_offsets_of_pixels_count_as_the_light_they_are_beside():

@@ -18,7 +18,7 @@ Array = NDArray[np.floating[Any]]
 UNKNOWN_CHANGE: Final = 0.1
 """Mean square, in c^2, where nothing tells it: that of eleven simulated scenes under a moving camera."""
 
-_UNMEASURED_CHANGE: Final = 0.4
+UNMEASURED_CHANGE: Final = 0.4
 """The same where a frame does not measure the pixel, so that none says that it has changed little: the variance
 half-way to such a frame is then that of a moving pixel, as on the same scenes."""
 
@@ -60,9 +60,30 @@ def silent_change(segment: BridgedSegment, quantisation_variance: float, thresho
     of_all, told = _told(given, seconds, q0, most, told_of)
     whole = max(of_all, 0.0) / told if told > _ENOUGH else UNKNOWN_CHANGE * threshold2
     _add_share(change.reshape(-1), untold.reshape(-1), np.float32(whole))
-    unknown, unmeasured = (np.float32(u * threshold2) for u in (UNKNOWN_CHANGE, _UNMEASURED_CHANGE))
+    unknown, unmeasured = (np.float32(u * threshold2) for u in (UNKNOWN_CHANGE, UNMEASURED_CHANGE))
     _mean(_sum_around(change), _sum_around(silent), *variances, unknown, unmeasured, mean)
     return mean
+
+
+def turns(on: Array, off: Array) -> float:
+    """How often a pixel with events turns between two frames, on average: twice for every event and one against it.
+
+    Parameters
+    ----------
+    on, off
+        (H, W) events between them.
+    """
+    pairs, events = _pairs(on.reshape(-1), off.reshape(-1))
+    return float(2.0 * pairs / max(events, 1))
+
+
+@nb.njit(cache=True, nogil=True)
+def _pairs(on, off):  # type: ignore[no-untyped-def]
+    pairs, active = 0.0, 0
+    for i in range(np.uint64(len(on))):
+        pairs += min(on[i], off[i])
+        active += on[i] + off[i] > 0
+    return pairs, active
 
 
 def forget_silence(

@@ -35,7 +35,13 @@ from kalux.augmentation.trail import (
     trail_at,
     trail_between,
 )
-from kalux.augmentation.unseen import UNKNOWN_CHANGE, forget_silence, silent_change
+from kalux.augmentation.unseen import (
+    UNKNOWN_CHANGE,
+    UNMEASURED_CHANGE,
+    forget_silence,
+    silent_change,
+    turns,
+)
 from kalux.compiled import apart
 from kalux.events import EventArray
 from kalux.filters import akf_bridged
@@ -296,8 +302,10 @@ class BridgedFrames(CommonMethod):
             memory.latent, second, on, off, memory.thresholds, self.noise, start, end, grown
         )
         change = self._silent_change(joined)
-        joined = joined._replace(trail=trail, silent_change=change)
+        joined = joined._replace(trail=trail, silent_change=change, turns=turns(on, off))
         joined, far_on, far_off = self._drifting(joined, memory, second, on, off)
+        change = self._of_black(change, memory.latent, second)
+        joined = joined._replace(silent_change=change)
         assert joined.net is not None
         unshown = self._follow_unshown(memory, second, following, joined.net)
         after = memory._replace(
@@ -397,6 +405,14 @@ class BridgedFrames(CommonMethod):
     def _silent_change(self, segment: BridgedSegment) -> Floats:
         return silent_change(segment, self.noise.quantisation_variance, self.on * self.off)
 
+    def _of_black(self, change: Floats, *frames: Latent) -> Floats:
+        """What silent pixels change, where one of the frames is black: no frame says that it is little (K11)."""
+        for frame in frames:
+            if frame.ceiling is not None:
+                unmeasured = np.float32(UNMEASURED_CHANGE * self.on * self.off)
+                change = np.where(np.isfinite(frame.ceiling), unmeasured, change)
+        return change
+
     def _drifting(
         self, segment: BridgedSegment, memory: BridgeMemory, second: Latent, on: Floats, off: Floats
     ) -> tuple[BridgedSegment, Floats, Floats]:
@@ -457,6 +473,9 @@ class BridgedFrames(CommonMethod):
 
     def measured(self, segment: BridgedSegment) -> tuple[Floats, Floats]:
         return segment.forward_variance, segment.backward_variance
+
+    def turns(self, segment: BridgedSegment) -> float:
+        return segment.turns
 
     def around(self, segment: BridgedSegment, t: int) -> Around:
         assert segment.events is not None

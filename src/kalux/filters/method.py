@@ -90,6 +90,9 @@ class Method(Protocol):
     def silent_change(self, segment: Any) -> Floats | None:
         """(H, W): `unseen.silent_change` of the segment; None: the method or the segment does not tell."""
 
+    def turns(self, segment: Any) -> float:
+        """How often a pixel with events turns in a frame interval, on average; 0: the method does not tell."""
+
     def around(self, segment: Any, t: int) -> Around | None:
         """What the two frames that a segment joins say of its pixels at ``t`` (K11); None: the method does not tell."""
 
@@ -119,6 +122,9 @@ class CommonMethod:
 
     def silent_change(self, segment: Any) -> Floats | None:
         return None
+
+    def turns(self, segment: Any) -> float:
+        return 0.0
 
     def around(self, segment: Any, t: int) -> Around | None:
         return None

@@ -6,6 +6,7 @@ has through the bridge; the noise of frames that all images share; and what no e
 
 from __future__ import annotations
 
+import math
 from typing import Any, Final, NamedTuple
 
 import numba as nb
@@ -34,6 +35,8 @@ scenes, exposed for a tenth to two thirds of the time."""
 WRONG_STEPS: Final = 0.002
 """Variance, in c^2 per squared number of events between two frames, half-way, of steps that are all wrong alike: the
 same scenes. A fifth of what thresholds that are 10 % off amount to (K10) where no frame ties them."""
+
+_FEW_TURNS: Final = 1e-2  # in an exposure: what they change is less than the digits of their exponentials
 
 ALONE: Final = 1.6
 """What is hidden of a pixel before its neighbours are heard (K12), in units of what is after it. Their mean takes a
@@ -96,6 +99,22 @@ def hidden_variance(
     hidden = between + (1.0 - between) * HIDDEN_EXPOSED * exposed
     still = hidden * HIDDEN_STILL if since is None else min(since, 1.0)
     return Hidden(still, threshold2 * hidden * HIDDEN_MOVING)
+
+
+def changed_within(exposed: float, turns: float) -> float:
+    """What share of the time frames would be exposed if a pixel went at random and hid as much in their exposures.
+
+    ``exposed`` is the share of the time for which they are, ``turns`` how often the light turns from frame to frame.
+    What turns n times has correlations exp(-n a) over a share a of the time: with x = n ``exposed``, its mean over an
+    exposure is off the middle by 1 + 2 (x - 1 + exp(-x)) / x^2 - 4 (1 - exp(-x/2)) / x of its variance, and it changes
+    by 2 (1 - exp(-n)) of it from frame to frame. Of a random walk, n = 0, the one over the other is ``exposed`` / 12.
+    """
+    within = turns * exposed
+    if within < _FEW_TURNS:
+        return exposed
+    mean = 2.0 * (within + math.expm1(-within)) / within**2
+    off = 1.0 + mean + 4.0 * math.expm1(-within / 2.0) / within
+    return -12.0 * off / (2.0 * math.expm1(-turns))
 
 
 def alone(hidden: Hidden) -> Hidden:
