@@ -94,7 +94,7 @@ class Method(Protocol):
         """What the two frames that a segment joins say of its pixels at ``t`` (K11); None: the method does not tell."""
 
     def unmeasured(self, segment: Any, cursor: Any) -> NDArray[np.int64] | None:
-        """(N,) pixels in the flattened image that neither frame of a segment measures; None: the method does not tell."""
+        """(N,) pixels in the flattened image that neither frame of a segment measures; None: not told."""
 
     def trail(self, segment: Any, cursor: Any, t: int) -> Floats | None:
         """(H, W): how far the light is ahead of its events at ``t`` (K14); None: the method does not tell."""

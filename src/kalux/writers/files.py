@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import _signal  # type: ignore[import-not-found]
 import contextlib
 import errno
 import os
@@ -10,6 +11,7 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 from kalux.errors import OutputError
 from kalux.wording import one_line
@@ -29,29 +31,34 @@ _REASONS = {
 }
 
 
-@contextlib.contextmanager
-def uninterrupted() -> Iterator[None]:
+class uninterrupted:
     """Hold back SIGINT (Ctrl-C) until the end of the block, then let it happen.
 
     Signals reach Python in the main thread only; in others there is nothing to hold back.
     """
-    previous = signal.getsignal(signal.SIGINT)
-    in_main = threading.current_thread() is threading.main_thread()
-    if not in_main or previous is None or previous == signal.SIG_IGN:
-        yield
-        return
-    received: list[int] = []
 
-    def note(number: int, frame: FrameType | None) -> None:
-        received.append(number)
+    # For every image: `contextlib` and what `signal` puts around `_signal` would be 0.1 ms, 1 % of an image.
 
-    signal.signal(signal.SIGINT, note)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, previous)
-        if received:
+    def __init__(self) -> None:
+        self._received = False
+        self._previous: Any = None
+
+    def __enter__(self) -> None:
+        previous = _signal.getsignal(_signal.SIGINT)
+        in_main = threading.current_thread() is threading.main_thread()
+        if in_main and previous is not None and previous != _signal.SIG_IGN:
+            self._previous = previous
+            _signal.signal(_signal.SIGINT, self._note)
+
+    def __exit__(self, *error: object) -> None:
+        if self._previous is None:
+            return
+        _signal.signal(_signal.SIGINT, self._previous)
+        if self._received:
             signal.raise_signal(signal.SIGINT)
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        self._received = True
 
 
 @contextlib.contextmanager
