@@ -153,6 +153,7 @@ def built_seeds(folder: Path) -> Iterator[Seed]:
     for name, write in (
         ("hqf", test_hdf5_layouts.write_hqf),
         ("mvsec", test_hdf5_layouts.write_mvsec),
+        ("v2e", test_hdf5_layouts.write_v2e),
         ("metavision", test_hdf5_layouts.write_metavision),
     ):
         yield put(name, f"{name}.h5", lambda p, w=write: w(p, events, frames, SIZE))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import threading
 from functools import lru_cache
 from typing import NamedTuple
@@ -148,4 +149,30 @@ def unlabelled(simulation: Simulation) -> Recording:
     """The simulated recording without its contrast thresholds."""
     return Recording.from_arrays(
         simulation.events, simulation.frames, sensor_size=simulation.scene.sensor_size, name="unlabelled"
+    )
+
+
+def sky(brightest: float) -> np.ndarray:
+    """Dark and bright surfaces with texture, a third of it a sky without any, at ``brightest``."""
+    rng = np.random.default_rng(2)
+    blocks = np.kron(np.exp(rng.uniform(np.log(0.05), np.log(1.0), (16, 24))), np.ones((5, 5)))
+    blocks[blocks > np.quantile(blocks, 0.67)] = 1.0
+    return brightest * blocks
+
+
+def textured(brightest: float) -> np.ndarray:
+    """Small surfaces of different brightness up to ``brightest``, white = 1."""
+    rng = np.random.default_rng(3)
+    return brightest * np.kron(np.exp(rng.uniform(np.log(0.05), 0.0, (20, 30))), np.ones((4, 4)))
+
+
+def passing_by(picture: np.ndarray, cut: int = 255, **sensor) -> Recording:
+    """A picture that moves by, recorded with thresholds of 0.2 by a camera whose frames end at ``cut``."""
+    scene = photograph_scene(picture, pan(60.0), sensor_size=(48, 64), duration=500_000)
+    made = simulate(
+        scene, SensorSettings(threshold_on=0.2, threshold_off=0.2, exposure=2_000, **sensor), seed=1
+    ).recording()
+    frames = [dataclasses.replace(frame, image=np.minimum(frame.image, cut)) for frame in made.frames()]
+    return Recording.from_arrays(
+        np.concatenate(list(made.events())), frames, sensor_size=made.sensor_size, name="cut"
     )

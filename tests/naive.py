@@ -54,7 +54,7 @@ class Pixel:
 def pixels(events, frames, sensor_size, settings, begin):
     """Split a recording into pixels. The newest event around each event is looked up in the whole stream."""
     height, width = sensor_size
-    camera = Camera.named(chosen_response(settings.camera.response, None), settings.camera.saturation)
+    camera = Camera.named(chosen_response(settings.camera.response, None), settings.camera.clipped_from)
     reference = settings.camera.reference_exposure
     out = {}
     for row in range(height):
@@ -88,7 +88,7 @@ def pixels(events, frames, sensor_size, settings, begin):
                 [f.exposure_end for f in frames],
                 [r * float(camera.response.inverse(q)) for r, q in zip(ratio, response, strict=True)],
                 ratio,
-                [r >= settings.camera.saturation for r in response],
+                [r >= settings.camera.clipped_from for r in response],
                 [float(camera.weight(r)) for r in response],
                 [r == 0 for r in response],
                 [dark_scale(f, settings.camera) for f in frames],
@@ -249,13 +249,13 @@ def trail(pixel, t, scale, height, on, off):
 
 def hides(camera):
     """K7: the most that black hides."""
-    response = Camera.named(chosen_response(camera.response, None), camera.saturation).response
+    response = Camera.named(chosen_response(camera.response, None), camera.clipped_from).response
     return float(response.inverse(0.5 / 255))
 
 
 def dark_scale(frame, camera):
     """K7: how the log intensity of what is black is distributed, by the share of black among what is hardly more."""
-    response = Camera.named(chosen_response(camera.response, None), camera.saturation).response
+    response = Camera.named(chosen_response(camera.response, None), camera.clipped_from).response
     most = hides(camera)
     values = response.inverse(frame.image.ravel() / 255)
     near = max(min(1.5 * most, 0.95), 1.1 * most)
@@ -626,14 +626,14 @@ def steps(rows, columns):
 
 def beyond_rims(split, settings, frames, k):
     """K15: how far above white pixels are that frame ``k`` clips, from those around. Of a sensor of one part."""
-    camera = Camera.named(chosen_response(settings.camera.response, None), settings.camera.saturation)
+    camera = Camera.named(chosen_response(settings.camera.response, None), settings.camera.clipped_from)
     edges = camera.response(np.array([0.475, 0.95]))
     half, white = (np.count_nonzero(frames[0].image / 255 >= edge) for edge in edges)
     fall = np.log(max(half, white) / white) if white else np.inf
     most = min(min(max(np.log(2) / max(fall, 1e-3), 0.3), 2.0) - 0.25, 0.5)
     near = clipped = 0
     for j in range(k + 1):
-        first = np.ceil(settings.camera.saturation * 255) / 255
+        first = np.ceil(settings.camera.clipped_from * 255) / 255
         found = {place for place, pixel in split.items() if pixel.clipped[j]}
         top = next(iter(split.values())).white[j]
         if found:

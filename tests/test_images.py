@@ -15,6 +15,7 @@ GREY = View(
     highlight_scale=1.0,
     highlight_spread=0.1,
     unknown_variance=9.0,
+    fixed_pattern=0.0,
     mosaic=None,
     gains=(1.0, 1.0, 1.0),
 )
@@ -33,6 +34,19 @@ def test_what_is_known_well_is_shown_as_it_is():
     np.testing.assert_allclose(image.intensity, levels, rtol=1e-3, atol=1e-6)
     np.testing.assert_allclose(image.variance, 1e-4, rtol=1e-3)
     assert (image.t, image.final, image.log_offset, image.colour) == (7, True, 0.05, None)
+
+
+def test_the_variance_counts_the_fixed_pattern_of_the_frames():
+    """0.01 of white beside I + I_0 of 0.1 and 0.5; in units of the brightest level that frames show."""
+    view = dataclasses.replace(GREY, fixed_pattern=0.01)
+    still = np.zeros((1, 2), bool)
+    known = estimate([[0.05, 0.45]], moving=still, silent_change=np.zeros((1, 2), np.float32))
+    image = make_image(known, view)
+    np.testing.assert_allclose(image.variance, [[1e-4 + 0.1**2, 1e-4 + 0.02**2]], rtol=1e-4)
+    assert image.fixed_pattern == pytest.approx(0.01)
+    np.testing.assert_array_equal(image.intensity, make_image(known, GREY).intensity)
+    longer = dataclasses.replace(known, white=float(np.log(2.05)))
+    assert make_image(longer, view).fixed_pattern == pytest.approx(0.02)
 
 
 def test_a_doubtful_highlight_is_drawn_towards_white_and_no_other_pixel():

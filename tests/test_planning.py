@@ -17,7 +17,7 @@ from kalux.pipeline import execute
 from kalux.planning import plan
 from kalux.settings import altered
 
-from builders import events, frame, moving_blocks, recording, unlabelled
+from builders import events, frame, moving_blocks, passing_by, recording, sky, textured, unlabelled
 
 
 @pytest.mark.parametrize(
@@ -180,6 +180,47 @@ def test_the_frame_noise_comes_from_the_frames_and_can_be_given():
     assert unknown.settings.camera.noise == (unknown.settings.camera.usual_frame_noise, 0.0)
     paper = plan(source, at="frames", preset="iccv2021").settings
     assert paper.camera.frame_noise is None  # it has a confidence instead
+
+
+@pytest.mark.parametrize("stated", [True, False], ids=["thresholds stated", "estimated"])
+@pytest.mark.parametrize("cut", [102, 240])
+def test_a_camera_that_ends_below_full_scale_saturates_there(cut, stated):
+    source = passing_by(textured(3 * cut / 255), cut)
+    settings = altered(PRESETS["default"], "events", threshold_on=0.2, threshold_off=0.2)
+    made = plan(source, at="frames", settings=settings if stated else None)
+    assert made.settings.camera.saturation == pytest.approx(0.98 * cut / 255)
+    assert made.ceiling.level == pytest.approx(cut / 255)
+    given = plan(source, at="frames", settings=altered(settings, "camera", saturation=0.9))
+    assert (given.settings.camera.saturation, given.ceiling) == (0.9, None)
+
+
+@pytest.mark.parametrize("picture", [sky(0.5), sky(0.9), textured(0.6)], ids=["sky", "bright sky", "texture"])
+def test_a_scene_that_ends_below_white_does_not_saturate(picture):
+    """Nor does the paper's filter, whatever it sees."""
+    made = plan(passing_by(picture), at="frames")
+    assert (made.settings.camera.saturation, made.ceiling) == (0.98, None)
+    paper = plan(passing_by(textured(1.2), 102), at="frames", preset="iccv2021")
+    assert (paper.settings.camera.saturation, paper.ceiling) == (0.98, None)
+
+
+def test_the_fixed_pattern_comes_from_the_frames_and_can_be_given():
+    rng = np.random.default_rng(0)
+    ramp, offset = np.linspace(20, 150, 60), rng.normal(0, 2, (60, 80))
+    frames = [
+        Frame(
+            (np.roll(ramp, 9 * k)[:, None] + offset).round().astype(np.uint8), 50_000 * k, 50_000 * k + 1000
+        )
+        for k in range(10)
+    ]
+    source = Recording.from_arrays(np.empty(0, EVENT_DTYPE), frames, sensor_size=offset.shape)
+    made = plan(source, at="frames")
+    assert (
+        made.settings.camera.fixed_pattern == made.fixed_pattern.deviation == pytest.approx(2 / 255, rel=0.1)
+    )
+    none = altered(PRESETS["default"], "camera", fixed_pattern=0.0)
+    assert plan(source, at="frames", settings=none).settings.camera.fixed_pattern == 0
+    assert plan(recording(), at="frames").settings.camera.fixed_pattern == 0  # its pixels are too few to tell
+    assert plan(source, at="frames", preset="iccv2021").settings.camera.fixed_pattern is None
 
 
 def test_the_bright_tail_comes_from_the_frames_and_can_be_given():

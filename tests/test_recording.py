@@ -101,9 +101,23 @@ def test_frames_in_memory_with_one_stamp_each():
 
 
 def test_a_white_value_that_can_hardly_be_right_is_warned_of():
-    dark = [dataclasses.replace(f, image=f.image.astype(np.uint16)) for f in small_frames()]
+    dark = [dataclasses.replace(f, image=f.image.astype(np.uint16) * 2) for f in small_frames()]
     with pytest.warns(UserWarning, match=r"arrays: no pixel .*white=1023"):
         in_memory(frames=dark)
+
+
+def test_white_is_found_where_frames_of_16_bits_end(recwarn):
+    """All frames get it, also those before the one that shows it, and copies; no warning is needed."""
+    frames = [
+        Frame(np.full((3, 4), level, np.uint16), 100 * k, 100 * k + 50) for k, level in enumerate((9, 4095))
+    ]
+    recording = Recording.from_arrays(small_events()[:0], frames, sensor_size=(3, 4))
+    assert recording.found_white == 4095
+    assert [frame.white for frame in recording.frames()] == [4095, 4095]
+    assert [frame.white for frame in recording.stored_frames()] == [4095, 4095]
+    assert not recwarn
+    given = Recording(recording.source, white=60000)
+    assert (given.found_white, {frame.white for frame in given.frames()}) == (None, {60000})
 
 
 def test_a_recording_says_what_it_is():

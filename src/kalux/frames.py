@@ -247,6 +247,36 @@ def _check_times(frame: Frame, where: str, index: int) -> None:
             )
 
 
+_BITS: Final = (8, 10, 12, 14)
+"""Of cameras whose frames may be stored in 16."""
+
+_CLIPPED: Final = 1e-3
+"""Share of the pixels that are at white where frames show that they clip: fewer are broken pixels."""
+
+
+def white_of_bits(frames: Iterable[Frame]) -> int | None:
+    """The largest value of 8, 10, 12 or 14 bits, where 16-bit frames whose white is not stated end exactly there.
+
+    That is, a thousandth of their pixels have it and none exceeds it: a scene does not end so, only a converter does.
+    """
+    largest = at_largest = pixels = 0
+    for frame in frames:
+        image = frame.image
+        if frame.white is not None or image.dtype != np.uint16:
+            return None
+        brightest = int(image.max(initial=0))
+        if brightest >= 1 << _BITS[-1]:
+            return None
+        if brightest >= largest:
+            at_largest = (at_largest if brightest == largest else 0) + int(
+                np.count_nonzero(image == brightest)
+            )
+            largest = brightest
+        pixels += image.size
+    is_white = largest + 1 in [1 << bits for bits in _BITS]
+    return largest if is_white and at_largest >= _CLIPPED * pixels else None
+
+
 class Levels:
     """Watches frames go by, and tells whether the white value that they state, or that their type has, can be right."""
 
@@ -268,7 +298,7 @@ class Levels:
             return None
         if self._frame.image.dtype.kind == "f":
             return self._doubt_of_floats()
-        bits = next((bits for bits in (10, 12, 14) if self._largest < 1 << bits), None)
+        bits = next((bits for bits in _BITS if self._largest < 1 << bits), None)
         if bits is None:
             return None
         white = (1 << bits) - 1

@@ -17,7 +17,7 @@ from kalux.augmentation.highlights import Unshown
 from kalux.augmentation.unseen import UNKNOWN_CHANGE
 from kalux.filters.highlights import keep_white, lifted, read_unshown, tempered
 from kalux.filters.readout import HighlightPrior, read_out
-from kalux.filters.uncertainty import Around, alone, given_variance, hidden_variance
+from kalux.filters.uncertainty import Around, add_pattern, alone, given_variance, hidden_variance
 from kalux.frames import Mosaic
 from kalux.models.colour import Gains, calm_highlights, demosaic, luminance
 
@@ -46,6 +46,8 @@ class Image:
     colour
         float32 (H, W, 3), linear red, green, blue with the scale of ``intensity``, which of a Bayer sensor holds each
         pixel's own channel before white balance, and of frames in RGB the luminance. None: the frames are grey.
+    fixed_pattern
+        Standard deviation, in units of the intensity, of the offsets of the sensor's pixels that ``variance`` counts.
     """
 
     t: int
@@ -54,6 +56,7 @@ class Image:
     log_offset: float
     final: bool
     colour: NDArray[np.float32] | None = None
+    fixed_pattern: float = 0.0
 
     def __repr__(self) -> str:
         height, width = self.intensity.shape
@@ -143,6 +146,8 @@ class View:
         off thresholds are where no frame checks them.
     unknown_variance
         P of a pixel of which nothing is known.
+    fixed_pattern
+        Standard deviation of the pixels' offsets in the frames (K11), white = 1.
     mosaic, gains
         Pattern of a Bayer sensor, None of others, and its white balance.
     """
@@ -153,6 +158,7 @@ class View:
     highlight_scale: float
     highlight_spread: float
     unknown_variance: float
+    fixed_pattern: float
     mosaic: Mosaic | None
     gains: Gains
 
@@ -193,11 +199,14 @@ def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) ->
         read_unshown(intensity, heard, estimate.log_intensity, unshown, view.log_offset, prior)
     if estimate.unmeasured is not None:
         keep_white(intensity, estimate.log_intensity, estimate.unmeasured, view.log_offset, prior)
+    pattern = view.fixed_pattern * (np.exp(estimate.white) - view.log_offset)
     if not tells:
         total = np.ndarray(intensity.shape, np.float32, _UNTOLD, strides=(0, 0))
     elif moving is not None and change is not None:
         total = given_variance(told, moving, change, hidden, estimate.around, total if left else None)
-    image = Image(estimate.t, intensity, total, view.log_offset, estimate.final)
+        if pattern > 0:
+            add_pattern(total, intensity, view.log_offset, pattern)
+    image = Image(estimate.t, intensity, total, view.log_offset, estimate.final, fixed_pattern=float(pattern))
     return dataclasses.replace(image, colour=_coloured(image, estimate, view))
 
 

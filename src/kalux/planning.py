@@ -18,7 +18,9 @@ from kalux.calibration.contrast import (
 )
 from kalux.calibration.delay import DelayEstimate, estimate_delay
 from kalux.calibration.event_model import EventModel, estimate_event_model
+from kalux.calibration.fixed_pattern import FixedPattern, estimate_fixed_pattern
 from kalux.calibration.frame_noise import FrameNoise, estimate_frame_noise
+from kalux.calibration.levels import Ceiling, exact_end, find_ceiling
 from kalux.calibration.mismatch import Mismatch, estimate_mismatch
 from kalux.calibration.noise import event_noise
 from kalux.calibration.steps import MAX_SAMPLES
@@ -59,8 +61,8 @@ class Plan:
     Attributes
     ----------
     settings
-        With thresholds, refractory period, delay, frame noise, I_0, step variance, reference exposure and white balance
-        filled in.
+        With thresholds, refractory period, delay, frame noise, fixed pattern, I_0, step variance, saturation, reference
+        exposure and white balance filled in.
     threshold_origin
         Whether the thresholds come from the settings, the recording, a calibration, an estimate, or are assumed.
     estimate
@@ -79,10 +81,14 @@ class Plan:
         What a calibration says of single pixels.
     frame_noise
         The fit of the frames' noise, where there was one.
+    fixed_pattern
+        The fit of the frames' fixed pattern, where there was one.
     mismatch
         The fit of the thresholds' spread between pixels, where there was one.
     background_rate
         The measured noise of events, Hz per pixel, where it was.
+    ceiling
+        Where the frames end at one level below the usual saturation while events go on.
     """
 
     settings: Settings
@@ -95,8 +101,10 @@ class Plan:
     smooth: bool
     pixels: PixelCalibration | None = None
     frame_noise: FrameNoise | None = None
+    fixed_pattern: FixedPattern | None = None
     mismatch: Mismatch | None = None
     background_rate: float | None = None
+    ceiling: Ceiling | None = None
 
 
 def plan(
@@ -126,8 +134,9 @@ def plan(
     if known.pixels is not None:
         require_size(known.pixels, recording.sensor_size)
     recording = remembering(recording, _REMEMBERED_EVENTS, _REMEMBERED_FRAMES)
+    chosen, ceiling = with_saturation(recording, chosen)
     response = chosen_response(chosen.camera.response, recording.response)
-    camera = Camera.named(response, chosen.camera.saturation)
+    camera = Camera.named(response, chosen.camera.clipped_from)
     exposures, tail = _survey(recording, camera if _measures_tail(chosen) else None)
     begin = _begin_time(exposures[0], chosen, lookahead)
     wanted = image_times(recording, exposures, begin, rate_hz=rate_hz, times=times, at=at)
@@ -136,6 +145,7 @@ def plan(
     chosen = altered(chosen, "camera", reference_exposure=reference, response=response)
     chosen = _with_white_balance(recording, chosen)
     chosen, noise = _with_frame_noise(recording, chosen)
+    chosen, pattern = _with_fixed_pattern(recording, chosen)
     chosen, delay = _with_delay(recording, chosen)
     filled, origin, estimate, model = _with_event_steps(recording, chosen)
     unsure = estimate.spread if estimate is not None and origin in _FOUND else 0.0
@@ -157,8 +167,10 @@ def plan(
         smooth=smooth,
         pixels=known.pixels,
         frame_noise=noise,
+        fixed_pattern=pattern,
         mismatch=mismatch,
         background_rate=background,
+        ceiling=ceiling,
     )
 
 
@@ -171,6 +183,28 @@ def _check_smooth(settings: Settings, lookahead: bool) -> None:
         raise InputError(
             "reconstruct: the complementary filter has no variance, so that it cannot be smoothed"
         )
+
+
+def with_saturation(recording: Recording, settings: Settings) -> tuple[Settings, Ceiling | None]:
+    """Fill in the saturation: from the settings, else where frames end at one level and events go on, else the usual.
+
+    Frames may end with the scene: events decide, by thresholds that are estimated as if the frames were clipped there.
+
+    Returns
+    -------
+    The settings, and where the frames end, if that was found.
+    """
+    camera = settings.camera
+    usual = altered(settings, "camera", saturation=camera.clipped_from)
+    if camera.saturation is not None or not _uses_steps(settings):
+        return usual, None
+    end = exact_end(recording, camera.usual_saturation)
+    if end is None:
+        return usual, None
+    clipped = altered(settings, "camera", saturation=camera.usual_saturation * end)
+    known, *_ = _with_event_steps(recording, _with_delay(recording, clipped)[0])
+    found = find_ceiling(recording, known.camera, known.events)
+    return (clipped, found) if found is not None and found.is_at(end) else (usual, None)
 
 
 def _survey(recording: Recording, camera: Camera | None) -> tuple[NDArray[np.int64], BrightTail | None]:
@@ -238,6 +272,14 @@ def _with_frame_noise(recording: Recording, settings: Settings) -> tuple[Setting
     read, shot = camera.noise if found is None else (found.read, found.shot)
     shot = shot if camera.shot_noise is None else camera.shot_noise
     return altered(settings, "camera", frame_noise=read, shot_noise=shot), found
+
+
+def _with_fixed_pattern(recording: Recording, settings: Settings) -> tuple[Settings, FixedPattern | None]:
+    """Fill in the frames' fixed pattern, where the variance counts it: from the settings, else an estimate, else 0."""
+    if settings.camera.fixed_pattern is not None or not _uses_steps(settings):
+        return settings, None
+    found = estimate_fixed_pattern(recording, settings.camera)
+    return altered(settings, "camera", fixed_pattern=0.0 if found is None else found.deviation), found
 
 
 def _with_event_steps(

@@ -128,10 +128,10 @@ class Reconstructor:
         self.thresholds = (assumed.threshold_on, assumed.threshold_off)
         self._delay = chosen.lateness
         camera = self.settings.camera
-        self._camera = Camera.named(camera.response, camera.saturation)
+        self._camera = Camera.named(camera.response, camera.clipped_from)
         if inverse_covariance is not None:
             self._camera = Camera.from_inverse_covariance(
-                inverse_covariance, self._camera.response, camera.saturation
+                inverse_covariance, self._camera.response, camera.clipped_from
             )
         self._gains = white_balance(camera.white_balance)
         self._reference = camera.reference_exposure or reference_exposure
@@ -407,6 +407,7 @@ class Reconstructor:
             highlight_scale=scale,
             highlight_spread=spread,
             unknown_variance=filtered.initial_variance,
+            fixed_pattern=self.settings.camera.fixed_pattern or 0.0,
             mosaic=mosaic,
             gains=(1.0, 1.0, 1.0) if frame is None or mosaic is None else self._gains_of(frame),
         )

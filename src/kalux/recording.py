@@ -6,6 +6,7 @@ import copy
 import dataclasses
 import warnings
 from collections.abc import Callable, Iterable, Iterator
+from functools import cached_property
 from itertools import islice
 from numbers import Real
 from pathlib import Path
@@ -38,6 +39,7 @@ from kalux.frames import (
     is_white,
     place_exposure,
     require_frame,
+    white_of_bits,
 )
 from kalux.models.colour import sample_mosaic
 from kalux.readers import CHUNK_EVENTS, Source, joined
@@ -45,6 +47,8 @@ from kalux.readers import CHUNK_EVENTS, Source, joined
 T = TypeVar("T")
 
 _LARGEST_SIDE: Final = 1 << 16  # coordinates of events have 16 bits
+
+_WATCHED: Final = 80  # frames, of which the white value is taken where nobody states it
 
 
 class EventStream:
@@ -139,7 +143,7 @@ class Recording:
     mosaic
         The Bayer pattern of the sensor, from the file or as given; None: it has none, or none is known.
     white
-        The value of a saturated pixel as given; None: what the frames say themselves.
+        The value of a saturated pixel as given; None: what the frames say themselves, or `found_white`.
     """
 
     def __init__(
@@ -275,6 +279,14 @@ class Recording:
         """The frame camera's response that the recording states, as in `kalux.settings.CameraSettings`, or None."""
         return self.source.response
 
+    @cached_property
+    def found_white(self) -> int | None:
+        """The value of a saturated pixel where nobody states it and 16-bit frames show it.
+
+        None: as of their type, or stated. Looks at the first 80 frames (`kalux.frames.white_of_bits`).
+        """
+        return white_of_bits(islice(self.source.frames(), _WATCHED)) if self.white is None else None
+
     @property
     def longest_exposure(self) -> int:
         """Of all frames, us; 0 without frames. They are read for it if nobody has read them all before."""
@@ -331,9 +343,12 @@ class Recording:
 
     def _checked_frames(self, *, as_stored: bool = False) -> Iterator[Frame]:
         previous, longest = None, 0
+        white = self.white
         for index, frame in enumerate(self.source.frames()):
-            if self.white is not None:
-                frame = dataclasses.replace(frame, white=self.white)
+            if index == 0 and frame.image.dtype == np.uint16 and white is None:
+                white = self.found_white
+            if white is not None:
+                frame = dataclasses.replace(frame, white=white)
             if self._exposure is not None:
                 frame = place_exposure(frame, self._exposure, self._stamp)
             if not as_stored:

@@ -34,8 +34,8 @@ class CameraSettings:
     Attributes
     ----------
     response
-        ``"linear"`` (raw sensor values: DAVIS, machine vision), ``"srgb"``, ``"gamma:EXPONENT"``, ``"s-curve:BLACK"``,
-        or a measured ``"curve:0 0.0012 ... 1"``: the irradiance at equally spaced response levels
+        ``"linear"`` (raw sensor values: DAVIS, machine vision), ``"srgb"``, ``"bt709"`` (video), ``"gamma:EXPONENT"``,
+        ``"s-curve:BLACK"``, or a measured ``"curve:0 0.0012 ... 1"``: the irradiance at equally spaced response levels
         (`kalux calibrate response`). Three with ";" between them are those of red, green and blue. ``"auto"``: what
         the recording states, else linear.
     log_offset
@@ -49,6 +49,10 @@ class CameraSettings:
     usual_frame_noise
         The frame noise where the recording does not tell it, without shot noise. 0.006 is what the paper's 7e5 1/s
         amounts to at 25 frames/s.
+    fixed_pattern
+        Standard deviation of the offsets that pixels of frames keep from frame to frame, white = 1: the images have
+        them, too, and their variance counts them (docs/equations.md, K11). None: an estimate from the recording
+        (`kalux.calibration.fixed_pattern`), 0 where it does not tell.
     confidence
         1 / sigma_im^2 of equation (6) as the paper uses it, a rate in 1/s: 7e5 (DAVIS), 7e7 (FLIR). For
         augmentation "paper" only.
@@ -56,8 +60,11 @@ class CameraSettings:
         Smallest f^w, which caps R_bar. 0.09 is the released code's; for augmentation "paper" only, since
         the other gives clipped pixels no weight at all.
     saturation
-        Response, 0 to 1, from which a pixel counts as clipped. 0.98: a few levels below 255, for sensors with
-        fixed pattern noise at the top.
+        Response, 0 to 1, from which a pixel counts as clipped. None: where the recording's frames all end at one level
+        while events go on (`kalux.calibration.levels`), else the usual one.
+    usual_saturation
+        The same where the recording does not tell it; of frames that end lower, the share of their end. 0.98: a few
+        levels below 255, for sensors with fixed pattern noise at the top.
     reference_exposure
         Exposure time, us, at which a saturated pixel has intensity 1; None: the recording's median.
     white_balance
@@ -71,9 +78,11 @@ class CameraSettings:
     frame_noise: float | None = None
     shot_noise: float | None = None
     usual_frame_noise: float = 0.006
+    fixed_pattern: float | None = None
     confidence: float = 7e5
     weight_floor: float = 0.09
-    saturation: float = 0.98
+    saturation: float | None = None
+    usual_saturation: float = 0.98
     reference_exposure: int | None = None
     white_balance: str = "as-recorded"
 
@@ -87,6 +96,11 @@ class CameraSettings:
         """Frame noise and shot noise, also where nobody has said or estimated them."""
         read = self.usual_frame_noise if self.frame_noise is None else self.frame_noise
         return read, self.shot_noise or 0.0
+
+    @property
+    def clipped_from(self) -> float:
+        """Response from which a pixel counts as clipped, also where nobody has said or found it."""
+        return self.usual_saturation if self.saturation is None else self.saturation
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -400,6 +414,7 @@ _POSITIVE: Final = {
     "confidence",
     "weight_floor",
     "saturation",
+    "usual_saturation",
     "reference_exposure",
     "threshold_on",
     "threshold_off",
@@ -414,10 +429,10 @@ _LARGEST_WHOLE: Final = 10**18  # fits int64
 _LARGEST: Final = 1e10  # more than any value can mean, and its square is a number in single precision
 _LEAST: Final = 1e-12  # but 0: less than any value can mean, and so is its square
 _LARGEST_OF: Final[Mapping[str, float]] = {
-    **dict.fromkeys(("saturation", "weight_floor"), 1.0),
+    **dict.fromkeys(("saturation", "usual_saturation", "weight_floor"), 1.0),
     "log_offset": 1e3,  # of white: its logarithm is then the same as its radiance
     **dict.fromkeys(
-        ("frame_noise", "usual_frame_noise", "shot_noise"), 10.0
+        ("frame_noise", "usual_frame_noise", "shot_noise", "fixed_pattern"), 10.0
     ),  # of white: nothing is left of a frame
     # Log intensity: exp(100) is more than single precision holds.
     **dict.fromkeys(("threshold_on", "threshold_off", "usual_threshold_on", "usual_threshold_off"), 100.0),
@@ -432,6 +447,8 @@ _LARGEST_OF: Final[Mapping[str, float]] = {
         ("step_variance", "usual_step_variance", "quantisation_variance", "deblur_variance"), 100.0
     ),  # c^2
     **dict.fromkeys(("highlight_tail", "unshown_tail"), 100.0),  # multiples of a log intensity
+    # us: pixels in the dark are late by tens of milliseconds, guessed stamps by an exposure, at most seconds.
+    **dict.fromkeys(("delay", "usual_delay", "refractory_period"), 10_000_000),
 }
 _LEAST_OF: Final[Mapping[str, float]] = {
     # The square of a frame's weight, 1 / noise^2, is still a number in single precision.
@@ -453,7 +470,7 @@ def _check(settings: Settings) -> None:
 
 
 def _check_value(label: str, name: str, value: Any, default: Any) -> None:
-    most = _LARGEST_WHOLE if name in _WHOLE else _LARGEST_OF.get(name, _LARGEST)
+    most = _LARGEST_OF.get(name, _LARGEST_WHOLE if name in _WHOLE else _LARGEST)
     least = _LEAST_OF.get(name, _LEAST)
     if name in _CHOICES:
         if value not in _CHOICES[name]:
@@ -469,7 +486,10 @@ def _check_value(label: str, name: str, value: Any, default: Any) -> None:
     elif name in _WHOLE and not (isinstance(value, int) and not isinstance(value, bool)):
         raise SettingsError(f"settings: {label} is {value!r}; whole microseconds are needed")
     elif isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= most:
-        raise SettingsError(f"settings: {label} is {value!r}; a finite number is needed, at most {most:g}")
+        hint = " us; kalux register brings clocks together that differ by more" if name in _SIGNED else ""
+        raise SettingsError(
+            f"settings: {label} is {value!r}; a finite number is needed, at most {most:g}{hint}"
+        )
     elif 0 < abs(value) < least:
         raise SettingsError(
             f"settings: {label} is {value!r}; {least:g} is the least above 0 that is possible"

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from kalux.calibration.levels import find_ceiling
+from kalux.calibration.levels import Ceiling, find_ceiling
 from kalux.recording import Recording
-from kalux.settings import AUTO, CameraSettings, Settings
+from kalux.settings import AUTO, Settings
 from kalux.wording import how_many
 
 if TYPE_CHECKING:
@@ -25,9 +25,6 @@ ORIGINS: Final = {
 """What to call where thresholds come from (`kalux.planning.ThresholdOrigin`)."""
 
 _NOTABLE_SHARE: Final = 0.05
-_ALIKE: Final = 0.99
-"""Of the level at which pixels saturate: where nearly all do from here on, it is one level."""
-
 _GIVEN: Final = "given"
 _USUAL: Final = ORIGINS["assumed"]
 
@@ -84,12 +81,25 @@ def _of_frames(recording: Recording, plan: Plan, asked: Settings) -> Iterator[tu
         how = _GIVEN if asked.camera.frame_noise is not None else "estimated" if plan.frame_noise else _USUAL
         half = np.sqrt(read**2 + shot / 2)
         yield "noise", f"of frames {read:.2g} of white in the dark, {half:.2g} at half of it ({how})"
+    if camera.fixed_pattern is not None:
+        how = _estimated(asked.camera.fixed_pattern, plan.fixed_pattern is not None)
+        what = (
+            f"fixed, of frames {camera.fixed_pattern:.2g} of white"
+            if camera.fixed_pattern
+            else "none that is fixed"
+        )
+        yield "pattern", f"{what} ({how})"
     if plan.settings.filter.bright_tail is not None and plan.settings.filter.highlight_scale > 0:
         how = "measured" if asked.filter.bright_tail is None else _GIVEN
         yield "bright tail", f"{plan.settings.filter.bright_tail:.2f} log intensity ({how})"
     stated = "usual, the recording does not state it" if recording.response is None else "as recorded"
     how = stated if asked.camera.response == AUTO else _GIVEN
     yield "response", f"{response_text(camera.response)} ({how})"
+    if recording.found_white is not None:
+        yield "white", f"{recording.found_white}, where the 16-bit frames end"
+    if plan.ceiling is not None:
+        how = f"frames end at {plan.ceiling.level:.2g}, {_going_on(plan.ceiling)}"
+        yield "saturation", f"from {camera.clipped_from:.2g} of white ({how})"
     if camera.white_balance != asked.camera.white_balance:
         yield "white balance", f"{camera.white_balance} for red, green, blue (measured)"
 
@@ -97,22 +107,26 @@ def _of_frames(recording: Recording, plan: Plan, asked: Settings) -> Iterator[tu
 def saturation_text(recording: Recording, plan: Plan, asked: Settings) -> str:
     """From which level on pixels count as clipped, and where the recording shows that they are.
 
-    Parameters are those of `settled`; it looks at up to 80 frames once more (`kalux.calibration.levels`).
+    For a plan without a ceiling, which `settled` tells. Parameters are those of `settled`; it looks at up to 80 frames
+    once more (`kalux.calibration.levels`).
     """
-    used = plan.settings.camera.saturation
-    how = "the usual" if asked.camera.saturation == CameraSettings.saturation else _GIVEN
+    used = plan.settings.camera.clipped_from
+    how = "the usual" if asked.camera.saturation is None else _GIVEN
     text = f"from {used:.2g} of white ({how}); "
     ceiling = find_ceiling(recording, plan.settings.camera, plan.settings.events)
     if ceiling is None:
         return text + "events do not go on where the frames end, or too few tell"
     level = f"{ceiling.level:.2g}"
-    if ceiling.least < _ALIKE * ceiling.level:
+    if not ceiling.is_at(ceiling.level):
         level = f"{ceiling.least:.2g} to {2 * ceiling.level - ceiling.least:.2g}"
-    text += f"frames end at {level}, where events go on"
+    text += f"frames end at {level}, {_going_on(ceiling)}"
     if ceiling.level < used:
-        percent = 100 * np.expm1(ceiling.excess)
-        text += f" by {percent:.0f} %: --camera.saturation {_ALIKE * ceiling.least:.2g} does not take that for measured"
+        text += f": --camera.saturation {0.99 * ceiling.least:.2g} does not take that for measured"
     return text
+
+
+def _going_on(ceiling: Ceiling) -> str:
+    return f"where events go on by {100 * np.expm1(ceiling.excess):.0f} %"
 
 
 def _threshold_origin(plan: Plan) -> str:

@@ -365,15 +365,16 @@ def combine(
         (forward.log_intensity, forward.variance, forward.unshown),
         (behind, backward.variance, backward.unshown),
     )
-    obey_bounds(level, *directions)
-    obey_bounds(level, *directions[::-1])
-    unshown = smoothed_unshown(level, *directions)
     variance, told = 1.0 / information, None
     shared = shared_errors(forward.around, backward.around)
     if shared is not None:
         together = (information + 2.0 * shared * np.sqrt(first * second)) / information**2
         black = _black(forward.around, backward.around)
         variance, told = np.where(black, variance, together), np.where(black, together, variance)
+    smoothed = (level, variance) if told is None else (level, variance, told)
+    obey_bounds(smoothed, *directions)
+    obey_bounds(smoothed, *directions[::-1])
+    unshown = smoothed_unshown(level, *directions)
     change = _mean_of_both(forward.silent_change, backward.silent_change)
     return Estimate(
         t=forward.t,

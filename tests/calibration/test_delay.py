@@ -111,3 +111,15 @@ def test_long_recordings_are_not_read_to_the_end(simulation, monkeypatch):
     source = dataclasses.replace(recording.source, frames=lambda: watched(simulation.frames))
     estimate_delay(Recording(source), CAMERA)
     assert len(read) <= 4 < len(simulation.frames)
+
+
+def test_a_valley_that_is_found_late_is_looked_at_on_both_sides(monkeypatch):
+    """What is tried first is least at 6 ms, what is tried for rivals at -3 ms, in a valley that goes on to -5."""
+    grid = delays().tolist()
+    valley = {-6_000: 0.9, -5_000: 0.3, -4_000: 0.4, -3_000: 0.5, 6_000: 0.8, 5_000: 0.85, 7_000: 0.85}
+    monkeypatch.setattr(
+        delay, "_samples", lambda recording, camera: (np.zeros(1_000), [(t, t) for t in grid])
+    )
+    monkeypatch.setattr(delay, "_residual", lambda difference, on, off: valley.get(on, 1.0))
+    found = estimate_delay(late(moving_blocks(), 0), CAMERA)
+    assert found.apparent == pytest.approx(-5_000, abs=500)

@@ -9,43 +9,20 @@ import pytest
 
 import kalux
 from kalux import EVENT_DTYPE, Frame, Recording
-from kalux.calibration.levels import clipping_levels, find_ceiling
-from kalux.datasets import SensorSettings, pan, photograph_scene, simulate
+from kalux.calibration.levels import clipping_levels, exact_end, find_ceiling
 from kalux.settings import PRESETS
+
+from builders import passing_by, sky, textured
 
 SETTINGS = PRESETS["default"]
 EVENTS = dataclasses.replace(SETTINGS.events, threshold_on=0.2, threshold_off=0.2)
-
-
-def sky(brightest: float) -> np.ndarray:
-    """Dark and bright surfaces with texture, a third of it a sky without any, at ``brightest``."""
-    rng = np.random.default_rng(2)
-    blocks = np.kron(np.exp(rng.uniform(np.log(0.05), np.log(1.0), (16, 24))), np.ones((5, 5)))
-    blocks[blocks > np.quantile(blocks, 0.67)] = 1.0
-    return brightest * blocks
-
-
-def recorded(picture: np.ndarray, cut: int = 255, **sensor) -> Recording:
-    scene = photograph_scene(picture, pan(60.0), sensor_size=(48, 64), duration=500_000)
-    made = simulate(
-        scene, SensorSettings(threshold_on=0.2, threshold_off=0.2, exposure=2_000, **sensor), seed=1
-    ).recording()
-    frames = [dataclasses.replace(frame, image=np.minimum(frame.image, cut)) for frame in made.frames()]
-    return Recording.from_arrays(
-        np.concatenate(list(made.events())), frames, sensor_size=made.sensor_size, name="cut"
-    )
-
-
-def textured(brightest: float) -> np.ndarray:
-    rng = np.random.default_rng(3)
-    return brightest * np.kron(np.exp(rng.uniform(np.log(0.05), 0.0, (20, 30))), np.ones((4, 4)))
 
 
 @pytest.mark.parametrize("cut", [100, 235, 255])
 @pytest.mark.parametrize("noise_rate", [0.0, 3.0])
 def test_a_camera_that_clips_is_found(cut, noise_rate):
     found = find_ceiling(
-        recorded(textured(3 * cut / 255), cut, noise_rate=noise_rate), SETTINGS.camera, EVENTS
+        passing_by(textured(3 * cut / 255), cut, noise_rate=noise_rate), SETTINGS.camera, EVENTS
     )
     assert found is not None
     assert 255 * found.level == pytest.approx(cut, abs=0.5)
@@ -58,11 +35,48 @@ def test_a_camera_that_clips_is_found(cut, noise_rate):
 def test_a_scene_that_ends_below_white_is_no_camera_that_clips(picture, wrong):
     """A third of the image is a sky at one level, and thresholds may be a quarter off."""
     events = dataclasses.replace(EVENTS, threshold_on=0.2 * wrong, threshold_off=0.2 * wrong)
-    assert find_ceiling(recorded(picture), SETTINGS.camera, events) is None
+    assert find_ceiling(passing_by(picture), SETTINGS.camera, events) is None
+
+
+def with_frames(*levels, white=None):
+    """(10, 10) frames of one level each."""
+    images = [np.full((10, 10), level, np.uint8) for level in levels]
+    frames = [Frame(image, 1000 * i, 1000 * i + 500, white) for i, image in enumerate(images)]
+    return Recording.from_arrays(np.empty(0, EVENT_DTYPE), frames, sensor_size=(10, 10))
+
+
+def test_the_exact_end_is_that_of_all_frames():
+    assert exact_end(with_frames(100, 200, 90), 0.98) == pytest.approx(200 / 255)
+    assert exact_end(with_frames(100, 200, 90, white=210), 0.98) == pytest.approx(200 / 210)
+    assert exact_end(with_frames(100, 255, 90), 0.98) is None
+    assert exact_end(with_frames(0, 0), 0.98) is None
+    assert exact_end(with_frames(), 0.98) is None
+
+
+def test_glints_are_no_end():
+    """Fewer than a thousandth of the pixels are as bright as the brightest."""
+    few, enough = ([Frame(np.full((50, 50), 9, np.uint8), 0, 5)] * 2 for _ in range(2))
+    for frames, count in ((few, 4), (enough, 5)):
+        image = frames[0].image.copy()
+        image.flat[:count] = 99
+        frames[1] = Frame(image, 10, 15)
+    found = [
+        exact_end(Recording.from_arrays(np.empty(0, EVENT_DTYPE), frames, sensor_size=(50, 50)), 0.98)
+        for frames in (few, enough)
+    ]
+    assert found == [None, pytest.approx(99 / 255)]
+
+
+def test_pixels_that_a_frame_does_not_see_end_nowhere():
+    image = np.full((10, 10), 90, np.uint8)
+    image[0] = 255
+    frames = [Frame(image, 0, 500, valid=image < 255)]
+    recording = Recording.from_arrays(np.empty(0, EVENT_DTYPE), frames, sensor_size=(10, 10))
+    assert exact_end(recording, 0.98) == pytest.approx(90 / 255)
 
 
 def test_without_events_or_light_nothing_is_told():
-    recording = recorded(textured(3.0))
+    recording = passing_by(textured(3.0))
     silent = Recording.from_arrays(
         next(iter(recording.events()))[:0], list(recording.frames()), sensor_size=recording.sensor_size
     )

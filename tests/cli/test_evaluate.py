@@ -15,7 +15,7 @@ from kalux.evaluation.held_out import evaluate_held_out, hold_out_frames
 from kalux.recording import open as open_recording
 from kalux.writers import hdf5
 
-from builders import moving_blocks
+from builders import colour_blocks, moving_blocks
 
 
 @pytest.fixture(scope="session")
@@ -36,6 +36,25 @@ def test_frames_are_held_out_where_there_is_no_truth(cli, recording):
     assert labels(found.out)[:7] == [m.label for n, m in methods().items() if n not in OPTIONAL]
     assert "images, " in lines[9]
     assert "pixels compared; data range 1" in lines[9]
+
+
+@pytest.mark.parametrize(
+    ("mosaic", "told"),
+    [("RGGB", "of every pixel of the mosaic its own colour"), (None, "of RGB the luminance")],
+)
+def test_says_what_of_colours_is_compared(cli, write_recording, tmp_path, mosaic, told):
+    _, made = colour_blocks(mosaic)
+    path = write_recording(
+        tmp_path / "rec.h5",
+        sensor_size=made.scene.sensor_size,
+        events=[made.events],
+        frames=made.frames,
+        contrast_threshold=None,
+        mosaic=mosaic,
+    )
+    found = cli("evaluate", path, "--methods", "hold", "-o", tmp_path / "scores.csv")
+    assert found.out.splitlines()[0].endswith(f"; {told}"), found.err
+    assert told in (tmp_path / "scores.csv").read_text()
 
 
 def test_truth_where_the_recording_has_it(cli, with_truth):

@@ -30,6 +30,7 @@ def test_says_all_that_reconstruct_would_settle(cli, write_recording, tmp_path):
         "background",
         "exposure",
         "noise",
+        "pattern",
         "bright tail",
         "response",
     ]

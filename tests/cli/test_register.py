@@ -79,6 +79,20 @@ def test_an_offset_file_is_taken(cli, files, tmp_path):
     )
 
 
+def test_the_response_that_the_frames_state_is_kept(cli, files, tmp_path):
+    source = kalux.open(files / "scene_frames.h5")
+    stated = tmp_path / "stated.h5"
+    hdf5.write(
+        stated, sensor_size=source.sensor_size, events=[], frames=source.frames(), response="gamma:2.2"
+    )
+    out = tmp_path / "both.h5"
+    done = cli(
+        "register", files / "scene.h5", "--frames", stated, "--rig", files / "true.toml", "--homography", "rig",
+        "--distance", DISTANCE, "--offset", OFFSET, "-o", out, "--quiet",
+    )  # fmt: skip
+    assert (done.code, kalux.open(out).response) == (0, "gamma:2.2")
+
+
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [

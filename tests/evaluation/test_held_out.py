@@ -11,6 +11,7 @@ from kalux.datasets import SensorSettings
 from kalux.errors import FrameError, InputError
 from kalux.evaluation.baselines import methods
 from kalux.evaluation.consistency import blur_consistency, valid_pixels
+from kalux.evaluation.exposures import End, end_of_frames
 from kalux.evaluation.held_out import (
     clipped_as,
     evaluate_held_out,
@@ -21,7 +22,7 @@ from kalux.evaluation.held_out import (
 )
 from kalux.evaluation.method import Estimated, Method
 
-from builders import frame, moving_blocks, pixel_events
+from builders import frame, moving_blocks, passing_by, pixel_events, textured
 
 
 def still(levels, exposures=None, size=(12, 12)):
@@ -106,7 +107,7 @@ def test_pixels_that_are_not_valid_do_not_count():
     scores = evaluate_held_out(held, constant(100 / 255))
     assert scores.mse == pytest.approx(0, abs=1e-12)
     assert scores.images[0].pixels == mask.sum()
-    np.testing.assert_array_equal(valid_pixels(frames[0]), mask)
+    np.testing.assert_array_equal(valid_pixels(frames[0], 0.98), mask)
 
 
 def test_held_out_frames_in_colour_are_clipped_where_one_colour_is():
@@ -143,6 +144,14 @@ def test_a_held_out_frames_own_noise_is_no_error_of_the_method():
     assert found.uncertainty()["rms_z"] == pytest.approx(1.0, abs=0.06)
 
 
+def test_a_pattern_that_the_held_out_frames_share_is_no_error_between_them():
+    intensity, own = np.array([[0.1, 0.4]]), np.array([[0.01, 0.02]])
+    made = Estimated(intensity, own + (0.05 / (intensity + 0.1)) ** 2, 0.1, 0.05)
+    np.testing.assert_allclose(made.variance_of_frames, own)
+    assert Estimated(intensity, own, 0.1).variance_of_frames is own
+    assert Estimated(intensity, None, 0.1, 0.05).variance_of_frames is None
+
+
 def test_nothing_is_clipped_unless_asked_for():
     held = hold_out_frames(still([255] * 8))
     assert evaluate_held_out(held, constant(3.0)).mse == pytest.approx(4.0)
@@ -160,7 +169,20 @@ def test_auto_exposure_frames_are_scaled_to_the_kept_frames_median():
     assert held.reference_exposure == 20
     assert evaluate_held_out(held, methods()["hold"]).mse == pytest.approx(0, abs=1e-12)
     short = frame(255, 0, 10)
-    assert clipped_as(np.array([[5.0, -1.0]]), short, 20).tolist() == [[2.0, 0.0]]
+    assert clipped_as(np.array([[5.0, -1.0]]), short, 20, End(0.98, 1.0)).tolist() == [[2.0, 0.0]]
+
+
+def test_images_are_clipped_where_a_camera_ends_below_full_scale():
+    """At 102 of 255, which events tell: highlights beyond are no error of theirs."""
+    recording = passing_by(textured(1.2), 102, noise_rate=0.0)
+    end = end_of_frames(recording, "linear")
+    assert end == (pytest.approx(0.98 * 0.4), pytest.approx(0.4))
+    held = hold_out_frames(recording)
+    assert held.end == end
+    bright = Method("bright", lambda rec, ts: (np.full(rec.sensor_size, 3.0) for _ in ts))
+    for pair in held_out_pairs(held, bright, clip=True):
+        np.testing.assert_allclose(pair.test, 0.4)
+        assert 0.05 < np.mean(pair.clipped) < 0.9
 
 
 def test_reads_are_averaged_across_the_exposure():
@@ -238,7 +260,7 @@ class TestBlurConsistency:
         levels[0], levels[1] = 255, 0
         frames = [frame(levels, 100 * i, 100 * i + 10) for i in range(3)]
         recording = Recording.from_arrays(pixel_events([], []), frames, sensor_size=(12, 12))
-        assert np.count_nonzero(valid_pixels(frames[0])) == 120
+        assert np.count_nonzero(valid_pixels(frames[0], 0.98)) == 120
         found = blur_consistency(recording, constant(0.5))
         assert found.frames == ((105, 120, pytest.approx(20.0)),)
 

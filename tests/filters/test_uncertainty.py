@@ -13,6 +13,7 @@ from kalux.filters.uncertainty import (
     ALIKE,
     ALONE,
     Around,
+    add_pattern,
     alone,
     given_variance,
     hidden_variance,
@@ -40,6 +41,12 @@ def test_without_frames_and_events_p_is_given():
     p = np.array([[0.01, 3.0]], np.float32)
     np.testing.assert_array_equal(given_variance(p, STILL, NO_CHANGE, NOTHING, None), p)
     np.testing.assert_allclose(given_variance(p, STILL, NO_CHANGE, NOTHING, around()), p, rtol=1e-6)
+
+
+def test_offsets_of_pixels_count_as_the_light_they_are_beside():
+    variance = np.array([[0.25, 0.5]], np.float32)
+    add_pattern(variance, np.array([[0.0, 0.3]], np.float32), 0.1, 0.02)
+    np.testing.assert_allclose(variance, [[0.25 + 0.2**2, 0.5 + 0.05**2]], rtol=1e-5)
 
 
 @given(variances, variances, st.floats(0.0, 30.0), st.floats(0.0, 0.1))

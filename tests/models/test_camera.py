@@ -29,6 +29,7 @@ RESPONSES = {
     "gamma": Response.gamma(2.2),
     "expanding gamma": Response.gamma(0.5),
     "srgb": Response.srgb(),
+    "bt709": Response.bt709(),
     "tabulated": Response.tabulated([3.0, 4.0, 6.0, 10.0, 40.0]),
 }
 every_response = pytest.mark.parametrize("response", RESPONSES.values(), ids=RESPONSES.keys())
@@ -83,6 +84,13 @@ def test_srgb_agrees_with_the_standard():
     np.testing.assert_allclose(Response.srgb().inverse(levels), expected, rtol=1e-4)
 
 
+def test_bt709_agrees_with_the_standard():
+    """ITU-R BT.709-6, item 1.2: 4.5 L below 0.018, 1.099 L^0.45 - 0.099 from there."""
+    irradiance = np.array([0.01, 0.018, 0.1, 0.5, 1.0])
+    expected = [0.045, 0.0812, 0.2910, 0.7055, 1.0]
+    np.testing.assert_allclose(Response.bt709()(irradiance), expected, atol=3e-4)
+
+
 def test_a_table_is_shifted_and_scaled():
     response = Response.tabulated([3.0, 4.0, 6.0, 10.0, 40.0])
     np.testing.assert_allclose(
@@ -92,7 +100,12 @@ def test_a_table_is_shifted_and_scaled():
 
 @pytest.mark.parametrize(
     ("name", "same"),
-    [("linear", Response.linear()), ("srgb", Response.srgb()), ("gamma:2.2", Response.gamma(2.2))],
+    [
+        ("linear", Response.linear()),
+        ("srgb", Response.srgb()),
+        ("bt709", Response.bt709()),
+        ("gamma:2.2", Response.gamma(2.2)),
+    ],
 )
 def test_named_responses(name, same):
     level = np.linspace(0, 1, 50)
@@ -101,7 +114,7 @@ def test_named_responses(name, same):
 
 @pytest.mark.parametrize("name", ["", "lin", "gamma", "gamma:", "gamma:two", "srgb:2", "LINEAR"])
 def test_unknown_names_say_what_is_known(name):
-    with pytest.raises(SettingsError, match="known are linear, srgb, gamma:EXPONENT"):
+    with pytest.raises(SettingsError, match="known are linear, srgb, bt709, gamma:EXPONENT"):
         Response.named(name)
 
 
@@ -362,6 +375,18 @@ def test_the_tail_is_one_of_light_not_of_response():
         image = np.random.default_rng(1).integers(0, white + 1, (30, 40)).astype(np.uint8)
         assert count_bright(linear, image, white) == count_bright(linear, image / white)
     assert count_bright(gamma, levels ** (1 / 2.2)) == count_bright(linear, levels)
+
+
+def test_what_counts_as_white_lies_below_where_pixels_clip():
+    """The same light, of a camera that clips at half of full scale; one that clips from 1 on is not brighter."""
+    levels = np.minimum(np.random.default_rng(2).exponential(0.4, (30, 40)), 1.0)
+    for response in ("linear", "gamma:2.2"):
+        whole = Camera.named(response, 0.98)
+        half = Camera.named(response, float(whole.response(0.5 * whole.response.inverse(np.array(0.98)))))
+        assert count_bright(half, whole.response(0.5 * levels)) == count_bright(whole, whole.response(levels))
+    assert count_bright(Camera.named("linear", 1.0), levels) == count_bright(
+        Camera.named("linear", 0.98), levels
+    )
 
 
 def test_a_white_value_beyond_the_type_is_one_that_no_pixel_has():

@@ -208,8 +208,20 @@ def test_masks_of_another_number_are_refused(path):
     write_kalux(path, frames=[dataclasses.replace(frame, valid=MASK) for frame in small_frames()])
     with h5py.File(path, "r+") as file:
         file["frames/valid"].resize(3, axis=0)
-    with pytest.raises(FormatError, match="different lengths"):
+    with pytest.raises(FormatError, match="3 masks of valid pixels for 4 frames"):
         readers.read(path)
+
+
+@pytest.mark.parametrize("name", ["events/x", "frames/image", "ground_truth/images"])
+def test_what_is_not_stored_in_full_is_not_read_as_zeros(path, name):
+    """HDF5 gives zeros for what a file lacks: black frames, or events of the first column."""
+    write_kalux(path)
+    with h5py.File(path, "r+") as file:
+        length = len(file[name])
+        file[name].resize(0, axis=0)
+        file[name].resize(length, axis=0)
+    with pytest.raises(FormatError, match=f"/{name} is not stored in full"):
+        readers.read(path).ground_truth()
 
 
 def rewritten(path, name, change):
@@ -243,9 +255,17 @@ def test_integers_of_any_type_are_read(path, name, change):
         ("events/p", lambda p: p.astype(np.float32), "events/p is float32; bool is needed"),
         ("events/x", lambda x: x.astype(np.int32) + 65536, "values from 65536 .*; uint16 is needed"),
         ("events/y", lambda y: y.astype(np.int16) - 1, "values from -1 .*; uint16 is needed"),
+        (
+            "frames/exposure_end",
+            lambda t: t * 1e-6,
+            "exposure_end is float64; int64 is needed, in whole micro",
+        ),
+        ("inverse_covariance", lambda f: f[:7], r"inverse_covariance is float64 \(7,\); 256 finite numbers"),
+        ("inverse_covariance", lambda f: -f, "inverse_covariance has a value of -2; none may be negative"),
+        ("inverse_covariance", lambda f: f.astype("S8"), "inverse_covariance is .*; 256 finite numbers"),
     ],
 )
-def test_columns_that_would_be_other_events_are_refused(path, name, change, told):
+def test_columns_that_would_be_something_else_are_refused(path, name, change, told):
     with pytest.raises(FormatError, match=told):
         all_events(readers.read(rewritten(path, name, change)))
 

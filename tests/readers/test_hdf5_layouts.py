@@ -14,6 +14,7 @@ import pytest
 import kalux
 from kalux import readers
 from kalux.errors import FormatError, FrameError
+from kalux.frames import Frame
 from kalux.readers import hdf5_layout
 from recordings import SIZE, all_events, colour_frames, complaint, damaged, small_events, small_frames
 
@@ -98,6 +99,17 @@ def write_mvsec(path, events, frames, size):
         file["davis/right/events"] = rows[:5]
 
 
+def write_v2e(path, events, frames, size):
+    rows = np.stack([events[name].astype(np.uint32) for name in "txyp"], axis=-1)
+    with h5py.File(path, "w") as file:
+        file.create_dataset("events", data=rows, maxshape=(None, 4), chunks=(100, 4), compression="gzip")
+        images = np.array([frame.image for frame in frames]).reshape(-1, *size)
+        stamps = np.array([frame.exposure_start for frame in frames], np.uint32)
+        file.create_dataset("frame", data=images, compression="gzip")
+        file.create_dataset("frame_ts", data=stamps, compression="gzip")
+        file.create_dataset("frame_idx", data=np.searchsorted(events["t"], stamps), compression="gzip")
+
+
 def write_metavision(path, events, frames, size):
     dtype = np.dtype([("x", "<u2"), ("y", "<u2"), ("p", "<i2"), ("t", "<i8")], align=True)
     rows = np.empty(len(events), dtype)
@@ -113,6 +125,7 @@ LAYOUTS = {
     "dsec": Layout(write_dsec, "events.h5", has_frames=False),
     "hqf": Layout(write_hqf, "slow_hand.h5"),
     "mvsec": Layout(write_mvsec, "indoor_flying1_data.hdf5"),
+    "v2e": Layout(write_v2e, "events.h5"),
     "metavision hdf5": Layout(write_metavision, "spinner.hdf5", has_frames=False),
 }
 
@@ -405,6 +418,39 @@ class TestMvsec:
         assert list(source.frames()) == []
 
 
+class TestV2e:
+    def test_events_alone(self, tmp_path):
+        path = write(tmp_path, "v2e")
+        with h5py.File(path, "r+") as file:
+            for name in ("frame", "frame_ts", "frame_idx"):
+                del file[name]
+        source = readers.read(path)
+        assert (source.count_frames(), source.sensor_size_known, list(source.frames())) == (0, False, [])
+        assert np.array_equal(all_events(source), small_events())
+
+    def test_polarity_that_is_none(self, tmp_path):
+        path = write(tmp_path, "v2e")
+        with h5py.File(path, "r+") as file:
+            file["events"][321, 3] = 2
+        with pytest.raises(FormatError, match="polarity of event 321"):
+            all_events(readers.read(path))
+
+    @pytest.mark.parametrize("times", [np.zeros(3, np.uint32), np.zeros(4)])
+    def test_times_that_are_none(self, tmp_path, times):
+        path = write(tmp_path, "v2e")
+        with h5py.File(path, "r+") as file:
+            del file["frame_ts"]
+            file["frame_ts"] = times
+        with pytest.raises(FormatError, match=r"4 images for 3 times|times of type float64; whole us"):
+            readers.read(path)
+
+    def test_another_table_is_not_taken_for_one(self, tmp_path):
+        with h5py.File(tmp_path / "other.h5", "w") as file:
+            file["events"] = np.zeros((5, 4))
+        with pytest.raises(FormatError, match="not a recording that kalux knows"):
+            readers.read(tmp_path / "other.h5")
+
+
 class TestMetavision:
     def test_the_missing_codec_is_named(self, tmp_path):
         path = write(tmp_path, "metavision hdf5")
@@ -436,9 +482,12 @@ class TestMetavision:
 
 
 def test_a_real_payload(shared_data, tmp_path, layout):
-    """Real payload, our writer."""
+    """Real payload, our writer; from time 0, since v2e has 32 bits for it."""
     source = readers.read(shared_data / "street_davis346.aedat4")
     events, frames = all_events(source), list(source.frames())
+    begin = min(int(events["t"][0]), frames[0].exposure_start)
+    events["t"] -= begin
+    frames = [Frame(f.image, f.exposure_start - begin, f.exposure_end - begin) for f in frames]
     read = readers.read(write(tmp_path, layout, events, frames, source.sensor_size))
     assert read.sensor_size == source.sensor_size
     assert np.array_equal(all_events(read), events)

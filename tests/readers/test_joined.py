@@ -233,11 +233,13 @@ def complaint(path, **options):
     return ""
 
 
-def write_video(path, images, *, codec="ffv1", pixels="gray", rate=25):
+def write_video(path, images, *, codec="ffv1", pixels="gray", rate=25, transfer=None):
     with av.open(str(path), "w") as container:
         stream = container.add_stream(codec, rate)
         stream.height, stream.width = images[0].shape
         stream.pix_fmt = pixels
+        if transfer is not None:
+            stream.codec_context.color_trc = transfer
         kind = "gray16le" if images[0].dtype == np.uint16 else "gray"
         for image in images:
             container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format=kind)))
@@ -274,6 +276,27 @@ class TestVideo:
         rec = kalux.open(events_only, frames=video, frames_start=0, frames_rate=30)
         means = [frame.image.mean() for frame in rec.stamped_frames()]
         assert means == pytest.approx([0, 100, 255], abs=3)
+
+    @pytest.mark.parametrize(
+        ("transfer", "response", "note"),
+        [
+            (1, "bt709", None),
+            (6, "bt709", None),
+            (13, "srgb", None),
+            (8, "linear", None),
+            (None, None, "The video does not state how its pictures follow the light"),
+            (16, None, "The video states transfer characteristics 16 of ITU-T H.273"),
+        ],
+    )
+    def test_the_tone_curve_that_a_video_states(self, events_only, tmp_path, transfer, response, note):
+        video = write_video(
+            tmp_path / "v.mp4", self.images, codec="h264", pixels="yuv420p", transfer=transfer
+        )
+        rec = kalux.open(events_only, frames=video, frames_start=0, frames_rate=30)
+        assert rec.response == response
+        notes = [text for text in rec.source.missing if "count as linear" in text]
+        assert len(notes) == (note is not None)
+        assert all(text.startswith(str(note)) for text in notes)
 
     def test_a_video_in_colour(self, events_only, tmp_path):
         """Its first picture may be black; red is red."""

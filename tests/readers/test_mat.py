@@ -188,7 +188,7 @@ def test_floating_point_images_keep_white(path, save):
         ({"image": None, "im_height": None}, "neither images nor im_height"),
         ({"im_width": 41.0}, "im_height x im_width is 30 x 41, but image is 30 x 40"),
         ({"ct": -0.1}, "ct is"),
-        ({"f_Q": np.ones(255)}, "f_Q has 255 values"),
+        ({"f_Q": np.ones(255)}, r"f_Q is float64 \(255,\); 256 finite numbers"),
         ({"HDR_mat": np.ones((*SIZE, 3, 5))}, "HDR_mat is 30 x 40 x 3 x 5 for 4 frames"),
     ],
 )

@@ -384,7 +384,9 @@ def test_images_in_colour(tmp_path, encoding, order, dtype):
 @pytest.mark.parametrize("bits", [8, 16])
 def test_raw_mosaics_say_their_pattern(tmp_path, mosaic, bits):
     path = tmp_path / "recording.bag"
-    frames = [dataclasses.replace(f, image=f.image.astype(f"u{bits // 8}")) for f in small_frames()]
+    frames = [
+        dataclasses.replace(f, image=f.image.astype(f"u{bits // 8}") << (bits - 8)) for f in small_frames()
+    ]
     write_bag1(path, image_messages([f.image for f in frames], f"bayer_{mosaic}{bits}"))
     recording = kalux.open(path)
     assert recording.mosaic == mosaic.upper()

@@ -61,6 +61,7 @@ def test_blocks_of_text_join_without_a_seam(path, monkeypatch):
         '\ufeff"t_us";"x";"y";"p"\r\n1000000; 2; 3; 1\r\n1500000;4 ;5;-1\r\n',
         "# t_s x y p\n1.0 2 3 1\n\n# comment\n 1.500000\t4  5 0 \n",
         "# a recording\n# t_s x y p\n1 2 3 1\n1.5 4 5 0\n",
+        "# a line\u2028\n# t_s x y p\n1 2 3 1\n1.5 4 5 0\n",  # ends no line of the table
         "x y pol time(ms)\n2 3 true 1e3\n4 5 False 1.5E+3\n",
         "t_ns\tx\ty\tp\n1000000000\t2\t3\t+1\n1500000000\t4\t5\t0\n",
         "id,t_us,note,x,y,p,t_us\n7,1000000,abc,2,3,1,9\n8,1500000,,4,5,0,9\n",
@@ -147,6 +148,24 @@ def test_a_malformed_line_is_named(path, line, fault):
 def test_an_endless_line_is_refused(path):
     with pytest.raises(FormatError, match="line 4: it is too long"):
         parse(path, "t,x,y,p\n" + "1,1,1,1\n" * 2 + "7" * 20_000)
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "",
+        "#!events.txt\n# Format is time (float s), x, y, polarity (0=off, 1=on) as specified at http://rpg\n",
+    ],
+    ids=["IJRR", "v2e"],
+)
+def test_lines_of_events_txt_need_no_names(path, header):
+    path.write_text(header + "0.1 2 3 1\n0.2500005 4 5 0\n")
+    source = readers.read(path)
+    assert all_events(source).tolist() == [(100_000, 2, 3, True), (250_001, 4, 5, False)]
+    assert any("taken as t (s), x, y, p" in text for text in source.missing)
+    path.write_text(header + "0.1 2 3 1\n0.2 1\n")
+    with pytest.raises(FormatError, match=rf"line {header.count(chr(10)) + 2}: it has fewer columns"):
+        all_events(readers.read(path))
 
 
 def test_numbers_without_names_are_refused_with_a_hint(path):

@@ -77,17 +77,29 @@ def estimate_delay(recording: Recording, camera: CameraSettings) -> DelayEstimat
     difference, nets = _samples(recording, camera)
     if len(difference) < _MIN_SAMPLES:
         return None
-    residuals = np.full(len(nets), np.inf)
-    coarse = range(0, len(nets), _COARSE)
-    for index in coarse:
-        residuals[index] = _residual(difference, *nets[index])
-    middle = int(np.argmin(residuals))
-    for index in range(max(middle - _COARSE + 1, 0), min(middle + _COARSE, len(nets))):
-        residuals[index] = _residual(difference, *nets[index])
     grid = delays()
-    nearer = np.abs(grid) <= abs(int(grid[np.argmin(residuals)])) - _VALLEY + STEP
-    for index in np.flatnonzero(nearer & np.isinf(residuals)).tolist():
-        residuals[index] = _residual(difference, *nets[index])
+    residuals = np.full(len(grid), np.inf)
+
+    def try_between(first: int, last: int) -> None:
+        for index in range(max(first, 0), min(last, len(grid) - 1) + 1):
+            if np.isinf(residuals[index]):
+                residuals[index] = _residual(difference, *nets[index])
+
+    def least() -> int:
+        return int(np.argmin(residuals))
+
+    for index in range(0, len(grid), _COARSE):
+        try_between(index, index)
+    try_between(least() - _COARSE + 1, least() + _COARSE - 1)
+    nearer = (
+        abs(int(grid[least()])) - _VALLEY
+    ) // STEP + 1  # steps from no delay, where rivals and those beside lie
+    middle = len(grid) // 2
+    try_between(middle - nearer, middle + nearer)
+    best = -1
+    while best != least():  # what was tried for rivals may be less than all before
+        best = least()
+        try_between(best - 1, best + 1)
     return best_delay(grid, residuals, len(difference))
 
 

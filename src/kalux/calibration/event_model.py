@@ -259,7 +259,7 @@ def _samples(
     count = 0
     response = named_responses(chosen_response(camera.response, recording.response))
     model = Camera(response[len(response) // 2])
-    white = float(model.response.inverse(np.array(camera.saturation)))
+    white = float(model.response.inverse(np.array(camera.clipped_from)))
     black = float(black_ceiling(model, np.zeros(1), 1.0)[0])
     black = black if black > CRUSHED else 0.0
     for interval, on, off in counted_intervals(

@@ -90,7 +90,7 @@ def intervals(
 ) -> Iterator[Interval]:
     """The intervals between the first ``most_frames`` frames, with the events up to ``margin`` us around each."""
     response = chosen_response(camera.response, recording.response)
-    model = Camera.named(response, camera.saturation)
+    model = Camera.named(response, camera.clipped_from)
     chunks = iter(recording.events())
     held: list[EventArray] = []
     previous: tuple[Frame, Shot] | None = None

@@ -47,6 +47,10 @@ _ALIKE: Final = 0.1
 0.05, newton, whose highlights are thin, 0.2."""
 
 
+_SHARP: Final = 0.99
+"""Of a level: where nearly all pixels saturate from here on, it is one level."""
+
+
 class Ceiling(NamedTuple):
     """Where a sensor's pixels saturate.
 
@@ -66,6 +70,10 @@ class Ceiling(NamedTuple):
     least: float
     excess: float
     pixels: int
+
+    def is_at(self, level: float) -> bool:
+        """Whether nearly all pixels saturate at this one level."""
+        return self.least >= _SHARP * level
 
 
 def find_ceiling(recording: Recording, camera: CameraSettings, events: EventSettings) -> Ceiling | None:
@@ -141,6 +149,23 @@ def _changes(
             for each in interval.frames:
                 chosen &= True if each.valid is None else each.valid
             yield np.stack([ends[chosen], sign * told[chosen]])
+
+
+def exact_end(recording: Recording, below: float) -> float | None:
+    """The response, if it is below ``below``, that a thousandth of the pixels of the first 80 frames have, and none
+    exceeds: where a sensor may clip, or a scene ends."""
+    end, at_end, pixels = 0.0, 0, 0
+    for frame in islice(recording.frames(), _MAX_FRAMES):
+        image = frame.image if frame.valid is None else frame.image[frame.valid]
+        brightest = image.max(initial=0)
+        response = float(brightest) / frame.white_value
+        if response >= below:
+            return None
+        if response >= end:
+            at_end = (at_end if response == end else 0) + int(np.count_nonzero(image == brightest))
+            end = response
+        pixels += image.size
+    return end if at_end >= max(_BRIGHTEST * pixels, 1) and end > 0 else None
 
 
 class ClippingLevels(NamedTuple):

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.calibration.delay import estimate_delay
+from kalux.calibration.fixed_pattern import FixedPattern, estimate_fixed_pattern
 from kalux.calibration.frame_noise import FrameNoise, estimate_frame_noise
 from kalux.calibration.levels import ClippingLevels, clipping_levels
 from kalux.calibration.refractory import shortest_interval
@@ -71,7 +72,7 @@ class NoiseCalibration:
 
     Attributes
     ----------
-    events, frames, levels
+    events, frames, pattern, levels
         See there.
     delay, apparent_delay
         Of the events, us (`kalux.calibration.delay`).
@@ -81,6 +82,7 @@ class NoiseCalibration:
 
     events: EventNoise | None
     frames: FrameNoise | None
+    pattern: FixedPattern | None
     levels: ClippingLevels
     delay: int | None
     apparent_delay: int | None
@@ -115,9 +117,12 @@ class NoiseCalibration:
                     "shot_noise": 2 * self.frames.error * self.frames.shot,
                 }
             measured["noise_at_half"] = self.frames.at_half
+        if self.pattern is not None and self.pattern.deviation > 0:
+            camera["fixed_pattern"] = self.pattern.deviation
+            errors["fixed_pattern"] = self.pattern.error / (2 * self.pattern.deviation)
         if self.levels.saturation is not None:
             measured["white_level"] = self.levels.saturation
-            camera["saturation"] = min(self.levels.saturation, CameraSettings().saturation)
+            camera["saturation"] = min(self.levels.saturation, CameraSettings.usual_saturation)
         if self.levels.black is not None:
             measured["black_level"] = self.levels.black
         settings = {"camera": camera, "events": events}
@@ -143,6 +148,7 @@ def calibrate_noise(recording: Recording, camera: CameraSettings) -> NoiseCalibr
     return NoiseCalibration(
         events=event_noise(recording),
         frames=estimate_frame_noise(recording, camera, most_frames=MAX_FRAMES),
+        pattern=estimate_fixed_pattern(recording, camera),
         levels=clipping_levels(recording, MAX_FRAMES),
         delay=None if delay is None else delay.delay,
         apparent_delay=None if delay is None else delay.apparent,

@@ -128,7 +128,7 @@ class Registration:
         return self.sampled(self.filtered(image))
 
     def frame(
-        self, frame: Frame, *, index: int = 0, saturation: float = CameraSettings().saturation
+        self, frame: Frame, *, index: int = 0, saturation: float = CameraSettings.usual_saturation
     ) -> Frame:
         """A frame in the event camera's pixels, with the mask of those that are measured.
 

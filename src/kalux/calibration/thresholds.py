@@ -285,7 +285,7 @@ def _latent(
     blurred = np.log(np.maximum(shot.intensity, 1e-6))
     steps = (np.full(blurred.shape, c) for c in thresholds)
     integrals = integrate_exposure(events, shot.start, shot.end, *steps)
-    good = latent_peak(blurred, integrals) < np.log(min(_WHITE, camera.saturation) * shot.white)
+    good = latent_peak(blurred, integrals) < np.log(min(_WHITE, camera.clipped_from) * shot.white)
     return latent_middle(blurred, integrals), good
 
 

@@ -42,6 +42,7 @@ UNITS: Final[Mapping[str, str]] = {
     "frame_noise": "standard deviation in the dark, white = 1",
     "noise_at_half": "standard deviation at half of white, white = 1",
     "shot_noise": "variance per intensity, white = 1",
+    "fixed_pattern": "standard deviation between pixels, white = 1",
     "saturation": "of white, 0 to 1",
     "black_level": "of white, 0 to 1: below, pixels pile up",
     "white_level": "of white, 0 to 1: above, pixels pile up",

@@ -29,7 +29,7 @@ def grey_world(recording: Recording, camera: CameraSettings) -> Gains:
     FrameError
         If there is none.
     """
-    model = Camera.named(camera.response, camera.saturation)
+    model = Camera.named(camera.response, camera.clipped_from)
     total = np.zeros(3)
     for frame in islice(recording.frames(), _MOST_FRAMES):
         cells = _cells(frame)

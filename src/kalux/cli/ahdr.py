@@ -81,7 +81,9 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
         camera,
         response=options.response,
         black=options.black / 255,
-        saturation=CameraSettings.saturation if options.saturation is None else options.saturation / 255,
+        saturation=CameraSettings.usual_saturation
+        if options.saturation is None
+        else options.saturation / 255,
         every=options.hold_out_frames,
     )
     white, black, pixels = 0, 0, 0

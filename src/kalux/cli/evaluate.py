@@ -106,7 +106,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
         contents = check_recording(recording, lambda count: progress.add(events=count))
     for text in contents.warnings():
         warn(text)
-    protocol = Protocol(recording, options)
+    protocol = Protocol(recording, options, contents.colours)
     say(f"{recording.source.path}: {protocol.described}")
     say(table_head(options))
     found, consistent = [], []
@@ -132,6 +132,8 @@ class Protocol:
         Checked.
     options
         The flags.
+    colours
+        As of `kalux.Frame`.
 
     Raises
     ------
@@ -139,7 +141,7 @@ class Protocol:
         There is no truth, too few frames, no such method.
     """
 
-    def __init__(self, recording: Recording, options: argparse.Namespace) -> None:
+    def __init__(self, recording: Recording, options: argparse.Namespace, colours: str) -> None:
         from kalux.evaluation import held_out, specs, truth
 
         self._recording, self._options = recording, options
@@ -164,6 +166,7 @@ class Protocol:
             self._score = lambda method, count: truth.evaluate_truth(
                 recording, reference, method, hdr_vdp=options.hdrvdp, lpips=weights, on_image=count
             )
+        self.described += _of_colours(colours)
         self.methods = specs.chosen_methods(
             named_methods(options),
             response=self._response,
@@ -210,6 +213,13 @@ def _reference(recording: Recording, options: argparse.Namespace) -> tuple[Any, 
     if options.clip:
         raise UsageError("--clip is for held-out frames, the recording has ground truth; --hold-out-frames 2")
     return prepare_reference(recording, images, mask), "" if file is None else f" of {file}"
+
+
+def _of_colours(colours: str) -> str:
+    """What of a recording in colour is compared, as the end of a sentence."""
+    if colours == "grey":
+        return ""
+    return "; of RGB the luminance" if colours == "RGB" else "; of every pixel of the mosaic its own colour"
 
 
 # Say.

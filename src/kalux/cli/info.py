@@ -75,6 +75,8 @@ def settled_lines(
         return [title, "  nothing can be estimated without exposure times; give --exposure"]
     asked = settings if calibration is None else calibration.apply(settings)
     made = plan(recording, at="frames", settings=asked, calibration=calibration)
-    rows = [*settled(recording, made, asked), ("saturation", saturation_text(recording, made, asked))]
+    rows = settled(recording, made, asked)
+    if made.ceiling is None:
+        rows.append(("saturation", saturation_text(recording, made, asked)))
     width = max(len(label) for label, _ in rows)
     return [title, *(f"  {label:<{width}}  {text}" for label, text in rows)]

@@ -13,6 +13,7 @@ from kalux.cli.calibrate_rig import add_frames
 from kalux.cli.parser import Parser, UsageError, number, whole
 from kalux.cli.recordings import add_exposure, check_stamp, write_streams
 from kalux.cli.terminal import say, warn
+from kalux.settings import AUTO, chosen_response
 from kalux.wording import how_many
 
 if TYPE_CHECKING:
@@ -47,9 +48,9 @@ def add_command(commands: Any) -> None:
     add_exposure(group)
     group.add_argument(
         "--response",
-        default="linear",
+        default=AUTO,
         metavar="NAME",
-        help="of the frames: linear, srgb or gamma:2.2 (linear)",
+        help="of the frames: linear, srgb, bt709 or gamma:2.2 (default: what they state, else linear)",
     )
     group = parser.add_argument_group("space")
     group.add_argument("--rig", type=Path, metavar="RIG.toml", help="calibration of both cameras")
@@ -116,6 +117,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
         exposure=None if by_trigger else options.exposure,
         stamp=options.stamp or "start",
     )
+    response = chosen_response(options.response, other.response)
     frames, exposure_known = _timed_frames(options, events, other, by_trigger)
     offset = None
     if options.offset is not None:
@@ -136,14 +138,14 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
         offset=offset,
         centre=centre,
         reach=reach,
-        camera=CameraSettings(response=options.response),
+        camera=CameraSettings(response=response),
     )
     if not options.quiet:
         for line in described(found, by_trigger):
             say(line)
     if not exposure_known:
         warn("the frames have no exposure times; --exposure and --stamp would put them in")
-    _write(options, events, size, found.frames(frames()), exposure_known)
+    _write(options, events, size, found.frames(frames()), exposure_known, response)
     if options.plot is not None and found.coarse is not None:
         from kalux.calibration.pictures import correlation_plot
 
@@ -220,6 +222,7 @@ def _write(
     size: tuple[int, int],
     frames: Iterable[Frame],
     exposure_known: bool,
+    response: str,
 ) -> None:
     from kalux.cli.progress import Progress
     from kalux.writers import hdf5
@@ -230,7 +233,7 @@ def _write(
         sensor_size=size,
         exposure_known=exposure_known,
         contrast_threshold=events.contrast_threshold,
-        response=None if options.response == "linear" else options.response,
+        response=None if response == "linear" else response,
     )
     with Progress("registering", quiet=options.quiet) as progress:
         write_streams(write, events.events(), frames, progress)

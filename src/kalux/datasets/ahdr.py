@@ -82,7 +82,7 @@ def artificial_hdr(
     *,
     response: str = "auto",
     black: float = 0.0,
-    saturation: float = CameraSettings.saturation,
+    saturation: float = CameraSettings.usual_saturation,
     every: int | None = None,
 ) -> Recording:
     """A recording as an artificial camera would have made it, with the original frames as ground truth.

@@ -179,10 +179,10 @@ def published_set(name: str) -> PublishedSet:
     InputError
         If there is none.
     """
-    for one in SETS:
-        if one.name == name.lower():
-            return one
-    known = [one.name for one in SETS]
+    for published in SETS:
+        if published.name == name.lower():
+            return published
+    known = [published.name for published in SETS]
     raise InputError(f"there is no set {name!r}{did_you_mean(name, known)}; known are {', '.join(known)}")
 
 
@@ -216,30 +216,32 @@ def contents(name: str, folder: str | Path) -> Contents:
     InputError
         If there is no such set or folder.
     """
-    one, folder = published_set(name), Path(folder)
+    published, folder = published_set(name), Path(folder)
     if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder; give the one that {one.name} was downloaded to")
-    folders = [path for path in (folder, *sorted(folder.rglob("*"))) if _is_sequence(one, path)]
-    paths = [(_name(path, folder), path / one.opens) for path in folders]
+        raise InputError(f"{folder}: no such folder; give the one that {published.name} was downloaded to")
+    folders = [path for path in (folder, *sorted(folder.rglob("*"))) if _is_sequence(published, path)]
+    paths = [(_name(path, folder), path / published.opens) for path in folders]
     unknown = []
     for path in sorted(p for p in folder.rglob("*") if p.is_file()):
         hidden = any(part.startswith(".") for part in path.relative_to(folder).parts)
         if hidden or any(path.is_relative_to(inside) for inside in folders):
             continue
-        beside = any(fnmatch.fnmatch(path.name.lower(), pattern) for pattern in one.beside)
-        if not beside and any(fnmatch.fnmatch(path.name.lower(), pattern) for pattern in one.files):
+        beside = any(fnmatch.fnmatch(path.name.lower(), pattern) for pattern in published.beside)
+        if not beside and any(fnmatch.fnmatch(path.name.lower(), pattern) for pattern in published.files):
             paths.append((_name(path, folder), path))
         elif not beside:
             unknown.append(str(path.relative_to(folder)))
     found = tuple(sorted(paths))
     stems = {Path(name).name.lower() for name, _ in found}
-    missing = tuple(s for s in one.sequences if s not in stems)
-    lacking = {_name(p, folder): tuple(w for w in one.wanted if not (p / w).exists()) for p in folders}
+    missing = tuple(s for s in published.sequences if s not in stems)
+    lacking = {_name(p, folder): tuple(w for w in published.wanted if not (p / w).exists()) for p in folders}
     return Contents(found, missing, {n: files for n, files in lacking.items() if files}, tuple(unknown))
 
 
-def _is_sequence(one: PublishedSet, path: Path) -> bool:
-    return bool(one.marks) and path.is_dir() and all((path / mark).is_file() for mark in one.marks)
+def _is_sequence(published: PublishedSet, path: Path) -> bool:
+    return (
+        bool(published.marks) and path.is_dir() and all((path / mark).is_file() for mark in published.marks)
+    )
 
 
 def _name(path: Path, folder: Path) -> str:
@@ -271,8 +273,10 @@ def sequences(
     """
     found = contents(name, folder).found
     if not found:
-        one = published_set(name)
-        raise InputError(f"{folder}: no sequence of {one.name} is in it; expected is {one.layout}")
+        published = published_set(name)
+        raise InputError(
+            f"{folder}: no sequence of {published.name} is in it; expected is {published.layout}"
+        )
     for sequence, path in found:
         yield sequence, open_recording(path, exposure=exposure, stamp=stamp)
 

@@ -82,7 +82,7 @@ def filtered_estimates(
     for image in reconstruct(
         recording, times=times, settings=settings, calibration=calibration, smooth=smooth
     ):
-        yield Estimated(image.intensity, image.variance, image.log_offset)
+        yield Estimated(image.intensity, image.variance, image.log_offset, image.fixed_pattern)
 
 
 _FILTERS: Final = {

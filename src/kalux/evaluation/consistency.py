@@ -13,12 +13,18 @@ from typing import Final
 import numpy as np
 
 from kalux.errors import FrameError
-from kalux.evaluation.exposures import exposure_times, linear_frame, means_of, reference_exposure
+from kalux.evaluation.exposures import (
+    end_of_frames,
+    exposure_times,
+    linear_frame,
+    means_of,
+    reference_exposure,
+)
 from kalux.evaluation.method import Method
 from kalux.evaluation.metrics import psnr
 from kalux.frames import Frame
 from kalux.recording import Recording
-from kalux.settings import AUTO, CameraSettings, chosen_response
+from kalux.settings import AUTO, chosen_response
 
 READS: Final = 9
 """Reads across an exposure."""
@@ -89,12 +95,13 @@ def blur_consistency(
     inner = [exposure_times(frame, READS) for frame in recording.frames()][1:-1]
     if not inner:
         raise FrameError(f"{recording.source.path}: blur consistency needs at least three frames")
+    end = end_of_frames(recording, response)
     images = means_of(method.images(recording, np.concatenate(inner)), READS)
     found, skipped = [], 0
     frames = iter(recording.frames())
     next(frames)
     for image, frame in zip(images, frames, strict=False):
-        valid = valid_pixels(frame)
+        valid = valid_pixels(frame, end.clipped_from)
         if valid.any():
             ratio = frame.exposure / reference
             taken = linear_frame(frame, frame.exposure, response)
@@ -108,9 +115,9 @@ def blur_consistency(
     return BlurConsistency(method.label, READS, tuple(found), skipped)
 
 
-def valid_pixels(frame: Frame) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-    """Where a frame is measured, and neither clipped nor black in any of its channels: (H, W) bool."""
+def valid_pixels(frame: Frame, clipped_from: float) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+    """Where a frame is measured, and neither clipped (response, white = 1) nor black in any channel: (H, W) bool."""
     values = frame.normalised()
-    inside = (values > 0) & (values < CameraSettings().saturation)
+    inside = (values > 0) & (values < clipped_from)
     valid = inside.all(axis=-1) if inside.ndim == 3 else inside
     return np.asarray(valid if frame.valid is None else valid & frame.valid, np.bool_)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from itertools import islice
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +14,9 @@ from kalux.evaluation.pairs import Array
 from kalux.filters.shots import take_shot
 from kalux.frames import Frame, median_exposure
 from kalux.models.camera import Camera
+from kalux.planning import with_saturation
 from kalux.recording import Recording
-from kalux.settings import CameraSettings
+from kalux.settings import CameraSettings, altered, preset
 
 
 def reference_exposure(recording: Recording) -> int:
@@ -37,7 +39,32 @@ def linear_frame(frame: Frame, reference: int, response: str) -> Array:
     Of a mosaic each pixel's own channel, of RGB the luminance: what images have as their intensity. ``response`` is the
     camera's, named as in `kalux.settings.CameraSettings`.
     """
-    return take_shot(frame, Camera.named(response, CameraSettings().saturation), reference).intensity
+    return take_shot(frame, Camera.named(response, CameraSettings.usual_saturation), reference).intensity
+
+
+class End(NamedTuple):
+    """Where frames end.
+
+    Attributes
+    ----------
+    clipped_from
+        Response, white = 1, from which on a pixel counts as clipped.
+    intensity
+        Of a pixel that is as bright as the camera can show, white = 1 at the frame's own exposure.
+    """
+
+    clipped_from: float
+    intensity: float
+
+
+def end_of_frames(recording: Recording, response: str) -> End:
+    """Where a recording's frames end, as `kalux.reconstruct` takes it by default; ``response`` as of `linear_frame`."""
+    settings, ceiling = with_saturation(recording, altered(preset("default"), "camera", response=response))
+    curve = Camera.named(response, settings.camera.clipped_from).response
+    return End(
+        settings.camera.clipped_from,
+        1.0 if ceiling is None else float(curve.inverse(np.array(ceiling.level))),
+    )
 
 
 def exposure_times(frame: Frame, reads: int) -> NDArray[np.int64]:

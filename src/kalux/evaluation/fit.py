@@ -29,7 +29,7 @@ from kalux.models.camera import Camera, frame_log_covariance
 from kalux.pipeline import reconstruct
 from kalux.planning import plan
 from kalux.recording import Recording
-from kalux.settings import Settings, from_dict, preset
+from kalux.settings import Settings, altered, from_dict, preset
 
 Array = NDArray[np.float64]
 
@@ -212,11 +212,15 @@ def _fitted_values(settings: Settings) -> dict[str, dict[str, float | int]]:
 
 
 def score_settings(held: HeldOut, settings: Settings, calibration: Calibration | None = None) -> Score:
-    """How likely settings make the held-out frames; of the calibration only the maps of pixels are used."""
+    """How likely settings make the held-out frames; of the calibration only the maps of pixels are used.
+
+    The frames' fixed pattern is in the held-out ones, too.
+    """
+    settings = altered(settings, "camera", fixed_pattern=0.0)
     images = reconstruct(held.kept, times=held.times.ravel(), settings=settings, calibration=calibration)
     reads = held.times.shape[1]
     nll, errors, pixels = 0.0, 0.0, 0
-    camera = Camera.named(settings.camera.response, settings.camera.saturation)
+    camera = Camera.named(settings.camera.response, settings.camera.clipped_from)
     for frame in held.frames():
         group = [next(images) for _ in range(reads)]
         mean: Array = np.stack([image.intensity for image in group]).mean(axis=0, dtype=np.float64)

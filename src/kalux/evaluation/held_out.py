@@ -18,7 +18,14 @@ from numpy.typing import NDArray
 
 from kalux.calibration.frame_noise import estimate_frame_noise
 from kalux.errors import FrameError, InputError
-from kalux.evaluation.exposures import exposure_times, linear_frame, means_of, reference_exposure
+from kalux.evaluation.exposures import (
+    End,
+    end_of_frames,
+    exposure_times,
+    linear_frame,
+    means_of,
+    reference_exposure,
+)
 from kalux.evaluation.lpips import LpipsWeights
 from kalux.evaluation.method import Method
 from kalux.evaluation.pairs import Array, Pair
@@ -60,6 +67,8 @@ class HeldOut:
         99.5th percentile of the intensities of all frames.
     response
         Of the camera, as in `kalux.settings.CameraSettings`.
+    end
+        Where the frames end.
     """
 
     whole: Recording
@@ -70,6 +79,7 @@ class HeldOut:
     reference_exposure: int
     scale: float
     response: str
+    end: End
 
     @cached_property
     def noise(self) -> tuple[float, float]:
@@ -133,7 +143,8 @@ def hold_out_frames(
     scale = intensity_percentile(recording, SCALE_PERCENTILE, reference, response)
     if scale <= 0:
         raise FrameError(f"{recording.source.path}: the frames are black; there is nothing to compare")
-    return HeldOut(recording, kept, every, compared, np.stack(times), reference, scale, response)
+    end = end_of_frames(recording, response)
+    return HeldOut(recording, kept, every, compared, np.stack(times), reference, scale, response, end)
 
 
 def without_frames(recording: Recording, every: int) -> Recording:
@@ -209,7 +220,8 @@ def held_out_pairs(held: HeldOut, method: Method, *, clip: bool = False) -> Iter
     """A method's images with the frames that were held out; ``clip`` as in `evaluate_held_out`.
 
     The variance of the mean of the reads of an exposure is taken as the mean of theirs: reads a few milliseconds apart
-    share their errors. The noise of the frame itself is that of `HeldOut.noise`.
+    share their errors. The noise of the frame itself is that of `HeldOut.noise`; its fixed
+    pattern is the method's, too.
     """
     offset = 0.0
 
@@ -217,14 +229,14 @@ def held_out_pairs(held: HeldOut, method: Method, *, clip: bool = False) -> Iter
         nonlocal offset
         for made in method.estimated(held.kept, held.times.ravel()):
             offset = made.log_offset
-            yield np.stack([part for part in (made.intensity, made.variance) if part is not None])
+            yield np.stack([part for part in (made.intensity, made.variance_of_frames) if part is not None])
 
-    camera = Camera.named(held.response, CameraSettings().saturation)
+    camera = Camera.named(held.response, held.end.clipped_from)
     for frame, means in zip(held.frames(), means_of(read(), held.times.shape[1]), strict=True):
-        image = clipped_as(means[0], frame, held.reference_exposure) if clip else means[0]
+        image = clipped_as(means[0], frame, held.reference_exposure, held.end) if clip else means[0]
         shot = take_shot(frame, camera, held.reference_exposure)
         variance = means[1] if len(means) == 2 else None
-        clipped = frame.normalised() >= CameraSettings().saturation
+        clipped = frame.normalised() >= held.end.clipped_from
         yield Pair(
             frame.middle,
             image,
@@ -239,9 +251,9 @@ def held_out_pairs(held: HeldOut, method: Method, *, clip: bool = False) -> Iter
         )
 
 
-def clipped_as(image: Array, frame: Frame, reference: int) -> Array:
-    """An image (1 = saturated at the reference exposure, us) clipped where a frame of this exposure saturates."""
-    return np.clip(image, 0.0, reference / frame.exposure)
+def clipped_as(image: Array, frame: Frame, reference: int, end: End) -> Array:
+    """An image (1 = white at the reference exposure, us) clipped where a frame of this exposure ends."""
+    return np.clip(image, 0.0, end.intensity * reference / frame.exposure)
 
 
 def intensity_percentile(recording: Recording, percent: float, reference: int, response: str) -> float:

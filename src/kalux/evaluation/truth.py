@@ -172,9 +172,9 @@ def evaluate_truth(
 def truth_pairs(recording: Recording, reference: Reference, method: Method) -> Iterator[Pair]:
     """A method's images with the reference images, and with its variances where it has them.
 
-    Images of a camera have noise, which counts as an error of theirs. Where a frame of the recording has the same
-    middle, it is that frame as the camera saw it (`kalux.datasets.ahdr`): pixels that this frame measures are the
-    reference itself, of which a variance says nothing.
+    Images of a camera have noise, which counts as an error of theirs, and the recording's fixed pattern. Where a frame
+    of the recording has the same middle, it is that frame as the camera saw it (`kalux.datasets.ahdr`): pixels that
+    this frame measures are the reference itself, of which a variance says nothing.
     """
     given = _given(recording, reference)
     for i, made in enumerate(method.estimated(recording, reference.times)):
@@ -184,7 +184,7 @@ def truth_pairs(recording: Recording, reference: Reference, method: Method) -> I
             made.intensity,
             reference.images[i],
             mask,
-            made.variance,
+            made.variance if reference.noise is None else made.variance_of_frames,
             log_offset=made.log_offset,
             noise=None
             if reference.noise is None
@@ -204,7 +204,7 @@ def _given(recording: Recording, reference: Reference) -> Iterator[NDArray[np.bo
     if reference.noise is None:
         yield from itertools.repeat(None)
         return
-    camera = Camera.named(chosen_response(AUTO, recording.response), CameraSettings.saturation)
+    camera = Camera.named(chosen_response(AUTO, recording.response), CameraSettings.usual_saturation)
     frames = iter(recording.frames())
     frame = next(frames)
     for t in reference.times:

@@ -154,25 +154,25 @@ def smoothed_unshown(
 
 
 def obey_bounds(
-    smoothed: Floats,
+    smoothed: tuple[Floats, ...],
     bound: tuple[Floats, Floats, Unshown | None],
     known: tuple[Floats, Floats, Unshown | None],
 ) -> None:
-    """Smoothed L, (H, W), where one direction of time knows no more than a ``bound``: that of the other. In place.
+    """Smoothed L, and variances of it, (H, W), where one direction of time knows no more than a ``bound``. In place.
 
-    Both are L, P and the pixels that no frame has measured in that direction. Where the level that is ``known`` lies
-    below the bound, both are wrong, each in proportion to its variance; what is expected above the bound counts as far
-    as the other direction knows no better than this one, by the squares of their variances.
+    Both are L, P and the pixels that no frame has measured in that direction. A bound is no measurement: L and P are
+    those of the other direction. Where the level that is ``known`` lies below the bound, both are wrong, each in
+    proportion to its variance.
     """
-    bounds, own, unshown = bound
+    bounds, _, unshown = bound
     level, variance, other = known
     if unshown is None:
         return
     only = np.ones(len(unshown.pixels), np.bool_)
     if other is not None:
         only = np.isin(unshown.pixels, other.pixels, assume_unique=True, invert=True)
-    pixels, noise, excess = unshown.pixels[only], unshown.noise[only], unshown.excess[only]
-    least, vague, likely, doubt = (values.reshape(-1)[pixels] for values in (bounds, own, level, variance))
+    pixels, noise = unshown.pixels[only], unshown.noise[only]
+    least, likely, doubt = (values.reshape(-1)[pixels] for values in (bounds, level, variance))
     raised = likely + np.maximum(least - likely, np.float32(0.0)) * doubt / (doubt + noise)
-    share = doubt**2 / (doubt**2 + vague**2)
-    smoothed.reshape(-1)[pixels] = raised + share * (least + excess - raised)
+    for plane, value in zip(smoothed, (raised, doubt, doubt), strict=False):
+        plane.reshape(-1)[pixels] = value

@@ -182,3 +182,30 @@ def _hear(variance, left, first, second, hidden, heard):  # type: ignore[no-unty
 def _hide(known, moving, change, hidden, given):  # type: ignore[no-untyped-def]
     for i in range(np.uint64(len(given))):
         given[i] = total_variance(known[i], moving[i], change[i], hidden)
+
+
+def add_pattern(variance: NDArray[np.float32], intensity: Array, log_offset: float, deviation: float) -> None:
+    """Add the variance of log(I + I_0) by offsets of the pixels that all frames share. In place.
+
+    Images have them as the frames do: events tell changes of the light only, and no number of frames averages them.
+
+    Parameters
+    ----------
+    variance
+        (H, W), contiguous.
+    intensity
+        (H, W) I.
+    log_offset
+        I_0.
+    deviation
+        Standard deviation of the offsets, in units of I.
+    """
+    scalars = np.float32(log_offset), np.float32(deviation)
+    _add_pattern(variance.reshape(-1), np.ascontiguousarray(intensity).reshape(-1), *scalars)
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy", fastmath=FUSED)
+def _add_pattern(variance, intensity, log_offset, deviation):  # type: ignore[no-untyped-def]
+    for i in range(np.uint64(len(variance))):
+        relative = deviation / (intensity[i] + log_offset)
+        variance[i] += relative * relative

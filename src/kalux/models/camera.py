@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.errors import SettingsError
+from kalux.settings import CameraSettings
 
 Array = NDArray[np.float64]
 
@@ -66,6 +67,18 @@ class Response:
         """The sRGB transfer function (IEC 61966-2-1)."""
         response = np.linspace(0.0, 1.0, _LEVELS)
         linear = np.where(response <= 0.04045, response / 12.92, ((response + 0.055) / 1.055) ** 2.4)
+        return cls(linear, response)
+
+    @classmethod
+    def bt709(cls) -> Response:
+        """The transfer function of video cameras (ITU-R BT.709-6, item 1.2; that of BT.601 and BT.2020, too).
+
+        Both parts meet in value and slope with the numbers that BT.2020-2, table 4, rounds to 1.0993 and 0.0181.
+        """
+        alpha, beta = 1.09929682680944, 0.018053968510807
+        response = np.linspace(0.0, 1.0, _LEVELS)
+        curved = ((response + (alpha - 1.0)) / alpha) ** (1 / 0.45)
+        linear = np.where(response < 4.5 * beta, response / 4.5, curved)
         return cls(linear, response)
 
     @classmethod
@@ -129,11 +142,19 @@ class Response:
 
     @classmethod
     def named(cls, name: str) -> Response:
-        """``"linear"`` or ``"auto"``, ``"srgb"``, ``"gamma:2.2"``, ``"s-curve:0.4"``, or ``"curve:0 0.2 1"``."""
+        """A name of `kalux.settings.CameraSettings`, as ``"gamma:2.2"``; ``"auto"`` is linear.
+
+        Raises
+        ------
+        SettingsError
+            If there is none of that name, or its numbers do not make a response.
+        """
         if name in ("linear", "auto"):
             return cls.linear()
         if name == "srgb":
             return cls.srgb()
+        if name == "bt709":
+            return cls.bt709()
         kind, _, exponent = name.partition(":")
         if kind == "curve":
             try:
@@ -150,8 +171,8 @@ class Response:
         if kind == "s-curve":
             return cls.s_curve(value)
         raise SettingsError(
-            f"response: unknown response {name!r}; known are linear, srgb, gamma:EXPONENT, s-curve:BLACK and "
-            "curve:NUMBERS"
+            f"response: unknown response {name!r}; known are linear, srgb, bt709, gamma:EXPONENT, s-curve:BLACK "
+            "and curve:NUMBERS"
         )
 
     def __call__(self, irradiance: Array) -> Array:
@@ -214,7 +235,7 @@ class Camera:
 
     response: Response
     weight_table: Array | None = None
-    saturation: float = 0.98
+    saturation: float = CameraSettings.usual_saturation
     colours: tuple[Response, ...] | None = None
 
     @classmethod
@@ -307,9 +328,14 @@ ABOUT_WHITE: Final = 0.95
 
 
 def count_bright(camera: Camera, image: NDArray[Any], white: float = 1.0) -> BrightTail:
-    """`BrightTail` of one frame: (H, W), or (H, W, 3) of which the mean counts; a saturated pixel is ``white``."""
+    """`BrightTail` of one frame: (H, W), or (H, W, 3) of which the mean counts; full scale is ``white``.
+
+    Where pixels count as clipped from lower on than usual, that far below lies what counts as white.
+    """
     grey = image if image.ndim == 2 else image.mean(axis=-1)
-    edges = camera.response(np.array([ABOUT_WHITE / 2, ABOUT_WHITE])) * white
+    ends = (camera.saturation, CameraSettings.usual_saturation)
+    end, usual = (float(camera.response.inverse(np.array(value))) for value in ends)
+    edges = camera.response(min(end / usual, 1.0) * np.array([ABOUT_WHITE / 2, ABOUT_WHITE])) * white
     if grey.dtype.kind in "iu":
         if edges[1] > np.iinfo(grey.dtype).max:  # white that no pixel can have
             return BrightTail(int(np.count_nonzero(grey >= edges[0])), 0)

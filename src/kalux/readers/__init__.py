@@ -25,6 +25,7 @@ from kalux.readers import (
     prophesee,
     rosbag,
     table,
+    v2e,
 )
 from kalux.readers.images import IMAGES, RADIANCE
 from kalux.readers.source import CHUNK_EVENTS, Source
@@ -76,6 +77,7 @@ READERS: tuple[Reader, ...] = (
     Reader("dsec", "DSEC folder or events.h5", dsec.recognises, dsec.read),
     Reader("hqf", "HDF5 of HQF and E2VID+ (ECNN)", hqf.recognises, hqf.read),
     Reader("mvsec", "HDF5 of MVSEC", mvsec.recognises, mvsec.read),
+    Reader("v2e", "HDF5 of v2e", v2e.recognises, v2e.read),
     Reader("metavision", "Metavision HDF5", metavision_hdf5.recognises, metavision_hdf5.read),
     Reader("es", "Event Stream (.es, DVS)", es.recognises, es.read),
     # Before IJRR, whose zips could also be .npz; a broken zip is left to IJRR to report.

@@ -17,10 +17,18 @@ from kalux.errors import FormatError, InputError
 from kalux.events import EVENT_DTYPE, EventArray, checked_thresholds
 from kalux.frames import MOSAICS, Frame, GroundTruth, Mosaic
 from kalux.layouts import HDF5_COLUMNS, HDF5_MAJOR_VERSION
-from kalux.readers.hdf5_layout import DAMAGE, SIGNATURE
-from kalux.readers.source import CHUNK_EVENTS, EXPOSURE_UNKNOWN, Source, begins_with, reading
+from kalux.readers.hdf5_layout import DAMAGE, SIGNATURE, check_dataset, common_length, opened
+from kalux.readers.source import (
+    CHUNK_EVENTS,
+    EXPOSURE_UNKNOWN,
+    Source,
+    begins_with,
+    checked_inverse_covariance,
+)
 
-_UNITS: Final = {"t": ", in whole microseconds"}
+_EVENT_COLUMNS: Final = tuple(f"events/{name}" for name in HDF5_COLUMNS)
+_EXPOSURES: Final = ("frames/exposure_start", "frames/exposure_end")
+_TIMES: Final = ("events/t", *_EXPOSURES)
 
 
 def recognises(path: Path) -> bool:
@@ -44,20 +52,24 @@ def read(path: Path) -> Source:
     InputError
         If it cannot be read.
     """
-    with reading(path, *DAMAGE), h5py.File(path, "r") as file:
+    with opened(path) as file:
         _check_version(path, _text(file.attrs.get("version", "")))
-        event_count = _common_length(path, file, "events", HDF5_COLUMNS)
-        frame_count = _common_length(path, file, "frames", _frame_columns(file))
+        event_count = common_length(path, file, _EVENT_COLUMNS)
+        frame_count = common_length(path, file, ("frames/image", *_EXPOSURES))
+        for column in (*_EVENT_COLUMNS, *_EXPOSURES):
+            _check_column(path, column, file[column].dtype)
+        _check_masks(path, file, frame_count)
         exposure_known = bool(file["frames"].attrs["exposure_known"])
         sensor_size = _sensor_size(path, file.attrs["sensor_size"])
         mosaic = _mosaic(path, file["frames"].attrs.get("mosaic"))
-        threshold = file.attrs.get("contrast_threshold")
-        inverse_covariance = file["inverse_covariance"][...] if "inverse_covariance" in file else None
+        inverse_covariance = (
+            checked_inverse_covariance(path, "inverse_covariance", file["inverse_covariance"][...])
+            if "inverse_covariance" in file
+            else None
+        )
         has_ground_truth = "ground_truth" in file
         response = _text(file["frames"].attrs["response"]) if "response" in file["frames"].attrs else None
-        contrast_threshold = _thresholds(path, threshold)
-        for name in HDF5_COLUMNS:
-            _check_column(path, name, file["events"][name].dtype)
+        contrast_threshold = _thresholds(path, file.attrs.get("contrast_threshold"))
     missing: tuple[str, ...] = ()
     if not event_count:
         missing += ("The file has no events.",)
@@ -101,12 +113,12 @@ def _thresholds(path: Path, value: Any) -> tuple[float, float] | None:
         raise FormatError(f"{path}: {error}") from error
 
 
-def _check_column(path: Path, name: str, found: np.dtype[Any]) -> None:
+def _check_column(path: Path, column: str, found: np.dtype[Any]) -> None:
     """What other programs write may be of any type of integers; `_as_stated` then looks at the values."""
-    if found.kind not in ("biu" if name == "p" else "iu"):
-        raise FormatError(
-            f"{path}: events/{name} is {found}; {EVENT_DTYPE[name]} is needed{_UNITS.get(name, '')}"
-        )
+    wanted = EVENT_DTYPE["t" if column in _TIMES else column[-1]]
+    if found.kind not in ("biu" if wanted.kind == "b" else "iu"):
+        unit = ", in whole microseconds" if column in _TIMES else ""
+        raise FormatError(f"{path}: {column} is {found}; {wanted} is needed{unit}")
 
 
 def _as_stated(path: Path, name: str, values: NDArray[Any]) -> NDArray[Any]:
@@ -133,9 +145,13 @@ def _mosaic(path: Path, value: Any) -> Mosaic | None:
     )
 
 
-def _frame_columns(file: Any) -> tuple[str, ...]:
-    columns = ("image", "exposure_start", "exposure_end")
-    return (*columns, "valid") if "valid" in file["frames"] else columns
+def _check_masks(path: Path, file: Any, frame_count: int) -> None:
+    """Masks need not be stored in full: of frames without one all pixels are valid, which is what fills them."""
+    if "frames/valid" in file and len(file["frames/valid"]) != frame_count:
+        raise FormatError(
+            f"{path}: there are {len(file['frames/valid'])} masks of valid pixels for {frame_count} frames; write it "
+            "again"
+        )
 
 
 def _text(value: Any) -> str:
@@ -153,18 +169,8 @@ def _check_version(path: Path, version: str) -> None:
         )
 
 
-def _common_length(path: Path, file: Any, group: str, names: tuple[str, ...]) -> int:
-    lengths = {name: len(file[group][name]) for name in names}
-    if len(set(lengths.values())) != 1:
-        found = ", ".join(f"{name} {length}" for name, length in lengths.items())
-        raise FormatError(
-            f"{path}: {group} have columns of different lengths ({found}); write the file again"
-        )
-    return next(iter(lengths.values()))
-
-
 def _events(path: Path) -> Iterator[EventArray]:
-    with reading(path, *DAMAGE), h5py.File(path, "r") as file:
+    with opened(path) as file:
         columns = [file["events"][name] for name in HDF5_COLUMNS]
         # Whole chunks of the file: reading across their borders decompresses each twice.
         stored = (columns[0].chunks or (CHUNK_EVENTS,))[0]
@@ -198,7 +204,7 @@ def _join(t, x, y, p, words):  # type: ignore[no-untyped-def]
 
 
 def _frames(path: Path) -> Iterator[Frame]:
-    with reading(path, *DAMAGE), h5py.File(path, "r") as file:
+    with opened(path) as file:
         group = file["frames"]
         white = float(group.attrs["white"]) if "white" in group.attrs else None
         starts, ends = group["exposure_start"][...], group["exposure_end"][...]
@@ -209,8 +215,9 @@ def _frames(path: Path) -> Iterator[Frame]:
 
 
 def _ground_truth(path: Path) -> GroundTruth:
-    with reading(path, *DAMAGE), h5py.File(path, "r") as file:
+    with opened(path) as file:
         group = file["ground_truth"]
+        check_dataset(path, group["images"])
         times, images = group["times"][...].astype(np.int64), group["images"][...].astype(np.float32)
         masks = group["masks"][...].astype(bool) if "masks" in group else None
         noise = [float(value) for value in np.ravel(group.attrs.get("noise", ()))]

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from kalux.errors import EventError, FormatError
 from kalux.events import EventArray, make_events
+from kalux.frames import Frame
 from kalux.readers.source import CHUNK_EVENTS, begins_with, reading
 
 DAMAGE: Final = (KeyError, ValueError, TypeError, RuntimeError, AttributeError, IndexError, MemoryError)
@@ -174,6 +175,34 @@ def size_of(path: Path, shape: tuple[int, ...], *, grey: bool = False) -> tuple[
     if len(shape) != 2 or not 0 < shape[0] * shape[1] <= LARGEST_IMAGE:
         raise FormatError(f"{path}: its images have the shape {shape}; (height, width) is needed")
     return int(shape[0]), int(shape[1])
+
+
+def stamped_images(path: Path, file: Any, images: str, stamps: str) -> tuple[tuple[int, int], NDArray[Any]]:
+    """(height, width) of grey images that are one dataset, and their times, as another states them.
+
+    Raises
+    ------
+    FormatError
+        If these are not as many, not stored in full, or the images are in colour.
+    """
+    size = size_of(path, file[images].shape[1:], grey=True)
+    if file[stamps].shape != file[images].shape[:1]:
+        raise FormatError(
+            f"{path}: has {file[images].shape[0]} images for {file[stamps].shape[0]} times; copy or download it again"
+        )
+    check_dataset(path, file[images])
+    check_dataset(path, file[stamps])
+    return size, file[stamps][...]
+
+
+def image_frames(path: Path, images: str, stamps: NDArray[np.int64]) -> Iterator[Frame]:
+    """Frames of unknown exposure from images that are one dataset, none of which is needed without ``stamps`` (us)."""
+    if not len(stamps):
+        return
+    with opened(path) as file:
+        size = size_of(path, file[images].shape[1:])
+        for index, stamp in enumerate(stamps.tolist()):
+            yield Frame(np.ascontiguousarray(file[images][index].reshape(size)), stamp, stamp)
 
 
 JOIN_FRAMES: Final = "join images of the events' pixels instead (--frames FOLDER --replace-frames)"

@@ -29,6 +29,19 @@ _LISTS: Final = ("frames.csv", "timestamps.csv", "images.txt")
 _LARGEST_LIST: Final = 1 << 27  # bytes; it is read as a whole
 _FIRST_PICTURES: Final = 10  # of a video, which tell whether it is in colour
 _GREY_ROUNDING: Final = 0.03
+_TRANSFERS: Final = {
+    1: "bt709",
+    4: "gamma:2.2",
+    5: "gamma:2.8",
+    6: "bt709",
+    8: "linear",
+    13: "srgb",
+    14: "bt709",
+    15: "bt709",
+}
+"""Responses by the number of a video's transfer characteristics (ITU-T H.273, table 3); 6, 14 and 15, of BT.601 and
+BT.2020, are the curve of BT.709."""
+_TRANSFER_NOT_STATED: Final = 2
 _ABOUT_FRAMES: Final = re.compile(r"\b(frames?|images?)\b")
 
 
@@ -196,6 +209,7 @@ def _video(path: Path, start: int | None, rate_hz: float | None) -> Source:
     first = next(iter(beginning), None)
     if first is None:
         raise FormatError(f"{path}: has no picture that can be decoded; copy or download it again")
+    transfer = _transfer(path)
 
     @cache
     def count_frames() -> int:
@@ -213,11 +227,31 @@ def _video(path: Path, start: int | None, rate_hz: float | None) -> Source:
         frames=read_frames,
         count_frames=count_frames,
         exposure_known=False,
+        response=_TRANSFERS.get(transfer),
         missing=(
             EXPOSURE_UNKNOWN,
             f"The frames are the {'colours' if colour else 'luma'} of a video, with whatever its encoder did to them.",
+            *(() if transfer in _TRANSFERS else (_no_response(transfer),)),
         ),
     )
+
+
+def _transfer(path: Path) -> int:
+    """How the pictures of a video follow the light, as a number of ITU-T H.273."""
+    import av
+
+    with reading(path, av.FFmpegError, ValueError, IndexError), av.open(str(path)) as container:
+        return int(container.streams.video[0].codec_context.color_trc)
+
+
+def _no_response(transfer: int) -> str:
+    if transfer == _TRANSFER_NOT_STATED:
+        stated = "The video does not state how its pictures follow the light"
+    else:
+        stated = (
+            f"The video states transfer characteristics {transfer} of ITU-T H.273, which kalux does not know"
+        )
+    return f"{stated}: they count as linear (--camera.response bt709 if a camera or an encoder gave them a tone curve)."
 
 
 def _has_colour(picture: NDArray[Any]) -> bool:

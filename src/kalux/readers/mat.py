@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from kalux.errors import EventError, FormatError
 from kalux.events import EventArray, make_events
 from kalux.frames import Frame, GroundTruth
-from kalux.readers.source import CHUNK_EVENTS, Source, begins_with, reading
+from kalux.readers.source import CHUNK_EVENTS, Source, begins_with, checked_inverse_covariance, reading
 
 _MAGIC_5: Final = b"MATLAB 5.0 MAT-file"
 _MAGIC_73: Final = b"MATLAB 7.3 MAT-file"
@@ -94,7 +94,11 @@ def read(path: Path) -> Source:
         count_frames=lambda: frame_count,
         exposure_known=not frame_count or "exposure" in shapes,
         contrast_threshold=_contrast_threshold(path, variables) if "ct" in shapes else None,
-        inverse_covariance=_inverse_covariance(path, variables) if "f_Q" in shapes else None,
+        inverse_covariance=(
+            checked_inverse_covariance(path, "f_Q", _numbers(path, variables, "f_Q"))
+            if "f_Q" in shapes
+            else None
+        ),
         ground_truth=_ground_truth(path, variables, shapes, (starts + ends) // 2),
         missing=missing,
     )
@@ -184,13 +188,6 @@ def _contrast_threshold(path: Path, variables: _Variables) -> tuple[float, float
     if len(ct) not in (1, 2) or ct.min() <= 0:
         raise FormatError(f"{path}: ct is {ct[:4].tolist()}; one positive threshold, or (on, off), is needed")
     return float(ct[0]), float(ct[-1])
-
-
-def _inverse_covariance(path: Path, variables: _Variables) -> NDArray[np.float64]:
-    values = _numbers(path, variables, "f_Q")
-    if len(values) != 256 or values.min() < 0:
-        raise FormatError(f"{path}: f_Q has {len(values)} values; 256 are needed, none negative")
-    return values
 
 
 def _ground_truth(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numba import njit
@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from kalux.errors import FormatError
 from kalux.events import EVENT_DTYPE, EventArray
-from kalux.frames import Frame
 from kalux.readers import hdf5_layout
 from kalux.readers.source import EXPOSURE_UNKNOWN, SIZE_UNKNOWN, Source, smallest_size
 
@@ -51,8 +50,10 @@ def read(path: Path) -> Source:
             )
         hdf5_layout.check_dataset(path, events)
         count = int(events.shape[0])
-        has_images = _IMAGES in file
-        stamps, size = _images(path, file) if has_images else (np.empty(0, np.int64), None)
+        size, stamps = None, np.empty(0, np.int64)
+        if _IMAGES in file:
+            size, seconds = hdf5_layout.stamped_images(path, file, _IMAGES, _STAMPS)
+            stamps = hdf5_layout.microseconds(path, seconds)
         has_right = _RIGHT in file
     missing: tuple[str, ...] = (EXPOSURE_UNKNOWN,) if len(stamps) else ("The file has no images.",)
     if has_right:
@@ -64,25 +65,13 @@ def read(path: Path) -> Source:
         format="mvsec",
         sensor_size=size or smallest_size(path, _events(path)),
         events=lambda: _events(path),
-        frames=lambda: _frames(path, stamps) if has_images else iter(()),
+        frames=lambda: hdf5_layout.image_frames(path, _IMAGES, stamps),
         count_events=lambda: count,
         count_frames=lambda: len(stamps),
         exposure_known=not len(stamps),
         missing=missing,
         sensor_size_known=size is not None,
     )
-
-
-def _images(path: Path, file: Any) -> tuple[NDArray[np.int64], tuple[int, int]]:
-    images = file[_IMAGES]
-    size = hdf5_layout.size_of(path, images.shape[1:], grey=True)
-    if file[_STAMPS].shape != images.shape[:1]:
-        raise FormatError(
-            f"{path}: has {images.shape[0]} images for {file[_STAMPS].shape[0]} times; copy or download it again"
-        )
-    hdf5_layout.check_dataset(path, images)
-    hdf5_layout.check_dataset(path, file[_STAMPS])
-    return hdf5_layout.microseconds(path, file[_STAMPS][...]), size
 
 
 def _events(path: Path) -> Iterator[EventArray]:
@@ -125,11 +114,3 @@ def _convert(
         y[i] = np.uint16(row)
         p[i] = polarity > 0
     return len(rows)
-
-
-def _frames(path: Path, stamps: NDArray[np.int64]) -> Iterator[Frame]:
-    with hdf5_layout.opened(path) as file:
-        images = file[_IMAGES]
-        size = hdf5_layout.size_of(path, images.shape[1:])
-        for index, stamp in enumerate(stamps.tolist()):
-            yield Frame(np.ascontiguousarray(images[index].reshape(size)), stamp, stamp)

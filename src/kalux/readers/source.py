@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -111,6 +111,21 @@ def smallest_size(path: Path, chunks: Iterable[EventArray]) -> tuple[int, int]:
     if not height:
         raise FormatError(f"{path}: has no events, and does not say how large the sensor is")
     return height, width
+
+
+def checked_inverse_covariance(path: Path, name: str, values: NDArray[Any]) -> NDArray[np.float64]:
+    """The released datasets' ``f_Q``, (256,), 1/s, which the file holds as ``name``.
+
+    Raises
+    ------
+    FormatError
+        If it is not a value for each of 256 levels, finite and none negative.
+    """
+    if values.shape != (256,) or values.dtype.kind not in "iuf" or not np.isfinite(values).all():
+        raise FormatError(f"{path}: {name} is {values.dtype} {values.shape}; 256 finite numbers are needed")
+    if values.min() < 0:
+        raise FormatError(f"{path}: {name} has a value of {values.min():g}; none may be negative")
+    return values.astype(np.float64)
 
 
 def begins_with(path: Path, *beginnings: bytes) -> bool:

@@ -1,7 +1,8 @@
 """Events in a text table whose first line names its columns: CSV, TSV, or separated by blanks.
 
 The columns may have any order and any of the names in `kalux.readers.columns`; others are skipped. Lines that begin
-with # are comments; the one with the names may begin with it, too (as ``numpy.savetxt`` writes it).
+with # are comments; the one with the names may begin with it, too (as ``numpy.savetxt`` writes it). Without names the
+lines may be those of ``events.txt`` in the IJRR layout, which other programs write alone.
 """
 
 from __future__ import annotations
@@ -38,18 +39,30 @@ _BLOCK_BYTES: Final = 8 * CHUNK_EVENTS
 _LONGEST_LINE: Final = 4096
 _MOST_COLUMNS: Final = 64
 _NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+_IJRR_LINE: Final = re.compile(r"\s*\d+\.\d+\s+\d+\s+\d+\s+[01]\s*")
+"""Seconds with decimals, x, y, and polarity, which nothing else is likely to be."""
+_IJRR_ASSUMED: Final = (
+    "The columns have no names; they are taken as t (s), x, y, p, as events.txt of IJRR has them."
+)
 _DECIMALS: Final = {"s": 6, "ms": 3, "us": 0, "ns": -3, None: 0}
 """How many decimals of each unit a microsecond needs."""
 
 
 class _Header(NamedTuple):
-    """The first line: where the data begin (bytes, lines), what separates columns, which column is what."""
+    """The first line: where the data begin (bytes, lines), what separates columns, which column is what.
+
+    ``assumed`` says what the file leaves open, for `Source.missing`.
+    """
 
     begin: int
     lines: int
     separator: str
     roles: tuple[int, ...]
     unit: str | None
+    assumed: tuple[str, ...]
+
+
+_IJRR: Final = _Header(0, 0, " ", (1, 2, 3, 4), "s", (_IJRR_ASSUMED,))
 
 
 def recognises(path: Path) -> bool:
@@ -72,7 +85,7 @@ def read(path: Path) -> Source:
     Raises
     ------
     FormatError
-        If the columns have no names, or a line (named by its number) cannot be read.
+        If the columns have no names that could be known, or a line (named by its number) cannot be read.
     InputError
         If the file cannot be read.
     """
@@ -93,7 +106,7 @@ def read(path: Path) -> Source:
         count_frames=lambda: 0,
         missing=(
             "The file has no frames.",
-            *(() if header.unit else (UNIT_ASSUMED,)),
+            *header.assumed,
             SIZE_UNKNOWN,
         ),
         sensor_size_known=False,
@@ -111,7 +124,8 @@ def _first_lines(data: bytes) -> list[str]:
         text = data[: error.start].decode("utf-8-sig")
         if len(data) - error.start >= 4:  # more than a character that is cut off
             return []
-    whole = text.splitlines()
+    # Not splitlines, which also ends lines where the parser does not.
+    whole = text.removesuffix("\n").split("\n")
     if len(data) == _LONGEST_LINE:
         whole = whole[:-1]
     lines: list[str] = []
@@ -153,10 +167,11 @@ def _has_numbers(line: str) -> bool:
 def _read_header(path: Path, data: bytes) -> _Header:
     lines = _first_lines(data)
     found = _columns_of(lines)
+    if found is None and lines and _IJRR_LINE.fullmatch(lines[-1]):
+        return _IJRR
     if found is None:
         raise FormatError(
-            f"{path}: its first line does not name the columns; put a line such as 't_us,x,y,p' there, in their order "
-            "(a folder in the IJRR layout is opened as a whole)"
+            f"{path}: its first line does not name the columns; put a line such as 't_us,x,y,p' there, in their order"
         )
     index, names, columns = found
     if len(names) > _MOST_COLUMNS:
@@ -168,7 +183,8 @@ def _read_header(path: Path, data: bytes) -> _Header:
         begin = data.index(b"\n", begin) + 1 if b"\n" in data[begin:] else len(data)
     roles = tuple(columns[:4].index(name) + 1 if name in columns[:4] else 0 for name in names)
     separator = _separator(lines[index].strip().lstrip("#").strip())
-    return _Header(begin, index + 1, separator, _once(roles), columns.unit)
+    assumed = () if columns.unit else (UNIT_ASSUMED,)
+    return _Header(begin, index + 1, separator, _once(roles), columns.unit, assumed)
 
 
 def _once(roles: tuple[int, ...]) -> tuple[int, ...]:

@@ -432,7 +432,7 @@ def camera_curves(recording: Recording, method: Method) -> dict[str, Any] | None
     named = chosen_response(camera_settings.response, recording.response).split(";")
     response = Response.named(named[len(named) // 2])  # of three the green
     table = recording.source.inverse_covariance
-    saturation = camera_settings.saturation
+    saturation = camera_settings.clipped_from
     camera = (
         Camera(response, None, saturation)
         if table is None

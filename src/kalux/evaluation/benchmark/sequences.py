@@ -51,7 +51,7 @@ class ArtificialHdr:
     low: float
     high: float
     black: float = 0.0
-    saturation: float = 255 * CameraSettings.saturation
+    saturation: float = 255 * CameraSettings.usual_saturation
 
     def __post_init__(self) -> None:
         _ = self.camera

@@ -1,0 +1,90 @@
+"""The fixed pattern of sensors where it is known."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from kalux import EVENT_DTYPE, Frame, Recording
+from kalux.calibration.fixed_pattern import estimate_fixed_pattern
+from kalux.settings import CameraSettings
+
+CAMERA = CameraSettings(frame_noise=0.003)
+SIZE = (120, 160)
+NOTHING = np.empty(0, EVENT_DTYPE)
+
+
+def scene(rows, columns):
+    """Broad light and dark with texture, 0.03 to 0.7."""
+    rng = np.random.default_rng(3)
+    broad, fine = (cv2.GaussianBlur(rng.standard_normal((rows, columns)), (0, 0), s) for s in (12, 2))
+    level = broad / broad.std() + 0.1 * fine / fine.std()
+    return (0.15 * np.exp(0.7 * level)).clip(0.03, 0.7)
+
+
+def recorded(offset, *, step=(3, 7), frames=20, noise=0.003, image=None, **fields):
+    """A pan over the scene by ``step`` pixels a frame; ``offset`` (H, W) is the sensor's own."""
+    rng = np.random.default_rng(4)
+    (down, right), (height, width) = step, SIZE
+    whole = scene(height + 20 * abs(down), width + 20 * abs(right)) if image is None else image
+    made = []
+    for k in range(frames):
+        seen = whole[k * down : k * down + height, k * right : k * right + width] + offset
+        values = np.rint(255 * (seen + noise * rng.standard_normal(SIZE)).clip(0, 1)).astype(np.uint8)
+        made.append(Frame(values, 40_000 * k, 40_000 * k + 10_000, **fields))
+    return Recording.from_arrays(NOTHING, made, sensor_size=SIZE)
+
+
+def pattern(deviation):
+    return deviation * np.random.default_rng(5).standard_normal(SIZE)
+
+
+@pytest.mark.parametrize("deviation", [0.004, 0.01])
+def test_offsets_that_stay_while_the_scene_moves_are_found(deviation):
+    found = estimate_fixed_pattern(recorded(pattern(deviation)), CAMERA)
+    assert found.deviation == pytest.approx(deviation, rel=0.1)
+    assert found.variance == pytest.approx(found.deviation**2)
+    assert found.variance > 6 * found.error
+
+
+def test_texture_and_noise_that_move_are_none():
+    assert estimate_fixed_pattern(recorded(0.0, noise=0.01), CAMERA).deviation == 0
+
+
+def test_what_stands_still_may_be_the_scene():
+    """Its texture is the same in all frames, as a pattern is: nothing is said."""
+    assert estimate_fixed_pattern(recorded(pattern(0.01), step=(0, 0)), CAMERA) is None
+
+
+def test_clipped_and_masked_pixels_do_not_count():
+    """White stays, whatever the offset; of masked pixels anything may stand in the frame."""
+    valid = np.arange(SIZE[1]) >= 40
+    spoilt = pattern(0.005) + np.where(valid, 0, 0.2 * np.random.default_rng(6).standard_normal(SIZE))
+    found = estimate_fixed_pattern(recorded(spoilt, valid=np.broadcast_to(valid, SIZE)), CAMERA)
+    assert found.deviation == pytest.approx(0.005, rel=0.1)
+    bright = estimate_fixed_pattern(recorded(pattern(0.005), image=3 * scene(180, 300)), CAMERA)
+    assert bright.deviation == pytest.approx(0.005, rel=0.1)
+
+
+def test_colours_of_a_mosaic_are_no_pattern():
+    """Neighbours of the same colour are asked: green ones see twice the light."""
+    filters = np.tile([[1.0, 2.0], [2.0, 1.0]], (90, 150))[:180, :300]
+    rng = np.random.default_rng(4)
+    whole, offset = 0.4 * scene(180, 300), pattern(0.004)
+    frames = []
+    for k in range(20):
+        light = whole[3 * k : 3 * k + 120, 7 * k : 7 * k + 160] * filters[:120, :160] + offset
+        values = np.rint(255 * (light + 0.003 * rng.standard_normal(SIZE)).clip(0, 1)).astype(np.uint8)
+        frames.append(Frame(values, 40_000 * k, 40_000 * k + 10_000, mosaic="RGGB"))
+    found = estimate_fixed_pattern(Recording.from_arrays(NOTHING, frames, sensor_size=SIZE), CAMERA)
+    assert found.deviation == pytest.approx(0.004, rel=0.1)
+
+
+def test_cameras_that_process_what_they_see_are_left_alone():
+    source = recorded(pattern(0.01))
+    assert estimate_fixed_pattern(source, CameraSettings(response="srgb")) is None
+    rgb = [
+        Frame(np.repeat(f.image[..., None], 3, 2), f.exposure_start, f.exposure_end) for f in source.frames()
+    ]
+    assert estimate_fixed_pattern(Recording.from_arrays(NOTHING, rgb, sensor_size=SIZE), CAMERA) is None
