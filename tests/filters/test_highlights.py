@@ -177,3 +177,14 @@ def test_a_bound_makes_nothing_surer():
 
 def test_where_neither_knows_more_nothing_changes():
     assert obeyed(0.0, 0.1, 1.5, 0.1, unshown([0], 0.2)) == (-9.0, -9.0)
+
+
+def test_an_estimate_tells_which_pixels_neither_frame_around_measures():
+    engine = kalux.Reconstructor((3, 3), contrast_threshold=(0.3, 0.3))
+    for k, clipped in enumerate(([4, 5], [3, 4], [])):
+        picture = np.full((3, 3), 128, np.uint8)
+        picture.flat[clipped] = 255
+        engine.push_frame(kalux.Frame(picture, k * 40_000, k * 40_000 + 10_000))
+    engine.finish()
+    assert engine.estimate(20_000).unmeasured.tolist() == [4]
+    assert engine.estimate(60_000).unmeasured.tolist() == []
