@@ -407,7 +407,7 @@ INFINITE_BITS: Final = 0x7F800000
 def magnitude_bits(values: NDArray[np.float32]) -> int:
     """The largest bits, without signs, of some float32: tells in one pass of what kind they are. 0 of none."""
     if values.size and not any(values.strides):  # one number, repeated
-        values = values.flat[:1]
+        return int(values[(0,) * values.ndim].view(np.int32)) & 0x7FFFFFFF
     return int(_magnitude_bits(np.ascontiguousarray(values).view(np.int32).reshape(-1)))
 
 

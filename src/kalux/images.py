@@ -100,9 +100,9 @@ class Estimate:
         (H, W): mean square change of silent pixels around each, from one frame to the next; None: not told.
     around
         What the frames around say of the pixels (K11); None: not told, or there is only one.
-    measured
-        (H, W) variances of the frames around, or of the only one known, `UNMEASURED` where there is nothing measured;
-        None: not told.
+    unmeasured
+        (N,) pixels in the flattened image that neither of the frames around measures, nor the only one known; None: not
+        told.
     exposed
         The share of the time for which frames are exposed, where the next one is known; more where the light turns more
         often (`kalux.filters.uncertainty.changed_within`).
@@ -124,7 +124,7 @@ class Estimate:
     unshown: Unshown | None = None
     silent_change: NDArray[np.floating[Any]] | None = None
     around: Around | None = None
-    measured: tuple[NDArray[np.floating[Any]], NDArray[np.floating[Any]]] | None = None
+    unmeasured: NDArray[np.int64] | None = None
     exposed: float = 0.0
     since: float | None = None
     told: NDArray[np.floating[Any]] | None = None
@@ -198,8 +198,8 @@ def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) ->
     )
     if unshown is not None:
         read_unshown(intensity, heard, estimate.log_intensity, unshown, view.log_offset, prior)
-    if estimate.measured is not None:
-        keep_white(intensity, estimate.log_intensity, estimate.measured, view.log_offset, prior)
+    if estimate.unmeasured is not None:
+        keep_white(intensity, estimate.log_intensity, estimate.unmeasured, view.log_offset, prior)
     pattern = view.fixed_pattern * (np.exp(estimate.white) - view.log_offset)
     if not tells:
         total = np.ndarray(intensity.shape, np.float32, _UNTOLD, strides=(0, 0))

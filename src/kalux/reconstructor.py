@@ -367,7 +367,7 @@ class Reconstructor:
             unshown=self._unshown(progress, variance),
             silent_change=self._method.silent_change(progress.segment),
             around=None if moment.after is None else self._method.around(progress.segment, t),
-            measured=self._method.measured(progress.segment),
+            unmeasured=self._method.unmeasured(progress.segment, progress.cursor),
             exposed=changed_within(moment.exposed, self._method.turns(progress.segment)),
             since=moment.since(self._interval),
         )

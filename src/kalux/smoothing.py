@@ -392,7 +392,7 @@ def combine(
         unshown=unshown,
         silent_change=change,
         around=None if forward.around is None else forward.around._replace(counted=UNMEASURED),
-        measured=forward.measured,
+        unmeasured=forward.unmeasured,
         exposed=forward.exposed,
         since=_least(forward.since, backward.since),
         told=told,

@@ -22,5 +22,5 @@ def test_integers_are_clipped():
 @given(st.lists(st.floats(-1.0, 2.0, width=32), min_size=1, max_size=70))
 def test_integers_are_rounded_to_the_nearest(values):
     for to_integer, top in ((to_uint8, 255), (to_uint16, 65535)):
-        expected = np.rint(np.clip(np.float32(values), 0, 1) * np.float32(top))
-        np.testing.assert_array_equal(to_integer(np.float32(values)), expected)
+        exact = np.clip(np.float64(np.float32(values)), 0, 1) * top
+        assert np.abs(to_integer(np.float32(values)) - exact).max() <= 0.505  # where the product is a float32

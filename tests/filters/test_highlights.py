@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import kalux
-from kalux.augmentation.bridge import UNMEASURED
 from kalux.augmentation.highlights import Unshown
 from kalux.events import make_events
 from kalux.filters.highlights import keep_white, lifted, obey_bounds, read_unshown, smoothed_unshown, tempered
@@ -104,10 +103,8 @@ def test_a_lamp_that_every_frame_clips_stays_white(how):
 
 
 def test_a_clipped_pixel_that_went_dark_between_the_frames_is_dark():
-    first, second = np.full((2, 1, 3), UNMEASURED)
-    second[0, 2] = 1.0
     image = np.full((1, 3), 0.5, np.float32)
-    keep_white(image, np.array([[WHITE + 0.2, WHITE - 0.9, WHITE]]), (first, second), OFFSET, PRIOR)
+    keep_white(image, np.array([[WHITE + 0.2, WHITE - 0.9, WHITE]]), np.array([0, 1]), OFFSET, PRIOR)
     np.testing.assert_allclose(image, [[1.0, 0.5, 0.5]], rtol=1e-6)
 
 
@@ -180,3 +177,14 @@ def test_a_bound_makes_nothing_surer():
 
 def test_where_neither_knows_more_nothing_changes():
     assert obeyed(0.0, 0.1, 1.5, 0.1, unshown([0], 0.2)) == (-9.0, -9.0)
+
+
+def test_an_estimate_tells_which_pixels_neither_frame_around_measures():
+    engine = kalux.Reconstructor((3, 3), contrast_threshold=(0.3, 0.3))
+    for k, clipped in enumerate(([4, 5], [3, 4], [])):
+        picture = np.full((3, 3), 128, np.uint8)
+        picture.flat[clipped] = 255
+        engine.push_frame(kalux.Frame(picture, k * 40_000, k * 40_000 + 10_000))
+    engine.finish()
+    assert engine.estimate(20_000).unmeasured.tolist() == [4]
+    assert engine.estimate(60_000).unmeasured.tolist() == []

@@ -8,7 +8,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.compiled import ONE
+from kalux.compiled import FUSED, ONE
 from kalux.display.intensities import Float32
 
 
@@ -33,7 +33,8 @@ def _to_integer(mapped: NDArray[Any], integers: NDArray[Any], top: int) -> NDArr
     return integers
 
 
-@nb.njit(cache=True, nogil=True)
+# As who calls it: numba would else compile it in the manner of whoever comes first, and keep that for all.
+@nb.njit(cache=True, nogil=True, fastmath=FUSED)
 def quantise(values, top, integers):  # type: ignore[no-untyped-def]
     # Added and taken away again, it rounds to a whole number, halves to even ones.
     rounding = np.float32(1.5 * 2**23)

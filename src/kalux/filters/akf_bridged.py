@@ -102,6 +102,8 @@ class Cursor:
         us: the segment's start, then a whole number of epochs later.
     moving
         `moving_pixels`, once it has been asked for, where it is the same throughout the segment.
+    unmeasured
+        `unmeasured_pixels`, once it has been asked for.
     """
 
     pixels: NDArray[np.void]
@@ -110,6 +112,7 @@ class Cursor:
     polarity: NDArray[np.int8]
     origin: int
     moving: NDArray[np.bool_] | None = None
+    unmeasured: NDArray[np.int64] | None = None
 
 
 class Noise(NamedTuple):
@@ -225,6 +228,14 @@ def moving_pixels(segment: BridgedSegment, cursor: Cursor) -> NDArray[np.bool_]:
     if segment.events is not None:  # all events of the segment are among them, whenever this is asked for
         cursor.moving = moving
     return moving
+
+
+def unmeasured_pixels(segment: BridgedSegment, cursor: Cursor) -> NDArray[np.int64]:
+    """(N,) pixels in the flattened image that neither frame around measures. Not to be changed."""
+    if cursor.unmeasured is None:
+        first, second = segment.forward_variance, segment.backward_variance
+        cursor.unmeasured = np.flatnonzero((first >= UNMEASURED) & (second >= UNMEASURED))
+    return cursor.unmeasured
 
 
 @nb.njit(cache=True, nogil=True)

@@ -471,8 +471,8 @@ class BridgedFrames(CommonMethod):
     def silent_change(self, segment: BridgedSegment) -> Floats | None:
         return segment.silent_change
 
-    def measured(self, segment: BridgedSegment) -> tuple[Floats, Floats]:
-        return segment.forward_variance, segment.backward_variance
+    def unmeasured(self, segment: Any, cursor: akf_bridged.Cursor) -> NDArray[np.int64]:
+        return akf_bridged.unmeasured_pixels(segment, cursor)
 
     def turns(self, segment: BridgedSegment) -> float:
         return segment.turns

@@ -8,9 +8,8 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.bridge import UNMEASURED
 from kalux.augmentation.highlights import Unshown
-from kalux.compiled import ONE, any_from, exponential
+from kalux.compiled import ONE, exponential
 from kalux.filters.readout import HighlightPrior, believed_highlight
 
 Floats = NDArray[np.floating[Any]]
@@ -21,9 +20,6 @@ _LIKELY: Final = np.float32(2.0)
 _ABOUT_WHITE: Final = np.float32(0.1)
 """How far below white, log intensity, pixels lie whom neighbours may take as far again: the least threshold of sensors.
 Those that frames have lifted lie up to 0.05 below it until the next frame."""
-
-_BLOCK: Final = 64
-"""Pixels that are looked at together."""
 
 _LEAST_SPREAD: Final = np.float32(0.3)
 """Standard deviation that is left where pixels around say that all lie just above their bounds."""
@@ -91,33 +87,28 @@ def read_unshown(
 def keep_white(
     image: NDArray[np.float32],
     log_intensity: Floats,
-    measured: tuple[Floats, Floats],
+    unmeasured: NDArray[np.int64],
     log_offset: float,
     prior: HighlightPrior,
 ) -> None:
-    """Pixels that no frame around measures, and of which L is about white or more, stay about white. In place.
+    """Of the pixels that no frame around measures, those of which L is about white or more stay about white. In place.
 
     The frames have clipped them then, and no event has taken them down since. The farther they are below white all the
     same, the farther neighbours may take them.
     """
-    offset = np.float32(log_offset)
-    level, first, second = (plane.reshape(-1) for plane in (log_intensity, *measured))
-    _keep(level, first, second, np.float32(prior.white), offset, image.reshape(-1))
+    scalars = np.float32(prior.white), np.float32(log_offset)
+    _keep(log_intensity.reshape(-1), unmeasured, *scalars, image.reshape(-1))
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _keep(log_intensity, first, second, white, log_offset, image):  # type: ignore[no-untyped-def]
-    unmeasured, size = np.float32(UNMEASURED), np.uint64(len(image))
-    for start in range(np.uint64(0), size, np.uint64(_BLOCK)):
-        pixels = range(start, min(size, start + np.uint64(_BLOCK)))
-        if not any_from(first, pixels, unmeasured):  # as in most of an image
-            continue
-        for i in pixels:
-            level = np.float32(log_intensity[i])
-            if level > white - ONE and min(first[i], second[i]) >= unmeasured:
-                below = max(white - level, np.float32(0.0))
-                least = exponential(white - below - below * below / _ABOUT_WHITE) - log_offset
-                image[i] = max(image[i], least)
+def _keep(log_intensity, unmeasured, white, log_offset, image):  # type: ignore[no-untyped-def]
+    for pixel in unmeasured:
+        i = np.uint64(pixel)
+        level = np.float32(log_intensity[i])
+        if level > white - ONE:
+            below = max(white - level, np.float32(0.0))
+            least = exponential(white - below - below * below / _ABOUT_WHITE) - log_offset
+            image[i] = max(image[i], least)
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")

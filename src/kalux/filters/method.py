@@ -96,8 +96,8 @@ class Method(Protocol):
     def around(self, segment: Any, t: int) -> Around | None:
         """What the two frames that a segment joins say of its pixels at ``t`` (K11); None: the method does not tell."""
 
-    def measured(self, segment: Any) -> tuple[Floats, Floats] | None:
-        """(H, W) variances of the frames that a segment joins, `UNMEASURED` where there is none; None: not told."""
+    def unmeasured(self, segment: Any, cursor: Any) -> NDArray[np.int64] | None:
+        """(N,) pixels in the flattened image that neither frame of a segment measures; None: not told."""
 
     def trail(self, segment: Any, cursor: Any, t: int) -> Floats | None:
         """(H, W): how far the light is ahead of its events at ``t`` (K14); None: the method does not tell."""
@@ -129,7 +129,7 @@ class CommonMethod:
     def around(self, segment: Any, t: int) -> Around | None:
         return None
 
-    def measured(self, segment: Any) -> tuple[Floats, Floats] | None:
+    def unmeasured(self, segment: Any, cursor: Any) -> NDArray[np.int64] | None:
         return None
 
     def unshown(self, segment: Any, variance: Floats) -> Unshown | None:
