@@ -260,6 +260,7 @@ class TestWhatIsSaid:
             "background",
             "exposure",
             "noise",
+            "pattern",
             "bright",
             "response",
             "filter",
