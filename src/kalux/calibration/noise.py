@@ -122,7 +122,8 @@ class NoiseCalibration:
             errors["fixed_pattern"] = self.pattern.error / (2 * self.pattern.deviation)
         if self.levels.saturation is not None:
             measured["white_level"] = self.levels.saturation
-            camera["saturation"] = min(self.levels.saturation, CameraSettings.usual_saturation)
+            if self.levels.saturation < CameraSettings.usual_saturation:  # else it is found out, or the usual
+                camera["saturation"] = self.levels.saturation
         if self.levels.black is not None:
             measured["black_level"] = self.levels.black
         settings = {"camera": camera, "events": events}
