@@ -73,6 +73,16 @@ def test_the_noise_of_a_truth_that_a_camera_took_is_no_error_and_what_was_given_
     assert found.pixels == 3 * size[0] * size[1]
 
 
+def test_a_method_without_variance_needs_no_noise_of_a_truth_that_is_black(simulation, recording):
+    """I_0 is 0 there, and the noise of a black pixel's logarithm has no end."""
+    truth = dataclasses.replace(
+        simulation.truth(), images=np.zeros_like(simulation.truth().images), noise=(0.02, 0.0)
+    )
+    truth.images[:, :2] = 1.0
+    scores = evaluate_truth(recording, prepare_reference(recording, truth), methods()["hold"])
+    assert scores.calibration is None
+
+
 def test_images_may_come_in_any_order(simulation, recording):
     truth = simulation.truth()
     shuffled = np.random.default_rng(0).permutation(len(truth.times))

@@ -187,7 +187,7 @@ def truth_pairs(recording: Recording, reference: Reference, method: Method) -> I
             made.variance if reference.noise is None else made.variance_of_frames,
             log_offset=made.log_offset,
             noise=None
-            if reference.noise is None
+            if reference.noise is None or made.variance is None
             else _noise(reference.images[i], reference.noise, made.log_offset),
             given=next(given),
         )
