@@ -52,8 +52,6 @@ def variants(ablation: bool) -> dict[str, Settings]:
             ("neighbours 0.6", "filter", {"neighbours": 0.6}),
             ("highlight scale 1", "filter", {"highlight_scale": 1.0}),
             ("highlight scale 3", "filter", {"highlight_scale": 3.0}),
-            ("extrapolation spread 0.1", "events", {"extrapolation_spread": 0.1}),
-            ("extrapolation spread 3", "events", {"extrapolation_spread": 3.0}),
             ("step variance 0.05", "events", {"step_variance": 0.05}),
             ("step variance 0.2", "events", {"step_variance": 0.2}),
             ("step variance 0.8", "events", {"step_variance": 0.8}),
