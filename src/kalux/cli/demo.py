@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from kalux.cli.loops import tell_of_compiling
 from kalux.cli.parser import Parser
 from kalux.cli.terminal import say
 
@@ -46,6 +47,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     """Run the command."""
     from kalux.demo import run_demo
 
+    tell_of_compiling()
     started = time.monotonic()
     try:
         found = run_demo(options.out, overwrite=options.overwrite, say=say)

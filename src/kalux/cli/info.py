@@ -6,6 +6,7 @@ import argparse
 from typing import TYPE_CHECKING, Any
 
 from kalux.cli.calibrations import add_calibration, calibration_lines, given_calibration
+from kalux.cli.loops import tell_of_compiling
 from kalux.cli.parser import Parser
 from kalux.cli.recordings import add_recording, open_recording
 from kalux.cli.terminal import say
@@ -47,6 +48,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     from kalux.info import describe, format_description
 
     settings = preset(options.preset)
+    tell_of_compiling()
     recording = open_recording(options)
     calibration = given_calibration(options)
     description = describe(recording)

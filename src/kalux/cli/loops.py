@@ -5,7 +5,10 @@ from __future__ import annotations
 import contextlib
 import importlib
 import sys
-from typing import Final
+from collections.abc import Callable
+from typing import Any, Final
+
+from kalux.cli.terminal import error_line
 
 _BLAS: Final = "scipy.linalg.cython_blas"
 
@@ -25,3 +28,24 @@ def prepare_loops() -> None:
             importlib.import_module("numba.np.arraymath")
     finally:
         del sys.modules[_BLAS]
+
+
+def tell_of_compiling(*, quiet: bool = False, tell: Callable[[str], None] = error_line) -> None:
+    """On a terminal, have it told, once, when loops are compiled: the first run of a kind waits for that."""
+    if quiet or not sys.stderr.isatty():
+        return
+    from numba.core import event
+
+    class Compiling(event.Listener):
+        def __init__(self) -> None:
+            self.told = False
+
+        def on_start(self, event: Any) -> None:
+            if not self.told:
+                self.told = True
+                tell("compiling what is used for the first time: up to a minute; later runs need not")
+
+        def on_end(self, event: Any) -> None:
+            pass
+
+    event.register("numba:compile", Compiling())  # type: ignore[no-untyped-call]

@@ -17,7 +17,7 @@ from kalux.ahead import default_threads
 from kalux.cli.calibrations import add_calibration, given_calibration
 from kalux.cli.checking import Contents, check_beside
 from kalux.cli.flags import HelpSettings, add_display, add_settings, given_settings
-from kalux.cli.loops import prepare_loops
+from kalux.cli.loops import prepare_loops, tell_of_compiling
 from kalux.cli.output import DEFAULT_RATE, FOLDER_FORMATS, Output, check_output, chosen_output, image_rate
 from kalux.cli.parser import Parser, UsageError, number, whole
 from kalux.cli.progress import Progress, short_number
@@ -158,6 +158,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     _check_apart(output, Path(options.recording))
     times = None if options.times is None else load_times(options.times)
     prepare_loops()
+    tell_of_compiling(quiet=options.quiet)
     recording = open_recording(options)
     threads = options.threads or default_threads()
     with Progress("checking", quiet=options.quiet) as progress:
