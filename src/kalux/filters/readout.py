@@ -272,8 +272,8 @@ def _ring(pitch):  # type: ignore[no-untyped-def]
         _lines(4 * count),
         np.empty((count, _STRIP), np.uint8),
         np.empty((count, 2), np.int64),
-        _lines(4),
-        _lines(2),
+        _lines(np.int64(4)),
+        _lines(np.int64(2)),
     )
 
 
@@ -338,7 +338,7 @@ def _read_out(  # type: ignore[no-untyped-def]
         for row in range(-3 * pitch if told else 0, height):
             following = row + 3 * pitch
             at = np.uint64(row)
-            first, last = _STRIP, 0
+            first, last = np.int64(_STRIP), np.int64(0)  # as literals, all that takes them would be compiled twice
             if told:
                 _take_row(
                     log_intensity, variance, moving, change, hidden, row + 2 * pitch, begin, count, known
