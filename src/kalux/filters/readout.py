@@ -338,7 +338,8 @@ def _read_out(  # type: ignore[no-untyped-def]
         for row in range(-3 * pitch if told else 0, height):
             following = row + 3 * pitch
             at = np.uint64(row)
-            first, last = np.int64(_STRIP), np.int64(0)  # as literals, all that takes them would be compiled twice
+            # As literals, all that takes them would be compiled twice.
+            first, last = np.int64(_STRIP), np.int64(0)
             if told:
                 _take_row(
                     log_intensity, variance, moving, change, hidden, row + 2 * pitch, begin, count, known
