@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 _DESCRIPTION = """\
 See what kalux does, without data of your own: simulates a recording with known truth, reconstructs it, and
-writes a picture, a video and the recording. Takes 10 to 60 s; the first run compiles."""
+writes a picture, a video and the recording. Takes half a minute, the first run, which compiles, one to two."""
 
 _EXAMPLES = """\
 examples:
