@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import h5py
 import hdf5plugin  # noqa: F401 - registers Blosc, LZ4, ZSTD and others with HDF5
@@ -16,7 +16,16 @@ from numpy.typing import NDArray
 from kalux.errors import EventError, FormatError
 from kalux.events import EventArray, make_events
 from kalux.frames import Frame
-from kalux.readers.source import CHUNK_EVENTS, begins_with, reading
+from kalux.readers.source import (
+    CHUNK_EVENTS,
+    EXPOSURE_UNKNOWN,
+    NO_FRAMES,
+    SIZE_UNKNOWN,
+    Source,
+    begins_with,
+    reading,
+    smallest_size,
+)
 
 DAMAGE: Final = (KeyError, ValueError, TypeError, RuntimeError, AttributeError, IndexError, MemoryError)
 """What h5py raises for damaged files, besides OSError."""
@@ -177,14 +186,36 @@ def size_of(path: Path, shape: tuple[int, ...], *, grey: bool = False) -> tuple[
     return int(shape[0]), int(shape[1])
 
 
-def stamped_images(path: Path, file: Any, images: str, stamps: str) -> tuple[tuple[int, int], NDArray[Any]]:
-    """(height, width) of grey images that are one dataset, and their times, as another states them.
+class Stack(NamedTuple):
+    """Grey images that are one dataset, of unknown exposures.
+
+    Attributes
+    ----------
+    name
+        Of the dataset.
+    size
+        (height, width); None: there is no such dataset.
+    stamps
+        us.
+    """
+
+    name: str
+    size: tuple[int, int] | None
+    stamps: NDArray[np.int64]
+
+
+def find_stack(
+    path: Path, file: Any, images: str, stamps: str, convert: Callable[[NDArray[Any]], NDArray[np.int64]]
+) -> Stack:
+    """The stack of ``images``, if the file has it; ``convert`` makes us of the times in ``stamps``.
 
     Raises
     ------
     FormatError
-        If these are not as many, not stored in full, or the images are in colour.
+        If images and times are not as many, not stored in full, or the images are in colour.
     """
+    if images not in file:
+        return Stack(images, None, np.empty(0, np.int64))
     size = size_of(path, file[images].shape[1:], grey=True)
     if file[stamps].shape != file[images].shape[:1]:
         raise FormatError(
@@ -192,17 +223,37 @@ def stamped_images(path: Path, file: Any, images: str, stamps: str) -> tuple[tup
         )
     check_dataset(path, file[images])
     check_dataset(path, file[stamps])
-    return size, file[stamps][...]
+    return Stack(images, size, convert(file[stamps][...]))
 
 
-def image_frames(path: Path, images: str, stamps: NDArray[np.int64]) -> Iterator[Frame]:
-    """Frames of unknown exposure from images that are one dataset, none of which is needed without ``stamps`` (us)."""
-    if not len(stamps):
+def source_with_stack(
+    path: Path, format: str, events: Callable[[], Iterator[EventArray]], count: int, stack: Stack, *notes: str
+) -> Source:
+    """A recording of ``count`` events and a stack of images; the sensor has the size of these, if there are any."""
+    missing = (EXPOSURE_UNKNOWN if len(stack.stamps) else NO_FRAMES, *notes)
+    if stack.size is None:
+        missing += (SIZE_UNKNOWN,)
+    return Source(
+        path=path,
+        format=format,
+        sensor_size=stack.size or smallest_size(path, events()),
+        events=events,
+        frames=lambda: _frames_of(path, stack),
+        count_events=lambda: count,
+        count_frames=lambda: len(stack.stamps),
+        exposure_known=not len(stack.stamps),
+        missing=missing,
+        sensor_size_known=stack.size is not None,
+    )
+
+
+def _frames_of(path: Path, stack: Stack) -> Iterator[Frame]:
+    if stack.size is None:
         return
     with opened(path) as file:
-        size = size_of(path, file[images].shape[1:])
-        for index, stamp in enumerate(stamps.tolist()):
-            yield Frame(np.ascontiguousarray(file[images][index].reshape(size)), stamp, stamp)
+        for index, stamp in enumerate(stack.stamps.tolist()):
+            image = file[stack.name][index]
+            yield Frame(np.ascontiguousarray(image.reshape(stack.size)), stamp, stamp)
 
 
 JOIN_FRAMES: Final = "join images of the events' pixels instead (--frames FOLDER --replace-frames)"

@@ -7,6 +7,7 @@ https://daniilidis-group.github.io/mvsec/. The left camera is read.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from kalux.errors import FormatError
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.readers import hdf5_layout
-from kalux.readers.source import EXPOSURE_UNKNOWN, SIZE_UNKNOWN, Source, smallest_size
+from kalux.readers.source import Source
 
 _EVENTS: Final = "davis/left/events"
 _IMAGES: Final = "davis/left/image_raw"
@@ -50,28 +51,9 @@ def read(path: Path) -> Source:
             )
         hdf5_layout.check_dataset(path, events)
         count = int(events.shape[0])
-        size, stamps = None, np.empty(0, np.int64)
-        if _IMAGES in file:
-            size, seconds = hdf5_layout.stamped_images(path, file, _IMAGES, _STAMPS)
-            stamps = hdf5_layout.microseconds(path, seconds)
-        has_right = _RIGHT in file
-    missing: tuple[str, ...] = (EXPOSURE_UNKNOWN,) if len(stamps) else ("The file has no images.",)
-    if has_right:
-        missing += ("The left camera is read.",)
-    if size is None:
-        missing += (SIZE_UNKNOWN,)
-    return Source(
-        path=path,
-        format="mvsec",
-        sensor_size=size or smallest_size(path, _events(path)),
-        events=lambda: _events(path),
-        frames=lambda: hdf5_layout.image_frames(path, _IMAGES, stamps),
-        count_events=lambda: count,
-        count_frames=lambda: len(stamps),
-        exposure_known=not len(stamps),
-        missing=missing,
-        sensor_size_known=size is not None,
-    )
+        stack = hdf5_layout.find_stack(path, file, _IMAGES, _STAMPS, partial(hdf5_layout.microseconds, path))
+        notes = ("The left camera is read.",) if _RIGHT in file else ()
+    return hdf5_layout.source_with_stack(path, "mvsec", lambda: _events(path), count, stack, *notes)
 
 
 def _events(path: Path) -> Iterator[EventArray]:

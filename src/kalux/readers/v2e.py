@@ -7,15 +7,17 @@ version 1.6), which takes pixel values as linear in the light.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from kalux.errors import FormatError
 from kalux.events import EventArray
 from kalux.readers import hdf5_layout
-from kalux.readers.source import EXPOSURE_UNKNOWN, SIZE_UNKNOWN, Source, smallest_size
+from kalux.readers.source import Source
 
 _EVENTS: Final = "events"
 _IMAGES: Final = "frame"
@@ -45,27 +47,14 @@ def read(path: Path) -> Source:
     with hdf5_layout.opened(path) as file:
         hdf5_layout.check_dataset(path, file[_EVENTS])
         count = int(file[_EVENTS].shape[0])
-        size, stamps = None, np.empty(0, np.int64)
-        if _IMAGES in file:
-            size, stated = hdf5_layout.stamped_images(path, file, _IMAGES, _STAMPS)
-            if stated.dtype.kind not in "iu":
-                raise FormatError(f"{path}: {_STAMPS} has times of type {stated.dtype}; whole us are needed")
-            stamps = stated.astype(np.int64)
-    missing: tuple[str, ...] = (EXPOSURE_UNKNOWN,) if len(stamps) else ("The file has no frames.",)
-    if size is None:
-        missing += (SIZE_UNKNOWN,)
-    return Source(
-        path=path,
-        format="v2e",
-        sensor_size=size or smallest_size(path, _events(path)),
-        events=lambda: _events(path),
-        frames=lambda: hdf5_layout.image_frames(path, _IMAGES, stamps),
-        count_events=lambda: count,
-        count_frames=lambda: len(stamps),
-        exposure_known=not len(stamps),
-        missing=missing,
-        sensor_size_known=size is not None,
-    )
+        stack = hdf5_layout.find_stack(path, file, _IMAGES, _STAMPS, partial(_whole, path))
+    return hdf5_layout.source_with_stack(path, "v2e", lambda: _events(path), count, stack)
+
+
+def _whole(path: Path, stamps: NDArray[Any]) -> NDArray[np.int64]:
+    if stamps.dtype.kind not in "iu":
+        raise FormatError(f"{path}: {_STAMPS} has times of type {stamps.dtype}; whole us are needed")
+    return stamps.astype(np.int64)
 
 
 def _events(path: Path) -> Iterator[EventArray]:
