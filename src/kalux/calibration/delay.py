@@ -91,9 +91,8 @@ def estimate_delay(recording: Recording, camera: CameraSettings) -> DelayEstimat
     for index in range(0, len(grid), _COARSE):
         try_between(index, index)
     try_between(least() - _COARSE + 1, least() + _COARSE - 1)
-    nearer = (
-        abs(int(grid[least()])) - _VALLEY
-    ) // STEP + 1  # steps from no delay, where rivals and those beside lie
+    # So many steps from no delay lie rivals, and those beside them.
+    nearer = (abs(int(grid[least()])) - _VALLEY) // STEP + 1
     middle = len(grid) // 2
     try_between(middle - nearer, middle + nearer)
     best = -1
