@@ -23,6 +23,9 @@ LATEST: Final = 10**18
 NEVER: Final = -(1 << 60)
 """us: the time of an event that has not been. Times of recordings may be negative, but are never that early."""
 
+LARGEST_SIDE: Final = 1 << 16
+"""Pixels of a sensor, either way: coordinates have 16 bits."""
+
 FIELD_NAMES: Final = {
     "t": ("t", "ts", "timestamp", "timestamps", "time", "times"),
     "x": ("x", "xs"),

@@ -250,31 +250,51 @@ def _check_times(frame: Frame, where: str, index: int) -> None:
 _BITS: Final = (8, 10, 12, 14)
 """Of cameras whose frames may be stored in 16."""
 
-_CLIPPED: Final = 1e-3
-"""Share of the pixels that are at white where frames show that they clip: fewer are broken pixels."""
+BRIGHTEST: Final = 1e-3
+"""Share of pixels that are at the brightest level where frames end there: fewer are broken ones, or glints."""
+
+
+def sharp_end(images: Iterable[tuple[NDArray[Any], float] | None], below: float) -> float | None:
+    """The level that a thousandth of all pixels have and none exceeds: where a sensor may clip, or a scene ends.
+
+    Parameters
+    ----------
+    images
+        Pixels of any shape, and what they are divided by; None: an image that cannot be compared.
+    below
+        The level has to be less.
+
+    Returns
+    -------
+    None where there is no such level, or an image cannot be compared.
+    """
+    end, at_end, pixels = 0.0, 0, 0
+    for given in images:
+        if given is None:
+            return None
+        image, scale = given
+        brightest = image.max(initial=0)
+        level = float(brightest) / scale
+        if level >= below:
+            return None
+        if level >= end:
+            at_end = (at_end if level == end else 0) + int(np.count_nonzero(image == brightest))
+            end = level
+        pixels += image.size
+    return end if end > 0 and at_end >= max(BRIGHTEST * pixels, 1) else None
 
 
 def white_of_bits(frames: Iterable[Frame]) -> int | None:
     """The largest value of 8, 10, 12 or 14 bits, where 16-bit frames whose white is not stated end exactly there.
 
-    That is, a thousandth of their pixels have it and none exceeds it: a scene does not end so, only a converter does.
+    A scene does not end so, only a converter does.
     """
-    largest = at_largest = pixels = 0
-    for frame in frames:
-        image = frame.image
-        if frame.white is not None or image.dtype != np.uint16:
-            return None
-        brightest = int(image.max(initial=0))
-        if brightest >= 1 << _BITS[-1]:
-            return None
-        if brightest >= largest:
-            at_largest = (at_largest if brightest == largest else 0) + int(
-                np.count_nonzero(image == brightest)
-            )
-            largest = brightest
-        pixels += image.size
-    is_white = largest + 1 in [1 << bits for bits in _BITS]
-    return largest if is_white and at_largest >= _CLIPPED * pixels else None
+    comparable = (
+        (frame.image, 1.0) if frame.white is None and frame.image.dtype == np.uint16 else None
+        for frame in frames
+    )
+    end = sharp_end(comparable, 1 << _BITS[-1])
+    return int(end) if end is not None and end + 1 in [1 << bits for bits in _BITS] else None
 
 
 class Levels:

@@ -20,6 +20,7 @@ from kalux import readers
 from kalux.compiled import event_column, event_row, event_words
 from kalux.errors import ExposureError, FormatError, FrameError, InputError, require_type
 from kalux.events import (
+    LARGEST_SIDE,
     LATEST,
     EventArray,
     as_events,
@@ -45,8 +46,6 @@ from kalux.models.colour import sample_mosaic
 from kalux.readers import CHUNK_EVENTS, Source, joined
 
 T = TypeVar("T")
-
-_LARGEST_SIDE: Final = 1 << 16  # coordinates of events have 16 bits
 
 _WATCHED: Final = 80  # frames, of which the white value is taken where nobody states it
 
@@ -165,10 +164,10 @@ class Recording:
             raise InputError(f"stamp is {stamp!r}; it must be 'start', 'middle' or 'end'")
         if mosaic not in (None, "none", *MOSAICS):
             raise InputError(f"mosaic is {mosaic!r}; it must be one of {', '.join(MOSAICS)}, or 'none'")
-        if not all(0 < n <= _LARGEST_SIDE for n in source.sensor_size):
+        if not all(0 < n <= LARGEST_SIDE for n in source.sensor_size):
             height, width = source.sensor_size
             raise FormatError(
-                f"{source.path}: states a sensor of {width}x{height} pixels; 1 to {_LARGEST_SIDE} a side are possible"
+                f"{source.path}: states a sensor of {width}x{height} pixels; 1 to {LARGEST_SIDE} a side are possible"
             )
         self.source = source
         self.mosaic: Mosaic | None = source.mosaic if mosaic is None else None if mosaic == "none" else mosaic

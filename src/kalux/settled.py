@@ -121,7 +121,7 @@ def saturation_text(recording: Recording, plan: Plan, asked: Settings) -> str:
         level = f"{ceiling.least:.2g} to {2 * ceiling.level - ceiling.least:.2g}"
     text += f"frames end at {level}, {_going_on(ceiling)}"
     if ceiling.level < used:
-        text += f": --camera.saturation {0.99 * ceiling.least:.2g} does not take that for measured"
+        text += f": --camera.saturation {ceiling.saturation:.2g} does not take that for measured"
     return text
 
 

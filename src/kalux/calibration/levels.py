@@ -15,14 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.calibration.intervals import counted_intervals
-from kalux.frames import Frame
+from kalux.frames import BRIGHTEST, Frame, sharp_end
 from kalux.recording import Recording
 from kalux.settings import CameraSettings, EventSettings
 
 Array = NDArray[np.float64]
-
-_BRIGHTEST: Final = 1e-3
-"""Share of pixels that are at the brightest level or above: fewer are broken ones, or glints."""
 
 _AT_TOP: Final = 0.9
 """Of the brightest level: sensors whose pixels clip unevenly do so within 5 % (slider_depth)."""
@@ -75,6 +72,11 @@ class Ceiling(NamedTuple):
         """Whether nearly all pixels saturate at this one level."""
         return self.least >= _SHARP * level
 
+    @property
+    def saturation(self) -> float:
+        """A response from which none of these pixels is taken for measured."""
+        return _SHARP * self.least
+
 
 def find_ceiling(recording: Recording, camera: CameraSettings, events: EventSettings) -> Ceiling | None:
     """The level at which pixels of the first 80 frames end while their events go on.
@@ -120,7 +122,7 @@ def _brightest(recording: Recording) -> float | None:
     if first is None or first.image.ndim == 3:
         return None
     histogram = _histogram(islice(recording.frames(), _MAX_FRAMES), _FINE)
-    reached = np.cumsum(histogram[::-1])[::-1] >= max(_BRIGHTEST * histogram.sum(), 1)
+    reached = np.cumsum(histogram[::-1])[::-1] >= max(BRIGHTEST * histogram.sum(), 1)
     brightest = int(np.flatnonzero(reached)[-1]) if reached.any() else 0
     return brightest / (_FINE - 1) if brightest > 0 else None
 
@@ -152,20 +154,10 @@ def _changes(
 
 
 def exact_end(recording: Recording, below: float) -> float | None:
-    """The response, if it is below ``below``, that a thousandth of the pixels of the first 80 frames have, and none
-    exceeds: where a sensor may clip, or a scene ends."""
-    end, at_end, pixels = 0.0, 0, 0
-    for frame in islice(recording.frames(), _MAX_FRAMES):
-        image = frame.image if frame.valid is None else frame.image[frame.valid]
-        brightest = image.max(initial=0)
-        response = float(brightest) / frame.white_value
-        if response >= below:
-            return None
-        if response >= end:
-            at_end = (at_end if response == end else 0) + int(np.count_nonzero(image == brightest))
-            end = response
-        pixels += image.size
-    return end if at_end >= max(_BRIGHTEST * pixels, 1) and end > 0 else None
+    """The response, if it is below ``below``, at which the first 80 frames end (`kalux.frames.sharp_end`)."""
+    frames = islice(recording.frames(), _MAX_FRAMES)
+    measured = ((f.image if f.valid is None else f.image[f.valid], f.white_value) for f in frames)
+    return sharp_end(measured, below)
 
 
 class ClippingLevels(NamedTuple):

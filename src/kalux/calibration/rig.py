@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.errors import FormatError, InputError
+from kalux.events import LARGEST_SIDE
 from kalux.settings import read_toml
 
 Array = NDArray[np.float64]
@@ -23,7 +24,6 @@ Array = NDArray[np.float64]
 VERSION: Final = 1
 """Of the rig file. Files of a greater version are refused."""
 
-_LARGEST_SIDE: Final = 1 << 16  # as of a recording's sensor
 _ROUNDS: Final = 60  # of the fixed point in `Lens.normalised`; 20 are enough at 0.01 pixel for a strong lens
 _CONVERGED: Final = 0.01  # pixel
 
@@ -57,9 +57,9 @@ class Lens:
                 f"lens: size {self.sensor_size}, matrix {self.matrix.shape}, distortion {self.distortion.shape}; "
                 "(height, width), (3, 3) and (5,) are needed"
             )
-        if max(self.sensor_size) > _LARGEST_SIDE:
+        if max(self.sensor_size) > LARGEST_SIDE:
             raise InputError(
-                f"lens: size {self.sensor_size}; at most {_LARGEST_SIDE} pixels a side are possible"
+                f"lens: size {self.sensor_size}; at most {LARGEST_SIDE} pixels a side are possible"
             )
         if not (np.isfinite(self.matrix).all() and np.isfinite(self.distortion).all()):
             raise InputError("lens: the camera matrix or the distortion is not finite")
