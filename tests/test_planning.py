@@ -10,12 +10,14 @@ import pytest
 
 import kalux
 from kalux import PRESETS, Frame, Recording, reconstruct
+from kalux.datasets import SensorSettings, demo_scene, simulate
 from kalux.errors import FrameError, InputError, SettingsError
 from kalux.events import EVENT_DTYPE
 from kalux.models.camera import BrightTail, Camera, count_bright
 from kalux.pipeline import execute
 from kalux.planning import plan
 from kalux.settings import altered
+from kalux.settled import settled
 
 from builders import events, frame, moving_blocks, passing_by, recording, sky, textured, unlabelled
 
@@ -221,6 +223,22 @@ def test_the_fixed_pattern_comes_from_the_frames_and_can_be_given():
     assert plan(source, at="frames", settings=none).settings.camera.fixed_pattern == 0
     assert plan(recording(), at="frames").settings.camera.fixed_pattern == 0  # its pixels are too few to tell
     assert plan(source, at="frames", preset="iccv2021").settings.camera.fixed_pattern is None
+
+
+def test_the_refractory_period_comes_from_noise_and_can_be_given():
+    """`iccv2021` knows none, and is not given any."""
+    sensor = SensorSettings(noise_rate=20.0, noise_resets=True, refractory=600.0)
+    seen = simulate(demo_scene(sensor_size=(90, 120)), sensor).recording()
+    found, given = plan(seen, at="frames"), plan(seen, at="frames", settings=refractory(700))
+    assert found.dead_time == found.settings.events.refractory_period == pytest.approx(600, rel=0.02)
+    assert (given.dead_time, given.settings.events.refractory_period) == (0, 700)
+    assert not plan(seen, at="frames", preset="iccv2021").settings.events.refractory_period
+    told = dict(settled(seen, found, PRESETS["default"]))
+    assert told["refractory"].endswith("ms (measured: noise follows other events no sooner)")
+
+
+def refractory(period):
+    return altered(PRESETS["default"], "events", refractory_period=period)
 
 
 def test_the_bright_tail_comes_from_the_frames_and_can_be_given():

@@ -23,6 +23,7 @@ from kalux.calibration.frame_noise import FrameNoise, estimate_frame_noise
 from kalux.calibration.levels import Ceiling, exact_end, find_ceiling
 from kalux.calibration.mismatch import Mismatch, estimate_mismatch
 from kalux.calibration.noise import event_noise
+from kalux.calibration.refractory import dead_time
 from kalux.calibration.steps import MAX_SAMPLES
 from kalux.calibration.values import Calibration
 from kalux.calibration.white_balance import grey_world
@@ -89,6 +90,8 @@ class Plan:
         The measured noise of events, Hz per pixel, where it was.
     ceiling
         Where the frames end at one level below the usual saturation while events go on.
+    dead_time
+        The refractory period that noise shows, us; 0 where it does not.
     """
 
     settings: Settings
@@ -105,6 +108,7 @@ class Plan:
     mismatch: Mismatch | None = None
     background_rate: float | None = None
     ceiling: Ceiling | None = None
+    dead_time: int = 0
 
 
 def plan(
@@ -147,6 +151,7 @@ def plan(
     chosen, noise = _with_frame_noise(recording, chosen)
     chosen, pattern = _with_fixed_pattern(recording, chosen)
     chosen, delay = _with_delay(recording, chosen)
+    chosen, blind = _with_dead_time(recording, chosen)
     filled, origin, estimate, model = _with_event_steps(recording, chosen)
     unsure = estimate.spread if estimate is not None and origin in _FOUND else 0.0
     filled, mismatch = _with_mismatch(recording, filled, unsure)
@@ -171,6 +176,7 @@ def plan(
         mismatch=mismatch,
         background_rate=background,
         ceiling=ceiling,
+        dead_time=blind,
     )
 
 
@@ -280,6 +286,14 @@ def _with_fixed_pattern(recording: Recording, settings: Settings) -> tuple[Setti
         return settings, None
     found = estimate_fixed_pattern(recording, settings.camera)
     return altered(settings, "camera", fixed_pattern=0.0 if found is None else found.deviation), found
+
+
+def _with_dead_time(recording: Recording, settings: Settings) -> tuple[Settings, int]:
+    """Fill in the refractory period where noise shows it; and what that is, us, 0 where it does not."""
+    if settings.events.refractory_period is not None or not _uses_steps(settings):
+        return settings, 0
+    period = dead_time(recording)
+    return altered(settings, "events", refractory_period=period or None), period
 
 
 def _with_event_steps(

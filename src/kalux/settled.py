@@ -148,6 +148,8 @@ def _threshold_origin(plan: Plan) -> str:
 def _refractory_origin(plan: Plan, asked: Settings) -> str:
     if asked.events.refractory_period is not None:
         return _GIVEN
+    if plan.dead_time:
+        return "measured: noise follows other events no sooner"
     if plan.estimate is None:
         return _USUAL
     return f"estimated from {how_many(plan.estimate.samples, 'sample')}"

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
-from kalux.calibration.refractory import intervals, possible_periods, shortest_interval
+from kalux.calibration.refractory import dead_time, intervals, possible_periods, shortest_interval
 from kalux.datasets import SensorSettings, demo_scene, simulate
 from kalux.events import make_events
 from kalux.recording import Recording
@@ -68,3 +70,45 @@ def test_no_period_is_longer_than_the_shortest_interval_may_be():
     assert possible_periods(1_000) == (0, 350, 600, 850, 1_100)
     assert possible_periods(1) == (0, 1)
     assert possible_periods(0) == (0,)
+
+
+def simulated(**sensor):
+    settings = SensorSettings(noise_rate=20.0, noise_resets=True, **sensor)
+    return simulate(demo_scene(sensor_size=(90, 120)), settings).recording()
+
+
+def random_intervals(draw):
+    """Of 100 pixels 2000 intervals each, drawn by a function of a random generator and their number."""
+    t = np.cumsum(draw(np.random.default_rng(1), (100, 2_000)), axis=1).astype(np.int64)
+    pixel = np.broadcast_to(np.arange(100)[:, None], t.shape).ravel()
+    order = np.argsort(t.ravel(), kind="stable")
+    events = make_events(t.ravel()[order], pixel[order] % 10, pixel[order] // 10, np.ones(t.size, bool))
+    return Recording.from_arrays(events, [], sensor_size=(10, 10))
+
+
+@pytest.mark.parametrize("refractory", [250, 1_000])
+def test_noise_shows_how_long_pixels_are_blind(refractory):
+    assert dead_time(simulated(refractory=float(refractory))) == pytest.approx(refractory, rel=0.03)
+
+
+@pytest.mark.parametrize("most_events", [50, 7_000])
+def test_how_long_pixels_are_blind_does_not_depend_on_chunks(most_events):
+    recording = random_intervals(lambda rng, shape: 700 + rng.exponential(20_000, shape))
+    events = np.concatenate(list(recording.events()))
+    parts = [events[i : i + most_events] for i in range(0, len(events), most_events)]
+    cut = SimpleNamespace(sensor_size=recording.sensor_size, events=lambda: iter(parts))
+    assert dead_time(cut) == dead_time(recording) == pytest.approx(700, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    "draw",
+    [
+        lambda rng, shape: rng.exponential(5_000, shape),
+        lambda rng, shape: 4_000 * rng.beta(8, 2, shape),
+        lambda rng, shape: 500 * rng.integers(1, 40, shape),
+        lambda rng, shape: np.maximum(500, rng.exponential(700, shape)),
+    ],
+    ids=["noise at any time", "the light's pace", "coarse times", "events that wait"],
+)
+def test_other_shortest_intervals_are_no_blindness(draw):
+    assert dead_time(random_intervals(draw)) == 0

@@ -31,7 +31,7 @@ from kalux.augmentation.deblur import between, integrate_exposure, latent_middle
 from kalux.augmentation.refractory import step_weight
 from kalux.calibration.contrast import Usual, estimate_thresholds
 from kalux.calibration.intervals import Interval, intervals
-from kalux.calibration.refractory import shortest_interval
+from kalux.calibration.refractory import dead_time, shortest_interval
 from kalux.calibration.regression import HUBER, robust_deviation, standard_errors, two_stage
 from kalux.calibration.values import Calibration
 from kalux.events import NEVER, EventArray
@@ -136,7 +136,7 @@ class ContrastCalibration:
 
 
 def calibrate_contrast(
-    recording: Recording, camera: CameraSettings, *, delay: int | None = None, refractory: int = 0
+    recording: Recording, camera: CameraSettings, *, delay: int | None = None, refractory: int | None = None
 ) -> ContrastCalibration | None:
     """Measure the contrast thresholds of a recording's sensor.
 
@@ -150,7 +150,7 @@ def calibrate_contrast(
         How late the events are, us. None: so that they trail the light by half a threshold, as those of an ideal
         pixel do.
     refractory
-        Refractory period, us, if it is known: what is lost in it is added to the events.
+        Refractory period, us: what is lost in it is added to the events. None: that which noise shows, else 0.
 
     Returns
     -------
@@ -166,7 +166,8 @@ def calibrate_contrast(
     first = estimate_thresholds(recording, camera, usual, delay=delay or 0)
     if first is None or first.usual_share > _UNTOLD:
         return None
-    view = _View((first.on, first.off), shortest_interval(recording), refractory)
+    period = dead_time(recording) if refractory is None else refractory
+    view = _View((first.on, first.off), shortest_interval(recording), period)
     if delay is None:
         delay = _delay_of_trailing(recording, camera, view)
     fit, data = None, None

@@ -41,9 +41,8 @@ def add_command(commands: Any) -> None:
     group.add_argument(
         "--refractory",
         type=whole,
-        default=0,
         metavar="US",
-        help="refractory period of the pixels (default 0)",
+        help="refractory period of the pixels (default: what noise shows, else 0)",
     )
     add_result(parser)
     parser.set_defaults(run=run)
