@@ -219,6 +219,32 @@ def test_an_interrupt_within_numba_is_an_interrupt(cli, recording, monkeypatch, 
     assert (found.code, found.err) == (130, "kalux: interrupted; what is finished is whole\n")
 
 
+def test_an_interrupt_that_a_library_loses_is_told_as_one_when_it_fails(cli, recording, monkeypatch):
+    """As numba does, where LLVM asks for a loop: it is printed, and `no compiled object` follows."""
+
+    class Lost:
+        def __del__(self):
+            signal.raise_signal(signal.SIGINT)
+
+    def interrupted(*arguments, **options):
+        Lost()
+        raise RuntimeError("no compiled object yet")
+
+    monkeypatch.setattr(kalux, "open", interrupted)
+    found = cli("info", recording)
+    assert (found.code, found.err) == (130, "kalux: interrupted; what is finished is whole\n")
+
+
+def test_an_interrupt_waits_for_an_import_that_would_lose_it(monkeypatch, tmp_path):
+    (tmp_path / "swallowing.py").write_text(
+        "import signal\ntry:\n    signal.raise_signal(signal.SIGINT)\nexcept:\n    lost = True\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(KeyboardInterrupt):
+        _imported("swallowing")
+    assert not hasattr(sys.modules.pop("swallowing"), "lost")
+
+
 class DeadTerminal(io.StringIO):
     """As a terminal that was closed."""
 
