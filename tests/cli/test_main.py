@@ -7,6 +7,7 @@ import errno
 import gc
 import io
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -203,6 +204,22 @@ def test_standard_output_that_is_full_is_told(recording):
         )
     assert done.returncode == 2
     assert done.stderr == "kalux: error: standard output: No space left on device\n"
+
+
+def test_no_room_for_compiled_loops_is_one_line(recording, tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-m", "kalux", "info", str(recording)],
+        env=dict(os.environ, NUMBA_CACHE_DIR=str(tmp_path / "loops")),
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000)),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert done.stderr == (
+        f"kalux: error: {tmp_path / 'loops'}: compiled loops cannot be kept ([Errno 27] File too large); make room "
+        "there, or name another folder in NUMBA_CACHE_DIR\n"
+    )
 
 
 @pytest.mark.parametrize("twice", [False, True])

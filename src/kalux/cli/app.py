@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import importlib
+import os
 import sys
 import traceback
 from collections.abc import Callable, Sequence
@@ -13,7 +14,8 @@ from kalux.cli.parser import Parser, UsageError, normalised
 from kalux.cli.signals import interrupts_held, termination_as_interrupt
 from kalux.cli.terminal import close_output, error_line, hold_closed_streams
 from kalux.errors import InternalError, KaluxError
-from kalux.kernel_cache import check_variables
+from kalux.kernel_cache import VARIABLE, check_variables
+from kalux.wording import one_line
 
 DONE, BUG, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 
@@ -96,6 +98,14 @@ def _guarded(arguments: list[str], was_interrupted: Callable[[], bool]) -> int:
 
 
 def _failed(error: Exception) -> int:
+    if _keeps_a_loop(error) or _keeps_a_loop(error.__cause__):
+        place = os.environ.get(VARIABLE) or importlib.import_module("kalux").__path__[0]
+        reason = one_line(error.__cause__ or error)
+        error_line(
+            f"error: {place}: compiled loops cannot be kept ({reason}); make room there, or name another folder in "
+            f"{VARIABLE}"
+        )
+        return BAD_INPUT
     if isinstance(error, KaluxError):
         error_line(f"error: {error}", *_notes(error))
         return BUG if isinstance(error, InternalError) else BAD_INPUT
@@ -103,6 +113,14 @@ def _failed(error: Exception) -> int:
         error_line(f"error: {error.filename}: {error.strerror or error}", *_notes(error))
         return BAD_INPUT
     return _bug(error)
+
+
+def _keeps_a_loop(error: BaseException | None) -> bool:
+    """Whether the system refused to keep what numba has compiled, e.g. on a full disk."""
+    if not isinstance(error, OSError):
+        return False
+    frames = traceback.walk_tb(error.__traceback__)
+    return any(frame.f_globals.get("__name__") == "numba.core.caching" for frame, _ in frames)
 
 
 def _bug(error: Exception) -> int:
