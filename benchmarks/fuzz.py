@@ -103,6 +103,7 @@ def built_seeds(folder: Path) -> Iterator[Seed]:
     import test_hdf5_layouts
     import test_ijrr
     import test_mat
+    import test_npz_folder
     import test_prophesee
     import test_rosbag
     import test_table
@@ -162,6 +163,8 @@ def built_seeds(folder: Path) -> Iterator[Seed]:
     yield put("numpy", "packed.npz", lambda p: np.savez_compressed(p, **columns))
     yield put("numpy", "plain.npz", lambda p: np.savez(p, **columns, height=SIZE[0], width=SIZE[1]))
     yield put("numpy", "plain.npy", lambda p: np.save(p, events))
+    for name, write in test_npz_folder.WRITERS.items():
+        yield put("npz-folder", name, lambda p, w=write: w(p, events, frames))
     ijrr = put("ijrr", "ijrr", test_ijrr.write_folder)
     yield ijrr
     yield put("ijrr", "ijrr.zip", lambda p: test_ijrr.zipped(ijrr.path, p))

@@ -309,6 +309,11 @@ class TestInterruptsHeld:
         with pytest.raises(KeyboardInterrupt), interrupts_held():
             signal.raise_signal(signal.SIGINT)
 
+    def test_what_was_finished_meanwhile_is_told(self):
+        with pytest.raises(KeyboardInterrupt) as caught, interrupts_held(done="it was finished"):
+            signal.raise_signal(signal.SIGINT)
+        assert caught.value.__notes__ == ["it was finished"]
+
     def test_other_threads_have_no_signals(self):
         done = []
 

@@ -7,6 +7,7 @@ import errno
 import gc
 import io
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -205,6 +206,22 @@ def test_standard_output_that_is_full_is_told(recording):
     assert done.stderr == "kalux: error: standard output: No space left on device\n"
 
 
+def test_no_room_for_compiled_loops_is_one_line(recording, tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-m", "kalux", "info", str(recording)],
+        env=dict(os.environ, NUMBA_CACHE_DIR=str(tmp_path / "loops")),
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000)),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert done.stderr == (
+        f"kalux: error: {tmp_path / 'loops'}: compiled loops cannot be kept ([Errno 27] File too large); make room "
+        "there, or name another folder in NUMBA_CACHE_DIR\n"
+    )
+
+
 @pytest.mark.parametrize("twice", [False, True])
 def test_an_interrupt_within_numba_is_an_interrupt(cli, recording, monkeypatch, twice):
     def interrupted(*arguments, **options):
@@ -217,6 +234,32 @@ def test_an_interrupt_within_numba_is_an_interrupt(cli, recording, monkeypatch, 
     monkeypatch.setattr(kalux, "open", interrupted)
     found = cli("info", recording)
     assert (found.code, found.err) == (130, "kalux: interrupted; what is finished is whole\n")
+
+
+def test_an_interrupt_that_a_library_loses_is_told_as_one_when_it_fails(cli, recording, monkeypatch):
+    """As numba does, where LLVM asks for a loop: it is printed, and `no compiled object` follows."""
+
+    class Lost:
+        def __del__(self):
+            signal.raise_signal(signal.SIGINT)
+
+    def interrupted(*arguments, **options):
+        Lost()
+        raise RuntimeError("no compiled object yet")
+
+    monkeypatch.setattr(kalux, "open", interrupted)
+    found = cli("info", recording)
+    assert (found.code, found.err) == (130, "kalux: interrupted; what is finished is whole\n")
+
+
+def test_an_interrupt_waits_for_an_import_that_would_lose_it(monkeypatch, tmp_path):
+    (tmp_path / "swallowing.py").write_text(
+        "import signal\ntry:\n    signal.raise_signal(signal.SIGINT)\nexcept:\n    lost = True\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(KeyboardInterrupt):
+        _imported("swallowing")
+    assert not hasattr(sys.modules.pop("swallowing"), "lost")
 
 
 class DeadTerminal(io.StringIO):

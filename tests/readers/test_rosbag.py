@@ -675,8 +675,10 @@ def test_a_file_cut_short_is_refused(tmp_path, container, share):
     write(path, davis_messages(cdr))
     data = path.read_bytes()
     path.write_bytes(data[: int(share * len(data))])
-    with pytest.raises(FormatError, match=str(path)):
+    with pytest.raises(FormatError, match=str(path)) as caught:
         readers.read(path)
+    [note] = caught.value.__notes__
+    assert note.startswith("if the recorder was killed, '")
 
 
 def test_damaged_messages_give_clear_errors(tmp_path):

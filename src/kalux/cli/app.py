@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import gc
 import importlib
+import os
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from types import ModuleType
 
 from kalux.cli.parser import Parser, UsageError, normalised
-from kalux.cli.signals import termination_as_interrupt
+from kalux.cli.signals import interrupts_held, termination_as_interrupt
 from kalux.cli.terminal import close_output, error_line, hold_closed_streams
 from kalux.errors import InternalError, KaluxError
-from kalux.kernel_cache import check_variables
+from kalux.kernel_cache import VARIABLE, check_variables
+from kalux.wording import one_line
 
 DONE, BUG, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 
@@ -76,34 +78,49 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     hold_closed_streams()
     try:
-        with termination_as_interrupt():
-            return _guarded(arguments)
+        with termination_as_interrupt() as was_interrupted:
+            return _guarded(arguments, was_interrupted)
     finally:
         close_output()
 
 
-def _guarded(arguments: list[str]) -> int:
+def _guarded(arguments: list[str], was_interrupted: Callable[[], bool]) -> int:
     try:
         return _run(arguments)
-    except InternalError as error:
-        error_line(f"error: {error}", *_notes(error))
-        return BUG
-    except KaluxError as error:
-        error_line(f"error: {error}", *_notes(error))
-        return BAD_INPUT
     except KeyboardInterrupt as interrupt:
         error_line("interrupted", *(_notes(interrupt) or ["nothing was written"]))
         return INTERRUPTED
-    except OSError as error:
-        if error.filename is None:
-            return _bug(error)
-        error_line(f"error: {error.filename}: {error.strerror or error}", *_notes(error))
-        return BAD_INPUT
     except Exception as error:
-        if _is_interrupt(error):
+        if was_interrupted() or _is_interrupt(error):
             error_line("interrupted", *(_notes(error) or ["what is finished is whole"]))
             return INTERRUPTED
-        return _bug(error)
+        return _failed(error)
+
+
+def _failed(error: Exception) -> int:
+    if _keeps_a_loop(error) or _keeps_a_loop(error.__cause__):
+        place = os.environ.get(VARIABLE) or importlib.import_module("kalux").__path__[0]
+        reason = one_line(error.__cause__ or error)
+        error_line(
+            f"error: {place}: compiled loops cannot be kept ({reason}); make room there, or name another folder in "
+            f"{VARIABLE}"
+        )
+        return BAD_INPUT
+    if isinstance(error, KaluxError):
+        error_line(f"error: {error}", *_notes(error))
+        return BUG if isinstance(error, InternalError) else BAD_INPUT
+    if isinstance(error, OSError) and error.filename is not None:
+        error_line(f"error: {error.filename}: {error.strerror or error}", *_notes(error))
+        return BAD_INPUT
+    return _bug(error)
+
+
+def _keeps_a_loop(error: BaseException | None) -> bool:
+    """Whether the system refused to keep what numba has compiled, e.g. on a full disk."""
+    if not isinstance(error, OSError):
+        return False
+    frames = traceback.walk_tb(error.__traceback__)
+    return any(frame.f_globals.get("__name__") == "numba.core.caching" for frame, _ in frames)
 
 
 def _bug(error: Exception) -> int:
@@ -162,7 +179,8 @@ def _imported(name: str) -> ModuleType:
     collects = gc.isenabled()
     gc.disable()
     try:
-        return importlib.import_module(name)
+        with interrupts_held():  # what is being imported may lose an interrupt, or turn it into another error
+            return importlib.import_module(name)
     finally:
         gc.freeze()
         if collects:

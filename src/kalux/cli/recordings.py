@@ -183,7 +183,7 @@ def write_streams(
     """
     from kalux.cli.signals import interrupts_held
 
-    with interrupts_held() as let_through:
+    with interrupts_held(done="the file was finished, and is whole") as let_through:
         write(
             events=counted(events, lambda chunk: progress.add(events=len(chunk)), let_through),
             frames=counted(frames, lambda _: progress.add(images=1), let_through),

@@ -4,23 +4,25 @@ from __future__ import annotations
 
 import contextlib
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from types import FrameType
 
 
 @contextlib.contextmanager
-def termination_as_interrupt() -> Iterator[None]:
+def termination_as_interrupt() -> Iterator[Callable[[], bool]]:
     """Inside the block, SIGTERM and SIGHUP do what Ctrl-C does: KeyboardInterrupt is raised, held back during a write.
 
     Where Ctrl-C is ignored, as in a shell's background jobs, it stays ignored, and SIGTERM still works. Where SIGHUP is
-    ignored, as by nohup, it stays so, too.
+    ignored, as by nohup, it stays so, too. The block gets a function that tells whether KeyboardInterrupt was raised:
+    libraries lose it, and fail with something else, as numba does where it comes while LLVM asks for a loop.
     """
+    raised = terminated = False
     if threading.current_thread() is not threading.main_thread():
-        yield
+        yield lambda: raised
         return
     ignores_interrupt = signal.getsignal(signal.SIGINT) == signal.SIG_IGN
-    terminated = False
 
     def terminate(number: int, frame: FrameType | None) -> None:
         nonlocal terminated
@@ -28,25 +30,34 @@ def termination_as_interrupt() -> Iterator[None]:
         signal.raise_signal(signal.SIGINT)
 
     def interrupt(number: int, frame: FrameType | None) -> None:
+        nonlocal raised
         if terminated or not ignores_interrupt:
+            raised = True
             raise KeyboardInterrupt
+
+    def tell_unraisable(unraisable: sys.UnraisableHookArgs) -> None:
+        if unraisable.exc_type is not KeyboardInterrupt:
+            previous_hook(unraisable)
 
     handlers = {signal.SIGTERM: terminate, signal.SIGINT: interrupt}
     if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
         handlers[signal.SIGHUP] = terminate
     previous = {number: signal.signal(number, handler) for number, handler in handlers.items()}
+    previous_hook, sys.unraisablehook = sys.unraisablehook, tell_unraisable
     try:
-        yield
+        yield lambda: raised
     finally:
+        sys.unraisablehook = previous_hook
         for number, handler in previous.items():
             signal.signal(number, handler if handler is not None else signal.SIG_DFL)
 
 
 @contextlib.contextmanager
-def interrupts_held() -> Iterator[Callable[[], None]]:
+def interrupts_held(*, done: str = "") -> Iterator[Callable[[], None]]:
     """Inside the block, an interrupt waits until the function that the block gets is called, or for its end.
 
-    For libraries that cannot bear an exception in the middle of their work.
+    For libraries that cannot bear an exception in the middle of their work. ``done`` says what is there where the
+    interrupt waited for the end.
     """
     received = False
 
@@ -69,4 +80,9 @@ def interrupts_held() -> Iterator[Callable[[], None]]:
     finally:
         signal.signal(signal.SIGINT, previous)
     if received:
-        signal.raise_signal(signal.SIGINT)
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt as interrupt:
+            if done:
+                interrupt.add_note(done)
+            raise

@@ -79,7 +79,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     # An interrupt inside HDF5 would crash it: it waits for the next chunk or frame.
     with (
         Progress("simulating", images=total, quiet=options.quiet, unit="ms") as progress,
-        interrupts_held() as let_through,
+        interrupts_held(done=f"{options.out} was finished, and is whole") as let_through,
     ):
 
         def on_time(t: float) -> None:

@@ -167,6 +167,28 @@ SETS: Final[tuple[PublishedSet, ...]] = (
         files=("*_data.hdf5", "*_data.bag"),
         beside=("*_gt.hdf5", "*_gt.bag", "*.txt", "*.md", "*.yaml", "*.zip"),
     ),
+    PublishedSet(
+        name="hs-ergb",
+        title="HS-ERGB: High Speed Event and RGB dataset (Time Lens)",
+        source="Tulyakov, Gehrig et al., CVPR 2021",
+        page="https://github.com/uzh-rpg/rpg_timelens",
+        licence="evaluation only (TimeLens Evaluation License, on the page)",
+        layout="close/test and far/test with a folder per sequence: events_aligned/*.npz, images_corrected/*.png",
+        reads="events and frames in colour; exposure times are not in it: give --exposure and --stamp",
+        marks=("images_corrected/timestamp.txt",),
+        wanted=("events_aligned",),
+    ),
+    PublishedSet(
+        name="bs-ergb",
+        title="BS-ERGB: Beam Splitter Event and RGB dataset (Time Lens++)",
+        source="Tulyakov, Bochicchio et al., CVPR 2022",
+        page="https://github.com/uzh-rpg/timelens-pp",
+        licence="evaluation only (Time Lens++ Evaluation License, on the page)",
+        layout="1_TEST, 2_VALIDATION, 3_TRAINING with a folder per sequence: events/*.npz, images/*.png",
+        reads="events and frames in colour; exposure times are not in it: give --exposure and --stamp",
+        marks=("images/timestamp.txt",),
+        wanted=("events",),
+    ),
 )
 """All sets that are known, in the order in which they are listed."""
 

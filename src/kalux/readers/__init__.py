@@ -21,6 +21,7 @@ from kalux.readers import (
     mat,
     metavision_hdf5,
     mvsec,
+    npz_folder,
     numpy_files,
     prophesee,
     rosbag,
@@ -80,6 +81,12 @@ READERS: tuple[Reader, ...] = (
     Reader("v2e", "HDF5 of v2e", v2e.recognises, v2e.read),
     Reader("metavision", "Metavision HDF5", metavision_hdf5.recognises, metavision_hdf5.read),
     Reader("es", "Event Stream (.es, DVS)", es.recognises, es.read),
+    Reader(
+        "npz-folder",
+        "folder of .npz event files and images (HS-ERGB, BS-ERGB, vid2e)",
+        npz_folder.recognises,
+        npz_folder.read,
+    ),
     # Before IJRR, whose zips could also be .npz; a broken zip is left to IJRR to report.
     Reader("numpy", "NumPy .npz or .npy", numpy_files.recognises, numpy_files.read),
     Reader("ijrr", "IJRR text folder or zip (events.txt, images.txt)", ijrr.recognises, ijrr.read),

@@ -25,7 +25,7 @@ from kalux.errors import FormatError
 from kalux.events import EventArray
 from kalux.frames import Frame
 from kalux.readers import hdf5_layout
-from kalux.readers.images import images_in, in_colour, read_image
+from kalux.readers.images import files_in_colour, images_in, load_image
 from kalux.readers.source import SIZE_NOT_STATED, Source, reading
 
 _COLUMNS: Final = ("events/t", "events/x", "events/y", "events/p")
@@ -160,7 +160,7 @@ def _find_images(folder: Path) -> _Images:
             f"{folder}: has {len(files)} images, but {len(times)} lines in {(exposures or stamps)!s}; "
             "copy or download it again"
         )
-    colour = in_colour(folder, files, lambda file: (file.name, _bytes(folder, file)))
+    colour = files_in_colour(folder, files)
     return _Images(files, times, exposures is not None, missing, colour)
 
 
@@ -178,22 +178,13 @@ def _read_times(path: Path, columns: int) -> Iterator[tuple[int, ...]]:
 
 
 def _check_first(path: Path, images: _Images, size: tuple[int, int]) -> None:
-    shape = _load(path, images.files[0], images.colour).shape[:2]
+    shape = load_image(path, images.files[0], colour=images.colour).shape[:2]
     if shape != size:
         raise FormatError(
             f"{path}: its images have {shape[1]}x{shape[0]} pixels, its events {size[1]}x{size[0]}; {_HINT}"
         )
 
 
-def _load(path: Path, file: Path, colour: bool) -> NDArray[Any]:
-    return read_image(path, file.name, _bytes(path, file), colour=colour)
-
-
-def _bytes(path: Path, file: Path) -> bytes:
-    with reading(path):
-        return file.read_bytes()
-
-
 def _frames(path: Path, images: _Images) -> Iterator[Frame]:
     for file, (start, end) in zip(images.files, images.times, strict=True):
-        yield Frame(_load(path, file, images.colour), start, end)
+        yield Frame(load_image(path, file, colour=images.colour), start, end)

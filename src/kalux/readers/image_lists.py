@@ -5,19 +5,21 @@ from __future__ import annotations
 import csv
 import re
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from decimal import ROUND_HALF_UP, Decimal
 from pathlib import Path
 from typing import Final, NamedTuple
 
 from kalux.errors import FormatError
 from kalux.events import FIELD_NAMES, LATEST
+from kalux.frames import Frame
 from kalux.readers.columns import find_name, find_time
-from kalux.readers.images import images_in
+from kalux.readers.images import images_in, load_image
 
 _EXPOSURE: Final = ("exposure", "exposure_time")
 _FILE: Final = ("file", "filename", "file_name", "image", "name", "path")
 _NUMBER: Final = re.compile(r"\d{1,18}(\.\d*)?|\.\d+")
+_PRINTED: Final = re.compile(r"(\d{1,18}(\.\d*)?|\.\d+)(e[+-]?\d{1,2})?", re.IGNORECASE)
 _PER_UNIT: Final = {"s": Decimal(10**6), "ms": Decimal(1000), "us": Decimal(1), "ns": Decimal("0.001")}
 
 WANTED: Final = (
@@ -90,6 +92,33 @@ def read_ijrr(path: Path | zipfile.Path, text: str) -> Iterator[tuple[int, str]]
         if len(fields) != 2:
             raise FormatError(f"{path}: line {number}: {line[:60]!r} is not 't file' with t in seconds")
         yield _microseconds(path, number, fields[0], "s"), fields[1].strip()
+
+
+def read_stamps(path: Path, text: str, unit: str) -> list[int]:
+    """The times, us, of a list that has nothing else: one a line, in ``"us"`` or ``"s"``, as programs print floats.
+
+    Raises
+    ------
+    FormatError
+        If a line cannot be read, or is no whole number of microseconds where they are the unit.
+    """
+    stamps = []
+    for number, line in enumerate(text.splitlines(), 1):
+        field = line.strip()
+        if not field or field.startswith("#"):
+            continue
+        stamp = Decimal(field) * _PER_UNIT[unit] if _PRINTED.fullmatch(field) else None
+        if stamp is None or stamp >= LATEST or (unit == "us" and stamp != stamp.to_integral_value()):
+            wanted = "a whole number of microseconds" if unit == "us" else "a time in seconds"
+            raise FormatError(f"{path}: line {number}: {field[:40]!r} is not {wanted}")
+        stamps.append(int(stamp.to_integral_value(ROUND_HALF_UP)))
+    return stamps
+
+
+def read_listed(place: Path, listed: Sequence[Listed], *, colour: bool) -> Iterator[Frame]:
+    """The frames of listed images; ``place`` is the recording, for messages."""
+    for image in listed:
+        yield Frame(load_image(place, image.file, colour=colour), image.start, image.end)
 
 
 def _microseconds(path: Path | zipfile.Path, number: int, text: str, unit: str | None) -> int:

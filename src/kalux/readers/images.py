@@ -89,6 +89,21 @@ def in_colour(path: Path, images: Sequence[T], load: Callable[[T], tuple[str, by
     return any(not _is_grey(_decoded(path, name, data)) for name, data in samples)
 
 
+def load_image(place: Path, file: Path, *, colour: bool) -> NDArray[Any]:
+    """As `read_image`, of a file; ``place`` is the recording, for messages."""
+    return read_image(place, file.name, _bytes(file), colour=colour)
+
+
+def files_in_colour(place: Path, files: Sequence[Path]) -> bool:
+    """As `in_colour`, of files; ``place`` is the recording, for messages."""
+    return in_colour(place, files, lambda file: (file.name, _bytes(file)))
+
+
+def _bytes(file: Path) -> bytes:
+    with reading(file):
+        return file.read_bytes()
+
+
 def _is_grey(image: NDArray[Any]) -> bool:
     return image.ndim == 2 or bool((image[..., :3] == image[..., :1]).all())
 

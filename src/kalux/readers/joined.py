@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from kalux.errors import FormatError, FrameError, InputError
 from kalux.frames import Frame
-from kalux.readers.image_lists import WANTED, Listed, read_csv, read_ijrr
-from kalux.readers.images import in_colour, read_image
+from kalux.readers.image_lists import WANTED, Listed, read_csv, read_ijrr, read_listed
+from kalux.readers.images import files_in_colour, load_image
 from kalux.readers.source import EXPOSURE_UNKNOWN, SIZE_NOT_STATED, Source, reading, smallest_size
 from kalux.wording import how_many
 
@@ -160,13 +160,13 @@ def _images(frames: Path, start: int | None, rate_hz: float | None) -> Source:
         raise FormatError(
             f"{path}: {len(absent)} of {len(listed)} images are missing, the first is {absent[0]}"
         )
-    colour = in_colour(frames, [image.file for image in listed], lambda file: (file.name, _bytes(file)))
-    first = _load(frames, listed[0].file, colour)
+    colour = files_in_colour(frames, [image.file for image in listed])
+    first = load_image(frames, listed[0].file, colour=colour)
     return _frames_only(
         frames,
         "images",
         sensor_size=first.shape[:2],
-        frames=lambda: (Frame(_load(frames, image.file, colour), image.start, image.end) for image in listed),
+        frames=lambda: read_listed(frames, listed, colour=colour),
         count_frames=lambda: len(listed),
         exposure_known=exposure_known,
         missing=() if exposure_known else (EXPOSURE_UNKNOWN,),
@@ -183,15 +183,6 @@ def _list_file(folder: Path) -> Path:
         found = f"{len(others)} CSV files" if others else "no list of times"
         raise FormatError(f"{folder}: has {found}; {WANTED} is needed")
     return others[0]
-
-
-def _load(frames: Path, file: Path, colour: bool) -> NDArray[Any]:
-    return read_image(frames, file.name, _bytes(file), colour=colour)
-
-
-def _bytes(file: Path) -> bytes:
-    with reading(file):
-        return file.read_bytes()
 
 
 # Video

@@ -18,6 +18,7 @@ from typing import IO, Any, Final, NamedTuple
 
 import numpy as np
 from numpy.lib import format as npy
+from numpy.typing import NDArray
 
 from kalux.errors import FormatError
 from kalux.events import EventArray
@@ -67,7 +68,9 @@ class _Array(NamedTuple):
         return "" if self.member is None else self.member.removesuffix(".npy")
 
 
-class _Layout(NamedTuple):
+class Layout(NamedTuple):
+    """Which arrays of a file are events, what their names mean, and how many events there are."""
+
     arrays: tuple[_Array, ...]
     columns: Columns
     length: int
@@ -118,6 +121,17 @@ def read(path: Path) -> Source:
     )
 
 
+def find_events(path: Path) -> Layout:
+    """Where the events of a file are.
+
+    Raises
+    ------
+    FormatError
+        If the arrays are not events, or the file is cut short or damaged.
+    """
+    return _find_layout(path, _list_arrays(path))
+
+
 @contextlib.contextmanager
 def _opened(path: Path, member: str | None) -> Iterator[IO[bytes]]:
     if member is None:
@@ -159,13 +173,13 @@ def _read_header(file: IO[bytes]) -> tuple[np.dtype[Any], tuple[int, ...], int]:
     return dtype, shape, file.tell()
 
 
-def _find_layout(path: Path, arrays: list[_Array]) -> _Layout:
-    structured = [array for array in arrays if array.dtype.names is not None and len(array.shape) == 1]
+def _find_layout(path: Path, arrays: list[_Array]) -> Layout:
+    structured = [array for array in arrays if array.dtype.names is not None and _is_column(array)]
     if len(structured) == 1:
         chosen = tuple(structured)
         columns = find_columns(structured[0].dtype.names or ())
     else:
-        flat = {array.name: array for array in arrays if len(array.shape) == 1}
+        flat = {array.name: array for array in arrays if _is_column(array)}
         columns = find_columns(list(flat))
         chosen = () if columns is None else tuple(flat[getattr(columns, field)] for field in "txyp")
     if columns is None:
@@ -176,7 +190,12 @@ def _find_layout(path: Path, arrays: list[_Array]) -> _Layout:
     if len(set(counts.values())) != 1:
         found = ", ".join(f"{name} {count}" for name, count in counts.items())
         raise FormatError(f"{path}: its arrays have different lengths ({found}); save them again")
-    return _Layout(chosen, columns, chosen[0].shape[0])
+    return Layout(chosen, columns, chosen[0].shape[0])
+
+
+def _is_column(array: _Array) -> bool:
+    """Whether it has one value for each event: (N,), or (N, 1), as Time Lens saves columns."""
+    return len(array.shape) >= 1 and math.prod(array.shape[1:]) == 1
 
 
 def _no_events(path: Path, arrays: list[_Array]) -> FormatError:
@@ -225,21 +244,32 @@ def _read_number(path: Path, array: _Array) -> int:
         return int(np.frombuffer(_exactly(file, array.dtype.itemsize), array.dtype)[0])
 
 
-def _events(path: Path, layout: _Layout) -> Iterator[EventArray]:
+def _events(path: Path, layout: Layout) -> Iterator[EventArray]:
+    return (join(path, data, layout.columns) for data in read_columns(path, layout))
+
+
+def read_columns(path: Path, layout: Layout) -> Iterator[dict[str, NDArray[Any]]]:
+    """Chunks of the columns as they are stored, by their names in the file.
+
+    Raises
+    ------
+    FormatError
+        If the file is cut short or damaged.
+    """
     with reading(path, *DAMAGE), contextlib.ExitStack() as stack:
         files = [stack.enter_context(_opened(path, array.member)) for array in layout.arrays]
         for file in files:
             _read_header(file)
         for start in range(0, layout.length, CHUNK_EVENTS):
             count = min(CHUNK_EVENTS, layout.length - start)
-            data: dict[str, Any] = {}
+            data: dict[str, NDArray[Any]] = {}
             for file, array in zip(files, layout.arrays, strict=True):
                 values = np.frombuffer(_exactly(file, count * array.dtype.itemsize), array.dtype)
                 if values.dtype.names is None:
                     data[array.name] = values
                 else:
                     data |= {name: values[name] for name in layout.columns[:4]}
-            yield join(path, data, layout.columns)
+            yield data
 
 
 def _exactly(file: IO[bytes], size: int) -> bytes:

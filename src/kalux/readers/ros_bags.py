@@ -27,6 +27,8 @@ SQLITE_MAGIC: Final = b"SQLite format 3\0"
 
 _ZSTD_MAGIC: Final = b"\x28\xb5\x2f\xfd"
 _RECORD_LIMIT: Final = 1 << 30
+# Commands of ROS and MCAP that make a recording whole that has no end.
+_MENDED_BY: Final = {"bag": "rosbag reindex", "mcap": "mcap recover"}
 # Whatever a wrong offset, size or compressed byte can lead to in the libraries.
 DAMAGE: Final = (
     ValueError,
@@ -114,9 +116,15 @@ def _open_file(path: Path) -> Bag:
     if path.suffix == ".zstd":
         raise FormatError(f"{path}: compressed as a whole; decompress it first: zstd -d {path.name}")
     kinds: dict[str | None, type[_Bag1 | _Mcap | _Sqlite]] = {"bag": _Bag1, "db3": _Sqlite, "mcap": _Mcap}
-    bag = kinds[container(path)](path)
-    with reading(path, *DAMAGE, *bag.damage):
-        _ = bag.topics
+    kind = container(path)
+    bag = kinds[kind](path)
+    try:
+        with reading(path, *DAMAGE, *bag.damage):
+            _ = bag.topics
+    except FormatError as error:
+        if kind in _MENDED_BY:
+            error.add_note(f"if the recorder was killed, {_MENDED_BY[kind]!r} may mend it")
+        raise
     return bag
 
 

@@ -13,6 +13,7 @@ from typing import Final, NamedTuple
 from kalux.ahead import InOrder
 from kalux.display import ToneState
 from kalux.errors import OutputError
+from kalux.wording import how_many
 from kalux.writers.base import ImageLike, Writer
 from kalux.writers.files import Claim, output_errors, remove_quietly, write_within
 from kalux.writers.images import Encode
@@ -132,7 +133,10 @@ class FolderWriter(Writer):
         self._told = time.monotonic()
 
     def _consequence(self) -> str:
-        return f"the {self._images} images listed in {self.path / LISTING} are whole"
+        if not self._images:
+            return "no image was finished"
+        verb = "is" if self._images == 1 else "are"
+        return f"the {how_many(self._images, 'image')} listed in {self.path / LISTING} {verb} whole"
 
 
 def append_line(file: FileIO, line: str) -> None:

@@ -32,6 +32,7 @@ from kalux.display import (
 )
 from kalux.errors import InputError, MissingDependencyError, OutputError, SettingsError
 from kalux.models.colour import LUMINANCE, luminance
+from kalux.wording import how_many
 from kalux.writers.base import ImageLike, Writer
 from kalux.writers.files import Claim, output_errors
 from kalux.writers.settings_file import SettingsFile, require_ours
@@ -207,7 +208,9 @@ class VideoWriter(Writer):
                 )
         container, stream = self._open
         self._whole = False
-        with encoder_errors(self.path, f"the video failed after {self._images} images and is removed"):
+        with encoder_errors(
+            self.path, f"the video failed after {how_many(self._images, 'image')} and is removed"
+        ):
             container.mux(stream.encode(frame))
         self._whole = True
         self._count(picture.t)
