@@ -7,7 +7,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from kalux.calibration.regression import huber_weights, standard_errors, two_stage
+from kalux.calibration.regression import NORMAL_MAD, huber_weights, products, standard_errors, two_stage
 
 
 def counts(rng, n=2000):
@@ -24,6 +24,18 @@ def test_the_fit_is_exact_without_noise(on, off, seed):
     found = two_stage(explained @ np.array([on, off]), explained, explained)
     assert found.solution == pytest.approx([on, off], rel=1e-9)
     assert found.residual <= 1e-9
+
+
+@pytest.mark.parametrize("n", [1, 2, 9, 1000, 1001])
+def test_the_robust_scale_is_by_the_median_as_numpy_has_it(n):
+    """Odd or even, bit for bit."""
+    residuals = np.random.default_rng(n).standard_normal(n)
+    assert huber_weights(residuals)[1] == NORMAL_MAD * np.median(np.abs(residuals))
+
+
+def test_products_are_those_of_matrices():
+    first, second = np.random.default_rng(4).standard_normal((2, 3, 50_000))
+    assert products(first, second[:2]) == pytest.approx(first @ second[:2].T, rel=1e-9, abs=1e-9)
 
 
 def test_the_fit_stands_a_fifth_of_outliers():

@@ -318,67 +318,99 @@ def bridge(
         net=net,
     )
     more = np.zeros(shape, first.value.dtype) if grown is None else grown
-    _bridge(*first[:2], *second[:2], on, off, more, thresholds, noise, seconds, planes, factors)
+    given, known, filled, learned = (
+        tuple(plane.reshape(-1) for plane in several)
+        for several in ((*first[:2], *second[:2], on, off, more), thresholds, planes, factors)
+    )
+    _bridge(given, known, noise, seconds, filled, learned)
     return segment, Thresholds(*factors)
 
 
+_SCRATCH: Final = 13
+_COUNT_ON, _COUNT_OFF, _CHANGE, _BOTH, _MOVES, _LEVEL, _SLOPE, *_LEARNED = (
+    np.uint64(k * _BLOCK) for k in range(_SCRATCH)
+)
+_STEP_ON, _STEP_OFF, _NEW_ON, _NEW_OFF, _LEFT_ON, _LEFT_OFF = _LEARNED
+"""Where the values of a block of pixels lie in the scratch memory of `_bridge`."""
+
+
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _bridge(  # type: ignore[no-untyped-def]
-    value, variance, next_value, next_variance, on, off, grown, thresholds, noise, seconds, planes, factors
-):
-    """Fill ``planes`` and ``factors``; in float64, whatever the arrays' type."""
+def _bridge(given, thresholds, noise, seconds, planes, factors):  # type: ignore[no-untyped-def]
+    """Fill ``planes`` and ``factors``; in float64, whatever the arrays' type.
+
+    Vector code: a block of pixels at a time, and in no loop more arrays than the compiler compares the places of. One
+    piece of scratch memory is one array.
+    """
     low, high = _SCALE_BOUNDS
+    value, variance, next_value, next_variance, on, off, grown = given
     augmented, slope, step_on, step_off, events, net, floor = planes
     new_on, new_off, new_on_variance, new_off_variance = factors
-    height, width = on.shape
-    told = np.empty(width)
-    for row in range(height):  # three loops each: one over all these arrays is no vector code
-        for column in range(width):
-            told[column] = np.float64(next_value[row, column]) - np.float64(grown[row, column])
-        for column in range(width):
-            i = row, column
-            saturated = (
-                min(variance[i], next_variance[i]) >= UNMEASURED
-                and max(variance[i], next_variance[i]) < UNSEEN
-            )
-            n_on, n_off = np.float64(on[i]), np.float64(off[i])
-            scale_on, scale_off = np.float64(thresholds.on[i]), np.float64(thresholds.off[i])
-            nominal_on, nominal_off = noise.threshold_on * scale_on, noise.threshold_off * scale_off
-            change = told[column] - np.float64(value[i])
-            both = np.float64(variance[i]) + np.float64(next_variance[i])
-            if saturated:  # two bounds: all that they say of the change is that it does not go on and on
-                change, both = -np.float64(grown[i]), noise.saturated_variance
-            mismatch = change - (nominal_on * n_on - nominal_off * n_off)
-            on_variance, off_variance = (
-                np.float64(thresholds.on_variance[i]),
-                np.float64(thresholds.off_variance[i]),
-            )
-            on_covariance = on_variance * noise.threshold_on * n_on
-            off_covariance = -off_variance * noise.threshold_off * n_off
+    scale_on, scale_off, variance_on, variance_off = thresholds
+    c_on, c_off, of_step = noise.threshold_on, noise.threshold_off, noise.step_variance
+    untold, of_saturated = noise.quantisation_variance, noise.saturated_variance
+    s = np.empty(_SCRATCH * _BLOCK)
+    size = np.uint64(len(value))
+    for first in range(np.uint64(0), size, np.uint64(_BLOCK)):
+        pixels = range(min(size - first, np.uint64(_BLOCK)))
+        for k in pixels:
+            i = first + k
+            before, after = np.float64(variance[i]), np.float64(next_variance[i])
+            here, more = np.float64(value[i]), np.float64(grown[i])
+            saturated = (min(before, after) >= UNMEASURED) & (max(before, after) < UNSEEN)
+            s[_COUNT_ON + k], s[_COUNT_OFF + k] = on[i], off[i]
+            # Two bounds: all that they say of the change is that it does not go on and on.
+            s[_CHANGE + k] = -more if saturated else np.float64(next_value[i]) - more - here
+            s[_BOTH + k] = of_saturated if saturated else before + after
+            s[_LEVEL + k], s[_MOVES + k] = here, 0.0 if saturated else before
+        for k in pixels:
+            i = first + k
+            n_on, n_off = s[_COUNT_ON + k], s[_COUNT_OFF + k]
+            of_on, of_off = np.float64(scale_on[i]), np.float64(scale_off[i])
+            nominal_on, nominal_off = c_on * of_on, c_off * of_off
+            mismatch = s[_CHANGE + k] - (nominal_on * n_on - nominal_off * n_off)
+            on_variance, off_variance = np.float64(variance_on[i]), np.float64(variance_off[i])
+            on_covariance = on_variance * c_on * n_on
+            off_covariance = -off_variance * c_off * n_off
             total = (
-                both
-                + on_covariance * noise.threshold_on * n_on
-                - off_covariance * noise.threshold_off * n_off
-                + noise.step_variance * (n_on + n_off)
-                + noise.quantisation_variance
+                s[_BOTH + k]
+                + on_covariance * c_on * n_on
+                - off_covariance * c_off * n_off
+                + of_step * (n_on + n_off)
+                + untold
             )
             inverse = 1.0 / total
             gain = mismatch * inverse
-            augmented[i] = value[i] if saturated else value[i] + gain * variance[i]
-            slope[i] = gain * noise.quantisation_variance / seconds
-            step_on[i] = nominal_on + gain * (noise.threshold_on * on_covariance + noise.step_variance)
-            step_off[i] = nominal_off + gain * (noise.threshold_off * off_covariance - noise.step_variance)
-            events[i] = n_on + n_off
-            new_on[i] = min(max(scale_on + gain * on_covariance, low), high)
-            new_off[i] = min(max(scale_off + gain * off_covariance, low), high)
-            new_on_variance[i] = on_variance - on_covariance * on_covariance * inverse + _SCALE_DRIFT
-            new_off_variance[i] = off_variance - off_covariance * off_covariance * inverse + _SCALE_DRIFT
-        for column in range(width):
-            i = row, column
+            s[_LEVEL + k] += gain * s[_MOVES + k]
+            s[_SLOPE + k] = gain * untold / seconds
+            s[_STEP_ON + k] = nominal_on + gain * (c_on * on_covariance + of_step)
+            s[_STEP_OFF + k] = nominal_off + gain * (c_off * off_covariance - of_step)
+            s[_NEW_ON + k] = min(max(of_on + gain * on_covariance, low), high)
+            s[_NEW_OFF + k] = min(max(of_off + gain * off_covariance, low), high)
+            s[_LEFT_ON + k] = on_variance - on_covariance * on_covariance * inverse + _SCALE_DRIFT
+            s[_LEFT_OFF + k] = off_variance - off_covariance * off_covariance * inverse + _SCALE_DRIFT
+        for k in pixels:
+            i = first + k
+            augmented[i], slope[i], events[i] = (
+                s[_LEVEL + k],
+                s[_SLOPE + k],
+                s[_COUNT_ON + k] + s[_COUNT_OFF + k],
+            )
+        for k in pixels:
+            step_on[first + k], step_off[first + k] = s[_STEP_ON + k], s[_STEP_OFF + k]
+        for k in pixels:
+            new_on[first + k], new_off[first + k] = s[_NEW_ON + k], s[_NEW_OFF + k]
+        for k in pixels:
+            new_on_variance[first + k], new_off_variance[first + k] = s[_LEFT_ON + k], s[_LEFT_OFF + k]
+        for k in pixels:
+            i = first + k
             net[i] = step_on[i] * on[i] - step_off[i] * off[i] + grown[i]
+        for k in pixels:
+            i = first + k
             # What is not known of a pixel that no frame measured is a constant: if events lead from it to less than
             # the next frame's bound, it was too low all the time.
-            bounded = variance[i] >= UNMEASURED and UNMEASURED <= next_variance[i] < UNSEEN
+            bounded = (
+                (variance[i] >= UNMEASURED) & (next_variance[i] >= UNMEASURED) & (next_variance[i] < UNSEEN)
+            )
             floor[i] = next_value[i] - net[i] if bounded else -np.inf
 
 

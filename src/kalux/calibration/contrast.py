@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.calibration.refractory import LATE, intervals, possible_periods
-from kalux.calibration.regression import Fit, standard_errors, two_stage
+from kalux.calibration.regression import Fit, products, standard_errors, two_stage
 from kalux.calibration.steps import MAX_SAMPLES, Steps, steps
 from kalux.recording import Recording
 from kalux.settings import CameraSettings
@@ -284,9 +284,10 @@ class _Seen(NamedTuple):
     share: Array
     sensor_size: tuple[int, int]
 
-    def columns(self, events: Array) -> Array:
-        """(N, 2) what explains changes: steps upwards and downwards."""
-        return np.column_stack([events[:, 0], -events[:, 1]]) * self.share[:, None]
+    def columns(self, events: Array, index: int) -> Array:
+        """(N, 2) what explains changes under a refractory period: steps upwards and downwards."""
+        late, soon = events[:, index, 0], events[:, index, 1]  # NumPy's sum over so short an axis is slow
+        return np.asarray((late + soon) * np.array([1.0, -1.0]) * self.share[:, None], np.float64)
 
     def residual(self) -> float:
         """Of the regression under the first refractory period; nan where there is none."""
@@ -297,11 +298,11 @@ class _Seen(NamedTuple):
 
     def explained(self, index: int) -> Array:
         """(N, 2) what explains the pixels' own changes under a refractory period."""
-        return self.columns(self.steps.events[:, index].sum(axis=1))
+        return self.columns(self.steps.events, index)
 
     def counts_around(self, index: int) -> Array:
         """(N, 2) the same of their neighbours."""
-        return self.columns(self.steps.events_around[:, index].sum(axis=1))
+        return self.columns(self.steps.events_around, index)
 
     def changes_around(self) -> Array:
         """(N, 2) the neighbours' changes, upwards and downwards."""
@@ -376,8 +377,9 @@ def _unexplained(seen: _Seen, fit: Fit, counts: Array) -> float:
     """What the neighbours' counts say that their frames do not, over what both say: mean squares."""
     predicted = np.abs(fit.solution[0]) * counts[:, 0] + np.abs(fit.solution[1]) * counts[:, 1]
     change = seen.steps.change_around
-    both = float(predicted @ change) ** 2
-    return float(predicted @ predicted) * float(change @ change) / max(both, 1e-12) - 1.0
+    both = np.stack([predicted, change])
+    (told, common), (_, shown) = products(both, both).tolist()
+    return float(told * shown / max(common**2, 1e-12)) - 1.0
 
 
 class _Parted(NamedTuple):

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.calibration.intervals import counted_intervals, spread
+from kalux.calibration.regression import products
 from kalux.models.camera import (
     CRUSHED,
     Camera,
@@ -175,9 +176,9 @@ def _log_offset(samples: Samples, shown: Shown | None, model: ErrorModel) -> flo
     What is usual counts as far as events do not explain what changes: noise says nothing of I_0.
     """
     change = np.log(samples.after + UNKNOWN_LOG_OFFSET) - np.log(samples.before + UNKNOWN_LOG_OFFSET)
-    predicted = model.told(samples)
-    squares = float(predicted @ predicted) * float(change @ change)
-    told = max(float(predicted @ change), 0.0) ** 2 / max(squares, 1e-12)
+    both = np.stack([model.told(samples), change])
+    (told_square, common), (_, change_square) = products(both, both).tolist()
+    told: float = max(common, 0.0) ** 2 / max(told_square * change_square, 1e-12)
     count = len(change) * told / _ALIKE
 
     def loss(log_offset: float) -> float:
@@ -267,7 +268,7 @@ def _samples(
     ):
         first, second = interval.first, interval.second
         chosen = spread(~first.clipped & ~second.clipped & (on + off > 0), MAX_SAMPLES - count)
-        pixels = (first.intensity, second.intensity, on, off)
+        pixels = (*(end.intensity for end in interval.ends), on, off)
         limits = (np.full(len(chosen), limit * second.white) for limit in (black, white))
         found.append((*(values.ravel()[chosen] for values in pixels), *limits))
         count += int(

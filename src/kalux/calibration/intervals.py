@@ -28,30 +28,77 @@ _WELL_EXPOSED: Final = (0.05, 0.95)  # of the response: away from black, noise a
 
 
 @dataclass(frozen=True, eq=False)
-class Interval:
-    """From the middle of one exposure to that of the next. Values of pixels are taken when they are asked for.
+class End:
+    """A frame where one interval ends and the next begins. Values of pixels are taken when they are asked for.
 
     Attributes
     ----------
-    start, end
-        The two middles, us.
-    chunks
-        The events between ``start`` and ``end``, and those of the margin before and after, in a few arrays.
-    first, second
-        The frames at both ends, as the filters see them.
-    frames
-        The same as recorded.
+    frame, shot
+        As recorded, and as the filters see it.
     log_offset
         I_0, white = 1.
     """
 
-    start: int
-    end: int
-    chunks: list[EventArray]
-    first: Shot
-    second: Shot
-    frames: tuple[Frame, Frame]
+    frame: Frame
+    shot: Shot
     log_offset: float
+
+    @cached_property
+    def intensity(self) -> Array:
+        """(H, W) I."""
+        return self.shot.intensity
+
+    @cached_property
+    def log_intensity(self) -> Array:
+        """(H, W) log(I + I_0)."""
+        levels: Array = log_intensity(self.shot.level_intensity, self.log_offset)[self.shot.levels]
+        return levels
+
+    @cached_property
+    def usable(self) -> NDArray[np.bool_]:
+        """(H, W): valid and well exposed, also where a stated saturation lies below what that usually is."""
+        low, high = _WELL_EXPOSED
+        level = self.frame.normalised()
+        inside = (level > low) & (level < high)
+        usable = np.asarray(inside.all(axis=-1) if inside.ndim == 3 else inside, np.bool_)
+        usable &= ~self.shot.clipped
+        return usable if self.frame.valid is None else usable & self.frame.valid
+
+
+@dataclass(frozen=True, eq=False)
+class Interval:
+    """From the middle of one exposure to that of the next.
+
+    Attributes
+    ----------
+    ends
+        The frames before and after.
+    chunks
+        The events between their middles, and those of the margin before and after, in a few arrays.
+    """
+
+    ends: tuple[End, End]
+    chunks: list[EventArray]
+
+    @property
+    def first(self) -> Shot:
+        """The frame before, as the filters see it."""
+        return self.ends[0].shot
+
+    @property
+    def second(self) -> Shot:
+        """The frame after."""
+        return self.ends[1].shot
+
+    @property
+    def start(self) -> int:
+        """The middle of the exposure before, us."""
+        return self.first.middle
+
+    @property
+    def end(self) -> int:
+        """The middle of the exposure after, us."""
+        return self.second.middle
 
     @cached_property
     def events(self) -> EventArray:
@@ -61,28 +108,17 @@ class Interval:
     @cached_property
     def change(self) -> Array:
         """(H, W) difference of log(I + I_0)."""
-        before, after = (log_intensity(shot.intensity, self.log_offset) for shot in (self.first, self.second))
-        return after - before
+        return self.ends[1].log_intensity - self.ends[0].log_intensity
 
     @cached_property
     def level(self) -> Array:
         """(H, W) mean of I at both ends."""
-        return (self.second.intensity + self.first.intensity) / 2
+        return (self.ends[1].intensity + self.ends[0].intensity) / 2
 
     @cached_property
     def usable(self) -> NDArray[np.bool_]:
         """(H, W): valid and well exposed at both ends."""
-        first, second = self.frames
-        return _is_usable(first, self.first) & _is_usable(second, self.second)
-
-
-def _is_usable(frame: Frame, shot: Shot) -> NDArray[np.bool_]:
-    """(H, W): valid and well exposed, also where a stated saturation lies below what that usually is."""
-    low, high = _WELL_EXPOSED
-    level = frame.normalised()
-    inside = (level > low) & (level < high)
-    usable = np.asarray(inside.all(axis=-1) if inside.ndim == 3 else inside, np.bool_) & ~shot.clipped
-    return usable if frame.valid is None else usable & frame.valid
+        return self.ends[0].usable & self.ends[1].usable
 
 
 def intervals(
@@ -93,7 +129,7 @@ def intervals(
     model = Camera.named(response, camera.clipped_from)
     chunks = iter(recording.events())
     held: list[EventArray] = []
-    previous: tuple[Frame, Shot] | None = None
+    previous: End | None = None
     reference = float(camera.reference_exposure or 0)
     for frame in islice(recording.frames(), most_frames):
         reference = reference or float(frame.exposure)
@@ -105,19 +141,12 @@ def intervals(
             if previous is None:  # only the margin before the first interval needs to be kept
                 held = _later(held, shot.middle - margin)
             held.append(chunk)
+        end = End(frame, shot, camera.offset)
         if previous is not None:
-            before, first = previous
-            yield Interval(
-                start=first.middle,
-                end=shot.middle,
-                chunks=all_between(held, first.middle - margin, shot.middle + margin),
-                first=first,
-                second=shot,
-                frames=(before, frame),
-                log_offset=camera.offset,
-            )
+            around = all_between(held, previous.shot.middle - margin, shot.middle + margin)
+            yield Interval((previous, end), around)
         held = _later(held, shot.middle - margin)
-        previous = frame, shot
+        previous = end
 
 
 def counted_intervals(

@@ -145,10 +145,11 @@ def _changes(
         most_frames=_MAX_FRAMES,
     ):
         told = events.threshold_on * on - events.threshold_off * off - interval.change
-        for sign, frame in zip((-1, 1), interval.frames, strict=True):
+        frames = [end.frame for end in interval.ends]
+        for sign, frame in zip((-1, 1), frames, strict=True):
             ends = frame.normalised()
             chosen = (sign * (on - off) >= _LEAST_NET) & (ends >= least)
-            for each in interval.frames:
+            for each in frames:
                 chosen &= True if each.valid is None else each.valid
             yield np.stack([ends[chosen], sign * told[chosen]])
 

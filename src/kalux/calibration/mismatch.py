@@ -92,10 +92,10 @@ def estimate_mismatch(recording: Recording, camera: CameraSettings, events: Even
         refractory_period=events.refractory,
         most_frames=_MAX_FRAMES,
     ):
-        first, second = interval.first, interval.second
+        first, second = interval.ends
         seen = Samples(first.intensity, second.intensity, on, off)
         bright = np.minimum(seen.before, seen.after) > DARKEST
-        told = ~first.clipped & ~second.clipped & bright & (on + off > 0)
+        told = ~first.shot.clipped & ~second.shot.clipped & bright & (on + off > 0)
         mismatch, variance = mismatch_of(seen, model, camera.offset, events.step_noise)
         _add(mismatch, variance, told, events.threshold_on * on, events.threshold_off * off, products)
         samples += int(np.count_nonzero(told))

@@ -366,15 +366,18 @@ def _looked_at(counts, change, usable, chosen):  # type: ignore[no-untyped-def]
     change_around = np.zeros(len(chosen))
     for n in range(len(chosen)):
         row, column = chosen[n] // width, chosen[n] % width
-        own[n] = counts[row, column]
         total = 0.0
+        for k in range(size):
+            own[n, k] = counts[row, column, k]
         for i in range(row - 1, row + 2):
             for j in range(column - 1, column + 2):
                 if usable[i, j] and not (i == row and j == column):
                     weight = 1.0 / (1.0 + ((change[i, j] - change[row, column]) / _ALIKE) ** 2)
-                    around[n] += weight * counts[i, j]
+                    for k in range(size):
+                        around[n, k] += weight * counts[i, j, k]
                     change_around[n] += weight * change[i, j]
                     total += weight
-        around[n] /= total
+        for k in range(size):
+            around[n, k] /= total
         change_around[n] /= total
     return own, around, change_around
