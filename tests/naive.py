@@ -688,9 +688,9 @@ def beyond_rims(split, settings, frames, k):
 
 
 def unshown(split, settings, frames, t):
-    """K15: (H, W) how far above their bounds pixels are expected that no frame has shown; nan where one has.
+    """K15: (2, H, W) how far above their bounds pixels are expected that no frame has shown, and the variance of that.
 
-    Of a sensor no larger than one part.
+    nan where a frame has. Of a sensor no larger than one part.
     """
     looked = min(sum(f.middle < t for f in frames), len(frames) - 1)  # the newest frame that is used
     excess = {}
@@ -699,14 +699,19 @@ def unshown(split, settings, frames, t):
             if split[place].shown > k and (k == 0 or split[place].raised[k - 1]):
                 excess[place] = min(excess.get(place, np.inf), level)
     told = [(p, excess[place]) for place, p in split.items() if 0 < p.shown <= looked]
-    of_all = (5 + sum(p.excess for p, _ in told if p.gone)) / (5 + sum(e for p, e in told if p.gone))
+    gone, gone_foretold = (
+        sum(of) for of in ([p.excess for p, _ in told if p.gone], [e for p, e in told if p.gone])
+    )
+    of_all = ((5 + gone) / (5 + gone_foretold)) ** (gone_foretold / (gone_foretold + 100))
     left = [(p.excess, e) for p, e in told if p.left]
-    total, foretold = sum(p for p, _ in left), sum(e for _, e in left)
-    out = np.full(frames[0].image.shape, np.nan)
+    total, foretold = sum(p for p, _ in left), of_all * sum(e for _, e in left)
+    out = np.full((2, *frames[0].image.shape), np.nan)
     for place, pixel in split.items():
         if pixel.shown > looked:
-            scaled = excess[place] * (total + 5 * min(of_all, 1.0)) / (foretold + 5)
-            out[place] = min(scaled, excess[place] + max(total - foretold, 0.0) / (len(left) + 10))
+            usual = of_all * excess[place]
+            scaled = usual * (total + 5) / (foretold + 5)
+            out[0][place] = min(scaled, usual + max(total - foretold, 0.0) / (len(left) + 10))
+            out[1][place] = (3 * usual) ** 2 * 5 / (foretold + 5)
     return out
 
 
@@ -735,7 +740,7 @@ def intensity(log_intensity, variance, settings, white, stretch):
 
 
 def reconstruct(events, frames, sensor_size, settings, times):
-    """The pixels, and of ``times``, (T, H, W) each: L, P, what is hidden (K11), who moves, what is expected (K15)."""
+    """The pixels, and of ``times``, (T, H, W) each: L, P, what is hidden (K11), who moves; (T, 2, H, W) of K15."""
     kind = settings.filter.kind
     if kind == "cf":
         method, begin = complementary, (frames[0].exposure_start + frames[0].exposure_end) // 2
@@ -749,7 +754,14 @@ def reconstruct(events, frames, sensor_size, settings, times):
     for (row, column), pixel in every.items():
         out[:2, :, row, column] = method(pixel, settings, times, on, off, *more).T
     if method is not bridged:
-        return every, out[0], out[1], out[2], out[3].astype(bool), np.full(out[0].shape, np.nan)
+        return (
+            every,
+            out[0],
+            out[1],
+            out[2],
+            out[3].astype(bool),
+            np.full((len(times), 2, *sensor_size), np.nan),
+        )
     for place, pixel in every.items():  # of which nothing depends on it but P and L
         pixel.forgotten = list(
             forgotten(every, place, on * off, settings.events.quantisation_variance * on * off)

@@ -76,11 +76,11 @@ def test_a_variance_that_is_not_wanted_changes_no_intensity():
 
 
 def test_a_pixel_that_no_frame_has_shown_is_above_its_bound_and_doubtful():
-    unshown = Unshown(np.array([1]), np.array([0.7], np.float32), np.array([0.01], np.float32))
+    unshown = Unshown(np.array([1]), *(np.array([value], np.float32) for value in (0.7, 0.01, 2.0)))
     plain, lifted = (make_image(estimate([[0.5, 1.0]], unshown=u), GREY) for u in (None, unshown))
     assert lifted.intensity[0, 0] == plain.intensity[0, 0]
     assert lifted.intensity[0, 1] > 1.2
-    assert lifted.variance[0, 1] > 100 * plain.variance[0, 1]
+    assert lifted.variance[0, 1] == pytest.approx(0.7**2 + 0.01 + 2.0)
 
 
 def test_frames_in_rgb_lend_their_ratios_to_the_intensity():

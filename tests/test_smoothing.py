@@ -363,17 +363,19 @@ def test_what_moves_before_or_after_moves_where_its_surroundings_do():
 
 def test_where_one_filter_knows_only_a_bound_it_is_one():
     """Of three pixels the first filter has bounds, the second measured two, one of them below its bound."""
-    of = {"noise": np.full(3, 0.1, np.float32), "excess": np.full(3, 0.4, np.float32)}
+    planes = {"noise": 0.1, "excess": 0.4, "doubt": 0.2}
+    of = {name: np.full(3, value, np.float32) for name, value in planes.items()}
     first = Estimate(
         5, np.zeros((1, 3)), np.full((1, 3), 1.1), 0.0, True, unshown=Unshown(np.arange(3), **of)
     )
-    seen = Unshown(np.array([2]), np.full(1, 0.2, np.float32), np.full(1, 0.3, np.float32))
+    seen = Unshown(np.array([2]), *(np.full(1, value, np.float32) for value in (0.2, 0.3, 0.1)))
     level, variance = np.array([[0.5, -0.2, 0.0]]), np.array([[1e-3, 0.1, 1.3]])
     found = combine(first, Estimate(-5, level, variance, 0.0, True, unshown=seen))
     np.testing.assert_allclose(found.log_intensity, [[0.5, -0.1, 0.0]], atol=1e-5)
     np.testing.assert_allclose(found.variance[0, :2], [1e-3, 0.1])
     assert found.unshown.pixels.tolist() == [2]
     assert found.unshown.excess[0] == pytest.approx(0.3)
+    assert found.unshown.doubt[0] == pytest.approx(0.1)
 
 
 @pytest.mark.parametrize(

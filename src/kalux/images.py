@@ -207,6 +207,8 @@ def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) ->
         total = given_variance(told, moving, change, hidden, estimate.around, total if left else None)
         if pattern > 0:
             add_pattern(total, intensity, view.log_offset, pattern)
+    if tells and unshown is not None:
+        total.reshape(-1)[unshown.pixels] += unshown.doubt
     image = Image(estimate.t, intensity, total, view.log_offset, estimate.final, fixed_pattern=float(pattern))
     return dataclasses.replace(image, colour=_coloured(image, estimate, view))
 

@@ -138,6 +138,11 @@ def test_masked_pixels_are_no_border():
     assert np.nanmax(without) < 0.2
 
 
+def of_all(told, foretold):
+    """The scale of the whole image."""
+    return ((told + 5) / (foretold + 5)) ** (foretold / (foretold + 100))
+
+
 def test_pixels_around_tell_and_far_ones_do_not():
     """Half of a block leaves saturation by events of -1, and is measured at -0.7: it was 0.3 above its bound."""
     left = np.zeros(SIZE, bool)
@@ -146,9 +151,8 @@ def test_pixels_around_tell_and_far_ones_do_not():
     memory = followed(memory, ~left, -0.7, np.where(left, np.float32(-1.0), np.float32(0.0)))
     found = excess_at(memory)
     np.testing.assert_array_equal(np.isnan(found), left)
-    of_all = (128 * 0.3 + 5) / (128 * 0.5 + 5)
     assert found[4, 8] == pytest.approx(0.3, abs=0.02)
-    assert found[-1, -1] == pytest.approx(0.5 * of_all, abs=1e-3)
+    assert found[-1, -1] == pytest.approx(0.5 * of_all(128 * 0.3, 128 * 0.5), abs=1e-3)
     assert (np.diff(found[4, 8:]) >= -1e-6).all()
 
 
@@ -164,8 +168,8 @@ def test_less_than_expected_scales_what_is_expected():
     """Every second row: 0.2 told of 0.5."""
     told, count = alternating()
     memory = followed(begun(EVERYWHERE), ~told, -0.8, np.where(told, np.float32(-1.0), np.float32(0.0)))
-    of_all = (960 * 0.2 + 5) / (960 * 0.5 + 5)
-    scaled = 0.5 * (0.2 * count + 5 * of_all) / (0.5 * count + 5)
+    usual = 0.5 * of_all(960 * 0.2, 960 * 0.5)
+    scaled = usual * (0.2 * count + 5) / (usual * count + 5)
     assert excess_at(memory)[2 * 8 + 3, 3 * 8 + 3] == pytest.approx(scaled, rel=2e-3)
 
 
@@ -173,8 +177,23 @@ def test_more_than_expected_is_added():
     """Every second row: 0.9 told of 0.5, against ten pixels that tell nothing more."""
     told, count = alternating()
     memory = followed(begun(EVERYWHERE), ~told, -0.1, np.where(told, np.float32(-1.0), np.float32(0.0)))
-    added = min(0.5 + 0.4 * count / (count + 10), 0.5 * (0.9 * count + 5) / (0.5 * count + 5))
+    usual = 0.5 * of_all(960 * 0.9, 960 * 0.5)
+    added = usual + (0.9 - usual) * count / (count + 10)
+    assert added < usual * (0.9 * count + 5) / (usual * count + 5)
     assert excess_at(memory)[2 * 8 + 3, 3 * 8 + 3] == pytest.approx(added, rel=2e-3)
+
+
+def test_what_is_expected_is_in_doubt_until_pixels_tell():
+    """Where nobody has, the mean has three times itself as its standard deviation."""
+    left = np.zeros(SIZE, bool)
+    left[:16, :8] = True
+    first = begun(EVERYWHERE)
+    np.testing.assert_allclose(first.doubt, (3 * 0.5) ** 2, rtol=1e-5)
+    second = followed(first, ~left, -0.7, np.where(left, np.float32(-1.0), np.float32(0.0)))
+    usual = 0.5 * of_all(128 * 0.3, 128 * 0.5)
+    doubt = expected_excess(second, np.ones(SIZE, np.float32), 1.0).doubt
+    assert doubt[-1] == pytest.approx((3 * usual) ** 2, rel=1e-3)
+    assert doubt[0] < 0.2 * doubt[-1]
 
 
 def test_pixels_that_noise_takes_out_of_saturation_tell_nothing():

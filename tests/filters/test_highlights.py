@@ -28,9 +28,10 @@ def regularised(value, variance, moving, difference, pitch):
     return np.log(image + OFFSET)
 
 
-def unshown(pixels, excess, noise=0.0):
-    count = len(pixels)
-    return Unshown(np.array(pixels), np.full(count, excess, np.float32), np.full(count, noise, np.float32))
+def unshown(pixels, excess, noise=0.0, doubt=0.0):
+    return Unshown(
+        np.array(pixels), *(np.full(len(pixels), value, np.float32) for value in (excess, noise, doubt))
+    )
 
 
 def read(level, where, difference=0.0, moving=None, pitch=1, prior=PRIOR):
@@ -49,6 +50,12 @@ def test_at_white_it_is_the_mean_of_what_is_expected():
     image = read(np.full((2, 2), WHITE), unshown([1], 0.4))
     assert image[0, 1] == pytest.approx(1.03 * np.exp(0.4 + 0.08) - 0.03, rel=1e-5)
     assert image[0, 0] == pytest.approx(1.0, abs=1e-6)
+
+
+def test_where_much_is_expected_its_mean_stays_finite():
+    """An exponential distribution of scale 1 or more has no mean intensity: what is added is half of the scale."""
+    image = read(np.full((1, 1), WHITE), unshown([0], 2.0))
+    assert image[0, 0] == pytest.approx(1.03 * np.exp(2.0 + 1.0) - 0.03, rel=1e-5)
 
 
 def test_noise_of_the_events_draws_to_white():
@@ -133,10 +140,12 @@ def both(smoothed, first, second):
 
 def test_of_both_directions_only_what_neither_has_seen_is_left():
     alike = np.full(10, 1.0)
-    found, level = both(alike, (alike, unshown([1, 4, 7], 0.2, 0.3)), (alike, unshown([4, 7, 9], 0.4, 0.1)))
+    first, second = unshown([1, 4, 7], 0.2, 0.3, 0.5), unshown([4, 7, 9], 0.4, 0.1, 0.8)
+    found, level = both(alike, (alike, first), (alike, second))
     np.testing.assert_array_equal(found.pixels, [4, 7])
     np.testing.assert_allclose(found.excess, 0.3, rtol=1e-6)
     np.testing.assert_allclose(found.noise, 0.1, rtol=1e-6)
+    np.testing.assert_allclose(found.doubt, 0.5, rtol=1e-6)
     np.testing.assert_array_equal(level, alike)
     assert both(alike, (alike, found), (alike, None))[0] is None
 

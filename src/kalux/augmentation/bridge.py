@@ -87,6 +87,8 @@ class UnshownMemory(NamedTuple):
     excess, expected
         (N,) float32: how far above it L is expected to be from what frames show around the pixels, and from what
         others have told besides.
+    doubt
+        (N,) float32: variance of the latter, as far as nobody has told.
     told
         By others.
     near, clipped
@@ -98,6 +100,7 @@ class UnshownMemory(NamedTuple):
     shape: tuple[int, ...]
     excess: NDArray[np.float32]
     expected: NDArray[np.float32]
+    doubt: NDArray[np.float32]
     told: Told
     near: int
     clipped: int

@@ -45,6 +45,14 @@ _PRIOR_PIXELS: Final = 10.0
 _PRIOR_TOLD: Final = 5.0
 """What these tell together, log intensity: 0.5 each, which is what clipped pixels of these scenes are above white."""
 
+_PRIOR_OF_ALL: Final = 100.0
+"""What is expected of pixels, log intensity, by whom half of the scale of the whole image is told. Many of them are one
+object's: on 32 simulated scenes those that leave saturation were expected to tell 100 to 1400 altogether."""
+
+_UNKNOWN_SCALE: Final = 3.0
+"""Standard deviation of the mean excess, in units of it, where nobody has told: by the errors of 32 simulated scenes,
+whose mean excess is half to ten times what frames make expect (docs/equations.md, K15)."""
+
 _NOISE: Final = 3.0
 """Standard deviations of a frame's noise below its bound from which a pixel has left saturation by more than noise."""
 
@@ -99,11 +107,14 @@ class Unshown(NamedTuple):
         too, of an exponential distribution.
     noise
         (N,) float32: variance of the bounds, that of the events.
+    doubt
+        (N,) float32: variance of that mean, which is an expectation itself.
     """
 
     pixels: NDArray[np.int64]
     excess: NDArray[np.float32]
     noise: NDArray[np.float32]
+    doubt: NDArray[np.float32]
 
 
 def begin_unshown(first: Latent, shown: Shown, tail: Tail) -> UnshownMemory:
@@ -114,7 +125,8 @@ def begin_unshown(first: Latent, shown: Shown, tail: Tail) -> UnshownMemory:
     told = Told(np.zeros(parts), np.zeros(parts), np.zeros(parts), 0.0, 0.0)
     near, clipped = _counts(shown)
     excess = beyond_rims(shown, pixels, near / max(clipped, 1), tail)
-    return UnshownMemory(pixels, bound, first.value.shape, excess, excess, told, near, clipped)
+    doubt = (np.float32(_UNKNOWN_SCALE) * excess) ** 2
+    return UnshownMemory(pixels, bound, first.value.shape, excess, excess, doubt, told, near, clipped)
 
 
 def follow_unshown(
@@ -159,11 +171,13 @@ def follow_unshown(
     if raised.any():
         around = beyond_rims(shown, unknown[raised], near / max(clipped, 1), tail)
         excess[raised] = np.minimum(excess[raised], around)
+    expected, doubt = _as_told(excess, unknown, memory.shape[1], told)
     return memory._replace(
         pixels=unknown,
         bound=bounded[~measured],
         excess=excess,
-        expected=_as_told(excess, unknown, memory.shape[1], told),
+        expected=expected,
+        doubt=doubt,
         told=told,
         near=near,
         clipped=clipped,
@@ -247,17 +261,23 @@ def _with_told(
 
 def _as_told(
     excess: NDArray[np.float32], pixels: NDArray[np.int64], width: int, told: Told
-) -> NDArray[np.float32]:
-    """``excess``, (N,), as far as what pixels have told confirms it."""
-    if told.tellers.sum() == 0.0 and told.gone_foretold == 0.0:
-        return excess
-    of_all = min((told.gone + _PRIOR_TOLD) / (told.gone_foretold + _PRIOR_TOLD), 1.0)
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """``excess``, (N,), as far as what pixels have told confirms it, and the variance of what nobody has told.
+
+    First all is scaled by what the whole image tells, then by what those around tell of what is expected then.
+    """
+    known = told.gone_foretold / (told.gone_foretold + _PRIOR_OF_ALL)
+    of_all = ((told.gone + _PRIOR_TOLD) / (told.gone_foretold + _PRIOR_TOLD)) ** known
     here, foretold, tellers = (_around(values) for values in told[:3])
-    factor = (here + _PRIOR_TOLD * of_all) / (foretold + _PRIOR_TOLD)
+    foretold *= of_all
+    factor = (here + _PRIOR_TOLD) / (foretold + _PRIOR_TOLD)
     more = np.maximum(here - foretold, 0.0) / (tellers + _PRIOR_PIXELS)
-    times, plus = (_between(values.astype(np.float32), pixels, width) for values in (factor, more))
-    confirmed: NDArray[np.float32] = np.minimum(times * excess, excess + plus)
-    return confirmed
+    untold = _UNKNOWN_SCALE**2 * _PRIOR_TOLD / (foretold + _PRIOR_TOLD)
+    times, plus, left = (
+        _between(values.astype(np.float32), pixels, width) for values in (factor, more, untold)
+    )
+    scaled = np.float32(of_all) * excess
+    return np.minimum(times * scaled, scaled + plus), left * scaled**2
 
 
 def expected_excess(memory: UnshownMemory, variance: Floats, initial_variance: float) -> Unshown | None:
@@ -274,7 +294,7 @@ def expected_excess(memory: UnshownMemory, variance: Floats, initial_variance: f
         return None
     noise = np.empty(len(memory.pixels), np.float32)
     _grown(memory.pixels, variance.reshape(-1), np.float32(initial_variance), noise)
-    return Unshown(memory.pixels, memory.expected, noise)
+    return Unshown(memory.pixels, memory.expected, noise, memory.doubt)
 
 
 @nb.njit(cache=True, nogil=True)

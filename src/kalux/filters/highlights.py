@@ -117,7 +117,7 @@ def _take_mean(excess, noise, log_offset, white, scale2, stretch, mean):  # type
     half, zero = np.float32(0.5), np.float32(0.0)
     doubted = scale2 > zero
     for i in range(len(mean)):
-        level = mean[i] + half * excess[i] * excess[i]
+        level = mean[i] + half * min(excess[i] * excess[i], excess[i])
         believed = white + believed_highlight(max(level - white, zero), noise[i], scale2, stretch)
         mean[i] = max(exponential(believed if doubted and level > white else level) - log_offset, zero)
 
@@ -139,18 +139,20 @@ def smoothed_unshown(
     pixels, *places = np.intersect1d(
         forward[2].pixels, backward[2].pixels, assume_unique=True, return_indices=True
     )
-    excesses, noises, bounds = [], [], []
+    excesses, noises, doubts, bounds = [], [], [], []
     for (level, _, unshown), place in zip((forward, backward), places, strict=True):
         assert unshown is not None
         excesses.append(unshown.excess[place])
         noises.append(unshown.noise[place])
+        doubts.append(unshown.doubt[place])
         bounds.append(level.reshape(-1)[pixels] - unshown.noise[place] / _USUAL)
     mean = smoothed.reshape(-1)[pixels]
     rise = np.maximum(np.maximum(*bounds) - mean, np.float32(0.0)).astype(np.float32)
     smoothed.reshape(-1)[pixels] = mean + rise
     excess = (excesses[0] + excesses[1]) / np.float32(2.0)
     noise = np.where(rise > 0, np.where(bounds[0] > bounds[1], *noises), np.minimum(*noises))
-    return Unshown(pixels, excess * excess / np.maximum(excess + rise, np.float32(1e-6)), noise)
+    excess = excess * excess / np.maximum(excess + rise, np.float32(1e-6))
+    return Unshown(pixels, excess, noise, np.minimum(*doubts))
 
 
 def obey_bounds(
