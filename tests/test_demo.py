@@ -74,13 +74,17 @@ def test_a_folder_with_other_things_is_refused(demo, tmp_path, capsys):
     assert capsys.readouterr().err.count("\n") == 1
 
 
-def test_an_interrupt_says_what_is_there(tmp_path, capsys, monkeypatch):
+@pytest.mark.parametrize("written", [False, True])
+def test_an_interrupt_says_what_is_there(tmp_path, capsys, monkeypatch, written):
     def interrupt(*arguments):
+        if written:
+            (tmp_path / "out" / "demo.h5").touch()
         raise KeyboardInterrupt
 
     monkeypatch.setattr("kalux.demo.simulate", interrupt)
-    assert main(["demo", "-o", str(tmp_path)]) == 130
-    assert f"what is in {tmp_path} is whole" in capsys.readouterr().err
+    assert main(["demo", "-o", str(tmp_path / "out")]) == 130
+    told = f"what is in {tmp_path / 'out'} is whole; kalux demo --overwrite makes the rest"
+    assert capsys.readouterr().err == f"kalux: interrupted; {told if written else 'nothing was written'}\n"
 
 
 def test_a_moment_without_frames_is_refused(tmp_path, small_scene):

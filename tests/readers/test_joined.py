@@ -338,7 +338,7 @@ class TestVideo:
 
     def test_no_video(self, events_only, tmp_path):
         (tmp_path / "v.mp4").write_bytes(b"nothing" * 100)
-        with pytest.raises(FormatError, match=r"v\.mp4: damaged"):
+        with pytest.raises(FormatError, match=r"v\.mp4: neither an image nor a video, or a damaged"):
             kalux.open(events_only, frames=tmp_path / "v.mp4", frames_start=0, frames_rate=30)
 
     @pytest.mark.parametrize(

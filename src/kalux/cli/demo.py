@@ -52,7 +52,8 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     try:
         found = run_demo(options.out, overwrite=options.overwrite, say=say)
     except KeyboardInterrupt as interrupt:
-        interrupt.add_note(f"what is in {options.out} is whole; kalux demo --overwrite makes the rest")
+        if options.out.is_dir() and any(options.out.iterdir()):
+            interrupt.add_note(f"what is in {options.out} is whole; kalux demo --overwrite makes the rest")
         raise
     say(f"done in {time.monotonic() - started:.0f} s\n")
     say(score_table(found))

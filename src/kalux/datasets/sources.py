@@ -22,6 +22,7 @@ from kalux.models.camera import Response
 from kalux.models.colour import LUMINANCE
 from kalux.readers.images import IMAGES, RADIANCE, images_in
 from kalux.readers.source import reading
+from kalux.readers.videos import opened_video
 from kalux.wording import how_many, one_line
 
 _KEPT: Final = 4  # decoded images
@@ -194,9 +195,7 @@ def _folder(path: Path) -> ImageSequence:
 
 
 def _video(path: Path) -> ImageSequence:
-    import av
-
-    with reading(path, av.FFmpegError, ValueError, IndexError), av.open(str(path)) as container:
+    with opened_video(path) as container:
         if not container.streams.video:
             raise FormatError(f"{path}: neither an image nor a video that can be decoded")
         stream = container.streams.video[0]
@@ -228,9 +227,7 @@ class _VideoPictures:
 
 
 def _decoded_video(path: Path) -> Iterator[Image]:
-    import av
-
-    with reading(path, av.FFmpegError, ValueError, IndexError), av.open(str(path)) as container:
+    with opened_video(path) as container:
         for picture in container.decode(container.streams.video[0]):
             deep = picture.format.components[0].bits > 8
             colour = picture.to_ndarray(format="rgb48le" if deep else "rgb24")

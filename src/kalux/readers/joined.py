@@ -23,6 +23,7 @@ from kalux.frames import Frame
 from kalux.readers.image_lists import WANTED, Listed, read_csv, read_ijrr, read_listed
 from kalux.readers.images import files_in_colour, load_image
 from kalux.readers.source import EXPOSURE_UNKNOWN, SIZE_NOT_STATED, Source, reading, smallest_size
+from kalux.readers.videos import opened_video
 from kalux.wording import how_many
 
 _LISTS: Final = ("frames.csv", "timestamps.csv", "images.txt")
@@ -230,9 +231,7 @@ def _video(path: Path, start: int | None, rate_hz: float | None) -> Source:
 
 def _transfer(path: Path) -> int:
     """How the pictures of a video follow the light, as a number of ITU-T H.273."""
-    import av
-
-    with reading(path, av.FFmpegError, ValueError, IndexError), av.open(str(path)) as container:
+    with opened_video(path) as container:
         return int(container.streams.video[0].codec_context.color_trc)
 
 
@@ -256,9 +255,7 @@ def _has_colour(picture: NDArray[Any]) -> bool:
 
 def _pictures(path: Path, *, colour: bool) -> Iterator[NDArray[Any]]:
     """Each picture, uint8, or uint16 where it has more than 8 bits: red, green, blue if it has colours, or the luma."""
-    import av
-
-    with reading(path, av.FFmpegError, ValueError, IndexError), av.open(str(path)) as container:
+    with opened_video(path) as container:
         if not container.streams.video:
             raise FormatError(f"{path}: neither an image folder nor a video; {WANTED}, or a video is needed")
         stream = container.streams.video[0]
