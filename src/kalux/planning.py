@@ -18,7 +18,7 @@ from kalux.calibration.contrast import (
 )
 from kalux.calibration.delay import DelayEstimate, estimate_delay
 from kalux.calibration.event_model import EventModel, estimate_event_model
-from kalux.calibration.fixed_pattern import FixedPattern, estimate_fixed_pattern
+from kalux.calibration.fixed_pattern import USUAL_PATTERN, FixedPattern, estimate_fixed_pattern
 from kalux.calibration.frame_noise import FrameNoise, estimate_frame_noise
 from kalux.calibration.levels import Ceiling, exact_end, find_ceiling
 from kalux.calibration.mismatch import Mismatch, estimate_mismatch
@@ -281,10 +281,15 @@ def _with_frame_noise(recording: Recording, settings: Settings) -> tuple[Setting
 
 
 def _with_fixed_pattern(recording: Recording, settings: Settings) -> tuple[Settings, FixedPattern | None]:
-    """Fill in the frames' fixed pattern, where the variance counts it: from the settings, else an estimate, else 0."""
+    """Fill in the frames' fixed pattern, where the variance counts it: from the settings, else an estimate.
+
+    Where the recording cannot tell, because nothing moves, the usual one; 0 of frames that have been processed.
+    """
     if settings.camera.fixed_pattern is not None or not _uses_steps(settings):
         return settings, None
     found = estimate_fixed_pattern(recording, settings.camera)
+    if found is not None and not found.told:
+        return altered(settings, "camera", fixed_pattern=USUAL_PATTERN), None
     return altered(settings, "camera", fixed_pattern=0.0 if found is None else found.deviation), found
 
 

@@ -52,7 +52,7 @@ class CameraSettings:
     fixed_pattern
         Standard deviation of the offsets that pixels of frames keep from frame to frame, white = 1: the images have
         them, too, and their variance counts them (docs/equations.md, K11). None: an estimate from the recording
-        (`kalux.calibration.fixed_pattern`), 0 where it does not tell.
+        (`kalux.calibration.fixed_pattern`), 0.005 where it cannot tell; 0 in a live stream.
     confidence
         1 / sigma_im^2 of equation (6) as the paper uses it, a rate in 1/s: 7e5 (DAVIS), 7e7 (FLIR). For
         augmentation "paper" only.

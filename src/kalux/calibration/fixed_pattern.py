@@ -37,6 +37,10 @@ _WHITE: Final = 1 + 1 / 8  # variance of white noise, and of what a pixel of it 
 _BELIEVED: Final = 6.0
 """Standard errors: 47 simulated scenes without a pattern say at most 4.3, with 0.005 at least 14."""
 
+USUAL_PATTERN: Final = 0.005
+"""Deviation where a recording cannot tell: half a percent, as of DAVIS sensors (0.002 of slider_depth's, 0.008 of
+newton's, 0.009 of street's)."""
+
 _MOST_FRAMES: Final = 32  # evenly among the first: more pairs say little more
 _LEAST_PARTS: Final = 8
 
@@ -49,12 +53,18 @@ class FixedPattern(NamedTuple):
     deviation
         Standard deviation of the pixels' offsets, white = 1; 0 where it cannot be told from none.
     variance, error
-        Its square as measured, which chance may make negative, and the standard error of that.
+        Its square as measured, which chance may make negative, and the standard error of that, infinite where too few
+        pixels change.
     """
 
     deviation: float
     variance: float
     error: float
+
+    @property
+    def told(self) -> bool:
+        """Whether there is one, or would have shown if it were the usual one."""
+        return self.deviation > 0 or self.variance + _BELIEVED * self.error < USUAL_PATTERN**2
 
 
 def estimate_fixed_pattern(recording: Recording, camera: CameraSettings) -> FixedPattern | None:
@@ -72,8 +82,7 @@ def estimate_fixed_pattern(recording: Recording, camera: CameraSettings) -> Fixe
     camera
         Response, saturation and frame noise.
 
-    Returns None where too few pixels change, and of cameras that have a curve or demosaic: these have processed what
-    the sensor gave.
+    Returns None of cameras that have a curve or demosaic: these have processed what the sensor gave.
 
     Raises
     ------
@@ -164,10 +173,10 @@ def _add_products(beyond, light, weight, apart, part, sums):  # type: ignore[no-
                     sums[part[i], 1] += both
 
 
-def _solved(sums: Array) -> FixedPattern | None:
+def _solved(sums: Array) -> FixedPattern:
     told = sums[sums[:, 1] > 0]
     if len(told) < _LEAST_PARTS:
-        return None
+        return FixedPattern(0.0, 0.0, np.inf)
     rest = told.sum(axis=0) - told
     variance = float(told[:, 0].sum() / told[:, 1].sum()) / _WHITE
     error = float(np.sqrt((len(told) - 1) * np.var(rest[:, 0] / rest[:, 1]))) / _WHITE
