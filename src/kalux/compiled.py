@@ -6,6 +6,7 @@ they take and return float32: a literal number would turn float32 arithmetic int
 
 from __future__ import annotations
 
+import gc
 import itertools
 import math
 from typing import Any, Final
@@ -13,7 +14,7 @@ from typing import Any, Final
 import numba as nb
 import numpy as np
 from llvmlite import ir
-from numba.core import cgutils, types
+from numba.core import cgutils, event, types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
@@ -23,6 +24,27 @@ from kalux.kernel_cache import check_variables
 from kalux.memory import PAGE
 
 check_variables()
+
+
+class _Compiling(event.Listener):
+    """Only young garbage is looked for while numba compiles: to look through all that it keeps takes it an eighth more."""
+
+    def __init__(self) -> None:
+        self._depth, self._usual = 0, gc.get_threshold()
+
+    def on_start(self, event: Any) -> None:  # under numba's lock, as all compiling
+        if self._depth == 0:
+            self._usual = gc.get_threshold()
+            gc.set_threshold(*self._usual[:2], 1000)
+        self._depth += 1
+
+    def on_end(self, event: Any) -> None:
+        self._depth -= 1
+        if self._depth == 0:
+            gc.set_threshold(*self._usual)
+
+
+event.register("numba:compile", _Compiling())  # type: ignore[no-untyped-call]
 
 MICROSECOND32: Final = np.float32(1e-6)
 """Seconds."""

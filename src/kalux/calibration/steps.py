@@ -360,21 +360,27 @@ def _something_happens(happened, usable):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _looked_at(counts, change, usable, chosen):  # type: ignore[no-untyped-def]
-    """Counts of the chosen pixels, and of their neighbours the mean counts and changes."""
+    """Counts of the chosen pixels, and of their neighbours the mean counts and changes.
+
+    One number at a time: of whole rows numba would compile, for 1.5 s, how it complains that they differ in size.
+    """
     width, size = counts.shape[1:]
     own, around = np.empty((len(chosen), size)), np.zeros((len(chosen), size))
     change_around = np.zeros(len(chosen))
     for n in range(len(chosen)):
         row, column = chosen[n] // width, chosen[n] % width
-        own[n] = counts[row, column]
+        for k in range(size):
+            own[n, k] = counts[row, column, k]
         total = 0.0
         for i in range(row - 1, row + 2):
             for j in range(column - 1, column + 2):
                 if usable[i, j] and not (i == row and j == column):
                     weight = 1.0 / (1.0 + ((change[i, j] - change[row, column]) / _ALIKE) ** 2)
-                    around[n] += weight * counts[i, j]
+                    for k in range(size):
+                        around[n, k] += weight * counts[i, j, k]
                     change_around[n] += weight * change[i, j]
                     total += weight
-        around[n] /= total
+        for k in range(size):
+            around[n, k] /= total
         change_around[n] /= total
     return own, around, change_around

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Generator, Sequence
 from typing import Any, Final
 
 from kalux.cli.terminal import error_line
@@ -49,3 +50,51 @@ def tell_of_compiling(*, quiet: bool = False, tell: Callable[[str], None] = erro
             pass
 
     event.register("numba:compile", Compiling())  # type: ignore[no-untyped-call]
+
+
+@contextlib.contextmanager
+def compiling_beside(parts: Sequence[str]) -> Generator[Callable[[], None], None, None]:
+    """Within it, where this process has to compile a loop, others compile what it will come to later.
+
+    numba compiles one loop at a time, whatever the number of threads. Processes start with the first loop that is not
+    kept: where all are, nothing is done. They leave nothing but numba's cache, so that no result depends on them, nor
+    on whether they come to an end. Those that are still running when the block is left are ended.
+
+    Parameters
+    ----------
+    parts
+        Of `kalux.cli.rehearsal`, for each of which there is a process.
+
+    Yields
+    ------
+    callable
+        Waits until the processes are done: to compile what they are compiling would be done twice.
+    """
+    from numba.core import event
+
+    running: list[subprocess.Popen[bytes]] = []
+    waiting = list(parts) if sys.executable else []
+
+    class Starting(event.Listener):
+        def on_start(self, event: Any) -> None:
+            while waiting:
+                # -P: what lies in the working folder is not imported in place of modules.
+                command = [sys.executable, "-P", "-m", "kalux.cli.rehearsal", waiting.pop()]
+                none = subprocess.DEVNULL
+                running.append(subprocess.Popen(command, stdin=none, stdout=none, stderr=none))
+
+        def on_end(self, event: Any) -> None:
+            pass
+
+    def wait() -> None:
+        for process in running:
+            process.wait()
+
+    try:
+        with event.install_listener("numba:compile", Starting()):
+            yield wait
+    finally:
+        waiting.clear()
+        for process in running:
+            process.terminate()
+            process.wait()

@@ -237,6 +237,7 @@ def read_out(
     levels : ndarray
         (N,) float32: L of the ``unshown`` pixels, after their neighbours are heard.
     """
+    height, width = log_intensity.shape
     unshown = np.empty(0, np.int64) if unshown is None else unshown
     heard = np.empty(len(unshown), np.float32)
     known = variance.astype(np.float32, copy=False)
@@ -253,6 +254,7 @@ def read_out(
         tuple(np.float32(value) for value in prior),
         np.float32(log_offset),
         unshown,
+        np.searchsorted(unshown, np.arange(height + 1) * width),
         out,
         total,
         heard,
@@ -308,6 +310,7 @@ def _read_out(  # type: ignore[no-untyped-def]
     prior,
     log_offset,
     unshown,
+    ends,
     out,
     total,
     heard,
@@ -328,7 +331,6 @@ def _read_out(  # type: ignore[no-untyped-def]
         np.empty(_STRIP, np.float32),
         np.empty(_STRIP, np.float32),
     )
-    ends = np.searchsorted(unshown, np.arange(height + 1) * width)
     met, met_by = ends[:-1].copy(), ends[1:]  # of every row, in strips from left to right
     for begin in range(0, width, _STRIP):
         end = min(begin + _STRIP, width)
