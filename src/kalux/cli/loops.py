@@ -81,7 +81,8 @@ def compiling_beside(parts: Sequence[str]) -> Generator[Callable[[], None], None
                 # -P: what lies in the working folder is not imported in place of modules.
                 command = [sys.executable, "-P", "-m", "kalux.cli.rehearsal", waiting.pop()]
                 none = subprocess.DEVNULL
-                running.append(subprocess.Popen(command, stdin=none, stdout=none, stderr=none))
+                with contextlib.suppress(OSError):  # no room for another process: all is compiled in this one
+                    running.append(subprocess.Popen(command, stdin=none, stdout=none, stderr=none))
 
         def on_end(self, event: Any) -> None:
             pass
