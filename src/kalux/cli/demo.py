@@ -8,7 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from kalux.cli.loops import tell_of_compiling
+from kalux.ahead import default_threads
+from kalux.cli.loops import compiling_beside, tell_of_compiling
 from kalux.cli.parser import Parser
 from kalux.cli.terminal import say
 
@@ -50,7 +51,9 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     tell_of_compiling()
     started = time.monotonic()
     try:
-        found = run_demo(options.out, overwrite=options.overwrite, say=say)
+        # These are done before the demo comes to them.
+        with compiling_beside(["images", "filter"][: default_threads() - 1]):
+            found = run_demo(options.out, overwrite=options.overwrite, say=say)
     except KeyboardInterrupt as interrupt:
         interrupt.add_note(f"what is in {options.out} is whole; kalux demo --overwrite makes the rest")
         raise
