@@ -268,14 +268,15 @@ def _add(points: _Points, level: Array, difference: Array, chosen: NDArray[np.bo
 def _in_bins(level, difference, kept):  # type: ignore[no-untyped-def]
     """Differences of the pixels that are kept, one bin of the level after the other; sum of the levels, and limits."""
     index = np.empty(len(kept), np.uint8)
-    sums, counts = np.zeros(_BINS), np.zeros(_BINS + 1, np.int64)
+    sums, stops = np.zeros(_BINS), np.zeros(_BINS + 1, np.int64)
     for i in range(len(kept)):
         value = level[kept[i]]
         k = min(int(value * _BINS), _BINS - 1)
         index[i] = k
         sums[k] += value
-        counts[k + 1] += 1
-    stops = np.cumsum(counts)
+        stops[k + 1] += 1
+    for k in range(_BINS):
+        stops[k + 1] += stops[k]
     ordered, free = np.empty(len(kept)), stops.copy()
     for i in range(len(kept)):
         ordered[free[index[i]]] = difference[kept[i]]

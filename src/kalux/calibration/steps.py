@@ -360,7 +360,10 @@ def _something_happens(happened, usable):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _looked_at(counts, change, usable, chosen):  # type: ignore[no-untyped-def]
-    """Counts of the chosen pixels, and of their neighbours the mean counts and changes."""
+    """Counts of the chosen pixels, and of their neighbours the mean counts and changes.
+
+    One number at a time: of whole rows numba would compile, for 1.5 s, how it complains that they differ in size.
+    """
     width, size = counts.shape[1:]
     own, around = np.empty((len(chosen), size)), np.zeros((len(chosen), size))
     change_around = np.zeros(len(chosen))

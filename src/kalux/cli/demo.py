@@ -8,7 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from kalux.cli.loops import tell_of_compiling
+from kalux.ahead import default_threads
+from kalux.cli.loops import compiling_beside, prepare_loops, tell_of_compiling
 from kalux.cli.parser import Parser
 from kalux.cli.terminal import say
 
@@ -47,10 +48,13 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     """Run the command."""
     from kalux.demo import run_demo
 
+    prepare_loops()
     tell_of_compiling()
     started = time.monotonic()
     try:
-        found = run_demo(options.out, overwrite=options.overwrite, say=say)
+        # These are done before the demo comes to them.
+        with compiling_beside(["images", "filter"][: default_threads() - 1]):
+            found = run_demo(options.out, overwrite=options.overwrite, say=say)
     except KeyboardInterrupt as interrupt:
         if options.out.is_dir() and any(options.out.iterdir()):
             interrupt.add_note(f"what is in {options.out} is whole; kalux demo --overwrite makes the rest")

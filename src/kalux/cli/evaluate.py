@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from kalux.cli.calibrations import add_calibration, given_calibration
 from kalux.cli.checking import check_recording
-from kalux.cli.loops import tell_of_compiling
+from kalux.cli.loops import prepare_loops, tell_of_compiling
 from kalux.cli.metrics import add_metrics, lpips_weights, named_methods
 from kalux.cli.parser import Parser, UsageError, whole
 from kalux.cli.recordings import add_recording, open_recording
@@ -102,6 +102,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     if options.clip and options.truth is not None:
         raise UsageError("--clip is for held-out frames, which clip; ground truth does not")
     require_dependencies()
+    prepare_loops()
     tell_of_compiling(quiet=options.quiet)
     recording = open_recording(options)
     with Progress("checking", quiet=options.quiet) as progress:

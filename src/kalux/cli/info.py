@@ -6,7 +6,7 @@ import argparse
 from typing import TYPE_CHECKING, Any
 
 from kalux.cli.calibrations import add_calibration, calibration_lines, given_calibration
-from kalux.cli.loops import tell_of_compiling
+from kalux.cli.loops import prepare_loops, tell_of_compiling
 from kalux.cli.parser import Parser
 from kalux.cli.recordings import add_recording, open_recording
 from kalux.cli.terminal import say
@@ -48,6 +48,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     from kalux.info import describe, format_description
 
     settings = preset(options.preset)
+    prepare_loops()
     tell_of_compiling()
     recording = open_recording(options)
     calibration = given_calibration(options)

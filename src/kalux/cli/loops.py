@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import functools
+import gc
 import importlib
+import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Generator, Sequence
 from typing import Any, Final
 
 from kalux.cli.terminal import error_line
@@ -14,12 +17,40 @@ _BLAS: Final = "scipy.linalg.cython_blas"
 
 
 def prepare_loops() -> None:
-    """Import what numba needs for any loop, without what it needs for products of matrices, which kalux's have none of.
+    """Have numba begin, and compile, without what takes it long and is for nothing here.
 
-    numba imports SciPy's BLAS only to see whether it is there: 0.1 s of the 0.3 that its first loop waits for. Must be
-    called before there are threads, which might import SciPy meanwhile. Where SciPy is imported already, or numba is
-    laid out otherwise, nothing is gained and nothing lost.
+    It imports SciPy's BLAS only to see whether it is there, for products of matrices, which kalux's loops have none of:
+    0.1 s of the 0.3 that its first loop waits for. And while it compiles only young garbage is looked for: looking
+    through all that it keeps takes an eighth more. Must be called before there are threads, which might import SciPy
+    meanwhile. Where SciPy is imported already, or numba is laid out otherwise, nothing is gained and nothing lost.
     """
+    _import_without_blas()
+    _look_for_young_garbage_only()
+
+
+@functools.cache  # once
+def _look_for_young_garbage_only() -> None:
+    from numba.core import event
+
+    class Compiling(event.Listener):
+        def __init__(self) -> None:
+            self.depth, self.usual = 0, gc.get_threshold()
+
+        def on_start(self, event: Any) -> None:  # under numba's lock, as all compiling
+            if self.depth == 0:
+                self.usual = gc.get_threshold()
+                gc.set_threshold(*self.usual[:2], 1000)
+            self.depth += 1
+
+        def on_end(self, event: Any) -> None:
+            self.depth -= 1
+            if self.depth == 0:
+                gc.set_threshold(*self.usual)
+
+    event.register("numba:compile", Compiling())  # type: ignore[no-untyped-call]
+
+
+def _import_without_blas() -> None:
     if _BLAS in sys.modules:
         return
     sys.modules[_BLAS] = None  # type: ignore[assignment]  # who asks for it is told that it is not there
@@ -49,3 +80,52 @@ def tell_of_compiling(*, quiet: bool = False, tell: Callable[[str], None] = erro
             pass
 
     event.register("numba:compile", Compiling())  # type: ignore[no-untyped-call]
+
+
+@contextlib.contextmanager
+def compiling_beside(parts: Sequence[str]) -> Generator[Callable[[], None], None, None]:
+    """Within it, where this process has to compile a loop, others compile what it will come to later.
+
+    numba compiles one loop at a time, whatever the number of threads. Processes start with the first loop that is not
+    kept: where all are, nothing is done. They leave nothing but numba's cache, so that no result depends on them, nor
+    on whether they come to an end. Those that are still running when the block is left are ended.
+
+    Parameters
+    ----------
+    parts
+        Of `kalux.cli.rehearsal`, for each of which there is a process.
+
+    Yields
+    ------
+    callable
+        Waits until the processes are done: to compile what they are compiling would be done twice.
+    """
+    from numba.core import event
+
+    running: list[subprocess.Popen[bytes]] = []
+    waiting = list(parts) if sys.executable else []
+
+    class Starting(event.Listener):
+        def on_start(self, event: Any) -> None:
+            while waiting:
+                # -P: what lies in the working folder is not imported in place of modules.
+                command = [sys.executable, "-P", "-m", "kalux.cli.rehearsal", waiting.pop()]
+                none = subprocess.DEVNULL
+                with contextlib.suppress(OSError):  # no room for another process: all is compiled in this one
+                    running.append(subprocess.Popen(command, stdin=none, stdout=none, stderr=none))
+
+        def on_end(self, event: Any) -> None:
+            pass
+
+    def wait() -> None:
+        for process in running:
+            process.wait()
+
+    try:
+        with event.install_listener("numba:compile", Starting()):
+            yield wait
+    finally:
+        waiting.clear()
+        for process in running:
+            process.terminate()
+            process.wait()

@@ -17,7 +17,7 @@ from kalux.ahead import default_threads
 from kalux.cli.calibrations import add_calibration, given_calibration
 from kalux.cli.checking import Contents, check_beside
 from kalux.cli.flags import HelpSettings, add_display, add_settings, given_settings
-from kalux.cli.loops import prepare_loops, tell_of_compiling
+from kalux.cli.loops import compiling_beside, prepare_loops, tell_of_compiling
 from kalux.cli.output import DEFAULT_RATE, FOLDER_FORMATS, Output, check_output, chosen_output, image_rate
 from kalux.cli.parser import Parser, UsageError, number, whole
 from kalux.cli.progress import Progress, short_number
@@ -159,38 +159,46 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     times = None if options.times is None else load_times(options.times)
     prepare_loops()
     tell_of_compiling(quiet=options.quiet)
-    recording = open_recording(options)
     threads = options.threads or default_threads()
-    with Progress("checking", quiet=options.quiet) as progress:
-        contents, made = check_beside(
-            recording,
-            lambda count: progress.add(events=count),
-            lambda: make_plan(recording, settings, times, options),
-            threads,
+    with compiling_beside(_compiled_later(settings)[: threads - 1]) as compiled:
+        recording = open_recording(options)
+        with Progress("checking", quiet=options.quiet) as progress:
+            contents, made = check_beside(
+                recording,
+                lambda count: progress.add(events=count),
+                lambda: make_plan(recording, settings, times, options),
+                threads,
+            )
+        for text in contents.warnings():
+            warn(text)
+        made = part_of(made, contents, options)
+        gap = gap_warning(made, contents)
+        if gap is not None:
+            warn(gap)
+        if made.threshold_origin in ("estimate", "assumed"):
+            warn(threshold_warning(made, options.preset))
+        if made.threshold_origin == "assumed" and made.estimate is not None and contradicts(made.estimate):
+            warn(
+                "the events do not explain how the frames change; if much moves, do both have the same clock (kalux "
+                "calibrate offset REC finds out), and is polarity 1 brighter?"
+            )
+        if not options.quiet:
+            say("\n".join(decided(recording, contents, made, settings, output, options)))
+        compiled()
+        seconds, images = write_images(
+            recording, made, output, metadata(recording, made, options, command), options
         )
-    for text in contents.warnings():
-        warn(text)
-    made = part_of(made, contents, options)
-    gap = gap_warning(made, contents)
-    if gap is not None:
-        warn(gap)
-    if made.threshold_origin in ("estimate", "assumed"):
-        warn(threshold_warning(made, options.preset))
-    if made.threshold_origin == "assumed" and made.estimate is not None and contradicts(made.estimate):
-        warn(
-            "the events do not explain how the frames change; if much moves, do both have the same clock (kalux "
-            "calibrate offset REC finds out), and is polarity 1 brighter?"
-        )
-    if not options.quiet:
-        say("\n".join(decided(recording, contents, made, settings, output, options)))
-    seconds, images = write_images(
-        recording, made, output, metadata(recording, made, options, command), options
-    )
-    if not options.quiet:
-        say(
-            f"wrote       {how_many(images, 'image')} to {output.path} in {seconds:.1f} s "
-            f"({short_number(images / seconds)} images/s), settings in {output.settings_path}"
-        )
+        if not options.quiet:
+            say(
+                f"wrote       {how_many(images, 'image')} to {output.path} in {seconds:.1f} s "
+                f"({short_number(images / seconds)} images/s), settings in {output.settings_path}"
+            )
+
+
+def _compiled_later(settings: Settings) -> list[str]:
+    """Parts of `kalux.cli.rehearsal` that a reconstruction comes to after the estimates; the longest first."""
+    is_default = settings.filter.kind == "akf" and settings.filter.augmentation == "bridge"
+    return ["images", "filter"] if is_default else ["images"]
 
 
 def _check_apart(output: Output, recording: Path) -> None:

@@ -262,7 +262,8 @@ def _grown(buffer: Buffer) -> Buffer:
     """The buffer with twice its room."""
     n = len(buffer.t)
     t, pixel, p = np.empty(2 * n), np.empty(2 * n, np.int64), np.empty(2 * n, np.bool_)
-    t[:n], pixel[:n], p[:n] = buffer.t, buffer.pixel, buffer.p
+    for i in range(n):  # of whole arrays, how numba complains of their sizes would take 2 s to compile
+        t[i], pixel[i], p[i] = buffer.t[i], buffer.pixel[i], buffer.p[i]
     return Buffer(t, pixel, p)
 
 

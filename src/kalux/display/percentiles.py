@@ -37,7 +37,8 @@ def percentiles(values: Float32, percents: list[float]) -> Statistics:
     positions = [percent / 100 * (values.size - 1) for percent in percents]
     ranks = [rank for position in positions for rank in (math.floor(position), math.ceil(position))]
     # Few numbers are left to be put in order: those that share their first bits with one that is looked for.
-    places, count = _narrowed(values.view(np.int32), np.array(ranks), bits)
+    order = sorted(range(len(ranks)), key=ranks.__getitem__)
+    places, count = _narrowed(values.view(np.int32), np.array(ranks), np.array(order), bits)
     ordered = np.partition(bits[:count], places)[places].view(np.float32).tolist()
     found = [
         low + (position - math.floor(position)) * (high - low)
@@ -47,8 +48,10 @@ def percentiles(values: Float32, percents: list[float]) -> Statistics:
 
 
 @nb.njit(cache=True, nogil=True)
-def _narrowed(rows, ranks, bits):  # type: ignore[no-untyped-def]
+def _narrowed(rows, ranks, order, bits):  # type: ignore[no-untyped-def]
     """The numbers among which those of some ranks are, in ``bits``, with room for one more; their places, and how many.
+
+    ``order`` is that of the ranks, from the lowest to the highest.
 
     Numbers are compared by their bits: as float32 that are not negative, they are in the same order.
     """
@@ -63,11 +66,11 @@ def _narrowed(rows, ranks, bits):  # type: ignore[no-untyped-def]
             bits[at] = value
             counts[at & np.uint64(3), np.uint64(value) >> np.uint64(_COARSE_BITS)] += 1
             at += np.uint64(1)
-    total = counts[0] + counts[1] + counts[2] + counts[3]
+    total = counts[0]
+    for i in range(len(total)):
+        total[i] += counts[1, i] + counts[2, i] + counts[3, i]
     wanted = np.zeros(len(total), np.uint8)
     places = np.empty(len(ranks), np.int64)
-    # From the lowest rank to the highest.
-    order = np.argsort(ranks)
     below, kept, part = np.int64(0), np.int64(0), 0
     for k in order:
         while below + total[part] <= ranks[k]:

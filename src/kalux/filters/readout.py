@@ -8,7 +8,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.compiled import FUSED, ONE, exponential, logarithm
+from kalux.compiled import FUSED, ONE, WITHIN, exponential, logarithm
 
 Array = NDArray[np.floating[Any]]
 
@@ -237,6 +237,7 @@ def read_out(
     levels : ndarray
         (N,) float32: L of the ``unshown`` pixels, after their neighbours are heard.
     """
+    height, width = log_intensity.shape
     unshown = np.empty(0, np.int64) if unshown is None else unshown
     heard = np.empty(len(unshown), np.float32)
     known = variance.astype(np.float32, copy=False)
@@ -253,6 +254,7 @@ def read_out(
         tuple(np.float32(value) for value in prior),
         np.float32(log_offset),
         unshown,
+        np.searchsorted(unshown, np.arange(height + 1) * width),
         out,
         total,
         heard,
@@ -260,7 +262,7 @@ def read_out(
     return out, known if with_variance and moving is None else total, heard
 
 
-@nb.njit(cache=True)
+@nb.njit(cache=True, **WITHIN)
 def _ring(pitch):  # type: ignore[no-untyped-def]
     # A row's neighbours, and the patches around them, lie in rows to twice the pitch ahead and one behind; the rows
     # that need what is made of them, in one more ahead.
@@ -277,7 +279,7 @@ def _ring(pitch):  # type: ignore[no-untyped-def]
     )
 
 
-@nb.njit(cache=True)
+@nb.njit(cache=True, **WITHIN)
 def _lines(rows):  # type: ignore[no-untyped-def]
     """Memory for some rows, which begin where lines of the cache do. One piece for all would not become vector code."""
     memory = np.empty(rows * _ROW + _VECTOR, np.float32)
@@ -308,6 +310,7 @@ def _read_out(  # type: ignore[no-untyped-def]
     prior,
     log_offset,
     unshown,
+    ends,
     out,
     total,
     heard,
@@ -328,7 +331,6 @@ def _read_out(  # type: ignore[no-untyped-def]
         np.empty(_STRIP, np.float32),
         np.empty(_STRIP, np.float32),
     )
-    ends = np.searchsorted(unshown, np.arange(height + 1) * width)
     met, met_by = ends[:-1].copy(), ends[1:]  # of every row, in strips from left to right
     for begin in range(0, width, _STRIP):
         end = min(begin + _STRIP, width)
@@ -395,7 +397,7 @@ def _any(words, first, count):  # type: ignore[no-untyped-def]
     return found != np.uint64(0)
 
 
-@nb.njit(cache=True)
+@nb.njit(cache=True, **WITHIN)
 def _clear(ring):  # type: ignore[no-untyped-def]
     """Before the first row of a strip: nothing is known, nothing is alike, nobody hears."""
     for place in range(len(ring.spans)):
@@ -433,7 +435,7 @@ def _take_row(  # type: ignore[no-untyped-def]
         known[into + _DOUBT + i] = doubt if doubt < _NOTHING else _NOTHING
 
 
-@nb.njit(cache=True)
+@nb.njit(cache=True, **WITHIN)
 def _mark_hearing(moving, row, begin, hears, spans):  # type: ignore[no-untyped-def]
     """Which pixels of a row hear their neighbours, and from which block of columns to which; none outside the image."""
     place = np.uint64(row % len(spans))
@@ -449,7 +451,7 @@ def _mark_hearing(moving, row, begin, hears, spans):  # type: ignore[no-untyped-
     spans[place, 0], spans[place, 1] = first, last
 
 
-@nb.njit(cache=True, error_model="numpy", fastmath=FUSED)
+@nb.njit(cache=True, error_model="numpy", fastmath=FUSED, **WITHIN)
 def _compare(  # type: ignore[no-untyped-def]
     row, first, last, allowed, pitch, known, least, unlike, alike, single
 ):
@@ -515,7 +517,7 @@ def _compare(  # type: ignore[no-untyped-def]
         alike[own + three + i] = _squared(of_cd * c)
 
 
-@nb.njit(cache=True, error_model="numpy", fastmath=FUSED)
+@nb.njit(cache=True, error_model="numpy", fastmath=FUSED, **WITHIN)
 def _hear_neighbours(  # type: ignore[no-untyped-def]
     row, first, last, pitch, known, least, alike, hears, heard, level
 ):
@@ -563,7 +565,7 @@ def _hear_neighbours(  # type: ignore[no-untyped-def]
         level[column + i] = together if hears[here, column + i] else alone
 
 
-@nb.njit(cache=True)
+@nb.njit(cache=True, **WITHIN)
 def _lessen(row, first, last, ring, left):  # type: ignore[no-untyped-def]
     """The variances of a row, ``left``, where pixels have heard their neighbours."""
     here, column, two = np.uint64(row % len(ring.spans)), np.uint64(first), np.uint64(_ROW + _MARGIN + first)
