@@ -61,7 +61,7 @@ def rehearse_images() -> None:
         final=True,
         moving=level > 0.0,
         silent_change=np.abs(level),
-        unshown=Unshown(some, ones, ones),
+        unshown=Unshown(some, ones, ones, ones),
         unmeasured=some,
     )
     view = View(0.02, 0.04, 0.1, 1.0, 0.3, 1.0, 0.0, None, (1.0, 1.0, 1.0))
