@@ -75,9 +75,10 @@ def test_a_red_wall_is_red(mosaic):
 def test_the_mosaic_is_filtered_like_a_grey_recording():
     """Intensity and variance of a mosaic are those of the same pixels without colour; colour is added to them.
 
-    But for what neighbours know: in a mosaic those of the same colour are two pixels away.
+    But for what neighbours know, and what the frames tell of the sensor's pattern: in a mosaic those of the same colour
+    are two pixels away.
     """
-    alone = altered(PRESETS["default"], "filter", neighbours=0.0)
+    alone = altered(altered(PRESETS["default"], "filter", neighbours=0.0), "camera", fixed_pattern=0.0)
     _, made = colour_blocks("RGGB")
     grey = Recording.from_arrays(
         made.events,

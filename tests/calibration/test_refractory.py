@@ -78,11 +78,12 @@ def simulated(**sensor):
 
 
 def random_intervals(draw):
-    """Of 100 pixels 2000 intervals each, drawn by a function of a random generator and their number."""
-    t = np.cumsum(draw(np.random.default_rng(1), (100, 2_000)), axis=1).astype(np.int64)
+    """Of 100 pixels 2000 intervals each, drawn by a function of a random generator and their number; noise."""
+    rng = np.random.default_rng(1)
+    t = np.cumsum(draw(rng, (100, 2_000)), axis=1).astype(np.int64)
     pixel = np.broadcast_to(np.arange(100)[:, None], t.shape).ravel()
     order = np.argsort(t.ravel(), kind="stable")
-    events = make_events(t.ravel()[order], pixel[order] % 10, pixel[order] // 10, np.ones(t.size, bool))
+    events = make_events(t.ravel()[order], pixel[order] % 10, pixel[order] // 10, rng.random(t.size) < 0.5)
     return Recording.from_arrays(events, [], sensor_size=(10, 10))
 
 
@@ -112,3 +113,13 @@ def test_how_long_pixels_are_blind_does_not_depend_on_chunks(most_events):
 )
 def test_other_shortest_intervals_are_no_blindness(draw):
     assert dead_time(random_intervals(draw)) == 0
+
+
+def test_edges_that_are_all_alike_are_no_noise():
+    """Of one speed and contrast: their intervals are, too, and of one polarity."""
+    recording = random_intervals(lambda rng, shape: 800 + rng.exponential(5_000, shape))
+    events = np.concatenate(list(recording.events()))
+    alike = events.copy()
+    alike["p"] = True
+    assert dead_time(recording) == pytest.approx(800, rel=0.02)
+    assert dead_time(Recording.from_arrays(alike, [], sensor_size=(10, 10))) == 0
