@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from itertools import pairwise
 from typing import Any, Final, NamedTuple
 
@@ -86,16 +87,9 @@ def intervals(recording: Recording, most_events: int = 3_000_000) -> Intervals:
     which follow the others at any time. Of the first ``most_events``, and the first 200 of each pixel, so that hot
     pixels, which keep no period that others have, do not decide.
     """
-    last = np.full(recording.sensor_size, NEVER, np.int64)
-    seen = np.zeros(recording.sensor_size, np.int32)
     histogram = np.zeros(len(_EDGE_BINS) - 1, np.int64)
-    count = 0
-    for chunk in recording.events():
-        part = chunk[: most_events - count]
-        histogram += np.histogram(_intervals_of(part["t"], part["x"], part["y"], last, seen), _EDGE_BINS)[0]
-        count += len(part)
-        if count >= most_events:
-            break
+    for found, _ in _of_first_events(recording, most_events):
+        histogram += np.histogram(found, _EDGE_BINS)[0]
     if not histogram.any():
         return Intervals(0, pile_up=False)
     coarse = histogram.reshape(-1, _FINE).sum(1)
@@ -110,18 +104,14 @@ def dead_time(recording: Recording) -> int:
     Events of noise come at any time, but for the refractory period of the event before them: where there are enough of
     them, intervals set in at its end, all at once. Of the first two million events, and the first 200 of each pixel.
     """
-    last = np.full(recording.sensor_size, NEVER, np.int64)
-    seen = np.zeros(recording.sensor_size, np.int32)
-    count = np.zeros((2, 2 * int(_DEAD_TIMES[-1])), np.int64)
-    read = 0
-    for chunk in recording.events():
-        part = chunk[: _DEAD_EVENTS - read]
-        _count_intervals(part["t"], part["x"], part["y"], part["p"], last, seen, count)
-        read += len(part)
-        if read >= _DEAD_EVENTS:
-            break
-    same, turning = np.cumsum(np.pad(count, ((0, 0), (1, 0))), axis=1)
-    return _onset(same + turning, turning)
+    longest = 2 * int(_DEAD_TIMES[-1])
+    count = np.zeros((2, longest), np.int64)
+    for found, turning in _of_first_events(recording, _DEAD_EVENTS):
+        short = found < longest
+        for row, chosen in zip(count, (short & ~turning, short & turning), strict=True):
+            row += np.bincount(found[chosen], minlength=longest)
+    going_on, turned = np.cumsum(np.pad(count, ((0, 0), (1, 0))), axis=1)
+    return _onset(going_on + turned, turned)
 
 
 def _onset(shorter: NDArray[np.int64], turning: NDArray[np.int64]) -> int:
@@ -173,29 +163,30 @@ def possible_periods(shortest: int) -> tuple[int, ...]:
     return (0, *sorted({round(share * shortest) for share in _TRIED} - {0}))
 
 
+def _of_first_events(recording: Recording, most_events: int) -> Iterator[tuple[NDArray[Any], NDArray[Any]]]:
+    """Of chunks of the first events: intervals, us, and whether both events of each differ in polarity."""
+    last = np.full(recording.sensor_size, NEVER, np.int64)
+    seen = np.zeros(recording.sensor_size, np.int32)
+    read = 0
+    for chunk in recording.events():
+        part = chunk[: most_events - read]
+        yield _intervals_of(part["t"], part["x"], part["y"], part["p"], last, seen)
+        read += len(part)
+        if read >= most_events:
+            break
+
+
 @nb.njit(cache=True, nogil=True)
-def _intervals_of(t, x, y, last, seen):  # type: ignore[no-untyped-def]
-    found = np.empty(len(t), np.int64)
+def _intervals_of(t, x, y, p, last, seen):  # type: ignore[no-untyped-def]
+    """``last`` is twice the time of a pixel's latest event, plus 1 if it was on."""
+    found, turning = np.empty(len(t), np.int64), np.empty(len(t), np.bool_)
     n = 0
     for i in range(len(t)):
-        before = last[y[i], x[i]]
+        code, before = t[i] * 2 + p[i], last[y[i], x[i]]
         if before != NEVER and seen[y[i], x[i]] < _MOST_OF_PIXEL:
-            found[n] = t[i] - before
+            found[n] = t[i] - (before >> 1)
+            turning[n] = (code ^ before) & 1
             n += 1
             seen[y[i], x[i]] += 1
-        last[y[i], x[i]] = t[i]
-    return found[:n]
-
-
-@nb.njit(cache=True, nogil=True)
-def _count_intervals(t, x, y, p, last, seen, count):  # type: ignore[no-untyped-def]
-    """Add intervals to ``count``, (2, N): of every length, us, between events of one polarity, and of both."""
-    for i in range(len(t)):
-        code = t[i] * 2 + p[i]
-        before = last[y[i], x[i]]
-        if before != NEVER and seen[y[i], x[i]] < _MOST_OF_PIXEL:
-            interval = t[i] - (before >> 1)
-            if interval < count.shape[1]:
-                count[(code ^ before) & 1, interval] += 1
-            seen[y[i], x[i]] += 1
         last[y[i], x[i]] = code
+    return found[:n], turning[:n]

@@ -32,22 +32,36 @@ def prepare_loops() -> None:
 def _look_for_young_garbage_only() -> None:
     from numba.core import event
 
-    class Compiling(event.Listener):
-        def __init__(self) -> None:
-            self.depth, self.usual = 0, gc.get_threshold()
+    depth, usual = 0, gc.get_threshold()
 
-        def on_start(self, event: Any) -> None:  # under numba's lock, as all compiling
-            if self.depth == 0:
-                self.usual = gc.get_threshold()
-                gc.set_threshold(*self.usual[:2], 1000)
-            self.depth += 1
+    def begin() -> None:  # under numba's lock, as all compiling
+        nonlocal depth, usual
+        if depth == 0:
+            usual = gc.get_threshold()
+            gc.set_threshold(*usual[:2], 1000)
+        depth += 1
+
+    def end() -> None:
+        nonlocal depth
+        depth -= 1
+        if depth == 0:
+            gc.set_threshold(*usual)
+
+    event.register("numba:compile", _listener(begin, end))  # type: ignore[no-untyped-call]
+
+
+def _listener(begin: Callable[[], None], end: Callable[[], None] = lambda: None) -> Any:
+    """What numba tells when it begins and ends to compile a loop."""
+    from numba.core import event
+
+    class Listener(event.Listener):
+        def on_start(self, event: Any) -> None:
+            begin()
 
         def on_end(self, event: Any) -> None:
-            self.depth -= 1
-            if self.depth == 0:
-                gc.set_threshold(*self.usual)
+            end()
 
-    event.register("numba:compile", Compiling())  # type: ignore[no-untyped-call]
+    return Listener()
 
 
 def _import_without_blas() -> None:
@@ -67,19 +81,15 @@ def tell_of_compiling(*, quiet: bool = False, tell: Callable[[str], None] = erro
         return
     from numba.core import event
 
-    class Compiling(event.Listener):
-        def __init__(self) -> None:
-            self.told = False
+    told = False
 
-        def on_start(self, event: Any) -> None:
-            if not self.told:
-                self.told = True
-                tell("compiling what is used for the first time: up to a minute; later runs need not")
+    def begin() -> None:
+        nonlocal told
+        if not told:
+            told = True
+            tell("compiling what is used for the first time: up to a minute; later runs need not")
 
-        def on_end(self, event: Any) -> None:
-            pass
-
-    event.register("numba:compile", Compiling())  # type: ignore[no-untyped-call]
+    event.register("numba:compile", _listener(begin))  # type: ignore[no-untyped-call]
 
 
 @contextlib.contextmanager
@@ -105,24 +115,20 @@ def compiling_beside(parts: Sequence[str]) -> Generator[Callable[[], None], None
     running: list[subprocess.Popen[bytes]] = []
     waiting = list(parts) if sys.executable else []
 
-    class Starting(event.Listener):
-        def on_start(self, event: Any) -> None:
-            while waiting:
-                # -P: what lies in the working folder is not imported in place of modules.
-                command = [sys.executable, "-P", "-m", "kalux.cli.rehearsal", waiting.pop()]
-                none = subprocess.DEVNULL
-                with contextlib.suppress(OSError):  # no room for another process: all is compiled in this one
-                    running.append(subprocess.Popen(command, stdin=none, stdout=none, stderr=none))
-
-        def on_end(self, event: Any) -> None:
-            pass
+    def begin() -> None:
+        while waiting:
+            # -P: what lies in the working folder is not imported in place of modules.
+            command = [sys.executable, "-P", "-m", "kalux.cli.rehearsal", waiting.pop()]
+            none = subprocess.DEVNULL
+            with contextlib.suppress(OSError):  # no room for another process: all is compiled in this one
+                running.append(subprocess.Popen(command, stdin=none, stdout=none, stderr=none))
 
     def wait() -> None:
         for process in running:
             process.wait()
 
     try:
-        with event.install_listener("numba:compile", Starting()):
+        with event.install_listener("numba:compile", _listener(begin)):
             yield wait
     finally:
         waiting.clear()
