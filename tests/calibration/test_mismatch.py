@@ -29,12 +29,12 @@ def scene(seed=0, flat=0.0):
     return photograph_scene(0.02 * 40**share, pan(80), sensor_size=(44, 60), duration=900_000)
 
 
-def found(spread, **sensor):
+def found(spread, exposure=1_000, **sensor):
     settings = SensorSettings(
         threshold_on=0.2,
         threshold_off=0.2,
         log_offset=0.02,
-        exposure=1_000,
+        exposure=exposure,
         threshold_mismatch=spread,
         **sensor,
     )
@@ -47,6 +47,11 @@ def test_the_spread_is_found(spread):
     assert np.sqrt(max(estimate.variance, 0.0)) == pytest.approx(spread, rel=0.2, abs=0.05)
     assert estimate.error < 0.002
     assert SPREADS[0] <= estimate.spread <= SPREADS[1]
+
+
+def test_blur_is_not_taken_for_it():
+    """The camera moves by two to three pixels within an exposure: taken as it is, 0.05 would be found as 0.11."""
+    assert np.sqrt(found(0.05, exposure=30_000).variance) == pytest.approx(0.05, abs=0.02)
 
 
 def test_noise_that_is_new_in_each_interval_is_not_taken_for_it():

@@ -16,22 +16,22 @@ CAMERA = CameraSettings(log_offset=0.004, response="linear")
 SIZE = (12, 16)
 
 
-def swinging(hertz, refractory=0.0):
+def swinging(hertz, refractory=0.0, exposure=5_000):
     """Pixels whose light swings by a factor of 5 either way, each at its own time; thresholds 0.2 / 0.25."""
     phase = np.random.default_rng(0).uniform(0, 2 * np.pi, SIZE)
 
     def radiance(t):
         return 0.3 * np.exp(0.8 * np.sin(2 * np.pi * hertz * t * 1e-6 + phase))
 
-    sensor = SensorSettings(threshold_on=0.2, threshold_off=0.25, exposure=5_000, refractory=refractory)
+    sensor = SensorSettings(threshold_on=0.2, threshold_off=0.25, exposure=exposure, refractory=refractory)
     return unlabelled(simulate(Scene(radiance, SIZE, 0, 1_000_000), sensor, seed=1))
 
 
 def told(recording, period=0):
     """By pixels: the change that frames show, and what events say of it."""
-    (found,) = steps(recording, CAMERA, delays=(0,), periods=(period,), late=np.inf)
+    (found,) = steps(recording, CAMERA, delays=(0,), periods=(period,), late=np.inf, thresholds=(0.2, 0.25))
     on, off = found.events.sum(axis=(1, 2)).T
-    return found.change, (0.2 * on - 0.25 * off) * found.level / (found.level + 0.004)
+    return found.change, (0.2 * on - 0.25 * off) * found.share
 
 
 @pytest.mark.parametrize("hertz", [2.0, 6.0])
@@ -41,6 +41,15 @@ def test_events_say_what_frames_show(hertz):
     assert len(change) > 500
     assert np.std(change - said) < 0.09
     assert (said @ change) / (change @ change) == pytest.approx(1.0, abs=0.03)
+
+
+def test_long_exposures_bend():
+    """A frame shows more than the mean of the logarithm where the light swings by a factor of 5 within its exposure."""
+    recording = swinging(8.0, exposure=30_000)
+    change, said = told(recording)
+    (bent,) = steps(recording, CAMERA, delays=(0,), periods=(0,), late=np.inf)
+    assert np.std(change - said) < 0.08
+    assert np.std(bent.change - said) > 1.3 * np.std(change - said)
 
 
 def test_what_is_lost_is_made_up_for():

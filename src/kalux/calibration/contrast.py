@@ -167,8 +167,14 @@ def estimate_thresholds(
         If the frames' exposures are not known.
     """
     shortest = 0 if refractory_period is not None else _reset_after(recording)
-    view = _View(recording, camera, of_log_offset, 0, shortest)
-    view = view.without_trailing(delay, refractory_period or 0)
+    view = _View(recording, camera, of_log_offset, delay - _TRAILING[1], shortest, (0.0, 0.0))
+    period = refractory_period or 0
+    if usual.spread == 0:
+        view = view._replace(thresholds=(usual.on, usual.off))
+    else:  # what the light does within exposures needs thresholds
+        rough = _by_information(view.seen(period, most=ROUGH_SAMPLES), usual, period, view, 0.0)
+        view = view if rough is None else view._replace(thresholds=(rough.on, rough.off))
+    view = view.without_trailing(delay, period)
     return _estimate(view, usual, refractory_period, most, delay)
 
 
@@ -191,7 +197,8 @@ def refine_thresholds(
 
     Parameters are those of `estimate_thresholds`, by which ``rough`` was made with the same ``refractory_period``.
     """
-    view = _View(recording, camera, of_log_offset, rough.delay, rough.shortest_interval)
+    thresholds = rough.on, rough.off
+    view = _View(recording, camera, of_log_offset, rough.delay, rough.shortest_interval, thresholds)
     period = rough.refractory_period
     if refractory_period is not None or period == 0:
         return _estimate(view, usual, refractory_period, MAX_SAMPLES, None) or rough
@@ -209,7 +216,7 @@ def _estimate(
     """
     period = refractory_period or 0
     samples = view.seen(period, most=most)
-    if len(samples.share) < _MIN_SAMPLES:
+    if len(samples.steps.change) < _MIN_SAMPLES:
         return None
     if not 0 < view.shortest <= _LARGEST_SHORTEST:
         return _by_information(samples, usual, period, view, 0.0)
@@ -231,7 +238,8 @@ def _estimate(
 class _View(NamedTuple):
     """How to look at a recording: whether events are steps of log(I + I_0), their delay and shortest interval, us.
 
-    The latter is 0 where the refractory period is not to be found.
+    The latter is 0 where the refractory period is not to be found. The thresholds are those that tell how far the light
+    moves within exposures.
     """
 
     recording: Recording
@@ -239,6 +247,7 @@ class _View(NamedTuple):
     of_log_offset: bool
     delay: int
     shortest: int
+    thresholds: tuple[float, float]
 
     def seen(self, *periods: int, most: int) -> _Seen:
         """Samples under refractory periods, us."""
@@ -267,31 +276,28 @@ class _View(NamedTuple):
             delays=delays,
             periods=periods,
             late=late,
+            thresholds=self.thresholds,
+            of_log_offset=self.of_log_offset,
             most=most,
             at_least=at_least,
         )
-        log_offset = 0.0 if self.of_log_offset else self.camera.offset
-        return [
-            _Seen(one, one.level / np.maximum(one.level + log_offset, 1e-9), self.recording.sensor_size)
-            for one in found
-        ]
+        return [_Seen(one, self.recording.sensor_size) for one in found]
 
 
 class _Seen(NamedTuple):
-    """Samples, the share of a step of log I that shows in log(I + I_0), (N,), and the size of the sensor."""
+    """Samples, and the size of the sensor."""
 
     steps: Steps
-    share: Array
     sensor_size: tuple[int, int]
 
     def columns(self, events: Array, index: int) -> Array:
         """(N, 2) what explains changes under a refractory period: steps upwards and downwards."""
         late, soon = events[:, index, 0], events[:, index, 1]  # NumPy's sum over so short an axis is slow
-        return np.asarray((late + soon) * np.array([1.0, -1.0]) * self.share[:, None], np.float64)
+        return np.asarray((late + soon) * np.array([1.0, -1.0]) * self.steps.share[:, None], np.float64)
 
     def residual(self) -> float:
         """Of the regression under the first refractory period; nan where there is none."""
-        if len(self.share) < _MIN_SAMPLES:
+        if len(self.steps.change) < _MIN_SAMPLES:
             return np.nan
         fit = two_stage(self.steps.change, self.explained(0), self.counts_around(0))
         return np.nan if fit is None else fit.residual
@@ -429,7 +435,7 @@ def _parted(seen: _Seen, index: int) -> _Parted | None:
 
     def columns(events: Array) -> Array:
         steps_of = on * events[:, index, :, 0] - off * events[:, index, :, 1]
-        return np.asarray(steps_of * seen.share[:, None], np.float64)
+        return np.asarray(steps_of * samples.share[:, None], np.float64)
 
     explained, instruments = columns(samples.events), columns(samples.events_around)
     again = two_stage(samples.change, explained, instruments)

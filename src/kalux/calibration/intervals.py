@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import islice
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from kalux import memory
 from kalux.augmentation.deblur import all_between, between, count_events
 from kalux.augmentation.refractory import EventClock
+from kalux.calibration.exposures import bends
 from kalux.compiled import event_words
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.filters.shots import Shot, take_shot
@@ -149,18 +150,51 @@ def intervals(
         previous = end
 
 
-def counted_intervals(
-    recording: Recording, camera: CameraSettings, *, delay: int, refractory_period: int, most_frames: int
-) -> Iterator[tuple[Interval, Array, Array]]:
-    """As `intervals`, with the weighed (K13) on and off events of every pixel between the frames, (H, W) each.
+class Counted(NamedTuple):
+    """An interval, and what its events tell of every pixel, (H, W) each.
 
-    Events are stamped ``delay`` us late; the refractory period is in us.
+    Attributes
+    ----------
+    on, off
+        Weighed (K13) events of either polarity between the middles of the exposures.
+    bend
+        By how much more the logarithms of the frames differ than that of the light at these middles.
+    """
+
+    interval: Interval
+    on: Array
+    off: Array
+    bend: Array
+
+
+def counted_intervals(
+    recording: Recording,
+    camera: CameraSettings,
+    *,
+    thresholds: tuple[float, float],
+    delay: int,
+    refractory_period: int,
+    most_frames: int,
+) -> Iterator[Counted]:
+    """As `intervals`, with the events of every pixel counted.
+
+    Thresholds (on, off; log intensity) tell what the light does within exposures. Events are stamped ``delay`` us late;
+    the refractory period is in us.
     """
     clock = EventClock(recording.sensor_size, refractory_period)
-    for interval in intervals(recording, camera, margin=abs(delay), most_frames=most_frames):
+
+    def bent(shot: Shot, events: EventArray) -> Array:
+        start, end = shot.start + delay, shot.end + delay
+        return bends(events, recording.sensor_size, start, end, thresholds).over_middle
+
+    margin = recording.longest_exposure + abs(delay)
+    before: Array | None = None
+    for interval in intervals(recording, camera, margin=margin, most_frames=most_frames):
         inside = clock.weighed(between(interval.events, interval.start + delay, interval.end + delay))
         on, off = count_events(inside, recording.sensor_size, weighed=True)
-        yield interval, on, off
+        first = bent(interval.first, interval.events) if before is None else before
+        before = bent(interval.second, interval.events)
+        yield Counted(interval, on, off, before - first)
 
 
 def _later(chunks: list[EventArray], t: int) -> list[EventArray]:

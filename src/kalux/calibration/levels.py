@@ -137,14 +137,15 @@ def _changes(
     """
     assert events.threshold_on is not None
     assert events.threshold_off is not None
-    for interval, on, off in counted_intervals(
+    for interval, on, off, bend in counted_intervals(
         recording,
         camera,
+        thresholds=(events.threshold_on, events.threshold_off),
         delay=events.lateness,
         refractory_period=events.refractory,
         most_frames=_MAX_FRAMES,
     ):
-        told = events.threshold_on * on - events.threshold_off * off - interval.change
+        told = events.threshold_on * on - events.threshold_off * off + bend - interval.change
         frames = [end.frame for end in interval.ends]
         for sign, frame in zip((-1, 1), frames, strict=True):
             ends = frame.normalised()

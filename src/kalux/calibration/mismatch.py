@@ -14,7 +14,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.calibration.event_model import DARKEST, ErrorModel, Samples, mismatch_of, noise_of_blurred
+from kalux.calibration.event_model import DARKEST, ErrorModel, Samples, mismatch_of
 from kalux.calibration.intervals import counted_intervals
 from kalux.calibration.regression import parts
 from kalux.recording import Recording
@@ -79,21 +79,22 @@ def estimate_mismatch(recording: Recording, camera: CameraSettings, events: Even
     assert events.threshold_off is not None
     model = ErrorModel(
         (events.threshold_on, events.threshold_off),
-        noise_of_blurred(camera),
+        camera.noise,
         events.usual_threshold_spread,
         events.quantisation_variance,
     )
     products: Array = np.zeros((*recording.sensor_size, *_PRODUCTS))
     samples = 0
-    for interval, on, off in counted_intervals(
+    for interval, on, off, bend in counted_intervals(
         recording,
         camera,
+        thresholds=(events.threshold_on, events.threshold_off),
         delay=events.lateness,
         refractory_period=events.refractory,
         most_frames=_MAX_FRAMES,
     ):
         first, second = interval.ends
-        seen = Samples(first.intensity, second.intensity, on, off)
+        seen = Samples(first.intensity, second.intensity, on, off, bend)
         bright = np.minimum(seen.before, seen.after) > DARKEST
         told = ~first.shot.clipped & ~second.shot.clipped & bright & (on + off > 0)
         mismatch, variance = mismatch_of(seen, model, camera.offset, events.step_noise)

@@ -9,8 +9,12 @@ over that time, so that only a part of it may lie between the frames:
 - It moves at the pace of the events beside, and waits between for the rest of a long time.
 
 Where nothing is wrong with the sensor this leaves half of what is left where a step counts as a whole when its event
-comes, and the error of the thresholds is within 2 %, whatever the exposures. What a frame shows is the mean over its
-exposure of where the light is. (To first order a mean of logarithms is the logarithm of the mean.)
+comes, and the error of the thresholds is within 2 %, whatever the exposures.
+
+A frame shows the logarithm of the mean over its exposure, while steps make the mean of the logarithm. By how much the
+one is more than the other events within the exposure tell, and it is taken off. Left in, steps that follow soon, which
+are of fast edges, seem worth 13 % less to 10 % more than others where exposures take three quarters of the time (nine
+simulated scenes; 4 % less to 1 % more without).
 """
 
 from __future__ import annotations
@@ -23,9 +27,11 @@ from numpy.typing import NDArray
 
 from kalux.augmentation.deblur import between
 from kalux.augmentation.refractory import step_weight
+from kalux.calibration.exposures import bends
 from kalux.calibration.intervals import Interval, intervals
 from kalux.compiled import event_column, event_is_on, event_row, event_words
 from kalux.events import NEVER
+from kalux.filters.shots import Shot
 from kalux.recording import Recording
 from kalux.settings import CameraSettings
 
@@ -60,11 +66,11 @@ class Steps(NamedTuple):
     Attributes
     ----------
     change
-        Of log(I + I_0) between the frames.
+        Of the mean of log(I + I_0) over each exposure, between the frames.
     change_around
         Mean of the same of the neighbours, weighed by how alike these change.
-    level
-        Mean I of both frames.
+    share
+        I / (I + I_0), the share of a step of log I that shows in log(I + I_0); 1 for steps of log(I + I_0).
     events, events_around
         (N, P, 2, 2): sums of the parts of events' steps that lie between the frames, in thresholds, of the pixel
         itself, and such means of its neighbours'; of events that come late after their predecessors first and of those
@@ -75,7 +81,7 @@ class Steps(NamedTuple):
 
     change: Array
     change_around: Array
-    level: Array
+    share: Array
     events: Array
     events_around: Array
     pixel: NDArray[np.int64]
@@ -88,6 +94,8 @@ def steps(
     delays: tuple[int, ...],
     periods: tuple[int, ...],
     late: float,
+    thresholds: tuple[float, float] = (0.0, 0.0),
+    of_log_offset: bool = False,
     most: int = MAX_SAMPLES,
     at_least: int = 4,
 ) -> list[Steps]:
@@ -106,6 +114,10 @@ def steps(
         where it turns light goes as often up as down meanwhile.
     late
         us after its predecessor from which on an event is late.
+    thresholds
+        On and off, log intensity: how far the light moved within the exposures. 0: as if it had not.
+    of_log_offset
+        Steps of log(I + I_0) instead of log I.
     most
         Pixels that are enough.
     at_least
@@ -117,8 +129,10 @@ def steps(
         If the frames' exposures are not known.
     """
     margin = recording.longest_exposure + max(abs(delay) for delay in delays) + round(_REACH)
+    log_offset = 0.0 if of_log_offset else camera.offset
     passings = [
-        _Passing(recording.sensor_size, periods, late, delay, -(-most // at_least)) for delay in delays
+        _Passing(recording.sensor_size, periods, late, delay, thresholds, log_offset, -(-most // at_least))
+        for delay in delays
     ]
     found: list[list[Steps]] = []
     count = 0
@@ -148,16 +162,26 @@ class _Passing:
     """What is known of every pixel as the intervals pass."""
 
     def __init__(
-        self, sensor_size: tuple[int, int], periods: tuple[int, ...], late: float, delay: int, most: int
+        self,
+        sensor_size: tuple[int, int],
+        periods: tuple[int, ...],
+        late: float,
+        delay: int,
+        thresholds: tuple[float, float],
+        log_offset: float,
+        most: int,
     ) -> None:
         height, width = sensor_size
         self._shape = sensor_size
         self._periods, self._late = np.array(periods, np.float32), float(late)
         self._delay, self._most = delay, most
+        self._thresholds = thresholds
+        self._log_offset = log_offset
         # Of the event before the interval's first: its time, and its sign, 0 if there was none.
         self._latest = np.full(height * width, NEVER, np.int64)
         self._sign = np.zeros(height * width, np.int8)
         self._seen_until = NEVER
+        self._bent: Array | None = None  # of the interval's first frame (`_bend`)
 
     def of(self, interval: Interval) -> Steps:
         """The pixels of the next interval."""
@@ -179,17 +203,27 @@ class _Passing:
         counts = np.zeros((height * width, len(self._periods), 2, 2), np.float32)
         _count(words, order, starts, self._latest, self._sign, exposures, self._periods, self._late, counts)
         shape = len(chosen), len(self._periods), 2, 2
+        share = interval.level / np.maximum(interval.level + self._log_offset, 1e-9)
+        # To second order, log(I + I_0) bends by the square of its share in the steps.
+        before = self._bend(interval, first) if self._bent is None else self._bent
+        self._bent = self._bend(interval, second)
+        change = interval.change - share**2 * (self._bent - before)
         own, around, change_around = _looked_at(
-            counts.reshape(height, width, 4 * len(self._periods)), interval.change, usable, chosen
+            counts.reshape(height, width, 4 * len(self._periods)), change, usable, chosen
         )
         return Steps(
-            interval.change.ravel()[chosen],
+            change.ravel()[chosen],
             change_around,
-            interval.level.ravel()[chosen],
+            share.ravel()[chosen],
             own.reshape(shape),
             around.reshape(shape),
             chosen,
         )
+
+    def _bend(self, interval: Interval, shot: Shot) -> Array:
+        """By how much the logarithm of the mean over an exposure is more than the mean of the logarithm, (H, W)."""
+        start, end = (t + self._delay for t in (shot.start, shot.end))
+        return bends(interval.events, self._shape, start, end, self._thresholds).over_mean
 
     def _chosen(self, interval: Interval) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """Indices of well exposed pixels around which something happens, spread evenly; (H, W) all well exposed ones.
