@@ -57,12 +57,14 @@ def _follow(words, width, ends, steps, place, over_mean, over_middle):  # type: 
     start, middle, end = ends
     # Level after the last event, us until that, integrals of level and exp(level) until then, level at the middle.
     paths = np.empty((len(words), 5))
+    pixels = np.empty(len(words), np.int64)
     count = 0
     for i in range(len(words)):
         word = words[i, 1]
         at = event_row(word) * width + event_column(word)
         if place[at] < 0:
             place[at] = count
+            pixels[count] = at
             for k in range(5):
                 paths[count, k] = 0.0
             count += 1
@@ -76,10 +78,9 @@ def _follow(words, width, ends, steps, place, over_mean, over_middle):  # type: 
         if words[i, 0] <= middle:
             path[4] = path[0]
     length = float(end - start)
-    for at in range(len(place)):
-        if place[at] >= 0:
-            path = paths[place[at]]
-            rest = length - path[1]
-            log_mean = np.log((path[3] + np.exp(path[0]) * rest) / length)
-            over_mean[at] = log_mean - (path[2] + path[0] * rest) / length
-            over_middle[at] = log_mean - path[4]
+    for n in range(count):
+        path, at = paths[n], pixels[n]
+        rest = length - path[1]
+        log_mean = np.log((path[3] + np.exp(path[0]) * rest) / length)
+        over_mean[at] = log_mean - (path[2] + path[0] * rest) / length
+        over_middle[at] = log_mean - path[4]
