@@ -25,6 +25,9 @@ half-way to such a frame is then that of a moving pixel, as on the same scenes."
 _ENOUGH: Final = 25.0
 """Pixels without noise, or as much information in more of them, that tell the change of the whole image."""
 
+RANDOM: Final = 0.25
+"""How far the middle of a random walk is off the mean of its ends: the variance, in units of that of its change."""
+
 _BLOCK: Final = 64
 """Pixels that are looked at together: few enough that what lies between stays in the nearest cache."""
 
@@ -84,6 +87,65 @@ def _pairs(on, off):  # type: ignore[no-untyped-def]
         pairs += min(on[i], off[i])
         active += on[i] + off[i] > 0
     return pairs, active
+
+
+def half_way(
+    before: Array, segment: BridgedSegment, quantisation_variance: float, threshold2: float
+) -> tuple[float, Array]:
+    """How far silent pixels are, half-way between two frames, off the mean of both, as the frames before tell.
+
+    Changes that go on from one frame interval to the next are those of a light that goes straight; changes that turn
+    back are of one that has turned in between as well. The correlation of both is that of the whole image.
+
+    Parameters
+    ----------
+    before
+        From the interval before: (H, W) change of its silent pixels, NaN of others.
+    segment
+        From `bridge`.
+    quantisation_variance
+        As in `BridgeNoise`.
+    threshold2
+        c^2.
+
+    Returns
+    -------
+    The variance in units of the mean square change from one frame to the next, 0 to 3/4; and (H, W) the changes, as
+    ``before`` is for the interval after.
+    """
+    assert segment.events is not None
+    change = np.empty_like(before)
+    seconds, q0 = np.float32((segment.end - segment.start) * 1e-6), np.float32(quantisation_variance)
+    planes = (
+        before,
+        segment.slope,
+        segment.forward_variance,
+        segment.backward_variance,
+        segment.events,
+        change,
+    )
+    both, squares = _alike(seconds, q0, np.float32(threshold2**0.5), *(plane.reshape(-1) for plane in planes))
+    usual = _ENOUGH * UNKNOWN_CHANGE * threshold2
+    goes_on = min(max(both / (max(squares, 0.0) + usual), -0.5), 1.0)
+    return 0.5 / (1.0 + goes_on) - 0.25, change
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _alike(seconds, q0, most, before, slope, forward, backward, events, change):  # type: ignore[no-untyped-def]
+    """Sums of the products of two changes of pixels silent in both intervals, and of their squares, without noise."""
+    both, squares = 0.0, 0.0
+    for i in range(np.uint64(len(change))):
+        noise = np.float32(forward[i]) + np.float32(backward[i])
+        share = q0 / (noise + q0)
+        moved = min(max(np.float32(slope[i]) * seconds / share, -most), most)
+        silent = noise < np.float32(UNMEASURED) and events[i] == np.float32(0.0)
+        change[i] = moved if silent else np.float32(np.nan)
+        if silent and before[i] == before[i]:
+            both += (
+                share * share * (before[i] * moved + np.float32(forward[i]))
+            )  # the frame's noise is in both
+            squares += share * share * ((before[i] * before[i] + moved * moved) / np.float32(2.0) - noise)
+    return both, squares
 
 
 def forget_silence(
