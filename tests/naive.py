@@ -558,7 +558,7 @@ def forgotten(pixels, place, c2, q0):
 
 def half_way(pixels, interval, c2, q0):
     """K11: how far the middle between two frames is off the mean of both, in units of their mean square change."""
-    both, squares = 0.0, 0.0
+    both, squares, noise = 0.0, 0.0, 0.0
     for q in pixels.values() if interval > 0 else ():
         before, now = q.changes[interval - 1], q.changes[interval]
         if all(before[:2]) and all(now[:2]):
@@ -566,7 +566,9 @@ def half_way(pixels, interval, c2, q0):
             (first, second), weight = now[3], (q0 / (sum(now[3]) + q0)) ** 2
             both += weight * (a * b + first)
             squares += weight * ((a**2 + b**2) / 2 - first - second)
-    correlation = np.clip(both / (max(squares, 0) + 25 * 0.1 * c2), -0.5, 1)
+            noise += weight * (first + second)
+    told = both * max(squares, 0) / (squares**2 + noise**2 + (25 * 0.1 * c2) ** 2)
+    correlation = np.clip(told, -0.5, 1)
     return 1 / (2 * (1 + correlation)) - 1 / 4
 
 

@@ -141,11 +141,16 @@ def test_half_way_light_is_off_the_mean_of_its_ends_as_its_changes_turn_back():
 
 
 def test_noise_of_the_frame_between_does_not_turn_light_back():
+    """Unless changes are less than the noise: then they are taken to go at random."""
     rng = np.random.default_rng(4)
-    level, *noise = 0.04 * rng.standard_normal((4, *SHAPE))
-    levels = [k * level + n for k, n in enumerate(noise)]
-    assert off_the_mean(*levels) > 0.2  # where the frames are believed
-    assert off_the_mean(*levels, variance=0.04**2) == pytest.approx(0.0, abs=0.05)
+    level, *noise = rng.standard_normal((4, *SHAPE))
+
+    def found(change, variance):
+        return off_the_mean(*(k * change * level + 0.02 * n for k, n in enumerate(noise)), variance=variance)
+
+    assert found(0.04, 1e-8) > 0.07  # where the frames are believed
+    assert found(0.04, 0.02**2) < 0.04
+    assert found(0.001, 0.03**2) == pytest.approx(0.25, abs=0.02)
 
 
 def test_what_is_not_known_to_go_on_goes_at_random():

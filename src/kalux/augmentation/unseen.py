@@ -124,16 +124,20 @@ def half_way(
         segment.events,
         change,
     )
-    both, squares = _alike(seconds, q0, np.float32(threshold2**0.5), *(plane.reshape(-1) for plane in planes))
+    both, squares, noise = _alike(
+        seconds, q0, np.float32(threshold2**0.5), *(plane.reshape(-1) for plane in planes)
+    )
     usual = _ENOUGH * UNKNOWN_CHANGE * threshold2
-    goes_on = min(max(both / (max(squares, 0.0) + usual), -0.5), 1.0)
+    # Little is known of changes that are less than the noise, the variance of which is an estimate.
+    goes_on = both * max(squares, 0.0) / (squares**2 + noise**2 + usual**2)
+    goes_on = min(max(goes_on, -0.5), 1.0)
     return 0.5 / (1.0 + goes_on) - 0.25, change
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _alike(seconds, q0, most, before, slope, forward, backward, events, change):  # type: ignore[no-untyped-def]
-    """Sums of the products of two changes of pixels silent in both intervals, and of their squares, without noise."""
-    both, squares = 0.0, 0.0
+    """Sums over pixels silent in two intervals: products of their changes, squares, both without noise, and noise."""
+    both, squares, of_noise = 0.0, 0.0, 0.0
     for i in range(np.uint64(len(change))):
         noise = np.float32(forward[i]) + np.float32(backward[i])
         share = q0 / (noise + q0)
@@ -141,11 +145,11 @@ def _alike(seconds, q0, most, before, slope, forward, backward, events, change):
         silent = noise < np.float32(UNMEASURED) and events[i] == np.float32(0.0)
         change[i] = moved if silent else np.float32(np.nan)
         if silent and before[i] == before[i]:
-            both += (
-                share * share * (before[i] * moved + np.float32(forward[i]))
-            )  # the frame's noise is in both
-            squares += share * share * ((before[i] * before[i] + moved * moved) / np.float32(2.0) - noise)
-    return both, squares
+            weight = share * share
+            both += weight * (before[i] * moved + np.float32(forward[i]))  # the frame between is in both
+            squares += weight * ((before[i] * before[i] + moved * moved) / np.float32(2.0) - noise)
+            of_noise += weight * noise
+    return both, squares, of_noise
 
 
 def forget_silence(
