@@ -46,7 +46,7 @@ class Pixel:
     raised: list[bool] = field(default_factory=list)
     left: bool = False
     gone: bool = False
-    changes: list[tuple[bool, bool, float, tuple[float, float]]] = field(default_factory=list)
+    changes: list[tuple[bool, bool, float, tuple[float, float], float]] = field(default_factory=list)
     forgotten: list[float] = field(default_factory=list)
     measured: list[bool] = field(default_factory=list)
 
@@ -344,7 +344,9 @@ def bridged(pixel, settings, times, on, off, scales):
         q0, noise = ev.quantisation_variance * c2, first[1] + second[1]
         told = (q0 / (noise + q0)) ** 2
         squared = min((q0 * mismatch / total) ** 2, c2) - noise * told + (1 - told) * 0.1 * c2
-        pixel.changes.append((noise < UNMEASURED, n_on + n_off == 0, squared, (first[1], second[1])))
+        pixel.changes.append(
+            (noise < UNMEASURED, n_on + n_off == 0, squared, (first[1], second[1]), mismatch)
+        )
         gain_on, gain_off = var_on * on * n_on / total, -var_off * off * n_off / total  # K2
         scale_on = min(max(scale_on + gain_on * mismatch, 0.3), 3.0)
         scale_off = min(max(scale_off + gain_off * mismatch, 0.3), 3.0)
@@ -549,9 +551,25 @@ def silent_change(pixels, place, interval, c2):
 
 def forgotten(pixels, place, c2, q0):
     """K11: what the state of a pixel loses in every frame interval."""
-    for k, (measured, silent, _, noise) in enumerate(pixels[place].changes):
+    for k, (measured, silent, _, noise, _) in enumerate(pixels[place].changes):
         missed = sum(noise) / (sum(noise) + q0)
         yield silent_change(pixels, place, k, c2) * missed**2 if measured and silent else 0.0
+
+
+def half_way(pixels, interval, c2, q0):
+    """K11: how far the middle between two frames is off the mean of both, in units of their mean square change."""
+    both, squares, noise = 0.0, 0.0, 0.0
+    for q in pixels.values() if interval > 0 else ():
+        before, now = q.changes[interval - 1], q.changes[interval]
+        if all(before[:2]) and all(now[:2]):
+            a, b = (np.clip(change[4], -np.sqrt(c2), np.sqrt(c2)) for change in (before, now))
+            (first, second), weight = now[3], (q0 / (sum(now[3]) + q0)) ** 2
+            both += weight * (a * b + first)
+            squares += weight * ((a**2 + b**2) / 2 - first - second)
+            noise += weight * (first + second)
+    told = both * max(squares, 0) / (squares**2 + noise**2 + (25 * 0.1 * c2) ** 2)
+    correlation = np.clip(told, -0.5, 1)
+    return 1 / (2 * (1 + correlation)) - 1 / 4
 
 
 def exposed_as(pixels, start, end, exposed):
@@ -576,9 +594,9 @@ def shown_change(pixels, place, interval, c2, camera):
     return 0.4 * c2 if black else silent_change(pixels, place, interval, c2)
 
 
-def hidden(pixels, place, moving, t, on, off, camera):
-    """K11: the variance of what no event has told."""
-    pixel, c2 = pixels[place], on * off
+def hidden(pixels, place, moving, t, on, off, settings):
+    """K11: the variance of what no event has told, before neighbours are heard, and as it is given out."""
+    pixel, c2, camera = pixels[place], on * off, settings.camera
     middles = pixel.middles
     k = sum(m < t for m in middles) - 1
     if 0 <= k < len(middles) - 1:
@@ -587,15 +605,20 @@ def hidden(pixels, place, moving, t, on, off, camera):
         exposures = [pixel.ends[i] - pixel.starts[i] for i in (k, k + 1)]
         between = 4 * share * (1 - share)
         exposed = exposed_as(pixels, middles[k], middles[k + 1], min(sum(exposures) / 2 / gap, 1))
-        between += (1 - between) * 0.09 * exposed
-        if moving:
-            return 0.08 * c2 * between
-        return 0.22 * between * shown_change(pixels, place, k, c2, camera)
+        between += (1 - between) * 0.2 * exposed**2
+        of_moving = 0.08 * c2 * between
+        still = half_way(pixels, k, c2, settings.events.quantisation_variance * c2)
+        still *= between * shown_change(pixels, place, k, c2, camera)
+        used = of_moving if moving else still
+        _, silent, _, frames, _ = pixel.changes[k]
+        waits = silent and min(frames) < UNMEASURED and (moving or max(frames) >= UNMEASURED)
+        return used, still / 2 + of_moving / 4 if waits else used
     if moving:
-        return 0.08 * c2
+        return 0.08 * c2, 0.08 * c2
     gap = middles[-1] - middles[-2] if k > 0 else USUAL_INTERVAL
     change = shown_change(pixels, place, k - 1, c2, camera) if k > 0 else 0.1 * c2
-    return min(abs(t - middles[max(k, 0)]) / gap, 1) * change
+    changed = min(abs(t - middles[max(k, 0)]) / gap, 1) * change
+    return changed, changed
 
 
 def known(pixel, variance, t, settings, c2, left):
@@ -740,7 +763,7 @@ def intensity(log_intensity, variance, settings, white, stretch):
 
 
 def reconstruct(events, frames, sensor_size, settings, times):
-    """The pixels, and of ``times``, (T, H, W) each: L, P, what is hidden (K11), who moves; (T, 2, H, W) of K15."""
+    """The pixels; of ``times``, (T, H, W) each: L, P, twice what is hidden (K11), who moves; (T, 2, H, W) of K15."""
     kind = settings.filter.kind
     if kind == "cf":
         method, begin = complementary, (frames[0].exposure_start + frames[0].exposure_end) // 2
@@ -748,7 +771,7 @@ def reconstruct(events, frames, sensor_size, settings, times):
         method = bridged if settings.filter.augmentation == "bridge" else paper
         begin = frames[0].exposure_start
     on, off = settings.events.threshold_on, settings.events.threshold_off
-    out = np.empty((4, len(times), *sensor_size))
+    out = np.empty((5, len(times), *sensor_size))
     every = pixels(events, frames, sensor_size, settings, begin)
     more = (trail_scales(every, settings),) if method is bridged else ()
     for (row, column), pixel in every.items():
@@ -758,8 +781,8 @@ def reconstruct(events, frames, sensor_size, settings, times):
             every,
             out[0],
             out[1],
-            out[2],
-            out[3].astype(bool),
+            out[2:4],
+            out[4].astype(bool),
             np.full((len(times), 2, *sensor_size), np.nan),
         )
     for place, pixel in every.items():  # of which nothing depends on it but P and L
@@ -770,9 +793,9 @@ def reconstruct(events, frames, sensor_size, settings, times):
         out[:2, :, row, column] = method(pixel, settings, times, on, off, *more).T
     for (row, column), pixel in every.items():
         for i, t in enumerate(times):
-            out[3, i, row, column] = is_moving(pixel, t)
-            out[2, i, row, column] = hidden(
-                every, (row, column), out[3, i, row, column], t, on, off, settings.camera
+            out[4, i, row, column] = is_moving(pixel, t)
+            out[2:4, i, row, column] = hidden(
+                every, (row, column), out[4, i, row, column], t, on, off, settings
             )
     expected = np.array([unshown(every, settings, frames, t) for t in times])
-    return every, out[0], out[1], out[2], out[3].astype(bool), expected
+    return every, out[0], out[1], out[2:4], out[4].astype(bool), expected

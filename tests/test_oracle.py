@@ -100,10 +100,10 @@ def test_engine_agrees_with_the_oracle(name, data):
             value, total, beyond, noise = naive.lifted(value, total, excess, chosen, top)
         given = total
         if chosen.filter.neighbours > 0:
-            known, told = total + 1.6 * hidden[i], total  # before neighbours are heard
+            known, told = total + 1.6 * hidden[0, i], total  # before neighbours are heard
             value, total = naive.regularised(value, known, moving[i], chosen.filter.neighbours)
             total = np.where(unshown, known, total)
-            given, left = hidden[i].copy(), total / known
+            given, left = hidden[1, i].copy(), total / known
             for place, pixel in pixels.items():
                 given[place] += naive.known(pixel, told[place], t, chosen, 0.21 * 0.17, left[place])
         least = np.minimum(bound, np.maximum(bound - 2 * np.sqrt(noise), top))

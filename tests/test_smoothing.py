@@ -86,11 +86,13 @@ def test_smoothing_is_two_filters_combined_by_information():
         change = np.mean(known, axis=0)
         after = min(max(int(np.searchsorted(middles, t)), 1), len(middles) - 1)
         share = (t - middles[after - 1]) / (middles[after] - middles[after - 1])
-        correlation = 0.0
+        correlation, around = 0.0, a.around
         if a.around is not None and b.around is not None:
             first, second = (variance < UNMEASURED for variance in a.around[:2])
             same = np.where(first, 1 - share, 0) + np.where(second, share, 0)
             correlation = 0.2 + 0.8 * same
+            half_way = (a.around.half_way + b.around.half_way) / 2
+            around = a.around._replace(counted=UNMEASURED, half_way=half_way)
         either = dataclasses.replace(
             a,
             log_intensity=level,
@@ -98,7 +100,7 @@ def test_smoothing_is_two_filters_combined_by_information():
             told=1 / sum(weights),
             moving=np.where(change > 0.005 * 0.2 * 0.25, a.moving | b.moving, a.moving & b.moving),
             silent_change=change,
-            around=None if a.around is None else a.around._replace(counted=UNMEASURED),
+            around=around,
             since=None if a.since is None else min(a.since, b.since),
         )
         expected = forward.image(either)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.highlights import Unshown
-from kalux.augmentation.unseen import UNKNOWN_CHANGE
+from kalux.augmentation.unseen import RANDOM, UNKNOWN_CHANGE
 from kalux.filters.highlights import keep_white, lifted, read_unshown, tempered
 from kalux.filters.readout import HighlightPrior, read_out
 from kalux.filters.uncertainty import Around, add_pattern, alone, given_variance, hidden_variance
@@ -180,7 +180,8 @@ def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) ->
     moving, change = estimate.moving, estimate.silent_change
     if change is None and moving is not None:  # K11 needs it only there
         change = np.full(log_intensity.shape, UNKNOWN_CHANGE * view.threshold2, np.float32)
-    hidden = hidden_variance(estimate.between, view.threshold2, estimate.exposed, estimate.since)
+    half_way = RANDOM if estimate.around is None else estimate.around.half_way
+    hidden = hidden_variance(estimate.between, view.threshold2, estimate.exposed, estimate.since, half_way)
     tells = with_variance or view.mosaic is not None  # the colours of a mosaic's highlights depend on it
     left = tells and (moving is None or (estimate.around is not None and estimate.around.misses_some))
     intensity, total, heard = read_out(

@@ -19,7 +19,7 @@ from kalux.calibration.contrast import (
 from kalux.calibration.delay import DelayEstimate, estimate_delay
 from kalux.calibration.event_model import EventModel, estimate_event_model
 from kalux.calibration.fixed_pattern import USUAL_PATTERN, FixedPattern, estimate_fixed_pattern
-from kalux.calibration.frame_noise import FrameNoise, estimate_frame_noise
+from kalux.calibration.frame_noise import FrameNoise, estimate_frame_noise, usual_noise
 from kalux.calibration.levels import Ceiling, exact_end, find_ceiling
 from kalux.calibration.mismatch import Mismatch, estimate_mismatch
 from kalux.calibration.noise import event_noise
@@ -275,7 +275,7 @@ def _with_frame_noise(recording: Recording, settings: Settings) -> tuple[Setting
     found = estimate_frame_noise(recording, camera)
     if found is not None and not found.believed:
         found = None
-    read, shot = camera.noise if found is None else (found.read, found.shot)
+    read, shot = usual_noise(recording, camera) if found is None else (found.read, found.shot)
     shot = shot if camera.shot_noise is None else camera.shot_noise
     return altered(settings, "camera", frame_noise=read, shot_noise=shot), found
 

@@ -47,8 +47,8 @@ class CameraSettings:
         None: an estimate from the recording (`kalux.calibration.frame_noise`); a shot noise beside a given frame noise
         is 0.
     usual_frame_noise
-        The frame noise where the recording does not tell it, without shot noise. 0.006 is what the paper's 7e5 1/s
-        amounts to at 25 frames/s.
+        The frame noise where the recording does not tell it, at half of white; all of it is read noise, unless dark
+        pixels show less. 0.006 is what the paper's 7e5 1/s amounts to at 25 frames/s.
     fixed_pattern
         Standard deviation of the offsets that pixels of frames keep from frame to frame, white = 1: the images have
         them, too, and their variance counts them (docs/equations.md, K11). None: an estimate from the recording

@@ -391,12 +391,20 @@ def combine(
         chroma=forward.chroma,
         unshown=unshown,
         silent_change=change,
-        around=None if forward.around is None else forward.around._replace(counted=UNMEASURED),
+        around=_around(forward.around, backward.around),
         unmeasured=forward.unmeasured,
         exposed=forward.exposed,
         since=_least(forward.since, backward.since),
         told=told,
     )
+
+
+def _around(forward: Around | None, backward: Around | None) -> Around | None:
+    """The forward one, with the next frame counted already, and what both directions say of half-way."""
+    if forward is None:
+        return None
+    half_way = forward.half_way if backward is None else (forward.half_way + backward.half_way) / 2.0
+    return forward._replace(counted=UNMEASURED, half_way=half_way)
 
 
 def shared_errors(forward: Around | None, backward: Around | None) -> NDArray[np.floating[Any]] | None:

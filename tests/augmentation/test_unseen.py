@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 
 from kalux.augmentation.bridge import UNMEASURED, BridgeNoise, Latent, bridge, nominal_thresholds
-from kalux.augmentation.unseen import UNKNOWN_CHANGE, forget_silence, silent_change, turns
+from kalux.augmentation.unseen import UNKNOWN_CHANGE, forget_silence, half_way, silent_change, turns
 
 SHAPE = (40, 60)
 C2 = 0.04
@@ -14,8 +16,8 @@ NOISE = BridgeNoise(0.2, 0.2, 0.2 * C2, C2 / 6)
 SECOND = 1_000_000
 
 
-def changes(change, *, on=None, variance=1e-4, clipped=None):
-    """`silent_change` of a level that changes by ``change`` between two frames of a variance."""
+def joined(change, *, on=None, variance=1e-4, clipped=None):
+    """A level that changes by ``change`` between two frames of a variance."""
     nothing = np.zeros(SHAPE, np.float32)
     variances = np.broadcast_to(np.asarray(variance, np.float32), SHAPE).copy()
     second = variances.copy()
@@ -33,7 +35,21 @@ def changes(change, *, on=None, variance=1e-4, clipped=None):
         0,
         SECOND,
     )
-    return silent_change(segment, NOISE.quantisation_variance, C2)
+    return segment
+
+
+def changes(change, **frames):
+    """`silent_change` of the same."""
+    return silent_change(joined(change, **frames), NOISE.quantisation_variance, C2)
+
+
+def off_the_mean(*levels, variance=1e-8, on=None):
+    """`half_way` between the last two frames that show these levels."""
+    found, before = None, np.full(SHAPE, np.nan, np.float32)
+    for first, second in itertools.pairwise(levels):
+        segment = joined(second - first, variance=variance, on=on)
+        found, before = half_way(before, segment, NOISE.quantisation_variance, C2)
+    return found
 
 
 def forgotten(variance, change, on, after=None):
@@ -114,6 +130,34 @@ def test_a_silent_pixel_forgets_what_the_slope_does_not_take():
     alike = forgotten(NOISE.quantisation_variance / 2, 0.01, on)  # half of the mismatch is the slope's
     np.testing.assert_allclose(alike[:, :30], 0.01 / 4, rtol=1e-5)
     assert (forgotten(100.0, 0.01, on, np.full(SHAPE, UNMEASURED, np.float32)) == 0).all()
+
+
+def test_half_way_light_is_off_the_mean_of_its_ends_as_its_changes_turn_back():
+    """Straight on not at all, at random by a quarter of its change, and by three where no frame is like the other."""
+    one, two, three = 0.05 * np.random.default_rng(3).standard_normal((3, *SHAPE))
+    assert off_the_mean(0 * one, one, 2 * one) == pytest.approx(0.0, abs=0.01)
+    assert off_the_mean(0 * one, one, one + two) == pytest.approx(0.25, abs=0.03)
+    assert off_the_mean(one, two, three) == pytest.approx(0.75, abs=0.05)
+
+
+def test_noise_of_the_frame_between_does_not_turn_light_back():
+    """Unless changes are less than the noise: then they are taken to go at random."""
+    rng = np.random.default_rng(4)
+    level, *noise = rng.standard_normal((4, *SHAPE))
+
+    def found(change, variance):
+        return off_the_mean(*(k * change * level + 0.02 * n for k, n in enumerate(noise)), variance=variance)
+
+    assert found(0.04, 1e-8) > 0.07  # where the frames are believed
+    assert found(0.04, 0.02**2) < 0.04
+    assert found(0.001, 0.03**2) == pytest.approx(0.25, abs=0.02)
+
+
+def test_what_is_not_known_to_go_on_goes_at_random():
+    one, two = 0.05 * np.random.default_rng(5).standard_normal((2, *SHAPE))
+    assert off_the_mean(0 * one, one) == 0.25  # no interval before
+    assert off_the_mean(0 * one, one, 2 * one, on=np.ones(SHAPE, np.float32)) == 0.25  # no pixel is silent
+    assert off_the_mean(*3 * [two]) == pytest.approx(0.25, abs=1e-3)  # nothing moves
 
 
 def test_light_turns_where_events_of_both_signs_come():

@@ -16,6 +16,7 @@ from kalux.calibration.frame_noise import (
     photon_transfer,
     rounding_error,
     trimmed_variance,
+    usual_noise,
 )
 from kalux.datasets import SensorSettings, demo_scene, simulate
 from kalux.events import make_events
@@ -146,6 +147,18 @@ def test_nothing_to_be_told():
     assert estimate_frame_noise(still(flat, 0.002, 0.0), CAMERA) is None  # a single level
     assert estimate_frame_noise(still(RAMP[:60, :80], 0.002, 0.0, events=busy), CAMERA) is None
     assert estimate_frame_noise(still(RAMP, 0.01, 0.0, frames=1), CAMERA) is None
+
+
+def test_dark_pixels_bound_the_noise_that_is_not_known():
+    """Whatever moves elsewhere; at half of white it is the usual."""
+    usual, dark = CAMERA.usual_frame_noise, np.where(np.arange(200) < 100, 0.015, RAMP)
+    moving = 0.1 * np.random.default_rng(6).random(RAMP.shape) * (np.arange(200) >= 100)
+    read, shot = usual_noise(still(dark, 0.003, 0.0, changes=moving), CAMERA)
+    assert read == pytest.approx(np.hypot(0.003, LEVEL), rel=0.1)
+    assert read**2 + shot / 2 == pytest.approx(usual**2)
+    assert usual_noise(still(dark, 1e-5, 0.0), CAMERA)[0] == 0.5 / 255  # no less than rounding can change
+    assert usual_noise(still(dark, 0.012, 0.0), CAMERA) == (usual, 0.0)
+    assert usual_noise(still(RAMP + 0.02, 0.003, 0.0), CAMERA) == (usual, 0.0)  # nothing is dark
 
 
 @pytest.mark.parametrize("electrons", [0, 5000], ids=["no noise", "shot noise only"])

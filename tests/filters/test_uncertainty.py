@@ -117,8 +117,26 @@ def test_more_is_hidden_between_frames_in_long_exposures_and_where_things_move()
 
 def test_still_pixels_hide_what_silent_ones_around_them_show():
     change = np.array([[0.0, 0.02]], np.float32)
-    found = given_variance(plane(0.01), STILL, change, hidden_variance(1.0, C2), None) - 0.01
-    np.testing.assert_allclose(found, [[0.0, 0.22 * 0.02]], atol=1e-8)
+    for half_way in (0.0, 0.25, 0.7):
+        hidden = hidden_variance(1.0, C2, half_way=half_way)
+        found = given_variance(plane(0.01), STILL, change, hidden, None) - 0.01
+        np.testing.assert_allclose(found, [[0.0, half_way * 0.02]], atol=1e-8)
+
+
+def test_a_pixel_that_waits_for_its_next_event_lies_between_still_and_moving_ones():
+    """One with an event of late, none in this interval; or silent, and measured by one of the frames alone."""
+    moving, change, p = np.array([[True, False]]), plane(0.02), plane(0.01)
+    hidden = Hidden(0.5, 0.004)
+
+    def found(first, second, events):
+        told = around(first, second, events, counted=UNMEASURED, quantisation_variance=0.0)
+        return given_variance(p, moving, change, hidden, told) - p
+
+    waits = 0.5 * 0.5 * 0.02 + 0.25 * 0.004
+    np.testing.assert_allclose(found(1e-6, 1e-6, 0.0), [[waits, 0.01]], rtol=1e-4)
+    np.testing.assert_allclose(found(1e-6, 1e-6, 1.0), [[0.004, 0.01]], rtol=1e-4)
+    np.testing.assert_allclose(found(UNMEASURED, 1e-6, 0.0), [[waits, waits]], rtol=1e-4)
+    np.testing.assert_allclose(found(UNMEASURED, UNMEASURED, 0.0), [[0.004, 0.01]], rtol=1e-4)
 
 
 def test_without_a_next_frame_nothing_holds_the_other_end():

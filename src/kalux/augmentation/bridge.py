@@ -144,7 +144,8 @@ class BridgedSegment(NamedTuple):
     Beyond what L^A and the state say here, the level is ahead of its newest event by ``trail`` (K14; None: it is not).
     ``unshown`` is of the pixels that no frame has measured until ``end``, or ``start`` in causal mode.
     ``silent_change`` is what silent pixels around each change from one frame to the next (`unseen`; None: not known).
-    ``turns`` is how often a pixel with events turns from one direction to the other between the frames, on average.
+    ``turns`` is how often a pixel with events turns from one direction to the other between the frames, on average;
+    ``half_way`` how far the middle of silent pixels is off the mean of both frames (`unseen.half_way`).
     """
 
     start: int
@@ -167,6 +168,7 @@ class BridgedSegment(NamedTuple):
     silent_change: Array | None = None
     net: Array | None = None
     turns: float = 0.0
+    half_way: float = 0.25
 
 
 def drift(

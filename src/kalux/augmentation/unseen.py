@@ -25,6 +25,9 @@ half-way to such a frame is then that of a moving pixel, as on the same scenes."
 _ENOUGH: Final = 25.0
 """Pixels without noise, or as much information in more of them, that tell the change of the whole image."""
 
+RANDOM: Final = 0.25
+"""How far the middle of a random walk is off the mean of its ends: the variance, in units of that of its change."""
+
 _BLOCK: Final = 64
 """Pixels that are looked at together: few enough that what lies between stays in the nearest cache."""
 
@@ -84,6 +87,69 @@ def _pairs(on, off):  # type: ignore[no-untyped-def]
         pairs += min(on[i], off[i])
         active += on[i] + off[i] > 0
     return pairs, active
+
+
+def half_way(
+    before: Array, segment: BridgedSegment, quantisation_variance: float, threshold2: float
+) -> tuple[float, Array]:
+    """How far silent pixels are, half-way between two frames, off the mean of both, as the frames before tell.
+
+    Changes that go on from one frame interval to the next are those of a light that goes straight; changes that turn
+    back are of one that has turned in between as well. The correlation of both is that of the whole image.
+
+    Parameters
+    ----------
+    before
+        From the interval before: (H, W) change of its silent pixels, NaN of others.
+    segment
+        From `bridge`.
+    quantisation_variance
+        As in `BridgeNoise`.
+    threshold2
+        c^2.
+
+    Returns
+    -------
+    The variance in units of the mean square change from one frame to the next, 0 to 3/4; and (H, W) the changes, as
+    ``before`` is for the interval after.
+    """
+    assert segment.events is not None
+    change = np.empty_like(before)
+    seconds, q0 = np.float32((segment.end - segment.start) * 1e-6), np.float32(quantisation_variance)
+    planes = (
+        before,
+        segment.slope,
+        segment.forward_variance,
+        segment.backward_variance,
+        segment.events,
+        change,
+    )
+    both, squares, noise = _alike(
+        seconds, q0, np.float32(threshold2**0.5), *(plane.reshape(-1) for plane in planes)
+    )
+    usual = _ENOUGH * UNKNOWN_CHANGE * threshold2
+    # Little is known of changes that are less than the noise, the variance of which is an estimate.
+    goes_on = both * max(squares, 0.0) / (squares**2 + noise**2 + usual**2)
+    goes_on = min(max(goes_on, -0.5), 1.0)
+    return 0.5 / (1.0 + goes_on) - 0.25, change
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _alike(seconds, q0, most, before, slope, forward, backward, events, change):  # type: ignore[no-untyped-def]
+    """Sums over pixels silent in two intervals: products of their changes, squares, both without noise, and noise."""
+    both, squares, of_noise = 0.0, 0.0, 0.0
+    for i in range(np.uint64(len(change))):
+        noise = np.float32(forward[i]) + np.float32(backward[i])
+        share = q0 / (noise + q0)
+        moved = min(max(np.float32(slope[i]) * seconds / share, -most), most)
+        silent = noise < np.float32(UNMEASURED) and events[i] == np.float32(0.0)
+        change[i] = moved if silent else np.float32(np.nan)
+        if silent and before[i] == before[i]:
+            weight = share * share
+            both += weight * (before[i] * moved + np.float32(forward[i]))  # the frame between is in both
+            squares += weight * ((before[i] * before[i] + moved * moved) / np.float32(2.0) - noise)
+            of_noise += weight * noise
+    return both, squares, of_noise
 
 
 def forget_silence(

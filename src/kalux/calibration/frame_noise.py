@@ -17,13 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.deblur import all_between
-from kalux.calibration.intervals import Interval, intervals
+from kalux.calibration.intervals import intervals
 from kalux.compiled import event_column, event_row, event_words
 from kalux.events import EventArray
-from kalux.filters.shots import Shot
+from kalux.filters.shots import Shot, take_shot
 from kalux.frames import Frame
+from kalux.models.camera import Camera
 from kalux.recording import Recording
-from kalux.settings import CameraSettings
+from kalux.settings import CameraSettings, chosen_response
 
 Array = NDArray[np.float64]
 
@@ -133,6 +134,40 @@ def estimate_frame_noise(
     return found._replace(read=read, shot=found.shot if found.shot > _LEAST_READ**2 else 0.0)
 
 
+def usual_noise(recording: Recording, camera: CameraSettings) -> tuple[float, float]:
+    """Read and shot noise where nothing tells them: the usual at half of white, in the dark what its pixels allow.
+
+    Whatever moves, pixels change by their noise at least: from 0.01 to 0.02 of white it is no more than they do.
+
+    Parameters
+    ----------
+    recording
+        With known exposures.
+    camera
+        Response, saturation, and ``usual_frame_noise``.
+
+    Raises
+    ------
+    ExposureError
+        If the frames' exposures are not known.
+    """
+    usual = camera.usual_frame_noise
+    model = Camera.named(chosen_response(camera.response, recording.response), camera.clipped_from)
+    reference = recording.longest_exposure
+    frames = itertools.islice(recording.frames(), _MIN_FRAMES)
+    found = []
+    for first, second in itertools.pairwise(take_shot(frame, model, reference) for frame in frames):
+        level, difference, usable, dark = _beyond_neighbours(first, second)
+        seen = difference[usable & ~_near(dark) & (level < 2 * _DARKEST)]
+        if 0.9 < first.white / second.white < 1.1 and len(seen) >= _LEAST:
+            found.append(trimmed_variance(seen) / 2)
+    if not found:
+        return usual, 0.0
+    changes = float(np.sqrt(np.median(found)))
+    read = min(max(changes, rounding_error(next(iter(recording.frames()))), _LEAST_READ), usual)
+    return read, (usual**2 - read**2) / 0.5
+
+
 def rounding_error(frame: Frame) -> float:
     """Half a level, white = 1; 0 for images of floating point.
 
@@ -184,9 +219,9 @@ def _points(
     for interval in intervals(recording, camera, margin=margin, most_frames=most_frames):
         if not 0.9 < interval.first.white / interval.second.white < 1.1:
             continue
-        level, difference, usable, dark = _beyond_neighbours(interval)
+        level, difference, usable, dark = _beyond_neighbours(interval.first, interval.second)
         busy = _busy(all_between(interval.chunks, interval.first.start, interval.second.end), level.shape)
-        near_dark = cv2.dilate(dark.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        near_dark = _near(dark)
         for points, around in zip(found, _SURROUNDINGS, strict=True):
             still = cv2.dilate(busy, around.shape) == 0
             too_dark = dark if around.moves else near_dark  # of a neighbour's noise a quarter counts
@@ -210,13 +245,19 @@ def _mark(words, busy):  # type: ignore[no-untyped-def]
         busy[event_row(words[i, 1]), event_column(words[i, 1])] = 1
 
 
-def _beyond_neighbours(interval: Interval) -> tuple[Array, Array, NDArray[np.bool_], NDArray[np.bool_]]:
+def _near(dark: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(H, W): where one is among 3x3."""
+    return np.asarray(cv2.dilate(dark.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0, np.bool_)
+
+
+def _beyond_neighbours(
+    first: Shot, second: Shot
+) -> tuple[Array, Array, NDArray[np.bool_], NDArray[np.bool_]]:
     """(H, W): mean intensity, the part of its change that neighbours do not share, where none clips, what is too dark.
 
     The part has the variance of the change where that is white noise. Frames in RGB have been demosaiced, most of them
     compressed too, so that neighbours share their noise: the whole change is taken.
     """
-    first, second = interval.first, interval.second
     level, change = np.empty((2, *first.levels.shape))
     bad = np.empty(level.shape, np.bool_)
     _compare(*_by_level(first), *_by_level(second), level, change, bad)
@@ -227,7 +268,7 @@ def _beyond_neighbours(interval: Interval) -> tuple[Array, Array, NDArray[np.boo
     for shot in (first, second):
         if shot.valid is not None:
             bad |= ~shot.valid
-    usable = cv2.dilate(bad.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0
+    usable = ~_near(bad)
     usable[[0, -1]] = False  # of pixels at the border a neighbour counts twice
     usable[:, [0, -1]] = False
     return level, np.asarray(beyond, np.float64), usable, dark

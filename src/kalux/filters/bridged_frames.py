@@ -39,6 +39,7 @@ from kalux.augmentation.unseen import (
     UNKNOWN_CHANGE,
     UNMEASURED_CHANGE,
     forget_silence,
+    half_way,
     silent_change,
     turns,
 )
@@ -81,6 +82,7 @@ class BridgeMemory(NamedTuple):
     In causal mode also the counts of events between the middle and the end of the latest exposure. Of pixels that the
     latest frames did not measure, the counts since one did (to the latest node); 0 elsewhere. ``since`` is the start of
     the first exposure, us. ``unshown`` is of the pixels that no frame has measured yet, ``tail`` how far highlights go.
+    ``silent`` is what silent pixels have changed in the latest interval, NaN of others (`unseen.half_way`).
     """
 
     latent: Latent
@@ -96,6 +98,7 @@ class BridgeMemory(NamedTuple):
     unshown: UnshownMemory
     tail: Tail
     silent_change: Floats
+    silent: Floats
 
 
 class BridgedFrames(CommonMethod):
@@ -227,6 +230,7 @@ class BridgedFrames(CommonMethod):
             unshown=begin_unshown(latent, shown(shot), tail),
             tail=tail,
             silent_change=unknown,
+            silent=np.full(self.shape, np.nan, np.float32),
         )
         if self.lookahead:
             value, variance = latent.value, latent.variance
@@ -302,7 +306,8 @@ class BridgedFrames(CommonMethod):
             memory.latent, second, on, off, memory.thresholds, self.noise, start, end, grown
         )
         change = self._silent_change(joined)
-        joined = joined._replace(trail=trail, silent_change=change, turns=turns(on, off))
+        share, silent = half_way(memory.silent, joined, self.noise.quantisation_variance, self.on * self.off)
+        joined = joined._replace(trail=trail, silent_change=change, turns=turns(on, off), half_way=share)
         joined, far_on, far_off = self._drifting(joined, memory, second, on, off)
         change = self._of_black(change, memory.latent, second)
         joined = joined._replace(silent_change=change)
@@ -320,6 +325,7 @@ class BridgedFrames(CommonMethod):
             at_middle=at_middle,
             unshown=unshown,
             silent_change=change,
+            silent=silent,
         )
         return joined._replace(unshown=unshown), after
 
@@ -494,6 +500,7 @@ class BridgedFrames(CommonMethod):
             repeated=1.0 - between / 2.0,
             wrong=WRONG_STEPS * between * self.on * self.off,
             share=share,
+            half_way=segment.half_way,
         )
 
 

@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.bridge import UNMEASURED
+from kalux.augmentation.unseen import RANDOM
 from kalux.compiled import FUSED
-from kalux.filters.readout import SHARED, Hidden, total_variance
+from kalux.filters.readout import SHARED, Hidden
 
 Array = NDArray[np.floating[Any]]
 
@@ -24,13 +25,13 @@ HIDDEN_MOVING: Final = 0.08
 late: by the errors of images, forward and both ways in time, of eleven simulated scenes and of the held-out frames of
 three real recordings."""
 
-HIDDEN_STILL: Final = 0.22
-"""Where no event has come of late, in units of the mean square change of the silent pixels around from one frame to the
-other (`kalux.augmentation.unseen`): the same scenes. A random walk between two known ends would have 1/4."""
+HIDDEN_EXPOSED: Final = 0.2
+"""What share of this, and of what silent pixels hide, is hidden at a frame that is exposed all the time, the mean of
+which is not the middle: fifty simulated scenes, exposed for a twentieth to three quarters of the time."""
 
-HIDDEN_EXPOSED: Final = 0.09
-"""What share of these is hidden at a frame that is exposed all the time, the mean of which is not the middle: the same
-scenes, exposed for a tenth to two thirds of the time."""
+WAITING: Final = (0.5, 0.25)
+"""What is hidden of a pixel that waits for its next event, in units of what one without an event of late hides and of
+what one with an event in this frame interval does: the same scenes, and the held-out frames."""
 
 WRONG_STEPS: Final = 0.002
 """Variance, in c^2 per squared number of events between two frames, half-way, of steps that are all wrong alike: the
@@ -70,6 +71,8 @@ class Around(NamedTuple):
         Variance of steps that are all wrong alike, per squared number of events.
     share
         Of the way from the frame before to the one after.
+    half_way
+        How far silent pixels are off the mean of both frames there (`kalux.augmentation.unseen.half_way`).
     """
 
     first: Array
@@ -81,6 +84,7 @@ class Around(NamedTuple):
     repeated: float
     wrong: float
     share: float
+    half_way: float = RANDOM
 
     @property
     def misses_some(self) -> bool:
@@ -89,15 +93,20 @@ class Around(NamedTuple):
 
 
 def hidden_variance(
-    between: float, threshold2: float, exposed: float = 0.0, since: float | None = None
+    between: float,
+    threshold2: float,
+    exposed: float = 0.0,
+    since: float | None = None,
+    half_way: float = RANDOM,
 ) -> Hidden:
     """What no event has told at ``between``, 0 at a frame and 1 half-way between two, with ``threshold2`` = c^2.
 
     ``exposed`` is the share of the time for which frames are exposed; ``since`` the time since the latest frame, in
-    intervals, where no next one is used: nothing then holds the other end of a silent pixel's change.
+    intervals, where no next one is used: nothing then holds the other end of a silent pixel's change. ``half_way`` is
+    that of `Around`.
     """
-    hidden = between + (1.0 - between) * HIDDEN_EXPOSED * exposed
-    still = hidden * HIDDEN_STILL if since is None else min(since, 1.0)
+    hidden = between + (1.0 - between) * HIDDEN_EXPOSED * exposed**2
+    still = hidden * half_way if since is None else min(since, 1.0)
     return Hidden(still, threshold2 * hidden * HIDDEN_MOVING)
 
 
@@ -164,17 +173,19 @@ def given_variance(
     planes = (variance,) if around is None else (variance, *around[:3])
     known, *frames = (np.ascontiguousarray(plane, np.float32) for plane in planes)
     given = np.empty_like(known)
+    waiting = np.zeros(moving.size, np.bool_)
     if around is not None:
-        scalars = tuple(np.float32(value) for value in around[3:-1])
+        scalars = tuple(np.float32(value) for value in around[3:-2])
         first, second, events = (plane.reshape(-1) for plane in frames)
         if left is not None:
             _hear(known.reshape(-1), left.reshape(-1), first, second, alone(hidden).moving, given.reshape(-1))
             known = given
         _know(known.reshape(-1), first, second, events, scalars, given.reshape(-1))
+        _wait(moving.reshape(-1), first, second, events, waiting)
         known = given
     change = np.ascontiguousarray(silent_change, np.float32)
     scaled = tuple(np.float32(value) for value in hidden)
-    _hide(known.reshape(-1), moving.reshape(-1), change.reshape(-1), scaled, given.reshape(-1))
+    _hide(known.reshape(-1), moving.reshape(-1), waiting, change.reshape(-1), scaled, given.reshape(-1))
     return given
 
 
@@ -197,10 +208,23 @@ def _hear(variance, left, first, second, hidden, heard):  # type: ignore[no-unty
         heard[i] = variance[i] * (one - _HEARD * max(lost, np.float32(0.0)) if neither else one)
 
 
+@nb.njit(cache=True, nogil=True)
+def _wait(moving, first, second, events, waiting):  # type: ignore[no-untyped-def]
+    """Pixels without an event between the frames, but with one of late, or measured by one of the frames alone."""
+    unmeasured = np.float32(UNMEASURED)
+    for i in range(np.uint64(len(waiting))):
+        late = moving[i] | (max(first[i], second[i]) >= unmeasured)
+        waiting[i] = late & (events[i] == np.float32(0.0)) & (min(first[i], second[i]) < unmeasured)
+
+
 @nb.njit(cache=True, nogil=True, error_model="numpy", fastmath=FUSED)
-def _hide(known, moving, change, hidden, given):  # type: ignore[no-untyped-def]
+def _hide(known, moving, waiting, change, hidden, given):  # type: ignore[no-untyped-def]
+    changing, of_moving = hidden
+    part, of_waiting = np.float32(WAITING[0]), np.float32(WAITING[1]) * of_moving
     for i in range(np.uint64(len(given))):
-        given[i] = total_variance(known[i], moving[i], change[i], hidden)
+        still = changing * change[i]
+        late = of_waiting + part * still if waiting[i] else of_moving
+        given[i] = known[i] + (late if moving[i] | waiting[i] else still)
 
 
 def add_pattern(variance: NDArray[np.float32], intensity: Array, log_offset: float, deviation: float) -> None:
