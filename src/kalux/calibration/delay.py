@@ -35,6 +35,9 @@ _RIVAL: Final = 1.05
 least residual is no larger than so many times the least of all, the one nearest to no delay is taken. At a simulated
 lamp of 100 Hz there are two, at -8.8 and 1.3 ms, whose residuals differ by 2 %."""
 
+_WALL: Final = 1.05
+"""Of the least residual, where walls of its valley are."""
+
 _MIN_SAMPLES: Final = 500
 _MAX_SAMPLES: Final = 60_000
 _MAX_FRAMES: Final = 60
@@ -122,17 +125,27 @@ def _within_exposures(
     on, off = fit.solution.tolist()
     grid = round(rough.apparent / STEP) * STEP + STEP * np.arange(*_AROUND)
     residuals = np.array([_residual(seen) for seen in _samples(recording, camera, grid, (on, off))])
-    least = int(np.argmin(residuals))
-    if least in (0, len(grid) - 1) or not np.isfinite(residuals).all():
+    middle = _middle(residuals)
+    if middle is None:
         return rough
-    bottoms = np.count_nonzero((residuals[1:-1] < residuals[:-2]) & (residuals[1:-1] < residuals[2:]))
-    if bottoms > 1:  # flat as far as can be told: where the valley as a whole is least
-        curvature, slope, _ = np.polyfit(np.arange(len(grid)) - least, residuals, 2)
-        shift = 0.0 if curvature <= 0 else float(np.clip(-0.5 * slope / curvature, -2.0, 2.0))
-    else:
-        shift = _vertex(*residuals[least - 1 : least + 2])
-    apparent = float(grid[least]) + STEP * shift
+    apparent = float(grid[0]) + STEP * middle
     return rough._replace(delay=round(_SHARE * apparent), apparent=round(apparent))
+
+
+def _middle(residuals: Array) -> float | None:
+    """Half-way between the walls of a valley, which may be flat at its bottom; None where one is missing.
+
+    In units of the grid, from its first point. The walls are looked at 5 % above the least, or as far as they go.
+    """
+    wall = min(_WALL * residuals.min(), residuals[0], residuals[-1])
+    if not residuals.min() < wall < np.inf:
+        return None
+    depth = wall - residuals
+    low = np.flatnonzero(depth > 0)
+    first, last = int(low[0]), int(low[-1])
+    left = first - depth[first] / (depth[first] - depth[first - 1])
+    right = last + depth[last] / (depth[last] - depth[last + 1])
+    return float(left + right) / 2
 
 
 def delays() -> NDArray[np.int64]:
