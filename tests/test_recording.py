@@ -206,6 +206,10 @@ def small_file(path):
     [
         (lambda path: path.touch(), "an empty file, not a recording"),
         (lambda path: path.mkdir(), "an empty folder, not a recording"),
+        (
+            lambda path: (path.mkdir(), (path / "images.txt").touch()),
+            r"frames \(images.txt\) without their events",
+        ),
         (os.mkfifo, "a pipe or a device, of which nothing can be read twice"),
         (lambda path: (path.mkdir(), (path / "0.png").touch()), "a folder of images, which --frames takes"),
         (lambda path: (path.mkdir(), small_file(path / "a.h5")), r"a folder of recordings \(a\.h5\)"),
