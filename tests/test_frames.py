@@ -54,6 +54,7 @@ def test_placing_an_exposure_keeps_the_rest():
 def test_a_frame_tells_itself_in_a_line():
     assert repr(frame()) == "<kalux.Frame uint8 (3, 4), grey, exposed from 100 to 200 us>"
     assert repr(Frame([[1]], 0, 1, mosaic="RGGB")) == "<kalux.Frame list, RGGB, exposed from 0 to 1 us>"
+    assert repr(Frame(None, 0, 1)) == "<kalux.Frame NoneType, grey, exposed from 0 to 1 us>"
 
 
 def test_colours():

@@ -106,6 +106,19 @@ def test_a_white_value_that_can_hardly_be_right_is_warned_of():
         in_memory(frames=dark)
 
 
+@pytest.mark.parametrize(
+    ("start", "told"), [(0, []), (1_850, ["only 3 of the 40"]), (9_999, ["none of the 40"])]
+)
+def test_clocks_that_can_hardly_be_the_same_are_warned_of(recwarn, start, told):
+    """Times of events in a notebook often begin at 0, those of frames with the time of day."""
+    frames = [Frame(np.zeros((4, 5), np.uint8), t, t + 50) for t in range(0, 2_000, 100)]
+    events = {"t": start + 50 * np.arange(40), "x": [0] * 40, "y": [0] * 40, "p": [True] * 40}
+    Recording.from_arrays(events, frames, sensor_size=(4, 5))
+    assert [str(warning.message).split(" events")[0] for warning in recwarn] == [
+        f"arrays: {text}" for text in told
+    ]
+
+
 def test_white_is_found_where_frames_of_16_bits_end(recwarn):
     """All frames get it, also those before the one that shows it, and copies; no warning is needed."""
     frames = [
@@ -193,6 +206,10 @@ def small_file(path):
     [
         (lambda path: path.touch(), "an empty file, not a recording"),
         (lambda path: path.mkdir(), "an empty folder, not a recording"),
+        (
+            lambda path: (path.mkdir(), (path / "images.txt").touch()),
+            r"frames \(images.txt\) without their events",
+        ),
         (os.mkfifo, "a pipe or a device, of which nothing can be read twice"),
         (lambda path: (path.mkdir(), (path / "0.png").touch()), "a folder of images, which --frames takes"),
         (lambda path: (path.mkdir(), small_file(path / "a.h5")), r"a folder of recordings \(a\.h5\)"),

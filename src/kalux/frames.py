@@ -66,7 +66,7 @@ class Frame:
     @property
     def colours(self) -> str:
         """``"grey"``, ``"RGB"``, or the pattern of the mosaic."""
-        return self.mosaic or ("RGB" if self.image.ndim == 3 else "grey")
+        return self.mosaic or ("RGB" if getattr(self.image, "ndim", 2) == 3 else "grey")
 
     @property
     def exposure(self) -> int:

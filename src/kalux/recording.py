@@ -47,6 +47,9 @@ from kalux.readers import CHUNK_EVENTS, Source, joined
 
 T = TypeVar("T")
 
+_FEW: Final = 0.1
+"""Of the events: a camera that records both has fewer of them between its frames only if it was started wrongly."""
+
 _WATCHED: Final = 80  # frames, of which the white value is taken where nobody states it
 
 
@@ -123,6 +126,24 @@ def no_frames(recording: Recording) -> FrameError:
 
 
 RECORDING_NEEDED: Final = "a kalux.Recording is needed, from kalux.open or Recording.from_arrays"
+
+
+def clock_doubt(events: int, between: int, enough: int = LATEST) -> str | None:
+    """What makes it doubtful that events and frames have the same clock, if anything does.
+
+    ``between`` is how many of the ``events`` lie from the first frame to the last; ``enough`` of them are no doubt.
+    """
+    if between >= min(_FEW * events, enough):
+        return None
+    if between == 0:
+        return (
+            f"none of the {events:,} events lies between the first and the last frame; do events and frames have the "
+            "same clock?"
+        )
+    return (
+        f"only {between:,} of the {events:,} events lie between the first and the last frame; are times of events and "
+        "frames in the same unit and clock?"
+    )
 
 
 class Recording:
@@ -223,7 +244,7 @@ class Recording:
         Warns
         -----
         UserWarning
-            If what is taken for white can hardly be right.
+            If what is taken for white can hardly be right, or events and frames hardly have the same clock.
         """
         size = checked_size(sensor_size)
         if ground_truth is not None:
@@ -257,10 +278,14 @@ class Recording:
         for _ in recording.events():
             pass
         levels = Levels()
-        for _ in levels.watched(recording.frames()):
-            pass
-        doubt = levels.doubt()
-        if doubt is not None:
+        exposures = [
+            (frame.exposure_start, frame.exposure_end) for frame in levels.watched(recording.frames())
+        ]
+        doubts = [levels.doubt()]
+        if exposures:
+            first, last = np.searchsorted(array["t"], (exposures[0][0], exposures[-1][1] + 1))
+            doubts.append(clock_doubt(len(array), int(last - first)))
+        for doubt in filter(None, doubts):
             warnings.warn(f"{name}: {doubt}", stacklevel=2)
         return recording
 

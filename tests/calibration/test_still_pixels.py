@@ -39,5 +39,5 @@ def test_still_pixels_of_a_recording_under_auto_exposure():
 def test_a_fixed_exposure_says_nothing():
     frames = [Frame(np.full((80, 96), 9, np.uint8), t, t + 5_000) for t in range(0, 200_000, 40_000)]
     recording = Recording.from_arrays(events((0, 0, 0, 1)), frames, sensor_size=(80, 96))
-    with pytest.raises(InputError, match="at 1 exposure times, three are needed"):
+    with pytest.raises(InputError, match="at 1 exposure time, three are needed"):
         still_pixels(recording)

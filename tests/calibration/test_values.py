@@ -76,6 +76,8 @@ def test_maps_that_fit_their_checksum_but_are_none(tmp_path, data):
         (lambda p: p.unlink(), InputError, "cannot be read"),
         (lambda p: p.write_text("a = ["), FormatError, "not valid TOML"),
         (lambda p: p.write_text("a = 1"), FormatError, "not a calibration"),
+        (lambda p: p.write_text("kalux_offset = 1"), FormatError, "it is for kalux register --offset"),
+        (lambda p: p.write_text("kalux_rig = 1"), FormatError, "it is for kalux register --rig"),
         (lambda p: p.write_text("kalux_calibration = 99"), FormatError, "version 99"),
         (
             lambda p: p.write_text("kalux_calibration = 1\n[settings.events]\nnonsense = 1"),

@@ -95,7 +95,7 @@ def test_response_from_images_with_given_times(cli, tmp_path):
         (["calibrate", "nonsense"], "nonsense"),
         (["calibrate", "contrast", "REC", "-o", "a.txt"], "ends in .toml"),
         (["calibrate", "contrast", "REC", "--refactory", "3"], "did you mean --refractory"),
-        (["calibrate", "response", "REC"], "exposure times, three are needed"),
+        (["calibrate", "response", "REC"], "1 exposure time, three are needed"),
         (["calibrate", "response", "a.png", "b.png", "--times", "x,y"], "numbers with commas"),
         (["info", "REC", "--calibration", "nowhere.toml"], "cannot be read"),
     ],

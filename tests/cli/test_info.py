@@ -70,6 +70,13 @@ def test_exposures_that_are_replaced_are_told(cli, recording):
     assert (found.code, "--exposure 3000 replaces them" in found.err) == (0, True)
 
 
+def test_exposures_of_no_frames_replace_nothing(cli, tmp_path):
+    """A recording without frames has no exposures either."""
+    (tmp_path / "events.txt").write_text("0.000001 3 4 1\n")
+    found = cli("info", tmp_path, "--no-estimate", "--exposure", 3000)
+    assert (found.code, found.err) == (0, "")
+
+
 def test_exposures_can_be_given(cli, damaged):
     found = cli("info", damaged("no exposure times"), "--exposure", 8000, "--stamp", "middle")
     assert found.code == 0

@@ -115,6 +115,23 @@ def test_the_settings_are_beside_the_recording(cli, photograph, tmp_path):
     assert "not an output of kalux" in refused.error
 
 
+def test_negative_pixels_are_told_once(cli, tmp_path):
+    """Of a photograph, of a folder and of what crosses before it."""
+    rng = np.random.default_rng(0)
+    (tmp_path / "frames").mkdir()
+    for i in range(3):
+        picture = rng.uniform(0.1, 9, (40, 50)).astype(np.float32)
+        picture[:2, :3] = -0.25
+        cv2.imwrite(str(tmp_path / "frames" / f"{i}.tif"), picture)
+    one = tmp_path / "frames" / "0.tif"
+    line = f"kalux: warning: {one}: 6 of 2,000 pixels (0.3 %) are negative, down to -0.25, and taken as black"
+    for source, flags in ((one, ["--foreground", one]), (tmp_path / "frames", ["--source-rate", "10"])):
+        told = cli("simulate", source, "-o", tmp_path / f"{source.stem}.h5", *flags, "--size", "20x16")
+        assert told.code == 0
+        lines = told.err.splitlines()
+        assert [text.split(";")[0] for text in lines if "negative" in text] == [line] * (1 + (source == one))
+
+
 def test_a_folder_needs_its_rate(cli, folder, tmp_path):
     out = tmp_path / "a.h5"
     refused = cli("simulate", folder, "-o", out)

@@ -102,11 +102,45 @@ def test_what_is_no_image_is_refused(tmp_path: Path, name: str, data: bytes) -> 
     assert "\n" not in str(error.value)
 
 
-def test_negative_radiance_and_unknown_channels_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(FormatError, match="negative or not finite"):
-        read_photograph(write_exr(tmp_path / "n.exr", Y=np.full((4, 4), -1.0)))
-    with pytest.raises(FormatError, match="has the channels depth"):
-        read_photograph(write_exr(tmp_path / "d.exr", depth=np.ones((4, 4))))
+def test_a_few_negative_pixels_are_black_and_told(tmp_path: Path) -> None:
+    """Colours outside of the gamut have them; a picture that is negative for the most part is something else."""
+    image = np.full((4, 5), 2.0)
+    image[0, :2] = (-0.25, -0.5)
+    found = read_photograph(write_exr(tmp_path / "n.exr", Y=image))
+    assert np.array_equal(found.radiance, np.maximum(image, 0))
+    assert (
+        found.doubt
+        == f"{tmp_path / 'n.exr'}: 2 of 20 pixels (10 %) are negative, down to -0.5, and taken as black"
+    )
+    image[:2] = -1.0
+    with pytest.raises(FormatError, match=r"10 of 20 pixels \(50 %\) are negative; linear"):
+        read_photograph(write_exr(tmp_path / "n.exr", Y=image))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_what_is_not_finite_is_refused(tmp_path: Path, value: float) -> None:
+    image = np.ones((4, 5))
+    image[3, 4] = value
+    with pytest.raises(FormatError, match=r"1 of 20 pixels \(5 %\) is not finite"):
+        read_photograph(write_exr(tmp_path / "n.exr", Y=image))
+
+
+def test_the_content_says_what_an_image_is(tmp_path: Path) -> None:
+    write_exr(tmp_path / "n.exr", Y=np.ones((4, 5))).rename(tmp_path / "n.hdr")
+    assert np.array_equal(read_photograph(tmp_path / "n.hdr").radiance, np.ones((4, 5)))
+
+
+def test_of_a_folder_the_first_doubt_is_told_once(tmp_path: Path) -> None:
+    for i in range(3):
+        write_exr(tmp_path / f"{i}.exr", Y=np.where(np.eye(4) > 0, 1.0 - 2 * min(i, 1), 1.0))
+    told: list[str] = []
+    sequence = open_sequence(tmp_path, told.append)
+    assert told == []
+    for index in (0, 1, 2, 1):
+        assert sequence.image(index).min() >= 0
+    assert [line.split(";")[0] for line in told] == [
+        f"{tmp_path / '1.exr'}: 4 of 16 pixels (25 %) are negative, down to -1, and taken as black"
+    ]
 
 
 def test_the_real_photograph(shared_data: Path) -> None:

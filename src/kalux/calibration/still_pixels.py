@@ -15,6 +15,7 @@ from kalux.errors import InputError
 from kalux.events import EventArray
 from kalux.frames import Frame
 from kalux.recording import Recording
+from kalux.wording import how_many
 
 ImageArray = NDArray[Any]
 
@@ -46,8 +47,8 @@ def still_pixels(recording: Recording) -> tuple[list[ImageArray], list[float]]:
     if best is None or len(best[0]) < 3:
         found = 0 if best is None else len(best[0])
         raise InputError(
-            f"{recording.source.path}: still pixels are seen at {found} exposure times, three are needed; record a "
-            "still scene while the exposure changes, or give images at several exposures"
+            f"{recording.source.path}: still pixels are seen at {how_many(found, 'exposure time')}, three are needed; "
+            "record a still scene while the exposure changes, or give images at several exposures"
         )
     images = [
         np.rint(255 * frame.normalised()[best[1]]).clip(0, 255).astype(np.uint8)[None] for frame in best[0]

@@ -158,8 +158,13 @@ def load_calibration(path: str | Path, *more: str | Path) -> Calibration:
 def _load(path: Path) -> Calibration:
     body = read_toml(path, damaged=FormatError)
     version = body.get("kalux_calibration")
+    for kind in ("rig", "offset"):
+        if f"kalux_{kind}" in body:
+            raise FormatError(f"{path}: of two cameras, not of a sensor; it is for kalux register --{kind}")
     if not isinstance(version, int):
-        raise FormatError(f"{path}: not a calibration; kalux calibrate makes them")
+        raise FormatError(
+            f"{path}: not a calibration; kalux calibrate contrast, noise and response make them"
+        )
     if version > VERSION:
         raise FormatError(
             f"{path}: a calibration of version {version}, this kalux reads up to {VERSION}; update kalux"

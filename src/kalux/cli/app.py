@@ -76,6 +76,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         0 done, 1 an error in kalux, 2 bad input or usage, 130 interrupted.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # of a damaged image kalux says it, in its line
     hold_closed_streams()
     try:
         with termination_as_interrupt() as was_interrupted:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from kalux.augmentation.deblur import between, events_until
 from kalux.frames import Levels
-from kalux.recording import Recording, no_frames
+from kalux.recording import Recording, clock_doubt, no_frames
 
 T = TypeVar("T")
 
@@ -20,9 +20,6 @@ CHECKED_FIRST: Final = 1 << 22
 """Events that are looked at before anything is made of a recording, 4 million: 0.05 s, and what is wrong with a file
 mostly begins with its first event. Those of a longer one are checked as they are used: its file is then decoded once,
 not twice."""
-
-_FEW: Final = 0.1
-"""Of the events: a camera that records both has fewer of them between its frames only if it was started wrongly."""
 
 _LONG_GAP: Final = 10_000_000
 """us without a frame that somebody should hear of: at 100 images/s there are a thousand of them."""
@@ -73,16 +70,10 @@ class Contents(NamedTuple):
             yield self.doubt
         if self.events == 0:
             yield "there are no events; the images show the frames only"
-        elif self.events_between == 0:
-            yield (
-                f"none of the {self.events:,} events lies between the first and the last frame; do events and "
-                "frames have the same clock?"
-            )
-        elif self.events_between < min(_FEW * self.events, CHECKED_FIRST):
-            yield (
-                f"only {self.events_between:,} of the {self.events:,} events lie between the first and the last frame; "
-                "are times of events and frames in the same unit and clock?"
-            )
+        else:
+            doubt = clock_doubt(self.events, self.events_between, CHECKED_FIRST)
+            if doubt is not None:
+                yield doubt
 
 
 def check_recording(

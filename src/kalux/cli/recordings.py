@@ -117,7 +117,7 @@ def open_recording(options: argparse.Namespace) -> Recording:
         mosaic=options.bayer,
         white=options.white,
     )
-    if options.exposure is not None and recording.source.exposure_known:
+    if options.exposure is not None and recording.source.exposure_known and recording.source.count_frames():
         warn(f"the recording states its exposure times; --exposure {options.exposure} replaces them")
     return recording
 

@@ -100,15 +100,15 @@ def chosen_scene(options: argparse.Namespace, size: tuple[int, int]) -> tuple[Sc
     InputError
         The source cannot be read or used.
     """
-    from kalux.datasets.sources import exposed, open_sequence, read_photograph, white_for
+    from kalux.datasets.sources import exposed, open_sequence, white_for
     from kalux.readers.images import IMAGES, RADIANCE
 
     source: Path = options.source
     if source.is_file() and source.suffix.lower() in IMAGES | RADIANCE:
-        photograph = read_photograph(source)
+        photograph = _photograph(source)
         is_hdr, scene = photograph.is_hdr, _photograph_scene(options, photograph, size)
     else:
-        sequence = open_sequence(source)
+        sequence = open_sequence(source, warn)
         is_hdr, scene = sequence.is_hdr, _sequence_scene(options, sequence, size)
     if options.saturate is not None and options.white is not None:
         raise UsageError("--saturate and --white say the same; give one of them")
@@ -122,6 +122,15 @@ def chosen_scene(options: argparse.Namespace, size: tuple[int, int]) -> tuple[Sc
     else:
         white = _or(options.white, 1.0)
     return _with_foreground(options, exposed(scene, white)), white
+
+
+def _photograph(path: Path) -> Photograph:
+    from kalux.datasets.sources import read_photograph
+
+    found = read_photograph(path)
+    if found.doubt is not None:
+        warn(found.doubt)
+    return found
 
 
 def _photograph_scene(options: argparse.Namespace, photograph: Photograph, size: tuple[int, int]) -> Scene:
@@ -237,7 +246,6 @@ def _with_foreground(options: argparse.Namespace, scene: Scene) -> Scene:
     import numpy as np
 
     from kalux.datasets.foreground import Sprite, ball, crossing, with_foreground
-    from kalux.datasets.sources import read_photograph
 
     if options.foreground is None:
         given = [
@@ -255,7 +263,7 @@ def _with_foreground(options: argparse.Namespace, scene: Scene) -> Scene:
     if options.foreground == "ball":
         sprite = ball()
     else:
-        image = read_photograph(Path(options.foreground))
+        image = _photograph(Path(options.foreground))
         sprite = Sprite(image.radiance, np.ones_like(image.radiance) if image.alpha is None else image.alpha)
     size = _or(options.foreground_size, 0.25 * scene.sensor_size[0])
     reach = 0.6 * size * max(1.0, sprite.alpha.shape[1] / sprite.alpha.shape[0])

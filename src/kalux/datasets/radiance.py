@@ -7,15 +7,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from kalux.datasets.brackets import Picture
+from kalux.datasets.exr import exr_channels, exr_image
 from kalux.errors import FormatError, InputError
 from kalux.models.camera import Response
 from kalux.models.colour import LUMINANCE
+from kalux.readers.images import decoded
 from kalux.readers.numpy_files import DAMAGE
+from kalux.readers.source import reading
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -84,25 +86,16 @@ def read_radiance(path: Path) -> HdrReference:
 
 
 def _read_exr(path: Path) -> tuple[NDArray[Any], Mask]:
-    import OpenEXR
-
-    try:
-        channels = OpenEXR.File(str(path), separate_channels=True).channels()
-    except (RuntimeError, ValueError, OSError) as error:
-        raise FormatError(f"{path}: not an EXR file, or damaged") from error
-    planes = {name: np.asarray(channel.pixels, np.float32) for name, channel in channels.items()}
-    if {"R", "G", "B"} <= planes.keys():
-        radiance = np.stack([planes[name] for name in "RGB"], axis=2)
-    elif "Y" in planes:
-        radiance = planes["Y"]
-    else:
-        raise FormatError(f"{path}: has no channels R, G, B or Y")
-    valid = planes["valid"] > 0.5 if "valid" in planes else np.ones(radiance.shape[:2], bool)
+    with reading(path):
+        channels = exr_channels(path, path.read_bytes())
+    radiance = exr_image(path, channels)
+    valid = channels["valid"] > 0.5 if "valid" in channels else np.ones(radiance.shape[:2], bool)
     return radiance, valid
 
 
 def _read_hdr(path: Path) -> tuple[NDArray[Any], Mask]:
-    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    with reading(path):
+        image = decoded(path.read_bytes())
     if image is None or image.dtype != np.float32:
         raise FormatError(f"{path}: not a Radiance HDR image, or damaged")
     return np.ascontiguousarray(image[..., ::-1]), np.ones(image.shape[:2], bool)

@@ -11,19 +11,19 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.datasets.exr import exr_channels, exr_image, is_exr
 from kalux.datasets.motion import Motion
 from kalux.datasets.scenes import Image, Scene, blurred, camera_matrix, check_scale, sample
 from kalux.errors import FormatError, InputError
 from kalux.models.camera import Response
 from kalux.models.colour import LUMINANCE
-from kalux.readers.images import IMAGES, RADIANCE, images_in
+from kalux.readers.images import IMAGES, RADIANCE, decoded, images_in
 from kalux.readers.source import reading
 from kalux.readers.videos import opened_video
-from kalux.wording import how_many, one_line
+from kalux.wording import how_many
 
 _KEPT: Final = 4  # decoded images
 _MOMENTS: Final = 16  # of a scene, by which white is chosen
@@ -40,16 +40,20 @@ class Photograph(NamedTuple):
     Attributes
     ----------
     radiance
-        (H, W) float32, linear, not negative.
+        (H, W) float32, linear, not negative: a luminance below 0, as of colours outside of the gamut and of dark noise,
+        is taken as black.
     alpha
         (H, W) float32, 0 to 1; None where the file has none.
     is_hdr
         Whether it was stored as linear radiance. Otherwise it was decoded from sRGB, and 1.0 is its white.
+    doubt
+        How many pixels were negative, a sentence; None if none was.
     """
 
     radiance: Image
     alpha: Image | None
     is_hdr: bool
+    doubt: str | None = None
 
 
 class ImageSequence(NamedTuple):
@@ -87,35 +91,41 @@ def read_photograph(path: Path) -> Photograph:
     InputError
         If the file cannot be read.
     FormatError
-        If it is no image that can be decoded, or has values that are negative or not finite.
+        If it is no image that can be decoded, has values that are not finite, or is negative in half of its pixels or
+        more.
     """
     with reading(path):
         data = path.read_bytes()
-    suffix = path.suffix.lower()
-    if suffix == ".exr":
-        colour, alpha = _read_exr(path)
+    colour: NDArray[Any]
+    if is_exr(data):
+        channels = exr_channels(path, data)
+        colour, alpha = exr_image(path, channels), channels.get("A")
     else:
-        pixels = None if not data else _decoded(data)
+        pixels = decoded(data)
         if pixels is None:
             raise FormatError(f"{path}: not an image, or damaged; .hdr, .exr, .png, .jpg or .tif is needed")
         colour, alpha = _split_alpha(pixels)
     is_hdr = colour.dtype.kind == "f"
     linear = colour.astype(np.float32) if is_hdr else _from_srgb(colour)
     radiance = linear if linear.ndim == 2 else np.asarray(linear @ LUMINANCE, np.float32)
-    if min(radiance.shape) < 2 or not (radiance.min() >= 0 and radiance.max() < np.inf):
-        raise FormatError(
-            f"{path}: {radiance.shape[1]}x{radiance.shape[0]} pixels, some of them negative or not finite; linear "
-            "radiance of at least 2x2 pixels is needed"
-        )
-    return Photograph(np.ascontiguousarray(radiance), alpha, is_hdr)
+    if min(radiance.shape) < 2:
+        raise FormatError(f"{path}: {radiance.shape[1]}x{radiance.shape[0]} pixels; at least 2x2 are needed")
+    unknown, negative = ~np.isfinite(radiance), radiance < 0
+    if unknown.any():
+        raise FormatError(f"{path}: {_part(unknown)} not finite (NaN or infinite); linear radiance is needed")
+    if 2 * negative.sum() >= negative.size:
+        raise FormatError(f"{path}: {_part(negative)} negative; linear radiance is needed")
+    doubt = None
+    if negative.any():
+        doubt = f"{path}: {_part(negative)} negative, down to {radiance.min():.2g}, and taken as black"
+        radiance = np.maximum(radiance, np.float32(0))
+    return Photograph(np.ascontiguousarray(radiance), alpha, is_hdr, doubt)
 
 
-def _decoded(data: bytes) -> NDArray[Any] | None:
-    try:
-        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error:
-        return None
-    return None if pixels is None else np.asarray(pixels)
+def _part(which: NDArray[np.bool_]) -> str:
+    """``12 of 3,400 pixels (0.35 %) are``."""
+    count, verb = int(which.sum()), "is" if which.sum() == 1 else "are"
+    return f"{count:,} of {how_many(which.size, 'pixel')} ({100 * count / which.size:.2g} %) {verb}"
 
 
 def _split_alpha(pixels: NDArray[Any]) -> tuple[NDArray[Any], Image | None]:
@@ -127,28 +137,6 @@ def _split_alpha(pixels: NDArray[Any]) -> tuple[NDArray[Any], Image | None]:
     return pixels[..., 2::-1], alpha
 
 
-def _read_exr(path: Path) -> tuple[NDArray[Any], Image | None]:
-    """Colour or grey, and alpha, of an OpenEXR file."""
-    import OpenEXR
-
-    try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            channels = {
-                name: np.asarray(channel.pixels, np.float32) for name, channel in file.channels().items()
-            }
-    except Exception as error:  # OpenEXR raises whatever its C++ does
-        raise FormatError(f"{path}: not an OpenEXR image, or damaged ({one_line(error)})") from error
-    alpha = channels.get("A")
-    if {"R", "G", "B"} <= channels.keys():
-        return np.stack([channels[name] for name in "RGB"], axis=-1), alpha
-    for name in ("Y", "L", "Z"):
-        if name in channels:
-            return channels[name], alpha
-    raise FormatError(
-        f"{path}: has the channels {', '.join(sorted(channels)) or 'none'}; R, G, B or Y is needed"
-    )
-
-
 def _from_srgb(pixels: NDArray[Any]) -> Image:
     top = int(np.iinfo(pixels.dtype).max)
     table = Response.srgb().inverse(np.arange(top + 1) / top).astype(np.float32)
@@ -158,8 +146,10 @@ def _from_srgb(pixels: NDArray[Any]) -> Image:
 # --- sequences --------------------------------------------------------------------------------------------
 
 
-def open_sequence(path: Path) -> ImageSequence:
+def open_sequence(path: Path, warn: Callable[[str], None] = lambda doubt: None) -> ImageSequence:
     """A folder of images, in the order of the numbers in their names, or a video.
+
+    ``warn`` is called with the `Photograph.doubt` of the first image that has one.
 
     Raises
     ------
@@ -170,20 +160,29 @@ def open_sequence(path: Path) -> ImageSequence:
     """
     if not path.exists():
         raise InputError(f"{path}: no such file or folder")
-    return _folder(path) if path.is_dir() else _video(path)
+    return _folder(path, warn) if path.is_dir() else _video(path)
 
 
-def _folder(path: Path) -> ImageSequence:
+def _folder(path: Path, warn: Callable[[str], None]) -> ImageSequence:
     files = images_in(path, IMAGES | RADIANCE)
     if len(files) < 2:
         raise FormatError(f"{path}: has {how_many(len(files), 'image')}; a sequence needs two or more")
     kinds = {file.suffix.lower() in RADIANCE for file in files}
     if len(kinds) > 1:
         raise FormatError(f"{path}: has HDR and ordinary images; keep one kind of them")
-    first = read_photograph(files[0])
+    doubts: list[str] = []
+
+    def photograph(index: int) -> Photograph:
+        found = read_photograph(files[index])
+        if found.doubt is not None and not doubts:
+            doubts.append(found.doubt)
+            warn(f"{found.doubt}; of other images of the folder this is not said again")
+        return found
+
+    first = photograph(0)
 
     def image(index: int) -> Image:
-        found = read_photograph(files[index]).radiance
+        found = photograph(index).radiance
         if found.shape != first.radiance.shape:
             raise FormatError(
                 f"{files[index]}: {found.shape[1]}x{found.shape[0]} pixels, the first image of the folder has "

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.lib.format import read_array
 from numpy.typing import NDArray
 
+from kalux.datasets.exr import exr_channels
 from kalux.errors import FormatError, FrameError, InputError
 from kalux.evaluation.method import Image, Times
 from kalux.readers.image_lists import read_csv
@@ -142,13 +143,7 @@ def _npy(folder: Path, file: Path, data: bytes) -> NDArray[Any]:
 
 
 def _exr(folder: Path, file: Path, data: bytes) -> NDArray[Any]:
-    import OpenEXR
-
-    try:
-        channels = OpenEXR.File(io.BytesIO(data), separate_channels=True).channels()
-    except (RuntimeError, ValueError, TypeError) as error:
-        raise FormatError(f"{file}: not an OpenEXR image, or damaged") from error
+    channels = exr_channels(file, data)
     if "Y" not in channels:
         raise FormatError(f"{file}: has the channels {', '.join(channels)[:80]}; Y, the intensity, is needed")
-    image: NDArray[Any] = channels["Y"].pixels
-    return image
+    return channels["Y"]

@@ -131,6 +131,8 @@ def _what_it_is(path: Path) -> str:
             return "an empty folder, "
         if any(name in IMAGES for name in names):
             return "a folder of images, which --frames takes beside the recording of the events; "
+        if "images.txt" in {file.name for file in path.iterdir()}:
+            return "a folder of frames (images.txt) without their events (events.txt); "
         recordings = _recordings_in(path)
         return (
             f"a folder of recordings ({', '.join(recordings)}), of which one can be opened; "

@@ -110,15 +110,21 @@ def _is_grey(image: NDArray[Any]) -> bool:
 
 def _decoded(path: Path, name: str, data: bytes) -> NDArray[Any]:
     """The image as stored: (H, W), or (H, W, 3 or 4) in the order blue, green, red."""
-    image = None
-    if _is_whole(data):
-        try:
-            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-        except cv2.error:
-            image = None
+    image = decoded(data)
     if image is None:
         raise FormatError(f"{path}: {name!r} is not an image, or damaged; copy or download it again")
-    return np.asarray(image)
+    return image
+
+
+def decoded(data: bytes) -> NDArray[Any] | None:
+    """An image as stored: (H, W), or (H, W, 3 or 4) in the order blue, green, red; None if it is none or damaged."""
+    if not _is_whole(data):
+        return None
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        return None
+    return None if image is None else np.asarray(image)
 
 
 def _is_whole(data: bytes) -> bool:
