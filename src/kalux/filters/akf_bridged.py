@@ -36,12 +36,7 @@ from kalux.compiled import (
     unpack,
 )
 from kalux.events import EventArray
-from kalux.filters.akf import (
-    State,
-    information_kept,
-    measurement_rate,
-    predicted_information,
-)
+from kalux.filters.akf import State, information_kept, measurement_rate, predicted_information
 from kalux.filters.common import EPOCH, Clock, moved_clock, newest_around_inside
 from kalux.models.events import signal_probability, threshold_noise
 

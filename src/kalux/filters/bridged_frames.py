@@ -10,21 +10,8 @@ from numpy.typing import NDArray
 
 from kalux.augmentation import bridge, deblur
 from kalux.augmentation.bridge import BridgedSegment, BridgeNoise, Latent, Thresholds, UnshownMemory
-from kalux.augmentation.deblur import (
-    EXPOSED,
-    EXPOSURE_FIELDS,
-    Exposure,
-    all_between,
-    relative_levels,
-)
-from kalux.augmentation.highlights import (
-    Shown,
-    Tail,
-    Unshown,
-    begin_unshown,
-    expected_excess,
-    follow_unshown,
-)
+from kalux.augmentation.deblur import EXPOSED, EXPOSURE_FIELDS, Exposure, all_between, relative_levels
+from kalux.augmentation.highlights import Shown, Tail, Unshown, begin_unshown, expected_excess, follow_unshown
 from kalux.augmentation.trail import (
     Followed,
     Trail,
@@ -35,13 +22,7 @@ from kalux.augmentation.trail import (
     trail_at,
     trail_between,
 )
-from kalux.augmentation.unseen import (
-    UNKNOWN_CHANGE,
-    UNMEASURED_CHANGE,
-    forget_silence,
-    silent_change,
-    turns,
-)
+from kalux.augmentation.unseen import UNKNOWN_CHANGE, UNMEASURED_CHANGE, forget_silence, silent_change, turns
 from kalux.compiled import apart
 from kalux.events import EventArray
 from kalux.filters import akf_bridged
@@ -50,13 +31,7 @@ from kalux.filters.common import make_clock
 from kalux.filters.method import FAR_FUTURE, USUAL_INTERVAL, Chunks, CommonMethod, Segment
 from kalux.filters.shots import Shot
 from kalux.filters.uncertainty import WRONG_STEPS, Around
-from kalux.models.camera import (
-    CRUSHED,
-    beyond_white,
-    dark_scale,
-    frame_log_covariance,
-    log_intensity,
-)
+from kalux.models.camera import CRUSHED, beyond_white, dark_scale, frame_log_covariance, log_intensity
 from kalux.models.pixels import PixelCalibration
 from kalux.settings import Settings
 

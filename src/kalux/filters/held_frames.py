@@ -12,11 +12,8 @@ from kalux.filters import complementary
 from kalux.filters.akf import State
 from kalux.filters.method import FAR_FUTURE, Chunks, CommonMethod, Segment
 from kalux.filters.shots import Shot
-from kalux.models.camera import (
-    log_intensity,
-)
+from kalux.models.camera import log_intensity
 
-Array = NDArray[np.float64]
 Floats = NDArray[np.floating[Any]]
 
 

@@ -13,18 +13,13 @@ from typing import Any, Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.deblur import (
-    all_between,
-    count_chunks,
-)
+from kalux.augmentation.deblur import all_between, count_chunks
 from kalux.augmentation.highlights import Unshown
 from kalux.events import EventArray
 from kalux.filters.akf import State
 from kalux.filters.shots import Shot
 from kalux.filters.uncertainty import Around
-from kalux.models.camera import (
-    log_intensity,
-)
+from kalux.models.camera import log_intensity
 from kalux.settings import Settings
 
 Array = NDArray[np.float64]

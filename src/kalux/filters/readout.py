@@ -50,10 +50,6 @@ _SLACK: Final = np.float32(1 / 8)
 _HALF_OF_PATCH: Final = np.float32(1 / 18)
 """From the sum over a patch of nine to half its mean."""
 
-_DIRECTIONS: Final = ((0, 1), (1, -1), (1, 0), (1, 1))
-"""Rows and columns to four neighbours; the other four are those to whom a pixel is one of these."""
-
-
 _LEVEL, _DOUBT = np.uint64(0), np.uint64(_ROW)
 _NEAR, _FAR = np.uint64(0), np.uint64(_ROW)
 
@@ -68,9 +64,10 @@ class _Ring(NamedTuple):
     least
         (R 2 _ROW,): information that a neighbour has about a pixel beside it, and about one diagonally away.
     unlike
-        (R 4 _ROW,): how unlike pixels are to those in `_DIRECTIONS`, the sum of three in a row.
+        (R 4 _ROW,): how unlike pixels are to four neighbours, (0, 1), (1, -1), (1, 0) and (1, 1) rows and columns away,
+        the sum of three in a row. To its other four neighbours a pixel is itself one of these.
     alike
-        (R 4 _ROW,): how far they are of one surface with them (`edge`).
+        (R 4 _ROW,): how far they are of one surface with these four (`edge`).
     hears, spans
         (R, _STRIP) whether pixels hear their neighbours, and (R, 2) between which columns any of a row do.
     single
@@ -455,7 +452,7 @@ def _mark_hearing(moving, row, begin, hears, spans):  # type: ignore[no-untyped-
 def _compare(  # type: ignore[no-untyped-def]
     row, first, last, allowed, pitch, known, least, unlike, alike, single
 ):
-    """How alike a row's pixels are to those in `_DIRECTIONS`, where columns ``first`` to ``last`` need it.
+    """How alike a row's pixels are to their four neighbours in `_Ring`, where columns ``first`` to ``last`` need it.
 
     Patches reach into the next row: that is compared first. Quotients share a division; those of four numbers a to d
     are (b, a) c d / a b c d and a b (d, c) / a b c d.
