@@ -190,10 +190,9 @@ class Trails:
 
     def __init__(self, spill: Spill, settings: Settings, hot: NDArray[np.bool_] | None) -> None:
         events = settings.events
-        assert events.threshold_on is not None
-        assert events.threshold_off is not None
+        on, off = events.thresholds
         self._spill = spill
-        self._heights = events.trail * events.threshold_on, events.trail * events.threshold_off
+        self._heights = events.trail * on, events.trail * off
         self._scales: list[float] = []
         delay = events.lateness
         followed = None

@@ -135,8 +135,7 @@ def _changes(
     First the response at the bright end, where that is ``least`` or more, then by how much more than the frames events
     say that it changed, log(I + I_0).
     """
-    assert events.threshold_on is not None
-    assert events.threshold_off is not None
+    threshold_on, threshold_off = events.thresholds
     for interval, on, off in counted_intervals(
         recording,
         camera,
@@ -144,7 +143,7 @@ def _changes(
         refractory_period=events.refractory,
         most_frames=_MAX_FRAMES,
     ):
-        told = events.threshold_on * on - events.threshold_off * off - interval.change
+        told = threshold_on * on - threshold_off * off - interval.change
         frames = [end.frame for end in interval.ends]
         for sign, frame in zip((-1, 1), frames, strict=True):
             ends = frame.normalised()

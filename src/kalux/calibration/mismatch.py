@@ -75,10 +75,9 @@ def estimate_mismatch(recording: Recording, camera: CameraSettings, events: Even
     ExposureError
         If the frames' exposures are not known.
     """
-    assert events.threshold_on is not None
-    assert events.threshold_off is not None
+    threshold_on, threshold_off = events.thresholds
     model = ErrorModel(
-        (events.threshold_on, events.threshold_off),
+        events.thresholds,
         noise_of_blurred(camera),
         events.usual_threshold_spread,
         events.quantisation_variance,
@@ -97,7 +96,7 @@ def estimate_mismatch(recording: Recording, camera: CameraSettings, events: Even
         bright = np.minimum(seen.before, seen.after) > DARKEST
         told = ~first.shot.clipped & ~second.shot.clipped & bright & (on + off > 0)
         mismatch, variance = mismatch_of(seen, model, camera.offset, events.step_noise)
-        _add(mismatch, variance, told, events.threshold_on * on, events.threshold_off * off, products)
+        _add(mismatch, variance, told, threshold_on * on, threshold_off * off, products)
         samples += int(np.count_nonzero(told))
         if samples >= MAX_SAMPLES:
             break
