@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from kalux.calibration.event_model import DARKEST, ErrorModel, Samples, mismatch_of, noise_of_blurred
 from kalux.calibration.intervals import counted_intervals
-from kalux.calibration.regression import parts
+from kalux.calibration.regression import parts, ratio_error
 from kalux.recording import Recording
 from kalux.settings import CameraSettings, EventSettings
 
@@ -134,18 +134,9 @@ def _solved(products: Array, samples: int, usual: float) -> Mismatch | None:
     if not possible.sum() > 0:
         return None
     variance = float(found.sum() / possible.sum())
-    error = _jackknifed(found, possible)
+    part = parts(found.shape).ravel()
+    error = ratio_error(np.array([np.bincount(part, values.ravel()) for values in (found, possible)]).T)
     prior = usual**2
     trust = prior**2 / (prior**2 + error**2)
     spread = np.sqrt(max(prior + trust * (variance - prior), 0.0))
     return Mismatch(float(np.clip(spread, *SPREADS)), variance, error, samples)
-
-
-def _jackknifed(found: Array, possible: Array) -> float:
-    """Standard error of the ratio of the sums, over blocks of the sensor."""
-    part = parts(found.shape).ravel()
-    sums = [np.bincount(part, values.ravel()) for values in (found, possible)]
-    rest = [values.sum() - values for values in sums]
-    kept = rest[1] > 0
-    n = int(kept.sum())
-    return float(np.sqrt((n - 1) * np.var(rest[0][kept] / rest[1][kept]))) if n > 1 else float("inf")
