@@ -99,12 +99,7 @@ def take_shots(frames: Iterable[Frame], camera: CameraSettings) -> Shots:
     middles, logs, shares, usable = [], [], [], []
     reference = 0
     for frame in frames:
-        values = frame.normalised()
-        grey = values if values.ndim == 2 else values.mean(axis=2)
-        low, high = _WELL_EXPOSED
-        good = (grey > low) & (grey < high)
-        if frame.valid is not None:
-            good &= frame.valid
+        grey, good = well_exposed(frame)
         linear = np.maximum(response.inverse(grey), 0.0)
         if frame.exposure > 0:
             reference = reference or frame.exposure
@@ -118,6 +113,15 @@ def take_shots(frames: Iterable[Frame], camera: CameraSettings) -> Shots:
             f"alignment: {how_many(len(middles), 'frame')}, too few; three at least, thirty are good"
         )
     return Shots(np.array(middles, np.int64), np.stack(logs), np.stack(shares), np.stack(usable))
+
+
+def well_exposed(frame: Frame) -> tuple[Array, NDArray[np.bool_]]:
+    """The response of a frame, of RGB the mean, and where it is measured and well exposed; (H', W')."""
+    values = frame.normalised()
+    grey = values if values.ndim == 2 else values.mean(axis=2)
+    low, high = _WELL_EXPOSED
+    good = (grey > low) & (grey < high)
+    return grey, good if frame.valid is None else good & frame.valid
 
 
 # --- events as levels --------------------------------------------------------------------------------------

@@ -102,6 +102,8 @@ class Method(Protocol):
 
 
 class CommonMethod:
+    """What the methods share. Of what only some of them tell, it says None, or 0."""
+
     def __init__(
         self, settings: Settings, thresholds: tuple[float, float], lookahead: bool, shape: tuple[int, int]
     ) -> None:
@@ -131,6 +133,7 @@ class CommonMethod:
         return None
 
     def log_frame(self, shot: Shot) -> Array:
+        """(H, W) log(I + I_0)."""
         log_frame: Array = log_intensity(shot.level_intensity, self.offset)[shot.levels]
         return log_frame
 
