@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from kalux.augmentation.deblur import between
 from kalux.calibration.registration import Registration
-from kalux.calibration.regression import huber_weights
+from kalux.calibration.regression import huber_weights, products
 from kalux.errors import InputError
 from kalux.events import NEVER, EventArray
 from kalux.frames import Frame
@@ -320,14 +320,13 @@ def _normal_equations(
     for residual, jacobian, change in rows:
         weight = weights[begin : begin + len(residual)]
         begin += len(residual)
-        weighted = jacobian * weight[:, None]
-        matrices.append(weighted.T @ jacobian)
-        vectors.append(weighted.T @ residual)
+        columns = np.ascontiguousarray(jacobian.T, np.float64)
+        weighted = columns * weight
+        matrices.append(products(weighted, columns))
+        vectors.append(products(weighted, np.asarray(residual[None], np.float64))[:, 0])
         before += float((weight * change**2).sum())
         after += float((weight * residual**2).sum())
-    return _Normal(
-        np.array(matrices, np.float64), np.array(vectors, np.float64), before, after, len(everything)
-    )
+    return _Normal(np.array(matrices), np.array(vectors), before, after, len(everything))
 
 
 def _linearised(
