@@ -27,9 +27,6 @@ _RANGE: Final = 8.0
 """Distance over which parts tell of each other, standard deviation of a normal curve, pixels. Of 4, 8 and 12 the excess
 of clipped pixels of 48 simulated scenes is explained alike."""
 
-_NEARNESS: Final = np.exp(-0.5 * (_PART / _RANGE * np.arange(-38, 39)) ** 2)
-"""Weights of parts along one side: all that are not 0 in double precision."""
-
 _NEAR: Final = 0.2
 """Pixels that are darker than white by less, log intensity, are just below it: levels of 0.8 to 0.98."""
 
@@ -353,5 +350,15 @@ def _around(parts: Floats) -> Floats:
 
     Not as a product of matrices: of large images BLAS has other last bits on another number of threads.
     """
-    near = cv2.sepFilter2D(parts, cv2.CV_64F, _NEARNESS, _NEARNESS, borderType=cv2.BORDER_CONSTANT)
+    below, beside = (_nearness(n) for n in parts.shape)
+    near = cv2.sepFilter2D(parts, cv2.CV_64F, beside, below, borderType=cv2.BORDER_CONSTANT)
     return np.asarray(near, np.float64)
+
+
+@functools.cache
+def _nearness(parts: int) -> Floats:
+    """Weights of parts to both sides of one, where there are so many: all that double precision tells from 0."""
+    reach = min(parts, 39)
+    distance = _PART * np.arange(1 - reach, reach)
+    nearness: Floats = np.exp(-0.5 * (distance / _RANGE) ** 2)
+    return nearness
