@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import os
+import subprocess
+import sys
 import threading
 from functools import lru_cache
 from typing import NamedTuple
@@ -176,3 +179,12 @@ def passing_by(picture: np.ndarray, cut: int = 255, **sensor) -> Recording:
     return Recording.from_arrays(
         np.concatenate(list(made.events())), frames, sensor_size=made.sensor_size, name="cut"
     )
+
+
+def printed_on_threads(code: str, *arguments: object) -> set[str]:
+    """What a program prints where BLAS has one thread and where it has two."""
+    command = [sys.executable, "-c", code, *map(str, arguments)]
+    return {
+        subprocess.check_output(command, env={**os.environ, "OPENBLAS_NUM_THREADS": threads}, text=True)
+        for threads in ("1", "2")
+    }

@@ -195,7 +195,7 @@ def _driven(
         while not ended and not engine.covers(frame.exposure_end):
             ended = not _push_next(engine, chunks, on_events)
         if ended:
-            engine.advance(frame.exposure_end + (plan.settings.events.delay or 0))
+            engine.advance(frame.exposure_end + plan.settings.events.lateness)
         while t is not None and _is_final(engine, t):
             yield engine.estimate(t)
             t = next(pending, None)

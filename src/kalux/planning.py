@@ -34,7 +34,7 @@ from kalux.models.colour import white_balance
 from kalux.models.pixels import PixelCalibration, require_size
 from kalux.recording import RECORDING_NEEDED, Recording, no_frames, remembering
 from kalux.schedule import image_times
-from kalux.settings import SETTINGS_NEEDED, EventSettings, Settings, altered, chosen_response
+from kalux.settings import SETTINGS_NEEDED, Settings, altered, chosen_response
 from kalux.settings import preset as named_preset
 
 ThresholdOrigin = Literal["settings", "recording", "calibration", "estimate", "assumed"]
@@ -330,19 +330,14 @@ def _with_thresholds(
     An estimate without I_0 is rough; with I_0 it is made again, from that.
     """
     events = settings.events
-    stated = (recording.contrast_threshold or (None, None)) if not _has_thresholds(events) else (None, None)
-    origin: ThresholdOrigin = "settings" if _has_thresholds(events) else "recording"
-    known = dataclasses.replace(
-        events,
-        threshold_on=stated[0] if events.threshold_on is None else events.threshold_on,
-        threshold_off=stated[1] if events.threshold_off is None else events.threshold_off,
-    )
+    origin: ThresholdOrigin = "settings" if events.has_thresholds else "recording"
+    known = events.with_thresholds(*(recording.contrast_threshold or (None, None)))
     finds_period = _uses_steps(settings) and events.refractory_period is None
-    if _has_thresholds(known) and not finds_period:
+    if known.has_thresholds and not finds_period:
         return dataclasses.replace(settings, events=known), origin, None
     usual = Usual(events.usual_threshold_on, events.usual_threshold_off, events.usual_spread)
-    if known.threshold_on is not None and known.threshold_off is not None:
-        usual = Usual(known.threshold_on, known.threshold_off, 0.0)
+    if known.has_thresholds:
+        usual = Usual(*known.thresholds, 0.0)
     of_log_offset = settings.filter.augmentation == "paper"
     period = events.refractory_period if _uses_steps(settings) else 0
     estimate: ThresholdEstimate | None
@@ -352,7 +347,7 @@ def _with_thresholds(
             settings.camera,
             usual,
             of_log_offset=of_log_offset,
-            delay=events.delay or 0,
+            delay=events.lateness,
             refractory_period=period,
             most=ROUGH_SAMPLES if settings.camera.log_offset is None else MAX_SAMPLES,
         )
@@ -368,23 +363,10 @@ def _with_thresholds(
     if finds_period:
         period = 0 if estimate is None else estimate.refractory_period
         known = dataclasses.replace(known, refractory_period=period)
-    if not _has_thresholds(known):
+    if not known.has_thresholds:
         origin = "assumed" if estimate is None or estimate.usual_share > 0.5 else "estimate"
-        known = known.assuming() if estimate is None else _estimated(known, estimate)
+        known = known.assuming() if estimate is None else known.with_thresholds(estimate.on, estimate.off)
     return dataclasses.replace(settings, events=known), origin, estimate
-
-
-def _has_thresholds(events: EventSettings) -> bool:
-    return events.threshold_on is not None and events.threshold_off is not None
-
-
-def _estimated(events: EventSettings, estimate: ThresholdEstimate) -> EventSettings:
-    """With the estimated thresholds where none is set."""
-    return dataclasses.replace(
-        events,
-        threshold_on=estimate.on if events.threshold_on is None else events.threshold_on,
-        threshold_off=estimate.off if events.threshold_off is None else events.threshold_off,
-    )
 
 
 def _with_event_model(recording: Recording, settings: Settings) -> tuple[Settings, EventModel | None]:
@@ -392,13 +374,11 @@ def _with_event_model(recording: Recording, settings: Settings) -> tuple[Setting
     camera, events = settings.camera, settings.events
     if camera.log_offset is not None and (events.step_variance is not None or not _uses_steps(settings)):
         return settings, None
-    assert events.threshold_on is not None
-    assert events.threshold_off is not None
     model = estimate_event_model(
         recording,
         camera,
-        (events.threshold_on, events.threshold_off),
-        delay=events.delay or 0,
+        events.thresholds,
+        delay=events.lateness,
         threshold_spread=events.mismatch,
         quantisation_variance=events.quantisation_variance,
         refractory_period=events.refractory if _uses_steps(settings) else 0,

@@ -121,12 +121,8 @@ class Reconstructor:
         chosen = self.settings.events
         unknown = on is None and chosen.threshold_on is None
         self._estimated = threshold_is_estimate or unknown
-        assumed = dataclasses.replace(
-            chosen, threshold_on=chosen.threshold_on or on, threshold_off=chosen.threshold_off or off
-        ).assuming()
-        assert assumed.threshold_on is not None
-        assert assumed.threshold_off is not None
-        self.thresholds = (assumed.threshold_on, assumed.threshold_off)
+        assumed = chosen.with_thresholds(on, off).assuming()
+        self.thresholds = assumed.thresholds
         self._delay = chosen.lateness
         camera = self.settings.camera
         self._camera = Camera.named(camera.response, camera.clipped_from)

@@ -216,16 +216,32 @@ class EventSettings:
         """The delay, us, also where nobody has said or estimated it."""
         return self.usual_delay if self.delay is None else self.delay
 
-    def assuming(self) -> EventSettings:
-        """With the usual thresholds where none is set, and a prior as wide as these are uncertain."""
-        if self.threshold_on is not None and self.threshold_off is not None:
-            return self
+    @property
+    def has_thresholds(self) -> bool:
+        """Whether both are set."""
+        return self.threshold_on is not None and self.threshold_off is not None
+
+    @property
+    def thresholds(self) -> tuple[float, float]:
+        """(on, off), of settings that have both."""
+        assert self.threshold_on is not None
+        assert self.threshold_off is not None
+        return self.threshold_on, self.threshold_off
+
+    def with_thresholds(self, on: float | None, off: float | None) -> EventSettings:
+        """With these where none is set."""
         return replace(
             self,
-            threshold_on=self.usual_threshold_on if self.threshold_on is None else self.threshold_on,
-            threshold_off=self.usual_threshold_off if self.threshold_off is None else self.threshold_off,
-            threshold_spread=max(self.mismatch, self.usual_spread),
+            threshold_on=on if self.threshold_on is None else self.threshold_on,
+            threshold_off=off if self.threshold_off is None else self.threshold_off,
         )
+
+    def assuming(self) -> EventSettings:
+        """With the usual thresholds where none is set, and a prior as wide as these are uncertain."""
+        if self.has_thresholds:
+            return self
+        assumed = self.with_thresholds(self.usual_threshold_on, self.usual_threshold_off)
+        return replace(assumed, threshold_spread=max(self.mismatch, self.usual_spread))
 
     @property
     def refractory(self) -> int:

@@ -33,7 +33,7 @@ from kalux.errors import OutputError
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.filters.highlights import obey_bounds, smoothed_unshown
 from kalux.filters.uncertainty import Around
-from kalux.frames import Frame, Mosaic
+from kalux.frames import Frame
 from kalux.images import Estimate
 from kalux.reconstructor import Reconstructor
 from kalux.recording import Recording
@@ -79,7 +79,7 @@ class Spill:
     def __init__(self, recording: Recording, folder: Path, refractory_period: float = 0.0) -> None:
         self._folder = folder
         self._events = folder / "events.bin"
-        self._exposures: list[tuple[int, int, float | None, Mosaic | None, bool]] = []
+        self._frames: list[Frame] = []  # without their pixels
         self.sensor_size = recording.sensor_size
         self.count = 0
         try:
@@ -92,15 +92,9 @@ class Spill:
                 np.save(self._frame_path(index), frame.image)
                 if frame.valid is not None:
                     np.save(self._mask_path(index), frame.valid)
-                self._exposures.append(
-                    (
-                        frame.exposure_start,
-                        frame.exposure_end,
-                        frame.white,
-                        frame.mosaic,
-                        frame.valid is not None,
-                    )
-                )
+                none = np.empty(0, np.bool_)
+                valid = None if frame.valid is None else none
+                self._frames.append(dataclasses.replace(frame, image=none, valid=valid))
         except OSError as error:
             raise OutputError(
                 f"{folder}: the recording cannot be spilled for the backward pass: {_reason(error)}"
@@ -108,19 +102,29 @@ class Spill:
 
     def __len__(self) -> int:
         """Number of frames."""
-        return len(self._exposures)
+        return len(self._frames)
+
+    @property
+    def start(self) -> int:
+        """Start of the first exposure, us."""
+        return self._frames[0].exposure_start
 
     @property
     def end(self) -> int:
         """End of the last exposure, us: before it, reversed, the backward pass knows nothing."""
-        return self._exposures[-1][1]
+        return self._frames[-1].exposure_end
 
     def reversed_frame(self, index: int) -> Frame:
         """The frame ``index`` of the reversed recording."""
         forward = len(self) - 1 - index
-        start, end, white, mosaic, masked = self._exposures[forward]
-        valid = np.load(self._mask_path(forward)) if masked else None
-        return Frame(np.load(self._frame_path(forward)), -end, -start, white, mosaic, valid)
+        frame = self._frames[forward]
+        return dataclasses.replace(
+            frame,
+            image=np.load(self._frame_path(forward)),
+            exposure_start=-frame.exposure_end,
+            exposure_end=-frame.exposure_start,
+            valid=None if frame.valid is None else np.load(self._mask_path(forward)),
+        )
 
     def reversed_events(self, first: int) -> EventArray:
         """A block of the reversed recording's events, from its event ``first`` on; empty at the end."""
@@ -136,9 +140,9 @@ class Spill:
         block["p"] = ~block["p"]
         return block
 
-    def exposure(self, index: int) -> tuple[int, int]:
-        """Start and end of a frame's exposure, us."""
-        return self._exposures[index][:2]
+    def middle(self, index: int) -> int:
+        """The middle of a frame's exposure, us."""
+        return self._frames[index].middle
 
     def events_between(self, start: int, end: int, without: NDArray[np.bool_] | None) -> Iterator[EventArray]:
         """The events with ``start`` < t <= ``end`` (us), in blocks, but for those of some pixels, (H, W) bool."""
@@ -190,19 +194,14 @@ class Trails:
 
     def __init__(self, spill: Spill, settings: Settings, hot: NDArray[np.bool_] | None) -> None:
         events = settings.events
-        assert events.threshold_on is not None
-        assert events.threshold_off is not None
+        on, off = events.thresholds
         self._spill = spill
-        self._heights = events.trail * events.threshold_on, events.trail * events.threshold_off
+        self._heights = events.trail * on, events.trail * off
         self._scales: list[float] = []
         delay = events.lateness
-        followed = None
+        followed, start = nothing_followed(spill.sensor_size), spill.start
         for index in range(len(spill)):
-            exposure = spill.exposure(index)
-            if followed is None:
-                followed = nothing_followed(spill.sensor_size)
-                start = exposure[0]
-            end = sum(exposure) // 2
+            end = spill.middle(index)
             chunks = spill.events_between(start + delay, end + delay, hot)
             _, _, followed = follow(chunks, followed, start + delay, end + delay)
             spill.save_newest(index, followed.newest - 2 * delay)
@@ -213,7 +212,7 @@ class Trails:
         """Of the frame ``index`` of the reversed recording."""
         forward = len(self._spill) - 1 - index
         newest = self._spill.load_newest(forward)
-        middle = sum(self._spill.exposure(forward)) // 2
+        middle = self._spill.middle(forward)
         after = min(forward + 1, len(self._spill) - 1)
         return FrameTrail(
             *(trail_at(newest, middle, (self._scales[k], *self._heights)) for k in (forward, after))

@@ -8,11 +8,12 @@ import pytest
 from kalux import Frame
 from kalux.calibration.alignment import align, levels, take_shots
 from kalux.calibration.registration import Registration
+from kalux.calibration.rig import rig_toml
 from kalux.errors import InputError
 from kalux.settings import CameraSettings
 from rigs import DISTANCE, OFFSET, distant_recording, misplaced, small_rig
 
-from builders import events, frame, pixel_events
+from builders import events, frame, pixel_events, printed_on_threads
 
 CAMERA = CameraSettings()
 
@@ -68,6 +69,26 @@ def test_offset_and_homography_are_found_together(shots):
     assert found.explained > 0.9
     assert found.thresholds == pytest.approx((0.2, 0.2), rel=0.2)
     assert found.moved == pytest.approx(misplaced(begin, found.registration).mean(), rel=0.05)
+
+
+_ALIGNED = """
+import sys
+import numpy as np
+from kalux.calibration.alignment import Shots, align
+from kalux.calibration.registration import Registration
+from kalux.calibration.rig import load_rig
+from pathlib import Path
+saved = np.load(sys.argv[1])
+shots, begin = Shots(*(saved[name] for name in Shots._fields)), Registration.of_rig(load_rig(Path(sys.argv[2])))
+print(align(shots, saved["events"], begin, offset=0.0, free_homography=False).offset.hex())
+"""
+
+
+def test_the_last_bits_do_not_depend_on_the_number_of_threads(shots, tmp_path):
+    """Those of OpenBLAS's sums do."""
+    np.savez(tmp_path / "seen.npz", events=distant_recording().events, **shots._asdict())
+    (tmp_path / "rig.toml").write_text(rig_toml(small_rig()))
+    assert len(printed_on_threads(_ALIGNED, tmp_path / "seen.npz", tmp_path / "rig.toml")) == 1
 
 
 def test_whole_steps_are_late(shots):

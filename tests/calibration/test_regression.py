@@ -7,7 +7,18 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from kalux.calibration.regression import NORMAL_MAD, huber_weights, products, standard_errors, two_stage
+from kalux.calibration.regression import (
+    NORMAL_MAD,
+    huber_weights,
+    products,
+    ratio_error,
+    robust_deviation,
+    standard_errors,
+    two_stage,
+    weighted_least_squares,
+)
+
+from builders import printed_on_threads
 
 
 def counts(rng, n=2000):
@@ -30,12 +41,35 @@ def test_the_fit_is_exact_without_noise(on, off, seed):
 def test_the_robust_scale_is_by_the_median_as_numpy_has_it(n):
     """Odd or even, bit for bit."""
     residuals = np.random.default_rng(n).standard_normal(n)
-    assert huber_weights(residuals)[1] == NORMAL_MAD * np.median(np.abs(residuals))
+    expected = NORMAL_MAD * np.median(np.abs(residuals))
+    assert robust_deviation(residuals) == huber_weights(residuals)[1] == expected
 
 
 def test_products_are_those_of_matrices():
     first, second = np.random.default_rng(4).standard_normal((2, 3, 50_000))
     assert products(first, second[:2]) == pytest.approx(first @ second[:2].T, rel=1e-9, abs=1e-9)
+
+
+def test_weighted_least_squares_are_those_of_numpy():
+    rng = np.random.default_rng(7)
+    explained, values, weights = rng.standard_normal((1000, 3)), rng.standard_normal(1000), rng.random(1000)
+    root = np.sqrt(weights)
+    expected = np.linalg.lstsq(explained * root[:, None], values * root, rcond=None)[0]
+    assert weighted_least_squares(values, explained, weights) == pytest.approx(expected, rel=1e-9)
+
+
+_SOLVED = """
+import numpy as np
+from kalux.calibration.regression import weighted_least_squares
+rng = np.random.default_rng(0)
+explained, values, weights = rng.standard_normal((400_000, 3)), rng.standard_normal(400_000), rng.random(400_000)
+print(weighted_least_squares(values, explained, weights).tobytes().hex())
+"""
+
+
+def test_the_last_bits_do_not_depend_on_the_number_of_threads():
+    """Those of OpenBLAS do, of as many samples."""
+    assert len(printed_on_threads(_SOLVED)) == 1
 
 
 def test_the_fit_stands_a_fifth_of_outliers():
@@ -98,3 +132,15 @@ def test_weights_fall_beyond_some_standard_deviations():
     assert scale == pytest.approx(1.0, rel=0.05)
     assert (weights[abs(residuals) < 1.2] == 1).all()
     assert weights[np.argmax(residuals)] == pytest.approx(1.345 * scale / residuals.max())
+
+
+def test_the_error_of_a_ratio_is_the_spread_of_repetitions():
+    """Parts that nothing is divided by do not make it infinite; one part alone does."""
+    rng, found, errors = np.random.default_rng(8), [], []
+    for _ in range(200):
+        below = rng.uniform(1.0, 2.0, 50)
+        sums = np.column_stack([3.0 * below + rng.standard_normal(50), below])
+        found.append(sums[:, 0].sum() / below.sum())
+        errors.append(ratio_error(np.vstack([sums, [0.0, 0.0]])))
+    assert np.mean(errors) == pytest.approx(np.std(found), rel=0.15)
+    assert ratio_error(sums[:1]) == np.inf

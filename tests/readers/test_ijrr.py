@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import shutil
+import tempfile
 import zipfile
 from decimal import ROUND_HALF_UP, Decimal
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -14,7 +16,7 @@ from hypothesis import strategies as st
 
 from kalux import readers
 from kalux.errors import FormatError
-from kalux.readers import ijrr
+from kalux.readers import characters
 from recordings import (
     SIZE,
     all_events,
@@ -77,8 +79,8 @@ def test_zip(folder, tmp_path, top):
 
 
 def test_blocks_of_text_join_without_a_seam(folder, monkeypatch):
-    monkeypatch.setattr(ijrr, "_BLOCK_BYTES", 1000)
-    monkeypatch.setattr(ijrr, "_LONGEST_LINE", 100)
+    monkeypatch.setattr(characters, "BLOCK_BYTES", 1000)
+    monkeypatch.setattr(characters, "LONGEST_LINE", 100)
     chunks = list(readers.read(folder).events())
     assert len(chunks) > 5
     assert np.array_equal(np.concatenate(chunks), small_events())
@@ -115,11 +117,10 @@ def test_other_spellings(folder):
     )
 )
 def test_times_are_rounded_from_their_digits(times):
-    text = "".join(f"{time} 1 1 1\n" for time in times).encode()
-    events, lines = ijrr._parse_block("text", memoryview(text), 0)
+    with tempfile.TemporaryDirectory() as folder:
+        found = parse(Path(folder), "".join(f"{time} 1 1 1\n" for time in times).encode())
     exact = [int((Decimal(time) * 10**6).to_integral_value(ROUND_HALF_UP)) for time in times]
-    assert events["t"].tolist() == exact
-    assert lines == len(times)
+    assert [t for t, *_ in found] == exact
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from kalux import readers
 from kalux.errors import FormatError
-from kalux.readers import table
+from kalux.readers import characters, table
 from recordings import all_events, assert_only_clear_errors, damaged, small_events
 
 EVENTS = small_events()
@@ -45,8 +45,8 @@ def test_a_table(path):
 
 def test_blocks_of_text_join_without_a_seam(path, monkeypatch):
     path.write_text(written())
-    monkeypatch.setattr(table, "_BLOCK_BYTES", 600)
-    monkeypatch.setattr(table, "_LONGEST_LINE", 100)
+    monkeypatch.setattr(characters, "BLOCK_BYTES", 600)
+    monkeypatch.setattr(characters, "LONGEST_LINE", 100)
     chunks = list(readers.read(path).events())
     assert len(chunks) > 5
     assert np.array_equal(np.concatenate(chunks), EVENTS)

@@ -279,27 +279,23 @@ def no_trail(shape: tuple[int, int]) -> Trail:
     return given_trail(nothing, nothing)
 
 
-def add_trail(
-    trail: Trail,
-    polarity: NDArray[np.int8],
-    clock: NDArray[np.int32],
-    now: int,
-    log_intensity: FloatArray,
-) -> None:
-    """Add what f has grown by since the start of the segment, in place.
+def trail_by_clock(
+    trail: Trail, polarity: NDArray[np.int8], clock: NDArray[np.int32], now: int
+) -> FloatArray:
+    """f at ``now`` (us after the clock's origin), (H, W) log intensity.
 
-    ``polarity`` and ``clock`` are those of the newest events at ``now`` (us after the clock's origin), with a frame of
-    one pixel around the sensor.
+    ``polarity`` and ``clock`` are those of the newest events, with a frame of one pixel around the sensor.
     """
-    _add_trail(trail.start, polarity, clock, np.int32(now), trail.heights, log_intensity)
+    out = memory.empty(trail.start.shape)
+    _trail_by_clock(polarity, clock, np.int32(now), trail.heights, out)
+    return out
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _add_trail(start, polarity, clock, now, heights, log_intensity):  # type: ignore[no-untyped-def]
-    height, width = start.shape
+def _trail_by_clock(polarity, clock, now, heights, out):  # type: ignore[no-untyped-def]
+    height, width = out.shape
     for row in range(height):
-        signs, times = polarity[row + 1, 1 : width + 1], clock[row + 1, 1 : width + 1]
-        first, out = start[row], log_intensity[row]
+        signs, times, ahead = polarity[row + 1, 1 : width + 1], clock[row + 1, 1 : width + 1], out[row]
         for column in range(width):
             age = np.float32(np.int32(now - times[column])) * MICROSECOND32
-            out[column] += ahead_of_event(signs[column], age, heights) - first[column]
+            ahead[column] = ahead_of_event(signs[column], age, heights)

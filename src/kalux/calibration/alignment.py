@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from kalux.augmentation.deblur import between
 from kalux.calibration.registration import Registration
-from kalux.calibration.regression import huber_weights
+from kalux.calibration.regression import huber_weights, products
 from kalux.errors import InputError
 from kalux.events import NEVER, EventArray
 from kalux.frames import Frame
@@ -99,12 +99,7 @@ def take_shots(frames: Iterable[Frame], camera: CameraSettings) -> Shots:
     middles, logs, shares, usable = [], [], [], []
     reference = 0
     for frame in frames:
-        values = frame.normalised()
-        grey = values if values.ndim == 2 else values.mean(axis=2)
-        low, high = _WELL_EXPOSED
-        good = (grey > low) & (grey < high)
-        if frame.valid is not None:
-            good &= frame.valid
+        grey, good = well_exposed(frame)
         linear = np.maximum(response.inverse(grey), 0.0)
         if frame.exposure > 0:
             reference = reference or frame.exposure
@@ -118,6 +113,15 @@ def take_shots(frames: Iterable[Frame], camera: CameraSettings) -> Shots:
             f"alignment: {how_many(len(middles), 'frame')}, too few; three at least, thirty are good"
         )
     return Shots(np.array(middles, np.int64), np.stack(logs), np.stack(shares), np.stack(usable))
+
+
+def well_exposed(frame: Frame) -> tuple[Array, NDArray[np.bool_]]:
+    """The response of a frame, of RGB the mean, and where it is measured and well exposed; (H', W')."""
+    values = frame.normalised()
+    grey = values if values.ndim == 2 else values.mean(axis=2)
+    low, high = _WELL_EXPOSED
+    good = (grey > low) & (grey < high)
+    return grey, good if frame.valid is None else good & frame.valid
 
 
 # --- events as levels --------------------------------------------------------------------------------------
@@ -316,14 +320,13 @@ def _normal_equations(
     for residual, jacobian, change in rows:
         weight = weights[begin : begin + len(residual)]
         begin += len(residual)
-        weighted = jacobian * weight[:, None]
-        matrices.append(weighted.T @ jacobian)
-        vectors.append(weighted.T @ residual)
+        columns = np.ascontiguousarray(jacobian.T, np.float64)
+        weighted = columns * weight
+        matrices.append(products(weighted, columns))
+        vectors.append(products(weighted, np.asarray(residual[None], np.float64))[:, 0])
         before += float((weight * change**2).sum())
         after += float((weight * residual**2).sum())
-    return _Normal(
-        np.array(matrices, np.float64), np.array(vectors, np.float64), before, after, len(everything)
-    )
+    return _Normal(np.array(matrices), np.array(vectors), before, after, len(everything))
 
 
 def _linearised(

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.calibration.frame_noise import MAX_FRAMES
-from kalux.calibration.regression import parts
+from kalux.calibration.regression import parts, ratio_error
 from kalux.filters.shots import Shot, take_shot
 from kalux.models.camera import Camera
 from kalux.recording import Recording
@@ -177,8 +177,7 @@ def _solved(sums: Array) -> FixedPattern:
     told = sums[sums[:, 1] > 0]
     if len(told) < _LEAST_PARTS:
         return FixedPattern(0.0, 0.0, np.inf)
-    rest = told.sum(axis=0) - told
     variance = float(told[:, 0].sum() / told[:, 1].sum()) / _WHITE
-    error = float(np.sqrt((len(told) - 1) * np.var(rest[:, 0] / rest[:, 1]))) / _WHITE
+    error = ratio_error(told) / _WHITE
     deviation = float(np.sqrt(variance)) if variance > _BELIEVED * error else 0.0
     return FixedPattern(deviation, variance, error)

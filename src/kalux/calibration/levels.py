@@ -135,17 +135,16 @@ def _changes(
     First the response at the bright end, where that is ``least`` or more, then by how much more than the frames events
     say that it changed, log(I + I_0).
     """
-    assert events.threshold_on is not None
-    assert events.threshold_off is not None
+    threshold_on, threshold_off = events.thresholds
     for interval, on, off, bend in counted_intervals(
         recording,
         camera,
-        thresholds=(events.threshold_on, events.threshold_off),
+        thresholds=events.thresholds,
         delay=events.lateness,
         refractory_period=events.refractory,
         most_frames=_MAX_FRAMES,
     ):
-        told = events.threshold_on * on - events.threshold_off * off + bend - interval.change
+        told = threshold_on * on - threshold_off * off + bend - interval.change
         frames = [end.frame for end in interval.ends]
         for sign, frame in zip((-1, 1), frames, strict=True):
             ends = frame.normalised()

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from kalux.calibration.event_model import DARKEST, ErrorModel, Samples, mismatch_of
 from kalux.calibration.intervals import counted_intervals
-from kalux.calibration.regression import parts
+from kalux.calibration.regression import parts, ratio_error
 from kalux.recording import Recording
 from kalux.settings import CameraSettings, EventSettings
 
@@ -75,10 +75,9 @@ def estimate_mismatch(recording: Recording, camera: CameraSettings, events: Even
     ExposureError
         If the frames' exposures are not known.
     """
-    assert events.threshold_on is not None
-    assert events.threshold_off is not None
+    threshold_on, threshold_off = events.thresholds
     model = ErrorModel(
-        (events.threshold_on, events.threshold_off),
+        events.thresholds,
         camera.noise,
         events.usual_threshold_spread,
         events.quantisation_variance,
@@ -88,7 +87,7 @@ def estimate_mismatch(recording: Recording, camera: CameraSettings, events: Even
     for interval, on, off, bend in counted_intervals(
         recording,
         camera,
-        thresholds=(events.threshold_on, events.threshold_off),
+        thresholds=events.thresholds,
         delay=events.lateness,
         refractory_period=events.refractory,
         most_frames=_MAX_FRAMES,
@@ -98,7 +97,7 @@ def estimate_mismatch(recording: Recording, camera: CameraSettings, events: Even
         bright = np.minimum(seen.before, seen.after) > DARKEST
         told = ~first.shot.clipped & ~second.shot.clipped & bright & (on + off > 0)
         mismatch, variance = mismatch_of(seen, model, camera.offset, events.step_noise)
-        _add(mismatch, variance, told, events.threshold_on * on, events.threshold_off * off, products)
+        _add(mismatch, variance, told, threshold_on * on, threshold_off * off, products)
         samples += int(np.count_nonzero(told))
         if samples >= MAX_SAMPLES:
             break
@@ -136,18 +135,9 @@ def _solved(products: Array, samples: int, usual: float) -> Mismatch | None:
     if not possible.sum() > 0:
         return None
     variance = float(found.sum() / possible.sum())
-    error = _jackknifed(found, possible)
+    part = parts(found.shape).ravel()
+    error = ratio_error(np.array([np.bincount(part, values.ravel()) for values in (found, possible)]).T)
     prior = usual**2
     trust = prior**2 / (prior**2 + error**2)
     spread = np.sqrt(max(prior + trust * (variance - prior), 0.0))
     return Mismatch(float(np.clip(spread, *SPREADS)), variance, error, samples)
-
-
-def _jackknifed(found: Array, possible: Array) -> float:
-    """Standard error of the ratio of the sums, over blocks of the sensor."""
-    part = parts(found.shape).ravel()
-    sums = [np.bincount(part, values.ravel()) for values in (found, possible)]
-    rest = [values.sum() - values for values in sums]
-    kept = rest[1] > 0
-    n = int(kept.sum())
-    return float(np.sqrt((n - 1) * np.var(rest[0][kept] / rest[1][kept]))) if n > 1 else float("inf")

@@ -21,6 +21,7 @@ from kalux.calibration.fixed_pattern import FixedPattern, estimate_fixed_pattern
 from kalux.calibration.frame_noise import FrameNoise, estimate_frame_noise
 from kalux.calibration.levels import ClippingLevels, clipping_levels
 from kalux.calibration.refractory import shortest_interval
+from kalux.calibration.regression import ratio_error
 from kalux.calibration.values import Calibration
 from kalux.events import NEVER, EventArray
 from kalux.recording import Recording
@@ -334,16 +335,9 @@ def _typical_rate(tally: _Tally, hot: NDArray[np.bool_]) -> tuple[float, float]:
     share = quiet / np.maximum(possible, 1)
     used = (possible > 0) & (quiet > 0) & (share >= _NEARLY * np.quantile(share[possible > 0], 0.95))
     rate = counts[used].sum() / quiet[used].sum()
-    # Jackknife over blocks of the sensor.
     block = np.tile(np.arange(size), len(tally.counts))[used]
-    by_block = np.bincount(block, counts[used], size), np.bincount(block, quiet[used], size)
-    seen = by_block[1] > 0
-    n = int(seen.sum())
-    without = (counts[used].sum() - by_block[0][seen]) / np.maximum(
-        quiet[used].sum() - by_block[1][seen], 1e-9
-    )
-    error = float(np.sqrt((n - 1) * np.var(without))) if n > 1 else float("inf")
-    return float(rate), error
+    by_block = np.array([np.bincount(block, values[used], size) for values in (counts, quiet)]).T
+    return float(rate), ratio_error(by_block[by_block[:, 1] > 0])
 
 
 def shrunk_rates(counts: Array, quiet: Array, rate: float, hot: NDArray[np.bool_]) -> Array:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.deblur import between
-from kalux.calibration.alignment import MOST_FRAMES, Alignment, Shots, align, take_shots
+from kalux.calibration.alignment import MOST_FRAMES, Alignment, Shots, align, take_shots, well_exposed
 from kalux.calibration.registration import Registration
 from kalux.errors import InputError
 from kalux.events import EVENT_DTYPE, EventArray
@@ -121,7 +121,8 @@ def frame_changes(
     rows: list[Array] = []
     before: tuple[NDArray[Any], NDArray[Any]] | None = None
     for frame in islice(frames, _COARSE_FRAMES):
-        log, good = _one(frame, camera)
+        grey, usable = well_exposed(frame)
+        log, good = np.log(grey + camera.offset).astype(np.float32), usable.astype(np.float32)
         now: tuple[NDArray[Any], NDArray[Any]]
         if registration is None:
             scale = max(1, frame.image.shape[1] // 160)
@@ -148,15 +149,6 @@ def frame_changes(
             f"offset: {how_many(len(middles), 'frame')}, too few; {_LEAST_FRAMES} at least, fifty are good"
         )
     return Changes(np.array(middles, np.int64), np.array(rows), registration is not None)
-
-
-def _one(frame: Frame, camera: CameraSettings) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    values = frame.normalised()
-    grey = values if values.ndim == 2 else values.mean(axis=2)
-    good = (grey > 0.03) & (grey < 0.95)
-    if frame.valid is not None:
-        good &= frame.valid
-    return np.log(np.maximum(grey, 0) + camera.offset).astype(np.float32), good.astype(np.float32)
 
 
 def correlate(

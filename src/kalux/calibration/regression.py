@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Floats = NDArray[np.floating[Any]]
 
 NORMAL_MAD: Final = 1.4826  # standard deviation over median absolute deviation, of a normal distribution
 HUBER: Final = 1.345  # 95 % efficiency for normal residuals (Huber 1981)
@@ -62,6 +63,14 @@ def two_stage(values: Array, explained: Array, instruments: Array) -> Fit | None
     return Fit(solution, scale, weights)
 
 
+def weighted_least_squares(values: Array, explained: Array, weights: Array) -> Array:
+    """(K,) coefficients of (N, K) ``explained`` in (N,) ``values``, with (N,) ``weights``."""
+    columns = np.ascontiguousarray(explained.T)
+    weighted = columns * weights
+    normal, right = products(weighted, columns), products(weighted, values[None])
+    return np.asarray(np.linalg.solve(normal, right)[:, 0], np.float64)
+
+
 def products(first: Array, second: Array) -> Array:
     """(K, M) sums over N of the products of (K, N) and (M, N).
 
@@ -74,21 +83,33 @@ def products(first: Array, second: Array) -> Array:
 def huber_weights(residuals: Array) -> tuple[Array, float]:
     """Huber's weights of residuals, and their robust standard deviation."""
     away = np.abs(residuals)
-    scale = max(NORMAL_MAD * _median(away), _LEAST_SCALE)
+    scale = max(_deviation(away), _LEAST_SCALE)
     return np.minimum(1.0, HUBER * scale / np.maximum(away, 1e-3 * _LEAST_SCALE)), scale
 
 
-def _median(values: Array) -> float:
-    """As of NumPy, which asks for three places at once and takes five to ten times as long for it."""
-    half = len(values) // 2
-    parted = np.partition(values, half)
-    return float(parted[half] if len(values) % 2 else (parted[:half].max() + parted[half]) / 2)
+def robust_deviation(residuals: Floats) -> float:
+    """Standard deviation about 0, from the median absolute value, as normal residuals have it; of one or more."""
+    return _deviation(np.abs(residuals))
+
+
+def _deviation(away: Floats) -> float:
+    """By the median, which NumPy takes five to ten times as long for: it asks for three places at once."""
+    half = len(away) // 2
+    parted = np.partition(away, half)
+    return NORMAL_MAD * float(parted[half] if len(away) % 2 else (parted[:half].max() + parted[half]) / 2)
 
 
 def parts(shape: tuple[int, int]) -> NDArray[np.int64]:
     """(H, W) which of 8 x 8 parts of the sensor a pixel lies in, for a jackknife."""
     height, width = shape
     return (np.arange(height)[:, None] * _TILES // height) * _TILES + np.arange(width) * _TILES // width
+
+
+def ratio_error(sums: Array) -> float:
+    """Standard error of the ratio of two sums, (N, 2) over parts of the sensor: jackknife; inf if too few tell."""
+    rest = sums.sum(axis=0) - sums
+    rest = rest[rest[:, 1] > 0]
+    return float(np.sqrt((len(rest) - 1) * np.var(rest[:, 0] / rest[:, 1]))) if len(rest) > 1 else np.inf
 
 
 def standard_errors(
@@ -121,8 +142,3 @@ def standard_errors(
         return np.full(count, np.inf)
     spread: Array = np.sqrt((len(without) - 1) * np.var(np.array(without), axis=0))
     return spread
-
-
-def robust_deviation(residuals: NDArray[np.floating[Any]]) -> float:
-    """Standard deviation about 0, from the median absolute value, as normal residuals have it."""
-    return NORMAL_MAD * float(np.median(np.abs(residuals)))

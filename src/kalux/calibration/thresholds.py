@@ -32,7 +32,14 @@ from kalux.augmentation.refractory import step_weight
 from kalux.calibration.contrast import Usual, estimate_thresholds
 from kalux.calibration.intervals import Interval, intervals
 from kalux.calibration.refractory import dead_time, shortest_interval
-from kalux.calibration.regression import HUBER, robust_deviation, standard_errors, two_stage
+from kalux.calibration.regression import (
+    HUBER,
+    products,
+    robust_deviation,
+    standard_errors,
+    two_stage,
+    weighted_least_squares,
+)
 from kalux.calibration.values import Calibration
 from kalux.events import NEVER, EventArray
 from kalux.filters.shots import Shot
@@ -385,8 +392,7 @@ def _per_pixel(
 ) -> ContrastCalibration:
     # Deviations of single pixels are regressed on their own counts, so the mean they deviate from must be as
     # attenuated as they are: that of least squares, not of the instruments.
-    weighted = data.explained * fit.weights[:, None]
-    plain: Array = np.linalg.solve(weighted.T @ data.explained, weighted.T @ data.change).astype(np.float64)
+    plain = weighted_least_squares(data.change, data.explained, fit.weights)
     variance = _residual_variance(data, plain)
     size = int(np.prod(recording.sensor_size))
     normal: Array = np.zeros((size, 3))
@@ -458,6 +464,6 @@ def shrunk(normal: Array, right: Array) -> tuple[Array, Array, Array, Array]:
             break
         mean = values[told].mean(axis=0)
         away = values[told] - mean
-        covariance = (away.T @ away) / len(told) + left[told].mean(axis=0)
+        covariance = products(away.T, away.T) / len(told) + left[told].mean(axis=0)
         covariance += _LEAST_SPREAD**2 * 1e-2 * np.eye(2)
     return mean, covariance, values - mean, np.stack([left[:, 0, 0], left[:, 1, 1]], axis=1)

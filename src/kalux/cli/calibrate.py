@@ -5,13 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any, Final
 
-from kalux.cli import (
-    calibrate_contrast,
-    calibrate_noise,
-    calibrate_offset,
-    calibrate_response,
-    calibrate_rig,
-)
+from kalux.cli import calibrate_contrast, calibrate_noise, calibrate_offset, calibrate_response, calibrate_rig
 from kalux.cli.parser import Parser, UsageError
 
 SUBCOMMANDS: Final = (

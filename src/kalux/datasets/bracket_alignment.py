@@ -13,14 +13,7 @@ from kalux.calibration.debevec import LEAST_SHARED
 from kalux.calibration.homography import find_features
 from kalux.datasets.brackets import Picture, best_exposed
 from kalux.datasets.radiance import luminance_of
-from kalux.datasets.warping import (
-    Match,
-    displacement,
-    match_features,
-    tone_compressed,
-    warped,
-    warped_mask,
-)
+from kalux.datasets.warping import Match, displacement, match_features, tone_compressed, warped, warped_mask
 from kalux.models.camera import Response
 
 Array = NDArray[np.float64]

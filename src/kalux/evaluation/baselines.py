@@ -49,9 +49,7 @@ def edi_video(recording: Recording, times: Times, *, settings: Settings | None =
     Nothing is known of clipped pixels: they are taken as they are.
     """
     chosen = plan(recording, times=times, settings=settings or PRESETS["default"]).settings
-    on, off = (
-        np.full(recording.sensor_size, c) for c in (chosen.events.threshold_on, chosen.events.threshold_off)
-    )
+    on, off = (np.full(recording.sensor_size, c) for c in chosen.events.thresholds)
     camera, reference = chosen.camera, reference_exposure(recording)
     window = EventWindow(recording.events())
     for frame, wanted in nearest_frames(recording.frames(), times):

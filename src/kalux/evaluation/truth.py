@@ -217,10 +217,14 @@ def _given(recording: Recording, reference: Reference) -> Iterator[NDArray[np.bo
             yield None
 
 
+TRUTH_SUFFIX: Final = "_gt.npz"
+"""Reference images beside a recording: ``X_gt.npz`` beside ``X.mat`` or the folder ``X``."""
+
+
 def truth_beside(path: Path) -> Path:
-    """Where the ground truth of a recording lies, if it has any: ``X_gt.npz`` beside ``X.mat`` or the folder ``X``."""
+    """Where the ground truth of a recording lies, if it has any."""
     name = path.name if path.is_dir() else path.stem
-    return path.with_name(f"{name}_gt.npz")
+    return path.with_name(f"{name}{TRUTH_SUFFIX}")
 
 
 def truth_file(path: Path, named: Path | None = None) -> Path | None:

@@ -20,13 +20,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.compiled import (
-    ONE,
-)
-
-Array = NDArray[np.float64]
-FloatArray = NDArray[np.float32]
-Times = NDArray[np.int64]
+from kalux.compiled import ONE
 
 
 class State(NamedTuple):

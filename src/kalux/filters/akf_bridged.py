@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from kalux import memory
 from kalux.augmentation.bridge import UNMEASURED, BridgedSegment, lift, lower
 from kalux.augmentation.deblur import words_until
-from kalux.augmentation.trail import NO_HEIGHTS, add_trail, ahead_of_event, no_trail
+from kalux.augmentation.trail import NO_HEIGHTS, ahead_of_event, no_trail, trail_by_clock
 from kalux.compiled import (
     AHEAD,
     FUSED,
@@ -36,12 +36,7 @@ from kalux.compiled import (
     unpack,
 )
 from kalux.events import EventArray
-from kalux.filters.akf import (
-    State,
-    information_kept,
-    measurement_rate,
-    predicted_information,
-)
+from kalux.filters.akf import State, information_kept, measurement_rate, predicted_information
 from kalux.filters.common import EPOCH, Clock, moved_clock, newest_around_inside
 from kalux.models.events import signal_probability, threshold_noise
 
@@ -183,12 +178,7 @@ def trail_ahead(segment: BridgedSegment, cursor: Cursor, t: int) -> FloatArray |
     """(H, W) how far the light is ahead of its events at ``t`` (us), K14; None where that is not told."""
     if segment.trail is None:
         return None
-    ahead = np.zeros(segment.augmented.shape, np.float32)
-    since_nothing = segment.trail._replace(start=ahead)
-    within = min(t - cursor.origin, EPOCH)
-    out = np.zeros_like(ahead)
-    add_trail(since_nothing, cursor.polarity, cursor.clock, within, out)
-    return out
+    return trail_by_clock(segment.trail, cursor.polarity, cursor.clock, min(t - cursor.origin, EPOCH))
 
 
 def _read(segment: BridgedSegment, cursor: Cursor, t: int) -> tuple[FloatArray, FloatArray]:

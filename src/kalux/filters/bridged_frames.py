@@ -10,21 +10,8 @@ from numpy.typing import NDArray
 
 from kalux.augmentation import bridge, deblur
 from kalux.augmentation.bridge import BridgedSegment, BridgeNoise, Latent, Thresholds, UnshownMemory
-from kalux.augmentation.deblur import (
-    EXPOSED,
-    EXPOSURE_FIELDS,
-    Exposure,
-    all_between,
-    relative_levels,
-)
-from kalux.augmentation.highlights import (
-    Shown,
-    Tail,
-    Unshown,
-    begin_unshown,
-    expected_excess,
-    follow_unshown,
-)
+from kalux.augmentation.deblur import EXPOSED, EXPOSURE_FIELDS, Exposure, all_between, relative_levels
+from kalux.augmentation.highlights import Shown, Tail, Unshown, begin_unshown, expected_excess, follow_unshown
 from kalux.augmentation.trail import (
     Followed,
     Trail,
@@ -51,13 +38,7 @@ from kalux.filters.common import make_clock
 from kalux.filters.method import FAR_FUTURE, USUAL_INTERVAL, Chunks, CommonMethod, Segment
 from kalux.filters.shots import Shot
 from kalux.filters.uncertainty import WRONG_STEPS, Around
-from kalux.models.camera import (
-    CRUSHED,
-    beyond_white,
-    dark_scale,
-    frame_log_covariance,
-    log_intensity,
-)
+from kalux.models.camera import CRUSHED, beyond_white, dark_scale, frame_log_covariance, log_intensity
 from kalux.models.pixels import PixelCalibration
 from kalux.settings import Settings
 
@@ -77,12 +58,29 @@ _DARKEST: Final = 10.0
 
 
 class BridgeMemory(NamedTuple):
-    """The latest frame, deblurred; the pixels' thresholds; the frame interval in s (0: not known yet).
+    """What later segments need of the frames until now.
 
-    In causal mode also the counts of events between the middle and the end of the latest exposure. Of pixels that the
-    latest frames did not measure, the counts since one did (to the latest node); 0 elsewhere. ``since`` is the start of
-    the first exposure, us. ``unshown`` is of the pixels that no frame has measured yet, ``tail`` how far highlights go.
-    ``silent`` is what silent pixels have changed in the latest interval, NaN of others (`unseen.half_way`).
+    Attributes
+    ----------
+    latent, thresholds
+        The latest frame, deblurred, and what is known of the pixels' thresholds.
+    interval
+        Between the latest two frames, s; the usual one until there are two.
+    on, off
+        (H, W) events from the middle of the latest exposure to its end; in causal mode only.
+    far_on, far_off
+        (H, W) events since a frame last measured a pixel, to the latest node; 0 where the latest one does.
+    since
+        Start of the first exposure, us.
+    followed, at_middle
+        What is known of the newest events at the latest node, and at the middle of the latest exposure (K14). The same
+        but in causal mode.
+    unshown, tail
+        Pixels that no frame has measured yet, and how far highlights go (K15).
+    silent_change
+        (H, W) mean square change of the silent pixels around each (K11).
+    silent
+        (H, W) what silent pixels have changed in the latest interval, NaN of others (`unseen.half_way`).
     """
 
     latent: Latent
@@ -206,11 +204,8 @@ class BridgedFrames(CommonMethod):
         thresholds = self._prior
         latent = self.latent(shot, events, thresholds)
         begin = self.begin_time(shot)
-        newest = make_clock(self.shape, begin - shot.start)
-        lead_in, nothing = None, nothing_followed(self.shape)
-        far = np.zeros(self.shape, np.float32)
+        nothing, far = nothing_followed(self.shape), np.zeros(self.shape, np.float32)
         tail = Tail(self.settings.filter.unshown_tail, beyond_white(shot.bright_tail))
-        unknown = np.full(self.shape, UNKNOWN_CHANGE * self.on * self.off, np.float32)
         if self.lookahead:
             on, off, followed = self.follow(events, begin, shot.middle, nothing)
         else:
@@ -219,7 +214,7 @@ class BridgedFrames(CommonMethod):
         memory = BridgeMemory(
             latent=latent,
             thresholds=thresholds,
-            interval=0.0,
+            interval=USUAL_INTERVAL * 1e-6,
             on=on,
             off=off,
             far_on=far,
@@ -229,28 +224,24 @@ class BridgedFrames(CommonMethod):
             at_middle=followed,
             unshown=begin_unshown(latent, shown(shot), tail),
             tail=tail,
-            silent_change=unknown,
+            silent_change=np.full(self.shape, UNKNOWN_CHANGE * self.on * self.off, np.float32),
             silent=np.full(self.shape, np.nan, np.float32),
         )
-        if self.lookahead:
-            value, variance = latent.value, latent.variance
-            if shot.middle > begin:
-                lead_in = bridge.extend_backward(latent, on, off, thresholds, self.noise, begin, shot.middle)
-                lead_in = lead_in._replace(
-                    still_since=shot.start,
-                    trail=self._lead_in_trail(shot, followed),
-                    unshown=memory.unshown,
-                )
-                value = lead_in.augmented
-                variance = lead_in.backward_variance + lead_in.step_variance * (on + off)
-        else:
-            carried = self._carried(memory, shot)
-            value, variance = carried.value, carried.variance
+        lead_in, value, variance = None, latent.value, latent.variance
+        if not self.lookahead:
+            value, variance, _ = self._carried(memory, shot)
+        elif shot.middle > begin:
+            lead_in = bridge.extend_backward(latent, on, off, thresholds, self.noise, begin, shot.middle)
+            lead_in = lead_in._replace(
+                still_since=shot.start, trail=self._lead_in_trail(shot, followed), unshown=memory.unshown
+            )
+            value = lead_in.augmented
+            variance = lead_in.backward_variance + lead_in.step_variance * (on + off)
         unmeasured = variance >= bridge.UNMEASURED
         variance = np.where(unmeasured, np.float32(self.settings.filter.initial_variance), variance)
         if shot.valid is not None:
             variance[~shot.valid] = self.unseen_variance(shot)
-        return memory, lead_in, State(value, variance, newest)
+        return memory, lead_in, State(value, variance, make_clock(self.shape, begin - shot.start))
 
     def segment(
         self, memory: BridgeMemory, shot: Shot, following: Shot | None, events: Chunks
@@ -273,15 +264,15 @@ class BridgedFrames(CommonMethod):
 
     def _alone(self, memory: BridgeMemory, shot: Shot) -> BridgedSegment:
         """From the latest frame on, without a next one."""
-        start, seconds = self.node(shot), memory.interval or USUAL_INTERVAL * 1e-6
+        start = self.node(shot)
         latent = memory.latent if self.lookahead else self._carried(memory, shot)
-        alone = bridge.extend(latent, memory.thresholds, self.noise, start, FAR_FUTURE, seconds, None)
+        alone = bridge.extend(latent, memory.thresholds, self.noise, start, FAR_FUTURE, memory.interval, None)
         if shot.trail is None:
             trail = self._trail(memory.followed, start, memory.followed.scale)
         else:
             trail = given_trail(shot.trail.before, np.zeros(self.shape, np.float32))
         return alone._replace(
-            still_since=_still_since(memory, start, seconds),
+            still_since=_still_since(memory, start),
             trail=trail,
             unshown=memory.unshown,
             silent_change=memory.silent_change,
@@ -293,32 +284,20 @@ class BridgedFrames(CommonMethod):
         """From the middle of one exposure to that of the next."""
         start, end = shot.middle, following.middle
         on, off, at_middle = self.follow(events, start, end, memory.followed)
-        scale = at_middle.scale
-        if shot.trail is not None and following.trail is not None:
-            trail = given_trail(shot.trail.before, following.trail.after)
-            grown = following.trail.after - trail.start
-        else:
-            at_start, grown = trail_between(
-                memory.followed.newest, at_middle.newest, (start, end), (scale, *self._trail_heights)
-            )
-            trail = Trail(at_start, polarity_of(memory.followed.newest), scale, *self._trail_heights)
+        trail, grown = self._trail_between(memory, shot, following, at_middle)
         joined, learned = bridge.bridge(
             memory.latent, second, on, off, memory.thresholds, self.noise, start, end, grown
         )
         change = self._silent_change(joined)
         share, silent = half_way(memory.silent, joined, self.noise.quantisation_variance, self.on * self.off)
-        joined = joined._replace(trail=trail, silent_change=change, turns=turns(on, off), half_way=share)
-        joined, far_on, far_off = self._drifting(joined, memory, second, on, off)
+        joined, far_on, far_off = self._drifting(joined, memory, second, (on, off), change)
         change = self._of_black(change, memory.latent, second)
-        joined = joined._replace(silent_change=change)
         assert joined.net is not None
         unshown = self._follow_unshown(memory, second, following, joined.net)
         after = memory._replace(
             latent=second,
             thresholds=learned,
             interval=(end - start) * 1e-6,
-            on=on,
-            off=off,
             far_on=far_on,
             far_off=far_off,
             followed=at_middle,
@@ -327,7 +306,10 @@ class BridgedFrames(CommonMethod):
             silent_change=change,
             silent=silent,
         )
-        return joined._replace(unshown=unshown), after
+        joined = joined._replace(
+            trail=trail, unshown=unshown, silent_change=change, turns=turns(on, off), half_way=share
+        )
+        return joined, after
 
     def _causal(
         self, memory: BridgeMemory, shot: Shot, following: Shot, second: Latent, events: Chunks
@@ -371,15 +353,13 @@ class BridgedFrames(CommonMethod):
             self.noise,
             start,
             following.end,
-            memory.interval or USUAL_INTERVAL * 1e-6,
+            memory.interval,
             self._carried(after, following),
         )
-        forward = forward._replace(
-            trail=self._trail(memory.followed, start, scale),
-            unshown=memory.unshown,
-            silent_change=memory.silent_change,
-        )
-        forward, far_on, far_off = self._drifting(forward, memory, second, on + tail_on, off + tail_off)
+        counts, change = (on + tail_on, off + tail_off), memory.silent_change
+        forward, far_on, far_off = self._drifting(forward, memory, second, counts, change)
+        trail = self._trail(memory.followed, start, scale)
+        forward = forward._replace(trail=trail, unshown=memory.unshown, silent_change=change)
         return forward, after._replace(far_on=far_on, far_off=far_off)
 
     def follow(
@@ -392,6 +372,18 @@ class BridgedFrames(CommonMethod):
         """By how much events trail the light in the segment from ``start`` on (K14)."""
         at_start = self._trail_at(followed, start, scale)
         return Trail(at_start, polarity_of(followed.newest), scale, *self._trail_heights)
+
+    def _trail_between(
+        self, memory: BridgeMemory, shot: Shot, following: Shot, at_end: Followed
+    ) -> tuple[Trail, Floats]:
+        """The same from the middle of one exposure to that of the next, and what it grows by until then."""
+        if shot.trail is not None and following.trail is not None:
+            before, after = shot.trail.before, following.trail.after
+            return given_trail(before, after), after - before
+        newest, heights = memory.followed.newest, self._trail_heights
+        span = shot.middle, following.middle
+        at_start, grown = trail_between(newest, at_end.newest, span, (at_end.scale, *heights))
+        return Trail(at_start, polarity_of(newest), at_end.scale, *heights), grown
 
     def _lead_in_trail(self, shot: Shot, followed: Followed) -> Trail:
         """The same before the middle of the first exposure, where the frame keeps its level."""
@@ -420,23 +412,26 @@ class BridgedFrames(CommonMethod):
         return change
 
     def _drifting(
-        self, segment: BridgedSegment, memory: BridgeMemory, second: Latent, on: Floats, off: Floats
+        self,
+        segment: BridgedSegment,
+        memory: BridgeMemory,
+        second: Latent,
+        counts: tuple[Floats, Floats],
+        change: Floats,
     ) -> tuple[BridgedSegment, Floats, Floats]:
-        """The segment with what its pixels may drift (K10), and the counts since they were measured, at its end."""
+        """The segment with what its pixels may drift (K10), and the counts since they were measured, at its end.
+
+        ``counts`` are its on and off events, ``change`` is what silent pixels around each change (K11).
+        """
         far = memory.far_on, memory.far_off
         grown, far_on, far_off = bridge.drift(
-            memory.latent, second, memory.thresholds, self.noise, far, (on, off)
+            memory.latent, second, memory.thresholds, self.noise, far, counts
         )
-        if segment.silent_change is not None:
-            q0 = self.noise.quantisation_variance
-            forget_silence(grown, segment, second, (on, off), segment.silent_change, q0)
+        forget_silence(grown, segment, second, counts, change, self.noise.quantisation_variance)
         if second.ceiling is not None:
             black = np.isfinite(second.ceiling)
             grown[black] = second.variance[black] / (_BLACK_FRAMES * (_BLACK_FRAMES + 1))
-        segment = segment._replace(
-            drift=grown,
-            still_since=_still_since(memory, segment.start, memory.interval or USUAL_INTERVAL * 1e-6),
-        )
+        segment = segment._replace(drift=grown, still_since=_still_since(memory, segment.start))
         return segment, far_on, far_off
 
     def _carried(self, memory: BridgeMemory, shot: Shot) -> Latent:
@@ -519,9 +514,9 @@ def shown(shot: Shot) -> Shown:
     return Shown(saturated & shot.valid, far, ~saturated & shot.valid, shot.pitch)
 
 
-def _still_since(memory: BridgeMemory, start: int, seconds: float) -> int:
+def _still_since(memory: BridgeMemory, start: int) -> int:
     """One frame interval before a segment, but not before the first exposure, us."""
-    return max(start - round(seconds * 1e6), memory.since)
+    return max(start - round(memory.interval * 1e6), memory.since)
 
 
 def latent_frame(

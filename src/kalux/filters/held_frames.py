@@ -12,11 +12,7 @@ from kalux.filters import complementary
 from kalux.filters.akf import State
 from kalux.filters.method import FAR_FUTURE, Chunks, CommonMethod, Segment
 from kalux.filters.shots import Shot
-from kalux.models.camera import (
-    log_intensity,
-)
 
-Array = NDArray[np.float64]
 Floats = NDArray[np.floating[Any]]
 
 
@@ -32,12 +28,7 @@ class HeldFrames(CommonMethod):
         return shot.end
 
     def start(self, shot: Shot, events: Chunks) -> tuple[None, None, State]:
-        return None, None, self._state(self.frame(shot))
-
-    def frame(self, shot: Shot) -> Floats:
-        """log(I + I_0), (H, W) float32."""
-        log_frame: Floats = log_intensity(shot.level_intensity, self.offset).astype(np.float32)[shot.levels]
-        return log_frame
+        return None, None, self._state(self.log_frame(shot).astype(np.float32))
 
     def segment(
         self, memory: None, shot: Shot, following: Shot | None, events: Chunks
@@ -46,8 +37,8 @@ class HeldFrames(CommonMethod):
         gain = np.full(self.shape, 2 * np.pi * self.settings.filter.cutoff, np.float32)
         if shot.valid is not None:
             gain[~shot.valid] = 0.0
-        held = complementary.HeldSegment(self.node(shot), end, self.frame(shot), gain, self.on, self.off)
-        return held, None
+        log_frame = self.log_frame(shot).astype(np.float32)
+        return complementary.HeldSegment(self.node(shot), end, log_frame, gain, self.on, self.off), None
 
     def begin(self, segment: Any, state: State) -> complementary.Cursor:
         return complementary.begin(segment, state.log_intensity)

@@ -8,24 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation import deblur, interpolation
-from kalux.augmentation.deblur import (
-    ExposureIntegrals,
-    all_between,
-    count_chunks,
-)
+from kalux.augmentation.deblur import ExposureIntegrals, all_between, count_chunks
 from kalux.events import EventArray
 from kalux.filters import akf_interpolated
 from kalux.filters.akf import State
 from kalux.filters.method import FAR_FUTURE, Chunks, CommonMethod, Segment
 from kalux.filters.shots import Shot
-from kalux.models.camera import (
-    covariance,
-    log_bias,
-    log_covariance,
-)
+from kalux.models.camera import covariance, log_bias, log_covariance
 
 Array = NDArray[np.float64]
-Floats = NDArray[np.floating[Any]]
 
 
 class InterpolationMemory(NamedTuple):

@@ -13,18 +13,13 @@ from typing import Any, Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.deblur import (
-    all_between,
-    count_chunks,
-)
+from kalux.augmentation.deblur import all_between, count_chunks
 from kalux.augmentation.highlights import Unshown
 from kalux.events import EventArray
 from kalux.filters.akf import State
 from kalux.filters.shots import Shot
 from kalux.filters.uncertainty import Around
-from kalux.models.camera import (
-    log_intensity,
-)
+from kalux.models.camera import log_intensity
 from kalux.settings import Settings
 
 Array = NDArray[np.float64]
@@ -107,6 +102,8 @@ class Method(Protocol):
 
 
 class CommonMethod:
+    """What the methods share. Of what only some of them tell, it says None, or 0."""
+
     def __init__(
         self, settings: Settings, thresholds: tuple[float, float], lookahead: bool, shape: tuple[int, int]
     ) -> None:
@@ -136,6 +133,7 @@ class CommonMethod:
         return None
 
     def log_frame(self, shot: Shot) -> Array:
+        """(H, W) log(I + I_0)."""
         log_frame: Array = log_intensity(shot.level_intensity, self.offset)[shot.levels]
         return log_frame
 

@@ -50,10 +50,6 @@ _SLACK: Final = np.float32(1 / 8)
 _HALF_OF_PATCH: Final = np.float32(1 / 18)
 """From the sum over a patch of nine to half its mean."""
 
-_DIRECTIONS: Final = ((0, 1), (1, -1), (1, 0), (1, 1))
-"""Rows and columns to four neighbours; the other four are those to whom a pixel is one of these."""
-
-
 _LEVEL, _DOUBT = np.uint64(0), np.uint64(_ROW)
 _NEAR, _FAR = np.uint64(0), np.uint64(_ROW)
 
@@ -68,9 +64,10 @@ class _Ring(NamedTuple):
     least
         (R 2 _ROW,): information that a neighbour has about a pixel beside it, and about one diagonally away.
     unlike
-        (R 4 _ROW,): how unlike pixels are to those in `_DIRECTIONS`, the sum of three in a row.
+        (R 4 _ROW,): how unlike pixels are to four neighbours, (0, 1), (1, -1), (1, 0) and (1, 1) rows and columns away,
+        the sum of three in a row. To its other four neighbours a pixel is itself one of these.
     alike
-        (R 4 _ROW,): how far they are of one surface with them (`edge`).
+        (R 4 _ROW,): how far they are of one surface with these four (`edge`).
     hears, spans
         (R, _STRIP) whether pixels hear their neighbours, and (R, 2) between which columns any of a row do.
     single
@@ -315,6 +312,11 @@ def _read_out(  # type: ignore[no-untyped-def]
     total,
     heard,
 ):
+    """Fill ``out``, ``total`` and ``heard``; ``ends`` is how many of the ``unshown`` pixels lie before each row.
+
+    Of rows, what is known is taken two pitches before they are read out, since the patches around neighbours reach so
+    far, and who hears three pitches before. From rows before the first one only looks ahead.
+    """
     white, scale2, _ = prior
     height, width = log_intensity.shape
     told = moving.size > 0
@@ -331,45 +333,47 @@ def _read_out(  # type: ignore[no-untyped-def]
         np.empty(_STRIP, np.float32),
         np.empty(_STRIP, np.float32),
     )
-    met, met_by = ends[:-1].copy(), ends[1:]  # of every row, in strips from left to right
+    next_unshown = ends[:-1].copy()  # of every row, in strips from left to right
     for begin in range(0, width, _STRIP):
         end = min(begin + _STRIP, width)
         start, size = np.uint64(begin), np.uint64(end - begin)
         _clear(ring)
         marks[:] = np.uint8(0)
         for row in range(-3 * pitch if told else 0, height):
-            following = row + 3 * pitch
             at = np.uint64(row)
-            # As literals, all that takes them would be compiled twice.
+            # The columns in which anybody hears. As literals, all that takes them would be compiled twice.
             first, last = np.int64(_STRIP), np.int64(0)
             if told:
                 _take_row(
                     log_intensity, variance, moving, change, hidden, row + 2 * pitch, begin, count, known
                 )
             if hear:
-                _mark_hearing(moving, following, begin, hears, spans)
+                _mark_hearing(moving, row + 3 * pitch, begin, hears, spans)
                 for place in range(count):
                     first, last = min(first, spans[place, 0]), max(last, spans[place, 1])
             if first < last and row + pitch >= 0:
                 _compare(row, first, last, allowed, pitch, known, least, unlike, alike, single)
             if row < 0:
                 continue
-            here = np.uint64(row % count) * np.uint64(2 * _ROW) + np.uint64(_MARGIN)
+            # L, and I.
             for i in range(size):
                 level[i] = log_intensity[at, start + i]
             if first < last:
                 _hear_neighbours(row, first, last, pitch, known, least, alike, hears, changed, level)
-            begun = met[row]
-            while met[row] < met_by[row] and unshown[met[row]] < row * width + end:
-                heard[met[row]] = level[unshown[met[row]] - row * width - begin]
-                met[row] += 1
-            for i in range(size):
-                marks[i] = level[i] > white
+            before, behind = next_unshown[row], next_unshown[row]  # those of this strip
+            while behind < ends[row + 1] and unshown[behind] < row * width + end:
+                heard[behind] = level[unshown[behind] - row * width - begin]
+                behind += 1
+            next_unshown[row] = behind
             for i in range(size):
                 out[at, start + i] = max(exponential(level[i]) - log_offset, np.float32(0.0))
+            # The variance, where it is wanted or highlights are doubted by it.
+            for i in range(size):
+                marks[i] = level[i] > white
             bright = scale2 > np.float32(0.0) and _any(words, 0, _STRIP)
             if not bright and len(total) == 0:
                 continue
+            here = np.uint64(row % count) * np.uint64(2 * _ROW) + np.uint64(_MARGIN)
             if told:
                 for i in range(size):
                     left[i] = known[here + _DOUBT + i]
@@ -378,9 +382,9 @@ def _read_out(  # type: ignore[no-untyped-def]
                     left[i] = variance[at, start + i]
             if first < last:
                 _lessen(row, first, last, ring, left)
-                for k in range(begun, met[row]):
-                    bound = np.uint64(unshown[k] - row * width - begin)
-                    left[bound] = known[here + _DOUBT + bound]
+                for k in range(before, behind):
+                    column = np.uint64(unshown[k] - row * width - begin)
+                    left[column] = known[here + _DOUBT + column]
             if len(total) > 0:
                 for i in range(size):
                     total[at, start + i] = left[i]
@@ -455,7 +459,7 @@ def _mark_hearing(moving, row, begin, hears, spans):  # type: ignore[no-untyped-
 def _compare(  # type: ignore[no-untyped-def]
     row, first, last, allowed, pitch, known, least, unlike, alike, single
 ):
-    """How alike a row's pixels are to those in `_DIRECTIONS`, where columns ``first`` to ``last`` need it.
+    """How alike a row's pixels are to their four neighbours in `_Ring`, where columns ``first`` to ``last`` need it.
 
     Patches reach into the next row: that is compared first. Quotients share a division; those of four numbers a to d
     are (b, a) c d / a b c d and a b (d, c) / a b c d.

@@ -8,18 +8,11 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.trail import (
-    FrameTrail,
-)
+from kalux.augmentation.trail import FrameTrail
 from kalux.errors import SettingsError
 from kalux.frames import Frame
 from kalux.models import colour
-from kalux.models.camera import (
-    BrightTail,
-    Camera,
-    black_ceiling,
-    inverse_response,
-)
+from kalux.models.camera import BrightTail, Camera, black_ceiling, inverse_response
 
 Array = NDArray[np.float64]
 

@@ -9,7 +9,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from kalux.events import EventArray
+from kalux.events import EVENT_DTYPE, EventArray
+from kalux.readers.source import CHUNK_EVENTS
 
 # Unsigned, of the width of what they are compared with: that keeps the compiled loops free of conversions and of the
 # test for negative indices, and doubles their speed.
@@ -32,14 +33,19 @@ def skip_blanks(text: NDArray[np.uint8], i: np.uint64) -> np.uint64:
     return i
 
 
-def parsed_blocks(
+# The shortest line, "0 0 0 0\n", has 8 bytes: a block holds at most CHUNK_EVENTS events.
+BLOCK_BYTES: Final = 8 * CHUNK_EVENTS
+LONGEST_LINE: Final = 4096
+TOO_LONG: Final = -1
+"""The fault of a line that is longer."""
+
+
+def parsed_events(
     file: Any,
-    parse: Callable[[memoryview, int], tuple[EventArray, int]],
-    too_long: Callable[[int, bytes], Exception],
+    parse: Callable[..., tuple[int, int, int, np.uint64]],
+    bad_line: Callable[[int, int, str], Exception],
     *,
-    lines_before: int,
-    block_bytes: int,
-    longest_line: int,
+    lines_before: int = 0,
 ) -> Iterator[EventArray]:
     """The events of a text file, in bounded memory.
 
@@ -48,16 +54,15 @@ def parsed_blocks(
     file
         Binary, at the beginning of a line.
     parse
-        Called with a block of whole lines and the number of lines before it; returns its events, and its lines.
-    too_long
-        The error for a line longer than ``longest_line``, of its number, from 1, and its beginning.
+        Called with a block of whole lines, whether it is the first, and the arrays t, x, y and p to be filled. Returns
+        events, whole lines read, fault (0: none), start of the faulty line.
+    bad_line
+        The error for a line: its number, from 1, the fault, and its beginning.
     lines_before
         Lines of the file before its position.
-    block_bytes
-        Read at a time.
     """
-    buffer = bytearray(block_bytes)  # used again and again: fresh memory costs as much as the parsing
-    filled = 0
+    buffer = bytearray(BLOCK_BYTES)  # used again and again: fresh memory costs as much as the parsing
+    filled, is_first = 0, True
     while True:
         got = file.readinto(memoryview(buffer)[filled:])
         if not got and filled:
@@ -67,12 +72,22 @@ def parsed_blocks(
             return
         filled += got
         end = buffer.rfind(b"\n", 0, filled) + 1
-        if filled - end > longest_line:
+        if filled - end > LONGEST_LINE:
             number = lines_before + buffer.count(b"\n", 0, end) + 1
-            raise too_long(number, bytes(buffer[end:filled]))
+            raise bad_line(number, TOO_LONG, _beginning(buffer, end))
         if end:
-            events, lines = parse(memoryview(buffer)[:end], lines_before)
+            text = np.frombuffer(buffer, np.uint8, end)
+            events: EventArray = np.empty(np.count_nonzero(text == NEWLINE), EVENT_DTYPE)
+            count, lines, fault, start = parse(text, is_first, *(events[name] for name in "txyp"))
+            lines_before, is_first = lines_before + lines, False
+            if fault:
+                raise bad_line(lines_before + 1, fault, _beginning(buffer, int(start)))
             buffer[: filled - end] = buffer[end:filled]
             filled -= end
-            lines_before += lines
-            yield events
+            yield events[:count]
+
+
+def _beginning(buffer: bytearray, start: int) -> str:
+    """Of a line, for messages."""
+    line = bytes(buffer[start : start + 60]).split(b"\n", 1)[0]
+    return line.decode("ascii", "replace").strip()

@@ -17,13 +17,24 @@ from numba import njit
 from numpy.typing import NDArray
 
 from kalux.errors import FormatError
-from kalux.events import EVENT_DTYPE, EventArray
+from kalux.events import EventArray
 from kalux.frames import Frame
-from kalux.readers.characters import DOT, FIVE, NEWLINE, NINE, ONE, SPACE, ZERO, parsed_blocks, skip_blanks
+from kalux.readers.characters import (
+    DOT,
+    FIVE,
+    LONGEST_LINE,
+    NEWLINE,
+    NINE,
+    ONE,
+    SPACE,
+    TOO_LONG,
+    ZERO,
+    parsed_events,
+    skip_blanks,
+)
 from kalux.readers.image_lists import read_ijrr
 from kalux.readers.images import in_colour, read_image
 from kalux.readers.source import (
-    CHUNK_EVENTS,
     EXPOSURE_UNKNOWN,
     SIZE_UNKNOWN,
     Source,
@@ -36,9 +47,6 @@ from kalux.readers.source import (
 _EVENTS: Final = "events.txt"
 _IMAGES: Final = "images.txt"
 _ZIP_SIGNATURE: Final = b"PK\x03\x04"
-# The shortest line, "0 0 0 0\n", has 8 bytes: a block holds at most CHUNK_EVENTS events.
-_BLOCK_BYTES: Final = 8 * CHUNK_EVENTS
-_LONGEST_LINE: Final = 4096
 _DAMAGE: Final = (
     zipfile.BadZipFile,
     zlib.error,
@@ -143,7 +151,7 @@ def _root_again(path: Path) -> _Place:
 def _check_beginning(path: Path, root: _Place) -> tuple[int, int] | None:
     """Check the unit of time; return (height, width) if the first line is a header ``width height``."""
     with (root / _EVENTS).open("rb") as file:
-        lines = [line.split() for line in file.read(_LONGEST_LINE).splitlines()[:-1]]
+        lines = [line.split() for line in file.read(LONGEST_LINE).splitlines()[:-1]]
     size = None
     if lines and len(lines[0]) == 2 and all(field.isdigit() for field in lines[0]):
         width, height = map(int, lines[0])
@@ -158,40 +166,19 @@ def _check_beginning(path: Path, root: _Place) -> tuple[int, int] | None:
 
 
 def _read_events(path: Path) -> Iterator[EventArray]:
-    root = _root_again(path)
-    with reading(path, *_DAMAGE), (root / _EVENTS).open("rb") as file:
-        yield from parsed_blocks(
-            file,
-            lambda text, lines: _parse_block(path, text, lines),
-            lambda number, line: _bad_line(path, number, line, "the line is too long"),
-            lines_before=0,
-            block_bytes=_BLOCK_BYTES,
-            longest_line=_LONGEST_LINE,
+    def bad_line(number: int, fault: int, shown: str) -> FormatError:
+        return FormatError(
+            f"{path}: {_EVENTS}, line {number}: {_FAULTS[fault]}: {shown!r}; a line is 't x y p', t in seconds as a "
+            "plain decimal, x and y from 0, p 0 or 1"
         )
 
-
-def _parse_block(path: Path, text: memoryview, lines_before: int) -> tuple[EventArray, int]:
-    """The events of whole lines of text, and the number of lines."""
-    array = np.frombuffer(text, np.uint8)
-    events: EventArray = np.empty(np.count_nonzero(array == NEWLINE), EVENT_DTYPE)
-    count, lines, fault, start = _parse(
-        array, lines_before == 0, events["t"], events["x"], events["y"], events["p"]
-    )
-    if fault:
-        line = bytes(text[int(start) : int(start) + _LONGEST_LINE]).split(b"\n", 1)[0]
-        raise _bad_line(path, lines_before + lines + 1, line, _FAULTS[fault])
-    return events[:count], lines
-
-
-def _bad_line(path: Path, number: int, line: bytes, fault: str) -> FormatError:
-    shown = line[:60].decode("ascii", "replace").strip()
-    return FormatError(
-        f"{path}: {_EVENTS}, line {number}: {fault}: {shown!r}; a line is 't x y p', t in seconds as a plain "
-        "decimal, x and y from 0, p 0 or 1"
-    )
+    root = _root_again(path)
+    with reading(path, *_DAMAGE), (root / _EVENTS).open("rb") as file:
+        yield from parsed_events(file, _parse, bad_line)
 
 
 _FAULTS: Final = {
+    TOO_LONG: "the line is too long",
     1: "the time is not a plain decimal number of seconds",
     2: "x is not a pixel coordinate",
     3: "y is not a pixel coordinate",

@@ -10,29 +10,30 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from kalux.errors import FormatError
-from kalux.events import EVENT_DTYPE, EventArray
+from kalux.events import EventArray
 from kalux.readers.characters import (
     DOT,
     FIVE,
+    LONGEST_LINE,
     NEWLINE,
     NINE,
     ONE,
     SPACE,
     TAB,
+    TOO_LONG,
     ZERO,
-    parsed_blocks,
+    parsed_events,
     skip_blanks,
 )
 from kalux.readers.columns import RENAME, UNIT_ASSUMED, Columns, find_columns
 from kalux.readers.source import (
-    CHUNK_EVENTS,
     NO_FRAMES,
     SIZE_UNKNOWN,
     Source,
@@ -41,9 +42,6 @@ from kalux.readers.source import (
     smallest_size,
 )
 
-# The shortest line, "0,0,0,0\n", has 8 bytes: a block holds at most CHUNK_EVENTS events.
-_BLOCK_BYTES: Final = 8 * CHUNK_EVENTS
-_LONGEST_LINE: Final = 4096
 _MOST_COLUMNS: Final = 64
 _NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 _IJRR_LINE: Final = re.compile(r"\s*\d+\.\d+\s+\d+\s+\d+\s+[01]\s*")
@@ -77,7 +75,7 @@ def recognises(path: Path) -> bool:
     if not path.is_file():
         return False
     with path.open("rb") as file:
-        lines = _first_lines(file.read(_LONGEST_LINE))
+        lines = _first_lines(file.read(LONGEST_LINE))
     if not lines:
         return False
     return _columns_of(lines) is not None or _has_numbers(lines[-1])
@@ -97,7 +95,7 @@ def read(path: Path) -> Source:
         If the file cannot be read.
     """
     with reading(path), path.open("rb") as file:
-        header = _read_header(path, file.read(_LONGEST_LINE))
+        header = _read_header(path, file.read(LONGEST_LINE))
     return Source(
         path=path,
         format="table",
@@ -126,7 +124,7 @@ def _first_lines(data: bytes) -> list[str]:
             return []
     # Not splitlines, which also ends lines where the parser does not.
     whole = text.removesuffix("\n").split("\n")
-    if len(data) == _LONGEST_LINE:
+    if len(data) == LONGEST_LINE:
         whole = whole[:-1]
     lines: list[str] = []
     for line in whole:
@@ -196,44 +194,18 @@ def _once(roles: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def _events(path: Path, header: _Header) -> Iterator[EventArray]:
+    roles, separator = np.array(header.roles, np.uint8), np.uint8(ord(header.separator))
+    whole_times, decimals = header.unit is None, _DECIMALS[header.unit]
+
+    def parse(text: NDArray[np.uint8], is_first: bool, *fields: NDArray[Any]) -> Any:
+        return _parse(text, separator, roles, whole_times, decimals, *fields)
+
+    def bad_line(number: int, fault: int, shown: str) -> FormatError:
+        return FormatError(f"{path}: line {number}: {_FAULTS[fault]}: {shown!r}")
+
     with reading(path), path.open("rb") as file:
         file.seek(header.begin)
-        yield from parsed_blocks(
-            file,
-            lambda text, lines: _parse_block(path, text, header, lines),
-            lambda number, line: _bad_line(path, number, line, "it is too long"),
-            lines_before=header.lines,
-            block_bytes=_BLOCK_BYTES,
-            longest_line=_LONGEST_LINE,
-        )
-
-
-def _parse_block(path: Path, text: memoryview, header: _Header, lines_before: int) -> tuple[EventArray, int]:
-    """The events of whole lines of text, and the number of lines."""
-    array = np.frombuffer(text, np.uint8)
-    events: EventArray = np.empty(np.count_nonzero(array == NEWLINE), EVENT_DTYPE)
-    roles = np.array(header.roles, np.uint8)
-    separator = np.uint8(ord(header.separator))
-    count, lines, fault, start = _parse(
-        array,
-        separator,
-        roles,
-        header.unit is None,
-        _DECIMALS[header.unit],
-        events["t"],
-        events["x"],
-        events["y"],
-        events["p"],
-    )
-    if fault:
-        line = bytes(text[int(start) : int(start) + _LONGEST_LINE]).split(b"\n", 1)[0]
-        raise _bad_line(path, lines_before + lines + 1, line, _FAULTS[fault])
-    return events[:count], lines
-
-
-def _bad_line(path: Path, number: int, line: bytes, fault: str) -> FormatError:
-    shown = line[:60].decode("ascii", "replace").strip()
-    return FormatError(f"{path}: line {number}: {fault}: {shown!r}")
+        yield from parsed_events(file, parse, bad_line, lines_before=header.lines)
 
 
 _T, _X, _Y, _P, _FEW, _MANY, _UNITLESS = range(1, 8)
@@ -244,6 +216,7 @@ _FAULTS: Final = {
     _P: "the polarity is none of 0, 1, -1, true and false",
     _FEW: "it has fewer columns than the first line",
     _MANY: "it has more columns than the first line",
+    TOO_LONG: "it is too long",
     _UNITLESS: f"the time has decimals, but no unit; {RENAME}",
 }
 _BAD: Final = np.int64(-2)

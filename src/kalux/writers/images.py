@@ -11,14 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from kalux.display import (
-    DisplaySettings,
-    ToneState,
-    colour_of,
-    next_state,
-    quantised,
-    shown_of,
-)
+from kalux.display import DisplaySettings, ToneState, colour_of, next_state, quantised, shown_of
 from kalux.writers.base import ImageLike
 from kalux.writers.exr import exr_file
 from kalux.writers.png import png_bytes

@@ -14,14 +14,11 @@ import kalux
 from kalux.calibration.values import Calibration, load_calibration
 from kalux.datasets.ahdr import ArtificialCamera, artificial_hdr
 from kalux.errors import InputError
-from kalux.evaluation.truth import truth_file
+from kalux.evaluation.truth import TRUTH_SUFFIX, truth_file
 from kalux.frames import Stamp
 from kalux.readers import READERS
 from kalux.recording import Recording
 from kalux.settings import AUTO, CameraSettings, read_toml
-
-TRUTH_SUFFIX: Final = "_gt.npz"
-"""Reference images beside a recording: ``pan_gt.npz`` beside ``pan.mat``."""
 
 EVERY: Final = 2
 """Every second frame is held out where there is no ground truth."""
