@@ -16,12 +16,11 @@ from __future__ import annotations
 
 from typing import Any, Final, NamedTuple
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.trail import Trail
-from kalux.compiled import any_from, apart
+from kalux.compiled import any_from, apart, loop
 
 Array = NDArray[np.floating[Any]]
 
@@ -202,7 +201,7 @@ def drift(
     return grown, far_on, far_off
 
 
-@nb.njit(cache=True, nogil=True)
+@loop
 def _drift(  # type: ignore[no-untyped-def]
     of_on,
     of_off,
@@ -259,7 +258,7 @@ def lower(log_intensity: Array, frame: Latent) -> None:
         np.minimum(log_intensity, frame.ceiling, out=log_intensity)
 
 
-@nb.njit(cache=True, nogil=True)
+@loop
 def _lift(log_intensity, value, variance):  # type: ignore[no-untyped-def]
     for i in range(len(value)):
         if UNMEASURED <= variance[i] < UNSEEN and value[i] > log_intensity[i]:
@@ -337,7 +336,7 @@ _STEP_ON, _STEP_OFF, _NEW_ON, _NEW_OFF, _LEFT_ON, _LEFT_OFF = _LEARNED
 """Where the values of a block of pixels lie in the scratch memory of `_bridge`."""
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@loop
 def _bridge(given, thresholds, noise, seconds, planes, factors):  # type: ignore[no-untyped-def]
     """Fill ``planes`` and ``factors``; in float64, whatever the arrays' type.
 

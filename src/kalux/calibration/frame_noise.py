@@ -12,13 +12,12 @@ import itertools
 from typing import Any, Final, NamedTuple
 
 import cv2
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.deblur import all_between
 from kalux.calibration.intervals import Interval, intervals
-from kalux.compiled import event_column, event_row, event_words
+from kalux.compiled import event_column, event_row, event_words, loop
 from kalux.events import EventArray
 from kalux.filters.shots import Shot
 from kalux.frames import Frame
@@ -204,7 +203,7 @@ def _busy(chunks: list[EventArray], shape: tuple[int, ...]) -> NDArray[np.uint8]
     return busy
 
 
-@nb.njit(cache=True, nogil=True)
+@loop
 def _mark(words, busy):  # type: ignore[no-untyped-def]
     for i in range(len(words)):
         busy[event_row(words[i, 1]), event_column(words[i, 1])] = 1
@@ -238,7 +237,7 @@ def _by_level(shot: Shot) -> tuple[NDArray[np.integer[Any]], Array, Array, NDArr
     return shot.levels, shot.level_intensity / shot.white, shot.level_weight, shot.level_clipped
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@loop
 def _compare(  # type: ignore[no-untyped-def]
     before, intensity, weight, clipped, after, next_intensity, next_weight, next_clipped, level, change, bad
 ):
@@ -264,7 +263,7 @@ def _add(points: _Points, level: Array, difference: Array, chosen: NDArray[np.bo
             found.append((float(total / (stop - start)), variance, int(stop - start)))
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@loop
 def _in_bins(level, difference, kept):  # type: ignore[no-untyped-def]
     """Differences of the pixels that are kept, one bin of the level after the other; sum of the levels, and limits."""
     index = np.empty(len(kept), np.uint8)
@@ -289,7 +288,7 @@ def trimmed_variance(values: Array) -> float:
     return float(_trimmed_variance(np.ascontiguousarray(values, np.float64)))
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@loop
 def _trimmed_variance(values):  # type: ignore[no-untyped-def]
     low, high = -np.inf, np.inf
     before, variance = -1, 0.0

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from kalux.augmentation.deblur import between
 from kalux.augmentation.refractory import step_weight
 from kalux.calibration.intervals import Interval, intervals
-from kalux.compiled import event_column, event_is_on, event_row, event_words
+from kalux.compiled import event_column, event_is_on, event_row, event_words, inner, loop
 from kalux.events import NEVER
 from kalux.recording import Recording
 from kalux.settings import CameraSettings
@@ -204,7 +204,7 @@ class _Passing:
         return candidates[:: max(-(-len(candidates) // self._most), 1)], usable
 
 
-@nb.njit(cache=True, nogil=True)
+@loop
 def _add(words, happened):  # type: ignore[no-untyped-def]
     """Count every pixel's events."""
     for i in range(len(words)):
@@ -212,7 +212,7 @@ def _add(words, happened):  # type: ignore[no-untyped-def]
         happened[event_row(word), event_column(word)] += 1
 
 
-@nb.njit(cache=True, nogil=True)
+@loop
 def _with_neighbours(chosen, height, width):  # type: ignore[no-untyped-def]
     """(H W) bool: pixels not at the border, and those around them."""
     found = np.zeros(height * width, np.bool_)
@@ -223,7 +223,7 @@ def _with_neighbours(chosen, height, width):  # type: ignore[no-untyped-def]
     return found
 
 
-@nb.njit(cache=True, nogil=True)
+@loop
 def _pass(words, width, latest, sign):  # type: ignore[no-untyped-def]
     """Remember time and sign of every pixel's newest event."""
     for i in range(len(words)):
@@ -233,7 +233,7 @@ def _pass(words, width, latest, sign):  # type: ignore[no-untyped-def]
         sign[at] = 1 if event_is_on(word) else -1
 
 
-@nb.njit(cache=True, nogil=True)
+@loop
 def _by_pixel(words, width, wanted):  # type: ignore[no-untyped-def]
     """Indices of the wanted pixels' events, one pixel after the other and in order, and where those of each start."""
     starts = np.zeros(len(wanted) + 1, np.int64)
@@ -264,7 +264,7 @@ def _ramp_sum(t, start, end):  # type: ignore[no-untyped-def]
     return t - 0.5 * (start + end)
 
 
-@nb.njit(cache=True, error_model="numpy")
+@inner
 def _ramp_mean(begin, stop, start, end):  # type: ignore[no-untyped-def]
     """Mean from ``begin`` to ``stop`` of what goes from 0 at ``start`` to 1 at ``end``."""
     if stop <= start:
@@ -274,14 +274,14 @@ def _ramp_mean(begin, stop, start, end):  # type: ignore[no-untyped-def]
     return (_ramp_sum(stop, start, end) - _ramp_sum(begin, start, end)) / (stop - begin)
 
 
-@nb.njit(cache=True, error_model="numpy")
+@inner
 def _shown(exposures, start, end):  # type: ignore[no-untyped-def]
     """By how much more the second exposure shows of what goes from 0 at ``start`` to 1 at ``end``."""
     begin, stop, second_begin, second_stop = exposures
     return _ramp_mean(second_begin, second_stop, start, end) - _ramp_mean(begin, stop, start, end)
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@loop
 def _count(words, order, starts, latest, sign, exposures, periods, late, counts):  # type: ignore[no-untyped-def]
     """Add the parts of the events' steps."""
     for at in range(len(starts) - 1):
@@ -323,7 +323,7 @@ def _count(words, order, starts, latest, sign, exposures, periods, late, counts)
             counts[at, k, 0, np.uint64(sign_before < 0)] += step
 
 
-@nb.njit(cache=True, nogil=True)
+@loop
 def _hot(happened):  # type: ignore[no-untyped-def]
     """(H, W): pixels with far more events than any of their neighbours."""
     height, width = happened.shape
@@ -340,7 +340,7 @@ def _hot(happened):  # type: ignore[no-untyped-def]
     return found
 
 
-@nb.njit(cache=True, nogil=True)
+@loop
 def _something_happens(happened, usable):  # type: ignore[no-untyped-def]
     """(H, W): well exposed pixels not at the border whose neighbours have enough events."""
     height, width = happened.shape
@@ -358,7 +358,7 @@ def _something_happens(happened, usable):  # type: ignore[no-untyped-def]
     return found
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@loop
 def _looked_at(counts, change, usable, chosen):  # type: ignore[no-untyped-def]
     """Counts of the chosen pixels, and of their neighbours the mean counts and changes.
 

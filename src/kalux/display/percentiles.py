@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from typing import Final
 
-import numba as nb
 import numpy as np
 
+from kalux.compiled import loop
 from kalux.display.intensities import LARGEST, Float32, Statistics
 
 SAMPLES: Final = 1 << 14
@@ -47,7 +47,7 @@ def percentiles(values: Float32, percents: list[float]) -> Statistics:
     return np.array(found)
 
 
-@nb.njit(cache=True, nogil=True)
+@loop
 def _narrowed(rows, ranks, order, bits):  # type: ignore[no-untyped-def]
     """The numbers among which those of some ranks are, in ``bits``, with room for one more; their places, and how many.
 

@@ -30,6 +30,7 @@ from kalux.compiled import (
     event_weight,
     event_words,
     flat,
+    loop,
     pack,
     packed,
     prefetch,
@@ -238,7 +239,7 @@ def unmeasured_pixels(segment: BridgedSegment, cursor: Cursor) -> NDArray[np.int
     return cursor.unmeasured
 
 
-@nb.njit(cache=True, nogil=True)
+@loop
 def _moving(clock, still_since, forward, backward, coming, knows_coming, moving):  # type: ignore[no-untyped-def]
     height, width = moving.shape
     for row in range(height):
@@ -271,7 +272,7 @@ def _since(clock, now):  # type: ignore[no-untyped-def]
     return np.int32(now - max(clock, np.int32(0)))
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@loop
 def _begin_bridged(given, scalars, before, pixels, steps):  # type: ignore[no-untyped-def]
     rate, step_variance = scalars
     log_intensity, floor, variance = before
@@ -320,7 +321,7 @@ def _copy(plane, row, first, count, out):  # type: ignore[no-untyped-def]
         out[i] = np.float32(plane[row, first + i])
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy", fastmath=FUSED)
+@loop(fastmath=FUSED)
 def _advance_bridged(words, pixels, steps, clock, polarity, origin, rate, step_variance, noise):  # type: ignore[no-untyped-def]
     scalars = _Scalars(
         np.float32(rate),
@@ -387,7 +388,7 @@ def _weighed(met, scalars):  # type: ignore[no-untyped-def]
     return at, np.float32(since) * MICROSECOND32, weight, is_on, ONE - signal, noise
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@loop
 def _read_bridged(  # type: ignore[no-untyped-def]
     pixels, clock, polarity, slope, heights, moment, log_intensity, variance
 ):
@@ -430,7 +431,7 @@ def _read_block(planes, first, count, newest, heights, moment, rows, ahead):  # 
         variance[column] = inverse
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@loop
 def _predict_bridged(pixels, clock, span):  # type: ignore[no-untyped-def]
     height, width = clock.shape
     for row in range(1, height - 1):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any, Final, NamedTuple
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
@@ -42,7 +41,7 @@ from kalux.augmentation.unseen import (
     silent_change,
     turns,
 )
-from kalux.compiled import apart
+from kalux.compiled import apart, loop
 from kalux.events import EventArray
 from kalux.filters import akf_bridged
 from kalux.filters.akf import State
@@ -551,7 +550,7 @@ def latent_frame(
     return Latent(*latent.reshape(2, *levels.shape))
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@loop
 def _latent_frame(  # type: ignore[no-untyped-def]
     levels, level_log, level_variance, exposure, duration, event_variance, value, variance
 ):

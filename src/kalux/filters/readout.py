@@ -8,7 +8,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.compiled import FUSED, ONE, WITHIN, exponential, logarithm
+from kalux.compiled import FUSED, ONE, exponential, inner, logarithm, loop
 
 Array = NDArray[np.floating[Any]]
 
@@ -262,7 +262,7 @@ def read_out(
     return out, known if with_variance and moving is None else total, heard
 
 
-@nb.njit(cache=True, **WITHIN)
+@inner
 def _ring(pitch):  # type: ignore[no-untyped-def]
     # A row's neighbours, and the patches around them, lie in rows to twice the pitch ahead and one behind; the rows
     # that need what is made of them, in one more ahead.
@@ -279,7 +279,7 @@ def _ring(pitch):  # type: ignore[no-untyped-def]
     )
 
 
-@nb.njit(cache=True, **WITHIN)
+@inner
 def _lines(rows):  # type: ignore[no-untyped-def]
     """Memory for some rows, which begin where lines of the cache do. One piece for all would not become vector code."""
     memory = np.empty(rows * _ROW + _VECTOR, np.float32)
@@ -298,7 +298,7 @@ def _plane(values: Array | None, shape: tuple[int, ...]) -> NDArray[np.float32]:
 # these are 4 % of an image.
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy", fastmath=FUSED)
+@loop(fastmath=FUSED)
 def _read_out(  # type: ignore[no-untyped-def]
     log_intensity,
     variance,
@@ -397,7 +397,7 @@ def _any(words, first, count):  # type: ignore[no-untyped-def]
     return found != np.uint64(0)
 
 
-@nb.njit(cache=True, **WITHIN)
+@inner
 def _clear(ring):  # type: ignore[no-untyped-def]
     """Before the first row of a strip: nothing is known, nothing is alike, nobody hears."""
     for place in range(len(ring.spans)):
@@ -435,7 +435,7 @@ def _take_row(  # type: ignore[no-untyped-def]
         known[into + _DOUBT + i] = doubt if doubt < _NOTHING else _NOTHING
 
 
-@nb.njit(cache=True, **WITHIN)
+@inner
 def _mark_hearing(moving, row, begin, hears, spans):  # type: ignore[no-untyped-def]
     """Which pixels of a row hear their neighbours, and from which block of columns to which; none outside the image."""
     place = np.uint64(row % len(spans))
@@ -451,7 +451,7 @@ def _mark_hearing(moving, row, begin, hears, spans):  # type: ignore[no-untyped-
     spans[place, 0], spans[place, 1] = first, last
 
 
-@nb.njit(cache=True, error_model="numpy", fastmath=FUSED, **WITHIN)
+@inner(fastmath=FUSED)
 def _compare(  # type: ignore[no-untyped-def]
     row, first, last, allowed, pitch, known, least, unlike, alike, single
 ):
@@ -517,7 +517,7 @@ def _compare(  # type: ignore[no-untyped-def]
         alike[own + three + i] = _squared(of_cd * c)
 
 
-@nb.njit(cache=True, error_model="numpy", fastmath=FUSED, **WITHIN)
+@inner(fastmath=FUSED)
 def _hear_neighbours(  # type: ignore[no-untyped-def]
     row, first, last, pitch, known, least, alike, hears, heard, level
 ):
@@ -565,7 +565,7 @@ def _hear_neighbours(  # type: ignore[no-untyped-def]
         level[column + i] = together if hears[here, column + i] else alone
 
 
-@nb.njit(cache=True, **WITHIN)
+@inner
 def _lessen(row, first, last, ring, left):  # type: ignore[no-untyped-def]
     """The variances of a row, ``left``, where pixels have heard their neighbours."""
     here, column, two = np.uint64(row % len(ring.spans)), np.uint64(first), np.uint64(_ROW + _MARGIN + first)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.bridge import UNMEASURED
-from kalux.compiled import FUSED
+from kalux.compiled import FUSED, loop
 from kalux.filters.readout import SHARED, Hidden, total_variance
 
 Array = NDArray[np.floating[Any]]
@@ -178,13 +178,13 @@ def given_variance(
     return given
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy", fastmath=FUSED)
+@loop(fastmath=FUSED)
 def _know(variance, first, second, events, around, known):  # type: ignore[no-untyped-def]
     for i in range(np.uint64(len(known))):
         known[i] = known_variance(variance[i], first[i], second[i], events[i], around)
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy", fastmath=FUSED)
+@loop(fastmath=FUSED)
 def _hear(variance, left, first, second, hidden, heard):  # type: ignore[no-untyped-def]
     """P of pixels that neither frame measures, after their neighbours are heard.
 
@@ -197,7 +197,7 @@ def _hear(variance, left, first, second, hidden, heard):  # type: ignore[no-unty
         heard[i] = variance[i] * (one - _HEARD * max(lost, np.float32(0.0)) if neither else one)
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy", fastmath=FUSED)
+@loop(fastmath=FUSED)
 def _hide(known, moving, change, hidden, given):  # type: ignore[no-untyped-def]
     for i in range(np.uint64(len(given))):
         given[i] = total_variance(known[i], moving[i], change[i], hidden)
@@ -223,7 +223,7 @@ def add_pattern(variance: NDArray[np.float32], intensity: Array, log_offset: flo
     _add_pattern(variance.reshape(-1), np.ascontiguousarray(intensity).reshape(-1), *scalars)
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy", fastmath=FUSED)
+@loop(fastmath=FUSED)
 def _add_pattern(variance, intensity, log_offset, deviation):  # type: ignore[no-untyped-def]
     for i in range(np.uint64(len(variance))):
         relative = deviation / (intensity[i] + log_offset)
