@@ -15,7 +15,9 @@ import numba as nb
 import numpy as np
 from llvmlite import ir
 from numba.core import cgutils, types
+from numba.core.typing.npydecl import parse_dtype, parse_shape
 from numba.extending import intrinsic
+from numba.np.arrayobj import _empty_nd_impl
 from numpy.typing import NDArray
 
 from kalux import memory
@@ -131,6 +133,31 @@ def apart(count: int, shape: tuple[int, ...], dtype: Any = np.float32) -> NDArra
     planes = piece[first : first + count * step].reshape(count, step)[:, :size]
     apart_: NDArray[Any] = planes.view(dtype).reshape(count, *shape)
     return apart_
+
+
+def _new_array(*, zeros: bool) -> Any:
+    def new_array(typing_context: Any, shape: Any, dtype: Any) -> Any:
+        dimensions, element = parse_shape(shape), parse_dtype(dtype)  # type: ignore[no-untyped-call]
+        kind = types.Array(element, dimensions, "C")
+
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            lengths = arguments[:1]
+            if isinstance(shape, types.BaseTuple):
+                lengths = cgutils.unpack_tuple(builder, arguments[0])  # type: ignore[no-untyped-call]
+            array = _empty_nd_impl(context, builder, kind, lengths)  # type: ignore[no-untyped-call]
+            if zeros:
+                size = builder.mul(array.itemsize, array.nitems)
+                cgutils.memset(builder, array.data, size, 0)  # type: ignore[no-untyped-call]
+            return array._getvalue()
+
+        return kind(shape, dtype), generate
+
+    return intrinsic(new_array)
+
+
+empty, zeros = _new_array(zeros=False), _new_array(zeros=True)
+"""As NumPy's, for loops, of a shape and a dtype: compiled in their place, where numba makes two or three functions of
+each."""
 
 
 def _prefetch(typing_context: Any, array: Any, index: Any) -> Any:

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.trail import Trail
-from kalux.compiled import any_from, apart, loop
+from kalux.compiled import any_from, apart, empty, loop
 
 Array = NDArray[np.floating[Any]]
 
@@ -219,7 +219,7 @@ def _drift(  # type: ignore[no-untyped-def]
     new_off,
 ):
     unmeasured, two, zero = np.float32(UNMEASURED), np.float32(2.0), np.float32(0.0)
-    drifted = np.empty(_BLOCK, np.float32)
+    drifted = empty(_BLOCK, np.float32)
     for first in range(np.uint64(0), np.uint64(len(grown)), np.uint64(_BLOCK)):
         pixels = range(first, min(np.uint64(len(grown)), first + np.uint64(_BLOCK)))
         if not any_from(after, pixels, unmeasured):
@@ -350,7 +350,7 @@ def _bridge(given, thresholds, noise, seconds, planes, factors):  # type: ignore
     scale_on, scale_off, variance_on, variance_off = thresholds
     c_on, c_off, of_step = noise.threshold_on, noise.threshold_off, noise.step_variance
     untold, of_saturated = noise.quantisation_variance, noise.saturated_variance
-    s = np.empty(_SCRATCH * _BLOCK)
+    s = empty(_SCRATCH * _BLOCK, np.float64)
     size = np.uint64(len(value))
     for first in range(np.uint64(0), size, np.uint64(_BLOCK)):
         pixels = range(min(size - first, np.uint64(_BLOCK)))

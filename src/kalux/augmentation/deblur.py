@@ -28,6 +28,7 @@ from kalux.compiled import (
     UNWEIGHED,
     WEIGHT_UNIT,
     apart,
+    empty,
     event_column,
     event_is_on,
     event_row,
@@ -241,7 +242,7 @@ def _touch(words, width, touched):  # type: ignore[no-untyped-def]
 
 @loop
 def _begin_exposure(pixels, touched, on, off, unit_on, unit_off):  # type: ignore[no-untyped-def]
-    fields = np.empty((EXPOSURE_FIELDS, EXPOSED), np.float32)
+    fields = empty((EXPOSURE_FIELDS, EXPOSED), np.float32)
     fields[_LEVEL] = fields[_PEAK] = fields[_AT_MIDDLE] = ONE
     fields[_INTEGRAL] = fields[_SINCE] = fields[_EVENTS] = np.float32(0.0)
     up, down = fields[_UP], fields[_DOWN]
@@ -317,7 +318,7 @@ def _finish_exposure(  # type: ignore[no-untyped-def]
 ):
     """Fill the planes of `ExposureIntegrals`: 0 where nothing has moved."""
     duration = np.float32(exposure)
-    fields = np.empty((EXPOSURE_FIELDS, EXPOSED), np.float32)
+    fields = empty((EXPOSURE_FIELDS, EXPOSED), np.float32)
     level, integral, since = fields[_LEVEL], fields[_INTEGRAL], fields[_SINCE]
     at_middle, peak, events = fields[_AT_MIDDLE], fields[_PEAK], fields[_EVENTS]
     for block in range(np.uint64(len(touched))):

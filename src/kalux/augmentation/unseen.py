@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from kalux import memory
 from kalux.augmentation.bridge import UNMEASURED, BridgedSegment, Latent
-from kalux.compiled import apart, loop
+from kalux.compiled import apart, empty, loop, zeros
 
 Array = NDArray[np.floating[Any]]
 
@@ -134,11 +134,11 @@ def _told(given, seconds, q0, most, told_of):  # type: ignore[no-untyped-def]
     change, untold, silent = told_of
     zero, one, unmeasured = np.float32(0.0), np.float32(1.0), np.float32(UNMEASURED)
     noise, share, is_silent = (
-        np.empty(_BLOCK, np.float32),
-        np.empty(_BLOCK, np.float32),
-        np.empty(_BLOCK, np.float32),
+        empty(_BLOCK, np.float32),
+        empty(_BLOCK, np.float32),
+        empty(_BLOCK, np.float32),
     )
-    sum_change, sum_share = np.zeros(_BLOCK), np.zeros(_BLOCK)
+    sum_change, sum_share = zeros(_BLOCK, np.float64), zeros(_BLOCK, np.float64)
     for first in range(np.uint64(0), np.uint64(len(slope)), np.uint64(_BLOCK)):
         pixels = range(min(np.uint64(len(slope)) - first, np.uint64(_BLOCK)))
         for k in pixels:

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from kalux.augmentation.deblur import between
 from kalux.calibration.registration import Registration
 from kalux.calibration.regression import huber_weights
-from kalux.compiled import loop
+from kalux.compiled import loop, zeros
 from kalux.errors import InputError
 from kalux.events import NEVER, EventArray
 from kalux.frames import Frame
@@ -155,8 +155,8 @@ def _levels(t, x, y, p, times, spread, longest, on, off):  # type: ignore[no-unt
     # Of every pixel: the event that waits for the one after it, the one before it, and the next time to be told.
     waiting = np.full((height, width), -1, np.int64)
     before = np.full((height, width), NEVER, np.int64)
-    upcoming = np.zeros((height, width), np.int64)
-    level = np.zeros((2, height, width), np.float32)
+    upcoming = zeros((height, width), np.int64)
+    level = zeros((2, height, width), np.float32)
     for i in range(len(t) + height * width):
         if i < len(t):
             row, column, now = y[i], x[i], t[i]

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from kalux.augmentation.deblur import all_between
 from kalux.calibration.intervals import Interval, intervals
-from kalux.compiled import event_column, event_row, event_words, loop
+from kalux.compiled import empty, event_column, event_row, event_words, loop, zeros
 from kalux.events import EventArray
 from kalux.filters.shots import Shot
 from kalux.frames import Frame
@@ -266,8 +266,8 @@ def _add(points: _Points, level: Array, difference: Array, chosen: NDArray[np.bo
 @loop
 def _in_bins(level, difference, kept):  # type: ignore[no-untyped-def]
     """Differences of the pixels that are kept, one bin of the level after the other; sum of the levels, and limits."""
-    index = np.empty(len(kept), np.uint8)
-    sums, stops = np.zeros(_BINS), np.zeros(_BINS + 1, np.int64)
+    index = empty(len(kept), np.uint8)
+    sums, stops = zeros(_BINS, np.float64), zeros(_BINS + 1, np.int64)
     for i in range(len(kept)):
         value = level[kept[i]]
         k = min(int(value * _BINS), _BINS - 1)
@@ -276,7 +276,7 @@ def _in_bins(level, difference, kept):  # type: ignore[no-untyped-def]
         stops[k + 1] += 1
     for k in range(_BINS):
         stops[k + 1] += stops[k]
-    ordered, free = np.empty(len(kept)), stops.copy()
+    ordered, free = empty(len(kept), np.float64), stops.copy()
     for i in range(len(kept)):
         ordered[free[index[i]]] = difference[kept[i]]
         free[index[i]] += 1

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from kalux.augmentation.deblur import between
 from kalux.augmentation.refractory import step_weight
 from kalux.calibration.intervals import Interval, intervals
-from kalux.compiled import event_column, event_is_on, event_row, event_words, inner, loop
+from kalux.compiled import empty, event_column, event_is_on, event_row, event_words, inner, loop, zeros
 from kalux.events import NEVER
 from kalux.recording import Recording
 from kalux.settings import CameraSettings
@@ -215,7 +215,7 @@ def _add(words, happened):  # type: ignore[no-untyped-def]
 @loop
 def _with_neighbours(chosen, height, width):  # type: ignore[no-untyped-def]
     """(H W) bool: pixels not at the border, and those around them."""
-    found = np.zeros(height * width, np.bool_)
+    found = zeros(height * width, np.bool_)
     for at in chosen:
         for i in range(-1, 2):
             for j in range(-1, 2):
@@ -236,7 +236,7 @@ def _pass(words, width, latest, sign):  # type: ignore[no-untyped-def]
 @loop
 def _by_pixel(words, width, wanted):  # type: ignore[no-untyped-def]
     """Indices of the wanted pixels' events, one pixel after the other and in order, and where those of each start."""
-    starts = np.zeros(len(wanted) + 1, np.int64)
+    starts = zeros(len(wanted) + 1, np.int64)
     for i in range(len(words)):
         word = words[i, 1]
         at = event_row(word) * width + event_column(word)
@@ -244,7 +244,7 @@ def _by_pixel(words, width, wanted):  # type: ignore[no-untyped-def]
     for at in range(len(wanted)):
         starts[at + 1] += starts[at]
     place = starts[:-1].copy()
-    order = np.empty(starts[-1], np.int32)
+    order = empty(starts[-1], np.int32)
     for i in range(len(words)):
         word = words[i, 1]
         at = event_row(word) * width + event_column(word)
@@ -327,7 +327,7 @@ def _count(words, order, starts, latest, sign, exposures, periods, late, counts)
 def _hot(happened):  # type: ignore[no-untyped-def]
     """(H, W): pixels with far more events than any of their neighbours."""
     height, width = happened.shape
-    found = np.zeros((height, width), np.bool_)
+    found = zeros((height, width), np.bool_)
     for row in range(height):
         for column in range(width):
             if happened[row, column] > _HOT_LEAST:
@@ -344,7 +344,7 @@ def _hot(happened):  # type: ignore[no-untyped-def]
 def _something_happens(happened, usable):  # type: ignore[no-untyped-def]
     """(H, W): well exposed pixels not at the border whose neighbours have enough events."""
     height, width = happened.shape
-    found = np.zeros((height, width), np.bool_)
+    found = zeros((height, width), np.bool_)
     for row in range(1, height - 1):
         for column in range(1, width - 1):
             if usable[row, column]:
@@ -365,8 +365,8 @@ def _looked_at(counts, change, usable, chosen):  # type: ignore[no-untyped-def]
     One number at a time: of whole rows numba would compile, for 1.5 s, how it complains that they differ in size.
     """
     width, size = counts.shape[1:]
-    own, around = np.empty((len(chosen), size)), np.zeros((len(chosen), size))
-    change_around = np.zeros(len(chosen))
+    own, around = empty((len(chosen), size), np.float64), zeros((len(chosen), size), np.float64)
+    change_around = zeros(len(chosen), np.float64)
     for n in range(len(chosen)):
         row, column = chosen[n] // width, chosen[n] % width
         total = 0.0

@@ -24,6 +24,7 @@ from kalux.compiled import (
     ONE,
     WEIGHT_UNIT,
     apart,
+    empty,
     event_column,
     event_is_on,
     event_row,
@@ -35,6 +36,7 @@ from kalux.compiled import (
     packed,
     prefetch,
     unpack,
+    zeros,
 )
 from kalux.events import EventArray
 from kalux.filters.akf import (
@@ -278,8 +280,8 @@ def _begin_bridged(given, scalars, before, pixels, steps):  # type: ignore[no-un
     log_intensity, floor, variance = before
     augmented, step_on, step_off, forward, backward, events, trail = given
     height, width = log_intensity.shape
-    states = np.empty((_STATE_FIELDS, _BEGUN), np.float32)
-    known = np.zeros((_STEP_FIELDS, _BEGUN), np.float32)
+    states = empty((_STATE_FIELDS, _BEGUN), np.float32)
+    known = zeros((_STEP_FIELDS, _BEGUN), np.float32)
     information, weighted, level, rates = (
         states[_INFORMATION],
         states[_WEIGHTED],
@@ -395,7 +397,7 @@ def _read_bridged(  # type: ignore[no-untyped-def]
     height, width = variance.shape
     pixels, clock, polarity = flat(pixels), flat(clock), flat(polarity)
     size = min(width, _BLOCK)
-    planes, ahead = np.empty((_STATE_FIELDS, size), np.float32), np.empty(size, np.float32)
+    planes, ahead = empty((_STATE_FIELDS, size), np.float32), empty(size, np.float32)
     for row in range(height):
         at = (row + 1) * (width + 2) + 1
         newest = clock[at : at + width], polarity[at : at + width]

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.interpolation import InterpolatedSegment
-from kalux.compiled import apart, loop
+from kalux.compiled import apart, empty, loop
 from kalux.events import EventArray
 from kalux.filters.akf import (
     State,
@@ -192,7 +192,7 @@ def _advance_interpolated(segment, cursor, t, x, y, p, noise):  # type: ignore[n
 def _read_printed(segment, cursor, t, log_intensity, variance):  # type: ignore[no-untyped-def]
     """`_predict_printed` of all pixels, a row at a time and few arrays a loop: vector code."""
     height, width = variance.shape
-    fraction, deviation, rate, seconds = np.empty((4, width))
+    fraction, deviation, rate, seconds = empty((4, width), np.float64)
     after, exposure = t >= segment.middle, _exposure(segment)
     now, share = _exposure_fraction(exposure, t), _covariance_fraction(segment, t, after)
     for row in range(height):

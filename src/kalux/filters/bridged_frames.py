@@ -41,7 +41,7 @@ from kalux.augmentation.unseen import (
     silent_change,
     turns,
 )
-from kalux.compiled import apart, loop
+from kalux.compiled import apart, empty, loop
 from kalux.events import EventArray
 from kalux.filters import akf_bridged
 from kalux.filters.akf import State
@@ -555,9 +555,9 @@ def _latent_frame(  # type: ignore[no-untyped-def]
     levels, level_log, level_variance, exposure, duration, event_variance, value, variance
 ):
     unmeasured = np.float32(bridge.UNMEASURED)
-    fields = np.empty((EXPOSURE_FIELDS, EXPOSED), np.float32)
-    middle, events = np.empty(EXPOSED, np.float32), np.empty(EXPOSED, np.float32)
-    log_frame, known = np.empty(EXPOSED, np.float32), np.empty(EXPOSED, np.float32)
+    fields = empty((EXPOSURE_FIELDS, EXPOSED), np.float32)
+    middle, events = empty(EXPOSED, np.float32), empty(EXPOSED, np.float32)
+    log_frame, known = empty(EXPOSED, np.float32), empty(EXPOSED, np.float32)
     for block in range(np.uint64(len(exposure.touched))):
         relative_levels(exposure, block, duration, fields, middle, events)
         first = block * np.uint64(EXPOSED)

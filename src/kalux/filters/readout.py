@@ -8,7 +8,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.compiled import FUSED, ONE, exponential, inner, logarithm, loop
+from kalux.compiled import FUSED, ONE, empty, exponential, inner, logarithm, loop, zeros
 
 Array = NDArray[np.floating[Any]]
 
@@ -272,8 +272,8 @@ def _ring(pitch):  # type: ignore[no-untyped-def]
         _lines(2 * count),
         _lines(4 * count),
         _lines(4 * count),
-        np.empty((count, _STRIP), np.uint8),
-        np.empty((count, 2), np.int64),
+        empty((count, _STRIP), np.uint8),
+        empty((count, 2), np.int64),
         _lines(np.int64(4)),
         _lines(np.int64(2)),
     )
@@ -282,7 +282,7 @@ def _ring(pitch):  # type: ignore[no-untyped-def]
 @inner
 def _lines(rows):  # type: ignore[no-untyped-def]
     """Memory for some rows, which begin where lines of the cache do. One piece for all would not become vector code."""
-    memory = np.empty(rows * _ROW + _VECTOR, np.float32)
+    memory = empty(rows * _ROW + _VECTOR, np.float32)
     begin = (_VECTOR - np.int64(memory.ctypes.data // 4) % _VECTOR) % _VECTOR
     return memory[begin : begin + rows * _ROW]
 
@@ -323,13 +323,13 @@ def _read_out(  # type: ignore[no-untyped-def]
     known, least, unlike, alike, single = ring.known, ring.least, ring.unlike, ring.alike, ring.single
     hears, spans, changed = ring.hears, ring.spans, ring.heard
     count = len(spans)
-    level, left = np.zeros(_STRIP, np.float32), np.zeros(_STRIP, np.float32)
-    marks = np.zeros(_STRIP, np.uint8)
+    level, left = zeros(_STRIP, np.float32), zeros(_STRIP, np.float32)
+    marks = zeros(_STRIP, np.uint8)
     words = marks.view(np.uint64)
     places, excess, doubt = (
-        np.empty(_STRIP, np.uint64),
-        np.empty(_STRIP, np.float32),
-        np.empty(_STRIP, np.float32),
+        empty(_STRIP, np.uint64),
+        empty(_STRIP, np.float32),
+        empty(_STRIP, np.float32),
     )
     met, met_by = ends[:-1].copy(), ends[1:]  # of every row, in strips from left to right
     for begin in range(0, width, _STRIP):

@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.compiled import loop
+from kalux.compiled import empty, loop
 from kalux.errors import SettingsError
 from kalux.frames import Mosaic
 
@@ -146,7 +146,7 @@ def _demosaic(padded, pattern, edge, out):  # type: ignore[no-untyped-def]
     """Fill ``out`` from the log mosaic with a border of 3; ``pattern`` is the 2x2 of `channels`."""
     height, width = out.shape[0], out.shape[1]
     half, quarter = np.float32(0.5), np.float32(0.25)
-    green = np.empty((height + 2, width + 2), np.float32)
+    green = empty((height + 2, width + 2), np.float32)
     for i in range(height + 2):
         for j in range(width + 2):
             r, c = i + 2, j + 2

@@ -15,7 +15,7 @@ import numpy as np
 from isal import isal_zlib
 from numpy.typing import NDArray
 
-from kalux.compiled import loop
+from kalux.compiled import empty, loop
 
 _MAGIC: Final = 20000630
 _VERSION: Final = 2
@@ -91,12 +91,12 @@ def _blocks(planes: list[NDArray[np.float32]]) -> Iterator[bytes]:
 def _differences(pairs):  # type: ignore[no-untyped-def]
     """Lower bytes, then upper ones, of pairs; each the difference from the one before, plus 128 (not the first)."""
     count = len(pairs)
-    parted = np.empty(2 * count, np.uint8)
+    parted = empty(2 * count, np.uint8)
     for i in range(count):
         parted[i] = np.uint8(pairs[i] & np.uint16(0xFF))
     for i in range(count):
         parted[count + i] = np.uint8(pairs[i] >> np.uint16(8))
-    out = np.empty(2 * count, np.uint8)
+    out = empty(2 * count, np.uint8)
     out[0] = parted[0]
     for i in range(1, 2 * count):
         out[i] = parted[i] - parted[i - 1] + np.uint8(128)

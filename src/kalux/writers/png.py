@@ -14,7 +14,7 @@ import numpy as np
 from isal import isal_zlib
 from numpy.typing import NDArray
 
-from kalux.compiled import loop
+from kalux.compiled import loop, zeros
 
 _SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
 _UP: Final = 2
@@ -64,7 +64,7 @@ def _filtered(picture: NDArray[Any]) -> NDArray[np.uint8]:
 
 @loop
 def _fill_bytes(rows, filtered):  # type: ignore[no-untyped-def]
-    above = np.zeros(rows.shape[1], np.uint8)
+    above = zeros(rows.shape[1], np.uint8)
     for row in range(len(rows)):
         values, out = rows[row], filtered[row]
         out[0] = _UP
@@ -75,7 +75,7 @@ def _fill_bytes(rows, filtered):  # type: ignore[no-untyped-def]
 
 @loop
 def _fill_pairs(rows, filtered):  # type: ignore[no-untyped-def]
-    above = np.zeros(rows.shape[1], np.uint16)
+    above = zeros(rows.shape[1], np.uint16)
     one, two, eight = np.uint64(1), np.uint64(2), np.uint16(8)
     for row in range(len(rows)):
         values, out = rows[row], filtered[row]
