@@ -295,7 +295,7 @@ def _plane(values: Array | None, shape: tuple[int, ...]) -> NDArray[np.float32]:
 # Positions are counted from the first of a loop, so that none is below another: unsigned numbers that wrap around keep
 # a loop from becoming vector code. So do many arrays, and loops that write to an array of which they read another row.
 # Arrays are given one by one: taking one out of a tuple counts a reference, in an atomic operation; for every row,
-# these are 4 % of an image.
+# these are 4 % of an image. Long functions are put in their place by numba, since LLVM would also compile them alone.
 
 
 @loop(fastmath=FUSED)
@@ -451,7 +451,7 @@ def _mark_hearing(moving, row, begin, hears, spans):  # type: ignore[no-untyped-
     spans[place, 0], spans[place, 1] = first, last
 
 
-@inner(fastmath=FUSED)
+@nb.njit(cache=True, inline="always")
 def _compare(  # type: ignore[no-untyped-def]
     row, first, last, allowed, pitch, known, least, unlike, alike, single
 ):
@@ -517,7 +517,7 @@ def _compare(  # type: ignore[no-untyped-def]
         alike[own + three + i] = _squared(of_cd * c)
 
 
-@inner(fastmath=FUSED)
+@nb.njit(cache=True, inline="always")
 def _hear_neighbours(  # type: ignore[no-untyped-def]
     row, first, last, pitch, known, least, alike, hears, heard, level
 ):
