@@ -12,12 +12,11 @@ from numbers import Real
 from pathlib import Path
 from typing import Any, Final, Generic, Literal, TypeVar
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
 from kalux import readers
-from kalux.compiled import event_column, event_row, event_words
+from kalux.compiled import event_column, event_row, event_words, loop
 from kalux.errors import ExposureError, FormatError, FrameError, InputError, require_type
 from kalux.events import (
     LARGEST_SIDE,
@@ -390,7 +389,7 @@ class Recording:
         self._longest = longest
 
 
-@nb.njit(cache=True, nogil=True)
+@loop
 def _are_fine(words, earliest, height, width):  # type: ignore[no-untyped-def]
     """What `check_events` checks, in one pass over the memory."""
     wrong = False

@@ -16,12 +16,11 @@ from __future__ import annotations
 
 from typing import Any, Final, NamedTuple
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.trail import Trail
-from kalux.compiled import any_from, apart
+from kalux.compiled import any_from, apart, empty, loop
 
 Array = NDArray[np.floating[Any]]
 
@@ -204,7 +203,7 @@ def drift(
     return grown, far_on, far_off
 
 
-@nb.njit(cache=True, nogil=True)
+@loop
 def _drift(  # type: ignore[no-untyped-def]
     of_on,
     of_off,
@@ -222,7 +221,7 @@ def _drift(  # type: ignore[no-untyped-def]
     new_off,
 ):
     unmeasured, two, zero = np.float32(UNMEASURED), np.float32(2.0), np.float32(0.0)
-    drifted = np.empty(_BLOCK, np.float32)
+    drifted = empty(_BLOCK, np.float32)
     for first in range(np.uint64(0), np.uint64(len(grown)), np.uint64(_BLOCK)):
         pixels = range(first, min(np.uint64(len(grown)), first + np.uint64(_BLOCK)))
         if not any_from(after, pixels, unmeasured):
@@ -261,7 +260,7 @@ def lower(log_intensity: Array, frame: Latent) -> None:
         np.minimum(log_intensity, frame.ceiling, out=log_intensity)
 
 
-@nb.njit(cache=True, nogil=True)
+@loop
 def _lift(log_intensity, value, variance):  # type: ignore[no-untyped-def]
     for i in range(len(value)):
         if UNMEASURED <= variance[i] < UNSEEN and value[i] > log_intensity[i]:
@@ -339,7 +338,7 @@ _STEP_ON, _STEP_OFF, _NEW_ON, _NEW_OFF, _LEFT_ON, _LEFT_OFF = _LEARNED
 """Where the values of a block of pixels lie in the scratch memory of `_bridge`."""
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@loop
 def _bridge(given, thresholds, noise, seconds, planes, factors):  # type: ignore[no-untyped-def]
     """Fill ``planes`` and ``factors``; in float64, whatever the arrays' type.
 
@@ -353,7 +352,7 @@ def _bridge(given, thresholds, noise, seconds, planes, factors):  # type: ignore
     scale_on, scale_off, variance_on, variance_off = thresholds
     c_on, c_off, of_step = noise.threshold_on, noise.threshold_off, noise.step_variance
     untold, of_saturated = noise.quantisation_variance, noise.saturated_variance
-    s = np.empty(_SCRATCH * _BLOCK)
+    s = empty(_SCRATCH * _BLOCK, np.float64)
     size = np.uint64(len(value))
     for first in range(np.uint64(0), size, np.uint64(_BLOCK)):
         pixels = range(min(size - first, np.uint64(_BLOCK)))

@@ -28,6 +28,7 @@ from kalux.compiled import (
     UNWEIGHED,
     WEIGHT_UNIT,
     apart,
+    empty,
     event_column,
     event_is_on,
     event_row,
@@ -35,6 +36,7 @@ from kalux.compiled import (
     event_words,
     exponential,
     logarithm,
+    loop,
     pack,
     packed,
     prefetch,
@@ -214,7 +216,7 @@ def events_until(events: EventArray, t: int) -> int:
     return int(words_until(event_words(events), t))
 
 
-@nb.njit(cache=True, nogil=True)
+@loop
 def words_until(words, t):  # type: ignore[no-untyped-def]
     """The same of events as machine words (`kalux.compiled.event_words`)."""
     first, last = 0, len(words)
@@ -231,16 +233,16 @@ def words_until(words, t):  # type: ignore[no-untyped-def]
 # of the packed pixels one by one, which is slower than plain code. `pack` and `unpack` take its place.
 
 
-@nb.njit(cache=True, nogil=True)
+@loop
 def _touch(words, width, touched):  # type: ignore[no-untyped-def]
     for i in range(len(words)):
         word = words[i, 1]
         touched[(event_row(word) * width + event_column(word)) // np.uint64(EXPOSED)] = True
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@loop
 def _begin_exposure(pixels, touched, on, off, unit_on, unit_off):  # type: ignore[no-untyped-def]
-    fields = np.empty((EXPOSURE_FIELDS, EXPOSED), np.float32)
+    fields = empty((EXPOSURE_FIELDS, EXPOSED), np.float32)
     fields[_LEVEL] = fields[_PEAK] = fields[_AT_MIDDLE] = ONE
     fields[_INTEGRAL] = fields[_SINCE] = fields[_EVENTS] = np.float32(0.0)
     up, down = fields[_UP], fields[_DOWN]
@@ -255,7 +257,7 @@ def _begin_exposure(pixels, touched, on, off, unit_on, unit_off):  # type: ignor
             pack(fields, pixels, np.int64(first), np.int64(count))
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy", fastmath=FUSED)
+@loop(fastmath=FUSED)
 def _integrate(words, pixels, width, start, middle, unit):  # type: ignore[no-untyped-def]
     # A level beyond float32 (88 in log intensity: a broken pixel) becomes infinite or 0; `logarithm` is finite there.
     last = len(words) - 1
@@ -310,13 +312,13 @@ def relative_levels(exposure, block, duration, fields, middle, events):  # type:
 
 
 # Not FUSED: the paper's (12) divides small differences of these, which would bring another rounding out a hundredfold.
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@loop
 def _finish_exposure(  # type: ignore[no-untyped-def]
     pixels, touched, exposure, log_mean, to_middle, to_end, largest, count_of
 ):
     """Fill the planes of `ExposureIntegrals`: 0 where nothing has moved."""
     duration = np.float32(exposure)
-    fields = np.empty((EXPOSURE_FIELDS, EXPOSED), np.float32)
+    fields = empty((EXPOSURE_FIELDS, EXPOSED), np.float32)
     level, integral, since = fields[_LEVEL], fields[_INTEGRAL], fields[_SINCE]
     at_middle, peak, events = fields[_AT_MIDDLE], fields[_PEAK], fields[_EVENTS]
     for block in range(np.uint64(len(touched))):
@@ -356,7 +358,7 @@ def count_chunks(
     return counts[1].reshape(shape), counts[0].reshape(shape)
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@loop
 def _count(words, counts, width, unit):  # type: ignore[no-untyped-def]
     for i in range(len(words)):
         word = words[i, 1]

@@ -12,11 +12,11 @@ import functools
 from typing import Any, Final, NamedTuple
 
 import cv2
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.bridge import UNMEASURED, UNSEEN, Latent, Told, UnshownMemory
+from kalux.compiled import loop
 
 Floats = NDArray[np.floating[Any]]
 
@@ -297,7 +297,7 @@ def expected_excess(memory: UnshownMemory, variance: Floats, initial_variance: f
     return Unshown(memory.pixels, memory.expected, noise, memory.doubt)
 
 
-@nb.njit(cache=True, nogil=True)
+@loop
 def _grown(pixels, variance, initial_variance, noise):  # type: ignore[no-untyped-def]
     """What has come to the variance."""
     for i in range(len(pixels)):
@@ -311,7 +311,7 @@ def _between(parts: NDArray[np.float32], pixels: NDArray[np.int64], width: int) 
     return values
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@loop
 def _at_pixels(pixels, width, parts, values):  # type: ignore[no-untyped-def]
     one, zero = np.float32(1.0), np.float32(0.0)
     last_row, last_column = parts.shape[0] - 1, parts.shape[1] - 1

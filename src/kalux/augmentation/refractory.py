@@ -28,6 +28,7 @@ from kalux.compiled import (
     event_is_on,
     event_row,
     event_words,
+    loop,
     prefetch,
     weighed,
 )
@@ -91,7 +92,7 @@ def step_weight(since_pixel, refractory_period):  # type: ignore[no-untyped-def]
     return MOST if since_pixel > MOST * looked else since_pixel / looked
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@loop
 def _weigh(words, latest, width, refractory_period):  # type: ignore[no-untyped-def]
     last = len(words) - 1
     for i in range(len(words)):
@@ -106,7 +107,7 @@ def _weigh(words, latest, width, refractory_period):  # type: ignore[no-untyped-
         words[i, 1] = weighed(word, np.int32((weight - ONE) / WEIGHT_UNIT + np.float32(0.5)))
 
 
-@nb.njit(cache=True, nogil=True)
+@loop
 def _weigh_equally(words):  # type: ignore[no-untyped-def]
     for i in range(len(words)):
         words[i, 1] = weighed(words[i, 1], np.int32(0))

@@ -30,6 +30,7 @@ from kalux.compiled import (
     event_weight,
     event_words,
     flat,
+    loop,
     packed,
     prefetch,
 )
@@ -156,20 +157,20 @@ def follow(
     return on, off, Followed(newest, span, intervals)
 
 
-@nb.njit(cache=True, nogil=True)
+@loop
 def _begin_following(newest, pixels):  # type: ignore[no-untyped-def]
     for i in range(len(pixels)):
         pixels[i].newest = newest[i]
         pixels[i].off = pixels[i].on = np.float32(0.0)
 
 
-@nb.njit(cache=True, nogil=True)
+@loop
 def _end_following(pixels, newest, off, on):  # type: ignore[no-untyped-def]
     for i in range(len(pixels)):
         newest[i], off[i], on[i] = pixels[i].newest, pixels[i].off, pixels[i].on
 
 
-@nb.njit(cache=True, nogil=True)
+@loop
 def _follow(words, codes, counts, width, late):  # type: ignore[no-untyped-def]
     """``codes`` and ``counts`` are the memory of `FOLLOWED_PIXEL`, as int64 and as float32."""
     span, count = np.int64(0), np.int64(0)
@@ -222,7 +223,7 @@ def polarity_of(newest: NDArray[np.int64]) -> NDArray[np.int8]:
     return polarity
 
 
-@nb.njit(cache=True, nogil=True)
+@loop
 def _polarity_of(newest, polarity):  # type: ignore[no-untyped-def]
     for i in range(len(newest)):
         sign = np.int8(newest[i] & 1) * np.int8(2) - np.int8(1)
@@ -251,13 +252,13 @@ def _ahead_of_newest(newest, t, heights):  # type: ignore[no-untyped-def]
     return (on if newest & 1 else -off) * beyond(age, scale)
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@loop
 def _trail_at(newest, t, heights, out):  # type: ignore[no-untyped-def]
     for i in range(len(out)):
         out[i] = _ahead_of_newest(newest[i], t, heights)
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@loop
 def _trail_between(first, last, begin, end, heights, start, grown):  # type: ignore[no-untyped-def]
     for i in range(len(start)):
         start[i] = _ahead_of_newest(first[i], begin, heights)
@@ -291,7 +292,7 @@ def trail_by_clock(
     return out
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@loop
 def _trail_by_clock(polarity, clock, now, heights, out):  # type: ignore[no-untyped-def]
     height, width = out.shape
     for row in range(height):

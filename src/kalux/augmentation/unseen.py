@@ -5,13 +5,12 @@ from __future__ import annotations
 from typing import Any, Final
 
 import cv2
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
 from kalux import memory
 from kalux.augmentation.bridge import UNMEASURED, BridgedSegment, Latent
-from kalux.compiled import apart
+from kalux.compiled import apart, empty, loop, zeros
 
 Array = NDArray[np.floating[Any]]
 
@@ -80,7 +79,7 @@ def turns(on: Array, off: Array) -> float:
     return float(2.0 * pairs / max(events, 1))
 
 
-@nb.njit(cache=True, nogil=True)
+@loop
 def _pairs(on, off):  # type: ignore[no-untyped-def]
     pairs, active = 0.0, 0
     for i in range(np.uint64(len(on))):
@@ -134,7 +133,7 @@ def half_way(
     return 0.5 / (1.0 + goes_on) - 0.25, change
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@loop
 def _alike(seconds, q0, most, before, slope, forward, backward, events, change):  # type: ignore[no-untyped-def]
     """Sums over pixels silent in two intervals: products of their changes, squares, both without noise, and noise."""
     both, squares, of_noise = 0.0, 0.0, 0.0
@@ -180,7 +179,7 @@ def forget_silence(
     _forget(np.float32(quantisation_variance), *(plane.reshape(-1) for plane in planes))
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@loop
 def _forget(q0, forward, backward, after, on, off, change, grown):  # type: ignore[no-untyped-def]
     zero, unmeasured = np.float32(0.0), np.float32(UNMEASURED)
     for i in range(np.uint64(len(grown))):
@@ -191,7 +190,7 @@ def _forget(q0, forward, backward, after, on, off, change, grown):  # type: igno
         grown[i] += lost if measured and on[i] + off[i] == zero else zero
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@loop
 def _told(given, seconds, q0, most, told_of):  # type: ignore[no-untyped-def]
     """Of silent pixels (0 elsewhere): squared change without noise, and the share of it that noise hides; both sums.
 
@@ -201,11 +200,11 @@ def _told(given, seconds, q0, most, told_of):  # type: ignore[no-untyped-def]
     change, untold, silent = told_of
     zero, one, unmeasured = np.float32(0.0), np.float32(1.0), np.float32(UNMEASURED)
     noise, share, is_silent = (
-        np.empty(_BLOCK, np.float32),
-        np.empty(_BLOCK, np.float32),
-        np.empty(_BLOCK, np.float32),
+        empty(_BLOCK, np.float32),
+        empty(_BLOCK, np.float32),
+        empty(_BLOCK, np.float32),
     )
-    sum_change, sum_share = np.zeros(_BLOCK), np.zeros(_BLOCK)
+    sum_change, sum_share = zeros(_BLOCK, np.float64), zeros(_BLOCK, np.float64)
     for first in range(np.uint64(0), np.uint64(len(slope)), np.uint64(_BLOCK)):
         pixels = range(min(np.uint64(len(slope)) - first, np.uint64(_BLOCK)))
         for k in pixels:
@@ -231,13 +230,13 @@ def _told(given, seconds, q0, most, told_of):  # type: ignore[no-untyped-def]
     return sum_change.sum(), sum_share.sum()
 
 
-@nb.njit(cache=True, nogil=True)
+@loop
 def _add_share(change, untold, whole):  # type: ignore[no-untyped-def]
     for i in range(np.uint64(len(change))):
         change[i] += untold[i] * whole
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@loop
 def _mean(total, count, forward, backward, unknown, unmeasured_change, mean):  # type: ignore[no-untyped-def]
     zero, one = np.float32(0.0), np.float32(1.0)
     unmeasured = np.float32(UNMEASURED)

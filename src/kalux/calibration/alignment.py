@@ -20,13 +20,13 @@ from collections.abc import Iterable, Iterator
 from typing import Any, Final, NamedTuple
 
 import cv2
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.deblur import between
 from kalux.calibration.registration import Registration
 from kalux.calibration.regression import huber_weights, products
+from kalux.compiled import loop, zeros
 from kalux.errors import InputError
 from kalux.events import NEVER, EventArray
 from kalux.frames import Frame
@@ -153,14 +153,14 @@ def levels(
     return on, off
 
 
-@nb.njit(cache=True, nogil=True)
+@loop(error_model="python")
 def _levels(t, x, y, p, times, spread, longest, on, off):  # type: ignore[no-untyped-def]
     queries, height, width = on.shape
     # Of every pixel: the event that waits for the one after it, the one before it, and the next time to be told.
     waiting = np.full((height, width), -1, np.int64)
     before = np.full((height, width), NEVER, np.int64)
-    upcoming = np.zeros((height, width), np.int64)
-    level = np.zeros((2, height, width), np.float32)
+    upcoming = zeros((height, width), np.int64)
+    level = zeros((2, height, width), np.float32)
     for i in range(len(t) + height * width):
         if i < len(t):
             row, column, now = y[i], x[i], t[i]

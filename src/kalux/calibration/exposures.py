@@ -8,12 +8,11 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.deblur import between
-from kalux.compiled import event_column, event_is_on, event_row, event_words
+from kalux.compiled import empty, event_column, event_is_on, event_row, event_words, loop
 from kalux.events import EventArray
 
 Array = NDArray[np.float64]
@@ -51,13 +50,13 @@ def bends(
     return Bends(*found.reshape(2, height, width))
 
 
-@nb.njit(cache=True, nogil=True)
+@loop
 def _follow(words, width, ends, steps, place, over_mean, over_middle):  # type: ignore[no-untyped-def]
     """``place``: where a pixel's path is kept, -1 as long as it has no event."""
     start, middle, end = ends
     # Level after the last event, us until that, integrals of level and exp(level) until then, level at the middle.
-    paths = np.empty((len(words), 5))
-    pixels = np.empty(len(words), np.int64)
+    paths = empty((len(words), 5), np.float64)
+    pixels = empty(len(words), np.int64)
     count = 0
     for i in range(len(words)):
         word = words[i, 1]

@@ -11,12 +11,12 @@ from __future__ import annotations
 from itertools import islice
 from typing import Final, NamedTuple
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
 from kalux.calibration.frame_noise import MAX_FRAMES
 from kalux.calibration.regression import parts, ratio_error
+from kalux.compiled import loop
 from kalux.filters.shots import Shot, take_shot
 from kalux.models.camera import Camera
 from kalux.recording import Recording
@@ -125,7 +125,7 @@ def _around(
     return beyond, light, weight
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@loop
 def _look_around(  # type: ignore[no-untyped-def]
     levels, intensity, valid, step, pitch, scalars, beyond, light, weight
 ):
@@ -159,7 +159,7 @@ def _look_around(  # type: ignore[no-untyped-def]
                 )
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@loop
 def _add_products(beyond, light, weight, apart, part, sums):  # type: ignore[no-untyped-def]
     """Of all pairs of frames: per part of the sensor, the weighed products and the weights."""
     more, less = np.float32(_LEAST_CHANGE), np.float32(1 / _LEAST_CHANGE)

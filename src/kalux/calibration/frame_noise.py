@@ -12,13 +12,12 @@ import itertools
 from typing import Any, Final, NamedTuple
 
 import cv2
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.deblur import all_between
 from kalux.calibration.intervals import intervals
-from kalux.compiled import event_column, event_row, event_words
+from kalux.compiled import empty, event_column, event_row, event_words, loop, zeros
 from kalux.events import EventArray
 from kalux.filters.shots import Shot, take_shot
 from kalux.frames import Frame
@@ -239,7 +238,7 @@ def _busy(chunks: list[EventArray], shape: tuple[int, ...]) -> NDArray[np.uint8]
     return busy
 
 
-@nb.njit(cache=True, nogil=True)
+@loop
 def _mark(words, busy):  # type: ignore[no-untyped-def]
     for i in range(len(words)):
         busy[event_row(words[i, 1]), event_column(words[i, 1])] = 1
@@ -279,7 +278,7 @@ def _by_level(shot: Shot) -> tuple[NDArray[np.integer[Any]], Array, Array, NDArr
     return shot.levels, shot.level_intensity / shot.white, shot.level_weight, shot.level_clipped
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@loop
 def _compare(  # type: ignore[no-untyped-def]
     before, intensity, weight, clipped, after, next_intensity, next_weight, next_clipped, level, change, bad
 ):
@@ -305,11 +304,11 @@ def _add(points: _Points, level: Array, difference: Array, chosen: NDArray[np.bo
             found.append((float(total / (stop - start)), variance, int(stop - start)))
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@loop
 def _in_bins(level, difference, kept):  # type: ignore[no-untyped-def]
     """Differences of the pixels that are kept, one bin of the level after the other; sum of the levels, and limits."""
-    index = np.empty(len(kept), np.uint8)
-    sums, stops = np.zeros(_BINS), np.zeros(_BINS + 1, np.int64)
+    index = empty(len(kept), np.uint8)
+    sums, stops = zeros(_BINS, np.float64), zeros(_BINS + 1, np.int64)
     for i in range(len(kept)):
         value = level[kept[i]]
         k = min(int(value * _BINS), _BINS - 1)
@@ -318,7 +317,7 @@ def _in_bins(level, difference, kept):  # type: ignore[no-untyped-def]
         stops[k + 1] += 1
     for k in range(_BINS):
         stops[k + 1] += stops[k]
-    ordered, free = np.empty(len(kept)), stops.copy()
+    ordered, free = empty(len(kept), np.float64), stops.copy()
     for i in range(len(kept)):
         ordered[free[index[i]]] = difference[kept[i]]
         free[index[i]] += 1
@@ -330,7 +329,7 @@ def trimmed_variance(values: Array) -> float:
     return float(_trimmed_variance(np.ascontiguousarray(values, np.float64)))
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@loop
 def _trimmed_variance(values):  # type: ignore[no-untyped-def]
     low, high = -np.inf, np.inf
     before, variance = -1, 0.0

@@ -10,13 +10,13 @@ from __future__ import annotations
 
 from typing import Final, NamedTuple
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
 from kalux.calibration.event_model import DARKEST, ErrorModel, Samples, mismatch_of
 from kalux.calibration.intervals import counted_intervals
 from kalux.calibration.regression import parts, ratio_error
+from kalux.compiled import loop
 from kalux.recording import Recording
 from kalux.settings import CameraSettings, EventSettings
 
@@ -109,7 +109,7 @@ _PRODUCTS: Final = (2, 3, 3)
 twice the products of neighbouring intervals."""
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@loop
 def _add(mismatches, variances, told, steps_on, steps_off, products):  # type: ignore[no-untyped-def]
     """One interval."""
     for row in range(told.shape[0]):

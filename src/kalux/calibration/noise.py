@@ -23,6 +23,7 @@ from kalux.calibration.levels import ClippingLevels, clipping_levels
 from kalux.calibration.refractory import shortest_interval
 from kalux.calibration.regression import ratio_error
 from kalux.calibration.values import Calibration
+from kalux.compiled import inner, loop
 from kalux.events import NEVER, EventArray
 from kalux.recording import Recording
 from kalux.settings import CameraSettings
@@ -240,7 +241,7 @@ def _tallied(chunks: Iterator[EventArray], first: int, last: int, ignored: NDArr
     return _Tally(counts, quiet, total)
 
 
-@nb.njit(cache=True, nogil=True)
+@inner
 def _add_quiet(start, end, first, length, row, column, quiet):  # type: ignore[no-untyped-def]
     """Spread the quiet time from start to end over the windows."""
     while start < end:
@@ -259,7 +260,7 @@ def _count_pending(pending, row, column, first, length, counts):  # type: ignore
         counts[window, row, column] += 1
 
 
-@nb.njit(cache=True, nogil=True)
+@loop
 def _tally(t, x, y, first, length, gap, ignored, busy_until, pending, counts, quiet, total):  # type: ignore[no-untyped-def]
     height, width = total.shape
     for i in range(len(t)):
@@ -286,7 +287,7 @@ def _tally(t, x, y, first, length, gap, ignored, busy_until, pending, counts, qu
                 busy_until[r, c] = max(busy_until[r, c], now + gap)
 
 
-@nb.njit(cache=True, nogil=True)
+@loop
 def _close(last, first, length, gap, busy_until, pending, counts, quiet):  # type: ignore[no-untyped-def]
     """The end of the recording."""
     end = last - gap

@@ -6,10 +6,10 @@ from collections.abc import Iterator
 from itertools import pairwise
 from typing import Any, Final, NamedTuple
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.compiled import empty, loop
 from kalux.events import NEVER
 from kalux.recording import Recording
 
@@ -176,10 +176,10 @@ def _of_first_events(recording: Recording, most_events: int) -> Iterator[tuple[N
             break
 
 
-@nb.njit(cache=True, nogil=True)
+@loop
 def _intervals_of(t, x, y, p, last, seen):  # type: ignore[no-untyped-def]
     """``last`` is twice the time of a pixel's latest event, plus 1 if it was on."""
-    found, turning = np.empty(len(t), np.int64), np.empty(len(t), np.bool_)
+    found, turning = empty(len(t), np.int64), empty(len(t), np.bool_)
     n = 0
     for i in range(len(t)):
         code, before = t[i] * 2 + p[i], last[y[i], x[i]]

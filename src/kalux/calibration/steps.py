@@ -29,7 +29,7 @@ from kalux.augmentation.deblur import between
 from kalux.augmentation.refractory import step_weight
 from kalux.calibration.exposures import bends
 from kalux.calibration.intervals import Interval, intervals
-from kalux.compiled import event_column, event_is_on, event_row, event_words
+from kalux.compiled import empty, event_column, event_is_on, event_row, event_words, inner, loop, zeros
 from kalux.events import NEVER
 from kalux.filters.shots import Shot
 from kalux.recording import Recording
@@ -238,7 +238,7 @@ class _Passing:
         return candidates[:: max(-(-len(candidates) // self._most), 1)], usable
 
 
-@nb.njit(cache=True, nogil=True)
+@loop
 def _add(words, happened):  # type: ignore[no-untyped-def]
     """Count every pixel's events."""
     for i in range(len(words)):
@@ -246,10 +246,10 @@ def _add(words, happened):  # type: ignore[no-untyped-def]
         happened[event_row(word), event_column(word)] += 1
 
 
-@nb.njit(cache=True, nogil=True)
+@loop
 def _with_neighbours(chosen, height, width):  # type: ignore[no-untyped-def]
     """(H W) bool: pixels not at the border, and those around them."""
-    found = np.zeros(height * width, np.bool_)
+    found = zeros(height * width, np.bool_)
     for at in chosen:
         for i in range(-1, 2):
             for j in range(-1, 2):
@@ -257,7 +257,7 @@ def _with_neighbours(chosen, height, width):  # type: ignore[no-untyped-def]
     return found
 
 
-@nb.njit(cache=True, nogil=True)
+@loop
 def _pass(words, width, latest, sign):  # type: ignore[no-untyped-def]
     """Remember time and sign of every pixel's newest event."""
     for i in range(len(words)):
@@ -267,10 +267,10 @@ def _pass(words, width, latest, sign):  # type: ignore[no-untyped-def]
         sign[at] = 1 if event_is_on(word) else -1
 
 
-@nb.njit(cache=True, nogil=True)
+@loop
 def _by_pixel(words, width, wanted):  # type: ignore[no-untyped-def]
     """Indices of the wanted pixels' events, one pixel after the other and in order, and where those of each start."""
-    starts = np.zeros(len(wanted) + 1, np.int64)
+    starts = zeros(len(wanted) + 1, np.int64)
     for i in range(len(words)):
         word = words[i, 1]
         at = event_row(word) * width + event_column(word)
@@ -278,7 +278,7 @@ def _by_pixel(words, width, wanted):  # type: ignore[no-untyped-def]
     for at in range(len(wanted)):
         starts[at + 1] += starts[at]
     place = starts[:-1].copy()
-    order = np.empty(starts[-1], np.int32)
+    order = empty(starts[-1], np.int32)
     for i in range(len(words)):
         word = words[i, 1]
         at = event_row(word) * width + event_column(word)
@@ -298,7 +298,7 @@ def _ramp_sum(t, start, end):  # type: ignore[no-untyped-def]
     return t - 0.5 * (start + end)
 
 
-@nb.njit(cache=True, error_model="numpy")
+@inner
 def _ramp_mean(begin, stop, start, end):  # type: ignore[no-untyped-def]
     """Mean from ``begin`` to ``stop`` of what goes from 0 at ``start`` to 1 at ``end``."""
     if stop <= start:
@@ -308,14 +308,14 @@ def _ramp_mean(begin, stop, start, end):  # type: ignore[no-untyped-def]
     return (_ramp_sum(stop, start, end) - _ramp_sum(begin, start, end)) / (stop - begin)
 
 
-@nb.njit(cache=True, error_model="numpy")
+@inner
 def _shown(exposures, start, end):  # type: ignore[no-untyped-def]
     """By how much more the second exposure shows of what goes from 0 at ``start`` to 1 at ``end``."""
     begin, stop, second_begin, second_stop = exposures
     return _ramp_mean(second_begin, second_stop, start, end) - _ramp_mean(begin, stop, start, end)
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@loop
 def _count(words, order, starts, latest, sign, exposures, periods, late, counts):  # type: ignore[no-untyped-def]
     """Add the parts of the events' steps."""
     for at in range(len(starts) - 1):
@@ -357,11 +357,11 @@ def _count(words, order, starts, latest, sign, exposures, periods, late, counts)
             counts[at, k, 0, np.uint64(sign_before < 0)] += step
 
 
-@nb.njit(cache=True, nogil=True)
+@loop
 def _hot(happened):  # type: ignore[no-untyped-def]
     """(H, W): pixels with far more events than any of their neighbours."""
     height, width = happened.shape
-    found = np.zeros((height, width), np.bool_)
+    found = zeros((height, width), np.bool_)
     for row in range(height):
         for column in range(width):
             if happened[row, column] > _HOT_LEAST:
@@ -374,11 +374,11 @@ def _hot(happened):  # type: ignore[no-untyped-def]
     return found
 
 
-@nb.njit(cache=True, nogil=True)
+@loop
 def _something_happens(happened, usable):  # type: ignore[no-untyped-def]
     """(H, W): well exposed pixels not at the border whose neighbours have enough events."""
     height, width = happened.shape
-    found = np.zeros((height, width), np.bool_)
+    found = zeros((height, width), np.bool_)
     for row in range(1, height - 1):
         for column in range(1, width - 1):
             if usable[row, column]:
@@ -392,15 +392,15 @@ def _something_happens(happened, usable):  # type: ignore[no-untyped-def]
     return found
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@loop
 def _looked_at(counts, change, usable, chosen):  # type: ignore[no-untyped-def]
     """Counts of the chosen pixels, and of their neighbours the mean counts and changes.
 
     One number at a time: of whole rows numba would compile, for 1.5 s, how it complains that they differ in size.
     """
     width, size = counts.shape[1:]
-    own, around = np.empty((len(chosen), size)), np.zeros((len(chosen), size))
-    change_around = np.zeros(len(chosen))
+    own, around = empty((len(chosen), size), np.float64), zeros((len(chosen), size), np.float64)
+    change_around = zeros(len(chosen), np.float64)
     for n in range(len(chosen)):
         row, column = chosen[n] // width, chosen[n] % width
         total = 0.0

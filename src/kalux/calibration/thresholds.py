@@ -23,7 +23,6 @@ from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 import cv2
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
@@ -41,6 +40,7 @@ from kalux.calibration.regression import (
     weighted_least_squares,
 )
 from kalux.calibration.values import Calibration
+from kalux.compiled import loop
 from kalux.events import NEVER, EventArray
 from kalux.filters.shots import Shot
 from kalux.recording import Recording
@@ -245,7 +245,7 @@ class _History:
         return on, off, crowded
 
 
-@nb.njit(cache=True, nogil=True)
+@loop
 def _count(t, x, y, p, last, sign, least, refractory, on, off, crowded):  # type: ignore[no-untyped-def]
     for i in range(len(t)):
         row, column = y[i], x[i]

@@ -9,7 +9,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.compiled import FUSED, ONE, exponential, logarithm
+from kalux.compiled import FUSED, ONE, empty, exponential, logarithm, loop
 from kalux.display.integers import fill_row, quantise
 from kalux.display.intensities import LARGEST, SMALLEST, Float32
 from kalux.display.settings import MID_GREY, Auto
@@ -97,7 +97,7 @@ def _rolled(intensity, shoulder):  # type: ignore[no-untyped-def]
     return low + scale * logarithm(ONE + gain * above)
 
 
-@nb.njit(cache=True, nogil=True, fastmath=FUSED)
+@loop(fastmath=FUSED)
 def _show(values, shoulder, rolled, power, shown):  # type: ignore[no-untyped-def]
     """Shoulder and power, each where there is one, limited to 0 to 1."""
     zero, largest = np.float32(0.0), np.float32(LARGEST)
@@ -115,21 +115,21 @@ def _show(values, shoulder, rolled, power, shown):  # type: ignore[no-untyped-de
             shown[i] = lifted if value > zero else zero
 
 
-@nb.njit(cache=True, nogil=True, fastmath=FUSED)
+@loop(fastmath=FUSED)
 def _show_levels(values, shoulder, rolled, power, offset, factor, plane):  # type: ignore[no-untyped-def]
     """`_show` and `fill_row`, a row at a time."""
     height, width = values.shape
-    shown = np.empty((1, width), np.float32)
+    shown = empty((1, width), np.float32)
     for row in range(len(plane)):
         if row < height:
             _show(values[row], shoulder, rolled, power, shown[0])
         fill_row(shown[0], offset, factor, plane[row])
 
 
-@nb.njit(cache=True, nogil=True, fastmath=FUSED)
+@loop(fastmath=FUSED)
 def _show_integers(values, shoulder, rolled, power, top, integers):  # type: ignore[no-untyped-def]
     """`_show` and `quantise`, a row at a time."""
-    shown = np.empty(values.shape[1], np.float32)
+    shown = empty(values.shape[1], np.float32)
     for row in range(len(values)):
         _show(values[row], shoulder, rolled, power, shown)
         quantise(shown, top, integers[row])

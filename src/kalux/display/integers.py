@@ -8,7 +8,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.compiled import FUSED, ONE
+from kalux.compiled import FUSED, ONE, loop
 from kalux.display.intensities import Float32
 
 
@@ -34,7 +34,7 @@ def _to_integer(mapped: NDArray[Any], integers: NDArray[Any], top: int) -> NDArr
 
 
 # As who calls it: numba would else compile it in the manner of whoever comes first, and keep that for all.
-@nb.njit(cache=True, nogil=True, fastmath=FUSED)
+@loop(fastmath=FUSED)
 def quantise(values, top, integers):  # type: ignore[no-untyped-def]
     # Added and taken away again, it rounds to a whole number, halves to even ones.
     rounding = np.float32(1.5 * 2**23)
@@ -45,7 +45,7 @@ def quantise(values, top, integers):  # type: ignore[no-untyped-def]
         integers[i] = np.int32((value * top + rounding) - rounding)
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@loop
 def _fill(values, offset, factor, plane):  # type: ignore[no-untyped-def]
     for row in range(len(plane)):
         fill_row(values[min(row, len(values) - 1)], offset, factor, plane[row])

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from typing import Final
 
-import numba as nb
 import numpy as np
 
+from kalux.compiled import empty, loop, zeros
 from kalux.display.intensities import LARGEST, Float32, Statistics
 
 SAMPLES: Final = 1 << 14
@@ -47,7 +47,7 @@ def percentiles(values: Float32, percents: list[float]) -> Statistics:
     return np.array(found)
 
 
-@nb.njit(cache=True, nogil=True)
+@loop
 def _narrowed(rows, ranks, order, bits):  # type: ignore[no-untyped-def]
     """The numbers among which those of some ranks are, in ``bits``, with room for one more; their places, and how many.
 
@@ -55,7 +55,7 @@ def _narrowed(rows, ranks, order, bits):  # type: ignore[no-untyped-def]
 
     Numbers are compared by their bits: as float32 that are not negative, they are in the same order.
     """
-    counts = np.zeros((4, 1 << (31 - _COARSE_BITS)), np.int32)  # four, so that equal neighbours need not wait
+    counts = zeros((4, 1 << (31 - _COARSE_BITS)), np.int32)  # four, so that equal neighbours need not wait
     height, width = rows.shape
     at = np.uint64(0)
     for row in range(height):
@@ -69,8 +69,8 @@ def _narrowed(rows, ranks, order, bits):  # type: ignore[no-untyped-def]
     total = counts[0]
     for i in range(len(total)):
         total[i] += counts[1, i] + counts[2, i] + counts[3, i]
-    wanted = np.zeros(len(total), np.uint8)
-    places = np.empty(len(ranks), np.int64)
+    wanted = zeros(len(total), np.uint8)
+    places = empty(len(ranks), np.int64)
     below, kept, part = np.int64(0), np.int64(0), 0
     for k in order:
         while below + total[part] <= ranks[k]:

@@ -24,16 +24,19 @@ from kalux.compiled import (
     ONE,
     WEIGHT_UNIT,
     apart,
+    empty,
     event_column,
     event_is_on,
     event_row,
     event_weight,
     event_words,
     flat,
+    loop,
     pack,
     packed,
     prefetch,
     unpack,
+    zeros,
 )
 from kalux.events import EventArray
 from kalux.filters.akf import State, information_kept, measurement_rate, predicted_information
@@ -228,7 +231,7 @@ def unmeasured_pixels(segment: BridgedSegment, cursor: Cursor) -> NDArray[np.int
     return cursor.unmeasured
 
 
-@nb.njit(cache=True, nogil=True)
+@loop
 def _moving(clock, still_since, forward, backward, coming, knows_coming, moving):  # type: ignore[no-untyped-def]
     height, width = moving.shape
     for row in range(height):
@@ -261,14 +264,14 @@ def _since(clock, now):  # type: ignore[no-untyped-def]
     return np.int32(now - max(clock, np.int32(0)))
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@loop
 def _begin_bridged(given, scalars, before, pixels, steps):  # type: ignore[no-untyped-def]
     rate, step_variance = scalars
     log_intensity, floor, variance = before
     augmented, step_on, step_off, forward, backward, events, trail = given
     height, width = log_intensity.shape
-    states = np.empty((_STATE_FIELDS, _BEGUN), np.float32)
-    known = np.zeros((_STEP_FIELDS, _BEGUN), np.float32)
+    states = empty((_STATE_FIELDS, _BEGUN), np.float32)
+    known = zeros((_STEP_FIELDS, _BEGUN), np.float32)
     information, weighted, level, rates = (
         states[_INFORMATION],
         states[_WEIGHTED],
@@ -310,7 +313,7 @@ def _copy(plane, row, first, count, out):  # type: ignore[no-untyped-def]
         out[i] = np.float32(plane[row, first + i])
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy", fastmath=FUSED)
+@loop(fastmath=FUSED)
 def _advance_bridged(words, pixels, steps, clock, polarity, origin, rate, step_variance, noise):  # type: ignore[no-untyped-def]
     scalars = _Scalars(
         np.float32(rate),
@@ -377,14 +380,14 @@ def _weighed(met, scalars):  # type: ignore[no-untyped-def]
     return at, np.float32(since) * MICROSECOND32, weight, is_on, ONE - signal, noise
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@loop
 def _read_bridged(  # type: ignore[no-untyped-def]
     pixels, clock, polarity, slope, heights, moment, log_intensity, variance
 ):
     height, width = variance.shape
     pixels, clock, polarity = flat(pixels), flat(clock), flat(polarity)
     size = min(width, _BLOCK)
-    planes, ahead = np.empty((_STATE_FIELDS, size), np.float32), np.empty(size, np.float32)
+    planes, ahead = empty((_STATE_FIELDS, size), np.float32), empty(size, np.float32)
     for row in range(height):
         at = (row + 1) * (width + 2) + 1
         newest = clock[at : at + width], polarity[at : at + width]
@@ -420,7 +423,7 @@ def _read_block(planes, first, count, newest, heights, moment, rows, ahead):  # 
         variance[column] = inverse
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@loop
 def _predict_bridged(pixels, clock, span):  # type: ignore[no-untyped-def]
     height, width = clock.shape
     for row in range(1, height - 1):

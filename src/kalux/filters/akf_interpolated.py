@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.interpolation import InterpolatedSegment
-from kalux.compiled import apart
+from kalux.compiled import apart, empty, loop
 from kalux.events import EventArray
 from kalux.filters.akf import (
     State,
@@ -119,7 +119,7 @@ def _covariance(segment, row, column, t, after):  # type: ignore[no-untyped-def]
     )
 
 
-@nb.njit(cache=True)
+@loop(error_model="python")
 def _predict_printed(segment, cursor, row, column, t):  # type: ignore[no-untyped-def]
     """L and P by (17) and (20) as printed."""
     since = cursor.since[row, column]
@@ -132,7 +132,7 @@ def _predict_printed(segment, cursor, row, column, t):  # type: ignore[no-untype
     return predicted_value + _blended(segment, forward, backward, t), 1.0 / predicted
 
 
-@nb.njit(cache=True)
+@loop(error_model="python")
 def _predict_exact(segment, cursor, row, column, t):  # type: ignore[no-untyped-def]
     """L and P by the exact solution, over stretches in which L^A and R are linear."""
     now = cursor.since[row, column]
@@ -163,7 +163,7 @@ def _predict_exact(segment, cursor, row, column, t):  # type: ignore[no-untyped-
     return weighted / information + augmented, 1.0 / information
 
 
-@nb.njit(cache=True, nogil=True)
+@loop
 def _advance_interpolated(segment, cursor, t, x, y, p, noise):  # type: ignore[no-untyped-def]
     for i in range(len(t)):
         row, column, now = y[i], x[i], t[i]
@@ -188,11 +188,11 @@ def _advance_interpolated(segment, cursor, t, x, y, p, noise):  # type: ignore[n
         cursor.newest[row, column] = now
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@loop
 def _read_printed(segment, cursor, t, log_intensity, variance):  # type: ignore[no-untyped-def]
     """`_predict_printed` of all pixels, a row at a time and few arrays a loop: vector code."""
     height, width = variance.shape
-    fraction, deviation, rate, seconds = np.empty((4, width))
+    fraction, deviation, rate, seconds = empty((4, width), np.float64)
     after, exposure = t >= segment.middle, _exposure(segment)
     now, share = _exposure_fraction(exposure, t), _covariance_fraction(segment, t, after)
     for row in range(height):
@@ -218,7 +218,7 @@ def _read_printed(segment, cursor, t, log_intensity, variance):  # type: ignore[
             out[i] = deviation[i] + _blend(forward[i], backward[i], now)
 
 
-@nb.njit(cache=True, nogil=True)
+@loop
 def _read_exact(segment, cursor, t, log_intensity, variance):  # type: ignore[no-untyped-def]
     height, width = variance.shape
     for row in range(height):

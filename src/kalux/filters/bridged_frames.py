@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any, Final, NamedTuple
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
@@ -30,7 +29,7 @@ from kalux.augmentation.unseen import (
     silent_change,
     turns,
 )
-from kalux.compiled import apart
+from kalux.compiled import apart, empty, loop
 from kalux.events import EventArray
 from kalux.filters import akf_bridged
 from kalux.filters.akf import State
@@ -553,14 +552,14 @@ def latent_frame(
     return Latent(*latent.reshape(2, *levels.shape))
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@loop
 def _latent_frame(  # type: ignore[no-untyped-def]
     levels, level_log, level_variance, exposure, duration, event_variance, value, variance
 ):
     unmeasured = np.float32(bridge.UNMEASURED)
-    fields = np.empty((EXPOSURE_FIELDS, EXPOSED), np.float32)
-    middle, events = np.empty(EXPOSED, np.float32), np.empty(EXPOSED, np.float32)
-    log_frame, known = np.empty(EXPOSED, np.float32), np.empty(EXPOSED, np.float32)
+    fields = empty((EXPOSURE_FIELDS, EXPOSED), np.float32)
+    middle, events = empty(EXPOSED, np.float32), empty(EXPOSED, np.float32)
+    log_frame, known = empty(EXPOSED, np.float32), empty(EXPOSED, np.float32)
     for block in range(np.uint64(len(exposure.touched))):
         relative_levels(exposure, block, duration, fields, middle, events)
         first = block * np.uint64(EXPOSED)

@@ -10,7 +10,7 @@ import numpy as np
 
 from kalux.augmentation.deblur import events_until
 from kalux.augmentation.refractory import EventClock
-from kalux.compiled import UNWEIGHED, event_column, event_row, event_words
+from kalux.compiled import UNWEIGHED, event_column, event_row, event_words, loop
 from kalux.events import EVENT_DTYPE, LATEST, EventArray
 
 _BLOCK: Final = 1 << 16
@@ -159,7 +159,7 @@ def _outside(word, height, width):  # type: ignore[no-untyped-def]
     return (event_column(word) >= width) | (event_row(word) >= height)
 
 
-@nb.njit(cache=True, nogil=True)
+@loop
 def _copy_checked(words, copy, earliest, delay, height, width, kept):  # type: ignore[no-untyped-def]
     """Copy event words, one or more, with their times moved; False if an event is out of order or outside the sensor.
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux import memory
-from kalux.compiled import largest_around
+from kalux.compiled import largest_around, loop
 
 MICROSECOND = 1e-6
 
@@ -39,7 +39,7 @@ def moved_clock(clock: Clock, span: int) -> Clock:
     return moved
 
 
-@nb.njit(cache=True, nogil=True)
+@loop
 def _move(clock, span, moved):  # type: ignore[no-untyped-def]
     for i in range(len(clock)):
         moved[i] = max(clock[i] - span, NEVER)

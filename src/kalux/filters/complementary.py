@@ -23,6 +23,7 @@ from kalux.compiled import (
     event_row,
     event_words,
     exponential,
+    loop,
     prefetch,
 )
 from kalux.events import EventArray
@@ -109,7 +110,7 @@ def decayed(deviation, gain, seconds):  # type: ignore[no-untyped-def]
     return deviation * exponential(-gain * seconds)
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy", fastmath=FUSED)
+@loop(fastmath=FUSED)
 def _advance(words, pixels, width, origin, scalars):  # type: ignore[no-untyped-def]
     last = len(words) - 1
     for i in range(len(words)):
@@ -124,14 +125,14 @@ def _advance(words, pixels, width, origin, scalars):  # type: ignore[no-untyped-
         pixel.since = now
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@loop
 def _read(log_frame, pixels, now, beyond, log_intensity):  # type: ignore[no-untyped-def]
     for i in range(len(pixels)):
         seconds = np.float32(np.int32(now - pixels[i].since)) * MICROSECOND32 + beyond
         log_intensity[i] = log_frame[i] + decayed(pixels[i].deviation, pixels[i].gain, seconds)
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@loop
 def _move_origin(pixels, span):  # type: ignore[no-untyped-def]
     """Predict every pixel at an origin ``span`` us later, so that times do not overflow."""
     for i in range(len(pixels)):

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.highlights import Unshown
-from kalux.compiled import ONE, exponential
+from kalux.compiled import ONE, exponential, loop
 from kalux.filters.readout import HighlightPrior, believed_highlight
 
 Floats = NDArray[np.floating[Any]]
@@ -100,7 +99,7 @@ def keep_white(
     _keep(log_intensity.reshape(-1), unmeasured, *scalars, image.reshape(-1))
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@loop
 def _keep(log_intensity, unmeasured, white, log_offset, image):  # type: ignore[no-untyped-def]
     for pixel in unmeasured:
         i = np.uint64(pixel)
@@ -111,7 +110,7 @@ def _keep(log_intensity, unmeasured, white, log_offset, image):  # type: ignore[
             image[i] = max(image[i], least)
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@loop
 def _take_mean(excess, noise, log_offset, white, scale2, stretch, mean):  # type: ignore[no-untyped-def]
     """From L to the mean of the intensity, in place, without branches, so that it becomes vector code."""
     half, zero = np.float32(0.5), np.float32(0.0)

@@ -8,7 +8,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.compiled import FUSED, ONE, WITHIN, exponential, logarithm
+from kalux.compiled import FUSED, ONE, empty, exponential, inner, logarithm, loop, zeros
 
 Array = NDArray[np.floating[Any]]
 
@@ -259,7 +259,7 @@ def read_out(
     return out, known if with_variance and moving is None else total, heard
 
 
-@nb.njit(cache=True, **WITHIN)
+@inner
 def _ring(pitch):  # type: ignore[no-untyped-def]
     # A row's neighbours, and the patches around them, lie in rows to twice the pitch ahead and one behind; the rows
     # that need what is made of them, in one more ahead.
@@ -269,17 +269,17 @@ def _ring(pitch):  # type: ignore[no-untyped-def]
         _lines(2 * count),
         _lines(4 * count),
         _lines(4 * count),
-        np.empty((count, _STRIP), np.uint8),
-        np.empty((count, 2), np.int64),
+        empty((count, _STRIP), np.uint8),
+        empty((count, 2), np.int64),
         _lines(np.int64(4)),
         _lines(np.int64(2)),
     )
 
 
-@nb.njit(cache=True, **WITHIN)
+@inner
 def _lines(rows):  # type: ignore[no-untyped-def]
     """Memory for some rows, which begin where lines of the cache do. One piece for all would not become vector code."""
-    memory = np.empty(rows * _ROW + _VECTOR, np.float32)
+    memory = empty(rows * _ROW + _VECTOR, np.float32)
     begin = (_VECTOR - np.int64(memory.ctypes.data // 4) % _VECTOR) % _VECTOR
     return memory[begin : begin + rows * _ROW]
 
@@ -292,10 +292,10 @@ def _plane(values: Array | None, shape: tuple[int, ...]) -> NDArray[np.float32]:
 # Positions are counted from the first of a loop, so that none is below another: unsigned numbers that wrap around keep
 # a loop from becoming vector code. So do many arrays, and loops that write to an array of which they read another row.
 # Arrays are given one by one: taking one out of a tuple counts a reference, in an atomic operation; for every row,
-# these are 4 % of an image.
+# these are 4 % of an image. Long functions are put in their place by numba, since LLVM would also compile them alone.
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy", fastmath=FUSED)
+@loop(fastmath=FUSED)
 def _read_out(  # type: ignore[no-untyped-def]
     log_intensity,
     variance,
@@ -325,13 +325,13 @@ def _read_out(  # type: ignore[no-untyped-def]
     known, least, unlike, alike, single = ring.known, ring.least, ring.unlike, ring.alike, ring.single
     hears, spans, changed = ring.hears, ring.spans, ring.heard
     count = len(spans)
-    level, left = np.zeros(_STRIP, np.float32), np.zeros(_STRIP, np.float32)
-    marks = np.zeros(_STRIP, np.uint8)
+    level, left = zeros(_STRIP, np.float32), zeros(_STRIP, np.float32)
+    marks = zeros(_STRIP, np.uint8)
     words = marks.view(np.uint64)
     places, excess, doubt = (
-        np.empty(_STRIP, np.uint64),
-        np.empty(_STRIP, np.float32),
-        np.empty(_STRIP, np.float32),
+        empty(_STRIP, np.uint64),
+        empty(_STRIP, np.float32),
+        empty(_STRIP, np.float32),
     )
     next_unshown = ends[:-1].copy()  # of every row, in strips from left to right
     for begin in range(0, width, _STRIP):
@@ -401,7 +401,7 @@ def _any(words, first, count):  # type: ignore[no-untyped-def]
     return found != np.uint64(0)
 
 
-@nb.njit(cache=True, **WITHIN)
+@inner
 def _clear(ring):  # type: ignore[no-untyped-def]
     """Before the first row of a strip: nothing is known, nothing is alike, nobody hears."""
     for place in range(len(ring.spans)):
@@ -439,7 +439,7 @@ def _take_row(  # type: ignore[no-untyped-def]
         known[into + _DOUBT + i] = doubt if doubt < _NOTHING else _NOTHING
 
 
-@nb.njit(cache=True, **WITHIN)
+@inner
 def _mark_hearing(moving, row, begin, hears, spans):  # type: ignore[no-untyped-def]
     """Which pixels of a row hear their neighbours, and from which block of columns to which; none outside the image."""
     place = np.uint64(row % len(spans))
@@ -455,7 +455,7 @@ def _mark_hearing(moving, row, begin, hears, spans):  # type: ignore[no-untyped-
     spans[place, 0], spans[place, 1] = first, last
 
 
-@nb.njit(cache=True, error_model="numpy", fastmath=FUSED, **WITHIN)
+@nb.njit(cache=True, inline="always")
 def _compare(  # type: ignore[no-untyped-def]
     row, first, last, allowed, pitch, known, least, unlike, alike, single
 ):
@@ -521,7 +521,7 @@ def _compare(  # type: ignore[no-untyped-def]
         alike[own + three + i] = _squared(of_cd * c)
 
 
-@nb.njit(cache=True, error_model="numpy", fastmath=FUSED, **WITHIN)
+@nb.njit(cache=True, inline="always")
 def _hear_neighbours(  # type: ignore[no-untyped-def]
     row, first, last, pitch, known, least, alike, hears, heard, level
 ):
@@ -569,7 +569,7 @@ def _hear_neighbours(  # type: ignore[no-untyped-def]
         level[column + i] = together if hears[here, column + i] else alone
 
 
-@nb.njit(cache=True, **WITHIN)
+@inner
 def _lessen(row, first, last, ring, left):  # type: ignore[no-untyped-def]
     """The variances of a row, ``left``, where pixels have heard their neighbours."""
     here, column, two = np.uint64(row % len(ring.spans)), np.uint64(first), np.uint64(_ROW + _MARGIN + first)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from kalux.augmentation.bridge import UNMEASURED
 from kalux.augmentation.unseen import RANDOM
-from kalux.compiled import FUSED
+from kalux.compiled import FUSED, loop
 from kalux.filters.readout import SHARED, Hidden
 
 Array = NDArray[np.floating[Any]]
@@ -189,13 +189,13 @@ def given_variance(
     return given
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy", fastmath=FUSED)
+@loop(fastmath=FUSED)
 def _know(variance, first, second, events, around, known):  # type: ignore[no-untyped-def]
     for i in range(np.uint64(len(known))):
         known[i] = known_variance(variance[i], first[i], second[i], events[i], around)
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy", fastmath=FUSED)
+@loop(fastmath=FUSED)
 def _hear(variance, left, first, second, hidden, heard):  # type: ignore[no-untyped-def]
     """P of pixels that neither frame measures, after their neighbours are heard.
 
@@ -208,7 +208,7 @@ def _hear(variance, left, first, second, hidden, heard):  # type: ignore[no-unty
         heard[i] = variance[i] * (one - _HEARD * max(lost, np.float32(0.0)) if neither else one)
 
 
-@nb.njit(cache=True, nogil=True)
+@loop
 def _wait(moving, first, second, events, waiting):  # type: ignore[no-untyped-def]
     """Pixels without an event between the frames, but with one of late, or measured by one of the frames alone."""
     unmeasured = np.float32(UNMEASURED)
@@ -217,7 +217,7 @@ def _wait(moving, first, second, events, waiting):  # type: ignore[no-untyped-de
         waiting[i] = late & (events[i] == np.float32(0.0)) & (min(first[i], second[i]) < unmeasured)
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy", fastmath=FUSED)
+@loop(fastmath=FUSED)
 def _hide(known, moving, waiting, change, hidden, given):  # type: ignore[no-untyped-def]
     changing, of_moving = hidden
     part, of_waiting = np.float32(WAITING[0]), np.float32(WAITING[1]) * of_moving
@@ -247,7 +247,7 @@ def add_pattern(variance: NDArray[np.float32], intensity: Array, log_offset: flo
     _add_pattern(variance.reshape(-1), np.ascontiguousarray(intensity).reshape(-1), *scalars)
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy", fastmath=FUSED)
+@loop(fastmath=FUSED)
 def _add_pattern(variance, intensity, log_offset, deviation):  # type: ignore[no-untyped-def]
     for i in range(np.uint64(len(variance))):
         relative = deviation / (intensity[i] + log_offset)

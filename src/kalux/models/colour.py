@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.compiled import empty, loop
 from kalux.errors import SettingsError
 from kalux.frames import Mosaic
 
@@ -141,12 +141,12 @@ def _mirrored(image: Float32, width: int) -> Float32:
     return np.pad(image, width, mode="reflect")
 
 
-@nb.njit(cache=True, nogil=True)
+@loop(error_model="python")
 def _demosaic(padded, pattern, edge, out):  # type: ignore[no-untyped-def]
     """Fill ``out`` from the log mosaic with a border of 3; ``pattern`` is the 2x2 of `channels`."""
     height, width = out.shape[0], out.shape[1]
     half, quarter = np.float32(0.5), np.float32(0.25)
-    green = np.empty((height + 2, width + 2), np.float32)
+    green = empty((height + 2, width + 2), np.float32)
     for i in range(height + 2):
         for j in range(width + 2):
             r, c = i + 2, j + 2
@@ -206,7 +206,7 @@ def calm_highlights(colour: Float32, variance: Float32, gains: Gains = (1.0, 1.0
     return out
 
 
-@nb.njit(cache=True, nogil=True)
+@loop(error_model="python")
 def _calm(colour, variance, gains):  # type: ignore[no-untyped-def]
     for y in range(colour.shape[0]):
         for x in range(colour.shape[1]):

@@ -11,10 +11,11 @@ import struct
 from collections.abc import Iterator, Mapping
 from typing import Final
 
-import numba as nb
 import numpy as np
 from isal import isal_zlib
 from numpy.typing import NDArray
+
+from kalux.compiled import empty, loop
 
 _MAGIC: Final = 20000630
 _VERSION: Final = 2
@@ -86,16 +87,16 @@ def _blocks(planes: list[NDArray[np.float32]]) -> Iterator[bytes]:
         yield struct.pack("<2i", top, len(data)) + data
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
+@loop
 def _differences(pairs):  # type: ignore[no-untyped-def]
     """Lower bytes, then upper ones, of pairs; each the difference from the one before, plus 128 (not the first)."""
     count = len(pairs)
-    parted = np.empty(2 * count, np.uint8)
+    parted = empty(2 * count, np.uint8)
     for i in range(count):
         parted[i] = np.uint8(pairs[i] & np.uint16(0xFF))
     for i in range(count):
         parted[count + i] = np.uint8(pairs[i] >> np.uint16(8))
-    out = np.empty(2 * count, np.uint8)
+    out = empty(2 * count, np.uint8)
     out[0] = parted[0]
     for i in range(1, 2 * count):
         out[i] = parted[i] - parted[i - 1] + np.uint8(128)

@@ -10,10 +10,11 @@ from __future__ import annotations
 import struct
 from typing import Any, Final
 
-import numba as nb
 import numpy as np
 from isal import isal_zlib
 from numpy.typing import NDArray
+
+from kalux.compiled import loop, zeros
 
 _SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
 _UP: Final = 2
@@ -61,9 +62,9 @@ def _filtered(picture: NDArray[Any]) -> NDArray[np.uint8]:
     return filtered
 
 
-@nb.njit(cache=True, nogil=True)
+@loop
 def _fill_bytes(rows, filtered):  # type: ignore[no-untyped-def]
-    above = np.zeros(rows.shape[1], np.uint8)
+    above = zeros(rows.shape[1], np.uint8)
     for row in range(len(rows)):
         values, out = rows[row], filtered[row]
         out[0] = _UP
@@ -72,9 +73,9 @@ def _fill_bytes(rows, filtered):  # type: ignore[no-untyped-def]
         above = values
 
 
-@nb.njit(cache=True, nogil=True)
+@loop
 def _fill_pairs(rows, filtered):  # type: ignore[no-untyped-def]
-    above = np.zeros(rows.shape[1], np.uint16)
+    above = zeros(rows.shape[1], np.uint16)
     one, two, eight = np.uint64(1), np.uint64(2), np.uint16(8)
     for row in range(len(rows)):
         values, out = rows[row], filtered[row]
