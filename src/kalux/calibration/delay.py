@@ -28,7 +28,7 @@ _VALLEY: Final = 4_000  # us
 
 _AROUND: Final = (-3, 3)
 """Delays of the grid, from the one at which frames are explained best if nothing moves within exposures, that are tried
-with what does: 0 to 1.6 ms earlier and up to 0.9 later on 38 simulated scenes."""
+with what does: 0 to 1.8 ms earlier or up to 0.9 later on 40 simulated scenes."""
 
 _RIVAL: Final = 1.05
 """Where light flickers, frames are explained nearly as well by events a period of it earlier or later: of valleys whose
