@@ -1,8 +1,4 @@
-"""What the light does within an exposure, as its events tell: a frame shows the mean, which is that of no moment.
-
-The filters deblur frames by the same double integral (`kalux.augmentation.deblur`), with the thresholds of every pixel
-and a weight for every event. Calibrations look at frames before these are known.
-"""
+"""What the light does within an exposure, as its events tell: a frame shows the mean, which is that of no moment."""
 
 from __future__ import annotations
 
@@ -11,8 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.deblur import between
-from kalux.compiled import empty, event_column, event_is_on, event_row, event_words, loop
+from kalux.augmentation.deblur import between, integrate_exposure
 from kalux.events import EventArray
 
 Array = NDArray[np.float64]
@@ -38,48 +33,18 @@ def bends(
 ) -> Bends:
     """Of an exposure from ``start`` to ``end`` (us), by the thresholds on and off, log intensity.
 
-    Between events the light is taken to be at the level of the last one. Where nothing happens nothing bends.
+    Between events the light is taken to be at the level of the last one (`kalux.augmentation.deblur`). Where nothing
+    happens, and where an exposure has no length, nothing bends.
     """
-    height, width = sensor_size
-    words = event_words(between(events, start, end))
-    found = np.zeros((2, height * width))
-    if len(words) > 0:
-        steps = np.array([thresholds[0], -thresholds[1]])
-        ends = start, (start + end) // 2, end
-        _follow(words, np.uint64(width), ends, steps, np.full(height * width, -1, np.int32), *found)
-    return Bends(*found.reshape(2, height, width))
-
-
-@loop
-def _follow(words, width, ends, steps, place, over_mean, over_middle):  # type: ignore[no-untyped-def]
-    """``place``: where a pixel's path is kept, -1 as long as it has no event."""
-    start, middle, end = ends
-    # Level after the last event, us until that, integrals of level and exp(level) until then, level at the middle.
-    paths = empty((len(words), 5), np.float64)
-    pixels = empty(len(words), np.int64)
-    count = 0
-    for i in range(len(words)):
-        word = words[i, 1]
-        at = event_row(word) * width + event_column(word)
-        if place[at] < 0:
-            place[at] = count
-            pixels[count] = at
-            for k in range(5):
-                paths[count, k] = 0.0
-            count += 1
-        path = paths[place[at]]
-        since = float(words[i, 0] - start)
-        held = since - path[1]
-        path[2] += path[0] * held
-        path[3] += np.exp(path[0]) * held
-        path[0] += steps[np.uint64(not event_is_on(word))]
-        path[1] = since
-        if words[i, 0] <= middle:
-            path[4] = path[0]
-    length = float(end - start)
-    for n in range(count):
-        path, at = paths[n], pixels[n]
-        rest = length - path[1]
-        log_mean = np.log((path[3] + np.exp(path[0]) * rest) / length)
-        over_mean[at] = log_mean - (path[2] + path[0] * rest) / length
-        over_middle[at] = log_mean - path[4]
+    within = between(events, start, end)
+    if len(within) == 0:
+        return Bends(np.zeros(sensor_size), np.zeros(sensor_size))
+    on, off = thresholds
+    steps = [np.full(sensor_size, threshold, np.float32) for threshold in thresholds]
+    integrals = integrate_exposure(within, start, end, steps[0], steps[1])
+    log_mean = integrals.log_mean.astype(np.float64)
+    # A step raises the mean by the share of the exposure that is left.
+    raised = np.where(within["p"], on, -off) * ((end - within["t"]) / (end - start))
+    at = within["y"].astype(np.intp) * sensor_size[1] + within["x"]
+    mean = np.bincount(at, raised, minlength=log_mean.size).reshape(sensor_size)
+    return Bends(log_mean - mean, log_mean - integrals.to_middle)
