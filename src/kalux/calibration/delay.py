@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.deblur import between, count_chunks
-from kalux.calibration.exposures import bends
-from kalux.calibration.intervals import Interval, intervals, spread
+from kalux.calibration.intervals import Exposures, Interval, intervals, spread
 from kalux.calibration.regression import Fit, two_stage
 from kalux.events import EventArray
 from kalux.recording import Recording
@@ -210,10 +209,11 @@ def _samples(
     parts: list[list[_Seen]] = []
     total = 0
     margin = LARGEST + (recording.longest_exposure if any(thresholds) else 0)
+    exposures = [(d, Exposures(recording.sensor_size, d, thresholds)) for d in grid.tolist()]
     for interval in intervals(recording, camera, margin=margin, most_frames=_MAX_FRAMES):
         seen = sum(_counts(interval.events, recording.sensor_size))
         chosen = spread(interval.usable & (seen >= 2), _MAX_SAMPLES - total)
-        parts.append([_of(interval, d, thresholds, recording.sensor_size, chosen) for d in grid.tolist()])
+        parts.append([_of(interval, d, within, recording.sensor_size, chosen) for d, within in exposures])
         total += len(chosen)
         if total >= _MAX_SAMPLES:
             break
@@ -228,19 +228,15 @@ def _samples(
 def _of(
     interval: Interval,
     delay: int,
-    thresholds: tuple[float, float],
+    exposures: Exposures,
     sensor_size: tuple[int, int],
     chosen: NDArray[np.int64],
 ) -> _Seen:
-    change = interval.change.ravel()[chosen]
-    if any(thresholds):
-        before, after = (
-            bends(interval.events, sensor_size, shot.start + delay, shot.end + delay, thresholds)
-            for shot in (interval.first, interval.second)
-        )
-        change = change - (after.over_middle - before.over_middle).ravel()[chosen]
+    before, after = exposures.of(interval)
     counts = _counts(between(interval.events, interval.start + delay, interval.end + delay), sensor_size)
-    return _Seen(change, *(each.ravel()[chosen].astype(np.float64) for each in counts))
+    planes = (interval.change, before.over_middle, after.over_middle, *counts)
+    change, first, second, on, off = (plane.ravel()[chosen].astype(np.float64) for plane in planes)
+    return _Seen(change - (second - first), on, off)
 
 
 def _counts(events: EventArray, shape: tuple[int, int]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -34,10 +34,10 @@ def bends(
     """Of an exposure from ``start`` to ``end`` (us), by the thresholds on and off, log intensity.
 
     Between events the light is taken to be at the level of the last one (`kalux.augmentation.deblur`). Where nothing
-    happens, and where an exposure has no length, nothing bends.
+    happens, where thresholds are 0, and where an exposure has no length, nothing bends.
     """
     within = between(events, start, end)
-    if len(within) == 0:
+    if len(within) == 0 or not any(thresholds):
         return Bends(np.zeros(sensor_size), np.zeros(sensor_size))
     on, off = thresholds
     steps = [np.full(sensor_size, threshold, np.float32) for threshold in thresholds]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from kalux import memory
 from kalux.augmentation.deblur import all_between, between, count_events
 from kalux.augmentation.refractory import EventClock
-from kalux.calibration.exposures import bends
+from kalux.calibration.exposures import Bends, bends
 from kalux.compiled import event_words
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.filters.shots import Shot, take_shot
@@ -150,6 +150,39 @@ def intervals(
         previous = end
 
 
+class Exposures:
+    """What the light does within the exposures of intervals that follow each other; each exposure is looked at once.
+
+    Parameters
+    ----------
+    sensor_size
+        (height, width), pixels.
+    delay
+        How much later than the frames' clock events are stamped, us. The intervals have events beyond their exposures.
+    thresholds
+        On and off, log intensity. 0: as if nothing moved.
+    """
+
+    def __init__(self, sensor_size: tuple[int, int], delay: int, thresholds: tuple[float, float]) -> None:
+        self._sensor_size, self._delay, self._thresholds = sensor_size, delay, thresholds
+        self._latest: tuple[Shot, Bends] | None = None
+
+    def of(self, interval: Interval) -> tuple[Bends, Bends]:
+        """Of the frames before and after."""
+        first, second = interval.first, interval.second
+        if self._latest is not None and self._latest[0] is first:
+            before = self._latest[1]
+        else:
+            before = self._looked_at(interval, first)
+        after = self._looked_at(interval, second)
+        self._latest = second, after
+        return before, after
+
+    def _looked_at(self, interval: Interval, shot: Shot) -> Bends:
+        start, end = shot.start + self._delay, shot.end + self._delay
+        return bends(interval.events, self._sensor_size, start, end, self._thresholds)
+
+
 class Counted(NamedTuple):
     """An interval, and what its events tell of every pixel, (H, W) each.
 
@@ -182,19 +215,13 @@ def counted_intervals(
     the refractory period is in us.
     """
     clock = EventClock(recording.sensor_size, refractory_period)
-
-    def bent(shot: Shot, events: EventArray) -> Array:
-        start, end = shot.start + delay, shot.end + delay
-        return bends(events, recording.sensor_size, start, end, thresholds).over_middle
-
+    exposures = Exposures(recording.sensor_size, delay, thresholds)
     margin = recording.longest_exposure + abs(delay)
-    before: Array | None = None
     for interval in intervals(recording, camera, margin=margin, most_frames=most_frames):
         inside = clock.weighed(between(interval.events, interval.start + delay, interval.end + delay))
         on, off = count_events(inside, recording.sensor_size, weighed=True)
-        first = bent(interval.first, interval.events) if before is None else before
-        before = bent(interval.second, interval.events)
-        yield Counted(interval, on, off, before - first)
+        before, after = exposures.of(interval)
+        yield Counted(interval, on, off, after.over_middle - before.over_middle)
 
 
 def _later(chunks: list[EventArray], t: int) -> list[EventArray]:

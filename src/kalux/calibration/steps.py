@@ -27,11 +27,9 @@ from numpy.typing import NDArray
 
 from kalux.augmentation.deblur import between
 from kalux.augmentation.refractory import step_weight
-from kalux.calibration.exposures import bends
-from kalux.calibration.intervals import Interval, intervals
+from kalux.calibration.intervals import Exposures, Interval, intervals
 from kalux.compiled import empty, event_column, event_is_on, event_row, event_words, inner, loop, zeros
 from kalux.events import NEVER
-from kalux.filters.shots import Shot
 from kalux.recording import Recording
 from kalux.settings import CameraSettings
 
@@ -175,13 +173,12 @@ class _Passing:
         self._shape = sensor_size
         self._periods, self._late = np.array(periods, np.float32), float(late)
         self._delay, self._most = delay, most
-        self._thresholds = thresholds
+        self._exposures = Exposures(sensor_size, delay, thresholds)
         self._log_offset = log_offset
         # Of the event before the interval's first: its time, and its sign, 0 if there was none.
         self._latest = np.full(height * width, NEVER, np.int64)
         self._sign = np.zeros(height * width, np.int8)
         self._seen_until = NEVER
-        self._bent: Array | None = None  # of the interval's first frame (`_bend`)
 
     def of(self, interval: Interval) -> Steps:
         """The pixels of the next interval."""
@@ -205,9 +202,8 @@ class _Passing:
         shape = len(chosen), len(self._periods), 2, 2
         share = interval.level / np.maximum(interval.level + self._log_offset, 1e-9)
         # To second order, log(I + I_0) bends by the square of its share in the steps.
-        before = self._bend(interval, first) if self._bent is None else self._bent
-        self._bent = self._bend(interval, second)
-        change = interval.change - share**2 * (self._bent - before)
+        before, after = self._exposures.of(interval)
+        change = interval.change - share**2 * (after.over_mean - before.over_mean)
         own, around, change_around = _looked_at(
             counts.reshape(height, width, 4 * len(self._periods)), change, usable, chosen
         )
@@ -219,11 +215,6 @@ class _Passing:
             around.reshape(shape),
             chosen,
         )
-
-    def _bend(self, interval: Interval, shot: Shot) -> Array:
-        """By how much the logarithm of the mean over an exposure is more than the mean of the logarithm, (H, W)."""
-        start, end = (t + self._delay for t in (shot.start, shot.end))
-        return bends(interval.events, self._shape, start, end, self._thresholds).over_mean
 
     def _chosen(self, interval: Interval) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """Indices of well exposed pixels around which something happens, spread evenly; (H, W) all well exposed ones.
