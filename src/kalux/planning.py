@@ -9,17 +9,17 @@ from typing import Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.calibration.contrast import (
+from kalux.calibration.delay import DelayEstimate, estimate_delay
+from kalux.calibration.event_model import EventModel, estimate_event_model
+from kalux.calibration.fixed_pattern import USUAL_PATTERN, FixedPattern, estimate_fixed_pattern
+from kalux.calibration.frame_noise import FrameNoise, estimate_frame_noise, usual_noise
+from kalux.calibration.global_thresholds import (
     ROUGH_SAMPLES,
     ThresholdEstimate,
     Usual,
     estimate_thresholds,
     refine_thresholds,
 )
-from kalux.calibration.delay import DelayEstimate, estimate_delay
-from kalux.calibration.event_model import EventModel, estimate_event_model
-from kalux.calibration.fixed_pattern import USUAL_PATTERN, FixedPattern, estimate_fixed_pattern
-from kalux.calibration.frame_noise import FrameNoise, estimate_frame_noise, usual_noise
 from kalux.calibration.levels import Ceiling, exact_end, find_ceiling
 from kalux.calibration.mismatch import Mismatch, estimate_mismatch
 from kalux.calibration.noise import event_noise

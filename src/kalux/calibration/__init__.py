@@ -1,1 +1,1 @@
-"""Calibration from a recording itself: `contrast`, the thresholds of the event pixels."""
+"""What a recording tells about its own cameras: thresholds, delay, noise, response, rigs of two cameras."""

@@ -50,7 +50,7 @@ def add_command(commands: Any) -> None:
 
 def run(options: argparse.Namespace, command: list[str]) -> None:
     """Run the command."""
-    from kalux.calibration.thresholds import calibrate_contrast
+    from kalux.calibration.pixel_thresholds import calibrate_contrast
     from kalux.errors import InputError
     from kalux.recording import no_frames
     from kalux.settings import CameraSettings

@@ -35,7 +35,7 @@ from kalux.settled import ORIGINS, settled
 from kalux.wording import how_many
 
 if TYPE_CHECKING:
-    from kalux.calibration.contrast import ThresholdEstimate
+    from kalux.calibration.global_thresholds import ThresholdEstimate
     from kalux.writers import Writer
 
 _MANY_SAMPLES: Final = 1000

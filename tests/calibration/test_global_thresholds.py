@@ -1,4 +1,4 @@
-"""Contrast thresholds from recordings whose thresholds are known."""
+"""Thresholds that a reconstruction finds by itself, from recordings whose thresholds are known."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 
 import kalux
 from kalux import Frame, Recording
-from kalux.calibration.contrast import Usual, estimate_thresholds, refine_thresholds
+from kalux.calibration.global_thresholds import Usual, estimate_thresholds, refine_thresholds
 from kalux.datasets import SensorSettings, demo_scene, simulate, static
 from kalux.datasets.scenes import Scene
 from kalux.errors import ExposureError
@@ -270,7 +270,7 @@ def test_of_a_rough_estimate_delay_and_period_are_kept(monkeypatch):
     rough = estimate_thresholds(lossy, CAMERA, USUAL, delay=1_500, refractory_period=None, most=2_000)
     camera = CameraSettings(log_offset=0.004)
     whole = estimate_thresholds(lossy, camera, USUAL, delay=1_500, refractory_period=None)
-    monkeypatch.delattr("kalux.calibration.contrast.intervals")
+    monkeypatch.delattr("kalux.calibration.global_thresholds.intervals")
     refined = refine_thresholds(lossy, camera, USUAL, rough, refractory_period=None)
     assert refined.shortest_interval == whole.shortest_interval > 0
     assert refined.delay == rough.delay

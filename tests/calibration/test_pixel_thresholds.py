@@ -1,4 +1,4 @@
-"""Contrast thresholds in earnest, from recordings whose thresholds are known."""
+"""What `kalux calibrate contrast` measures, from recordings whose thresholds are known."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 
 import kalux
 from kalux import Recording
-from kalux.calibration.thresholds import calibrate_contrast, shrunk
+from kalux.calibration.pixel_thresholds import calibrate_contrast, shrunk
 from kalux.datasets import SensorSettings, demo_scene, simulate, static
 from kalux.settings import CameraSettings
 

@@ -1,7 +1,7 @@
-"""Contrast thresholds in earnest: global and per pixel, with their spread and with what is not known of them.
+"""`kalux calibrate contrast`: thresholds of the sensor and of its single pixels, with what is not known of them.
 
-`kalux.calibration.contrast` is the quick estimate of a reconstruction. Here the change d of the deblurred log intensity
-between the middles of two exposures is explained by
+A reconstruction finds those of the sensor by itself (`kalux.calibration.global_thresholds`). Here the change d of the
+deblurred log intensity between the middles of two exposures is explained by
 
     d = c_on n_on - c_off n_off + h s
 
@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from kalux.augmentation.deblur import between, integrate_exposure, latent_middle, latent_peak
 from kalux.augmentation.refractory import step_weight
-from kalux.calibration.contrast import Usual, estimate_thresholds
+from kalux.calibration.global_thresholds import Usual, estimate_thresholds
 from kalux.calibration.intervals import Interval, intervals
 from kalux.calibration.refractory import dead_time, shortest_interval
 from kalux.calibration.regression import (

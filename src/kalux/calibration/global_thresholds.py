@@ -1,4 +1,4 @@
-"""Contrast thresholds and refractory period from a recording: log frame differences against event counts.
+"""The sensor's thresholds and refractory period, for a reconstruction: log frame differences against event counts.
 
 Counts of events are wrong: by noise, by events that are lost, by what is not told yet. Least squares would take their
 errors for smaller thresholds (attenuation), down to nothing where nothing moves. Two kinds of instruments do not: the
