@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -150,9 +150,8 @@ def plan(
     chosen = _with_white_balance(recording, chosen)
     chosen, noise = _with_frame_noise(recording, chosen)
     chosen, pattern = _with_fixed_pattern(recording, chosen)
-    chosen, delay = _with_delay(recording, chosen)
     chosen, blind = _with_dead_time(recording, chosen)
-    filled, origin, estimate, model = _with_event_steps(recording, chosen)
+    filled, origin, estimate, delay, model = _with_event_steps(recording, chosen)
     unsure = estimate.spread if estimate is not None and origin in _FOUND else 0.0
     filled, mismatch = _with_mismatch(recording, filled, unsure)
     filled, background = _with_background(recording, filled, known.pixels)
@@ -208,7 +207,7 @@ def with_saturation(recording: Recording, settings: Settings) -> tuple[Settings,
     if end is None:
         return usual, None
     clipped = altered(settings, "camera", saturation=camera.usual_saturation * end)
-    known, *_ = _with_event_steps(recording, _with_delay(recording, clipped)[0])
+    known = _with_event_steps(recording, clipped).settings
     found = find_ceiling(recording, known.camera, known.events)
     return (clipped, found) if found is not None and found.is_at(end) else (usual, None)
 
@@ -258,13 +257,29 @@ def _are_calibrated(settings: Settings, calibration: Calibration) -> bool:
     return all(name in found and found[name] == getattr(settings.events, name) for name in names)
 
 
-def _with_delay(recording: Recording, settings: Settings) -> tuple[Settings, DelayEstimate | None]:
-    """Fill in the events' delay: from the settings, else an estimate, else the usual."""
-    if settings.events.delay is not None:
+def _with_delay(
+    recording: Recording, settings: Settings, late: DelayEstimate | None, estimate: ThresholdEstimate | None
+) -> tuple[Settings, DelayEstimate | None]:
+    """Fill in the events' delay: from the settings, else how late they seem and are, else the usual.
+
+    How late they are is known from an estimate of the thresholds; without, of one that is made with known ones.
+    """
+    events = settings.events
+    if events.delay is not None:
         return settings, None
-    estimate = estimate_delay(recording, settings.camera)
-    delay = settings.events.usual_delay if estimate is None else estimate.delay
-    return altered(settings, "events", delay=delay), estimate
+    if late is not None and estimate is None:
+        estimate = estimate_thresholds(
+            recording,
+            settings.camera,
+            Usual.of(events),
+            of_log_offset=settings.filter.augmentation == "paper",
+            delay=late.apparent,
+            refractory_period=events.refractory if _uses_steps(settings) else 0,
+            most=ROUGH_SAMPLES,
+        )
+    if late is not None and estimate is not None:
+        late = late._replace(true=estimate.delay)
+    return altered(settings, "events", delay=events.usual_delay if late is None else late.delay), late
 
 
 def _with_frame_noise(recording: Recording, settings: Settings) -> tuple[Settings, FrameNoise | None]:
@@ -301,32 +316,47 @@ def _with_dead_time(recording: Recording, settings: Settings) -> tuple[Settings,
     return altered(settings, "events", refractory_period=period or None), period
 
 
-def _with_event_steps(
-    recording: Recording, settings: Settings
-) -> tuple[Settings, ThresholdOrigin, ThresholdEstimate | None, EventModel | None]:
-    """Fill in what an event's step is: thresholds and refractory period, then I_0 and the step's variance.
+class _EventSteps(NamedTuple):
+    """Settings in which what an event's step is, and when, is filled in; and what was found on the way."""
+
+    settings: Settings
+    origin: ThresholdOrigin
+    estimate: ThresholdEstimate | None
+    delay: DelayEstimate | None
+    model: EventModel | None
+
+
+def _with_event_steps(recording: Recording, settings: Settings) -> _EventSteps:
+    """Fill in what an event's step is: thresholds, refractory period and delay, then I_0 and the step's variance.
 
     Thresholds depend on I_0 a little, and it on them: they are estimated once more with the I_0 that is found.
     """
-    filled, origin, estimate = _with_thresholds(recording, settings)
+    late = estimate_delay(recording, settings.camera) if settings.events.delay is None else None
+    filled, origin, estimate = _with_thresholds(recording, settings, late)
+    filled, late = _with_delay(recording, filled, late, estimate)
     filled, model = _with_event_model(recording, filled)
     if estimate is not None and settings.camera.log_offset is None:
         estimated = origin in _FOUND
         if estimated or (estimate.may_lose and settings.camera.offset != filled.camera.offset):
-            unfilled = dataclasses.replace(settings.events, step_variance=filled.events.step_variance)
-            filled, origin, estimate = _with_thresholds(
-                recording, dataclasses.replace(filled, events=unfilled), estimate if estimated else None
+            events = filled.events
+            unfilled = dataclasses.replace(
+                settings.events, delay=events.delay, step_variance=events.step_variance
             )
-    return filled, origin, estimate, model
+            filled, origin, estimate = _with_thresholds(
+                recording, dataclasses.replace(filled, events=unfilled), late, estimate if estimated else None
+            )
+    return _EventSteps(filled, origin, estimate, late, model)
 
 
 def _with_thresholds(
     recording: Recording,
     settings: Settings,
+    late: DelayEstimate | None,
     rough: ThresholdEstimate | None = None,
 ) -> tuple[Settings, ThresholdOrigin, ThresholdEstimate | None]:
     """Fill in thresholds and refractory period: from the settings, else the recording, else an estimate, else usual.
 
+    How ``late`` events seem tells where to look; without, that is where the settings say.
     An estimate without I_0 is rough; with I_0 it is made again, from that.
     """
     events = settings.events
@@ -335,9 +365,7 @@ def _with_thresholds(
     finds_period = _uses_steps(settings) and events.refractory_period is None
     if known.has_thresholds and not finds_period:
         return dataclasses.replace(settings, events=known), origin, None
-    usual = Usual(events.usual_threshold_on, events.usual_threshold_off, events.usual_spread)
-    if known.has_thresholds:
-        usual = Usual(*known.thresholds, 0.0)
+    usual = Usual.of(known)
     of_log_offset = settings.filter.augmentation == "paper"
     period = events.refractory_period if _uses_steps(settings) else 0
     estimate: ThresholdEstimate | None
@@ -347,7 +375,7 @@ def _with_thresholds(
             settings.camera,
             usual,
             of_log_offset=of_log_offset,
-            delay=events.lateness,
+            delay=events.lateness if late is None else late.apparent,
             refractory_period=period,
             most=ROUGH_SAMPLES if settings.camera.log_offset is None else MAX_SAMPLES,
         )

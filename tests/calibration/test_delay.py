@@ -60,8 +60,11 @@ def test_long_exposures_are_no_delay():
 
 
 def test_not_all_of_it_is_corrected(simulation):
+    """But what is not trailing and half of what is; where that is not known, seven tenths."""
     found = estimate_delay(late(simulation, 4_000), CAMERA)
+    assert found.true is None
     assert found.delay == pytest.approx(0.7 * found.apparent, abs=1)
+    assert found._replace(true=4_000).delay == pytest.approx(4_000 + 0.5 * (found.apparent - 4_000), abs=1)
 
 
 def test_a_still_scene_says_nothing(simulation):
@@ -105,10 +108,18 @@ def test_a_stated_delay_is_taken_back(simulation, smooth):
         np.testing.assert_array_equal(one.variance, other.variance)
 
 
-def test_the_plan_fills_it_in(simulation):
+@pytest.mark.parametrize("known", [{}, {"threshold_on": 0.15, "threshold_off": 0.15, "refractory_period": 0}])
+def test_the_plan_fills_it_in(simulation, known):
+    """With what of it is trailing, also where it needs no thresholds."""
     recording = late(simulation, 4_000)
-    made = plan(recording, rate_hz=10)
-    assert made.settings.events.delay == made.delay_estimate.delay > 2_000
+    found = plan(recording, rate_hz=10, settings=altered(PRESETS["default"], "events", **known))
+    assert found.settings.events.delay == found.delay_estimate.delay
+    assert found.delay_estimate.true == pytest.approx(4_000, abs=900)
+    assert found.delay_estimate.true < found.settings.events.delay < found.delay_estimate.apparent
+
+
+def test_a_stated_delay_is_not_looked_for(simulation):
+    recording = late(simulation, 4_000)
     assert plan(recording, rate_hz=10, preset="iccv2021").settings.events.delay == 0
     given = altered(PRESETS["default"], "events", delay=-7)
     assert plan(recording, rate_hz=10, settings=given).settings.events.delay == -7

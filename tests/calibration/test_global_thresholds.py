@@ -258,7 +258,7 @@ def test_the_half_threshold_by_which_events_trail_is_not_taken_for_delay(late):
     moved["t"] += late
     recording = Recording.from_arrays(moved, [*whole.frames()], sensor_size=whole.sensor_size)
     camera = CameraSettings(log_offset=0.004)
-    for seeming in (late + 1_000, late + 2_500):
+    for seeming in (late, late + 1_000, late + 2_500, late + 5_000):
         found = estimate_thresholds(recording, camera, USUAL, delay=seeming)
         assert found.delay == pytest.approx(late, abs=400)
         np.testing.assert_allclose([found.on, found.off], 0.2, rtol=0.04)

@@ -41,8 +41,7 @@ _MIN_SAMPLES: Final = 500
 _MAX_SAMPLES: Final = 60_000
 _MAX_FRAMES: Final = 60
 _SHARE: Final = 0.7
-"""Share of the apparent delay that is corrected. Events trail the light by half a threshold, which looks like delay
-too: an ideal sensor shows 1 to 4 ms of it, real ones 2 to 7. On both 0.7 of it is best (docs/tuning.md)."""
+"""Share of the apparent delay that is corrected where the true one is not known."""
 
 
 class DelayEstimate(NamedTuple):
@@ -50,20 +49,25 @@ class DelayEstimate(NamedTuple):
 
     Attributes
     ----------
-    delay
-        By how much to shift the events, us: the share that is corrected of the apparent delay.
     apparent
         The delay at which the events explain the frames best, us.
     improvement
         Share of the residual at no delay that the apparent one removes, 0 to 1, of frames as they are.
     samples
         Pixels and frame intervals used.
+    true
+        The delay without the half threshold by which events trail the light, us; None where it is not known.
     """
 
-    delay: int
     apparent: int
     improvement: float
     samples: int
+    true: int | None = None
+
+    @property
+    def delay(self) -> int:
+        """By how much to shift the events, us: by the true delay and half of the trailing (docs/equations.md, K8)."""
+        return round(_SHARE * self.apparent if self.true is None else (self.apparent + self.true) / 2)
 
 
 def estimate_delay(recording: Recording, camera: CameraSettings) -> DelayEstimate | None:
@@ -128,7 +132,7 @@ def _within_exposures(
     if middle is None:
         return rough
     apparent = float(grid[0]) + STEP * middle
-    return rough._replace(delay=round(_SHARE * apparent), apparent=round(apparent))
+    return rough._replace(apparent=round(apparent))
 
 
 def _middle(residuals: Array) -> float | None:
@@ -169,7 +173,7 @@ def best_delay(grid: NDArray[np.int64], residuals: Array, samples: int) -> Delay
         return None
     improvement = 1.0 - residuals[best] / residuals[int(np.flatnonzero(grid == 0)[0])]
     apparent = float(grid[best]) + STEP * _vertex(*residuals[best - 1 : best + 2])
-    return DelayEstimate(round(_SHARE * apparent), round(apparent), float(improvement), samples)
+    return DelayEstimate(round(apparent), float(improvement), samples)
 
 
 def _vertex(before: float, here: float, after: float) -> float:

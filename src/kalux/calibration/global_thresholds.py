@@ -21,7 +21,7 @@ from kalux.calibration.refractory import LATE, intervals, possible_periods
 from kalux.calibration.regression import Fit, products, standard_errors, two_stage
 from kalux.calibration.steps import MAX_SAMPLES, Steps, steps
 from kalux.recording import Recording
-from kalux.settings import CameraSettings
+from kalux.settings import CameraSettings, EventSettings
 
 Array = NDArray[np.float64]
 
@@ -33,9 +33,8 @@ ROUGH_SAMPLES: Final = 10_000
 """Pixels for one delay, of which the best is then within 0.2 ms of that of more on twenty scenes and recordings, and
 for thresholds that I_0 is to be found with: these are then within 1 %, and two intervals have them."""
 
-_TRAILING: Final = (0, 2_000, 4_000)
-"""us by which events may seem later than they are: 1.4 to 4.4 ms on seventeen scenes whose events are in time, of which
-`kalux.calibration.delay` takes seven tenths."""
+_TRAILING: Final = (0, 2_000, 4_000, 6_000)
+"""us by which events may seem later than they are: 0.9 to 5.0 ms on forty scenes whose events are in time."""
 
 _PERIOD_SAMPLES: Final = 30_000
 """Pixels for the refractory period: what is not known of the excess is then 0.02 on scenes where something is lost."""
@@ -122,6 +121,13 @@ class Usual(NamedTuple):
     off: float
     spread: float
 
+    @classmethod
+    def of(cls, events: EventSettings) -> Usual:
+        """Those of the settings: known ones if there are, with a spread of 0."""
+        if events.has_thresholds:
+            return cls(*events.thresholds, 0.0)
+        return cls(events.usual_threshold_on, events.usual_threshold_off, events.usual_spread)
+
 
 def estimate_thresholds(
     recording: Recording,
@@ -153,7 +159,7 @@ def estimate_thresholds(
         Steps of log(I + I_0) instead of log I, s = 1, as in the paper's model.
     delay
         How much later than the frames' clock events seem to be, us (`kalux.calibration.delay`): what of it is due to
-        the half threshold by which they trail the light is found and taken off.
+        the half threshold by which they trail the light, 0 to 6 ms, is found and taken off.
     refractory_period
         Of the pixels, us: what is lost in it is added to the events (docs/equations.md, K13). None: to be found.
     most
@@ -262,10 +268,11 @@ class _View(NamedTuple):
         residuals = [seen.residual() for seen in self._seen(delays, (period,), ROUGH_SAMPLES)]
         if not np.isfinite(residuals).all():
             return self
-        curvature, slope, _ = np.polyfit(_TRAILING, residuals, 2)
-        most = float(_TRAILING[-1])
-        best = float(np.clip(-0.5 * slope / curvature, 0.0, most)) if curvature > 0 else 0.0
-        return self._replace(delay=delay - round(best))
+        least = int(np.argmin(residuals))
+        first = min(max(least - 1, 0), len(_TRAILING) - 3)
+        curvature, slope, _ = np.polyfit(_TRAILING[first : first + 3], residuals[first : first + 3], 2)
+        best = -0.5 * slope / curvature if curvature > 0 else _TRAILING[least]
+        return self._replace(delay=delay - round(min(max(best, 0.0), _TRAILING[-1])))
 
     def _seen(self, delays: tuple[int, ...], periods: tuple[int, ...], most: int) -> list[_Seen]:
         at_least = 2 if most <= ROUGH_SAMPLES else 4

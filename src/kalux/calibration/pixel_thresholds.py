@@ -168,9 +168,7 @@ def calibrate_contrast(
     ExposureError
         If the frames' exposures are not known.
     """
-    assumed = EventSettings()
-    usual = Usual(assumed.usual_threshold_on, assumed.usual_threshold_off, assumed.usual_spread)
-    first = estimate_thresholds(recording, camera, usual, delay=delay or 0)
+    first = estimate_thresholds(recording, camera, Usual.of(EventSettings()), delay=delay or 0)
     if first is None or first.usual_share > _UNTOLD:
         return None
     period = dead_time(recording) if refractory is None else refractory
