@@ -34,6 +34,9 @@ UNSEEN: Final = 2.0**41
 REPEATED: Final = 2.0**39
 """Variance of a frame that measures a pixel, but tells of it only what others have told already (K11): black."""
 
+RANDOM: Final = 0.25
+"""How far the middle of a random walk is off the mean of its ends: the variance, in units of that of its change."""
+
 _BLOCK: Final = 64
 """Pixels that are looked at together: parts of the image that frames measure are left out where they may be."""
 
@@ -167,7 +170,7 @@ class BridgedSegment(NamedTuple):
     silent_change: Array | None = None
     net: Array | None = None
     turns: float = 0.0
-    half_way: float = 0.25
+    half_way: float = RANDOM
 
 
 def drift(
