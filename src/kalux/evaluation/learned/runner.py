@@ -98,7 +98,7 @@ def fit_scale(
     made = network_images(recording, middles, name, network, window)
     for frame, image in zip(recording.frames(), made, strict=True):
         x, y = image.astype(np.float64).ravel(), linear_frame(frame, reference, response).ravel()
-        moments += np.array([x.size, x.sum(), y.sum(), x @ x, x @ y])
+        moments += np.array([x.size, x.sum(), y.sum(), (x * x).sum(), (x * y).sum()])
     pixels, x_sum, y_sum, xx, xy = moments
     spread = pixels * xx - x_sum**2
     gain = float((pixels * xy - x_sum * y_sum) / spread) if spread > 0 else 0.0
