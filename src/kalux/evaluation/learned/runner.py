@@ -21,13 +21,13 @@ from numpy.typing import NDArray
 
 from kalux.errors import InputError
 from kalux.evaluation.baselines import EventWindow
-from kalux.evaluation.exposures import linear_frame, reference_exposure
+from kalux.evaluation.exposures import linear_frame
 from kalux.evaluation.learned.catalogue import NETWORKS, Tone
 from kalux.evaluation.learned.networks import Network
 from kalux.evaluation.learned.voxels import normalise, voxel_grid
 from kalux.evaluation.learned.weights import load_network
 from kalux.evaluation.method import Image, Times
-from kalux.recording import Recording
+from kalux.recording import Recording, reference_exposure
 from kalux.wording import how_many
 
 SHARE_OF_WINDOW: Final = 3
