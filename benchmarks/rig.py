@@ -12,8 +12,11 @@ pictures to look at.
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 
 import cv2
 import numpy as np
@@ -27,7 +30,8 @@ from kalux.calibration.rig import rig_toml
 from kalux.calibration.two_cameras import register
 from kalux.datasets import Sampling, SensorSettings, combine, shake
 from kalux.datasets.exposure import frame_stream, plan_exposures
-from kalux.datasets.rig_scene import (
+from kalux.writers import hdf5
+from rig_scene import (
     BlinkingBoard,
     board_poses,
     board_scenes,
@@ -37,7 +41,6 @@ from kalux.datasets.rig_scene import (
     patchwork,
     record,
 )
-from kalux.writers import hdf5
 
 OFFSET = 7_300
 DISTANCE = 20.0

@@ -9,7 +9,7 @@ import numpy as np
 from kalux.calibration.registration import Registration
 from kalux.calibration.rig import Rig
 from kalux.datasets import Sampling, SensorSettings, combine, shake
-from kalux.datasets.rig_scene import (
+from rig_scene import (
     BlinkingBoard,
     RigRecording,
     board_poses,

@@ -265,7 +265,8 @@ def test_highlights_are_believed_less_where_thresholds_are_estimated():
     frames = [Frame(np.full((4, 4), 200, np.uint8), t, t + 1000) for t in (0, 50_000)]
     rise = np.zeros(8, EVENT_DTYPE)
     rise["t"], rise["p"] = np.arange(60_000, 68_000, 1000), True
-    source = Recording.from_arrays(rise, frames, sensor_size=(4, 4))
+    with pytest.warns(UserWarning, match="none of the 8 events lies between"):
+        source = Recording.from_arrays(rise, frames, sensor_size=(4, 4))
     stated = altered(PRESETS["default"], "events", threshold_on=0.2, threshold_off=0.2)
     seen = []
     for origin in ("settings", "estimate"):

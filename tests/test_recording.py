@@ -11,7 +11,7 @@ import pytest
 
 from kalux import readers, recording
 from kalux.errors import EventError, ExposureError, FormatError, FrameError, InputError
-from kalux.frames import Frame
+from kalux.frames import Frame, GroundTruth
 from kalux.recording import Recording, remembering
 from kalux.writers import hdf5
 from recordings import SIZE, same_frames, small_events, small_frames
@@ -49,7 +49,7 @@ def test_chunks_are_bounded(monkeypatch):
 
 
 def test_what_is_given_is_kept():
-    reference = readers.GroundTruth(np.array([1]), np.ones((1, *SIZE), np.float32))
+    reference = GroundTruth(np.array([1]), np.ones((1, *SIZE), np.float32))
     rec = in_memory(contrast_threshold=0.2, ground_truth=reference, inverse_covariance=np.ones(256))
     assert rec.contrast_threshold == (0.2, 0.2)
     assert rec.ground_truth() is reference

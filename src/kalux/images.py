@@ -13,8 +13,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.augmentation.bridge import RANDOM
 from kalux.augmentation.highlights import Unshown
-from kalux.augmentation.unseen import RANDOM, UNKNOWN_CHANGE
+from kalux.augmentation.unseen import UNKNOWN_CHANGE
 from kalux.filters.highlights import keep_white, lifted, read_unshown, tempered
 from kalux.filters.readout import HighlightPrior, read_out
 from kalux.filters.uncertainty import Around, add_pattern, alone, given_variance, hidden_variance

@@ -48,7 +48,7 @@ def reconstruct(
     rate_hz
         Images per second, from the start of the first exposure to the end of the last.
     times
-        (N,) increasing times, us.
+        (N,) us, in order of time; the same one may come again.
     at
         ``"frames"``: one image at the middle of each exposure.
     preset, settings

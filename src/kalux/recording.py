@@ -37,6 +37,7 @@ from kalux.frames import (
     Stamp,
     check_frame,
     is_white,
+    median_exposure,
     place_exposure,
     require_frame,
     white_of_bits,
@@ -52,27 +53,14 @@ _FEW: Final = 0.1
 _WATCHED: Final = 80  # frames, of which the white value is taken where nobody states it
 
 
-class EventStream:
-    """The events of a recording: iterate for chunks of `EVENT_DTYPE`; ``len()`` is the number of events."""
+class Stream(Generic[T]):
+    """The events of a recording, in chunks of `EVENT_DTYPE`, or its frames; ``len()`` is the number of either."""
 
-    def __init__(self, chunks: Callable[[], Iterator[EventArray]], count: Callable[[], int]) -> None:
-        self._chunks, self._count = chunks, count
+    def __init__(self, items: Callable[[], Iterator[T]], count: Callable[[], int]) -> None:
+        self._items, self._count = items, count
 
-    def __iter__(self) -> Iterator[EventArray]:
-        return self._chunks()
-
-    def __len__(self) -> int:
-        return self._count()
-
-
-class FrameStream:
-    """The frames of a recording: iterate for `Frame` objects; ``len()`` is the number of frames."""
-
-    def __init__(self, frames: Callable[[], Iterator[Frame]], count: Callable[[], int]) -> None:
-        self._frames, self._count = frames, count
-
-    def __iter__(self) -> Iterator[Frame]:
-        return self._frames()
+    def __iter__(self) -> Iterator[T]:
+        return self._items()
 
     def __len__(self) -> int:
         return self._count()
@@ -122,6 +110,20 @@ def no_frames(recording: Recording) -> FrameError:
         f"{recording.source.path}: no frames; kalux needs frames as well as events; join images or a video with "
         "--frames (frames=)"
     )
+
+
+def reference_exposure(recording: Recording) -> int:
+    """The exposure, us, at which a saturated pixel is 1 where nothing else is said: the median of all frames.
+
+    Raises
+    ------
+    FrameError
+        If the recording has no frames.
+    """
+    exposures = [frame.exposure for frame in recording.frames()]
+    if not exposures:
+        raise no_frames(recording)
+    return median_exposure(exposures)
 
 
 RECORDING_NEEDED: Final = "a kalux.Recording is needed, from kalux.open or Recording.from_arrays"
@@ -322,11 +324,11 @@ class Recording:
         """Reference images that came with the recording, or None."""
         return None if self.source.ground_truth is None else self.source.ground_truth()
 
-    def events(self) -> EventStream:
+    def events(self) -> Stream[EventArray]:
         """The events, as checked, time-ordered chunks of bounded size."""
-        return EventStream(self._checked_events, self.source.count_events)
+        return Stream(self._checked_events, self.source.count_events)
 
-    def frames(self) -> FrameStream:
+    def frames(self) -> Stream[Frame]:
         """The frames, checked, in time order, with their exposures.
 
         Raises
@@ -341,13 +343,13 @@ class Recording:
             )
         return self.stamped_frames()
 
-    def stamped_frames(self) -> FrameStream:
+    def stamped_frames(self) -> Stream[Frame]:
         """The frames even where their exposure is unknown: start and end then both hold the stamp."""
-        return FrameStream(self._checked_frames, self.source.count_frames)
+        return Stream(self._checked_frames, self.source.count_frames)
 
-    def stored_frames(self) -> FrameStream:
+    def stored_frames(self) -> Stream[Frame]:
         """As `stamped_frames`, but RGB that was made of a mosaic stays RGB: for a copy without loss."""
-        return FrameStream(lambda: self._checked_frames(as_stored=True), self.source.count_frames)
+        return Stream(lambda: self._checked_frames(as_stored=True), self.source.count_frames)
 
     def _checked_events(self) -> Iterator[EventArray]:
         count, previous_t = 0, None

@@ -37,12 +37,12 @@ def image_times(
     Returns
     -------
     ndarray
-        (N,) int64 us, increasing.
+        (N,) int64 us; none before the one before it.
 
     Raises
     ------
     InputError
-        If they are not times, do not increase, or lie outside the recording; or the rate is out of range.
+        If they are not times, go back, or lie outside the recording; or the rate is out of range.
     """
     if at is not None:
         if at != "frames":
@@ -52,14 +52,7 @@ def image_times(
     end = int(exposures[-1, 1])
     if rate_hz is not None:
         return _grid(begin, end, rate_hz)
-    wanted = _whole_microseconds(times)
-    backward = np.flatnonzero(np.diff(wanted) < 0)
-    if len(backward):
-        index = int(backward[0]) + 1
-        raise InputError(
-            f"reconstruct: times[{index}] is {wanted[index]} us, before {wanted[index - 1]} us, the one before it; "
-            "times must increase"
-        )
+    wanted = checked_times(times, "reconstruct: times")
     if wanted[0] < begin:
         raise InputError(
             f"reconstruct: {wanted[0]} us lies before {begin} us, the earliest time the recording's frames allow"
@@ -84,15 +77,36 @@ def _grid(begin: int, end: int, rate_hz: float) -> NDArray[np.int64]:
     return begin + grid
 
 
-def _whole_microseconds(times: Any) -> NDArray[np.int64]:
-    """The times to read as integers. Fractions are refused, not rounded: they may be seconds."""
+def checked_times(times: Any, name: str) -> NDArray[np.int64]:
+    """The times of images as integers; one may repeat. Fractions are refused, not rounded: they may be seconds.
+
+    Parameters
+    ----------
+    times
+        (N,) numbers, us.
+    name
+        What they are called in messages.
+
+    Raises
+    ------
+    InputError
+        If they are no numbers, none at all, not whole, out of range, or go back.
+    """
     given = np.asarray(times)
     if given.ndim != 1 or len(given) == 0 or given.dtype.kind not in "iuf":
-        raise InputError("reconstruct: times must be a list of whole microseconds, with at least one entry")
-    fractional = np.flatnonzero(~np.isfinite(given) | (given != np.rint(given)))
-    if len(fractional):
-        index = int(fractional[0])
+        raise InputError(f"{name} must be a list of whole microseconds, with at least one entry")
+    wrong = np.flatnonzero(~(np.abs(given.astype(np.float64)) < 2.0**62) | (given != np.rint(given)))
+    if len(wrong):
+        index = int(wrong[0])
         raise InputError(
-            f"reconstruct: times[{index}] is {given[index]}; whole microseconds are needed, such as np.rint gives"
+            f"{name}[{index}] is {given[index]}; whole microseconds are needed, such as np.rint gives"
         )
-    return given.astype(np.int64)
+    whole: NDArray[np.int64] = given.astype(np.int64)
+    backward = np.flatnonzero(np.diff(whole) < 0)
+    if len(backward):
+        index = int(backward[0]) + 1
+        raise InputError(
+            f"{name}[{index}] is {whole[index]} us, before {whole[index - 1]} us, the one before it; "
+            "times must not go back"
+        )
+    return whole

@@ -159,11 +159,11 @@ def _delay_origin(plan: Plan, asked: Settings) -> str:
     found = plan.delay_estimate
     if found is None:
         return _USUAL if asked.events.delay is None else _GIVEN
-    seem = f"{found.apparent * 1e-3:.1f} ms explain the frames {100 * found.improvement:.0f} % better"
+    seem = f"the {found.apparent * 1e-3:.1f} ms that explain the frames {100 * found.improvement:.0f} % better"
     if found.true is None:
-        return f"estimated: 0.7 of what they seem; {seem}"
+        return f"estimated: 0.7 of {seem}, as events trail the light, too"
     trailing = (found.apparent - found.true) * 1e-3
-    return f"estimated: {seem}; of the {trailing:.1f} of these by which events trail the light, half is corrected"
+    return f"estimated: {seem}, less half of the {trailing:.1f} ms by which events trail the light"
 
 
 def _model_origin(plan: Plan, asked: float | None) -> str:

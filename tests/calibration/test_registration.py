@@ -9,8 +9,8 @@ import pytest
 from kalux import Frame
 from kalux.calibration.registration import Registration, require_overlap, undistortion_maps
 from kalux.calibration.rig import Lens
-from kalux.datasets.rig_scene import example_rig
 from kalux.errors import FrameError, InputError
+from rig_scene import example_rig
 from rigs import DISTANCE, SENSOR, distant_recording, small_rig
 
 SIZE = (30, 40)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from kalux.calibration.rig import Lens, Rig, load_rig, rig_toml
-from kalux.datasets.rig_scene import example_rig
 from kalux.errors import FormatError, InputError
+from rig_scene import example_rig
 
 MATRIX = np.array([[300.0, 0, 158], [0, 304, 119], [0, 0, 1]])
 

@@ -149,7 +149,8 @@ def test_thresholds_of_pixels_are_the_priors():
     maps = full().maps
     known = Calibration({"events": {"threshold_on": 0.3, "threshold_off": 0.3, "noise_rate": 0.0}}, maps=maps)
     alone = altered(known.apply(PRESETS["default"]), "filter", neighbours=0.0)
-    moving = recording(pixel_events([100_000], [1], x=0, y=1))
+    with pytest.warns(UserWarning, match="none of the 1 events lies between"):
+        moving = recording(pixel_events([100_000], [1], x=0, y=1))
     images = list(kalux.reconstruct(moving, times=[90_000, 100_000], settings=alone, calibration=known))
     moved = np.log((images[1].intensity + 0.03) / (images[0].intensity + 0.03))
     assert moved[1, 0] == pytest.approx(0.3 * maps["threshold_on"][1, 0], rel=0.02)

@@ -91,9 +91,10 @@ def started(monkeypatch) -> list[subprocess.Popen[bytes]]:
 
 
 def test_others_compile_from_the_first_loop_on_that_is_not_kept_and_are_waited_for(started) -> None:
+    """With this process as many as there may be threads."""
     compiled = nb.njit(lambda x: x + 1)
     compiled(1)
-    with compiling_beside(["0.2", "0.3"]) as wait:
+    with compiling_beside(["0.2", "0.3", "60"], 3) as wait:
         compiled(1)
         assert not started
         compiled(1.0)
@@ -107,7 +108,7 @@ def test_others_compile_from_the_first_loop_on_that_is_not_kept_and_are_waited_f
 
 def test_others_are_ended_with_an_interrupt(started) -> None:
     def interrupted() -> None:
-        with compiling_beside(["60"]):
+        with compiling_beside(["60"], 2):
             nb.njit(lambda x: x + 1)(1)
             raise KeyboardInterrupt
 
@@ -123,7 +124,7 @@ def test_a_run_does_without_others_where_there_can_be_none(monkeypatch) -> None:
         raise BlockingIOError
 
     monkeypatch.setattr(loops.subprocess, "Popen", refuse)
-    with compiling_beside(["60"]) as wait:
+    with compiling_beside(["60"], 2) as wait:
         assert nb.njit(lambda x: x + 1)(1) == 2
         wait()
 

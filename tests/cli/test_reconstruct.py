@@ -139,19 +139,21 @@ class TestOutput:
         assert times_in(tmp_path / "out") == [frame.middle for frame in simulation.frames]
 
     def test_times_come_from_text_npy_or_a_former_output(self, cli, recording, tmp_path):
-        wanted = [100_000, 150_001, 300_000]
-        (tmp_path / "t.txt").write_text("# us\n100000\n150001\n\n300000\n")
+        wanted = [100_000, 150_001, 150_001, 300_000]
+        (tmp_path / "t.txt").write_text("# us\n100000\n150001\n150001\n\n300000\n")
         np.save(tmp_path / "t.npy", wanted)
         for name, file in (("a", "t.txt"), ("b", "t.npy"), ("c", "a/timestamps.csv")):
             assert cli("reconstruct", recording, "-o", tmp_path / name, "--times", tmp_path / file).code == 0
             assert times_in(tmp_path / name) == wanted
+        found = cli("reconstruct", recording, "-o", tmp_path / "v.mp4", "--times", tmp_path / "t.txt")
+        assert (found.code, "a time comes twice" in found.error) == (2, True)
 
     @pytest.mark.parametrize(
         ("name", "content", "told"),
         [
             ("t.csv", b"index,t_us,file\n5\n", "line 2: '' is not a whole number"),
             ("t.npy", b"PK\x03\x04", "not a NumPy array"),
-            ("t.npy", np.array([1 << 63], np.uint64), "out of range"),
+            ("t.npy", np.array([1 << 63], np.uint64), "times[0] is 9223372036854775808; whole microseconds"),
         ],
     )
     def test_times_that_are_none_are_refused(self, cli, recording, tmp_path, name, content, told):
@@ -396,18 +398,17 @@ class TestBadInput:
     @pytest.mark.parametrize(
         ("name", "content", "told"),
         [
-            ("t.txt", "100000\n90000\n", "time 2 is 90000 us"),
-            ("t.txt", "100000\n100000\n", "must increase"),
+            ("t.txt", "100000\n90000\n", "t.txt: times[1] is 90000 us"),
             ("t.txt", "100000\n0.5 s\n", "line 2: '0.5 s'"),
-            ("t.txt", "# nothing\n", "no times"),
+            ("t.txt", "# nothing\n", "at least one"),
             ("t.txt", "9" * 40, "out of range"),
             ("t.txt", b"\xff\xfe\x00", "neither text"),
             ("t.txt", "1\n", "1 us lies before"),
             ("t.txt", "900000000\n", "after the recording's end"),
             ("t.npy", b"not an array", "not a NumPy array"),
-            ("t.npy", np.array([0.5]), "not whole"),
-            ("t.npy", np.array([np.nan]), "not finite"),
-            ("t.npy", np.array([[1, 2]]), "(1, 2)"),
+            ("t.npy", np.array([0.5]), "t.npy: times[0] is 0.5; whole microseconds"),
+            ("t.npy", np.array([np.nan]), "whole microseconds"),
+            ("t.npy", np.array([[1, 2]]), "must be a list"),
         ],
     )
     def test_times(self, cli, recording, tmp_path, name, content, told):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import kalux
-from kalux.datasets.ahdr import CUTS, ArtificialCamera, artificial_hdr
+from kalux.datasets.ahdr import ArtificialCamera, artificial_hdr
 from kalux.errors import FrameError, InputError, SettingsError
 from kalux.evaluation.baselines import methods
 from kalux.evaluation.truth import evaluate_truth, prepare_reference
@@ -30,7 +30,7 @@ def recording_of(images, exposures=None):
     return kalux.Recording.from_arrays(np.empty(0, kalux.EVENT_DTYPE), frames, sensor_size=images[0].shape)
 
 
-@pytest.mark.parametrize("cut", CUTS)
+@pytest.mark.parametrize("cut", [30, 50, 80, 100, 115])  # of the published data
 def test_ends_are_cut_and_the_rest_is_what_it_was(cut):
     """Below the cut black, above 255 - cut white; between, the stated response gives back the original."""
     found = artificial_hdr(recording_of([LEVELS] * 3), ArtificialCamera.with_cut(cut))

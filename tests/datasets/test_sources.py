@@ -50,7 +50,9 @@ def hdr_folder(tmp_path: Path) -> Path:
 # --- photographs ------------------------------------------------------------------------------------------
 
 
-def test_radiance_hdr_is_luminance(tmp_path: Path) -> None:
+def test_radiance_hdr_is_luminance(tmp_path: Path, monkeypatch) -> None:
+    """Also where OpenCV has no room for a copy of its own."""
+    monkeypatch.setenv("OPENCV_TEMP_PATH", str(tmp_path / "none"))
     colour = RNG.uniform(0.01, 50.0, (8, 9, 3)).astype(np.float32)  # R, G, B
     cv2.imwrite(str(tmp_path / "a.hdr"), colour[..., ::-1])
     found = read_photograph(tmp_path / "a.hdr")

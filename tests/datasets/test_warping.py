@@ -17,7 +17,7 @@ from kalux.datasets.warping import (
     warped,
 )
 
-from builders import blocks
+from builders import blocks, printed_on_threads
 
 SIZE = (100, 130)
 
@@ -41,6 +41,21 @@ def test_a_perspective_is_found(photograph):
     better, deviation = refined(fixed + 0.4, log, mask, everywhere, match.matrix)
     assert displacement(better, truth, SIZE) < 0.2
     assert deviation < 0.02
+
+
+_REFINED = """
+import numpy as np
+from kalux.datasets.warping import refined
+y, x = np.indices((240, 320))
+image = np.sin(0.05 * x) + np.cos(0.04 * y + 0.01 * x)
+mask = np.ones(image.shape, bool)
+matrix = np.array([[1.0, 0.0, 0.3], [0.0, 1.0, -0.2], [0.0, 0.0, 1.0]])
+print(refined(image, image, mask, mask, matrix)[0].tobytes())
+"""
+
+
+def test_the_last_bits_do_not_depend_on_the_number_of_threads():
+    assert len(printed_on_threads(_REFINED)) == 1
 
 
 def test_pictures_without_features_do_not_match():

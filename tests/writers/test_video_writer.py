@@ -215,7 +215,7 @@ try:
             writer.write(Image(1000 * k, noise[k % 8], noise[0]))
             print(k, flush=True)
 except OutputError as error:
-    print(error, flush=True)
+    print(error, *getattr(error, "__notes__", ()), flush=True)
     sys.exit(2)
 except KeyboardInterrupt:
     sys.exit(130)
@@ -240,7 +240,9 @@ def test_a_disk_that_is_really_full(tmp_path, limit):
     process = child(tmp_path / "v.mp4", limit)
     output, _ = process.communicate(timeout=20)
     assert process.returncode == 2
-    assert "v.mp4: the file would be larger than allowed; the video" in output.splitlines()[-1]
+    said = output.splitlines()[-1]
+    assert "v.mp4: the file would be larger than allowed; the video" in said
+    assert said.count("v.mp4") == 1
     assert names(tmp_path) == set()
 
 

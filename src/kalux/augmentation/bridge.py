@@ -34,6 +34,9 @@ UNSEEN: Final = 2.0**41
 REPEATED: Final = 2.0**39
 """Variance of a frame that measures a pixel, but tells of it only what others have told already (K11): black."""
 
+RANDOM: Final = 0.25
+"""How far the middle of a random walk is off the mean of its ends: the variance, in units of that of its change."""
+
 _BLOCK: Final = 64
 """Pixels that are looked at together: parts of the image that frames measure are left out where they may be."""
 
@@ -128,23 +131,47 @@ class BridgeNoise(NamedTuple):
 
 
 class BridgedSegment(NamedTuple):
-    """L^A and its uncertainty from one moment to the next.
+    """L^A and its uncertainty from one moment to the next; arrays are (H, W) in the type of the frames.
 
-    Times are int us, arrays (H, W) in the type of the frames, log intensity. Between events L^A moves by ``slope``
-    (1/s); an event moves it by ``step_on`` or -``step_off`` (both usually positive) and moves ``step_variance`` from
-    the way to the end to the way from the start. The covariance of L^A as a measurement is
-    R = 1 / (rate (1/forward + 1/backward)), ``rate`` in 1/s, where ``forward`` is ``forward_variance`` and
-    ``step_variance`` for each event since the start, and ``backward`` is ``backward_variance`` and ``step_variance``
-    for each of the ``events`` still to come (None: not known, and none are counted). ``net`` is what all events add to
-    the level, and what the light grows by besides (None: not known). At ``start`` the level is ``floor`` or more where
-    that is known (K7; None: nowhere): of what no frame measures then, but a clipped one bounds at the end. At ``end``
-    the pixel obeys the frame ``bound`` (`lift`), and its variance grows by ``drift``, what its thresholds may have been
-    wrong by (`drift`; None: nothing). Pixels without an event after ``still_since`` are still.
-    Beyond what L^A and the state say here, the level is ahead of its newest event by ``trail`` (K14; None: it is not).
-    ``unshown`` is of the pixels that no frame has measured until ``end``, or ``start`` in causal mode.
-    ``silent_change`` is what silent pixels around each change from one frame to the next (`unseen`; None: not known).
-    ``turns`` is how often a pixel with events turns from one direction to the other between the frames, on average;
-    ``half_way`` how far the middle of silent pixels is off the mean of both frames (`unseen.half_way`).
+    The covariance of L^A as a measurement is R = 1 / (rate (1/forward + 1/backward)), where ``forward`` is
+    ``forward_variance`` and ``step_variance`` for each event since the start, and ``backward`` is ``backward_variance``
+    and ``step_variance`` for each of the ``events`` still to come.
+
+    Attributes
+    ----------
+    start, end
+        int us.
+    augmented
+        L^A at the start, log intensity.
+    slope
+        By which it moves between events, 1/s.
+    step_on, step_off
+        By which an event moves it, up and down; both usually positive.
+    forward_variance, backward_variance, step_variance, rate
+        Of R: variances, log intensity^2, and 1/s.
+    events
+        Between start and end; None: not known, and none are counted.
+    bound
+        The frame that the pixel obeys at the end (`lift`).
+    drift
+        What its variance grows by there, as its thresholds may have been wrong (`drift`); None: nothing.
+    still_since
+        us: pixels without an event after it are still.
+    floor
+        The level is this or more at the start (K7): of what no frame measures then, but a clipped one bounds at the
+        end. None: nowhere.
+    trail
+        By which the level is ahead of its newest event, beyond what L^A and the state say (K14); None: it is not.
+    unshown
+        Pixels that no frame has measured until the end, or until the start in causal mode (K15).
+    silent_change
+        What silent pixels around each change from one frame to the next (`unseen`); None: not known.
+    net
+        What all events add to the level, and what the light grows by besides; None: not known.
+    turns
+        How often a pixel with events turns from one direction to the other, on average.
+    half_way
+        How far the middle of silent pixels is off the mean of both frames (`unseen.half_way`).
     """
 
     start: int
@@ -167,7 +194,7 @@ class BridgedSegment(NamedTuple):
     silent_change: Array | None = None
     net: Array | None = None
     turns: float = 0.0
-    half_way: float = 0.25
+    half_way: float = RANDOM
 
 
 def drift(

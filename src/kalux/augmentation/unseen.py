@@ -24,9 +24,6 @@ half-way to such a frame is then that of a moving pixel, as on the same scenes."
 _ENOUGH: Final = 25.0
 """Pixels without noise, or as much information in more of them, that tell the change of the whole image."""
 
-RANDOM: Final = 0.25
-"""How far the middle of a random walk is off the mean of its ends: the variance, in units of that of its change."""
-
 _BLOCK: Final = 64
 """Pixels that are looked at together: few enough that what lies between stays in the nearest cache."""
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.errors import FormatError, InputError, MissingDependencyError
+from kalux.readers.source import reading
 
 
 class Exposure(NamedTuple):
@@ -97,11 +98,16 @@ def read_photograph(path: Path) -> NDArray[Any]:
 
     Raises
     ------
+    InputError
+        If it cannot be read.
     FormatError
-        If it cannot be read, or has other levels.
+        If it is damaged, or has other levels.
     """
     # Not turned as EXIF says: a bracket is compared as the sensor saw it.
-    image = cv2.imread(str(path), cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    with reading(path):
+        data = np.frombuffer(path.read_bytes(), np.uint8)
+    image = cv2.imdecode(data, flags) if len(data) else None
     if image is None or image.dtype not in (np.uint8, np.uint16) or image.ndim not in (2, 3):
         raise FormatError(f"{path}: not an image of 8 or 16 bits, or damaged; copy it again")
     return np.asarray(image) if image.ndim == 2 else np.ascontiguousarray(image[..., 2::-1])

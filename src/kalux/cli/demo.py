@@ -53,7 +53,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     started = time.monotonic()
     try:
         # These are done before the demo comes to them.
-        with compiling_beside(["images", "filter"][: default_threads() - 1]):
+        with compiling_beside(["images", "filter"], default_threads()):
             found = run_demo(options.out, overwrite=options.overwrite, say=say)
     except KeyboardInterrupt as interrupt:
         if options.out.is_dir() and any(options.out.iterdir()):

@@ -93,7 +93,7 @@ def tell_of_compiling(*, quiet: bool = False, tell: Callable[[str], None] = erro
 
 
 @contextlib.contextmanager
-def compiling_beside(parts: Sequence[str]) -> Generator[Callable[[], None], None, None]:
+def compiling_beside(parts: Sequence[str], threads: int) -> Generator[Callable[[], None], None, None]:
     """Within it, where this process has to compile a loop, others compile what it will come to later.
 
     numba compiles one loop at a time, whatever the number of threads. Processes start with the first loop that is not
@@ -104,6 +104,8 @@ def compiling_beside(parts: Sequence[str]) -> Generator[Callable[[], None], None
     ----------
     parts
         Of `kalux.cli.rehearsal`, for each of which there is a process.
+    threads
+        That there may be, of which this process is one: the last parts have none where there are too few.
 
     Yields
     ------
@@ -113,7 +115,7 @@ def compiling_beside(parts: Sequence[str]) -> Generator[Callable[[], None], None
     from numba.core import event
 
     running: list[subprocess.Popen[bytes]] = []
-    waiting = list(parts) if sys.executable else []
+    waiting = list(parts[: threads - 1]) if sys.executable else []
 
     def begin() -> None:
         while waiting:

@@ -157,10 +157,14 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     check_output(output)
     _check_apart(output, Path(options.recording))
     times = None if options.times is None else load_times(options.times)
+    if times is not None and output.format == "mp4" and not np.diff(times).all():
+        raise UsageError(
+            f"{options.times}: a time comes twice; a video has one image of each, a folder may have more"
+        )
     prepare_loops()
     tell_of_compiling(quiet=options.quiet)
     threads = options.threads or default_threads()
-    with compiling_beside(_compiled_later(settings)[: threads - 1]) as compiled:
+    with compiling_beside(_compiled_later(settings), threads) as compiled:
         recording = open_recording(options)
         with Progress("checking", quiet=options.quiet) as progress:
             contents, made = check_beside(

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.lib.format import read_array
 from numpy.typing import NDArray
 
 from kalux.cli.parser import UsageError
-
-Times = NDArray[np.int64]
+from kalux.schedule import checked_times
 
 
 def exposure_times(text: str) -> list[float]:
@@ -29,7 +29,7 @@ def exposure_times(text: str) -> list[float]:
         raise UsageError(f"--times {text}: seconds are needed, numbers with commas, as 2,0.5,1/8") from None
 
 
-def load_times(path: Path) -> Times:
+def load_times(path: Path) -> NDArray[np.int64]:
     """Read the times of images.
 
     Parameters
@@ -41,43 +41,26 @@ def load_times(path: Path) -> Times:
     Raises
     ------
     UsageError
-        The file cannot be read, a time is not a whole number, or they do not increase; names the line.
+        The file cannot be read, or a time is not a whole number; names the line.
+    InputError
+        As of `checked_times`.
     """
     try:
         times = _from_numpy(path) if path.suffix == ".npy" else _from_text(path)
     except OSError as error:
         raise UsageError(f"{path}: cannot be read: {error.strerror or error}") from error
-    if len(times) == 0:
-        raise UsageError(f"{path}: no times; one time per line is needed, in us")
-    falls = np.flatnonzero(np.diff(times) <= 0)
-    if len(falls):
-        i = int(falls[0])
-        raise UsageError(
-            f"{path}: time {i + 2} is {times[i + 1]} us, not after the one before it ({times[i]} us); "
-            "times must increase"
-        )
-    return times
+    return checked_times(times, f"{path}: times")
 
 
-def _from_numpy(path: Path) -> Times:
+def _from_numpy(path: Path) -> NDArray[Any]:
     try:
         with path.open("rb") as file:
-            values = read_array(file, allow_pickle=False)
+            return np.asarray(read_array(file, allow_pickle=False))
     except (ValueError, EOFError) as error:
         raise UsageError(f"{path}: not a NumPy array of numbers") from error
-    if values.ndim != 1 or values.dtype.kind not in "iuf":
-        raise UsageError(
-            f"{path}: an array of shape {values.shape} and type {values.dtype}; (N,) us is needed"
-        )
-    if not (np.abs(values.astype(np.float64)) < 2**62).all():  # also refuses NaN
-        raise UsageError(f"{path}: a time is not finite, or out of range; whole us are needed")
-    if (values != np.rint(values)).any():
-        raise UsageError(f"{path}: times are not whole; us are needed, not seconds")
-    times: Times = values.astype(np.int64)
-    return times
 
 
-def _from_text(path: Path) -> Times:
+def _from_text(path: Path) -> NDArray[np.int64]:
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except UnicodeDecodeError as error:

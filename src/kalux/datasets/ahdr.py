@@ -17,7 +17,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,9 +29,6 @@ from kalux.models.colour import luminance
 from kalux.recording import Recording
 from kalux.settings import CameraSettings, chosen_response
 from kalux.wording import how_many
-
-CUTS: Final = (30, 50, 80, 100, 115)
-"""Those of the published data, of 255."""
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -11,7 +12,7 @@ from kalux.datasets.motion import Motion, Pose
 from kalux.datasets.scenes import Image, Scene, blurred, checked_pose, overlay
 from kalux.errors import InputError
 
-_BALL: Final = 129  # pixels
+_PAINT: Final = (0.76, 0.11, 0.55, 0.16, 0.87, 0.25)
 
 # Of a sprite: what can be told from nothing and still be a thing before a scene.
 _LEAST_SIZE: Final = 0.5
@@ -26,15 +27,17 @@ class Sprite(NamedTuple):
     alpha: NDArray[Any]
 
 
-def ball() -> Sprite:
-    """A beach ball with six segments and a cap; its brightest paint is 1."""
-    middle = (_BALL - 1) / 2
-    radius = middle - 2.0
-    y, x = np.mgrid[:_BALL, :_BALL].astype(np.float32) - np.float32(middle)
+def ball(
+    size: int = 129, margin: float = 2.0, *, segments: Sequence[float] = _PAINT, cap: float = 1.0
+) -> Sprite:
+    """A beach ball with six segments and a cap, ``size`` pixels wide with its ``margin``; as bright as its paints."""
+    middle = (size - 1) / 2
+    radius = middle - margin
+    y, x = np.mgrid[:size, :size].astype(np.float32) - np.float32(middle)
     distance, angle = np.hypot(x, y), np.arctan2(y, x)
     segment = np.floor((angle + np.pi) / (np.pi / 3)).astype(int) % 6
-    paint = np.array([0.76, 0.11, 0.55, 0.16, 0.87, 0.25], np.float32)[segment]
-    paint[distance < 0.22 * radius] = 1.0
+    paint = np.array(segments, np.float32)[segment]
+    paint[distance < 0.22 * radius] = cap
     shade = np.clip(1.0 - 0.6 * (distance / radius) ** 4, 0.2, 1.0)
     return Sprite(paint * shade, np.clip(radius - distance + 0.5, 0.0, 1.0))
 

@@ -95,7 +95,7 @@ def _read_exr(path: Path) -> tuple[NDArray[Any], Mask]:
 
 def _read_hdr(path: Path) -> tuple[NDArray[Any], Mask]:
     with reading(path):
-        image = decoded(path.read_bytes())
+        image = decoded(path.read_bytes(), path)
     if image is None or image.dtype != np.float32:
         raise FormatError(f"{path}: not a Radiance HDR image, or damaged")
     return np.ascontiguousarray(image[..., ::-1]), np.ones(image.shape[:2], bool)

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from kalux.calibration.homography import Features, find_features
 from kalux.datasets.warping import match_features, refined, tone_compressed, warped, warped_mask
 from kalux.errors import InputError
-from kalux.frames import Frame, GroundTruth, median_exposure
+from kalux.frames import Frame, GroundTruth
 from kalux.models.camera import Camera, Response, inverse_response
 from kalux.models.colour import luminance as luminance_of
-from kalux.recording import Recording
+from kalux.recording import Recording, reference_exposure
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -116,7 +116,7 @@ def register_frames(
         If no frame can be registered, or each is of another brightness.
     """
     camera = Camera(Response.named(response))
-    exposure = _median_exposure(recording)
+    exposure = reference_exposure(recording)
     found: list[RegisteredFrame] = []
     features: Features | None = None
     for index, frame in enumerate(recording.frames()):
@@ -160,13 +160,6 @@ def _blurred(image: Image, mask: Mask, sigma: float) -> Image:
     weight = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), sigma)
     total = cv2.GaussianBlur(np.where(mask, image, 0).astype(np.float32), (0, 0), sigma)
     return np.asarray(total / np.maximum(weight, 1e-6), np.float32)
-
-
-def _median_exposure(recording: Recording) -> int:
-    exposures = [frame.exposure for frame in recording.frames()]
-    if not exposures:
-        raise InputError(f"{recording.source.path}: no frames to register a reference to")
-    return median_exposure(exposures)
 
 
 def _register(

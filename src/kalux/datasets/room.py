@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.datasets.foreground import ball
 from kalux.datasets.motion import combine, pan, shake
 from kalux.datasets.scenes import Image, Scene, blurred, camera_matrix, overlay, sample
 
@@ -15,7 +16,8 @@ from kalux.datasets.scenes import Image, Scene, blurred, camera_matrix, overlay,
 _FINE: Final = 4
 _ROOM: Final = (200, 330)  # rows, columns, in pixels of such a sensor
 _WINDOW: Final = (118, 16, 222, 116)  # left, top, right, bottom
-_BALL_RADIUS: Final = 15.0
+_CENTRE: Final = _FINE * 17.0  # of the ball in its image, canvas pixels
+_PAINT: Final = (0.42, 0.06, 0.30, 0.09, 0.48, 0.14)  # of its segments
 
 
 def demo_scene(
@@ -37,7 +39,10 @@ def demo_scene(
     """
     zoom = sensor_size[1] / 240
     room = blurred(_draw_room(seed), 0.5 * _FINE / zoom)
-    ball, alpha = (blurred(part, 0.5 * _FINE / zoom) for part in _draw_ball())
+    drawn = ball(int(2 * _CENTRE) + 1, 2.0 * _FINE, segments=_PAINT, cap=0.55)
+    weighed, alpha = (
+        blurred(part, 0.5 * _FINE / zoom) for part in (drawn.radiance * drawn.alpha, drawn.alpha)
+    )
     camera = combine(pan(42.0 * zoom), shake(seed, amplitude=0.7 * zoom, roll=0.004, band=(2.0, 9.0)))
     scale = _FINE / zoom
     center = (_FINE * 138.0, _FINE * 98.0)
@@ -46,7 +51,7 @@ def demo_scene(
         out = np.empty(sensor_size, np.float32)
         matrix = camera_matrix(camera(t), sensor_size, scale, center)
         sample(room, matrix, out)
-        overlay(ball, alpha, _ball_matrix(t) @ np.vstack([matrix, [0.0, 0.0, 1.0]]), out)
+        overlay(weighed, alpha, _ball_matrix(t) @ np.vstack([matrix, [0.0, 0.0, 1.0]]), out)
         return out
 
     return Scene(radiance, sensor_size, 0, duration, "demo")
@@ -61,24 +66,9 @@ def _ball_matrix(t: float) -> NDArray[np.float64]:
     y = floor - height * 4.0 * phase * (1.0 - phase)
     turn = -5.0 * seconds
     cos, sin = np.cos(turn), np.sin(turn)
-    middle = _FINE * (_BALL_RADIUS + 2.0)
     rotation = np.array([[cos, -sin], [sin, cos]])
-    shift = middle - rotation @ (_FINE * np.array([x, y]))
+    shift = _CENTRE - rotation @ (_FINE * np.array([x, y]))
     return np.column_stack([rotation, shift])
-
-
-def _draw_ball() -> tuple[Image, Image]:
-    """Radiance times alpha, and alpha, of a beach ball with six segments and a cap."""
-    size = int(2 * _FINE * (_BALL_RADIUS + 2.0)) + 1
-    middle, radius = (size - 1) / 2, _FINE * _BALL_RADIUS
-    y, x = np.mgrid[:size, :size].astype(np.float32) - np.float32(middle)
-    distance, angle = np.hypot(x, y), np.arctan2(y, x)
-    segment = np.floor((angle + np.pi) / (np.pi / 3)).astype(int) % 6
-    paint = np.array([0.42, 0.06, 0.30, 0.09, 0.48, 0.14], np.float32)[segment]
-    paint[distance < 0.22 * radius] = 0.55
-    shade = 1.0 - 0.6 * (distance / radius) ** 4
-    alpha = np.clip(radius - distance + 0.5, 0.0, 1.0).astype(np.float32)
-    return (paint * np.clip(shade, 0.2, 1.0) * alpha).astype(np.float32), alpha
 
 
 def _draw_room(seed: int) -> Image:

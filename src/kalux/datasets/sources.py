@@ -101,7 +101,7 @@ def read_photograph(path: Path) -> Photograph:
         channels = exr_channels(path, data)
         colour, alpha = exr_image(path, channels), channels.get("A")
     else:
-        pixels = decoded(data)
+        pixels = decoded(data, path)
         if pixels is None:
             raise FormatError(f"{path}: not an image, or damaged; .hdr, .exr, .png, .jpg or .tif is needed")
         colour, alpha = _split_alpha(pixels)

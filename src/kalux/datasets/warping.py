@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.calibration.homography import Features, agreed_homography, alike
-from kalux.calibration.regression import HUBER, robust_deviation
+from kalux.calibration.regression import HUBER, products, robust_deviation
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -207,13 +207,14 @@ def refined(
         inside[0], inside[-1], inside[:, 0], inside[:, -1] = False, False, False, False
         slope = x * gx + y * gy
         columns_of = (gx * x, gx * y, gx, gy * x, gy * y, gy, -slope * x, -slope * y, np.ones(size))
-        jacobian = np.stack([column[inside] for column in columns_of], axis=1)
+        jacobian = np.stack([column[inside] for column in columns_of])
         residual = (target - image)[inside]
         offset = np.median(residual)
         deviation = robust_deviation(residual - offset) + 1e-9
         weight = np.minimum(1.0, HUBER * deviation / np.maximum(np.abs(residual - offset), 1e-12))
-        normal = jacobian.T @ (weight[:, None] * jacobian)
-        step = np.linalg.lstsq(normal, jacobian.T @ (weight * residual), rcond=1e-10)[0]
+        weighted = weight * jacobian
+        normal, right = products(weighted, jacobian), products(weighted, residual[None])[:, 0]
+        step = np.linalg.lstsq(normal, right, rcond=1e-10)[0]
         update = np.eye(3) + np.append(step[:8], 0.0).reshape(3, 3)
         following = current @ np.linalg.inv(centre) @ update @ centre
         following = following / following[2, 2]

@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 
 from kalux.augmentation.deblur import between, count_events, integrate_exposure, latent_middle
 from kalux.calibration.values import Calibration
-from kalux.evaluation.exposures import linear_frame, reference_exposure
+from kalux.evaluation.exposures import linear_frame
 from kalux.evaluation.method import Estimated, Image, Method, Times
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.frames import Frame
 from kalux.models.camera import log_intensity
 from kalux.pipeline import reconstruct
 from kalux.planning import plan
-from kalux.recording import Recording
+from kalux.recording import Recording, reference_exposure
 from kalux.settings import AUTO, PRESETS, Settings, altered, chosen_response
 
 

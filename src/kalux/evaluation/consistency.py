@@ -18,12 +18,11 @@ from kalux.evaluation.exposures import (
     exposure_times,
     linear_frame,
     means_of,
-    reference_exposure,
 )
 from kalux.evaluation.method import Method
 from kalux.evaluation.metrics import psnr
 from kalux.frames import Frame
-from kalux.recording import Recording
+from kalux.recording import Recording, reference_exposure
 from kalux.settings import AUTO, chosen_response
 
 READS: Final = 9

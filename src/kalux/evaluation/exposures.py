@@ -9,28 +9,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.errors import FrameError
 from kalux.evaluation.pairs import Array
 from kalux.filters.shots import take_shot
-from kalux.frames import Frame, median_exposure
+from kalux.frames import Frame
 from kalux.models.camera import Camera
 from kalux.planning import with_saturation
 from kalux.recording import Recording
 from kalux.settings import CameraSettings, altered, preset
-
-
-def reference_exposure(recording: Recording) -> int:
-    """The exposure, us, at which a saturated pixel is 1: as `kalux.reconstruct` takes it.
-
-    Raises
-    ------
-    FrameError
-        If the recording has no frames.
-    """
-    exposures = [frame.exposure for frame in recording.frames()]
-    if not exposures:
-        raise FrameError(f"{recording.source.path}: no frames; an evaluation needs frames")
-    return median_exposure(exposures)
 
 
 def linear_frame(frame: Frame, reference: int, response: str) -> Array:

@@ -24,7 +24,6 @@ from kalux.evaluation.exposures import (
     exposure_times,
     linear_frame,
     means_of,
-    reference_exposure,
 )
 from kalux.evaluation.lpips import LpipsWeights
 from kalux.evaluation.method import Method
@@ -33,7 +32,7 @@ from kalux.evaluation.scores import Scores, score
 from kalux.filters.shots import take_shot
 from kalux.frames import Frame
 from kalux.models.camera import Camera, frame_log_covariance
-from kalux.recording import Recording
+from kalux.recording import Recording, reference_exposure
 from kalux.settings import AUTO, CameraSettings, chosen_response
 from kalux.wording import how_many
 

@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.errors import FormatError, FrameError, InputError, require_type
+from kalux.errors import FormatError, InputError, require_type
 from kalux.evaluation.lpips import LpipsWeights
 from kalux.evaluation.method import Method
 from kalux.evaluation.pairs import Pair
@@ -20,7 +20,7 @@ from kalux.filters.shots import take_shot
 from kalux.frames import GROUND_TRUTH_NEEDED, GroundTruth
 from kalux.models.camera import Camera, log_covariance, noise_variance
 from kalux.readers.numpy_files import DAMAGE
-from kalux.recording import RECORDING_NEEDED, Recording
+from kalux.recording import RECORDING_NEEDED, Recording, no_frames
 from kalux.settings import AUTO, CameraSettings, chosen_response
 from kalux.wording import how_many
 
@@ -304,5 +304,5 @@ def _frames_span(recording: Recording) -> tuple[int, int, NDArray[np.bool_]]:
         spans.append((frame.middle, frame.exposure_end))
         seen |= True if frame.valid is None else frame.valid
     if not spans:
-        raise FrameError(f"{recording.source.path}: no frames; an evaluation needs frames")
+        raise no_frames(recording)
     return spans[0][0], spans[-1][1], seen

@@ -34,7 +34,7 @@ from kalux.events import EventArray
 from kalux.filters import akf_bridged
 from kalux.filters.akf import State
 from kalux.filters.common import make_clock
-from kalux.filters.method import FAR_FUTURE, USUAL_INTERVAL, Chunks, CommonMethod, Segment
+from kalux.filters.method import FAR_FUTURE, USUAL_INTERVAL, Chunks, Method, Segment
 from kalux.filters.shots import Shot
 from kalux.filters.uncertainty import WRONG_STEPS, Around
 from kalux.models.camera import CRUSHED, beyond_white, dark_scale, frame_log_covariance, log_intensity
@@ -98,7 +98,7 @@ class BridgeMemory(NamedTuple):
     silent: Floats
 
 
-class BridgedFrames(CommonMethod):
+class BridgedFrames(Method):
     """The default: `bridge` from the middle of one exposure to that of the next, the exact filter.
 
     Causal mode (``lookahead=False``) goes from the end of one exposure to the end of the next, forward only.

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from kalux.events import EventArray
 from kalux.filters import complementary
 from kalux.filters.akf import State
-from kalux.filters.method import FAR_FUTURE, Chunks, CommonMethod, Segment
+from kalux.filters.method import FAR_FUTURE, Chunks, Method, Segment
 from kalux.filters.shots import Shot
 
 Floats = NDArray[np.floating[Any]]
 
 
-class HeldFrames(CommonMethod):
+class HeldFrames(Method):
     """The complementary filter on held frames: each from the middle of its exposure, or its end if causal."""
 
     def node(self, shot: Shot) -> int:

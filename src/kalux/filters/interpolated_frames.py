@@ -12,7 +12,7 @@ from kalux.augmentation.deblur import ExposureIntegrals, all_between, count_chun
 from kalux.events import EventArray
 from kalux.filters import akf_interpolated
 from kalux.filters.akf import State
-from kalux.filters.method import FAR_FUTURE, Chunks, CommonMethod, Segment
+from kalux.filters.method import FAR_FUTURE, Chunks, Method, Segment
 from kalux.filters.shots import Shot
 from kalux.models.camera import covariance, log_bias, log_covariance
 
@@ -40,7 +40,7 @@ class InterpolationMemory(NamedTuple):
     previous: Shot | None
 
 
-class InterpolatedFrames(CommonMethod):
+class InterpolatedFrames(Method):
     """The paper's augmentation (10)-(13) and filter, from the start of one exposure to that of the next.
 
     Causal mode goes from the end of one exposure to the end of the next with L^{A-} and the previous c_p.

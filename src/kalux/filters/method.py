@@ -7,6 +7,7 @@ follows from the frames at both ends and the events in between; a memory value c
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any, Final, Protocol
 
@@ -44,65 +45,11 @@ class Segment(Protocol):
     def end(self) -> int: ...
 
 
-class Method(Protocol):
-    """One way to filter. Memory, segments and cursors are values of the method's own; only it looks inside."""
+class Method(ABC):
+    """One way to filter. Memory, segments and cursors are values of the method's own; only it looks inside.
 
-    lookahead: bool
-
-    def node(self, shot: Shot) -> int:
-        """The moment, us, at which a frame's segment begins."""
-
-    def begin_time(self, shot: Shot) -> int:
-        """The first moment, us, that can be read when ``shot`` is the first frame."""
-
-    def needed_until(self, shot: Shot) -> int:
-        """Events up to this time, us, are needed before the segment that ends at the frame is final."""
-
-    def start(self, shot: Shot, events: Chunks) -> tuple[Any, Segment | None, State]:
-        """From the first frame: memory, the segment before its node if there is one, and the first state."""
-
-    def segment(self, memory: Any, shot: Shot, following: Shot | None, events: Chunks) -> tuple[Segment, Any]:
-        """The segment from a frame to the next (None: not known, or none comes), and the memory after it.
-
-        ``events`` are those after the frame's node, as far as known.
-        """
-
-    def begin(self, segment: Any, state: State) -> Any:
-        """A cursor at the segment's start."""
-
-    def advance(self, segment: Any, cursor: Any, events: EventArray) -> None:
-        """Take the cursor over events, in place."""
-
-    def read(self, segment: Any, cursor: Any, t: int) -> tuple[Floats, Floats]:
-        """L and P at ``t``; P is infinite where the method has none."""
-
-    def end(self, segment: Any, cursor: Any) -> State:
-        """The state at the end of the segment. The cursor must not be used after it."""
-
-    def moving(self, segment: Any, cursor: Any) -> NDArray[np.bool_] | None:
-        """(H, W): pixels with an event in this frame interval, also one to come, or the one before, or unmeasured."""
-
-    def silent_change(self, segment: Any) -> Floats | None:
-        """(H, W): `unseen.silent_change` of the segment; None: the method or the segment does not tell."""
-
-    def turns(self, segment: Any) -> float:
-        """How often a pixel with events turns in a frame interval, on average; 0: the method does not tell."""
-
-    def around(self, segment: Any, t: int) -> Around | None:
-        """What the two frames that a segment joins say of its pixels at ``t`` (K11); None: the method does not tell."""
-
-    def unmeasured(self, segment: Any, cursor: Any) -> NDArray[np.int64] | None:
-        """(N,) pixels in the flattened image that neither frame of a segment measures; None: not told."""
-
-    def trail(self, segment: Any, cursor: Any, t: int) -> Floats | None:
-        """(H, W): how far the light is ahead of its events at ``t`` (K14); None: the method does not tell."""
-
-    def unshown(self, segment: Any, variance: Floats) -> Unshown | None:
-        """Pixels that no frame has measured until then (K15), given P there; None: the method knows none."""
-
-
-class CommonMethod:
-    """What the methods share. Of what only some of them tell, it says None, or 0."""
+    Of what only some methods tell, the others say None, or 0.
+    """
 
     def __init__(
         self, settings: Settings, thresholds: tuple[float, float], lookahead: bool, shape: tuple[int, int]
@@ -111,25 +58,71 @@ class CommonMethod:
         self.on, self.off = thresholds
         self.offset = settings.camera.offset
 
-    def moving(self, segment: Any, cursor: Any) -> NDArray[np.bool_] | None:
-        return None
+    @abstractmethod
+    def node(self, shot: Shot) -> int:
+        """The moment, us, at which a frame's segment begins."""
 
-    def trail(self, segment: Any, cursor: Any, t: int) -> Floats | None:
+    @abstractmethod
+    def begin_time(self, shot: Shot) -> int:
+        """The first moment, us, that can be read when ``shot`` is the first frame."""
+
+    @abstractmethod
+    def needed_until(self, shot: Shot) -> int:
+        """Events up to this time, us, are needed before the segment that ends at the frame is final."""
+
+    @abstractmethod
+    def start(self, shot: Shot, events: Chunks) -> tuple[Any, Segment | None, State]:
+        """From the first frame: memory, the segment before its node if there is one, and the first state."""
+
+    @abstractmethod
+    def segment(self, memory: Any, shot: Shot, following: Shot | None, events: Chunks) -> tuple[Segment, Any]:
+        """The segment from a frame to the next (None: not known, or none comes), and the memory after it.
+
+        ``events`` are those after the frame's node, as far as known.
+        """
+
+    @abstractmethod
+    def begin(self, segment: Any, state: State) -> Any:
+        """A cursor at the segment's start."""
+
+    @abstractmethod
+    def advance(self, segment: Any, cursor: Any, events: EventArray) -> None:
+        """Take the cursor over events, in place."""
+
+    @abstractmethod
+    def read(self, segment: Any, cursor: Any, t: int) -> tuple[Floats, Floats]:
+        """L and P at ``t``; P is infinite where the method has none."""
+
+    @abstractmethod
+    def end(self, segment: Any, cursor: Any) -> State:
+        """The state at the end of the segment. The cursor must not be used after it."""
+
+    def moving(self, segment: Any, cursor: Any) -> NDArray[np.bool_] | None:
+        """(H, W): pixels with an event in this frame interval, also one to come, or the one before, or unmeasured."""
         return None
 
     def silent_change(self, segment: Any) -> Floats | None:
+        """(H, W): `unseen.silent_change` of the segment; None: the method or the segment does not tell."""
         return None
 
     def turns(self, segment: Any) -> float:
+        """How often a pixel with events turns in a frame interval, on average; 0: the method does not tell."""
         return 0.0
 
     def around(self, segment: Any, t: int) -> Around | None:
+        """What the two frames that a segment joins say of its pixels at ``t`` (K11); None: the method does not tell."""
         return None
 
     def unmeasured(self, segment: Any, cursor: Any) -> NDArray[np.int64] | None:
+        """(N,) pixels in the flattened image that neither frame of a segment measures; None: not told."""
+        return None
+
+    def trail(self, segment: Any, cursor: Any, t: int) -> Floats | None:
+        """(H, W): how far the light is ahead of its events at ``t`` (K14); None: the method does not tell."""
         return None
 
     def unshown(self, segment: Any, variance: Floats) -> Unshown | None:
+        """Pixels that no frame has measured until then (K15), given P there; None: the method knows none."""
         return None
 
     def log_frame(self, shot: Shot) -> Array:

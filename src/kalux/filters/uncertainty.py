@@ -13,8 +13,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.bridge import UNMEASURED
-from kalux.augmentation.unseen import RANDOM
+from kalux.augmentation.bridge import RANDOM, UNMEASURED
 from kalux.compiled import FUSED, loop
 from kalux.filters.readout import SHARED, Hidden
 

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from kalux.errors import FormatError, InputError
-from kalux.frames import GroundTruth
 from kalux.readers import (
     aedat2,
     aedat3,
@@ -31,7 +30,7 @@ from kalux.readers import (
 from kalux.readers.images import IMAGES, RADIANCE
 from kalux.readers.source import CHUNK_EVENTS, Source
 
-__all__ = ["CHUNK_EVENTS", "READERS", "GroundTruth", "Reader", "Source", "read"]
+__all__ = ["CHUNK_EVENTS", "READERS", "Reader", "Source", "read"]
 
 _VIDEOS: Final = frozenset({".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v"})
 

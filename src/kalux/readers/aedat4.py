@@ -37,7 +37,7 @@ from kalux.readers.source import (
     begins_with,
     reading,
 )
-from kalux.readers.streams import in_order
+from kalux.readers.streams import in_order, unzstd
 from kalux.wording import one_line
 
 T = TypeVar("T")
@@ -357,20 +357,12 @@ def _lz4(data: bytes) -> bytes:
     return out
 
 
-def _zstd(data: bytes) -> bytes:
-    decompressor = zstandard.ZstdDecompressor().decompressobj()
-    out = decompressor.decompress(data)
-    if not decompressor.eof:
-        raise EOFError("compressed data are incomplete")
-    return out
-
-
 _DECOMPRESS: Final[dict[int, Callable[[bytes], bytes]]] = {
     0: lambda data: data,
     1: _lz4,
     2: _lz4,  # high compression, same format
-    3: _zstd,
-    4: _zstd,
+    3: unzstd,
+    4: unzstd,
 }
 
 

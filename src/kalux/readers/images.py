@@ -22,6 +22,7 @@ RADIANCE: Final = frozenset({".hdr", ".pic", ".exr"})
 
 _PNG_SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
 _JPEG_START, _JPEG_END = b"\xff\xd8\xff", b"\xff\xd9"
+_RADIANCE_START: Final = b"#?"
 
 
 T = TypeVar("T")
@@ -116,12 +117,19 @@ def _decoded(path: Path, name: str, data: bytes) -> NDArray[Any]:
     return image
 
 
-def decoded(data: bytes) -> NDArray[Any] | None:
-    """An image as stored: (H, W), or (H, W, 3 or 4) in the order blue, green, red; None if it is none or damaged."""
+def decoded(data: bytes, file: Path | None = None) -> NDArray[Any] | None:
+    """An image as stored: (H, W), or (H, W, 3 or 4) in the order blue, green, red; None if it is none or damaged.
+
+    With the ``file`` that has the data, OpenCV need not copy a Radiance image to ``/tmp``, which may be full. Of a name
+    that is not UTF-8 it would crash.
+    """
     if not _is_whole(data):
         return None
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        if file is not None and data.startswith(_RADIANCE_START) and str(file).isprintable():
+            image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        else:
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         return None
     return None if image is None else np.asarray(image)

@@ -20,6 +20,7 @@ import zstandard
 
 from kalux.errors import FormatError, MissingDependencyError
 from kalux.readers.source import natural_order, reading
+from kalux.readers.streams import unzstd
 
 BAG_MAGIC: Final = b"#ROSBAG V"
 MCAP_MAGIC: Final = b"\x89MCAP0\r\n"
@@ -134,13 +135,7 @@ def _kind(name: str) -> str:
 
 def _uncompressed(data: bytes) -> bytes:
     """Messages may be compressed one by one; no message begins like zstd."""
-    if data[:4] != _ZSTD_MAGIC:
-        return data
-    decompressor = zstandard.ZstdDecompressor().decompressobj()
-    out = decompressor.decompress(data)
-    if not decompressor.eof:
-        raise EOFError("a compressed message is incomplete")
-    return out
+    return unzstd(data) if data[:4] == _ZSTD_MAGIC else data
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What readers do with streams: join small packets of events, put late frames in order."""
+"""What readers do with streams: decompress, join small packets of events, put late frames in order."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator
 from typing import Final
 
 import numpy as np
+import zstandard
 
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.frames import Frame
@@ -35,6 +36,23 @@ def rechunk(packets: Iterable[EventArray]) -> Iterator[EventArray]:
 def _join(packets: list[EventArray]) -> EventArray:
     # As plain numbers: NumPy joins structured arrays field by field, five times slower.
     return np.concatenate([packet.view(np.uint64) for packet in packets]).view(EVENT_DTYPE)
+
+
+def unzstd(data: bytes) -> bytes:
+    """Decompress a Zstandard frame, whatever size it claims.
+
+    Raises
+    ------
+    EOFError
+        If it is incomplete.
+    zstandard.ZstdError
+        If it is damaged.
+    """
+    decompressor = zstandard.ZstdDecompressor().decompressobj()
+    out = decompressor.decompress(data)
+    if not decompressor.eof:
+        raise EOFError("compressed data are incomplete")
+    return out
 
 
 def in_order(frames: Iterable[Frame]) -> Iterator[Frame]:

@@ -228,9 +228,7 @@ class VideoWriter(Writer):
         try:
             if self._open is None and complete:
                 raise OutputError(f"{self.path}: not written, there was no image")
-            if not self._whole:
-                raise OutputError(f"{self.path}: not written, the encoder has failed")
-            if self._open is not None:
+            if self._open is not None and self._whole:  # that the encoder has failed is told already
                 self._finish_container(*self._open)
                 self._publish(complete)
         finally:

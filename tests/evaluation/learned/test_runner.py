@@ -20,6 +20,10 @@ from random_networks import CASES, save  # noqa: E402
 
 from builders import frame, moving_blocks, pixel_events  # noqa: E402
 
+anywhere = pytest.mark.filterwarnings(
+    "ignore:arrays"
+)  # events before and after all frames, of which it is told
+
 
 def recording_of(middles, times, size=(3, 4)):
     shots = [frame(100, t - 5, t + 5, size) for t in middles]
@@ -40,18 +44,21 @@ def weights(tmp_path):
     return of
 
 
+@anywhere
 def test_windows_end_with_the_frames_and_go_on_on_both_sides():
     assert edges(recording_of([1000, 1100, 1210], [950]), 6) == [895, 1000, 1100, 1210, 1315, 1420]
     assert edges(recording_of([1000, 1100, 1200], [790]), 5) == [700, 800, 900, 1000, 1100]
     assert edges(recording_of([1000, 1100, 1200], [1000]), 3) == [900, 1000, 1100]
 
 
+@anywhere
 def test_windows_begin_just_before_the_first_event():
     assert edges(recording_of([1000, 1100, 1200], [1101]), 3) == [1100, 1200, 1300]
     assert edges(recording_of([1000, 1100, 1200], [5000]), 3) == [1200, 1300, 1400]
     assert edges(recording_of([1000, 1100, 1200], [1150]), 4, window=30) == [1149, 1179, 1209, 1239]
 
 
+@anywhere
 def test_windows_need_events_and_two_frames_or_a_length():
     with pytest.raises(InputError, match="has no events"):
         edges(recording_of([100, 200], []), 1)

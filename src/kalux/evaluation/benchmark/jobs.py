@@ -18,7 +18,7 @@ import kalux
 from kalux.errors import InputError, KaluxError
 from kalux.evaluation.baselines import frames_around
 from kalux.evaluation.benchmark.sequences import EVERY, Options, Sequence, files_under
-from kalux.evaluation.exposures import linear_frame, reference_exposure
+from kalux.evaluation.exposures import linear_frame
 from kalux.evaluation.held_out import held_out_pairs, hold_out_frames
 from kalux.evaluation.lpips import load_lpips
 from kalux.evaluation.method import Method
@@ -27,7 +27,7 @@ from kalux.evaluation.scores import Scores, finite_or_none, score
 from kalux.evaluation.specs import chosen_methods, relocated, spec_path
 from kalux.evaluation.truth import find_truth, prepare_reference, truth_pairs
 from kalux.models.camera import Camera, Response
-from kalux.recording import Recording
+from kalux.recording import Recording, reference_exposure
 from kalux.settings import chosen_response, to_dict
 from kalux.writers.settings_file import versions
 

@@ -21,13 +21,13 @@ from numpy.typing import NDArray
 
 from kalux.errors import InputError
 from kalux.evaluation.baselines import EventWindow
-from kalux.evaluation.exposures import linear_frame, reference_exposure
+from kalux.evaluation.exposures import linear_frame
 from kalux.evaluation.learned.catalogue import NETWORKS, Tone
 from kalux.evaluation.learned.networks import Network
 from kalux.evaluation.learned.voxels import normalise, voxel_grid
 from kalux.evaluation.learned.weights import load_network
 from kalux.evaluation.method import Image, Times
-from kalux.recording import Recording
+from kalux.recording import Recording, reference_exposure
 from kalux.wording import how_many
 
 SHARE_OF_WINDOW: Final = 3
@@ -98,7 +98,7 @@ def fit_scale(
     made = network_images(recording, middles, name, network, window)
     for frame, image in zip(recording.frames(), made, strict=True):
         x, y = image.astype(np.float64).ravel(), linear_frame(frame, reference, response).ravel()
-        moments += np.array([x.size, x.sum(), y.sum(), x @ x, x @ y])
+        moments += np.array([x.size, x.sum(), y.sum(), (x * x).sum(), (x * y).sum()])
     pixels, x_sum, y_sum, xx, xy = moments
     spread = pixels * xx - x_sum**2
     gain = float((pixels * xy - x_sum * y_sum) / spread) if spread > 0 else 0.0

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kalux.datasets import pan, still
-from kalux.datasets.rig_scene import (
+from rig_scene import (
     BlinkingBoard,
     board_poses,
     board_scenes,
