@@ -159,7 +159,9 @@ def _delay_origin(plan: Plan, asked: Settings) -> str:
     found = plan.delay_estimate
     if found is None:
         return _USUAL if asked.events.delay is None else _GIVEN
-    seem = f"the {found.apparent * 1e-3:.1f} ms that explain the frames {100 * found.improvement:.0f} % better"
+    seem = (
+        f"the {found.apparent * 1e-3:.1f} ms that explain the frames {100 * found.improvement:.0f} % better"
+    )
     if found.true is None:
         return f"estimated: 0.7 of {seem}, as events trail the light, too"
     trailing = (found.apparent - found.true) * 1e-3
