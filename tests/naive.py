@@ -680,7 +680,7 @@ def beyond_rims(split, settings, frames, k):
     edges = camera.response(np.array([0.475, 0.95]))
     half, white = (np.count_nonzero(frames[0].image / 255 >= edge) for edge in edges)
     fall = np.log(max(half, white) / white) if white else np.inf
-    most = min(min(max(np.log(2) / max(fall, 1e-3), 0.3), 2.0) - 0.25, 0.5)
+    most = min(min(max(np.log(2) / max(fall, 1e-3), 0.3), 2.0) - 0.275, 0.5)
     near = clipped = 0
     for j in range(k + 1):
         first = np.ceil(settings.camera.clipped_from * 255) / 255

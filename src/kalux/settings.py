@@ -273,7 +273,7 @@ class FilterSettings:
     highlight_tail
         The same where thresholds are only an estimate, as a multiple of how far the frames' bright tail goes on
         (`kalux.models.camera.beyond_white`), but no more than highlight_scale: scenes of which little saturates do
-        not go far beyond white. 3 (docs/tuning.md).
+        not go far beyond white. 6 (docs/tuning.md).
     unshown_tail
         How far above their bounds pixels are taken to lie that every frame so far has clipped, as a share of the scale
         that pixels just below white around them have (docs/equations.md, K15). 0 leaves them at their bounds. 0.5
@@ -293,7 +293,7 @@ class FilterSettings:
     deblur: bool = True
     initial_variance: float = 1.0
     highlight_scale: float = 2.0
-    highlight_tail: float = 3.0
+    highlight_tail: float = 6.0
     unshown_tail: float = 0.5
     bright_tail: float | None = None
     neighbours: float = 0.2
