@@ -272,7 +272,9 @@ class _View(NamedTuple):
         first = min(max(least - 1, 0), len(_TRAILING) - 3)
         curvature, slope, _ = np.polyfit(_TRAILING[first : first + 3], residuals[first : first + 3], 2)
         best = -0.5 * slope / curvature if curvature > 0 else _TRAILING[least]
-        return self._replace(delay=delay - round(min(max(best, 0.0), _TRAILING[-1])))
+        if best >= _TRAILING[-1]:  # no delay explains the frames
+            return self
+        return self._replace(delay=delay - round(max(best, 0.0)))
 
     def _seen(self, delays: tuple[int, ...], periods: tuple[int, ...], most: int) -> list[_Seen]:
         at_least = 2 if most <= ROUGH_SAMPLES else 4
