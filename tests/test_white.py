@@ -57,3 +57,4 @@ def test_a_few_broken_pixels_are_no_white(count, found):
     image = np.full((50, 100), 7, np.uint16)
     image.flat[:count] = 4095
     assert white_of_bits([Frame(image, 0, 1)]) == found
+    assert white_of_bits([Frame(image, t, t + 1) for t in range(3)]) == found
