@@ -108,6 +108,7 @@ def test_good_frames_pass():
     for dtype in (np.uint16, np.float32, np.float64):
         check(frame(dtype=dtype))
         check(frame(dtype=dtype, shape=(3, 4, 3)))
+    check(frame(white=255))
     check(frame(mosaic="RGGB"), previous=frame(0, 100, mosaic="RGGB"))
 
 
