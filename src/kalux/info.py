@@ -9,9 +9,10 @@ from typing import Final
 import numpy as np
 
 from kalux.events import EventArray
-from kalux.frames import Frame, Levels
+from kalux.frames import Frame
 from kalux.recording import Recording
 from kalux.settled import response_text
+from kalux.white import WhiteCheck
 
 _RATE_BIN: Final = 10_000  # us, over which the peak event rate is taken
 _SATURATED: Final = 0.99  # of white: DAVIS frames clip a few values below it
@@ -151,9 +152,9 @@ def describe(recording: Recording) -> Description:
     first = next(iter(recording.stamped_frames()), None)
     stored = next(iter(recording.stored_frames()), None)
     events = summarise_events(recording.events())
-    levels = Levels()
+    white = WhiteCheck()
     frames = summarise_frames(
-        levels.watched(recording.stamped_frames()), exposure_known=recording.exposure_known
+        white.watched(recording.stamped_frames()), exposure_known=recording.exposure_known
     )
     return Description(
         path=str(source.path),
@@ -169,7 +170,7 @@ def describe(recording: Recording) -> Description:
         colours=None if first is None else first.colours,
         stored_in_rgb=stored is not None and stored.image.ndim == 3 and recording.mosaic is not None,
         response=recording.response,
-        doubt=levels.doubt(),
+        doubt=white.doubt(),
     )
 
 

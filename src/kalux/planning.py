@@ -73,7 +73,7 @@ class Plan:
     event_model
         The fit of I_0 and the variance of an event's step, where there was one.
     times
-        (N,) int64 us, increasing: the images to make.
+        (N,) int64 us, none before the one before it: the images to make.
     lookahead
         Whether images use the frame after them.
     smooth

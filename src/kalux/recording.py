@@ -32,7 +32,6 @@ from kalux.frames import (
     MOSAICS,
     Frame,
     GroundTruth,
-    Levels,
     Mosaic,
     Stamp,
     check_frame,
@@ -40,10 +39,10 @@ from kalux.frames import (
     median_exposure,
     place_exposure,
     require_frame,
-    white_of_bits,
 )
 from kalux.models.colour import sample_mosaic
 from kalux.readers import CHUNK_EVENTS, Source, joined
+from kalux.white import WhiteCheck, white_of_bits
 
 T = TypeVar("T")
 
@@ -278,11 +277,11 @@ class Recording:
         )
         for _ in recording.events():
             pass
-        levels = Levels()
+        check = WhiteCheck()
         exposures = [
-            (frame.exposure_start, frame.exposure_end) for frame in levels.watched(recording.frames())
+            (frame.exposure_start, frame.exposure_end) for frame in check.watched(recording.frames())
         ]
-        doubts = [levels.doubt()]
+        doubts = [check.doubt()]
         if exposures:
             first, last = np.searchsorted(array["t"], (exposures[0][0], exposures[-1][1] + 1))
             doubts.append(clock_doubt(len(array), int(last - first)))
@@ -308,7 +307,7 @@ class Recording:
     def found_white(self) -> int | None:
         """The value of a saturated pixel where nobody states it and 16-bit frames show it.
 
-        None: as of their type, or stated. Looks at the first 80 frames (`kalux.frames.white_of_bits`).
+        None: as of their type, or stated. Looks at the first 80 frames (`kalux.white.white_of_bits`).
         """
         return white_of_bits(islice(self.source.frames(), _WATCHED)) if self.white is None else None
 

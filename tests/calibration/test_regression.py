@@ -144,3 +144,9 @@ def test_the_error_of_a_ratio_is_the_spread_of_repetitions():
         errors.append(ratio_error(np.vstack([sums, [0.0, 0.0]])))
     assert np.mean(errors) == pytest.approx(np.std(found), rel=0.15)
     assert ratio_error(sums[:1]) == np.inf
+
+
+def test_the_error_of_a_ratio_is_that_of_the_jackknife():
+    sums = np.array([[1.0, 2.0], [3.0, 4.0], [2.0, 5.0], [0.0, 1.0]])
+    left = [np.divide(*np.delete(sums, i, axis=0).sum(axis=0)) for i in range(4)]
+    assert ratio_error(sums) == pytest.approx(np.sqrt(3 / 4 * np.sum((left - np.mean(left)) ** 2)))

@@ -25,6 +25,14 @@ def test_a_sprite_has_its_place_and_size() -> None:
     assert shown[50, 70] == pytest.approx(0.1, rel=1e-5)
 
 
+@pytest.mark.parametrize(("size", "margin"), [(129, 2.0), (137, 8.0)])
+def test_a_ball_is_round_within_its_margin(size: int, margin: float) -> None:
+    radius = (size - 1) / 2 - margin
+    drawn = ball(size, margin, cap=0.5)
+    assert drawn.alpha.sum() == pytest.approx(np.pi * radius**2, rel=1e-3)
+    assert drawn.radiance[size // 2, size // 2] == 0.5
+
+
 def test_a_sprite_zooms_and_turns() -> None:
     bar = Sprite(np.ones((40, 40)), np.zeros((40, 40)))
     bar.alpha[18:22, 20:] = 1.0  # to the right of the middle

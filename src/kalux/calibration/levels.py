@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.calibration.intervals import counted_intervals
-from kalux.frames import BRIGHTEST, Frame, sharp_end
+from kalux.frames import Frame
 from kalux.recording import Recording
 from kalux.settings import CameraSettings, EventSettings
+from kalux.white import BRIGHTEST, sharp_end
 
 Array = NDArray[np.float64]
 
@@ -155,7 +156,7 @@ def _changes(
 
 
 def exact_end(recording: Recording, below: float) -> float | None:
-    """The response, if it is below ``below``, at which the first 80 frames end (`kalux.frames.sharp_end`)."""
+    """The response, if it is below ``below``, at which the first 80 frames end (`kalux.white.sharp_end`)."""
     frames = islice(recording.frames(), _MAX_FRAMES)
     measured = ((f.image if f.valid is None else f.image[f.valid], f.white_value) for f in frames)
     return sharp_end(measured, below)

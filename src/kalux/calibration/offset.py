@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.deblur import between
-from kalux.calibration.alignment import MOST_FRAMES, Alignment, Shots, align, take_shots, well_exposed
+from kalux.calibration.alignment import MOST_FRAMES, Shots, align, take_shots, well_exposed
 from kalux.calibration.registration import Registration
 from kalux.errors import InputError
 from kalux.events import EVENT_DTYPE, EventArray
@@ -82,21 +82,18 @@ class OffsetEstimate(NamedTuple):
     Attributes
     ----------
     offset, standard_error
-        us, to be added to the frames' times; of the fine fit where there is one.
+        us, to be added to the frames' times: of the fit pixel by pixel.
     apparent
         us: the offset at which whole event steps explain the frames best. It includes the half threshold by which
-        events trail the light, as the delay that `kalux.reconstruct` corrects does. None without a fine fit.
+        events trail the light, as the delay that `kalux.reconstruct` corrects does.
     coarse
         The search over seconds.
-    fine
-        The fit, pixel by pixel; None where frames and events have not the same pixels.
     """
 
     offset: float
     standard_error: float
-    apparent: float | None
+    apparent: float
     coarse: Correlation
-    fine: Alignment | None
 
 
 class Changes(NamedTuple):
@@ -333,4 +330,4 @@ def estimate_offset(
     )
     fine = align(shots, inside, registration, offset=coarse.offset, free_homography=False)
     whole = align(shots, inside, registration, offset=fine.offset, free_homography=False, spread=False)
-    return OffsetEstimate(fine.offset, fine.standard_error, whole.offset, coarse, fine)
+    return OffsetEstimate(fine.offset, fine.standard_error, whole.offset, coarse)

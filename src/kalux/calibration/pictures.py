@@ -12,6 +12,7 @@ from kalux.calibration.offset import Correlation
 from kalux.events import EventArray
 from kalux.frames import Frame
 
+_PLOT: Final = (520, 900)  # rows, columns
 _INK: Final = (40, 40, 40)
 _LINE: Final = (190, 110, 30)
 _MARK: Final = (40, 40, 220)
@@ -36,11 +37,9 @@ def overlay(frame: Frame, events: EventArray, *, scale: int = 2) -> NDArray[Any]
     return picture
 
 
-def correlation_plot(
-    found: Correlation, *, offset: float, standard_error: float, size: tuple[int, int] = (520, 900)
-) -> NDArray[Any]:
+def correlation_plot(found: Correlation, *, offset: float, standard_error: float) -> NDArray[Any]:
     """The correlation over the offset, all of it and around the peak: (H, W, 3) uint8, BGR."""
-    height, width = size
+    height, width = _PLOT
     picture = np.full((height, width, 3), 255, np.uint8)
     half = width // 2
     text = f"offset {offset * 1e-3:.2f} ms +- {standard_error * 1e-3:.2f} ms (add to the frames' times)"

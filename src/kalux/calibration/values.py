@@ -242,5 +242,5 @@ def _map_text(values: NDArray[Any]) -> str:
     size = "x".join(str(n) for n in values.shape[::-1])
     if values.dtype.kind == "b":
         return f"{size}: {np.count_nonzero(values):,} pixels"
-    low, middle, high = np.quantile(values, [0.05, 0.5, 0.95])
-    return f"{size}: median {middle:.3g}, 5 to 95 % from {low:.3g} to {high:.3g}"
+    low, middle, high = (_number(part) for part in np.quantile(values, [0.05, 0.5, 0.95]).tolist())
+    return f"{size}: median {middle}, 5 to 95 % from {low} to {high}"

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.deblur import between, events_until
-from kalux.frames import Levels
 from kalux.recording import Recording, clock_doubt, no_frames
+from kalux.white import WhiteCheck
 
 T = TypeVar("T")
 
@@ -96,8 +96,8 @@ def check_recording(
         Whatever is wrong with the recording, or it has no frames.
     """
     exposures, colours = [], "grey"
-    levels = Levels()
-    for frame in levels.watched(recording.frames()):
+    white = WhiteCheck()
+    for frame in white.watched(recording.frames()):
         exposures.append((frame.exposure_start, frame.exposure_end))
         colours = frame.colours
     if not exposures:
@@ -114,7 +114,7 @@ def check_recording(
         events_from += len(chunk) - events_until(chunk, start - 1)
         on_events(len(chunk))
     gap = _gap(np.array(exposures, np.int64))
-    return Contents(len(exposures), count, start, end, events_between, colours, levels.doubt(), complete, gap)
+    return Contents(len(exposures), count, start, end, events_between, colours, white.doubt(), complete, gap)
 
 
 def _gap(exposures: NDArray[np.int64]) -> tuple[int, int] | None:

@@ -64,7 +64,7 @@ def measure(intensity: NDArray[Any], curve: Curve) -> Statistics:
     Raises
     ------
     InputError
-        The intensity is not two-dimensional, is empty, or is not finite.
+        The intensity is of another shape than `tone_map` takes, is empty, or is not finite.
     """
     return statistics_of(checked_image(intensity), curve)
 
