@@ -354,21 +354,30 @@ def bridged(pixel, settings, times, on, off, scales):
         var_off += 1e-5 - gain_off**2 * total
         learned.append((scale_on, scale_off))
         first = second
+
+    def added(interval, k):  # what events and K14 add to the level in all of an interval
+        n_on, n_off = counts(*interval[:2])
+        up, down = (own_step(interval, p, on, off, ev, c2, counts) for p in (True, False))
+        return n_on * up + n_off * down + grown(k, interval[1])
+
+    def said(interval, k):  # K15: what the frames around say themselves of a clipped pixel, at the first
+        left, right = interval[2:4]
+        return max(left[0], right[0] - added(interval, k) if right[1] >= UNMEASURED else -np.inf)
+
     # K15: from which frame on it is known, and how far above its bound it was then; which clipped frames raise that;
     # whether it is clearly below what it was at least, by the frame, and by its events.
-    pixel.shown, bound, pixel.raised = 0, intervals[0][3][0], []
+    pixel.shown, bounds, pixel.raised = 0, [intervals[0][3][0]], []
     if intervals[0][3][1] >= UNMEASURED:
         pixel.shown = count
-        for k, (a, b, _, right, s_on, s_off, *_) in enumerate(intervals[1:], 1):
-            before = bound
-            bound += event_sum(pixel, a, b, on * s_on, off * s_off) + grown(k, b)
+        for k, interval in enumerate(intervals[1:], 1):
+            bound, right = bounds[-1] + added(interval, k), interval[3]
             if right[1] < UNMEASURED:
                 pixel.shown, pixel.excess = k, max(right[0] - bound, 0.0)
-                pixel.left = right[0] < before - 3 * np.sqrt(frame_variance(k))
-                pixel.gone = bound < before - off / 2
+                pixel.left = right[0] < bounds[-1] - 3 * np.sqrt(frame_variance(k))
+                pixel.gone = bound < bounds[-1] - off / 2
                 break
             pixel.raised.append(right[0] > bound + 1e-4)
-            bound = max(bound, right[0])
+            bounds.append(max(bound, right[0]))
     last = (pixel.middles[-1], None, first, None, scale_on, scale_off, var_on, var_off, 0.0)
     intervals.append(last)
 
@@ -377,6 +386,10 @@ def bridged(pixel, settings, times, on, off, scales):
         yield 0.0
         for k, (a, b, left, right, _, _, v_on, v_off, _) in enumerate(intervals[1:-1], 1):
             n_on, n_off = counts(a, b)
+            if k <= pixel.shown:  # K15
+                above = max(bounds[k - 1] - said(intervals[k], k), 0.0)
+                far_on = min(far_on, above / on / np.sqrt(v_on))
+                far_off = min(far_off, above / off / np.sqrt(v_off))
             if right[1] < UNMEASURED:
                 far_on = far_off = 0
                 unseen = pixel.forgotten[k - 1] if pixel.forgotten else 0.0
@@ -439,12 +452,19 @@ def bridged(pixel, settings, times, on, off, scales):
         return min(value, most), variance + drifts[index]
 
     def raised(value):  # K7: what events take below the next frame's bound was too low all the time
-        a, b, left, right, *_ = intervals[index]
+        _, _, left, right, *_ = intervals[index]
         if right is None or left[1] < UNMEASURED or right[1] < UNMEASURED:
             return value
-        n_on, n_off = counts(a, b)
-        up, down = (own_step(intervals[index], p, on, off, ev, c2, counts) for p in (True, False))
-        return max(value, right[0] - (n_on * up + n_off * down) - grown(index, b))
+        return max(value, right[0] - added(intervals[index], index))
+
+    def sure(
+        value, variance
+    ):  # K15: a bound is too high by what it is above what frames say themselves, at most
+        _, _, left, right, *_ = intervals[index]
+        if index > pixel.shown or (right is not None and right[1] < UNMEASURED):
+            return variance
+        alone = left[0] if right is None else said(intervals[index], index)
+        return min(variance, settings.filter.initial_variance + max(value - alone, 0.0) ** 2)
 
     def step_to(limit):
         nonlocal state, at
@@ -463,7 +483,7 @@ def bridged(pixel, settings, times, on, off, scales):
             step_to(intervals[index][1])
             state, at = bounded(intervals[index][1]), intervals[index][1]
             index += 1
-            state = (raised(state[0]), state[1])
+            state = (raised(state[0]), sure(*state))
         step_to(t)
         out.append(bounded(t))
     return np.array(out)
@@ -706,7 +726,8 @@ def beyond_rims(split, settings, frames, k):
     level = (
         most * (1 - np.exp(-settings.filter.unshown_tail * scale / most)) * (np.mean(hard) if hard else 1.0)
     )
-    far = {p: min((steps(p[0] - q[0], p[1] - q[1]) for q in darker), default=np.inf) for p in found}
+    size = sum(frames[k].image.shape)  # where all is clipped
+    far = {p: min((steps(p[0] - q[0], p[1] - q[1]) for q in darker), default=size) for p in found}
     return {p: level * (1 - np.exp(-distance)) for p, distance in far.items()}
 
 

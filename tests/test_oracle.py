@@ -44,7 +44,9 @@ def streams(draw):
         exposure = draw(st.integers(1000, 30_000))
         levels = draw(
             st.lists(
-                st.one_of(st.just(0), st.integers(0, 255)), min_size=HEIGHT * WIDTH, max_size=HEIGHT * WIDTH
+                st.one_of(st.just(0), st.just(255), st.integers(0, 255)),
+                min_size=HEIGHT * WIDTH,
+                max_size=HEIGHT * WIDTH,
             )
         )
         frames.append(Frame(np.array(levels, np.uint8).reshape(HEIGHT, WIDTH), t, t + exposure))

@@ -12,6 +12,7 @@ from kalux import PRESETS, Frame, Recording, smoothing
 from kalux.augmentation.bridge import REPEATED, UNMEASURED
 from kalux.augmentation.highlights import Unshown
 from kalux.augmentation.refractory import EventClock
+from kalux.calibration.values import Calibration
 from kalux.compiled import event_words
 from kalux.datasets import SensorSettings, demo_scene, simulate
 from kalux.datasets.ahdr import ArtificialCamera, artificial_hdr
@@ -108,12 +109,21 @@ def test_smoothing_is_two_filters_combined_by_information():
         np.testing.assert_allclose(image.variance, expected.variance, rtol=1e-6)
 
 
-def test_the_mirrored_recording_gives_the_mirrored_video():
-    """Nothing in a smoothed image knows the direction of time, but for K14."""
+@pytest.mark.parametrize("calibrated", [False, True])
+def test_the_mirrored_recording_gives_the_mirrored_video(calibrated):
+    """Nothing in a smoothed image knows the direction of time, but for K14; nor do thresholds of single pixels."""
     source = recording(1)
+    rise, fall = (np.random.default_rng(k).uniform(low, 1.5 * low, SIZE) for k, low in enumerate((0.8, 0.6)))
+    names = ["threshold_on", "threshold_on_variance", "threshold_off", "threshold_off_variance"]
+    known, mirror = None, None
+    if calibrated:
+        known = Calibration(maps=dict(zip(names, (rise, 1e-4 * rise, fall, 1e-3 * fall), strict=True)))
+        mirror = Calibration(maps=dict(zip(names, (fall, 1e-3 * fall, rise, 1e-4 * rise), strict=True)))
     times = np.arange(2_500, 171_000, 8_000)  # no event or edge falls on them
-    ahead = list(kalux.reconstruct(source, times=times, settings=STEPS, smooth=True))
-    reverse = kalux.reconstruct(mirrored(source), times=-times[::-1], settings=STEPS, smooth=True)
+    ahead = list(kalux.reconstruct(source, times=times, settings=STEPS, calibration=known, smooth=True))
+    reverse = kalux.reconstruct(
+        mirrored(source), times=-times[::-1], settings=STEPS, calibration=mirror, smooth=True
+    )
     back = list(reverse)[::-1]
     for one, other in zip(ahead, back, strict=True):
         # The middle of an exposure of an odd number of microseconds is rounded to the other side.
@@ -376,7 +386,8 @@ def test_where_one_filter_knows_only_a_bound_it_is_one():
     np.testing.assert_allclose(found.log_intensity, [[0.5, -0.1, 0.0]], atol=1e-5)
     np.testing.assert_allclose(found.variance[0, :2], [1e-3, 0.1])
     assert found.unshown.pixels.tolist() == [2]
-    assert found.unshown.excess[0] == pytest.approx(0.3)
+    weights = 0.1 / 0.2**2, 0.2 / 0.4**2  # the less is known of the one, the more the other counts
+    assert found.unshown.excess[0] == pytest.approx(np.average([0.4, 0.2], weights=weights))
     assert found.unshown.doubt[0] == pytest.approx(0.1)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import tempfile
 from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
@@ -20,7 +21,7 @@ from kalux.planning import DOUBTED, Plan, plan
 from kalux.reconstructor import Reconstructor
 from kalux.recording import Recording
 from kalux.settings import Settings
-from kalux.smoothing import Backward, combine, reversed_settings
+from kalux.smoothing import Backward, combine, reversed_pixels, reversed_settings
 
 _IMAGES_AHEAD: Final = 4
 """Images that are held while those before are written: a frame takes the filter as long as ten images, and meanwhile
@@ -104,7 +105,7 @@ def execute(
     Not ``with_variance`` is faster; grey images then have an infinite one.
     """
     memory.give_back()  # what planning and checking have used
-    engine = _engine(recording, plan, plan.settings)
+    engine = _engine(recording, plan)
     several = threads > 1
     estimates = _smoothed_estimates(recording, engine, plan, on_events, on_backward, several)
     images = _images(engine, ahead(estimates, name="filter") if several else estimates, with_variance)
@@ -132,9 +133,12 @@ def _smoothed_estimates(
         return
     with tempfile.TemporaryDirectory(prefix="kalux-") as folder:
         trail = _trail(plan)
+        reverse = dataclasses.replace(
+            plan, settings=reversed_settings(plan.settings), pixels=reversed_pixels(plan.pixels)
+        )
         backward = Backward(
             recording,
-            _engine(recording, plan, reversed_settings(plan.settings)),
+            _engine(recording, reverse),
             plan.times,
             Path(folder),
             on_backward,
@@ -154,10 +158,10 @@ def _trail(plan: Plan) -> tuple[Settings, NDArray[np.bool_] | None] | None:
     return plan.settings, hot
 
 
-def _engine(recording: Recording, plan: Plan, settings: Settings) -> Reconstructor:
+def _engine(recording: Recording, plan: Plan) -> Reconstructor:
     return Reconstructor(
         recording.sensor_size,
-        settings=settings,
+        settings=plan.settings,
         lookahead=plan.lookahead,
         threshold_is_estimate=plan.threshold_origin in DOUBTED,
         inverse_covariance=recording.source.inverse_covariance,

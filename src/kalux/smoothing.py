@@ -35,6 +35,7 @@ from kalux.filters.highlights import obey_bounds, smoothed_unshown
 from kalux.filters.uncertainty import Around
 from kalux.frames import Frame
 from kalux.images import Estimate
+from kalux.models.pixels import PixelCalibration
 from kalux.reconstructor import Reconstructor
 from kalux.recording import Recording
 from kalux.settings import Settings
@@ -476,3 +477,16 @@ def reversed_settings(settings: Settings) -> Settings:
         trail=0.0,
     )
     return dataclasses.replace(settings, events=events)
+
+
+def reversed_pixels(pixels: PixelCalibration | None) -> PixelCalibration | None:
+    """What is known of single pixels, of the reversed recording: on and off change places."""
+    if pixels is None:
+        return None
+    return dataclasses.replace(
+        pixels,
+        on=pixels.off,
+        off=pixels.on,
+        on_variance=pixels.off_variance,
+        off_variance=pixels.on_variance,
+    )

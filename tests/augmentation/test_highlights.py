@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kalux.augmentation.bridge import UNMEASURED, UNSEEN, Latent
+from kalux.augmentation.bridge import UNMEASURED, UNSEEN, BridgeNoise, Latent, bridge, nominal_thresholds
 from kalux.augmentation.highlights import (
     Shown,
     Tail,
+    above_frames,
     begin_unshown,
     beyond_rims,
     expected_excess,
@@ -256,6 +257,18 @@ def test_what_came_to_the_variance_is_noise():
     variance[0, 0] = 0.5
     noise = expected_excess(begun(EVERYWHERE), variance, 1.0).noise
     assert (noise[0], noise[1]) == (0.0, 0.25)
+
+
+def test_a_bound_is_too_high_by_what_it_is_above_the_frames_at_most():
+    """Four pixels, clipped at 0 or masked; on events come at the first, off events at the second."""
+    first = Latent(np.zeros((1, 4)), np.array([[UNMEASURED] * 3 + [UNSEEN]]))
+    second = Latent(np.zeros((1, 4)), np.array([[UNMEASURED] * 2 + [UNSEEN] * 2]))
+    noise = BridgeNoise(0.5, 0.5, 0.0, 0.0)
+    on, off = np.array([[2.0, 0, 0, 0]]), np.array([[0, 2.0, 0, 0]])
+    segment, _ = bridge(first, second, on, off, nominal_thresholds((1, 4), 0.0), noise, 0, 40_000)
+    found = above_frames(segment, np.arange(4), np.array([1.5, 1.5, 1.5, 1.5]))
+    np.testing.assert_allclose(found, [1.5, 0.5, np.inf, np.inf])
+    np.testing.assert_array_equal(above_frames(segment, np.arange(2), np.array([0.0, 0.5])), [0.0, 0.0])
 
 
 _SUMS = """

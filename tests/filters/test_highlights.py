@@ -143,7 +143,9 @@ def test_of_both_directions_only_what_neither_has_seen_is_left():
     first, second = unshown([1, 4, 7], 0.2, 0.3, 0.5), unshown([4, 7, 9], 0.4, 0.1, 0.8)
     found, level = both(alike, (alike, first), (alike, second))
     np.testing.assert_array_equal(found.pixels, [4, 7])
-    np.testing.assert_allclose(found.excess, 0.3, rtol=1e-6)
+    np.testing.assert_allclose(
+        found.excess, (5 * 0.2 + 12.5 * 0.4) / 17.5, rtol=1e-6
+    )  # 0.5 / 0.2^2 and 0.8 / 0.4^2
     np.testing.assert_allclose(found.noise, 0.1, rtol=1e-6)
     np.testing.assert_allclose(found.doubt, 0.5, rtol=1e-6)
     np.testing.assert_array_equal(level, alike)
@@ -156,12 +158,13 @@ def test_of_both_directions_only_what_neither_has_seen_is_left():
     ids=["exact", "known", "as much as both differ", "anything"],
 )
 def test_the_higher_of_two_bounds_holds_as_far_as_its_events_are_exact(noise, rise):
-    """Half of what is above white is expected to be less than 0.35: noise of variance v takes off v / 0.5."""
-    low, high = (np.array([1.0]), unshown([0], 0.2, 0.01)), (np.array([2.2]), unshown([0], 0.4, noise))
+    """What is expected above it, 0.3, and not known of that, 0.4, are a scale of 0.5: noise v takes off v / 0.5."""
+    low = np.array([1.0]), unshown([0], 0.2, 0.01, 0.16)
+    high = np.array([2.2]), unshown([0], 0.4, noise, 0.64)
     for first, second in ((low, high), (high, low)):
         found, level = both(np.array([1.6]), first, second)
         assert level[0] == pytest.approx(1.6 + rise, abs=1e-6)
-        assert found.excess[0] == pytest.approx(0.3 / (1 + rise / 0.3), rel=1e-5)
+        assert found.excess[0] == pytest.approx(0.3 / (1 + rise / 0.5), rel=1e-5)
         assert found.noise[0] == pytest.approx(noise if rise else min(noise, 0.01))
 
 

@@ -196,6 +196,26 @@ def test_a_pixel_that_frames_cease_to_measure_may_have_changed_unseen():
     assert after == pytest.approx(clipped, rel=1e-3)
 
 
+@MODES
+def test_a_bound_that_a_frame_sets_anew_has_no_noise_of_events_before(lookahead):
+    """Five events up and, a frame later, five down again: the clipped frame after says white, which needs no events."""
+    spread = altered(PRESETS["default"], "events", threshold_spread=0.1, noise_rate=0.0, trail=0.0)
+    engine = Reconstructor((1, 1), settings=spread, lookahead=lookahead, contrast_threshold=THRESHOLD)
+    frames = [Frame(np.full((1, 1), 255, np.uint8), t, t + 1000) for t in range(0, 240_000, 40_000)]
+    for frame in frames:
+        engine.push_frame(frame)
+    ups, downs = (np.arange(first, first + 5_000, 1_000) for first in (50_000, 130_000))
+    t, zeros = np.concatenate([ups, downs]), np.zeros(10, np.int64)
+    engine.push_events(make_events(t, zeros, zeros, t < 100_000))
+    engine.finish()
+    found = [engine.estimate(frame.exposure_end + 10_000) for frame in frames]
+    noise = [float(estimate.unshown.noise[0]) for estimate in found]
+    assert noise[2] > 5 * 0.07 * THRESHOLD**2  # of the events alone
+    np.testing.assert_allclose([noise[k] for k in (0, 4, 5)], 0.0, atol=1e-6)
+    assert found[2].log_intensity[0, 0] == pytest.approx(found[0].log_intensity[0, 0] + 1.0, abs=0.02)
+    assert found[4].log_intensity[0, 0] == pytest.approx(found[0].log_intensity[0, 0], abs=2e-3)
+
+
 def test_black_of_a_linear_response_is_a_measurement():
     """It hides less than the frame's noise."""
     shot = take_shot(Frame(np.array([[0, 9]], np.uint8), 0, 1000), Camera.named("linear", 0.98), 1000)

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.bridge import UNMEASURED, UNSEEN, Latent, Told, UnshownMemory
+from kalux.augmentation.bridge import UNMEASURED, UNSEEN, BridgedSegment, Latent, Told, UnshownMemory
 from kalux.compiled import loop
 
 Floats = NDArray[np.floating[Any]]
@@ -302,6 +302,20 @@ def _grown(pixels, variance, initial_variance, noise):  # type: ignore[no-untype
     """What has come to the variance."""
     for i in range(len(pixels)):
         noise[i] = max(np.float32(variance[pixels[i]]) - initial_variance, np.float32(0.0))
+
+
+def above_frames(segment: BridgedSegment, pixels: NDArray[np.int64], bound: Floats) -> Floats:
+    """(N,) by how much ``bound``, of ``pixels`` at the segment's start, is more than the frames around say themselves.
+
+    That is how far it can be too high: what the frame at the start says needs no events, what the one at the end says
+    (`BridgedSegment.floor`) none from before. Infinite where one of them is masked.
+    """
+    variances = segment.forward_variance, segment.backward_variance
+    seen = np.maximum(*(plane.reshape(-1)[pixels] for plane in variances)) < UNSEEN
+    least = np.where(seen, segment.augmented.reshape(-1)[pixels], -np.inf)
+    if segment.floor is not None:
+        least = np.maximum(least, segment.floor.reshape(-1)[pixels])
+    return np.maximum(bound - least, 0.0)
 
 
 def _between(parts: NDArray[np.float32], pixels: NDArray[np.int64], width: int) -> NDArray[np.float32]:

@@ -10,7 +10,15 @@ from numpy.typing import NDArray
 from kalux.augmentation import bridge, deblur
 from kalux.augmentation.bridge import BridgedSegment, BridgeNoise, Latent, Thresholds, UnshownMemory
 from kalux.augmentation.deblur import EXPOSED, EXPOSURE_FIELDS, Exposure, all_between, relative_levels
-from kalux.augmentation.highlights import Shown, Tail, Unshown, begin_unshown, expected_excess, follow_unshown
+from kalux.augmentation.highlights import (
+    Shown,
+    Tail,
+    Unshown,
+    above_frames,
+    begin_unshown,
+    expected_excess,
+    follow_unshown,
+)
 from kalux.augmentation.trail import (
     Followed,
     Trail,
@@ -54,6 +62,9 @@ _BLACK_FRAMES: Final = 3.0
 
 _DARKEST: Final = 10.0
 """Below white, log intensity: black."""
+
+_LEAST_ERROR: Final = 1e-9
+"""Of a threshold, log intensity: a division."""
 
 
 class BridgeMemory(NamedTuple):
@@ -422,9 +433,8 @@ class BridgedFrames(Method):
 
         ``counts`` are its on and off events, ``change`` is what silent pixels around each change (K11).
         """
-        far = memory.far_on, memory.far_off
         grown, far_on, far_off = bridge.drift(
-            memory.latent, second, memory.thresholds, self.noise, far, counts
+            memory.latent, second, memory.thresholds, self.noise, self._far(memory, segment), counts
         )
         forget_silence(grown, segment, second, counts, change, self.noise.quantisation_variance)
         if second.ceiling is not None:
@@ -432,6 +442,19 @@ class BridgedFrames(Method):
             grown[black] = second.variance[black] / (_BLACK_FRAMES * (_BLACK_FRAMES + 1))
         segment = segment._replace(drift=grown, still_since=_still_since(memory, segment.start))
         return segment, far_on, far_off
+
+    def _far(self, memory: BridgeMemory, segment: BridgedSegment) -> tuple[Floats, Floats]:
+        """(H, W) on and off events whose errors a pixel's level has: of a bound, at most what frames have not set."""
+        pixels, known = memory.unshown.pixels, memory.thresholds
+        if len(pixels) == 0:
+            return memory.far_on, memory.far_off
+        above = above_frames(segment, pixels, memory.unshown.bound)
+        far = memory.far_on.copy(), memory.far_off.copy()
+        steps = (self.on, known.on_variance), (self.off, known.off_variance)
+        for counts, (threshold, variance) in zip(far, steps, strict=True):
+            each = np.maximum(threshold * np.sqrt(variance.reshape(-1)[pixels]), _LEAST_ERROR)
+            counts.reshape(-1)[pixels] = np.minimum(counts.reshape(-1)[pixels], above / each)
+        return far
 
     def _carried(self, memory: BridgeMemory, shot: Shot) -> Latent:
         """The latest frame, ``shot``, from the middle to the end of its exposure, with the events between (10)."""
@@ -446,7 +469,17 @@ class BridgedFrames(Method):
         )
 
     def begin(self, segment: Any, state: State) -> akf_bridged.Cursor:
-        return akf_bridged.begin(segment, state)
+        return akf_bridged.begin(segment, self._with_sure_bounds(segment, state))
+
+    def _with_sure_bounds(self, segment: BridgedSegment, state: State) -> State:
+        """The state at the segment's start, the noise of bounds no more than what frames leave of it (K15)."""
+        if segment.unshown is None or len(segment.unshown.pixels) == 0:
+            return state
+        pixels, variance = segment.unshown.pixels, state.variance.copy()
+        above = above_frames(segment, pixels, state.log_intensity.reshape(-1)[pixels])
+        most = self.settings.filter.initial_variance + above**2
+        variance.reshape(-1)[pixels] = np.minimum(variance.reshape(-1)[pixels], most)
+        return state._replace(variance=variance)
 
     def advance(self, segment: Any, cursor: akf_bridged.Cursor, events: EventArray) -> None:
         akf_bridged.advance(segment, cursor, events, self._event_noise)

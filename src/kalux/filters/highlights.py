@@ -23,8 +23,8 @@ Those that frames have lifted lie up to 0.05 below it until the next frame."""
 _LEAST_SPREAD: Final = np.float32(0.3)
 """Standard deviation that is left where pixels around say that all lie just above their bounds."""
 
-_USUAL: Final = np.float32(0.5)
-"""How far above white clipped pixels are (docs/equations.md, K15), log intensity."""
+_LEAST: Final = np.float32(1e-6)
+"""Of what is expected above a bound, and of what is not known of it: a division."""
 
 
 def tempered(unshown: Unshown, bound: Floats, prior: HighlightPrior) -> Unshown:
@@ -128,30 +128,36 @@ def smoothed_unshown(
 ) -> Unshown | None:
     """Pixels that no frame of the recording measures: both bounds hold. Raises ``smoothed``, (H, W) L, in place.
 
-    Both directions are L, P and the pixels that no frame has measured in that direction. The level is the mean of
-    both, but no less than either bound where its events can be trusted: if highlights fall off exponentially, as far
-    as they usually go, a bound with noise is believed to be lower by the noise over that. What the level rises by is no
-    more to be expected above it, as in `tempered`.
+    Both directions are L, P and the pixels that no frame has measured in that direction. What is expected above the
+    bounds is the mean of what both expect, weighted by what they know of it, each in units of its own. The level is
+    the mean of both, but no less than either bound where its events can be trusted: highlights fall off exponentially
+    with the scale of what is expected and what is not known of it, and a bound with noise is believed to be lower by
+    the noise over that scale. What the level rises by is no more to be expected above it.
     """
     if forward[2] is None or backward[2] is None:
         return None
     pixels, *places = np.intersect1d(
         forward[2].pixels, backward[2].pixels, assume_unique=True, return_indices=True
     )
-    excesses, noises, doubts, bounds = [], [], [], []
-    for (level, _, unshown), place in zip((forward, backward), places, strict=True):
-        assert unshown is not None
-        excesses.append(unshown.excess[place])
-        noises.append(unshown.noise[place])
-        doubts.append(unshown.doubt[place])
-        bounds.append(level.reshape(-1)[pixels] - unshown.noise[place] / _USUAL)
+    first, second = (
+        Unshown(pixels, *(values[place] for values in unshown[1:]))
+        for unshown, place in zip((forward[2], backward[2]), places, strict=True)
+    )
+    # The variances of the logarithms of both means: the less is known of one, the more the other counts.
+    of_first, of_second = (u.doubt / np.maximum(u.excess, _LEAST) ** 2 + _LEAST for u in (first, second))
+    excess = (of_second * first.excess + of_first * second.excess) / (of_first + of_second)
+    doubt = np.minimum(first.doubt, second.doubt)
+    scale = np.maximum(np.sqrt(excess**2 + doubt), _LEAST)
+    bounds = tuple(
+        level.reshape(-1)[pixels] - unshown.noise / scale
+        for (level, *_), unshown in ((forward, first), (backward, second))
+    )
     mean = smoothed.reshape(-1)[pixels]
     rise = np.maximum(np.maximum(*bounds) - mean, np.float32(0.0)).astype(np.float32)
     smoothed.reshape(-1)[pixels] = mean + rise
-    excess = (excesses[0] + excesses[1]) / np.float32(2.0)
+    noises = first.noise, second.noise
     noise = np.where(rise > 0, np.where(bounds[0] > bounds[1], *noises), np.minimum(*noises))
-    excess = excess * excess / np.maximum(excess + rise, np.float32(1e-6))
-    return Unshown(pixels, excess, noise, np.minimum(*doubts))
+    return Unshown(pixels, excess / (np.float32(1.0) + rise / scale), noise, doubt)
 
 
 def obey_bounds(
