@@ -311,8 +311,8 @@ _TAIL_BOUNDS: Final = (0.3, 2.0)
 
 _NO_TAIL: Final = 0.275
 """Scale of a tail that does not go on beyond white, just below the least that is told. It is 0.30 where the sun glints
-on cars in a street and no frame tells how much brighter that is, 0.34 on another recording, 0.44 to 2 on forty simulated
-scenes that do go on, by 0.3 to 4.4 in log intensity."""
+on cars in a street and no frame tells how much brighter that is, 0.34 on another recording, 0.44 to 2 on forty
+simulated scenes that do go on, by 0.3 to 4.4 in log intensity."""
 
 _MOST_BEYOND: Final = 0.5
 """Where much of a frame is white, its tail says no more than that highlights go far: how far, pixels that leave
