@@ -117,6 +117,10 @@ def test_text_has_values_errors_and_units():
     rows = dict(describe_calibration(full()))
     assert rows["threshold_on"] == "0.3 +- 0.01  (log intensity)"
     assert rows["map hot"] == "4x3: 3 pixels"
+    assert rows["map threshold_on_variance"] == "4x3: median 0.01, 5 to 95 % from 0.01 to 0.01"
+    curve = "curve:" + " ".join(["0.125"] * 33)
+    ((_, short),) = describe_calibration(Calibration({"camera": {"response": curve}}))
+    assert (short[:37], len(short.split("  ")[0])) == (curve[:37], 40)
 
 
 # --- in a reconstruction ---------------------------------------------------------------------------------------
