@@ -52,7 +52,7 @@ def open_writer(
     video
         Compression of a video.
     threads
-        Of a folder, how many images are encoded at a time; of a video, how many are mapped to pictures, which one
+        Of a folder, how many images are encoded at a time; of a video, one more than are mapped to pictures, which one
         encoder takes in turn. With more than one, images are written, and errors of writing are raised, up to as many
         calls later, at the latest in ``close()``; images given must not be changed.
 
