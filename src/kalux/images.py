@@ -212,7 +212,8 @@ def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) ->
     if tells and unshown is not None:
         total.reshape(-1)[unshown.pixels] += unshown.doubt
     image = Image(estimate.t, intensity, total, view.log_offset, estimate.final, fixed_pattern=float(pattern))
-    return dataclasses.replace(image, colour=_coloured(image, estimate, view))
+    colour = _coloured(image, estimate, view)
+    return image if colour is None else dataclasses.replace(image, colour=colour)
 
 
 def _above_bounds(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import math
 import tempfile
 from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
@@ -200,7 +201,8 @@ def _driven(
             ended = not _push_next(engine, chunks, on_events)
         if ended:
             engine.advance(frame.exposure_end + plan.settings.events.lateness)
-        while t is not None and _is_final(engine, t):
+        final = _final_until(engine)
+        while t is not None and t <= final:
             yield engine.estimate(t)
             t = next(pending, None)
         if t is None:
@@ -209,7 +211,8 @@ def _driven(
     engine.end_frames()
     while not ended and t is not None:
         ended = not _push_next(engine, chunks, on_events)
-        while t is not None and _is_final(engine, t):
+        final = _final_until(engine)
+        while t is not None and t <= final:
             yield engine.estimate(t)
             t = next(pending, None)
         if t is not None:
@@ -220,9 +223,10 @@ def _driven(
         t = next(pending, None)
 
 
-def _is_final(engine: Reconstructor, t: int) -> bool:
+def _final_until(engine: Reconstructor) -> float:
+    """As the engine says; reading does not change it."""
     until = engine.final_until
-    return until is not None and t <= until
+    return -math.inf if until is None else until
 
 
 def _push_next(

@@ -530,7 +530,7 @@ class Reconstructor:
         taken = max(progress.taken, self._events.first)
         for events in self._events.after(taken, t):
             self._method.advance(progress.segment, progress.cursor, events)
-            progress.latest = int(event_words(events)[-1, 0])
+            progress.latest = int(events["t"][-1])
             taken += len(events)
         progress.taken = taken
 

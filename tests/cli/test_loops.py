@@ -16,6 +16,7 @@ from numba.core import event
 
 from kalux.cli import loops
 from kalux.cli.loops import compiling_beside, prepare_loops, tell_of_compiling
+from kalux.compiled import magnitude_bits
 
 _RUN = """
 import sys
@@ -35,6 +36,27 @@ prepare_loops()
 
 def test_loops_run_without_scipy_and_scipy_can_still_be_imported() -> None:
     done = subprocess.run([sys.executable, "-c", _RUN], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+_KEPT = """
+import sys
+import numba as nb
+import numpy as np
+from kalux.cli.loops import prepare_loops
+prepare_loops()
+from kalux.compiled import magnitude_bits
+assert magnitude_bits(np.ones(3, np.float32)) == 0x3F800000
+assert "numba.typed.typeddict" not in sys.modules
+assert nb.njit(lambda x: [x, x + 1.5])(1.0) == [1.0, 2.5]
+assert "numba.typed.typeddict" in sys.modules
+assert magnitude_bits(np.zeros(3, np.float32)) == 0
+"""
+
+
+def test_a_loop_that_is_kept_runs_without_the_compiler_and_another_is_compiled() -> None:
+    magnitude_bits(np.ones(3, np.float32))
+    done = subprocess.run([sys.executable, "-c", _KEPT], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
 
 

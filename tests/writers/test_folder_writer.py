@@ -611,7 +611,7 @@ class TestSeveralEncoders:
             raise MemoryError("no room")
 
         monkeypatch.setattr("kalux.writers.images.png_bytes", broken)
-        writer = open_writer(tmp_path / "o", format="png", threads=2)
+        writer = open_writer(tmp_path / "o", format="png", threads=3)
         writer.write(make_image(0))
         with pytest.raises(MemoryError, match="no room"):
             writer.close()

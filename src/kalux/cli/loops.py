@@ -20,12 +20,29 @@ def prepare_loops() -> None:
     """Have numba begin, and compile, without what takes it long and is for nothing here.
 
     It imports SciPy's BLAS only to see whether it is there, for products of matrices, which kalux's loops have none of:
-    0.1 s of the 0.3 that its first loop waits for. And while it compiles only young garbage is looked for: looking
-    through all that it keeps takes an eighth more. Must be called before there are threads, which might import SciPy
-    meanwhile. Where SciPy is imported already, or numba is laid out otherwise, nothing is gained and nothing lost.
+    0.1 s of the 0.3 that its first loop waits for. The other 0.2 s are what it knows of all types, which a loop that is
+    kept needs none of. And while it compiles only young garbage is looked for: looking through all that it keeps takes
+    an eighth more. Must be called before there are threads, which might import SciPy meanwhile. Where SciPy is imported
+    already, or numba is laid out otherwise, nothing is gained and nothing lost.
     """
     _import_without_blas()
+    _load_without_compiler()
     _look_for_young_garbage_only()
+
+
+@functools.cache  # once
+def _load_without_compiler() -> None:
+    """Have loops that are kept loaded without what numba needs to compile, which it sees to itself when it does."""
+    from numba.core import caching
+    from numba.core.runtime.nrt import rtsys
+
+    def load(cache: Any, signature: Any, context: Any) -> Any:
+        rtsys.initialize(context)  # memory of arrays
+        with cache._guard_against_spurious_io_errors():
+            return cache._load_overload(signature, context)
+
+    if {"_guard_against_spurious_io_errors", "_load_overload"} <= {*dir(caching.Cache)}:
+        caching.Cache.load_overload = load  # type: ignore[method-assign]
 
 
 @functools.cache  # once

@@ -136,10 +136,11 @@ class EventBuffer:
         for block in self._blocks:
             count = block.stop - block.start
             if number < first + count:
-                events = block.events[max(number - first, 0) : block.until(until)]
-                if len(events) == 0:
+                start, stop = max(number - first, 0), block.until(until)
+                if start < stop:
+                    yield block.events[start:stop]
+                if stop < count:
                     return
-                yield events
             first += count
 
     def _shrink(self, block: _Block) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.bridge import RANDOM, UNMEASURED
-from kalux.compiled import FUSED, loop
+from kalux.compiled import FUSED, empty, loop, zeros
 from kalux.filters.readout import SHARED, Hidden
 
 Array = NDArray[np.floating[Any]]
@@ -45,6 +45,9 @@ fifth to a third of the squared errors."""
 ALIKE: Final = 0.4
 """Part of P that its neighbours leave of a pixel that neither frame around measures: there, errors of neighbours have
 correlations of 0.1 to 0.5 (K12). `kalux.filters.readout.SHARED`, by which highlights are doubted, is more."""
+
+_BLOCK: Final = 4096
+"""Pixels that all steps to the variance are taken of at a time."""
 
 _HEARD: Final = np.float32((1.0 - ALIKE) / (1.0 - SHARED))
 
@@ -169,23 +172,41 @@ def given_variance(
     left
         (H, W): what neighbours leave of P and what is hidden (`kalux.filters.readout.read_out`); None: all of it.
     """
-    planes = (variance,) if around is None else (variance, *around[:3])
-    known, *frames = (np.ascontiguousarray(plane, np.float32) for plane in planes)
-    given = np.empty_like(known)
-    waiting = np.zeros(moving.size, np.bool_)
-    if around is not None:
-        scalars = tuple(np.float32(value) for value in around[3:-2])
-        first, second, events = (plane.reshape(-1) for plane in frames)
-        if left is not None:
-            _hear(known.reshape(-1), left.reshape(-1), first, second, alone(hidden).moving, given.reshape(-1))
-            known = given
-        _know(known.reshape(-1), first, second, events, scalars, given.reshape(-1))
-        _wait(moving.reshape(-1), first, second, events, waiting)
-        known = given
-    change = np.ascontiguousarray(silent_change, np.float32)
-    scaled = tuple(np.float32(value) for value in hidden)
-    _hide(known.reshape(-1), moving.reshape(-1), waiting, change.reshape(-1), scaled, given.reshape(-1))
+    given = np.empty(variance.shape, np.float32)
+    nothing = np.empty(0, np.float32)
+    planes = variance, silent_change, *((nothing,) * 3 if around is None else around[:3])
+    _give(
+        *(np.ascontiguousarray(plane, np.float32).reshape(-1) for plane in planes),
+        tuple(np.float32(value) for value in ((0.0,) * 5 if around is None else around[3:-2])),
+        nothing if left is None else left.reshape(-1),
+        moving.reshape(-1),
+        tuple(np.float32(value) for value in hidden),
+        np.float32(alone(hidden).moving),
+        given.reshape(-1),
+    )
     return given
+
+
+@loop
+def _give(  # type: ignore[no-untyped-def]
+    variance, change, first, second, events, around, left, moving, hidden, before, given
+):
+    """`given_variance`, a few pixels at a time: what one step leaves is in the nearer caches for the next.
+
+    No step writes over what it reads, or it would be no vector code.
+    """
+    heard, told, waiting = empty(_BLOCK, np.float32), empty(_BLOCK, np.float32), zeros(_BLOCK, np.bool_)
+    for start in range(0, len(given), _BLOCK):
+        here = slice(start, min(start + _BLOCK, len(given)))
+        known, count = variance[here], len(given[here])
+        if len(events):
+            if len(left):
+                _hear(known, left[here], first[here], second[here], before, heard[:count])
+                known = heard[:count]
+            _know(known, first[here], second[here], events[here], around, told[:count])
+            _wait(moving[here], first[here], second[here], events[here], waiting[:count])
+            known = told[:count]
+        _hide(known, moving[here], waiting, change[here], hidden, given[here])
 
 
 @loop(fastmath=FUSED)

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
-import h5py
 import numba as nb
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +16,7 @@ from kalux.errors import FormatError, InputError
 from kalux.events import EVENT_DTYPE, EventArray, checked_thresholds
 from kalux.frames import MOSAICS, Frame, GroundTruth, Mosaic
 from kalux.layouts import HDF5_COLUMNS, HDF5_MAJOR_VERSION
-from kalux.readers.hdf5_layout import DAMAGE, SIGNATURE, check_dataset, common_length, opened
+from kalux.readers.hdf5_layout import DAMAGE, SIGNATURE, check_dataset, common_length, library, opened
 from kalux.readers.source import (
     CHUNK_EVENTS,
     EXPOSURE_UNKNOWN,
@@ -38,7 +37,7 @@ def recognises(path: Path) -> bool:
     if not begins_with(path, SIGNATURE):
         return False
     try:
-        with h5py.File(path, "r") as file:
+        with library().File(path, "r") as file:
             return _text(file.attrs.get("format", "")) == "kalux"
     except (OSError, *DAMAGE):
         return True
@@ -185,7 +184,7 @@ def _events(path: Path) -> Iterator[EventArray]:
             # One by one: other threads that read HDF5 wait meanwhile.
             for first in range(0, len(events), stored):
                 part = events[first : first + stored]
-                here = h5py.h5s.create_simple((len(part),))
+                here = library().h5s.create_simple((len(part),))
                 for column, space, kind, buffer in zip(columns, spaces, kinds, buffers, strict=True):
                     space.select_hyperslab((start + first,), (len(part),))
                     column.id.read(here, space, buffer, kind)

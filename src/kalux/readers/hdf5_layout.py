@@ -8,8 +8,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-import h5py
-import hdf5plugin  # noqa: F401 - registers Blosc, LZ4, ZSTD and others with HDF5
 import numpy as np
 from numpy.typing import NDArray
 
@@ -42,10 +40,18 @@ SIGNATURE: Final = b"\x89HDF\r\n\x1a\n"
 _ECF: Final = 0x8ECF
 
 
+def library() -> Any:
+    """h5py, which takes 0.1 s to import: recordings of other formats do without."""
+    import h5py
+    import hdf5plugin  # noqa: F401 - registers Blosc, LZ4, ZSTD and others with HDF5
+
+    return h5py
+
+
 @contextmanager
 def opened(path: Path) -> Iterator[Any]:
     """The file, open for reading; damage becomes a FormatError."""
-    with reading(path, *DAMAGE), h5py.File(path, "r") as file:
+    with reading(path, *DAMAGE), library().File(path, "r") as file:
         yield file
 
 
@@ -54,8 +60,8 @@ def holds(path: Path, names: tuple[str, ...]) -> bool:
     if not begins_with(path, SIGNATURE):
         return False
     try:
-        with h5py.File(path, "r") as file:
-            return all(isinstance(file.get(name), h5py.Dataset) for name in names)
+        with library().File(path, "r") as file:
+            return all(isinstance(file.get(name), library().Dataset) for name in names)
     except (OSError, *DAMAGE):
         return False
 
@@ -90,7 +96,7 @@ def check_dataset(path: Path, dataset: Any) -> None:
     plist = dataset.id.get_create_plist()
     for index in range(plist.get_nfilters()):
         code, _, _, name = plist.get_filter(index)
-        if not h5py.h5z.filter_avail(code):
+        if not library().h5z.filter_avail(code):
             raise FormatError(f"{path}: {_missing_filter(code, name)}")
     if dataset.chunks is not None and math.prod(dataset.chunks) * dataset.dtype.itemsize > LARGEST_CHUNK:
         raise FormatError(

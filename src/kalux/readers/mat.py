@@ -17,13 +17,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, Final, Protocol
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from kalux.errors import EventError, FormatError
 from kalux.events import EventArray, make_events
 from kalux.frames import Frame, GroundTruth
+from kalux.readers.hdf5_layout import library
 from kalux.readers.source import (
     CHUNK_EVENTS,
     NO_EVENTS,
@@ -420,7 +420,7 @@ class _Version73:
             return {
                 name: self._shape(item)
                 for name, item in file.items()
-                if isinstance(item, h5py.Dataset) and name != "#refs#"
+                if isinstance(item, library().Dataset) and name != "#refs#"
             }
 
     def array(self, name: str) -> NDArray[Any]:
@@ -453,7 +453,7 @@ class _Version73:
 
     @contextmanager
     def _file(self) -> Iterator[Any]:
-        with reading(self._path, *_DAMAGE), h5py.File(self._path, "r") as file:
+        with reading(self._path, *_DAMAGE), library().File(self._path, "r") as file:
             yield file
 
     @staticmethod

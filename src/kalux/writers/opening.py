@@ -52,9 +52,9 @@ def open_writer(
     video
         Compression of a video.
     threads
-        Of a folder, how many images are encoded at a time; of a video, how many are mapped to pictures, which one
-        encoder takes in turn. With more than one, images are written, and errors of writing are raised, up to as many
-        calls later, at the latest in ``close()``; images given must not be changed.
+        How many EXR or NPY files are encoded at a time; of PNG, and of a video's pictures, which one encoder takes in
+        turn, one less, but one at least. With more than one, images are written, and errors of writing are raised, up
+        to as many calls later, at the latest in ``close()``; images given must not be changed.
 
     Returns
     -------
@@ -89,7 +89,9 @@ def open_writer(
         return VideoWriter(path, display, video, ticks, settings, overwrite=overwrite, threads=threads)
     inside = settings_file(path / SETTINGS, metadata or {}, described)
     encode = {"png": encode_png(display, png_bits), "exr": encode_exr, "npy": encode_npy}[chosen]
-    return FolderWriter(path, encode, f".{chosen}", inside, overwrite=overwrite, encoders=threads)
+    # With two threads, handing a PNG over would take longer than it saves the one that writes.
+    encoders = max(threads - 1, 1) if chosen == "png" else threads
+    return FolderWriter(path, encode, f".{chosen}", inside, overwrite=overwrite, encoders=encoders)
 
 
 def choose_format(path: Path, format: str | None) -> str:

@@ -136,8 +136,9 @@ class Picture(NamedTuple):
 class VideoWriter(Writer):
     """Encodes into a temporary file beside the output, which gets its name when it is finished.
 
-    With several ``threads``, that many pictures are made at a time, in threads of their own. They are encoded in order,
-    each after up to as many calls of `write`: so late, too, is the error of one that cannot be.
+    With more than two ``threads``, all but one make pictures at the same time, in threads of their own; with two, to
+    hand a picture over would take half as long as to make it. They are encoded in order, each after up to as many calls
+    of `write`: so late, too, is the error of one that cannot be.
     """
 
     def __init__(
@@ -152,8 +153,8 @@ class VideoWriter(Writer):
         threads: int = 1,
     ) -> None:
         super().__init__(path)
-        self._threads = threads
-        self._pending: InOrder[Picture] = InOrder(threads, "pictures")
+        self._makers = max(threads - 1, 1)
+        self._pending: InOrder[Picture] = InOrder(self._makers, "pictures")
         self._display = display
         self._video = video
         self._ticks = ticks
@@ -188,7 +189,7 @@ class VideoWriter(Writer):
             return Picture(t, frame)
 
         self._pending.give(picture)
-        self._encode(0 if self._threads == 1 else self._threads)
+        self._encode(0 if self._makers == 1 else self._makers)
 
     def _encode(self, most: int) -> None:
         """Encode pictures, the first first, until at most ``most`` are pending. After an error the rest is given up."""
