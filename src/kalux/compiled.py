@@ -162,6 +162,39 @@ empty, zeros = _new_array(zeros=False), _new_array(zeros=True)
 each."""
 
 
+def _one_of_two(symbol: str) -> Any:
+    def one_of_two(typing_context: Any, one: Any, other: Any) -> Any:
+        kind = typing_context.unify_types(one, other)
+
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            first, second = (
+                Number(builder, kind, context.cast(builder, value, given, kind))
+                for value, given in zip(arguments, signature.args, strict=True)
+            )
+            return choose(second < first if symbol == "<" else second > first, second, first).value
+
+        return kind(one, other), generate
+
+    return intrinsic(one_of_two)
+
+
+smaller, larger = _one_of_two("<"), _one_of_two(">")
+"""`min` and `max` of two numbers, for loops, compiled in their place, where numba makes a function of each."""
+
+
+def _word_at(typing_context: Any, octets: Any, place: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
+        address = builder.gep(data, [arguments[1]])
+        return builder.load(builder.bitcast(address, ir.IntType(64).as_pointer()), align=1)
+
+    return types.uint64(octets, place), generate
+
+
+word_at: Any = intrinsic(_word_at)
+"""Eight of an array's bytes, 1-D uint8, from a place on."""
+
+
 def _prefetch(typing_context: Any, array: Any, index: Any) -> Any:
     signature = types.void(array, index)
 

@@ -28,7 +28,18 @@ from numpy.typing import NDArray
 from kalux.augmentation.deblur import between
 from kalux.augmentation.refractory import step_weight
 from kalux.calibration.intervals import Exposures, Interval, intervals
-from kalux.compiled import empty, event_column, event_is_on, event_row, event_words, inner, loop, zeros
+from kalux.compiled import (
+    empty,
+    event_column,
+    event_is_on,
+    event_row,
+    event_words,
+    inner,
+    larger,
+    loop,
+    smaller,
+    zeros,
+)
 from kalux.events import NEVER
 from kalux.recording import Recording
 from kalux.settings import CameraSettings
@@ -321,26 +332,26 @@ def _count(words, order, starts, latest, sign, exposures, periods, late, counts)
             if t > exposures[0] and before < exposures[3]:
                 pace_after = _SLOWEST
                 if j + 1 < starts[at + 1] and event_is_on(words[order[j + 1], 1]) == on:
-                    pace_after = min(_SLOWEST, float(words[order[j + 1], 0]) - t)
+                    pace_after = smaller(_SLOWEST, float(words[order[j + 1], 0]) - t)
                 soon, column = np.uint64(since < late), np.uint64(not on)
                 if own_sign == -sign_before:
                     # At one pace, the way out takes a quarter of the time and the way back the rest.
-                    out = _shown(exposures, before, before + min(_PEAK * pace_before, 0.25 * since))
-                    back = _shown(exposures, t - min((1 + _PEAK) * pace_after, 0.75 * since), t)
+                    out = _shown(exposures, before, before + smaller(_PEAK * pace_before, 0.25 * since))
+                    back = _shown(exposures, t - smaller((1 + _PEAK) * pace_after, 0.75 * since), t)
                     for k in range(len(periods)):
                         counts[at, k, soon, column] += back
                         counts[at, k, soon, 1 - column] += _PEAK * (out - back)
                 else:
-                    arrive = 0.5 * min(pace_after, since)
+                    arrive = 0.5 * smaller(pace_after, since)
                     if sign_before == 0:  # where the light was before the pixel's first event is not known
                         step = _shown(exposures, t - 2.0 * arrive, t)
                     else:
-                        leave = 0.5 * min(pace_before, since)
+                        leave = 0.5 * smaller(pace_before, since)
                         step = 0.5 * _shown(exposures, before, before + leave)
                         step += 0.5 * _shown(exposures, t - arrive, t)
                     for k in range(len(periods)):
                         counts[at, k, soon, column] += step * step_weight(np.float32(since), periods[k])
-            pace_before = min(_SLOWEST, since) if own_sign == sign_before else _SLOWEST
+            pace_before = smaller(_SLOWEST, since) if own_sign == sign_before else _SLOWEST
             before, sign_before = t, own_sign
         # The next event is too far away to know its sign: on both ways lies half a threshold.
         step = 0.5 * _shown(exposures, before, before + 0.5 * pace_before)
@@ -357,10 +368,10 @@ def _hot(happened):  # type: ignore[no-untyped-def]
         for column in range(width):
             if happened[row, column] > _HOT_LEAST:
                 most = 0
-                for i in range(max(row - 1, 0), min(row + 2, height)):
-                    for j in range(max(column - 1, 0), min(column + 2, width)):
+                for i in range(larger(row - 1, 0), smaller(row + 2, height)):
+                    for j in range(larger(column - 1, 0), smaller(column + 2, width)):
                         if not (i == row and j == column):
-                            most = max(most, happened[i, j])
+                            most = larger(most, happened[i, j])
                 found[row, column] = happened[row, column] > _HOT_LEAST + _HOT_FACTOR * most
     return found
 
