@@ -3,6 +3,7 @@
 Of a function that numba puts in its place it copies every step and infers its types again wherever it is used, and a
 logarithm has 87 steps. A `formula` is one step: a Python function, run on numbers that are still to come, of which each
 operation writes down an instruction. It has no branches but `choose`, and the numbers of an operation are of one type.
+So it is for one pixel of a loop: with rows for arguments it looks up and fills what it needs.
 """
 
 from __future__ import annotations
@@ -96,6 +97,24 @@ class Number:
         return Number(self.builder, kind, self.builder.bitcast(self.value, _machine_type(kind)))
 
 
+class Row:
+    """A flat array of a loop, without gaps, of numbers; places in it are uint64."""
+
+    __slots__ = ("_builder", "_data", "_kind")
+
+    def __init__(self, builder: Any, kind: Any, data: Any) -> None:
+        self._builder, self._kind, self._data = builder, kind, data
+
+    def __getitem__(self, place: Number) -> Number:
+        return Number(self._builder, self._kind, self._builder.load(self._at(place)))
+
+    def __setitem__(self, place: Number, number: Number) -> None:
+        self._builder.store(number.to(self._kind).value, self._at(place))
+
+    def _at(self, place: Number) -> Any:
+        return self._builder.gep(self._data, [place.to(types.uint64).value])
+
+
 def choose(condition: Number, one: Number, other: Number) -> Number:
     """``one`` where the condition holds, else the ``other``."""
     value = condition.builder.select(condition.value, one.value, one.like(other).value)
@@ -108,22 +127,30 @@ def _machine_type(kind: Any) -> Any:
     return ir.IntType(1 if kind == types.boolean else kind.bitwidth)
 
 
-def formula(result: Any) -> Callable[[Callable[..., Number]], Any]:
+def formula(result: Any = None) -> Callable[[Callable[..., Any]], Any]:
     """Decorates a formula for use in loops; ``of`` is the formula itself, for use in others.
 
     Parameters
     ----------
     result
-        numba's type of what the formula returns.
+        numba's type of what the formula returns; None: nothing, it fills rows.
     """
 
-    def decorate(function: Callable[..., Number]) -> Any:
+    def decorate(function: Callable[..., Any]) -> Any:
         def define(typing_context: Any, *kinds: Any) -> Any:
             def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-                numbers = [Number(builder, k, a) for k, a in zip(signature.args, arguments, strict=True)]
-                return function(*numbers).to(result).value
+                def given(kind: Any, argument: Any) -> Number | Row:
+                    if isinstance(kind, types.Array):
+                        if (kind.ndim, kind.layout) != (1, "C"):
+                            raise TypeError(f"{kind} in a formula, where rows are flat and without gaps")
+                        data = context.make_array(kind)(context, builder, argument).data
+                        return Row(builder, kind.dtype, data)
+                    return Number(builder, kind, argument)
 
-            return result(*kinds), generate
+                returned = function(*map(given, signature.args, arguments))
+                return context.get_dummy_value() if result is None else returned.to(result).value
+
+            return (types.void if result is None else result)(*kinds), generate
 
         # numba would take what has no names for a tuple.
         parameters = inspect.signature(function).parameters.values()

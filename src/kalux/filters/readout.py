@@ -24,7 +24,7 @@ from kalux.compiled import (
     word_at,
     zeros,
 )
-from kalux.formulas import Number, choose, formula
+from kalux.formulas import Number, Row, choose, formula
 
 Array = NDArray[np.floating[Any]]
 
@@ -66,6 +66,7 @@ _SLACK: Final = np.float32(1 / 8)
 _HALF_OF_PATCH: Final = np.float32(1 / 18)
 """From the sum over a patch of nine to half its mean."""
 
+_ZERO, _ONE, _TWO, _THREE, _FOUR = (np.uint64(k * _ROW) for k in range(5))
 _LEVEL, _DOUBT = np.uint64(0), np.uint64(_ROW)
 _NEAR, _FAR = np.uint64(0), np.uint64(_ROW)
 
@@ -181,8 +182,7 @@ def total_variance(variance, moving, change, hidden):  # type: ignore[no-untyped
     return variance + (of_moving if moving else changing * change)
 
 
-@nb.njit(cache=True, inline="always", error_model="numpy")
-def edge(unlikeness):  # type: ignore[no-untyped-def]
+def edge(unlikeness: Number) -> Number:
     """Between two pixels, of the sum over a patch of e^2 / (P + P' + slack): 1 where there is none.
 
     They are of one surface as far as 1 / edge^2, 0 to 1, says.
@@ -190,8 +190,7 @@ def edge(unlikeness):  # type: ignore[no-untyped-def]
     return ONE + unlikeness * _HALF_OF_PATCH
 
 
-@nb.njit(cache=True, inline="always")
-def _squared(value):  # type: ignore[no-untyped-def]
+def _squared(value: Number) -> Number:
     return value * value
 
 
@@ -448,14 +447,69 @@ def _mark_hearing(moving, row, begin, hears, spans):  # type: ignore[no-untyped-
     spans[place, 0], spans[place, 1] = first, last
 
 
+# Of four numbers a to d, quotients by them share a division: (b, a) c d / a b c d and a b (d, c) / a b c d.
+
+
+@formula()
+def _tell_unlike(
+    known: Row,
+    own: Number,
+    other: Number,
+    step: Number,
+    near_slack: Number,
+    far_slack: Number,
+    single: Row,
+    into: Number,
+) -> None:
+    """How unlike a pixel at ``own`` and its four neighbours are, of which three are in the row of ``other``."""
+    level, doubt = known[own + _LEVEL], known[own + _DOUBT]
+    right = known[own + _LEVEL + step] - level
+    left_under = known[other + _LEVEL - step] - level
+    straight_under = known[other + _LEVEL] - level
+    right_under = known[other + _LEVEL + step] - level
+    a = doubt + known[own + _DOUBT + step] + near_slack
+    b = doubt + known[other + _DOUBT - step] + far_slack
+    c = doubt + known[other + _DOUBT] + near_slack
+    d = doubt + known[other + _DOUBT + step] + far_slack
+    ab, cd = a * b, c * d
+    inverse = ONE / (ab * cd)
+    of_ab, of_cd = inverse * cd, inverse * ab
+    single[into] = right * right * (of_ab * b)
+    single[into + _ONE] = left_under * left_under * (of_ab * a)
+    single[into + _TWO] = straight_under * straight_under * (of_cd * d)
+    single[into + _THREE] = right_under * right_under * (of_cd * c)
+
+
+@formula()
+def _tell_least(known: Row, own: Number, near: Number, far: Number, least: Row) -> None:
+    a, b = known[own + _DOUBT] + near, known[own + _DOUBT] + far
+    inverse = ONE / (a * b)
+    least[own + _NEAR] = b * inverse
+    least[own + _FAR] = a * inverse
+
+
+@formula()
+def _tell_alike(unlike: Row, before: Number, own: Number, after: Number, alike: Row) -> None:
+    """How far a pixel is of one surface with its four neighbours, from three rows around both."""
+    a, b, c, d = (
+        edge(unlike[before + k] + unlike[own + k] + unlike[after + k]) for k in (_ZERO, _ONE, _TWO, _THREE)
+    )
+    ab, cd = a * b, c * d
+    inverse = ONE / (ab * cd)
+    of_ab, of_cd = inverse * cd, inverse * ab
+    alike[own] = _squared(of_ab * b)
+    alike[own + _ONE] = _squared(of_ab * a)
+    alike[own + _TWO] = _squared(of_cd * d)
+    alike[own + _THREE] = _squared(of_cd * c)
+
+
 @nb.njit(cache=True, inline="always")
 def _compare(  # type: ignore[no-untyped-def]
     row, first, last, allowed, pitch, known, least, unlike, alike, single
 ):
     """How alike a row's pixels are to their four neighbours in `_Ring`, where columns ``first`` to ``last`` need it.
 
-    Patches reach into the next row: that is compared first. Quotients share a division; those of four numbers a to d
-    are (b, a) c d / a b c d and a b (d, c) / a b c d.
+    Patches reach into the next row: that is compared first.
     """
     count = 4 * pitch + 1
     above, here, below, under = (
@@ -466,52 +520,56 @@ def _compare(  # type: ignore[no-untyped-def]
     )
     size, step = np.uint64(last - first + 2 * _ASIDE), np.uint64(pitch)
     begin = np.uint64(_MARGIN - _ASIDE + first)
-    one, two, three = np.uint64(_ROW), np.uint64(2 * _ROW), np.uint64(3 * _ROW)
     near, far = allowed * np.float32(pitch * pitch), allowed * np.float32(2 * pitch * pitch)
     near_slack, far_slack = larger(near * _SLACK, _SURE), larger(far * _SLACK, _SURE)
-    own, other = below * two + begin, under * two + begin
+    near, far = larger(near, _SURE), larger(far, _SURE)
+    own, other = below * _TWO + begin, under * _TWO + begin
     for i in range(size):
-        level, doubt = known[own + _LEVEL + i], known[own + _DOUBT + i]
-        right = known[own + _LEVEL + step + i] - level
-        left_under = known[other + _LEVEL - step + i] - level
-        straight_under = known[other + _LEVEL + i] - level
-        right_under = known[other + _LEVEL + step + i] - level
-        a = doubt + known[own + _DOUBT + step + i] + near_slack
-        b = doubt + known[other + _DOUBT - step + i] + far_slack
-        c = doubt + known[other + _DOUBT + i] + near_slack
-        d = doubt + known[other + _DOUBT + step + i] + far_slack
-        ab, cd = a * b, c * d
-        inverse = ONE / (ab * cd)
-        of_ab, of_cd = inverse * cd, inverse * ab
-        single[begin + i] = right * right * (of_ab * b)
-        single[begin + one + i] = left_under * left_under * (of_ab * a)
-        single[begin + two + i] = straight_under * straight_under * (of_cd * d)
-        single[begin + three + i] = right_under * right_under * (of_cd * c)
+        _tell_unlike(known, own + i, other + i, step, near_slack, far_slack, single, begin + i)
     for i in range(size):
-        a, b = known[own + _DOUBT + i] + larger(near, _SURE), known[own + _DOUBT + i] + larger(far, _SURE)
-        inverse = ONE / (a * b)
-        least[own + _NEAR + i] = b * inverse
-        least[own + _FAR + i] = a * inverse
-    into = below * np.uint64(4 * _ROW) + begin
+        _tell_least(known, own + i, near, far, least)
+    into = below * _FOUR + begin
     for k in range(np.uint64(4)):
-        start = begin + k * one
+        start = begin + k * _ONE
         for i in range(size):
-            unlike[into + k * one + i] = (
+            unlike[into + k * _ONE + i] = (
                 single[start - step + i] + single[start + i] + single[start + step + i]
             )
-    before, own = above * np.uint64(4 * _ROW) + begin, here * np.uint64(4 * _ROW) + begin
+    before, own = above * _FOUR + begin, here * _FOUR + begin
     for i in range(size):
-        a = edge(unlike[before + i] + unlike[own + i] + unlike[into + i])
-        b = edge(unlike[before + one + i] + unlike[own + one + i] + unlike[into + one + i])
-        c = edge(unlike[before + two + i] + unlike[own + two + i] + unlike[into + two + i])
-        d = edge(unlike[before + three + i] + unlike[own + three + i] + unlike[into + three + i])
-        ab, cd = a * b, c * d
-        inverse = ONE / (ab * cd)
-        of_ab, of_cd = inverse * cd, inverse * ab
-        alike[own + i] = _squared(of_ab * b)
-        alike[own + one + i] = _squared(of_ab * a)
-        alike[own + two + i] = _squared(of_cd * d)
-        alike[own + three + i] = _squared(of_cd * c)
+        _tell_alike(unlike, before + i, own + i, into + i, alike)
+
+
+@formula()
+def _hear(
+    known: Row,
+    least: Row,
+    alike: Row,
+    up: Number,
+    own: Number,
+    down: Number,
+    of_up: Number,
+    of_own: Number,
+    step: Number,
+    heard: Row,
+    into: Number,
+) -> None:
+    """K12 of a pixel: the mean of itself and its eight neighbours, and its variance."""
+    value, doubt = known[own + _LEVEL], known[own + _DOUBT]
+    information, deviation = None, None
+    for onward, back, ahead, behind, distance in (
+        (of_own, of_own - step, own + step, own - step, _NEAR),
+        (of_own + _ONE, of_up + _ONE + step, down - step, up + step, _FAR),
+        (of_own + _TWO, of_up + _TWO, down, up, _NEAR),
+        (of_own + _THREE, of_up + _THREE - step, down + step, up - step, _FAR),
+    ):
+        there, back_there = alike[onward] * least[ahead + distance], alike[back] * least[behind + distance]
+        more = there * (known[ahead + _LEVEL] - value) + back_there * (known[behind + _LEVEL] - value)
+        deviation = more if deviation is None else deviation + more
+        information = there + back_there if information is None else information + (there + back_there)
+    independent = doubt / (ONE + doubt * information)  # 1 / (1 / doubt + information)
+    heard[into] = value + deviation * independent
+    heard[into + _ONE] = SHARED * doubt + (ONE - SHARED) * independent
 
 
 @nb.njit(cache=True, inline="always")
@@ -527,36 +585,10 @@ def _hear_neighbours(  # type: ignore[no-untyped-def]
     )
     size, step = np.uint64(last - first), np.uint64(pitch)
     begin, column = np.uint64(_MARGIN + first), np.uint64(first)
-    one, two, three, four = np.uint64(_ROW), np.uint64(2 * _ROW), np.uint64(3 * _ROW), np.uint64(4 * _ROW)
-    up, own, down = above * two + begin, here * two + begin, below * two + begin
-    of_up, of_own = above * four + begin, here * four + begin
+    up, own, down = above * _TWO + begin, here * _TWO + begin, below * _TWO + begin
+    of_up, of_own = above * _FOUR + begin, here * _FOUR + begin
     for i in range(size):
-        value, doubt = known[own + _LEVEL + i], known[own + _DOUBT + i]
-        onward = alike[of_own + i] * least[own + _NEAR + step + i]
-        back = alike[of_own - step + i] * least[own + _NEAR - step + i]
-        information = onward + back
-        deviation = onward * (known[own + _LEVEL + step + i] - value) + back * (
-            known[own + _LEVEL - step + i] - value
-        )
-        onward = alike[of_own + one + i] * least[down + _FAR - step + i]
-        back = alike[of_up + one + step + i] * least[up + _FAR + step + i]
-        information += onward + back
-        deviation += onward * (known[down + _LEVEL - step + i] - value) + back * (
-            known[up + _LEVEL + step + i] - value
-        )
-        onward = alike[of_own + two + i] * least[down + _NEAR + i]
-        back = alike[of_up + two + i] * least[up + _NEAR + i]
-        information += onward + back
-        deviation += onward * (known[down + _LEVEL + i] - value) + back * (known[up + _LEVEL + i] - value)
-        onward = alike[of_own + three + i] * least[down + _FAR + step + i]
-        back = alike[of_up + three - step + i] * least[up + _FAR - step + i]
-        information += onward + back
-        deviation += onward * (known[down + _LEVEL + step + i] - value) + back * (
-            known[up + _LEVEL - step + i] - value
-        )
-        independent = doubt / (ONE + doubt * information)  # 1 / (1 / doubt + information)
-        heard[begin + i] = value + deviation * independent
-        heard[begin + one + i] = SHARED * doubt + (ONE - SHARED) * independent
+        _hear(known, least, alike, up + i, own + i, down + i, of_up + i, of_own + i, step, heard, begin + i)
     for i in range(size):
         alone, together = level[column + i], heard[begin + i]
         level[column + i] = together if hears[here, column + i] else alone
