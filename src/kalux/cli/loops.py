@@ -95,7 +95,7 @@ def tell_of_compiling(*, quiet: bool = False, tell: Callable[[str], None] = erro
 OF_IMAGES: Final = ("images", "display")
 """Parts of `kalux.cli.rehearsal` that every reconstruction comes to after the estimates."""
 
-OF_ALL: Final = ("images", "joining", "display", "filter")
+OF_ALL: Final = ("images", "segment", "display", "filter")
 """Those of the default filter. What is come to last is first, and half of the parts by turns is half of the work."""
 
 _MOST_BESIDE: Final = 2
