@@ -110,6 +110,14 @@ def test_there_are_no_more_others_than_asked_for_nor_than_two(started, processes
     assert len(started) == count
 
 
+def test_one_process_leaves_the_begin_of_the_filter_to_the_command(monkeypatch, started) -> None:
+    parts = ("60", "61", "62")
+    monkeypatch.setattr(loops, "OF_ALL", parts)
+    with compiling_beside(parts, 1):
+        nb.njit(lambda x: x + 1)(1)
+    assert started[0].args == ["sleep", "60", "61"]
+
+
 def test_others_are_ended_with_an_interrupt(started) -> None:
     def interrupted() -> None:
         with compiling_beside(["60"], 1):

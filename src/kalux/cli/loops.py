@@ -96,7 +96,8 @@ OF_IMAGES: Final = ("images", "display")
 """Parts of `kalux.cli.rehearsal` that every reconstruction comes to after the estimates."""
 
 OF_ALL: Final = ("images", "segment", "display", "filter")
-"""Those of the default filter. What is come to last is first, and half of the parts by turns is half of the work."""
+"""Those of the default filter. What is come to last is first; "filter", the last, is left to the command where one
+process alone does the others, which take it as long."""
 
 _MOST_BESIDE: Final = 2
 """Processes: the estimates, which the command itself compiles, take as long as each of these does then."""
@@ -122,6 +123,7 @@ def compiling_beside(parts: Sequence[str], processes: int) -> Generator[None, No
 
     running: list[subprocess.Popen[bytes]] = []
     count = min(processes, _MOST_BESIDE) if sys.executable else 0
+    parts = OF_ALL[:-1] if count == 1 and parts == OF_ALL else parts
     waiting = [list(parts[number::count]) for number in range(count)]
 
     def begin() -> None:
