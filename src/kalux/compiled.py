@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from kalux import memory
 from kalux.events import EventArray
+from kalux.formulas import Number, choose, formula
 from kalux.kernel_cache import check_variables
 from kalux.memory import PAGE
 
@@ -58,22 +59,22 @@ def event_words(events: EventArray) -> NDArray[np.int64]:
     return np.ascontiguousarray(events).view(np.int64).reshape(-1, 2)
 
 
-@nb.njit(cache=True, inline="always")
-def event_column(word):  # type: ignore[no-untyped-def]
+@formula(types.uint64)
+def event_column(word: Number) -> Number:
     """x of an event's second word; unsigned, as all indices: numba need not look for negative ones."""
-    return np.uint64(word) & np.uint64(0xFFFF)
+    return word.to(types.uint64) & np.uint64(0xFFFF)
 
 
-@nb.njit(cache=True, inline="always")
-def event_row(word):  # type: ignore[no-untyped-def]
+@formula(types.uint64)
+def event_row(word: Number) -> Number:
     """y of an event's second word."""
-    return (np.uint64(word) >> np.uint64(16)) & np.uint64(0xFFFF)
+    return (word.to(types.uint64) >> np.uint64(16)) & np.uint64(0xFFFF)
 
 
-@nb.njit(cache=True, inline="always")
-def event_is_on(word):  # type: ignore[no-untyped-def]
+@formula(types.boolean)
+def event_is_on(word: Number) -> Number:
     """p of an event's second word; the three bytes above it are padding and may hold anything."""
-    return ((np.uint64(word) >> np.uint64(32)) & np.uint64(0xFF)) != np.uint64(0)
+    return ((word.to(types.uint64) >> np.uint64(32)) & np.uint64(0xFF)) != np.uint64(0)
 
 
 @nb.njit(cache=True, inline="always")
@@ -86,16 +87,17 @@ UNWEIGHED: Final = np.int64(0xFF_FFFF_FFFF)
 """The bits of an event's second word without its weight; by themselves they have the weight 1."""
 
 
-@nb.njit(cache=True, inline="always")
-def weighed(word, extra):  # type: ignore[no-untyped-def]
+@formula(types.int64)
+def weighed(word: Number, extra: Number) -> Number:
     """An event's second word with a weight of 1 and ``extra`` units of `WEIGHT_UNIT`, 0 to 65535, in its padding."""
-    return (word & UNWEIGHED) | (np.int64(extra) << np.int64(40))
+    return (word & UNWEIGHED) | (extra.to(types.int64) << np.int64(40))
 
 
-@nb.njit(cache=True, inline="always")
-def event_weight(word, unit):  # type: ignore[no-untyped-def]
+@formula(types.float32)
+def event_weight(word: Number, unit: Number) -> Number:
     """The weight of an event's second word: `WEIGHT_UNIT` where events carry one, 0, for 1, where they do not."""
-    return ONE + np.float32(np.int32((np.uint64(word) >> np.uint64(40)) & np.uint64(0xFFFF))) * unit
+    extra = (word.to(types.uint64) >> np.uint64(40)) & np.uint64(0xFFFF)
+    return ONE + extra.to(types.int32).to(types.float32) * unit
 
 
 _LINE: Final = 64
@@ -158,6 +160,39 @@ def _new_array(*, zeros: bool) -> Any:
 empty, zeros = _new_array(zeros=False), _new_array(zeros=True)
 """As NumPy's, for loops, of a shape and a dtype: compiled in their place, where numba makes two or three functions of
 each."""
+
+
+def _one_of_two(symbol: str) -> Any:
+    def one_of_two(typing_context: Any, one: Any, other: Any) -> Any:
+        kind = typing_context.unify_types(one, other)
+
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            first, second = (
+                Number(builder, kind, context.cast(builder, value, given, kind))
+                for value, given in zip(arguments, signature.args, strict=True)
+            )
+            return choose(second < first if symbol == "<" else second > first, second, first).value
+
+        return kind(one, other), generate
+
+    return intrinsic(one_of_two)
+
+
+smaller, larger = _one_of_two("<"), _one_of_two(">")
+"""`min` and `max` of two numbers, for loops, compiled in their place, where numba makes a function of each."""
+
+
+def _word_at(typing_context: Any, octets: Any, place: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
+        address = builder.gep(data, [arguments[1]])
+        return builder.load(builder.bitcast(address, ir.IntType(64).as_pointer()), align=1)
+
+    return types.uint64(octets, place), generate
+
+
+word_at: Any = intrinsic(_word_at)
+"""Eight of an array's bytes, 1-D uint8, from a place on."""
 
 
 def _prefetch(typing_context: Any, array: Any, index: Any) -> Any:
@@ -334,27 +369,6 @@ def pack(planes, records, first, count):  # type: ignore[no-untyped-def]
         _pack_one(records, first + column, planes, column)
 
 
-def _as_float_of(typing_context: Any, bits: Any) -> Any:
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.bitcast(arguments[0], ir.FloatType())
-
-    return types.float32(types.int32), generate
-
-
-def _as_integer_of(typing_context: Any, value: Any) -> Any:
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.bitcast(arguments[0], ir.IntType(32))
-
-    return types.int32(types.float32), generate
-
-
-_as_float: Any = intrinsic(_as_float_of)
-"""The float32 that has the bits of an int32."""
-
-_as_integer: Any = intrinsic(_as_integer_of)
-"""The int32 that has the bits of a float32."""
-
-
 _LOG2_E: Final = np.float32(1.4426950408889634)
 _LN2_HIGH: Final = np.float32(0.693359375)  # few bits, so that its small multiples are exact
 _LN2_LOW: Final = np.float32(-2.12194440e-4)
@@ -399,38 +413,31 @@ def any_from(values, places, least):  # type: ignore[no-untyped-def]
     return count > 0
 
 
-@nb.njit(cache=True, inline="always", error_model="numpy")
-def exponential(x):  # type: ignore[no-untyped-def]
+@formula(types.float32)
+def exponential(x: Number) -> Number:
     """e^x in float32, to 2e-7 of itself; x is taken into [-87, 88]."""
-    x = _LEAST_EXPONENT if x < _LEAST_EXPONENT else x  # min and max would also look for NaN
-    x = _LARGEST_EXPONENT if x > _LARGEST_EXPONENT else x
+    x = x.to(types.float32)
+    x = choose(x < _LEAST_EXPONENT, x.like(_LEAST_EXPONENT), x)
+    x = choose(x > _LARGEST_EXPONENT, x.like(_LARGEST_EXPONENT), x)
     shifted = x * _LOG2_E + _ROUNDING
     whole = shifted - _ROUNDING
     r = (x - whole * _LN2_HIGH) - whole * _LN2_LOW
-    p = _EXP[0]
-    p = p * r + _EXP[1]
-    p = p * r + _EXP[2]
-    p = p * r + _EXP[3]
-    p = p * r + _EXP[4]
-    p = p * r + _EXP[5]
-    return (p * r * r + r + ONE) * _as_float((np.int32(whole) + np.int32(127)) << np.int32(23))
+    p = x.like(_EXP[0])
+    for c in _EXP[1:]:
+        p = p * r + c
+    scale = ((whole.to(types.int32) + np.int32(127)) << np.int32(23)).bits_as(types.float32)
+    return (p * r * r + r + ONE) * scale
 
 
-@nb.njit(cache=True, inline="always", error_model="numpy")
-def logarithm(x):  # type: ignore[no-untyped-def]
+@formula(types.float32)
+def logarithm(x: Number) -> Number:
     """log(x) of a normal positive float32, to 2e-7 of itself or 1e-7, whichever is larger; finite whatever x is."""
-    bits = np.int32(_as_integer(x) - _SQRT_HALF_BITS)  # numba's integers become 64 bits wide otherwise
-    exponent = np.float32(np.int32(bits >> np.int32(23)))
-    m = _as_float((bits & np.int32(0x007FFFFF)) + _SQRT_HALF_BITS) - ONE
-    p = _LOG[0]
-    p = p * m + _LOG[1]
-    p = p * m + _LOG[2]
-    p = p * m + _LOG[3]
-    p = p * m + _LOG[4]
-    p = p * m + _LOG[5]
-    p = p * m + _LOG[6]
-    p = p * m + _LOG[7]
-    p = p * m + _LOG[8]
+    bits = x.to(types.float32).bits_as(types.int32) - _SQRT_HALF_BITS
+    exponent = (bits >> np.int32(23)).to(types.float32)
+    m = ((bits & np.int32(0x007FFFFF)) + _SQRT_HALF_BITS).bits_as(types.float32) - ONE
+    p = m.like(_LOG[0])
+    for c in _LOG[1:]:
+        p = p * m + c
     square = m * m
     tail = exponent * _LN2_LOW + p * m * square
     return (tail - _HALF * square) + m + exponent * _LN2_HIGH

@@ -104,28 +104,42 @@ def started(monkeypatch) -> list[subprocess.Popen[bytes]]:
     start = subprocess.Popen
 
     def sleeping(command, **options):
-        assert command[:-1] == [sys.executable, "-P", "-m", "kalux.cli.rehearsal"]
-        processes.append(start(["sleep", command[-1]], **options))
+        assert command[:4] == [sys.executable, "-P", "-m", "kalux.cli.rehearsal"]
+        processes.append(start(["sleep", *command[4:]], **options))
         return processes[-1]
 
     monkeypatch.setattr(loops.subprocess, "Popen", sleeping)
     return processes
 
 
-def test_others_compile_from_the_first_loop_on_that_is_not_kept_and_are_waited_for(started) -> None:
-    """With this process as many as there may be threads."""
+def test_others_compile_from_the_first_loop_on_that_is_not_kept(started) -> None:
     compiled = nb.njit(lambda x: x + 1)
     compiled(1)
-    with compiling_beside(["0.2", "0.3", "60"], 3) as wait:
+    with compiling_beside(["60", "61", "62"], 3):
         compiled(1)
         assert not started
         compiled(1.0)
         compiled(np.float32(1.0))
-        assert len(started) == 2
-        wait()
-        assert [process.returncode for process in started] == [0, 0]
+        assert [process.args for process in started] == [["sleep", "60", "62"], ["sleep", "61"]]
     nb.njit(lambda x: x + 2)(1)
     assert len(started) == 2
+
+
+@pytest.mark.parametrize(("threads", "count"), [(1, 0), (2, 1), (8, 2)])
+def test_with_this_process_as_many_as_there_may_be_threads_but_no_more_than_three(
+    started, threads, count
+) -> None:
+    with compiling_beside(["60", "60"], threads):
+        nb.njit(lambda x: x + 1)(1)
+    assert len(started) == count
+
+
+def test_one_process_leaves_the_begin_of_the_filter_to_the_command(monkeypatch, started) -> None:
+    parts = ("60", "61", "62")
+    monkeypatch.setattr(loops, "OF_ALL", parts)
+    with compiling_beside(parts, 2):
+        nb.njit(lambda x: x + 1)(1)
+    assert started[0].args == ["sleep", "60", "61"]
 
 
 def test_others_are_ended_with_an_interrupt(started) -> None:
@@ -146,19 +160,22 @@ def test_a_run_does_without_others_where_there_can_be_none(monkeypatch) -> None:
         raise BlockingIOError
 
     monkeypatch.setattr(loops.subprocess, "Popen", refuse)
-    with compiling_beside(["60"], 2) as wait:
+    with compiling_beside(["60"], 2):
         assert nb.njit(lambda x: x + 1)(1) == 2
-        wait()
 
 
 _REHEARSED = """
 import sys
 from numba.core.dispatcher import Dispatcher
-from kalux.cli import main, rehearsal
+from kalux.cli import loops, main, rehearsal
 
 rehearsal.prepare_loops()
 for part in rehearsal.PARTS.values():
     part()
+assert set(rehearsal.PARTS) == set(loops.OF_ALL) > set(loops.OF_IMAGES)
+modules = [module for name, module in sys.modules.items() if name.startswith("kalux.")]
+values = [value for module in modules for value in vars(module).values()]
+print([loop for loop in values if isinstance(loop, Dispatcher) and len(loop.overloads) > 1])
 add, new = Dispatcher.add_overload, []
 
 def watched(self, compiled):
@@ -172,7 +189,7 @@ print([name for name in new if name.startswith(("kalux.filters", "kalux.display"
 """
 
 
-def test_a_reconstruction_comes_to_nothing_after_the_estimates_that_is_not_rehearsed(
+def test_a_reconstruction_comes_to_nothing_after_the_estimates_that_is_not_rehearsed_once(
     simulation, write_recording, tmp_path
 ) -> None:
     frames = [dataclasses.replace(frame, image=np.tile(frame.image, (8, 8))) for frame in simulation.frames]
@@ -183,4 +200,4 @@ def test_a_reconstruction_comes_to_nothing_after_the_estimates_that_is_not_rehea
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.splitlines()[-1] == "[]"
+    assert [done.stdout.splitlines()[line] for line in (0, -1)] == ["[]", "[]"]

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.trail import Trail
-from kalux.compiled import any_from, apart, empty, loop
+from kalux.compiled import any_from, apart, empty, larger, loop, smaller
 
 Array = NDArray[np.floating[Any]]
 
@@ -250,7 +250,7 @@ def _drift(  # type: ignore[no-untyped-def]
     unmeasured, two, zero = np.float32(UNMEASURED), np.float32(2.0), np.float32(0.0)
     drifted = empty(_BLOCK, np.float32)
     for first in range(np.uint64(0), np.uint64(len(grown)), np.uint64(_BLOCK)):
-        pixels = range(first, min(np.uint64(len(grown)), first + np.uint64(_BLOCK)))
+        pixels = range(first, smaller(np.uint64(len(grown)), first + np.uint64(_BLOCK)))
         if not any_from(after, pixels, unmeasured):
             for i in pixels:  # few arrays a loop: vector code
                 grown[i] = zero
@@ -382,12 +382,12 @@ def _bridge(given, thresholds, noise, seconds, planes, factors):  # type: ignore
     s = empty(_SCRATCH * _BLOCK, np.float64)
     size = np.uint64(len(value))
     for first in range(np.uint64(0), size, np.uint64(_BLOCK)):
-        pixels = range(min(size - first, np.uint64(_BLOCK)))
+        pixels = range(smaller(size - first, np.uint64(_BLOCK)))
         for k in pixels:
             i = first + k
             before, after = np.float64(variance[i]), np.float64(next_variance[i])
             here, more = np.float64(value[i]), np.float64(grown[i])
-            saturated = (min(before, after) >= UNMEASURED) & (max(before, after) < UNSEEN)
+            saturated = (smaller(before, after) >= UNMEASURED) & (larger(before, after) < UNSEEN)
             s[_COUNT_ON + k], s[_COUNT_OFF + k] = on[i], off[i]
             # Two bounds: all that they say of the change is that it does not go on and on.
             s[_CHANGE + k] = -more if saturated else np.float64(next_value[i]) - more - here
@@ -415,8 +415,8 @@ def _bridge(given, thresholds, noise, seconds, planes, factors):  # type: ignore
             s[_SLOPE + k] = gain * untold / seconds
             s[_STEP_ON + k] = nominal_on + gain * (c_on * on_covariance + of_step)
             s[_STEP_OFF + k] = nominal_off + gain * (c_off * off_covariance - of_step)
-            s[_NEW_ON + k] = min(max(of_on + gain * on_covariance, low), high)
-            s[_NEW_OFF + k] = min(max(of_off + gain * off_covariance, low), high)
+            s[_NEW_ON + k] = smaller(larger(of_on + gain * on_covariance, low), high)
+            s[_NEW_OFF + k] = smaller(larger(of_off + gain * off_covariance, low), high)
             s[_LEFT_ON + k] = on_variance - on_covariance * on_covariance * inverse + _SCALE_DRIFT
             s[_LEFT_OFF + k] = off_variance - off_covariance * off_covariance * inverse + _SCALE_DRIFT
         for k in pixels:

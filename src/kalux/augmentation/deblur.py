@@ -40,6 +40,7 @@ from kalux.compiled import (
     pack,
     packed,
     prefetch,
+    smaller,
     unpack,
 )
 from kalux.events import EventArray
@@ -249,7 +250,7 @@ def _begin_exposure(pixels, touched, on, off, unit_on, unit_off):  # type: ignor
     for block in range(np.uint64(len(touched))):
         first = block * np.uint64(EXPOSED)
         if touched[block]:
-            count = min(np.uint64(len(pixels)) - first, np.uint64(EXPOSED))
+            count = smaller(np.uint64(len(pixels)) - first, np.uint64(EXPOSED))
             for i in range(count):
                 up[i] = exponential(unit_on * np.float32(on[first + i]))
             for i in range(count):
@@ -262,7 +263,7 @@ def _integrate(words, pixels, width, start, middle, unit):  # type: ignore[no-un
     # A level beyond float32 (88 in log intensity: a broken pixel) becomes infinite or 0; `logarithm` is finite there.
     last = len(words) - 1
     for i in range(len(words)):
-        ahead = words[min(i + AHEAD, last), 1]
+        ahead = words[smaller(i + AHEAD, last), 1]
         prefetch(pixels, event_row(ahead) * width + event_column(ahead))
         word = words[i, 1]
         pixel = pixels[event_row(word) * width + event_column(word)]
@@ -299,7 +300,7 @@ def relative_levels(exposure, block, duration, fields, middle, events):  # type:
         middle[:] = events[:] = np.float32(0.0)
         return
     first = block * np.uint64(EXPOSED)
-    count = min(np.uint64(len(exposure.pixels)) - first, np.uint64(EXPOSED))
+    count = smaller(np.uint64(len(exposure.pixels)) - first, np.uint64(EXPOSED))
     unpack(exposure.pixels, np.int64(first), np.int64(count), fields)
     level, integral, since = fields[_LEVEL], fields[_INTEGRAL], fields[_SINCE]
     at_middle, count_of = fields[_AT_MIDDLE], fields[_EVENTS]
@@ -323,7 +324,7 @@ def _finish_exposure(  # type: ignore[no-untyped-def]
     at_middle, peak, events = fields[_AT_MIDDLE], fields[_PEAK], fields[_EVENTS]
     for block in range(np.uint64(len(touched))):
         first = block * np.uint64(EXPOSED)
-        count = min(np.uint64(len(pixels)) - first, np.uint64(EXPOSED))
+        count = smaller(np.uint64(len(pixels)) - first, np.uint64(EXPOSED))
         if not touched[block]:
             for plane in (log_mean, to_middle, to_end, largest, count_of):
                 plane[first : first + count] = np.float32(0.0)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.bridge import UNMEASURED, UNSEEN, BridgedSegment, Latent, Told, UnshownMemory
-from kalux.compiled import loop
+from kalux.compiled import larger, loop, smaller
 
 Floats = NDArray[np.floating[Any]]
 
@@ -301,7 +301,7 @@ def expected_excess(memory: UnshownMemory, variance: Floats, initial_variance: f
 def _grown(pixels, variance, initial_variance, noise):  # type: ignore[no-untyped-def]
     """What has come to the variance."""
     for i in range(len(pixels)):
-        noise[i] = max(np.float32(variance[pixels[i]]) - initial_variance, np.float32(0.0))
+        noise[i] = larger(np.float32(variance[pixels[i]]) - initial_variance, np.float32(0.0))
 
 
 def above_frames(segment: BridgedSegment, pixels: NDArray[np.int64], bound: Floats) -> Floats:
@@ -331,10 +331,10 @@ def _at_pixels(pixels, width, parts, values):  # type: ignore[no-untyped-def]
     last_row, last_column = parts.shape[0] - 1, parts.shape[1] - 1
     for i in range(len(pixels)):
         row, column = divmod(pixels[i], width)
-        y = max((np.float32(row) + np.float32(0.5)) / np.float32(_PART) - np.float32(0.5), zero)
-        x = max((np.float32(column) + np.float32(0.5)) / np.float32(_PART) - np.float32(0.5), zero)
-        top, left = min(int(y), last_row), min(int(x), last_column)
-        below, beside = min(top + 1, last_row), min(left + 1, last_column)
+        y = larger((np.float32(row) + np.float32(0.5)) / np.float32(_PART) - np.float32(0.5), zero)
+        x = larger((np.float32(column) + np.float32(0.5)) / np.float32(_PART) - np.float32(0.5), zero)
+        top, left = smaller(np.int64(y), last_row), smaller(np.int64(x), last_column)
+        below, beside = smaller(top + 1, last_row), smaller(left + 1, last_column)
         down, right = y - np.float32(top), x - np.float32(left)
         upper = parts[top, left] * (one - right) + parts[top, beside] * right
         lower = parts[below, left] * (one - right) + parts[below, beside] * right

@@ -30,6 +30,7 @@ from kalux.compiled import (
     event_words,
     loop,
     prefetch,
+    smaller,
     weighed,
 )
 from kalux.events import EVENT_DTYPE, NEVER, EventArray
@@ -96,7 +97,7 @@ def step_weight(since_pixel, refractory_period):  # type: ignore[no-untyped-def]
 def _weigh(words, latest, width, refractory_period):  # type: ignore[no-untyped-def]
     last = len(words) - 1
     for i in range(len(words)):
-        ahead = words[min(i + AHEAD, last), 1]
+        ahead = words[smaller(i + AHEAD, last), 1]
         prefetch(latest, event_row(ahead) * width + event_column(ahead))
         t, word = words[i, 0], words[i, 1]
         at = event_row(word) * width + event_column(word)

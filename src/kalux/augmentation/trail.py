@@ -33,6 +33,7 @@ from kalux.compiled import (
     loop,
     packed,
     prefetch,
+    smaller,
 )
 from kalux.events import EventArray
 
@@ -177,7 +178,7 @@ def _follow(words, codes, counts, width, late):  # type: ignore[no-untyped-def]
     words, one, two = flat(words), np.uint64(1), np.uint64(2)
     last = np.uint64(len(words)) - two
     for i in range(np.uint64(0), last + one, two):
-        ahead = words[min(i + two * np.uint64(AHEAD), last) + one]
+        ahead = words[smaller(i + two * np.uint64(AHEAD), last) + one]
         prefetch(codes, (event_row(ahead) * width + event_column(ahead)) * two)
         t, word = words[i], words[i + one]
         at = (event_row(word) * width + event_column(word)) * two

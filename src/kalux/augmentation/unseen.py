@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from kalux import memory
 from kalux.augmentation.bridge import UNMEASURED, BridgedSegment, Latent
-from kalux.compiled import apart, empty, loop, zeros
+from kalux.compiled import apart, empty, larger, loop, smaller, zeros
 
 Array = NDArray[np.floating[Any]]
 
@@ -80,7 +80,7 @@ def turns(on: Array, off: Array) -> float:
 def _pairs(on, off):  # type: ignore[no-untyped-def]
     pairs, active = 0.0, 0
     for i in range(np.uint64(len(on))):
-        pairs += min(on[i], off[i])
+        pairs += smaller(on[i], off[i])
         active += on[i] + off[i] > 0
     return pairs, active
 
@@ -137,7 +137,7 @@ def _alike(seconds, q0, most, before, slope, forward, backward, events, change):
     for i in range(np.uint64(len(change))):
         noise = np.float32(forward[i]) + np.float32(backward[i])
         share = q0 / (noise + q0)
-        moved = min(max(np.float32(slope[i]) * seconds / share, -most), most)
+        moved = smaller(larger(np.float32(slope[i]) * seconds / share, -most), most)
         silent = noise < np.float32(UNMEASURED) and events[i] == np.float32(0.0)
         change[i] = moved if silent else np.float32(np.nan)
         if silent and before[i] == before[i]:
@@ -182,7 +182,7 @@ def _forget(q0, forward, backward, after, on, off, change, grown):  # type: igno
     for i in range(np.uint64(len(grown))):
         noise = np.float32(forward[i]) + np.float32(backward[i])
         missed = noise / (noise + q0)
-        measured = max(np.float32(forward[i]), np.float32(after[i])) < unmeasured
+        measured = larger(np.float32(forward[i]), np.float32(after[i])) < unmeasured
         lost = np.float32(change[i]) * missed * missed
         grown[i] += lost if measured and on[i] + off[i] == zero else zero
 
@@ -203,7 +203,7 @@ def _told(given, seconds, q0, most, told_of):  # type: ignore[no-untyped-def]
     )
     sum_change, sum_share = zeros(_BLOCK, np.float64), zeros(_BLOCK, np.float64)
     for first in range(np.uint64(0), np.uint64(len(slope)), np.uint64(_BLOCK)):
-        pixels = range(min(np.uint64(len(slope)) - first, np.uint64(_BLOCK)))
+        pixels = range(smaller(np.uint64(len(slope)) - first, np.uint64(_BLOCK)))
         for k in pixels:
             noise[k] = np.float32(forward[first + k]) + np.float32(backward[first + k])
         for k in pixels:
@@ -214,8 +214,8 @@ def _told(given, seconds, q0, most, told_of):  # type: ignore[no-untyped-def]
             share[k] = taken * taken
         for k in pixels:
             moved = np.float32(slope[first + k]) * seconds
-            of_noise = min(noise[k], unmeasured) * share[k]
-            change[first + k] = is_silent[k] * (min(moved * moved, most) - of_noise)
+            of_noise = smaller(noise[k], unmeasured) * share[k]
+            change[first + k] = is_silent[k] * (smaller(moved * moved, most) - of_noise)
         for k in pixels:
             untold[first + k] = is_silent[k] * (one - share[k])
         for k in pixels:
@@ -224,7 +224,11 @@ def _told(given, seconds, q0, most, told_of):  # type: ignore[no-untyped-def]
             sum_change[k] += change[first + k]
         for k in pixels:
             sum_share[k] += is_silent[k] * share[k]
-    return sum_change.sum(), sum_share.sum()
+    of_change, of_share = 0.0, 0.0
+    for k in range(_BLOCK):
+        of_change += sum_change[k]
+        of_share += sum_share[k]
+    return of_change, of_share
 
 
 @loop
@@ -240,7 +244,7 @@ def _mean(total, count, forward, backward, unknown, unmeasured_change, mean):  #
     for row in range(total.shape[0]):
         for column in range(total.shape[1]):
             i = row, column
-            near = max(total[i], zero) / max(np.float32(count[i]), one) if count[i] > 0 else unknown
+            near = larger(total[i], zero) / larger(np.float32(count[i]), one) if count[i] > 0 else unknown
             measured = np.float32(forward[i]) + np.float32(backward[i]) < unmeasured
             mean[i] = near if measured else unmeasured_change
 

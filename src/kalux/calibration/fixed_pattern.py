@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from kalux.calibration.frame_noise import MAX_FRAMES
 from kalux.calibration.regression import parts, ratio_error
-from kalux.compiled import loop
+from kalux.compiled import larger, loop, smaller
 from kalux.filters.shots import Shot, take_shot
 from kalux.models.camera import Camera
 from kalux.recording import Recording
@@ -137,7 +137,8 @@ def _look_around(  # type: ignore[no-untyped-def]
     for row in range(0, height, step):
         for column in range(0, width, step):
             place += 1
-            if min(row, column, height - 1 - row, width - 1 - column) < pitch:
+            to_row, to_column = smaller(row, height - 1 - row), smaller(column, width - 1 - column)
+            if smaller(to_row, to_column) < pitch:
                 continue
             own = intensity[levels[row, column]]
             total, squares, usable = np.float32(0.0), np.float32(0.0), True
@@ -151,7 +152,7 @@ def _look_around(  # type: ignore[no-untyped-def]
             mean = total * eighth
             around = own + mean
             if usable and np.isfinite(total) and around > darkest:
-                spread = max(squares * eighth - mean * mean, np.float32(0.0))
+                spread = larger(squares * eighth - mean * mean, np.float32(0.0))
                 beyond[place] = -mean
                 light[place] = around
                 weight[place] = np.float32(1.0) / (

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from kalux.augmentation.deblur import all_between
 from kalux.calibration.intervals import intervals
-from kalux.compiled import empty, event_column, event_row, event_words, loop, zeros
+from kalux.compiled import empty, event_column, event_row, event_words, loop, smaller, zeros
 from kalux.events import EventArray
 from kalux.filters.shots import Shot, take_shot
 from kalux.frames import Frame
@@ -311,7 +311,7 @@ def _in_bins(level, difference, kept):  # type: ignore[no-untyped-def]
     sums, stops = zeros(_BINS, np.float64), zeros(_BINS + 1, np.int64)
     for i in range(len(kept)):
         value = level[kept[i]]
-        k = min(int(value * _BINS), _BINS - 1)
+        k = smaller(np.int64(value * _BINS), _BINS - 1)
         index[i] = k
         sums[k] += value
         stops[k + 1] += 1
@@ -344,7 +344,7 @@ def _trimmed_variance(values):  # type: ignore[no-untyped-def]
         mean, squares = total / count, 0.0
         for value in values:
             if low <= value <= high:
-                squares += (value - mean) ** 2
+                squares += (value - mean) * (value - mean)
         before, variance = count, squares / count
         spread = np.sqrt(variance)
         low, high = mean - 4 * spread, mean + 4 * spread

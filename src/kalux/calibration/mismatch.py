@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from kalux.calibration.event_model import DARKEST, ErrorModel, Samples, mismatch_of
 from kalux.calibration.intervals import counted_intervals
 from kalux.calibration.regression import parts, ratio_error
-from kalux.compiled import loop
+from kalux.compiled import larger, loop, smaller
 from kalux.recording import Recording
 from kalux.settings import CameraSettings, EventSettings
 
@@ -117,7 +117,7 @@ def _add(mismatches, variances, told, steps_on, steps_off, products):  # type: i
             i = row, column
             on, off = steps_on[i], steps_off[i]
             most = _CLIP * np.sqrt(variances[i])
-            mismatch = min(max(mismatches[i], -most), most)
+            mismatch = smaller(larger(mismatches[i], -most), most)
             weight = 1.0 / variances[i] if told[i] else 0.0
             for polarity in range(2):
                 own, other = (on, off) if polarity == 0 else (-off, -on)

@@ -24,7 +24,7 @@ from kalux.calibration.levels import ClippingLevels, clipping_levels
 from kalux.calibration.refractory import dead_time, shortest_interval
 from kalux.calibration.regression import ratio_error
 from kalux.calibration.values import Calibration
-from kalux.compiled import inner, loop
+from kalux.compiled import inner, larger, loop, smaller
 from kalux.events import NEVER, EventArray
 from kalux.recording import Recording
 from kalux.settings import CameraSettings, EventSettings
@@ -256,9 +256,11 @@ def _tallied(chunks: Iterator[EventArray], first: int, last: int, ignored: NDArr
 def _add_quiet(start, end, first, length, row, column, quiet):  # type: ignore[no-untyped-def]
     """Spread the quiet time from start to end over the windows."""
     while start < end:
-        window = min(int((start - first) / length), quiet.shape[0] - 1)
-        stop = end if window == quiet.shape[0] - 1 else min(end, first + int((window + 1) * length) + 1)
-        stop = max(stop, start + 1)  # over hundreds of years a float's step is more than 1 us
+        window = smaller(np.int64((start - first) / length), quiet.shape[0] - 1)
+        stop = (
+            end if window == quiet.shape[0] - 1 else smaller(end, first + np.int64((window + 1) * length) + 1)
+        )
+        stop = larger(stop, start + 1)  # over hundreds of years a float's step is more than 1 us
         quiet[window, row, column] += stop - start
         start = stop
 
@@ -267,7 +269,7 @@ def _add_quiet(start, end, first, length, row, column, quiet):  # type: ignore[n
 def _count_pending(pending, row, column, first, length, counts):  # type: ignore[no-untyped-def]
     """Count a pixel's event that waits, if one does, in the window of its time."""
     if pending[row, column] != NEVER:
-        window = min(int((pending[row, column] - first) / length), counts.shape[0] - 1)
+        window = smaller(np.int64((pending[row, column] - first) / length), counts.shape[0] - 1)
         counts[window, row, column] += 1
 
 
@@ -284,8 +286,8 @@ def _tally(t, x, y, first, length, gap, ignored, busy_until, pending, counts, qu
             pending[row, column] = now
         if ignored[row, column]:
             continue
-        for r in range(max(0, row - 1), min(height, row + 2)):
-            for c in range(max(0, column - 1), min(width, column + 2)):
+        for r in range(larger(0, row - 1), smaller(height, row + 2)):
+            for c in range(larger(0, column - 1), smaller(width, column + 2)):
                 if r == row and c == column:
                     continue
                 # Quiet until `gap` before this event.
@@ -295,7 +297,7 @@ def _tally(t, x, y, first, length, gap, ignored, busy_until, pending, counts, qu
                 if pending[r, c] <= end:
                     _count_pending(pending, r, c, first, length, counts)
                 pending[r, c] = NEVER
-                busy_until[r, c] = max(busy_until[r, c], now + gap)
+                busy_until[r, c] = larger(busy_until[r, c], now + gap)
 
 
 @loop

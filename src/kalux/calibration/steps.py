@@ -21,15 +21,17 @@ from __future__ import annotations
 
 from typing import Final, NamedTuple
 
-import numba as nb
+import cv2
 import numpy as np
+from numba.core import types
 from numpy.typing import NDArray
 
-from kalux.augmentation.deblur import between
+from kalux.augmentation.deblur import between, count_chunks
 from kalux.augmentation.refractory import step_weight
 from kalux.calibration.intervals import Exposures, Interval, intervals
-from kalux.compiled import empty, event_column, event_is_on, event_row, event_words, inner, loop, zeros
+from kalux.compiled import empty, event_column, event_is_on, event_row, event_words, loop, smaller, zeros
 from kalux.events import NEVER
+from kalux.formulas import Number, choose, formula
 from kalux.recording import Recording
 from kalux.settings import CameraSettings
 
@@ -41,6 +43,7 @@ MAX_SAMPLES: Final = 100_000
 _MAX_FRAMES: Final = 200
 _LEAST_AROUND: Final = 8  # events of the eight neighbours: where less happens it may be noise
 _LEAST_NEIGHBOURS: Final = 4  # that frames show well
+_PATCH: Final = tuple((row, column) for row in (-1, 0, 1) for column in (-1, 0, 1))
 
 _HOT_LEAST: Final = 10
 _HOT_FACTOR: Final = 4
@@ -222,29 +225,18 @@ class _Passing:
         Hot pixels are none of either.
         """
         start, end = interval.start + self._delay, interval.end + self._delay
-        happened = np.zeros(self._shape, np.int32)
-        _add(event_words(between(interval.events, start, end)), happened)
+        on, off = count_chunks([between(interval.events, start, end)], self._shape, weighed=False)
+        happened = on + off
         usable = interval.usable & ~_hot(happened)
         candidates = np.flatnonzero(_something_happens(happened, usable))
         return candidates[:: max(-(-len(candidates) // self._most), 1)], usable
 
 
-@loop
-def _add(words, happened):  # type: ignore[no-untyped-def]
-    """Count every pixel's events."""
-    for i in range(len(words)):
-        word = words[i, 1]
-        happened[event_row(word), event_column(word)] += 1
-
-
-@loop
-def _with_neighbours(chosen, height, width):  # type: ignore[no-untyped-def]
+def _with_neighbours(chosen: NDArray[np.int64], height: int, width: int) -> NDArray[np.bool_]:
     """(H W) bool: pixels not at the border, and those around them."""
-    found = zeros(height * width, np.bool_)
-    for at in chosen:
-        for i in range(-1, 2):
-            for j in range(-1, 2):
-                found[at + i * width + j] = True
+    found = np.zeros(height * width, np.bool_)
+    for place in _PATCH:
+        found[chosen + place[0] * width + place[1]] = True
     return found
 
 
@@ -279,30 +271,23 @@ def _by_pixel(words, width, wanted):  # type: ignore[no-untyped-def]
     return order, starts
 
 
-@nb.njit(cache=True, inline="always", error_model="numpy")
-def _ramp_sum(t, start, end):  # type: ignore[no-untyped-def]
+def _ramp_sum(t: Number, start: Number, end: Number) -> Number:
     """Integral until t, us, of what goes from 0 at ``start`` to 1 at ``end``."""
-    if t <= start:
-        return 0.0
-    if t < end:
-        return (t - start) ** 2 / (2.0 * (end - start))
-    return t - 0.5 * (start + end)
+    within = (t - start) * (t - start) / (2.0 * (end - start))
+    return choose(t > start, choose(t < end, within, t - 0.5 * (start + end)), t.like(0.0))
 
 
-@inner
-def _ramp_mean(begin, stop, start, end):  # type: ignore[no-untyped-def]
+def _ramp_mean(begin: Number, stop: Number, start: Number, end: Number) -> Number:
     """Mean from ``begin`` to ``stop`` of what goes from 0 at ``start`` to 1 at ``end``."""
-    if stop <= start:
-        return 0.0
-    if begin >= end:
-        return 1.0
-    return (_ramp_sum(stop, start, end) - _ramp_sum(begin, start, end)) / (stop - begin)
+    mean = (_ramp_sum(stop, start, end) - _ramp_sum(begin, start, end)) / (stop - begin)
+    return choose(stop > start, choose(begin < end, mean, mean.like(1.0)), mean.like(0.0))
 
 
-@inner
-def _shown(exposures, start, end):  # type: ignore[no-untyped-def]
+@formula(types.float64)
+def _shown(
+    begin: Number, stop: Number, second_begin: Number, second_stop: Number, start: Number, end: Number
+) -> Number:
     """By how much more the second exposure shows of what goes from 0 at ``start`` to 1 at ``end``."""
-    begin, stop, second_begin, second_stop = exposures
     return _ramp_mean(second_begin, second_stop, start, end) - _ramp_mean(begin, stop, start, end)
 
 
@@ -321,65 +306,50 @@ def _count(words, order, starts, latest, sign, exposures, periods, late, counts)
             if t > exposures[0] and before < exposures[3]:
                 pace_after = _SLOWEST
                 if j + 1 < starts[at + 1] and event_is_on(words[order[j + 1], 1]) == on:
-                    pace_after = min(_SLOWEST, float(words[order[j + 1], 0]) - t)
+                    pace_after = smaller(_SLOWEST, float(words[order[j + 1], 0]) - t)
                 soon, column = np.uint64(since < late), np.uint64(not on)
                 if own_sign == -sign_before:
                     # At one pace, the way out takes a quarter of the time and the way back the rest.
-                    out = _shown(exposures, before, before + min(_PEAK * pace_before, 0.25 * since))
-                    back = _shown(exposures, t - min((1 + _PEAK) * pace_after, 0.75 * since), t)
+                    out = _shown(*exposures, before, before + smaller(_PEAK * pace_before, 0.25 * since))
+                    back = _shown(*exposures, t - smaller((1 + _PEAK) * pace_after, 0.75 * since), t)
                     for k in range(len(periods)):
                         counts[at, k, soon, column] += back
                         counts[at, k, soon, 1 - column] += _PEAK * (out - back)
                 else:
-                    arrive = 0.5 * min(pace_after, since)
+                    arrive = 0.5 * smaller(pace_after, since)
                     if sign_before == 0:  # where the light was before the pixel's first event is not known
-                        step = _shown(exposures, t - 2.0 * arrive, t)
+                        step = _shown(*exposures, t - 2.0 * arrive, t)
                     else:
-                        leave = 0.5 * min(pace_before, since)
-                        step = 0.5 * _shown(exposures, before, before + leave)
-                        step += 0.5 * _shown(exposures, t - arrive, t)
+                        leave = 0.5 * smaller(pace_before, since)
+                        step = 0.5 * _shown(*exposures, before, before + leave)
+                        step += 0.5 * _shown(*exposures, t - arrive, t)
                     for k in range(len(periods)):
                         counts[at, k, soon, column] += step * step_weight(np.float32(since), periods[k])
-            pace_before = min(_SLOWEST, since) if own_sign == sign_before else _SLOWEST
+            pace_before = smaller(_SLOWEST, since) if own_sign == sign_before else _SLOWEST
             before, sign_before = t, own_sign
         # The next event is too far away to know its sign: on both ways lies half a threshold.
-        step = 0.5 * _shown(exposures, before, before + 0.5 * pace_before)
+        step = 0.5 * _shown(*exposures, before, before + 0.5 * pace_before)
         for k in range(len(periods)):
             counts[at, k, 0, np.uint64(sign_before < 0)] += step
 
 
-@loop
-def _hot(happened):  # type: ignore[no-untyped-def]
+def _hot(happened: NDArray[np.float32]) -> NDArray[np.bool_]:
     """(H, W): pixels with far more events than any of their neighbours."""
-    height, width = happened.shape
-    found = zeros((height, width), np.bool_)
-    for row in range(height):
-        for column in range(width):
-            if happened[row, column] > _HOT_LEAST:
-                most = 0
-                for i in range(max(row - 1, 0), min(row + 2, height)):
-                    for j in range(max(column - 1, 0), min(column + 2, width)):
-                        if not (i == row and j == column):
-                            most = max(most, happened[i, j])
-                found[row, column] = happened[row, column] > _HOT_LEAST + _HOT_FACTOR * most
+    found, bordered = np.zeros(happened.shape, np.bool_), np.pad(happened, 1)
+    busy = np.nonzero(happened > _HOT_LEAST)
+    beside = [bordered[busy[0] + 1 + i, busy[1] + 1 + j] for i, j in _PATCH if (i, j) != (0, 0)]
+    found[busy] = happened[busy] > _HOT_LEAST + _HOT_FACTOR * np.max(beside, axis=0)
     return found
 
 
-@loop
-def _something_happens(happened, usable):  # type: ignore[no-untyped-def]
+def _something_happens(happened: NDArray[np.float32], usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """(H, W): well exposed pixels not at the border whose neighbours have enough events."""
-    height, width = happened.shape
-    found = zeros((height, width), np.bool_)
-    for row in range(1, height - 1):
-        for column in range(1, width - 1):
-            if usable[row, column]:
-                around = -happened[row, column]
-                neighbours = -1
-                for i in range(row - 1, row + 2):
-                    for j in range(column - 1, column + 2):
-                        around += happened[i, j]
-                        neighbours += usable[i, j]
-                found[row, column] = around >= _LEAST_AROUND and neighbours >= _LEAST_NEIGHBOURS
+    around, neighbours = (
+        cv2.boxFilter(values, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT) - values
+        for values in (happened, usable.view(np.uint8))
+    )
+    found = np.zeros_like(usable)
+    found[1:-1, 1:-1] = (usable & (around >= _LEAST_AROUND) & (neighbours >= _LEAST_NEIGHBOURS))[1:-1, 1:-1]
     return found
 
 
@@ -400,7 +370,8 @@ def _looked_at(counts, change, usable, chosen):  # type: ignore[no-untyped-def]
         for i in range(row - 1, row + 2):
             for j in range(column - 1, column + 2):
                 if usable[i, j] and not (i == row and j == column):
-                    weight = 1.0 / (1.0 + ((change[i, j] - change[row, column]) / _ALIKE) ** 2)
+                    apart = (change[i, j] - change[row, column]) / _ALIKE
+                    weight = 1.0 / (1.0 + apart * apart)
                     for k in range(size):
                         around[n, k] += weight * counts[i, j, k]
                     change_around[n] += weight * change[i, j]

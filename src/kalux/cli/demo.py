@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from kalux.ahead import default_threads
-from kalux.cli.loops import compiling_beside, prepare_loops, tell_of_compiling
+from kalux.cli.loops import OF_ALL, compiling_beside, prepare_loops, tell_of_compiling
 from kalux.cli.parser import Parser
 from kalux.cli.terminal import say
 
@@ -53,7 +53,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     started = time.monotonic()
     try:
         # These are done before the demo comes to them.
-        with compiling_beside(["images", "filter"], default_threads()):
+        with compiling_beside(OF_ALL, default_threads()):
             found = run_demo(options.out, overwrite=options.overwrite, say=say)
     except KeyboardInterrupt as interrupt:
         if options.out.is_dir() and any(options.out.iterdir()):

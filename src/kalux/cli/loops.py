@@ -109,46 +109,51 @@ def tell_of_compiling(*, quiet: bool = False, tell: Callable[[str], None] = erro
     event.register("numba:compile", _listener(begin))  # type: ignore[no-untyped-call]
 
 
+OF_IMAGES: Final = ("images", "display")
+"""Parts of `kalux.cli.rehearsal` that every reconstruction comes to after the estimates."""
+
+OF_ALL: Final = ("images", "segment", "display", "filter")
+"""Those of the default filter. What is come to last is first; "filter", the last, is left to the command where one
+process alone does the others, which take it as long."""
+
+_MOST_BESIDE: Final = 2
+"""Processes: the estimates, which the command itself compiles, take as long as each of these does then."""
+
+
 @contextlib.contextmanager
-def compiling_beside(parts: Sequence[str], threads: int) -> Generator[Callable[[], None], None, None]:
+def compiling_beside(parts: Sequence[str], threads: int) -> Generator[None, None, None]:
     """Within it, where this process has to compile a loop, others compile what it will come to later.
 
     numba compiles one loop at a time, whatever the number of threads. Processes start with the first loop that is not
     kept: where all are, nothing is done. They leave nothing but numba's cache, so that no result depends on them, nor
-    on whether they come to an end. Those that are still running when the block is left are ended.
+    on whether they come to an end, and nobody waits for them: what they have not compiled in time this process
+    compiles itself. Those that are still running when the block is left are ended.
 
     Parameters
     ----------
     parts
-        Of `kalux.cli.rehearsal`, for each of which there is a process.
+        Of `kalux.cli.rehearsal`, which the processes take in turns.
     threads
-        That there may be, of which this process is one: the last parts have none where there are too few.
-
-    Yields
-    ------
-    callable
-        Waits until the processes are done: to compile what they are compiling would be done twice.
+        That there may be, of which this process is one.
     """
     from numba.core import event
 
     running: list[subprocess.Popen[bytes]] = []
-    waiting = list(parts[: threads - 1]) if sys.executable else []
+    count = min(threads - 1, _MOST_BESIDE) if sys.executable else 0
+    parts = OF_ALL[:-1] if count == 1 and parts == OF_ALL else parts
+    waiting = [list(parts[number::count]) for number in range(count)]
 
     def begin() -> None:
         while waiting:
             # -P: what lies in the working folder is not imported in place of modules.
-            command = [sys.executable, "-P", "-m", "kalux.cli.rehearsal", waiting.pop()]
+            command = [sys.executable, "-P", "-m", "kalux.cli.rehearsal", *waiting.pop(0)]
             none = subprocess.DEVNULL
             with contextlib.suppress(OSError):  # no room for another process: all is compiled in this one
                 running.append(subprocess.Popen(command, stdin=none, stdout=none, stderr=none))
 
-    def wait() -> None:
-        for process in running:
-            process.wait()
-
     try:
         with event.install_listener("numba:compile", _listener(begin)):
-            yield wait
+            yield
     finally:
         waiting.clear()
         for process in running:

@@ -17,7 +17,7 @@ from kalux.ahead import default_threads
 from kalux.cli.calibrations import add_calibration, given_calibration
 from kalux.cli.checking import Contents, check_beside
 from kalux.cli.flags import HelpSettings, add_display, add_settings, given_settings
-from kalux.cli.loops import compiling_beside, prepare_loops, tell_of_compiling
+from kalux.cli.loops import OF_ALL, OF_IMAGES, compiling_beside, prepare_loops, tell_of_compiling
 from kalux.cli.output import DEFAULT_RATE, FOLDER_FORMATS, Output, check_output, chosen_output, image_rate
 from kalux.cli.parser import Parser, UsageError, number, whole
 from kalux.cli.progress import Progress, short_number
@@ -164,7 +164,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     prepare_loops()
     tell_of_compiling(quiet=options.quiet)
     threads = options.threads or default_threads()
-    with compiling_beside(_compiled_later(settings), threads) as compiled:
+    with compiling_beside(_compiled_later(settings), threads):
         recording = open_recording(options)
         with Progress("checking", quiet=options.quiet) as progress:
             contents, made = check_beside(
@@ -188,7 +188,6 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
             )
         if not options.quiet:
             say("\n".join(decided(recording, contents, made, settings, output, options)))
-        compiled()
         seconds, images = write_images(
             recording, made, output, metadata(recording, made, options, command), options
         )
@@ -199,10 +198,10 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
             )
 
 
-def _compiled_later(settings: Settings) -> list[str]:
-    """Parts of `kalux.cli.rehearsal` that a reconstruction comes to after the estimates; the longest first."""
+def _compiled_later(settings: Settings) -> tuple[str, ...]:
+    """Parts of `kalux.cli.rehearsal` that a reconstruction comes to after the estimates."""
     is_default = settings.filter.kind == "akf" and settings.filter.augmentation == "bridge"
-    return ["images", "filter"] if is_default else ["images"]
+    return OF_ALL if is_default else OF_IMAGES
 
 
 def _check_apart(output: Output, recording: Path) -> None:

@@ -12,10 +12,17 @@ from typing import Final
 
 import numpy as np
 
+from kalux.augmentation.bridge import BridgeNoise, Latent, bridge, drift, nominal_thresholds
 from kalux.augmentation.highlights import Unshown
+from kalux.augmentation.trail import Trail, nothing_followed, polarity_of, trail_between
+from kalux.augmentation.unseen import forget_silence, half_way, silent_change, turns
 from kalux.cli.loops import prepare_loops
+from kalux.compiled import apart
 from kalux.display import Auto, DisplaySettings, fill_levels, measure, quantised
 from kalux.events import EVENT_DTYPE
+from kalux.filters import akf_bridged
+from kalux.filters.akf import State
+from kalux.filters.common import make_clock
 from kalux.frames import Frame
 from kalux.images import Estimate, View, make_image
 from kalux.reconstructor import Reconstructor
@@ -50,7 +57,7 @@ def rehearse_filter() -> None:
 
 
 def rehearse_images() -> None:
-    """From L to an intensity, and on to the levels of a video and to a PNG."""
+    """From L to an intensity."""
     level = np.random.default_rng(0).normal(-1.0, 1.0, _SIZE).astype(np.float32)
     some, ones = np.arange(100), np.ones(100, np.float32)
     estimate = Estimate(
@@ -65,15 +72,51 @@ def rehearse_images() -> None:
         unmeasured=some,
     )
     view = View(0.02, 0.04, 0.1, 1.0, 0.3, 1.0, 0.0, None, (1.0, 1.0, 1.0))
-    intensity = make_image(estimate, view, with_variance=False).intensity
+    make_image(estimate, view, with_variance=False)
+
+
+def rehearse_display() -> None:
+    """From an intensity to the levels of a video and to a PNG."""
+    intensity = np.random.default_rng(0).random(_SIZE, np.float32)
     display = DisplaySettings(Auto())
     statistics = measure(intensity, display.curve)
     fill_levels(intensity, display, statistics, (16.0, 235.0), np.empty(_SIZE, np.uint8))
     png_bytes(quantised(intensity, display, statistics, np.uint16))
 
 
-PARTS: Final[dict[str, Callable[[], None]]] = {"images": rehearse_images, "filter": rehearse_filter}
-"""What can be compiled by itself, in about the same time each; the estimates before them take as long again."""
+def rehearse_segment() -> None:
+    """What is done for pixels between two frames, once the events between are counted."""
+    random = np.random.default_rng(0)
+    seconds, variance, change = 1e-6 * _PERIOD, 0.01, np.full(_SIZE, np.nan, np.float32)
+    planes = apart(8, _SIZE)
+    planes[:] = random.random(planes.shape, np.float32)
+    first, second = Latent(planes[0], planes[1]), Latent(planes[2], planes[3])
+    on, off, far_on, far_off = planes[4:]
+    thresholds = nominal_thresholds(_SIZE, 0.1, np.float32)
+    noise = BridgeNoise(0.2, 0.2, variance, variance, variance)
+    newest = nothing_followed(_SIZE).newest
+    start, grown = trail_between(newest, newest, (0, _PERIOD), (seconds, 0.1, 0.1))
+    joined, _ = bridge(first, second, on, off, thresholds, noise, 0, _PERIOD, grown)
+    of_silent = silent_change(joined, variance, variance)
+    half_way(change, joined, variance, variance)
+    drifted, _, _ = drift(first, second, thresholds, noise, (far_on, far_off), (on, off))
+    forget_silence(drifted, joined, second, (on, off), of_silent, variance)
+    turns(on, off)
+    trail = Trail(start, polarity_of(newest), seconds, 0.1, 0.1)
+    segment = joined._replace(trail=trail, drift=drifted)
+    cursor = akf_bridged.begin(segment, State(first.value, first.variance, make_clock(_SIZE, 0)))
+    akf_bridged.advance(segment, cursor, np.zeros(1, EVENT_DTYPE), akf_bridged.Noise(0.1, variance, variance))
+    akf_bridged.moving_pixels(segment, cursor)
+    akf_bridged.end(segment, cursor)
+
+
+PARTS: Final[dict[str, Callable[[], None]]] = {
+    "images": rehearse_images,
+    "segment": rehearse_segment,
+    "display": rehearse_display,
+    "filter": rehearse_filter,
+}
+"""What can be compiled by itself: a fifth, a quarter and a fifteenth of all, and a tenth that is left of the filter."""
 
 if __name__ == "__main__":
     prepare_loops()

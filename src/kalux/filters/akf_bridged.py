@@ -31,10 +31,12 @@ from kalux.compiled import (
     event_weight,
     event_words,
     flat,
+    larger,
     loop,
     pack,
     packed,
     prefetch,
+    smaller,
     unpack,
     zeros,
 )
@@ -261,7 +263,7 @@ def _move_origin(cursor: Cursor, origin: int) -> None:
 @nb.njit(cache=True, inline="always")
 def _since(clock, now):  # type: ignore[no-untyped-def]
     """us from the time for which a pixel's state holds until ``now``; both us after the origin."""
-    return np.int32(now - max(clock, np.int32(0)))
+    return np.int32(now - larger(clock, np.int32(0)))
 
 
 @loop
@@ -282,7 +284,7 @@ def _begin_bridged(given, scalars, before, pixels, steps):  # type: ignore[no-un
     for row in range(np.uint64(height)):
         at = (row + np.uint64(1)) * np.uint64(width + 2) + np.uint64(1)
         for first in range(np.uint64(0), np.uint64(width), np.uint64(_BEGUN)):
-            count = min(np.uint64(width) - first, np.uint64(_BEGUN))
+            count = smaller(np.uint64(width) - first, np.uint64(_BEGUN))
             _copy(step_on, row, first, count, known[_STEP_ON])
             _copy(step_off, row, first, count, known[_STEP_OFF])
             _copy(forward, row, first, count, first_variance)
@@ -292,7 +294,7 @@ def _begin_bridged(given, scalars, before, pixels, steps):  # type: ignore[no-un
             for i in range(count):
                 information[i] = ONE / np.float32(variance[row, first + i])
             for i in range(count):
-                known_before = max(
+                known_before = larger(
                     np.float32(log_intensity[row, first + i]), np.float32(floor[row, first + i])
                 )  # K7
                 weighted[i] = information[i] * (known_before - level[i])
@@ -334,9 +336,9 @@ def _advance_bridged(words, pixels, steps, clock, polarity, origin, rate, step_v
     # While an event is filtered, the next one is weighed, and the clock is looked at for the one after: none waits for
     # another, and the processor works at all of them at a time.
     event = _weighed(_met(words, np.uint64(0), clock, polarity, stride, origin), scalars)
-    following = _met(words, min(two, last), clock, polarity, stride, origin)
+    following = _met(words, smaller(two, last), clock, polarity, stride, origin)
     for i in range(np.uint64(0), last + one, two):
-        ahead = words[min(i + two * np.uint64(AHEAD), last) + one]
+        ahead = words[smaller(i + two * np.uint64(AHEAD), last) + one]
         place = event_row(ahead) * stride + event_column(ahead) + stride + one
         prefetch(pixels, place)
         prefetch(steps, place)
@@ -354,7 +356,7 @@ def _advance_bridged(words, pixels, steps, clock, polarity, origin, rate, step_v
         pixel.rate = measurement_rate(scalars.rate, forward, known.backward + coming * scalars.step_variance)
         known.forward, known.coming = forward, coming
         event = _weighed(following, scalars)
-        following = _met(words, min(i + two + two, last), clock, polarity, stride, origin)
+        following = _met(words, smaller(i + two + two, last), clock, polarity, stride, origin)
 
 
 @nb.njit(cache=True, inline="always")
@@ -386,14 +388,14 @@ def _read_bridged(  # type: ignore[no-untyped-def]
 ):
     height, width = variance.shape
     pixels, clock, polarity = flat(pixels), flat(clock), flat(polarity)
-    size = min(width, _BLOCK)
+    size = smaller(width, _BLOCK)
     planes, ahead = empty((_STATE_FIELDS, size), np.float32), empty(size, np.float32)
     for row in range(height):
         at = (row + 1) * (width + 2) + 1
         newest = clock[at : at + width], polarity[at : at + width]
         rows = slope[row], log_intensity[row], variance[row]
         for first in range(0, width, size):  # the last block begins where it ends with the row
-            first = min(first, width - size)
+            first = smaller(first, width - size)
             unpack(pixels, at + first, size, planes)
             _read_block(planes, first, size, newest, heights, moment, rows, ahead)
 
@@ -429,5 +431,5 @@ def _predict_bridged(pixels, clock, span):  # type: ignore[no-untyped-def]
     for row in range(1, height - 1):
         for column in range(1, width - 1):
             pixel = pixels[row, column]
-            seconds = np.float32(span - max(clock[row, column], 0)) * MICROSECOND32
+            seconds = np.float32(span - larger(clock[row, column], 0)) * MICROSECOND32
             pixel.information = predicted_information(pixel.information, pixel.rate, seconds)

@@ -37,7 +37,7 @@ from kalux.augmentation.unseen import (
     silent_change,
     turns,
 )
-from kalux.compiled import apart, empty, loop
+from kalux.compiled import apart, empty, loop, smaller
 from kalux.events import EventArray
 from kalux.filters import akf_bridged
 from kalux.filters.akf import State
@@ -596,7 +596,7 @@ def _latent_frame(  # type: ignore[no-untyped-def]
     for block in range(np.uint64(len(exposure.touched))):
         relative_levels(exposure, block, duration, fields, middle, events)
         first = block * np.uint64(EXPOSED)
-        count = min(np.uint64(len(levels)) - first, np.uint64(EXPOSED))
+        count = smaller(np.uint64(len(levels)) - first, np.uint64(EXPOSED))
         for i in range(count):  # looking up is no vector code, the rest is
             log_frame[i] = level_log[levels[first + i]]
             known[i] = level_variance[levels[first + i]]
@@ -604,4 +604,4 @@ def _latent_frame(  # type: ignore[no-untyped-def]
             value[first + i] = log_frame[i] + middle[i]
         for i in range(count):
             doubt = known[i] + event_variance * events[i]
-            variance[first + i] = min(doubt, unmeasured)
+            variance[first + i] = smaller(doubt, unmeasured)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux import memory
-from kalux.compiled import largest_around, loop
+from kalux.compiled import larger, largest_around, loop, smaller
 
 MICROSECOND = 1e-6
 
@@ -42,7 +42,7 @@ def moved_clock(clock: Clock, span: int) -> Clock:
 @loop
 def _move(clock, span, moved):  # type: ignore[no-untyped-def]
     for i in range(len(clock)):
-        moved[i] = max(clock[i] - span, NEVER)
+        moved[i] = larger(clock[i] - span, NEVER)
 
 
 @nb.njit(cache=True, inline="always")
@@ -53,9 +53,9 @@ def newest_around(newest, row, column):  # type: ignore[no-untyped-def]
     """
     height, width = newest.shape
     latest = newest[row, column]
-    for i in range(max(row - 1, 0), min(row + 2, height)):
-        for j in range(max(column - 1, 0), min(column + 2, width)):
-            latest = max(latest, newest[i, j])
+    for i in range(larger(row - 1, 0), smaller(row + 2, height)):
+        for j in range(larger(column - 1, 0), smaller(column + 2, width)):
+            latest = larger(latest, newest[i, j])
     return latest
 
 

@@ -25,6 +25,7 @@ from kalux.compiled import (
     exponential,
     loop,
     prefetch,
+    smaller,
 )
 from kalux.events import EventArray
 from kalux.filters.common import EPOCH
@@ -114,7 +115,7 @@ def decayed(deviation, gain, seconds):  # type: ignore[no-untyped-def]
 def _advance(words, pixels, width, origin, scalars):  # type: ignore[no-untyped-def]
     last = len(words) - 1
     for i in range(len(words)):
-        ahead = words[min(i + AHEAD, last), 1]
+        ahead = words[smaller(i + AHEAD, last), 1]
         prefetch(pixels, event_row(ahead) * width + event_column(ahead))
         word = words[i, 1]
         pixel = pixels[event_row(word) * width + event_column(word)]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.highlights import Unshown
-from kalux.compiled import ONE, exponential, loop
+from kalux.compiled import ONE, exponential, larger, loop, smaller
 from kalux.filters.readout import HighlightPrior, believed_highlight
 
 Floats = NDArray[np.floating[Any]]
@@ -105,9 +105,9 @@ def _keep(log_intensity, unmeasured, white, log_offset, image):  # type: ignore[
         i = np.uint64(pixel)
         level = np.float32(log_intensity[i])
         if level > white - ONE:
-            below = max(white - level, np.float32(0.0))
+            below = larger(white - level, np.float32(0.0))
             least = exponential(white - below - below * below / _ABOUT_WHITE) - log_offset
-            image[i] = max(image[i], least)
+            image[i] = larger(image[i], least)
 
 
 @loop
@@ -116,9 +116,9 @@ def _take_mean(excess, noise, log_offset, white, scale2, stretch, mean):  # type
     half, zero = np.float32(0.5), np.float32(0.0)
     doubted = scale2 > zero
     for i in range(len(mean)):
-        level = mean[i] + half * min(excess[i] * excess[i], excess[i])
-        believed = white + believed_highlight(max(level - white, zero), noise[i], scale2, stretch)
-        mean[i] = max(exponential(believed if doubted and level > white else level) - log_offset, zero)
+        level = mean[i] + half * smaller(excess[i] * excess[i], excess[i])
+        believed = white + believed_highlight(larger(level - white, zero), noise[i], scale2, stretch)
+        mean[i] = larger(exponential(believed if doubted and level > white else level) - log_offset, zero)
 
 
 def smoothed_unshown(

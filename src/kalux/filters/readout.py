@@ -2,13 +2,29 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any, Final, NamedTuple
 
 import numba as nb
 import numpy as np
+from numba.core import types
 from numpy.typing import NDArray
 
-from kalux.compiled import FUSED, ONE, empty, exponential, inner, logarithm, loop, zeros
+from kalux.compiled import (
+    FUSED,
+    ONE,
+    empty,
+    exponential,
+    inner,
+    larger,
+    logarithm,
+    loop,
+    packed,
+    smaller,
+    word_at,
+    zeros,
+)
+from kalux.formulas import Number, Row, choose, formula
 
 Array = NDArray[np.floating[Any]]
 
@@ -50,6 +66,7 @@ _SLACK: Final = np.float32(1 / 8)
 _HALF_OF_PATCH: Final = np.float32(1 / 18)
 """From the sum over a patch of nine to half its mean."""
 
+_ZERO, _ONE, _TWO, _THREE, _FOUR = (np.uint64(k * _ROW) for k in range(5))
 _LEVEL, _DOUBT = np.uint64(0), np.uint64(_ROW)
 _NEAR, _FAR = np.uint64(0), np.uint64(_ROW)
 
@@ -122,25 +139,26 @@ def believed_highlight(excess, variance, scale2, stretch):  # type: ignore[no-un
         believed = w / stretch
         slope = exponential(-w) / (ONE + w)  # of d in the shrunk excess
         left *= slope * slope
-    return believed + np.float32(0.5) * min(left, believed * np.sqrt(left))
+    return believed + np.float32(0.5) * smaller(left, believed * np.sqrt(left))
 
 
-@nb.njit(cache=True, inline="always", error_model="numpy")
-def lambert_w(x):  # type: ignore[no-untyped-def]
-    """Lambert's W of a float32 x >= 0, to 4e-7 of itself, without branches.
+@formula(types.float32)
+def lambert_w(x: Number) -> Number:
+    """Lambert's W of a float32 x >= 0, to 4e-7 of itself.
 
     A guess that is everywhere within 2 % (Iacono and Boyd 2017, eq. 17, in other words), and one step of
     Fritsch's iteration, which takes the error to its fourth power.
     """
     two = np.float32(2.0)
-    x = max(x, np.float32(1e-30))
-    log = logarithm(ONE + x)
-    guess = log * (ONE - logarithm(ONE + log) / (two + log))
+    least = x.like(np.float32(1e-30))
+    x = choose(x < least, least, x)
+    log = logarithm.of(ONE + x)
+    guess = log * (ONE - logarithm.of(ONE + log) / (two + log))
     # The logarithm of 1 + x cannot tell a small x; there W = x - x^2.
-    w = guess if x > np.float32(1e-3) else x * (ONE - x)
-    z = logarithm(x / w) - w
+    w = choose(x > np.float32(1e-3), guess, x * (ONE - x))
+    z = logarithm.of(x / w) - w
     q = two * (ONE + w) * (ONE + w + two / np.float32(3.0) * z)
-    return w * (ONE + z / (ONE + w) * (q - z) / (q - two * z))
+    return w * (ONE + z / (ONE + w) * (q - z) / (q - two * z))  # type: ignore[no-any-return]
 
 
 class Hidden(NamedTuple):
@@ -164,8 +182,7 @@ def total_variance(variance, moving, change, hidden):  # type: ignore[no-untyped
     return variance + (of_moving if moving else changing * change)
 
 
-@nb.njit(cache=True, inline="always", error_model="numpy")
-def edge(unlikeness):  # type: ignore[no-untyped-def]
+def edge(unlikeness: Number) -> Number:
     """Between two pixels, of the sum over a patch of e^2 / (P + P' + slack): 1 where there is none.
 
     They are of one surface as far as 1 / edge^2, 0 to 1, says.
@@ -173,8 +190,7 @@ def edge(unlikeness):  # type: ignore[no-untyped-def]
     return ONE + unlikeness * _HALF_OF_PATCH
 
 
-@nb.njit(cache=True, inline="always")
-def _squared(value):  # type: ignore[no-untyped-def]
+def _squared(value: Number) -> Number:
     return value * value
 
 
@@ -240,7 +256,9 @@ def read_out(
     known = variance.astype(np.float32, copy=False)
     out = np.empty(log_intensity.shape, np.float32)
     total = np.empty(out.shape if with_variance and moving is not None else (0, 0), np.float32)
-    _read_out(
+    ends = np.searchsorted(unshown, np.arange(height + 1) * width)
+    next_unshown = ends[:-1].copy()  # of every row, in strips from left to right
+    given = (
         log_intensity.astype(np.float32, copy=False),
         known,
         np.empty((0, 0), np.bool_) if moving is None else moving,
@@ -251,37 +269,29 @@ def read_out(
         tuple(np.float32(value) for value in prior),
         np.float32(log_offset),
         unshown,
-        np.searchsorted(unshown, np.arange(height + 1) * width),
-        out,
-        total,
-        heard,
+        ends,
     )
+    for begin in range(0, width, _STRIP):
+        ring = _ring(0 if moving is None else pitch)
+        _read_out(*given, next_unshown, begin, ring, out, total, heard)
     return out, known if with_variance and moving is None else total, heard
 
 
-@inner
-def _ring(pitch):  # type: ignore[no-untyped-def]
+def _ring(pitch: int) -> _Ring:
+    """Before the first row of a strip: nothing is known, nothing is alike, nobody hears."""
     # A row's neighbours, and the patches around them, lie in rows to twice the pitch ahead and one behind; the rows
     # that need what is made of them, in one more ahead.
     count = 4 * pitch + 1
-    return _Ring(
-        _lines(2 * count),
-        _lines(2 * count),
-        _lines(4 * count),
-        _lines(4 * count),
-        empty((count, _STRIP), np.uint8),
-        empty((count, 2), np.int64),
-        _lines(np.int64(4)),
-        _lines(np.int64(2)),
+    rows = 0, 2 * count, 4 * count, 8 * count, 12 * count, 12 * count + 4, 12 * count + 6
+    memory = packed((rows[-1] * _ROW,), np.dtype(np.float32))  # all rows begin where lines of the cache do
+    memory[:] = 0.0
+    known, least, unlike, alike, single, heard = (
+        memory[begin * _ROW : end * _ROW] for begin, end in itertools.pairwise(rows)
     )
-
-
-@inner
-def _lines(rows):  # type: ignore[no-untyped-def]
-    """Memory for some rows, which begin where lines of the cache do. One piece for all would not become vector code."""
-    memory = empty(rows * _ROW + _VECTOR, np.float32)
-    begin = (_VECTOR - np.int64(memory.ctypes.data // 4) % _VECTOR) % _VECTOR
-    return memory[begin : begin + rows * _ROW]
+    known.reshape(count, 2, _ROW)[:, 1] = _NOTHING
+    spans = np.empty((count, 2), np.int64)
+    spans[:] = _STRIP, 0
+    return _Ring(known, least, unlike, alike, np.zeros((count, _STRIP), np.uint8), spans, single, heard)
 
 
 def _plane(values: Array | None, shape: tuple[int, ...]) -> NDArray[np.float32]:
@@ -308,11 +318,16 @@ def _read_out(  # type: ignore[no-untyped-def]
     log_offset,
     unshown,
     ends,
+    next_unshown,
+    begin,
+    ring,
     out,
     total,
     heard,
 ):
-    """Fill ``out``, ``total`` and ``heard``; ``ends`` is how many of the ``unshown`` pixels lie before each row.
+    """Fill ``out``, ``total`` and ``heard`` in the columns of the strip that begins with ``begin``.
+
+    ``ends`` is how many of the ``unshown`` pixels lie before each row, ``next_unshown`` how many before the strip's.
 
     Of rows, what is known is taken two pitches before they are read out, since the patches around neighbours reach so
     far, and who hears three pitches before. From rows before the first one only looks ahead.
@@ -321,99 +336,76 @@ def _read_out(  # type: ignore[no-untyped-def]
     height, width = log_intensity.shape
     told = moving.size > 0
     hear = told and allowed > np.float32(0.0)
-    ring = _ring(pitch if told else 0)
     known, least, unlike, alike, single = ring.known, ring.least, ring.unlike, ring.alike, ring.single
     hears, spans, changed = ring.hears, ring.spans, ring.heard
     count = len(spans)
     level, left = zeros(_STRIP, np.float32), zeros(_STRIP, np.float32)
     marks = zeros(_STRIP, np.uint8)
-    words = marks.view(np.uint64)
     places, excess, doubt = (
         empty(_STRIP, np.uint64),
         empty(_STRIP, np.float32),
         empty(_STRIP, np.float32),
     )
-    next_unshown = ends[:-1].copy()  # of every row, in strips from left to right
-    for begin in range(0, width, _STRIP):
-        end = min(begin + _STRIP, width)
-        start, size = np.uint64(begin), np.uint64(end - begin)
-        _clear(ring)
-        marks[:] = np.uint8(0)
-        for row in range(-3 * pitch if told else 0, height):
-            at = np.uint64(row)
-            # The columns in which anybody hears. As literals, all that takes them would be compiled twice.
-            first, last = np.int64(_STRIP), np.int64(0)
-            if told:
-                _take_row(
-                    log_intensity, variance, moving, change, hidden, row + 2 * pitch, begin, count, known
-                )
-            if hear:
-                _mark_hearing(moving, row + 3 * pitch, begin, hears, spans)
-                for place in range(count):
-                    first, last = min(first, spans[place, 0]), max(last, spans[place, 1])
-            if first < last and row + pitch >= 0:
-                _compare(row, first, last, allowed, pitch, known, least, unlike, alike, single)
-            if row < 0:
-                continue
-            # L, and I.
+    end = smaller(begin + _STRIP, width)
+    start, size = np.uint64(begin), np.uint64(end - begin)
+    for row in range(-3 * pitch if told else 0, height):
+        at = np.uint64(row)
+        # The columns in which anybody hears. As literals, all that takes them would be compiled twice.
+        first, last = np.int64(_STRIP), np.int64(0)
+        if told:
+            _take_row(log_intensity, variance, moving, change, hidden, row + 2 * pitch, begin, count, known)
+        if hear:
+            _mark_hearing(moving, row + 3 * pitch, begin, hears, spans)
+            for place in range(count):
+                first, last = smaller(first, spans[place, 0]), larger(last, spans[place, 1])
+        if first < last and row + pitch >= 0:
+            _compare(row, first, last, allowed, pitch, known, least, unlike, alike, single)
+        if row < 0:
+            continue
+        # L, and I.
+        for i in range(size):
+            level[i] = log_intensity[at, start + i]
+        if first < last:
+            _hear_neighbours(row, first, last, pitch, known, least, alike, hears, changed, level)
+        before, behind = next_unshown[row], next_unshown[row]  # those of this strip
+        while behind < ends[row + 1] and unshown[behind] < row * width + end:
+            heard[behind] = level[unshown[behind] - row * width - begin]
+            behind += 1
+        next_unshown[row] = behind
+        for i in range(size):
+            out[at, start + i] = larger(exponential(level[i]) - log_offset, np.float32(0.0))
+        # The variance, where it is wanted or highlights are doubted by it.
+        for i in range(size):
+            marks[i] = level[i] > white
+        bright = scale2 > np.float32(0.0) and _any(marks, 0, _STRIP)
+        if not bright and len(total) == 0:
+            continue
+        here = np.uint64(row % count) * np.uint64(2 * _ROW) + np.uint64(_MARGIN)
+        if told:
             for i in range(size):
-                level[i] = log_intensity[at, start + i]
-            if first < last:
-                _hear_neighbours(row, first, last, pitch, known, least, alike, hears, changed, level)
-            before, behind = next_unshown[row], next_unshown[row]  # those of this strip
-            while behind < ends[row + 1] and unshown[behind] < row * width + end:
-                heard[behind] = level[unshown[behind] - row * width - begin]
-                behind += 1
-            next_unshown[row] = behind
+                left[i] = known[here + _DOUBT + i]
+        else:
             for i in range(size):
-                out[at, start + i] = max(exponential(level[i]) - log_offset, np.float32(0.0))
-            # The variance, where it is wanted or highlights are doubted by it.
+                left[i] = variance[at, start + i]
+        if first < last:
+            _lessen(row, first, last, ring, left)
+            for k in range(before, behind):
+                column = np.uint64(unshown[k] - row * width - begin)
+                left[column] = known[here + _DOUBT + column]
+        if len(total) > 0:
             for i in range(size):
-                marks[i] = level[i] > white
-            bright = scale2 > np.float32(0.0) and _any(words, 0, _STRIP)
-            if not bright and len(total) == 0:
-                continue
-            here = np.uint64(row % count) * np.uint64(2 * _ROW) + np.uint64(_MARGIN)
-            if told:
-                for i in range(size):
-                    left[i] = known[here + _DOUBT + i]
-            else:
-                for i in range(size):
-                    left[i] = variance[at, start + i]
-            if first < last:
-                _lessen(row, first, last, ring, left)
-                for k in range(before, behind):
-                    column = np.uint64(unshown[k] - row * width - begin)
-                    left[column] = known[here + _DOUBT + column]
-            if len(total) > 0:
-                for i in range(size):
-                    total[at, start + i] = left[i]
-            if bright:
-                _believe(level, left, at, start, marks, words, prior, log_offset, places, excess, doubt, out)
+                total[at, start + i] = left[i]
+        if bright:
+            _believe(level, left, at, start, marks, prior, log_offset, places, excess, doubt, out)
 
 
 @nb.njit(cache=True, inline="always")
-def _any(words, first, count):  # type: ignore[no-untyped-def]
-    """Whether any of ``count`` bytes from ``first`` on is not 0: multiples of 8, with the bytes as ``words`` of 8."""
+def _any(octets, first, count):  # type: ignore[no-untyped-def]
+    """Whether any of ``count`` bytes from ``first`` on is not 0: ``count`` is a multiple of 8."""
     found = np.uint64(0)
-    for k in range(count // 8):
-        found |= words[np.uint64(first // 8) + np.uint64(k)]
+    for k in range(np.uint64(first), np.uint64(first + count), np.uint64(8)):
+        found |= word_at(octets, k)
     return found != np.uint64(0)
-
-
-@inner
-def _clear(ring):  # type: ignore[no-untyped-def]
-    """Before the first row of a strip: nothing is known, nothing is alike, nobody hears."""
-    for place in range(len(ring.spans)):
-        first = place * 2 * _ROW
-        ring.known[first : first + _ROW] = np.float32(0.0)
-        ring.known[first + _ROW : first + 2 * _ROW] = _NOTHING
-        ring.spans[place, 0], ring.spans[place, 1] = _STRIP, 0
-    ring.least[:] = np.float32(0.0)
-    ring.unlike[:] = np.float32(0.0)
-    ring.alike[:] = np.float32(0.0)
-    ring.single[:] = np.float32(0.0)
-    ring.hears[:] = np.uint8(0)
 
 
 @nb.njit(cache=True, inline="always")
@@ -429,8 +421,8 @@ def _take_row(  # type: ignore[no-untyped-def]
         for i in range(np.uint64(_ROW)):
             known[place + _DOUBT + i] = _NOTHING
         return
-    first = max(begin - _MARGIN, 0)
-    size = np.uint64(min(begin + _STRIP + _MARGIN, width) - first)
+    first = larger(begin - _MARGIN, 0)
+    size = np.uint64(smaller(begin + _STRIP + _MARGIN, width) - first)
     at, start, into = np.uint64(row), np.uint64(first), place + np.uint64(first - begin + _MARGIN)
     for i in range(size):
         known[into + _LEVEL + i] = log_intensity[at, start + i]
@@ -446,13 +438,69 @@ def _mark_hearing(moving, row, begin, hears, spans):  # type: ignore[no-untyped-
     first, last = _STRIP, 0
     if row < len(moving):
         at, start = np.uint64(row), np.uint64(begin)
-        for i in range(np.uint64(min(moving.shape[1] - begin, _STRIP))):
+        for i in range(np.uint64(smaller(moving.shape[1] - begin, _STRIP))):
             hears[place, i] = moving[at, start + i]
-        words = hears[place].view(np.uint64)
+        own = hears[place]
         for block in range(0, _STRIP, _BLOCK):
-            if _any(words, block, _BLOCK):
-                first, last = min(first, block), block + _BLOCK
+            if _any(own, block, _BLOCK):
+                first, last = smaller(first, block), block + _BLOCK
     spans[place, 0], spans[place, 1] = first, last
+
+
+# Of four numbers a to d, quotients by them share a division: (b, a) c d / a b c d and a b (d, c) / a b c d.
+
+
+@formula()
+def _tell_unlike(
+    known: Row,
+    own: Number,
+    other: Number,
+    step: Number,
+    near_slack: Number,
+    far_slack: Number,
+    single: Row,
+    into: Number,
+) -> None:
+    """How unlike a pixel at ``own`` and its four neighbours are, of which three are in the row of ``other``."""
+    level, doubt = known[own + _LEVEL], known[own + _DOUBT]
+    right = known[own + _LEVEL + step] - level
+    left_under = known[other + _LEVEL - step] - level
+    straight_under = known[other + _LEVEL] - level
+    right_under = known[other + _LEVEL + step] - level
+    a = doubt + known[own + _DOUBT + step] + near_slack
+    b = doubt + known[other + _DOUBT - step] + far_slack
+    c = doubt + known[other + _DOUBT] + near_slack
+    d = doubt + known[other + _DOUBT + step] + far_slack
+    ab, cd = a * b, c * d
+    inverse = ONE / (ab * cd)
+    of_ab, of_cd = inverse * cd, inverse * ab
+    single[into] = right * right * (of_ab * b)
+    single[into + _ONE] = left_under * left_under * (of_ab * a)
+    single[into + _TWO] = straight_under * straight_under * (of_cd * d)
+    single[into + _THREE] = right_under * right_under * (of_cd * c)
+
+
+@formula()
+def _tell_least(known: Row, own: Number, near: Number, far: Number, least: Row) -> None:
+    a, b = known[own + _DOUBT] + near, known[own + _DOUBT] + far
+    inverse = ONE / (a * b)
+    least[own + _NEAR] = b * inverse
+    least[own + _FAR] = a * inverse
+
+
+@formula()
+def _tell_alike(unlike: Row, before: Number, own: Number, after: Number, alike: Row) -> None:
+    """How far a pixel is of one surface with its four neighbours, from three rows around both."""
+    a, b, c, d = (
+        edge(unlike[before + k] + unlike[own + k] + unlike[after + k]) for k in (_ZERO, _ONE, _TWO, _THREE)
+    )
+    ab, cd = a * b, c * d
+    inverse = ONE / (ab * cd)
+    of_ab, of_cd = inverse * cd, inverse * ab
+    alike[own] = _squared(of_ab * b)
+    alike[own + _ONE] = _squared(of_ab * a)
+    alike[own + _TWO] = _squared(of_cd * d)
+    alike[own + _THREE] = _squared(of_cd * c)
 
 
 @nb.njit(cache=True, inline="always")
@@ -461,8 +509,7 @@ def _compare(  # type: ignore[no-untyped-def]
 ):
     """How alike a row's pixels are to their four neighbours in `_Ring`, where columns ``first`` to ``last`` need it.
 
-    Patches reach into the next row: that is compared first. Quotients share a division; those of four numbers a to d
-    are (b, a) c d / a b c d and a b (d, c) / a b c d.
+    Patches reach into the next row: that is compared first.
     """
     count = 4 * pitch + 1
     above, here, below, under = (
@@ -473,52 +520,56 @@ def _compare(  # type: ignore[no-untyped-def]
     )
     size, step = np.uint64(last - first + 2 * _ASIDE), np.uint64(pitch)
     begin = np.uint64(_MARGIN - _ASIDE + first)
-    one, two, three = np.uint64(_ROW), np.uint64(2 * _ROW), np.uint64(3 * _ROW)
     near, far = allowed * np.float32(pitch * pitch), allowed * np.float32(2 * pitch * pitch)
-    near_slack, far_slack = max(near * _SLACK, _SURE), max(far * _SLACK, _SURE)
-    own, other = below * two + begin, under * two + begin
+    near_slack, far_slack = larger(near * _SLACK, _SURE), larger(far * _SLACK, _SURE)
+    near, far = larger(near, _SURE), larger(far, _SURE)
+    own, other = below * _TWO + begin, under * _TWO + begin
     for i in range(size):
-        level, doubt = known[own + _LEVEL + i], known[own + _DOUBT + i]
-        right = known[own + _LEVEL + step + i] - level
-        left_under = known[other + _LEVEL - step + i] - level
-        straight_under = known[other + _LEVEL + i] - level
-        right_under = known[other + _LEVEL + step + i] - level
-        a = doubt + known[own + _DOUBT + step + i] + near_slack
-        b = doubt + known[other + _DOUBT - step + i] + far_slack
-        c = doubt + known[other + _DOUBT + i] + near_slack
-        d = doubt + known[other + _DOUBT + step + i] + far_slack
-        ab, cd = a * b, c * d
-        inverse = ONE / (ab * cd)
-        of_ab, of_cd = inverse * cd, inverse * ab
-        single[begin + i] = right * right * (of_ab * b)
-        single[begin + one + i] = left_under * left_under * (of_ab * a)
-        single[begin + two + i] = straight_under * straight_under * (of_cd * d)
-        single[begin + three + i] = right_under * right_under * (of_cd * c)
+        _tell_unlike(known, own + i, other + i, step, near_slack, far_slack, single, begin + i)
     for i in range(size):
-        a, b = known[own + _DOUBT + i] + max(near, _SURE), known[own + _DOUBT + i] + max(far, _SURE)
-        inverse = ONE / (a * b)
-        least[own + _NEAR + i] = b * inverse
-        least[own + _FAR + i] = a * inverse
-    into = below * np.uint64(4 * _ROW) + begin
+        _tell_least(known, own + i, near, far, least)
+    into = below * _FOUR + begin
     for k in range(np.uint64(4)):
-        start = begin + k * one
+        start = begin + k * _ONE
         for i in range(size):
-            unlike[into + k * one + i] = (
+            unlike[into + k * _ONE + i] = (
                 single[start - step + i] + single[start + i] + single[start + step + i]
             )
-    before, own = above * np.uint64(4 * _ROW) + begin, here * np.uint64(4 * _ROW) + begin
+    before, own = above * _FOUR + begin, here * _FOUR + begin
     for i in range(size):
-        a = edge(unlike[before + i] + unlike[own + i] + unlike[into + i])
-        b = edge(unlike[before + one + i] + unlike[own + one + i] + unlike[into + one + i])
-        c = edge(unlike[before + two + i] + unlike[own + two + i] + unlike[into + two + i])
-        d = edge(unlike[before + three + i] + unlike[own + three + i] + unlike[into + three + i])
-        ab, cd = a * b, c * d
-        inverse = ONE / (ab * cd)
-        of_ab, of_cd = inverse * cd, inverse * ab
-        alike[own + i] = _squared(of_ab * b)
-        alike[own + one + i] = _squared(of_ab * a)
-        alike[own + two + i] = _squared(of_cd * d)
-        alike[own + three + i] = _squared(of_cd * c)
+        _tell_alike(unlike, before + i, own + i, into + i, alike)
+
+
+@formula()
+def _hear(
+    known: Row,
+    least: Row,
+    alike: Row,
+    up: Number,
+    own: Number,
+    down: Number,
+    of_up: Number,
+    of_own: Number,
+    step: Number,
+    heard: Row,
+    into: Number,
+) -> None:
+    """K12 of a pixel: the mean of itself and its eight neighbours, and its variance."""
+    value, doubt = known[own + _LEVEL], known[own + _DOUBT]
+    information, deviation = None, None
+    for onward, back, ahead, behind, distance in (
+        (of_own, of_own - step, own + step, own - step, _NEAR),
+        (of_own + _ONE, of_up + _ONE + step, down - step, up + step, _FAR),
+        (of_own + _TWO, of_up + _TWO, down, up, _NEAR),
+        (of_own + _THREE, of_up + _THREE - step, down + step, up - step, _FAR),
+    ):
+        there, back_there = alike[onward] * least[ahead + distance], alike[back] * least[behind + distance]
+        more = there * (known[ahead + _LEVEL] - value) + back_there * (known[behind + _LEVEL] - value)
+        deviation = more if deviation is None else deviation + more
+        information = there + back_there if information is None else information + (there + back_there)
+    independent = doubt / (ONE + doubt * information)  # 1 / (1 / doubt + information)
+    heard[into] = value + deviation * independent
+    heard[into + _ONE] = SHARED * doubt + (ONE - SHARED) * independent
 
 
 @nb.njit(cache=True, inline="always")
@@ -534,36 +585,10 @@ def _hear_neighbours(  # type: ignore[no-untyped-def]
     )
     size, step = np.uint64(last - first), np.uint64(pitch)
     begin, column = np.uint64(_MARGIN + first), np.uint64(first)
-    one, two, three, four = np.uint64(_ROW), np.uint64(2 * _ROW), np.uint64(3 * _ROW), np.uint64(4 * _ROW)
-    up, own, down = above * two + begin, here * two + begin, below * two + begin
-    of_up, of_own = above * four + begin, here * four + begin
+    up, own, down = above * _TWO + begin, here * _TWO + begin, below * _TWO + begin
+    of_up, of_own = above * _FOUR + begin, here * _FOUR + begin
     for i in range(size):
-        value, doubt = known[own + _LEVEL + i], known[own + _DOUBT + i]
-        onward = alike[of_own + i] * least[own + _NEAR + step + i]
-        back = alike[of_own - step + i] * least[own + _NEAR - step + i]
-        information = onward + back
-        deviation = onward * (known[own + _LEVEL + step + i] - value) + back * (
-            known[own + _LEVEL - step + i] - value
-        )
-        onward = alike[of_own + one + i] * least[down + _FAR - step + i]
-        back = alike[of_up + one + step + i] * least[up + _FAR + step + i]
-        information += onward + back
-        deviation += onward * (known[down + _LEVEL - step + i] - value) + back * (
-            known[up + _LEVEL + step + i] - value
-        )
-        onward = alike[of_own + two + i] * least[down + _NEAR + i]
-        back = alike[of_up + two + i] * least[up + _NEAR + i]
-        information += onward + back
-        deviation += onward * (known[down + _LEVEL + i] - value) + back * (known[up + _LEVEL + i] - value)
-        onward = alike[of_own + three + i] * least[down + _FAR + step + i]
-        back = alike[of_up + three - step + i] * least[up + _FAR - step + i]
-        information += onward + back
-        deviation += onward * (known[down + _LEVEL + step + i] - value) + back * (
-            known[up + _LEVEL - step + i] - value
-        )
-        independent = doubt / (ONE + doubt * information)  # 1 / (1 / doubt + information)
-        heard[begin + i] = value + deviation * independent
-        heard[begin + one + i] = SHARED * doubt + (ONE - SHARED) * independent
+        _hear(known, least, alike, up + i, own + i, down + i, of_up + i, of_own + i, step, heard, begin + i)
     for i in range(size):
         alone, together = level[column + i], heard[begin + i]
         level[column + i] = together if hears[here, column + i] else alone
@@ -580,13 +605,13 @@ def _lessen(row, first, last, ring, left):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, inline="always", error_model="numpy")
 def _believe(  # type: ignore[no-untyped-def]
-    level, variance, row, start, marks, words, prior, log_offset, places, excess, doubt, out
+    level, variance, row, start, marks, prior, log_offset, places, excess, doubt, out
 ):
     """K6 of the marked pixels of a row, brought together so that they go through vector code and others do not pay."""
     white, scale2, stretch = prior
     count = np.uint64(0)
     for first in range(0, len(level), _BLOCK):
-        if _any(words, first, _BLOCK):
+        if _any(marks, first, _BLOCK):
             for column in range(np.uint64(first), np.uint64(first + _BLOCK)):
                 places[count] = column
                 count += np.uint64(marks[column])
@@ -595,6 +620,6 @@ def _believe(  # type: ignore[no-untyped-def]
         doubt[k] = variance[places[k]]
     for k in range(count):
         believed = believed_highlight(excess[k], doubt[k], scale2, stretch)
-        excess[k] = max(exponential(white + believed) - log_offset, np.float32(0.0))
+        excess[k] = larger(exponential(white + believed) - log_offset, np.float32(0.0))
     for k in range(count):
         out[row, start + places[k]] = excess[k]

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.bridge import RANDOM, UNMEASURED
-from kalux.compiled import FUSED, empty, loop, zeros
+from kalux.compiled import FUSED, empty, larger, loop, smaller, zeros
 from kalux.filters.readout import SHARED, Hidden
 
 Array = NDArray[np.floating[Any]]
@@ -143,7 +143,9 @@ def known_variance(variance, first, second, events, around):  # type: ignore[no-
     coming, counted, q0, repeated, wrong = around
     following = counted + second + coming * events
     slope = q0 / (first + second + q0)
-    known = max(variance * following / (variance + following), repeated * slope * slope * min(first, second))
+    known = larger(
+        variance * following / (variance + following), repeated * slope * slope * smaller(first, second)
+    )
     return known + wrong * events * events
 
 
@@ -224,8 +226,8 @@ def _hear(variance, left, first, second, hidden, heard):  # type: ignore[no-unty
     one, unmeasured, hidden = np.float32(1.0), np.float32(UNMEASURED), np.float32(hidden)
     for i in range(np.uint64(len(heard))):
         lost = one - np.float32(left[i]) / (variance[i] + hidden)
-        neither = min(first[i], second[i]) >= unmeasured
-        heard[i] = variance[i] * (one - _HEARD * max(lost, np.float32(0.0)) if neither else one)
+        neither = smaller(first[i], second[i]) >= unmeasured
+        heard[i] = variance[i] * (one - _HEARD * larger(lost, np.float32(0.0)) if neither else one)
 
 
 @loop
@@ -233,8 +235,8 @@ def _wait(moving, first, second, events, waiting):  # type: ignore[no-untyped-de
     """Pixels without an event between the frames, but with one of late, or measured by one of the frames alone."""
     unmeasured = np.float32(UNMEASURED)
     for i in range(np.uint64(len(waiting))):
-        late = moving[i] | (max(first[i], second[i]) >= unmeasured)
-        waiting[i] = late & (events[i] == np.float32(0.0)) & (min(first[i], second[i]) < unmeasured)
+        late = moving[i] | (larger(first[i], second[i]) >= unmeasured)
+        waiting[i] = late & (events[i] == np.float32(0.0)) & (smaller(first[i], second[i]) < unmeasured)
 
 
 @loop(fastmath=FUSED)

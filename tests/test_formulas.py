@@ -1,0 +1,56 @@
+"""Formulas of loops: what numba makes of the same Python, bit for bit."""
+
+from __future__ import annotations
+
+import numba as nb
+import numpy as np
+import pytest
+from numba.core import types
+
+from kalux.formulas import choose, formula
+
+
+@formula(types.float32)
+def of_floats(a, b):
+    return choose(a < b, np.float32(2.0) / (a - b), (np.float32(1.0) - a) * b + a) + np.float32(0.5)
+
+
+@formula(types.int64)
+def of_integers(a, b):
+    changed = (b & np.int64(0xFF)) << np.int64(3)
+    return choose(a > b, (a >> np.int64(2)) | changed, np.int64(7) - a) + choose(a != b, b, a)
+
+
+@formula(types.float32)
+def converted(word, small):
+    high = (word.to(types.uint64) >> np.uint64(60)).to(types.int32).to(types.float32)
+    return high + small.to(types.float32) + small.to(types.int64).to(types.float32) + word.to(types.float32)
+
+
+def called(function):
+    return nb.njit(lambda a, b: function(a, b), error_model="numpy")
+
+
+def test_a_formula_is_what_numpy_makes_of_its_operations() -> None:
+    one, half = np.float32(1.0), np.float32(0.5)
+    function = called(of_floats)
+    for a, b in np.random.default_rng(0).normal(size=(50, 2)).astype(np.float32):
+        assert function(a, b) == (np.float32(2.0) / (a - b) if a < b else (one - a) * b + a) + half
+
+
+@pytest.mark.parametrize("a", [-9, 0, 5, 2**40])
+@pytest.mark.parametrize("b", [-300, 5, 2**33 + 17])
+def test_whole_numbers_keep_their_sign_when_shifted(a, b) -> None:
+    expected = (a >> 2 | (b & 0xFF) << 3 if a > b else 7 - a) + (b if a != b else a)
+    assert called(of_integers)(a, b) == expected
+
+
+@pytest.mark.parametrize("word", [-1, -(2**62), 2**62 + 12345, 0])
+def test_conversions_know_signs(word) -> None:
+    expected = np.float32((word % 2**64) >> 60) + np.float32(-3) + np.float32(-3) + np.float32(word)
+    assert called(converted)(word, np.int8(-3)) == expected
+
+
+def test_numbers_of_different_types_are_refused() -> None:
+    with pytest.raises((TypeError, nb.core.errors.NumbaError), match="float64 and float32 in one operation"):
+        called(of_floats)(1.0, 2.0)
