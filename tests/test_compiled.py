@@ -16,12 +16,15 @@ from kalux.compiled import (
     event_row,
     event_words,
     exponential,
+    larger,
     largest_around,
     logarithm,
     magnitude_bits,
     pack,
     packed,
+    smaller,
     unpack,
+    word_at,
 )
 from kalux.events import EVENT_DTYPE
 
@@ -82,6 +85,28 @@ def test_words_share_the_memory():
     events = np.zeros(3, EVENT_DTYPE)
     event_words(events[1:])[0, 0] = 7
     assert events["t"].tolist() == [0, 7, 0]
+
+
+@nb.njit
+def ends(one, other):
+    return smaller(one, other), larger(one, other)
+
+
+@pytest.mark.parametrize(
+    ("one", "other"), [(1, 2), (2, 1), (1, -0.5), (np.nan, 1.0), (1.0, np.nan), (np.int32(3), 2**40)]
+)
+def test_the_smaller_and_the_larger_are_those_of_python(one, other):
+    np.testing.assert_array_equal(ends(one, other), (min(one, other), max(one, other)))
+
+
+@nb.njit
+def word_from(octets, place):
+    return word_at(octets, place)
+
+
+def test_a_word_is_eight_bytes_from_any_place():
+    octets = np.arange(20, dtype=np.uint8)
+    assert word_from(octets, np.uint64(3)) == int.from_bytes(bytes(range(3, 11)), "little")
 
 
 @nb.njit

@@ -51,6 +51,28 @@ def test_conversions_know_signs(word) -> None:
     assert called(converted)(word, np.int8(-3)) == expected
 
 
+@formula()
+def shifted(row, at, other):
+    other[at] = row[at + np.uint64(1)] - row[at]
+
+
+@nb.njit
+def over(row, other):
+    for at in range(np.uint64(len(other))):
+        shifted(row, at, other)
+
+
+def test_rows_are_looked_up_and_filled() -> None:
+    row, other = np.array([1.0, 4.0, 9.0, 7.0], np.float32), np.empty(3, np.float32)
+    over(row, other)
+    assert other.tolist() == [3.0, 5.0, -2.0]
+
+
+def test_rows_with_gaps_are_refused() -> None:
+    with pytest.raises((TypeError, nb.core.errors.NumbaError), match="without gaps"):
+        over(np.zeros(8, np.float32)[::2], np.empty(3, np.float32))
+
+
 def test_numbers_of_different_types_are_refused() -> None:
     with pytest.raises((TypeError, nb.core.errors.NumbaError), match="float64 and float32 in one operation"):
         called(of_floats)(1.0, 2.0)
