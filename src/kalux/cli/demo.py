@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 _DESCRIPTION = """\
 See what kalux does, without data of your own: simulates a recording with known truth, reconstructs it, and
-writes a picture, a video and the recording. Takes half a minute, the first run, which compiles, one to two."""
+writes a picture, a video and the recording. Takes a quarter of a minute, the first run, which compiles, up to one."""
 
 _EXAMPLES = """\
 examples:
