@@ -134,12 +134,11 @@ def test_with_this_process_as_many_as_there_may_be_threads_but_no_more_than_thre
     assert len(started) == count
 
 
-def test_one_process_leaves_the_begin_of_the_filter_to_the_command(monkeypatch, started) -> None:
-    parts = ("60", "61", "62")
-    monkeypatch.setattr(loops, "OF_ALL", parts)
-    with compiling_beside(parts, 2):
+def test_one_process_leaves_the_begin_of_the_filter_to_the_command(started) -> None:
+    assert loops.OF_ALL[-1] == "filter"
+    with compiling_beside(("60", "61", "62", "63"), 2):
         nb.njit(lambda x: x + 1)(1)
-    assert started[0].args == ["sleep", "60", "61"]
+    assert started[0].args == ["sleep", "60", "61", "62"]
 
 
 def test_others_are_ended_with_an_interrupt(started) -> None:

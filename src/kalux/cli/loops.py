@@ -113,8 +113,10 @@ OF_IMAGES: Final = ("images", "display")
 """Parts of `kalux.cli.rehearsal` that every reconstruction comes to after the estimates."""
 
 OF_ALL: Final = ("images", "segment", "display", "filter")
-"""Those of the default filter. What is come to last is first; "filter", the last, is left to the command where one
-process alone does the others, which take it as long."""
+"""Those of the default filter. What is come to last is first."""
+
+_MOST_ALONE: Final = 3
+"""Parts that one process alone does: they take it as long as the others take the command."""
 
 _MOST_BESIDE: Final = 2
 """Processes: the estimates, which the command itself compiles, take as long as each of these does then."""
@@ -132,7 +134,7 @@ def compiling_beside(parts: Sequence[str], threads: int) -> Generator[None, None
     Parameters
     ----------
     parts
-        Of `kalux.cli.rehearsal`, which the processes take in turns.
+        Of `kalux.cli.rehearsal`, which the processes take in turns; one alone leaves those after three to the command.
     threads
         That there may be, of which this process is one.
     """
@@ -140,7 +142,7 @@ def compiling_beside(parts: Sequence[str], threads: int) -> Generator[None, None
 
     running: list[subprocess.Popen[bytes]] = []
     count = min(threads - 1, _MOST_BESIDE) if sys.executable else 0
-    parts = OF_ALL[:-1] if count == 1 and parts == OF_ALL else parts
+    parts = parts[:_MOST_ALONE] if count == 1 else parts
     waiting = [list(parts[number::count]) for number in range(count)]
 
     def begin() -> None:
