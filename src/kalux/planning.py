@@ -19,6 +19,7 @@ from kalux.calibration.global_thresholds import (
     Usual,
     estimate_thresholds,
     refine_thresholds,
+    with_true_delay,
 )
 from kalux.calibration.levels import Ceiling, exact_end, find_ceiling
 from kalux.calibration.mismatch import Mismatch, estimate_mismatch
@@ -267,19 +268,20 @@ def _with_delay(
     events = settings.events
     if events.delay is not None:
         return settings, None
-    if late is not None and estimate is None:
-        estimate = estimate_thresholds(
+    if late is None:
+        return altered(settings, "events", delay=events.usual_delay), None
+    if estimate is not None:
+        late = late._replace(true=estimate.delay)
+    else:
+        late = with_true_delay(
             recording,
             settings.camera,
+            late,
             Usual.of(events),
             of_log_offset=settings.filter.augmentation == "paper",
-            delay=late.apparent,
             refractory_period=events.refractory if _uses_steps(settings) else 0,
-            most=ROUGH_SAMPLES,
         )
-    if late is not None and estimate is not None:
-        late = late._replace(true=estimate.delay)
-    return altered(settings, "events", delay=events.usual_delay if late is None else late.delay), late
+    return altered(settings, "events", delay=late.delay), late
 
 
 def _with_frame_noise(recording: Recording, settings: Settings) -> tuple[Settings, FrameNoise | None]:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from kalux.calibration.delay import SHARE
 from kalux.calibration.levels import Ceiling, find_ceiling
 from kalux.recording import Recording
 from kalux.settings import AUTO, Settings
@@ -163,7 +164,7 @@ def _delay_origin(plan: Plan, asked: Settings) -> str:
         f"the {found.apparent * 1e-3:.1f} ms that explain the frames {100 * found.improvement:.0f} % better"
     )
     if found.true is None:
-        return f"estimated: 0.7 of {seem}, as events trail the light, too"
+        return f"estimated: {SHARE:g} of {seem}, as events trail the light, too"
     trailing = (found.apparent - found.true) * 1e-3
     return f"estimated: {seem}, less half of the {trailing:.1f} ms by which events trail the light"
 

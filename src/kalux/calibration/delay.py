@@ -40,7 +40,7 @@ _WALL: Final = 1.05
 _MIN_SAMPLES: Final = 500
 _MAX_SAMPLES: Final = 60_000
 _MAX_FRAMES: Final = 60
-_SHARE: Final = 0.7
+SHARE: Final = 0.7
 """Share of the apparent delay that is corrected where the true one is not known."""
 
 
@@ -67,7 +67,7 @@ class DelayEstimate(NamedTuple):
     @property
     def delay(self) -> int:
         """By how much to shift the events, us: by the true delay and half of the trailing (docs/equations.md, K8)."""
-        return round(_SHARE * self.apparent if self.true is None else (self.apparent + self.true) / 2)
+        return round(SHARE * self.apparent if self.true is None else (self.apparent + self.true) / 2)
 
 
 def estimate_delay(recording: Recording, camera: CameraSettings) -> DelayEstimate | None:
@@ -172,14 +172,14 @@ def best_delay(grid: NDArray[np.int64], residuals: Array, samples: int) -> Delay
     if best in (0, len(grid) - 1):
         return None
     improvement = 1.0 - residuals[best] / residuals[int(np.flatnonzero(grid == 0)[0])]
-    apparent = float(grid[best]) + STEP * _vertex(*residuals[best - 1 : best + 2])
+    apparent = float(grid[best]) + STEP * (vertex(*residuals[best - 1 : best + 2]) or 0.0)
     return DelayEstimate(round(apparent), float(improvement), samples)
 
 
-def _vertex(before: float, here: float, after: float) -> float:
-    """Where a parabola through three points one apart is least, from the one in the middle."""
+def vertex(before: float, here: float, after: float) -> float | None:
+    """Where a parabola through three points one apart is least, from the one in the middle; None: nowhere."""
     curvature = before - 2 * here + after
-    return 0.0 if curvature <= 0 else 0.5 * (before - after) / curvature
+    return 0.5 * (before - after) / curvature if curvature > 0 else None
 
 
 class _Seen(NamedTuple):

@@ -17,6 +17,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.calibration.delay import DelayEstimate, vertex
 from kalux.calibration.refractory import LATE, intervals, possible_periods
 from kalux.calibration.regression import Fit, products, standard_errors, two_stage
 from kalux.calibration.steps import MAX_SAMPLES, Steps, steps
@@ -184,6 +185,31 @@ def estimate_thresholds(
     return _estimate(view, usual, refractory_period, most, delay)
 
 
+def with_true_delay(
+    recording: Recording,
+    camera: CameraSettings,
+    late: DelayEstimate,
+    usual: Usual,
+    *,
+    of_log_offset: bool = False,
+    refractory_period: int = 0,
+) -> DelayEstimate:
+    """How late events are, of how late they seem, where an estimate of the thresholds finds it.
+
+    Parameters are those of `estimate_thresholds`.
+    """
+    found = estimate_thresholds(
+        recording,
+        camera,
+        usual,
+        of_log_offset=of_log_offset,
+        delay=late.apparent,
+        refractory_period=refractory_period,
+        most=ROUGH_SAMPLES,
+    )
+    return late if found is None else late._replace(true=found.delay)
+
+
 def _reset_after(recording: Recording) -> int:
     """Shortest interval, us, up to which a refractory period may hide something; 0 where events wait for its end."""
     found = intervals(recording, _SHORTEST_EVENTS)
@@ -269,9 +295,9 @@ class _View(NamedTuple):
         if not np.isfinite(residuals).all():
             return self
         least = int(np.argmin(residuals))
-        first = min(max(least - 1, 0), len(_TRAILING) - 3)
-        curvature, slope, _ = np.polyfit(_TRAILING[first : first + 3], residuals[first : first + 3], 2)
-        best = -0.5 * slope / curvature if curvature > 0 else _TRAILING[least]
+        middle = min(max(least, 1), len(_TRAILING) - 2)
+        found = vertex(*residuals[middle - 1 : middle + 2])
+        best = _TRAILING[least] if found is None else _TRAILING[middle] + _TRAILING[1] * found
         if best >= _TRAILING[-1]:  # no delay explains the frames
             return self
         return self._replace(delay=delay - round(max(best, 0.0)))

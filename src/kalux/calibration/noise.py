@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from kalux.calibration.delay import estimate_delay
 from kalux.calibration.fixed_pattern import FixedPattern, estimate_fixed_pattern
 from kalux.calibration.frame_noise import FrameNoise, estimate_frame_noise
-from kalux.calibration.global_thresholds import ROUGH_SAMPLES, Usual, estimate_thresholds
+from kalux.calibration.global_thresholds import Usual, with_true_delay
 from kalux.calibration.levels import ClippingLevels, clipping_levels
 from kalux.calibration.refractory import dead_time, shortest_interval
 from kalux.calibration.regression import ratio_error
@@ -150,15 +150,8 @@ def calibrate_noise(recording: Recording, camera: CameraSettings) -> NoiseCalibr
     """
     delay = estimate_delay(recording, camera)
     if delay is not None:
-        steps = estimate_thresholds(
-            recording,
-            camera,
-            Usual.of(EventSettings()),
-            delay=delay.apparent,
-            refractory_period=dead_time(recording),
-            most=ROUGH_SAMPLES,
-        )
-        delay = delay if steps is None else delay._replace(true=steps.delay)
+        period = dead_time(recording)
+        delay = with_true_delay(recording, camera, delay, Usual.of(EventSettings()), refractory_period=period)
     return NoiseCalibration(
         events=event_noise(recording),
         frames=estimate_frame_noise(recording, camera, most_frames=MAX_FRAMES),
