@@ -100,6 +100,11 @@ def event_weight(word: Number, unit: Number) -> Number:
     return ONE + extra.to(types.int32).to(types.float32) * unit
 
 
+def weight_unit(weighed: bool) -> np.float32:
+    """The ``unit`` of `event_weight` for events that carry weights, or do not."""
+    return WEIGHT_UNIT if weighed else np.float32(0.0)
+
+
 _LINE: Final = 64
 """Bytes that the memory hands out at a time."""
 

@@ -7,10 +7,10 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.deblur import between, count_chunks
 from kalux.calibration.exposures import Exposures
 from kalux.calibration.intervals import Interval, intervals, spread
 from kalux.calibration.regression import Fit, two_stage
+from kalux.event_slices import between, count_chunks
 from kalux.events import EventArray
 from kalux.recording import Recording
 from kalux.settings import CameraSettings

@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.deblur import between, integrate_exposure
+from kalux.augmentation.deblur import integrate_exposure
+from kalux.event_slices import between
 from kalux.events import EventArray
 from kalux.filters.shots import Shot
 

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux import memory
-from kalux.augmentation.deblur import all_between, between, count_events
 from kalux.augmentation.refractory import EventClock
 from kalux.calibration.exposures import Exposures
 from kalux.compiled import event_words
+from kalux.event_slices import all_between, between, count_events
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.filters.shots import Shot, take_shot
 from kalux.frames import Frame

@@ -26,11 +26,11 @@ import numpy as np
 from numba.core import types
 from numpy.typing import NDArray
 
-from kalux.augmentation.deblur import between, count_chunks
 from kalux.augmentation.refractory import step_weight
 from kalux.calibration.exposures import Exposures
 from kalux.calibration.intervals import Interval, intervals
 from kalux.compiled import empty, event_column, event_is_on, event_row, event_words, loop, smaller, zeros
+from kalux.event_slices import between, count_chunks
 from kalux.events import NEVER
 from kalux.formulas import Number, choose, formula
 from kalux.recording import Recording

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from kalux import memory
 from kalux.augmentation.bridge import UNMEASURED, BridgedSegment, lift, lower
-from kalux.augmentation.deblur import words_until
 from kalux.augmentation.trail import NO_HEIGHTS, ahead_of_event, no_trail, trail_by_clock
 from kalux.compiled import (
     AHEAD,
@@ -40,6 +39,7 @@ from kalux.compiled import (
     unpack,
     zeros,
 )
+from kalux.event_slices import words_until
 from kalux.events import EventArray
 from kalux.filters.akf import State, information_kept, measurement_rate, predicted_information
 from kalux.filters.common import EPOCH, Clock, moved_clock, newest_around_inside

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from kalux.augmentation import bridge, deblur
 from kalux.augmentation.bridge import BridgedSegment, BridgeNoise, Latent, Thresholds, UnshownMemory
-from kalux.augmentation.deblur import EXPOSED, EXPOSURE_FIELDS, Exposure, all_between, relative_levels
+from kalux.augmentation.deblur import EXPOSED, EXPOSURE_FIELDS, Exposure, relative_levels
 from kalux.augmentation.highlights import (
     Shown,
     Tail,
@@ -38,6 +38,7 @@ from kalux.augmentation.unseen import (
     turns,
 )
 from kalux.compiled import apart, empty, loop, smaller
+from kalux.event_slices import all_between
 from kalux.events import EventArray
 from kalux.filters import akf_bridged
 from kalux.filters.akf import State

@@ -14,8 +14,8 @@ from typing import Any, Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.deblur import all_between, count_chunks
 from kalux.augmentation.highlights import Unshown
+from kalux.event_slices import all_between, count_chunks
 from kalux.events import EventArray
 from kalux.filters.akf import State
 from kalux.filters.shots import Shot
