@@ -14,8 +14,8 @@ from kalux.augmentation.bridge import (
     BridgeNoise,
     Latent,
     bridge,
-    lift,
     nominal_thresholds,
+    raise_to_bound,
 )
 from kalux.events import make_events
 from kalux.filters.methods import make_method
@@ -131,7 +131,7 @@ def test_unseen_pixels_start_with_the_variance_of_the_others():
 def test_a_masked_pixel_is_no_bound():
     frame = Latent(np.zeros((1, 3)), np.array([[0.1, UNMEASURED, UNSEEN]]))
     level = np.full((1, 3), -1.0)
-    lift(level, frame)
+    raise_to_bound(level, frame)
     np.testing.assert_array_equal(level, [[-1.0, 0.0, -1.0]])
     clipped = Latent(np.zeros((1, 3)), np.full((1, 3), UNMEASURED))
     thresholds, noise = nominal_thresholds((1, 3), 0.1), BridgeNoise(0.5, 0.5, 0.05, 0.04)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux import memory
-from kalux.augmentation.bridge import UNMEASURED, BridgedSegment, lift, lower
+from kalux.augmentation.bridge import UNMEASURED, BridgedSegment, lower_to_ceiling, raise_to_bound
 from kalux.augmentation.trail import NO_HEIGHTS, ahead_of_event, no_trail, trail_by_clock
 from kalux.compiled import (
     AHEAD,
@@ -200,8 +200,8 @@ def _read(segment: BridgedSegment, cursor: Cursor, t: int) -> tuple[FloatArray, 
         if segment.trail is not None and segment.trail.end is not None:
             log_intensity += segment.trail.end
         if segment.bound is not None:
-            lift(log_intensity, segment.bound)  # K7
-            lower(log_intensity, segment.bound)
+            raise_to_bound(log_intensity, segment.bound)  # K7
+            lower_to_ceiling(log_intensity, segment.bound)
         if segment.drift is not None:
             variance += segment.drift  # K10
     return log_intensity, variance
