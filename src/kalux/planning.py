@@ -404,15 +404,8 @@ def _with_event_model(recording: Recording, settings: Settings) -> tuple[Setting
     camera, events = settings.camera, settings.events
     if camera.log_offset is not None and (events.step_variance is not None or not _uses_steps(settings)):
         return settings, None
-    model = estimate_event_model(
-        recording,
-        camera,
-        events.thresholds,
-        delay=events.lateness,
-        threshold_spread=events.mismatch,
-        quantisation_variance=events.quantisation_variance,
-        refractory_period=events.refractory if _uses_steps(settings) else 0,
-    )
+    weighed = events if _uses_steps(settings) else dataclasses.replace(events, refractory_period=None)
+    model = estimate_event_model(recording, camera, weighed)
     if model is not None:
         if camera.log_offset is None:
             camera = dataclasses.replace(camera, log_offset=model.log_offset)

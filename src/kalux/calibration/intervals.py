@@ -21,7 +21,7 @@ from kalux.filters.shots import Shot, take_shot
 from kalux.frames import Frame
 from kalux.models.camera import Camera, log_intensity
 from kalux.recording import Recording
-from kalux.settings import CameraSettings, chosen_response
+from kalux.settings import CameraSettings, EventSettings, chosen_response
 
 Array = NDArray[np.float64]
 
@@ -168,21 +168,15 @@ class Counted(NamedTuple):
 
 
 def counted_intervals(
-    recording: Recording,
-    camera: CameraSettings,
-    *,
-    thresholds: tuple[float, float],
-    delay: int,
-    refractory_period: int,
-    most_frames: int,
+    recording: Recording, camera: CameraSettings, events: EventSettings, *, most_frames: int
 ) -> Iterator[Counted]:
     """As `intervals`, with the events of every pixel counted.
 
-    Thresholds (on, off; log intensity) tell what the light does within exposures. Events are stamped ``delay`` us late;
-    the refractory period is in us.
+    Of ``events``, thresholds, delay and refractory period are used.
     """
-    clock = EventClock(recording.sensor_size, refractory_period)
-    exposures = Exposures(recording.sensor_size, delay, thresholds)
+    delay = events.lateness
+    clock = EventClock(recording.sensor_size, events.refractory)
+    exposures = Exposures(recording.sensor_size, delay, events.thresholds)
     margin = recording.longest_exposure + abs(delay)
     for interval in intervals(recording, camera, margin=margin, most_frames=most_frames):
         inside = clock.weighed(between(interval.events, interval.start + delay, interval.end + delay))
