@@ -219,6 +219,8 @@ def test_a_bound_that_a_frame_sets_anew_has_no_noise_of_events_before(lookahead)
 def test_black_of_a_linear_response_is_a_measurement():
     """It hides less than the frame's noise."""
     shot = take_shot(Frame(np.array([[0, 9]], np.uint8), 0, 1000), Camera.named("linear", 0.98), 1000)
-    method = make_method(PRESETS["default"], (0.2, 0.2), True, (1, 2))
+    method = make_method(
+        altered(PRESETS["default"], "events", threshold_on=0.2, threshold_off=0.2), True, (1, 2)
+    )
     assert method.crushed(shot) is None
     assert method.latent(shot, [], method._prior).ceiling is None

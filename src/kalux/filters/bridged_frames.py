@@ -119,12 +119,11 @@ class BridgedFrames(Method):
     def __init__(
         self,
         settings: Settings,
-        thresholds: tuple[float, float],
         lookahead: bool,
         shape: tuple[int, int],
         pixels: PixelCalibration | None,
     ) -> None:
-        super().__init__(settings, thresholds, lookahead, shape)
+        super().__init__(settings, lookahead, shape)
         events, c2 = settings.events, self.on * self.off
         scale2 = 2.0 * settings.filter.highlight_scale**2  # of the difference of two highlights
         self.noise = BridgeNoise(

@@ -51,11 +51,9 @@ class Method(ABC):
     Queries that a method does not support return None, or 0.
     """
 
-    def __init__(
-        self, settings: Settings, thresholds: tuple[float, float], lookahead: bool, shape: tuple[int, int]
-    ) -> None:
+    def __init__(self, settings: Settings, lookahead: bool, shape: tuple[int, int]) -> None:
         self.settings, self.lookahead, self.shape = settings, lookahead, shape
-        self.on, self.off = thresholds
+        self.on, self.off = settings.events.thresholds
         self.offset = settings.camera.offset
 
     @abstractmethod
