@@ -443,7 +443,7 @@ class BridgedFrames(Method):
         return segment, far_on, far_off
 
     def _far(self, memory: BridgeMemory, segment: BridgedSegment) -> tuple[Floats, Floats]:
-        """(H, W) on and off events since a pixel was last measured; of a bound, only those that raised it above the frames'."""
+        """(H, W) on and off events since a pixel was measured; of a bound, as many as raised it above the frames'."""
         pixels, known = memory.unshown.pixels, memory.thresholds
         if len(pixels) == 0:
             return memory.far_on, memory.far_off
