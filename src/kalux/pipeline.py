@@ -60,7 +60,7 @@ def reconstruct(
         From `kalux.load_calibration`: what was measured replaces the preset's settings (not those of ``settings``), and
         what is known of single pixels is used.
     lookahead
-        Whether an image uses the frame after it too; False is what a robot would see.
+        Whether an image uses the frame after it too; False: causal, as a robot needs it.
     smooth
         Whether an image uses everything after it: the filter runs backward too (`kalux.smoothing`). Takes
         three times as long, and room for the events and some states in the folder for temporary files.
@@ -68,11 +68,18 @@ def reconstruct(
     Raises
     ------
     InputError
-        If not exactly one of rate_hz, times and at is given, or times lie outside the recording.
+        If not exactly one of rate_hz, times and at is given, times lie outside the recording, or ``smooth`` is asked of
+        the causal mode or the complementary filter.
+    SettingsError
+        If the preset or a setting is unknown.
     FrameError
         If the recording has no frames.
-    EventError, ExposureError
-        If the recording is damaged; images before the damage have been returned.
+    ExposureError
+        If the frames' exposures are not known.
+    EventError, FrameError, ExposureError
+        If the recording is damaged; images before the damage may have been returned.
+    OutputError
+        If ``smooth`` finds no room for temporary files.
     """
     return execute(
         recording,
