@@ -27,6 +27,7 @@ from kalux.augmentation.bridge import BridgeNoise, Latent, nominal_thresholds
 from kalux.augmentation.bridge import bridge as join
 from kalux.augmentation.interpolation import InterpolatedSegment
 from kalux.augmentation.refractory import EventClock
+from kalux.event_slices import count_chunks
 from kalux.events import EVENT_DTYPE
 from kalux.filters import akf_bridged, akf_interpolated, complementary
 from kalux.filters.akf import State
@@ -100,7 +101,7 @@ def segment_of(size, events):
     ]
     thresholds = nominal_thresholds(size, 0.1, np.float32)
     noise = BridgeNoise(THRESHOLD, THRESHOLD, 0.2 * THRESHOLD**2, THRESHOLD**2 / 2)
-    on, off = deblur.count_chunks([events], size, weighed=True)
+    on, off = count_chunks([events], size, weighed=True)
     segment, _ = join(*frames, on, off, thresholds, noise, 0, int(events["t"][-1]) + 1)
     return segment, State(frames[0].value, frames[0].variance, make_clock(size, 0))
 

@@ -139,43 +139,55 @@ def test_one_in_another():
 
 class TestInOrder:
     @pytest.mark.parametrize("threads", [1, 2, 4])
-    def test_what_is_made_comes_in_the_order_of_giving(self, threads):
-        work = InOrder(threads)
+    def test_what_is_made_is_used_in_the_order_of_giving(self, threads):
+        """All but the last few pieces at once, and these at the end; with one thread every one at once."""
+        work, used = InOrder(threads), []
         for k in range(20):
-            work.give(lambda k=k: time.sleep(0.001 * (k % 3)) or k)
-        assert len(work) == 20
-        assert [work.take() for _ in range(20)] == list(range(20))
-        with pytest.raises(IndexError):
-            work.take()
+            work.give(lambda k=k: time.sleep(0.001 * (k % 3)) or k, used.append)
+            assert used == list(range(k + 1 if threads == 1 else max(k + 1 - threads, 0)))
+        work.finish(used.append)
+        assert used == list(range(20))
         work.end()
 
     def test_several_are_done_at_a_time(self):
         """Each of two waits for the other."""
-        work, both = InOrder(2), threading.Barrier(2)
+        work, both, used = InOrder(2), threading.Barrier(2), []
         for _ in range(2):
-            work.give(lambda: both.wait(timeout=20))
-        assert sorted(work.take() for _ in range(2)) == [0, 1]
+            work.give(lambda: both.wait(timeout=20), used.append)
+        work.finish(used.append)
+        assert sorted(used) == [0, 1]
         work.end()
 
     @pytest.mark.parametrize("threads", [1, 3])
-    def test_an_error_comes_where_its_result_would_have(self, threads):
-        work = InOrder(threads)
-        for divisor in (1, 0, 2):
-            work.give(lambda divisor=divisor: 2 // divisor)
-        assert work.take() == 2
+    @pytest.mark.parametrize("fails", ["work", "use"])
+    def test_an_error_comes_where_its_result_would_have_and_the_rest_is_given_up(self, threads, fails):
+        work, used = InOrder(threads), []
+
+        def use(divisor):
+            used.append(1 // divisor)
+
+        def give_all():
+            for divisor in (1, 0, 2, 1):
+                if fails == "work":
+                    work.give(lambda divisor=divisor: 1 // divisor, used.append)
+                else:
+                    work.give(lambda divisor=divisor: divisor, use)
+            work.finish(used.append if fails == "work" else use)
+
         with pytest.raises(ZeroDivisionError):
-            work.take()
-        assert work.take() == 1
-        work.end()
+            give_all()
+        assert used == [1]
+        work.finish(used.append)
+        assert used == [1]
 
-    @pytest.mark.parametrize("threads", [1, 3])
-    def test_the_end_gives_up_what_was_not_taken(self, threads):
-        work = InOrder(threads)
-        for _ in range(100):
-            work.give(lambda: time.sleep(0.01))
+    def test_the_end_gives_up_what_was_not_used(self):
+        work, used = InOrder(50), []
+        for _ in range(50):
+            work.give(lambda: time.sleep(0.1), used.append)
         start = time.monotonic()
         work.end()
-        assert len(work) == 0
+        work.finish(used.append)
+        assert used == []
         assert time.monotonic() - start < 0.5
 
 

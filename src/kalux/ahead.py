@@ -60,36 +60,45 @@ def ahead(items: Iterable[T], depth: int = 2, name: str = "ahead") -> Generator[
 
 
 class InOrder(Generic[T]):
-    """Pieces of work that may be done at the same time; what they make is taken in the order in which they were given.
+    """Pieces of work that may be done at the same time; what they make is used in the order in which they were given.
+
+    After an error, of a piece or of its use, the rest is given up and the threads end.
 
     Parameters
     ----------
     threads
-        How many are done at a time, in threads of their own. 1: each is done where and when it is taken.
+        How many are done at a time, in threads of their own. 1: each is done where and when it is given.
     name
         As of `ahead`.
     """
 
     def __init__(self, threads: int, name: str = "in-order") -> None:
+        self._most_pending = threads if threads > 1 else 0
         self._pool = ThreadPoolExecutor(threads, f"kalux-{name}") if threads > 1 else None
         self._pending: deque[Callable[[], T]] = deque()
 
-    def __len__(self) -> int:
-        return len(self._pending)
-
-    def give(self, work: Callable[[], T]) -> None:
-        """Add a piece of work."""
+    def give(self, work: Callable[[], T], use: Callable[[T], None]) -> None:
+        """Add a piece of work; ``use``, here, what the first ones made, until only as many as threads are pending."""
         self._pending.append(work if self._pool is None else self._pool.submit(work).result)
+        self._use_first(use, self._most_pending)
 
-    def take(self) -> T:
-        """What the first piece made, once it is done; raises its error. IndexError: there is none."""
-        return self._pending.popleft()()
+    def finish(self, use: Callable[[T], None]) -> None:
+        """Use what is pending, once it is made."""
+        self._use_first(use, 0)
 
     def end(self) -> None:
-        """Give up what has not been taken, and end the threads."""
+        """Give up what is pending, and end the threads."""
         self._pending.clear()
         if self._pool is not None:
             self._pool.shutdown(cancel_futures=True)
+
+    def _use_first(self, use: Callable[[T], None], left: int) -> None:
+        try:
+            while len(self._pending) > left:
+                use(self._pending.popleft()())
+        except BaseException:
+            self.end()
+            raise
 
 
 class _Item(Generic[T]):

@@ -1,4 +1,4 @@
-"""What the compiled loops share: events as machine words, hints to the memory, and float32 elementary functions.
+"""What the compiled loops share: events as machine words, memory layout, and float32 elementary functions.
 
 The functions here are for numba's loops. They are branchless, so that loops over pixels become vector code, and
 they take and return float32: a literal number would turn float32 arithmetic into float64.
@@ -34,24 +34,24 @@ MICROSECOND32: Final = np.float32(1e-6)
 ONE: Final = np.float32(1.0)
 
 AHEAD: Final = 48
-"""How many events ahead pixels are asked for: enough to cover a wait for memory, few enough to stay in the cache."""
+"""Events ahead whose pixels are prefetched: enough to cover the latency of memory, few enough to stay in the cache."""
 
 
 FUSED: Final = {"contract"}
-"""The one liberty that event loops take with arithmetic (numba's ``fastmath``): a product and a sum may be one
+"""The only relaxation of arithmetic in loops (numba's ``fastmath``): a product and a sum may be fused into one
 instruction, which rounds once instead of twice."""
 
 
 loop: Any = functools.partial(nb.njit, cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True)
-"""Decorates a loop. Of what loops use of its own, numba compiles a copy for every set of options, so all have these;
-without the way in from C they compile a twentieth faster."""
+"""Decorates a loop. All have the same options, since numba compiles its own helpers once for every set of options;
+without the wrapper for C they compile a twentieth faster."""
 
 inner: Any = functools.partial(loop, no_cpython_wrapper=True)
-"""Decorates what only loops call: without the way in from Python it compiles a tenth faster."""
+"""Decorates functions that only loops call: without the wrapper for Python they compile a tenth faster."""
 
 
 WEIGHT_UNIT: Final = np.float32(1 / 4096)
-"""Of the weights that events carry (`event_weight`): sums of a few thousand are exact in float32."""
+"""Resolution of the weights that events carry (`event_weight`): sums of a few thousand are exact in float32."""
 
 
 def event_words(events: EventArray) -> NDArray[np.int64]:
@@ -61,7 +61,7 @@ def event_words(events: EventArray) -> NDArray[np.int64]:
 
 @formula(types.uint64)
 def event_column(word: Number) -> Number:
-    """x of an event's second word; unsigned, as all indices: numba need not look for negative ones."""
+    """x of an event's second word; unsigned, as all indices, so that numba does not check for negative ones."""
     return word.to(types.uint64) & np.uint64(0xFFFF)
 
 
@@ -100,33 +100,38 @@ def event_weight(word: Number, unit: Number) -> Number:
     return ONE + extra.to(types.int32).to(types.float32) * unit
 
 
+def weight_unit(weighed: bool) -> np.float32:
+    """The ``unit`` of `event_weight` for events that carry weights, or do not."""
+    return WEIGHT_UNIT if weighed else np.float32(0.0)
+
+
 _LINE: Final = 64
-"""Bytes that the memory hands out at a time."""
+"""Bytes of a cache line."""
 
 _APART: Final = 7 * _LINE
-"""Bytes: more than what loops take of a plane at a time, 64 float32, and lines of nine planes do not meet."""
+"""Bytes between planes, modulo a page: more than loops take of a plane at a time, 64 float32, and no two of nine planes
+share cache lines' places."""
 
 _begins: Final = itertools.count(0, 25)
-"""Lines of a page where the planes of a call of `apart` begin: far from those of the calls before. No result depends on
-it."""
+"""Cache lines of a page at which successive calls of `apart` begin: far from each other. No result depends on it."""
 
 
 def packed(shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """An array of records or numbers, not filled, of which none lies in two lines of the memory that holds one each.
+    """An uninitialised array aligned to cache lines: no record that fits one lies in two.
 
-    NumPy's arrays commonly begin 16 bytes behind a line, so that every other record of 32 bytes lies in two: the filter
+    NumPy's arrays commonly begin 16 bytes after a line, so that every other record of 32 bytes lies in two: the filter
     then takes 1.35 times as long, and EDI 1.8 times.
     """
-    return memory.empty(shape, dtype)  # which begins with a page
+    return memory.empty(shape, dtype)  # aligned to a page
 
 
 def apart(count: int, shape: tuple[int, ...], dtype: Any = np.float32) -> NDArray[Any]:
-    """``count`` arrays, not filled, for loops over all of them at once: (count, *shape).
+    """``count`` uninitialised planes for loops over all of them at once, without cache conflicts: (count, *shape).
 
-    Planes of many sensors are whole pages of memory, and addresses that are whole pages apart compete for the same few
-    places of the nearest cache: the same pixel of all planes would, and stores would wait for loads that have nothing
-    to do with them. A loop over twenty planes then takes 1.4 times as long. These begin `_APART` further on in a page
-    each, and those of another call elsewhere.
+    Planes of many sensors are whole pages of memory, and addresses whole pages apart compete for the same few places of
+    the first-level cache, as the same pixel of all planes would; stores would also wait for unrelated loads. A loop over
+    twenty planes then takes 1.4 times as long. Here each plane begins `_APART` further on in a page, and those of
+    another call elsewhere.
     """
     size = math.prod(shape) * np.dtype(dtype).itemsize
     step = size + (_APART - size) % PAGE
@@ -158,8 +163,7 @@ def _new_array(*, zeros: bool) -> Any:
 
 
 empty, zeros = _new_array(zeros=False), _new_array(zeros=True)
-"""As NumPy's, for loops, of a shape and a dtype: compiled in their place, where numba makes two or three functions of
-each."""
+"""NumPy's, for loops, of a shape and a dtype. Compiled inline, where numba's own are two or three functions each."""
 
 
 def _one_of_two(symbol: str) -> Any:
@@ -179,7 +183,7 @@ def _one_of_two(symbol: str) -> Any:
 
 
 smaller, larger = _one_of_two("<"), _one_of_two(">")
-"""`min` and `max` of two numbers, for loops, compiled in their place, where numba makes a function of each."""
+"""`min` and `max` of two numbers, for loops. Compiled inline, where numba's own are functions."""
 
 
 def _word_at(typing_context: Any, octets: Any, place: Any) -> Any:
@@ -192,7 +196,7 @@ def _word_at(typing_context: Any, octets: Any, place: Any) -> Any:
 
 
 word_at: Any = intrinsic(_word_at)
-"""Eight of an array's bytes, 1-D uint8, from a place on."""
+"""Eight bytes of an array, 1-D uint8, from an index on, as a uint64."""
 
 
 def _prefetch(typing_context: Any, array: Any, index: Any) -> Any:
@@ -214,7 +218,7 @@ def _prefetch(typing_context: Any, array: Any, index: Any) -> Any:
 
 
 prefetch: Any = intrinsic(_prefetch)
-"""Ask for the memory of ``array[index]``, 1-D, which will be written soon."""
+"""Prefetch ``array[index]``, 1-D, for writing."""
 
 
 def _largest_around(typing_context: Any, plane: Any, at: Any, stride: Any) -> Any:
@@ -406,7 +410,7 @@ _SQRT_HALF_BITS: Final = np.int32(0x3F3504F3)
 
 @nb.njit(cache=True, inline="always")
 def any_from(values, places, least):  # type: ignore[no-untyped-def]
-    """Whether a value at one of the places is ``least`` or more; counted, which is vector code."""
+    """Whether a value at one of the ``places`` is ``least`` or more; by counting, which is vector code."""
     count = np.int32(0)
     for i in places:
         count += np.int32(values[i] >= least)
@@ -448,7 +452,7 @@ INFINITE_BITS: Final = 0x7F800000
 
 
 def magnitude_bits(values: NDArray[np.float32]) -> int:
-    """The largest bits, without signs, of some float32: tells in one pass of what kind they are. 0 of none."""
+    """The largest bit pattern, without signs, of some float32, to find infinite ones and NaN in one pass; 0 of none."""
     if values.size and not any(values.strides):  # one number, repeated
         return int(values[(0,) * values.ndim].view(np.int32)) & 0x7FFFFFFF
     return int(_magnitude_bits(np.ascontiguousarray(values).view(np.int32).reshape(-1)))

@@ -1,7 +1,7 @@
-"""Images: what the filter says at one moment, and the picture of intensities that is made of it.
+"""Images: the filter's estimate at one moment, and the image of linear intensities that is made of it.
 
-`Estimate` is the filter's raw state, `Image` what users are given. Between them lie the prior on highlights (K6, K15),
-the neighbours (K12), the variance that is given out (K11), and the colours of a Bayer sensor or of frames in RGB.
+`Estimate` is the filter's state, `Image` what users get. In between: the prior on highlights (K6, K15), averaging of
+neighbours (K12), the variance that is given out (K11), and the colours of a Bayer sensor or of frames in RGB.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from kalux.filters.uncertainty import Around, add_pattern, alone, given_variance
 from kalux.frames import Mosaic
 from kalux.models.colour import Gains, calm_highlights, demosaic, luminance
 
-_UNTOLD: Final = np.full(1, np.inf, np.float32)
+_INFINITE: Final = np.full(1, np.inf, np.float32)
 """The variance of all pixels where it is not wanted."""
-_UNTOLD.flags.writeable = False
+_INFINITE.flags.writeable = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,12 +38,12 @@ class Image:
     intensity
         float32 (H, W), linear: 1.0 = a saturated frame pixel at the reference exposure; more in highlights.
     variance
-        float32 (H, W), P: the variance of log(intensity + log_offset) (20); infinite for the complementary filter,
-        which knows none.
+        float32 (H, W): the variance of log(intensity + log_offset), from P (20); infinite for the complementary filter,
+        which has none.
     log_offset
         I_0 of equation (8).
     final
-        Whether more data can no longer change it. With lookahead an image is final one frame later.
+        Whether it will not change with more data. With lookahead an image is final one frame later.
     colour
         float32 (H, W, 3), linear red, green, blue with the scale of ``intensity``, which of a Bayer sensor holds each
         pixel's own channel before white balance, and of frames in RGB the luminance. None: the frames are grey.
@@ -76,7 +76,7 @@ class Image:
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """The filter's raw estimate at one moment, before what is known of highlights is applied.
+    """The filter's estimate at one moment, before the prior on highlights and averaging of neighbours.
 
     Attributes
     ----------
@@ -85,33 +85,34 @@ class Estimate:
     log_intensity, variance
         (H, W): L = log(I + I_0), and P. float32; float64 with augmentation "paper".
     white
-        log(1 + I_0) of the brightest level that frames show there.
+        log(I + I_0) of a saturated pixel in the frames around.
     final
         As of `Image`.
     moving
-        (H, W) bool: pixels with an event in this frame interval, also one to come, or the one before, and those that
-        neither frame measures; None: not told.
+        (H, W) bool: pixels with an event in this frame interval (before or after ``t``) or the one before, and those
+        that neither frame measures; None: not known.
     between
-        0 at a frame, 1 half-way between two, and where the next one is not known or not used.
+        0 at a frame, 1 half-way between two, and 1 where the next one is not known or not used.
     chroma
         Of frames in RGB: float32 (H, W, 3), the ratios of the channels to the luminance; else None.
     unshown
-        Pixels that no frame has measured until then, of which L is a bound; None: there are none.
+        Pixels that no frame has measured until then, of which L is a lower bound; None: there are none.
     silent_change
-        (H, W): mean square change of silent pixels around each, from one frame to the next; None: not told.
+        (H, W): mean square change of the silent pixels (without events) around each, from one frame to the next; None:
+        not known.
     around
-        What the frames around say of the pixels (K11); None: not told, or there is only one.
+        The variances and event counts between the two frames around (K11); None: not known, or there is only one frame.
     unmeasured
-        (N,) pixels in the flattened image that neither of the frames around measures, nor the only one known; None: not
-        told.
+        (N,) indices in the flattened image of pixels that neither of the frames around measures, nor the only one
+        known; None: not known.
     exposed
-        The share of the time for which frames are exposed, where the next one is known; more where the light turns more
-        often (`kalux.filters.uncertainty.changed_within`).
+        Exposure over frame interval, where the next frame is known; more where the intensity reverses more often
+        (`kalux.filters.uncertainty.changed_within`).
     since
-        Where it is not known or not used: time to the only frame, in intervals between frames; else None.
+        Where the next frame is not known or not used: time to the only frame, in frame intervals; else None.
     told
-        (H, W): variance of what frames and events have told, where that is not P; None: P. Both ways in time P counts
-        the errors as well that both directions share, which are what no event has told; these K11 adds itself.
+        (H, W): variance due to frames and events alone, where that is not P; None: P. Both ways in time, P includes the
+        errors that both directions share: changes that no event has signalled, which K11 adds itself.
     """
 
     t: int
@@ -133,21 +134,21 @@ class Estimate:
 
 @dataclass(frozen=True)
 class View:
-    """What images of an engine's estimates need to know of its camera and settings.
+    """The settings and the camera's properties by which images are made of estimates.
 
     Attributes
     ----------
     log_offset
         I_0 of equation (8).
     threshold2
-        c^2, of the thresholds on and off: their product.
+        c^2: the product of the thresholds on and off.
     neighbours
-        The share of what neighbours know (K12).
+        `kalux.settings.FilterSettings.neighbours` (K12).
     highlight_scale, highlight_spread
-        Of the prior on what lies beyond white (K6): its standard deviation in log intensity, 0 for none, and how far
-        off thresholds are where no frame checks them.
+        Of the prior on what lies beyond white (K6): its standard deviation in log intensity, 0 for none, and that of
+        the log of the thresholds' error where no frame corrects it.
     unknown_variance
-        P of a pixel of which nothing is known.
+        P of a pixel that has not been measured.
     fixed_pattern
         Standard deviation of the pixels' offsets in the frames (K11), white = 1.
     mosaic, gains
@@ -172,9 +173,9 @@ class View:
 
 
 def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) -> Image:
-    """The image of an estimate: highlights as far as they are believed (K6), with what neighbours know (K12).
+    """The image of an estimate, with the prior on highlights (K6, K15) and averaging of neighbours (K12).
 
-    Where its variance is not wanted it is infinite: to tell it (K11) takes a seventh of the time.
+    Where the variance is not wanted it is infinite: computing it (K11) takes a seventh of the time.
     """
     prior = view.prior(estimate.white)
     log_intensity, variance, told, unshown = _above_bounds(estimate, prior)
@@ -183,9 +184,12 @@ def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) ->
         change = np.full(log_intensity.shape, UNKNOWN_CHANGE * view.threshold2, np.float32)
     half_way = RANDOM if estimate.around is None else estimate.around.half_way
     hidden = hidden_variance(estimate.between, view.threshold2, estimate.exposed, estimate.since, half_way)
-    tells = with_variance or view.mosaic is not None  # the colours of a mosaic's highlights depend on it
-    left = tells and (moving is None or (estimate.around is not None and estimate.around.misses_some))
-    intensity, total, heard = read_out(
+    needs_variance = with_variance or view.mosaic is not None  # colours of a mosaic's highlights depend on it
+    # That after averaging counts only for pixels that neither frame measures (K11).
+    needs_averaged = needs_variance and (
+        moving is None or (estimate.around is not None and estimate.around.misses_some)
+    )
+    intensity, total, levels = read_out(
         log_intensity,
         variance,
         view.log_offset,
@@ -196,20 +200,22 @@ def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) ->
         view.neighbours,
         1 if view.mosaic is None else 2,  # to neighbours of the same colour
         None if unshown is None else unshown.pixels,
-        with_variance=left,
+        with_variance=needs_averaged,
     )
     if unshown is not None:
-        read_unshown(intensity, heard, estimate.log_intensity, unshown, view.log_offset, prior)
+        read_unshown(intensity, levels, estimate.log_intensity, unshown, view.log_offset, prior)
     if estimate.unmeasured is not None:
         keep_white(intensity, estimate.log_intensity, estimate.unmeasured, view.log_offset, prior)
     pattern = view.fixed_pattern * (np.exp(estimate.white) - view.log_offset)
-    if not tells:
-        total = np.ndarray(intensity.shape, np.float32, _UNTOLD, strides=(0, 0))
+    if not needs_variance:
+        total = np.ndarray(intensity.shape, np.float32, _INFINITE, strides=(0, 0))
     elif moving is not None and change is not None:
-        total = given_variance(told, moving, change, hidden, estimate.around, total if left else None)
+        total = given_variance(
+            told, moving, change, hidden, estimate.around, total if needs_averaged else None
+        )
         if pattern > 0:
             add_pattern(total, intensity, view.log_offset, pattern)
-    if tells and unshown is not None:
+    if needs_variance and unshown is not None:
         total.reshape(-1)[unshown.pixels] += unshown.doubt
     image = Image(estimate.t, intensity, total, view.log_offset, estimate.final, fixed_pattern=float(pattern))
     colour = _coloured(image, estimate, view)
@@ -219,7 +225,7 @@ def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) ->
 def _above_bounds(
     estimate: Estimate, prior: HighlightPrior
 ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], Unshown | None]:
-    """L, P and what of it was told, with pixels that no frame has shown where they are expected (K15); and these."""
+    """L, P, `Estimate.told` and the unshown pixels, raised from their bounds to where they are expected (K15)."""
     if estimate.unshown is None:
         variance = estimate.variance
         return estimate.log_intensity, variance, variance if estimate.told is None else estimate.told, None
@@ -230,13 +236,13 @@ def _above_bounds(
 
 
 def _coloured(image: Image, estimate: Estimate, view: View) -> NDArray[np.float32] | None:
-    """The image's colours: the mosaic's, or those that the frames lend to the luminance; None where frames are grey."""
+    """The image's colours: demosaiced, or the luminance with the frames' chromaticity; None where frames are grey."""
     if estimate.chroma is not None:
         return estimate.chroma * image.intensity[..., None]
     if view.mosaic is None:
         return None
     colour = demosaic(image.intensity, view.mosaic, view.log_offset, view.gains)
-    # The complementary filter knows no variance: its highlights are taken as any are that were never seen.
-    # What is expected above a bound (K15) is no knowledge of its colour: there, P counts.
+    # The complementary filter has no variance: its highlights are treated as never measured.
+    # An expected excess above a bound (K15) says nothing about the colour: there, P counts.
     known = np.maximum(image.variance, estimate.variance)
     return calm_highlights(colour, np.minimum(known, np.float32(view.unknown_variance)), view.gains)

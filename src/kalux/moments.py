@@ -1,4 +1,4 @@
-"""What the frames before and after a moment say of it, beside what the filter makes of them."""
+"""A moment between two frames: what images need of the frames besides the filter's estimate."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Moment(NamedTuple):
     after
         The next; None where it is not known or not used.
     share
-        Of the way from one to the other, as the filter goes it: 0 to 1.
+        Of the segment that has passed: 0 to 1.
     """
 
     t: int
@@ -38,25 +38,25 @@ class Moment(NamedTuple):
 
     @property
     def exposed(self) -> float:
-        """The share of the time for which frames are exposed; 0 where there is only one."""
+        """Exposure over frame interval; 0 where there is only one frame."""
         if self.after is None:
             return 0.0
         exposures = self.before.end - self.before.start + self.after.end - self.after.start
         return min(exposures / 2 / (self.after.middle - self.before.middle), 1.0)
 
     def since(self, interval: float) -> float | None:
-        """Time to the only frame, in intervals of so many us; None where there are two."""
+        """Time to the only frame, in units of ``interval`` (us); None where there are two frames."""
         return None if self.after is not None else abs(self.t - self.before.middle) / interval
 
     def white(self, offset: float) -> float:
-        """log(I + ``offset``) of the brightest level that frames show: from one frame's to the next's."""
+        """log(I + ``offset``) of a saturated pixel, interpolated between the frames."""
         white = float(np.log(self.before.white + offset))
         if self.after is None:
             return white
         return white + self.share * (float(np.log(self.after.white + offset)) - white)
 
     def chroma(self) -> NDArray[np.float32] | None:
-        """What RGB frames say of the chromaticity, by their distance in time; None of others."""
+        """Chromaticity of RGB frames, interpolated in time; None of others."""
         if self.before.chroma is None:
             return None
         fraction = 0.0

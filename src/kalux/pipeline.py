@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import math
 import tempfile
+from collections import deque
 from collections.abc import Callable, Generator, Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -59,7 +60,7 @@ def reconstruct(
         From `kalux.load_calibration`: what was measured replaces the preset's settings (not those of ``settings``), and
         what is known of single pixels is used.
     lookahead
-        Whether an image uses the frame after it too; False is what a robot would see.
+        Whether an image uses the frame after it too; False: causal, as a robot needs it.
     smooth
         Whether an image uses everything after it: the filter runs backward too (`kalux.smoothing`). Takes
         three times as long, and room for the events and some states in the folder for temporary files.
@@ -67,11 +68,18 @@ def reconstruct(
     Raises
     ------
     InputError
-        If not exactly one of rate_hz, times and at is given, or times lie outside the recording.
+        If not exactly one of rate_hz, times and at is given, times lie outside the recording, or ``smooth`` is asked of
+        the causal mode or the complementary filter.
+    SettingsError
+        If the preset or a setting is unknown.
     FrameError
         If the recording has no frames.
-    EventError, ExposureError
-        If the recording is damaged; images before the damage have been returned.
+    ExposureError
+        If the frames' exposures are not known.
+    EventError, FrameError, ExposureError
+        If the recording is damaged; images before the damage may have been returned.
+    OutputError
+        If ``smooth`` finds no room for temporary files.
     """
     return execute(
         recording,
@@ -108,7 +116,10 @@ def execute(
     memory.give_back()  # what planning and checking have used
     engine = _engine(recording, plan)
     several = threads > 1
-    estimates = _smoothed_estimates(recording, engine, plan, on_events, on_backward, several)
+    if plan.smooth:
+        estimates = _smoothed_estimates(recording, engine, plan, on_events, on_backward, several)
+    else:
+        estimates = _forward_estimates(recording, engine, plan, on_events, several)
     images = _images(engine, ahead(estimates, name="filter") if several else estimates, with_variance)
     yield from ahead(images, _IMAGES_AHEAD, "images") if several else images
 
@@ -129,24 +140,17 @@ def _smoothed_estimates(
     on_backward: Callable[[int], None] | None,
     read_ahead: bool,
 ) -> Generator[Estimate, None, None]:
-    if not plan.smooth:
-        yield from _estimates(recording, engine, plan, on_events, read_ahead)
-        return
+    """The forward filter's estimates, each combined with the backward filter's at the same time."""
+    trail = _trail(plan)
+    reverse = dataclasses.replace(
+        plan, settings=reversed_settings(plan.settings), pixels=reversed_pixels(plan.pixels)
+    )
+    on, off = engine.thresholds
     with tempfile.TemporaryDirectory(prefix="kalux-") as folder:
-        trail = _trail(plan)
-        reverse = dataclasses.replace(
-            plan, settings=reversed_settings(plan.settings), pixels=reversed_pixels(plan.pixels)
-        )
         backward = Backward(
-            recording,
-            _engine(recording, reverse),
-            plan.times,
-            Path(folder),
-            on_backward,
-            trail=trail,
+            recording, _engine(recording, reverse), plan.times, Path(folder), on_backward, trail=trail
         )
-        on, off = engine.thresholds
-        for estimate in _estimates(recording, engine, plan, on_events, read_ahead):
+        for estimate in _forward_estimates(recording, engine, plan, on_events, read_ahead):
             ahead_of_events = None if trail is None else engine.trail(estimate.t)
             yield combine(estimate, backward.estimate(estimate.t), ahead_of_events, on * off)
 
@@ -170,68 +174,49 @@ def _engine(recording: Recording, plan: Plan) -> Reconstructor:
     )
 
 
-def _estimates(
+def _forward_estimates(
     recording: Recording,
     engine: Reconstructor,
     plan: Plan,
     on_events: Callable[[int], None] | None,
     read_ahead: bool,
-) -> Iterator[Estimate]:
+) -> Generator[Estimate, None, None]:
     """Drive the engine over the recording, reading each time of the plan as soon as it is final."""
-    if not read_ahead:
-        yield from _driven(recording, iter(recording.events()), engine, plan, on_events)
-        return
-    with contextlib.closing(ahead(recording.events(), 1, "read")) as chunks:
-        yield from _driven(recording, chunks, engine, plan, on_events)
-
-
-def _driven(
-    recording: Recording,
-    chunks: Iterator[EventArray],
-    engine: Reconstructor,
-    plan: Plan,
-    on_events: Callable[[int], None] | None,
-) -> Iterator[Estimate]:
-    pending = iter(plan.times.tolist())
-    t = next(pending, None)
-    ended = False
-    for frame in recording.frames():
-        engine.push_frame(frame)
-        while not ended and not engine.covers(frame.exposure_end):
+    events, times, ended = recording.events(), deque(plan.times.tolist()), False
+    reading: AbstractContextManager[Iterator[EventArray]] = (
+        contextlib.closing(ahead(events, 1, "read")) if read_ahead else contextlib.nullcontext(iter(events))
+    )
+    with reading as chunks:
+        for frame in recording.frames():
+            engine.push_frame(frame)
+            while not ended and not engine.covers(frame.exposure_end):
+                ended = not _push_next(engine, chunks, on_events)
+            if ended:
+                engine.advance(frame.exposure_end + plan.settings.events.lateness)
+            yield from _final_estimates(engine, times)
+            if not times:
+                return
+        engine.end_frames()
+        while not ended and times:
             ended = not _push_next(engine, chunks, on_events)
-        if ended:
-            engine.advance(frame.exposure_end + plan.settings.events.lateness)
-        final = _final_until(engine)
-        while t is not None and t <= final:
-            yield engine.estimate(t)
-            t = next(pending, None)
-        if t is None:
-            return
-        engine.forget(t)
-    engine.end_frames()
-    while not ended and t is not None:
-        ended = not _push_next(engine, chunks, on_events)
-        final = _final_until(engine)
-        while t is not None and t <= final:
-            yield engine.estimate(t)
-            t = next(pending, None)
-        if t is not None:
-            engine.forget(t)
-    engine.finish()
-    while t is not None:
-        yield engine.estimate(t)
-        t = next(pending, None)
+            yield from _final_estimates(engine, times)
+        engine.finish()
+        yield from _final_estimates(engine, times)
 
 
-def _final_until(engine: Reconstructor) -> float:
-    """As the engine says; reading does not change it."""
-    until = engine.final_until
-    return -math.inf if until is None else until
+def _final_estimates(engine: Reconstructor, times: deque[int]) -> Iterator[Estimate]:
+    """Estimates at those of ``times`` that are final, taken from it; what only led to them is forgotten."""
+    until = engine.final_until  # reading does not change it
+    while times and until is not None and times[0] <= until:
+        yield engine.estimate(times.popleft())
+    if times:
+        engine.forget(times[0])
 
 
 def _push_next(
     engine: Reconstructor, chunks: Iterator[EventArray], on_events: Callable[[int], None] | None
 ) -> bool:
+    """Push the next chunk; False: there is none."""
     chunk = next(chunks, None)
     if chunk is None:
         return False

@@ -1,4 +1,4 @@
-"""What a reconstruction will do: what the settings leave open is found in the recording, and the images are chosen."""
+"""Plan a reconstruction: settings that are None are estimated from the recording, and the times of images chosen."""
 
 from __future__ import annotations
 
@@ -40,15 +40,15 @@ from kalux.settings import preset as named_preset
 
 ThresholdOrigin = Literal["settings", "recording", "calibration", "estimate", "assumed"]
 
-_FOUND: Final[tuple[ThresholdOrigin, ...]] = ("estimate", "assumed")
+_NOT_STATED: Final[tuple[ThresholdOrigin, ...]] = ("estimate", "assumed")
 
-DOUBTED: Final[tuple[ThresholdOrigin, ...]] = ("calibration", *_FOUND)
-"""Thresholds of these origins are not quite the pixels' own: highlights are then believed less."""
+DOUBTED: Final[tuple[ThresholdOrigin, ...]] = ("calibration", *_NOT_STATED)
+"""Origins of thresholds that may differ from the pixels' own: highlights are then shrunk more towards white."""
 
 _CALIBRATION_NEEDED: Final = "a kalux.Calibration is needed, from kalux.load_calibration"
 
 _NOISE_EVENTS: Final = 1_000_000
-"""Of which the background noise is taken: at 15 million events/s the quiet time of 300,000 pixels in 70 ms."""
+"""From which the background noise is estimated: at 15 million events/s, those of 300,000 pixels in 70 ms."""
 
 _REMEMBERED_EVENTS: Final = 1 << 21
 _REMEMBERED_FRAMES: Final = 1 << 25
@@ -124,7 +124,7 @@ def plan(
     lookahead: bool = True,
     smooth: bool = False,
 ) -> Plan:
-    """Decide what a reconstruction will do. See `reconstruct` for the parameters and errors."""
+    """Plan a reconstruction. See `kalux.reconstruct` for the parameters and errors."""
     require_type("reconstruct: recording", recording, Recording, RECORDING_NEEDED)
     if settings is not None:
         require_type("reconstruct: settings", settings, Settings, SETTINGS_NEEDED)
@@ -151,18 +151,18 @@ def plan(
     chosen = _with_white_balance(recording, chosen)
     chosen, noise = _with_frame_noise(recording, chosen)
     chosen, pattern = _with_fixed_pattern(recording, chosen)
-    chosen, blind = _with_dead_time(recording, chosen)
-    filled, origin, estimate, delay, model = _with_event_steps(recording, chosen)
-    unsure = estimate.spread if estimate is not None and origin in _FOUND else 0.0
-    filled, mismatch = _with_mismatch(recording, filled, unsure)
-    filled, background = _with_background(recording, filled, known.pixels)
-    if origin == "settings" and _are_calibrated(filled, known):
+    chosen, period = _with_dead_time(recording, chosen)
+    chosen, origin, estimate, delay, model = _with_event_steps(recording, chosen)
+    unsure = estimate.spread if estimate is not None and origin in _NOT_STATED else 0.0
+    chosen, mismatch = _with_mismatch(recording, chosen, unsure)
+    chosen, background = _with_background(recording, chosen, known.pixels)
+    if origin == "settings" and _are_calibrated(chosen, known):
         origin = "calibration"
-    doubted = origin in DOUBTED or (_uses_steps(filled) and filled.filter.unshown_tail > 0)
+    doubted = origin in DOUBTED or (_uses_steps(chosen) and chosen.filter.unshown_tail > 0)
     if doubted and tail is not None:
-        filled = altered(filled, "filter", bright_tail=tail.scale)
+        chosen = altered(chosen, "filter", bright_tail=tail.scale)
     return Plan(
-        settings=filled,
+        settings=chosen,
         threshold_origin=origin,
         estimate=estimate,
         delay_estimate=delay,
@@ -176,7 +176,7 @@ def plan(
         mismatch=mismatch,
         background_rate=background,
         ceiling=ceiling,
-        dead_time=blind,
+        dead_time=period,
     )
 
 
@@ -192,13 +192,13 @@ def _check_smooth(settings: Settings, lookahead: bool) -> None:
 
 
 def with_saturation(recording: Recording, settings: Settings) -> tuple[Settings, Ceiling | None]:
-    """Fill in the saturation: from the settings, else where frames end at one level and events go on, else the usual.
+    """Fill in the saturation: from the settings, else the level at which all frames end while events go on, else usual.
 
-    Frames may end with the scene: events decide, by thresholds that are estimated as if the frames were clipped there.
+    Frames may also end where the scene does. Events decide, by thresholds estimated as if frames were clipped there.
 
     Returns
     -------
-    The settings, and where the frames end, if that was found.
+    The settings, and the level at which frames are clipped, if that was found.
     """
     camera = settings.camera
     usual = altered(settings, "camera", saturation=camera.clipped_from)
@@ -214,10 +214,7 @@ def with_saturation(recording: Recording, settings: Settings) -> tuple[Settings,
 
 
 def _survey(recording: Recording, camera: Camera | None) -> tuple[NDArray[np.int64], BrightTail | None]:
-    """(K, 2) exposure starts and ends, us, and how the brightness of pixels falls off towards white; of all frames.
-
-    Without a camera, the brightness is not looked at.
-    """
+    """(K, 2) exposure starts and ends, us, of all frames, and, given a camera, their bright tail."""
     exposures, tail = [], BrightTail()
     for frame in recording.frames():
         exposures.append((frame.exposure_start, frame.exposure_end))
@@ -229,7 +226,7 @@ def _survey(recording: Recording, camera: Camera | None) -> tuple[NDArray[np.int
 
 
 def _measures_tail(settings: Settings) -> bool:
-    """Whether the bright tail of the frames may be of use: where highlights are looked at, and it is not given."""
+    """Whether the frames' bright tail may be needed: for the prior on highlights, unless it is given."""
     filtered = settings.filter
     return filtered.kind == "akf" and filtered.highlight_scale > 0 and filtered.bright_tail is None
 
@@ -338,7 +335,7 @@ def _with_event_steps(recording: Recording, settings: Settings) -> _EventSteps:
     filled, late = _with_delay(recording, filled, late, estimate)
     filled, model = _with_event_model(recording, filled)
     if estimate is not None and settings.camera.log_offset is None:
-        estimated = origin in _FOUND
+        estimated = origin in _NOT_STATED
         if estimated or (estimate.may_lose and settings.camera.offset != filled.camera.offset):
             events = filled.events
             unfilled = dataclasses.replace(
@@ -404,15 +401,8 @@ def _with_event_model(recording: Recording, settings: Settings) -> tuple[Setting
     camera, events = settings.camera, settings.events
     if camera.log_offset is not None and (events.step_variance is not None or not _uses_steps(settings)):
         return settings, None
-    model = estimate_event_model(
-        recording,
-        camera,
-        events.thresholds,
-        delay=events.lateness,
-        threshold_spread=events.mismatch,
-        quantisation_variance=events.quantisation_variance,
-        refractory_period=events.refractory if _uses_steps(settings) else 0,
-    )
+    weighed = events if _uses_steps(settings) else dataclasses.replace(events, refractory_period=None)
+    model = estimate_event_model(recording, camera, weighed)
     if model is not None:
         if camera.log_offset is None:
             camera = dataclasses.replace(camera, log_offset=model.log_offset)

@@ -79,15 +79,14 @@ class Reconstructor:
         Log-intensity step of an event, or (on, off). Settings win. Default: the preset's usual ones, and the pixels'
         own are learned.
     threshold_is_estimate
-        Whether the threshold was estimated: highlights beyond white, where no frame checks it, are then
-        believed less.
+        Whether the threshold was estimated: highlights beyond white, where no frame corrects its error, are then
+        shrunk more towards white.
     reference_exposure
         Exposure time, us, at which a saturated pixel is 1.0; default: that of the first frame. Settings win.
     inverse_covariance
         A released ``f_Q``: 1 / R_bar for each level of the response, its shape used as f^w (5).
     pixels
-        What is known of single pixels, from a calibration: priors of their thresholds, and hot ones, whose events
-        are left out.
+        Calibration of single pixels: priors of their thresholds, and hot ones, whose events are left out.
 
     Raises
     ------
@@ -117,13 +116,11 @@ class Reconstructor:
             raise InputError(f"reference_exposure is {reference_exposure} us; it must be positive")
         self.settings = settings if settings is not None else named_preset(preset)
         self.lookahead = lookahead
-        on, off = checked_thresholds(contrast_threshold) or (None, None)
-        chosen = self.settings.events
-        unknown = on is None and chosen.threshold_on is None
-        self._estimated = threshold_is_estimate or unknown
-        assumed = chosen.with_thresholds(on, off).assuming()
-        self.thresholds = assumed.thresholds
-        self._delay = chosen.lateness
+        stated = self.settings.events.with_thresholds(*checked_thresholds(contrast_threshold) or (None, None))
+        self._thresholds_estimated = threshold_is_estimate or stated.threshold_on is None
+        events = stated.assuming()
+        self.thresholds = events.thresholds
+        self._delay = events.lateness
         camera = self.settings.camera
         self._camera = Camera.named(camera.response, camera.clipped_from)
         if inverse_covariance is not None:
@@ -131,22 +128,22 @@ class Reconstructor:
                 inverse_covariance, self._camera.response, camera.clipped_from
             )
         self._gains = white_balance(camera.white_balance)
-        self._reference = camera.reference_exposure or reference_exposure
-        used = dataclasses.replace(self.settings, events=assumed)
+        self._reference_exposure = camera.reference_exposure or reference_exposure
         if pixels is not None:
             require_type("pixels", pixels, PixelCalibration, _PIXELS_NEEDED)
             require_size(pixels, self.sensor_size)
-        self._ignored = pixels.hot if pixels is not None and pixels.hot.any() else None
-        self._method: Method = make_method(used, self.thresholds, lookahead, self.sensor_size, pixels)
+        self._hot = pixels.hot if pixels is not None and pixels.hot.any() else None
+        used = dataclasses.replace(self.settings, events=events)
+        self._method: Method = make_method(used, lookahead, self.sensor_size, pixels)
         self._shots: list[Shot] = []  # from the current segment's frame on
-        clock = EventClock(self.sensor_size, chosen.refractory)
+        clock = EventClock(self.sensor_size, events.refractory)
         self._events = EventBuffer(clock)  # those after the current segment's start
         self._state: State | None = None  # at the current segment's start
         self._memory: Any = None
         self._progress: _Progress | None = None
         self._last_frame: Frame | None = None
         self._frame_count = 0
-        self._interval = USUAL_INTERVAL  # between the latest two frames whose segment is committed, us
+        self._frame_interval = USUAL_INTERVAL  # between the latest two frames whose segment is committed, us
         self._bright_tail = self.settings.filter.bright_tail  # None: that of the first frame
         self._event_count = 0
         self._last_event: int | None = None
@@ -175,10 +172,10 @@ class Reconstructor:
                 "push: end_frames() was called, no frame can be pushed after it; a new Reconstructor can begin with it"
             )
         check_frame(frame, self.sensor_size, index=self._frame_count, previous=self._last_frame)
-        self._reference = self._reference or frame.exposure
+        self._reference_exposure = self._reference_exposure or frame.exposure
         if self._bright_tail is None:
             self._bright_tail = count_bright(self._camera, frame.image, frame.white_value).scale
-        shot = take_shot(frame, self._camera, self._reference, self._gains_of(frame))
+        shot = take_shot(frame, self._camera, self._reference_exposure, self._gains_of(frame))
         self._shots.append(shot._replace(trail=trail, bright_tail=self._bright_tail))
         self._last_frame = frame
         self._frame_count += 1
@@ -221,9 +218,9 @@ class Reconstructor:
             earliest = self._complete_until + 1 + self._delay
             previous = earliest if previous is None else max(previous, earliest)
         kept = array
-        if self._ignored is not None:
+        if self._hot is not None:
             check_events(array, self.sensor_size, first_index=self._event_count, previous_t=previous)
-            words = event_words(array)[~self._ignored[array["y"], array["x"]]]
+            words = event_words(array)[~self._hot[array["y"], array["x"]]]
             kept = words.reshape(-1).view(EVENT_DTYPE)  # words keep the weights
         if not self._events.append(
             kept, self.sensor_size, earliest=previous, delay=self._delay, weighed=weighed
@@ -326,7 +323,7 @@ class Reconstructor:
         return self.image(self.estimate(t))
 
     def estimate(self, t: int) -> Estimate:
-        """The raw estimate at time ``t`` (us). Never changes the result of any other read.
+        """The filter's estimate at time ``t`` (us), for `image`. Never changes the result of any other read.
 
         Reads may repeat, and go back as far as the newest frame that is final.
 
@@ -365,32 +362,32 @@ class Reconstructor:
             around=None if moment.after is None else self._method.around(progress.segment, t),
             unmeasured=self._method.unmeasured(progress.segment, progress.cursor),
             exposed=changed_within(moment.exposed, self._method.turns(progress.segment)),
-            since=moment.since(self._interval),
+            since=moment.since(self._frame_interval),
         )
 
     def trail(self, t: int) -> NDArray[np.floating[Any]] | None:
         """(H, W) how far, in log intensity, the light is ahead of its events at ``t`` (us), K14.
 
-        ``t`` is a time that can be read. None: the method does not tell.
+        ``t`` is a time that can be read. None: the method does not follow it.
         """
         progress = self._progress_to(t)
         self._take(progress, t)
         return self._method.trail(progress.segment, progress.cursor, t)
 
     def image(self, estimate: Estimate, *, with_variance: bool = True) -> Image:
-        """The image of an estimate: highlights as far as they are believed (K6), with what neighbours know (K12).
+        """The image of an estimate, with the prior on highlights (K6, K15) and averaging of neighbours (K12).
 
-        Where its variance is not wanted it is infinite: to tell it (K11) takes a seventh of the time.
+        Where the variance is not wanted it is infinite: computing it (K11) takes a seventh of the time.
         """
         return make_image(estimate, self._view(), with_variance=with_variance)
 
     def _view(self) -> View:
-        """What images need of the camera, the settings, and the first frame."""
+        """The settings and the camera's properties by which images are made."""
         filtered, events = self.settings.filter, self.settings.events
         # The prior on highlights needs a variance, which the complementary filter has not.
         scale = filtered.highlight_scale if filtered.kind == "akf" else 0.0
         spread = events.mismatch
-        if self._estimated:
+        if self._thresholds_estimated:
             assert self._bright_tail is not None  # a frame has been pushed
             scale = min(scale, filtered.highlight_tail * beyond_white(self._bright_tail))
             spread = events.believed_extrapolation
@@ -512,7 +509,7 @@ class Reconstructor:
         self._memory = progress.memory
         self._progress = None
         if progress.starts_frame:
-            self._interval = self._shots[1].middle - self._shots[0].middle
+            self._frame_interval = self._shots[1].middle - self._shots[0].middle
             self._shots.pop(0)
         self._events.drop(progress.segment.end)
 

@@ -66,7 +66,7 @@ class Stream(Generic[T]):
 
 
 class _Remembered(Generic[T]):
-    """Items that are gone through several times, the first of which stay in memory; others are made anew each time."""
+    """An iterable whose first items stay in memory from the first pass on; the others are made anew in each pass."""
 
     def __init__(self, make: Callable[[], Iterator[T]], size: Callable[[T], int], room: int) -> None:
         self._make, self._size, self._room = make, size, room
@@ -90,9 +90,9 @@ class _Remembered(Generic[T]):
 
 
 def remembering(recording: Recording, events: int, frame_bytes: int) -> Recording:
-    """The same recording, whose first ``events`` and ``frame_bytes`` of frames are read once for all who look at them.
+    """The same recording, whose first ``events`` and ``frame_bytes`` of frames are read once for all passes over it.
 
-    They stay in memory as long as it is held; nobody may change them.
+    They stay in memory as long as it is held, and must not be changed.
     """
     remembered = copy.copy(recording)
     remembered.source = dataclasses.replace(
@@ -129,9 +129,9 @@ RECORDING_NEEDED: Final = "a kalux.Recording is needed, from kalux.open or Recor
 
 
 def clock_doubt(events: int, between: int, enough: int = LATEST) -> str | None:
-    """What makes it doubtful that events and frames have the same clock, if anything does.
+    """A warning if events and frames hardly have the same clock, else None.
 
-    ``between`` is how many of the ``events`` lie from the first frame to the last; ``enough`` of them are no doubt.
+    ``between`` is how many of the ``events`` lie from the first frame to the last; with ``enough`` there is none.
     """
     if between >= min(_FEW * events, enough):
         return None
@@ -451,9 +451,13 @@ def open(
     Raises
     ------
     InputError, FormatError
-        If a file is missing, unknown or damaged, or the frames are not wanted as they are given.
+        If a file is missing, unknown or damaged, or an argument does not fit it.
+    ExposureError
+        If ``exposure`` is not positive and whole.
     FrameError
         If ``frames`` have not the size of the sensor.
+    MissingDependencyError
+        If the format needs a library that is not installed.
     """
     source = readers.read(path)
     if frames is not None:

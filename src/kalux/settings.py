@@ -14,7 +14,7 @@ from kalux.errors import InputError, KaluxError, SettingsError, did_you_mean
 FilterName = Literal["akf", "cf"]
 AugmentationName = Literal["bridge", "paper"]
 AUTO: Final = "auto"
-"""Stands in files for None: found out from the recording."""
+"""In files and flags, stands for None: estimated from the recording."""
 
 SolutionName = Literal["exact", "printed"]
 
@@ -88,18 +88,18 @@ class CameraSettings:
 
     @property
     def offset(self) -> float:
-        """I_0, also where nobody has said or estimated it."""
+        """I_0: ``log_offset``, or its usual value while that is None."""
         return UNKNOWN_LOG_OFFSET if self.log_offset is None else self.log_offset
 
     @property
     def noise(self) -> tuple[float, float]:
-        """Frame noise and shot noise, also where nobody has said or estimated them."""
+        """(``frame_noise``, ``shot_noise``), or their usual values while they are None."""
         read = self.usual_frame_noise if self.frame_noise is None else self.frame_noise
         return read, self.shot_noise or 0.0
 
     @property
     def clipped_from(self) -> float:
-        """Response from which a pixel counts as clipped, also where nobody has said or found it."""
+        """``saturation``, or the usual one while that is None."""
         return self.usual_saturation if self.saturation is None else self.saturation
 
 
@@ -121,22 +121,21 @@ class EventSettings:
         Variance of one event's step in units of c^2. None: an estimate from the recording
         (`kalux.calibration.event_model`).
     refractory_period
-        For how long after an event a pixel does not look, us: what the light did meanwhile is added to its next event
-        (docs/equations.md, K13). None: an estimate from the recording, 0 where its frames say that nothing is lost
+        Time after an event in which a pixel produces no other, us: the change meanwhile is added to its next event
+        (docs/equations.md, K13). None: an estimate from the recording, 0 where its frames show that no change is lost
         and in a live stream. For augmentation "bridge" only.
     quantisation_variance
-        Variance, in c^2, of the change that events have not yet told at both ends of a frame interval: two
-        uniform distributions one threshold wide, 2/12.
+        Variance, in c^2, of the changes below the threshold at both ends of a frame interval, which have produced no
+        event yet: two uniform distributions one threshold wide, 2/12.
     deblur_variance
         Variance, in c^2, that each event of an exposure adds to the deblurred frame. 0.05 (docs/tuning.md).
     noise_rate
         Background noise, Hz per pixel, that makes isolated events doubtful. None: the usual, or what is measured in
         the recording (`kalux.calibration.noise`) where that is more.
     extrapolation_spread
-        Standard deviation of the log of the scale of what events say of highlights beyond white, where no
-        frame can check it, when the threshold is only an estimate; or threshold_spread, if a recording has told it and
-        it is less. 0.15: how well large steps between well exposed frames agree with estimated thresholds, on three
-        real and eleven simulated recordings.
+        Where thresholds are only estimates: standard deviation of the log of their common error beyond white, where no
+        frame corrects it; or threshold_spread, if that is known and less. 0.15: how well large changes between well
+        exposed frames agree with estimated thresholds, on three real and eleven simulated recordings.
     trail
         By how much, in c, a pixel is on average beyond the level of its newest event, at most (docs/equations.md,
         K14): events trail the light. 0 turns it off. 0.4 (docs/tuning.md).
@@ -189,47 +188,48 @@ class EventSettings:
 
     @property
     def step_noise(self) -> float:
-        """Variance of one event's step in units of c^2, also where nobody has said or estimated it."""
+        """``step_variance``, or the usual one while that is None."""
         return self.usual_step_variance if self.step_variance is None else self.step_variance
 
     @property
     def mismatch(self) -> float:
-        """Spread of the threshold between pixels, also where nobody has said or estimated it."""
+        """``threshold_spread``, or the usual one while that is None."""
         return self.usual_threshold_spread if self.threshold_spread is None else self.threshold_spread
 
     @property
     def believed_extrapolation(self) -> float:
-        """Spread of the scale of events beyond white where thresholds are estimated.
+        """The spread of the events' scale beyond white where thresholds are estimated, as used.
 
-        A spread that a recording tells counts what is not known of its thresholds; more than usual is in P (K10).
+        A ``threshold_spread`` from a recording includes the uncertainty of its thresholds; where it is larger than
+        ``extrapolation_spread``, P accounts for the rest (K10).
         """
-        told = self.threshold_spread
-        return self.extrapolation_spread if told is None else min(told, self.extrapolation_spread)
+        spread = self.threshold_spread
+        return self.extrapolation_spread if spread is None else min(spread, self.extrapolation_spread)
 
     @property
     def background_rate(self) -> float:
-        """Background noise, Hz per pixel, also where nobody has said or estimated it."""
+        """``noise_rate``, or the usual one while that is None."""
         return self.usual_noise_rate if self.noise_rate is None else self.noise_rate
 
     @property
     def lateness(self) -> int:
-        """The delay, us, also where nobody has said or estimated it."""
+        """``delay``, us, or the usual one while that is None."""
         return self.usual_delay if self.delay is None else self.delay
 
     @property
     def has_thresholds(self) -> bool:
-        """Whether both are set."""
+        """Whether both thresholds are set."""
         return self.threshold_on is not None and self.threshold_off is not None
 
     @property
     def thresholds(self) -> tuple[float, float]:
-        """(on, off), of settings that have both."""
+        """(on, off); both must be set."""
         assert self.threshold_on is not None
         assert self.threshold_off is not None
         return self.threshold_on, self.threshold_off
 
     def with_thresholds(self, on: float | None, off: float | None) -> EventSettings:
-        """With these where none is set."""
+        """With these thresholds in place of those that are None."""
         return replace(
             self,
             threshold_on=on if self.threshold_on is None else self.threshold_on,
@@ -237,7 +237,7 @@ class EventSettings:
         )
 
     def assuming(self) -> EventSettings:
-        """With the usual thresholds where none is set, and a prior as wide as these are uncertain."""
+        """With the usual thresholds in place of those that are None, and a prior as wide as these are uncertain."""
         if self.has_thresholds:
             return self
         assumed = self.with_thresholds(self.usual_threshold_on, self.usual_threshold_off)
@@ -245,7 +245,7 @@ class EventSettings:
 
     @property
     def refractory(self) -> int:
-        """The refractory period, us, 0 where nobody has said or estimated it."""
+        """``refractory_period``, us, or 0 while that is None."""
         return 0 if self.refractory_period is None else self.refractory_period
 
 
@@ -268,21 +268,22 @@ class FilterSettings:
         P at the start where the first frame is clipped, and everywhere with augmentation "paper" (0.09 in
         the released code). 1.0: a clipped pixel is white or up to a few times brighter.
     highlight_scale
-        Standard deviation, in log intensity, of how far scenes go beyond white: what is not known of a
-        highlight is drawn towards white by it. 0 turns it off. 2 (docs/tuning.md).
+        Standard deviation, in log intensity, of the prior on how far scenes go beyond white, which shrinks uncertain
+        highlights towards white. 0 turns it off. 2 (docs/tuning.md).
     highlight_tail
         The same where thresholds are only an estimate, as a multiple of how far the frames' bright tail goes on
         (`kalux.models.camera.beyond_white`), but no more than highlight_scale: scenes of which little saturates do
         not go far beyond white. 6 (docs/tuning.md).
     unshown_tail
-        How far above their bounds pixels are taken to lie that every frame so far has clipped, as a share of the scale
-        that pixels just below white around them have (docs/equations.md, K15). 0 leaves them at their bounds. 0.5
-        (docs/tuning.md).
+        How far pixels that every frame so far has clipped are expected to lie above their lower bounds, as a share of
+        the scale of the pixels just below white around them (docs/equations.md, K15). 0 leaves them at their bounds.
+        0.5 (docs/tuning.md).
     bright_tail
         Scale of the frames' bright tail; None: from the recording's frames, in a live stream from the first.
     neighbours
-        Standard deviation, in log intensity, by which neighbouring pixels of a surface differ: moving pixels are
-        given what their eight neighbours know (docs/equations.md, K12). 0 turns it off. 0.2 (docs/tuning.md).
+        Standard deviation, in log intensity, by which neighbouring pixels of a surface differ: moving pixels become
+        weighted means of themselves and their eight neighbours (docs/equations.md, K12). 0 turns it off. 0.2
+        (docs/tuning.md).
     cutoff
         Of the complementary filter, Hz. 1.0 (Scheerlinck 2018 uses 2 pi rad/s).
     """

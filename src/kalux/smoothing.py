@@ -25,11 +25,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.bridge import REPEATED, UNMEASURED
-from kalux.augmentation.deblur import between
 from kalux.augmentation.refractory import EventClock
 from kalux.augmentation.trail import FrameTrail, follow, nothing_followed, trail_at
 from kalux.compiled import event_words
 from kalux.errors import OutputError
+from kalux.event_slices import between
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.filters.highlights import obey_bounds, smoothed_unshown
 from kalux.filters.uncertainty import Around

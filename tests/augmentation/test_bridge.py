@@ -16,8 +16,8 @@ from kalux.augmentation.bridge import (
     bridge,
     extend,
     extend_backward,
-    lift,
     nominal_thresholds,
+    raise_to_bound,
 )
 
 NOISE = BridgeNoise(threshold_on=0.3, threshold_off=0.2, step_variance=0.012, quantisation_variance=0.01)
@@ -173,7 +173,7 @@ def test_only_what_is_clipped_is_a_bound(dtype):
     """K7: up to it, never down, and a measured pixel says nothing of the kind. The first is just short of clipped."""
     frame = Latent(*np.array([[[0.5, 0.5, 0.5, 0.5]], [[1e11, UNMEASURED, UNMEASURED, 0.1]]], dtype))
     level = np.array([[0.0, 0.0, 2.0, 0.0]], dtype)
-    lift(level, frame)
+    raise_to_bound(level, frame)
     np.testing.assert_array_equal(level, np.array([[0.0, 0.5, 2.0, 0.0]], dtype))
 
 

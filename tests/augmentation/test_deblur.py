@@ -11,8 +11,6 @@ from hypothesis import strategies as st
 
 from kalux.augmentation.deblur import (
     EXPOSED,
-    between,
-    count_events,
     expose,
     integrate_exposure,
     latent_end,
@@ -173,23 +171,6 @@ def test_the_origin_of_time_does_not_matter(rows, shift):
         strict=True,
     ):
         np.testing.assert_array_equal(a, b)
-
-
-@given(moments, st.integers(800, 2200))
-def test_intervals_add_up(rows, cut):
-    array = pixel_events([t for t, _ in rows], [p for _, p in rows])
-    parts = [between(array, 800, cut), between(array, cut, 2200)]
-    np.testing.assert_array_equal(np.concatenate(parts), between(array, 800, 2200))
-    total = count_events(between(array, 800, 2200), (1, 1))
-    split = [count_events(part, (1, 1)) for part in parts]
-    for polarity in (0, 1):
-        np.testing.assert_array_equal(split[0][polarity] + split[1][polarity], total[polarity])
-
-
-def test_counts_by_polarity():
-    on, off = count_events(events((1, 0, 0, 1), (2, 2, 1, 0), (3, 2, 1, 0), (4, 2, 1, 1)), (2, 3))
-    np.testing.assert_array_equal(on, [[1, 0, 0], [0, 0, 1]])
-    np.testing.assert_array_equal(off, [[0, 0, 0], [0, 0, 2]])
 
 
 # --- a blurred picture ----------------------------------------------------------------------------------

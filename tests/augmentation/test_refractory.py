@@ -7,9 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kalux.augmentation.deblur import count_events, integrate_exposure
+from kalux.augmentation.deblur import integrate_exposure
 from kalux.augmentation.refractory import MOST, EventClock, step_weight
 from kalux.compiled import WEIGHT_UNIT, event_words
+from kalux.event_slices import count_events
 from kalux.events import EVENT_DTYPE, make_events
 
 SIZE = (3, 4)

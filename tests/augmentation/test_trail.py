@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from kalux import PRESETS, Frame, Reconstructor
 from kalux.augmentation import trail
-from kalux.augmentation.deblur import count_chunks
 from kalux.augmentation.refractory import EventClock
+from kalux.event_slices import count_chunks
 from kalux.events import make_events
 from kalux.settings import altered
 

@@ -21,12 +21,12 @@ from kalux.calibration.event_model import (
 from kalux.datasets import SensorSettings, pan, photograph_scene, simulate
 from kalux.datasets.ahdr import ArtificialCamera, artificial_hdr
 from kalux.planning import plan
-from kalux.settings import CameraSettings
+from kalux.settings import CameraSettings, EventSettings
 
 from builders import dark_scene
 
-THRESHOLDS = (0.2, 0.2)
-MODEL = ErrorModel(THRESHOLDS, (1e-3, 0.0), 0.02, 1 / 6)
+EVENTS = EventSettings(threshold_on=0.2, threshold_off=0.2)
+MODEL = ErrorModel(EVENTS.thresholds, (1e-3, 0.0), 0.02, 1 / 6)
 
 
 def recorded(**sensor):
@@ -43,14 +43,14 @@ def recordings():
     ("offset", "allowed"), [(0.004, (0.004, 0.008)), (0.03, (0.024, 0.036)), (0.06, (0.05, 0.06))]
 )
 def test_the_offset_of_the_events_logarithm_is_found(recordings, offset, allowed):
-    found = estimate_event_model(recordings[offset], CameraSettings(), THRESHOLDS)
+    found = estimate_event_model(recordings[offset], CameraSettings(), EVENTS)
     assert allowed[0] <= found.log_offset <= allowed[1]
     assert found.samples > 5_000
 
 
 def test_noise_makes_steps_less_certain(recordings):
-    quiet = estimate_event_model(recordings[0.03], CameraSettings(), THRESHOLDS)
-    noisy = estimate_event_model(recorded(log_offset=0.03, noise_rate=20.0), CameraSettings(), THRESHOLDS)
+    quiet = estimate_event_model(recordings[0.03], CameraSettings(), EVENTS)
+    noisy = estimate_event_model(recorded(log_offset=0.03, noise_rate=20.0), CameraSettings(), EVENTS)
     assert quiet.step_variance == 0.07
     assert noisy.step_variance >= 0.2
 
@@ -60,21 +60,23 @@ def test_a_delay_is_taken_into_account(recordings):
     events["t"] += 6_000
     late = Recording.from_arrays(events, recordings[0.03].frames(), sensor_size=recordings[0.03].sensor_size)
     assert len(events) == len(recordings[0.03].events())
-    known = estimate_event_model(late, CameraSettings(), THRESHOLDS, delay=6_000)
-    assert known == estimate_event_model(recordings[0.03], CameraSettings(), THRESHOLDS)
+    known = estimate_event_model(late, CameraSettings(), dataclasses.replace(EVENTS, delay=6_000))
+    assert known == estimate_event_model(recordings[0.03], CameraSettings(), EVENTS)
 
 
 def test_a_refractory_period_would_shift_the_offset():
     """What is lost makes steps near white look larger, as a large I_0 does."""
     lossy = recorded(log_offset=0.004, refractory=2_000.0)
-    known = estimate_event_model(lossy, CameraSettings(), THRESHOLDS, refractory_period=2_000)
+    known = estimate_event_model(
+        lossy, CameraSettings(), dataclasses.replace(EVENTS, refractory_period=2_000)
+    )
     assert known.log_offset < 0.01
-    assert estimate_event_model(lossy, CameraSettings(), THRESHOLDS).log_offset > 2 * known.log_offset
+    assert estimate_event_model(lossy, CameraSettings(), EVENTS).log_offset > 2 * known.log_offset
 
 
 def test_an_offset_between_those_tried_is_found(recordings):
     """A factor of two, between values tried, is 20 % of newton's error."""
-    found = estimate_event_model(recorded(log_offset=0.02), CameraSettings(), THRESHOLDS)
+    found = estimate_event_model(recorded(log_offset=0.02), CameraSettings(), EVENTS)
     assert found.log_offset == pytest.approx(0.02, rel=0.25)
 
 
@@ -85,14 +87,14 @@ def test_noise_says_nothing_of_the_offset(recordings):
     others = Recording.from_arrays(
         next(iter(recordings[0.06].events())), still, sensor_size=recordings[0.004].sensor_size
     )
-    found = estimate_event_model(others, CameraSettings(), THRESHOLDS)
+    found = estimate_event_model(others, CameraSettings(), EVENTS)
     assert found is None or 0.02 < found.log_offset < 0.045
 
 
 def test_a_still_scene_says_nothing():
     still = photograph_scene(np.full((40, 60), 0.5), pan(0), sensor_size=(36, 48), duration=300_000)
     recording = simulate(still, SensorSettings(noise_rate=1.0), seed=0).recording()
-    assert estimate_event_model(recording, CameraSettings(), THRESHOLDS) is None
+    assert estimate_event_model(recording, CameraSettings(), EVENTS) is None
 
 
 def test_likelihood_compares_densities_of_the_intensity():

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kalux.calibration.exposures import bends
+from kalux.calibration import exposures as module
+from kalux.calibration.exposures import Exposures, bends
+from kalux.filters.shots import take_shot
+from kalux.models.camera import Camera
 
-from builders import pixel_events
+from builders import pixel_events, random_stream
 
 
 def test_one_step_within_an_exposure():
@@ -41,3 +46,24 @@ def test_a_mean_is_no_less_than_the_mean_of_its_logarithm(events):
     assert found.over_mean[0, 0] >= -1e-6
     assert found.over_mean[0, 1] == found.over_middle[0, 1] == 0
     assert bends(stream, (1, 1), 500, 500, (0.3, 0.2)).over_mean[0, 0] == 0
+
+
+def test_each_exposure_is_integrated_once(monkeypatch):
+    """And what is kept of it is what its own events say."""
+    stream, delay, integrated = random_stream(4), 1_500, []
+    size, thresholds = stream.sensor_size, (0.2, 0.3)
+
+    def watched(events, sensor_size, start, end, thresholds):
+        integrated.append(start - delay)
+        return bends(events, sensor_size, start, end, thresholds)
+
+    monkeypatch.setattr(module, "bends", watched)
+    exposures = Exposures(size, delay, thresholds)
+    shots = [take_shot(one, Camera.named("linear", 0.98), 10_000.0) for one in stream.frames]
+    found = [exposures.of(*pair, stream.events) for pair in itertools.pairwise(shots)]
+    assert integrated == [shot.start for shot in shots]
+    for both, pair in zip(found, itertools.pairwise(shots), strict=True):
+        for one, shot in zip(both, pair, strict=True):
+            alone = bends(stream.events, size, shot.start + delay, shot.end + delay, thresholds)
+            np.testing.assert_array_equal(one.over_mean, alone.over_mean)
+            np.testing.assert_array_equal(one.over_middle, alone.over_middle)

@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 
 from kalux import Recording
-from kalux.calibration import intervals as module
-from kalux.calibration.exposures import bends
-from kalux.calibration.intervals import Exposures, intervals, spread
+from kalux.calibration.intervals import intervals, spread
 from kalux.settings import CameraSettings
 
 from builders import frame, pixel_events, random_stream
@@ -79,31 +77,3 @@ def test_of_many_pixels_some_are_taken_evenly():
     assert len(some) == 7
     assert set(np.diff(some)) == {12, 15}
     assert len(spread(chosen, 0)) == 0
-
-
-def test_each_exposure_is_looked_at_once(monkeypatch):
-    """And what is kept of it is what its own events say."""
-    stream, delay, looked_at = random_stream(4), 1_500, []
-
-    def watched(events, sensor_size, start, end, thresholds):
-        looked_at.append(start - delay)
-        return bends(events, sensor_size, start, end, thresholds)
-
-    monkeypatch.setattr(module, "bends", watched)
-    exposures = Exposures(stream.sensor_size, delay, (0.2, 0.3))
-    found = [
-        exposures.of(interval)
-        for interval in intervals(recording(stream, 50), CAMERA, margin=50_000, most_frames=100)
-    ]
-    assert looked_at == [shot.exposure_start for shot in stream.frames]
-    for (before, after), shots in zip(found, itertools.pairwise(stream.frames), strict=True):
-        for one, shot in zip((before, after), shots, strict=True):
-            alone = bends(
-                stream.events,
-                stream.sensor_size,
-                shot.exposure_start + delay,
-                shot.exposure_end + delay,
-                (0.2, 0.3),
-            )
-            np.testing.assert_array_equal(one.over_mean, alone.over_mean)
-            np.testing.assert_array_equal(one.over_middle, alone.over_middle)

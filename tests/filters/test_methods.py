@@ -14,8 +14,8 @@ from kalux.augmentation.bridge import (
     BridgeNoise,
     Latent,
     bridge,
-    lift,
     nominal_thresholds,
+    raise_to_bound,
 )
 from kalux.events import make_events
 from kalux.filters.methods import make_method
@@ -131,7 +131,7 @@ def test_unseen_pixels_start_with_the_variance_of_the_others():
 def test_a_masked_pixel_is_no_bound():
     frame = Latent(np.zeros((1, 3)), np.array([[0.1, UNMEASURED, UNSEEN]]))
     level = np.full((1, 3), -1.0)
-    lift(level, frame)
+    raise_to_bound(level, frame)
     np.testing.assert_array_equal(level, [[-1.0, 0.0, -1.0]])
     clipped = Latent(np.zeros((1, 3)), np.full((1, 3), UNMEASURED))
     thresholds, noise = nominal_thresholds((1, 3), 0.1), BridgeNoise(0.5, 0.5, 0.05, 0.04)
@@ -219,6 +219,8 @@ def test_a_bound_that_a_frame_sets_anew_has_no_noise_of_events_before(lookahead)
 def test_black_of_a_linear_response_is_a_measurement():
     """It hides less than the frame's noise."""
     shot = take_shot(Frame(np.array([[0, 9]], np.uint8), 0, 1000), Camera.named("linear", 0.98), 1000)
-    method = make_method(PRESETS["default"], (0.2, 0.2), True, (1, 2))
+    method = make_method(
+        altered(PRESETS["default"], "events", threshold_on=0.2, threshold_off=0.2), True, (1, 2)
+    )
     assert method.crushed(shot) is None
     assert method.latent(shot, [], method._prior).ceiling is None

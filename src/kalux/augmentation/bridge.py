@@ -29,16 +29,16 @@ UNMEASURED: Final = 2.0**40
 from 0 beside any information in use (1e-2 and more), and the formulas need no special case."""
 
 UNSEEN: Final = 2.0**41
-"""Variance of a pixel of which the frame says nothing (`Frame.valid`): as little weight, and no bound."""
+"""Variance of a pixel that the frame masks out (`Frame.valid`): no weight, and, unlike a clipped one, no bound."""
 
 REPEATED: Final = 2.0**39
-"""Variance of a frame that measures a pixel, but tells of it only what others have told already (K11): black."""
+"""Variance of a black pixel in K11: a measurement, but one that adds nothing to those of other frames."""
 
 RANDOM: Final = 0.25
-"""How far the middle of a random walk is off the mean of its ends: the variance, in units of that of its change."""
+"""Of a random walk: variance of its middle about the mean of its ends, over the variance of its change."""
 
 _BLOCK: Final = 64
-"""Pixels that are looked at together: parts of the image that frames measure are left out where they may be."""
+"""Pixels in a block: blocks that frames measure completely are skipped where they may be."""
 
 _SCALE_BOUNDS: Final = (0.3, 3.0)
 _SCALE_DRIFT: Final = 1e-5  # variance per frame: a calibration never becomes certain, temperatures drift
@@ -47,8 +47,8 @@ _SCALE_DRIFT: Final = 1e-5  # variance per frame: a calibration never becomes ce
 class Latent(NamedTuple):
     """A deblurred frame at one moment: (H, W) log intensity and its variance.
 
-    The variance is `UNMEASURED` where the frame is clipped, `UNSEEN` where it is masked. ``ceiling`` is the most that a
-    black pixel can be, inf where the value is a measurement; None where black hides nothing.
+    The variance is `UNMEASURED` where the frame is clipped, `UNSEEN` where it is masked. ``ceiling`` is the upper bound
+    of black pixels, inf where the value is a measurement; None: black is a measurement as any other.
     """
 
     value: Array
@@ -57,13 +57,13 @@ class Latent(NamedTuple):
 
 
 class Told(NamedTuple):
-    """What pixels that have left saturation tell of those that have not (K15).
+    """Statistics of pixels that have left saturation, for the expectation of those that have not (K15).
 
     Attributes
     ----------
     told, foretold, tellers
-        Of every part of the image: sum of the distances of pixels from their bounds, the same as it had been expected,
-        and the number of these pixels.
+        Of every part of the image: sum of the distances of these pixels from their bounds, sum of the distances that
+        had been expected, and their number.
     gone, gone_foretold
         Both sums over the whole image, of pixels that events have taken out of saturation.
     """
@@ -81,20 +81,20 @@ class UnshownMemory(NamedTuple):
     Attributes
     ----------
     pixels
-        (N,) their places in the flattened image, ascending.
+        (N,) their indices in the flattened image, ascending.
     bound
-        (N,) float32, the least that L can be.
+        (N,) float32, lower bound of L.
     shape
         (H, W).
     excess, expected
-        (N,) float32: how far above it L is expected to be from what frames show around the pixels, and from what
-        others have told besides.
+        (N,) float32: how far above it L is expected to be by what frames show around the pixels; and the same,
+        corrected by pixels that have left saturation.
     doubt
-        (N,) float32: variance of the latter, as far as nobody has told.
+        (N,) float32: variance of ``expected``.
     told
-        By others.
+        Of pixels that have left saturation.
     near, clipped
-        Pixels just below white and clipped ones, in all frames until now.
+        Numbers of pixels just below white and of clipped ones, in all frames until now.
     """
 
     pixels: NDArray[np.int64]
@@ -109,7 +109,7 @@ class UnshownMemory(NamedTuple):
 
 
 class Thresholds(NamedTuple):
-    """What is known of every pixel's thresholds: (H, W) factors of the nominal ones, and their variances."""
+    """Every pixel's thresholds: (H, W) estimated factors of the nominal ones, and the variances of these."""
 
     on: Array
     off: Array
@@ -120,7 +120,7 @@ class Thresholds(NamedTuple):
 class BridgeNoise(NamedTuple):
     """The scalars of the noise model: nominal thresholds (log intensity), and variances in log intensity^2.
 
-    ``saturated_variance`` is that of the change of a pixel that two successive frames clip.
+    ``saturated_variance`` is that of the change between two successive frames that both clip the pixel.
     """
 
     threshold_on: float
@@ -144,34 +144,34 @@ class BridgedSegment(NamedTuple):
     augmented
         L^A at the start, log intensity.
     slope
-        By which it moves between events, 1/s.
+        Rate at which it moves between events, 1/s.
     step_on, step_off
-        By which an event moves it, up and down; both usually positive.
+        Steps of an on event, up, and of an off event, down; both usually positive.
     forward_variance, backward_variance, step_variance, rate
         Of R: variances, log intensity^2, and 1/s.
     events
-        Between start and end; None: not known, and none are counted.
+        Number between start and end; None: not known, and none are counted.
     bound
-        The frame that the pixel obeys at the end (`lift`).
+        The frame at the end, whose clipped pixels are bounds of the state there (`raise_to_bound`).
     drift
-        What its variance grows by there, as its thresholds may have been wrong (`drift`); None: nothing.
+        Growth of P at the end by errors of the thresholds (`drift`); None: none.
     still_since
         us: pixels without an event after it are still.
     floor
-        The level is this or more at the start (K7): of what no frame measures then, but a clipped one bounds at the
-        end. None: nowhere.
+        Lower bound of L at the start (K7), of pixels that no frame measures there and that the next one clips. None:
+        there are none.
     trail
-        By which the level is ahead of its newest event, beyond what L^A and the state say (K14); None: it is not.
+        By how much the light is ahead of its newest event, in addition to L^A and the state (K14); None: nothing.
     unshown
         Pixels that no frame has measured until the end, or until the start in causal mode (K15).
     silent_change
-        What silent pixels around each change from one frame to the next (`unseen`); None: not known.
+        Mean square change of silent pixels around each between the frames (`unseen.silent_change`); None: not known.
     net
-        What all events add to the level, and what the light grows by besides; None: not known.
+        Change of L by all events, and by K14, from start to end; None: not known.
     turns
-        How often a pixel with events turns from one direction to the other, on average.
+        How often the intensity of a pixel with events reverses, on average (`unseen.turns`).
     half_way
-        How far the middle of silent pixels is off the mean of both frames (`unseen.half_way`).
+        Variance of silent pixels about the mean of both frames (`unseen.half_way`).
     """
 
     start: int
@@ -205,11 +205,10 @@ def drift(
     far: tuple[Array, Array],
     counts: tuple[Array, Array],
 ) -> tuple[Array, Array, Array]:
-    """By how much events add to the variance of a pixel that no frame measures (docs/equations.md, K10).
+    """Growth of P by errors of the thresholds, of pixels that no frame measures (docs/equations.md, K10).
 
-    A threshold that is wrong is wrong for all events alike: after N of them the level is off by N times the error, and
-    the variance is N^2 times the threshold's. From its last measurement on, nothing but events tells of changes: what
-    they have not told yet is added once.
+    A wrong threshold is wrong for all events alike: after N of them the level is off by N times the error, and the
+    variance is N^2 times the threshold's. The change below the threshold since the last measurement is added once.
 
     Parameters
     ----------
@@ -220,7 +219,7 @@ def drift(
 
     Returns
     -------
-    (H, W) what the variance grows by, and the on and off events since the last measurement, up to ``second``.
+    (H, W) growth of the variance, and the on and off events since the last measurement, up to ``second``.
     """
     grown, far_on, far_off = apart(3, second.variance.shape)
     of_on, of_off = np.float32(noise.threshold_on**2), np.float32(noise.threshold_off**2)
@@ -272,23 +271,23 @@ def _drift(  # type: ignore[no-untyped-def]
             new_off[i] = far_off[i] + off[i] if after[i] >= unmeasured else zero
 
 
-def lift(log_intensity: Array, frame: Latent) -> None:
-    """A clipped pixel does say one thing: it was no darker than this (docs/equations.md, K7). In place.
+def raise_to_bound(log_intensity: Array, frame: Latent) -> None:
+    """Raise L to the lower bounds that a frame's clipped pixels are (docs/equations.md, K7). In place.
 
     A frame integrates: where its value is clipped, the mean over the exposure was at least the value, and the
     latent value computed from it is a bound for every moment.
     """
-    _lift(log_intensity.reshape(-1), frame.value.reshape(-1), frame.variance.reshape(-1))
+    _raise_to_bound(log_intensity.reshape(-1), frame.value.reshape(-1), frame.variance.reshape(-1))
 
 
-def lower(log_intensity: Array, frame: Latent) -> None:
-    """The same of a black pixel: it was no brighter than its ceiling. In place."""
+def lower_to_ceiling(log_intensity: Array, frame: Latent) -> None:
+    """Lower L to the upper bounds that a frame's black pixels are (K7). In place."""
     if frame.ceiling is not None:
         np.minimum(log_intensity, frame.ceiling, out=log_intensity)
 
 
 @loop
-def _lift(log_intensity, value, variance):  # type: ignore[no-untyped-def]
+def _raise_to_bound(log_intensity, value, variance):  # type: ignore[no-untyped-def]
     for i in range(len(value)):
         if UNMEASURED <= variance[i] < UNSEEN and value[i] > log_intensity[i]:
             log_intensity[i] = value[i]
@@ -321,11 +320,11 @@ def bridge(
     thresholds
         What is known of the pixels' thresholds so far.
     grown
-        (H, W) by how much more the light changes than its events tell (K14); None: by nothing.
+        (H, W) change of L between the frames in addition to the events' steps (K14); None: none.
 
     Returns
     -------
-    The segment, and the thresholds with what this interval says of them.
+    The segment, and the thresholds updated by this interval.
     """
     seconds = (end - start) * 1e-6
     shape = first.value.shape

@@ -26,7 +26,6 @@ from kalux.compiled import (
     FUSED,
     ONE,
     UNWEIGHED,
-    WEIGHT_UNIT,
     apart,
     empty,
     event_column,
@@ -42,7 +41,9 @@ from kalux.compiled import (
     prefetch,
     smaller,
     unpack,
+    weight_unit,
 )
+from kalux.event_slices import all_between
 from kalux.events import EventArray
 
 Array = NDArray[np.float64]
@@ -166,13 +167,8 @@ def expose(
     units = (np.float32(step) for step in nominal)
     _begin_exposure(pixels, touched, *(plane.reshape(-1) for plane in thresholds), *units)
     for words in inside:
-        _integrate(words, pixels, np.uint64(width), start, (start + end) // 2, _unit(weighed))
+        _integrate(words, pixels, np.uint64(width), start, (start + end) // 2, weight_unit(weighed))
     return Exposure(pixels, touched)
-
-
-def _unit(weighed: bool) -> np.float32:
-    """Of the events' weights: 0 makes all of them 1."""
-    return WEIGHT_UNIT if weighed else np.float32(0.0)
 
 
 def still_exposure(shape: tuple[int, int]) -> ExposureIntegrals:
@@ -198,36 +194,6 @@ def latent_end(log_frame: Array, integrals: ExposureIntegrals) -> Array:
 def latent_peak(log_frame: Array, integrals: ExposureIntegrals) -> Array:
     """The largest L^D within the exposure: whether a pixel was brighter than white for a part of it."""
     return latent_start(log_frame, integrals) + integrals.peak
-
-
-def between(events: EventArray, start: int, end: int) -> EventArray:
-    """The events with start < t <= end."""
-    words = event_words(events)
-    return events[words_until(words, start) : words_until(words, end)]
-
-
-def all_between(chunks: Sequence[EventArray], start: int, end: int) -> list[EventArray]:
-    """The same of events in several arrays."""
-    inside = (between(chunk, start, end) for chunk in chunks)
-    return [events for events in inside if len(events)]
-
-
-def events_until(events: EventArray, t: int) -> int:
-    """Number of events up to and at ``t`` (us). NumPy's search would copy the whole column first."""
-    return int(words_until(event_words(events), t))
-
-
-@loop
-def words_until(words, t):  # type: ignore[no-untyped-def]
-    """The same of events as machine words (`kalux.compiled.event_words`)."""
-    first, last = 0, len(words)
-    while first < last:
-        middle = (first + last) // 2
-        if words[middle, 0] <= t:
-            first = middle + 1
-        else:
-            last = middle
-    return first
 
 
 # Elementary functions go over a block of pixels at a time, in arrays of their own: vector code would pick the fields
@@ -340,28 +306,3 @@ def _finish_exposure(  # type: ignore[no-untyped-def]
                 largest[first + i] = logarithm(peak[i])
             for i in range(count):
                 count_of[first + i] = events[i]
-
-
-def count_events(events: EventArray, shape: tuple[int, int], *, weighed: bool = False) -> tuple[Array, Array]:
-    """Number of on and off events of every pixel, two (H, W) float64; the sums of their weights if they carry such."""
-    on, off = count_chunks([events], shape, weighed=weighed)
-    return on.astype(np.float64), off.astype(np.float64)
-
-
-def count_chunks(
-    chunks: Sequence[EventArray], shape: tuple[int, int], *, weighed: bool
-) -> tuple[FloatArray, FloatArray]:
-    """The same of events in several arrays, two (H, W) float32; sums of weights where the events carry such."""
-    height, width = shape
-    counts = np.zeros((2, height * width), np.float32)
-    for chunk in chunks:
-        _count(event_words(chunk), counts, np.uint64(width), _unit(weighed))
-    return counts[1].reshape(shape), counts[0].reshape(shape)
-
-
-@loop
-def _count(words, counts, width, unit):  # type: ignore[no-untyped-def]
-    for i in range(len(words)):
-        word = words[i, 1]
-        at = event_row(word) * width + event_column(word)
-        counts[np.uint64(event_is_on(word)), at] += event_weight(word, unit)

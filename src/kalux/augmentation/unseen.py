@@ -1,4 +1,7 @@
-"""How much pixels change without an event, from what frames say of silent ones (docs/equations.md, K11)."""
+"""Changes below the threshold: how much silent pixels, those without events, change from frame to frame.
+
+For the variance of images (docs/equations.md, K11).
+"""
 
 from __future__ import annotations
 
@@ -15,28 +18,28 @@ from kalux.compiled import apart, empty, larger, loop, smaller, zeros
 Array = NDArray[np.floating[Any]]
 
 UNKNOWN_CHANGE: Final = 0.1
-"""Mean square, in c^2, where nothing tells it: that of eleven simulated scenes under a moving camera."""
+"""Mean square change, in c^2, where it cannot be estimated: that of eleven simulated scenes under a moving camera."""
 
 UNMEASURED_CHANGE: Final = 0.4
-"""The same where a frame does not measure the pixel, so that none says that it has changed little: the variance
-half-way to such a frame is then that of a moving pixel, as on the same scenes."""
+"""The same where a frame does not measure the pixel, so that the change may be large: the variance half-way to such a
+frame is then that of a moving pixel, as on the same scenes."""
 
 _ENOUGH: Final = 25.0
-"""Pixels without noise, or as much information in more of them, that tell the change of the whole image."""
+"""Least information from which the change of the whole image is estimated: that of so many pixels without noise."""
 
 _BLOCK: Final = 64
-"""Pixels that are looked at together: few enough that what lies between stays in the nearest cache."""
+"""Pixels in a block: few enough that intermediate values stay in the first-level cache."""
 
 _WINDOW: Final = 5
-"""Pixels: one difference says little of a mean square. 3 to 9 predict the errors of these scenes about alike."""
+"""Pixels, side of the window of the mean. 3 to 9 predict the errors of these scenes about alike."""
 
 
 def silent_change(segment: BridgedSegment, quantisation_variance: float, threshold2: float) -> Array:
     """Mean square change of silent pixels from one frame to the next, around every pixel: (H, W), log intensity^2.
 
-    The mean is over the pixels of 5 x 5 that have no event in the segment and are measured by both frames, of the
-    squares of what the frames say of their change (``segment.slope``), at most c^2, since more cannot be hidden, less
-    what the frames' noise makes of them. As far as noise hides a pixel's change, that of the whole image stands in.
+    The mean is over the pixels of 5 x 5 that have no event in the segment and are measured by both frames, of their
+    squared changes by the frames (``segment.slope``), at most c^2, since larger changes cause events, less the variance
+    of the frames' noise. As far as noise hides a pixel's change, that of the whole image takes its place.
 
     Parameters
     ----------
@@ -65,7 +68,7 @@ def silent_change(segment: BridgedSegment, quantisation_variance: float, thresho
 
 
 def turns(on: Array, off: Array) -> float:
-    """How often a pixel with events turns between two frames, on average: twice for every event and one against it.
+    """How often the intensity of a pixel with events reverses between two frames: twice for every on and off event.
 
     Parameters
     ----------
@@ -88,10 +91,10 @@ def _pairs(on, off):  # type: ignore[no-untyped-def]
 def half_way(
     before: Array, segment: BridgedSegment, quantisation_variance: float, threshold2: float
 ) -> tuple[float, Array]:
-    """How far silent pixels are, half-way between two frames, off the mean of both, as the frames before tell.
+    """Variance of silent pixels half-way between two frames about the mean of both, from this interval and the last.
 
-    Changes that go on from one frame interval to the next are those of a light that goes straight; changes that turn
-    back are of one that has turned in between as well. The correlation of both is that of the whole image.
+    If the changes of successive intervals are correlated, intensities move along straight lines; if they are
+    anti-correlated, they have reversed within the intervals, too. One correlation is taken for the whole image.
 
     Parameters
     ----------
@@ -124,7 +127,7 @@ def half_way(
         seconds, q0, np.float32(threshold2**0.5), *(plane.reshape(-1) for plane in planes)
     )
     usual = _ENOUGH * UNKNOWN_CHANGE * threshold2
-    # Little is known of changes that are less than the noise, the variance of which is an estimate.
+    # Shrunk towards 0 where changes are less than the noise, whose variance is an estimate.
     goes_on = both * max(squares, 0.0) / (squares**2 + noise**2 + usual**2)
     goes_on = min(max(goes_on, -0.5), 1.0)
     return 0.5 / (1.0 + goes_on) - 0.25, change
@@ -156,10 +159,10 @@ def forget_silence(
     change: Array,
     quantisation_variance: float,
 ) -> None:
-    """Add to ``grown``, (H, W), what the state of silent pixels loses from one frame to the next. In place.
+    """Add the variance by changes of silent pixels from one frame to the next to ``grown``, (H, W). In place.
 
-    What such a pixel changes is not told by events, and by frames only as far as the slope takes it, the share q0 / V
-    of the mismatch (K1): of the mean square change the square of the other share comes to P (docs/equations.md, K11).
+    The slope of the bridge follows such a change by the share q0 / V of the mismatch (K1): P grows by the mean square
+    change times the square of the other share (docs/equations.md, K11).
 
     Parameters
     ----------
@@ -191,7 +194,7 @@ def _forget(q0, forward, backward, after, on, off, change, grown):  # type: igno
 def _told(given, seconds, q0, most, told_of):  # type: ignore[no-untyped-def]
     """Of silent pixels (0 elsewhere): squared change without noise, and the share of it that noise hides; both sums.
 
-    Flat planes, a few pixels at a time and few arrays a loop: vector code, and sums that do not depend on it.
+    Blocks of flat planes and few arrays in a loop: vector code, with sums that do not depend on it.
     """
     slope, forward, backward, events = given
     change, untold, silent = told_of

@@ -23,11 +23,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.deblur import between
 from kalux.calibration.registration import Registration
 from kalux.calibration.regression import huber_weights, products
 from kalux.compiled import loop, zeros
 from kalux.errors import InputError
+from kalux.event_slices import between
 from kalux.events import NEVER, EventArray
 from kalux.frames import Frame
 from kalux.models.camera import Response

@@ -7,9 +7,10 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.deblur import between, count_chunks
-from kalux.calibration.intervals import Exposures, Interval, intervals, spread
+from kalux.calibration.exposures import Exposures
+from kalux.calibration.intervals import Interval, intervals, spread
 from kalux.calibration.regression import Fit, two_stage
+from kalux.event_slices import between, count_chunks
 from kalux.events import EventArray
 from kalux.recording import Recording
 from kalux.settings import CameraSettings
@@ -236,7 +237,7 @@ def _of(
     sensor_size: tuple[int, int],
     chosen: NDArray[np.int64],
 ) -> _Seen:
-    before, after = exposures.of(interval)
+    before, after = exposures.of(interval.first, interval.second, interval.events)
     counts = _counts(between(interval.events, interval.start + delay, interval.end + delay), sensor_size)
     planes = (interval.change, before.over_middle, after.over_middle, *counts)
     change, first, second, on, off = (plane.ravel()[chosen].astype(np.float64) for plane in planes)

@@ -26,7 +26,7 @@ from kalux.models.camera import (
     noise_variance,
 )
 from kalux.recording import Recording
-from kalux.settings import UNKNOWN_LOG_OFFSET, CameraSettings, chosen_response
+from kalux.settings import UNKNOWN_LOG_OFFSET, CameraSettings, EventSettings, chosen_response
 
 Array = NDArray[np.float64]
 
@@ -121,14 +121,7 @@ class ErrorModel(NamedTuple):
 
 
 def estimate_event_model(
-    recording: Recording,
-    camera: CameraSettings,
-    thresholds: tuple[float, float],
-    *,
-    delay: int = 0,
-    threshold_spread: float = 0.1,
-    quantisation_variance: float = 1 / 6,
-    refractory_period: int = 0,
+    recording: Recording, camera: CameraSettings, events: EventSettings
 ) -> EventModel | None:
     """I_0 and the variance of an event's step, from the first 80 frames.
 
@@ -138,14 +131,8 @@ def estimate_event_model(
         With frames and exposures.
     camera
         Response, saturation, frame noise, and I_0 if it is known.
-    thresholds
-        (on, off) contrast thresholds, log intensity.
-    delay
-        How much later than the frames' clock events are stamped, us.
-    threshold_spread, quantisation_variance
-        As in `kalux.settings.EventSettings`.
-    refractory_period
-        us.
+    events
+        Thresholds, delay, refractory period, threshold spread and quantisation variance.
 
     Returns None where fewer than 1000 pixels changed by two events between two frames that show them well enough.
 
@@ -154,13 +141,13 @@ def estimate_event_model(
     ExposureError
         If the frames' exposures are not known.
     """
-    samples, shown = _samples(recording, camera, thresholds, delay, refractory_period)
+    samples, shown = _samples(recording, camera, events)
     net, darkest = np.abs(samples.on - samples.off), np.minimum(samples.before, samples.after)
     chosen = (net >= _LEAST_NET) & (darkest > np.maximum(shown.least, DARKEST))
     signals = Samples(*(values[chosen] for values in samples))
     if len(signals.before) < _MIN_SAMPLES:
         return None
-    model = ErrorModel(thresholds, camera.noise, threshold_spread, quantisation_variance)
+    model = ErrorModel(events.thresholds, camera.noise, events.mismatch, events.quantisation_variance)
     if camera.log_offset is None:
         # Frames that show the dark range over a hundred to one: what is beyond matters little, and lost events, of
         # which the model knows nothing, would count for more.
@@ -249,13 +236,7 @@ def _below(t: Array) -> Array:
     return half + 0.5
 
 
-def _samples(
-    recording: Recording,
-    camera: CameraSettings,
-    thresholds: tuple[float, float],
-    delay: int,
-    refractory_period: int,
-) -> tuple[Samples, Shown]:
+def _samples(recording: Recording, camera: CameraSettings, events: EventSettings) -> tuple[Samples, Shown]:
     """Pixels with events that no frame clips at either end, interval by interval, and what their frames could show."""
     found: list[tuple[Array, ...]] = []
     count = 0
@@ -264,14 +245,7 @@ def _samples(
     white = float(model.response.inverse(np.array(camera.clipped_from)))
     black = float(black_ceiling(model, np.zeros(1), 1.0)[0])
     black = black if black > CRUSHED else 0.0
-    for interval, on, off, bend in counted_intervals(
-        recording,
-        camera,
-        thresholds=thresholds,
-        delay=delay,
-        refractory_period=refractory_period,
-        most_frames=_MAX_FRAMES,
-    ):
+    for interval, on, off, bend in counted_intervals(recording, camera, events, most_frames=_MAX_FRAMES):
         first, second = interval.first, interval.second
         chosen = spread(~first.clipped & ~second.clipped & (on + off > 0), MAX_SAMPLES - count)
         pixels = (*(end.intensity for end in interval.ends), on, off, bend)

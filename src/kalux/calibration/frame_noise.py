@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.deblur import all_between
 from kalux.calibration.intervals import intervals
 from kalux.compiled import empty, event_column, event_row, event_words, loop, smaller, zeros
+from kalux.event_slices import all_between
 from kalux.events import EventArray
 from kalux.filters.shots import Shot, take_shot
 from kalux.frames import Frame

@@ -12,16 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux import memory
-from kalux.augmentation.deblur import all_between, between, count_events
 from kalux.augmentation.refractory import EventClock
-from kalux.calibration.exposures import Bends, bends
+from kalux.calibration.exposures import Exposures
 from kalux.compiled import event_words
+from kalux.event_slices import all_between, between, count_events
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.filters.shots import Shot, take_shot
 from kalux.frames import Frame
 from kalux.models.camera import Camera, log_intensity
 from kalux.recording import Recording
-from kalux.settings import CameraSettings, chosen_response
+from kalux.settings import CameraSettings, EventSettings, chosen_response
 
 Array = NDArray[np.float64]
 
@@ -150,39 +150,6 @@ def intervals(
         previous = end
 
 
-class Exposures:
-    """What the light does within the exposures of intervals that follow each other; each exposure is looked at once.
-
-    Parameters
-    ----------
-    sensor_size
-        (height, width), pixels.
-    delay
-        How much later than the frames' clock events are stamped, us. The intervals have events beyond their exposures.
-    thresholds
-        On and off, log intensity. 0: as if nothing moved.
-    """
-
-    def __init__(self, sensor_size: tuple[int, int], delay: int, thresholds: tuple[float, float]) -> None:
-        self._sensor_size, self._delay, self._thresholds = sensor_size, delay, thresholds
-        self._latest: tuple[Shot, Bends] | None = None
-
-    def of(self, interval: Interval) -> tuple[Bends, Bends]:
-        """Of the frames before and after."""
-        first, second = interval.first, interval.second
-        if self._latest is not None and self._latest[0] is first:
-            before = self._latest[1]
-        else:
-            before = self._looked_at(interval, first)
-        after = self._looked_at(interval, second)
-        self._latest = second, after
-        return before, after
-
-    def _looked_at(self, interval: Interval, shot: Shot) -> Bends:
-        start, end = shot.start + self._delay, shot.end + self._delay
-        return bends(interval.events, self._sensor_size, start, end, self._thresholds)
-
-
 class Counted(NamedTuple):
     """An interval, and what its events tell of every pixel, (H, W) each.
 
@@ -191,7 +158,7 @@ class Counted(NamedTuple):
     on, off
         Weighed (K13) events of either polarity between the middles of the exposures.
     bend
-        By how much more the logarithms of the frames differ than that of the light at these middles.
+        By how much more the logs of the frames differ than the log intensities at these middles (`Bends.over_middle`).
     """
 
     interval: Interval
@@ -201,26 +168,20 @@ class Counted(NamedTuple):
 
 
 def counted_intervals(
-    recording: Recording,
-    camera: CameraSettings,
-    *,
-    thresholds: tuple[float, float],
-    delay: int,
-    refractory_period: int,
-    most_frames: int,
+    recording: Recording, camera: CameraSettings, events: EventSettings, *, most_frames: int
 ) -> Iterator[Counted]:
     """As `intervals`, with the events of every pixel counted.
 
-    Thresholds (on, off; log intensity) tell what the light does within exposures. Events are stamped ``delay`` us late;
-    the refractory period is in us.
+    Of ``events``, thresholds, delay and refractory period are used.
     """
-    clock = EventClock(recording.sensor_size, refractory_period)
-    exposures = Exposures(recording.sensor_size, delay, thresholds)
+    delay = events.lateness
+    clock = EventClock(recording.sensor_size, events.refractory)
+    exposures = Exposures(recording.sensor_size, delay, events.thresholds)
     margin = recording.longest_exposure + abs(delay)
     for interval in intervals(recording, camera, margin=margin, most_frames=most_frames):
         inside = clock.weighed(between(interval.events, interval.start + delay, interval.end + delay))
         on, off = count_events(inside, recording.sensor_size, weighed=True)
-        before, after = exposures.of(interval)
+        before, after = exposures.of(interval.first, interval.second, interval.events)
         yield Counted(interval, on, off, after.over_middle - before.over_middle)
 
 

@@ -137,14 +137,7 @@ def _changes(
     say that it changed, log(I + I_0).
     """
     threshold_on, threshold_off = events.thresholds
-    for interval, on, off, bend in counted_intervals(
-        recording,
-        camera,
-        thresholds=events.thresholds,
-        delay=events.lateness,
-        refractory_period=events.refractory,
-        most_frames=_MAX_FRAMES,
-    ):
+    for interval, on, off, bend in counted_intervals(recording, camera, events, most_frames=_MAX_FRAMES):
         told = threshold_on * on - threshold_off * off + bend - interval.change
         frames = [end.frame for end in interval.ends]
         for sign, frame in zip((-1, 1), frames, strict=True):

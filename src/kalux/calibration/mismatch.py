@@ -84,14 +84,7 @@ def estimate_mismatch(recording: Recording, camera: CameraSettings, events: Even
     )
     products: Array = np.zeros((*recording.sensor_size, *_PRODUCTS))
     samples = 0
-    for interval, on, off, bend in counted_intervals(
-        recording,
-        camera,
-        thresholds=events.thresholds,
-        delay=events.lateness,
-        refractory_period=events.refractory,
-        most_frames=_MAX_FRAMES,
-    ):
+    for interval, on, off, bend in counted_intervals(recording, camera, events, most_frames=_MAX_FRAMES):
         first, second = interval.ends
         seen = Samples(first.intensity, second.intensity, on, off, bend)
         bright = np.minimum(seen.before, seen.after) > DARKEST

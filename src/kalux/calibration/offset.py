@@ -15,10 +15,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.deblur import between
 from kalux.calibration.alignment import MOST_FRAMES, Shots, align, take_shots, well_exposed
 from kalux.calibration.registration import Registration
 from kalux.errors import InputError
+from kalux.event_slices import between
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.frames import Frame
 from kalux.settings import CameraSettings

@@ -26,7 +26,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.deblur import between, integrate_exposure, latent_middle, latent_peak
+from kalux.augmentation.deblur import integrate_exposure, latent_middle, latent_peak
 from kalux.augmentation.refractory import step_weight
 from kalux.calibration.global_thresholds import Usual, estimate_thresholds
 from kalux.calibration.intervals import Interval, intervals
@@ -41,6 +41,7 @@ from kalux.calibration.regression import (
 )
 from kalux.calibration.values import Calibration
 from kalux.compiled import loop
+from kalux.event_slices import between
 from kalux.events import NEVER, EventArray
 from kalux.filters.shots import Shot
 from kalux.recording import Recording

@@ -26,10 +26,11 @@ import numpy as np
 from numba.core import types
 from numpy.typing import NDArray
 
-from kalux.augmentation.deblur import between, count_chunks
 from kalux.augmentation.refractory import step_weight
-from kalux.calibration.intervals import Exposures, Interval, intervals
+from kalux.calibration.exposures import Exposures
+from kalux.calibration.intervals import Interval, intervals
 from kalux.compiled import empty, event_column, event_is_on, event_row, event_words, loop, smaller, zeros
+from kalux.event_slices import between, count_chunks
 from kalux.events import NEVER
 from kalux.formulas import Number, choose, formula
 from kalux.recording import Recording
@@ -205,7 +206,7 @@ class _Passing:
         shape = len(chosen), len(self._periods), 2, 2
         share = interval.level / np.maximum(interval.level + self._log_offset, 1e-9)
         # To second order, log(I + I_0) bends by the square of its share in the steps.
-        before, after = self._exposures.of(interval)
+        before, after = self._exposures.of(interval.first, interval.second, interval.events)
         change = interval.change - share**2 * (after.over_mean - before.over_mean)
         own, around, change_around = _looked_at(
             counts.reshape(height, width, 4 * len(self._periods)), change, usable, chosen

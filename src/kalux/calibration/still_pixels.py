@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.deblur import between
 from kalux.errors import InputError
+from kalux.event_slices import between
 from kalux.events import EventArray
 from kalux.frames import Frame
 from kalux.recording import Recording

@@ -10,7 +10,7 @@ from typing import Final, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.deblur import between, events_until
+from kalux.event_slices import between, events_until
 from kalux.recording import Recording, clock_doubt, no_frames
 from kalux.white import WhiteCheck
 

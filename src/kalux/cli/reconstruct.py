@@ -8,6 +8,7 @@ import dataclasses
 import importlib.metadata
 import itertools
 import shlex
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -167,7 +168,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     with compiling_beside(_compiled_later(settings), threads):
         recording = open_recording(options)
         with Progress("checking", quiet=options.quiet) as progress:
-            contents, made = check_beside(
+            contents, planned = check_beside(
                 recording,
                 lambda count: progress.add(events=count),
                 lambda: make_plan(recording, settings, times, options),
@@ -175,22 +176,13 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
             )
         for text in contents.warnings():
             warn(text)
-        made = part_of(made, contents, options)
-        gap = gap_warning(made, contents)
-        if gap is not None:
-            warn(gap)
-        if made.threshold_origin in ("estimate", "assumed"):
-            warn(threshold_warning(made, options.preset))
-        if made.threshold_origin == "assumed" and made.estimate is not None and contradicts(made.estimate):
-            warn(
-                "the events do not explain how the frames change; if much moves, do both have the same clock (kalux "
-                "calibrate offset REC finds out), and is polarity 1 brighter?"
-            )
+        planned = part_of(planned, contents, options)
+        for text in plan_warnings(planned, contents, options.preset):
+            warn(text)
         if not options.quiet:
-            say("\n".join(decided(recording, contents, made, settings, output, options)))
-        seconds, images = write_images(
-            recording, made, output, metadata(recording, made, options, command), options
-        )
+            say("\n".join(decided(recording, contents, planned, settings, output, options)))
+        described = metadata(recording, planned, options, command)
+        seconds, images = write_images(recording, planned, output, described, options, threads)
         if not options.quiet:
             say(
                 f"wrote       {how_many(images, 'image')} to {output.path} in {seconds:.1f} s "
@@ -236,7 +228,7 @@ def make_plan(recording: Recording, settings: Settings, times: Any, options: arg
     InputError
         As of `kalux.planning.plan`.
     """
-    made = plan(
+    planned = plan(
         recording,
         rate_hz=image_rate(options),
         times=times,
@@ -246,10 +238,10 @@ def make_plan(recording: Recording, settings: Settings, times: Any, options: arg
         lookahead=not options.causal,
         smooth=options.smooth,
     )
-    return dataclasses.replace(made, threshold_origin=_origin(made, options))
+    return dataclasses.replace(planned, threshold_origin=_origin(planned, options))
 
 
-def part_of(made: Plan, contents: Contents, options: argparse.Namespace) -> Plan:
+def part_of(planned: Plan, contents: Contents, options: argparse.Namespace) -> Plan:
     """The plan of the part that --start and --end leave.
 
     Raises
@@ -262,8 +254,8 @@ def part_of(made: Plan, contents: Contents, options: argparse.Namespace) -> Plan
             raise UsageError(f"{flag} is {value}; seconds are needed")
     first = -np.inf if options.start is None else contents.start + 1e6 * options.start
     last = np.inf if options.end is None else contents.start + 1e6 * options.end
-    kept = made.times[(made.times >= first) & (made.times <= last)]
-    if len(made.times) == 0:
+    kept = planned.times[(planned.times >= first) & (planned.times <= last)]
+    if len(planned.times) == 0:
         raise UsageError(
             "--at frames --causal: no exposure has its middle after the end of the first, where images begin"
         )
@@ -272,50 +264,72 @@ def part_of(made: Plan, contents: Contents, options: argparse.Namespace) -> Plan
             "no image lies in the part that --start and --end leave of the recording's "
             f"{contents.seconds:.3f} s"
         )
-    return dataclasses.replace(made, times=kept)
+    return dataclasses.replace(planned, times=kept)
 
 
-def _origin(made: Plan, options: argparse.Namespace) -> Any:
+def _origin(planned: Plan, options: argparse.Namespace) -> Any:
     """Where the thresholds come from; those of a former run's `kalux.toml` come from where they did then."""
     flags = given_settings(options).get("events", {})
     if (
-        made.threshold_origin != "settings"
+        planned.threshold_origin != "settings"
         or options.settings is None
         or {"threshold_on", "threshold_off"} & {*flags}
     ):
-        return made.threshold_origin
+        return planned.threshold_origin
     former = read_toml(options.settings).get("thresholds", {})
     origin = former.get("origin") if isinstance(former, dict) else None
-    return origin if origin in ORIGINS else made.threshold_origin
+    return origin if origin in ORIGINS else planned.threshold_origin
 
 
 # Say.
 
 
-def threshold_warning(made: Plan, name: str) -> str:
-    """What it means that nobody knows the thresholds."""
-    how = "estimated from the recording" if made.threshold_origin == "estimate" else "unknown and assumed"
-    sensor = ", or the sensor's --preset" if made.threshold_origin == "assumed" and name == "default" else ""
-    if made.estimate is not None:
-        how += f" (+- {100 * made.estimate.spread:.0f} %)"
+def plan_warnings(planned: Plan, contents: Contents, preset_name: str) -> Iterator[str]:
+    """Warnings of images in gaps between frames, of unknown thresholds, and of events that contradict the frames."""
+    gap = gap_warning(planned, contents)
+    if gap is not None:
+        yield gap
+    if planned.threshold_origin in ("estimate", "assumed"):
+        yield threshold_warning(planned, preset_name)
+    if (
+        planned.threshold_origin == "assumed"
+        and planned.estimate is not None
+        and contradicts(planned.estimate)
+    ):
+        yield (
+            "the events do not explain how the frames change; if much moves, do both have the same clock (kalux "
+            "calibrate offset REC finds out), and is polarity 1 brighter?"
+        )
+
+
+def threshold_warning(planned: Plan, preset_name: str) -> str:
+    """That thresholds are not known, what follows, and how to state them."""
+    how = "estimated from the recording" if planned.threshold_origin == "estimate" else "unknown and assumed"
+    sensor = (
+        ", or the sensor's --preset"
+        if planned.threshold_origin == "assumed" and preset_name == "default"
+        else ""
+    )
+    if planned.estimate is not None:
+        how += f" (+- {100 * planned.estimate.spread:.0f} %)"
     return (
         f"the contrast thresholds are {how}, so brightness above white is uncertain; "
         f"if you know them, give --events.threshold-on and --events.threshold-off{sensor}"
     )
 
 
-def gap_warning(made: Plan, contents: Contents) -> str | None:
+def gap_warning(planned: Plan, contents: Contents) -> str | None:
     """How many images lie where there is no frame for long; None where there is no such time, or no image in it."""
     if contents.gap is None:
         return None
     begin, end = contents.gap
-    images = int(np.count_nonzero((made.times > begin) & (made.times < end)))
+    images = int(np.count_nonzero((planned.times > begin) & (planned.times < end)))
     if not images:
         return None
     first, last = ((t - contents.start) * 1e-6 for t in contents.gap)
     return (
         f"there is no frame for {(end - begin) * 1e-6:,.0f} s, from {first:.3f} to {last:.3f} s: {images:,} of "
-        f"{how_many(len(made.times), 'image')} lie there; are the times right? --start and --end choose a part"
+        f"{how_many(len(planned.times), 'image')} lie there; are the times right? --start and --end choose a part"
     )
 
 
@@ -327,7 +341,7 @@ def contradicts(estimate: ThresholdEstimate) -> bool:
 def decided(
     recording: Recording,
     contents: Contents,
-    made: Plan,
+    planned: Plan,
     asked: Settings,
     output: Output,
     options: argparse.Namespace,
@@ -335,49 +349,51 @@ def decided(
     """What is about to be done, in a few lines."""
     height, width = recording.sensor_size
     source = recording.source
-    begin, end = ((int(t) - contents.start) * 1e-6 for t in (made.times[0], made.times[-1]))
+    begin, end = ((int(t) - contents.start) * 1e-6 for t in (planned.times[0], planned.times[-1]))
     spacing = "at given times" if output.rate_hz is None else f"at {output.rate_hz:g} Hz"
     if options.at is not None:
         spacing = "at the frames"
-    ahead = "both ways in time" if made.smooth else "one frame ahead" if made.lookahead else "causal"
-    colours = [] if contents.colours == "grey" else [f"colour      {_colour_line(contents, made, options)}"]
+    ahead = "both ways in time" if planned.smooth else "one frame ahead" if planned.lookahead else "causal"
+    colours = (
+        [] if contents.colours == "grey" else [f"colour      {_colour_line(contents, planned, options)}"]
+    )
     return [
         f"recording   {source.path}: {source.format}, {width}x{height} pixels, {contents.seconds:.3f} s, "
         f"{how_many(contents.frames, 'frame')}, "
         f"{'' if contents.complete else 'more than '}{how_many(contents.events, 'event')}",
         *(
             f"{label:<11} {text}"
-            for label, text in settled(recording, made, asked)
+            for label, text in settled(recording, planned, asked)
             if label != "white balance"
         ),
         *colours,
-        f"filter      {made.settings.filter.kind}, preset {options.preset}"
+        f"filter      {planned.settings.filter.kind}, preset {options.preset}"
         f"{'' if options.settings is None else f' changed by {options.settings}'}, {ahead}",
-        f"images      {len(made.times):,} {spacing}, {begin:.3f} to {end:.3f} s -> {output.path} ({output.format})",
+        f"images      {len(planned.times):,} {spacing}, {begin:.3f} to {end:.3f} s -> {output.path} ({output.format})",
     ]
 
 
-def _colour_line(contents: Contents, made: Plan, options: argparse.Namespace) -> str:
+def _colour_line(contents: Contents, planned: Plan, options: argparse.Namespace) -> str:
     what = (
         "RGB frames: luminance filtered, chromaticity of the frames"
         if contents.colours == "RGB"
         else f"Bayer mosaic {contents.colours}, demosaiced after the filter"
     )
-    return f"{what}; white balance {made.settings.camera.white_balance}{', written in grey' if options.grey else ''}"
+    return f"{what}; white balance {planned.settings.camera.white_balance}{', written in grey' if options.grey else ''}"
 
 
 def metadata(
-    recording: Recording, made: Plan, options: argparse.Namespace, command: list[str]
+    recording: Recording, planned: Plan, options: argparse.Namespace, command: list[str]
 ) -> dict[str, Any]:
     """What `kalux.toml` tells of the run; `kalux reconstruct --settings` reads the settings from it."""
     height, width = recording.sensor_size
-    estimate = None if made.estimate is None else made.estimate._asdict()
+    estimate = None if planned.estimate is None else planned.estimate._asdict()
     return {
         "command": shlex.join(command),
         "preset": options.preset,
         "calibration": [str(path) for path in options.calibration or []],
-        "settings": to_dict(made.settings),
-        "thresholds": {"origin": made.threshold_origin, "estimate": estimate},
+        "settings": to_dict(planned.settings),
+        "thresholds": {"origin": planned.threshold_origin, "estimate": estimate},
         "input": {
             "path": options.recording,
             "format": recording.source.format,
@@ -393,13 +409,13 @@ def metadata(
             "bayer": options.bayer,
         },
         "images_wanted": {
-            "count": len(made.times),
+            "count": len(planned.times),
             "times_file": options.times,
             "at": options.at,
             "start": options.start,
             "end": options.end,
-            "lookahead": made.lookahead,
-            "smooth": made.smooth,
+            "lookahead": planned.lookahead,
+            "smooth": planned.smooth,
         },
         "versions": {"numba": importlib.metadata.version("numba")},
     }
@@ -409,16 +425,20 @@ def metadata(
 
 
 def write_images(
-    recording: Recording, made: Plan, output: Output, described: dict[str, Any], options: argparse.Namespace
+    recording: Recording,
+    planned: Plan,
+    output: Output,
+    described: dict[str, Any],
+    options: argparse.Namespace,
+    threads: int,
 ) -> tuple[float, int]:
     """Carry out the plan; returns the seconds it took and the number of images."""
-    threads = options.threads or default_threads()
     writer = output.open(described, threads)
-    progress = Progress("reconstructing", images=len(made.times), quiet=options.quiet)
+    progress = Progress("reconstructing", images=len(planned.times), quiet=options.quiet)
     backward = Progress("backward pass", quiet=options.quiet)
     images = execute(
         recording,
-        made,
+        planned,
         lambda count: progress.add(events=count),
         lambda count: backward.add(events=count),
         threads=threads,
@@ -427,7 +447,7 @@ def write_images(
     try:
         with writer, contextlib.closing(images):
             # The first image comes when the backward pass, if there is one, is done.
-            with backward if made.smooth else contextlib.nullcontext():
+            with backward if planned.smooth else contextlib.nullcontext():
                 first = next(images, None)
             with progress:
                 for image in itertools.chain([] if first is None else [first], images):

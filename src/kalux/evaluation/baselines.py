@@ -10,10 +10,11 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.deblur import between, count_events, integrate_exposure, latent_middle
+from kalux.augmentation.deblur import integrate_exposure, latent_middle
 from kalux.calibration.values import Calibration
 from kalux.evaluation.exposures import linear_frame
 from kalux.evaluation.method import Estimated, Image, Method, Times
+from kalux.event_slices import between, count_events
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.frames import Frame
 from kalux.models.camera import log_intensity

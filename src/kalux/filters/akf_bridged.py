@@ -1,7 +1,7 @@
-"""The asynchronous Kalman filter along a bridge (`kalux.augmentation.bridge`): kalux's own form, float32.
+"""The asynchronous Kalman filter along a bridge (`kalux.augmentation.bridge`), in float32: the default's filter.
 
-The state takes the same calibrated steps and the same slope as L^A, and R changes only at events, so that J D stands
-still in between (`akf`).
+The state takes the same calibrated steps and the same slope as L^A, and R changes only at events, so that J D is
+constant in between (`akf`).
 """
 
 from __future__ import annotations
@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux import memory
-from kalux.augmentation.bridge import UNMEASURED, BridgedSegment, lift, lower
-from kalux.augmentation.deblur import words_until
+from kalux.augmentation.bridge import UNMEASURED, BridgedSegment, lower_to_ceiling, raise_to_bound
 from kalux.augmentation.trail import NO_HEIGHTS, ahead_of_event, no_trail, trail_by_clock
 from kalux.compiled import (
     AHEAD,
@@ -40,6 +39,7 @@ from kalux.compiled import (
     unpack,
     zeros,
 )
+from kalux.event_slices import words_until
 from kalux.events import EventArray
 from kalux.filters.akf import State, information_kept, measurement_rate, predicted_information
 from kalux.filters.common import EPOCH, Clock, moved_clock, newest_around_inside
@@ -50,31 +50,31 @@ FloatArray = NDArray[np.float32]
 STATE_PIXEL: Final = np.dtype(
     [
         ("information", "f4"),  # J = 1/P after the pixel's latest event, or at the origin of the clock
-        ("weighted", "f4"),  # J D, which stands still between events
+        ("weighted", "f4"),  # J D, constant between events
         ("augmented", "f4"),  # L^A without the part of its slope, less the trail at the start (K14)
         ("rate", "f4"),  # 1/R until the pixel's next event
     ],
     align=True,
 )
-"""What an image needs of a pixel in the bridged form: 16 bytes, which every image reads."""
+"""A pixel's state as far as images need it: 16 bytes, which every image reads."""
 
 STEP_PIXEL: Final = np.dtype(
     {
         "names": [
             "step_on",
             "step_off",
-            "forward",  # variance of L^A as seen from the start
-            "backward",  # the same from the end, without the events still to come
-            "coming",  # sum of their weights; exact, where taking away their variances would leave rounding errors
+            "forward",  # variance of L^A from the frame before
+            "backward",  # the same from the frame after, without the events still to come
+            "coming",  # sum of their weights; exact, where subtracting their variances would leave rounding errors
         ],
         "formats": ["f4"] * 5,
         "itemsize": 32,
     }
 )
-"""What events need besides: 32 bytes, so that none lies in two lines of memory."""
+"""What events need in addition: 32 bytes, so that none lies in two lines of memory."""
 
 _BLOCK: Final = 128
-"""Pixels that are read together: few enough that their fields stay in the nearest cache."""
+"""Pixels that are read together: few enough that their fields stay in the first-level cache."""
 
 _BEGUN: Final = 64
 """The same where a segment begins, with more fields."""
@@ -171,7 +171,7 @@ def advance(segment: BridgedSegment, cursor: Cursor, events: EventArray, noise: 
 def read(segment: BridgedSegment, cursor: Cursor, t: int) -> tuple[FloatArray, FloatArray]:
     """L and P at ``t`` (us), which must not lie before an event the cursor has taken. Changes nothing.
 
-    Backward in time L is without what the light is ahead of its events (K14).
+    Backward in time L is without the trail (K14): the forward filter adds it (`kalux.smoothing.combine`).
     """
     log_intensity, variance = _read(segment, cursor, t)
     if t == segment.end and segment.trail is not None and segment.trail.end is not None:
@@ -180,14 +180,14 @@ def read(segment: BridgedSegment, cursor: Cursor, t: int) -> tuple[FloatArray, F
 
 
 def trail_ahead(segment: BridgedSegment, cursor: Cursor, t: int) -> FloatArray | None:
-    """(H, W) how far the light is ahead of its events at ``t`` (us), K14; None where that is not told."""
+    """(H, W) how far the light is ahead of its events at ``t`` (us), K14; None where that is not followed."""
     if segment.trail is None:
         return None
     return trail_by_clock(segment.trail, cursor.polarity, cursor.clock, min(t - cursor.origin, EPOCH))
 
 
 def _read(segment: BridgedSegment, cursor: Cursor, t: int) -> tuple[FloatArray, FloatArray]:
-    """The same with all that is known at the end of the segment."""
+    """The same, at the end of the segment with the trail, bounds (K7) and drift (K10) there."""
     shape = segment.augmented.shape
     log_intensity, variance = apart(2, shape)
     within = min(t - cursor.origin, EPOCH)
@@ -200,8 +200,8 @@ def _read(segment: BridgedSegment, cursor: Cursor, t: int) -> tuple[FloatArray, 
         if segment.trail is not None and segment.trail.end is not None:
             log_intensity += segment.trail.end
         if segment.bound is not None:
-            lift(log_intensity, segment.bound)  # K7
-            lower(log_intensity, segment.bound)
+            raise_to_bound(log_intensity, segment.bound)  # K7
+            lower_to_ceiling(log_intensity, segment.bound)
         if segment.drift is not None:
             variance += segment.drift  # K10
     return log_intensity, variance
@@ -210,8 +210,7 @@ def _read(segment: BridgedSegment, cursor: Cursor, t: int) -> tuple[FloatArray, 
 def moving_pixels(segment: BridgedSegment, cursor: Cursor) -> NDArray[np.bool_]:
     """(H, W): pixels with an event since ``segment.still_since`` or to come in the segment, and unmeasured ones.
 
-    Still pixels are those of which frames have shown the fine texture many times, as none has of a clipped one.
-    Not to be changed.
+    The fine texture of the others, still pixels, has been measured by many frames. Not to be changed.
     """
     if cursor.moving is not None:
         return cursor.moving
@@ -262,7 +261,7 @@ def _move_origin(cursor: Cursor, origin: int) -> None:
 
 @nb.njit(cache=True, inline="always")
 def _since(clock, now):  # type: ignore[no-untyped-def]
-    """us from the time for which a pixel's state holds until ``now``; both us after the origin."""
+    """us from the time at which a pixel's state holds until ``now``; both us after the origin."""
     return np.int32(now - larger(clock, np.int32(0)))
 
 
@@ -333,8 +332,8 @@ def _advance_bridged(words, pixels, steps, clock, polarity, origin, rate, step_v
         flat(polarity),
     )
     last = np.uint64(len(words)) - two
-    # While an event is filtered, the next one is weighed, and the clock is looked at for the one after: none waits for
-    # another, and the processor works at all of them at a time.
+    # A software pipeline: while an event is filtered, the next one is weighed, and the clock is read for the one after.
+    # None waits for another, so that the processor works at all of them at a time.
     event = _weighed(_met(words, np.uint64(0), clock, polarity, stride, origin), scalars)
     following = _met(words, smaller(two, last), clock, polarity, stride, origin)
     for i in range(np.uint64(0), last + one, two):
@@ -342,14 +341,14 @@ def _advance_bridged(words, pixels, steps, clock, polarity, origin, rate, step_v
         place = event_row(ahead) * stride + event_column(ahead) + stride + one
         prefetch(pixels, place)
         prefetch(steps, place)
-        at, seconds, weight, is_on, unsure, unsaid = event
+        at, seconds, weight, is_on, p_noise, q = event
         pixel, known = pixels[at], steps[at]
         information = predicted_information(pixel.information, pixel.rate, seconds)
         step_on, step_off = known.step_on, known.step_off
         step = weight * (step_on if is_on else -step_off)
-        kept = information_kept(information, unsaid)
-        # The state moves by the expected step, L^A by the whole one: the frames have told which it was.
-        pixel.weighted = (pixel.weighted - information * unsure * step) * kept
+        kept = information_kept(information, q)
+        # The state moves by the expected step, L^A by the whole one: the bridge has calibrated it by the frames.
+        pixel.weighted = (pixel.weighted - information * p_noise * step) * kept
         pixel.information = information * kept
         pixel.augmented += step
         forward, coming = known.forward + weight * scalars.step_variance, known.coming - weight
@@ -373,8 +372,8 @@ def _met(words, i, clock, polarity, stride, origin):  # type: ignore[no-untyped-
 
 @nb.njit(cache=True, inline="always", error_model="numpy")
 def _weighed(met, scalars):  # type: ignore[no-untyped-def]
-    """What an event is worth, after `_met`: its pixel's place, the seconds since that's state holds, its weight and
-    polarity, the probability that it is noise, and Q."""
+    """An event after `_met`, weighed: its pixel's place, the seconds since that's state holds, its weight and polarity,
+    the probability that it is noise, and Q."""
     at, since, age, word = met
     signal = signal_probability(scalars.noise_rate, np.float32(age) * MICROSECOND32)
     weight, is_on = event_weight(word, WEIGHT_UNIT), event_is_on(word)

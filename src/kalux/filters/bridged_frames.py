@@ -1,4 +1,4 @@
-"""kalux's own way from frame to frame: `kalux.augmentation.bridge` joins them, the exact filter follows."""
+"""The default method: `kalux.augmentation.bridge` joins successive frames, and the exact filter follows the bridge."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from kalux.augmentation import bridge, deblur
 from kalux.augmentation.bridge import BridgedSegment, BridgeNoise, Latent, Thresholds, UnshownMemory
-from kalux.augmentation.deblur import EXPOSED, EXPOSURE_FIELDS, Exposure, all_between, relative_levels
+from kalux.augmentation.deblur import EXPOSED, EXPOSURE_FIELDS, Exposure, relative_levels
 from kalux.augmentation.highlights import (
     Shown,
     Tail,
@@ -38,6 +38,7 @@ from kalux.augmentation.unseen import (
     turns,
 )
 from kalux.compiled import apart, empty, loop, smaller
+from kalux.event_slices import all_between
 from kalux.events import EventArray
 from kalux.filters import akf_bridged
 from kalux.filters.akf import State
@@ -52,19 +53,17 @@ from kalux.settings import Settings
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating[Any]]
 
-
 _SHARES: Final = (np.arange(64) + 0.5) / 64
-"""Of the pixels that are black, those at which their distribution is looked at."""
+"""Quantiles at which the distribution of black pixels is sampled."""
 
 _BLACK_FRAMES: Final = 3.0
-"""Black says the same in every frame: so many of them count as one, and all as no more (docs/equations.md, K7)."""
-
+"""Black frames of a pixel that count as one measurement, since all say the same (docs/equations.md, K7)."""
 
 _DARKEST: Final = 10.0
-"""Below white, log intensity: black."""
+"""Log intensity below white from which on a pixel is black."""
 
 _LEAST_ERROR: Final = 1e-9
-"""Of a threshold, log intensity: a division."""
+"""Least error of a threshold, log intensity, by which is divided."""
 
 
 class BridgeMemory(NamedTuple):
@@ -73,7 +72,7 @@ class BridgeMemory(NamedTuple):
     Attributes
     ----------
     latent, thresholds
-        The latest frame, deblurred, and what is known of the pixels' thresholds.
+        The latest frame, deblurred, and the pixels' thresholds as learned so far.
     interval
         Between the latest two frames, s; the usual one until there are two.
     on, off
@@ -83,14 +82,14 @@ class BridgeMemory(NamedTuple):
     since
         Start of the first exposure, us.
     followed, at_middle
-        What is known of the newest events at the latest node, and at the middle of the latest exposure (K14). The same
-        but in causal mode.
+        The pixels' newest events (K14) at the latest node, and at the middle of the latest exposure; they differ in
+        causal mode only.
     unshown, tail
-        Pixels that no frame has measured yet, and how far highlights go (K15).
+        Pixels that no frame has measured yet, and the distribution of highlights (K15).
     silent_change
         (H, W) mean square change of the silent pixels around each (K11).
     silent
-        (H, W) what silent pixels have changed in the latest interval, NaN of others (`unseen.half_way`).
+        (H, W) change of silent pixels in the latest interval, NaN of others (`unseen.half_way`).
     """
 
     latent: Latent
@@ -118,12 +117,11 @@ class BridgedFrames(Method):
     def __init__(
         self,
         settings: Settings,
-        thresholds: tuple[float, float],
         lookahead: bool,
         shape: tuple[int, int],
         pixels: PixelCalibration | None,
     ) -> None:
-        super().__init__(settings, thresholds, lookahead, shape)
+        super().__init__(settings, lookahead, shape)
         events, c2 = settings.events, self.on * self.off
         scale2 = 2.0 * settings.filter.highlight_scale**2  # of the difference of two highlights
         self.noise = BridgeNoise(
@@ -192,7 +190,7 @@ class BridgedFrames(Method):
         )
 
     def crushed(self, shot: Shot) -> NDArray[np.bool_] | None:
-        """(N,) levels that are black and hide more than a linear response's would; None where black does not.
+        """(N,) black levels that cover more intensities than a linear response's; None: there are none.
 
         With a linear response 0 is a measurement like others.
         """
@@ -201,7 +199,7 @@ class BridgedFrames(Method):
         return black & hides if hides[black].any() else None
 
     def black(self, shot: Shot, crushed: NDArray[np.bool_]) -> tuple[Array, Array]:
-        """What black levels say of log(I + I_0): its mean, and its variance (K7)."""
+        """Mean and variance of log(I + I_0) of black levels (K7)."""
         seen = shot.levels if shot.valid is None else shot.levels[shot.valid]
         counts = np.bincount(seen.ravel(), minlength=len(shot.level_intensity))
         ceilings, place = np.unique(shot.level_ceiling[crushed], return_inverse=True)
@@ -219,7 +217,7 @@ class BridgedFrames(Method):
         if self.lookahead:
             on, off, followed = self.follow(events, begin, shot.middle, nothing)
         else:
-            # The clock begins at the end of the exposure: nothing is known of what came before.
+            # The clock begins at the end of the exposure: events before are not known.
             (on, off), followed = self.counts(events, shot.middle, shot.end), nothing
         memory = BridgeMemory(
             latent=latent,
@@ -324,9 +322,10 @@ class BridgedFrames(Method):
     def _causal(
         self, memory: BridgeMemory, shot: Shot, following: Shot, second: Latent, events: Chunks
     ) -> tuple[BridgedSegment, BridgeMemory]:
-        """From the end of one exposure to that of the next, with what came before the first.
+        """From the end of one exposure to that of the next, forward only.
 
-        What the segment holds is still to come when it is read.
+        The bridge from the middle of the first exposure serves the thresholds and later segments: when this segment is
+        read, the second frame is not known yet.
         """
         start = shot.end
         on, off, at_middle = self.follow(events, start, following.middle, memory.followed)
@@ -375,7 +374,7 @@ class BridgedFrames(Method):
     def follow(
         self, events: Chunks, start: int, end: int, before: Followed
     ) -> tuple[Floats, Floats, Followed]:
-        """`counts`, and what is known of the pixels' newest events at ``end`` (K14)."""
+        """`counts`, and the pixels' newest events at ``end`` (K14)."""
         return follow(all_between(events, start, end), before, start, end)
 
     def _trail(self, followed: Followed, start: int, scale: float) -> Trail:
@@ -386,7 +385,7 @@ class BridgedFrames(Method):
     def _trail_between(
         self, memory: BridgeMemory, shot: Shot, following: Shot, at_end: Followed
     ) -> tuple[Trail, Floats]:
-        """The same from the middle of one exposure to that of the next, and what it grows by until then."""
+        """The same from the middle of one exposure to that of the next, and its growth until then."""
         if shot.trail is not None and following.trail is not None:
             before, after = shot.trail.before, following.trail.after
             return given_trail(before, after), after - before
@@ -396,7 +395,7 @@ class BridgedFrames(Method):
         return Trail(at_start, polarity_of(newest), at_end.scale, *heights), grown
 
     def _lead_in_trail(self, shot: Shot, followed: Followed) -> Trail:
-        """The same before the middle of the first exposure, where the frame keeps its level."""
+        """The same before the middle of the first exposure, where the frame's level stays as it is."""
         if shot.trail is not None:
             return given_trail(shot.trail.after, shot.trail.after)
         trail = self._trail(followed, shot.middle, followed.scale)
@@ -414,7 +413,7 @@ class BridgedFrames(Method):
         return silent_change(segment, self.noise.quantisation_variance, self.on * self.off)
 
     def _of_black(self, change: Floats, *frames: Latent) -> Floats:
-        """What silent pixels change, where one of the frames is black: no frame says that it is little (K11)."""
+        """The change of silent pixels, where a frame is black: there frames do not show that it is small (K11)."""
         for frame in frames:
             if frame.ceiling is not None:
                 unmeasured = np.float32(UNMEASURED_CHANGE * self.on * self.off)
@@ -429,9 +428,9 @@ class BridgedFrames(Method):
         counts: tuple[Floats, Floats],
         change: Floats,
     ) -> tuple[BridgedSegment, Floats, Floats]:
-        """The segment with what its pixels may drift (K10), and the counts since they were measured, at its end.
+        """The segment with the drift of its pixels (K10), and the events since they were last measured, at its end.
 
-        ``counts`` are its on and off events, ``change`` is what silent pixels around each change (K11).
+        ``counts`` are its on and off events, ``change`` is the mean square change of silent pixels around each (K11).
         """
         grown, far_on, far_off = bridge.drift(
             memory.latent, second, memory.thresholds, self.noise, self._far(memory, segment), counts
@@ -444,7 +443,7 @@ class BridgedFrames(Method):
         return segment, far_on, far_off
 
     def _far(self, memory: BridgeMemory, segment: BridgedSegment) -> tuple[Floats, Floats]:
-        """(H, W) on and off events whose errors a pixel's level has: of a bound, at most what frames have not set."""
+        """(H, W) on and off events since a pixel was measured; of a bound, as many as raised it above the frames'."""
         pixels, known = memory.unshown.pixels, memory.thresholds
         if len(pixels) == 0:
             return memory.far_on, memory.far_off
@@ -472,7 +471,7 @@ class BridgedFrames(Method):
         return akf_bridged.begin(segment, self._with_sure_bounds(segment, state))
 
     def _with_sure_bounds(self, segment: BridgedSegment, state: State) -> State:
-        """The state at the segment's start, the noise of bounds no more than what frames leave of it (K15)."""
+        """The state at the segment's start; P of a bound is limited by how far it lies above the frames' (K15)."""
         if segment.unshown is None or len(segment.unshown.pixels) == 0:
             return state
         pixels, variance = segment.unshown.pixels, state.variance.copy()
@@ -532,7 +531,7 @@ class BridgedFrames(Method):
 
 
 def shown(shot: Shot) -> Shown:
-    """What a frame shows of highlights."""
+    """The clipped pixels of a frame, and how far below white the others are."""
     clipped = shot.level_clipped
     white = shot.level_intensity[clipped].min() if clipped.any() else shot.white
     with np.errstate(divide="ignore"):

@@ -8,9 +8,9 @@ from typing import Any, Final
 import numba as nb
 import numpy as np
 
-from kalux.augmentation.deblur import events_until
 from kalux.augmentation.refractory import EventClock
 from kalux.compiled import UNWEIGHED, event_column, event_row, event_words, loop
+from kalux.event_slices import events_until
 from kalux.events import EVENT_DTYPE, LATEST, EventArray
 
 _BLOCK: Final = 1 << 16

@@ -13,7 +13,6 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.deblur import events_until
 from kalux.compiled import (
     AHEAD,
     FUSED,
@@ -27,6 +26,7 @@ from kalux.compiled import (
     prefetch,
     smaller,
 )
+from kalux.event_slices import events_until
 from kalux.events import EventArray
 from kalux.filters.common import EPOCH
 

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation import deblur, interpolation
-from kalux.augmentation.deblur import ExposureIntegrals, all_between, count_chunks
+from kalux.augmentation.deblur import ExposureIntegrals
+from kalux.event_slices import all_between, count_chunks
 from kalux.events import EventArray
 from kalux.filters import akf_interpolated
 from kalux.filters.akf import State

@@ -1,4 +1,4 @@
-"""What every method of driving a filter from frame to frame can be asked.
+"""The interface of the methods that drive a filter from frame to frame.
 
 A method cuts time at one moment per frame, its ``node``. Between two nodes lies a segment, whose augmentation
 follows from the frames at both ends and the events in between; a memory value carries what later segments need.
@@ -14,8 +14,8 @@ from typing import Any, Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.deblur import all_between, count_chunks
 from kalux.augmentation.highlights import Unshown
+from kalux.event_slices import all_between, count_chunks
 from kalux.events import EventArray
 from kalux.filters.akf import State
 from kalux.filters.shots import Shot
@@ -46,16 +46,14 @@ class Segment(Protocol):
 
 
 class Method(ABC):
-    """One way to filter. Memory, segments and cursors are values of the method's own; only it looks inside.
+    """One way to filter. Memory, segments and cursors are opaque to its caller.
 
-    Of what only some methods tell, the others say None, or 0.
+    Queries that a method does not support return None, or 0.
     """
 
-    def __init__(
-        self, settings: Settings, thresholds: tuple[float, float], lookahead: bool, shape: tuple[int, int]
-    ) -> None:
+    def __init__(self, settings: Settings, lookahead: bool, shape: tuple[int, int]) -> None:
         self.settings, self.lookahead, self.shape = settings, lookahead, shape
-        self.on, self.off = thresholds
+        self.on, self.off = settings.events.thresholds
         self.offset = settings.camera.offset
 
     @abstractmethod
@@ -98,31 +96,31 @@ class Method(ABC):
         """The state at the end of the segment. The cursor must not be used after it."""
 
     def moving(self, segment: Any, cursor: Any) -> NDArray[np.bool_] | None:
-        """(H, W): pixels with an event in this frame interval, also one to come, or the one before, or unmeasured."""
+        """(H, W): pixels with an event in this frame interval or the one before, or that neither frame measures."""
         return None
 
     def silent_change(self, segment: Any) -> Floats | None:
-        """(H, W): `unseen.silent_change` of the segment; None: the method or the segment does not tell."""
+        """(H, W): `kalux.augmentation.unseen.silent_change` of the segment, if known."""
         return None
 
     def turns(self, segment: Any) -> float:
-        """How often a pixel with events turns in a frame interval, on average; 0: the method does not tell."""
+        """How often the intensity of a pixel with events reverses in a frame interval, on average."""
         return 0.0
 
     def around(self, segment: Any, t: int) -> Around | None:
-        """What the two frames that a segment joins say of its pixels at ``t`` (K11); None: the method does not tell."""
+        """Variances and event counts between the two frames that a segment joins, for K11 at ``t``."""
         return None
 
     def unmeasured(self, segment: Any, cursor: Any) -> NDArray[np.int64] | None:
-        """(N,) pixels in the flattened image that neither frame of a segment measures; None: not told."""
+        """(N,) indices in the flattened image of pixels that neither frame of a segment measures."""
         return None
 
     def trail(self, segment: Any, cursor: Any, t: int) -> Floats | None:
-        """(H, W): how far the light is ahead of its events at ``t`` (K14); None: the method does not tell."""
+        """(H, W): how far, in log intensity, the light is ahead of its events at ``t`` (K14)."""
         return None
 
     def unshown(self, segment: Any, variance: Floats) -> Unshown | None:
-        """Pixels that no frame has measured until then (K15), given P there; None: the method knows none."""
+        """Pixels that no frame has measured so far (K15), given P."""
         return None
 
     def log_frame(self, shot: Shot) -> Array:
@@ -135,10 +133,10 @@ class Method(ABC):
         return count_chunks(all_between(events, start, end), self.shape, weighed=True)
 
     def unseen(self, shot: Shot) -> NDArray[np.bool_]:
-        """(H, W) bool: where the frame says nothing."""
+        """(H, W) bool: pixels that the frame masks out."""
         return np.zeros(self.shape, bool) if shot.valid is None else ~shot.valid
 
     def unseen_variance(self, shot: Shot) -> float:
-        """P of a pixel of which the first frame says nothing: it is distributed as the others are."""
+        """P of a pixel that the first frame masks out: at least the variance of the others' log intensities."""
         seen = self.log_frame(shot)[shot.valid]
         return max(self.settings.filter.initial_variance, float(np.var(seen)) if seen.size else 0.0)

@@ -11,18 +11,14 @@ from kalux.settings import Settings
 
 
 def make_method(
-    settings: Settings,
-    thresholds: tuple[float, float],
-    lookahead: bool,
-    shape: tuple[int, int],
-    pixels: PixelCalibration | None = None,
+    settings: Settings, lookahead: bool, shape: tuple[int, int], pixels: PixelCalibration | None = None
 ) -> Method:
-    """The method that the settings name, with the nominal (on, off) thresholds.
+    """The method that the settings, which must have thresholds, name.
 
-    ``pixels`` is what is known of single pixels beforehand; only the bridge uses it.
+    ``pixels`` is the calibration of single pixels; only the bridge uses it.
     """
     if settings.filter.kind == "cf":
-        return HeldFrames(settings, thresholds, lookahead, shape)
+        return HeldFrames(settings, lookahead, shape)
     if settings.filter.augmentation == "bridge":
-        return BridgedFrames(settings, thresholds, lookahead, shape, pixels)
-    return InterpolatedFrames(settings, thresholds, lookahead, shape)
+        return BridgedFrames(settings, lookahead, shape, pixels)
+    return InterpolatedFrames(settings, lookahead, shape)

@@ -41,7 +41,7 @@ class Encoded(NamedTuple):
 class FolderWriter(Writer):
     """Writes every image to its own file, then its line into the list; their count into the settings once a second.
 
-    With several ``encoders``, that many images are encoded at a time, in threads of their own. They are still written
+    With several ``makers``, that many files are encoded at a time, in threads of their own. They are still written
     in order, each after up to as many calls of `write`: so late, too, is the error of one that cannot be.
     """
 
@@ -53,15 +53,14 @@ class FolderWriter(Writer):
         settings: SettingsFile,
         *,
         overwrite: bool,
-        encoders: int = 1,
+        makers: int = 1,
     ) -> None:
         super().__init__(path)
         self._encode = encode
         self._suffix = suffix
         self._settings = settings
         self._state: ToneState | None = None
-        self._encoders = encoders
-        self._pending: InOrder[Encoded] = InOrder(encoders, "encode")
+        self._pending: InOrder[Encoded] = InOrder(makers, "encode")
         with output_errors(path, "the output folder cannot be used"):
             make_folder(path)
             self._claim = Claim(path, is_folder=True)
@@ -78,19 +77,9 @@ class FolderWriter(Writer):
     def _write(self, image: ImageLike) -> None:
         data, self._state = self._encode(image, self._state)
         t = int(image.t)
-        self._pending.give(lambda: Encoded(t, data()))
-        self._store(0 if self._encoders == 1 else self._encoders)
+        self._pending.give(lambda: Encoded(t, data()), self._store)
 
-    def _store(self, most: int) -> None:
-        """Write images, the first first, until at most ``most`` are pending. After an error the rest is given up."""
-        try:
-            while len(self._pending) > most:
-                self._store_next(self._pending.take())
-        except BaseException:
-            self._pending.end()
-            raise
-
-    def _store_next(self, image: Encoded) -> None:
+    def _store(self, image: Encoded) -> None:
         name = f"{self._images:06d}{self._suffix}"
         file = self.path / name
         with output_errors(file, self._consequence()):
@@ -110,7 +99,7 @@ class FolderWriter(Writer):
 
     def _finish(self, complete: bool) -> None:
         try:
-            self._store(0)
+            self._pending.finish(self._store)
         except BaseException:
             # If this fails too, the settings on disk are those of an incomplete output already.
             with contextlib.suppress(OutputError):

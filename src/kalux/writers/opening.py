@@ -83,15 +83,16 @@ def open_writer(
         described["display"] = settings_table(display)
     if chosen == "png":
         described["bits"] = png_bits
+    # Of what is soon made, one thread is left for the encoder and the disk: with two, handing an image over would take
+    # half as long as to make it.
+    makers = max(threads - 1, 1) if chosen in ("png", "mp4") else threads
     if chosen == "mp4":
         described["video"] = plain(video, "video")
         settings = settings_file(beside(path), metadata or {}, described)
-        return VideoWriter(path, display, video, ticks, settings, overwrite=overwrite, threads=threads)
+        return VideoWriter(path, display, video, ticks, settings, overwrite=overwrite, makers=makers)
     inside = settings_file(path / SETTINGS, metadata or {}, described)
     encode = {"png": encode_png(display, png_bits), "exr": encode_exr, "npy": encode_npy}[chosen]
-    # With two threads, handing a PNG over would take longer than it saves the one that writes.
-    encoders = max(threads - 1, 1) if chosen == "png" else threads
-    return FolderWriter(path, encode, f".{chosen}", inside, overwrite=overwrite, encoders=encoders)
+    return FolderWriter(path, encode, f".{chosen}", inside, overwrite=overwrite, makers=makers)
 
 
 def choose_format(path: Path, format: str | None) -> str:

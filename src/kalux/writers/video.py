@@ -136,9 +136,8 @@ class Picture(NamedTuple):
 class VideoWriter(Writer):
     """Encodes into a temporary file beside the output, which gets its name when it is finished.
 
-    With more than two ``threads``, all but one make pictures at the same time, in threads of their own; with two, to
-    hand a picture over would take half as long as to make it. They are encoded in order, each after up to as many calls
-    of `write`: so late, too, is the error of one that cannot be.
+    With several ``makers``, that many pictures are made at a time, in threads of their own. They are encoded in order,
+    each after up to as many calls of `write`: so late, too, is the error of one that cannot be.
     """
 
     def __init__(
@@ -150,11 +149,10 @@ class VideoWriter(Writer):
         settings: SettingsFile,
         *,
         overwrite: bool,
-        threads: int = 1,
+        makers: int = 1,
     ) -> None:
         super().__init__(path)
-        self._makers = max(threads - 1, 1)
-        self._pending: InOrder[Picture] = InOrder(self._makers, "pictures")
+        self._pending: InOrder[Picture] = InOrder(makers, "pictures")
         self._display = display
         self._video = video
         self._ticks = ticks
@@ -188,19 +186,9 @@ class VideoWriter(Writer):
             frame.pts, frame.time_base = pts, self._ticks.time_base
             return Picture(t, frame)
 
-        self._pending.give(picture)
-        self._encode(0 if self._makers == 1 else self._makers)
+        self._pending.give(picture, self._encode)
 
-    def _encode(self, most: int) -> None:
-        """Encode pictures, the first first, until at most ``most`` are pending. After an error the rest is given up."""
-        try:
-            while len(self._pending) > most:
-                self._encode_next(self._pending.take())
-        except BaseException:
-            self._pending.end()
-            raise
-
-    def _encode_next(self, picture: Picture) -> None:
+    def _encode(self, picture: Picture) -> None:
         frame = picture.frame
         if self._open is None:
             with encoder_errors(self.path, "the video cannot be written"):
@@ -218,7 +206,7 @@ class VideoWriter(Writer):
 
     def _finish(self, complete: bool) -> None:
         try:
-            self._encode(0)
+            self._pending.finish(self._encode)
         except BaseException:
             with contextlib.suppress(OutputError):  # the error that comes first is told
                 self._end_video(complete=False)

@@ -1,0 +1,69 @@
+"""Parts of an event stream: slices by time, and the numbers of events of every pixel."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux.compiled import event_column, event_is_on, event_row, event_weight, event_words, loop, weight_unit
+from kalux.events import EventArray
+
+Array = NDArray[np.float64]
+FloatArray = NDArray[np.float32]
+
+
+def between(events: EventArray, start: int, end: int) -> EventArray:
+    """The events with start < t <= end."""
+    words = event_words(events)
+    return events[words_until(words, start) : words_until(words, end)]
+
+
+def all_between(chunks: Sequence[EventArray], start: int, end: int) -> list[EventArray]:
+    """The same of events in several arrays."""
+    inside = (between(chunk, start, end) for chunk in chunks)
+    return [events for events in inside if len(events)]
+
+
+def events_until(events: EventArray, t: int) -> int:
+    """Number of events up to and at ``t`` (us). NumPy's search would copy the whole column first."""
+    return int(words_until(event_words(events), t))
+
+
+@loop
+def words_until(words, t):  # type: ignore[no-untyped-def]
+    """The same of events as machine words (`kalux.compiled.event_words`)."""
+    first, last = 0, len(words)
+    while first < last:
+        middle = (first + last) // 2
+        if words[middle, 0] <= t:
+            first = middle + 1
+        else:
+            last = middle
+    return first
+
+
+def count_events(events: EventArray, shape: tuple[int, int], *, weighed: bool = False) -> tuple[Array, Array]:
+    """Number of on and off events of every pixel, two (H, W) float64; the sums of their weights if they carry such."""
+    on, off = count_chunks([events], shape, weighed=weighed)
+    return on.astype(np.float64), off.astype(np.float64)
+
+
+def count_chunks(
+    chunks: Sequence[EventArray], shape: tuple[int, int], *, weighed: bool
+) -> tuple[FloatArray, FloatArray]:
+    """The same of events in several arrays, two (H, W) float32; sums of weights where the events carry such."""
+    height, width = shape
+    counts = np.zeros((2, height * width), np.float32)
+    for chunk in chunks:
+        _count(event_words(chunk), counts, np.uint64(width), weight_unit(weighed))
+    return counts[1].reshape(shape), counts[0].reshape(shape)
+
+
+@loop
+def _count(words, counts, width, unit):  # type: ignore[no-untyped-def]
+    for i in range(len(words)):
+        word = words[i, 1]
+        at = event_row(word) * width + event_column(word)
+        counts[np.uint64(event_is_on(word)), at] += event_weight(word, unit)

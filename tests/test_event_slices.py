@@ -1,0 +1,54 @@
+"""Slices of an event stream by time, and the numbers of events of every pixel."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kalux.augmentation.refractory import EventClock
+from kalux.event_slices import all_between, between, count_chunks, count_events, events_until
+
+from builders import events, pixel_events, random_stream
+
+moments = st.lists(st.tuples(st.integers(900, 2100), st.booleans()), max_size=12).map(sorted)
+
+
+@given(moments, st.integers(800, 2200))
+def test_slices_add_up(rows, cut):
+    array = pixel_events([t for t, _ in rows], [p for _, p in rows])
+    parts = [between(array, 800, cut), between(array, cut, 2200)]
+    np.testing.assert_array_equal(np.concatenate(parts), between(array, 800, 2200))
+    total = count_events(between(array, 800, 2200), (1, 1))
+    split = [count_events(part, (1, 1)) for part in parts]
+    for polarity in (0, 1):
+        np.testing.assert_array_equal(split[0][polarity] + split[1][polarity], total[polarity])
+
+
+def test_slices_are_open_at_the_start_and_closed_at_the_end():
+    array = pixel_events([10, 10, 20, 20, 30], [1, 0, 1, 0, 1])
+    assert [events_until(array, t) for t in (9, 10, 19, 20, 30)] == [0, 2, 2, 4, 5]
+    assert between(array, 10, 20)["t"].tolist() == [20, 20]
+    assert [part["t"].tolist() for part in all_between([array[:3], array[3:4], array[4:]], 10, 25)] == [
+        [20],
+        [20],
+    ]
+
+
+def test_counts_by_polarity():
+    on, off = count_events(events((1, 0, 0, 1), (2, 2, 1, 0), (3, 2, 1, 0), (4, 2, 1, 1)), (2, 3))
+    np.testing.assert_array_equal(on, [[1, 0, 0], [0, 0, 1]])
+    np.testing.assert_array_equal(off, [[0, 0, 0], [0, 0, 2]])
+
+
+def test_chunks_count_together_and_weights_only_where_they_are_asked_for():
+    stream = random_stream(5)
+    weighed = EventClock(stream.sensor_size, 3_000).weighed(stream.events)
+    whole, chunks = [weighed], [weighed[:100], weighed[100:]]
+    ones = count_events(stream.events, stream.sensor_size)
+    for counted, expected in zip(count_chunks(chunks, stream.sensor_size, weighed=False), ones, strict=True):
+        np.testing.assert_array_equal(counted, expected)
+    sums = count_chunks(chunks, stream.sensor_size, weighed=True)
+    for counted, expected in zip(sums, count_chunks(whole, stream.sensor_size, weighed=True), strict=True):
+        np.testing.assert_allclose(counted, expected, rtol=1e-6)
+    assert sum(map(np.sum, sums)) > 1.1 * sum(map(np.sum, ones))
