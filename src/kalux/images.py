@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from kalux.augmentation.bridge import RANDOM
 from kalux.augmentation.highlights import Unshown
+from kalux.augmentation.motion import Along, joined_along
 from kalux.augmentation.unseen import UNKNOWN_CHANGE
 from kalux.filters.highlights import keep_white, lifted, read_unshown, tempered
 from kalux.filters.readout import HighlightPrior, read_out
@@ -130,6 +131,7 @@ class Estimate:
     exposed: float = 0.0
     since: float | None = None
     told: NDArray[np.floating[Any]] | None = None
+    along: Along | None = None
 
 
 @dataclass(frozen=True)
@@ -184,7 +186,8 @@ def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) ->
         change = np.full(log_intensity.shape, UNKNOWN_CHANGE * view.threshold2, np.float32)
     half_way = RANDOM if estimate.around is None else estimate.around.half_way
     hidden = hidden_variance(estimate.between, view.threshold2, estimate.exposed, estimate.since, half_way)
-    needs_variance = with_variance or view.mosaic is not None  # colours of a mosaic's highlights depend on it
+    # Colours of a mosaic's highlights depend on it, and how far the frames along the paths are believed.
+    needs_variance = with_variance or view.mosaic is not None or estimate.along is not None
     # That after averaging counts only for pixels that neither frame measures (K11).
     needs_averaged = needs_variance and (
         moving is None or (estimate.around is not None and estimate.around.misses_some)
@@ -208,7 +211,7 @@ def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) ->
         keep_white(intensity, estimate.log_intensity, estimate.unmeasured, view.log_offset, prior)
     pattern = view.fixed_pattern * (np.exp(estimate.white) - view.log_offset)
     if not needs_variance:
-        total = np.ndarray(intensity.shape, np.float32, _INFINITE, strides=(0, 0))
+        total = _infinite(intensity.shape)
     elif moving is not None and change is not None:
         total = given_variance(
             told, moving, change, hidden, estimate.around, total if needs_averaged else None
@@ -217,9 +220,28 @@ def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) ->
             add_pattern(total, intensity, view.log_offset, pattern)
     if needs_variance and unshown is not None:
         total.reshape(-1)[unshown.pixels] += unshown.doubt
+    if estimate.along is not None:
+        _look_along(intensity, total, estimate.along, view.log_offset)
+        if not with_variance:
+            total = _infinite(intensity.shape)
     image = Image(estimate.t, intensity, total, view.log_offset, estimate.final, fixed_pattern=float(pattern))
     colour = _coloured(image, estimate, view)
     return image if colour is None else dataclasses.replace(image, colour=colour)
+
+
+def _infinite(shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """The variance of an image that is not wanted, in no memory."""
+    return np.ndarray(shape, np.float32, _INFINITE, strides=(0, 0))
+
+
+def _look_along(
+    intensity: NDArray[np.float32], variance: NDArray[np.float32], along: Along, log_offset: float
+) -> None:
+    """Join an image with what the frames around show along the paths of what moves (K16). In place."""
+    here = along.motion.window
+    offset = np.float32(log_offset)
+    level, variance[here] = joined_along(along, np.log(intensity[here] + offset), variance[here])
+    intensity[here] = np.maximum(np.exp(level) - offset, np.float32(0.0))
 
 
 def _above_bounds(

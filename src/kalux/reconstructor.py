@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.highlights import Unshown
+from kalux.augmentation.motion import Along, Motion
 from kalux.augmentation.refractory import EventClock
 from kalux.augmentation.trail import FrameTrail
 from kalux.compiled import event_words
@@ -34,7 +35,7 @@ from kalux.filters.buffer import EventBuffer
 from kalux.filters.method import USUAL_INTERVAL, Method, Segment
 from kalux.filters.methods import make_method
 from kalux.filters.shots import Shot, take_shot
-from kalux.filters.uncertainty import changed_within
+from kalux.filters.uncertainty import changed_within, hidden_variance
 from kalux.frames import Frame, check_frame
 from kalux.images import Estimate, Image, View, make_image
 from kalux.models.camera import Camera, beyond_white, count_bright
@@ -58,6 +59,8 @@ class _Progress:
         self.starts_frame = starts_frame  # False for the lead-in before the first frame's node
         self.taken = 0  # number of the first event that the cursor has not taken, or an earlier one
         self.latest = segment.start  # time of the last event taken
+        self.motion: Motion | None = None  # what moves, once it has been looked for
+        self.looked = False
 
 
 class Reconstructor:
@@ -286,6 +289,8 @@ class Reconstructor:
             return
         progress = self._progress_to(limit)
         if progress.ready or (self._frames_ended and len(self._shots) == 1):  # no frame will change it
+            if self._moment(progress, limit).after is not None and limit < progress.segment.end:
+                self._look_for_motion(progress)
             self._take(progress, limit)
             self._events.drop(progress.latest)
             self._earliest = limit
@@ -363,6 +368,7 @@ class Reconstructor:
             unmeasured=self._method.unmeasured(progress.segment, progress.cursor),
             exposed=changed_within(moment.exposed, self._method.turns(progress.segment)),
             since=moment.since(self._frame_interval),
+            along=self._along(progress, moment),
         )
 
     def trail(self, t: int) -> NDArray[np.floating[Any]] | None:
@@ -420,6 +426,32 @@ class Reconstructor:
             return Moment(t, self._shots[0], None, 0.0)
         share = (t - segment.start) / (segment.end - segment.start)
         return Moment(t, self._shots[0], self._shots[1], share)
+
+    def _along(self, progress: _Progress, moment: Moment) -> Along | None:
+        """What moves between the frames around an image (K16); None at a frame, and where there is one frame alone."""
+        if moment.after is None or not 0.0 < moment.share < 1.0:
+            return None
+        self._look_for_motion(progress)
+        return None if progress.motion is None else Along(progress.motion, moment.share)
+
+    def _look_for_motion(self, progress: _Progress) -> None:
+        """Look for what moves in a segment that is final, once, while all of its events are here."""
+        if progress.looked:
+            return
+        progress.looked = True
+        segment = progress.segment
+        path = self._method.path(segment)
+        if path is None:
+            return
+        assert self._state is not None
+        half_way = (segment.start + segment.end) // 2
+        cursor = self._method.begin(segment, self._state)
+        self._take(_Progress(segment, progress.memory, cursor, ready=True, starts_frame=True), half_way)
+        level, variance = self._method.read(segment, cursor, half_way)
+        on, off = self.thresholds
+        progress.motion = self._method.bent(
+            segment, path, level, variance + hidden_variance(1.0, on * off).moving
+        )
 
     # Segments.
 
@@ -520,6 +552,7 @@ class Reconstructor:
         self._progress = _Progress(
             progress.segment, progress.memory, cursor, progress.ready, progress.starts_frame
         )
+        self._progress.motion, self._progress.looked = progress.motion, progress.looked
         return self._progress
 
     def _take(self, progress: _Progress, t: int) -> None:

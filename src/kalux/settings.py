@@ -284,6 +284,9 @@ class FilterSettings:
         Standard deviation, in log intensity, by which neighbouring pixels of a surface differ: moving pixels become
         weighted means of themselves and their eight neighbours (docs/equations.md, K12). 0 turns it off. 0.2
         (docs/tuning.md).
+    motion
+        Read the frames around an image along the paths of what moves between them (docs/equations.md, K16). With
+        augmentation "bridge" and lookahead only; not of Bayer mosaics.
     cutoff
         Of the complementary filter, Hz. 1.0 (Scheerlinck 2018 uses 2 pi rad/s).
     """
@@ -298,6 +301,7 @@ class FilterSettings:
     unshown_tail: float = 0.5
     bright_tail: float | None = None
     neighbours: float = 0.2
+    motion: bool = True
     cutoff: float = 1.0
 
 

@@ -396,6 +396,7 @@ def combine(
         exposed=forward.exposed,
         since=_least(forward.since, backward.since),
         told=told,
+        along=forward.along,
     )
 
 
@@ -476,7 +477,8 @@ def reversed_settings(settings: Settings) -> Settings:
         delay=-settings.events.lateness,
         trail=0.0,
     )
-    return dataclasses.replace(settings, events=events)
+    filtered = dataclasses.replace(settings.filter, motion=False)  # the forward filter's images have it
+    return dataclasses.replace(settings, events=events, filter=filtered)
 
 
 def reversed_pixels(pixels: PixelCalibration | None) -> PixelCalibration | None:

@@ -172,6 +172,8 @@ class BridgedSegment(NamedTuple):
         How often the intensity of a pixel with events reverses, on average (`unseen.turns`).
     half_way
         Variance of silent pixels about the mean of both frames (`unseen.half_way`).
+    latents
+        The frames at both ends, where they are looked at along the paths of what moves (K16); else None.
     """
 
     start: int
@@ -195,6 +197,7 @@ class BridgedSegment(NamedTuple):
     net: Array | None = None
     turns: float = 0.0
     half_way: float = RANDOM
+    latents: tuple[Latent, Latent] | None = None
 
 
 def drift(

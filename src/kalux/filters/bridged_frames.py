@@ -19,6 +19,7 @@ from kalux.augmentation.highlights import (
     expected_excess,
     follow_unshown,
 )
+from kalux.augmentation.motion import Motion, Plane, bent, find_path
 from kalux.augmentation.trail import (
     Followed,
     Trail,
@@ -315,7 +316,12 @@ class BridgedFrames(Method):
             silent=silent,
         )
         joined = joined._replace(
-            trail=trail, unshown=unshown, silent_change=change, turns=turns(on, off), half_way=share
+            trail=trail,
+            unshown=unshown,
+            silent_change=change,
+            turns=turns(on, off),
+            half_way=share,
+            latents=(memory.latent, second) if self.settings.filter.motion and shot.pitch == 1 else None,
         )
         return joined, after
 
@@ -505,6 +511,15 @@ class BridgedFrames(Method):
 
     def unmeasured(self, segment: Any, cursor: akf_bridged.Cursor) -> NDArray[np.int64]:
         return akf_bridged.unmeasured_pixels(segment, cursor)
+
+    def path(self, segment: BridgedSegment) -> Plane | None:
+        if segment.latents is None:
+            return None
+        return find_path(*segment.latents, *(float(np.log(i + self.offset)) for i in (0.0, 1.0)))
+
+    def bent(self, segment: BridgedSegment, path: Plane, level: Floats, variance: Floats) -> Motion | None:
+        assert segment.latents is not None
+        return bent(*segment.latents, path, level, variance)
 
     def turns(self, segment: BridgedSegment) -> float:
         return segment.turns

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.highlights import Unshown
+from kalux.augmentation.motion import Motion, Plane
 from kalux.event_slices import all_between, count_chunks
 from kalux.events import EventArray
 from kalux.filters.akf import State
@@ -109,6 +110,14 @@ class Method(ABC):
 
     def around(self, segment: Any, t: int) -> Around | None:
         """Variances and event counts between the two frames that a segment joins, for K11 at ``t``."""
+        return None
+
+    def path(self, segment: Any) -> Plane | None:
+        """(H, W, 2) by how much pixels move between the frames of a segment (K16); None: not told, or nothing does."""
+        return None
+
+    def bent(self, segment: Any, path: Plane, level: Floats, variance: Floats) -> Motion | None:
+        """The paths bent to L and P half-way; None: they tell nothing."""
         return None
 
     def unmeasured(self, segment: Any, cursor: Any) -> NDArray[np.int64] | None:

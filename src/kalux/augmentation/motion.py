@@ -1,0 +1,286 @@
+"""Frames seen along the paths of what moves between them (docs/equations.md, K16).
+
+Both frames around an image show what it shows, elsewhere. Optical flow tells where. Events tell when: half-way the
+filter knows the image, and the path of every pixel is bent so that the frames explain it best. Seen along these paths
+both frames are one more estimate of the image, the better the better they agree with each other.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import Any, Final, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux.augmentation.bridge import UNMEASURED, Latent
+
+Floats = NDArray[np.floating[Any]]
+Plane = NDArray[np.float32]
+
+# Flow.
+
+_COLUMNS: Final = 44
+"""Of the points whose flow is followed, on any sensor: 8 pixels apart on a DAVIS346, 15 at 640x480."""
+
+_WINDOW: Final = (15, 15)
+"""Pixels around a point that are looked for in the other frame."""
+
+_LEVELS: Final = 3
+"""Halvings of the image: flows up to some 50 pixels are found."""
+
+_STILL: Final = 0.25
+"""Pixels of flow up to which both frames say the same at the same place."""
+
+# The bend of the paths.
+
+_BENDS: Final = 2
+"""Steps of Gauss and Newton by which the path is bent."""
+
+_MOST_BENT: Final = 4.0
+"""Pixels that a path is bent by at most, half-way."""
+
+_ALIKE: Final = np.float32(1.0 / 20.0)
+"""Of the pixels of a tile so many tell something of their own, since errors of neighbours are alike."""
+
+_BEND_INFORMATION: Final = np.float32(1.0)
+"""1 / pixel^2: what is known of a bend beforehand."""
+
+_OUTLIER: Final = np.float32(4.0)
+"""Squared error, in units of its variance, at which a pixel counts for a quarter."""
+
+# What is seen along them.
+
+_RESAMPLING: Final = np.float32(5e-4)
+"""Variance, in log intensity^2, of a frame that is read between its pixels."""
+
+_FINE_RESAMPLING: Final = np.float32(0.1)
+"""The same, in units of the mean square of what 3x3 pixels do not have in common."""
+
+_DISAGREEMENT: Final = np.float32(0.25)
+"""Variance of the mean of both frames, in units of their mean squared difference: of independent errors."""
+
+_DISTRUST: Final = np.float32(0.5)
+"""How much less is believed where the filter contradicts, per mean squared difference in units of its variance."""
+
+_LEAST_MOVING: Final = np.float32(1e-6)
+"""Share of the frames' difference that motion explains where it explains nothing: a division."""
+
+_TEXTURE: Final = (3, 3)
+_EVIDENCE: Final = (5, 5)
+
+_LEAST_GAIN: Final = 0.02
+"""Where no pixel is taken so far towards what is seen, the frames are not looked at."""
+
+_ONE_MAP: Final = np.empty(0, np.float32)
+"""OpenCV takes columns and rows from one array where the other is empty."""
+
+
+class Motion(NamedTuple):
+    """Two frames, and the paths of what moves from one to the other.
+
+    Attributes
+    ----------
+    first, second
+        The frames, without blur.
+    path
+        (H, W, 2) float32: columns and rows from ``first`` to ``second`` of what is at a pixel half-way.
+    bend
+        (H, W, 2) float32: how far both ends of the path are shifted for what is at a pixel half-way.
+    window
+        Rows and columns outside which nothing is seen that is not known.
+    """
+
+    first: Latent
+    second: Latent
+    path: Plane
+    bend: Plane
+    window: tuple[slice, slice]
+
+
+class Along(NamedTuple):
+    """What moves, at a share of the way from the first frame to the second."""
+
+    motion: Motion
+    share: float
+
+
+def find_path(first: Latent, second: Latent, dark: float, white: float) -> Plane | None:
+    """(H, W, 2) float32: columns and rows by which what is at a pixel half-way moves from one frame to the next.
+
+    Lucas and Kanade's flow with pyramids, of a grid of points and in either direction (OpenCV): half of the difference
+    of both, its median over 5x5 points, linear between the points.
+
+    Parameters
+    ----------
+    first, second
+        The frames.
+    dark, white
+        Log intensities of black and of white.
+
+    Returns
+    -------
+    The path; None: nothing moves.
+    """
+    height, width = first.value.shape
+    columns = max(min(_COLUMNS, width // 8), 1)
+    rows = max(round(columns * height / width), 1)
+    points = np.stack(np.meshgrid(_centres(columns, width), _centres(rows, height)), axis=-1).reshape(
+        -1, 1, 2
+    )
+    image, following = (_octets(frame.value, dark, white) for frame in (first, second))
+    flow = _flow(image, following, points) - _flow(following, image, points)
+    grid = np.ascontiguousarray(np.moveaxis(flow.reshape(rows, columns, 2) / np.float32(2.0), -1, 0))
+    steady = np.stack([cv2.medianBlur(part, 5) for part in grid], axis=-1)
+    if float(np.abs(steady).max()) < _STILL:
+        return None
+    return np.asarray(cv2.resize(steady, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
+
+
+def _centres(count: int, side: int) -> Plane:
+    """Of ``count`` parts of a side, in pixels."""
+    return np.asarray((np.arange(count) + 0.5) * (side / count) - 0.5, np.float32)
+
+
+def _octets(value: Floats, dark: float, white: float) -> NDArray[np.uint8]:
+    levels: NDArray[np.uint8] = np.clip((value - dark) * (255.0 / (white - dark)), 0.0, 255.0).astype(
+        np.uint8
+    )
+    return levels
+
+
+def _flow(image: NDArray[np.uint8], other: NDArray[np.uint8], points: Plane) -> Plane:
+    """(N, 1, 2): by how much points of an image have moved in another; 0 where that is not found."""
+    ends, found, _ = cv2.calcOpticalFlowPyrLK(
+        image, other, points, np.empty_like(points), winSize=_WINDOW, maxLevel=_LEVELS
+    )
+    return np.where(found[..., None] == 1, ends - points, np.float32(0.0))
+
+
+def bent(first: Latent, second: Latent, path: Plane, level: Floats, variance: Floats) -> Motion | None:
+    """The paths between two frames, bent to the image half-way.
+
+    What moves need not go straight on, nor at one pace. The bend of a tile, 4 points of the grid wide, is the one by
+    which the frames explain the image best: two steps of Gauss and Newton, of overlapping tiles.
+
+    Parameters
+    ----------
+    first, second, path
+        The frames, and the path from `find_path`.
+    level, variance
+        (H, W): L half-way, and its variance.
+
+    Returns
+    -------
+    The motion; None: nothing is seen along the paths that is not known.
+    """
+    height, width = path.shape[:2]
+    level, variance = np.asarray(level, np.float32), np.asarray(variance, np.float32)
+    side = 2 * (2 * width // min(_COLUMNS, width)) - 1
+    motion = Motion(first, second, path, np.zeros_like(path), (slice(0, height), slice(0, width)))
+    for _ in range(_BENDS):
+        seen, doubt = seen_along(Along(motion, 0.5))
+        motion = motion._replace(
+            bend=_bent_further(motion.bend, seen, level - seen, variance + doubt, (side, side))
+        )
+    gain = _gain(*seen_along(Along(motion, 0.5)), level, variance, 1.0)
+    told = np.argwhere(_mean(gain, _EVIDENCE) > _LEAST_GAIN)
+    if len(told) == 0:
+        return None
+    margin = math.ceil(float(np.abs(path).max()) / 2.0) + max(
+        _EVIDENCE
+    )  # it moves to either side until a frame
+    (top, left), (bottom, right) = told.min(axis=0) - margin, told.max(axis=0) + margin + 1
+    return motion._replace(
+        window=(slice(max(int(top), 0), int(bottom)), slice(max(int(left), 0), int(right)))
+    )
+
+
+def _bent_further(bend: Plane, seen: Plane, error: Plane, variance: Plane, tile: tuple[int, int]) -> Plane:
+    """A step of Gauss and Newton: what is seen is shifted, tile by tile, so that its ``error`` becomes least."""
+    weight = _ALIKE / (variance * np.square(1.0 + error * error / (_OUTLIER * variance)))
+    of_x, of_y = (cv2.Sobel(seen, cv2.CV_32F, *axis, scale=1.0 / 8.0) for axis in ((1, 0), (0, 1)))
+    pixels = np.float32(tile[0] * tile[1])
+    weighted_x, weighted_y = weight * of_x * pixels, weight * of_y * pixels
+    xx = _mean(weighted_x * of_x, tile) + _BEND_INFORMATION
+    yy = _mean(weighted_y * of_y, tile) + _BEND_INFORMATION
+    xy = _mean(weighted_x * of_y, tile)
+    x = _mean(weighted_x * error, tile) - _BEND_INFORMATION * bend[..., 0]
+    y = _mean(weighted_y * error, tile) - _BEND_INFORMATION * bend[..., 1]
+    step = np.stack([yy * x - xy * y, xx * y - xy * x], axis=-1) / (xx * yy - xy * xy)[..., None]
+    return np.clip(bend + step, -_MOST_BENT, _MOST_BENT)
+
+
+def seen_along(along: Along) -> tuple[Plane, Plane]:
+    """What both frames show along the paths, in the window: log intensity, and its variance.
+
+    With s the share, the mean of both is weighted by 1 - s and s. It is the less certain the more the frames disagree
+    there, the finer the texture is that is read between its pixels, and the better they agree where nothing moves.
+    """
+    motion = along.motion
+    share, rest = np.float32(along.share), np.float32(1.0 - along.share)
+    straight, bend = motion.path[motion.window], motion.bend[motion.window] * (np.float32(4.0) * share * rest)
+    here = _places(*motion.path.shape[:2])[motion.window] + bend
+    first, first_variance = _read(motion.first, here - share * straight)
+    second, second_variance = _read(motion.second, here + rest * straight)
+    seen = rest * first + share * second
+    doubt = _DISAGREEMENT * _mean(np.square(first - second), _TEXTURE) + _RESAMPLING
+    doubt += _FINE_RESAMPLING * _mean(np.square(seen - _mean(seen, _TEXTURE)), _TEXTURE)
+    doubt += rest * rest * first_variance + share * share * second_variance
+    unmoved = motion.first.value[motion.window] - motion.second.value[motion.window]
+    unexplained = _mean(np.square(first - second), _EVIDENCE)
+    unexplained /= np.maximum(_mean(np.square(unmoved), _EVIDENCE), _RESAMPLING)
+    return seen, doubt / np.maximum(np.float32(1.0) - unexplained, _LEAST_MOVING)
+
+
+@functools.lru_cache(maxsize=4)
+def _places(height: int, width: int) -> Plane:
+    """(H, W, 2): column and row of every pixel."""
+    places = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float32)
+    places.flags.writeable = False
+    return places
+
+
+def _read(frame: Latent, places: Plane) -> tuple[Plane, Plane]:
+    """Log intensity of a frame between its pixels, and its variance: nothing is known outside, or of black (K7)."""
+    value, variance = np.asarray(frame.value, np.float32), np.asarray(frame.variance, np.float32)
+    if frame.ceiling is not None:
+        variance = np.where(np.isfinite(frame.ceiling), np.float32(UNMEASURED), variance)
+    levels = cv2.remap(value, places, _ONE_MAP, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    unknown = float(UNMEASURED)
+    doubt = cv2.remap(
+        variance, places, _ONE_MAP, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=unknown
+    )
+    return np.asarray(levels, np.float32), np.asarray(doubt, np.float32)
+
+
+def _mean(values: Floats, patch: tuple[int, int]) -> Plane:
+    """Of the pixels around every pixel."""
+    return np.asarray(cv2.blur(values, patch), np.float32)
+
+
+def _gain(seen: Plane, doubt: Plane, level: Plane, variance: Plane, between: float) -> Plane:
+    """How far an image is taken towards what is seen along the paths, 0 to 1."""
+    contradiction = _mean(np.square(level - seen) / (variance + doubt), _EVIDENCE)
+    trust = np.float32(between) * variance / (doubt * np.square(np.float32(1.0) + _DISTRUST * contradiction))
+    gain: Plane = trust / (np.float32(1.0) + trust)
+    return gain
+
+
+def joined_along(along: Along, level: Plane, variance: Plane) -> tuple[Plane, Plane]:
+    """An image joined with what is seen along the paths, in the window: log intensity, and its variance.
+
+    With s the share, what is seen counts 4 s (1 - s) times: at a frame the filter knows the frame itself.
+
+    Parameters
+    ----------
+    along
+        The paths, and the share.
+    level, variance
+        Log intensity and its variance in the window.
+    """
+    seen, doubt = seen_along(along)
+    gain = _gain(seen, doubt, level, variance, 4.0 * along.share * (1.0 - along.share))
+    return level + gain * (seen - level), variance * (np.float32(1.0) - gain)
