@@ -74,9 +74,6 @@ _EVIDENCE: Final = (5, 5)
 _LEAST_GAIN: Final = 0.02
 """Where no pixel is taken so far towards what is seen, the frames are not looked at."""
 
-_ONE_MAP: Final = np.empty(0, np.float32)
-"""OpenCV takes columns and rows from one array where the other is empty."""
-
 
 class Motion(NamedTuple):
     """Two frames, and the paths of what moves from one to the other.
@@ -86,9 +83,9 @@ class Motion(NamedTuple):
     first, second
         The frames, without blur.
     path
-        (H, W, 2) float32: columns and rows from ``first`` to ``second`` of what is at a pixel half-way.
+        (2, H, W) float32: columns and rows from ``first`` to ``second`` of what is at a pixel half-way.
     bend
-        (H, W, 2) float32: how far both ends of the path are shifted for what is at a pixel half-way.
+        (2, H, W) float32: how far both ends of the path are shifted for what is at a pixel half-way.
     window
         Rows and columns outside which nothing is seen that is not known.
     """
@@ -108,7 +105,7 @@ class Along(NamedTuple):
 
 
 def find_path(first: Latent, second: Latent, dark: float, white: float) -> Plane | None:
-    """(H, W, 2) float32: columns and rows by which what is at a pixel half-way moves from one frame to the next.
+    """(2, H, W) float32: columns and rows by which what is at a pixel half-way moves from one frame to the next.
 
     Lucas and Kanade's flow with pyramids, of a grid of points and in either direction (OpenCV): half of the difference
     of both, its median over 5x5 points, linear between the points.
@@ -133,10 +130,11 @@ def find_path(first: Latent, second: Latent, dark: float, white: float) -> Plane
     image, following = (_octets(frame.value, dark, white) for frame in (first, second))
     flow = _flow(image, following, points) - _flow(following, image, points)
     grid = np.ascontiguousarray(np.moveaxis(flow.reshape(rows, columns, 2) / np.float32(2.0), -1, 0))
-    steady = np.stack([cv2.medianBlur(part, 5) for part in grid], axis=-1)
+    steady = [cv2.medianBlur(part, 5) for part in grid]
     if float(np.abs(steady).max()) < _STILL:
         return None
-    return np.asarray(cv2.resize(steady, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
+    parts = (cv2.resize(part, (width, height), interpolation=cv2.INTER_LINEAR) for part in steady)
+    return np.stack([np.asarray(part, np.float32) for part in parts])
 
 
 def _centres(count: int, side: int) -> Plane:
@@ -176,7 +174,7 @@ def bent(first: Latent, second: Latent, path: Plane, level: Floats, variance: Fl
     -------
     The motion; None: nothing is seen along the paths that is not known.
     """
-    height, width = path.shape[:2]
+    height, width = path.shape[1:]
     level, variance = np.asarray(level, np.float32), np.asarray(variance, np.float32)
     side = 2 * (2 * width // min(_COLUMNS, width)) - 1
     motion = Motion(first, second, path, np.zeros_like(path), (slice(0, height), slice(0, width)))
@@ -207,10 +205,11 @@ def _bent_further(bend: Plane, seen: Plane, error: Plane, variance: Plane, tile:
     xx = _mean(weighted_x * of_x, tile) + _BEND_INFORMATION
     yy = _mean(weighted_y * of_y, tile) + _BEND_INFORMATION
     xy = _mean(weighted_x * of_y, tile)
-    x = _mean(weighted_x * error, tile) - _BEND_INFORMATION * bend[..., 0]
-    y = _mean(weighted_y * error, tile) - _BEND_INFORMATION * bend[..., 1]
-    step = np.stack([yy * x - xy * y, xx * y - xy * x], axis=-1) / (xx * yy - xy * xy)[..., None]
-    return np.clip(bend + step, -_MOST_BENT, _MOST_BENT)
+    x = _mean(weighted_x * error, tile) - _BEND_INFORMATION * bend[0]
+    y = _mean(weighted_y * error, tile) - _BEND_INFORMATION * bend[1]
+    step = np.stack([yy * x - xy * y, xx * y - xy * x]) / (xx * yy - xy * xy)
+    further: Plane = np.clip(bend + step, -_MOST_BENT, _MOST_BENT)
+    return further
 
 
 def seen_along(along: Along) -> tuple[Plane, Plane]:
@@ -221,8 +220,9 @@ def seen_along(along: Along) -> tuple[Plane, Plane]:
     """
     motion = along.motion
     share, rest = np.float32(along.share), np.float32(1.0 - along.share)
-    straight, bend = motion.path[motion.window], motion.bend[motion.window] * (np.float32(4.0) * share * rest)
-    here = _places(*motion.path.shape[:2])[motion.window] + bend
+    window = (slice(0, 2), *motion.window)
+    straight, bend = motion.path[window], motion.bend[window] * (np.float32(4.0) * share * rest)
+    here = _places(*motion.path.shape[1:])[window] + bend
     first, first_variance = _read(motion.first, here - share * straight)
     second, second_variance = _read(motion.second, here + rest * straight)
     seen = rest * first + share * second
@@ -237,8 +237,8 @@ def seen_along(along: Along) -> tuple[Plane, Plane]:
 
 @functools.lru_cache(maxsize=4)
 def _places(height: int, width: int) -> Plane:
-    """(H, W, 2): column and row of every pixel."""
-    places = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float32)
+    """(2, H, W): column and row of every pixel."""
+    places = np.stack(np.meshgrid(np.arange(width), np.arange(height))).astype(np.float32)
     places.flags.writeable = False
     return places
 
@@ -248,10 +248,10 @@ def _read(frame: Latent, places: Plane) -> tuple[Plane, Plane]:
     value, variance = np.asarray(frame.value, np.float32), np.asarray(frame.variance, np.float32)
     if frame.ceiling is not None:
         variance = np.where(np.isfinite(frame.ceiling), np.float32(UNMEASURED), variance)
-    levels = cv2.remap(value, places, _ONE_MAP, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    unknown = float(UNMEASURED)
+    columns, rows = places
+    levels = cv2.remap(value, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     doubt = cv2.remap(
-        variance, places, _ONE_MAP, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=unknown
+        variance, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=UNMEASURED
     )
     return np.asarray(levels, np.float32), np.asarray(doubt, np.float32)
 
