@@ -28,11 +28,11 @@ from kalux.cli.times import load_times
 from kalux.display import CURVES
 from kalux.errors import InputError
 from kalux.pipeline import execute
+from kalux.plan_report import ORIGINS, plan_report
 from kalux.planning import Plan, plan
 from kalux.reconstructor import Reconstructor
 from kalux.recording import Recording
 from kalux.settings import PRESETS, Settings, from_dict, load, preset, read_toml, to_dict
-from kalux.settled import ORIGINS, settled
 from kalux.wording import how_many
 
 if TYPE_CHECKING:
@@ -363,7 +363,7 @@ def decided(
         f"{'' if contents.complete else 'more than '}{how_many(contents.events, 'event')}",
         *(
             f"{label:<11} {text}"
-            for label, text in settled(recording, planned, asked)
+            for label, text in plan_report(recording, planned, asked)
             if label != "white balance"
         ),
         *colours,
