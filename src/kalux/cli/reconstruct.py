@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from kalux.ahead import default_threads
 from kalux.cli.calibrations import add_calibration, given_calibration
 from kalux.cli.checking import Contents, check_beside
 from kalux.cli.flags import HelpSettings, add_display, add_settings, given_settings
@@ -33,6 +32,7 @@ from kalux.planning import Plan, plan
 from kalux.reconstructor import Reconstructor
 from kalux.recording import Recording
 from kalux.settings import PRESETS, Settings, from_dict, load, preset, read_toml, to_dict
+from kalux.threads import default_threads
 from kalux.wording import how_many
 
 if TYPE_CHECKING:
