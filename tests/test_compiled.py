@@ -21,7 +21,6 @@ from kalux.compiled import (
     logarithm,
     magnitude_bits,
     pack,
-    packed,
     smaller,
     unpack,
     word_at,
@@ -167,16 +166,6 @@ def test_planes_apart_begin_at_different_places_of_a_page(shape):
     assert len(begins) == 5
     planes[:] = np.arange(5)[:, None, None]
     assert all((plane == k).all() for k, plane in enumerate(planes))
-
-
-@pytest.mark.parametrize("shape", [(1, 1), (3, 5), (480, 640)])
-def test_packed_records_lie_in_one_line_each(shape):
-    records = packed(shape, np.dtype([(name, "f4") for name in "abcdefgh"]))
-    assert records.shape == shape
-    assert records.ctypes.data % 64 == 0
-    records["h"] = 1.0
-    assert (records["h"] == 1.0).all()
-    assert records.flags.c_contiguous
 
 
 @given(st.lists(st.floats(width=32), max_size=70))

@@ -72,7 +72,7 @@ def streams(draw):
 @given(data=st.data())
 @settings(max_examples=40, deadline=None)
 def test_engine_agrees_with_the_oracle(name, data):
-    """Log intensity to 1e-4, variance to 1e-4 of itself, intensity to what float32 holds."""
+    """Log intensity to 1e-4 and 5e-5 of itself, variance to 2e-4 of itself."""
     events, frames, times = data.draw(streams())
     chosen = VARIANTS[name]
     chosen = dataclasses.replace(
@@ -118,7 +118,11 @@ def test_engine_agrees_with_the_oracle(name, data):
             for place, pixel in pixels.items():
                 least = naive.kept_white(expected[i][place], pixel, t, white, offset)
                 level[place] = max(level[place], least)
-        np.testing.assert_allclose(np.log(image.intensity + offset), np.log(level + offset), atol=1e-4)
+        # Highlights are shrunk by their variance (K6), which float32 holds as far as below: more than 1e-4 in one of
+        # some thousand random streams.
+        np.testing.assert_allclose(
+            np.log(image.intensity + offset), np.log(level + offset), atol=1e-4, rtol=5e-5
+        )
         if name != "cf":
             # What float32 leaves of differences of variances: more than 1e-4 in one of some thousand random streams.
             np.testing.assert_allclose(image.variance, given + np.nan_to_num(doubt), rtol=2e-4)

@@ -15,9 +15,9 @@ from kalux.errors import FrameError, InputError, SettingsError
 from kalux.events import EVENT_DTYPE
 from kalux.models.camera import BrightTail, Camera, count_bright
 from kalux.pipeline import execute
+from kalux.plan_report import plan_report
 from kalux.planning import plan
 from kalux.settings import altered
-from kalux.settled import settled
 
 from builders import events, frame, moving_blocks, passing_by, recording, sky, textured, unlabelled
 
@@ -236,7 +236,7 @@ def test_the_refractory_period_comes_from_noise_and_can_be_given():
     assert found.dead_time == found.settings.events.refractory_period == pytest.approx(600, rel=0.02)
     assert (given.dead_time, given.settings.events.refractory_period) == (0, 700)
     assert not plan(seen, at="frames", preset="iccv2021").settings.events.refractory_period
-    told = dict(settled(seen, found, PRESETS["default"]))
+    told = dict(plan_report(seen, found, PRESETS["default"]))
     assert told["refractory"].endswith("ms (measured: noise follows other events no sooner)")
 
 

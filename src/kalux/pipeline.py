@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux import memory
-from kalux.ahead import ahead
 from kalux.calibration.values import Calibration
 from kalux.events import EventArray
 from kalux.images import Estimate, Image
@@ -24,6 +23,7 @@ from kalux.reconstructor import Reconstructor
 from kalux.recording import Recording
 from kalux.settings import Settings
 from kalux.smoothing import Backward, combine, reversed_pixels, reversed_settings
+from kalux.threads import ahead
 
 _IMAGES_AHEAD: Final = 4
 """Images that are held while those before are written: a frame takes the filter as long as ten images, and meanwhile

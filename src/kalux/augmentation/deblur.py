@@ -21,6 +21,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux import memory
 from kalux.compiled import (
     AHEAD,
     FUSED,
@@ -37,7 +38,6 @@ from kalux.compiled import (
     logarithm,
     loop,
     pack,
-    packed,
     prefetch,
     smaller,
     unpack,
@@ -159,7 +159,7 @@ def expose(
         Whether the events carry weights (`kalux.augmentation.refractory`).
     """
     height, width = thresholds[0].shape
-    pixels = packed((height * width,), EXPOSURE_PIXEL)
+    pixels = memory.empty((height * width,), EXPOSURE_PIXEL)
     touched = np.zeros(-(-len(pixels) // EXPOSED), np.bool_)
     inside = [event_words(events) for events in all_between(chunks, start, end)]
     for words in inside:

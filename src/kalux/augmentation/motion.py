@@ -31,6 +31,9 @@ _WINDOW: Final = (15, 15)
 _LEVELS: Final = 3
 """Halvings of the image: flows up to some 50 pixels are found."""
 
+_ENDS: Final = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.03)
+"""Steps that are taken for a point, and pixels below which a step is the last."""
+
 _STILL: Final = 0.25
 """Pixels of flow up to which both frames say the same at the same place."""
 
@@ -152,7 +155,7 @@ def _octets(value: Floats, dark: float, white: float) -> NDArray[np.uint8]:
 def _flow(image: NDArray[np.uint8], other: NDArray[np.uint8], points: Plane) -> Plane:
     """(N, 1, 2): by how much points of an image have moved in another; 0 where that is not found."""
     ends, found, _ = cv2.calcOpticalFlowPyrLK(
-        image, other, points, np.empty_like(points), winSize=_WINDOW, maxLevel=_LEVELS
+        image, other, points, np.empty_like(points), winSize=_WINDOW, maxLevel=_LEVELS, criteria=_ENDS
     )
     return np.where(found[..., None] == 1, ends - points, np.float32(0.0))
 

@@ -31,7 +31,6 @@ from kalux.compiled import (
     event_words,
     flat,
     loop,
-    packed,
     prefetch,
     smaller,
 )
@@ -144,7 +143,7 @@ def follow(
     before
         What was known before them.
     """
-    pixels = packed((before.newest.size,), FOLLOWED_PIXEL)
+    pixels = memory.empty((before.newest.size,), FOLLOWED_PIXEL)
     _begin_following(before.newest.reshape(-1), pixels)
     codes, counts, width = pixels.view(np.int64), pixels.view(np.float32), np.uint64(before.newest.shape[1])
     span, intervals = _KEPT * before.span, _KEPT * before.intervals

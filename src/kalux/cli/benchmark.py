@@ -172,8 +172,8 @@ def _work(plan: Plan, store: Store, jobs: list[Job], options: argparse.Namespace
 
 
 def _outcomes(jobs: list[Job], options: argparse.Namespace) -> Outcomes:
-    from kalux.ahead import cores
     from kalux.evaluation.benchmark import runners
+    from kalux.threads import cores
 
     if options.dask is not None:
         return runners.on_dask(jobs, options.dask)

@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from kalux.ahead import default_threads
 from kalux.cli.loops import OF_ALL, compiling_beside, prepare_loops, tell_of_compiling
 from kalux.cli.parser import Parser
 from kalux.cli.terminal import say
+from kalux.threads import default_threads
 
 if TYPE_CHECKING:
     from kalux.demo import Score

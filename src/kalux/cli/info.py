@@ -68,8 +68,8 @@ def settled_lines(
     name: str,
 ) -> list[str]:
     """What a reconstruction would settle, a line each; why it could not, if it could not."""
+    from kalux.plan_report import plan_report, saturation_text
     from kalux.planning import plan
-    from kalux.settled import saturation_text, settled
 
     title = f"reconstruct would use, with the preset {name}"
     if not description.frames.count:
@@ -78,7 +78,7 @@ def settled_lines(
         return [title, "  nothing can be estimated without exposure times; give --exposure"]
     asked = settings if calibration is None else calibration.apply(settings)
     made = plan(recording, at="frames", settings=asked, calibration=calibration)
-    rows = settled(recording, made, asked)
+    rows = plan_report(recording, made, asked)
     if made.ceiling is None:
         rows.append(("saturation", saturation_text(recording, made, asked)))
     width = max(len(label) for label, _ in rows)

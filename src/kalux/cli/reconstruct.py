@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from kalux.ahead import default_threads
 from kalux.cli.calibrations import add_calibration, given_calibration
 from kalux.cli.checking import Contents, check_beside
 from kalux.cli.flags import HelpSettings, add_display, add_settings, given_settings
@@ -28,11 +27,12 @@ from kalux.cli.times import load_times
 from kalux.display import CURVES
 from kalux.errors import InputError
 from kalux.pipeline import execute
+from kalux.plan_report import ORIGINS, plan_report
 from kalux.planning import Plan, plan
 from kalux.reconstructor import Reconstructor
 from kalux.recording import Recording
 from kalux.settings import PRESETS, Settings, from_dict, load, preset, read_toml, to_dict
-from kalux.settled import ORIGINS, settled
+from kalux.threads import default_threads
 from kalux.wording import how_many
 
 if TYPE_CHECKING:
@@ -363,7 +363,7 @@ def decided(
         f"{'' if contents.complete else 'more than '}{how_many(contents.events, 'event')}",
         *(
             f"{label:<11} {text}"
-            for label, text in settled(recording, planned, asked)
+            for label, text in plan_report(recording, planned, asked)
             if label != "white balance"
         ),
         *colours,

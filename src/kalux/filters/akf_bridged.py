@@ -33,7 +33,6 @@ from kalux.compiled import (
     larger,
     loop,
     pack,
-    packed,
     prefetch,
     smaller,
     unpack,
@@ -137,7 +136,7 @@ def begin(segment: BridgedSegment, state: State) -> Cursor:
     """The cursor at the start of a segment: L stays, L^A is the segment's. The clock's origin is the start."""
     clock: Clock = memory.empty(state.newest.shape, np.int32)
     clock[:] = state.newest
-    pixels, steps = packed(clock.shape, STATE_PIXEL), packed(clock.shape, STEP_PIXEL)
+    pixels, steps = memory.empty(clock.shape, STATE_PIXEL), memory.empty(clock.shape, STEP_PIXEL)
     polarity = memory.empty(clock.shape, np.int8)
     polarity[:] = 0
     floor = state.log_intensity if segment.floor is None else segment.floor

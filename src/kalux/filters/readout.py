@@ -13,6 +13,7 @@ import numpy as np
 from numba.core import types
 from numpy.typing import NDArray
 
+from kalux import memory
 from kalux.compiled import (
     FUSED,
     ONE,
@@ -22,7 +23,6 @@ from kalux.compiled import (
     larger,
     logarithm,
     loop,
-    packed,
     smaller,
     word_at,
     zeros,
@@ -281,10 +281,10 @@ def _ring(pitch: int) -> _Ring:
     # one pitch further ahead.
     count = 4 * pitch + 1
     rows = 0, 2 * count, 4 * count, 8 * count, 12 * count, 12 * count + 4, 12 * count + 6
-    memory = packed((rows[-1] * _ROW,), np.dtype(np.float32))  # all rows begin where lines of the cache do
-    memory[:] = 0.0
+    buffer = memory.empty((rows[-1] * _ROW,))  # aligned, so that all rows begin with a cache line
+    buffer[:] = 0.0
     states, weights, distances, similarities, differences, averaged = (
-        memory[begin * _ROW : end * _ROW] for begin, end in itertools.pairwise(rows)
+        buffer[begin * _ROW : end * _ROW] for begin, end in itertools.pairwise(rows)
     )
     states.reshape(count, 2, _ROW)[:, 1] = _UNKNOWN
     spans = np.empty((count, 2), np.int64)

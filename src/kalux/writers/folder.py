@@ -10,9 +10,9 @@ from io import FileIO
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from kalux.ahead import InOrder
 from kalux.display import ToneState
 from kalux.errors import OutputError
+from kalux.threads import InOrder
 from kalux.wording import how_many
 from kalux.writers.base import ImageLike, Writer
 from kalux.writers.files import Claim, output_errors, remove_quietly, write_within

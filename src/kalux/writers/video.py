@@ -18,7 +18,6 @@ from av.container import OutputContainer
 from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
-from kalux.ahead import InOrder
 from kalux.display import (
     DisplaySettings,
     Float32,
@@ -32,6 +31,7 @@ from kalux.display import (
 )
 from kalux.errors import InputError, MissingDependencyError, OutputError, SettingsError
 from kalux.models.colour import LUMINANCE, luminance
+from kalux.threads import InOrder
 from kalux.wording import how_many
 from kalux.writers.base import ImageLike, Writer
 from kalux.writers.files import Claim, output_errors

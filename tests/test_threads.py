@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from kalux.ahead import MOST_THREADS, InOrder, ahead, default_threads
+from kalux.threads import MOST_THREADS, InOrder, ahead, default_threads
 
 
 @pytest.fixture(autouse=True)

@@ -8,16 +8,16 @@ import re
 import numpy as np
 
 from kalux import PRESETS, Recording
+from kalux.plan_report import plan_report
 from kalux.planning import plan
 from kalux.settings import from_dict
-from kalux.settled import settled
 
 from builders import moving_blocks, passing_by, textured
 
 
 def rows_of(recording, **groups):
     asked = from_dict(groups, PRESETS["default"])
-    return dict(settled(recording, plan(recording, at="frames", settings=asked), asked))
+    return dict(plan_report(recording, plan(recording, at="frames", settings=asked), asked))
 
 
 def test_what_the_settings_state_is_given():

@@ -1,4 +1,4 @@
-"""What a reconstruction settles before it begins, for people: values with their units, and where they come from."""
+"""A plan as text: the settings that it filled in, with their units, and where they come from."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ _GIVEN: Final = "given"
 _USUAL: Final = ORIGINS["assumed"]
 
 
-def settled(recording: Recording, plan: Plan, asked: Settings) -> list[tuple[str, str]]:
-    """What the settings left to the recording: name, value with its unit and where that comes from.
+def plan_report(recording: Recording, plan: Plan, asked: Settings) -> list[tuple[str, str]]:
+    """What a plan found in the recording, line by line: name, and value with its unit and where that comes from.
 
     Parameters
     ----------
@@ -108,8 +108,8 @@ def _of_frames(recording: Recording, plan: Plan, asked: Settings) -> Iterator[tu
 def saturation_text(recording: Recording, plan: Plan, asked: Settings) -> str:
     """From which level on pixels count as clipped, and where the recording shows that they are.
 
-    For a plan without a ceiling, which `settled` tells. Parameters are those of `settled`; it looks at up to 80 frames
-    once more (`kalux.calibration.levels`).
+    For a plan without a ceiling, which `plan_report` tells. Parameters are those of `plan_report`; it looks at up to 80
+    frames once more (`kalux.calibration.levels`).
     """
     used = plan.settings.camera.clipped_from
     how = "the usual" if asked.camera.saturation is None else _GIVEN
