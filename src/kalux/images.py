@@ -238,10 +238,10 @@ def _look_along(
     intensity: NDArray[np.float32], variance: NDArray[np.float32], along: Along, log_offset: float
 ) -> None:
     """Join an image with what the frames around show along the paths of what moves (K16). In place."""
-    here = along.motion.window
     offset = np.float32(log_offset)
-    level, variance[here] = joined_along(along, np.log(intensity[here] + offset), variance[here])
-    intensity[here] = np.maximum(np.exp(level) - offset, np.float32(0.0))
+    for window, level, left in list(joined_along(along, np.log(intensity + offset), variance)):
+        intensity[window] = np.maximum(np.exp(level) - offset, np.float32(0.0))
+        variance[window] = left
 
 
 def _above_bounds(

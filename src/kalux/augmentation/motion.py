@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Iterator
 from typing import Any, Final, NamedTuple
 
 import cv2
@@ -25,11 +26,15 @@ Plane = NDArray[np.float32]
 _COLUMNS: Final = 44
 """Of the points whose flow is followed, on any sensor: 8 pixels apart on a DAVIS346, 15 at 640x480."""
 
-_WINDOW: Final = (15, 15)
+_WINDOW: Final = (11, 11)
 """Pixels around a point that are looked for in the other frame."""
 
 _LEVELS: Final = 3
 """Halvings of the image: flows up to some 50 pixels are found."""
+
+_CHANGED: Final = 2.0
+"""Mean squared difference of the frames around a point, in units of its variance by their noise: from there on it is
+followed."""
 
 _ENDS: Final = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.03)
 """Steps that are taken for a point, and pixels below which a step is the last."""
@@ -78,6 +83,16 @@ _LEAST_GAIN: Final = 0.02
 """Where no pixel is taken so far towards what is seen, the frames are not looked at."""
 
 
+_TILE: Final = (32, 32)
+"""Rows and columns that are looked at along the paths if anything is seen there."""
+
+_MARGIN: Final = 4
+"""Pixels around a window that what is seen in it depends on: half of `_EVIDENCE`, twice."""
+
+Window = tuple[slice, slice]
+"""Rows and columns."""
+
+
 class Motion(NamedTuple):
     """Two frames, and the paths of what moves from one to the other.
 
@@ -89,15 +104,15 @@ class Motion(NamedTuple):
         (2, H, W) float32: columns and rows from ``first`` to ``second`` of what is at a pixel half-way.
     bend
         (2, H, W) float32: how far both ends of the path are shifted for what is at a pixel half-way.
-    window
-        Rows and columns outside which nothing is seen that is not known.
+    windows
+        Strips of rows, and the columns of each, outside which nothing is seen that is not known.
     """
 
     first: Latent
     second: Latent
     path: Plane
     bend: Plane
-    window: tuple[slice, slice]
+    windows: tuple[Window, ...]
 
 
 class Along(NamedTuple):
@@ -127,11 +142,15 @@ def find_path(first: Latent, second: Latent, dark: float, white: float) -> Plane
     height, width = first.value.shape
     columns = max(min(_COLUMNS, width // 8), 1)
     rows = max(round(columns * height / width), 1)
-    points = np.stack(np.meshgrid(_centres(columns, width), _centres(rows, height)), axis=-1).reshape(
-        -1, 1, 2
-    )
+    x, y = _centres(columns, width), _centres(rows, height)
+    points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 1, 2)
+    moved = np.square(first.value - second.value) / (first.variance + second.variance)
+    followed = _mean(moved, _WINDOW)[np.ix_(y.astype(int), x.astype(int))].reshape(-1) > _CHANGED
+    if not followed.any():
+        return None
     image, following = (_octets(frame.value, dark, white) for frame in (first, second))
-    flow = _flow(image, following, points) - _flow(following, image, points)
+    flow = np.zeros_like(points)
+    flow[followed] = _flow(image, following, points[followed]) - _flow(following, image, points[followed])
     grid = np.ascontiguousarray(np.moveaxis(flow.reshape(rows, columns, 2) / np.float32(2.0), -1, 0))
     steady = [cv2.medianBlur(part, 5) for part in grid]
     if float(np.abs(steady).max()) < _STILL:
@@ -180,23 +199,31 @@ def bent(first: Latent, second: Latent, path: Plane, level: Floats, variance: Fl
     height, width = path.shape[1:]
     level, variance = np.asarray(level, np.float32), np.asarray(variance, np.float32)
     side = 2 * (2 * width // min(_COLUMNS, width)) - 1
-    motion = Motion(first, second, path, np.zeros_like(path), (slice(0, height), slice(0, width)))
+    whole = slice(0, height), slice(0, width)
+    motion = Motion(first, second, path, np.zeros_like(path), (whole,))
     for _ in range(_BENDS):
-        seen, doubt = seen_along(Along(motion, 0.5))
+        seen, doubt = seen_along(Along(motion, 0.5), whole)
         motion = motion._replace(
             bend=_bent_further(motion.bend, seen, level - seen, variance + doubt, (side, side))
         )
-    gain = _gain(*seen_along(Along(motion, 0.5)), level, variance, 1.0)
-    told = np.argwhere(_mean(gain, _EVIDENCE) > _LEAST_GAIN)
-    if len(told) == 0:
-        return None
-    margin = math.ceil(float(np.abs(path).max()) / 2.0) + max(
-        _EVIDENCE
-    )  # it moves to either side until a frame
-    (top, left), (bottom, right) = told.min(axis=0) - margin, told.max(axis=0) + margin + 1
-    return motion._replace(
-        window=(slice(max(int(top), 0), int(bottom)), slice(max(int(left), 0), int(right)))
-    )
+    gain = _gain(*seen_along(Along(motion, 0.5), whole), level, variance, 1.0)
+    moving = np.abs(path).max(axis=0)
+    told = (_mean(gain, _EVIDENCE) > _LEAST_GAIN) & (moving > _STILL)
+    # What is seen half-way moves on until the next frame.
+    reach = np.ones((2 * math.ceil(float(moving.max()) / 2.0) + 1,) * 2, np.uint8)
+    windows = tuple(_windows(np.asarray(cv2.dilate(told.astype(np.uint8), reach), np.bool_)))
+    return motion._replace(windows=windows) if windows else None
+
+
+def _windows(told: NDArray[np.bool_]) -> Iterator[Window]:
+    """Tiles in which any pixel is told, those beside each other together."""
+    (height, width), (rows, columns) = told.shape, _TILE
+    for top in range(0, height, rows):
+        strip = slice(top, min(top + rows, height))
+        tiles = np.flatnonzero(np.logical_or.reduceat(told[strip].any(axis=0), np.arange(0, width, columns)))
+        for run in np.split(tiles, np.flatnonzero(np.diff(tiles) > 1) + 1):
+            if len(run):
+                yield strip, slice(int(run[0]) * columns, min((int(run[-1]) + 1) * columns, width))
 
 
 def _bent_further(bend: Plane, seen: Plane, error: Plane, variance: Plane, tile: tuple[int, int]) -> Plane:
@@ -215,24 +242,24 @@ def _bent_further(bend: Plane, seen: Plane, error: Plane, variance: Plane, tile:
     return further
 
 
-def seen_along(along: Along) -> tuple[Plane, Plane]:
-    """What both frames show along the paths, in the window: log intensity, and its variance.
+def seen_along(along: Along, window: Window) -> tuple[Plane, Plane]:
+    """What both frames show along the paths, in a window: log intensity, and its variance.
 
     With s the share, the mean of both is weighted by 1 - s and s. It is the less certain the more the frames disagree
     there, the finer the texture is that is read between its pixels, and the better they agree where nothing moves.
     """
     motion = along.motion
     share, rest = np.float32(along.share), np.float32(1.0 - along.share)
-    window = (slice(0, 2), *motion.window)
-    straight, bend = motion.path[window], motion.bend[window] * (np.float32(4.0) * share * rest)
-    here = _places(*motion.path.shape[1:])[window] + bend
+    both = (slice(0, 2), *window)
+    straight, bend = motion.path[both], motion.bend[both] * (np.float32(4.0) * share * rest)
+    here = _places(*motion.path.shape[1:])[both] + bend
     first, first_variance = _read(motion.first, here - share * straight)
     second, second_variance = _read(motion.second, here + rest * straight)
     seen = rest * first + share * second
     doubt = _DISAGREEMENT * _mean(np.square(first - second), _TEXTURE) + _RESAMPLING
     doubt += _FINE_RESAMPLING * _mean(np.square(seen - _mean(seen, _TEXTURE)), _TEXTURE)
     doubt += rest * rest * first_variance + share * share * second_variance
-    unmoved = motion.first.value[motion.window] - motion.second.value[motion.window]
+    unmoved = motion.first.value[window] - motion.second.value[window]
     unexplained = _mean(np.square(first - second), _EVIDENCE)
     unexplained /= np.maximum(_mean(np.square(unmoved), _EVIDENCE), _RESAMPLING)
     return seen, doubt / np.maximum(np.float32(1.0) - unexplained, _LEAST_MOVING)
@@ -272,8 +299,8 @@ def _gain(seen: Plane, doubt: Plane, level: Plane, variance: Plane, between: flo
     return gain
 
 
-def joined_along(along: Along, level: Plane, variance: Plane) -> tuple[Plane, Plane]:
-    """An image joined with what is seen along the paths, in the window: log intensity, and its variance.
+def joined_along(along: Along, level: Plane, variance: Plane) -> Iterator[tuple[Window, Plane, Plane]]:
+    """An image joined with what is seen along the paths, where anything is: log intensity, and its variance.
 
     With s the share, what is seen counts 4 s (1 - s) times: at a frame the filter knows the frame itself.
 
@@ -282,8 +309,25 @@ def joined_along(along: Along, level: Plane, variance: Plane) -> tuple[Plane, Pl
     along
         The paths, and the share.
     level, variance
-        Log intensity and its variance in the window.
+        (H, W): log intensity and its variance.
     """
-    seen, doubt = seen_along(along)
-    gain = _gain(seen, doubt, level, variance, 4.0 * along.share * (1.0 - along.share))
-    return level + gain * (seen - level), variance * (np.float32(1.0) - gain)
+    between = 4.0 * along.share * (1.0 - along.share)
+    for window in along.motion.windows:
+        wider, inside = _widened(window, level.shape)
+        seen, doubt = seen_along(along, wider)
+        before, unsure = level[wider], variance[wider]
+        gain = _gain(seen, doubt, before, unsure, between)[inside]
+        yield (
+            window,
+            before[inside] + gain * (seen - before)[inside],
+            unsure[inside] * (np.float32(1.0) - gain),
+        )
+
+
+def _widened(window: Window, shape: tuple[int, ...]) -> tuple[Window, Window]:
+    """A window with its margin, as far as the image goes, and the window within that."""
+    wider = [
+        slice(max(s.start - _MARGIN, 0), min(s.stop + _MARGIN, n)) for s, n in zip(window, shape, strict=True)
+    ]
+    inside = [slice(s.start - w.start, s.stop - w.start) for s, w in zip(window, wider, strict=True)]
+    return (wider[0], wider[1]), (inside[0], inside[1])

@@ -19,11 +19,10 @@ from kalux.calibration.intervals import intervals
 from kalux.compiled import empty, event_column, event_row, event_words, loop, smaller, zeros
 from kalux.event_slices import all_between
 from kalux.events import EventArray
-from kalux.filters.shots import Shot, take_shot
+from kalux.filters.shots import Shot
 from kalux.frames import Frame
-from kalux.models.camera import Camera
 from kalux.recording import Recording
-from kalux.settings import CameraSettings, chosen_response
+from kalux.settings import CameraSettings
 
 Array = NDArray[np.float64]
 
@@ -136,7 +135,9 @@ def estimate_frame_noise(
 def usual_noise(recording: Recording, camera: CameraSettings) -> tuple[float, float]:
     """Read and shot noise where nothing tells them: the usual at half of white, in the dark what its pixels allow.
 
-    Whatever moves, pixels change by their noise at least: from 0.01 to 0.02 of white it is no more than they do.
+    Whatever moves, pixels change by their noise at least: from 0.01 to 0.02 of white it is no more than those do that
+    see no event, nor the four beside, or than all do where these are too few. Where nothing is still the rounding is
+    another one in every frame, so that its standard deviation is the least.
 
     Parameters
     ----------
@@ -150,20 +151,28 @@ def usual_noise(recording: Recording, camera: CameraSettings) -> tuple[float, fl
     ExposureError
         If the frames' exposures are not known.
     """
-    usual = camera.usual_frame_noise
-    model = Camera.named(chosen_response(camera.response, recording.response), camera.clipped_from)
-    reference = recording.longest_exposure
-    frames = itertools.islice(recording.frames(), _MIN_FRAMES)
-    found = []
-    for first, second in itertools.pairwise(take_shot(frame, model, reference) for frame in frames):
-        level, difference, usable, dark = _beyond_neighbours(first, second)
-        seen = difference[usable & ~_near(dark) & (level < 2 * _DARKEST)]
-        if 0.9 < first.white / second.white < 1.1 and len(seen) >= _LEAST:
-            found.append(trimmed_variance(seen) / 2)
+    usual, cross = camera.usual_frame_noise, _SURROUNDINGS[-1]
+    of_silent: list[float] = []
+    of_all: list[float] = []
+    for interval in intervals(recording, camera, margin=recording.longest_exposure, most_frames=_MIN_FRAMES):
+        if not 0.9 < interval.first.white / interval.second.white < 1.1:
+            continue
+        level, difference, usable, dark = _beyond_neighbours(interval.first, interval.second)
+        low = usable & ~dark & (level < 2 * _DARKEST)
+        busy = _busy(all_between(interval.chunks, interval.first.start, interval.second.end), level.shape)
+        silent = low & (cv2.dilate(busy, cross.shape) == 0)
+        for chosen, least, into in (
+            (low & ~_near(dark), _LEAST, of_all),
+            (silent, cross.least, of_silent),
+        ):
+            if np.count_nonzero(chosen) >= least:
+                into.append(trimmed_variance(difference[chosen]) / 2)
+    found = of_silent or of_all
     if not found:
         return usual, 0.0
     changes = float(np.sqrt(np.median(found)))
-    read = min(max(changes, rounding_error(next(iter(recording.frames()))), _LEAST_READ), usual)
+    rounding = rounding_error(next(iter(recording.frames()))) / 3**0.5
+    read = min(max(changes, rounding, _LEAST_READ), usual)
     return read, (usual**2 - read**2) / 0.5
 
 
