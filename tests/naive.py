@@ -1,4 +1,4 @@
-"""The slow oracle: float64, one pixel at a time, the paper's equations (and docs/equations.md, K1 to K15) as written.
+"""The slow oracle: float64, one pixel at a time, the paper's equations (and docs/equations.md, K1 to K16) as written.
 
 Nothing here is incremental: L^A(t) is summed from the events anew at every t, integrals are taken by Gauss-Legendre
 quadrature where a closed form would repeat the code under test. Lookahead mode only; 8-bit frames. The paper's
@@ -820,3 +820,58 @@ def reconstruct(events, frames, sensor_size, settings, times):
             )
     expected = np.array([unshown(every, settings, frames, t) for t in times])
     return every, out[0], out[1], out[2:4], out[4].astype(bool), expected
+
+
+def joined_along(first, second, path, bend, share, level, variance, between):
+    """L and its variance joined with what both frames show along the paths (K16); ``first``, ``second``: L and V."""
+    height, width = level.shape
+    seen, doubt, apart = np.empty(level.shape), np.empty(level.shape), np.empty(level.shape)
+    for row, column in np.ndindex(height, width):
+        x = column + 4 * share * (1 - share) * bend[0, row, column]
+        y = row + 4 * share * (1 - share) * bend[1, row, column]
+        step_x, step_y = path[0, row, column], path[1, row, column]
+        a = resampled(*first, x - share * step_x, y - share * step_y)
+        b = resampled(*second, x + (1 - share) * step_x, y + (1 - share) * step_y)
+        seen[row, column] = (1 - share) * a[0] + share * b[0]
+        doubt[row, column] = (1 - share) ** 2 * a[1] + share**2 * b[1]
+        apart[row, column] = (a[0] - b[0]) ** 2
+    fine = (seen - around(seen, 1)) ** 2
+    doubt += 0.25 * around(apart, 1) + 5e-4 + 0.1 * around(fine, 1)
+    unexplained = around(apart, 2) / np.maximum(around((first[0] - second[0]) ** 2, 2), 5e-4)
+    doubt /= np.maximum(1 - unexplained, 1e-6)
+    contradiction = around((level - seen) ** 2 / (variance + doubt), 2)
+    trust = between / (doubt * (1 + 0.5 * contradiction) ** 2)
+    return (level / variance + seen * trust) / (1 / variance + trust), 1 / (1 / variance + trust)
+
+
+def resampled(value, variance, x, y):
+    """Between the pixels: Keys' cubic (a = -3/4) of the values, linear of the variances; unmeasured outside."""
+    height, width = value.shape
+    column, row = int(np.floor(x)), int(np.floor(y))
+    level = doubt = 0.0
+    for i, j in np.ndindex(4, 4):
+        r, c = row - 1 + i, column - 1 + j
+        inside = value[min(max(r, 0), height - 1), min(max(c, 0), width - 1)]
+        level += keys(y - r) * keys(x - c) * inside
+        known = variance[r, c] if 0 <= r < height and 0 <= c < width else 2.0**40
+        doubt += max(1 - abs(y - r), 0) * max(1 - abs(x - c), 0) * known
+    return level, doubt
+
+
+def keys(d):
+    d, a = abs(d), -0.75
+    if d <= 1:
+        return (a + 2) * d**3 - (a + 3) * d**2 + 1
+    return a * (d**3 - 5 * d**2 + 8 * d - 4) if d < 2 else 0.0
+
+
+def around(values, reach):
+    """Mean of the square around every pixel; outside, the image is mirrored at its outermost pixels."""
+    wide = np.pad(values, reach, mode="reflect")
+    size = 2 * reach + 1
+    return np.array(
+        [
+            [wide[row : row + size, column : column + size].mean() for column in range(values.shape[1])]
+            for row in range(values.shape[0])
+        ]
+    )

@@ -175,12 +175,32 @@ def test_what_is_forgotten_cannot_be_read_and_is_freed():
     middle = (stream.frames[1].middle + stream.frames[2].middle) // 2
     live.forget(middle)
     assert live.begin_time == middle
-    assert len(live._events) == np.sum(stream.events["t"] > middle)
+    assert len(live._events) == np.sum(
+        stream.events["t"] > stream.frames[1].middle
+    )  # the segment's, to go back in it
     with pytest.raises(InputError, match=r"forget\(\) has freed"):
         live.read(middle - 1)
     assert_same(live.read(middle), filled(stream).read(middle))
     live.forget(middle - 5_000)  # an earlier promise is kept already
     assert live.begin_time == middle
+    later = live.read(middle + 2_000)
+    assert_same(live.read(middle + 1_000), filled(stream).read(middle + 1_000))
+    assert_same(live.read(middle + 2_000), later)
+
+
+def test_after_the_last_frame_what_is_forgotten_lets_reads_go_forward_only():
+    """Events that led to an earlier image are gone: it would be another one."""
+    live = engine((1, 1))
+    live.push_frame(frame(100, 0, 10_000))
+    live.push_events(pixel_events([12_000, 22_000, 32_000, 42_000], [1, 1, 0, 1]))
+    live.finish()
+    expected = live.read(25_000)
+    live.forget(20_000)
+    assert_same(live.read(25_000), expected)
+    live.read(35_000)
+    with pytest.raises(InputError, match="reads can then only go forward"):
+        live.read(25_000)
+    live.read(36_000)
 
 
 def test_nothing_is_forgotten_that_is_not_final():

@@ -154,6 +154,7 @@ class Reconstructor:
         self._frames_ended = False
         self._finished = False
         self._earliest: int | None = None  # what `forget` was told
+        self._freed: int | None = None  # events of the current segment up to this time are gone
 
     # Pushing.
 
@@ -268,7 +269,8 @@ class Reconstructor:
     def forget(self, t: int) -> None:
         """Promise not to read before ``t`` (us), so that the memory of what led there can be freed.
 
-        Frees what is final; reading frees in the same way, but only up to the segment that is read.
+        Frees what is final; reading frees in the same way, but only up to the segment that is read. Where no frame is
+        to come (`end_frames`), reads can then only go forward.
 
         Raises
         ------
@@ -288,12 +290,13 @@ class Reconstructor:
         if begin is None or limit <= begin:
             return
         progress = self._progress_to(limit)
-        if progress.ready or (self._frames_ended and len(self._shots) == 1):  # no frame will change it
-            if self._moment(progress, limit).after is not None and limit < progress.segment.end:
-                self._look_for_motion(progress)
+        endless = self._frames_ended and len(self._shots) == 1
+        if progress.ready or endless:  # no frame will change it
+            self._earliest = limit
+        if endless:
             self._take(progress, limit)
             self._events.drop(progress.latest)
-            self._earliest = limit
+            self._freed = limit
 
     # Reading.
 
@@ -461,7 +464,7 @@ class Reconstructor:
         start = self._start_time()
         if start is None:
             return self._shots[0].start if self._shots else None
-        return start if self._earliest is None else max(start, self._earliest)
+        return start if self._freed is None else max(start, self._freed)
 
     def _require_open(self) -> None:
         if self._finished:
@@ -480,7 +483,13 @@ class Reconstructor:
         return None
 
     def _progress_to(self, t: int) -> _Progress:
-        """The segment that holds ``t``, with a cursor that has taken no event after it; commits those before."""
+        """The segment that holds ``t``, with a cursor that has taken no event after it; commits those before.
+
+        Raises
+        ------
+        InputError
+            If events that lead to ``t`` are gone.
+        """
         if self._state is None:
             if not self._is_complete(self._shots[0]):
                 return self._provisional(t)
@@ -488,7 +497,14 @@ class Reconstructor:
         while True:
             progress = self._open()
             if t <= progress.segment.end:
-                return progress if t >= progress.latest else self._restart(progress)
+                if t >= progress.latest:
+                    return progress
+                if self._freed is not None:
+                    raise InputError(
+                        f"read: {t} us lies before an event at {progress.latest} us that was read, and forget() has "
+                        "freed what led there: after the last frame, reads can then only go forward"
+                    )
+                return self._restart(progress)
             self._take(progress, progress.segment.end)
             self._commit(progress)
 

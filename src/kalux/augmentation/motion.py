@@ -29,6 +29,9 @@ _COLUMNS: Final = 44
 _WINDOW: Final = (11, 11)
 """Pixels around a point that are looked for in the other frame."""
 
+_LEAST_SIDE: Final = 32
+"""Rows and columns without which there is not much to follow."""
+
 _LEVELS: Final = 3
 """Halvings of the image: flows up to some 50 pixels are found."""
 
@@ -137,10 +140,12 @@ def find_path(first: Latent, second: Latent, dark: float, white: float) -> Plane
 
     Returns
     -------
-    The path; None: nothing moves.
+    The path; None: nothing moves, or the sensor has less than 32 rows or columns.
     """
     height, width = first.value.shape
-    columns = max(min(_COLUMNS, width // 8), 1)
+    if min(height, width) < _LEAST_SIDE:
+        return None
+    columns = min(_COLUMNS, width // 8)
     rows = max(round(columns * height / width), 1)
     x, y = _centres(columns, width), _centres(rows, height)
     points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 1, 2)
@@ -198,7 +203,7 @@ def bent(first: Latent, second: Latent, path: Plane, level: Floats, variance: Fl
     """
     height, width = path.shape[1:]
     level, variance = np.asarray(level, np.float32), np.asarray(variance, np.float32)
-    side = 2 * (2 * width // min(_COLUMNS, width)) - 1
+    side = 4 * (width // min(_COLUMNS, width // 8)) - 1
     whole = slice(0, height), slice(0, width)
     motion = Motion(first, second, path, np.zeros_like(path), (whole,))
     for _ in range(_BENDS):

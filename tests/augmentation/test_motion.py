@@ -1,0 +1,208 @@
+"""Frames seen along the paths of what moves between them."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kalux import PRESETS, Frame, Reconstructor
+from kalux.augmentation.bridge import UNMEASURED, Latent
+from kalux.augmentation.motion import Along, Motion, bent, find_path, joined_along
+from kalux.events import make_events
+from kalux.settings import altered
+
+import naive
+
+SHAPE = (72, 96)
+INSIDE = (slice(16, -16), slice(16, -16))
+
+
+def texture(seed, x=0.0, y=0.0, shape=SHAPE, scale=3.0):
+    """Smooth noise of standard deviation 0.5, whose pixel (row, column) is at (row - y, column - x) of the first."""
+    wide = cv2.GaussianBlur(np.random.default_rng(seed).normal(size=(160, 200)), (0, 0), scale)
+    wide = (0.5 * wide / wide.std() - 1.0).astype(np.float32)
+    rows, columns = np.mgrid[: shape[0], : shape[1]].astype(np.float32) + 40
+    return cv2.remap(wide, columns - np.float32(x), rows - np.float32(y), cv2.INTER_CUBIC)
+
+
+def frame_of(value, variance=1e-4):
+    return Latent(value, np.full(value.shape, variance, np.float32))
+
+
+@pytest.mark.parametrize(("x", "y"), [(3.0, 0.0), (-1.5, 4.0), (6.0, -5.0), (0.0, 0.5)])
+def test_the_path_is_what_a_texture_moves_by(x, y):
+    path = find_path(frame_of(texture(0)), frame_of(texture(0, x, y)), -3.5, 1.0)
+    np.testing.assert_allclose(np.median(path[0][INSIDE]), x, atol=0.1)
+    np.testing.assert_allclose(np.median(path[1][INSIDE]), y, atol=0.1)
+    assert path.shape == (2, *SHAPE)
+
+
+def test_nothing_moves_where_frames_differ_by_their_noise():
+    first = texture(0)
+    noise = np.random.default_rng(1).normal(0, 0.05, (2, *SHAPE)).astype(np.float32)
+    frames = [frame_of(first + part, 0.05**2) for part in noise]
+    assert find_path(*frames, -3.5, 1.0) is None
+
+
+def test_nothing_is_followed_where_frames_measure_nothing():
+    frames = [frame_of(texture(0, x), UNMEASURED) for x in (0.0, 3.0)]
+    assert find_path(*frames, -3.5, 1.0) is None
+
+
+def test_a_sensor_of_a_few_rows_is_not_followed():
+    frames = [frame_of(texture(0, x, shape=(31, 200))) for x in (0.0, 3.0)]
+    assert find_path(*frames, -3.5, 1.0) is None
+
+
+@pytest.mark.parametrize("late", [-0.8, 0.5, 1.2])
+def test_the_path_is_bent_to_the_image_half_way(late):
+    """A texture that moves by 4 pixels, but is not where 2 are half-way: the bend finds it, and it is seen there."""
+    first, second = frame_of(texture(0)), frame_of(texture(0, 4.0))
+    level, variance = texture(0, 2.0 + late), np.full(SHAPE, 1e-3, np.float32)
+    motion = bent(first, second, find_path(first, second, -3.5, 1.0), level, variance)
+    np.testing.assert_allclose(np.median(motion.bend[0][INSIDE]), -late, atol=0.1)
+    np.testing.assert_allclose(np.median(motion.bend[1][INSIDE]), 0.0, atol=0.05)
+    noisy = level + np.random.default_rng(1).normal(0, 0.1, SHAPE).astype(np.float32)
+    joined, left = whole(Along(motion, 0.5), noisy, np.full(SHAPE, 0.01, np.float32))
+    error = np.sqrt(np.mean(np.square(joined - level)[INSIDE]))
+    assert error < 0.05
+    assert (left <= 0.01).all()
+
+
+def test_a_wrong_path_is_not_believed():
+    """Frames that have nothing to do with the image leave it as it is."""
+    first, second = frame_of(texture(0)), frame_of(texture(1))
+    level, variance = texture(2), np.full(SHAPE, 1e-3, np.float32)
+    path = find_path(first, second, -3.5, 1.0)
+    motion = bent(first, second, path, level, variance)
+    if motion is not None:
+        joined, _ = whole(Along(motion, 0.5), level, variance)
+        assert np.sqrt(np.mean(np.square(joined - level))) < 0.01
+
+
+def whole(along, level, variance):
+    """`joined_along` of the whole image."""
+    level, variance = level.copy(), variance.copy()
+    for window, seen, left in list(joined_along(along, level, variance)):
+        level[window], variance[window] = seen, left
+    return level, variance
+
+
+@given(
+    seed=st.integers(0, 1000), share=st.sampled_from([0.25, 0.5, 0.75]), moved=st.sampled_from([0, 1, 2.5])
+)
+@settings(max_examples=10, deadline=None)
+def test_it_is_the_oracle(seed, share, moved):
+    """To what float32 and OpenCV's tables, of 32 places between two pixels, leave."""
+    rng = np.random.default_rng(seed)
+    shape = (14, 17)
+    first, second = (texture(seed, x, shape=shape) for x in (0.0, moved))
+    variances = rng.uniform(1e-4, 1e-2, (2, *shape)).astype(np.float32)
+    variances[:, 3:5, 2:6] = UNMEASURED
+    path, bend = rng.integers(-32, 33, (2, 2, *shape)).astype(np.float32) / 8
+    level = texture(seed, moved / 2, shape=shape) + rng.normal(0, 0.05, shape).astype(np.float32)
+    variance = rng.uniform(1e-4, 1e-2, shape).astype(np.float32)
+    frames = Latent(first, variances[0]), Latent(second, variances[1])
+    motion = Motion(*frames, path, bend, ((slice(0, 14), slice(0, 17)),))
+    found = whole(Along(motion, share), level, variance)
+    between = 4 * share * (1 - share)
+    expected = naive.joined_along(
+        *((frame.value.astype(float), frame.variance.astype(float)) for frame in frames),
+        path,
+        bend,
+        share,
+        level.astype(float),
+        variance.astype(float),
+        between,
+    )
+    np.testing.assert_allclose(found[0], expected[0], atol=1e-4)
+    np.testing.assert_allclose(found[1], expected[1], rtol=2e-3)
+
+
+@given(told=st.lists(st.tuples(st.integers(0, 129), st.integers(0, 199)), min_size=1, max_size=6))
+@settings(deadline=None)
+def test_windows_hold_what_is_told_once(told):
+    """A motion that is seen in a few places only is looked at there, and in no pixel twice."""
+    from kalux.augmentation.motion import _windows
+
+    marks = np.zeros((130, 200), bool)
+    marks[tuple(np.transpose(told))] = True
+    times = np.zeros(marks.shape, int)
+    for window in _windows(marks):
+        times[window] += 1
+        assert marks[window].any()
+    assert times.max() == 1
+    assert (times[marks] == 1).all()
+
+
+# --- the engine ----------------------------------------------------------------------------------------------
+
+
+def moving_recording():
+    """Frames of a texture that accelerates to the right, 3 to 8 pixels a frame, and its events of steps of 0.3."""
+    places = np.cumsum(np.linspace(0.0, 0.8, 100)) / 4
+    levels = [texture(0, place) for place in places]
+    frames = [
+        Frame(np.clip(255 * np.exp(level), 0, 255).astype(np.uint8), t - 500, t + 500)
+        for t, level in list(zip(range(1_000, 101_000, 1_000), levels, strict=True))[::20]
+    ]
+    reference, rows = levels[0].copy(), []
+    for t, level in zip(range(1_000, 101_000, 1_000), levels, strict=True):
+        for _ in range(8):
+            steps = np.trunc((level - reference) / 0.3).clip(-1, 1)
+            y, x = np.nonzero(steps)
+            rows += [(t, column, row, steps[row, column] > 0) for row, column in zip(y, x, strict=True)]
+            reference += 0.3 * steps
+    return frames, make_events(*(np.array(part) for part in zip(*rows, strict=True))), levels
+
+
+@pytest.fixture(scope="module")
+def moving():
+    return moving_recording()
+
+
+def engine(moving, motion=True, **kwargs):
+    frames, events, _ = moving
+    chosen = altered(PRESETS["default"], "filter", motion=motion)
+    made = Reconstructor(
+        SHAPE, settings=altered(chosen, "events", threshold_on=0.3, threshold_off=0.3, delay=0), **kwargs
+    )
+    for frame in frames:
+        made.push_frame(frame)
+    made.push_events(events)
+    made.finish()
+    return made
+
+
+def error(made, levels, t):
+    found = np.log(np.maximum(made.read(t).intensity, 1e-3))
+    return np.sqrt(np.mean(np.square(found - levels[t // 1_000 - 1])[INSIDE]))
+
+
+def test_images_between_frames_are_nearer_to_the_truth(moving):
+    """Half-way and a quarter of the way; at frames nothing changes."""
+    made, without = engine(moving), engine(moving, motion=False)
+    for t in (46_000, 51_000, 56_000):
+        assert error(made, moving[2], t) < 0.8 * error(without, moving[2], t)
+    np.testing.assert_array_equal(made.read(61_000).intensity, without.read(61_000).intensity)
+
+
+def test_what_moves_depends_neither_on_reads_nor_on_what_is_forgotten(moving):
+    made, other, third = engine(moving), engine(moving), engine(moving)
+    times = [43_000, 48_000, 51_000, 58_000]
+    expected = [made.read(t) for t in times]
+    other.forget(times[1])
+    for t, image in list(zip(times, expected, strict=True))[:0:-1]:
+        np.testing.assert_array_equal(other.read(t).intensity, image.intensity)
+    for t, image in zip(times, expected, strict=True):
+        again = third.image(third.estimate(t), with_variance=False)
+        np.testing.assert_array_equal(again.intensity, image.intensity)
+        assert np.isinf(again.variance).all()
+
+
+def test_a_live_stream_looks_at_no_frame_ahead(moving):
+    made, without = engine(moving, lookahead=False), engine(moving, motion=False, lookahead=False)
+    np.testing.assert_array_equal(made.read(51_000).intensity, without.read(51_000).intensity)
