@@ -155,6 +155,8 @@ def test_unusable_columns_are_refused(changes, message):
         ({"t": [1], "x": [1], "y": [1]}, {}, "no column for 'p'"),
         ({"t": [1.0], "x": [1], "y": [1], "p": [1]}, {"time_unit": "min"}, "unknown time_unit"),
         ({"t": [np.inf], "x": [1], "y": [1], "p": [1]}, {"time_unit": "s"}, "time of event 0 is not finite"),
+        ({"t": ["1"], "x": [1], "y": [1], "p": [1]}, {"time_unit": "ns"}, "times are <U1, not integer"),
+        ({"t": [1j], "x": [1], "y": [1], "p": [1]}, {"time_unit": "ns"}, "times are complex128, not integer"),
         (np.zeros((3, 4), int), {}, "order of its columns"),
         (np.zeros((3, 5), int), {"columns": "txyp"}, "cannot read an array of shape"),
         (np.array([[1, 0.5, 1, 1]]), {"columns": "txyp", "time_unit": "us"}, "x of event 0 is 0.5"),

@@ -109,6 +109,7 @@ def test_good_frames_pass():
         check(frame(dtype=dtype))
         check(frame(dtype=dtype, shape=(3, 4, 3)))
     check(frame(white=255))
+    check(Frame(np.full((3, 4), 9e14), 100, 200, white=1000))
     check(frame(mosaic="RGGB"), previous=frame(0, 100, mosaic="RGGB"))
 
 
@@ -135,6 +136,18 @@ def not_finite():
         (frame(dtype=np.int16), {}, FrameError, "dtype int16"),
         (frame(dtype=">u2"), {}, FrameError, "dtype >u2; .*in this machine's order of bytes"),
         (not_finite(), {}, FrameError, "not finite .* at x=2, y=1"),
+        (
+            Frame(np.full((3, 4), 1e300), 100, 200),
+            {},
+            FrameError,
+            r"values up to 1e\+300, white is 1; at most 1e\+12",
+        ),
+        (
+            Frame(np.full((3, 4), -2e15), 100, 200, white=1000),
+            {},
+            FrameError,
+            r"values up to 2e\+15, white is 1000",
+        ),
         (frame(100, 100), {}, ExposureError, "exposure of 0 us"),
         (frame(100, 90), {}, ExposureError, "exposure of -10 us"),
         (frame(), {"previous": frame(100, 150)}, FrameError, "not after the frame before it"),

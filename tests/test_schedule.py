@@ -79,6 +79,19 @@ def test_times_that_cannot_be(options, message):
         reconstruct(recording(), **options)
 
 
+@pytest.mark.parametrize(("last", "rate"), [(1_700_000_000_000_000, 100), (3_600_000_000, 1e6)])
+def test_more_images_than_memory_holds_are_refused(last, rate):
+    """One damaged time stamp in a recording makes years of it."""
+    rec = Recording.from_arrays(
+        events(),
+        [frame(9, 0, 10_000), frame(9, last, last + 10_000)],
+        sensor_size=(1, 1),
+        contrast_threshold=0.2,
+    )
+    with pytest.raises(InputError, match=r"100,000,000 at most are possible\. Are the frames' times right"):
+        plan(rec, rate_hz=rate)
+
+
 def test_times_may_be_floats_that_are_whole():
     times = np.linspace(30_000, 50_000, 3)
     assert [image.t for image in reconstruct(recording(), times=times)] == [30_000, 40_000, 50_000]

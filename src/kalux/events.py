@@ -113,7 +113,7 @@ def as_events(data: Any, *, columns: str | None = None, time_unit: str | None = 
         microseconds = np.rint(t.astype(np.float64) * _TIME_UNITS[time_unit or "us"])
         _check_times(microseconds)
         t = microseconds.astype(np.int64)
-    elif time_unit not in (None, "us"):
+    elif t.dtype.kind in "iu" and time_unit not in (None, "us"):
         scale = _TIME_UNITS[time_unit]
         _check_times(t * scale)
         t = t.astype(np.int64) * int(scale) if scale >= 1 else t.astype(np.int64) // round(1 / scale)

@@ -20,6 +20,9 @@ Stamp = Literal["start", "middle", "end"]
 Mosaic = Literal["RGGB", "BGGR", "GRBG", "GBRG"]
 """A Bayer pattern: the colours of the upper left 2x2 pixels, by rows."""
 
+_LARGEST: Final = 1e12
+"""Times white: no scene is brighter, and the squares of such values are still numbers. A damaged float may be 1e300."""
+
 MOSAICS: Final[tuple[Mosaic, ...]] = get_args(Mosaic)
 
 
@@ -177,7 +180,7 @@ def check_frame(
     Raises
     ------
     FrameError
-        Wrong size, colours or dtype, not finite, or out of order.
+        Wrong size, colours or dtype, not finite, beyond 1e12 times white, or out of order.
     ExposureError
         An exposure that is empty, or that begins before the previous one has ended.
     """
@@ -208,6 +211,11 @@ def check_frame(
     if image.dtype.kind == "f" and not np.isfinite(image).all():
         y, x = (int(i[0]) for i in np.nonzero(~np.isfinite(image))[:2])
         raise FrameError(f"{where}: frame {index} is not finite (NaN or infinite) at x={x}, y={y}")
+    if image.dtype.kind == "f" and np.abs(image).max(initial=0) > _LARGEST * frame.white_value:
+        raise FrameError(
+            f"{where}: frame {index} has values up to {np.abs(image).max():g}, white is {frame.white_value:g}; at most "
+            f"{_LARGEST:g} times white is possible"
+        )
     valid = frame.valid
     if valid is not None and not (_is_plain(valid) and valid.shape == sensor_size and valid.dtype == bool):
         got = f"{valid.dtype} {valid.shape}" if _is_plain(valid) else type(valid).__name__

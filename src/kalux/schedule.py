@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from numbers import Real
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kalux.errors import InputError
 from kalux.recording import Recording
+
+MOST_IMAGES: Final = 100_000_000
+"""Times of one rate: 0.8 GB. An hour at 10 kHz has a third of them; of more, a time in the recording is wrong."""
 
 
 def image_times(
@@ -73,6 +76,11 @@ def _grid(begin: int, end: int, rate_hz: float) -> NDArray[np.int64]:
             f"reconstruct: the image rate is {rate_hz!r} Hz; at least 1e-6 and at most 1e6 is possible"
         )
     count = int(np.floor((end - begin) * 1e-6 * rate_hz + 1e-9)) + 1
+    if count > MOST_IMAGES:
+        raise InputError(
+            f"reconstruct: {rate_hz:g} Hz over the {(end - begin) * 1e-6:,.0f} s that the frames cover makes {count:,} "
+            f"images; {MOST_IMAGES:,} at most are possible. Are the frames' times right? kalux info says them"
+        )
     grid: NDArray[np.int64] = np.rint(np.arange(count) * (1e6 / rate_hz)).astype(np.int64)
     return begin + grid
 

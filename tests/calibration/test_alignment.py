@@ -124,5 +124,5 @@ def test_what_is_too_little():
         take_shots([frame(5, 0, 1), frame(5, 2, 3)], CAMERA)
     dark = [Frame(np.zeros((240, 320), np.uint8), t, t + 1) for t in (0, 10, 20)]
     begin = Registration.of_rig(small_rig())
-    with pytest.raises(InputError, match="less than 500 well exposed pixels"):
+    with pytest.raises(InputError, match="fewer than 500 pixels are well exposed"):
         align(take_shots(dark, CAMERA), pixel_events([5], [1]), begin, offset=0.0, free_homography=False)

@@ -68,6 +68,15 @@ def test_maps_that_fit_their_checksum_but_are_none(tmp_path, data):
         load_calibration(path)
 
 
+def test_a_map_of_text_is_refused(tmp_path):
+    path = tmp_path / "c.toml"
+    np.savez(path.with_suffix(".npz"), noise_rate=np.full((3, 4), b"abc"))
+    checksum = hashlib.sha256(path.with_suffix(".npz").read_bytes()).hexdigest()
+    path.write_text(f'kalux_calibration = 1\n[maps]\nfile = "c.npz"\nsha256 = "{checksum}"')
+    with pytest.raises(FormatError, match=r"map noise_rate is \|S3; numbers are needed"):
+        load_calibration(path)
+
+
 @pytest.mark.parametrize(
     ("damage", "kind", "message"),
     [

@@ -145,6 +145,12 @@ def test_usage_of_calibrate_rig(cli, files, tmp_path, arguments, told):
     assert not out.exists()
 
 
+def test_an_offset_needs_frames(cli, files):
+    done = cli("calibrate", "offset", files / "scene.h5")
+    assert done.code == 2
+    assert "scene.h5: no frames; kalux needs frames as well as events" in done.error
+
+
 def test_calibrate_needs_to_know_what(cli):
     done = cli("calibrate")
     assert done.code == 2

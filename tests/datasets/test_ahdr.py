@@ -149,6 +149,8 @@ def test_what_cannot_be():
         artificial_hdr(recording, camera, black=1.0)
     with pytest.raises(FrameError, match="too few"):
         artificial_hdr(recording_of([LEVELS]), camera)
+    with pytest.raises(FrameError, match="3 frames, too few to leave out every 4th"):
+        artificial_hdr(recording, camera, every=4)
     with pytest.raises(FrameError, match="black"):
         artificial_hdr(recording_of([LEVELS * 0] * 3), camera)
     with pytest.raises(SettingsError, match="s-curve is black up to 1"):

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -57,6 +61,44 @@ def test_progress_is_told(scene) -> None:
         pass
     assert told == sorted(told)
     assert told[-1] == scene.end
+
+
+INTERRUPTED = """
+import os, signal, time
+import numpy as np
+from kalux.datasets import Sampling, SensorSettings, event_stream, log_ramp
+from kalux.datasets.pixels import Segment
+
+scene, sensor = log_ramp(0.1, 2.0, sensor_size=(50, 60)), SensorSettings()
+advance = event_stream.advance
+
+def slow(segment, pixels, buffer, count):
+    first = np.zeros(3000), np.ones(3000)
+    steps = Segment(segment.t0, segment.t1, first[0], first[0] + 300.0, first[1], first[1])
+    advance(segment, pixels, buffer, count)  # compiled or loaded by now
+    parent = os.getpid()
+    if os.fork() == 0:
+        time.sleep(0.01)
+        os.kill(parent, signal.SIGINT)
+        os._exit(0)
+    return advance(steps, pixels, buffer, 0)  # millions of events
+
+event_stream.advance = slow
+try:
+    for _ in event_stream.event_chunks(scene, sensor, seed=0, sampling=Sampling()):
+        print("not interrupted")
+except KeyboardInterrupt:
+    print("interrupted")
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="another process interrupts")
+def test_an_interrupt_inside_the_loop_waits_for_its_end() -> None:
+    """Raised where compiled code gives its results to Python, it would crash the process."""
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", INTERRUPTED], capture_output=True, text=True, timeout=120
+    )
+    assert (done.returncode, done.stdout) == (0, "interrupted\n"), done.stderr
 
 
 def test_rates_are_drawn_per_pixel() -> None:

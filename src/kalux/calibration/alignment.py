@@ -311,7 +311,8 @@ def _normal_equations(
     rows = [*_linearised(shots, events, registration, now, blur, spread)]
     if not rows or sum(len(row.residual) for row in rows) < 500:
         raise InputError(
-            "alignment: less than 500 well exposed pixels are in both cameras' view; is the registration right?"
+            "alignment: fewer than 500 pixels are well exposed and seen by frames and events; are the frames dark or "
+            "clipped, or is the registration wrong?"
         )
     everything = np.concatenate([row.residual for row in rows])
     weights, _ = huber_weights(everything)

@@ -208,6 +208,9 @@ def _maps(path: Path, entry: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
     shapes = {values.shape for values in maps.values()}
     if len(shapes) > 1:
         raise FormatError(f"{beside}: maps of different sizes: {sorted(shapes)}")
+    for key, values in maps.items():
+        if values.dtype.kind not in "biuf":
+            raise FormatError(f"{beside}: map {key} is {values.dtype}; numbers are needed, calibrate again")
     return maps
 
 

@@ -75,6 +75,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     from kalux.calibration.rig import Lens
     from kalux.cli.output import check_file, check_picture, write_picture
     from kalux.cli.progress import Progress, counted
+    from kalux.recording import no_frames
     from kalux.writers.files import save
 
     centre, reach = checked_range(options)
@@ -82,6 +83,8 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
         check_file(options.out, overwrite=options.overwrite)
     check_picture(options.plot, overwrite=options.overwrite)
     recording = open_recording(options)
+    if not recording.source.count_frames():
+        raise no_frames(recording)
     lens = Lens.pinhole(recording.sensor_size)
     same = Registration(lens, lens, np.eye(3))
     with Progress("correlating", quiet=options.quiet) as progress:

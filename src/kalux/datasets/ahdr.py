@@ -109,7 +109,7 @@ def artificial_hdr(
     InputError
         If ``every``, ``black`` or ``saturation`` is out of its range.
     FrameError
-        If there are too few frames, or all are black.
+        If there are too few frames, or none that ``every`` leaves out, or all are black.
     """
     _check(camera, black, saturation, every)
     real = Camera(Response.named(chosen_response(response, recording.response)))
@@ -118,6 +118,10 @@ def artificial_hdr(
     if len(kept) < 2:
         raise FrameError(
             f"{recording.source.path}: {how_many(len(kept), 'frame')}, too few for artificial HDR"
+        )
+    if every is not None and len(kept) < every:
+        raise FrameError(
+            f"{recording.source.path}: {how_many(len(kept), 'frame')}, too few to leave out every {every}th as truth"
         )
 
     def frames() -> Iterator[Frame]:

@@ -21,6 +21,7 @@ from kalux.datasets.pixels import (
 from kalux.datasets.scenes import Scene
 from kalux.datasets.sensors import Sampling, SensorSettings
 from kalux.events import EVENT_DTYPE, EventArray
+from kalux.writers.files import uninterrupted
 
 # One stream of random numbers per cause, so that switching one on leaves the others as they were.
 MISMATCH, NOISE, CAMERA, RATES, HOT, PHASE, FIXED = range(7)
@@ -81,7 +82,8 @@ def event_chunks(
     pixels = _pixels(scene, settings, seed)
     buffer, count = empty_buffer(_CHUNK), 0
     for segment in _segments(scene, settings, sampling):
-        buffer, count = advance(segment, pixels, buffer, count)
+        with uninterrupted():  # an exception while compiled code makes a named tuple would crash the process
+            buffer, count = advance(segment, pixels, buffer, count)
         if count >= chunk:
             # Events still to be found are later than this tick, or in it.
             horizon = np.rint((segment.t1 + settings.latency) / resolution) * resolution
