@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from kalux import PRESETS, Frame, Reconstructor
 from kalux.augmentation.bridge import UNMEASURED, Latent
-from kalux.augmentation.motion import Along, Motion, bent, find_path, joined_along
+from kalux.augmentation.motion import Along, Motion, _windows, bent, find_path, joined_along
 from kalux.events import make_events
 from kalux.settings import altered
 
@@ -106,7 +106,8 @@ def test_it_is_the_oracle(seed, share, moved):
     level = texture(seed, moved / 2, shape=shape) + rng.normal(0, 0.05, shape).astype(np.float32)
     variance = rng.uniform(1e-4, 1e-2, shape).astype(np.float32)
     frames = Latent(first, variances[0]), Latent(second, variances[1])
-    motion = Motion(*frames, path, bend, ((slice(0, 14), slice(0, 17)),))
+    unmoved = naive.around((first.astype(float) - second) ** 2, 2).astype(np.float32)
+    motion = Motion(*frames, path, bend, unmoved, ((slice(0, 14), slice(0, 17)),))
     found = whole(Along(motion, share), level, variance)
     between = 4 * share * (1 - share)
     expected = naive.joined_along(
@@ -126,8 +127,6 @@ def test_it_is_the_oracle(seed, share, moved):
 @settings(deadline=None)
 def test_windows_hold_what_is_told_once(told):
     """A motion that is seen in a few places only is looked at there, and in no pixel twice."""
-    from kalux.augmentation.motion import _windows
-
     marks = np.zeros((130, 200), bool)
     marks[tuple(np.transpose(told))] = True
     times = np.zeros(marks.shape, int)

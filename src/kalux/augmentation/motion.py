@@ -107,14 +107,17 @@ class Motion(NamedTuple):
         (2, H, W) float32: columns and rows from ``first`` to ``second`` of what is at a pixel half-way.
     bend
         (2, H, W) float32: how far both ends of the path are shifted for what is at a pixel half-way.
+    unmoved
+        (H, W) float32: mean squared difference of the frames around every pixel, at the same place.
     windows
-        Strips of rows, and the columns of each, outside which nothing is seen that is not known.
+        Rows and columns, no pixel twice, outside which nothing is seen that is not known.
     """
 
     first: Latent
     second: Latent
     path: Plane
     bend: Plane
+    unmoved: Plane
     windows: tuple[Window, ...]
 
 
@@ -205,7 +208,8 @@ def bent(first: Latent, second: Latent, path: Plane, level: Floats, variance: Fl
     level, variance = np.asarray(level, np.float32), np.asarray(variance, np.float32)
     side = 4 * (width // min(_COLUMNS, width // 8)) - 1
     whole = slice(0, height), slice(0, width)
-    motion = Motion(first, second, path, np.zeros_like(path), (whole,))
+    unmoved = _mean(np.square(first.value - second.value), _EVIDENCE)
+    motion = Motion(first, second, path, np.zeros_like(path), unmoved, (whole,))
     for _ in range(_BENDS):
         seen, doubt = seen_along(Along(motion, 0.5), whole)
         motion = motion._replace(
@@ -261,13 +265,13 @@ def seen_along(along: Along, window: Window) -> tuple[Plane, Plane]:
     first, first_variance = _read(motion.first, here - share * straight)
     second, second_variance = _read(motion.second, here + rest * straight)
     seen = rest * first + share * second
-    doubt = _DISAGREEMENT * _mean(np.square(first - second), _TEXTURE) + _RESAMPLING
+    apart = np.square(first - second)
+    doubt = _DISAGREEMENT * _mean(apart, _TEXTURE) + _RESAMPLING
     doubt += _FINE_RESAMPLING * _mean(np.square(seen - _mean(seen, _TEXTURE)), _TEXTURE)
     doubt += rest * rest * first_variance + share * share * second_variance
-    unmoved = motion.first.value[window] - motion.second.value[window]
-    unexplained = _mean(np.square(first - second), _EVIDENCE)
-    unexplained /= np.maximum(_mean(np.square(unmoved), _EVIDENCE), _RESAMPLING)
-    return seen, doubt / np.maximum(np.float32(1.0) - unexplained, _LEAST_MOVING)
+    unexplained = _mean(apart, _EVIDENCE) / np.maximum(motion.unmoved[window], _RESAMPLING)
+    doubt /= np.maximum(np.float32(1.0) - unexplained, _LEAST_MOVING)
+    return seen, doubt
 
 
 @functools.lru_cache(maxsize=4)
