@@ -37,7 +37,7 @@ ROUGH_SAMPLES: Final = 10_000
 """Pixels for one delay, of which the best is then within 0.2 ms of that of more on twenty scenes and recordings, and
 for thresholds that I_0 is to be found with: these are then within 1 %, and two intervals have them."""
 
-_TRAILING: Final = (0, 2_000, 4_000, 6_000, 8_000)
+_TRAILING: Final = (0, 2_000, 4_000, 6_000)
 """us by which events may seem later than they are: 0.9 to 5.9 ms on forty scenes whose events are in time."""
 
 _PERIOD_SAMPLES: Final = 30_000
@@ -64,7 +64,7 @@ and all pixels are lost from one to the next: by the share that is lost, times t
 changes. Of the same scenes, 0.10 there and 0.43 at half a threshold, where half or more is lost."""
 
 _PRIOR_REACH: Final = 6.0  # standard deviations, or a factor of 400
-_PRIOR_POINTS: Final = 2401  # 0.0025 apart with the usual spread, an eighth of the least error
+_PRIOR_POINTS: Final = 1201  # 0.005 apart with the usual spread, a quarter of the least error
 
 _LEAST_EXCESS: Final = 0.05
 """By how much more events that follow soon must tell than late ones, two standard errors taken off, for something to be
@@ -312,7 +312,7 @@ class _View(NamedTuple):
         middle = min(max(least, 1), len(_TRAILING) - 2)
         found = vertex(*residuals[middle - 1 : middle + 2])
         best = _TRAILING[least] if found is None else _TRAILING[middle] + _TRAILING[1] * found
-        if best >= _TRAILING[-1]:  # no delay explains the frames
+        if best >= _TRAILING[-1] + _TRAILING[1] / 2:  # no delay explains the frames
             return self
         return self._replace(delay=delay - round(max(best, 0.0)))
 
