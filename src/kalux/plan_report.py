@@ -142,7 +142,7 @@ def _threshold_origin(plan: Plan) -> str:
     text = f"{ORIGINS['estimate']} from {how_many(found.samples, 'sample')}, residual {found.residual:.2f}"
     text += f": +- {100 * found.spread:.0f} %"
     if found.usual_share > _NOTABLE_SHARE:
-        text += f"; {100 * found.usual_share:.0f} % is the usual of the preset, as little moves"
+        text += f"; {100 * found.usual_share:.0f} % is the usual of the preset, as frames show little change"
     return text
 
 

@@ -125,16 +125,15 @@ def test_it_is_the_oracle(seed, share, moved):
 
 @given(told=st.lists(st.tuples(st.integers(0, 129), st.integers(0, 199)), min_size=1, max_size=6))
 @settings(deadline=None)
-def test_windows_hold_what_is_told_once(told):
-    """A motion that is seen in a few places only is looked at there, and in no pixel twice."""
-    marks = np.zeros((130, 200), bool)
-    marks[tuple(np.transpose(told))] = True
-    times = np.zeros(marks.shape, int)
-    for window in _windows(marks):
+def test_windows_hold_the_tiles_that_matter_once(told):
+    """A motion that matters in a few places only is looked at there, and in no pixel twice."""
+    gain = np.zeros((130, 200), np.float32)
+    for row, column in told:
+        gain[row // 32 * 32 : row // 32 * 32 + 32, column // 32 * 32 : column // 32 * 32 + 32] = 0.2
+    times = np.zeros(gain.shape, int)
+    for window in _windows(gain):
         times[window] += 1
-        assert marks[window].any()
-    assert times.max() == 1
-    assert (times[marks] == 1).all()
+    np.testing.assert_array_equal(times, gain > 0)
 
 
 # --- the engine ----------------------------------------------------------------------------------------------

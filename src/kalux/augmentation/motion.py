@@ -8,7 +8,6 @@ both frames are one more estimate of the image, the better the better they agree
 from __future__ import annotations
 
 import functools
-import math
 from collections.abc import Iterator
 from typing import Any, Final, NamedTuple
 
@@ -82,12 +81,11 @@ _LEAST_MOVING: Final = np.float32(1e-6)
 _TEXTURE: Final = (3, 3)
 _EVIDENCE: Final = (5, 5)
 
-_LEAST_GAIN: Final = 0.02
-"""Where no pixel is taken so far towards what is seen, the frames are not looked at."""
-
-
 _TILE: Final = (32, 32)
-"""Rows and columns that are looked at along the paths if anything is seen there."""
+"""Rows and columns that are looked at along the paths, or not."""
+
+_LEAST_GAIN: Final = 0.1
+"""Of a tile: the share by which the image is taken towards what is seen, half-way, below which it is not worth the time."""
 
 _MARGIN: Final = 4
 """Pixels around a window that what is seen in it depends on: half of `_EVIDENCE`, twice."""
@@ -216,20 +214,18 @@ def bent(first: Latent, second: Latent, path: Plane, level: Floats, variance: Fl
             bend=_bent_further(motion.bend, seen, level - seen, variance + doubt, (side, side))
         )
     gain = _gain(*seen_along(Along(motion, 0.5), whole), level, variance, 1.0)
-    moving = np.abs(path).max(axis=0)
-    told = (_mean(gain, _EVIDENCE) > _LEAST_GAIN) & (moving > _STILL)
-    # What is seen half-way moves on until the next frame.
-    reach = np.ones((2 * math.ceil(float(moving.max()) / 2.0) + 1,) * 2, np.uint8)
-    windows = tuple(_windows(np.asarray(cv2.dilate(told.astype(np.uint8), reach), np.bool_)))
+    windows = tuple(_windows(np.where(np.abs(path).max(axis=0) > _STILL, gain, np.float32(0.0))))
     return motion._replace(windows=windows) if windows else None
 
 
-def _windows(told: NDArray[np.bool_]) -> Iterator[Window]:
-    """Tiles in which any pixel is told, those beside each other together."""
-    (height, width), (rows, columns) = told.shape, _TILE
+def _windows(gain: Plane) -> Iterator[Window]:
+    """Tiles in which what is seen counts for `_LEAST_GAIN` on average, those beside each other together."""
+    (height, width), (rows, columns) = gain.shape, _TILE
     for top in range(0, height, rows):
         strip = slice(top, min(top + rows, height))
-        tiles = np.flatnonzero(np.logical_or.reduceat(told[strip].any(axis=0), np.arange(0, width, columns)))
+        lefts = range(0, width, columns)
+        means = np.array([gain[strip, left : left + columns].mean() for left in lefts])
+        tiles = np.flatnonzero(means > _LEAST_GAIN)
         for run in np.split(tiles, np.flatnonzero(np.diff(tiles) > 1) + 1):
             if len(run):
                 yield strip, slice(int(run[0]) * columns, min((int(run[-1]) + 1) * columns, width))

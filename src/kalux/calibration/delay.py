@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from kalux.calibration.exposures import Exposures
 from kalux.calibration.intervals import Interval, intervals, spread
-from kalux.calibration.regression import Fit, two_stage
+from kalux.calibration.regression import Fit, halves, two_stage
 from kalux.event_slices import between, count_chunks
 from kalux.events import EventArray
 from kalux.recording import Recording
@@ -194,14 +194,19 @@ class _Seen(NamedTuple):
 def _fit(seen: _Seen) -> Fit | None:
     """Thresholds that fit best; None if one is not determined."""
     counts = np.column_stack([seen.on, -seen.off])
-    fit = two_stage(seen.change, counts, counts)
+    fit = two_stage(seen.change, counts, halves(seen.change))
     return fit if fit is not None and (fit.solution > 0).all() else None
 
 
 def _residual(seen: _Seen) -> float:
-    """Robust standard deviation of what thresholds that fit best leave; nan if one is not determined."""
+    """Robust standard deviation of what thresholds that fit best leave, in these; nan if one is not determined."""
     fit = _fit(seen)
-    return float("nan") if fit is None else fit.residual
+    return float("nan") if fit is None else in_thresholds(fit)
+
+
+def in_thresholds(fit: Fit) -> float:
+    """The residual of a fit in units of its thresholds, both positive: how far counts are from what frames say."""
+    return fit.residual / float(np.sqrt(fit.solution.prod()))
 
 
 def _samples(

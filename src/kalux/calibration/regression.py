@@ -63,6 +63,16 @@ def two_stage(values: Array, explained: Array, instruments: Array) -> Fit | None
     return Fit(solution, scale, weights)
 
 
+def halves(changes: Array) -> Array:
+    """(N, 2) the part upwards and the part downwards of (N,) changes of frames: instruments for thresholds.
+
+    A pixel is looked at if both of its frames are well exposed: changes are selected, counts only through these. What
+    frames say explains counts without bias whatever is selected by it. The other way round, where frames show a range
+    of a few thresholds, those counts are kept that say too much, and thresholds come out too small.
+    """
+    return np.column_stack([np.maximum(changes, 0.0), np.minimum(changes, 0.0)])
+
+
 def weighted_least_squares(values: Array, explained: Array, weights: Array) -> Array:
     """(K,) coefficients of (N, K) ``explained`` in (N,) ``values``, with (N,) ``weights``."""
     columns = np.ascontiguousarray(explained.T)

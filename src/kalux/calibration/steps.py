@@ -19,7 +19,7 @@ simulated scenes; 4 % less to 1 % more without).
 
 from __future__ import annotations
 
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -79,6 +79,9 @@ class Steps(NamedTuple):
         that follow soon second, of either on first and off second.
     pixel
         Index of the pixel.
+    lost
+        Of the pixels that one frame of the interval shows well and around which something happens, the share that the
+        other does not.
     """
 
     change: Array
@@ -87,6 +90,7 @@ class Steps(NamedTuple):
     events: Array
     events_around: Array
     pixel: NDArray[np.int64]
+    lost: Array
 
 
 def steps(
@@ -153,7 +157,7 @@ def steps(
 
 def _nothing(periods: int) -> Steps:
     none, counts = np.empty(0), np.empty((0, periods, 2, 2))
-    return Steps(none, none, none, counts, counts, np.empty(0, np.int64))
+    return Steps(none, none, none, counts, counts, np.empty(0, np.int64), none)
 
 
 _REACH: Final = (1 + _PEAK) * _SLOWEST
@@ -193,7 +197,7 @@ class _Passing:
         passed = event_words(between(interval.events, self._seen_until, begin))
         _pass(passed, np.uint64(width), self._latest, self._sign)
         self._seen_until = begin
-        chosen, usable = self._chosen(interval)
+        chosen, usable, lost = self._chosen(interval)
         words = event_words(between(interval.events, begin, end))
         order, starts = _by_pixel(words, np.uint64(width), _with_neighbours(chosen, height, width))
         exposures = tuple(
@@ -218,19 +222,24 @@ class _Passing:
             own.reshape(shape),
             around.reshape(shape),
             chosen,
+            np.full(len(chosen), lost),
         )
 
-    def _chosen(self, interval: Interval) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    def _chosen(self, interval: Interval) -> tuple[NDArray[np.int64], NDArray[np.bool_], float]:
         """Indices of well exposed pixels around which something happens, spread evenly; (H, W) all well exposed ones.
 
-        Hot pixels are none of either.
+        Hot pixels are none of either. And the share of those that one of the frames alone shows well.
         """
         start, end = interval.start + self._delay, interval.end + self._delay
         on, off = count_chunks([between(interval.events, start, end)], self._shape, weighed=False)
         happened = on + off
         usable = interval.usable & ~_hot(happened)
-        candidates = np.flatnonzero(_something_happens(happened, usable))
-        return candidates[:: max(-(-len(candidates) // self._most), 1)], usable
+        eventful = _something_happens(happened)
+        either = sum(int(np.count_nonzero(end.usable & eventful)) for end in interval.ends)
+        lost = 1.0 - 2 * int(np.count_nonzero(interval.usable & eventful)) / max(either, 1)
+        neighbours = _sum_around(usable.view(np.uint8))
+        candidates = np.flatnonzero(eventful & usable & (neighbours >= _LEAST_NEIGHBOURS))
+        return candidates[:: max(-(-len(candidates) // self._most), 1)], usable, lost
 
 
 def _with_neighbours(chosen: NDArray[np.int64], height: int, width: int) -> NDArray[np.bool_]:
@@ -343,15 +352,17 @@ def _hot(happened: NDArray[np.float32]) -> NDArray[np.bool_]:
     return found
 
 
-def _something_happens(happened: NDArray[np.float32], usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(H, W): well exposed pixels not at the border whose neighbours have enough events."""
-    around, neighbours = (
-        cv2.boxFilter(values, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT) - values
-        for values in (happened, usable.view(np.uint8))
-    )
-    found = np.zeros_like(usable)
-    found[1:-1, 1:-1] = (usable & (around >= _LEAST_AROUND) & (neighbours >= _LEAST_NEIGHBOURS))[1:-1, 1:-1]
+def _something_happens(happened: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """(H, W): pixels not at the border whose neighbours have enough events."""
+    found = np.zeros(happened.shape, np.bool_)
+    found[1:-1, 1:-1] = (_sum_around(happened) >= _LEAST_AROUND)[1:-1, 1:-1]
     return found
+
+
+def _sum_around(values: NDArray[Any]) -> NDArray[Any]:
+    """(H, W): of the eight neighbours."""
+    total = cv2.boxFilter(values, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
+    return np.asarray(total - values)
 
 
 @loop

@@ -69,7 +69,7 @@ class ArtificialCamera:
     @property
     def response(self) -> str:
         """Its response, as in `kalux.settings.CameraSettings`: irradiance 1 is its white."""
-        return f"s-curve:{self.low / self.high!r}"
+        return f"s-curve:{float(self.low / self.high)!r}"
 
 
 def artificial_hdr(
