@@ -75,7 +75,7 @@ PICTURES = {
     "highlight-scale": ("clean", one("filter.highlight_scale", 0, 3)),
     "highlight-tail": ("street", one("filter.highlight_tail", 0.5, 10)),
     "unshown-tail": ("noisy", one("filter.unshown_tail", 0, 1)),
-    "motion": ("slider_depth", (Change("not along the paths", {"filter": {"motion": False}}),)),
+    "motion": ("slider_depth", (Change("not along the paths", {"filter": {"motion": "off"}}),)),
     "neighbours": ("noisy", one("filter.neighbours", 0, 0.6)),
     "step-variance": ("noisy", one("events.step_variance", 0.02, 2)),
     "noise-rate": ("noisy", one("events.noise_rate", 0, 30)),

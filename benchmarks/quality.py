@@ -47,7 +47,7 @@ def variants(ablation: bool) -> dict[str, Settings]:
             ("no delay", "events", {"delay": 0}),
             ("no slope", "events", {"quantisation_variance": 0.0}),
             ("no trail", "events", {"trail": 0.0}),
-            ("no motion", "filter", {"motion": False}),
+            ("no motion", "filter", {"motion": "off"}),
             ("no neighbours", "filter", {"neighbours": 0.0}),
             ("neighbours 0.15", "filter", {"neighbours": 0.15}),
             ("neighbours 0.6", "filter", {"neighbours": 0.6}),

@@ -144,6 +144,9 @@ def plan(
     camera = Camera.named(response, chosen.camera.clipped_from)
     exposures, tail = _survey(recording, camera if _measures_tail(chosen) else None)
     begin = _begin_time(exposures[0], chosen, lookahead)
+    if chosen.filter.motion == "auto":
+        follows = smooth or chosen.filter.follows_motion(recording.sensor_size)
+        chosen = altered(chosen, "filter", motion="on" if follows else "off")
     wanted = image_times(recording, exposures, begin, rate_hz=rate_hz, times=times, at=at)
     lengths = exposures[:, 1] - exposures[:, 0]
     reference = chosen.camera.reference_exposure or median_exposure(lengths)

@@ -17,6 +17,7 @@ AUTO: Final = "auto"
 """In files and flags, stands for None: estimated from the recording."""
 
 SolutionName = Literal["exact", "printed"]
+MotionName = Literal["auto", "on", "off"]
 
 UNKNOWN_LOG_OFFSET: Final = 0.03
 """I_0 where it is not known: what real recordings of DAVIS sensors agree with best (docs/tuning.md)."""
@@ -249,6 +250,10 @@ class EventSettings:
         return 0 if self.refractory_period is None else self.refractory_period
 
 
+_FOLLOWED_PIXELS: Final = 120_000
+"""Pixels of a sensor up to which motion is followed where nothing is said (docs/speed.md)."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class FilterSettings:
     """The filter, equations (14)-(21).
@@ -285,8 +290,10 @@ class FilterSettings:
         weighted means of themselves and their eight neighbours (docs/equations.md, K12). 0 turns it off. 0.2
         (docs/tuning.md).
     motion
-        Read the frames around an image along the paths of what moves between them (docs/equations.md, K16). With
-        augmentation "bridge" and lookahead only; not of Bayer mosaics.
+        Whether the frames around an image are read along the paths of what moves between them (docs/equations.md, K16):
+        ``"on"``, ``"off"``, or ``"auto"``, on for sensors of up to 120,000 pixels, of which two processor cores make
+        300 images/s so, and wherever an image uses everything after it. With augmentation "bridge" and lookahead only;
+        not of Bayer mosaics.
     cutoff
         Of the complementary filter, Hz. 1.0 (Scheerlinck 2018 uses 2 pi rad/s).
     """
@@ -301,8 +308,13 @@ class FilterSettings:
     unshown_tail: float = 0.5
     bright_tail: float | None = None
     neighbours: float = 0.2
-    motion: bool = True
+    motion: MotionName = "auto"
     cutoff: float = 1.0
+
+    def follows_motion(self, sensor_size: tuple[int, int]) -> bool:
+        """Whether frames of a sensor are read along the paths of what moves."""
+        height, width = sensor_size
+        return self.motion == "on" or (self.motion == "auto" and height * width <= _FOLLOWED_PIXELS)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -490,6 +502,7 @@ _CHOICES: Final = {
     "kind": ("akf", "cf"),
     "augmentation": ("bridge", "paper"),
     "solution": ("exact", "printed"),
+    "motion": ("auto", "on", "off"),
 }
 
 

@@ -477,7 +477,7 @@ def reversed_settings(settings: Settings) -> Settings:
         delay=-settings.events.lateness,
         trail=0.0,
     )
-    filtered = dataclasses.replace(settings.filter, motion=False)  # the forward filter's images have it
+    filtered = dataclasses.replace(settings.filter, motion="off")  # the forward filter's images have it
     return dataclasses.replace(settings, events=events, filter=filtered)
 
 

@@ -129,7 +129,7 @@ def test_windows_hold_the_tiles_that_matter_once(told):
     """A motion that matters in a few places only is looked at there, and in no pixel twice."""
     gain = np.zeros((130, 200), np.float32)
     for row, column in told:
-        gain[row // 32 * 32 : row // 32 * 32 + 32, column // 32 * 32 : column // 32 * 32 + 32] = 0.2
+        gain[row // 64 * 64 : row // 64 * 64 + 64, column // 64 * 64 : column // 64 * 64 + 64] = 0.2
     times = np.zeros(gain.shape, int)
     for window in _windows(gain):
         times[window] += 1
@@ -162,7 +162,7 @@ def moving():
     return moving_recording()
 
 
-def engine(moving, motion=True, **kwargs):
+def engine(moving, motion="on", **kwargs):
     frames, events, _ = moving
     chosen = altered(PRESETS["default"], "filter", motion=motion)
     made = Reconstructor(
@@ -182,7 +182,7 @@ def error(made, levels, t):
 
 def test_images_between_frames_are_nearer_to_the_truth(moving):
     """Half-way and a quarter of the way; at frames nothing changes."""
-    made, without = engine(moving), engine(moving, motion=False)
+    made, without = engine(moving), engine(moving, motion="off")
     for t in (46_000, 51_000, 56_000):
         assert error(made, moving[2], t) < 0.8 * error(without, moving[2], t)
     np.testing.assert_array_equal(made.read(61_000).intensity, without.read(61_000).intensity)
@@ -202,5 +202,5 @@ def test_what_moves_depends_neither_on_reads_nor_on_what_is_forgotten(moving):
 
 
 def test_a_live_stream_looks_at_no_frame_ahead(moving):
-    made, without = engine(moving, lookahead=False), engine(moving, motion=False, lookahead=False)
+    made, without = engine(moving, lookahead=False), engine(moving, motion="off", lookahead=False)
     np.testing.assert_array_equal(made.read(51_000).intensity, without.read(51_000).intensity)

@@ -81,11 +81,11 @@ _LEAST_MOVING: Final = np.float32(1e-6)
 _TEXTURE: Final = (3, 3)
 _EVIDENCE: Final = (5, 5)
 
-_TILE: Final = (32, 32)
+_TILE: Final = (64, 64)
 """Rows and columns that are looked at along the paths, or not."""
 
 _LEAST_GAIN: Final = 0.1
-"""Of a tile: the share by which the image is taken towards what is seen, half-way, below which it is not worth the time."""
+"""Share by which a tile of an image is taken towards what is seen, half-way, below which it is not worth the time."""
 
 _MARGIN: Final = 4
 """Pixels around a window that what is seen in it depends on: half of `_EVIDENCE`, twice."""

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+import cv2
 import numpy as np
 
 from kalux.cli.calibrations import add_calibration, given_calibration
@@ -165,6 +166,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     prepare_loops()
     tell_of_compiling(quiet=options.quiet)
     threads = options.threads or default_threads()
+    cv2.setNumThreads(1)  # its own threads would come on top of those
     with compiling_beside(_compiled_later(settings), threads):
         recording = open_recording(options)
         with Progress("checking", quiet=options.quiet) as progress:

@@ -132,6 +132,7 @@ class BridgedFrames(Method):
             events.quantisation_variance * c2,
             scale2 if scale2 > 0 else bridge.UNMEASURED,
         )
+        self._follows_motion = settings.filter.follows_motion(shape)
         self._event_noise = akf_bridged.Noise(events.background_rate, events.step_noise, c2)
         self._prior = (
             bridge.nominal_thresholds(shape, settings.events.mismatch, np.float32)
@@ -321,7 +322,7 @@ class BridgedFrames(Method):
             silent_change=change,
             turns=turns(on, off),
             half_way=share,
-            latents=(memory.latent, second) if self.settings.filter.motion and shot.pitch == 1 else None,
+            latents=(memory.latent, second) if self._follows_motion and shot.pitch == 1 else None,
         )
         return joined, after
 
