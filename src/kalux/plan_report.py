@@ -99,8 +99,7 @@ def _of_frames(recording: Recording, plan: Plan, asked: Settings) -> Iterator[tu
     if recording.found_white is not None:
         yield "white", f"{recording.found_white}, where the 16-bit frames end"
     if plan.ceiling is not None:
-        how = f"frames end at {plan.ceiling.level:.2g}, {_going_on(plan.ceiling)}"
-        yield "saturation", f"from {camera.clipped_from:.2g} of white ({how})"
+        yield "saturation", f"from {camera.clipped_from:.2g} of white ({ceiling_text(plan.ceiling)})"
     if camera.white_balance != asked.camera.white_balance:
         yield "white balance", f"{camera.white_balance} for red, green, blue (measured)"
 
@@ -117,17 +116,18 @@ def saturation_text(recording: Recording, plan: Plan, asked: Settings) -> str:
     ceiling = find_ceiling(recording, plan.settings.camera, plan.settings.events)
     if ceiling is None:
         return text + "events do not go on where the frames end, or too few tell"
-    level = f"{ceiling.level:.2g}"
-    if not ceiling.is_at(ceiling.level):
-        level = f"{ceiling.least:.2g} to {2 * ceiling.level - ceiling.least:.2g}"
-    text += f"frames end at {level}, {_going_on(ceiling)}"
+    text += ceiling_text(ceiling)
     if ceiling.level < used:
         text += f": --camera.saturation {ceiling.saturation:.2g} does not take that for measured"
     return text
 
 
-def _going_on(ceiling: Ceiling) -> str:
-    return f"where events go on by {100 * np.expm1(ceiling.excess):.0f} %"
+def ceiling_text(ceiling: Ceiling) -> str:
+    """Where frames end, as a share of white, and what events say there."""
+    level = f"{ceiling.level:.2g}"
+    if not ceiling.is_at(ceiling.level):
+        level = f"{ceiling.least:.2g} to {2 * ceiling.level - ceiling.least:.2g}"
+    return f"frames end at {level}, where events go on by {100 * np.expm1(ceiling.excess):.0f} %"
 
 
 def _threshold_origin(plan: Plan) -> str:

@@ -6,6 +6,8 @@ import pytest
 
 import kalux
 
+from builders import passing_by, textured
+
 
 def test_from_a_recording_to_scores(cli, recording, tmp_path):
     out = tmp_path / "a.h5"
@@ -28,6 +30,25 @@ def test_what_saturates_in_the_original_is_no_truth(cli, recording, tmp_path):
         found[level] = kalux.open(out).ground_truth()
         assert ("of 100.0 % of pixels" in run.out) == (found[level].masks is None)
     assert (found[70].masks == (found[250].images * 60 < 69.99)).mean() > 0.999
+
+
+@pytest.mark.parametrize(("white", "warned"), [(102, True), (255, False)])
+def test_an_original_that_saturates_below_white_is_told(cli, tmp_path, write_recording, white, warned):
+    original = passing_by(textured(1.2 if warned else 0.9), white)
+    path = write_recording(
+        tmp_path / "original.h5",
+        sensor_size=original.sensor_size,
+        events=list(original.events()),
+        frames=list(original.frames()),
+        contrast_threshold=None,
+    )
+    cut = "--cut-low", 5, "--cut-high", 0.7 * white, "--overwrite"
+    found = cli("ahdr", path, "-o", tmp_path / "a.h5", *cut)
+    assert ("where events go on" in found.err) == warned
+    if warned:
+        assert "the original frames end at 0.4, where" in found.err
+        assert "--saturation 100 leaves that out" in found.err
+        assert cli("ahdr", path, "-o", tmp_path / "a.h5", *cut, "--saturation", 100).err == ""
 
 
 def test_held_out_frames(cli, recording, tmp_path):

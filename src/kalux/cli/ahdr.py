@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from kalux.cli.parser import Parser, UsageError, number, whole
 from kalux.cli.recordings import add_recording, open_recording
 from kalux.cli.terminal import say, warn
 from kalux.wording import how_many
+
+if TYPE_CHECKING:
+    from kalux.recording import Recording
 
 _DESCRIPTION = """\
 Make an artificial HDR recording of a real one, as the paper's AHDR data: an artificial camera response makes
@@ -76,8 +79,9 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     check_name(options.out, Path(options.recording))
     check_file(options.out, overwrite=options.overwrite)
     camera = _camera(options)
+    original = open_recording(options)
     recording = artificial_hdr(
-        open_recording(options),
+        original,
         camera,
         response=options.response,
         black=options.black / 255,
@@ -95,6 +99,8 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
         write_copy(recording, options.out, progress)
     if white == 0:
         warn("no pixel of any frame is white: nothing is left to reconstruct beyond it; try a larger cut")
+    if options.saturation is None:
+        _warn_of_saturation(original, options.response)
     if not options.quiet:
         truth = recording.ground_truth()
         assert truth is not None
@@ -106,6 +112,23 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
             f"truth up to {known.max(initial=0.0):.2f} x white, of {share:.1f} % of pixels"
         )
         say(f"wrote {how_many(progress.images, 'frame')}, {len(truth.times):,} of truth, to {options.out}")
+
+
+def _warn_of_saturation(original: Recording, response: str) -> None:
+    """Where the original frames end below white while events go on: what these tell would count as an error."""
+    from kalux.calibration.levels import find_ceiling
+    from kalux.plan_report import ceiling_text
+    from kalux.planning import plan
+    from kalux.settings import PRESETS, altered
+
+    made = plan(original, at="frames", settings=altered(PRESETS["default"], "camera", response=response))
+    settings = made.settings
+    found = made.ceiling or find_ceiling(original, settings.camera, settings.events)
+    if found is not None and found.level < settings.camera.usual_saturation:
+        warn(
+            f"the original {ceiling_text(found)}: from there on they are no truth; "
+            f"--saturation {int(255 * found.saturation)} leaves that out"
+        )
 
 
 def _camera(options: argparse.Namespace) -> Any:
