@@ -129,7 +129,7 @@ def test_windows_hold_the_tiles_that_matter_once(told):
     """A motion that matters in a few places only is looked at there, and in no pixel twice."""
     gain = np.zeros((130, 200), np.float32)
     for row, column in told:
-        gain[row // 64 * 64 : row // 64 * 64 + 64, column // 64 * 64 : column // 64 * 64 + 64] = 0.2
+        gain[row // 64 * 64 : row // 64 * 64 + 64, column // 64 * 64 : column // 64 * 64 + 64] = 0.3
     times = np.zeros(gain.shape, int)
     for window in _windows(gain):
         times[window] += 1

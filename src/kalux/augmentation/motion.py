@@ -22,8 +22,8 @@ Plane = NDArray[np.float32]
 
 # Flow.
 
-_COLUMNS: Final = 44
-"""Of the points whose flow is followed, on any sensor: 8 pixels apart on a DAVIS346, 15 at 640x480."""
+_COLUMNS: Final = 32
+"""Of the points whose flow is followed, on any sensor: 11 pixels apart on a DAVIS346, 20 at 640x480."""
 
 _WINDOW: Final = (11, 11)
 """Pixels around a point that are looked for in the other frame."""
@@ -84,7 +84,7 @@ _EVIDENCE: Final = (5, 5)
 _TILE: Final = (64, 64)
 """Rows and columns that are looked at along the paths, or not."""
 
-_LEAST_GAIN: Final = 0.1
+_LEAST_GAIN: Final = 0.2
 """Share by which a tile of an image is taken towards what is seen, half-way, below which it is not worth the time."""
 
 _MARGIN: Final = 4
@@ -146,7 +146,7 @@ def find_path(first: Latent, second: Latent, dark: float, white: float) -> Plane
     height, width = first.value.shape
     if min(height, width) < _LEAST_SIDE:
         return None
-    columns = min(_COLUMNS, width // 8)
+    columns = min(_COLUMNS, width // 4)
     rows = max(round(columns * height / width), 1)
     x, y = _centres(columns, width), _centres(rows, height)
     points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 1, 2)
@@ -204,7 +204,7 @@ def bent(first: Latent, second: Latent, path: Plane, level: Floats, variance: Fl
     """
     height, width = path.shape[1:]
     level, variance = np.asarray(level, np.float32), np.asarray(variance, np.float32)
-    side = 4 * (width // min(_COLUMNS, width // 8)) - 1
+    side = 4 * (width // min(_COLUMNS, width // 4)) - 1
     whole = slice(0, height), slice(0, width)
     unmoved = _mean(np.square(first.value - second.value), _EVIDENCE)
     motion = Motion(first, second, path, np.zeros_like(path), unmoved, (whole,))
