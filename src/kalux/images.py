@@ -239,6 +239,7 @@ def _look_along(
 ) -> None:
     """Join an image with what the frames around show along the paths of what moves (K16). In place."""
     offset = np.float32(log_offset)
+    # All before any is changed: windows look at pixels beside them.
     for window, level, left in list(joined_along(along, np.log(intensity + offset), variance)):
         intensity[window] = np.maximum(np.exp(level) - offset, np.float32(0.0))
         variance[window] = left

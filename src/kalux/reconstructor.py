@@ -564,12 +564,9 @@ class Reconstructor:
     def _restart(self, progress: _Progress) -> _Progress:
         """The same segment with a fresh cursor, to read at an earlier time."""
         assert self._state is not None
-        cursor = self._method.begin(progress.segment, self._state)
-        self._progress = _Progress(
-            progress.segment, progress.memory, cursor, progress.ready, progress.starts_frame
-        )
-        self._progress.motion, self._progress.looked = progress.motion, progress.looked
-        return self._progress
+        progress.cursor = self._method.begin(progress.segment, self._state)
+        progress.taken, progress.latest = 0, progress.segment.start
+        return progress
 
     def _take(self, progress: _Progress, t: int) -> None:
         """Take the cursor over the events up to ``t`` that it has not taken yet."""

@@ -79,7 +79,10 @@ _LEAST_MOVING: Final = np.float32(1e-6)
 """Share of the frames' difference that motion explains where it explains nothing: a division."""
 
 _TEXTURE: Final = (3, 3)
+"""Pixels over which texture and the frames' disagreement are averaged, to tell how uncertain a pixel is."""
+
 _EVIDENCE: Final = (5, 5)
+"""Pixels over which is averaged what speaks for a path: how far it explains the frames, and the image."""
 
 _TILE: Final = (64, 64)
 """Rows and columns that are looked at along the paths, or not."""
@@ -146,7 +149,7 @@ def find_path(first: Latent, second: Latent, dark: float, white: float) -> Plane
     height, width = first.value.shape
     if min(height, width) < _LEAST_SIDE:
         return None
-    columns = min(_COLUMNS, width // 4)
+    columns = _columns(width)
     rows = max(round(columns * height / width), 1)
     x, y = _centres(columns, width), _centres(rows, height)
     points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 1, 2)
@@ -163,6 +166,11 @@ def find_path(first: Latent, second: Latent, dark: float, white: float) -> Plane
         return None
     parts = (cv2.resize(part, (width, height), interpolation=cv2.INTER_LINEAR) for part in steady)
     return np.stack([np.asarray(part, np.float32) for part in parts])
+
+
+def _columns(width: int) -> int:
+    """Of the points whose flow is followed."""
+    return min(_COLUMNS, width // 4)
 
 
 def _centres(count: int, side: int) -> Plane:
@@ -204,7 +212,7 @@ def bent(first: Latent, second: Latent, path: Plane, level: Floats, variance: Fl
     """
     height, width = path.shape[1:]
     level, variance = np.asarray(level, np.float32), np.asarray(variance, np.float32)
-    side = 4 * (width // min(_COLUMNS, width // 4)) - 1
+    side = 4 * (width // _columns(width)) - 1
     whole = slice(0, height), slice(0, width)
     unmoved = _mean(np.square(first.value - second.value), _EVIDENCE)
     motion = Motion(first, second, path, np.zeros_like(path), unmoved, (whole,))
