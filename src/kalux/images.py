@@ -13,9 +13,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.augmentation.along import Along, joined_along
 from kalux.augmentation.bridge import RANDOM
 from kalux.augmentation.highlights import Unshown
-from kalux.augmentation.motion import Along, joined_along
 from kalux.augmentation.unseen import UNKNOWN_CHANGE
 from kalux.filters.highlights import keep_white, lifted, read_unshown, tempered
 from kalux.filters.readout import HighlightPrior, read_out

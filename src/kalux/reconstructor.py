@@ -15,8 +15,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.augmentation.along import Along, Motion
 from kalux.augmentation.highlights import Unshown
-from kalux.augmentation.motion import Along, Motion
 from kalux.augmentation.refractory import EventClock
 from kalux.augmentation.trail import FrameTrail
 from kalux.compiled import event_words

@@ -1,35 +1,21 @@
-"""Frames seen along the paths of what moves between them."""
+"""The paths of what moves between frames, and the engine that follows them."""
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kalux import PRESETS, Frame, Reconstructor
-from kalux.augmentation.bridge import UNMEASURED, Latent
-from kalux.augmentation.motion import Along, Motion, _windows, bent, find_path, joined_along
+from kalux.augmentation.along import Along
+from kalux.augmentation.bridge import UNMEASURED
+from kalux.augmentation.motion import _windows, bent, find_path
 from kalux.events import make_events
 from kalux.settings import altered
+from textures import SHAPE, frame_of, texture, whole
 
-import naive
-
-SHAPE = (72, 96)
 INSIDE = (slice(16, -16), slice(16, -16))
-
-
-def texture(seed, x=0.0, y=0.0, shape=SHAPE, scale=3.0):
-    """Smooth noise of standard deviation 0.5, whose pixel (row, column) is at (row - y, column - x) of the first."""
-    wide = cv2.GaussianBlur(np.random.default_rng(seed).normal(size=(160, 200)), (0, 0), scale)
-    wide = (0.5 * wide / wide.std() - 1.0).astype(np.float32)
-    rows, columns = np.mgrid[: shape[0], : shape[1]].astype(np.float32) + 40
-    return cv2.remap(wide, columns - np.float32(x), rows - np.float32(y), cv2.INTER_CUBIC)
-
-
-def frame_of(value, variance=1e-4):
-    return Latent(value, np.full(value.shape, variance, np.float32))
 
 
 @pytest.mark.parametrize(("x", "y"), [(3.0, 0.0), (-1.5, 4.0), (6.0, -5.0), (0.0, 0.5)])
@@ -83,46 +69,6 @@ def test_a_wrong_path_is_not_believed():
         assert np.sqrt(np.mean(np.square(joined - level))) < 0.01
 
 
-def whole(along, level, variance):
-    """`joined_along` of the whole image."""
-    level, variance = level.copy(), variance.copy()
-    for window, seen, left in list(joined_along(along, level, variance)):
-        level[window], variance[window] = seen, left
-    return level, variance
-
-
-@given(
-    seed=st.integers(0, 1000), share=st.sampled_from([0.25, 0.5, 0.75]), moved=st.sampled_from([0, 1, 2.5])
-)
-@settings(max_examples=10, deadline=None)
-def test_it_is_the_oracle(seed, share, moved):
-    """To what float32 and OpenCV's tables, of 32 places between two pixels, leave."""
-    rng = np.random.default_rng(seed)
-    shape = (14, 17)
-    first, second = (texture(seed, x, shape=shape) for x in (0.0, moved))
-    variances = rng.uniform(1e-4, 1e-2, (2, *shape)).astype(np.float32)
-    variances[:, 3:5, 2:6] = UNMEASURED
-    path, bend = rng.integers(-32, 33, (2, 2, *shape)).astype(np.float32) / 8
-    level = texture(seed, moved / 2, shape=shape) + rng.normal(0, 0.05, shape).astype(np.float32)
-    variance = rng.uniform(1e-4, 1e-2, shape).astype(np.float32)
-    frames = Latent(first, variances[0]), Latent(second, variances[1])
-    unmoved = naive.around((first.astype(float) - second) ** 2, 2).astype(np.float32)
-    motion = Motion(*frames, path, bend, unmoved, ((slice(0, 14), slice(0, 17)),))
-    found = whole(Along(motion, share), level, variance)
-    between = 4 * share * (1 - share)
-    expected = naive.joined_along(
-        *((frame.value.astype(float), frame.variance.astype(float)) for frame in frames),
-        path,
-        bend,
-        share,
-        level.astype(float),
-        variance.astype(float),
-        between,
-    )
-    np.testing.assert_allclose(found[0], expected[0], atol=1e-4)
-    np.testing.assert_allclose(found[1], expected[1], rtol=2e-3)
-
-
 @given(told=st.lists(st.tuples(st.integers(0, 129), st.integers(0, 199)), min_size=1, max_size=6))
 @settings(deadline=None)
 def test_windows_hold_the_tiles_that_matter_once(told):
@@ -134,6 +80,14 @@ def test_windows_hold_the_tiles_that_matter_once(told):
     for window in _windows(gain):
         times[window] += 1
     np.testing.assert_array_equal(times, gain > 0)
+
+
+def test_tiles_beside_and_below_each_other_are_one_window():
+    gain = np.zeros((130, 200), np.float32)
+    gain[:, 64:192] = gain[:64, 192:] = 0.3
+    assert _windows(gain) == [(slice(0, 64), slice(64, 200)), (slice(64, 130), slice(64, 192))]
+    assert _windows(np.ones_like(gain)) == [(slice(0, 130), slice(0, 200))]
+    assert _windows(np.zeros_like(gain)) == []
 
 
 # --- the engine ----------------------------------------------------------------------------------------------

@@ -6,12 +6,14 @@ come to later is then ready. Nothing is written but numba's cache, and no result
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 from collections.abc import Callable
 from typing import Final
 
 import numpy as np
 
+from kalux.augmentation.along import Along, Motion
 from kalux.augmentation.bridge import BridgeNoise, Latent, bridge, drift, nominal_thresholds
 from kalux.augmentation.highlights import Unshown
 from kalux.augmentation.trail import Trail, nothing_followed, polarity_of, trail_between
@@ -73,7 +75,10 @@ def rehearse_images() -> None:
     )
     view = View(0.02, 0.04, 0.1, 1.0, 0.3, 1.0, 0.0, None, (1.0, 1.0, 1.0))
     make_image(estimate, view, with_variance=False)
-    make_image(estimate, view)  # as where motion is followed
+    frame, still = Latent(level, np.abs(level)), np.zeros((2, *_SIZE), np.float32)
+    everywhere = slice(0, _SIZE[0]), slice(0, _SIZE[1])
+    motion = Motion(frame, frame, still, still, np.abs(level), (everywhere,))
+    make_image(dataclasses.replace(estimate, along=Along(motion, 0.5)), view)
 
 
 def rehearse_display() -> None:

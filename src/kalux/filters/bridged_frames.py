@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation import bridge, deblur
+from kalux.augmentation.along import Motion, Plane
 from kalux.augmentation.bridge import BridgedSegment, BridgeNoise, Latent, Thresholds, UnshownMemory
 from kalux.augmentation.deblur import EXPOSED, EXPOSURE_FIELDS, Exposure, relative_levels
 from kalux.augmentation.highlights import (
@@ -19,7 +20,7 @@ from kalux.augmentation.highlights import (
     expected_excess,
     follow_unshown,
 )
-from kalux.augmentation.motion import Motion, Plane, bent, find_path
+from kalux.augmentation.motion import bent, find_path
 from kalux.augmentation.trail import (
     Followed,
     Trail,

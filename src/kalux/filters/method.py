@@ -14,8 +14,8 @@ from typing import Any, Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.augmentation.along import Motion, Plane
 from kalux.augmentation.highlights import Unshown
-from kalux.augmentation.motion import Motion, Plane
 from kalux.event_slices import all_between, count_chunks
 from kalux.events import EventArray
 from kalux.filters.akf import State

@@ -1,0 +1,85 @@
+"""What frames show along the paths of what moves between them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kalux.augmentation.along import Along, Motion, as_seen, unmoved_difference
+from kalux.augmentation.bridge import UNMEASURED, Latent
+from textures import SHAPE, frame_of, texture, whole
+
+import naive
+
+
+@given(
+    seed=st.integers(0, 1000), share=st.sampled_from([0.25, 0.5, 0.75]), moved=st.sampled_from([0, 1, 2.5])
+)
+@settings(max_examples=10, deadline=None)
+def test_it_is_the_oracle(seed, share, moved):
+    """To what float32 and OpenCV's tables, of 32 places between two pixels, leave."""
+    rng = np.random.default_rng(seed)
+    shape = (14, 17)
+    first, second = (texture(seed, x, shape=shape) for x in (0.0, moved))
+    variances = rng.uniform(1e-4, 1e-2, (2, *shape)).astype(np.float32)
+    variances[:, 3:5, 2:6] = UNMEASURED
+    path, bend = rng.integers(-32, 33, (2, 2, *shape)).astype(np.float32) / 8
+    level = texture(seed, moved / 2, shape=shape) + rng.normal(0, 0.05, shape).astype(np.float32)
+    variance = rng.uniform(1e-4, 1e-2, shape).astype(np.float32)
+    frames = Latent(first, variances[0]), Latent(second, variances[1])
+    unmoved = naive.around((first.astype(float) - second) ** 2, 2).astype(np.float32)
+    motion = Motion(*frames, path, bend, unmoved, ((slice(0, 14), slice(0, 17)),))
+    found = whole(Along(motion, share), level, variance)
+    between = 4 * share * (1 - share)
+    expected = naive.joined_along(
+        *((frame.value.astype(float), frame.variance.astype(float)) for frame in frames),
+        path,
+        bend,
+        share,
+        level.astype(float),
+        variance.astype(float),
+        between,
+    )
+    np.testing.assert_allclose(found[0], expected[0], atol=1e-4)
+    np.testing.assert_allclose(found[1], expected[1], rtol=2e-3)
+
+
+@pytest.mark.parametrize(
+    "windows",
+    [
+        [(slice(0, 72), slice(0, 40)), (slice(0, 72), slice(40, 96))],
+        [(slice(0, 30), slice(0, 96)), (slice(30, 72), slice(0, 50)), (slice(30, 72), slice(50, 96))],
+    ],
+)
+def test_windows_show_what_the_whole_image_does(windows):
+    """To what the order of a sum leaves: every pixel sees its neighbours, in its window or not."""
+    rng = np.random.default_rng(0)
+    frames = [frame_of(texture(0, x)) for x in (0.0, 3.0)]
+    path = np.zeros((2, *SHAPE), np.float32)
+    path[0] = 3.0
+    bend = rng.normal(0, 0.3, path.shape).astype(np.float32)
+    level, variance = texture(0, 1.2), np.full(SHAPE, 1e-3, np.float32)
+    all_of_it = (slice(0, 72), slice(0, 96))
+    found = [
+        whole(
+            Along(Motion(*frames, path, bend, unmoved_difference(*frames), tuple(parts)), 0.4),
+            level,
+            variance,
+        )
+        for parts in ([all_of_it], windows)
+    ]
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-6)
+
+
+def test_a_black_pixel_measures_nothing_and_a_frame_may_be_in_float64():
+    value, ceiling = np.zeros((3, 4)), np.full((3, 4), np.inf)
+    ceiling[1, 2] = 0.5
+    seen = as_seen(Latent(value, value + 0.1, ceiling))
+    expected = np.full((3, 4), 0.1, np.float32)
+    expected[1, 2] = UNMEASURED
+    np.testing.assert_array_equal(seen.variance, expected)
+    assert seen.value.dtype == seen.variance.dtype == np.float32
+    assert seen.ceiling is None
