@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.bridge import UNMEASURED, Latent
-from kalux.compiled import FUSED, apart, larger, loop
+from kalux.compiled import FUSED, larger, loop
 
 Floats = NDArray[np.floating[Any]]
 Plane = NDArray[np.float32]
@@ -105,17 +105,18 @@ def seen_along(along: Along, window: Window) -> tuple[Plane, Plane]:
     there, the finer the texture is that is read between its pixels, and the better they agree where nothing moves.
     """
     motion, share = along.motion, np.float32(along.share)
-    shape = tuple(part.stop - part.start for part in window)
-    first, second = apart(2, shape), apart(2, shape)  # columns and rows
-    for axis, here in enumerate(_places(*motion.path.shape[1:])):
-        paths = (plane[window] for plane in (here, motion.path[axis], motion.bend[axis]))
-        _follow(*_rows(*paths, first[axis], second[axis]), share, np.float32(along.between))
-    frames = *_read(motion.first, *first), *_read(motion.second, *second)
-    seen, difference, doubt = apart(3, shape)
-    _see(*_rows(*frames, seen, difference, doubt), share)
+    rows, columns = (part.stop - part.start for part in window)
+    flat = np.empty((7, rows * columns), np.float32)
+    x, other_x, y, other_y, seen, difference, doubt = flat.reshape(7, rows, columns)
+    here = _places(*motion.path.shape[1:])
+    for axis in (0, 1):
+        paths = (_flat(plane[axis][window]) for plane in (here, motion.path, motion.bend))
+        _follow(*paths, *flat[2 * axis : 2 * axis + 2], share, np.float32(along.between))
+    frames = *_read(motion.first, x, y), *_read(motion.second, other_x, other_y)
+    _see(*map(_flat, frames), *flat[4:], share)
     fine = np.square(seen - mean_around(seen, _TEXTURE))
     local = mean_around(_DISAGREEMENT * difference + _FINE_RESAMPLING * fine, _TEXTURE)
-    _doubt(*_rows(local, mean_around(difference, _EVIDENCE), motion.unmoved[window], doubt))
+    _doubt(*map(_flat, (local, mean_around(difference, _EVIDENCE), motion.unmoved[window])), flat[6])
     return seen, doubt
 
 
@@ -127,9 +128,9 @@ def _places(height: int, width: int) -> Plane:
     return places
 
 
-def _rows(*planes: Plane) -> Iterator[Plane]:
-    """Planes as loops take them; one that is written to must be contiguous."""
-    return (np.ascontiguousarray(plane).reshape(-1) for plane in planes)
+def _flat(plane: Plane) -> Plane:
+    """As loops take it."""
+    return np.ascontiguousarray(plane).reshape(-1)
 
 
 @loop(fastmath=FUSED)
@@ -185,10 +186,11 @@ def joined(seen: Plane, doubt: Plane, level: Plane, variance: Plane, between: fl
 
     What is seen counts ``between`` times (`Along.between`): at a frame the filter knows the frame itself.
     """
-    both = apart(2, seen.shape)
-    planes = seen, doubt, level, variance
-    _contradict(*_rows(*planes, both[0]))
-    _join(*_rows(mean_around(both[0], _EVIDENCE), *planes, *both), np.float32(between))
+    flat = np.empty((2, seen.size), np.float32)
+    both = flat.reshape(2, *seen.shape)
+    planes = [_flat(plane) for plane in (seen, doubt, level, variance)]
+    _contradict(*planes, flat[0])
+    _join(_flat(mean_around(both[0], _EVIDENCE)), *planes, *flat, np.float32(between))
     return both[0], both[1]
 
 
