@@ -91,7 +91,7 @@ class Around(NamedTuple):
     @property
     def misses_some(self) -> bool:
         """Whether there are pixels that neither frame measures."""
-        return bool((np.minimum(self.first, self.second) >= UNMEASURED).any())
+        return bool(np.minimum(self.first, self.second).max() >= UNMEASURED)
 
 
 def hidden_variance(
