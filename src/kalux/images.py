@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from kalux.augmentation.along import Along, joined_along
 from kalux.augmentation.bridge import RANDOM
 from kalux.augmentation.highlights import Unshown
+from kalux.augmentation.motion import Paths
 from kalux.augmentation.unseen import UNKNOWN_CHANGE
 from kalux.filters.highlights import keep_white, lifted, read_unshown, tempered
 from kalux.filters.readout import HighlightPrior, read_out
@@ -114,6 +115,10 @@ class Estimate:
     told
         (H, W): variance due to frames and events alone, where that is not P; None: P. Both ways in time, P includes the
         errors that both directions share: changes that no event has signalled, which K11 adds itself.
+    paths
+        Of what moves between the frames around (K16); None: not looked for, or nothing moves.
+    share
+        Of the way from the frame before to the one after; 0 where that is not known or not used.
     """
 
     t: int
@@ -131,7 +136,8 @@ class Estimate:
     exposed: float = 0.0
     since: float | None = None
     told: NDArray[np.floating[Any]] | None = None
-    along: Along | None = None
+    paths: Paths | None = None
+    share: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -187,7 +193,8 @@ def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) ->
     half_way = RANDOM if estimate.around is None else estimate.around.half_way
     hidden = hidden_variance(estimate.between, view.threshold2, estimate.exposed, estimate.since, half_way)
     # Colours of a mosaic's highlights depend on it, and how far the frames along the paths are believed.
-    needs_variance = with_variance or view.mosaic is not None or estimate.along is not None
+    along = _along(estimate)
+    needs_variance = with_variance or view.mosaic is not None or along is not None
     # That after averaging counts only for pixels that neither frame measures (K11).
     needs_averaged = needs_variance and (
         moving is None or (estimate.around is not None and estimate.around.misses_some)
@@ -220,8 +227,8 @@ def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) ->
             add_pattern(total, intensity, view.log_offset, pattern)
     if needs_variance and unshown is not None:
         total.reshape(-1)[unshown.pixels] += unshown.doubt
-    if estimate.along is not None:
-        _look_along(intensity, total, estimate.along, view.log_offset)
+    if along is not None:
+        _look_along(intensity, total, along, view.log_offset)
         if not with_variance:
             total = _infinite(intensity.shape)
     image = Image(estimate.t, intensity, total, view.log_offset, estimate.final, fixed_pattern=float(pattern))
@@ -232,6 +239,12 @@ def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) ->
 def _infinite(shape: tuple[int, ...]) -> NDArray[np.float32]:
     """The variance of an image that is not wanted, in no memory."""
     return np.ndarray(shape, np.float32, _INFINITE, strides=(0, 0))
+
+
+def _along(estimate: Estimate) -> Along | None:
+    """What the frames around an image show along the paths of what moves; None: nothing that is not known."""
+    motion = None if estimate.paths is None else estimate.paths.motion
+    return None if motion is None else Along(motion, estimate.share)
 
 
 def _look_along(

@@ -15,8 +15,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.along import Along, Motion
 from kalux.augmentation.highlights import Unshown
+from kalux.augmentation.motion import Paths
 from kalux.augmentation.refractory import EventClock
 from kalux.augmentation.trail import FrameTrail
 from kalux.compiled import event_words
@@ -59,7 +59,7 @@ class _Progress:
         self.starts_frame = starts_frame  # False for the lead-in before the first frame's node
         self.taken = 0  # number of the first event that the cursor has not taken, or an earlier one
         self.latest = segment.start  # time of the last event taken
-        self.motion: Motion | None = None  # what moves, once it has been looked for
+        self.paths: Paths | None = None  # of what moves, once it has been looked for
         self.looked = False
 
 
@@ -371,7 +371,8 @@ class Reconstructor:
             unmeasured=self._method.unmeasured(progress.segment, progress.cursor),
             exposed=changed_within(moment.exposed, self._method.turns(progress.segment)),
             since=moment.since(self._frame_interval),
-            along=self._along(progress, moment),
+            paths=self._paths(progress, moment),
+            share=moment.share,
         )
 
     def trail(self, t: int) -> NDArray[np.floating[Any]] | None:
@@ -430,12 +431,12 @@ class Reconstructor:
         share = (t - segment.start) / (segment.end - segment.start)
         return Moment(t, self._shots[0], self._shots[1], share)
 
-    def _along(self, progress: _Progress, moment: Moment) -> Along | None:
-        """What moves between the frames around an image (K16); None at a frame, and where there is one frame alone."""
+    def _paths(self, progress: _Progress, moment: Moment) -> Paths | None:
+        """Of what moves between the frames around an image (K16); None at a frame, and where there is one alone."""
         if moment.after is None or not 0.0 < moment.share < 1.0:
             return None
         self._look_for_motion(progress)
-        return None if progress.motion is None else Along(progress.motion, moment.share)
+        return progress.paths
 
     def _look_for_motion(self, progress: _Progress) -> None:
         """Look for what moves in a segment that is final, once, while all of its events are here."""
@@ -452,7 +453,7 @@ class Reconstructor:
         self._take(_Progress(segment, progress.memory, cursor, ready=True, starts_frame=True), half_way)
         level, variance = self._method.read(segment, cursor, half_way)
         on, off = self.thresholds
-        progress.motion = self._method.bent(
+        progress.paths = self._method.paths(
             segment, path, level, variance + hidden_variance(1.0, on * off).moving
         )
 

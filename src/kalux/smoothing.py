@@ -396,7 +396,8 @@ def combine(
         exposed=forward.exposed,
         since=_least(forward.since, backward.since),
         told=told,
-        along=forward.along,
+        paths=forward.paths,
+        share=forward.share,
     )
 
 

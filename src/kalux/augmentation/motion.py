@@ -7,6 +7,7 @@ along these paths is in `kalux.augmentation.along`.
 
 from __future__ import annotations
 
+import functools
 from typing import Any, Final
 
 import cv2
@@ -141,6 +142,29 @@ def _flow(image: NDArray[np.uint8], other: NDArray[np.uint8], points: Plane) -> 
         image, other, points, np.empty_like(points), winSize=_WINDOW, maxLevel=_LEVELS, criteria=_ENDS
     )
     return np.where(found[..., None] == 1, ends - points, np.float32(0.0))
+
+
+class Paths:
+    """The paths of what moves between two frames, found when they are first asked for.
+
+    Finding them takes about as long as all else that is done for a frame: the filter tells what it knows half-way and
+    goes on, and whoever makes an image asks.
+
+    Parameters
+    ----------
+    first, second, path
+        The frames, and the path from `find_path`.
+    level, variance
+        (H, W): L half-way, and its variance.
+    """
+
+    def __init__(self, first: Latent, second: Latent, path: Plane, level: Floats, variance: Floats) -> None:
+        self._known = first, second, path, level, variance
+
+    @functools.cached_property
+    def motion(self) -> Motion | None:
+        """None: nothing is seen along the paths that is not known."""
+        return bent(*self._known)
 
 
 def bent(first: Latent, second: Latent, path: Plane, level: Floats, variance: Floats) -> Motion | None:

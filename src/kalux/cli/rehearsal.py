@@ -13,9 +13,9 @@ from typing import Final
 
 import numpy as np
 
-from kalux.augmentation.along import Along, Motion
 from kalux.augmentation.bridge import BridgeNoise, Latent, bridge, drift, nominal_thresholds
 from kalux.augmentation.highlights import Unshown
+from kalux.augmentation.motion import Paths
 from kalux.augmentation.trail import Trail, nothing_followed, polarity_of, trail_between
 from kalux.augmentation.unseen import forget_silence, half_way, silent_change, turns
 from kalux.cli.loops import prepare_loops
@@ -75,10 +75,12 @@ def rehearse_images() -> None:
     )
     view = View(0.02, 0.04, 0.1, 1.0, 0.3, 1.0, 0.0, None, (1.0, 1.0, 1.0))
     make_image(estimate, view, with_variance=False)
-    frame, still = Latent(level, np.abs(level)), np.zeros((2, *_SIZE), np.float32)
-    everywhere = slice(0, _SIZE[0]), slice(0, _SIZE[1])
-    motion = Motion(frame, frame, still, still, np.abs(level), (everywhere,))
-    make_image(dataclasses.replace(estimate, along=Along(motion, 0.5)), view)
+    even, known = np.zeros(_SIZE, np.float32), np.ones(_SIZE, np.float32)
+    frame, aside = Latent(even, known), np.ones((2, *_SIZE), np.float32)
+    moving = dataclasses.replace(
+        estimate, log_intensity=even, variance=known, paths=Paths(frame, frame, aside, even, known), share=0.5
+    )
+    make_image(moving, view)
 
 
 def rehearse_display() -> None:

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation import bridge, deblur
-from kalux.augmentation.along import Motion, Plane
 from kalux.augmentation.bridge import BridgedSegment, BridgeNoise, Latent, Thresholds, UnshownMemory
 from kalux.augmentation.deblur import EXPOSED, EXPOSURE_FIELDS, Exposure, relative_levels
 from kalux.augmentation.highlights import (
@@ -20,7 +19,7 @@ from kalux.augmentation.highlights import (
     expected_excess,
     follow_unshown,
 )
-from kalux.augmentation.motion import bent, find_path
+from kalux.augmentation.motion import Paths, Plane, find_path
 from kalux.augmentation.trail import (
     Followed,
     Trail,
@@ -519,9 +518,9 @@ class BridgedFrames(Method):
             return None
         return find_path(*segment.latents, *(float(np.log(i + self.offset)) for i in (0.0, 1.0)))
 
-    def bent(self, segment: BridgedSegment, path: Plane, level: Floats, variance: Floats) -> Motion | None:
+    def paths(self, segment: BridgedSegment, path: Plane, level: Floats, variance: Floats) -> Paths:
         assert segment.latents is not None
-        return bent(*segment.latents, path, level, variance)
+        return Paths(*segment.latents, path, level, variance)
 
     def turns(self, segment: BridgedSegment) -> float:
         return segment.turns

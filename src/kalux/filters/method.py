@@ -14,8 +14,8 @@ from typing import Any, Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.along import Motion, Plane
 from kalux.augmentation.highlights import Unshown
+from kalux.augmentation.motion import Paths, Plane
 from kalux.event_slices import all_between, count_chunks
 from kalux.events import EventArray
 from kalux.filters.akf import State
@@ -116,8 +116,8 @@ class Method(ABC):
         """(H, W, 2) by how much pixels move between the frames of a segment (K16); None: not told, or nothing does."""
         return None
 
-    def bent(self, segment: Any, path: Plane, level: Floats, variance: Floats) -> Motion | None:
-        """The paths bent to L and P half-way; None: they tell nothing."""
+    def paths(self, segment: Any, path: Plane, level: Floats, variance: Floats) -> Paths | None:
+        """The same bent to L and P half-way; None: not told."""
         return None
 
     def unmeasured(self, segment: Any, cursor: Any) -> NDArray[np.int64] | None:
