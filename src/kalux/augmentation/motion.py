@@ -184,30 +184,38 @@ def bent(first: Latent, second: Latent, path: Plane, level: Floats, variance: Fl
     -------
     The motion; None: nothing is seen along the paths that is not known.
     """
-    height, width = path.shape[1:]
-    level, variance = np.asarray(level, np.float32), np.asarray(variance, np.float32)
-    side = 4 * (width // _columns(width)) - 1
-    whole = slice(0, height), slice(0, width)
+    moving = np.abs(path).max(axis=0) > _STILL
+    if not moving.any():
+        return None
+    side = 4 * (path.shape[2] // _columns(path.shape[2])) - 1
+    window = _around(moving, side)
+    level, variance = np.asarray(level[window], np.float32), np.asarray(variance[window], np.float32)
     first, second = as_seen(first), as_seen(second)
-    motion = Motion(first, second, path, np.zeros_like(path), unmoved_difference(first, second), (whole,))
+    motion = Motion(first, second, path, np.zeros_like(path), unmoved_difference(first, second), (window,))
+    half_way, bend = Along(motion, 0.5), motion.bend[:, *window]
     for _ in range(_BENDS):
-        seen, doubt = seen_along(Along(motion, 0.5), whole)
-        motion = motion._replace(
-            bend=_bent_further(motion.bend, seen, level - seen, variance + doubt, (side, side))
-        )
-    _, left = joined(*seen_along(Along(motion, 0.5), whole), level, variance, 1.0)
-    gain = 1.0 - left / variance
-    windows = tuple(_windows(np.where(np.abs(path).max(axis=0) > _STILL, gain, np.float32(0.0))))
+        seen, doubt = seen_along(half_way, window)
+        bend[:] = _bent_further(bend, seen, level - seen, variance + doubt, (side, side))
+    _, left = joined(*seen_along(half_way, window), level, variance, 1.0)
+    gain = np.zeros(moving.shape, np.float32)
+    gain[window] = np.where(moving[window], 1.0 - left / variance, np.float32(0.0))
+    windows = tuple(_windows(gain))
     return motion._replace(windows=windows) if windows else None
+
+
+def _around(places: NDArray[np.bool_], margin: int) -> Window:
+    """The rows and columns that hold all places that are true, and a margin around them."""
+    held = (np.flatnonzero(places.any(axis=axis)) for axis in (1, 0))
+    rows, columns = (slice(max(int(at[0]) - margin, 0), int(at[-1]) + margin + 1) for at in held)
+    height, width = places.shape
+    return slice(rows.start, min(rows.stop, height)), slice(columns.start, min(columns.stop, width))
 
 
 def _windows(gain: Plane) -> list[Window]:
     """Tiles in which what is seen counts for `_LEAST_GAIN` on average; those beside each other are one window."""
     (height, width), (rows, columns) = gain.shape, _TILE
     found: list[Window] = []
-    above: dict[
-        tuple[int, int], int
-    ] = {}  # first rows of the windows that end above the strip, by their columns
+    above: dict[tuple[int, int], int] = {}  # of windows that reach down to the strip: first row, by columns
     for top in [*range(0, height, rows), height]:
         strip = gain[top : top + rows]
         lefts = range(0, width, columns)
