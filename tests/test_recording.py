@@ -106,6 +106,13 @@ def test_a_white_value_that_can_hardly_be_right_is_warned_of():
         in_memory(frames=dark)
 
 
+def test_a_last_exposure_that_can_hardly_be_right_is_warned_of():
+    *others, last = small_frames()
+    damaged = dataclasses.replace(last, exposure_end=last.exposure_end + 10**6)
+    with pytest.warns(UserWarning, match="arrays: the last frame is exposed for .* is the end .* right"):
+        in_memory(frames=[*others, damaged])
+
+
 @pytest.mark.parametrize(
     ("start", "told"), [(0, []), (1_850, ["only 3 of the 40"]), (9_999, ["none of the 40"])]
 )

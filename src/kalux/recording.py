@@ -35,6 +35,7 @@ from kalux.frames import (
     Mosaic,
     Stamp,
     check_frame,
+    exposure_doubt,
     is_white,
     median_exposure,
     place_exposure,
@@ -244,7 +245,8 @@ class Recording:
         Warns
         -----
         UserWarning
-            If what is taken for white can hardly be right, or events and frames hardly have the same clock.
+            If what is taken for white can hardly be right, or the last exposure is longer than frames are apart, or
+            events and frames hardly have the same clock.
         """
         size = checked_size(sensor_size)
         if ground_truth is not None:
@@ -278,12 +280,11 @@ class Recording:
         for _ in recording.events():
             pass
         check = WhiteCheck()
-        exposures = [
-            (frame.exposure_start, frame.exposure_end) for frame in check.watched(recording.frames())
-        ]
-        doubts = [check.doubt()]
-        if exposures:
-            first, last = np.searchsorted(array["t"], (exposures[0][0], exposures[-1][1] + 1))
+        spans = [(frame.exposure_start, frame.exposure_end) for frame in check.watched(recording.frames())]
+        exposures = np.array(spans, np.int64).reshape(-1, 2)
+        doubts = [check.doubt(), exposure_doubt(exposures)]
+        if len(exposures):
+            first, last = np.searchsorted(array["t"], (exposures[0, 0], exposures[-1, 1] + 1))
             doubts.append(clock_doubt(len(array), int(last - first)))
         for doubt in filter(None, doubts):
             warnings.warn(f"{name}: {doubt}", stacklevel=2)
