@@ -18,7 +18,7 @@ from kalux import memory
 from kalux.calibration.values import Calibration
 from kalux.events import EventArray
 from kalux.images import Estimate, Image
-from kalux.planning import DOUBTED, Plan, plan
+from kalux.planning import UNCERTAIN_ORIGINS, Plan, plan
 from kalux.reconstructor import Reconstructor
 from kalux.recording import Recording
 from kalux.settings import Settings
@@ -168,7 +168,7 @@ def _engine(recording: Recording, plan: Plan) -> Reconstructor:
         recording.sensor_size,
         settings=plan.settings,
         lookahead=plan.lookahead,
-        threshold_is_estimate=plan.threshold_origin in DOUBTED,
+        threshold_is_estimate=plan.threshold_origin in UNCERTAIN_ORIGINS,
         inverse_covariance=recording.source.inverse_covariance,
         pixels=plan.pixels,
     )

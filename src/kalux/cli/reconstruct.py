@@ -29,7 +29,7 @@ from kalux.display import CURVES
 from kalux.errors import InputError
 from kalux.pipeline import execute
 from kalux.plan_report import ORIGINS, plan_report
-from kalux.planning import Plan, plan
+from kalux.planning import ESTIMATED_ORIGINS, Plan, plan
 from kalux.reconstructor import Reconstructor
 from kalux.recording import Recording
 from kalux.settings import PRESETS, Settings, from_dict, load, preset, read_toml, to_dict
@@ -194,8 +194,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
 
 def _compiled_later(settings: Settings) -> tuple[str, ...]:
     """Parts of `kalux.cli.rehearsal` that a reconstruction comes to after the estimates."""
-    is_default = settings.filter.kind == "akf" and settings.filter.augmentation == "bridge"
-    return OF_ALL if is_default else OF_IMAGES
+    return OF_ALL if settings.filter.joins_frames else OF_IMAGES
 
 
 def _check_apart(output: Output, recording: Path) -> None:
@@ -291,7 +290,7 @@ def plan_warnings(planned: Plan, contents: Contents, preset_name: str) -> Iterat
     gap = gap_warning(planned, contents)
     if gap is not None:
         yield gap
-    if planned.threshold_origin in ("estimate", "assumed"):
+    if planned.threshold_origin in ESTIMATED_ORIGINS:
         yield threshold_warning(planned, preset_name)
     if (
         planned.threshold_origin == "assumed"
