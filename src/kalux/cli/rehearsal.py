@@ -15,7 +15,7 @@ import numpy as np
 from kalux.augmentation.bridge import BridgeNoise, Latent, bridge, drift, nominal_thresholds
 from kalux.augmentation.highlights import Unshown
 from kalux.augmentation.trail import Trail, nothing_followed, polarity_of, trail_between
-from kalux.augmentation.unseen import forget_silence, half_way, silent_change, turns
+from kalux.augmentation.unseen import add_missed_change, half_way, silent_change, turns
 from kalux.cli.loops import prepare_loops
 from kalux.compiled import apart
 from kalux.display import Auto, DisplaySettings, fill_levels, measure, quantised
@@ -101,7 +101,7 @@ def rehearse_segment() -> None:
     of_silent = silent_change(joined, variance, variance)
     half_way(change, joined, variance, variance)
     drifted, _, _ = drift(first, second, thresholds, noise, (far_on, far_off), (on, off))
-    forget_silence(drifted, joined, second, (on, off), of_silent, variance)
+    add_missed_change(drifted, joined, second, (on, off), of_silent, variance)
     turns(on, off)
     trail = Trail(start, polarity_of(newest), seconds, 0.1, 0.1)
     segment = joined._replace(trail=trail, drift=drifted)
