@@ -293,7 +293,7 @@ def _with_frame_noise(recording: Recording, settings: Settings) -> tuple[Setting
     if camera.frame_noise is not None or not settings.filter.joins_frames:
         return settings, None
     found = estimate_frame_noise(recording, camera)
-    if found is not None and not found.believed:
+    if found is not None and not found.is_reliable:
         found = None
     read, shot = usual_noise(recording, camera) if found is None else (found.read, found.shot)
     shot = shot if camera.shot_noise is None else camera.shot_noise
@@ -308,7 +308,7 @@ def _with_fixed_pattern(recording: Recording, settings: Settings) -> tuple[Setti
     if settings.camera.fixed_pattern is not None or not settings.filter.joins_frames:
         return settings, None
     found = estimate_fixed_pattern(recording, settings.camera)
-    if found is not None and not found.told:
+    if found is not None and not found.is_measured:
         return altered(settings, "camera", fixed_pattern=USUAL_PATTERN), None
     return altered(settings, "camera", fixed_pattern=0.0 if found is None else found.deviation), found
 

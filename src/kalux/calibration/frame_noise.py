@@ -74,7 +74,7 @@ class FrameNoise(NamedTuple):
     variances: Array
 
     @property
-    def believed(self) -> bool:
+    def is_reliable(self) -> bool:
         """Whether the points lie on a line well enough to be taken as settings."""
         return self.error < _BELIEVED
 

@@ -40,8 +40,8 @@ scenes 0.26 to 0.7; eight that frames show wholly, of which two have thresholds 
 _EXPLAINED: Final = 0.5
 """By how much events may say more or less than frames at other levels: beyond that they do not explain the frames."""
 
-_ALIKE: Final = 0.1
-"""Between the quartiles of the brightest levels over their median, at most: sensors that end at one level have 0 to
+_LARGEST_SPREAD: Final = 0.1
+"""Largest interquartile range of the brightest levels, over their median: sensors that end at one level have 0 to
 0.05, newton, whose highlights are thin, 0.2."""
 
 
@@ -112,7 +112,7 @@ def find_ceiling(recording: Recording, camera: CameraSettings, events: EventSett
     usual = float(np.median(mismatches[below]))
     excess = float(np.median(mismatches[top])) - usual
     low, level, high, most = (float(value) for value in np.quantile(ends[top], [0.25, 0.5, 0.75, 0.95]))
-    if excess < _EXCESS or abs(usual) > _EXPLAINED or high - low > _ALIKE * level:
+    if excess < _EXCESS or abs(usual) > _EXPLAINED or high - low > _LARGEST_SPREAD * level:
         return None
     return Ceiling(level, 2 * level - most, excess, int(np.count_nonzero(top)))
 
@@ -138,14 +138,14 @@ def _changes(
     """
     threshold_on, threshold_off = events.thresholds
     for interval, on, off, bend in counted_intervals(recording, camera, events, most_frames=_MAX_FRAMES):
-        told = threshold_on * on - threshold_off * off + bend - interval.change
+        beyond = threshold_on * on - threshold_off * off + bend - interval.change
         frames = [end.frame for end in interval.ends]
         for sign, frame in zip((-1, 1), frames, strict=True):
             ends = frame.normalised()
             chosen = (sign * (on - off) >= _LEAST_NET) & (ends >= least)
             for each in frames:
                 chosen &= True if each.valid is None else each.valid
-            yield np.stack([ends[chosen], sign * told[chosen]])
+            yield np.stack([ends[chosen], sign * beyond[chosen]])
 
 
 def exact_end(recording: Recording, below: float) -> float | None:

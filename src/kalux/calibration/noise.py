@@ -113,7 +113,7 @@ class NoiseCalibration:
         if self.refractory_at_most is not None:
             measured["refractory_at_most"] = self.refractory_at_most
         if self.frames is not None:
-            if self.frames.believed:
+            if self.frames.is_reliable:
                 camera |= {"frame_noise": self.frames.read, "shot_noise": self.frames.shot}
                 errors |= {
                     "frame_noise": self.frames.error * self.frames.read,

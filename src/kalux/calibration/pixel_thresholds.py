@@ -451,7 +451,7 @@ def shrunk(normal: Array, right: Array) -> tuple[Array, Array, Array, Array]:
     Mean (2,) and covariance (2, 2) of the pixels that say something; (N, 2) estimates of every pixel relative to that
     mean, shrunk towards it; (N, 2) the variance that is left. A pixel that says nothing is the mean.
     """
-    told = np.flatnonzero(normal[:, 0] + normal[:, 2] > 0)
+    known = np.flatnonzero(normal[:, 0] + normal[:, 2] > 0)
     mean, covariance = np.zeros(2), 0.01 * np.eye(2)
     values, left = np.zeros((len(normal), 2)), np.zeros((len(normal), 2, 2))
     information = np.stack([normal[:, [0, 1]], normal[:, [1, 2]]], axis=1)
@@ -459,10 +459,10 @@ def shrunk(normal: Array, right: Array) -> tuple[Array, Array, Array, Array]:
         prior = np.linalg.inv(covariance)
         left = np.linalg.inv(information + prior)
         values = np.einsum("nij,nj->ni", left, right + prior @ mean)
-        if len(told) < 10:
+        if len(known) < 10:
             break
-        mean = values[told].mean(axis=0)
-        away = values[told] - mean
-        covariance = products(away.T, away.T) / len(told) + left[told].mean(axis=0)
+        mean = values[known].mean(axis=0)
+        away = values[known] - mean
+        covariance = products(away.T, away.T) / len(known) + left[known].mean(axis=0)
         covariance += _LEAST_SPREAD**2 * 1e-2 * np.eye(2)
     return mean, covariance, values - mean, np.stack([left[:, 0, 0], left[:, 1, 1]], axis=1)

@@ -201,7 +201,7 @@ def _noise(recording: Recording, response: str, black: float, high: float) -> tu
     if name not in ("auto", "linear"):
         return None
     found = estimate_frame_noise(recording, CameraSettings(response=name))
-    if found is None or not found.believed:
+    if found is None or not found.is_reliable:
         return None
     scale = high * (1.0 - black)
     return found.read / scale, found.shot / scale
