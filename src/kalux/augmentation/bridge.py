@@ -275,7 +275,7 @@ def _drift(  # type: ignore[no-untyped-def]
 
 
 def raise_to_bound(log_intensity: Array, frame: Latent) -> None:
-    """Raise L to the lower bounds that a frame's clipped pixels are (docs/equations.md, K7). In place.
+    """Raise L to the lower bounds that clipped pixels of a frame give (docs/equations.md, K7). In place.
 
     A frame integrates: where its value is clipped, the mean over the exposure was at least the value, and the
     latent value computed from it is a bound for every moment.
@@ -284,7 +284,7 @@ def raise_to_bound(log_intensity: Array, frame: Latent) -> None:
 
 
 def lower_to_ceiling(log_intensity: Array, frame: Latent) -> None:
-    """Lower L to the upper bounds that a frame's black pixels are (K7). In place."""
+    """Lower L to the upper bounds that black pixels of a frame give (K7). In place."""
     if frame.ceiling is not None:
         np.minimum(log_intensity, frame.ceiling, out=log_intensity)
 
@@ -297,7 +297,7 @@ def _raise_to_bound(log_intensity, value, variance):  # type: ignore[no-untyped-
 
 
 def nominal_thresholds(shape: tuple[int, int], spread: float, dtype: Any = np.float64) -> Thresholds:
-    """Before any calibration: factor 1 with the variance that pixels have among each other."""
+    """Thresholds before any calibration: all factors are 1, with the variance between pixels."""
     return Thresholds(*(np.full(shape, value, dtype) for value in (1.0, 1.0, spread**2, spread**2)))
 
 
@@ -391,7 +391,7 @@ def _bridge(given, thresholds, noise, seconds, planes, factors):  # type: ignore
             here, more = np.float64(value[i]), np.float64(grown[i])
             saturated = (smaller(before, after) >= UNMEASURED) & (larger(before, after) < MASKED)
             s[_COUNT_ON + k], s[_COUNT_OFF + k] = on[i], off[i]
-            # Two bounds: all that they say of the change is that it does not go on and on.
+            # Two lower bounds have no information of the change, but that it does not grow without limit.
             s[_CHANGE + k] = -more if saturated else np.float64(next_value[i]) - more - here
             s[_BOTH + k] = of_saturated if saturated else before + after
             s[_LEVEL + k], s[_MOVES + k] = here, 0.0 if saturated else before
@@ -439,8 +439,8 @@ def _bridge(given, thresholds, noise, seconds, planes, factors):  # type: ignore
             net[i] = step_on[i] * on[i] - step_off[i] * off[i] + grown[i]
         for k in pixels:
             i = first + k
-            # What is not known of a pixel that no frame measured is a constant: if events lead from it to less than
-            # the next frame's bound, it was too low all the time.
+            # The unknown excess of a pixel that no frame measures does not change: if events lead to a level below the
+            # next frame's bound, the level was too low all the time.
             bounded = (
                 (variance[i] >= UNMEASURED) & (next_variance[i] >= UNMEASURED) & (next_variance[i] < MASKED)
             )

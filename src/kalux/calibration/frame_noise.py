@@ -194,9 +194,16 @@ _Points = list[list[tuple[float, float, int]]]
 
 
 class _Surroundings(NamedTuple):
-    """Pixels around one, which see no event: their ``shape``, and how many such are enough in a bin of a frame pair.
+    """Which pixels around one must be without events for it to count as still.
 
-    ``moves``: so few that faint motion counts.
+    Attributes
+    ----------
+    shape
+        The pixels: a mask with the pixel in its middle.
+    least
+        How many still pixels are enough in a bin of a frame pair.
+    moves
+        Whether the mask is so small that faint motion passes it.
     """
 
     shape: NDArray[np.uint8]
@@ -212,7 +219,7 @@ _SURROUNDINGS: Final = (
 
 
 def _is_curve(points: _Points) -> bool:
-    """Whether there are two levels at least."""
+    """Whether there are points at two levels, the least that a line can be fitted to."""
     return sum(map(bool, points)) >= 2
 
 
@@ -254,7 +261,7 @@ def _mark(words, busy):  # type: ignore[no-untyped-def]
 
 
 def _near(dark: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(H, W): where one is among 3x3."""
+    """(H, W): pixels with a marked one among the 3x3 around them."""
     return np.asarray(cv2.dilate(dark.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0, np.bool_)
 
 

@@ -104,7 +104,7 @@ twice the products of neighbouring intervals."""
 
 @loop
 def _add(mismatches, variances, usable, steps_on, steps_off, products):  # type: ignore[no-untyped-def]
-    """One interval."""
+    """Add one interval to the sums of `_PRODUCTS`, in place."""
     for row in range(usable.shape[0]):
         for column in range(usable.shape[1]):
             i = row, column

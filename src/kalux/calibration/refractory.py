@@ -76,7 +76,7 @@ class Intervals(NamedTuple):
 
 
 def shortest_interval(recording: Recording, most_events: int = 3_000_000) -> int:
-    """The first of `intervals`."""
+    """`Intervals.shortest` of the first ``most_events``, us."""
     return intervals(recording, most_events).shortest
 
 
@@ -136,7 +136,7 @@ def _onset(shorter: NDArray[np.int64], turning: NDArray[np.int64]) -> int:
         return 0
 
     def likelihood(number: NDArray[np.int64], time: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Logarithm of that of so many intervals, at the density that they have; but for what all edges share."""
+        """Log likelihood of ``number`` intervals in ``time`` at their own density, up to terms that all edges share."""
         return np.asarray(number * np.log(np.maximum(number, 1) / time))
 
     gain = likelihood(before, of_before) + likelihood(after, of_after)

@@ -193,7 +193,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
 
 
 def _compiled_later(settings: Settings) -> tuple[str, ...]:
-    """Parts of `kalux.cli.rehearsal` that a reconstruction comes to after the estimates."""
+    """Parts of `kalux.cli.rehearsal` that a reconstruction needs after the estimates."""
     return OF_ALL if settings.filter.joins_frames else OF_IMAGES
 
 
@@ -222,7 +222,7 @@ def chosen_settings(options: argparse.Namespace) -> Settings:
 
 
 def make_plan(recording: Recording, settings: Settings, times: Any, options: argparse.Namespace) -> Plan:
-    """Decide everything, of the whole recording.
+    """The plan of the whole recording.
 
     Raises
     ------
@@ -269,7 +269,7 @@ def part_of(planned: Plan, contents: Contents, options: argparse.Namespace) -> P
 
 
 def _origin(planned: Plan, options: argparse.Namespace) -> Any:
-    """Where the thresholds come from; those of a former run's `kalux.toml` come from where they did then."""
+    """Where the thresholds come from; of those in a former run's `kalux.toml`, the origin that it states."""
     flags = given_settings(options).get("events", {})
     if (
         planned.threshold_origin != "settings"
@@ -335,7 +335,7 @@ def gap_warning(planned: Plan, contents: Contents) -> str | None:
 
 
 def contradicts(estimate: ThresholdEstimate) -> bool:
-    """Whether many samples say next to nothing of the thresholds."""
+    """Whether many samples have next to no information of the thresholds."""
     return estimate.samples >= _MANY_SAMPLES and estimate.usual_share > _NEARLY_ALL
 
 

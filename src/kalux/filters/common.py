@@ -61,5 +61,5 @@ def newest_around(newest, row, column):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, inline="always")
 def newest_around_inside(clock, at, stride):  # type: ignore[no-untyped-def]
-    """The same of a flat `Clock` of rows of ``stride``, by a pixel's index in it."""
+    """As `newest_around`, of a flat `Clock` with rows of ``stride``, by a pixel's index in it."""
     return largest_around(clock, at, stride)

@@ -1,4 +1,4 @@
-"""The paper's way from frame to frame: frames deblurred and interpolated by (10) to (13)."""
+"""The paper's method: frames are deblurred, and interpolated by (10) to (13)."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ class Segment(Protocol):
 
 
 class Method(ABC):
-    """One way to filter. Memory, segments and cursors are opaque to its caller.
+    """A method to filter from frame to frame. Memory, segments and cursors are opaque to its caller.
 
     Queries that a method does not support return None, or 0.
     """

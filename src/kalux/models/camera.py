@@ -291,7 +291,7 @@ class BrightTail(NamedTuple):
     white: int = 0
 
     def joined(self, other: BrightTail) -> BrightTail:
-        """Both together."""
+        """The counts of two sets of frames together."""
         return BrightTail(self.half + other.half, self.white + other.white)
 
     @property
