@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from kalux import memory
 from kalux.compiled import larger, largest_around, loop, smaller
 
-MICROSECOND = 1e-6
+MICROSECOND: Final = 1e-6
+"""Seconds."""
 
 Clock = NDArray[np.int32]
 """(H + 2, W + 2) int32: time of every pixel's newest event, us after an origin kept beside it. The frame of one pixel
