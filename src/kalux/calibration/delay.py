@@ -23,20 +23,22 @@ STEP: Final = 1_000
 LARGEST: Final = 12_000
 """Largest delay that is tried, us: the photoreceptor's, in the dark, is some milliseconds (Lichtsteiner 2008)."""
 
-_COARSE: Final = 3  # delays of the grid, of which one is tried first: residuals have valleys 4 ms wide
-_VALLEY: Final = 4_000  # us
+_COARSE: Final = (
+    3  # points of the grid from one delay tried first to the next: valleys of the residuals are wider
+)
+_VALLEY: Final = 4_000  # us: their width
 
 _AROUND: Final = (-3, 3)
-"""Delays of the grid, from the one at which frames are explained best if nothing moves within exposures, that are tried
-with what does: 0 to 1.8 ms earlier or up to 0.9 later on 40 simulated scenes."""
+"""Points of the grid around the delay found without motion within exposures, between which it is searched with such
+motion: on 40 simulated scenes it is 0 to 1.8 ms earlier or up to 0.9 later."""
 
 _RIVAL: Final = 1.05
-"""Where light flickers, frames are explained nearly as well by events a period of it earlier or later: of valleys whose
-least residual is no larger than so many times the least of all, the one nearest to no delay is taken. At a simulated
-lamp of 100 Hz there are two, at -8.8 and 1.3 ms, whose residuals differ by 2 %."""
+"""Factor of the least residual up to which the minimum of another valley is a rival; of these, the one nearest to no
+delay is taken. Under light that flickers, events a period earlier or later explain frames nearly as well: with a
+simulated lamp of 100 Hz there are minima at -8.8 and 1.3 ms, which differ by 2 %."""
 
 _WALL: Final = 1.05
-"""Of the least residual, where walls of its valley are."""
+"""Factor of the least residual at which the walls of its valley are taken."""
 
 _MIN_SAMPLES: Final = 500
 _MAX_SAMPLES: Final = 60_000

@@ -31,17 +31,18 @@ Array = NDArray[np.float64]
 
 _MIN_SAMPLES: Final = 200
 _SHORTEST_EVENTS: Final = 500_000
-"""Of which the shortest interval is taken: its edge is then that of 10,000 pairs."""
+"""Events from which the shortest interval is taken: some 10,000 intervals then lie at its edge."""
 
 ROUGH_SAMPLES: Final = 10_000
-"""Pixels for one delay, of which the best is then within 0.2 ms of that of more on twenty scenes and recordings, and
-for thresholds that I_0 is to be found with: these are then within 1 %, and two intervals have them."""
+"""Pixels for each delay that is tried: on twenty scenes and recordings the best delay is then within 0.2 ms of that of
+more pixels. Also for the thresholds with which I_0 is estimated: they are then within 1 %, and two frame intervals have
+so many pixels."""
 
 _TRAILING: Final = (0, 2_000, 4_000, 6_000)
-"""us by which events may seem later than they are: 0.9 to 5.9 ms on forty scenes whose events are in time."""
+"""us by which the apparent delay may exceed the true one: 0.9 to 5.9 ms on forty scenes whose true delay is 0."""
 
 _PERIOD_SAMPLES: Final = 30_000
-"""Pixels for the refractory period: what is not known of the excess is then 0.02 on scenes where something is lost."""
+"""Pixels for the refractory period: the standard error of the excess is then 0.02 on scenes where changes are lost."""
 
 _MODEL: Final = 0.02
 """Relative error of thresholds from the neighbours' counts, beside the statistical one: -1.3 to 4.3 %, 1.6 % in the
@@ -67,23 +68,23 @@ _PRIOR_REACH: Final = 6.0  # standard deviations, or a factor of 400
 _PRIOR_POINTS: Final = 1201  # 0.005 apart with the usual spread, a quarter of the least error
 
 _LEAST_EXCESS: Final = 0.05
-"""By how much more events that follow soon must tell than late ones, two standard errors taken off, for something to be
-lost in the refractory period. Where nothing is lost it is -0.02 to 0.05 on twelve simulated scenes and -0.18 +- 0.05,
-0.12 +- 0.06 and -0.02 +- 0.08 on three recordings, with 0.2 to 2 ms 0.12 to 0.92 on eight scenes. What is lost and not
-believed costs more than what is believed and not lost: 0.2 ms change the held-out errors of the three recordings by 5 %
-to the better and 2 % to the worse."""
+"""Least excess of the steps of events that follow soon over those of late ones, less two standard errors, from which
+changes count as lost in the refractory period. Where nothing is lost it is -0.02 to 0.05 on twelve simulated scenes and
+-0.18 +- 0.05, 0.12 +- 0.06 and -0.02 +- 0.08 on three recordings; with 0.2 to 2 ms it is 0.12 to 0.92 on eight scenes.
+The limit is low because a period that is missed costs more than one that is assumed wrongly: 0.2 ms change the held-out
+errors of the three recordings by 5 % to the better and 2 % to the worse."""
 
 _USUAL_EXCESS: Final = 0.02  # where nothing is lost
 
 _THRESHOLD_OF_EXCESS: Final = 0.6
-"""Relative error of thresholds over that of the excess: what is lost makes thresholds of seven scenes by 0.3 to 0.63 of
-the excess too large."""
+"""Relative error of thresholds over that of the excess: lost changes make the thresholds of seven scenes too large by
+0.3 to 0.63 of the excess."""
 
 _LEAST_DOUBT: Final = 0.02
-"""Of thresholds, by what may be lost: that of an excess that would be believed if it were exact."""
+"""Least relative error of thresholds, by changes that may be lost, that matters: that of the least excess."""
 
 _LARGEST_SHORTEST: Final = 5_000
-"""us: of pixels that never follow sooner little is lost in the refractory period of any sensor, some 2 ms at most."""
+"""us: where events of a pixel are never closer, little is lost in the refractory period of any sensor, at most 2 ms."""
 
 
 class ThresholdEstimate(NamedTuple):
@@ -125,7 +126,7 @@ class ThresholdEstimate(NamedTuple):
 
     @property
     def may_lose(self) -> bool:
-        """Whether something is lost in the refractory period, or may be as far as this estimate can tell."""
+        """Whether changes are lost in the refractory period, or the estimate cannot exclude it."""
         return self.refractory_period > 0 or self.doubt > _LEAST_DOUBT
 
 
@@ -208,9 +209,9 @@ def with_true_delay(
     of_log_offset: bool = False,
     refractory_period: int = 0,
 ) -> DelayEstimate:
-    """How late events are, of how late they seem, where an estimate of the thresholds finds it.
+    """A delay estimate completed by the true delay, where an estimate of the thresholds finds that.
 
-    Parameters are those of `estimate_thresholds`.
+    ``late`` has the apparent delay. The other parameters are those of `estimate_thresholds`.
     """
     found = estimate_thresholds(
         recording,
@@ -240,7 +241,7 @@ def refine_thresholds(
     of_log_offset: bool = False,
     refractory_period: int | None = 0,
 ) -> ThresholdEstimate:
-    """The thresholds with another I_0 than that of a rough estimate, whose delay is right whatever I_0 is.
+    """The thresholds with another I_0 than a ``rough`` estimate, of which the delay is kept: it does not depend on I_0.
 
     Parameters are those of `estimate_thresholds`, by which ``rough`` was made with the same ``refractory_period``.
     """
@@ -458,9 +459,9 @@ def _log_thresholds(
     """The thresholds of a regression, with ``error`` its relative error beside the statistical one."""
     if fit is None:
         return _LogThresholds(np.zeros(2), np.full(2, np.inf))
-    steps = samples.steps
+    observed = samples.steps
     errors = standard_errors(
-        steps.change, explained, instruments, fit.weights, steps.pixel, samples.sensor_size
+        observed.change, explained, instruments, fit.weights, observed.pixel, samples.sensor_size
     )
     found = fit.solution[:2]
     positive = found > 0

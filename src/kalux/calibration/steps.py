@@ -1,20 +1,20 @@
-"""What pixels and their neighbours saw between two frames: the events, and by how much the frames changed.
+"""Samples for regressions: events of pixels and their neighbours between two frames, and the changes of the frames.
 
-An event says that the light has moved by a threshold since the pixel's previous one, not when. Here its step is spread
-over that time, so that only a part of it may lie between the frames:
+An event means that the light has moved by a threshold since the pixel's previous one, but not when. Here its step is
+spread over that time, so that only a part of it may lie between the frames:
 
-- Between two events of one sign the light goes straight from level to level.
-- Where the direction turns it goes on first, by half a threshold (0 to 1 are all as likely), and then back by one and a
-  half. Without the way back that no event tells of, thresholds come out 5 to 13 % too large where texture is fine.
-- It moves at the pace of the events beside, and waits between for the rest of a long time.
+- Between two events of one sign the light moves straight from level to level.
+- Where the direction turns it first goes on by half a threshold, the mean of 0 to 1, and then back by one and a half.
+  Without the unreported way back, thresholds come out 5 to 13 % too large where texture is fine.
+- It moves at the pace of the neighbouring events of the pixel, and rests for what remains of a long time.
 
-Where nothing is wrong with the sensor this leaves half of what is left where a step counts as a whole when its event
-comes, and the error of the thresholds is within 2 %, whatever the exposures.
+On ideal sensors the residuals are half of those with steps that count as a whole at the time of their event, and the
+error of the thresholds is within 2 %, whatever the exposures.
 
-A frame shows the logarithm of the mean over its exposure, while steps make the mean of the logarithm. By how much the
-one is more than the other events within the exposure tell, and it is taken off. Left in, steps that follow soon, which
-are of fast edges, seem worth 13 % less to 10 % more than others where exposures take three quarters of the time (nine
-simulated scenes; 4 % less to 1 % more without).
+A frame shows the logarithm of the mean over its exposure, while steps add up to the mean of the logarithm. The
+difference follows from the events within the exposure, and is subtracted. Otherwise steps of events that follow soon,
+which are those of fast edges, would seem 13 % smaller to 10 % larger than others where exposures take three quarters of
+the time (nine simulated scenes; 4 % smaller to 1 % larger with the correction).
 """
 
 from __future__ import annotations
@@ -39,24 +39,24 @@ from kalux.settings import CameraSettings
 Array = NDArray[np.float64]
 
 MAX_SAMPLES: Final = 100_000
-"""Pixels that are enough: the standard error of thresholds is then below 1 %."""
+"""Number of pixels that is enough: the standard error of thresholds is then below 1 %."""
 
 _MAX_FRAMES: Final = 200
-_LEAST_AROUND: Final = 8  # events of the eight neighbours: where less happens it may be noise
-_LEAST_NEIGHBOURS: Final = 4  # that frames show well
+_LEAST_AROUND: Final = 8  # events of the eight neighbours: fewer may be noise
+_LEAST_NEIGHBOURS: Final = 4  # neighbours that frames show well
 _PATCH: Final = tuple((row, column) for row in (-1, 0, 1) for column in (-1, 0, 1))
 
 _HOT_LEAST: Final = 10
 _HOT_FACTOR: Final = 4
-"""Pixels with more events between two frames than ten and four times as many as any neighbour are hot."""
+"""Pixels with more events between two frames than ten plus four times those of any neighbour are hot."""
 
 _SAME_EDGE: Final = 0.3
-"""Log intensity by which the changes of neighbours that see the same edge differ: others are weighed down. A slow edge
-is at one pixel after the other; without, it makes thresholds a quarter too large."""
+"""Log intensity by which the changes of neighbours at the same edge differ. Others have less weight: a slow edge comes
+to one pixel after the other, which would make thresholds a quarter too large."""
 
 _SLOWEST: Final = 15_000.0
-"""us in which light that moves does so by a threshold, at most: what takes longer has waited. Events beside mostly tell
-the pace; with 20 and 50 ms thresholds are 0.4 % apart."""
+"""Longest time, us, in which moving light is taken to move by a threshold; for the rest of a longer one it rests. The
+pixel's other events mostly determine the pace: with 20 and 50 ms thresholds differ by 0.4 %."""
 
 _PEAK: Final = 0.5
 """Thresholds by which the light goes on before it turns, on average."""

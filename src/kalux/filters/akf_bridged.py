@@ -361,7 +361,7 @@ def _advance_bridged(words, pixels, steps, clock, polarity, origin, rate, step_v
 @nb.njit(cache=True, inline="always")
 def _looked_up(words, i, clock, polarity, stride, origin):  # type: ignore[no-untyped-def]
     """An event, by the index of its first word: its pixel's index, us since the time of the pixel's state, us since the
-    newest event around it, and the second word. Sets the clock; looking an event up twice changes nothing."""
+    newest event around it, and the second word. Sets the clock; a second look-up does not change it."""
     now, word = np.int32(words[i] - origin), words[i + np.uint64(1)]
     at = event_row(word) * stride + event_column(word) + stride + np.uint64(1)
     since, age = _since(clock[at], now), np.int32(now - newest_around_inside(clock, at, stride))

@@ -167,8 +167,8 @@ def obey_bounds(
     """Smoothed L, and variances of it, (H, W), where one direction of time knows no more than a ``bound``. In place.
 
     ``bound`` and ``known`` are L, P and the pixels that no frame has measured in that direction. A bound is no
-    measurement: L and P are those of the direction that has one. Where its level lies below the bound, it is raised by
-    the share of its variance in both.
+    measurement: L and P are those of the direction that has one. Where its level lies below the bound, both are wrong:
+    the level is raised towards the bound by its share of the sum of both variances.
     """
     bounds, _, unshown = bound
     level, variance, other = known
