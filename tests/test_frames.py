@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kalux.errors import ExposureError, FrameError
-from kalux.frames import Frame, check_frame, place_exposure
+from kalux.frames import Frame, check_frame, exposure_doubt, place_exposure
 
 
 def frame(start=100, end=200, dtype=np.uint8, shape=(3, 4), white=None, mosaic=None):
@@ -55,6 +55,25 @@ def test_a_frame_tells_itself_in_a_line():
     assert repr(frame()) == "<kalux.Frame uint8 (3, 4), grey, exposed from 100 to 200 us>"
     assert repr(Frame([[1]], 0, 1, mosaic="RGGB")) == "<kalux.Frame list, RGGB, exposed from 0 to 1 us>"
     assert repr(Frame(None, 0, 1)) == "<kalux.Frame NoneType, grey, exposed from 0 to 1 us>"
+
+
+@pytest.mark.parametrize("last", [(90, 91), (90, 140), (120, 170)])
+def test_a_last_exposure_no_longer_than_a_frame_interval_is_believed(last):
+    assert exposure_doubt(np.array([(0, 50), (50, 90), last])) is None
+
+
+@pytest.mark.parametrize("starts", [(), (7,)])
+def test_without_a_frame_interval_no_exposure_is_doubted(starts):
+    assert exposure_doubt(np.array([(t, 10**9) for t in starts], np.int64).reshape(-1, 2)) is None
+
+
+def test_a_last_exposure_longer_than_every_frame_interval_is_doubted():
+    """The other exposures have to end before the next one begins; nothing begins after the last."""
+    doubt = exposure_doubt(np.array([(0, 10), (30, 40), (50, 5_050)]))
+    assert doubt == (
+        "the last frame is exposed for 5,000 us, from 50 to 5050 us, though frames follow each other within 30 us; "
+        "is the end of its exposure right?"
+    )
 
 
 def test_colours():

@@ -106,6 +106,18 @@ def test_colours_are_said(mosaic, image, said):
     assert [line.startswith(said) for line in lines] == ([True] if said else [])
 
 
+def test_a_last_exposure_that_is_doubtful_is_noted():
+    *others, last = small_frames()
+    with pytest.warns(UserWarning, match="the last frame is exposed"):
+        rec = Recording.from_arrays(
+            small_events(),
+            [*others, Frame(last.image, last.exposure_start, last.exposure_end + 10**6)],
+            sensor_size=SIZE,
+        )
+    assert "note       the last frame is exposed for" in format_description(describe(rec))
+    assert summarise_frames(rec.frames(), exposure_known=False).doubt is None
+
+
 def test_streams_that_do_not_overlap():
     late = small_events()
     late["t"] += 10**6

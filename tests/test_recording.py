@@ -12,7 +12,7 @@ import pytest
 from kalux import readers, recording
 from kalux.errors import EventError, ExposureError, FormatError, FrameError, InputError
 from kalux.frames import Frame, GroundTruth
-from kalux.recording import Recording, remembering
+from kalux.recording import Recording, with_cached_start
 from kalux.writers import hdf5
 from recordings import SIZE, same_frames, small_events, small_frames
 
@@ -104,6 +104,13 @@ def test_a_white_value_that_can_hardly_be_right_is_warned_of():
     dark = [dataclasses.replace(f, image=f.image.astype(np.uint16) * 2) for f in small_frames()]
     with pytest.warns(UserWarning, match=r"arrays: no pixel .*white=1023"):
         in_memory(frames=dark)
+
+
+def test_a_last_exposure_that_can_hardly_be_right_is_warned_of():
+    *others, last = small_frames()
+    damaged = dataclasses.replace(last, exposure_end=last.exposure_end + 10**6)
+    with pytest.warns(UserWarning, match="arrays: the last frame is exposed for .* is the end .* right"):
+        in_memory(frames=[*others, damaged])
 
 
 @pytest.mark.parametrize(
@@ -297,20 +304,20 @@ def counted(made):
 
 
 @pytest.mark.parametrize("events", [0, len(small_events()) // 3, len(small_events())])
-def test_what_is_remembered_is_the_same(events):
-    remembered = remembering(counted([]), events, small_frames()[0].image.nbytes)
-    next(iter(remembered.events()))
+def test_a_recording_with_a_cached_start_is_the_same(events):
+    cached = with_cached_start(counted([]), events, small_frames()[0].image.nbytes)
+    next(iter(cached.events()))
     for _ in range(2):
-        assert np.array_equal(np.concatenate(list(remembered.events())), small_events())
-        assert same_frames(list(remembered.frames()), small_frames())
+        assert np.array_equal(np.concatenate(list(cached.events())), small_events())
+        assert same_frames(list(cached.frames()), small_frames())
 
 
-def test_what_is_remembered_is_read_once():
+def test_what_is_cached_is_read_once():
     made = []
-    remembered = remembering(counted(made), len(small_events()), 1 << 20)
+    cached = with_cached_start(counted(made), len(small_events()), 1 << 20)
     for _ in range(3):
-        list(remembered.events())
-        list(remembered.frames())
+        list(cached.events())
+        list(cached.frames())
     assert (made.count("chunk"), made.count("frame")) == (10, len(small_frames()))
 
 

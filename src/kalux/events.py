@@ -18,13 +18,13 @@ EventArray = NDArray[np.void]
 """A 1-D array of `EVENT_DTYPE`, sorted by ``t``."""
 
 LATEST: Final = 10**18
-"""us, 32 000 years: of times, what later sums have still room for in an int64."""
+"""us, 32 000 years: latest possible time, so that sums of times fit into an int64."""
 
 NEVER: Final = -(1 << 60)
-"""us: the time of an event that has not been. Times of recordings may be negative, but are never that early."""
+"""us: stands for the time of an event that has not happened. Times of recordings are never that early."""
 
 LARGEST_SIDE: Final = 1 << 16
-"""Pixels of a sensor, either way: coordinates have 16 bits."""
+"""Most pixels of a sensor in either direction: coordinates have 16 bits."""
 
 FIELD_NAMES: Final = {
     "t": ("t", "ts", "timestamp", "timestamps", "time", "times"),
@@ -256,7 +256,7 @@ def _named(data: Any, names: list[str]) -> dict[str, NDArray[Any]]:
 
 
 def _check_times(t: NDArray[Any], where: str = "events", first_index: int = 0) -> None:
-    """Refuse times, us, that nothing could be added to."""
+    """Refuse times, us, beyond 10^18, to which nothing can be added in an int64."""
     if len(t) and (t.min() < -LATEST or t.max() > LATEST):
         i = int(np.flatnonzero((t < -LATEST) | (t > LATEST))[0])
         raise EventError(f"{where}: event {first_index + i} is at {t[i]} us; at most 10^18 us is possible")

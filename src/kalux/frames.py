@@ -126,6 +126,29 @@ def median_exposure(exposures: Iterable[int]) -> int:
     return round(float(np.median([*exposures])))
 
 
+def exposure_doubt(exposures: NDArray[np.int64]) -> str | None:
+    """A warning if the last exposure ends later than it can be expected to, else None.
+
+    Every other exposure has to end before the next one begins (`check_frame`). Nothing follows the last one: it is
+    doubted where it is longer than the longest interval between two frames.
+
+    Parameters
+    ----------
+    exposures
+        (K, 2) starts and ends, us, in time order.
+    """
+    if len(exposures) < 2:
+        return None
+    start, end = (int(t) for t in exposures[-1])
+    interval = int(np.diff(exposures[:, 0]).max())
+    if end - start <= interval:
+        return None
+    return (
+        f"the last frame is exposed for {end - start:,} us, from {start} to {end} us, though frames follow each other "
+        f"within {interval:,} us; is the end of its exposure right?"
+    )
+
+
 def place_exposure(frame: Frame, exposure: int, stamp: Stamp) -> Frame:
     """Give a frame that has only a stamp its exposure interval.
 

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from kalux.events import EventArray
-from kalux.frames import Frame
+from kalux.frames import Frame, exposure_doubt
 from kalux.plan_report import response_text
 from kalux.recording import Recording
 from kalux.white import WhiteCheck
@@ -72,6 +72,8 @@ class FrameSummary:
         Intervals longer than 1.5 times the median: frames that were dropped, perhaps.
     largest_gap
         Longest interval between the starts of two frames, us; None below two frames.
+    doubt
+        What makes the end of the last exposure doubtful, if anything does.
     """
 
     count: int
@@ -85,6 +87,7 @@ class FrameSummary:
     near_black_share: float | None = None
     gap_count: int = 0
     largest_gap: int | None = None
+    doubt: str | None = None
 
 
 @dataclass(frozen=True)
@@ -209,34 +212,33 @@ def summarise_events(chunks: Iterable[EventArray]) -> EventSummary:
 
 def summarise_frames(frames: Iterable[Frame], *, exposure_known: bool = True) -> FrameSummary:
     """Numbers about frames in time order, one in memory at a time."""
-    starts: list[int] = []
-    exposures: list[int] = []
+    spans: list[tuple[int, int]] = []
     pixels = saturated = near_black = 0
-    last = None
     for frame in frames:
-        starts.append(frame.exposure_start)
-        exposures.append(frame.exposure)
-        last = frame.exposure_end
+        spans.append((frame.exposure_start, frame.exposure_end))
         image = frame.image if frame.valid is None else frame.image[frame.valid]
         pixels += image.size
         saturated += int(np.count_nonzero(image >= _SATURATED * frame.white_value))
         near_black += int(np.count_nonzero(image <= _NEAR_BLACK * frame.white_value))
-    if last is None:
+    if not spans:
         return FrameSummary(0)
-    intervals = np.diff(np.array(starts, np.float64))
+    exposures = np.array(spans, np.int64)
+    lengths = exposures[:, 1] - exposures[:, 0]
+    intervals = np.diff(exposures[:, 0].astype(np.float64))
     median_interval = float(np.median(intervals)) if len(intervals) else None
     return FrameSummary(
-        count=len(starts),
-        first=starts[0],
-        last=last,
+        count=len(spans),
+        first=int(exposures[0, 0]),
+        last=int(exposures[-1, 1]),
         rate=1e6 / median_interval if median_interval else None,
-        exposure_min=min(exposures) if exposure_known else None,
-        exposure_median=float(np.median(exposures)) if exposure_known else None,
-        exposure_max=max(exposures) if exposure_known else None,
+        exposure_min=int(lengths.min()) if exposure_known else None,
+        exposure_median=float(np.median(lengths)) if exposure_known else None,
+        exposure_max=int(lengths.max()) if exposure_known else None,
         saturated_share=saturated / max(pixels, 1),
         near_black_share=near_black / max(pixels, 1),
         gap_count=int(np.count_nonzero(intervals > _LARGE_GAP * median_interval)) if median_interval else 0,
         largest_gap=int(intervals.max()) if len(intervals) else None,
+        doubt=exposure_doubt(exposures) if exposure_known else None,
     )
 
 
@@ -276,8 +278,7 @@ def format_description(description: Description) -> str:
     if description.has_ground_truth:
         rows.append(("reference", "ground truth images are included"))
     rows += [("note", sentence) for sentence in description.missing]
-    if description.doubt is not None:
-        rows.append(("note", description.doubt))
+    rows += [("note", doubt) for doubt in (description.doubt, description.frames.doubt) if doubt is not None]
     label_width = max(len(label) for label, _ in rows)
     return "\n".join([description.path, *(f"  {label:<{label_width}}  {text}" for label, text in rows)])
 

@@ -1,10 +1,8 @@
-"""What numba's environment variables say; where compiled loops are kept.
+"""Where numba keeps compiled loops, and checks of its environment variables.
 
-That is beside the package, or elsewhere where that cannot be written.
-
-numba keeps them in ``__pycache__`` beside the source. Of a package that is installed read-only, and without a home
-folder that can be written, it refuses even to be told of a function that shall be cached. No large imports: this
-runs whenever kalux is imported.
+numba keeps them in ``__pycache__`` beside the source. Where neither that nor the home folder can be written, as of a
+package that is installed read-only, its decorator already fails for a function that is to be cached. kalux then names
+another folder. No large imports here, since this runs whenever kalux is imported.
 """
 
 from __future__ import annotations
@@ -20,11 +18,11 @@ from typing import Final
 from kalux.errors import SettingsError
 
 VARIABLE: Final = "NUMBA_CACHE_DIR"
-"""The environment variable of numba that says where; kalux sets it only where nobody has and it is needed."""
+"""numba's environment variable for that folder; kalux sets it only if it is not set and needed."""
 
 
 def ensure_writable(package: Path) -> None:
-    """See to it that numba finds a place: the package, ``~/.cache/kalux``, or one for this process.
+    """Make sure that numba has a folder to write to: the package, ``~/.cache/kalux``, or one for this process.
 
     ``XDG_CACHE_HOME`` stands for ``~/.cache`` where it is set.
     """
@@ -68,7 +66,7 @@ def _is_writable(package: Path) -> bool:
 
 
 def _user_folder() -> Path | None:
-    """The folder for caches of this user, which others cannot write: its files are trusted."""
+    """The user's folder for caches, made so that others cannot write to it: numba runs what it finds there."""
     base = os.environ.get("XDG_CACHE_HOME")
     try:
         place = (Path(base) if base else Path.home() / ".cache") / "kalux"

@@ -1,7 +1,7 @@
-"""Arrays aligned to pages, large ones in memory that is used again: fresh pages cost about as much as filling them.
+"""Arrays aligned to pages; the memory of large ones is reused, since fresh pages cost about as much as filling them.
 
 The engine makes and drops the same planes frame after frame. Whether the system's allocator keeps such memory depends
-on the system, the thread, and what else it holds at that moment.
+on the system, the thread, and what else is allocated at that moment.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ _SMALL: Final = 1 << 16
 """Bytes below which the usual allocator is as good."""
 
 MOST_FREE: Final = 96 << 20
-"""Bytes that are kept at most while nobody uses them: at 640x480 a segment ends with 50 MB of it. 128 MB are no
-faster and make a run larger by as much as they are more."""
+"""Most bytes of free memory that are kept: at 640x480 a segment ends with 50 MB. With 128 MB a run is not faster, but
+its memory grows by the difference."""
 
 
 class _Free:
-    """Pieces of memory that nobody uses, by their sizes in bytes, of which there are eight between powers of two."""
+    """Free pieces of memory, by their sizes in bytes, of which there are eight between two powers of two."""
 
     def __init__(self) -> None:
-        # A thread may take it twice: Python may collect an array, whose memory then comes back, at any moment.
+        # Reentrant: while a thread holds it, Python may collect an array, whose memory is then given back.
         self._lock = threading.RLock()
         self._pieces: dict[int, list[NDArray[np.uint8]]] = {}
         self.total = 0
@@ -50,7 +50,10 @@ class _Free:
         return _fresh(size)
 
     def give(self, piece: NDArray[np.uint8], most: int = MOST_FREE) -> None:
-        """``most`` is no name of the module's: when Python ends, arrays come back after those are gone."""
+        """Keep a piece for reuse, if there is room for it in ``most`` bytes.
+
+        ``most`` is a default argument because arrays are also collected at Python's exit, after the module's names.
+        """
         with self._lock:
             if self.total + piece.size > most:  # of another sensor, most likely
                 self._pieces.clear()

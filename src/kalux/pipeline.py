@@ -18,7 +18,7 @@ from kalux import memory
 from kalux.calibration.values import Calibration
 from kalux.events import EventArray
 from kalux.images import Estimate, Image
-from kalux.planning import DOUBTED, Plan, plan
+from kalux.planning import UNCERTAIN_ORIGINS, Plan, plan
 from kalux.reconstructor import Reconstructor
 from kalux.recording import Recording
 from kalux.settings import Settings
@@ -26,8 +26,8 @@ from kalux.smoothing import Backward, combine, reversed_pixels, reversed_setting
 from kalux.threads import ahead
 
 _IMAGES_AHEAD: Final = 4
-"""Images that are held while those before are written: a frame takes the filter as long as ten images, and meanwhile
-none come. With 2, which is 2.5 MB less at 640x480, two cores would take 2 % longer; more than 8 gain nothing."""
+"""Images that wait to be written: for a new frame the filter takes as long as for ten images, and makes none meanwhile.
+With 2, which is 2.5 MB less at 640x480, two cores would take 2 % longer; more than 8 gain nothing."""
 
 
 def reconstruct(
@@ -106,14 +106,22 @@ def execute(
     threads: int = 1,
     with_variance: bool = True,
 ) -> Generator[Image, None, None]:
-    """Carry out a plan. The callbacks are told the number of events of every chunk read, for progress:
+    """Carry out a plan.
 
-    ``on_backward`` in the backward pass of a smoothed reconstruction, ``on_events`` in the pass that makes the images.
-    With more than one of ``threads``, reading, filtering, and making images of what the filter says have a thread each,
-    while the caller uses the images before; the callbacks are then called in the second. The images are the same.
-    Not ``with_variance`` is faster; grey images then have an infinite one.
+    Parameters
+    ----------
+    recording, plan
+        From `kalux.planning.plan`, with the same recording.
+    on_events, on_backward
+        Called with the number of events of every chunk read, for progress: in the pass that makes the images, and in
+        the backward pass of a smoothed reconstruction. With several threads, in the one that filters.
+    threads
+        With more than one, reading, filtering and making images of the estimates have a thread each, which run ahead of
+        the caller. The images are the same.
+    with_variance
+        Without, grey images have an infinite variance and are made faster.
     """
-    memory.give_back()  # what planning and checking have used
+    memory.give_back()  # that planning and checking have used
     engine = _engine(recording, plan)
     several = threads > 1
     if plan.smooth:
@@ -156,7 +164,7 @@ def _smoothed_estimates(
 
 
 def _trail(plan: Plan) -> tuple[Settings, NDArray[np.bool_] | None] | None:
-    """What the backward filter must know of K14, where the forward one follows it."""
+    """What the backward pass needs to follow the trail (K14): settings and hot pixels; None: it is not followed."""
     if plan.settings.filter.augmentation != "bridge" or plan.settings.events.trail == 0:
         return None
     hot = None if plan.pixels is None or not plan.pixels.hot.any() else plan.pixels.hot
@@ -168,7 +176,7 @@ def _engine(recording: Recording, plan: Plan) -> Reconstructor:
         recording.sensor_size,
         settings=plan.settings,
         lookahead=plan.lookahead,
-        threshold_is_estimate=plan.threshold_origin in DOUBTED,
+        threshold_is_estimate=plan.threshold_origin in UNCERTAIN_ORIGINS,
         inverse_covariance=recording.source.inverse_covariance,
         pixels=plan.pixels,
     )
@@ -205,7 +213,7 @@ def _forward_estimates(
 
 
 def _final_estimates(engine: Reconstructor, times: deque[int]) -> Iterator[Estimate]:
-    """Estimates at those of ``times`` that are final, taken from it; what only led to them is forgotten."""
+    """Estimates at the first of ``times`` as long as they are final; these are removed, and memory is freed."""
     until = engine.final_until  # reading does not change it
     while times and until is not None and times[0] <= until:
         yield engine.estimate(times.popleft())
@@ -216,7 +224,7 @@ def _final_estimates(engine: Reconstructor, times: deque[int]) -> Iterator[Estim
 def _push_next(
     engine: Reconstructor, chunks: Iterator[EventArray], on_events: Callable[[int], None] | None
 ) -> bool:
-    """Push the next chunk; False: there is none."""
+    """Push the next chunk of events; False if there is none."""
     chunk = next(chunks, None)
     if chunk is None:
         return False

@@ -33,27 +33,28 @@ from kalux.frames import median_exposure
 from kalux.models.camera import BrightTail, Camera, count_bright
 from kalux.models.colour import white_balance
 from kalux.models.pixels import PixelCalibration, require_size
-from kalux.recording import RECORDING_NEEDED, Recording, no_frames, remembering
+from kalux.recording import RECORDING_NEEDED, Recording, no_frames, with_cached_start
 from kalux.schedule import image_times
 from kalux.settings import SETTINGS_NEEDED, Settings, altered, chosen_response
 from kalux.settings import preset as named_preset
 
 ThresholdOrigin = Literal["settings", "recording", "calibration", "estimate", "assumed"]
 
-_NOT_STATED: Final[tuple[ThresholdOrigin, ...]] = ("estimate", "assumed")
+ESTIMATED_ORIGINS: Final[tuple[ThresholdOrigin, ...]] = ("estimate", "assumed")
+"""Origins of thresholds that nobody has stated or measured."""
 
-DOUBTED: Final[tuple[ThresholdOrigin, ...]] = ("calibration", *_NOT_STATED)
+UNCERTAIN_ORIGINS: Final[tuple[ThresholdOrigin, ...]] = ("calibration", *ESTIMATED_ORIGINS)
 """Origins of thresholds that may differ from the pixels' own: highlights are then shrunk more towards white."""
 
 _CALIBRATION_NEEDED: Final = "a kalux.Calibration is needed, from kalux.load_calibration"
 
 _NOISE_EVENTS: Final = 1_000_000
-"""From which the background noise is estimated: at 15 million events/s, those of 300,000 pixels in 70 ms."""
+"""Number of events from which the background noise is estimated: at 15 million events/s, those of 70 ms."""
 
-_REMEMBERED_EVENTS: Final = 1 << 21
-_REMEMBERED_FRAMES: Final = 1 << 25
-"""Events (32 MB) and bytes of frames at the beginning that are read once for all estimates, which take most of their
-samples from there."""
+_CACHED_EVENTS: Final = 1 << 21
+_CACHED_FRAME_BYTES: Final = 1 << 25
+"""Number of events (32 MB) and bytes of frames (32 MB) at the beginning of a recording that stay in memory while it is
+planned: most estimates take their samples from there, so that they are read and decoded once."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +139,7 @@ def plan(
         _check_smooth(chosen, lookahead)
     if known.pixels is not None:
         require_size(known.pixels, recording.sensor_size)
-    recording = remembering(recording, _REMEMBERED_EVENTS, _REMEMBERED_FRAMES)
+    recording = with_cached_start(recording, _CACHED_EVENTS, _CACHED_FRAME_BYTES)
     chosen, ceiling = with_saturation(recording, chosen)
     response = chosen_response(chosen.camera.response, recording.response)
     camera = Camera.named(response, chosen.camera.clipped_from)
@@ -156,13 +157,13 @@ def plan(
     chosen, pattern = _with_fixed_pattern(recording, chosen)
     chosen, period = _with_dead_time(recording, chosen)
     chosen, origin, estimate, delay, model = _with_event_steps(recording, chosen)
-    unsure = estimate.spread if estimate is not None and origin in _NOT_STATED else 0.0
-    chosen, mismatch = _with_mismatch(recording, chosen, unsure)
+    threshold_error = estimate.spread if estimate is not None and origin in ESTIMATED_ORIGINS else 0.0
+    chosen, mismatch = _with_mismatch(recording, chosen, threshold_error)
     chosen, background = _with_background(recording, chosen, known.pixels)
     if origin == "settings" and _are_calibrated(chosen, known):
         origin = "calibration"
-    doubted = origin in DOUBTED or (_uses_steps(chosen) and chosen.filter.unshown_tail > 0)
-    if doubted and tail is not None:
+    uses_tail = origin in UNCERTAIN_ORIGINS or (chosen.filter.joins_frames and chosen.filter.unshown_tail > 0)
+    if uses_tail and tail is not None:
         chosen = altered(chosen, "filter", bright_tail=tail.scale)
     return Plan(
         settings=chosen,
@@ -197,7 +198,8 @@ def _check_smooth(settings: Settings, lookahead: bool) -> None:
 def with_saturation(recording: Recording, settings: Settings) -> tuple[Settings, Ceiling | None]:
     """Fill in the saturation: from the settings, else the level at which all frames end while events go on, else usual.
 
-    Frames may also end where the scene does. Events decide, by thresholds estimated as if frames were clipped there.
+    Frames also end where the scene has nothing brighter. Events tell which it is: pixels at that level are clipped if
+    events go on there, by thresholds that are estimated as if it were the saturation.
 
     Returns
     -------
@@ -205,7 +207,7 @@ def with_saturation(recording: Recording, settings: Settings) -> tuple[Settings,
     """
     camera = settings.camera
     usual = altered(settings, "camera", saturation=camera.clipped_from)
-    if camera.saturation is not None or not _uses_steps(settings):
+    if camera.saturation is not None or not settings.filter.joins_frames:
         return usual, None
     end = exact_end(recording, camera.usual_saturation)
     if end is None:
@@ -217,7 +219,7 @@ def with_saturation(recording: Recording, settings: Settings) -> tuple[Settings,
 
 
 def _survey(recording: Recording, camera: Camera | None) -> tuple[NDArray[np.int64], BrightTail | None]:
-    """(K, 2) exposure starts and ends, us, of all frames, and, given a camera, their bright tail."""
+    """(K, 2) starts and ends, us, of all exposures, and, given a camera, the frames' bright tail, in one pass."""
     exposures, tail = [], BrightTail()
     for frame in recording.frames():
         exposures.append((frame.exposure_start, frame.exposure_end))
@@ -229,13 +231,13 @@ def _survey(recording: Recording, camera: Camera | None) -> tuple[NDArray[np.int
 
 
 def _measures_tail(settings: Settings) -> bool:
-    """Whether the frames' bright tail may be needed: for the prior on highlights, unless it is given."""
+    """Whether the prior on highlights may need the frames' bright tail, which is not given."""
     filtered = settings.filter
     return filtered.kind == "akf" and filtered.highlight_scale > 0 and filtered.bright_tail is None
 
 
 def _begin_time(first: NDArray[np.int64], settings: Settings, lookahead: bool) -> int:
-    """The first time that can be read, us, as the engine says, by the ``first`` exposure."""
+    """The first time that can be read, us, given the ``first`` exposure; the same as `Reconstructor.begin_time`."""
     start, end = (int(t) for t in first)
     if not lookahead:
         return end
@@ -259,38 +261,39 @@ def _are_calibrated(settings: Settings, calibration: Calibration) -> bool:
 
 
 def _with_delay(
-    recording: Recording, settings: Settings, late: DelayEstimate | None, estimate: ThresholdEstimate | None
+    recording: Recording, settings: Settings, delay: DelayEstimate | None, estimate: ThresholdEstimate | None
 ) -> tuple[Settings, DelayEstimate | None]:
-    """Fill in the events' delay: from the settings, else how late they seem and are, else the usual.
+    """Fill in the events' delay: from the settings, else an estimate, else the usual.
 
-    How late they are is known from an estimate of the thresholds; without, of one that is made with known ones.
+    ``delay`` holds the apparent one. The true one is a result of estimating the thresholds; where these are known, and
+    ``estimate`` is None, they are estimated for its sake alone.
     """
     events = settings.events
     if events.delay is not None:
         return settings, None
-    if late is None:
+    if delay is None:
         return altered(settings, "events", delay=events.usual_delay), None
     if estimate is not None:
-        late = late._replace(true=estimate.delay)
+        delay = delay._replace(true=estimate.delay)
     else:
-        late = with_true_delay(
+        delay = with_true_delay(
             recording,
             settings.camera,
-            late,
+            delay,
             Usual.of(events),
-            of_log_offset=settings.filter.augmentation == "paper",
-            refractory_period=events.refractory if _uses_steps(settings) else 0,
+            of_log_offset=_steps_log_offset(settings),
+            refractory_period=_refractory_period(settings) or 0,
         )
-    return altered(settings, "events", delay=late.delay), late
+    return altered(settings, "events", delay=delay.delay), delay
 
 
 def _with_frame_noise(recording: Recording, settings: Settings) -> tuple[Settings, FrameNoise | None]:
     """Fill in the frames' noise, where the filter uses it: from the settings, else an estimate, else the usual."""
     camera = settings.camera
-    if camera.frame_noise is not None or not _uses_steps(settings):
+    if camera.frame_noise is not None or not settings.filter.joins_frames:
         return settings, None
     found = estimate_frame_noise(recording, camera)
-    if found is not None and not found.believed:
+    if found is not None and not found.is_reliable:
         found = None
     read, shot = usual_noise(recording, camera) if found is None else (found.read, found.shot)
     shot = shot if camera.shot_noise is None else camera.shot_noise
@@ -302,24 +305,24 @@ def _with_fixed_pattern(recording: Recording, settings: Settings) -> tuple[Setti
 
     Where the recording cannot tell, because nothing moves, the usual one; 0 of frames that have been processed.
     """
-    if settings.camera.fixed_pattern is not None or not _uses_steps(settings):
+    if settings.camera.fixed_pattern is not None or not settings.filter.joins_frames:
         return settings, None
     found = estimate_fixed_pattern(recording, settings.camera)
-    if found is not None and not found.told:
+    if found is not None and not found.is_measured:
         return altered(settings, "camera", fixed_pattern=USUAL_PATTERN), None
     return altered(settings, "camera", fixed_pattern=0.0 if found is None else found.deviation), found
 
 
 def _with_dead_time(recording: Recording, settings: Settings) -> tuple[Settings, int]:
-    """Fill in the refractory period where noise shows it; and what that is, us, 0 where it does not."""
-    if settings.events.refractory_period is not None or not _uses_steps(settings):
+    """Fill in the refractory period where noise events show it. Returned as well, us; 0 where they do not."""
+    if settings.events.refractory_period is not None or not settings.filter.joins_frames:
         return settings, 0
     period = dead_time(recording)
     return altered(settings, "events", refractory_period=period or None), period
 
 
 class _EventSteps(NamedTuple):
-    """Settings in which what an event's step is, and when, is filled in; and what was found on the way."""
+    """Settings with the size and the time of an event's step filled in, and the estimates that these come from."""
 
     settings: Settings
     origin: ThresholdOrigin
@@ -333,43 +336,46 @@ def _with_event_steps(recording: Recording, settings: Settings) -> _EventSteps:
 
     Thresholds depend on I_0 a little, and it on them: they are estimated once more with the I_0 that is found.
     """
-    late = estimate_delay(recording, settings.camera) if settings.events.delay is None else None
-    filled, origin, estimate = _with_thresholds(recording, settings, late)
-    filled, late = _with_delay(recording, filled, late, estimate)
+    delay = estimate_delay(recording, settings.camera) if settings.events.delay is None else None
+    filled, origin, estimate = _with_thresholds(recording, settings, delay)
+    filled, delay = _with_delay(recording, filled, delay, estimate)
     filled, model = _with_event_model(recording, filled)
     if estimate is not None and settings.camera.log_offset is None:
-        estimated = origin in _NOT_STATED
+        estimated = origin in ESTIMATED_ORIGINS
         if estimated or (estimate.may_lose and settings.camera.offset != filled.camera.offset):
             events = filled.events
             unfilled = dataclasses.replace(
                 settings.events, delay=events.delay, step_variance=events.step_variance
             )
             filled, origin, estimate = _with_thresholds(
-                recording, dataclasses.replace(filled, events=unfilled), late, estimate if estimated else None
+                recording,
+                dataclasses.replace(filled, events=unfilled),
+                delay,
+                estimate if estimated else None,
             )
-    return _EventSteps(filled, origin, estimate, late, model)
+    return _EventSteps(filled, origin, estimate, delay, model)
 
 
 def _with_thresholds(
     recording: Recording,
     settings: Settings,
-    late: DelayEstimate | None,
+    delay: DelayEstimate | None,
     rough: ThresholdEstimate | None = None,
 ) -> tuple[Settings, ThresholdOrigin, ThresholdEstimate | None]:
     """Fill in thresholds and refractory period: from the settings, else the recording, else an estimate, else usual.
 
-    How ``late`` events seem tells where to look; without, that is where the settings say.
-    An estimate without I_0 is rough; with I_0 it is made again, from that.
+    Events are counted under the apparent ``delay``, or that of the settings where it is None. With ``rough``, an
+    estimate made before I_0 was known, only what depends on I_0 is estimated again.
     """
     events = settings.events
     origin: ThresholdOrigin = "settings" if events.has_thresholds else "recording"
     known = events.with_thresholds(*(recording.contrast_threshold or (None, None)))
-    finds_period = _uses_steps(settings) and events.refractory_period is None
+    finds_period = _refractory_period(settings) is None
     if known.has_thresholds and not finds_period:
         return dataclasses.replace(settings, events=known), origin, None
     usual = Usual.of(known)
-    of_log_offset = settings.filter.augmentation == "paper"
-    period = events.refractory_period if _uses_steps(settings) else 0
+    of_log_offset = _steps_log_offset(settings)
+    period = _refractory_period(settings)
     estimate: ThresholdEstimate | None
     if rough is None:
         estimate = estimate_thresholds(
@@ -377,7 +383,7 @@ def _with_thresholds(
             settings.camera,
             usual,
             of_log_offset=of_log_offset,
-            delay=events.lateness if late is None else late.apparent,
+            delay=events.lateness if delay is None else delay.apparent,
             refractory_period=period,
             most=ROUGH_SAMPLES if settings.camera.log_offset is None else MAX_SAMPLES,
         )
@@ -399,36 +405,48 @@ def _with_thresholds(
     return dataclasses.replace(settings, events=known), origin, estimate
 
 
+def _refractory_period(settings: Settings) -> int | None:
+    """The refractory period, us, that the filter corrects for: None while it is to be estimated, 0 in other filters."""
+    return settings.events.refractory_period if settings.filter.joins_frames else 0
+
+
+def _steps_log_offset(settings: Settings) -> bool:
+    """Whether events are taken as steps of log(I + I_0), as in the paper, rather than of log I."""
+    return settings.filter.augmentation == "paper"
+
+
 def _with_event_model(recording: Recording, settings: Settings) -> tuple[Settings, EventModel | None]:
     """Fill in I_0 and the variance of steps: from the settings, else an estimate, else the usual."""
     camera, events = settings.camera, settings.events
-    if camera.log_offset is not None and (events.step_variance is not None or not _uses_steps(settings)):
+    if camera.log_offset is not None and (
+        events.step_variance is not None or not settings.filter.joins_frames
+    ):
         return settings, None
-    weighed = events if _uses_steps(settings) else dataclasses.replace(events, refractory_period=None)
-    model = estimate_event_model(recording, camera, weighed)
+    used = dataclasses.replace(events, refractory_period=_refractory_period(settings))
+    model = estimate_event_model(recording, camera, used)
     if model is not None:
         if camera.log_offset is None:
             camera = dataclasses.replace(camera, log_offset=model.log_offset)
         if events.step_variance is None:
             events = dataclasses.replace(events, step_variance=model.step_variance)
-    # What could not be estimated is written down as it will be used.
+    # What could not be estimated is filled in with the usual value, so that the settings tell what was used.
     camera = dataclasses.replace(camera, log_offset=camera.offset)
     events = dataclasses.replace(events, step_variance=events.step_noise)
     return dataclasses.replace(settings, camera=camera, events=events), model
 
 
 def _with_mismatch(
-    recording: Recording, settings: Settings, unsure: float
+    recording: Recording, settings: Settings, threshold_error: float
 ) -> tuple[Settings, Mismatch | None]:
     """Fill in the thresholds' spread between pixels: from the settings, else an estimate, else the usual.
 
-    Where the thresholds themselves are estimated, with the relative error ``unsure``, that is a part of it.
+    The relative error of estimated thresholds, 0 of others, is a part of it.
     """
     events = settings.events
-    if events.threshold_spread is not None or not _uses_steps(settings):
+    if events.threshold_spread is not None or not settings.filter.joins_frames:
         return settings, None
     found = estimate_mismatch(recording, settings.camera, events)
-    spread = float(np.hypot(events.mismatch if found is None else found.spread, unsure))
+    spread = float(np.hypot(events.mismatch if found is None else found.spread, threshold_error))
     return altered(settings, "events", threshold_spread=spread), found
 
 
@@ -437,12 +455,8 @@ def _with_background(
 ) -> tuple[Settings, float | None]:
     """Fill in the background noise: from the settings, else the usual, or what is measured where that is more."""
     events = settings.events
-    if events.noise_rate is not None or not _uses_steps(settings):
+    if events.noise_rate is not None or not settings.filter.joins_frames:
         return settings, None
     found = event_noise(recording, _NOISE_EVENTS, None if pixels is None else pixels.hot)
     rate = events.background_rate if found is None else max(found.rate, events.usual_noise_rate)
     return altered(settings, "events", noise_rate=rate), None if found is None else found.rate
-
-
-def _uses_steps(settings: Settings) -> bool:
-    return settings.filter.kind == "akf" and settings.filter.augmentation == "bridge"

@@ -35,6 +35,7 @@ from kalux.frames import (
     Mosaic,
     Stamp,
     check_frame,
+    exposure_doubt,
     is_white,
     median_exposure,
     place_exposure,
@@ -46,10 +47,12 @@ from kalux.white import WhiteCheck, white_of_bits
 
 T = TypeVar("T")
 
-_FEW: Final = 0.1
-"""Of the events: a camera that records both has fewer of them between its frames only if it was started wrongly."""
+_LEAST_SHARE: Final = 0.1
+"""Share of the events between the first frame and the last below which the clocks are doubted: a camera that records
+both starts and stops them together."""
 
-_WATCHED: Final = 80  # frames, of which the white value is taken where nobody states it
+_WHITE_FRAMES: Final = 80
+"""Frames, some 3 s of them, that tell the white value where it is not stated."""
 
 
 class Stream(Generic[T]):
@@ -65,13 +68,23 @@ class Stream(Generic[T]):
         return self._count()
 
 
-class _Remembered(Generic[T]):
-    """An iterable whose first items stay in memory from the first pass on; the others are made anew in each pass."""
+class _CachedStart(Generic[T]):
+    """Makes iterators over the same items, the first of which stay in memory from the first pass on.
+
+    Parameters
+    ----------
+    make
+        A new iterator over all items.
+    size
+        Size of an item, in the unit of ``room``.
+    room
+        Items are kept as long as their sizes together are no more.
+    """
 
     def __init__(self, make: Callable[[], Iterator[T]], size: Callable[[T], int], room: int) -> None:
         self._make, self._size, self._room = make, size, room
         self._kept: list[T] = []
-        self._all = False
+        self._all = False  # whether no item follows the kept ones
 
     def __call__(self) -> Iterator[T]:
         given = 0
@@ -89,18 +102,19 @@ class _Remembered(Generic[T]):
         self._all = given == len(self._kept)
 
 
-def remembering(recording: Recording, events: int, frame_bytes: int) -> Recording:
-    """The same recording, whose first ``events`` and ``frame_bytes`` of frames are read once for all passes over it.
+def with_cached_start(recording: Recording, events: int, frame_bytes: int) -> Recording:
+    """The same recording, whose beginning is read only once however often one iterates over it.
 
-    They stay in memory as long as it is held, and must not be changed.
+    Chunks of the first ``events`` events, and the first ``frame_bytes`` bytes of frames, stay in memory as long as the
+    returned recording does. They must not be changed.
     """
-    remembered = copy.copy(recording)
-    remembered.source = dataclasses.replace(
+    cached = copy.copy(recording)
+    cached.source = dataclasses.replace(
         recording.source,
-        events=_Remembered(recording.source.events, len, events),
-        frames=_Remembered(recording.source.frames, lambda frame: frame.image.nbytes, frame_bytes),
+        events=_CachedStart(recording.source.events, len, events),
+        frames=_CachedStart(recording.source.frames, lambda frame: frame.image.nbytes, frame_bytes),
     )
-    return remembered
+    return cached
 
 
 def no_frames(recording: Recording) -> FrameError:
@@ -131,9 +145,16 @@ RECORDING_NEEDED: Final = "a kalux.Recording is needed, from kalux.open or Recor
 def clock_doubt(events: int, between: int, enough: int = LATEST) -> str | None:
     """A warning if events and frames hardly have the same clock, else None.
 
-    ``between`` is how many of the ``events`` lie from the first frame to the last; with ``enough`` there is none.
+    Parameters
+    ----------
+    events
+        Their number.
+    between
+        How many of them lie from the first frame to the last.
+    enough
+        With so many between the frames the clocks are believed, whatever the share.
     """
-    if between >= min(_FEW * events, enough):
+    if between >= min(_LEAST_SHARE * events, enough):
         return None
     if between == 0:
         return (
@@ -244,7 +265,8 @@ class Recording:
         Warns
         -----
         UserWarning
-            If what is taken for white can hardly be right, or events and frames hardly have the same clock.
+            If what is taken for white can hardly be right, or the last exposure is longer than frames are apart, or
+            events and frames hardly have the same clock.
         """
         size = checked_size(sensor_size)
         if ground_truth is not None:
@@ -278,12 +300,11 @@ class Recording:
         for _ in recording.events():
             pass
         check = WhiteCheck()
-        exposures = [
-            (frame.exposure_start, frame.exposure_end) for frame in check.watched(recording.frames())
-        ]
-        doubts = [check.doubt()]
-        if exposures:
-            first, last = np.searchsorted(array["t"], (exposures[0][0], exposures[-1][1] + 1))
+        spans = [(frame.exposure_start, frame.exposure_end) for frame in check.watched(recording.frames())]
+        exposures = np.array(spans, np.int64).reshape(-1, 2)
+        doubts = [check.doubt(), exposure_doubt(exposures)]
+        if len(exposures):
+            first, last = np.searchsorted(array["t"], (exposures[0, 0], exposures[-1, 1] + 1))
             doubts.append(clock_doubt(len(array), int(last - first)))
         for doubt in filter(None, doubts):
             warnings.warn(f"{name}: {doubt}", stacklevel=2)
@@ -305,15 +326,15 @@ class Recording:
 
     @cached_property
     def found_white(self) -> int | None:
-        """The value of a saturated pixel where nobody states it and 16-bit frames show it.
+        """The value of a saturated pixel that 16-bit frames show, where it is not stated (`kalux.white.white_of_bits`).
 
-        None: as of their type, or stated. Looks at the first 80 frames (`kalux.white.white_of_bits`).
+        None: it is stated, or the frames do not show another one than that of their type. Looks at the first 80 frames.
         """
-        return white_of_bits(islice(self.source.frames(), _WATCHED)) if self.white is None else None
+        return white_of_bits(islice(self.source.frames(), _WHITE_FRAMES)) if self.white is None else None
 
     @property
     def longest_exposure(self) -> int:
-        """Of all frames, us; 0 without frames. They are read for it if nobody has read them all before."""
+        """The longest exposure, us; 0 without frames. Reads all frames, unless one iteration has come to their end."""
         if self._longest is None:
             for _ in self.frames():
                 pass
@@ -357,8 +378,8 @@ class Recording:
             if len(chunk) == 0:
                 continue
             earliest, latest = -LATEST if previous_t is None else previous_t, int(chunk["t"][-1])
-            fine = _are_fine(event_words(chunk), earliest, np.uint64(height), np.uint64(width))
-            if not fine or latest > LATEST:
+            valid = _are_valid(event_words(chunk), earliest, np.uint64(height), np.uint64(width))
+            if not valid or latest > LATEST:  # `check_events` is slower, and says what is wrong
                 where = str(self.source.path)
                 check_events(chunk, self.sensor_size, where=where, first_index=count, previous_t=previous_t)
             count += len(chunk)
@@ -391,8 +412,8 @@ class Recording:
 
 
 @loop
-def _are_fine(words, earliest, height, width):  # type: ignore[no-untyped-def]
-    """What `check_events` checks, in one pass over the memory."""
+def _are_valid(words, earliest, height, width):  # type: ignore[no-untyped-def]
+    """Whether `check_events` would find nothing, in one pass over the memory."""
     wrong = False
     for i in range(len(words)):
         t, word = words[i, 0], words[i, 1]
@@ -402,7 +423,7 @@ def _are_fine(words, earliest, height, width):  # type: ignore[no-untyped-def]
 
 
 def _with_mosaic(frame: Frame, mosaic: Mosaic | None) -> Frame:
-    """The frame as a mosaic, of RGB every pixel's own channel; or without one."""
+    """The frame with another mosaic, or none; from RGB every pixel keeps the channel of its own filter."""
     if mosaic == frame.mosaic:
         return frame
     image = frame.image

@@ -311,6 +311,11 @@ class FilterSettings:
     motion: MotionName = "auto"
     cutoff: float = 1.0
 
+    @property
+    def joins_frames(self) -> bool:
+        """Whether the filter follows frames that are joined by events (docs/equations.md, K1): the default's way."""
+        return self.kind == "akf" and self.augmentation == "bridge"
+
     def follows_motion(self, sensor_size: tuple[int, int]) -> bool:
         """Whether frames of a sensor are read along the paths of what moves."""
         height, width = sensor_size

@@ -48,14 +48,14 @@ def ahead(items: Iterable[T], depth: int = 2, name: str = "ahead") -> Generator[
     name
         Of the thread, after "kalux-", for tools that show threads.
     """
-    belt: _Belt[T] = _Belt(depth)
-    thread = threading.Thread(target=_make, args=(items, belt), name=f"kalux-{name}", daemon=True)
+    queue: _BoundedQueue[T] = _BoundedQueue(depth)
+    thread = threading.Thread(target=_make, args=(items, queue), name=f"kalux-{name}", daemon=True)
     thread.start()
     try:
-        while (item := belt.take()) is not None:
+        while (item := queue.take()) is not None:
             yield item.value
     finally:
-        belt.stop()
+        queue.stop()
         thread.join()
 
 
@@ -115,11 +115,12 @@ class _End:
         self.error = error
 
 
-class _Belt(Generic[T]):
-    """Items on their way from one thread to another, and room for more on its way back.
+class _BoundedQueue(Generic[T]):
+    """A queue of bounded length between two threads, which either end can close.
 
-    Both are the standard library's queues in C: conditions are written in Python, of which every step takes several
-    times as long after loops over whole images, which leave nothing of it in the nearer caches.
+    Made of two of the standard library's queues in C, one for items and one for room. Its conditions, and with them
+    `queue.Queue`, are written in Python, which runs several times slower after loops over whole images have emptied the
+    nearer caches of it.
     """
 
     def __init__(self, depth: int) -> None:
@@ -156,13 +157,13 @@ class _Belt(Generic[T]):
         self._room.put(None)
 
 
-def _make(items: Iterable[T], belt: _Belt[T]) -> None:
+def _make(items: Iterable[T], queue: _BoundedQueue[T]) -> None:
     error: BaseException | None = None
     try:
         iterator = iter(items)
         try:
             for value in iterator:
-                if not belt.put(value):
+                if not queue.put(value):
                     break
         finally:
             close = getattr(iterator, "close", None)
@@ -170,4 +171,4 @@ def _make(items: Iterable[T], belt: _Belt[T]) -> None:
                 close()
     except BaseException as failure:  # raised in the thread that takes
         error = failure
-    belt.end(error)
+    queue.end(error)

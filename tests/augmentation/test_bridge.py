@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kalux.augmentation.bridge import (
+    MASKED,
     UNMEASURED,
-    UNSEEN,
     BridgeNoise,
     Latent,
     Thresholds,
@@ -268,7 +268,7 @@ def test_thresholds_of_saturated_pixels_let_their_events_cancel():
     assert drifts[0] < 1.2
     assert drifts[-1] < 0.4
     # One frame that says nothing of the pixel, or a prior that is turned off, teach nothing.
-    masked = latent(0.0, UNSEEN)
+    masked = latent(0.0, MASKED)
     for first, second, chosen in (
         (masked, saturated, noise),
         (saturated, masked, noise),

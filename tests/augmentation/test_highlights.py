@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kalux.augmentation.bridge import UNMEASURED, UNSEEN, BridgeNoise, Latent, bridge, nominal_thresholds
+from kalux.augmentation.bridge import MASKED, UNMEASURED, BridgeNoise, Latent, bridge, nominal_thresholds
 from kalux.augmentation.highlights import (
-    Shown,
+    FrameHighlights,
     Tail,
     above_frames,
     begin_unshown,
-    beyond_rims,
+    excess_from_surroundings,
     expected_excess,
     follow_unshown,
 )
@@ -32,19 +32,21 @@ def latent(clipped, value=0.0):
     return Latent(level, np.where(clipped, UNMEASURED, NOISE).astype(np.float32))
 
 
-def shown(clipped, darker=1.0, pitch=1):
+def frame_highlights(clipped, darker=1.0, pitch=1):
     below = np.where(clipped, 0.0, darker).astype(np.float32)
-    return Shown(clipped, below, ~clipped, pitch)
+    return FrameHighlights(clipped, below, ~clipped, pitch)
 
 
 def begun(clipped, darker=1.0):
-    return begin_unshown(latent(clipped), shown(clipped, darker), TAIL)
+    return begin_unshown(latent(clipped), frame_highlights(clipped, darker), TAIL)
 
 
 def followed(memory, clipped, value, net):
     """The next frame, which is ``value`` where it is not ``clipped``."""
     noise = np.full(len(memory.pixels), NOISE, np.float32)
-    return follow_unshown(memory, latent(clipped, value), shown(clipped, -value), noise, net, MOVED, TAIL)
+    return follow_unshown(
+        memory, latent(clipped, value), frame_highlights(clipped, -value), noise, net, MOVED, TAIL
+    )
 
 
 def excess_at(memory):
@@ -55,11 +57,11 @@ def excess_at(memory):
 
 
 def around(seen, tail=TAIL):
-    """`beyond_rims` as an image; nan where nothing is clipped."""
+    """`excess_from_surroundings` as an image; nan where nothing is clipped."""
     pixels = np.flatnonzero(seen.clipped)
     out = np.full(seen.clipped.shape, np.nan)
     near = (seen.measured & (seen.darker < 0.2)).sum() / max(len(pixels), 1)
-    out.reshape(-1)[pixels] = beyond_rims(seen, pixels, near, tail)
+    out.reshape(-1)[pixels] = excess_from_surroundings(seen, pixels, near, tail)
     return out
 
 
@@ -75,8 +77,8 @@ def test_where_nothing_is_clipped_nothing_is_expected():
 
 def test_masked_pixels_have_no_bound():
     first = latent(EVERYWHERE)
-    first.variance[:, 5] = UNSEEN
-    memory = begin_unshown(first, shown(EVERYWHERE), TAIL)
+    first.variance[:, 5] = MASKED
+    memory = begin_unshown(first, frame_highlights(EVERYWHERE), TAIL)
     assert not np.isin(np.arange(40) * 48 + 5, memory.pixels).any()
 
 
@@ -88,7 +90,7 @@ def test_a_tail_of_pixels_just_below_white_goes_on():
     """Half of every part is clipped, half just below: the scale is 0.2, of which half is expected, softly bounded."""
     clipped = np.zeros(SIZE, bool)
     clipped[:, ::2] = True
-    found = around(shown(clipped, 0.1), Tail(0.5, 0.5))
+    found = around(frame_highlights(clipped, 0.1), Tail(0.5, 0.5))
     hard, inside = 0.1 / (0.1 + 0.05), 1 - np.exp(-1)
     expected = 0.5 * (1 - np.exp(-0.1 / 0.5)) * hard * inside
     np.testing.assert_allclose(found[:, ::2], expected, rtol=2e-3)
@@ -97,19 +99,21 @@ def test_a_tail_of_pixels_just_below_white_goes_on():
 def test_the_share_and_the_most_that_are_expected():
     clipped = np.zeros(SIZE, bool)
     clipped[:, ::2] = True
-    seen = shown(clipped, 0.1)
+    seen = frame_highlights(clipped, 0.1)
     doubled, wide = around(seen, Tail(1.0, 1.0)), around(seen, Tail(0.5, 0.5))
     np.testing.assert_allclose(doubled[clipped], 2 * wide[clipped], rtol=1e-5)
-    assert np.nanmax(around(shown(window(), 3.0), Tail(0.5, 0.05))) == pytest.approx(0.05, rel=0.02)
+    assert np.nanmax(around(frame_highlights(window(), 3.0), Tail(0.5, 0.05))) == pytest.approx(
+        0.05, rel=0.02
+    )
 
 
 def test_beyond_a_soft_border_less_is_expected_than_beyond_a_hard_one():
-    soft, hard = (around(shown(window(), darker))[20, 24] for darker in (0.02, 2.0))
+    soft, hard = (around(frame_highlights(window(), darker))[20, 24] for darker in (0.02, 2.0))
     assert 0 < soft < 0.1 * hard
 
 
 def test_at_the_border_less_is_expected_than_inside():
-    found = around(shown(window(), 2.0))[20, 14:24]
+    found = around(frame_highlights(window(), 2.0))[20, 14:24]
     assert (np.diff(found) > -1e-3).all()
     assert found[0] == pytest.approx(found[-1] * (1 - np.exp(-1)), rel=0.05)
 
@@ -118,7 +122,7 @@ def test_two_windows_of_their_own():
     """One in the dark, one on a bright wall."""
     clipped = window(sides=np.s_[14:26, 4:16]) | window(sides=np.s_[14:26, 32:44])
     darker = np.where(np.arange(48) < 24, 2.0, 0.05) * np.ones(SIZE)
-    found = around(shown(clipped, darker))
+    found = around(frame_highlights(clipped, darker))
     assert found[20, 10] > 3 * found[20, 38]
 
 
@@ -126,18 +130,18 @@ def test_pixels_of_a_mosaic_have_neighbours_of_their_colour():
     """Only one colour is clipped: its borders are with its own pixels, two apart."""
     clipped = np.zeros(SIZE, bool)
     clipped[12:28:2, 14:34:2] = True
-    found = around(shown(clipped, 2.0, pitch=2))
+    found = around(frame_highlights(clipped, 2.0, pitch=2))
     assert found[12, 14] == pytest.approx(found[18, 22] * (1 - np.exp(-2)), rel=0.05)
-    assert found[18, 22] > 1.3 * around(shown(clipped, 2.0))[18, 22]
+    assert found[18, 22] > 1.3 * around(frame_highlights(clipped, 2.0))[18, 22]
 
 
 def test_masked_pixels_are_no_border():
     clipped = window()
-    seen = shown(clipped, 0.01)
+    seen = frame_highlights(clipped, 0.01)
     masked = np.zeros(SIZE, bool)
     masked[:, 34] = True
     darker = np.where(masked, 0.0, seen.darker).astype(np.float32)
-    without = around(Shown(clipped, darker, ~clipped & ~masked))
+    without = around(FrameHighlights(clipped, darker, ~clipped & ~masked))
     assert np.nanmax(without) < 0.2
 
 
@@ -203,7 +207,7 @@ def test_pixels_that_noise_takes_out_of_saturation_tell_nothing():
     """2 standard deviations below their bound, and no event: they were at white; those beside need not be."""
     told, _ = alternating()
     memory = followed(begun(EVERYWHERE), ~told, -0.02, STILL)
-    assert memory.told.tellers.sum() == 0
+    assert memory.revealed.pixels.sum() == 0
     assert len(memory.pixels) == 40 * 48 / 2
     np.testing.assert_allclose(memory.expected, 0.5, rtol=1e-6)
 
@@ -215,8 +219,8 @@ def test_what_deblurring_adds_to_the_variance_silences_nobody():
     frame = latent(~told, -0.08)
     moving = frame._replace(variance=np.where(told, np.float32(0.01), frame.variance))
     noise = np.full(len(memory.pixels), NOISE, np.float32)
-    memory = follow_unshown(memory, moving, shown(~told, 0.08), noise, net, MOVED, TAIL)
-    assert memory.told.tellers.sum() == told.sum()
+    memory = follow_unshown(memory, moving, frame_highlights(~told, 0.08), noise, net, MOVED, TAIL)
+    assert memory.revealed.pixels.sum() == told.sum()
 
 
 def test_silent_pixels_that_leave_saturation_tell_those_near():
@@ -249,7 +253,10 @@ def test_a_bound_rises_with_events_and_never_falls_below_a_clipped_frame():
     assert memory.bound[0] == 2.0
     memory = followed(memory, np.zeros(SIZE, bool), -1.0, 1.5 * step)
     assert len(memory.pixels) == 0
-    assert (memory.told.told.sum(), memory.told.tellers.sum()) == (0.0, 1.0)  # -1, as its bound had said
+    assert (memory.revealed.excess.sum(), memory.revealed.pixels.sum()) == (
+        0.0,
+        1.0,
+    )  # -1, as its bound had said
 
 
 def test_what_came_to_the_variance_is_noise():
@@ -261,8 +268,8 @@ def test_what_came_to_the_variance_is_noise():
 
 def test_a_bound_is_too_high_by_what_it_is_above_the_frames_at_most():
     """Four pixels, clipped at 0 or masked; on events come at the first, off events at the second."""
-    first = Latent(np.zeros((1, 4)), np.array([[UNMEASURED] * 3 + [UNSEEN]]))
-    second = Latent(np.zeros((1, 4)), np.array([[UNMEASURED] * 2 + [UNSEEN] * 2]))
+    first = Latent(np.zeros((1, 4)), np.array([[UNMEASURED] * 3 + [MASKED]]))
+    second = Latent(np.zeros((1, 4)), np.array([[UNMEASURED] * 2 + [MASKED] * 2]))
     noise = BridgeNoise(0.5, 0.5, 0.0, 0.0)
     on, off = np.array([[2.0, 0, 0, 0]]), np.array([[0, 2.0, 0, 0]])
     segment, _ = bridge(first, second, on, off, nominal_thresholds((1, 4), 0.0), noise, 0, 40_000)
@@ -273,8 +280,8 @@ def test_a_bound_is_too_high_by_what_it_is_above_the_frames_at_most():
 
 _SUMS = """
 import numpy as np
-from kalux.augmentation.highlights import _around
-print(_around(np.random.default_rng(0).random((90, 160))).tobytes().hex())
+from kalux.augmentation.highlights import _weighted_sums
+print(_weighted_sums(np.random.default_rng(0).random((90, 160))).tobytes().hex())
 """
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from kalux.augmentation.bridge import UNMEASURED, BridgeNoise, Latent, bridge, nominal_thresholds
-from kalux.augmentation.unseen import UNKNOWN_CHANGE, forget_silence, half_way, silent_change, turns
+from kalux.augmentation.unseen import UNKNOWN_CHANGE, add_missed_change, half_way, silent_change, turns
 
 SHAPE = (40, 60)
 C2 = 0.04
@@ -60,7 +60,7 @@ def forgotten(variance, change, on, after=None):
     segment, _ = bridge(frame, frame, nothing, nothing, thresholds, NOISE, 0, SECOND)
     grown, plane = nothing.copy(), np.full(SHAPE, change, np.float32)
     second = frame if after is None else Latent(nothing, after)
-    forget_silence(grown, segment, second, (on, nothing), plane, NOISE.quantisation_variance)
+    add_missed_change(grown, segment, second, (on, nothing), plane, NOISE.quantisation_variance)
     return grown
 
 

@@ -149,7 +149,7 @@ def test_a_valley_that_is_found_late_is_looked_at_on_both_sides(monkeypatch):
     valley = {-6_000: 0.9, -5_000: 0.3, -4_000: 0.4, -3_000: 0.5, 6_000: 0.8, 5_000: 0.85, 7_000: 0.85}
 
     def seen(recording, camera, grid, thresholds):
-        return [delay._Seen(*np.full((3, 1_000), float(t))) for t in grid]
+        return [delay._Samples(*np.full((3, 1_000), float(t))) for t in grid]
 
     monkeypatch.setattr(delay, "_samples", seen)
     monkeypatch.setattr(delay, "_residual", lambda seen: valley.get(seen.on[0], 1.0))

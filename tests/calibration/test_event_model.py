@@ -13,8 +13,8 @@ from kalux import PRESETS, Recording
 from kalux.calibration import event_model
 from kalux.calibration.event_model import (
     ErrorModel,
+    FrameLimits,
     Samples,
-    Shown,
     estimate_event_model,
     negative_log_likelihood,
 )
@@ -157,7 +157,7 @@ def test_what_frames_cannot_show_says_nothing_of_the_offset():
         np.maximum(-steps, 0)[kept] * 1.0,
         np.zeros(int(kept.sum())),
     )
-    shown = Shown(np.full(int(kept.sum()), 0.17), np.full(int(kept.sum()), 0.98))
+    shown = FrameLimits(np.full(int(kept.sum()), 0.17), np.full(int(kept.sum()), 0.98))
     found = []
     for limits in (None, shown):
         losses = [
@@ -170,7 +170,7 @@ def test_what_frames_cannot_show_says_nothing_of_the_offset():
 def test_the_share_of_students_t():
     """Against SciPy's."""
     t = np.array([-np.inf, -30.0, -1.3, 0.0, 0.4, 5.0, np.inf])
-    np.testing.assert_allclose(event_model._below(t), stats.t.cdf(t, 4), atol=1e-6)
+    np.testing.assert_allclose(event_model._student_t_share(t), stats.t.cdf(t, 4), atol=1e-6)
 
 
 def test_dark_current_is_found_behind_a_camera_that_crushes_the_dark(shared_data):

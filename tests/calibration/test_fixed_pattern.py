@@ -51,19 +51,19 @@ def test_offsets_that_stay_while_the_scene_moves_are_found(deviation):
 def test_texture_and_noise_that_move_are_none():
     found = estimate_fixed_pattern(recorded(0.0, noise=0.01), CAMERA)
     assert found.deviation == 0
-    assert found.told
+    assert found.is_measured
 
 
 def test_less_than_chance_makes_is_no_answer_where_the_usual_would_be_as_little():
-    assert FixedPattern(0.0, 0.001**2, 0.0018**2).told
-    assert not FixedPattern(0.0, 0.0047**2, 0.0019**2).told
+    assert FixedPattern(0.0, 0.001**2, 0.0018**2).is_measured
+    assert not FixedPattern(0.0, 0.0047**2, 0.0019**2).is_measured
 
 
 def test_what_stands_still_may_be_the_scene():
     """Its texture is the same in all frames, as a pattern is: nothing is said."""
     found = estimate_fixed_pattern(recorded(pattern(0.01), step=(0, 0)), CAMERA)
     assert found.deviation == 0
-    assert not found.told
+    assert not found.is_measured
 
 
 def test_clipped_and_masked_pixels_do_not_count():

@@ -50,7 +50,7 @@ def test_read_and_shot_noise_of_a_still_ramp():
     assert found.shot == pytest.approx(1 / 5000, rel=0.05)
     assert found.read == pytest.approx(np.hypot(0.005, LEVEL), rel=0.1)
     assert found.at_half == pytest.approx(np.sqrt(found.read**2 + found.shot / 2))
-    assert found.believed
+    assert found.is_reliable
 
 
 def test_noise_of_less_than_half_a_level_is_the_rounding():
@@ -85,7 +85,7 @@ def test_where_noise_leaves_no_pixel_alone_those_beside_one_must_do():
     k, y, x = np.nonzero(there)
     events = make_events(40_000 * k + 20_000, x, y, np.ones(len(k), np.int64))
     found = estimate_frame_noise(still(RAMP, 0.02, 1 / 800, events=events), CAMERA)
-    assert found.believed
+    assert found.is_reliable
     assert found.read == pytest.approx(0.02, rel=0.15)
     assert found.shot == pytest.approx(1 / 800, rel=0.2)
 
@@ -217,7 +217,7 @@ def test_photon_transfer_is_a_line_without_negative_parts():
     falling = photon_transfer(levels, 1e-4 * (1 - levels), np.ones(9))
     assert falling.shot == 0.0
     scattered = photon_transfer(levels, np.where(np.arange(9) % 2, 1e-4, 1e-6), np.ones(9))
-    assert not scattered.believed
+    assert not scattered.is_reliable
 
 
 @given(st.integers(0, 10**6), st.booleans())

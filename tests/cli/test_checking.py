@@ -50,6 +50,14 @@ def test_events_in_another_unit_are_doubted():
     assert not list(check_recording(WHOLE, lambda count: None).warnings())
 
 
+def test_a_last_exposure_longer_than_the_frame_intervals_is_doubted():
+    *others, last = STREAM.frames
+    damaged = [*others, dataclasses.replace(last, exposure_end=last.exposure_end + 10**6)]
+    doubtful = Recording(dataclasses.replace(WHOLE.source, frames=lambda: iter(damaged)))
+    (warning,) = check_recording(doubtful, lambda count: None).warnings()
+    assert warning.startswith("the last frame is exposed for")
+
+
 def test_enough_are_those_after_the_first_frame_begins():
     first = STREAM.frames[0].exposure_start
     early = STREAM.events[:60].copy()

@@ -9,8 +9,8 @@ import pytest
 
 from kalux import PRESETS, Frame, Reconstructor
 from kalux.augmentation.bridge import (
+    MASKED,
     UNMEASURED,
-    UNSEEN,
     BridgeNoise,
     Latent,
     bridge,
@@ -129,7 +129,7 @@ def test_unseen_pixels_start_with_the_variance_of_the_others():
 
 
 def test_a_masked_pixel_is_no_bound():
-    frame = Latent(np.zeros((1, 3)), np.array([[0.1, UNMEASURED, UNSEEN]]))
+    frame = Latent(np.zeros((1, 3)), np.array([[0.1, UNMEASURED, MASKED]]))
     level = np.full((1, 3), -1.0)
     raise_to_bound(level, frame)
     np.testing.assert_array_equal(level, [[-1.0, 0.0, -1.0]])

@@ -18,8 +18,6 @@ from kalux.frames import Frame
 from kalux.readers import hdf5_layout
 from recordings import SIZE, all_events, colour_frames, complaint, damaged, small_events, small_frames
 
-STARTS = [frame.exposure_start for frame in small_frames()]
-
 
 class Layout(NamedTuple):
     """A writer, the file it makes, and what of a recording the layout keeps."""

@@ -28,7 +28,7 @@ UNMEASURED: Final = 2.0**40
 """Variance of a clipped pixel, a number that float32 holds too. 1/R is then 1e-12, which cannot be told
 from 0 beside any information in use (1e-2 and more), and the formulas need no special case."""
 
-UNSEEN: Final = 2.0**41
+MASKED: Final = 2.0**41
 """Variance of a pixel that the frame masks out (`Frame.valid`): no weight, and, unlike a clipped one, no bound."""
 
 REPEATED: Final = 2.0**39
@@ -47,7 +47,7 @@ _SCALE_DRIFT: Final = 1e-5  # variance per frame: a calibration never becomes ce
 class Latent(NamedTuple):
     """A deblurred frame at one moment: (H, W) log intensity and its variance.
 
-    The variance is `UNMEASURED` where the frame is clipped, `UNSEEN` where it is masked. ``ceiling`` is the upper bound
+    The variance is `UNMEASURED` where the frame is clipped, `MASKED` where it is masked. ``ceiling`` is the upper bound
     of black pixels, inf where the value is a measurement; None: black is a measurement as any other.
     """
 
@@ -56,23 +56,23 @@ class Latent(NamedTuple):
     ceiling: Array | None = None
 
 
-class Told(NamedTuple):
+class Revealed(NamedTuple):
     """Statistics of pixels that have left saturation, for the expectation of those that have not (K15).
 
     Attributes
     ----------
-    told, foretold, tellers
+    excess, expected, pixels
         Of every part of the image: sum of the distances of these pixels from their bounds, sum of the distances that
-        had been expected, and their number.
-    gone, gone_foretold
-        Both sums over the whole image, of pixels that events have taken out of saturation.
+        had been expected, and the number of these pixels. T, F and n of docs/equations.md.
+    moved_excess, moved_expected
+        Both sums over the whole image, of pixels that events have taken out of saturation. T_all and F_all.
     """
 
-    told: Array
-    foretold: Array
-    tellers: Array
-    gone: float
-    gone_foretold: float
+    excess: Array
+    expected: Array
+    pixels: Array
+    moved_excess: float
+    moved_expected: float
 
 
 class UnshownMemory(NamedTuple):
@@ -91,8 +91,8 @@ class UnshownMemory(NamedTuple):
         corrected by pixels that have left saturation.
     doubt
         (N,) float32: variance of ``expected``.
-    told
-        Of pixels that have left saturation.
+    revealed
+        Statistics of the pixels that have left saturation.
     near, clipped
         Numbers of pixels just below white and of clipped ones, in all frames until now.
     """
@@ -103,7 +103,7 @@ class UnshownMemory(NamedTuple):
     excess: NDArray[np.float32]
     expected: NDArray[np.float32]
     doubt: NDArray[np.float32]
-    told: Told
+    revealed: Revealed
     near: int
     clipped: int
 
@@ -226,9 +226,9 @@ def drift(
     """
     grown, far_on, far_off = apart(3, second.variance.shape)
     of_on, of_off = np.float32(noise.threshold_on**2), np.float32(noise.threshold_off**2)
-    untold = np.float32(noise.quantisation_variance / 2)
+    unsignalled = np.float32(noise.quantisation_variance / 2)
     planes = first.variance, second.variance, thresholds.on_variance, thresholds.off_variance, *far, *counts
-    _drift(of_on, of_off, untold, *(p.reshape(-1) for p in (*planes, grown, far_on, far_off)))
+    _drift(of_on, of_off, unsignalled, *(p.reshape(-1) for p in (*planes, grown, far_on, far_off)))
     return grown, far_on, far_off
 
 
@@ -236,7 +236,7 @@ def drift(
 def _drift(  # type: ignore[no-untyped-def]
     of_on,
     of_off,
-    untold,
+    unsignalled,
     before,
     after,
     on_variance,
@@ -266,7 +266,7 @@ def _drift(  # type: ignore[no-untyped-def]
         for i in pixels:
             drifted[i - first] += off_variance[i] * of_off * off[i] * (two * far_off[i] + off[i])
         for i in pixels:
-            more = untold if before[i] < unmeasured else zero
+            more = unsignalled if before[i] < unmeasured else zero
             grown[i] = drifted[i - first] + more if after[i] >= unmeasured else zero
         for i in pixels:
             new_on[i] = far_on[i] + on[i] if after[i] >= unmeasured else zero
@@ -275,7 +275,7 @@ def _drift(  # type: ignore[no-untyped-def]
 
 
 def raise_to_bound(log_intensity: Array, frame: Latent) -> None:
-    """Raise L to the lower bounds that a frame's clipped pixels are (docs/equations.md, K7). In place.
+    """Raise L to the lower bounds that clipped pixels of a frame give (docs/equations.md, K7). In place.
 
     A frame integrates: where its value is clipped, the mean over the exposure was at least the value, and the
     latent value computed from it is a bound for every moment.
@@ -284,7 +284,7 @@ def raise_to_bound(log_intensity: Array, frame: Latent) -> None:
 
 
 def lower_to_ceiling(log_intensity: Array, frame: Latent) -> None:
-    """Lower L to the upper bounds that a frame's black pixels are (K7). In place."""
+    """Lower L to the upper bounds that black pixels of a frame give (K7). In place."""
     if frame.ceiling is not None:
         np.minimum(log_intensity, frame.ceiling, out=log_intensity)
 
@@ -292,12 +292,12 @@ def lower_to_ceiling(log_intensity: Array, frame: Latent) -> None:
 @loop
 def _raise_to_bound(log_intensity, value, variance):  # type: ignore[no-untyped-def]
     for i in range(len(value)):
-        if UNMEASURED <= variance[i] < UNSEEN and value[i] > log_intensity[i]:
+        if UNMEASURED <= variance[i] < MASKED and value[i] > log_intensity[i]:
             log_intensity[i] = value[i]
 
 
 def nominal_thresholds(shape: tuple[int, int], spread: float, dtype: Any = np.float64) -> Thresholds:
-    """Before any calibration: factor 1 with the variance that pixels have among each other."""
+    """Thresholds before any calibration: all factors are 1, with the variance between pixels."""
     return Thresholds(*(np.full(shape, value, dtype) for value in (1.0, 1.0, spread**2, spread**2)))
 
 
@@ -380,7 +380,7 @@ def _bridge(given, thresholds, noise, seconds, planes, factors):  # type: ignore
     new_on, new_off, new_on_variance, new_off_variance = factors
     scale_on, scale_off, variance_on, variance_off = thresholds
     c_on, c_off, of_step = noise.threshold_on, noise.threshold_off, noise.step_variance
-    untold, of_saturated = noise.quantisation_variance, noise.saturated_variance
+    unsignalled, of_saturated = noise.quantisation_variance, noise.saturated_variance
     s = empty(_SCRATCH * _BLOCK, np.float64)
     size = np.uint64(len(value))
     for first in range(np.uint64(0), size, np.uint64(_BLOCK)):
@@ -389,9 +389,9 @@ def _bridge(given, thresholds, noise, seconds, planes, factors):  # type: ignore
             i = first + k
             before, after = np.float64(variance[i]), np.float64(next_variance[i])
             here, more = np.float64(value[i]), np.float64(grown[i])
-            saturated = (smaller(before, after) >= UNMEASURED) & (larger(before, after) < UNSEEN)
+            saturated = (smaller(before, after) >= UNMEASURED) & (larger(before, after) < MASKED)
             s[_COUNT_ON + k], s[_COUNT_OFF + k] = on[i], off[i]
-            # Two bounds: all that they say of the change is that it does not go on and on.
+            # Two lower bounds have no information of the change, but that it does not grow without limit.
             s[_CHANGE + k] = -more if saturated else np.float64(next_value[i]) - more - here
             s[_BOTH + k] = of_saturated if saturated else before + after
             s[_LEVEL + k], s[_MOVES + k] = here, 0.0 if saturated else before
@@ -409,12 +409,12 @@ def _bridge(given, thresholds, noise, seconds, planes, factors):  # type: ignore
                 + on_covariance * c_on * n_on
                 - off_covariance * c_off * n_off
                 + of_step * (n_on + n_off)
-                + untold
+                + unsignalled
             )
             inverse = 1.0 / total
             gain = mismatch * inverse
             s[_LEVEL + k] += gain * s[_MOVES + k]
-            s[_SLOPE + k] = gain * untold / seconds
+            s[_SLOPE + k] = gain * unsignalled / seconds
             s[_STEP_ON + k] = nominal_on + gain * (c_on * on_covariance + of_step)
             s[_STEP_OFF + k] = nominal_off + gain * (c_off * off_covariance - of_step)
             s[_NEW_ON + k] = smaller(larger(of_on + gain * on_covariance, low), high)
@@ -439,10 +439,10 @@ def _bridge(given, thresholds, noise, seconds, planes, factors):  # type: ignore
             net[i] = step_on[i] * on[i] - step_off[i] * off[i] + grown[i]
         for k in pixels:
             i = first + k
-            # What is not known of a pixel that no frame measured is a constant: if events lead from it to less than
-            # the next frame's bound, it was too low all the time.
+            # The unknown excess of a pixel that no frame measures does not change: if events lead to a level below the
+            # next frame's bound, the level was too low all the time.
             bounded = (
-                (variance[i] >= UNMEASURED) & (next_variance[i] >= UNMEASURED) & (next_variance[i] < UNSEEN)
+                (variance[i] >= UNMEASURED) & (next_variance[i] >= UNMEASURED) & (next_variance[i] < MASKED)
             )
             floor[i] = next_value[i] - net[i] if bounded else -np.inf
 

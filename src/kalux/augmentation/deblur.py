@@ -63,7 +63,7 @@ EXPOSURE_PIXEL: Final = np.dtype(
     ],
     align=True,
 )
-"""What a pixel remembers within an exposure: 32 bytes, half a cache line, fetched and stored at once."""
+"""State of a pixel within an exposure: 32 bytes, half a cache line, fetched and stored at once."""
 
 EXPOSURE_FIELDS: Final = len(EXPOSURE_PIXEL.names or ())
 _LEVEL, _INTEGRAL, _SINCE, _PEAK, _AT_MIDDLE, _EVENTS, _UP, _DOWN = range(EXPOSURE_FIELDS)
@@ -119,7 +119,7 @@ def integrate_exposure(
 
 
 class Exposure(NamedTuple):
-    """What the pixels remember of an exposure.
+    """Levels of the pixels during an exposure, and their integrals.
 
     Attributes
     ----------
@@ -147,7 +147,7 @@ def expose(
     *,
     weighed: bool,
 ) -> Exposure:
-    """Take an exposure, from ``start`` to ``end`` (us), over its events.
+    """Integrate the pixels' levels over an exposure, from ``start`` to ``end`` (us).
 
     Parameters
     ----------

@@ -1,9 +1,10 @@
 """Highlights that no frame has shown yet: clipped in every frame since the start (docs/equations.md, K15).
 
-Of such a pixel the frames and its events give a bound. How far it is above white, the pixels around tell: light is
-continuous, so that beside many pixels just below white little is far above it. And pixels tell that were like it and
-have left saturation: where a frame first measures one, its distance from its bound is known. That is learned as the
-recording goes on, and for every part of the image, since a window is brighter than the floor that it lights.
+The frames and the events of such a pixel give a lower bound of its intensity. How far above the bound it is expected is
+estimated twice. First from the pixels around it: intensities are continuous, so that where many pixels lie just below
+white, few lie far above it. Then from pixels that were clipped, too, and have left saturation: when a frame measures
+one for the first time, its distance from its bound is known. These distances are collected as the recording goes on,
+for every part of the image, since a window is brighter than the floor that it lights.
 """
 
 from __future__ import annotations
@@ -15,54 +16,54 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.bridge import UNMEASURED, UNSEEN, BridgedSegment, Latent, Told, UnshownMemory
+from kalux.augmentation.bridge import MASKED, UNMEASURED, BridgedSegment, Latent, Revealed, UnshownMemory
 from kalux.compiled import larger, loop, smaller
 
 Floats = NDArray[np.floating[Any]]
 
 _PART: Final = 8
-"""Side of the parts of the image for which it is learned, pixels."""
+"""Side of the parts of the image for which distances are collected, pixels."""
 
 _RANGE: Final = 8.0
-"""Distance over which parts tell of each other, standard deviation of a normal curve, pixels. Of 4, 8 and 12 the excess
-of clipped pixels of 48 simulated scenes is explained alike."""
+"""Standard deviation, pixels, of the normal weights by which parts count for each other. 4, 8 and 12 explain the excess
+of clipped pixels of 48 simulated scenes equally well."""
 
 _NEAR: Final = 0.2
-"""Pixels that are darker than white by less, log intensity, are just below it: levels of 0.8 to 0.98."""
+"""Log intensity below white up to which a pixel counts as just below it: levels of 0.8 to 0.98."""
 
 _WHOLE: Final = 0.1
-"""Share of a neighbourhood that the whole image stands in for: where nothing else is near, its pixels count."""
+"""Share of a neighbourhood's pixels as which the whole image counts: it decides where nothing else is near."""
 
 _LEAST: Final = 1e-4
-"""Share of a neighbourhood that is just below white at least: a division."""
+"""Least share of a neighbourhood that counts as just below white, since it is divided by."""
 
 _SOFT: Final = 0.05
-"""Where the darkest pixel at a border is darker than white by so much, log intensity, the border is half hard."""
+"""Hardness of a border is 1/2 where its darkest pixel is this much darker than white, log intensity."""
 
 _PRIOR_PIXELS: Final = 10.0
-"""Pixels that the prior counts for, beside those that tell: little beside the tens of a part that leave saturation."""
+"""Pixels as which the prior counts: few beside the tens of pixels of a part that leave saturation."""
 
-_PRIOR_TOLD: Final = 5.0
-"""What these tell together, log intensity: 0.5 each, which is what clipped pixels of these scenes are above white."""
+_PRIOR_EXCESS: Final = 5.0
+"""Sum of their distances from their bounds, log intensity: 0.5 each, the mean of the clipped pixels of these scenes."""
 
 _PRIOR_OF_ALL: Final = 100.0
-"""What is expected of pixels, log intensity, by whom half of the scale of the whole image is told. Many of them are one
-object's: on 32 simulated scenes those that leave saturation were expected to tell 100 to 1400 altogether."""
+"""Sum of expected distances, log intensity, at which the logarithm of the whole image's scale counts half. So large
+because many of the pixels belong to one object: on 32 simulated scenes these sums are 100 to 1400."""
 
 _UNKNOWN_SCALE: Final = 3.0
-"""Standard deviation of the mean excess, in units of it, where nobody has told: by the errors of 32 simulated scenes,
-whose mean excess is half to ten times what frames make expect (docs/equations.md, K15)."""
+"""Standard deviation of the mean excess, in units of it, where no pixel has left saturation: by the errors of 32
+simulated scenes, whose mean excess is half to ten times the expected one (docs/equations.md, K15)."""
 
 _NOISE: Final = 3.0
-"""Standard deviations of a frame's noise below its bound from which a pixel has left saturation by more than noise."""
+"""Standard deviations of a frame's noise by which a pixel must lie below its bound to have left saturation."""
 
 _RAISED: Final = np.float32(1e-4)
-"""By more than this, log intensity, and not by rounding, a frame raises a bound."""
+"""Log intensity by which a frame must raise a bound to count: less may be rounding."""
 
-_AROUND: Final = np.ones((3, 3), np.uint8)
+_NEIGHBOURHOOD: Final = np.ones((3, 3), np.uint8)
 
 
-class Shown(NamedTuple):
+class FrameHighlights(NamedTuple):
     """What a frame shows of highlights.
 
     Attributes
@@ -89,7 +90,7 @@ class Shown(NamedTuple):
 
 
 class Tail(NamedTuple):
-    """How far highlights go on beyond white: ``share`` of what pixels just below it say, ``most`` at most (K15)."""
+    """How far highlights go beyond white: ``share`` of the scale of pixels just below it, at most ``most`` (K15)."""
 
     share: float
     most: float
@@ -117,209 +118,219 @@ class Unshown(NamedTuple):
     doubt: NDArray[np.float32]
 
 
-def begin_unshown(first: Latent, shown: Shown, tail: Tail) -> UnshownMemory:
-    """What the first frame does not show."""
-    pixels = np.flatnonzero((first.variance >= UNMEASURED) & (first.variance < UNSEEN))
+def begin_unshown(first: Latent, highlights: FrameHighlights, tail: Tail) -> UnshownMemory:
+    """The pixels that the first frame clips, and what it makes expect of them."""
+    pixels = np.flatnonzero((first.variance >= UNMEASURED) & (first.variance < MASKED))
     bound = first.value.reshape(-1)[pixels].astype(np.float32)
     parts = tuple(-(-side // _PART) for side in first.value.shape)
-    told = Told(np.zeros(parts), np.zeros(parts), np.zeros(parts), 0.0, 0.0)
-    near, clipped = _counts(shown)
-    excess = beyond_rims(shown, pixels, near / max(clipped, 1), tail)
+    revealed = Revealed(np.zeros(parts), np.zeros(parts), np.zeros(parts), 0.0, 0.0)
+    near, clipped = _counts(highlights)
+    excess = excess_from_surroundings(highlights, pixels, near / max(clipped, 1), tail)
     doubt = (np.float32(_UNKNOWN_SCALE) * excess) ** 2
-    return UnshownMemory(pixels, bound, first.value.shape, excess, excess, doubt, told, near, clipped)
+    return UnshownMemory(pixels, bound, first.value.shape, excess, excess, doubt, revealed, near, clipped)
 
 
 def follow_unshown(
     memory: UnshownMemory,
     following: Latent,
-    shown: Shown,
+    highlights: FrameHighlights,
     noise: Floats,
     net: Floats,
     moved: float,
     tail: Tail,
 ) -> UnshownMemory:
-    """After the next frame.
+    """The pixels that are still not measured after the next frame.
 
-    A pixel that is measured below its bound was at it: events are not exact.
+    A pixel that is measured below its bound counts as having been at it, since events are not exact.
 
     Parameters
     ----------
-    following, shown
+    following, highlights
         The next frame.
     noise
-        (N,) variance of what it shows of the pixels, by its own noise. Noise is what takes a pixel that does not move
-        out of saturation; what deblurring adds is of pixels that do.
+        (N,) variance of these pixels in it, by the noise of the frame alone: that is what takes still pixels out of
+        saturation. Deblurring adds variance to moving pixels only.
     net
-        (H, W) what events add to L between the two.
+        (H, W) what events add to L between the two frames.
     moved
-        By so much, log intensity, a pixel gets darker if it is by more than a wrong event.
+        Log intensity by which events must take a pixel down for it to have moved: more than one wrong event.
     """
     pixels = memory.pixels
     predicted = memory.bound + net.reshape(-1)[pixels].astype(np.float32)
     value, variance = following.value.reshape(-1)[pixels], following.variance.reshape(-1)[pixels]
     measured = variance < UNMEASURED
-    bounded = np.where(variance < UNSEEN, np.maximum(predicted, value), predicted)
+    bounded = np.where(variance < MASKED, np.maximum(predicted, value), predicted)
     left = measured & (value < memory.bound - _NOISE * np.sqrt(noise))
-    gone = measured & (predicted < memory.bound - moved)
+    moved_out = measured & (predicted < memory.bound - moved)
     distance = np.maximum(value - predicted, np.float32(0.0))
-    told = _with_told(memory, left, gone, distance)
+    revealed = _with_revealed(memory, left, moved_out, distance)
     near, clipped = (
-        old + new for old, new in zip((memory.near, memory.clipped), _counts(shown), strict=True)
+        old + new for old, new in zip((memory.near, memory.clipped), _counts(highlights), strict=True)
     )
     unknown, excess = pixels[~measured], memory.excess[~measured]
     raised = (bounded > predicted + _RAISED)[~measured]
     if raised.any():
-        around = beyond_rims(shown, unknown[raised], near / max(clipped, 1), tail)
+        around = excess_from_surroundings(highlights, unknown[raised], near / max(clipped, 1), tail)
         excess[raised] = np.minimum(excess[raised], around)
-    expected, doubt = _as_told(excess, unknown, memory.shape[1], told)
+    expected, doubt = _corrected(excess, unknown, memory.shape[1], revealed)
     return memory._replace(
         pixels=unknown,
         bound=bounded[~measured],
         excess=excess,
         expected=expected,
         doubt=doubt,
-        told=told,
+        revealed=revealed,
         near=near,
         clipped=clipped,
     )
 
 
-def beyond_rims(shown: Shown, pixels: NDArray[np.int64], near: float, tail: Tail) -> NDArray[np.float32]:
-    """How far above white clipped pixels are, from the pixels around them.
+def excess_from_surroundings(
+    highlights: FrameHighlights, pixels: NDArray[np.int64], near: float, tail: Tail
+) -> NDArray[np.float32]:
+    """How far above white clipped pixels are expected, from the pixels around them.
 
-    If the density of log intensities goes on beyond white as it is below, and falls off exponentially, its scale is
-    `_NEAR` times the clipped pixels over those just below white. Both are counted around every part of the image. That
-    holds as far as borders of the clipped areas are hard, and one pixel from them: where the frame goes up to white
-    slowly, it goes on slowly.
+    If the density of log intensities continues beyond white and falls off exponentially, its scale is `_NEAR` times the
+    number of clipped pixels over that of pixels just below white. Both are counted around every part of the image. The
+    result is less where borders of the clipped areas are soft, and within a pixel of them: where a frame approaches
+    white slowly, the scene goes on slowly.
 
     Parameters
     ----------
     pixels
         (N,) which pixels, in the flattened image, ascending.
     near
-        Pixels just below white over clipped ones, of the whole recording until now.
+        Number of pixels just below white over that of clipped ones, of all frames until now.
     """
-    distance, rim, hardness = _rims(shown)
-    of_parts = (_around(_sums(plane)) for plane in (shown.clipped, shown.just_below, rim, hardness))
+    distance, rim, hardness = _borders(highlights)
+    of_parts = (
+        _weighted_sums(_part_sums(plane))
+        for plane in (highlights.clipped, highlights.just_below, rim, hardness)
+    )
     clipped, below, rims, hard = of_parts
-    area = _area(shown.darker.shape)
+    area = _weighted_area(highlights.darker.shape)
     scale = _NEAR * (clipped + _WHOLE * area) / (below + (_WHOLE * near + _LEAST) * area)
     hard = np.where(rims > 0.0, hard / np.maximum(rims, 1e-300), 1.0)
     level = tail.most * -np.expm1(-tail.share * scale / tail.most) * hard
     inside = -np.expm1(-distance.reshape(-1)[pixels])
-    excess: NDArray[np.float32] = _between(level.astype(np.float32), pixels, shown.darker.shape[1]) * inside
+    excess: NDArray[np.float32] = (
+        _interpolated(level.astype(np.float32), pixels, highlights.darker.shape[1]) * inside
+    )
     return excess
 
 
-def _counts(shown: Shown) -> tuple[int, int]:
+def _counts(highlights: FrameHighlights) -> tuple[int, int]:
     """Pixels just below white, and clipped ones."""
-    return int(np.count_nonzero(shown.just_below)), int(np.count_nonzero(shown.clipped))
+    return int(np.count_nonzero(highlights.just_below)), int(np.count_nonzero(highlights.clipped))
 
 
-def _rims(shown: Shown) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.float32]]:
-    """(H, W) each: distances to the nearest pixels that are not clipped, which pixels border on clipped ones, how hard.
+def _borders(
+    highlights: FrameHighlights,
+) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.float32]]:
+    """(H, W) each: distance to the nearest pixel not clipped, pixels that border on clipped ones, and their hardness.
 
-    Distances are right to 2 %, hardness is 0 to 1.
+    Distances, in pixels, are right to 2 %. Hardness is 0 to 1, 0 away from borders.
     """
-    shape, pitch = shown.clipped.shape, shown.pitch
+    shape, pitch = highlights.clipped.shape, highlights.pitch
     distance, hardness = np.empty(shape, np.float32), np.zeros(shape, np.float32)
     rim = np.zeros(shape, np.bool_)
     for row, column in np.ndindex(pitch, pitch):
         of_colour = np.s_[row::pitch, column::pitch]
-        clipped = np.ascontiguousarray(shown.clipped[of_colour], np.uint8)
+        clipped = np.ascontiguousarray(highlights.clipped[of_colour], np.uint8)
         steps = cv2.distanceTransform(clipped, cv2.DIST_L2, cv2.DIST_MASK_5)
-        distance[of_colour] = pitch * np.minimum(
-            steps, np.float32(sum(shape))
-        )  # where all is clipped, it is anything
-        beside = cv2.dilate(clipped, _AROUND).view(np.bool_) & shown.measured[of_colour]
-        darkest = cv2.dilate(np.ascontiguousarray(shown.darker[of_colour]), _AROUND)[beside]
+        # Where all pixels are clipped, OpenCV's distances have no meaning.
+        distance[of_colour] = pitch * np.minimum(steps, np.float32(sum(shape)))
+        beside = cv2.dilate(clipped, _NEIGHBOURHOOD).view(np.bool_) & highlights.measured[of_colour]
+        darkest = cv2.dilate(np.ascontiguousarray(highlights.darker[of_colour]), _NEIGHBOURHOOD)[beside]
         rim[of_colour] = beside
         hardness[of_colour][beside] = darkest / (darkest + np.float32(_SOFT))
     return distance, rim, hardness
 
 
-def _with_told(
-    memory: UnshownMemory, left: NDArray[np.bool_], gone: NDArray[np.bool_], distance: Floats
-) -> Told:
-    """With what pixels tell: those that have ``left`` saturation, and those that events say are ``gone``."""
-    told, shape = memory.told, memory.told.told.shape
+def _with_revealed(
+    memory: UnshownMemory, left: NDArray[np.bool_], moved_out: NDArray[np.bool_], distance: Floats
+) -> Revealed:
+    """The statistics with the pixels that have now ``left`` saturation, or that events have ``moved_out`` of it.
+
+    ``distance`` is how far above its bound each pixel was, (N,) as the masks.
+    """
+    known, shape = memory.revealed, memory.revealed.excess.shape
     row, column = np.divmod(memory.pixels[left], memory.shape[1])
     part = row // _PART * shape[1] + column // _PART
 
     def more(weights: Floats | None) -> Floats:
-        sums: Floats = np.bincount(part, weights, told.told.size).reshape(shape).astype(np.float64)
+        sums: Floats = np.bincount(part, weights, known.excess.size).reshape(shape).astype(np.float64)
         return sums
 
-    return Told(
-        told.told + more(distance[left]),
-        told.foretold + more(memory.excess[left]),
-        told.tellers + more(None),
-        told.gone + float(distance[gone].sum(dtype=np.float64)),
-        told.gone_foretold + float(memory.excess[gone].sum(dtype=np.float64)),
+    return Revealed(
+        known.excess + more(distance[left]),
+        known.expected + more(memory.excess[left]),
+        known.pixels + more(None),
+        known.moved_excess + float(distance[moved_out].sum(dtype=np.float64)),
+        known.moved_expected + float(memory.excess[moved_out].sum(dtype=np.float64)),
     )
 
 
-def _as_told(
-    excess: NDArray[np.float32], pixels: NDArray[np.int64], width: int, told: Told
+def _corrected(
+    excess: NDArray[np.float32], pixels: NDArray[np.int64], width: int, revealed: Revealed
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """``excess``, (N,), as far as what pixels have told confirms it, and the variance of what nobody has told.
+    """The expected ``excess``, (N,), corrected by the pixels that have left saturation, and the variance of its mean.
 
-    First all is scaled by what the whole image tells, then by what those around tell of what is expected then.
+    It is scaled by what the whole image has revealed, R of docs/equations.md, and then by what the pixels around have,
+    in comparison with what is expected of them after the first step.
     """
-    known = told.gone_foretold / (told.gone_foretold + _PRIOR_OF_ALL)
-    of_all = ((told.gone + _PRIOR_TOLD) / (told.gone_foretold + _PRIOR_TOLD)) ** known
-    here, foretold, tellers = (_around(values) for values in told[:3])
-    foretold *= of_all
-    factor = (here + _PRIOR_TOLD) / (foretold + _PRIOR_TOLD)
-    more = np.maximum(here - foretold, 0.0) / (tellers + _PRIOR_PIXELS)
-    untold = _UNKNOWN_SCALE**2 * _PRIOR_TOLD / (foretold + _PRIOR_TOLD)
+    certainty = revealed.moved_expected / (revealed.moved_expected + _PRIOR_OF_ALL)
+    scale = ((revealed.moved_excess + _PRIOR_EXCESS) / (revealed.moved_expected + _PRIOR_EXCESS)) ** certainty
+    found, expected, count = (_weighted_sums(values) for values in revealed[:3])
+    expected *= scale
+    factor = (found + _PRIOR_EXCESS) / (expected + _PRIOR_EXCESS)
+    surplus = np.maximum(found - expected, 0.0) / (count + _PRIOR_PIXELS)
+    unknown = _UNKNOWN_SCALE**2 * _PRIOR_EXCESS / (expected + _PRIOR_EXCESS)
     times, plus, left = (
-        _between(values.astype(np.float32), pixels, width) for values in (factor, more, untold)
+        _interpolated(values.astype(np.float32), pixels, width) for values in (factor, surplus, unknown)
     )
-    scaled = np.float32(of_all) * excess
+    scaled = np.float32(scale) * excess
     return np.minimum(times * scaled, scaled + plus), left * scaled**2
 
 
 def expected_excess(memory: UnshownMemory, variance: Floats, initial_variance: float) -> Unshown | None:
-    """How far pixels are expected above their bounds; None: there are none.
+    """How far the pixels are expected above their bounds; None if there are no such pixels.
 
     Parameters
     ----------
-    memory
-        Which pixels, and what is expected of them.
     variance, initial_variance
-        (H, W) P, and what it began as: what has come to it is noise of the events.
+        (H, W) P, and its value at the start: the difference is the noise of the events.
     """
     if len(memory.pixels) == 0:
         return None
     noise = np.empty(len(memory.pixels), np.float32)
-    _grown(memory.pixels, variance.reshape(-1), np.float32(initial_variance), noise)
+    _bound_noise(memory.pixels, variance.reshape(-1), np.float32(initial_variance), noise)
     return Unshown(memory.pixels, memory.expected, noise, memory.doubt)
 
 
 @loop
-def _grown(pixels, variance, initial_variance, noise):  # type: ignore[no-untyped-def]
-    """What has come to the variance."""
+def _bound_noise(pixels, variance, initial_variance, noise):  # type: ignore[no-untyped-def]
+    """By how much P has grown."""
     for i in range(len(pixels)):
         noise[i] = larger(np.float32(variance[pixels[i]]) - initial_variance, np.float32(0.0))
 
 
 def above_frames(segment: BridgedSegment, pixels: NDArray[np.int64], bound: Floats) -> Floats:
-    """(N,) by how much ``bound``, of ``pixels`` at the segment's start, is more than the frames around say themselves.
+    """(N,) by how much the ``bound`` of ``pixels`` at the segment's start exceeds the bounds by the frames around.
 
-    That is how far it can be too high: what the frame at the start says needs no events, what the one at the end says
-    (`BridgedSegment.floor`) none from before. Infinite where one of them is masked.
+    The bound is too high by that at most. The frame at the start bounds the pixel without events, the one at the end
+    (`BridgedSegment.floor`) without those from before the segment. Infinite where one of them is masked.
     """
     variances = segment.forward_variance, segment.backward_variance
-    seen = np.maximum(*(plane.reshape(-1)[pixels] for plane in variances)) < UNSEEN
+    seen = np.maximum(*(plane.reshape(-1)[pixels] for plane in variances)) < MASKED
     least = np.where(seen, segment.augmented.reshape(-1)[pixels], -np.inf)
     if segment.floor is not None:
         least = np.maximum(least, segment.floor.reshape(-1)[pixels])
     return np.maximum(bound - least, 0.0)
 
 
-def _between(parts: NDArray[np.float32], pixels: NDArray[np.int64], width: int) -> NDArray[np.float32]:
-    """(N,) values of the ``parts`` at pixels, linear between their middles."""
+def _interpolated(parts: NDArray[np.float32], pixels: NDArray[np.int64], width: int) -> NDArray[np.float32]:
+    """(N,) values of the ``parts`` at pixels, interpolated linearly between the middles of the parts."""
     values = np.empty(len(pixels), np.float32)
     _at_pixels(pixels, width, parts, values)
     return values
@@ -341,8 +352,8 @@ def _at_pixels(pixels, width, parts, values):  # type: ignore[no-untyped-def]
         values[i] = upper * (one - down) + lower * down
 
 
-def _sums(values: NDArray[Any]) -> Floats:
-    """Over the pixels of every part."""
+def _part_sums(values: NDArray[Any]) -> Floats:
+    """Sums over the pixels of every part."""
     height, width = values.shape
     below, right = -height % _PART, -width % _PART
     plane: NDArray[Any] = values.astype(np.float32, copy=False)
@@ -354,24 +365,27 @@ def _sums(values: NDArray[Any]) -> Floats:
 
 
 @functools.cache
-def _area(shape: tuple[int, int]) -> Floats:
-    """Of every part, the pixels around. Not to be changed."""
-    return _around(_sums(np.ones(shape, np.float32)))
+def _weighted_area(shape: tuple[int, int]) -> Floats:
+    """Weighted number of pixels around every part. Not to be changed, since it is cached."""
+    return _weighted_sums(_part_sums(np.ones(shape, np.float32)))
 
 
-def _around(parts: Floats) -> Floats:
-    """Of every part, the sum of those around, weighted by their nearness.
+def _weighted_sums(parts: Floats) -> Floats:
+    """For every part, the sum over all parts, weighted by their nearness.
 
-    Not as a product of matrices: of large images BLAS has other last bits on another number of threads.
+    Not as a product of matrices: the last bits of BLAS depend on the number of threads.
     """
-    below, beside = (_nearness(n) for n in parts.shape)
+    below, beside = (_weights(n) for n in parts.shape)
     near = cv2.sepFilter2D(parts, cv2.CV_64F, beside, below, borderType=cv2.BORDER_CONSTANT)
     return np.asarray(near, np.float64)
 
 
 @functools.cache
-def _nearness(parts: int) -> Floats:
-    """Weights of parts to both sides of one, where there are so many: all that double precision tells from 0."""
+def _weights(parts: int) -> Floats:
+    """Weights of the parts on both sides of one, along an axis of so many ``parts``.
+
+    The farthest are those whose weights double precision tells from 0.
+    """
     reach = min(parts, 39)
     distance = _PART * np.arange(1 - reach, reach)
     nearness: Floats = np.exp(-0.5 * (distance / _RANGE) ** 2)

@@ -1,4 +1,4 @@
-"""What the light did while a pixel could not report it: a weight for every event.
+"""Changes that a pixel cannot report in its refractory period: a weight for every event makes up for them.
 
 After an event a pixel is held in reset for its refractory period, and compares with the light at the end of that, not
 with the light at the event. What changed meanwhile is never reported. If the light goes on at one pace from one event
@@ -45,7 +45,7 @@ earlier is noise, of which no light was missed."""
 
 
 class EventClock:
-    """When every pixel had its latest event: what weighing a stream of events needs to know of the past.
+    """Weighs the events of a stream; remembers when every pixel had its latest one.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ class EventClock:
 
 @nb.njit(cache=True, inline="always", error_model="numpy")
 def step_weight(since_pixel, refractory_period):  # type: ignore[no-untyped-def]
-    """K13: how many thresholds an event tells of, ``since_pixel`` after the pixel's previous one; float32, us."""
+    """Thresholds that an event stands for (K13), ``since_pixel`` us after the pixel's previous one; float32."""
     if since_pixel <= _EARLY * refractory_period:  # also without a period, of events at one time
         return ONE
     looked = since_pixel - refractory_period

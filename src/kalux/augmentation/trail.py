@@ -1,7 +1,7 @@
-"""By how much events trail the light: what a pixel that has just had an event has gone on since.
+"""How far the light is ahead of a pixel's newest event (docs/equations.md, K14).
 
-Between two events nothing is told, but a brightness that moves seldom stops at a threshold: a time a after its newest
-event a pixel is on average
+Between two events a pixel reports nothing, but a brightness that moves seldom stops at a threshold: a time a after its
+newest event a pixel is on average
 
     f(a) = h c 2 x / (1 + x^2),   x = a / s,
 
@@ -81,7 +81,7 @@ class Followed(NamedTuple):
 
 
 class Trail(NamedTuple):
-    """f of one segment.
+    """How far the light is ahead of its events in one segment: f of the module's text.
 
     Attributes
     ----------
@@ -125,7 +125,7 @@ class FrameTrail(NamedTuple):
 
 
 def nothing_followed(shape: tuple[int, int]) -> Followed:
-    """Before the first event."""
+    """`Followed` before the first event."""
     return Followed(np.full(shape, NO_EVENT, np.int64), 0.0, 0.0)
 
 

@@ -24,14 +24,14 @@ UNMEASURED_CHANGE: Final = 0.4
 """The same where a frame does not measure the pixel, so that the change may be large: the variance half-way to such a
 frame is then that of a moving pixel, as on the same scenes."""
 
-_ENOUGH: Final = 25.0
-"""Least information from which the change of the whole image is estimated: that of so many pixels without noise."""
+_LEAST_INFORMATION: Final = 25.0
+"""Least information from which the change of the whole image is estimated, in pixels without noise."""
 
 _BLOCK: Final = 64
 """Pixels in a block: few enough that intermediate values stay in the first-level cache."""
 
 _WINDOW: Final = 5
-"""Pixels, side of the window of the mean. 3 to 9 predict the errors of these scenes about alike."""
+"""Side of the window of the mean, pixels. 3 to 9 predict the errors of these scenes about equally well."""
 
 
 def silent_change(segment: BridgedSegment, quantisation_variance: float, threshold2: float) -> Array:
@@ -52,23 +52,25 @@ def silent_change(segment: BridgedSegment, quantisation_variance: float, thresho
     """
     assert segment.events is not None
     shape = segment.slope.shape
-    change, untold = apart(2, shape)
+    change, hidden = apart(2, shape)
     mean, silent = memory.empty(shape), memory.empty(shape, np.uint8)
     seconds = np.float32((segment.end - segment.start) * 1e-6)
     q0, most = np.float32(quantisation_variance), np.float32(threshold2)
     variances = segment.forward_variance, segment.backward_variance
     given = tuple(plane.reshape(-1) for plane in (segment.slope, *variances, segment.events))
-    told_of = tuple(plane.reshape(-1) for plane in (change, untold, silent))
-    of_all, told = _told(given, seconds, q0, most, told_of)
-    whole = max(of_all, 0.0) / told if told > _ENOUGH else UNKNOWN_CHANGE * threshold2
-    _add_share(change.reshape(-1), untold.reshape(-1), np.float32(whole))
+    filled = tuple(plane.reshape(-1) for plane in (change, hidden, silent))
+    of_all, information = _squared_changes(given, seconds, q0, most, filled)
+    whole = (
+        max(of_all, 0.0) / information if information > _LEAST_INFORMATION else UNKNOWN_CHANGE * threshold2
+    )
+    _add_share(change.reshape(-1), hidden.reshape(-1), np.float32(whole))
     unknown, unmeasured = (np.float32(u * threshold2) for u in (UNKNOWN_CHANGE, UNMEASURED_CHANGE))
     _mean(_sum_around(change), _sum_around(silent), *variances, unknown, unmeasured, mean)
     return mean
 
 
 def turns(on: Array, off: Array) -> float:
-    """How often the intensity of a pixel with events reverses between two frames: twice for every on and off event.
+    """How often the intensity of a pixel with events reverses between two frames: twice for every pair of on and off.
 
     Parameters
     ----------
@@ -123,10 +125,10 @@ def half_way(
         segment.events,
         change,
     )
-    both, squares, noise = _alike(
+    both, squares, noise = _correlation_sums(
         seconds, q0, np.float32(threshold2**0.5), *(plane.reshape(-1) for plane in planes)
     )
-    usual = _ENOUGH * UNKNOWN_CHANGE * threshold2
+    usual = _LEAST_INFORMATION * UNKNOWN_CHANGE * threshold2
     # Shrunk towards 0 where changes are less than the noise, whose variance is an estimate.
     goes_on = both * max(squares, 0.0) / (squares**2 + noise**2 + usual**2)
     goes_on = min(max(goes_on, -0.5), 1.0)
@@ -134,8 +136,8 @@ def half_way(
 
 
 @loop
-def _alike(seconds, q0, most, before, slope, forward, backward, events, change):  # type: ignore[no-untyped-def]
-    """Sums over pixels silent in two intervals: products of their changes, squares, both without noise, and noise."""
+def _correlation_sums(seconds, q0, most, before, slope, forward, backward, events, change):  # type: ignore[no-untyped-def]
+    """Sums over pixels silent in two intervals: products of their changes, squares, both less noise, and the noise."""
     both, squares, of_noise = 0.0, 0.0, 0.0
     for i in range(np.uint64(len(change))):
         noise = np.float32(forward[i]) + np.float32(backward[i])
@@ -151,7 +153,7 @@ def _alike(seconds, q0, most, before, slope, forward, backward, events, change):
     return both, squares, of_noise
 
 
-def forget_silence(
+def add_missed_change(
     grown: Array,
     segment: BridgedSegment,
     second: Latent,
@@ -159,10 +161,10 @@ def forget_silence(
     change: Array,
     quantisation_variance: float,
 ) -> None:
-    """Add the variance by changes of silent pixels from one frame to the next to ``grown``, (H, W). In place.
+    """Add to ``grown``, (H, W), the part of silent pixels' changes that the bridge does not follow. In place.
 
-    The slope of the bridge follows such a change by the share q0 / V of the mismatch (K1): P grows by the mean square
-    change times the square of the other share (docs/equations.md, K11).
+    Its slope follows the share q0 / V of the mismatch (K1). P grows by the mean square change times the square of the
+    other share (docs/equations.md, K11).
 
     Parameters
     ----------
@@ -176,11 +178,11 @@ def forget_silence(
         As in `BridgeNoise`.
     """
     planes = segment.forward_variance, segment.backward_variance, second.variance, *counts, change, grown
-    _forget(np.float32(quantisation_variance), *(plane.reshape(-1) for plane in planes))
+    _add_missed_change(np.float32(quantisation_variance), *(plane.reshape(-1) for plane in planes))
 
 
 @loop
-def _forget(q0, forward, backward, after, on, off, change, grown):  # type: ignore[no-untyped-def]
+def _add_missed_change(q0, forward, backward, after, on, off, change, grown):  # type: ignore[no-untyped-def]
     zero, unmeasured = np.float32(0.0), np.float32(UNMEASURED)
     for i in range(np.uint64(len(grown))):
         noise = np.float32(forward[i]) + np.float32(backward[i])
@@ -191,13 +193,13 @@ def _forget(q0, forward, backward, after, on, off, change, grown):  # type: igno
 
 
 @loop
-def _told(given, seconds, q0, most, told_of):  # type: ignore[no-untyped-def]
-    """Of silent pixels (0 elsewhere): squared change without noise, and the share of it that noise hides; both sums.
+def _squared_changes(given, seconds, q0, most, filled):  # type: ignore[no-untyped-def]
+    """Of silent pixels (0 of others): squared change less noise, and the share that noise hides. Returns both sums.
 
     Blocks of flat planes and few arrays in a loop: vector code, with sums that do not depend on it.
     """
     slope, forward, backward, events = given
-    change, untold, silent = told_of
+    change, hidden, silent = filled
     zero, one, unmeasured = np.float32(0.0), np.float32(1.0), np.float32(UNMEASURED)
     noise, share, is_silent = (
         empty(_BLOCK, np.float32),
@@ -220,7 +222,7 @@ def _told(given, seconds, q0, most, told_of):  # type: ignore[no-untyped-def]
             of_noise = smaller(noise[k], unmeasured) * share[k]
             change[first + k] = is_silent[k] * (smaller(moved * moved, most) - of_noise)
         for k in pixels:
-            untold[first + k] = is_silent[k] * (one - share[k])
+            hidden[first + k] = is_silent[k] * (one - share[k])
         for k in pixels:
             silent[first + k] = np.uint8(is_silent[k])
         for k in pixels:
@@ -235,9 +237,9 @@ def _told(given, seconds, q0, most, told_of):  # type: ignore[no-untyped-def]
 
 
 @loop
-def _add_share(change, untold, whole):  # type: ignore[no-untyped-def]
+def _add_share(change, hidden, whole):  # type: ignore[no-untyped-def]
     for i in range(np.uint64(len(change))):
-        change[i] += untold[i] * whole
+        change[i] += hidden[i] * whole
 
 
 @loop
@@ -253,7 +255,7 @@ def _mean(total, count, forward, backward, unknown, unmeasured_change, mean):  #
 
 
 def _sum_around(values: NDArray[Any]) -> NDArray[Any]:
-    """Over 5 x 5 pixels, in the same type; beyond the border there is nothing."""
+    """Sums over 5 x 5 pixels, in the same type; 0 beyond the border."""
     size = (_WINDOW, _WINDOW)
     sums = memory.empty(values.shape, values.dtype)
     return np.asarray(cv2.boxFilter(values, -1, size, sums, normalize=False, borderType=cv2.BORDER_CONSTANT))

@@ -23,20 +23,22 @@ STEP: Final = 1_000
 LARGEST: Final = 12_000
 """Largest delay that is tried, us: the photoreceptor's, in the dark, is some milliseconds (Lichtsteiner 2008)."""
 
-_COARSE: Final = 3  # delays of the grid, of which one is tried first: residuals have valleys 4 ms wide
-_VALLEY: Final = 4_000  # us
+_COARSE: Final = (
+    3  # points of the grid from one delay tried first to the next: valleys of the residuals are wider
+)
+_VALLEY: Final = 4_000  # us: their width
 
 _AROUND: Final = (-3, 3)
-"""Delays of the grid, from the one at which frames are explained best if nothing moves within exposures, that are tried
-with what does: 0 to 1.8 ms earlier or up to 0.9 later on 40 simulated scenes."""
+"""Points of the grid around the delay found without motion within exposures, between which it is searched with such
+motion: on 40 simulated scenes it is 0 to 1.8 ms earlier or up to 0.9 later."""
 
 _RIVAL: Final = 1.05
-"""Where light flickers, frames are explained nearly as well by events a period of it earlier or later: of valleys whose
-least residual is no larger than so many times the least of all, the one nearest to no delay is taken. At a simulated
-lamp of 100 Hz there are two, at -8.8 and 1.3 ms, whose residuals differ by 2 %."""
+"""Factor of the least residual up to which the minimum of another valley is a rival; of these, the one nearest to no
+delay is taken. Under light that flickers, events a period earlier or later explain frames nearly as well: with a
+simulated lamp of 100 Hz there are minima at -8.8 and 1.3 ms, which differ by 2 %."""
 
 _WALL: Final = 1.05
-"""Of the least residual, where walls of its valley are."""
+"""Factor of the least residual at which the walls of its valley are taken."""
 
 _MIN_SAMPLES: Final = 500
 _MAX_SAMPLES: Final = 60_000
@@ -88,15 +90,15 @@ def estimate_delay(recording: Recording, camera: CameraSettings) -> DelayEstimat
         If the frames' exposures are not known.
     """
     grid = delays()
-    seen = _samples(recording, camera, grid, (0.0, 0.0))
-    if len(seen[0].change) < _MIN_SAMPLES:
+    samples = _samples(recording, camera, grid, (0.0, 0.0))
+    if len(samples[0].change) < _MIN_SAMPLES:
         return None
     residuals = np.full(len(grid), np.inf)
 
     def try_between(first: int, last: int) -> None:
         for index in range(max(first, 0), min(last, len(grid) - 1) + 1):
             if np.isinf(residuals[index]):
-                residuals[index] = _residual(seen[index])
+                residuals[index] = _residual(samples[index])
 
     def least() -> int:
         return int(np.argmin(residuals))
@@ -104,42 +106,39 @@ def estimate_delay(recording: Recording, camera: CameraSettings) -> DelayEstimat
     for index in range(0, len(grid), _COARSE):
         try_between(index, index)
     try_between(least() - _COARSE + 1, least() + _COARSE - 1)
-    # So many steps from no delay lie rivals, and those beside them.
+    # Rivals that would be preferred lie so many steps from no delay.
     nearer = (abs(int(grid[least()])) - _VALLEY) // STEP + 1
     middle = len(grid) // 2
     try_between(middle - nearer, middle + nearer)
     best = -1
-    while best != least():  # what was tried for rivals may be less than all before
+    while best != least():  # the new least may be among those tried for rivals
         best = least()
         try_between(best - 1, best + 1)
-    rough = best_delay(grid, residuals, len(seen[0].change))
+    rough = best_delay(grid, residuals, len(samples[0].change))
     if rough is None:
         return None
-    return _within_exposures(
-        recording, camera, rough, _fit(seen[int(np.argmin(np.abs(grid - rough.apparent)))])
-    )
+    fit = _fit(samples[int(np.argmin(np.abs(grid - rough.apparent)))])
+    return rough if fit is None else _with_moving_exposures(recording, camera, rough, fit)
 
 
-def _within_exposures(
-    recording: Recording, camera: CameraSettings, rough: DelayEstimate, fit: Fit | None
+def _with_moving_exposures(
+    recording: Recording, camera: CameraSettings, rough: DelayEstimate, fit: Fit
 ) -> DelayEstimate:
-    """The delay that is best if the light moves within exposures as the thresholds of a fit say; else the rough one."""
-    if fit is None:
-        return rough
+    """The best delay if the light moves within exposures by the thresholds of a fit; the rough one if there is none."""
     on, off = fit.solution.tolist()
     grid = round(rough.apparent / STEP) * STEP + STEP * np.arange(*_AROUND)
-    residuals = np.array([_residual(seen) for seen in _samples(recording, camera, grid, (on, off))])
-    middle = _middle(residuals)
+    residuals = np.array([_residual(samples) for samples in _samples(recording, camera, grid, (on, off))])
+    middle = _valley_middle(residuals)
     if middle is None:
         return rough
     apparent = float(grid[0]) + STEP * middle
     return rough._replace(apparent=round(apparent))
 
 
-def _middle(residuals: Array) -> float | None:
-    """Half-way between the walls of a valley, which may be flat at its bottom; None where one is missing.
+def _valley_middle(residuals: Array) -> float | None:
+    """The middle of a valley, which may be flat at its bottom, in points of the grid; None where a wall is missing.
 
-    In units of the grid, from its first point. The walls are looked at 5 % above the least, or as far as they go.
+    Half-way between its walls, at 5 % above the least residual, or as high as the lower wall.
     """
     wall = min(_WALL * residuals.min(), residuals[0], residuals[-1])
     if not residuals.min() < wall < np.inf:
@@ -183,7 +182,7 @@ def vertex(before: float, here: float, after: float) -> float | None:
     return 0.5 * (before - after) / curvature if curvature > 0 else None
 
 
-class _Seen(NamedTuple):
+class _Samples(NamedTuple):
     """Changes of pixels, log intensity, and their on and off events under one delay, (N,) each."""
 
     change: Array
@@ -191,16 +190,16 @@ class _Seen(NamedTuple):
     off: Array
 
 
-def _fit(seen: _Seen) -> Fit | None:
+def _fit(samples: _Samples) -> Fit | None:
     """Thresholds that fit best; None if one is not determined."""
-    counts = np.column_stack([seen.on, -seen.off])
-    fit = two_stage(seen.change, counts, halves(seen.change))
+    counts = np.column_stack([samples.on, -samples.off])
+    fit = two_stage(samples.change, counts, halves(samples.change))
     return fit if fit is not None and (fit.solution > 0).all() else None
 
 
-def _residual(seen: _Seen) -> float:
-    """Robust standard deviation of what thresholds that fit best leave, in these; nan if one is not determined."""
-    fit = _fit(seen)
+def _residual(samples: _Samples) -> float:
+    """Robust standard deviation of the fit's residuals, in thresholds; nan if one of these is not determined."""
+    fit = _fit(samples)
     return float("nan") if fit is None else in_thresholds(fit)
 
 
@@ -211,42 +210,45 @@ def in_thresholds(fit: Fit) -> float:
 
 def _samples(
     recording: Recording, camera: CameraSettings, grid: NDArray[np.int64], thresholds: tuple[float, float]
-) -> list[_Seen]:
-    """Usable pixels as they are seen under every delay.
+) -> list[_Samples]:
+    """Changes and events of usable pixels under every delay of the grid.
 
-    The thresholds tell what the light does within exposures; 0: nothing.
+    By the ``thresholds``, log intensity, the light moves within exposures; 0: it stands still.
     """
-    parts: list[list[_Seen]] = []
+    parts: list[list[_Samples]] = []
     total = 0
     margin = LARGEST + (recording.longest_exposure if any(thresholds) else 0)
     exposures = [(d, Exposures(recording.sensor_size, d, thresholds)) for d in grid.tolist()]
     for interval in intervals(recording, camera, margin=margin, most_frames=_MAX_FRAMES):
-        seen = sum(_counts(interval.events, recording.sensor_size))
-        chosen = spread(interval.usable & (seen >= 2), _MAX_SAMPLES - total)
-        parts.append([_of(interval, d, within, recording.sensor_size, chosen) for d, within in exposures])
+        events = sum(_counts(interval.events, recording.sensor_size))
+        chosen = spread(interval.usable & (events >= 2), _MAX_SAMPLES - total)
+        parts.append(
+            [_samples_under(interval, d, within, recording.sensor_size, chosen) for d, within in exposures]
+        )
         total += len(chosen)
         if total >= _MAX_SAMPLES:
             break
     if not parts:
-        return [_Seen(*np.empty((3, 0))) for _ in grid]
+        return [_Samples(*np.empty((3, 0))) for _ in grid]
     return [
-        _Seen(*(np.concatenate(values) for values in zip(*of_delay, strict=True)))
+        _Samples(*(np.concatenate(values) for values in zip(*of_delay, strict=True)))
         for of_delay in zip(*parts, strict=True)
     ]
 
 
-def _of(
+def _samples_under(
     interval: Interval,
     delay: int,
     exposures: Exposures,
     sensor_size: tuple[int, int],
     chosen: NDArray[np.int64],
-) -> _Seen:
+) -> _Samples:
+    """The ``chosen`` pixels of an interval under one delay, us."""
     before, after = exposures.of(interval.first, interval.second, interval.events)
     counts = _counts(between(interval.events, interval.start + delay, interval.end + delay), sensor_size)
     planes = (interval.change, before.over_middle, after.over_middle, *counts)
     change, first, second, on, off = (plane.ravel()[chosen].astype(np.float64) for plane in planes)
-    return _Seen(change - (second - first), on, off)
+    return _Samples(change - (second - first), on, off)
 
 
 def _counts(events: EventArray, shape: tuple[int, int]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -43,8 +43,8 @@ _MIN_SAMPLES: Final = 1_000
 _MAX_FRAMES: Final = 80
 _LEAST_NET: Final = 2  # a net count of one may be noise
 DARKEST: Final = 0.01  # two to three levels of 8 bits: below, a frame's log is rounding
-_ALIKE: Final = 50.0
-"""Samples that say what one says, if all that changes is explained: those of one edge in one interval."""
+_CORRELATED: Final = 50.0
+"""Samples that count as one independent observation: pixels along one edge have the same errors in an interval."""
 
 _LOG_OFFSET_SPREAD: Final = 1.0  # of log I_0: 0.004 to 0.03 on simulations and recordings
 _FREEDOM: Final = 4.0  # degrees of freedom of Student's t, whose tails take flicker and occlusions
@@ -81,8 +81,8 @@ class Samples(NamedTuple):
     bend: Array
 
 
-class Shown(NamedTuple):
-    """Between which I the frames could show what came after: both (N,); ``least`` is 0 where black is not crushed."""
+class FrameLimits(NamedTuple):
+    """Least and most I that the frames after can show, (N,) each; the least is 0 where black is not crushed."""
 
     least: Array
     most: Array
@@ -110,14 +110,16 @@ class ErrorModel(NamedTuple):
     threshold_spread: float
     quantisation_variance: float
 
-    def told(self, samples: Samples) -> Array:
-        """(N,) by how much the frames' log intensity changed as the events say."""
+    def predicted_change(self, samples: Samples) -> Array:
+        """(N,) change of the frames' log intensity by their events."""
         on, off = self.thresholds
         return on * samples.on - off * samples.off + samples.bend
 
-    def best(self, samples: Samples, shown: Shown | None, log_offset: float) -> tuple[float, float]:
-        """The least loss, and the variance of a step that has it."""
-        return min((negative_log_likelihood(samples, self, log_offset, q, shown), q) for q in STEP_VARIANCES)
+    def best_fit(
+        self, samples: Samples, limits: FrameLimits | None, log_offset: float
+    ) -> tuple[float, float]:
+        """The least negative log-likelihood with this I_0, and the variance of a step that has it."""
+        return min((negative_log_likelihood(samples, self, log_offset, q, limits), q) for q in STEP_VARIANCES)
 
 
 def estimate_event_model(
@@ -141,9 +143,9 @@ def estimate_event_model(
     ExposureError
         If the frames' exposures are not known.
     """
-    samples, shown = _samples(recording, camera, events)
+    samples, limits = _samples(recording, camera, events)
     net, darkest = np.abs(samples.on - samples.off), np.minimum(samples.before, samples.after)
-    chosen = (net >= _LEAST_NET) & (darkest > np.maximum(shown.least, DARKEST))
+    chosen = (net >= _LEAST_NET) & (darkest > np.maximum(limits.least, DARKEST))
     signals = Samples(*(values[chosen] for values in samples))
     if len(signals.before) < _MIN_SAMPLES:
         return None
@@ -151,31 +153,32 @@ def estimate_event_model(
     if camera.log_offset is None:
         # Frames that show the dark range over a hundred to one: what is beyond matters little, and lost events, of
         # which the model knows nothing, would count for more.
-        limits = Shown(*(limit[chosen] for limit in shown)) if shown.least.any() else None
-        log_offset = _log_offset(signals, limits, model)
+        of_signals = FrameLimits(*(limit[chosen] for limit in limits)) if limits.least.any() else None
+        log_offset = _log_offset(signals, of_signals, model)
     else:
         log_offset = camera.log_offset
     # Single events, most of them noise where nothing moves, say much of the step and nothing of I_0; so do those of
     # pixels that go black, whose steps are the least sure. Without these artificial HDR of slider_depth errs a seventh
     # more: they make up for what is not modelled of events where no frame checks them.
-    _, step_variance = model.best(samples, None, log_offset)
+    _, step_variance = model.best_fit(samples, None, log_offset)
     return EventModel(log_offset, step_variance, len(samples.before))
 
 
-def _log_offset(samples: Samples, shown: Shown | None, model: ErrorModel) -> float:
-    """The I_0 that is likeliest, within a fifth: of those tried, then of those between the best and its neighbours.
+def _log_offset(samples: Samples, limits: FrameLimits | None, model: ErrorModel) -> float:
+    """The most likely I_0, to a fifth of itself: of those tried, then of those between the best and its neighbours.
 
-    What is usual counts as far as events do not explain what changes: noise says nothing of I_0.
+    Samples count as far as events explain the changes of frames, since noise has no information of I_0; the less they
+    count, the more does the prior around the usual I_0.
     """
     change = np.log(samples.after + UNKNOWN_LOG_OFFSET) - np.log(samples.before + UNKNOWN_LOG_OFFSET)
-    both = np.stack([model.told(samples), change])
-    (told_square, common), (_, change_square) = products(both, both).tolist()
-    told: float = max(common, 0.0) ** 2 / max(told_square * change_square, 1e-12)
-    count = len(change) * told / _ALIKE
+    both = np.stack([model.predicted_change(samples), change])
+    (predicted_square, common), (_, change_square) = products(both, both).tolist()
+    explained: float = max(common, 0.0) ** 2 / max(predicted_square * change_square, 1e-12)
+    count = len(change) * explained / _CORRELATED
 
     def loss(log_offset: float) -> float:
         prior = 0.5 * (np.log(log_offset / UNKNOWN_LOG_OFFSET) / _LOG_OFFSET_SPREAD) ** 2
-        return float(prior) + count * model.best(samples, shown, log_offset)[0]
+        return float(prior) + count * model.best_fit(samples, limits, log_offset)[0]
 
     losses = {offset: loss(offset) for offset in LOG_OFFSETS}
     for _ in range(2):
@@ -191,7 +194,7 @@ def _log_offset(samples: Samples, shown: Shown | None, model: ErrorModel) -> flo
 def mismatch_of(
     samples: Samples, model: ErrorModel, log_offset: float, step_variance: float
 ) -> tuple[Array, Array]:
-    """What the frames changed beyond what events tell, and the variance that the bridge takes it to have (K1)."""
+    """The mismatch: change of the frames less that by the events; and its variance in the model of the bridge (K1)."""
     on, off = model.thresholds
     change = np.log(samples.after + log_offset) - np.log(samples.before + log_offset)
     variance = (
@@ -200,7 +203,7 @@ def mismatch_of(
         + model.threshold_spread**2 * ((on * samples.on) ** 2 + (off * samples.off) ** 2)
         + on * off * (step_variance * (samples.on + samples.off) + model.quantisation_variance)
     )
-    return change - model.told(samples), variance
+    return change - model.predicted_change(samples), variance
 
 
 def negative_log_likelihood(
@@ -208,35 +211,36 @@ def negative_log_likelihood(
     model: ErrorModel,
     log_offset: float,
     step_variance: float,
-    shown: Shown | None = None,
+    limits: FrameLimits | None = None,
 ) -> float:
     """Mean over the samples of -log p(I after | I before, events), up to a constant.
 
-    The mismatch between frames and events (docs/equations.md, K1) is Student's t with the variance that the bridge
-    takes it to have. The density is one of I, not of log(I + I_0), so that different I_0 can be compared. It is that of
-    what is ``shown``: pixels that became brighter than white or darker than black are not among the samples, and events
-    that took them there would seem to say too much.
+    The mismatch between frames and events has Student's t distribution with the variance of `mismatch_of`. The density
+    is one of I, not of log(I + I_0), so that different I_0 can be compared. It is truncated to ``limits``: pixels that
+    became brighter than white or darker than black are not among the samples.
     """
     mismatch, variance = mismatch_of(samples, model, log_offset, step_variance)
     tails = (_FREEDOM + 1) / 2 * np.log1p(mismatch**2 / (_FREEDOM * variance))
     after = np.log(samples.after + log_offset)
     losses = 0.5 * np.log(variance) + tails + after
-    if shown is not None:
+    if limits is not None:
         predicted, scale = after - mismatch, np.sqrt(variance)
-        share = _below((np.log(shown.most + log_offset) - predicted) / scale)
-        share -= _below((np.log(shown.least + log_offset) - predicted) / scale)
+        share = _student_t_share((np.log(limits.most + log_offset) - predicted) / scale)
+        share -= _student_t_share((np.log(limits.least + log_offset) - predicted) / scale)
         losses += np.log(np.maximum(share, _LEAST_SHARE))
     return float(np.mean(losses))
 
 
-def _below(t: Array) -> Array:
+def _student_t_share(t: Array) -> Array:
     """The share of Student's t of `_FREEDOM` (4) below ``t``; in closed form (Abramowitz and Stegun, 26.7.4)."""
     sine2 = 1.0 / (1.0 + _FREEDOM / np.maximum(np.square(t), 1e-12))  # of the angle atan(t / 2)
     half: Array = np.copysign(np.sqrt(sine2) * (1.0 + (1.0 - sine2) / 2.0) / 2.0, t)
     return half + 0.5
 
 
-def _samples(recording: Recording, camera: CameraSettings, events: EventSettings) -> tuple[Samples, Shown]:
+def _samples(
+    recording: Recording, camera: CameraSettings, events: EventSettings
+) -> tuple[Samples, FrameLimits]:
     """Pixels with events that no frame clips at either end, interval by interval, and what their frames could show."""
     found: list[tuple[Array, ...]] = []
     count = 0
@@ -249,7 +253,9 @@ def _samples(recording: Recording, camera: CameraSettings, events: EventSettings
         first, second = interval.first, interval.second
         chosen = spread(~first.clipped & ~second.clipped & (on + off > 0), MAX_SAMPLES - count)
         pixels = (*(end.intensity for end in interval.ends), on, off, bend)
-        limits = (np.full(len(chosen), limit * second.white) for limit in (black, white))
+        limits = (
+            np.full(len(chosen), limit * second.white) for limit in (black, white)
+        )  # of the frame after
         found.append((*(values.ravel()[chosen] for values in pixels), *limits))
         count += int(
             np.count_nonzero(np.minimum(pixels[0], pixels[1]).ravel()[chosen] >= black * second.white)
@@ -257,4 +263,4 @@ def _samples(recording: Recording, camera: CameraSettings, events: EventSettings
         if count >= MAX_SAMPLES:
             break
     columns = [np.concatenate(column) for column in zip(*found, strict=True)] if found else [np.empty(0)] * 7
-    return Samples(*columns[:5]), Shown(*columns[5:])
+    return Samples(*columns[:5]), FrameLimits(*columns[5:])

@@ -33,7 +33,7 @@ class Bends(NamedTuple):
 def bends(
     events: EventArray, sensor_size: tuple[int, int], start: int, end: int, thresholds: tuple[float, float]
 ) -> Bends:
-    """Of an exposure from ``start`` to ``end`` (us), by the contrast thresholds on and off.
+    """The bends of an exposure from ``start`` to ``end`` (us), by the contrast thresholds on and off.
 
     Between events the intensity is taken to stay at the level of the last one (`kalux.augmentation.deblur`). Both are 0
     where there is no event, where the thresholds are 0, and where the exposure has no length.
@@ -70,7 +70,7 @@ class Exposures:
         self._latest: tuple[Shot, Bends] | None = None
 
     def of(self, first: Shot, second: Shot, events: EventArray) -> tuple[Bends, Bends]:
-        """Of two successive frames, with all events of both exposures."""
+        """The bends of two successive frames; ``events`` has all events of both exposures."""
         if self._latest is not None and self._latest[0] is first:
             before = self._latest[1]
         else:

@@ -1,9 +1,9 @@
 """The fixed pattern of a sensor's frames: an offset of each pixel that is the same in all of them.
 
-Noise between frames does not show it, and no number of frames averages it. But it stays on the sensor while the scene
-moves: where two frames show different light around a pixel, what the pixel has beyond its neighbours is another texture
-in either, and the products of both are on average those of its own offset alone. Textures are far stronger than the
-pattern, so that smooth surroundings tell most.
+Differences of frames do not contain it, and no number of frames averages it out. But it stays on the sensor while the
+scene moves. Let r be how much brighter a pixel is than the mean of its neighbours. In two frames that show different
+parts of the scene there, r has the texture of either part and the same offset: the mean product of both is the variance
+of the offset. Textures are far stronger than the pattern, so that smooth surroundings have most of the information.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class FixedPattern(NamedTuple):
     Attributes
     ----------
     deviation
-        Standard deviation of the pixels' offsets, white = 1; 0 where it cannot be told from none.
+        Standard deviation of the pixels' offsets, white = 1; 0 where it cannot be is_measured from none.
     variance, error
         Its square as measured, which chance may make negative, and the standard error of that, infinite where too few
         pixels change.
@@ -62,8 +62,8 @@ class FixedPattern(NamedTuple):
     error: float
 
     @property
-    def told(self) -> bool:
-        """Whether there is one, or would have shown if it were the usual one."""
+    def is_measured(self) -> bool:
+        """Whether the recording tells it: there is one, or the usual one would have been found."""
         return self.deviation > 0 or self.variance + _BELIEVED * self.error < USUAL_PATTERN**2
 
 
@@ -175,10 +175,10 @@ def _add_products(beyond, light, weight, apart, part, sums):  # type: ignore[no-
 
 
 def _solved(sums: Array) -> FixedPattern:
-    told = sums[sums[:, 1] > 0]
-    if len(told) < _LEAST_PARTS:
+    used = sums[sums[:, 1] > 0]
+    if len(used) < _LEAST_PARTS:
         return FixedPattern(0.0, 0.0, np.inf)
-    variance = float(told[:, 0].sum() / told[:, 1].sum()) / _WHITE
-    error = ratio_error(told) / _WHITE
+    variance = float(used[:, 0].sum() / used[:, 1].sum()) / _WHITE
+    error = ratio_error(used) / _WHITE
     deviation = float(np.sqrt(variance)) if variance > _BELIEVED * error else 0.0
     return FixedPattern(deviation, variance, error)

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.calibration.intervals import intervals
+from kalux.calibration.intervals import Interval, intervals
 from kalux.compiled import empty, event_column, event_row, event_words, loop, smaller, zeros
 from kalux.event_slices import all_between
 from kalux.events import EventArray
@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 MAX_FRAMES: Final = 80
 _MIN_FRAMES: Final = 20
 _ENOUGH_PIXELS: Final = 80 * 260 * 346
-"""Of a larger sensor so many fewer frames say as much as 80 of a DAVIS346, whose standard error is well below 1 %."""
+"""Pixels of all frames that are enough: those of 80 frames of a DAVIS346, whose standard error is well below 1 %."""
 
 _BEYOND_NEIGHBOURS: Final = np.array([[0, -0.25, 0], [-0.25, 1, -0.25], [0, -0.25, 0]])
 
@@ -46,10 +46,10 @@ _DARKEST: Final = 0.01  # two to three levels of 8 bits: below, black cuts the n
 
 
 _LEAST_READ: Final = 0.5 / 65535
-"""Read noise, white = 1, of frames in floats that have less or none: the rounding of 16 bits, finer than any camera."""
+"""Least read noise of frames in floats, white = 1: the rounding of 16 bits, finer than any camera's."""
 
-_SPAN: Final = 3.0
-_BELIEVED: Final = 0.3
+_SPAN: Final = 3.0  # largest over smallest level, below which read and shot noise cannot be told apart
+_LARGEST_ERROR: Final = 0.3  # relative: beyond it the points are no photon transfer curve
 
 
 class FrameNoise(NamedTuple):
@@ -74,9 +74,9 @@ class FrameNoise(NamedTuple):
     variances: Array
 
     @property
-    def believed(self) -> bool:
+    def is_reliable(self) -> bool:
         """Whether the points lie on a line well enough to be taken as settings."""
-        return self.error < _BELIEVED
+        return self.error < _LARGEST_ERROR
 
     @property
     def at_half(self) -> float:
@@ -155,7 +155,7 @@ def usual_noise(recording: Recording, camera: CameraSettings) -> tuple[float, fl
     of_silent: list[float] = []
     of_all: list[float] = []
     for interval in intervals(recording, camera, margin=recording.longest_exposure, most_frames=_MIN_FRAMES):
-        if not 0.9 < interval.first.white / interval.second.white < 1.1:
+        if not _has_one_exposure(interval):
             continue
         level, difference, usable, dark = _beyond_neighbours(interval.first, interval.second)
         low = usable & ~dark & (level < 2 * _DARKEST)
@@ -185,6 +185,11 @@ def rounding_error(frame: Frame) -> float:
     return 0.0 if frame.image.dtype.kind == "f" else 0.5 / frame.white_value
 
 
+def _has_one_exposure(interval: Interval) -> bool:
+    """Whether the exposure times of both frames are the same but for a tenth, so that their noise is, too."""
+    return 0.9 < interval.first.white / interval.second.white < 1.1
+
+
 def _enough_frames(sensor_size: tuple[int, int]) -> int:
     height, width = sensor_size
     return min(max(-(-_ENOUGH_PIXELS // (height * width)), _MIN_FRAMES), MAX_FRAMES)
@@ -194,9 +199,16 @@ _Points = list[list[tuple[float, float, int]]]
 
 
 class _Surroundings(NamedTuple):
-    """Pixels around one, which see no event: their ``shape``, and how many such are enough in a bin of a frame pair.
+    """Which pixels around one must be without events for it to count as still.
 
-    ``moves``: so few that faint motion counts.
+    Attributes
+    ----------
+    shape
+        The pixels: a mask with the pixel in its middle.
+    least
+        How many still pixels are enough in a bin of a frame pair.
+    moves
+        Whether the mask is so small that faint motion passes it.
     """
 
     shape: NDArray[np.uint8]
@@ -212,7 +224,7 @@ _SURROUNDINGS: Final = (
 
 
 def _is_curve(points: _Points) -> bool:
-    """Whether there are two levels at least."""
+    """Whether there are points at two levels, the least that a line can be fitted to."""
     return sum(map(bool, points)) >= 2
 
 
@@ -225,7 +237,7 @@ def _points(
     """
     found: tuple[_Points, ...] = tuple([[] for _ in range(_BINS)] for _ in _SURROUNDINGS)
     for interval in intervals(recording, camera, margin=margin, most_frames=most_frames):
-        if not 0.9 < interval.first.white / interval.second.white < 1.1:
+        if not _has_one_exposure(interval):
             continue
         level, difference, usable, dark = _beyond_neighbours(interval.first, interval.second)
         busy = _busy(all_between(interval.chunks, interval.first.start, interval.second.end), level.shape)
@@ -254,7 +266,7 @@ def _mark(words, busy):  # type: ignore[no-untyped-def]
 
 
 def _near(dark: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(H, W): where one is among 3x3."""
+    """(H, W): pixels with a marked one among the 3x3 around them."""
     return np.asarray(cv2.dilate(dark.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0, np.bool_)
 
 

@@ -1,16 +1,16 @@
 """The sensor's thresholds and refractory period, for a reconstruction: log frame differences against event counts.
 
-Counts of events are wrong: by noise, by events that are lost, by what is not told yet. Least squares would take their
-errors for smaller thresholds (attenuation), down to nothing where nothing moves. Two kinds of instruments do not: the
-mean counts of the eight neighbours, which see the same edges with errors of their own, and the mean change of the
-neighbours as the frames show it.
+Counts of events have errors: noise events, lost events, changes below the threshold. In ordinary least squares errors
+of the regressors make thresholds too small (attenuation), and 0 where nothing moves. Two-stage least squares avoids
+this by instruments, which are correlated with the counts but not with their errors. There are two kinds:
 
-The first tell more, and are right where the noise of neighbours is not the same; where little moves and lamps flicker
-it is. And only pixels that both frames show well are seen: where frames show a range of a few thresholds, these are
-pixels of which counts say too much, and thresholds come out too small. The second are what the pixels are selected by,
-so that it does not bias them, nor do they care what noise events have; but changes too small for an event make
-thresholds too large. Each has a variance for that, the usual thresholds have theirs, and all are combined by Bayes'
-rule.
+- The mean counts of the eight neighbours, which see the same edges. They have more information. They are biased where
+  the errors of neighbours are correlated, as those of flickering lamps are, and where frames show a range of only a few
+  thresholds: pixels are used if both frames show them well, and among these are too many whose counts are too large.
+- The mean change of the neighbours between the frames. It has nothing to do with errors of events, and the selection by
+  frames does not bias it. But changes too small for an event make thresholds too large.
+
+Each kind has a variance for its bias. The two results and the usual thresholds are combined by Bayes' rule.
 """
 
 from __future__ import annotations
@@ -31,17 +31,18 @@ Array = NDArray[np.float64]
 
 _MIN_SAMPLES: Final = 200
 _SHORTEST_EVENTS: Final = 500_000
-"""Of which the shortest interval is taken: its edge is then that of 10,000 pairs."""
+"""Events from which the shortest interval is taken: some 10,000 intervals then lie at its edge."""
 
 ROUGH_SAMPLES: Final = 10_000
-"""Pixels for one delay, of which the best is then within 0.2 ms of that of more on twenty scenes and recordings, and
-for thresholds that I_0 is to be found with: these are then within 1 %, and two intervals have them."""
+"""Pixels for each delay that is tried: on twenty scenes and recordings the best delay is then within 0.2 ms of that of
+more pixels. Also for the thresholds with which I_0 is estimated: they are then within 1 %, and two frame intervals have
+so many pixels."""
 
 _TRAILING: Final = (0, 2_000, 4_000, 6_000)
-"""us by which events may seem later than they are: 0.9 to 5.9 ms on forty scenes whose events are in time."""
+"""us by which the apparent delay may exceed the true one: 0.9 to 5.9 ms on forty scenes whose true delay is 0."""
 
 _PERIOD_SAMPLES: Final = 30_000
-"""Pixels for the refractory period: what is not known of the excess is then 0.02 on scenes where something is lost."""
+"""Pixels for the refractory period: the standard error of the excess is then 0.02 on scenes where changes are lost."""
 
 _MODEL: Final = 0.02
 """Relative error of thresholds from the neighbours' counts, beside the statistical one: -1.3 to 4.3 %, 1.6 % in the
@@ -67,23 +68,23 @@ _PRIOR_REACH: Final = 6.0  # standard deviations, or a factor of 400
 _PRIOR_POINTS: Final = 1201  # 0.005 apart with the usual spread, a quarter of the least error
 
 _LEAST_EXCESS: Final = 0.05
-"""By how much more events that follow soon must tell than late ones, two standard errors taken off, for something to be
-lost in the refractory period. Where nothing is lost it is -0.02 to 0.05 on twelve simulated scenes and -0.18 +- 0.05,
-0.12 +- 0.06 and -0.02 +- 0.08 on three recordings, with 0.2 to 2 ms 0.12 to 0.92 on eight scenes. What is lost and not
-believed costs more than what is believed and not lost: 0.2 ms change the held-out errors of the three recordings by 5 %
-to the better and 2 % to the worse."""
+"""Least excess of the steps of events that follow soon over those of late ones, less two standard errors, from which
+changes count as lost in the refractory period. Where nothing is lost it is -0.02 to 0.05 on twelve simulated scenes and
+-0.18 +- 0.05, 0.12 +- 0.06 and -0.02 +- 0.08 on three recordings; with 0.2 to 2 ms it is 0.12 to 0.92 on eight scenes.
+The limit is low because a period that is missed costs more than one that is assumed wrongly: 0.2 ms change the held-out
+errors of the three recordings by 5 % to the better and 2 % to the worse."""
 
 _USUAL_EXCESS: Final = 0.02  # where nothing is lost
 
 _THRESHOLD_OF_EXCESS: Final = 0.6
-"""Relative error of thresholds over that of the excess: what is lost makes thresholds of seven scenes by 0.3 to 0.63 of
-the excess too large."""
+"""Relative error of thresholds over that of the excess: lost changes make the thresholds of seven scenes too large by
+0.3 to 0.63 of the excess."""
 
 _LEAST_DOUBT: Final = 0.02
-"""Of thresholds, by what may be lost: that of an excess that would be believed if it were exact."""
+"""Least relative error of thresholds, by changes that may be lost, that matters: that of the least excess."""
 
 _LARGEST_SHORTEST: Final = 5_000
-"""us: of pixels that never follow sooner little is lost in the refractory period of any sensor, some 2 ms at most."""
+"""us: where events of a pixel are never closer, little is lost in the refractory period of any sensor, at most 2 ms."""
 
 
 class ThresholdEstimate(NamedTuple):
@@ -125,7 +126,7 @@ class ThresholdEstimate(NamedTuple):
 
     @property
     def may_lose(self) -> bool:
-        """Whether something is lost in the refractory period, or may be as far as this estimate can tell."""
+        """Whether changes are lost in the refractory period, or the estimate cannot exclude it."""
         return self.refractory_period > 0 or self.doubt > _LEAST_DOUBT
 
 
@@ -187,16 +188,16 @@ def estimate_thresholds(
     ExposureError
         If the frames' exposures are not known.
     """
-    shortest = 0 if refractory_period is not None else _reset_after(recording)
-    view = _View(recording, camera, of_log_offset, delay - _TRAILING[1], shortest, (0.0, 0.0))
+    shortest = 0 if refractory_period is not None else _shortest_with_reset(recording)
+    sampling = _Sampling(recording, camera, of_log_offset, delay - _TRAILING[1], shortest, (0.0, 0.0))
     period = refractory_period or 0
     if usual.spread == 0:
-        view = view._replace(thresholds=(usual.on, usual.off))
+        sampling = sampling._replace(thresholds=(usual.on, usual.off))
     else:  # what the light does within exposures needs thresholds
-        rough = _by_information(view.seen(period, most=ROUGH_SAMPLES), usual, period, view, 0.0)
-        view = view if rough is None else view._replace(thresholds=(rough.on, rough.off))
-    view = view.without_trailing(delay, period)
-    return _estimate(view, usual, refractory_period, most, delay)
+        rough = _by_information(sampling.samples(period, most=ROUGH_SAMPLES), usual, period, sampling, 0.0)
+        sampling = sampling if rough is None else sampling._replace(thresholds=(rough.on, rough.off))
+    sampling = sampling.without_trailing(delay, period)
+    return _estimate(sampling, usual, refractory_period, most, delay)
 
 
 def with_true_delay(
@@ -208,9 +209,9 @@ def with_true_delay(
     of_log_offset: bool = False,
     refractory_period: int = 0,
 ) -> DelayEstimate:
-    """How late events are, of how late they seem, where an estimate of the thresholds finds it.
+    """A delay estimate completed by the true delay, where an estimate of the thresholds finds that.
 
-    Parameters are those of `estimate_thresholds`.
+    ``late`` has the apparent delay. The other parameters are those of `estimate_thresholds`.
     """
     found = estimate_thresholds(
         recording,
@@ -224,8 +225,9 @@ def with_true_delay(
     return late if found is None else late._replace(true=found.delay)
 
 
-def _reset_after(recording: Recording) -> int:
-    """Shortest interval, us, up to which a refractory period may hide something; 0 where events wait for its end."""
+def _shortest_with_reset(recording: Recording) -> int:
+    """Shortest interval between two events of a pixel, us; 0 where events wait for the end of the refractory period,
+    in which nothing is lost then."""
     found = intervals(recording, _SHORTEST_EVENTS)
     return 0 if found.pile_up else found.shortest
 
@@ -239,53 +241,64 @@ def refine_thresholds(
     of_log_offset: bool = False,
     refractory_period: int | None = 0,
 ) -> ThresholdEstimate:
-    """The thresholds with another I_0 than that of a rough estimate, whose delay is right whatever I_0 is.
+    """The thresholds with another I_0 than a ``rough`` estimate, of which the delay is kept: it does not depend on I_0.
 
     Parameters are those of `estimate_thresholds`, by which ``rough`` was made with the same ``refractory_period``.
     """
     thresholds = rough.on, rough.off
-    view = _View(recording, camera, of_log_offset, rough.delay, rough.shortest_interval, thresholds)
+    sampling = _Sampling(recording, camera, of_log_offset, rough.delay, rough.shortest_interval, thresholds)
     period = rough.refractory_period
     if refractory_period is not None or period == 0:
-        return _estimate(view, usual, refractory_period, MAX_SAMPLES, None) or rough
-    period = _without_excess(view) or period
-    return _by_information(view.seen(period, most=MAX_SAMPLES), usual, period, view, rough.doubt) or rough
+        return _estimate(sampling, usual, refractory_period, MAX_SAMPLES, None) or rough
+    period = _period_without_excess(sampling) or period
+    return (
+        _by_information(sampling.samples(period, most=MAX_SAMPLES), usual, period, sampling, rough.doubt)
+        or rough
+    )
 
 
 def _estimate(
-    view: _View, usual: Usual, refractory_period: int | None, most: int, delay: int | None
+    sampling: _Sampling, usual: Usual, refractory_period: int | None, most: int, delay: int | None
 ) -> ThresholdEstimate | None:
     """Thresholds, and the refractory period if it is not given; None where there are too few pixels.
 
-    ``delay`` is what events seem to be late, us, of which the part that is due to what is lost is looked for. None:
-    that of the view is right.
+    ``delay`` is the apparent one, us: what is lost in the refractory period makes events seem late, too, so that the
+    delay is found again with the period. None: that of the sampling is right.
     """
     period = refractory_period or 0
-    samples = view.seen(period, most=most)
+    samples = sampling.samples(period, most=most)
     if len(samples.steps.change) < _MIN_SAMPLES:
         return None
-    if not 0 < view.shortest <= _LARGEST_SHORTEST:
-        return _by_information(samples, usual, period, view, 0.0)
-    excess = _excess_of_soon(samples)
-    # Where it is too uncertain to be believed, thresholds may still be as much too large.
-    maybe = _THRESHOLD_OF_EXCESS * max(excess.value - _USUAL_EXCESS, 0.0)
-    estimate = _by_information(samples, usual, period, view, maybe)
+    if not 0 < sampling.shortest <= _LARGEST_SHORTEST:
+        return _by_information(samples, usual, period, sampling, 0.0)
+    excess = _measured_excess(samples)
+    # Thresholds may be too large by this even where the excess is too uncertain to be corrected.
+    doubt = _THRESHOLD_OF_EXCESS * max(excess.value - _USUAL_EXCESS, 0.0)
+    estimate = _by_information(samples, usual, period, sampling, doubt)
     if estimate is None or not excess.value - 2 * excess.error > _LEAST_EXCESS:
         return estimate
-    for _ in range(2 if delay is not None else 1):  # what is lost looks like delay, too
-        period = _without_excess(view)
+    for _ in range(2 if delay is not None else 1):
+        period = _period_without_excess(sampling)
         if period == 0:
             return estimate
-        view = view if delay is None else view.without_trailing(delay, period)
+        sampling = sampling if delay is None else sampling.without_trailing(delay, period)
     doubt = _THRESHOLD_OF_EXCESS * float(np.hypot(excess.error, _USUAL_EXCESS))
-    return _by_information(view.seen(period, most=most), usual, period, view, doubt) or estimate
+    return _by_information(sampling.samples(period, most=most), usual, period, sampling, doubt) or estimate
 
 
-class _View(NamedTuple):
-    """How to look at a recording: whether events are steps of log(I + I_0), their delay and shortest interval, us.
+class _Sampling(NamedTuple):
+    """How pixels and their events are sampled from a recording.
 
-    The latter is 0 where the refractory period is not to be found. The thresholds are those that tell how far the light
-    moves within exposures.
+    Attributes
+    ----------
+    recording, camera, of_log_offset
+        As in `estimate_thresholds`.
+    delay
+        Of the events, us.
+    shortest
+        Shortest interval between two events of a pixel, us; 0 where the refractory period is not to be found.
+    thresholds
+        On and off, log intensity: by these the intensity moves within exposures.
     """
 
     recording: Recording
@@ -295,17 +308,18 @@ class _View(NamedTuple):
     shortest: int
     thresholds: tuple[float, float]
 
-    def seen(self, *periods: int, most: int) -> _Seen:
+    def samples(self, *periods: int, most: int) -> _Samples:
         """Samples under refractory periods, us."""
-        return self._seen((self.delay,), periods, most)[0]
+        return self._of_delays((self.delay,), periods, most)[0]
 
-    def without_trailing(self, delay: int, period: int) -> _View:
-        """With the delay under which events explain the frames best when their steps are spread over time (`steps`).
+    def without_trailing(self, delay: int, period: int) -> _Sampling:
+        """With the true delay in place of the apparent ``delay``, us.
 
-        Half a threshold, by which events trail the light, is a part of ``delay``; spread over time they do not trail.
+        The apparent one includes the time that the light needs for half a threshold, by which events trail it. Steps
+        that are spread over time (`steps`) do not trail: the delay under which they explain the frames best is true.
         """
         delays = tuple(delay - trailing for trailing in _TRAILING)
-        residuals = [seen.residual() for seen in self._seen(delays, (period,), ROUGH_SAMPLES)]
+        residuals = [samples.residual() for samples in self._of_delays(delays, (period,), ROUGH_SAMPLES)]
         if not np.isfinite(residuals).all():
             return self
         least = int(np.argmin(residuals))
@@ -316,7 +330,8 @@ class _View(NamedTuple):
             return self
         return self._replace(delay=delay - round(max(best, 0.0)))
 
-    def _seen(self, delays: tuple[int, ...], periods: tuple[int, ...], most: int) -> list[_Seen]:
+    def _of_delays(self, delays: tuple[int, ...], periods: tuple[int, ...], most: int) -> list[_Samples]:
+        """Samples under each of the delays, us."""
         at_least = 2 if most <= ROUGH_SAMPLES else 4
         late = LATE * self.shortest if self.shortest else np.inf
         found = steps(
@@ -330,11 +345,11 @@ class _View(NamedTuple):
             most=most,
             at_least=at_least,
         )
-        return [_Seen(one, self.recording.sensor_size) for one in found]
+        return [_Samples(one, self.recording.sensor_size) for one in found]
 
 
-class _Seen(NamedTuple):
-    """Samples, and the size of the sensor."""
+class _Samples(NamedTuple):
+    """Samples, and the size of the sensor; columns of regressions on them."""
 
     steps: Steps
     sensor_size: tuple[int, int]
@@ -345,7 +360,7 @@ class _Seen(NamedTuple):
         return np.asarray((late + soon) * np.array([1.0, -1.0]) * self.steps.share[:, None], np.float64)
 
     def residual(self) -> float:
-        """In thresholds, of the regression on frames under the first refractory period; nan where there is none."""
+        """Residual of the regression by frames under the first refractory period, in thresholds; nan: undetermined."""
         if len(self.steps.change) < _MIN_SAMPLES:
             return np.nan
         fit = two_stage(self.steps.change, self.explained(0), self.changes_around())
@@ -364,32 +379,34 @@ class _Seen(NamedTuple):
         return halves(self.steps.change_around)
 
 
-class _Told(NamedTuple):
-    """What a regression tells: logs of the thresholds on and off, and their variances, (2,); inf where nothing."""
+class _LogThresholds(NamedTuple):
+    """Logs of the thresholds on and off, and their variances, (2,) each; inf where nothing is known."""
 
     logs: Array
     variances: Array
 
 
 def _by_information(
-    seen: _Seen, usual: Usual, period: int, view: _View, doubt: float
+    samples: _Samples, usual: Usual, period: int, sampling: _Sampling, doubt: float
 ) -> ThresholdEstimate | None:
     """Thresholds from either kind of instruments and the usual ones, weighted by the inverse of their variances.
 
-    ``doubt`` is the relative error of thresholds that comes from the period's.
+    ``doubt`` is the relative error of the thresholds that is due to the error of the refractory ``period``.
     """
-    change, explained = seen.steps.change, seen.explained(0)
-    counts, changes = seen.counts_around(0), seen.changes_around()
+    change, explained = samples.steps.change, samples.explained(0)
+    counts, changes = samples.counts_around(0), samples.changes_around()
     by_counts, by_changes = (two_stage(change, explained, instruments) for instruments in (counts, changes))
     fits = [fit for fit in (by_counts, by_changes) if fit is not None]
     if not fits:
         return None
     model = np.hypot(_MODEL, doubt)
-    common = np.log1p(_SHARED * _unexplained(seen, by_counts, counts)) if by_counts is not None else np.inf
-    of_counts = _told(seen, by_counts, explained, counts, float(np.hypot(common, model)))
-    of_changes = _told(seen, by_changes, explained, changes, float(np.hypot(_SUBTHRESHOLD, doubt)))
-    moved, lost = float(np.sqrt(np.mean(change**2))), float(np.mean(seen.steps.lost))
-    known = _likely(usual, of_counts, of_changes, moved, lost)
+    common = np.log1p(_SHARED * _unexplained(samples, by_counts, counts)) if by_counts is not None else np.inf
+    of_counts = _log_thresholds(samples, by_counts, explained, counts, float(np.hypot(common, model)))
+    of_changes = _log_thresholds(
+        samples, by_changes, explained, changes, float(np.hypot(_SUBTHRESHOLD, doubt))
+    )
+    moved, lost = float(np.sqrt(np.mean(change**2))), float(np.mean(samples.steps.lost))
+    known = _posterior(usual, of_counts, of_changes, moved, lost)
     on, off = np.exp(known.logs)
     return ThresholdEstimate(
         on=float(on),
@@ -399,66 +416,71 @@ def _by_information(
         spread=float(np.sqrt(np.mean(known.variances))),
         usual_share=float(np.mean(np.minimum(known.variances / max(usual.spread**2, 1e-12), 1.0))),
         refractory_period=period,
-        delay=view.delay,
+        delay=sampling.delay,
         doubt=doubt,
-        shortest_interval=view.shortest,
+        shortest_interval=sampling.shortest,
     )
 
 
-def _likely(usual: Usual, of_counts: _Told, of_changes: _Told, moved: float, lost: float) -> _Told:
-    """Mean and variance of the logs of thresholds, by Bayes' rule: the usual ones, and what both instruments say.
+def _posterior(
+    usual: Usual, of_counts: _LogThresholds, of_changes: _LogThresholds, moved: float, lost: float
+) -> _LogThresholds:
+    """Posterior mean and variance of the logs of the thresholds: the usual ones are the prior, both fits the data.
 
-    ``moved`` is the root mean square of the changes, ``lost`` the share of pixels of which one frame alone tells. How
-    wrong either instrument is depends on how many thresholds ``moved`` is: a small estimate from narrow frames may be
-    one of large thresholds, a large one hardly of small ones.
+    ``moved`` is the root mean square of the frames' changes, ``lost`` the share of pixels that only one of two frames
+    shows well. The errors of the fits depend on how many of the true thresholds ``moved`` is: where frames change
+    little, large thresholds may look small, but hardly small ones large.
     """
     expected = np.log([usual.on, usual.off])
     if usual.spread == 0:
-        return _Told(expected, np.zeros(2))
+        return _LogThresholds(expected, np.zeros(2))
     reach = min(_PRIOR_REACH * usual.spread, _PRIOR_REACH)
     logs = expected[:, None] + np.linspace(-reach, reach, _PRIOR_POINTS)
     narrow = np.exp(logs) / max(moved, 1e-6)
     counts = of_counts.variances[:, None] + np.square(_NARROW_COUNTS * lost * narrow**3)
     changes = of_changes.variances[:, None] + np.square(_SMALL_CHANGES * narrow**2)
-    # What both cannot explain is noise that neighbours share, or what frames do not show.
+    # The counts are to blame where the fits differ by more than their errors: neighbours share noise, or frames do not
+    # show all.
     apart = np.square(of_counts.logs - of_changes.logs)[:, None] - 4 * (counts + changes)
     counts += np.maximum(apart, 0.0)
     loss = np.square((logs - expected[:, None]) / usual.spread)
-    for told, variances in ((of_counts, counts), (of_changes, changes)):
+    for fitted, variances in ((of_counts, counts), (of_changes, changes)):
         information = 1 / np.minimum(variances, 1e9)
-        loss += information * np.square(told.logs[:, None] - logs) - np.log(information)
+        loss += information * np.square(fitted.logs[:, None] - logs) - np.log(information)
     weights = np.exp(0.5 * (loss.min(axis=1, keepdims=True) - loss))
     weights /= weights.sum(axis=1, keepdims=True)
     mean = (weights * logs).sum(axis=1)
-    return _Told(mean, (weights * np.square(logs - mean[:, None])).sum(axis=1))
+    return _LogThresholds(mean, (weights * np.square(logs - mean[:, None])).sum(axis=1))
 
 
-def _told(seen: _Seen, fit: Fit | None, explained: Array, instruments: Array, error: float) -> _Told:
-    """A regression's thresholds, with ``error`` the relative error that it has beside the statistical one."""
+def _log_thresholds(
+    samples: _Samples, fit: Fit | None, explained: Array, instruments: Array, error: float
+) -> _LogThresholds:
+    """The thresholds of a regression, with ``error`` its relative error beside the statistical one."""
     if fit is None:
-        return _Told(np.zeros(2), np.full(2, np.inf))
-    samples = seen.steps
+        return _LogThresholds(np.zeros(2), np.full(2, np.inf))
+    observed = samples.steps
     errors = standard_errors(
-        samples.change, explained, instruments, fit.weights, samples.pixel, seen.sensor_size
+        observed.change, explained, instruments, fit.weights, observed.pixel, samples.sensor_size
     )
     found = fit.solution[:2]
     positive = found > 0
     logs = np.log(np.where(positive, found, 1.0))
     variances = (errors[:2] / np.where(positive, found, 1.0)) ** 2 + error**2
-    return _Told(logs, np.where(positive, variances, np.inf))
+    return _LogThresholds(logs, np.where(positive, variances, np.inf))
 
 
-def _unexplained(seen: _Seen, fit: Fit, counts: Array) -> float:
-    """What the neighbours' counts say that their frames do not, over what both say: mean squares."""
+def _unexplained(samples: _Samples, fit: Fit, counts: Array) -> float:
+    """Mean square of the part of the neighbours' counts that their frames do not explain, over that of the rest."""
     predicted = np.abs(fit.solution[0]) * counts[:, 0] + np.abs(fit.solution[1]) * counts[:, 1]
-    change = seen.steps.change_around
+    change = samples.steps.change_around
     both = np.stack([predicted, change])
-    (told, common), (_, shown) = products(both, both).tolist()
-    return float(told * shown / max(common**2, 1e-12)) - 1.0
+    (of_counts, common), (_, of_frames) = products(both, both).tolist()
+    return float(of_counts * of_frames / max(common**2, 1e-12)) - 1.0
 
 
-class _Parted(NamedTuple):
-    """The regression on late events and events that follow soon, both in units of the thresholds."""
+class _LateAndSoon(NamedTuple):
+    """A regression on late events and on those that follow soon, both in units of the thresholds."""
 
     explained: Array
     instruments: Array
@@ -466,59 +488,58 @@ class _Parted(NamedTuple):
 
     @property
     def excess(self) -> float:
-        """By which share events that follow soon tell more than late ones."""
+        """By which share the step of an event that follows soon is larger than that of a late one."""
         return float(self.fit.solution[1] / self.fit.solution[0]) - 1.0
 
 
 class _Excess(NamedTuple):
-    """By which share events that follow soon tell more than late ones, and its standard error; 0 and inf if unknown."""
+    """`_LateAndSoon.excess` and its standard error; 0 and inf where it is not determined."""
 
     value: float
     error: float
 
 
-def _excess_of_soon(seen: _Seen) -> _Excess:
-    """If nothing is lost."""
-    parted = _parted(seen, 0)
-    if parted is None:
+def _measured_excess(samples: _Samples) -> _Excess:
+    """The excess under the first refractory period."""
+    found = _fit_late_and_soon(samples, 0)
+    if found is None:
         return _Excess(0.0, np.inf)
-    samples = seen.steps
     late, soon = standard_errors(
-        samples.change,
-        parted.explained,
-        parted.instruments,
-        parted.fit.weights,
-        samples.pixel,
-        seen.sensor_size,
+        samples.steps.change,
+        found.explained,
+        found.instruments,
+        found.fit.weights,
+        samples.steps.pixel,
+        samples.sensor_size,
     )
-    return _Excess(parted.excess, float(np.hypot(late, soon) / parted.fit.solution[0]))
+    return _Excess(found.excess, float(np.hypot(late, soon) / found.fit.solution[0]))
 
 
-def _parted(seen: _Seen, index: int) -> _Parted | None:
-    """Under a refractory period; None where it is not determined."""
-    samples = seen.steps
-    fit = two_stage(samples.change, seen.explained(index), seen.counts_around(index))
+def _fit_late_and_soon(samples: _Samples, index: int) -> _LateAndSoon | None:
+    """The regression under a refractory period, by its index; None where it is not determined."""
+    known = samples.steps
+    fit = two_stage(known.change, samples.explained(index), samples.counts_around(index))
     if fit is None:
         return None
     on, off = fit.solution
 
     def columns(events: Array) -> Array:
         steps_of = on * events[:, index, :, 0] - off * events[:, index, :, 1]
-        return np.asarray(steps_of * samples.share[:, None], np.float64)
+        return np.asarray(steps_of * known.share[:, None], np.float64)
 
-    explained, instruments = columns(samples.events), columns(samples.events_around)
-    again = two_stage(samples.change, explained, instruments)
-    return None if again is None or not again.solution[0] > 0 else _Parted(explained, instruments, again)
+    explained, instruments = columns(known.events), columns(known.events_around)
+    again = two_stage(known.change, explained, instruments)
+    return None if again is None or not again.solution[0] > 0 else _LateAndSoon(explained, instruments, again)
 
 
-def _without_excess(view: _View) -> int:
-    """The refractory period, us, under which events that follow soon tell as much as late ones; 0 if unknown."""
-    periods = possible_periods(view.shortest)
-    seen = view.seen(*periods, most=_PERIOD_SAMPLES)
-    parted = [_parted(seen, index) for index in range(len(periods))]
-    excess = np.array([np.nan if one is None else one.excess for one in parted])
+def _period_without_excess(sampling: _Sampling) -> int:
+    """The refractory period, us, under which events that follow soon have the steps of late ones; 0 if unknown."""
+    periods = possible_periods(sampling.shortest)
+    samples = sampling.samples(*periods, most=_PERIOD_SAMPLES)
+    fits = [_fit_late_and_soon(samples, index) for index in range(len(periods))]
+    excess = np.array([np.nan if fit is None else fit.excess for fit in fits])
     if not np.isfinite(excess).all():
         return 0
-    # A longer period always explains more; what noise makes otherwise is evened out.
+    # A longer period explains more of the excess; what does not decrease is noise.
     falling = np.minimum.accumulate(excess)
     return round(float(np.interp(-_USUAL_EXCESS, -falling, periods)))

@@ -23,10 +23,10 @@ from kalux.white import BRIGHTEST, sharp_end
 Array = NDArray[np.float64]
 
 _AT_TOP: Final = 0.9
-"""Of the brightest level: sensors whose pixels clip unevenly do so within 5 % (slider_depth)."""
+"""Share of the brightest level from which a pixel may be clipped: uneven sensors clip within 5 % (slider_depth)."""
 
 _BELOW: Final = (0.6, 0.85)
-"""Of the brightest level: those that are compared."""
+"""Shares of the brightest level between which lie the pixels for comparison."""
 
 _LEAST_NET: Final = 2  # a net count of one may be noise
 _LEAST_PIXELS: Final = 100
@@ -34,19 +34,20 @@ _MAX_FRAMES: Final = 80
 _FINE: Final = 4096  # levels of the histogram
 
 _EXCESS: Final = 0.15
-"""By how much more events must say than at other levels, log intensity. slider_depth has 0.2, street 0.3, simulated
-scenes 0.26 to 0.7; eight that frames show wholly, of which two have thresholds a third too large, -0.2 to 0.07."""
+"""Least log intensity by which the change by events exceeds that of frames more at the brightest than at other levels.
+slider_depth has 0.2, street 0.3, simulated scenes 0.26 to 0.7; eight that frames show wholly, two of them with
+thresholds a third too large, -0.2 to 0.07."""
 
 _EXPLAINED: Final = 0.5
-"""By how much events may say more or less than frames at other levels: beyond that they do not explain the frames."""
+"""Largest difference of the changes by events and by frames at other levels; beyond it events do not explain frames."""
 
-_ALIKE: Final = 0.1
-"""Between the quartiles of the brightest levels over their median, at most: sensors that end at one level have 0 to
+_LARGEST_SPREAD: Final = 0.1
+"""Largest interquartile range of the brightest levels, over their median: sensors that end at one level have 0 to
 0.05, newton, whose highlights are thin, 0.2."""
 
 
 _SHARP: Final = 0.99
-"""Of a level: where nearly all pixels saturate from here on, it is one level."""
+"""Share of a level from which nearly all pixels must saturate for it to count as one level."""
 
 
 class Ceiling(NamedTuple):
@@ -112,7 +113,7 @@ def find_ceiling(recording: Recording, camera: CameraSettings, events: EventSett
     usual = float(np.median(mismatches[below]))
     excess = float(np.median(mismatches[top])) - usual
     low, level, high, most = (float(value) for value in np.quantile(ends[top], [0.25, 0.5, 0.75, 0.95]))
-    if excess < _EXCESS or abs(usual) > _EXPLAINED or high - low > _ALIKE * level:
+    if excess < _EXCESS or abs(usual) > _EXPLAINED or high - low > _LARGEST_SPREAD * level:
         return None
     return Ceiling(level, 2 * level - most, excess, int(np.count_nonzero(top)))
 
@@ -138,14 +139,14 @@ def _changes(
     """
     threshold_on, threshold_off = events.thresholds
     for interval, on, off, bend in counted_intervals(recording, camera, events, most_frames=_MAX_FRAMES):
-        told = threshold_on * on - threshold_off * off + bend - interval.change
+        beyond = threshold_on * on - threshold_off * off + bend - interval.change
         frames = [end.frame for end in interval.ends]
         for sign, frame in zip((-1, 1), frames, strict=True):
             ends = frame.normalised()
             chosen = (sign * (on - off) >= _LEAST_NET) & (ends >= least)
             for each in frames:
                 chosen &= True if each.valid is None else each.valid
-            yield np.stack([ends[chosen], sign * told[chosen]])
+            yield np.stack([ends[chosen], sign * beyond[chosen]])
 
 
 def exact_end(recording: Recording, below: float) -> float | None:

@@ -1,9 +1,9 @@
 """By how much the contrast threshold differs between a recording's pixels.
 
-A pixel's own threshold is wrong in every interval between two frames, while frame noise, single steps and what events
-have not told yet are new in each. So the products of what a pixel's events and frames disagree about in *different*
-intervals are on average that of the threshold alone, without a model of the rest. Neighbouring intervals have a frame
-in common and are left out.
+The mismatch of a pixel's events and frames has many causes. The deviation of its threshold is the same in all frame
+intervals, while frame noise, the noise of single steps and changes below the threshold are independent. So the mean
+product of the mismatches of two *different* intervals is due to the threshold alone, and no model of the rest is
+needed. Neighbouring intervals have a frame, and its noise, in common and are left out.
 """
 
 from __future__ import annotations
@@ -88,10 +88,10 @@ def estimate_mismatch(recording: Recording, camera: CameraSettings, events: Even
         first, second = interval.ends
         seen = Samples(first.intensity, second.intensity, on, off, bend)
         bright = np.minimum(seen.before, seen.after) > DARKEST
-        told = ~first.shot.clipped & ~second.shot.clipped & bright & (on + off > 0)
+        usable = ~first.shot.clipped & ~second.shot.clipped & bright & (on + off > 0)
         mismatch, variance = mismatch_of(seen, model, camera.offset, events.step_noise)
-        _add(mismatch, variance, told, threshold_on * on, threshold_off * off, products)
-        samples += int(np.count_nonzero(told))
+        _add(mismatch, variance, usable, threshold_on * on, threshold_off * off, products)
+        samples += int(np.count_nonzero(usable))
         if samples >= MAX_SAMPLES:
             break
     return _solved(products, samples, events.usual_threshold_spread)
@@ -103,15 +103,15 @@ twice the products of neighbouring intervals."""
 
 
 @loop
-def _add(mismatches, variances, told, steps_on, steps_off, products):  # type: ignore[no-untyped-def]
-    """One interval."""
-    for row in range(told.shape[0]):
-        for column in range(told.shape[1]):
+def _add(mismatches, variances, usable, steps_on, steps_off, products):  # type: ignore[no-untyped-def]
+    """Add one interval to the sums of `_PRODUCTS`, in place."""
+    for row in range(usable.shape[0]):
+        for column in range(usable.shape[1]):
             i = row, column
             on, off = steps_on[i], steps_off[i]
             most = _CLIP * np.sqrt(variances[i])
             mismatch = smaller(larger(mismatches[i], -most), most)
-            weight = 1.0 / variances[i] if told[i] else 0.0
+            weight = 1.0 / variances[i] if usable[i] else 0.0
             for polarity in range(2):
                 own, other = (on, off) if polarity == 0 else (-off, -on)
                 values = weight * mismatch * own, weight * own * own, weight * own * other

@@ -71,12 +71,16 @@ class EventNoise(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class NoiseCalibration:
-    """All of it; None what the recording does not tell.
+    """All that is measured of a sensor's noise; None where the recording does not tell it.
 
     Attributes
     ----------
-    events, frames, pattern, levels
-        See there.
+    events
+        Background events, hot and dead pixels.
+    frames, pattern
+        Read and shot noise of frames, and their fixed pattern.
+    levels
+        Where frames clip.
     delay, apparent_delay
         Of the events, us (`kalux.calibration.delay`).
     refractory_at_most
@@ -113,7 +117,7 @@ class NoiseCalibration:
         if self.refractory_at_most is not None:
             measured["refractory_at_most"] = self.refractory_at_most
         if self.frames is not None:
-            if self.frames.believed:
+            if self.frames.is_reliable:
                 camera |= {"frame_noise": self.frames.read, "shot_noise": self.frames.shot}
                 errors |= {
                     "frame_noise": self.frames.error * self.frames.read,
@@ -260,7 +264,7 @@ def _add_quiet(start, end, first, length, row, column, quiet):  # type: ignore[n
 
 @nb.njit(cache=True, nogil=True, inline="always")
 def _count_pending(pending, row, column, first, length, counts):  # type: ignore[no-untyped-def]
-    """Count a pixel's event that waits, if one does, in the window of its time."""
+    """Count a pixel's pending event, if it has one, in the window of its time."""
     if pending[row, column] != NEVER:
         window = smaller(np.int64((pending[row, column] - first) / length), counts.shape[0] - 1)
         counts[window, row, column] += 1
@@ -295,7 +299,7 @@ def _tally(t, x, y, first, length, gap, ignored, busy_until, pending, counts, qu
 
 @loop
 def _close(last, first, length, gap, busy_until, pending, counts, quiet):  # type: ignore[no-untyped-def]
-    """The end of the recording."""
+    """Add the quiet time up to the end of the recording, and count pending events that lie in it."""
     end = last - gap
     for row in range(busy_until.shape[0]):
         for column in range(busy_until.shape[1]):

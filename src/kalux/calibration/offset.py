@@ -44,7 +44,7 @@ _LEAST_CORRELATION: Final = 0.25
 
 
 class Correlation(NamedTuple):
-    """The coarse search.
+    """Result of the coarse search for the offset, by correlation.
 
     Attributes
     ----------
@@ -261,7 +261,7 @@ def busiest(changes: Changes, most: int = MOST_FRAMES) -> slice:
 
 
 def some_frames(frames: Iterable[Frame], chosen: slice) -> Iterator[Frame]:
-    """Those of a stretch."""
+    """The frames of a stretch."""
     return islice(frames, chosen.start, chosen.stop)
 
 

@@ -59,9 +59,10 @@ _IN_TIME: Final = (0.7, 0.95, 1.15)
 """h over the mean threshold where events are in time: 1 in theory, 0.79 to 1.02 on five simulated scenes. Between the
 outer values no delay is corrected, beyond them until the middle one is reached."""
 _MIN_SAMPLES: Final = 500
-_UNTOLD: Final = 0.1
-"""Share of the usual thresholds in the quick estimate, from which on a recording tells too little: 0.01 at most on
-fifteen scenes and recordings with motion, 0.17 where only lamps and noise make events."""
+_MOST_USUAL: Final = 0.1
+"""Largest share of the usual thresholds in the quick estimate (`ThresholdEstimate.usual_share`) with which a recording
+tells enough: it is 0.01 at most on fifteen scenes and recordings with motion, 0.17 where only lamps and noise make
+events."""
 _WHITE: Final = 0.95  # of the response: the whole deblurred path lies below
 _CROWDED: Final = 3.0
 """Intervals with events closer than this many times the smallest inter-event interval are left out. With 3, a
@@ -170,29 +171,29 @@ def calibrate_contrast(
         If the frames' exposures are not known.
     """
     first = estimate_thresholds(recording, camera, Usual.of(EventSettings()), delay=delay or 0)
-    if first is None or first.usual_share > _UNTOLD:
+    if first is None or first.usual_share > _MOST_USUAL:
         return None
     period = dead_time(recording) if refractory is None else refractory
-    view = _View((first.on, first.off), shortest_interval(recording), period)
+    sampling = _Sampling((first.on, first.off), shortest_interval(recording), period)
     if delay is None:
-        delay = _delay_of_trailing(recording, camera, view)
+        delay = _delay_of_trailing(recording, camera, sampling)
     fit, data = None, None
     for _ in range(2):  # the second time deblurred with the thresholds of the first
-        data = _gathered(_samples(recording, camera, view, (delay,), MAX_FRAMES), _GLOBAL_SAMPLES)
+        data = _gathered(_samples(recording, camera, sampling, (delay,), MAX_FRAMES), _GLOBAL_SAMPLES)
         fit = _fit(data[0]) if data else None
         if fit is None:
             return None
-        view = view._replace(thresholds=(fit.on, fit.off))
+        sampling = sampling._replace(thresholds=(fit.on, fit.off))
     assert fit is not None
     assert data is not None
-    return _per_pixel(recording, camera, view, fit, data[0], delay)
+    return _per_pixel(recording, camera, sampling, fit, data[0], delay)
 
 
 # --- samples --------------------------------------------------------------------------------------------------
 
 
-class _View(NamedTuple):
-    """How to look at a recording: thresholds to deblur with, shortest inter-event interval and refractory, us."""
+class _Sampling(NamedTuple):
+    """How pixels are sampled: thresholds to deblur with, shortest inter-event interval and refractory period, us."""
 
     thresholds: tuple[float, float]
     shortest: int
@@ -211,25 +212,25 @@ class _Samples(NamedTuple):
 def _samples(
     recording: Recording,
     camera: CameraSettings,
-    view: _View,
+    sampling: _Sampling,
     delays: tuple[int, ...],
     most_frames: int,
 ) -> Iterator[tuple[_Samples, ...]]:
     """The usable pixels of every frame interval, once for every delay."""
     margin = recording.longest_exposure + max(abs(d) for d in delays)
-    histories = [_History(recording.sensor_size, view) for _ in delays]
+    histories = [_History(recording.sensor_size, sampling) for _ in delays]
     for interval in intervals(recording, camera, margin=margin, most_frames=most_frames):
         yield tuple(
-            _of_interval(interval, history, camera, view, d)
+            _of_interval(interval, history, camera, sampling, d)
             for history, d in zip(histories, delays, strict=True)
         )
 
 
 class _History:
-    """What every pixel's latest event was, as the intervals pass."""
+    """Counts events interval by interval, and remembers time and sign of every pixel's latest one."""
 
-    def __init__(self, shape: tuple[int, int], view: _View) -> None:
-        self._view, self._shape = view, shape
+    def __init__(self, shape: tuple[int, int], sampling: _Sampling) -> None:
+        self._sampling, self._shape = sampling, shape
         self._last = np.full(shape, NEVER, np.int64)
         self.sign = np.zeros(shape)
         self.begun = False
@@ -238,9 +239,11 @@ class _History:
         """On and off counts of events, and which pixels had some that follow too fast."""
         on, off = np.zeros(self._shape), np.zeros(self._shape)
         crowded = np.zeros(self._shape, np.bool_)
-        least = _CROWDED * max(self._view.shortest, self._view.refractory)
+        least = _CROWDED * max(self._sampling.shortest, self._sampling.refractory)
         t, x, y, p = (events[name] for name in ("t", "x", "y", "p"))
-        _count(t, x, y, p, self._last, self.sign, least, np.float32(self._view.refractory), on, off, crowded)
+        _count(
+            t, x, y, p, self._last, self.sign, least, np.float32(self._sampling.refractory), on, off, crowded
+        )
         return on, off, crowded
 
 
@@ -262,7 +265,7 @@ def _count(t, x, y, p, last, sign, least, refractory, on, off, crowded):  # type
 
 
 def _of_interval(
-    interval: Interval, history: _History, camera: CameraSettings, view: _View, delay: int
+    interval: Interval, history: _History, camera: CameraSettings, sampling: _Sampling, delay: int
 ) -> _Samples:
     events = interval.events.copy()
     events["t"] -= delay
@@ -273,7 +276,7 @@ def _of_interval(
     on, off, crowded = history.counts(between(events, interval.start, interval.end))
     turned = (history.sign - before) / 2.0
     (first, first_good), (second, second_good) = (
-        _latent(shot, events, camera, view.thresholds) for shot in (interval.first, interval.second)
+        _latent(shot, events, camera, sampling.thresholds) for shot in (interval.first, interval.second)
     )
     around = [_around(values) for values in (on, -off, turned)]
     good = interval.usable & first_good & second_good & ~crowded & (_around(on + off) >= 1.0)
@@ -341,14 +344,14 @@ def _fit(data: _Samples) -> _Fit | None:
     return _Fit(on, off, trailing, found.residual, found.weights) if on > 0 and off > 0 else None
 
 
-def _delay_of_trailing(recording: Recording, camera: CameraSettings, view: _View) -> int:
+def _delay_of_trailing(recording: Recording, camera: CameraSettings, sampling: _Sampling) -> int:
     """The delay, us, at which events trail the light by half a threshold; 0 where it cannot be told."""
-    parts = _samples(recording, camera, view, _SEARCHED, _SEARCH_FRAMES)
+    parts = _samples(recording, camera, sampling, _SEARCHED, _SEARCH_FRAMES)
     found = [_fit(data) for data in _gathered(parts, _GLOBAL_SAMPLES // 2)]
     fits = [fit for fit in found if fit is not None]
     if len(fits) < len(_SEARCHED):
         return 0
-    # A longer delay always leaves less trailing; what noise makes otherwise is evened out.
+    # A longer delay leaves less trailing; what does not decrease is noise.
     trailing = np.array([2 * fit.trailing / (fit.on + fit.off) for fit in fits], np.float64)
     ratio = np.minimum.accumulate(trailing)
     low, wanted, high = _IN_TIME
@@ -368,7 +371,7 @@ class _Variance(NamedTuple):
 
 
 def _residual_variance(data: _Samples, solution: Array) -> _Variance:
-    """By a robust variance for every number of events, and a line through these."""
+    """A line through the robust variances of the residuals with each number of events."""
     events = np.abs(data.explained[:, :2]).sum(axis=1).round().astype(np.int64)
     residual = data.change - data.explained @ solution
     numbers, variances, sizes = [], [], []
@@ -387,7 +390,7 @@ def _residual_variance(data: _Samples, solution: Array) -> _Variance:
 
 
 def _per_pixel(
-    recording: Recording, camera: CameraSettings, view: _View, fit: _Fit, data: _Samples, delay: int
+    recording: Recording, camera: CameraSettings, sampling: _Sampling, fit: _Fit, data: _Samples, delay: int
 ) -> ContrastCalibration:
     # Deviations of single pixels are regressed on their own counts, so the mean they deviate from must be as
     # attenuated as they are: that of least squares, not of the instruments.
@@ -397,7 +400,7 @@ def _per_pixel(
     normal: Array = np.zeros((size, 3))
     right: Array = np.zeros((size, 2))
     count = 0
-    for (part,) in _samples(recording, camera, view, (delay,), MAX_FRAMES):
+    for (part,) in _samples(recording, camera, sampling, (delay,), MAX_FRAMES):
         count += 1
         predicted = part.explained[:, :2] * plain[:2]  # by factor 1 of either threshold
         residual = part.change - part.explained @ plain
@@ -425,8 +428,8 @@ def _per_pixel(
         trailing=fit.trailing,
         residual=fit.residual,
         step_variance=variance.per_event / (fit.on * fit.off),
-        shortest_interval=view.shortest,
-        refractory=view.refractory,
+        shortest_interval=sampling.shortest,
+        refractory=sampling.refractory,
         samples=len(data.change),
         intervals=count,
         on_factor=np.clip(1 + offset[:, 0], 0.3, 3.0).reshape(shape),
@@ -448,10 +451,10 @@ def shrunk(normal: Array, right: Array) -> tuple[Array, Array, Array, Array]:
 
     Returns
     -------
-    Mean (2,) and covariance (2, 2) of the pixels that say something; (N, 2) estimates of every pixel relative to that
-    mean, shrunk towards it; (N, 2) the variance that is left. A pixel that says nothing is the mean.
+    Mean (2,) and covariance (2, 2) of the pixels with information; (N, 2) estimates of every pixel relative to that
+    mean, shrunk towards it; (N, 2) their posterior variance. A pixel without information has the mean.
     """
-    told = np.flatnonzero(normal[:, 0] + normal[:, 2] > 0)
+    known = np.flatnonzero(normal[:, 0] + normal[:, 2] > 0)
     mean, covariance = np.zeros(2), 0.01 * np.eye(2)
     values, left = np.zeros((len(normal), 2)), np.zeros((len(normal), 2, 2))
     information = np.stack([normal[:, [0, 1]], normal[:, [1, 2]]], axis=1)
@@ -459,10 +462,10 @@ def shrunk(normal: Array, right: Array) -> tuple[Array, Array, Array, Array]:
         prior = np.linalg.inv(covariance)
         left = np.linalg.inv(information + prior)
         values = np.einsum("nij,nj->ni", left, right + prior @ mean)
-        if len(told) < 10:
+        if len(known) < 10:
             break
-        mean = values[told].mean(axis=0)
-        away = values[told] - mean
-        covariance = products(away.T, away.T) / len(told) + left[told].mean(axis=0)
+        mean = values[known].mean(axis=0)
+        away = values[known] - mean
+        covariance = products(away.T, away.T) / len(known) + left[known].mean(axis=0)
         covariance += _LEAST_SPREAD**2 * 1e-2 * np.eye(2)
     return mean, covariance, values - mean, np.stack([left[:, 0, 0], left[:, 1, 1]], axis=1)

@@ -13,49 +13,49 @@ from kalux.compiled import empty, loop
 from kalux.events import NEVER
 from kalux.recording import Recording
 
-_EDGE: Final = 0.02  # of the most frequent inter-event interval: what is rarer and shorter is noise
-_MOST_OF_PIXEL: Final = 200  # intervals: some hot pixels are then a few percent of a recording's
-_FINE: Final = 10  # fine bins, 2 % wide, in one of the bins whose edges count
+_EDGE: Final = 0.02  # share of the histogram's peak below which shorter intervals are noise
+_MOST_OF_PIXEL: Final = 200  # intervals of a pixel that count, so that hot pixels have a few percent of all
+_FINE: Final = 10  # fine bins, 2 % wide, in a coarse bin, at one of which the shortest interval begins
 _EDGE_BINS: Final = np.logspace(1, 6, 50 * _FINE + 1)  # us
 
 _PILE: Final = 0.1
-"""Share of the intervals up to twice as long that one fine bin has where events pile up in it. 0.005 to 0.05 on forty
-scenes and recordings whose pixels are reset or lose nothing, 0.15 to 0.48 on eight whose events wait."""
+"""Share of the intervals up to twice as long that lies in one fine bin if events pile up there. It is 0.005 to 0.05 on
+forty scenes and recordings whose pixels are reset or lose nothing, 0.15 to 0.48 on eight whose events wait for the end
+of the refractory period."""
 
-_LEAST_PILE: Final = 100  # us: fine bins of shorter intervals hold one or two whole microseconds
-_LEAST_PILED: Final = 1_000  # intervals up to twice as long, so that no share of 0.05 is chance
+_LEAST_PILE: Final = 100  # us: fine bins of shorter intervals hold only one or two microseconds
+_LEAST_PILED: Final = 1_000  # intervals up to twice as long: so many that a share of 0.1 is not chance
 
 _TRIED: Final = (0.35, 0.6, 0.85, 1.1)
-"""Refractory periods that are tried, as shares of the shortest interval, between which the best is interpolated. None
-is longer than that, but it is only known to lie in a bin of a quarter of its size."""
+"""Refractory periods that are tried, as shares of the shortest interval; the best is interpolated between them. It is
+not longer than that interval, which is known to a coarse bin of a quarter of its size."""
 
 LATE: Final = 5.0
-"""Events later than so many shortest intervals after their predecessors say little of the refractory period: at most a
-quarter of their step is lost. And they are as often noise, or the rest of a change that was not finished."""
-
+"""Shortest intervals after its predecessor from which an event has little information of the refractory period: at most
+a quarter of its step is lost. Later ones are often noise, or the rest of a change."""
 
 _DEAD_EVENTS: Final = 2_000_000
 _DEAD_TIMES: Final = np.arange(50, 5_001)  # us: those of sensors and simulators
 _LEAST_AFTER: Final = 25
-"""Intervals up to a tenth longer than the dead time: were there none, 125 would lie in the half of it before them."""
+"""Least number of intervals from one to 1.1 dead times. Of noise without a dead time 125 would lie in the half of it
+before them."""
 
 _MOST_BEFORE: Final = 0.02
-"""Of how densely intervals lie just beyond the dead time, how densely they may lie in the half of it before: pixels
-differ. Where only the light's pace keeps events apart, intervals set in by degrees: 0.06 of it and more where their
-density grows by the tenth power of their length."""
+"""Largest density of intervals from a half to one dead time, over that from 1 to 1.1; not 0, since pixels differ. Where
+only the pace of the light keeps events apart, the density rises gradually: the ratio is 0.06 and more where it grows by
+the tenth power of the length."""
 
 _MOST_BEYOND: Final = 1.6
-"""How many times as dense, or less, intervals of 1.1 to 1.2 dead times are: 0.7 to 1.2 on thirteen simulated scenes,
-2.3 on a DAVIS346 before a bench, where the density grows from near nothing by the tenth power."""
+"""Largest density of intervals from 1.1 to 1.2 dead times, over that from 1 to 1.1: 0.7 to 1.2 on thirteen simulated
+scenes, 2.3 on a DAVIS346 before a bench, where the density grows by the tenth power of the length."""
 
 _LEAST_BEYOND: Final = 1 / 3
-"""The same, at least: events that wait for the end of their pixel's dead time and lose nothing (`Intervals.pile_up`)
-are denser there."""
-
+"""The least of the same ratio: it is less where events wait for the end of the dead time, so that nothing is lost
+(`Intervals.pile_up`)."""
 
 _LEAST_TURNING: Final = 0.2
-"""Share of the intervals just beyond the dead time whose events differ in polarity: a half of noise, 0.29 to 0.57 on
-thirteen simulated scenes; none where edges of one speed and contrast make intervals that are all alike."""
+"""Least share of the intervals from 1 to 1.1 dead times whose events differ in polarity. It is a half for noise, 0.29
+to 0.57 on thirteen simulated scenes, and 0 where edges of one speed and contrast make equal intervals."""
 
 
 class Intervals(NamedTuple):
@@ -64,11 +64,11 @@ class Intervals(NamedTuple):
     Attributes
     ----------
     shortest
-        Their lower edge, us: no refractory period is longer. 0 without events that follow one another.
+        Their lower edge, us, which no refractory period exceeds. 0 if no pixel has two events.
     pile_up
-        Whether many are the same. A pixel that is held in reset needs a new change of a threshold after that, and no
-        interval is preferred. Where events only wait, to be told as soon as the pixel may, they come when its time is
-        over: nothing is lost (equations.md, K13).
+        Whether many have the same length. After a reset a pixel needs a new change of a threshold, so that no length is
+        preferred. Where events only wait for the end of the refractory period they come at that moment, and nothing is
+        lost (docs/equations.md, K13).
     """
 
     shortest: int
@@ -76,7 +76,7 @@ class Intervals(NamedTuple):
 
 
 def shortest_interval(recording: Recording, most_events: int = 3_000_000) -> int:
-    """The first of `intervals`."""
+    """`Intervals.shortest` of the first ``most_events``, us."""
     return intervals(recording, most_events).shortest
 
 
@@ -136,7 +136,7 @@ def _onset(shorter: NDArray[np.int64], turning: NDArray[np.int64]) -> int:
         return 0
 
     def likelihood(number: NDArray[np.int64], time: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Logarithm of that of so many intervals, at the density that they have; but for what all edges share."""
+        """Log likelihood of ``number`` intervals in ``time`` at their own density, up to terms that all edges share."""
         return np.asarray(number * np.log(np.maximum(number, 1) / time))
 
     gain = likelihood(before, of_before) + likelihood(after, of_after)

@@ -60,7 +60,7 @@ class Registration:
 
     @classmethod
     def of_rig(cls, rig: Rig, distance: float | None = None) -> Registration:
-        """That of a rig, for a scene at a distance (m), or infinitely far."""
+        """The registration of a rig, for a scene at a distance (m), or infinitely far."""
         return cls(rig.events, rig.frames, rig.homography(distance))
 
     @cached_property

@@ -1,20 +1,20 @@
-"""What pixels and their neighbours saw between two frames: the events, and by how much the frames changed.
+"""Samples for regressions: events of pixels and their neighbours between two frames, and the changes of the frames.
 
-An event says that the light has moved by a threshold since the pixel's previous one, not when. Here its step is spread
-over that time, so that only a part of it may lie between the frames:
+An event means that the light has moved by a threshold since the pixel's previous one, but not when. Here its step is
+spread over that time, so that only a part of it may lie between the frames:
 
-- Between two events of one sign the light goes straight from level to level.
-- Where the direction turns it goes on first, by half a threshold (0 to 1 are all as likely), and then back by one and a
-  half. Without the way back that no event tells of, thresholds come out 5 to 13 % too large where texture is fine.
-- It moves at the pace of the events beside, and waits between for the rest of a long time.
+- Between two events of one sign the light moves straight from level to level.
+- Where the direction turns it first goes on by half a threshold, the mean of 0 to 1, and then back by one and a half.
+  Without the unreported way back, thresholds come out 5 to 13 % too large where texture is fine.
+- It moves at the pace of the neighbouring events of the pixel, and rests for what remains of a long time.
 
-Where nothing is wrong with the sensor this leaves half of what is left where a step counts as a whole when its event
-comes, and the error of the thresholds is within 2 %, whatever the exposures.
+On ideal sensors the residuals are half of those with steps that count as a whole at the time of their event, and the
+error of the thresholds is within 2 %, whatever the exposures.
 
-A frame shows the logarithm of the mean over its exposure, while steps make the mean of the logarithm. By how much the
-one is more than the other events within the exposure tell, and it is taken off. Left in, steps that follow soon, which
-are of fast edges, seem worth 13 % less to 10 % more than others where exposures take three quarters of the time (nine
-simulated scenes; 4 % less to 1 % more without).
+A frame shows the logarithm of the mean over its exposure, while steps add up to the mean of the logarithm. The
+difference follows from the events within the exposure, and is subtracted. Otherwise steps of events that follow soon,
+which are those of fast edges, would seem 13 % smaller to 10 % larger than others where exposures take three quarters of
+the time (nine simulated scenes; 4 % smaller to 1 % larger with the correction).
 """
 
 from __future__ import annotations
@@ -39,24 +39,24 @@ from kalux.settings import CameraSettings
 Array = NDArray[np.float64]
 
 MAX_SAMPLES: Final = 100_000
-"""Pixels that are enough: the standard error of thresholds is then below 1 %."""
+"""Number of pixels that is enough: the standard error of thresholds is then below 1 %."""
 
 _MAX_FRAMES: Final = 200
-_LEAST_AROUND: Final = 8  # events of the eight neighbours: where less happens it may be noise
-_LEAST_NEIGHBOURS: Final = 4  # that frames show well
+_LEAST_AROUND: Final = 8  # events of the eight neighbours: fewer may be noise
+_LEAST_NEIGHBOURS: Final = 4  # neighbours that frames show well
 _PATCH: Final = tuple((row, column) for row in (-1, 0, 1) for column in (-1, 0, 1))
 
 _HOT_LEAST: Final = 10
 _HOT_FACTOR: Final = 4
-"""Pixels with more events between two frames than ten and four times as many as any neighbour are hot."""
+"""Pixels with more events between two frames than ten plus four times those of any neighbour are hot."""
 
-_ALIKE: Final = 0.3
-"""Log intensity by which the changes of neighbours that see the same edge differ: others are weighed down. A slow edge
-is at one pixel after the other; without, it makes thresholds a quarter too large."""
+_SAME_EDGE: Final = 0.3
+"""Log intensity by which the changes of neighbours at the same edge differ. Others have less weight: a slow edge comes
+to one pixel after the other, which would make thresholds a quarter too large."""
 
 _SLOWEST: Final = 15_000.0
-"""us in which light that moves does so by a threshold, at most: what takes longer has waited. Events beside mostly tell
-the pace; with 20 and 50 ms thresholds are 0.4 % apart."""
+"""Longest time, us, in which moving light is taken to move by a threshold; for the rest of a longer one it rests. The
+pixel's other events mostly determine the pace: with 20 and 50 ms thresholds differ by 0.4 %."""
 
 _PEAK: Final = 0.5
 """Thresholds by which the light goes on before it turns, on average."""
@@ -136,26 +136,28 @@ def steps(
     """
     margin = recording.longest_exposure + max(abs(delay) for delay in delays) + round(_REACH)
     log_offset = 0.0 if of_log_offset else camera.offset
-    passings = [
-        _Passing(recording.sensor_size, periods, late, delay, thresholds, log_offset, -(-most // at_least))
+    samplers = [
+        _StepSampler(
+            recording.sensor_size, periods, late, delay, thresholds, log_offset, -(-most // at_least)
+        )
         for delay in delays
     ]
     found: list[list[Steps]] = []
     count = 0
     for interval in intervals(recording, camera, margin=margin, most_frames=_MAX_FRAMES):
-        found.append([passing.of(interval) for passing in passings])
+        found.append([sampler.sample(interval) for sampler in samplers])
         count += len(found[-1][0].change)
         if count >= most:
             break
     if not found:
-        return [_nothing(len(periods)) for _ in delays]
+        return [_no_steps(len(periods)) for _ in delays]
     return [
         Steps(*(np.concatenate(values) for values in zip(*parts, strict=True)))
         for parts in zip(*found, strict=True)
     ]
 
 
-def _nothing(periods: int) -> Steps:
+def _no_steps(periods: int) -> Steps:
     none, counts = np.empty(0), np.empty((0, periods, 2, 2))
     return Steps(none, none, none, counts, counts, np.empty(0, np.int64), none)
 
@@ -164,8 +166,8 @@ _REACH: Final = (1 + _PEAK) * _SLOWEST
 """us before and after two exposures in which events tell where the light was during these."""
 
 
-class _Passing:
-    """What is known of every pixel as the intervals pass."""
+class _StepSampler:
+    """Samples successive intervals, and remembers every pixel's newest event before each."""
 
     def __init__(
         self,
@@ -183,19 +185,19 @@ class _Passing:
         self._delay, self._most = delay, most
         self._exposures = Exposures(sensor_size, delay, thresholds)
         self._log_offset = log_offset
-        # Of the event before the interval's first: its time, and its sign, 0 if there was none.
+        # Time and sign of every pixel's newest event before the interval; 0 if there was none.
         self._latest = np.full(height * width, NEVER, np.int64)
         self._sign = np.zeros(height * width, np.int8)
         self._seen_until = NEVER
 
-    def of(self, interval: Interval) -> Steps:
-        """The pixels of the next interval."""
+    def sample(self, interval: Interval) -> Steps:
+        """The samples of the next interval."""
         height, width = self._shape
         first, second = interval.first, interval.second
         begin = first.start + self._delay - round(_REACH)
         end = second.end + self._delay + round(_REACH)
         passed = event_words(between(interval.events, self._seen_until, begin))
-        _pass(passed, np.uint64(width), self._latest, self._sign)
+        _remember_newest(passed, np.uint64(width), self._latest, self._sign)
         self._seen_until = begin
         chosen, usable, lost = self._chosen(interval)
         words = event_words(between(interval.events, begin, end))
@@ -212,7 +214,7 @@ class _Passing:
         # To second order, log(I + I_0) bends by the square of its share in the steps.
         before, after = self._exposures.of(interval.first, interval.second, interval.events)
         change = interval.change - share**2 * (after.over_mean - before.over_mean)
-        own, around, change_around = _looked_at(
+        own, around, change_around = _own_and_around(
             counts.reshape(height, width, 4 * len(self._periods)), change, usable, chosen
         )
         return Steps(
@@ -226,15 +228,15 @@ class _Passing:
         )
 
     def _chosen(self, interval: Interval) -> tuple[NDArray[np.int64], NDArray[np.bool_], float]:
-        """Indices of well exposed pixels around which something happens, spread evenly; (H, W) all well exposed ones.
+        """Which pixels are sampled: indices, (H, W) all usable pixels, and `Steps.lost`.
 
-        Hot pixels are none of either. And the share of those that one of the frames alone shows well.
+        Usable pixels are well exposed and not hot. Of those with enough events around, evenly spread ones are sampled.
         """
         start, end = interval.start + self._delay, interval.end + self._delay
         on, off = count_chunks([between(interval.events, start, end)], self._shape, weighed=False)
-        happened = on + off
-        usable = interval.usable & ~_hot(happened)
-        eventful = _something_happens(happened)
+        events = on + off
+        usable = interval.usable & ~_hot(events)
+        eventful = _eventful(events)
         either = sum(int(np.count_nonzero(end.usable & eventful)) for end in interval.ends)
         lost = 1.0 - 2 * int(np.count_nonzero(interval.usable & eventful)) / max(either, 1)
         neighbours = _sum_around(usable.view(np.uint8))
@@ -243,7 +245,7 @@ class _Passing:
 
 
 def _with_neighbours(chosen: NDArray[np.int64], height: int, width: int) -> NDArray[np.bool_]:
-    """(H W) bool: pixels not at the border, and those around them."""
+    """(H W) bool: the ``chosen`` pixels, which are not at the border, and their neighbours."""
     found = np.zeros(height * width, np.bool_)
     for place in _PATCH:
         found[chosen + place[0] * width + place[1]] = True
@@ -251,7 +253,7 @@ def _with_neighbours(chosen: NDArray[np.int64], height: int, width: int) -> NDAr
 
 
 @loop
-def _pass(words, width, latest, sign):  # type: ignore[no-untyped-def]
+def _remember_newest(words, width, latest, sign):  # type: ignore[no-untyped-def]
     """Remember time and sign of every pixel's newest event."""
     for i in range(len(words)):
         word = words[i, 1]
@@ -282,28 +284,28 @@ def _by_pixel(words, width, wanted):  # type: ignore[no-untyped-def]
 
 
 def _ramp_sum(t: Number, start: Number, end: Number) -> Number:
-    """Integral until t, us, of what goes from 0 at ``start`` to 1 at ``end``."""
+    """Integral until t, us, of a ramp from 0 at ``start`` to 1 at ``end``."""
     within = (t - start) * (t - start) / (2.0 * (end - start))
     return choose(t > start, choose(t < end, within, t - 0.5 * (start + end)), t.like(0.0))
 
 
 def _ramp_mean(begin: Number, stop: Number, start: Number, end: Number) -> Number:
-    """Mean from ``begin`` to ``stop`` of what goes from 0 at ``start`` to 1 at ``end``."""
+    """Mean from ``begin`` to ``stop`` of a ramp from 0 at ``start`` to 1 at ``end``."""
     mean = (_ramp_sum(stop, start, end) - _ramp_sum(begin, start, end)) / (stop - begin)
     return choose(stop > start, choose(begin < end, mean, mean.like(1.0)), mean.like(0.0))
 
 
 @formula(types.float64)
-def _shown(
+def _ramp_difference(
     begin: Number, stop: Number, second_begin: Number, second_stop: Number, start: Number, end: Number
 ) -> Number:
-    """By how much more the second exposure shows of what goes from 0 at ``start`` to 1 at ``end``."""
+    """Mean over the second exposure less that over the first of a ramp from 0 at ``start`` to 1 at ``end``."""
     return _ramp_mean(second_begin, second_stop, start, end) - _ramp_mean(begin, stop, start, end)
 
 
 @loop
 def _count(words, order, starts, latest, sign, exposures, periods, late, counts):  # type: ignore[no-untyped-def]
-    """Add the parts of the events' steps."""
+    """Add to ``counts`` the part of every event's step that lies between the two exposures."""
     for at in range(len(starts) - 1):
         if starts[at] == starts[at + 1]:
             continue
@@ -320,56 +322,61 @@ def _count(words, order, starts, latest, sign, exposures, periods, late, counts)
                 soon, column = np.uint64(since < late), np.uint64(not on)
                 if own_sign == -sign_before:
                     # At one pace, the way out takes a quarter of the time and the way back the rest.
-                    out = _shown(*exposures, before, before + smaller(_PEAK * pace_before, 0.25 * since))
-                    back = _shown(*exposures, t - smaller((1 + _PEAK) * pace_after, 0.75 * since), t)
+                    out = _ramp_difference(
+                        *exposures, before, before + smaller(_PEAK * pace_before, 0.25 * since)
+                    )
+                    back = _ramp_difference(
+                        *exposures, t - smaller((1 + _PEAK) * pace_after, 0.75 * since), t
+                    )
                     for k in range(len(periods)):
                         counts[at, k, soon, column] += back
                         counts[at, k, soon, 1 - column] += _PEAK * (out - back)
                 else:
                     arrive = 0.5 * smaller(pace_after, since)
                     if sign_before == 0:  # where the light was before the pixel's first event is not known
-                        step = _shown(*exposures, t - 2.0 * arrive, t)
+                        step = _ramp_difference(*exposures, t - 2.0 * arrive, t)
                     else:
                         leave = 0.5 * smaller(pace_before, since)
-                        step = 0.5 * _shown(*exposures, before, before + leave)
-                        step += 0.5 * _shown(*exposures, t - arrive, t)
+                        step = 0.5 * _ramp_difference(*exposures, before, before + leave)
+                        step += 0.5 * _ramp_difference(*exposures, t - arrive, t)
                     for k in range(len(periods)):
                         counts[at, k, soon, column] += step * step_weight(np.float32(since), periods[k])
             pace_before = smaller(_SLOWEST, since) if own_sign == sign_before else _SLOWEST
             before, sign_before = t, own_sign
         # The next event is too far away to know its sign: on both ways lies half a threshold.
-        step = 0.5 * _shown(*exposures, before, before + 0.5 * pace_before)
+        step = 0.5 * _ramp_difference(*exposures, before, before + 0.5 * pace_before)
         for k in range(len(periods)):
             counts[at, k, 0, np.uint64(sign_before < 0)] += step
 
 
-def _hot(happened: NDArray[np.float32]) -> NDArray[np.bool_]:
+def _hot(events: NDArray[np.float32]) -> NDArray[np.bool_]:
     """(H, W): pixels with far more events than any of their neighbours."""
-    found, bordered = np.zeros(happened.shape, np.bool_), np.pad(happened, 1)
-    busy = np.nonzero(happened > _HOT_LEAST)
+    found, bordered = np.zeros(events.shape, np.bool_), np.pad(events, 1)
+    busy = np.nonzero(events > _HOT_LEAST)
     beside = [bordered[busy[0] + 1 + i, busy[1] + 1 + j] for i, j in _PATCH if (i, j) != (0, 0)]
-    found[busy] = happened[busy] > _HOT_LEAST + _HOT_FACTOR * np.max(beside, axis=0)
+    found[busy] = events[busy] > _HOT_LEAST + _HOT_FACTOR * np.max(beside, axis=0)
     return found
 
 
-def _something_happens(happened: NDArray[np.float32]) -> NDArray[np.bool_]:
+def _eventful(events: NDArray[np.float32]) -> NDArray[np.bool_]:
     """(H, W): pixels not at the border whose neighbours have enough events."""
-    found = np.zeros(happened.shape, np.bool_)
-    found[1:-1, 1:-1] = (_sum_around(happened) >= _LEAST_AROUND)[1:-1, 1:-1]
+    found = np.zeros(events.shape, np.bool_)
+    found[1:-1, 1:-1] = (_sum_around(events) >= _LEAST_AROUND)[1:-1, 1:-1]
     return found
 
 
 def _sum_around(values: NDArray[Any]) -> NDArray[Any]:
-    """(H, W): of the eight neighbours."""
+    """(H, W): sum over the eight neighbours."""
     total = cv2.boxFilter(values, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
     return np.asarray(total - values)
 
 
 @loop
-def _looked_at(counts, change, usable, chosen):  # type: ignore[no-untyped-def]
-    """Counts of the chosen pixels, and of their neighbours the mean counts and changes.
+def _own_and_around(counts, change, usable, chosen):  # type: ignore[no-untyped-def]
+    """Counts of the chosen pixels, and weighted means of the counts and changes of their neighbours.
 
-    One number at a time: of whole rows numba would compile, for 1.5 s, how it complains that they differ in size.
+    One number at a time: for operations on whole rows numba would compile the error of rows that differ in size, which
+    takes 1.5 s.
     """
     width, size = counts.shape[1:]
     own, around = empty((len(chosen), size), np.float64), zeros((len(chosen), size), np.float64)
@@ -382,7 +389,7 @@ def _looked_at(counts, change, usable, chosen):  # type: ignore[no-untyped-def]
         for i in range(row - 1, row + 2):
             for j in range(column - 1, column + 2):
                 if usable[i, j] and not (i == row and j == column):
-                    apart = (change[i, j] - change[row, column]) / _ALIKE
+                    apart = (change[i, j] - change[row, column]) / _SAME_EDGE
                     weight = 1.0 / (1.0 + apart * apart)
                     for k in range(size):
                         around[n, k] += weight * counts[i, j, k]

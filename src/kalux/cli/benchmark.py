@@ -164,7 +164,7 @@ def _work(plan: Plan, store: Store, jobs: list[Job], options: argparse.Namespace
                 del left[job]
                 progress.add(images=1)
                 if not options.quiet:
-                    _tell(len(jobs) - len(left), len(jobs), progress.seconds, job, outcome)
+                    _print_outcome(len(jobs) - len(left), len(jobs), progress.seconds, job, outcome)
     except KeyboardInterrupt as interrupt:
         interrupt.add_note(_interrupted(plan, list(left), options.out))
         raise
@@ -180,7 +180,7 @@ def _outcomes(jobs: list[Job], options: argparse.Namespace) -> Outcomes:
     return runners.in_processes(jobs, options.processes or cores())
 
 
-def _tell(number: int, total: int, seconds: float, job: Job, outcome: Outcome) -> None:
+def _print_outcome(number: int, total: int, seconds: float, job: Job, outcome: Outcome) -> None:
     from kalux.cli.progress import clock
     from kalux.evaluation.benchmark.jobs import Failed
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.event_slices import between, events_until
+from kalux.frames import exposure_doubt
 from kalux.recording import Recording, clock_doubt, no_frames
 from kalux.white import WhiteCheck
 
@@ -41,8 +42,8 @@ class Contents(NamedTuple):
         The events from start to end, of those.
     colours
         As of `kalux.Frame`: ``"grey"``, ``"RGB"`` or the pattern of a mosaic.
-    doubt
-        What makes the frames' white value doubtful, if anything does.
+    doubts
+        What makes the frames' white value or the end of the last exposure doubtful.
     complete
         Whether these are all events, or only the first ones.
     gap
@@ -55,7 +56,7 @@ class Contents(NamedTuple):
     end: int
     events_between: int
     colours: str
-    doubt: str | None = None
+    doubts: tuple[str, ...] = ()
     complete: bool = True
     gap: tuple[int, int] | None = None
 
@@ -66,8 +67,7 @@ class Contents(NamedTuple):
 
     def warnings(self) -> Iterator[str]:
         """What is allowed, but probably not meant."""
-        if self.doubt is not None:
-            yield self.doubt
+        yield from self.doubts
         if self.events == 0:
             yield "there are no events; the images show the frames only"
         else:
@@ -95,14 +95,15 @@ def check_recording(
     InputError
         Whatever is wrong with the recording, or it has no frames.
     """
-    exposures, colours = [], "grey"
+    spans, colours = [], "grey"
     white = WhiteCheck()
     for frame in white.watched(recording.frames()):
-        exposures.append((frame.exposure_start, frame.exposure_end))
+        spans.append((frame.exposure_start, frame.exposure_end))
         colours = frame.colours
-    if not exposures:
+    if not spans:
         raise no_frames(recording)
-    start, end = exposures[0][0], exposures[-1][1]
+    exposures = np.array(spans, np.int64)
+    start, end = (int(t) for t in (exposures[0, 0], exposures[-1, 1]))
     count = events_between = events_from = 0
     complete = True
     for chunk in recording.events():
@@ -113,8 +114,10 @@ def check_recording(
         events_between += len(between(chunk, start - 1, end))
         events_from += len(chunk) - events_until(chunk, start - 1)
         on_events(len(chunk))
-    gap = _gap(np.array(exposures, np.int64))
-    return Contents(len(exposures), count, start, end, events_between, colours, white.doubt(), complete, gap)
+    doubts = tuple(filter(None, (white.doubt(), exposure_doubt(exposures))))
+    return Contents(
+        len(exposures), count, start, end, events_between, colours, doubts, complete, _gap(exposures)
+    )
 
 
 def _gap(exposures: NDArray[np.int64]) -> tuple[int, int] | None:

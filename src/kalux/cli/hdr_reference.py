@@ -203,7 +203,7 @@ def _truth(options: argparse.Namespace, reference: HdrReference) -> bytes:
             blur=options.blur,
             on_frame=lambda: progress.add(images=1),
         )
-    for line in _told(found):
+    for line in _left_out(found):
         warn(line)
     placed = [frame for frame in found.frames if not frame.failure]
     say(
@@ -222,5 +222,5 @@ def _truth(options: argparse.Namespace, reference: HdrReference) -> bytes:
     return file.getvalue()
 
 
-def _told(found: RegisteredTruth) -> list[str]:
+def _left_out(found: RegisteredTruth) -> list[str]:
     return [f"frame {f.number} ({f.time} us) is left out: {f.failure}" for f in found.frames if f.failure]

@@ -1,4 +1,4 @@
-"""How a command that runs compiled loops starts numba."""
+"""How commands have numba start, and compile, in less time."""
 
 from __future__ import annotations
 
@@ -17,22 +17,24 @@ _BLAS: Final = "scipy.linalg.cython_blas"
 
 
 def prepare_loops() -> None:
-    """Have numba begin, and compile, without what takes it long and is for nothing here.
+    """Have numba start and compile without steps that take time and that kalux's loops do not need.
 
-    It imports SciPy's BLAS only to see whether it is there, for products of matrices, which kalux's loops have none of:
-    0.1 s of the 0.3 that its first loop waits for. The other 0.2 s are what it knows of all types, which a loop that is
-    kept needs none of. And while it compiles only young garbage is looked for: looking through all that it keeps takes
-    an eighth more. Must be called before there are threads, which might import SciPy meanwhile. Where SciPy is imported
-    already, or numba is laid out otherwise, nothing is gained and nothing lost.
+    - numba imports SciPy's BLAS to find out whether products of matrices can be compiled: 0.1 s of the 0.3 s before the
+      first loop runs. kalux's loops have no such products.
+    - It registers its implementations of all types, 0.2 s, which only compiling needs, not loading from the cache.
+    - While it compiles, full collections of garbage look through all that it keeps, which takes an eighth more.
+
+    Must be called before threads are started, which might import SciPy at the same time. Where SciPy is imported
+    already, or another version of numba has other internals, nothing is gained and nothing lost.
     """
     _import_without_blas()
     _load_without_compiler()
-    _look_for_young_garbage_only()
+    _collect_young_garbage_only()
 
 
 @functools.cache  # once
 def _load_without_compiler() -> None:
-    """Have loops that are kept loaded without what numba needs to compile, which it sees to itself when it does."""
+    """Have cached loops loaded without the implementations of types, which numba registers itself when it compiles."""
     from numba.core import caching
     from numba.core.runtime.nrt import rtsys
 
@@ -46,7 +48,8 @@ def _load_without_compiler() -> None:
 
 
 @functools.cache  # once
-def _look_for_young_garbage_only() -> None:
+def _collect_young_garbage_only() -> None:
+    """Have no full collection of garbage while numba compiles."""
     from numba.core import event
 
     depth, usual = 0, gc.get_threshold()
@@ -68,7 +71,7 @@ def _look_for_young_garbage_only() -> None:
 
 
 def _listener(begin: Callable[[], None], end: Callable[[], None] = lambda: None) -> Any:
-    """What numba tells when it begins and ends to compile a loop."""
+    """A listener that calls ``begin`` and ``end`` when numba begins and ends to compile a loop."""
     from numba.core import event
 
     class Listener(event.Listener):
@@ -82,9 +85,10 @@ def _listener(begin: Callable[[], None], end: Callable[[], None] = lambda: None)
 
 
 def _import_without_blas() -> None:
+    """Import the part of numba that imports SciPy's BLAS while that cannot be imported."""
     if _BLAS in sys.modules:
         return
-    sys.modules[_BLAS] = None  # type: ignore[assignment]  # who asks for it is told that it is not there
+    sys.modules[_BLAS] = None  # type: ignore[assignment]  # an import of it then fails
     try:
         with contextlib.suppress(ImportError):
             importlib.import_module("numba.np.arraymath")
@@ -93,7 +97,7 @@ def _import_without_blas() -> None:
 
 
 def tell_of_compiling(*, quiet: bool = False, tell: Callable[[str], None] = error_line) -> None:
-    """On a terminal, have it told, once, when loops are compiled: the first run of a kind waits for that."""
+    """On a terminal, have a line printed when the first loop is compiled, which the first run of a kind waits for."""
     if quiet or not sys.stderr.isatty():
         return
     from numba.core import event
@@ -110,33 +114,33 @@ def tell_of_compiling(*, quiet: bool = False, tell: Callable[[str], None] = erro
 
 
 OF_IMAGES: Final = ("images", "display")
-"""Parts of `kalux.cli.rehearsal` that every reconstruction comes to after the estimates."""
+"""Parts of `kalux.cli.rehearsal` that every reconstruction needs after the estimates."""
 
 OF_ALL: Final = ("images", "segment", "display", "filter")
-"""Those of the default filter. What is come to last is first."""
+"""Those that the default filter needs. The part that is needed last comes first."""
 
 _MOST_ALONE: Final = 3
-"""Parts that one process alone does: they take it as long as the others take the command."""
+"""Parts that a single process compiles: it takes as long for these as the command for the rest."""
 
 _MOST_BESIDE: Final = 2
-"""Processes: the estimates, which the command itself compiles, take as long as each of these does then."""
+"""Most processes beside the command: each takes as long as the command, which compiles the estimates."""
 
 
 @contextlib.contextmanager
 def compiling_beside(parts: Sequence[str], threads: int) -> Generator[None, None, None]:
-    """Within it, where this process has to compile a loop, others compile what it will come to later.
+    """Inside the block, if this process has to compile a loop, other processes compile loops that it needs later.
 
-    numba compiles one loop at a time, whatever the number of threads. Processes start with the first loop that is not
-    kept: where all are, nothing is done. They leave nothing but numba's cache, so that no result depends on them, nor
-    on whether they come to an end, and nobody waits for them: what they have not compiled in time this process
-    compiles itself. Those that are still running when the block is left are ended.
+    numba compiles one loop at a time, whatever the number of threads. The processes start with the first loop that is
+    not in the cache, if there is one. All that they leave is numba's cache: no result depends on them, and nobody waits
+    for them. What they have not compiled in time this process compiles itself. Those that still run at the end of the
+    block are terminated.
 
     Parameters
     ----------
     parts
-        Of `kalux.cli.rehearsal`, which the processes take in turns; one alone leaves those after three to the command.
+        Of `kalux.cli.rehearsal`, dealt out to the processes; a single process takes only the first three.
     threads
-        That there may be, of which this process is one.
+        How many may be used, this process among them.
     """
     from numba.core import event
 
@@ -150,7 +154,7 @@ def compiling_beside(parts: Sequence[str], threads: int) -> Generator[None, None
             # -P: what lies in the working folder is not imported in place of modules.
             command = [sys.executable, "-P", "-m", "kalux.cli.rehearsal", *waiting.pop(0)]
             none = subprocess.DEVNULL
-            with contextlib.suppress(OSError):  # no room for another process: all is compiled in this one
+            with contextlib.suppress(OSError):  # no process can be started: this one compiles all
                 running.append(subprocess.Popen(command, stdin=none, stdout=none, stderr=none))
 
     try:

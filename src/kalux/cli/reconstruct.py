@@ -29,7 +29,7 @@ from kalux.display import CURVES
 from kalux.errors import InputError
 from kalux.pipeline import execute
 from kalux.plan_report import ORIGINS, plan_report
-from kalux.planning import Plan, plan
+from kalux.planning import ESTIMATED_ORIGINS, Plan, plan
 from kalux.reconstructor import Reconstructor
 from kalux.recording import Recording
 from kalux.settings import PRESETS, Settings, from_dict, load, preset, read_toml, to_dict
@@ -193,9 +193,8 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
 
 
 def _compiled_later(settings: Settings) -> tuple[str, ...]:
-    """Parts of `kalux.cli.rehearsal` that a reconstruction comes to after the estimates."""
-    is_default = settings.filter.kind == "akf" and settings.filter.augmentation == "bridge"
-    return OF_ALL if is_default else OF_IMAGES
+    """Parts of `kalux.cli.rehearsal` that a reconstruction needs after the estimates."""
+    return OF_ALL if settings.filter.joins_frames else OF_IMAGES
 
 
 def _check_apart(output: Output, recording: Path) -> None:
@@ -223,7 +222,7 @@ def chosen_settings(options: argparse.Namespace) -> Settings:
 
 
 def make_plan(recording: Recording, settings: Settings, times: Any, options: argparse.Namespace) -> Plan:
-    """Decide everything, of the whole recording.
+    """The plan of the whole recording.
 
     Raises
     ------
@@ -270,7 +269,7 @@ def part_of(planned: Plan, contents: Contents, options: argparse.Namespace) -> P
 
 
 def _origin(planned: Plan, options: argparse.Namespace) -> Any:
-    """Where the thresholds come from; those of a former run's `kalux.toml` come from where they did then."""
+    """Where the thresholds come from; of those in a former run's `kalux.toml`, the origin that it states."""
     flags = given_settings(options).get("events", {})
     if (
         planned.threshold_origin != "settings"
@@ -291,7 +290,7 @@ def plan_warnings(planned: Plan, contents: Contents, preset_name: str) -> Iterat
     gap = gap_warning(planned, contents)
     if gap is not None:
         yield gap
-    if planned.threshold_origin in ("estimate", "assumed"):
+    if planned.threshold_origin in ESTIMATED_ORIGINS:
         yield threshold_warning(planned, preset_name)
     if (
         planned.threshold_origin == "assumed"
@@ -336,7 +335,7 @@ def gap_warning(planned: Plan, contents: Contents) -> str | None:
 
 
 def contradicts(estimate: ThresholdEstimate) -> bool:
-    """Whether many samples say next to nothing of the thresholds."""
+    """Whether many samples have next to no information of the thresholds."""
     return estimate.samples >= _MANY_SAMPLES and estimate.usual_share > _NEARLY_ALL
 
 

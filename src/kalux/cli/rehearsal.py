@@ -1,7 +1,7 @@
-"""Loops of a reconstruction run once on a scene that is made up, so that they are compiled and kept.
+"""Runs loops of a reconstruction once, on made-up data, so that numba compiles them and keeps them in its cache.
 
-`kalux.cli.loops` starts ``python -m kalux.cli.rehearsal PART`` beside a command that has to compile: what that would
-come to later is then ready. Nothing is written but numba's cache, and no result depends on it.
+`kalux.cli.loops` starts ``python -m kalux.cli.rehearsal PART`` beside a command that has to compile, which then finds
+the loops that it needs later in the cache. No result depends on it.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from kalux.augmentation.bridge import BridgeNoise, Latent, bridge, drift, nomina
 from kalux.augmentation.highlights import Unshown
 from kalux.augmentation.motion import Paths
 from kalux.augmentation.trail import Trail, nothing_followed, polarity_of, trail_between
-from kalux.augmentation.unseen import forget_silence, half_way, silent_change, turns
+from kalux.augmentation.unseen import add_missed_change, half_way, silent_change, turns
 from kalux.cli.loops import prepare_loops
 from kalux.compiled import apart
 from kalux.display import Auto, DisplaySettings, fill_levels, measure, quantised
@@ -59,7 +59,7 @@ def rehearse_filter() -> None:
 
 
 def rehearse_images() -> None:
-    """From L to an intensity."""
+    """From an estimate to an image, without and with its variance."""
     level = np.random.default_rng(0).normal(-1.0, 1.0, _SIZE).astype(np.float32)
     some, ones = np.arange(100), np.ones(100, np.float32)
     estimate = Estimate(
@@ -93,7 +93,7 @@ def rehearse_display() -> None:
 
 
 def rehearse_segment() -> None:
-    """What is done for pixels between two frames, once the events between are counted."""
+    """A segment between two frames, from the counts of its events to its last state."""
     random = np.random.default_rng(0)
     seconds, variance, change = 1e-6 * _PERIOD, 0.01, np.full(_SIZE, np.nan, np.float32)
     planes = apart(8, _SIZE)
@@ -108,7 +108,7 @@ def rehearse_segment() -> None:
     of_silent = silent_change(joined, variance, variance)
     half_way(change, joined, variance, variance)
     drifted, _, _ = drift(first, second, thresholds, noise, (far_on, far_off), (on, off))
-    forget_silence(drifted, joined, second, (on, off), of_silent, variance)
+    add_missed_change(drifted, joined, second, (on, off), of_silent, variance)
     turns(on, off)
     trail = Trail(start, polarity_of(newest), seconds, 0.1, 0.1)
     segment = joined._replace(trail=trail, drift=drifted)
@@ -124,7 +124,8 @@ PARTS: Final[dict[str, Callable[[], None]]] = {
     "display": rehearse_display,
     "filter": rehearse_filter,
 }
-"""What can be compiled by itself: a fifth, a quarter and a fifteenth of all, and a tenth that is left of the filter."""
+"""Parts that can be compiled by themselves: a fifth, a quarter and a fifteenth of all, and the rest of the filter, a
+tenth."""
 
 if __name__ == "__main__":
     prepare_loops()

@@ -114,7 +114,7 @@ def artificial_hdr(
     _check(camera, black, saturation, every)
     real = Camera(Response.named(chosen_response(response, recording.response)))
     artificial = Response.named(camera.response)
-    kept = [frame.exposure for frame in _kept(recording, every)]
+    kept = [frame.exposure for frame in _taken_frames(recording, every)]
     if len(kept) < 2:
         raise FrameError(
             f"{recording.source.path}: {how_many(len(kept), 'frame')}, too few for artificial HDR"
@@ -125,7 +125,7 @@ def artificial_hdr(
         )
 
     def frames() -> Iterator[Frame]:
-        for frame in _kept(recording, every):
+        for frame in _taken_frames(recording, every):
             intensity = _intensity(frame, real, black, 1.0)
             level = artificial(np.minimum(intensity / camera.high, 1.0))
             levels = np.rint(255 * level).astype(np.uint8)
@@ -135,7 +135,7 @@ def artificial_hdr(
 
     def truth() -> GroundTruth:
         times, images, masks = [], [], []
-        for frame in _told(recording, every):
+        for frame in _truth_frames(recording, every):
             image = _intensity(frame, real, black, reference / frame.exposure) / camera.high
             times.append(frame.middle)
             grey = image if image.ndim == 2 else luminance(image)
@@ -178,30 +178,30 @@ def _check(camera: ArtificialCamera, black: float, saturation: float, every: int
         )
 
 
-def _kept(recording: Recording, every: int | None) -> Iterator[Frame]:
+def _taken_frames(recording: Recording, every: int | None) -> Iterator[Frame]:
     """The frames that the artificial camera takes."""
     return (f for i, f in enumerate(recording.frames()) if every is None or i % every != every - 1)
 
 
-def _told(recording: Recording, every: int | None) -> Iterator[Frame]:
-    """The frames that are truth."""
+def _truth_frames(recording: Recording, every: int | None) -> Iterator[Frame]:
+    """The original frames that are the truth: those held out, or all."""
     return (f for i, f in enumerate(recording.frames()) if every is None or i % every == every - 1)
 
 
 def _measured(frame: Frame, saturation: float) -> NDArray[np.bool_]:
-    """(H, W) where a frame says what light there was, in all of its colours."""
+    """(H, W) where a frame is neither saturated in any of its colours nor masked."""
     below = np.asarray(frame.normalised() < saturation)
     measured = below if below.ndim == 2 else below.all(axis=-1)
     return np.asarray(measured if frame.valid is None else measured & frame.valid)
 
 
 def _noise(recording: Recording, response: str, black: float, high: float) -> tuple[float, float] | None:
-    """Read and shot noise of the original frames, 1 = ``high``; None: not linear, or they do not tell."""
+    """Read and shot noise of the original frames, 1 = ``high``; None: not linear, or no estimate is reliable."""
     name = chosen_response(response, recording.response)
     if name not in ("auto", "linear"):
         return None
     found = estimate_frame_noise(recording, CameraSettings(response=name))
-    if found is None or not found.believed:
+    if found is None or not found.is_reliable:
         return None
     scale = high * (1.0 - black)
     return found.read / scale, found.shot / scale

@@ -160,23 +160,23 @@ def hdr_reference(
     check_bracket(pictures)
     everywhere = np.ones(pictures[0].levels.shape[:2], bool)
     placed = align(pictures) if aligned else [Aligned(p, everywhere, None, "as it lies") for p in pictures]
-    shown, covered = [a.picture for a in placed], [a.covered for a in placed]
-    curve = response if isinstance(response, Response) else recover_response(shown, response)
-    exposures = measured_exposures(shown, curve, covered)
-    stated = [picture.exposure for picture in shown]
-    shown = [Picture(p.name, p.levels, e) for p, e in zip(shown, exposures, strict=True)]
-    spread = relative_spread(shown, curve, covered)
-    found = consistency(shown, curve, covered, spread) if ghosts else None
+    photographs, covered = [a.picture for a in placed], [a.covered for a in placed]
+    curve = response if isinstance(response, Response) else recover_response(photographs, response)
+    exposures = measured_exposures(photographs, curve, covered)
+    stated = [picture.exposure for picture in photographs]
+    photographs = [Picture(p.name, p.levels, e) for p, e in zip(photographs, exposures, strict=True)]
+    spread = relative_spread(photographs, curve, covered)
+    found = consistency(photographs, curve, covered, spread) if ghosts else None
     reference = float(np.median(exposures))
-    radiance, valid = merge(shown, curve, covered, None if found is None else found.moved, reference)
+    radiance, valid = merge(photographs, curve, covered, None if found is None else found.moved, reference)
     if found is not None:
         valid &= ~found.unsettled
-    said = [_told(placed, stated, exposures, found, k) for k in range(len(shown))]
+    said = [_described(placed, stated, exposures, found, k) for k in range(len(photographs))]
     said.append(f"exposures agree within {100 * spread:.1f} % (one standard deviation)")
-    return HdrReference(radiance, valid, reference, curve, tuple(said), tuple(shown))
+    return HdrReference(radiance, valid, reference, curve, tuple(said), tuple(photographs))
 
 
-def _told(
+def _described(
     placed: Sequence[Aligned],
     stated: Sequence[float],
     exposures: Sequence[float],

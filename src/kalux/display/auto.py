@@ -19,7 +19,10 @@ _NO_SHOULDER: Final = 1.0 + 1e-3
 
 
 def map_auto(intensity: Float32, curve: Auto, median: float, white: float) -> Float32:
-    """Of values of any size: it limits them itself."""
+    """Map intensities, which may have any finite value, by the curve `Auto` to 0 to 1.
+
+    ``median`` and ``white`` are the image's statistics: its median and its bright end.
+    """
     shown = np.empty(intensity.shape, np.float32)
     values = np.ascontiguousarray(intensity).reshape(-1)
     _show(values, *_tone(curve, median, white), shown.reshape(-1))
@@ -57,7 +60,7 @@ def _tone(curve: Auto, median: float, white: float) -> tuple[_Shoulder, bool, np
 
 
 class _Shoulder(NamedTuple):
-    """float32: where it begins, how far it goes, and a (gain) and scale of scale log(1 + a x)."""
+    """Where the shoulder begins, how far it goes, and a (``gain``) and ``scale`` of scale log(1 + a x), all float32."""
 
     knee: np.float32
     room: np.float32
@@ -66,7 +69,7 @@ class _Shoulder(NamedTuple):
 
 
 def _shoulder(knee: float, white: float) -> _Shoulder:
-    """That of an image with nothing above 1 is none: it begins beyond every intensity."""
+    """The shoulder from ``knee`` to ``white``; of an image without highlights it begins beyond every intensity."""
     if white <= _NO_SHOULDER:
         return _Shoulder(np.float32(2 * LARGEST), np.float32(0), np.float32(0), np.float32(0))
     gain = _shoulder_gain(1 - knee, white - knee)

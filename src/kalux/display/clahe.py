@@ -24,7 +24,7 @@ def measure_clahe(intensity: Float32, curve: Clahe) -> Statistics:
 
 
 def map_clahe(intensity: Float32, curve: Clahe, statistics: Statistics) -> Float32:
-    """By the distributions of `measure_clahe`, linear between the centres of tiles."""
+    """Equalise an image by the distributions of `measure_clahe`, linear between the centres of tiles."""
     tiles = curve.tiles
     distributions = statistics[2:].astype(np.float32).reshape(tiles, tiles, BINS + 1)
     position = _log_position(intensity, statistics[:2])

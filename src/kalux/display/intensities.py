@@ -21,7 +21,7 @@ LARGEST = 1e30
 
 
 def checked_image(intensity: NDArray[Any]) -> Float32:
-    """The intensity as it can be worked with, but for values that `bounded` or the curve has to limit."""
+    """The intensity, contiguous float32, of a possible shape and finite; `bounded` or the curve limits its values."""
     checked = np.ascontiguousarray(intensity, np.float32)
     if (checked.ndim != 2 and checked.shape[2:] != (3,)) or checked.size == 0:
         raise InputError(
@@ -39,11 +39,11 @@ def bounded(values: Float32) -> Float32:
 
 
 def log_of(intensity: NDArray[Any]) -> Statistics:
-    """Logarithms, of black too."""
+    """Logarithms of intensities, finite for black, too."""
     return np.log(np.asarray(intensity, np.float64) + SMALLEST)
 
 
 def intensities_of(statistics: Statistics) -> tuple[float, float]:
-    """Of two statistics that are logarithms; the inverse of `log_of`."""
+    """The intensities of two statistics that are logarithms; the inverse of `log_of`."""
     first, second = np.maximum(np.exp(statistics) - SMALLEST, 0)
     return float(first), float(second)

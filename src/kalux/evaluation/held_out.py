@@ -85,7 +85,7 @@ class HeldOut:
         """Read and shot noise of the frames, estimated from all of them: by it a held-out frame itself is off."""
         settings = CameraSettings(response=self.response)
         found = estimate_frame_noise(self.whole, settings)
-        return (found.read, found.shot) if found is not None and found.believed else settings.noise
+        return (found.read, found.shot) if found is not None and found.is_reliable else settings.noise
 
     def frames(self) -> Iterator[Frame]:
         """The frames that are compared."""

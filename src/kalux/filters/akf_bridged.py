@@ -70,13 +70,13 @@ STEP_PIXEL: Final = np.dtype(
         "itemsize": 32,
     }
 )
-"""What events need in addition: 32 bytes, so that none lies in two lines of memory."""
+"""What events need in addition: 32 bytes, so that no pixel lies in two lines of the cache."""
 
 _BLOCK: Final = 128
 """Pixels that are read together: few enough that their fields stay in the first-level cache."""
 
-_BEGUN: Final = 64
-"""The same where a segment begins, with more fields."""
+_BEGIN_BLOCK: Final = 64
+"""The same where a segment begins, which needs more fields."""
 
 _STATE_FIELDS: Final = STATE_PIXEL.itemsize // 4
 _STEP_FIELDS: Final = STEP_PIXEL.itemsize // 4
@@ -207,9 +207,10 @@ def _read(segment: BridgedSegment, cursor: Cursor, t: int) -> tuple[FloatArray, 
 
 
 def moving_pixels(segment: BridgedSegment, cursor: Cursor) -> NDArray[np.bool_]:
-    """(H, W): pixels with an event since ``segment.still_since`` or to come in the segment, and unmeasured ones.
+    """(H, W): pixels with an event since ``segment.still_since`` or later in the segment, and unmeasured ones.
 
-    The fine texture of the others, still pixels, has been measured by many frames. Not to be changed.
+    The others are still: many frames have measured their texture, so that neighbours are of no use (K12). Not to be
+    changed.
     """
     if cursor.moving is not None:
         return cursor.moving
@@ -270,8 +271,8 @@ def _begin_bridged(given, scalars, before, pixels, steps):  # type: ignore[no-un
     log_intensity, floor, variance = before
     augmented, step_on, step_off, forward, backward, events, trail = given
     height, width = log_intensity.shape
-    states = empty((_STATE_FIELDS, _BEGUN), np.float32)
-    known = zeros((_STEP_FIELDS, _BEGUN), np.float32)
+    states = empty((_STATE_FIELDS, _BEGIN_BLOCK), np.float32)
+    known = zeros((_STEP_FIELDS, _BEGIN_BLOCK), np.float32)
     information, weighted, level, rates = (
         states[_INFORMATION],
         states[_WEIGHTED],
@@ -281,8 +282,8 @@ def _begin_bridged(given, scalars, before, pixels, steps):  # type: ignore[no-un
     first_variance, last_variance, coming = known[_FORWARD], known[_BACKWARD], known[_COMING]
     for row in range(np.uint64(height)):
         at = (row + np.uint64(1)) * np.uint64(width + 2) + np.uint64(1)
-        for first in range(np.uint64(0), np.uint64(width), np.uint64(_BEGUN)):
-            count = smaller(np.uint64(width) - first, np.uint64(_BEGUN))
+        for first in range(np.uint64(0), np.uint64(width), np.uint64(_BEGIN_BLOCK)):
+            count = smaller(np.uint64(width) - first, np.uint64(_BEGIN_BLOCK))
             _copy(step_on, row, first, count, known[_STEP_ON])
             _copy(step_off, row, first, count, known[_STEP_OFF])
             _copy(forward, row, first, count, first_variance)
@@ -331,10 +332,10 @@ def _advance_bridged(words, pixels, steps, clock, polarity, origin, rate, step_v
         flat(polarity),
     )
     last = np.uint64(len(words)) - two
-    # A software pipeline: while an event is filtered, the next one is weighed, and the clock is read for the one after.
-    # None waits for another, so that the processor works at all of them at a time.
-    event = _weighed(_met(words, np.uint64(0), clock, polarity, stride, origin), scalars)
-    following = _met(words, smaller(two, last), clock, polarity, stride, origin)
+    # A software pipeline: while an event is filtered, the noise of the next one is computed, and the clock is read for
+    # the one after. None of these depends on another, so that the processor executes them at the same time.
+    event = _with_noise(_looked_up(words, np.uint64(0), clock, polarity, stride, origin), scalars)
+    following = _looked_up(words, smaller(two, last), clock, polarity, stride, origin)
     for i in range(np.uint64(0), last + one, two):
         ahead = words[smaller(i + two * np.uint64(AHEAD), last) + one]
         place = event_row(ahead) * stride + event_column(ahead) + stride + one
@@ -353,14 +354,14 @@ def _advance_bridged(words, pixels, steps, clock, polarity, origin, rate, step_v
         forward, coming = known.forward + weight * scalars.step_variance, known.coming - weight
         pixel.rate = measurement_rate(scalars.rate, forward, known.backward + coming * scalars.step_variance)
         known.forward, known.coming = forward, coming
-        event = _weighed(following, scalars)
-        following = _met(words, smaller(i + two + two, last), clock, polarity, stride, origin)
+        event = _with_noise(following, scalars)
+        following = _looked_up(words, smaller(i + two + two, last), clock, polarity, stride, origin)
 
 
 @nb.njit(cache=True, inline="always")
-def _met(words, i, clock, polarity, stride, origin):  # type: ignore[no-untyped-def]
-    """An event, by the index of its first word: its pixel's place, us since that's state holds and since the newest
-    event around, and its second word. Sets the clock; the same event may be met again."""
+def _looked_up(words, i, clock, polarity, stride, origin):  # type: ignore[no-untyped-def]
+    """An event, by the index of its first word: its pixel's index, us since the time of the pixel's state, us since the
+    newest event around it, and the second word. Sets the clock; a second look-up does not change it."""
     now, word = np.int32(words[i] - origin), words[i + np.uint64(1)]
     at = event_row(word) * stride + event_column(word) + stride + np.uint64(1)
     since, age = _since(clock[at], now), np.int32(now - newest_around_inside(clock, at, stride))
@@ -370,10 +371,10 @@ def _met(words, i, clock, polarity, stride, origin):  # type: ignore[no-untyped-
 
 
 @nb.njit(cache=True, inline="always", error_model="numpy")
-def _weighed(met, scalars):  # type: ignore[no-untyped-def]
-    """An event after `_met`, weighed: its pixel's place, the seconds since that's state holds, its weight and polarity,
-    the probability that it is noise, and Q."""
-    at, since, age, word = met
+def _with_noise(event, scalars):  # type: ignore[no-untyped-def]
+    """An event after `_looked_up`, with its noise: the index of its pixel, seconds since the time of the pixel's state,
+    weight, whether it is on, the probability that it is noise, and Q."""
+    at, since, age, word = event
     signal = signal_probability(scalars.noise_rate, np.float32(age) * MICROSECOND32)
     weight, is_on = event_weight(word, WEIGHT_UNIT), event_is_on(word)
     noise = weight * threshold_noise(scalars.event_variance, scalars.threshold2, signal)

@@ -11,7 +11,7 @@ from kalux.augmentation import bridge, deblur
 from kalux.augmentation.bridge import BridgedSegment, BridgeNoise, Latent, Thresholds, UnshownMemory
 from kalux.augmentation.deblur import EXPOSED, EXPOSURE_FIELDS, Exposure, relative_levels
 from kalux.augmentation.highlights import (
-    Shown,
+    FrameHighlights,
     Tail,
     Unshown,
     above_frames,
@@ -33,7 +33,7 @@ from kalux.augmentation.trail import (
 from kalux.augmentation.unseen import (
     UNKNOWN_CHANGE,
     UNMEASURED_CHANGE,
-    forget_silence,
+    add_missed_change,
     half_way,
     silent_change,
     turns,
@@ -58,13 +58,13 @@ _SHARES: Final = (np.arange(64) + 0.5) / 64
 """Quantiles at which the distribution of black pixels is sampled."""
 
 _BLACK_FRAMES: Final = 3.0
-"""Black frames of a pixel that count as one measurement, since all say the same (docs/equations.md, K7)."""
+"""Black frames of a pixel that count as one measurement, since their errors are the same (docs/equations.md, K7)."""
 
 _DARKEST: Final = 10.0
-"""Log intensity below white from which on a pixel is black."""
+"""Largest log intensity below white that is told apart, so that black, log 0, stays finite."""
 
 _LEAST_ERROR: Final = 1e-9
-"""Least error of a threshold, log intensity, by which is divided."""
+"""Least standard deviation of a threshold, log intensity, since it is divided by."""
 
 
 class BridgeMemory(NamedTuple):
@@ -179,7 +179,7 @@ class BridgedFrames(Method):
             event_variance=self.settings.events.deblur_variance * self.on * self.off,
         )
         if shot.valid is not None:
-            latent.variance[~shot.valid] = bridge.UNSEEN
+            latent.variance[~shot.valid] = bridge.MASKED
         if crushed is None:
             return latent
         room = np.where(crushed, np.log(shot.level_ceiling + self.offset) - level_log, np.inf)
@@ -201,7 +201,7 @@ class BridgedFrames(Method):
         return black & hides if hides[black].any() else None
 
     def black(self, shot: Shot, crushed: NDArray[np.bool_]) -> tuple[Array, Array]:
-        """Mean and variance of log(I + I_0) of black levels (K7)."""
+        """Mean and variance of log(I + I_0) of the black levels, (N,) each (K7)."""
         seen = shot.levels if shot.valid is None else shot.levels[shot.valid]
         counts = np.bincount(seen.ravel(), minlength=len(shot.level_intensity))
         ceilings, place = np.unique(shot.level_ceiling[crushed], return_inverse=True)
@@ -232,14 +232,14 @@ class BridgedFrames(Method):
             since=shot.start,
             followed=followed,
             at_middle=followed,
-            unshown=begin_unshown(latent, shown(shot), tail),
+            unshown=begin_unshown(latent, frame_highlights(shot), tail),
             tail=tail,
             silent_change=np.full(self.shape, UNKNOWN_CHANGE * self.on * self.off, np.float32),
             silent=np.full(self.shape, np.nan, np.float32),
         )
         lead_in, value, variance = None, latent.value, latent.variance
         if not self.lookahead:
-            value, variance, _ = self._carried(memory, shot)
+            value, variance, _ = self._latent_at_end(memory, shot)
         elif shot.middle > begin:
             lead_in = bridge.extend_backward(latent, on, off, thresholds, self.noise, begin, shot.middle)
             lead_in = lead_in._replace(
@@ -250,16 +250,16 @@ class BridgedFrames(Method):
         unmeasured = variance >= bridge.UNMEASURED
         variance = np.where(unmeasured, np.float32(self.settings.filter.initial_variance), variance)
         if shot.valid is not None:
-            variance[~shot.valid] = self.unseen_variance(shot)
+            variance[~shot.valid] = self.masked_variance(shot)
         return memory, lead_in, State(value, variance, make_clock(self.shape, begin - shot.start))
 
     def segment(
         self, memory: BridgeMemory, shot: Shot, following: Shot | None, events: Chunks
     ) -> tuple[Segment, BridgeMemory]:
         if following is None:
-            return self._alone(memory, shot), memory
+            return self._open_segment(memory, shot), memory
         second = self.latent(following, events, memory.thresholds)
-        join = self._joined if self.lookahead else self._causal
+        join = self._lookahead_segment if self.lookahead else self._causal_segment
         return join(memory, shot, following, second, events)
 
     def _follow_unshown(
@@ -270,12 +270,14 @@ class BridgedFrames(Method):
         levels = following.levels.reshape(-1)[memory.unshown.pixels]
         noise = self.level_variance(following)[levels]
         moved = self.off / 2
-        return follow_unshown(memory.unshown, second, shown(following), noise, net, moved, memory.tail)
+        return follow_unshown(
+            memory.unshown, second, frame_highlights(following), noise, net, moved, memory.tail
+        )
 
-    def _alone(self, memory: BridgeMemory, shot: Shot) -> BridgedSegment:
-        """From the latest frame on, without a next one."""
+    def _open_segment(self, memory: BridgeMemory, shot: Shot) -> BridgedSegment:
+        """The segment from the latest frame on, while there is no next one."""
         start = self.node(shot)
-        latent = memory.latent if self.lookahead else self._carried(memory, shot)
+        latent = memory.latent if self.lookahead else self._latent_at_end(memory, shot)
         alone = bridge.extend(latent, memory.thresholds, self.noise, start, FAR_FUTURE, memory.interval, None)
         if shot.trail is None:
             trail = self._trail(memory.followed, start, memory.followed.scale)
@@ -288,10 +290,10 @@ class BridgedFrames(Method):
             silent_change=memory.silent_change,
         )
 
-    def _joined(
+    def _lookahead_segment(
         self, memory: BridgeMemory, shot: Shot, following: Shot, second: Latent, events: Chunks
     ) -> tuple[BridgedSegment, BridgeMemory]:
-        """From the middle of one exposure to that of the next."""
+        """The segment from the middle of one exposure to that of the next, and the memory after it."""
         start, end = shot.middle, following.middle
         on, off, at_middle = self.follow(events, start, end, memory.followed)
         trail, grown = self._trail_between(memory, shot, following, at_middle)
@@ -300,8 +302,8 @@ class BridgedFrames(Method):
         )
         change = self._silent_change(joined)
         share, silent = half_way(memory.silent, joined, self.noise.quantisation_variance, self.on * self.off)
-        joined, far_on, far_off = self._drifting(joined, memory, second, (on, off), change)
-        change = self._of_black(change, memory.latent, second)
+        joined, far_on, far_off = self._with_drift(joined, memory, second, (on, off), change)
+        change = self._with_black_change(change, memory.latent, second)
         assert joined.net is not None
         unshown = self._follow_unshown(memory, second, following, joined.net)
         after = memory._replace(
@@ -326,13 +328,13 @@ class BridgedFrames(Method):
         )
         return joined, after
 
-    def _causal(
+    def _causal_segment(
         self, memory: BridgeMemory, shot: Shot, following: Shot, second: Latent, events: Chunks
     ) -> tuple[BridgedSegment, BridgeMemory]:
-        """From the end of one exposure to that of the next, forward only.
+        """The segment from the end of one exposure to that of the next, forward only, and the memory after it.
 
-        The bridge from the middle of the first exposure serves the thresholds and later segments: when this segment is
-        read, the second frame is not known yet.
+        The second frame is not known yet when the segment is read. The bridge to it is made for what later segments
+        need: thresholds, silent pixels, highlights.
         """
         start = shot.end
         on, off, at_middle = self.follow(events, start, following.middle, memory.followed)
@@ -364,16 +366,16 @@ class BridgedFrames(Method):
             silent_change=self._silent_change(behind),
         )
         forward = bridge.extend(
-            self._carried(memory, shot),
+            self._latent_at_end(memory, shot),
             memory.thresholds,
             self.noise,
             start,
             following.end,
             memory.interval,
-            self._carried(after, following),
+            self._latent_at_end(after, following),
         )
         counts, change = (on + tail_on, off + tail_off), memory.silent_change
-        forward, far_on, far_off = self._drifting(forward, memory, second, counts, change)
+        forward, far_on, far_off = self._with_drift(forward, memory, second, counts, change)
         trail = self._trail(memory.followed, start, scale)
         forward = forward._replace(trail=trail, unshown=memory.unshown, silent_change=change)
         return forward, after._replace(far_on=far_on, far_off=far_off)
@@ -419,15 +421,15 @@ class BridgedFrames(Method):
     def _silent_change(self, segment: BridgedSegment) -> Floats:
         return silent_change(segment, self.noise.quantisation_variance, self.on * self.off)
 
-    def _of_black(self, change: Floats, *frames: Latent) -> Floats:
-        """The change of silent pixels, where a frame is black: there frames do not show that it is small (K11)."""
+    def _with_black_change(self, change: Floats, *frames: Latent) -> Floats:
+        """The ``change`` of silent pixels, larger where a frame is black and cannot show that it is small (K11)."""
         for frame in frames:
             if frame.ceiling is not None:
                 unmeasured = np.float32(UNMEASURED_CHANGE * self.on * self.off)
                 change = np.where(np.isfinite(frame.ceiling), unmeasured, change)
         return change
 
-    def _drifting(
+    def _with_drift(
         self,
         segment: BridgedSegment,
         memory: BridgeMemory,
@@ -440,17 +442,25 @@ class BridgedFrames(Method):
         ``counts`` are its on and off events, ``change`` is the mean square change of silent pixels around each (K11).
         """
         grown, far_on, far_off = bridge.drift(
-            memory.latent, second, memory.thresholds, self.noise, self._far(memory, segment), counts
+            memory.latent,
+            second,
+            memory.thresholds,
+            self.noise,
+            self._events_since_measured(memory, segment),
+            counts,
         )
-        forget_silence(grown, segment, second, counts, change, self.noise.quantisation_variance)
+        add_missed_change(grown, segment, second, counts, change, self.noise.quantisation_variance)
         if second.ceiling is not None:
             black = np.isfinite(second.ceiling)
             grown[black] = second.variance[black] / (_BLACK_FRAMES * (_BLACK_FRAMES + 1))
         segment = segment._replace(drift=grown, still_since=_still_since(memory, segment.start))
         return segment, far_on, far_off
 
-    def _far(self, memory: BridgeMemory, segment: BridgedSegment) -> tuple[Floats, Floats]:
-        """(H, W) on and off events since a pixel was measured; of a bound, as many as raised it above the frames'."""
+    def _events_since_measured(self, memory: BridgeMemory, segment: BridgedSegment) -> tuple[Floats, Floats]:
+        """(H, W) on and off events since a frame measured each pixel.
+
+        Of a pixel that no frame has measured, at most as many as raise its bound above those by the frames (K15).
+        """
         pixels, known = memory.unshown.pixels, memory.thresholds
         if len(pixels) == 0:
             return memory.far_on, memory.far_off
@@ -462,8 +472,8 @@ class BridgedFrames(Method):
             counts.reshape(-1)[pixels] = np.minimum(counts.reshape(-1)[pixels], above / each)
         return far
 
-    def _carried(self, memory: BridgeMemory, shot: Shot) -> Latent:
-        """The latest frame, ``shot``, from the middle to the end of its exposure, with the events between (10)."""
+    def _latent_at_end(self, memory: BridgeMemory, shot: Shot) -> Latent:
+        """The latest frame, ``shot``, at the end of its exposure: moved there from its middle by events (10)."""
         step = self.on * memory.thresholds.on * memory.on - self.off * memory.thresholds.off * memory.off
         scale = memory.followed.scale
         step += self._trail_at(memory.followed, shot.end, scale)
@@ -475,10 +485,13 @@ class BridgedFrames(Method):
         )
 
     def begin(self, segment: Any, state: State) -> akf_bridged.Cursor:
-        return akf_bridged.begin(segment, self._with_sure_bounds(segment, state))
+        return akf_bridged.begin(segment, self._with_limited_bounds(segment, state))
 
-    def _with_sure_bounds(self, segment: BridgedSegment, state: State) -> State:
-        """The state at the segment's start; P of a bound is limited by how far it lies above the frames' (K15)."""
+    def _with_limited_bounds(self, segment: BridgedSegment, state: State) -> State:
+        """The state at the segment's start, with P of pixels that no frame has measured limited (K15).
+
+        Their bounds are too high by no more than their distance from the bounds by the frames.
+        """
         if segment.unshown is None or len(segment.unshown.pixels) == 0:
             return state
         pixels, variance = segment.unshown.pixels, state.variance.copy()
@@ -546,8 +559,8 @@ class BridgedFrames(Method):
         )
 
 
-def shown(shot: Shot) -> Shown:
-    """The clipped pixels of a frame, and how far below white the others are."""
+def frame_highlights(shot: Shot) -> FrameHighlights:
+    """What a frame shows of highlights: its clipped pixels, and how far the others are below white."""
     clipped = shot.level_clipped
     white = shot.level_intensity[clipped].min() if clipped.any() else shot.white
     with np.errstate(divide="ignore"):
@@ -556,13 +569,14 @@ def shown(shot: Shot) -> Shown:
     of_levels = np.clip(darker, 0.0, _DARKEST).astype(np.float32)
     saturated, far = shot.clipped, of_levels[shot.levels]
     if shot.valid is None:
-        return Shown(saturated, far, ~saturated, shot.pitch)
+        return FrameHighlights(saturated, far, ~saturated, shot.pitch)
     far[~shot.valid] = 0.0
-    return Shown(saturated & shot.valid, far, ~saturated & shot.valid, shot.pitch)
+    return FrameHighlights(saturated & shot.valid, far, ~saturated & shot.valid, shot.pitch)
 
 
 def _still_since(memory: BridgeMemory, start: int) -> int:
-    """One frame interval before a segment, but not before the first exposure, us."""
+    """us: pixels without an event since then are still; one frame interval before the segment that begins at ``start``,
+    but not before the first exposure."""
     return max(start - round(memory.interval * 1e6), memory.since)
 
 

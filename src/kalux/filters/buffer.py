@@ -14,7 +14,7 @@ from kalux.event_slices import events_until
 from kalux.events import EVENT_DTYPE, LATEST, EventArray
 
 _BLOCK: Final = 1 << 16
-"""Events that a block of memory holds at least: 1 MB, so that single events cost no allocation each."""
+"""Least events of a block of memory, 1 MB, so that pushes of single events do not allocate each."""
 
 _SPARE: Final = 1 << 20
 """Largest block that is kept for reuse: fresh memory costs more than the copy into it."""
@@ -144,7 +144,7 @@ class EventBuffer:
             first += count
 
     def _shrink(self, block: _Block) -> None:
-        """A small rest must not keep a large block in memory."""
+        """Copy the rest of a large block to memory of its own size, so that the block is freed."""
         if len(block.memory) > _SPARE:
             rest = _copied(block.events)
             block.memory, block.start, block.stop = rest, 0, len(rest)

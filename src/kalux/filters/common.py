@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from kalux import memory
 from kalux.compiled import larger, largest_around, loop, smaller
 
-MICROSECOND = 1e-6
+MICROSECOND: Final = 1e-6
+"""Seconds."""
 
 Clock = NDArray[np.int32]
 """(H + 2, W + 2) int32: time of every pixel's newest event, us after an origin kept beside it. The frame of one pixel
@@ -61,5 +62,5 @@ def newest_around(newest, row, column):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, inline="always")
 def newest_around_inside(clock, at, stride):  # type: ignore[no-untyped-def]
-    """The same of a flat `Clock` of rows of ``stride``, by a pixel's index in it."""
+    """As `newest_around`, of a flat `Clock` with rows of ``stride``, by a pixel's index in it."""
     return largest_around(clock, at, stride)

@@ -1,4 +1,4 @@
-"""The complementary filter's way from frame to frame: each frame is held until the next."""
+"""The complementary filter from frame to frame: each frame is held until the next."""
 
 from __future__ import annotations
 
@@ -53,5 +53,5 @@ class HeldFrames(Method):
         return self._state(complementary.read(segment, cursor, segment.end))
 
     def _state(self, log_intensity: Floats) -> State:
-        """It has neither a variance nor a memory of events."""
+        """The filter's state, which has neither a variance nor times of events."""
         return State(log_intensity, np.empty(0), np.empty(0, np.int64))

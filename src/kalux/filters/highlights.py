@@ -17,22 +17,22 @@ _LIKELY: Final = np.float32(2.0)
 """Standard deviations of its events by which a bound may be too high."""
 
 _ABOUT_WHITE: Final = np.float32(0.1)
-"""How far below white, log intensity, pixels lie whom neighbours may take as far again: the least threshold of sensors.
-Those that frames have lifted lie up to 0.05 below it until the next frame."""
+"""How far below white, log intensity, a pixel lies that averaging may take down by as much again: the least threshold
+of sensors. Pixels that frames have raised lie up to 0.05 below white until the next frame."""
 
 _LEAST_SPREAD: Final = np.float32(0.3)
-"""Standard deviation that is left where pixels around say that all lie just above their bounds."""
+"""Least standard deviation of the excess, where hardly any is expected."""
 
 _LEAST: Final = np.float32(1e-6)
-"""Of what is expected above a bound, and of what is not known of it: a division."""
+"""Least expected excess, and least variance of it, since it is divided by these."""
 
 
 def tempered(unshown: Unshown, bound: Floats, prior: HighlightPrior) -> Unshown:
-    """What is expected above a bound that is beyond white itself: highlights end somewhere.
+    """``unshown`` with less expected above bounds that lie beyond white themselves, by the prior on highlights (K6).
 
-    Above the bound the exponential distribution of `Unshown` and the normal one of the prior on highlights (K6) fall at
-    the rates 1 / e and d / s^2, d the bound's distance from white: together, e becomes 1 / (1 / e + d / s^2). Without
-    that prior nothing changes.
+    Above the bound the exponential distribution of `Unshown` and the normal one of the prior fall at the rates 1 / e
+    and d / s^2, d the bound's distance from white: together, e becomes 1 / (1 / e + d / s^2). Without the prior nothing
+    changes.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ def tempered(unshown: Unshown, bound: Floats, prior: HighlightPrior) -> Unshown:
 
 
 def lifted(log_intensity: Floats, variance: Floats, unshown: Unshown) -> tuple[Floats, Floats]:
-    """L and P, (H, W), with pixels where they are expected above their bounds, and the variance of that."""
+    """L and P, (H, W), with unshown pixels raised to their expected levels, with the variances of these."""
     level, spread = log_intensity.copy(), variance.copy()
     level.reshape(-1)[unshown.pixels] += unshown.excess
     spread.reshape(-1)[unshown.pixels] = np.maximum(unshown.excess, _LEAST_SPREAD) ** 2 + unshown.noise
@@ -56,28 +56,28 @@ def lifted(log_intensity: Floats, variance: Floats, unshown: Unshown) -> tuple[F
 
 def read_unshown(
     image: NDArray[np.float32],
-    heard: Floats,
+    level: Floats,
     bound: Floats,
     unshown: Unshown,
     log_offset: float,
     prior: HighlightPrior,
 ) -> None:
-    """Pixels that no frame has shown are given the mean of their intensity. In place.
+    """Read out pixels that no frame has shown: the mean of their intensity, into ``image``. In place.
 
     Parameters
     ----------
     image
         (H, W) I.
-    heard
-        (N,) L of these pixels of `lifted`, after their neighbours are heard (K12).
+    level
+        (N,) L of these pixels of `lifted`, after averaging with their neighbours (K12).
     bound
-        (H, W) L: what neighbours say of a pixel takes it no farther below than its noise makes likely, nor below white.
+        (H, W) L: averaging takes a pixel no farther below than its noise makes likely, nor below white.
     log_offset, prior
-        I_0, and the prior on highlights (K6), which is to doubt what events say of them, not that they are bright.
+        I_0, and the prior on highlights (K6), applied to the events' part of their levels only.
     """
     least = bound.reshape(-1)[unshown.pixels]
     likely = np.maximum(least - _LIKELY * np.sqrt(unshown.noise), np.float32(prior.white))
-    mean = np.maximum(heard, np.minimum(least, likely)).astype(np.float32)
+    mean = np.maximum(level, np.minimum(least, likely)).astype(np.float32)
     white, scale2, stretch = (np.float32(value) for value in prior)
     _take_mean(unshown.excess, unshown.noise, np.float32(log_offset), white, scale2, stretch, mean)
     image.reshape(-1)[unshown.pixels] = mean
@@ -90,10 +90,10 @@ def keep_white(
     log_offset: float,
     prior: HighlightPrior,
 ) -> None:
-    """Of the pixels that no frame around measures, those of which L is about white or more stay about white. In place.
+    """Keep averaging (K12) from darkening pixels that the frames around clip: these stay about white. In place.
 
-    The frames have clipped them then, and no event has taken them down since. The farther they are below white all the
-    same, the farther neighbours may take them.
+    Of the ``unmeasured`` pixels they are those with L about white or more: no event has taken them down since. The
+    farther L is below white, the farther below it they may be.
     """
     scalars = np.float32(prior.white), np.float32(log_offset)
     _keep(log_intensity.reshape(-1), unmeasured, *scalars, image.reshape(-1))
@@ -128,11 +128,10 @@ def smoothed_unshown(
 ) -> Unshown | None:
     """Pixels that no frame of the recording measures: both bounds hold. Raises ``smoothed``, (H, W) L, in place.
 
-    Both directions are L, P and the pixels that no frame has measured in that direction. What is expected above the
-    bounds is the mean of what both expect, weighted by what they know of it, each in units of its own. The level is
-    the mean of both, but no less than either bound where its events can be trusted: highlights fall off exponentially
-    with the scale of what is expected and what is not known of it, and a bound with noise is believed to be lower by
-    the noise over that scale. What the level rises by is no more to be expected above it.
+    ``forward`` and ``backward`` are L, P and the pixels that no frame has measured in that direction. The expected
+    excess is the mean of both, weighted by the inverse relative variance. The level is the mean of both, but no less
+    than either bound, lowered by its noise over the scale of the excess: that is the mean of a normal variable times
+    an exponential density. By what the level rises, less is expected above it.
     """
     if forward[2] is None or backward[2] is None:
         return None
@@ -167,9 +166,9 @@ def obey_bounds(
 ) -> None:
     """Smoothed L, and variances of it, (H, W), where one direction of time knows no more than a ``bound``. In place.
 
-    Both are L, P and the pixels that no frame has measured in that direction. A bound is no measurement: L and P are
-    those of the other direction. Where the level that is ``known`` lies below the bound, both are wrong, each in
-    proportion to its variance.
+    ``bound`` and ``known`` are L, P and the pixels that no frame has measured in that direction. A bound is no
+    measurement: L and P are those of the direction that has one. Where its level lies below the bound, both are wrong:
+    the level is raised towards the bound by its share of the sum of both variances.
     """
     bounds, _, unshown = bound
     level, variance, other = known

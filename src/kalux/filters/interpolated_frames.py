@@ -1,4 +1,4 @@
-"""The paper's way from frame to frame: frames deblurred and interpolated by (10) to (13)."""
+"""The paper's method: frames are deblurred, and interpolated by (10) to (13)."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class InterpolatedFrames(Method):
     Causal mode goes from the end of one exposure to the end of the next with L^{A-} and the previous c_p.
     """
 
-    _UNSEEN: Final = 1e6  # R_bar: worth nothing beside P, and integrals of 1/R over a linear R (7) stay exact
+    _MASKED: Final = 1e6  # R_bar: worth nothing beside P, and integrals of 1/R over a linear R (7) stay exact
 
     def node(self, shot: Shot) -> int:
         return shot.start if self.lookahead else shot.end
@@ -76,7 +76,7 @@ class InterpolatedFrames(Method):
     def measured_r_bar(self, shot: Shot) -> Array:
         """R_bar as a measurement: without weight where the frame says nothing."""
         r_bar = self.r_bar(shot)
-        return r_bar if shot.valid is None else np.where(shot.valid, r_bar, self._UNSEEN)
+        return r_bar if shot.valid is None else np.where(shot.valid, r_bar, self._MASKED)
 
     def log_frame(self, shot: Shot) -> Array:
         """L^F of equation (8), with its bias."""
@@ -89,7 +89,7 @@ class InterpolatedFrames(Method):
         value = latent if self.lookahead else deblur.latent_end(self.log_frame(shot), integrals)
         variance = np.full(self.shape, self.settings.filter.initial_variance)
         if shot.valid is not None:
-            variance[~shot.valid] = self.unseen_variance(shot)
+            variance[~shot.valid] = self.masked_variance(shot)
         return memory, None, State(value, variance, np.full(self.shape, self.node(shot), np.int64))
 
     def segment(
@@ -99,8 +99,8 @@ class InterpolatedFrames(Method):
             return self._causal(memory, shot, following, events)
         start_latent = deblur.latent_start(self.log_frame(shot), memory.integrals)
         # (17) as printed follows L^A wherever that goes, so that L^A must not go to values that are no measurements.
-        unseen = self.unseen(shot)
-        start_latent[unseen] = memory.forward[unseen]
+        masked = self.masked(shot)
+        start_latent[masked] = memory.forward[masked]
         if following is None:
             segment = self._segment(memory, shot, None, start_latent, memory.scale, FAR_FUTURE)
             return segment, memory
@@ -108,12 +108,12 @@ class InterpolatedFrames(Method):
         end_latent = deblur.latent_end(self.log_frame(following), integrals)
         integral = self.nominal(all_between(events, shot.start, following.end))
         scale = interpolation.threshold_scale(end_latent - start_latent, integral)  # (12)
-        unseen_next = self.unseen(following)
-        scale[unseen | unseen_next] = 1.0
-        end_latent[unseen_next] = (start_latent + integral)[unseen_next]
+        masked_next = self.masked(following)
+        scale[masked | masked_next] = 1.0
+        end_latent[masked_next] = (start_latent + integral)[masked_next]
         at_start = interpolation.backward(end_latent, scale, integral)  # (11)
-        start_latent[unseen] = at_start[unseen]
-        memory = memory._replace(forward=np.where(unseen, at_start, memory.forward))
+        start_latent[masked] = at_start[masked]
+        memory = memory._replace(forward=np.where(masked, at_start, memory.forward))
         segment = self._segment(memory, shot, following, at_start, scale, following.start)
         to_next = self.nominal(all_between(events, shot.start, following.start))
         forward = interpolation.forward(start_latent, scale, to_next)  # (10)
@@ -167,7 +167,7 @@ class InterpolatedFrames(Method):
         start_latent = deblur.latent_start(self.log_frame(shot), memory.integrals)
         integral = memory.integrals.to_end + self.nominal(all_between(events, shot.end, following.end))
         scale = interpolation.threshold_scale(end_latent - start_latent, integral)
-        scale[self.unseen(shot) | self.unseen(following)] = 1.0
+        scale[self.masked(shot) | self.masked(following)] = 1.0
         return segment, InterpolationMemory(integrals, end_latent, scale, shot)
 
     @property

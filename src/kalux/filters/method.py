@@ -47,7 +47,7 @@ class Segment(Protocol):
 
 
 class Method(ABC):
-    """One way to filter. Memory, segments and cursors are opaque to its caller.
+    """A method to filter from frame to frame. Memory, segments and cursors are opaque to its caller.
 
     Queries that a method does not support return None, or 0.
     """
@@ -141,11 +141,11 @@ class Method(ABC):
         """Number of on and off events of every pixel with start < t <= end."""
         return count_chunks(all_between(events, start, end), self.shape, weighed=True)
 
-    def unseen(self, shot: Shot) -> NDArray[np.bool_]:
+    def masked(self, shot: Shot) -> NDArray[np.bool_]:
         """(H, W) bool: pixels that the frame masks out."""
         return np.zeros(self.shape, bool) if shot.valid is None else ~shot.valid
 
-    def unseen_variance(self, shot: Shot) -> float:
+    def masked_variance(self, shot: Shot) -> float:
         """P of a pixel that the first frame masks out: at least the variance of the others' log intensities."""
         seen = self.log_frame(shot)[shot.valid]
         return max(self.settings.filter.initial_variance, float(np.var(seen)) if seen.size else 0.0)

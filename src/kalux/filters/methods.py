@@ -1,4 +1,4 @@
-"""The method that settings name."""
+"""Choice of the method that settings name."""
 
 from __future__ import annotations
 

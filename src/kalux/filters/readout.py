@@ -32,10 +32,10 @@ from kalux.formulas import Number, Row, choose, formula
 Array = NDArray[np.floating[Any]]
 
 _UNKNOWN: Final = np.float32(1e9)
-"""Variance of a pixel without information; the product of four sums of two is still a float32."""
+"""Variance of a pixel without information. The product of four sums of two such variances is finite in float32."""
 
 _LEAST_VARIANCE: Final = np.float32(1e-9)
-"""Least that is added to a variance, so that the inverse of such a product is a float32 as well."""
+"""Least value that is added to a variance, so that the inverse of such a product is finite as well."""
 
 _BLOCK: Final = 32
 """Pixels of a row in a block: blocks without highlights, or without moving pixels, are skipped."""
@@ -52,21 +52,21 @@ _VECTOR: Final = 16
 """float32 in a line of the cache, and in the widest vector."""
 
 _ASIDE: Final = _VECTOR
-"""Pixels of the margin that are compared: at least three times the pitch, and a whole vector, so that rows stay aligned
-to lines of the cache."""
+"""Pixels of the margin that are compared with their neighbours: at least three times the pitch, and a whole vector, so
+that rows stay aligned to lines of the cache."""
 
 _ROW: Final = _STRIP + 2 * _MARGIN
 
 SHARED: Final = np.float32(0.7)
-"""Part of the variance that averaging neighbours does not reduce, since their errors are correlated: by 0.1 to 0.5 on
-eleven simulated scenes, whose relative MSE is 1 % less at 0.5; real sensors, whose thresholds and bandwidth are wrong
-for all pixels alike, ask for more (docs/equations.md, K12)."""
+"""Part of the variance that averaging does not reduce, since errors of neighbours are correlated. Correlations are 0.1
+to 0.5 on eleven simulated scenes, whose relative MSE is 1 % less at 0.5; real sensors, with errors of thresholds and
+bandwidth that are common to all pixels, need more (docs/equations.md, K12)."""
 
 _SLACK: Final = np.float32(1 / 8)
 """Part of the variance of neighbours' differences by which patches of one surface differ beyond their noise."""
 
 _HALF_OF_PATCH: Final = np.float32(1 / 18)
-"""From the sum over a patch of nine to half its mean."""
+"""Factor from the sum over a patch of nine pixels to half its mean."""
 
 _ZERO, _ONE, _TWO, _THREE, _FOUR = (np.uint64(k * _ROW) for k in range(5))
 _LEVEL, _VARIANCE = np.uint64(0), np.uint64(_ROW)
@@ -151,8 +151,8 @@ def believed_highlight(excess, variance, scale2, stretch):  # type: ignore[no-un
 def lambert_w(x: Number) -> Number:
     """Lambert's W of a float32 x >= 0, to 4e-7 of itself.
 
-    A guess that is everywhere within 2 % (Iacono and Boyd 2017, eq. 17, in other words), and one step of
-    Fritsch's iteration, which takes the error to its fourth power.
+    A first guess with errors of up to 2 % (Iacono and Boyd 2017, eq. 17, rearranged), and one step of Fritsch's
+    iteration, after which the error is its fourth power.
     """
     two = np.float32(2.0)
     least = x.like(np.float32(1e-30))
@@ -297,11 +297,11 @@ def _plane(values: Array | None, shape: tuple[int, ...]) -> NDArray[np.float32]:
     return np.zeros(shape, np.float32) if values is None else np.ascontiguousarray(values, np.float32)
 
 
-# The loops below take whole arrays and offsets into them: a view of a row costs more than some of the work on it.
-# Offsets count from the first pixel of a loop, so that none is below another: unsigned numbers that wrap around keep
-# a loop from becoming vector code. So do many arrays, and loops that write to an array of which they read another row.
-# Arrays are passed one by one: taking one out of a tuple counts a reference, in an atomic operation; for every row,
-# these are 4 % of an image. Long functions are inlined by numba, since LLVM would also compile them alone.
+# The loops below take whole arrays and offsets into them, since making a view of a row costs more than some of the work
+# on it. Three things keep a loop from becoming vector code: unsigned offsets that wrap around (so they count from the
+# first pixel of a loop), many arrays, and writing to an array of which another row is read. Arrays are passed one by
+# one: taking one out of a tuple counts a reference, an atomic operation, which for every row is 4 % of an image. Long
+# functions are inlined by numba, since LLVM would also compile them separately.
 
 
 @loop(fastmath=FUSED)
@@ -350,7 +350,7 @@ def _read_out(  # type: ignore[no-untyped-def]
     start, size = np.uint64(begin), np.uint64(end - begin)
     for row in range(-3 * pitch if knows_moving else 0, height):
         at = np.uint64(row)
-        # The columns with moving pixels. As literals, all functions that take them would be compiled twice.
+        # The columns with moving pixels. Typed, since for literals all functions that take them are compiled once more.
         first, last = np.int64(_STRIP), np.int64(0)
         if knows_moving:
             _load_row(log_intensity, variance, moving, change, hidden, row + 2 * pitch, begin, count, states)
@@ -451,7 +451,7 @@ def _mark_moving(moving, row, begin, marked, spans):  # type: ignore[no-untyped-
     spans[place, 0], spans[place, 1] = first, last
 
 
-# Of four numbers a to d, quotients by them share a division: (b, a) c d / a b c d and a b (d, c) / a b c d.
+# Quotients by four numbers a to d share one division: 1/a = b c d / (a b c d), and so on.
 
 
 @formula()

@@ -285,20 +285,20 @@ def inverse_response(camera: Camera, response: Array, exposure_ratio: float) -> 
 
 
 class BrightTail(NamedTuple):
-    """How many pixels of frames are at least half as bright as white, and how many about white."""
+    """Numbers of pixels that are at least half as bright as white, and about white."""
 
     half: int = 0
     white: int = 0
 
     def joined(self, other: BrightTail) -> BrightTail:
-        """Both together."""
+        """The counts of two sets of frames together."""
         return BrightTail(self.half + other.half, self.white + other.white)
 
     @property
     def scale(self) -> float:
-        """Of an exponential distribution of the log intensity that falls as much from half of white to white.
+        """Scale of an exponential distribution of the log intensity that falls as much from half of white to white.
 
-        Bounded by 0.3, also where nothing is white, and 2: beyond these the few pixels say nothing.
+        Within 0.3, which is also taken where nothing is white, and 2: beyond these it rests on too few pixels.
         """
         if self.white == 0:
             return _TAIL_BOUNDS[0]
@@ -310,14 +310,14 @@ class BrightTail(NamedTuple):
 _TAIL_BOUNDS: Final = (0.3, 2.0)
 
 _NO_TAIL: Final = 0.275
-"""Scale of a tail that does not go on beyond white, just below the least that is told. It is 0.30 where the sun glints
-on cars in a street and no frame tells how much brighter that is, 0.34 on another recording, 0.44 to 2 on forty
-simulated scenes that do go on, by 0.3 to 4.4 in log intensity."""
+"""Scale of a tail that does not go on beyond white, just below the least measured one. That is 0.30 where the sun
+glints on cars in a street, and no frame shows how bright that is; it is 0.34 on another recording, and 0.44 to 2 on
+forty simulated scenes that go on beyond white, by 0.3 to 4.4 in log intensity."""
 
 _MOST_BEYOND: Final = 0.5
-"""Where much of a frame is white, its tail says no more than that highlights go far: how far, pixels that leave
-saturation tell. On eleven simulated scenes bounds of 0.5, 0.8 and none are alike (relative MSE 0.165, 0.163, 0.164);
-without one, scenes of which a large part is white but hardly more come out four times as bright."""
+"""Where much of a frame is white, its tail shows only that highlights go far beyond white; how far, pixels that leave
+saturation show. On eleven simulated scenes bounds of 0.5, 0.8 and none are about equal (relative MSE 0.165, 0.163,
+0.164); without one, scenes of which a large part is white but hardly more come out four times too bright."""
 
 
 def beyond_white(scale: float) -> float:

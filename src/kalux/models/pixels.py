@@ -1,4 +1,4 @@
-"""What is known of single event pixels: their thresholds, and which of them are not to be believed."""
+"""Calibration of single event pixels: their thresholds, and which of them are hot."""
 
 from __future__ import annotations
 

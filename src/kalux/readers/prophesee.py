@@ -32,7 +32,8 @@ _SIZES: Final = {
 }
 _VERSIONS: Final = {"2.0": "EVT2", "2.1": "EVT21", "3.0": "EVT3"}
 _ENCODINGS: Final = {"EVT2": evt.EVT2, "EVT21": evt.EVT21, "EVT3": evt.EVT3}
-_DAT_EVENTS: Final = {0: "events", 12: "events", 14: "edges of trigger inputs"}  # type: kind of record
+_DAT_EVENTS: Final = {0: "events", 12: "events", 14: "edges of trigger inputs"}
+"""What the records of a DAT file are, by the type that it states."""
 
 
 @dataclass(frozen=True)

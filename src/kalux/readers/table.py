@@ -182,11 +182,11 @@ def _read_header(path: Path, data: bytes) -> _Header:
     roles = tuple(columns[:4].index(name) + 1 if name in columns[:4] else 0 for name in names)
     separator = _separator(lines[index].strip().lstrip("#").strip())
     assumed = () if columns.unit else (UNIT_ASSUMED,)
-    return _Header(begin, index + 1, separator, _once(roles), columns.unit, assumed)
+    return _Header(begin, index + 1, separator, _first_of_each(roles), columns.unit, assumed)
 
 
-def _once(roles: tuple[int, ...]) -> tuple[int, ...]:
-    """A name that occurs twice counts where it comes first."""
+def _first_of_each(roles: tuple[int, ...]) -> tuple[int, ...]:
+    """The roles of columns, 0 where an earlier column has the same role."""
     return tuple(0 if role in roles[:i] else role for i, role in enumerate(roles))
 
 

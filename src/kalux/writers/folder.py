@@ -67,7 +67,7 @@ class FolderWriter(Writer):
             try:
                 prepare_folder(path, overwrite=overwrite)
                 settings.write(complete=False, images=0, times=None)
-                self._told = time.monotonic()
+                self._settings_written = time.monotonic()
                 write_within(path / LISTING, f"{HEADER}\n".encode())
                 self._listing = FileIO(path / LISTING, "a")
             except BaseException:
@@ -94,7 +94,7 @@ class FolderWriter(Writer):
                 remove_quietly(file)
                 raise
         self._count(image.t)
-        if time.monotonic() - self._told >= SETTINGS_EVERY:
+        if time.monotonic() - self._settings_written >= SETTINGS_EVERY:
             self._write_settings(complete=False)
 
     def _finish(self, complete: bool) -> None:
@@ -119,7 +119,7 @@ class FolderWriter(Writer):
     def _write_settings(self, *, complete: bool) -> None:
         with output_errors(self._settings.path, self._consequence()):
             self._settings.write(complete=complete, images=self._images, times=self._times)
-        self._told = time.monotonic()
+        self._settings_written = time.monotonic()
 
     def _consequence(self) -> str:
         if not self._images:

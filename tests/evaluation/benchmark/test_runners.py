@@ -3,7 +3,14 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
+import pickle
+import signal
+import subprocess
+import sys
 import time
+from contextlib import suppress
+from pathlib import Path
 
 import pytest
 
@@ -53,14 +60,60 @@ def test_giving_up_stops_the_processes(small_set, monkeypatch):
     running = in_processes([small_set.job("hold"), small_set.job("cf")], 2)
     job, outcome = next(running)
     assert (job.method, type(outcome)) == ("hold", Finished)
-    deadline = time.monotonic() + 60
-    while not list(small_set.folder.glob("pid-*")) and time.monotonic() < deadline:
-        time.sleep(0.05)
+    assert wait_until(lambda: list(small_set.folder.glob("pid-*")), 60)
     begun = time.monotonic()
     running.close()
     assert time.monotonic() - begun < 10
     alive = {process.pid for process in multiprocessing.active_children()}
     assert not alive & {int(path.name[4:]) for path in small_set.folder.glob("pid-*")}
+
+
+BENCHMARK = """
+import pickle, sys
+import deadly
+from kalux.evaluation.benchmark import runners
+
+runners.run_job = deadly.endless
+jobs = pickle.loads(sys.stdin.buffer.read())
+list(runners.in_processes(jobs, len(jobs)))
+"""
+
+
+def runs(pid):
+    """Whether a process runs; one that has ended and is not waited for by its parent does not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def wait_until(condition, seconds):
+    deadline = time.monotonic() + seconds
+    while not condition() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    return condition()
+
+
+def test_processes_end_when_their_parent_is_killed(small_set):
+    """It has no chance to stop them, and nobody would take what they find."""
+    jobs = [small_set.job("cf"), small_set.job("mean")]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    parent = subprocess.Popen([sys.executable, "-c", BENCHMARK], stdin=subprocess.PIPE, env=environment)
+    workers = []
+    try:
+        parent.stdin.write(pickle.dumps(jobs))
+        parent.stdin.close()
+        assert wait_until(lambda: len(list(small_set.folder.glob("pid-*"))) == 2, 120)
+        workers = [int(path.name[4:]) for path in small_set.folder.glob("pid-*")]
+        assert all(map(runs, workers))
+        parent.kill()
+        assert wait_until(lambda: not any(map(runs, workers)), 10)
+    finally:
+        parent.kill()
+        parent.wait()
+        for worker in filter(runs, workers):
+            with suppress(ProcessLookupError):
+                os.kill(worker, signal.SIGKILL)
 
 
 def test_dask_finds_what_this_process_finds_and_runs_the_job_of_a_killed_worker_again(

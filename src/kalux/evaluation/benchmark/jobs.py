@@ -337,7 +337,7 @@ def _comparison(job: Job, recording: Recording) -> _Comparison:
 
 
 def _artificial_described(options: Options) -> str:
-    """Whose truth that of an artificial recording is."""
+    """What the truth of an artificial recording is, as the end of a sentence."""
     assert options.ahdr is not None
     frames = "original frames"
     if options.hold_out_frames is not None:
@@ -403,7 +403,7 @@ class Pictures:
 
 
 def _masked(image: NDArray[Any], pair: Pair) -> NDArray[Any]:
-    """NaN where nothing is compared."""
+    """The image with NaN where nothing is compared."""
     return np.asarray(image, np.float64) if pair.mask is None else np.where(pair.mask, image, np.nan)
 
 

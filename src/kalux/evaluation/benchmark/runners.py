@@ -11,9 +11,11 @@ import importlib
 import multiprocessing
 import os
 import signal
+import threading
 from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from multiprocessing.connection import wait
 from typing import Any, Final
 
 from kalux.errors import InputError, MissingDependencyError
@@ -64,7 +66,7 @@ def _pool(jobs: list[Job], processes: int) -> Generator[tuple[Job, Outcome | Non
     pool = ProcessPoolExecutor(
         min(processes, len(jobs)),
         mp_context=multiprocessing.get_context("spawn"),
-        initializer=_ignore_interrupts,
+        initializer=_begin_worker,
     )
     try:
         with _environment(_ONE_THREAD):  # the processes start with the first job
@@ -85,9 +87,20 @@ def _pool(jobs: list[Job], processes: int) -> Generator[tuple[Job, Outcome | Non
                 process.join(0.05)
 
 
-def _ignore_interrupts() -> None:
-    """Ctrl-C reaches all processes of a terminal; only the first is to answer."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+def _begin_worker() -> None:
+    """Prepare a process of the pool: it leaves Ctrl-C to its parent, and does not outlive it."""
+    signal.signal(
+        signal.SIGINT, signal.SIG_IGN
+    )  # a terminal sends it to all processes; only the first answers
+    threading.Thread(target=_exit_with_parent, name="kalux-parent", daemon=True).start()
+
+
+def _exit_with_parent() -> None:
+    """Exit as soon as the parent has ended: one that was killed cannot stop its processes, nor take their outcomes."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    wait([parent.sentinel])
+    os._exit(1)
 
 
 @contextlib.contextmanager
