@@ -52,7 +52,8 @@ def signal_shares(on: Floats, off: Floats, expected: float) -> tuple[Floats, Flo
         _count(counts.reshape(-1), near.reshape(-1), _OF_NUMBER, pixels)
     own = np.arange(1, _MOST)
     noise = np.minimum(expected / 2.0 / own * pixels[:, :-1] / pixels[:, 1:], 1.0)
-    signal = (1.0 - np.minimum.accumulate(noise, axis=1)).astype(np.float32)  # no less for more events
+    signal = np.ones((_CLASSES, _MOST), np.float32)  # also of no event
+    signal[:, 1:] = 1.0 - np.minimum.accumulate(noise, axis=1)  # no less for more events
     shares = apart(2, on.shape)
     for counts, near, share in zip(planes, around, shares, strict=True):
         half = np.float32(expected / 2.0)
@@ -103,9 +104,7 @@ def _look_up(counts, near, classes, signal, expected, shares):  # type: ignore[n
     most, last, one = np.int64(signal.shape[1]), np.int64(len(classes) - 1), np.float32(1.0)
     for i in range(len(counts)):
         own = np.int64(counts[i])
-        if own == 0:
-            shares[i] = one
-        elif own <= most:
-            shares[i] = signal[classes[smaller(np.int64(near[i]), last)], own - 1]
+        if own < most:
+            shares[i] = signal[classes[smaller(np.int64(near[i]), last)], own]
         else:
             shares[i] = one - smaller(expected / counts[i], one)
