@@ -20,6 +20,7 @@ US = 1e-6
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(24)
 UNMEASURED = 1e12
 USUAL_INTERVAL = 40_000
+SURE = (1.0, 1.0)  # on and off events are signal
 
 
 @dataclass
@@ -29,6 +30,7 @@ class Pixel:
 
     Changes, of frame intervals, K11: whether both frames measure it, whether it is silent, how much its L changed,
     squared, without what noise makes of that, and the variances of both frames. Forgotten: what comes to P after each.
+    Signal: probability that its on and its off events of every frame interval are no noise (K5); none: by their age.
     """
 
     starts: list[int]
@@ -49,6 +51,7 @@ class Pixel:
     changes: list[tuple[bool, bool, float, tuple[float, float], float]] = field(default_factory=list)
     forgotten: list[float] = field(default_factory=list)
     measured: list[bool] = field(default_factory=list)
+    signal: list[tuple[float, float]] = field(default_factory=list)
 
 
 def pixels(events, frames, sensor_size, settings, begin):
@@ -328,26 +331,31 @@ def bridged(pixel, settings, times, on, off, scales):
     begin = pixel.starts[0]
     first = latent(0)
     pixel.measured.append(first[1] < UNMEASURED)
-    intervals = [(begin, pixel.middles[0], None, first, scale_on, scale_off, var_on, var_off, 0.0)]
+    intervals = [(begin, pixel.middles[0], None, first, scale_on, scale_off, var_on, var_off, 0.0, SURE)]
     for k in range(count - 1):
         second = latent(k + 1)
         pixel.measured.append(second[1] < UNMEASURED)
         a, b = pixel.middles[k], pixel.middles[k + 1]
         n_on, n_off = counts(a, b)
+        signal = pixel.signal[k] if pixel.signal else SURE
+        q_on, q_off = (step_noise(f, ev) * c2 for f in signal)
+        told_on, told_off = signal[0] * n_on, signal[1] * n_off
         saturated = first[1] >= UNMEASURED and second[1] >= UNMEASURED and settings.filter.highlight_scale > 0
         mismatch = 0.0 if saturated else second[0] - first[0]
-        mismatch -= on * scale_on * n_on - off * scale_off * n_off + grown(k + 1, b)
+        mismatch -= on * scale_on * told_on - off * scale_off * told_off + grown(k + 1, b)
         total = 2 * settings.filter.highlight_scale**2 if saturated else first[1] + second[1]
-        total += var_on * (on * n_on) ** 2 + var_off * (off * n_off) ** 2
-        total += ev.step_noise * c2 * (n_on + n_off) + ev.quantisation_variance * c2
-        intervals.append((a, b, first, second, scale_on, scale_off, var_on, var_off, mismatch / total))
+        total += var_on * (on * told_on) ** 2 + var_off * (off * told_off) ** 2
+        total += q_on * n_on + q_off * n_off + ev.quantisation_variance * c2
+        intervals.append(
+            (a, b, first, second, scale_on, scale_off, var_on, var_off, mismatch / total, signal)
+        )
         q0, noise = ev.quantisation_variance * c2, first[1] + second[1]
         told = (q0 / (noise + q0)) ** 2
         squared = min((q0 * mismatch / total) ** 2, c2) - noise * told + (1 - told) * 0.1 * c2
         pixel.changes.append(
             (noise < UNMEASURED, n_on + n_off == 0, squared, (first[1], second[1]), mismatch)
         )
-        gain_on, gain_off = var_on * on * n_on / total, -var_off * off * n_off / total  # K2
+        gain_on, gain_off = var_on * on * told_on / total, -var_off * off * told_off / total  # K2
         scale_on = min(max(scale_on + gain_on * mismatch, 0.3), 3.0)
         scale_off = min(max(scale_off + gain_off * mismatch, 0.3), 3.0)
         var_on += 1e-5 - gain_on**2 * total
@@ -378,14 +386,14 @@ def bridged(pixel, settings, times, on, off, scales):
                 break
             pixel.raised.append(right[0] > bound + 1e-4)
             bounds.append(max(bound, right[0]))
-    last = (pixel.middles[-1], None, first, None, scale_on, scale_off, var_on, var_off, 0.0)
+    last = (pixel.middles[-1], None, first, None, scale_on, scale_off, var_on, var_off, 0.0, SURE)
     intervals.append(last)
 
     def drift():  # K10: what the thresholds add to the variance at the end of every interval
         far_on = far_off = 0
         yield 0.0
-        for k, (a, b, left, right, _, _, v_on, v_off, _) in enumerate(intervals[1:-1], 1):
-            n_on, n_off = counts(a, b)
+        for k, (a, b, left, right, _, _, v_on, v_off, _, signal) in enumerate(intervals[1:-1], 1):
+            n_on, n_off = (f * n for f, n in zip(signal, counts(a, b), strict=True))
             if k <= pixel.shown:  # K15
                 above = max(bounds[k - 1] - said(intervals[k], k), 0.0)
                 far_on = min(far_on, above / on / np.sqrt(v_on))
@@ -403,16 +411,17 @@ def bridged(pixel, settings, times, on, off, scales):
     drifts = list(drift())
 
     def augmented(interval, t, known_until):  # K1: posterior mean of the level at t, given both frames
-        a, b, left, right, s_on, s_off, v_on, v_off, gain = interval
+        a, b, left, right, s_on, s_off, v_on, v_off, gain, (f_on, f_off) = interval
         if left is None:
             return right[0] - event_sum(pixel, known_until, b, on * s_on, off * s_off)
-        prior = left[0] + event_sum(pixel, a, known_until, on * s_on, off * s_off)
+        prior = left[0] + event_sum(pixel, a, known_until, f_on * on * s_on, f_off * off * s_off)
         if right is None:
             return prior
         (t_on, t_off), (n_on, n_off) = counts(a, known_until), counts(a, b)
         shared = left[1] if min(left[1], right[1]) < UNMEASURED else 0.0  # two bounds measure nothing
-        shared += v_on * on**2 * t_on * n_on + v_off * off**2 * t_off * n_off
-        shared += ev.step_noise * c2 * (t_on + t_off) + ev.quantisation_variance * c2 * (t - a) / (b - a)
+        shared += v_on * (f_on * on) ** 2 * t_on * n_on + v_off * (f_off * off) ** 2 * t_off * n_off
+        shared += c2 * (step_noise(f_on, ev) * t_on + step_noise(f_off, ev) * t_off)
+        shared += ev.quantisation_variance * c2 * (t - a) / (b - a)
         return prior + shared * gain
 
     def rate(interval, known_until):  # K4
@@ -471,10 +480,16 @@ def bridged(pixel, settings, times, on, off, scales):
         while pending and pending[0][0] <= limit:
             t, polarity, near, _, weight = pending.pop(0)
             value, variance = predict(t)
-            signal = 1 / (1 + (9 * ev.background_rate * (t - near) * US) ** 2)  # K5
+            joined = intervals[index][2] is not None and intervals[index][3] is not None
+            signal = 1.0
+            if pixel.signal and joined:  # K5; the steps of L^A are those that are expected
+                noise = step_noise(intervals[index][-1][0 if polarity else 1], ev)
+            else:
+                signal = 1 / (1 + (9 * ev.background_rate * (t - near) * US) ** 2)
+                noise = ev.step_noise + signal * (1 - signal)
             # Several events may share a time: this one alone moves L^A by its own step.
             step = weight * own_step(intervals[index], polarity, on, off, ev, c2, counts)
-            q = weight * c2 * (ev.step_noise + signal * (1 - signal))
+            q = weight * c2 * noise
             state = (value + signal * step, variance + q)
             at = t
 
@@ -489,15 +504,50 @@ def bridged(pixel, settings, times, on, off, scales):
     return np.array(out)
 
 
+def step_noise(signal, ev):
+    """K5: variance of an event's step, in c^2, that is signal with a probability."""
+    return signal * (ev.step_noise + 1 - signal)
+
+
+def signal_shares(every, k, settings):
+    """K5: probabilities that on and off events of every pixel between two frames are signal, by their neighbours."""
+    start, end = next(iter(every.values())).middles[k : k + 2]
+    m = settings.events.noise_rate * (end - start) * US / 2
+    own, near, shares = {}, {}, {}
+    for polarity in (True, False):
+        for place, pixel in every.items():
+            own[polarity, place] = round(
+                sum(w for t, p, *_, w in pixel.events if start < t <= end and p == polarity)
+            )
+        for row, column in every:
+            around = [
+                (max(abs(r - row), abs(c - column)), own[polarity, (r, c)])
+                for r, c in every
+                if 0 < max(abs(r - row), abs(c - column)) <= 2
+            ]
+            n = sum((3 - distance) * count for distance, count in around)
+            near[polarity, (row, column)] = n if n < 4 else int(2 * np.log2(n))
+    for (polarity, place), a in own.items():
+        alike = [own[other] for other, n in near.items() if n == near[polarity, place]]
+        noise = 0.0
+        for b in range(1, a + 1):
+            fewer, as_many = (4 + alike.count(number) for number in (b - 1, b))
+            one = min(m / b * (fewer / as_many if b < 6 else 1.0), 1.0)
+            noise = one if b == 1 or b >= 6 else min(noise, one)
+        shares[polarity, place] = 1 - noise
+    return shares
+
+
 def own_step(interval, polarity, on, off, ev, c2, counts):
     """By how much one event moves L^A: its nominal step and its share of the mismatch (K1)."""
-    a, b, left, right, s_on, s_off, v_on, v_off, gain = interval
+    a, b, left, right, s_on, s_off, v_on, v_off, gain, signal = interval
     nominal = on * s_on if polarity else -off * s_off
     if left is None or right is None:
         return nominal
-    n_on, n_off = counts(a, b)
-    shared = v_on * on**2 * n_on if polarity else v_off * off**2 * n_off
-    return nominal + gain * (shared + ev.step_noise * c2)
+    which = 0 if polarity else 1
+    f, n = signal[which], counts(a, b)[which]
+    shared = v_on * (f * on) ** 2 * n if polarity else v_off * (f * off) ** 2 * n
+    return f * nominal + gain * (shared + step_noise(f, ev) * c2)
 
 
 def first_variance(interval, counts, ev, c2, settings):
@@ -795,6 +845,11 @@ def reconstruct(events, frames, sensor_size, settings, times):
     out = np.empty((5, len(times), *sensor_size))
     every = pixels(events, frames, sensor_size, settings, begin)
     more = (trail_scales(every, settings),) if method is bridged else ()
+    if method is bridged and settings.events.noise_rate is not None:
+        for k in range(len(frames) - 1):
+            shares = signal_shares(every, k, settings)
+            for place, pixel in every.items():
+                pixel.signal.append((shares[True, place], shares[False, place]))
     for (row, column), pixel in every.items():
         out[:2, :, row, column] = method(pixel, settings, times, on, off, *more).T
     if method is not bridged:

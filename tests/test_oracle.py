@@ -28,6 +28,9 @@ VARIANTS = {
     "default-refractory": dataclasses.replace(
         PRESETS["default"], events=dataclasses.replace(PRESETS["default"].events, refractory_period=2_000)
     ),
+    "default-background": dataclasses.replace(
+        PRESETS["default"], events=dataclasses.replace(PRESETS["default"].events, noise_rate=5.0)
+    ),
     "iccv2021": PRESETS["iccv2021"],
     "iccv2021-exact": dataclasses.replace(
         PRESETS["iccv2021"], filter=dataclasses.replace(PRESETS["iccv2021"].filter, solution="exact")

@@ -240,6 +240,20 @@ def test_the_refractory_period_comes_from_noise_and_can_be_given():
     assert told["refractory"].endswith("ms (measured: noise follows other events no sooner)")
 
 
+def test_the_background_is_measured_and_at_least_the_least():
+    """With lookahead neighbours tell what is noise, by its rate; else ages do, and the usual rate is the least."""
+    quiet = passing_by(textured(1.2), 102, noise_rate=0.0)
+    loud = passing_by(textured(1.2), 102, noise_rate=6.0)
+    made = plan(quiet, at="frames")
+    assert made.background_rate < made.settings.events.noise_rate == 0.5
+    told = dict(plan_report(quiet, made, PRESETS["default"]))["background"]
+    assert "the least that is assumed; measured" in told
+    assert plan(quiet, at="frames", lookahead=False).settings.events.noise_rate == 3.0
+    for lookahead in (True, False):
+        rate = plan(loud, at="frames", lookahead=lookahead).settings.events.noise_rate
+        assert rate == pytest.approx(6.0, rel=0.2)
+
+
 def refractory(period):
     return altered(PRESETS["default"], "events", refractory_period=period)
 

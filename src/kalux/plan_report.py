@@ -69,7 +69,7 @@ def _of_events(plan: Plan, asked: Settings) -> Iterator[tuple[str, str]]:
     if events.noise_rate is not None:
         how = _estimated(asked.events.noise_rate, plan.background_rate == events.noise_rate)
         if plan.background_rate is not None and plan.background_rate < events.noise_rate:
-            how = f"the usual, which is the least; measured {plan.background_rate:.2g}"
+            how = f"the least that is assumed; measured {plan.background_rate:.2g}"
         yield "background", f"{events.noise_rate:.2g} Hz per pixel of events without reason ({how})"
 
 

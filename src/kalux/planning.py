@@ -51,6 +51,11 @@ _CALIBRATION_NEEDED: Final = "a kalux.Calibration is needed, from kalux.load_cal
 _NOISE_EVENTS: Final = 1_000_000
 """Number of events from which the background noise is estimated: at 15 million events/s, those of 70 ms."""
 
+
+_LEAST_NOISE: Final = 0.5
+"""Least background noise with lookahead, Hz per pixel: events are isolated for other reasons, too (leak of bright
+pixels, flicker). slider_depth has 0.15 where nothing is seen, street 0.005 (docs/equations.md, K5)."""
+
 _CACHED_EVENTS: Final = 1 << 21
 _CACHED_FRAME_BYTES: Final = 1 << 25
 """Number of events (32 MB) and bytes of frames (32 MB) at the beginning of a recording that stay in memory while it is
@@ -159,7 +164,7 @@ def plan(
     chosen, origin, estimate, delay, model = _with_event_steps(recording, chosen)
     threshold_error = estimate.spread if estimate is not None and origin in ESTIMATED_ORIGINS else 0.0
     chosen, mismatch = _with_mismatch(recording, chosen, threshold_error)
-    chosen, background = _with_background(recording, chosen, known.pixels)
+    chosen, background = _with_background(recording, chosen, known.pixels, lookahead)
     if origin == "settings" and _are_calibrated(chosen, known):
         origin = "calibration"
     uses_tail = origin in UNCERTAIN_ORIGINS or (chosen.filter.joins_frames and chosen.filter.unshown_tail > 0)
@@ -451,12 +456,19 @@ def _with_mismatch(
 
 
 def _with_background(
-    recording: Recording, settings: Settings, pixels: PixelCalibration | None
+    recording: Recording, settings: Settings, pixels: PixelCalibration | None, lookahead: bool
 ) -> tuple[Settings, float | None]:
-    """Fill in the background noise: from the settings, else the usual, or what is measured where that is more."""
+    """Fill in the background noise: from the settings, else what is measured, at least the least, else the usual.
+
+    With lookahead neighbours tell what is noise, by its rate; else ages of events do, for which the usual is the least.
+    """
     events = settings.events
     if events.noise_rate is not None or not settings.filter.joins_frames:
         return settings, None
     found = event_noise(recording, _NOISE_EVENTS, None if pixels is None else pixels.hot)
-    rate = events.background_rate if found is None else max(found.rate, events.usual_noise_rate)
+    if found is None:
+        rate = events.background_rate
+    else:
+        least = min(_LEAST_NOISE, events.usual_noise_rate) if lookahead else events.usual_noise_rate
+        rate = max(found.rate, least)
     return altered(settings, "events", noise_rate=rate), None if found is None else found.rate

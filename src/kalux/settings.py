@@ -131,8 +131,8 @@ class EventSettings:
     deblur_variance
         Variance, in c^2, that each event of an exposure adds to the deblurred frame. 0.05 (docs/tuning.md).
     noise_rate
-        Background noise, Hz per pixel, that makes isolated events doubtful. None: the usual, or what is measured in
-        the recording (`kalux.calibration.noise`) where that is more.
+        Background noise, Hz per pixel, that makes isolated events doubtful. None: what is measured in the recording
+        (`kalux.calibration.noise`), at least 0.5, in causal mode at least the usual; the usual in a live stream.
     extrapolation_spread
         Where thresholds are only estimates: standard deviation of the log of their common error beyond white, where no
         frame corrects it; or threshold_spread, if that is known and less. 0.15: how well large changes between well
@@ -150,10 +150,10 @@ class EventSettings:
         The spread between pixels where the recording does not tell it. 0.1: data sheets and the literature give 2 to
         10 % (Lichtsteiner 2008: 2.1 % of contrast at c = 0.2), real recordings more.
     usual_noise_rate
-        The least background noise, whatever is measured: isolated events are doubtful for other reasons, too (leak of
-        bright pixels, flicker). 3: typical of a DAVIS at its default biases in room light. slider_depth has 0.15 where
-        nothing is seen; at 0.5 its artificial highlights drift to three times the error of 3, street costs 3 %, and
-        simulated scenes gain less than 1 % (docs/tuning.md).
+        The background noise where it is not measured, and the least of causal mode, which goes by the ages of events
+        (K5): isolated events are doubtful for other reasons, too (leak of bright pixels, flicker). 3: typical of a
+        DAVIS at its default biases in room light. slider_depth has 0.15 where nothing is seen; by their ages, at 0.5
+        its artificial highlights drift to three times the error of 3 (docs/tuning.md).
     usual_delay
         The delay where the recording does not tell it, us. 0: as stamped.
     usual_step_variance

@@ -48,6 +48,55 @@ def reached(segment, on, off):
 variances = st.floats(1e-8, 1.0) | st.just(UNMEASURED)
 
 
+# --- noise ----------------------------------------------------------------------------------------------
+
+
+def test_events_that_are_all_signal_are_what_they_were():
+    first, second, on, off = (
+        latent([0.0, -1.0], 0.01),
+        latent([0.5, UNMEASURED], 0.02),
+        counts(3, 2),
+        counts(1, 0),
+    )
+    sure = np.ones((1, 2))
+    plain, learned = join(first, second, on, off)
+    told, as_well = bridge(
+        first, second, on, off, nominal_thresholds((1, 2), 0.1), NOISE, START, END, None, (sure, sure)
+    )
+    for one, other in zip(
+        (*learned, plain.step_on, plain.slope), (*as_well, told.step_on, told.slope), strict=True
+    ):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_events_of_noise_move_nothing():
+    """K5: a pixel whose events are noise is joined as a silent one is, and its thresholds stay."""
+    first, second, none = latent(0.0, 0.01), latent(0.1, 0.02), np.zeros((1, 1))
+    thresholds = nominal_thresholds((1, 1), 0.1)
+    noisy, learned = bridge(
+        first, second, counts(2), counts(1), thresholds, NOISE, START, END, None, (none, none)
+    )
+    silent, _ = join(first, second, none, none)
+    assert noisy.step_on == noisy.step_off == 0.0
+    np.testing.assert_array_equal(noisy.slope, silent.slope)
+    np.testing.assert_array_equal(noisy.augmented, silent.augmented)
+    assert learned.on == thresholds.on
+    assert learned.off == thresholds.off
+
+
+def test_an_event_in_doubt_takes_what_the_frames_leave_to_it():
+    """Its expected step is half a threshold; sure frames that say there was none take nearly all of it back."""
+    sure, half = latent(0.0, 1e-9), np.full((1, 1), 0.5)
+    noise = BridgeNoise(0.2, 0.2, 0.1 * 0.04, 1e-6)
+    thresholds = nominal_thresholds((1, 1), 0.0)
+    one, none = counts(1), counts(0)
+    told, _ = bridge(sure, sure, one, none, thresholds, noise, START, END, None, (half, half))
+    free = latent(0.0, UNMEASURED)
+    untold, _ = bridge(sure, free, one, none, thresholds, noise, START, END, None, (half, half))
+    assert untold.step_on[0, 0] == pytest.approx(0.1)
+    assert abs(told.step_on[0, 0]) < 1e-4
+
+
 # --- conservation ---------------------------------------------------------------------------------------
 
 

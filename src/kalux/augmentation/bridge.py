@@ -174,6 +174,10 @@ class BridgedSegment(NamedTuple):
         Variance of silent pixels about the mean of both frames (`unseen.half_way`).
     latents
         The frames at both ends, where they are looked at along the paths of what moves (K16); else None.
+    doubt
+        By how much the variance of an on and of an off event's step is more than a sure event's
+        (`kalux.augmentation.background`); the steps are then those that are expected. None: every event is weighed by
+        the age of those around it.
     """
 
     start: int
@@ -198,6 +202,7 @@ class BridgedSegment(NamedTuple):
     turns: float = 0.0
     half_way: float = RANDOM
     latents: tuple[Latent, Latent] | None = None
+    doubt: tuple[Array, Array] | None = None
 
 
 def drift(
@@ -311,6 +316,7 @@ def bridge(
     start: int,
     end: int,
     grown: Array | None = None,
+    signal: tuple[Array, Array] | None = None,
 ) -> tuple[BridgedSegment, Thresholds]:
     """Join two latent frames (docs/equations.md, K1), and learn the pixels' thresholds from them (K2).
 
@@ -324,6 +330,8 @@ def bridge(
         What is known of the pixels' thresholds so far.
     grown
         (H, W) change of L between the frames in addition to the events' steps (K14); None: none.
+    signal
+        (H, W) shares of the on and of the off events that are signal (K5); None: all.
 
     Returns
     -------
@@ -351,9 +359,10 @@ def bridge(
         net=net,
     )
     more = np.zeros(shape, first.value.dtype) if grown is None else grown
+    shares = (np.ones(shape, first.value.dtype),) * 2 if signal is None else signal
     given, known, filled, learned = (
         tuple(plane.reshape(-1) for plane in several)
-        for several in ((*first[:2], *second[:2], on, off, more), thresholds, planes, factors)
+        for several in ((*first[:2], *second[:2], on, off, more, *shares), thresholds, planes, factors)
     )
     _bridge(given, known, noise, seconds, filled, learned)
     return segment, Thresholds(*factors)
@@ -375,7 +384,7 @@ def _bridge(given, thresholds, noise, seconds, planes, factors):  # type: ignore
     piece of scratch memory is one array.
     """
     low, high = _SCALE_BOUNDS
-    value, variance, next_value, next_variance, on, off, grown = given
+    value, variance, next_value, next_variance, on, off, grown, signal_on, signal_off = given
     augmented, slope, step_on, step_off, events, net, floor = planes
     new_on, new_off, new_on_variance, new_off_variance = factors
     scale_on, scale_off, variance_on, variance_off = thresholds
@@ -397,7 +406,9 @@ def _bridge(given, thresholds, noise, seconds, planes, factors):  # type: ignore
             s[_LEVEL + k], s[_MOVES + k] = here, 0.0 if saturated else before
         for k in pixels:
             i = first + k
-            n_on, n_off = s[_COUNT_ON + k], s[_COUNT_OFF + k]
+            f_on, f_off = np.float64(signal_on[i]), np.float64(signal_off[i])
+            n_on, n_off = f_on * s[_COUNT_ON + k], f_off * s[_COUNT_OFF + k]
+            in_doubt_on, in_doubt_off = (1.0 - f_on) * c_on * c_off, (1.0 - f_off) * c_on * c_off
             of_on, of_off = np.float64(scale_on[i]), np.float64(scale_off[i])
             nominal_on, nominal_off = c_on * of_on, c_off * of_off
             mismatch = s[_CHANGE + k] - (nominal_on * n_on - nominal_off * n_off)
@@ -409,14 +420,17 @@ def _bridge(given, thresholds, noise, seconds, planes, factors):  # type: ignore
                 + on_covariance * c_on * n_on
                 - off_covariance * c_off * n_off
                 + of_step * (n_on + n_off)
+                + (in_doubt_on * n_on + in_doubt_off * n_off)
                 + unsignalled
             )
             inverse = 1.0 / total
             gain = mismatch * inverse
             s[_LEVEL + k] += gain * s[_MOVES + k]
             s[_SLOPE + k] = gain * unsignalled / seconds
-            s[_STEP_ON + k] = nominal_on + gain * (c_on * on_covariance + of_step)
-            s[_STEP_OFF + k] = nominal_off + gain * (c_off * off_covariance - of_step)
+            s[_STEP_ON + k] = f_on * (nominal_on + gain * (c_on * on_covariance + (of_step + in_doubt_on)))
+            s[_STEP_OFF + k] = f_off * (
+                nominal_off + gain * (c_off * off_covariance - (of_step + in_doubt_off))
+            )
             s[_NEW_ON + k] = smaller(larger(of_on + gain * on_covariance, low), high)
             s[_NEW_OFF + k] = smaller(larger(of_off + gain * off_covariance, low), high)
             s[_LEFT_ON + k] = on_variance - on_covariance * on_covariance * inverse + _SCALE_DRIFT

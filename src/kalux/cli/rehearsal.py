@@ -13,6 +13,7 @@ from typing import Final
 
 import numpy as np
 
+from kalux.augmentation.background import doubt, signal_shares
 from kalux.augmentation.bridge import BridgeNoise, Latent, bridge, drift, nominal_thresholds
 from kalux.augmentation.highlights import Unshown
 from kalux.augmentation.motion import Paths
@@ -104,14 +105,15 @@ def rehearse_segment() -> None:
     noise = BridgeNoise(0.2, 0.2, variance, variance, variance)
     newest = nothing_followed(_SIZE).newest
     start, grown = trail_between(newest, newest, (0, _PERIOD), (seconds, 0.1, 0.1))
-    joined, _ = bridge(first, second, on, off, thresholds, noise, 0, _PERIOD, grown)
+    signal = signal_shares(on, off, 0.1)
+    joined, _ = bridge(first, second, on, off, thresholds, noise, 0, _PERIOD, grown, signal)
     of_silent = silent_change(joined, variance, variance)
     half_way(change, joined, variance, variance)
     drifted, _, _ = drift(first, second, thresholds, noise, (far_on, far_off), (on, off))
     add_missed_change(drifted, joined, second, (on, off), of_silent, variance)
     turns(on, off)
     trail = Trail(start, polarity_of(newest), seconds, 0.1, 0.1)
-    segment = joined._replace(trail=trail, drift=drifted)
+    segment = joined._replace(trail=trail, drift=drifted, doubt=doubt(signal, variance, variance))
     cursor = akf_bridged.begin(segment, State(first.value, first.variance, make_clock(_SIZE, 0)))
     akf_bridged.advance(segment, cursor, np.zeros(1, EVENT_DTYPE), akf_bridged.Noise(0.1, variance, variance))
     akf_bridged.moving_pixels(segment, cursor)

@@ -64,9 +64,11 @@ STEP_PIXEL: Final = np.dtype(
             "step_off",
             "forward",  # variance of L^A from the frame before
             "backward",  # the same from the frame after, without the events still to come
+            "doubt_on",  # variance of an on event's step beyond that of a sure one
+            "doubt_off",
             "coming",  # sum of their weights; exact, where subtracting their variances would leave rounding errors
         ],
-        "formats": ["f4"] * 5,
+        "formats": ["f4"] * 7,
         "itemsize": 32,
     }
 )
@@ -81,7 +83,7 @@ _BEGIN_BLOCK: Final = 64
 _STATE_FIELDS: Final = STATE_PIXEL.itemsize // 4
 _STEP_FIELDS: Final = STEP_PIXEL.itemsize // 4
 _INFORMATION, _WEIGHTED, _AUGMENTED, _RATE = range(_STATE_FIELDS)
-_STEP_ON, _STEP_OFF, _FORWARD, _BACKWARD, _COMING = range(len(STEP_PIXEL.names or ()))
+_STEP_ON, _STEP_OFF, _FORWARD, _BACKWARD, _DOUBT_ON, _DOUBT_OFF, _COMING = range(len(STEP_PIXEL.names or ()))
 
 
 @dataclass
@@ -144,7 +146,9 @@ def begin(segment: BridgedSegment, state: State) -> Cursor:
     variances = segment.forward_variance, segment.backward_variance
     coming = np.zeros_like(segment.augmented) if segment.events is None else segment.events
     trail = no_trail(coming.shape) if segment.trail is None else segment.trail
-    given = segment.augmented, segment.step_on, segment.step_off, *variances, coming, trail.start
+    none = np.zeros_like(segment.augmented)
+    doubts = (none, none) if segment.doubt is None else segment.doubt
+    given = segment.augmented, segment.step_on, segment.step_off, *variances, coming, trail.start, *doubts
     before = state.log_intensity, floor, state.variance
     _begin_bridged(given, scalars, before, pixels.reshape(-1), steps.reshape(-1))
     polarity[1:-1, 1:-1] = trail.polarity
@@ -160,7 +164,8 @@ def advance(segment: BridgedSegment, cursor: Cursor, events: EventArray, noise: 
             within = words[: words_until(words, cursor.origin + EPOCH)]
         if len(within):
             arrays = cursor.pixels, cursor.steps, cursor.clock, cursor.polarity
-            _advance_bridged(within, *arrays, cursor.origin, segment.rate, segment.step_variance, noise)
+            told = noise if segment.doubt is None else noise._replace(noise_rate=0.0)
+            _advance_bridged(within, *arrays, cursor.origin, segment.rate, segment.step_variance, told)
         words = words[len(within) :]
         if len(words):
             epochs = (int(words[0, 0]) - 1 - segment.start) // EPOCH
@@ -269,7 +274,7 @@ def _since(clock, now):  # type: ignore[no-untyped-def]
 def _begin_bridged(given, scalars, before, pixels, steps):  # type: ignore[no-untyped-def]
     rate, step_variance = scalars
     log_intensity, floor, variance = before
-    augmented, step_on, step_off, forward, backward, events, trail = given
+    augmented, step_on, step_off, forward, backward, events, trail, doubt_on, doubt_off = given
     height, width = log_intensity.shape
     states = empty((_STATE_FIELDS, _BEGIN_BLOCK), np.float32)
     known = zeros((_STEP_FIELDS, _BEGIN_BLOCK), np.float32)
@@ -289,6 +294,8 @@ def _begin_bridged(given, scalars, before, pixels, steps):  # type: ignore[no-un
             _copy(forward, row, first, count, first_variance)
             _copy(backward, row, first, count, last_variance)
             _copy(events, row, first, count, coming)
+            _copy(doubt_on, row, first, count, known[_DOUBT_ON])
+            _copy(doubt_off, row, first, count, known[_DOUBT_OFF])
             _copy(augmented, row, first, count, level)
             for i in range(count):
                 information[i] = ONE / np.float32(variance[row, first + i])
@@ -346,6 +353,7 @@ def _advance_bridged(words, pixels, steps, clock, polarity, origin, rate, step_v
         information = predicted_information(pixel.information, pixel.rate, seconds)
         step_on, step_off = known.step_on, known.step_off
         step = weight * (step_on if is_on else -step_off)
+        q += weight * (known.doubt_on if is_on else known.doubt_off)
         kept = information_kept(information, q)
         # The state moves by the expected step, L^A by the whole one: the bridge has calibrated it by the frames.
         pixel.weighted = (pixel.weighted - information * p_noise * step) * kept

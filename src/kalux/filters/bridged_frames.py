@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation import bridge, deblur
+from kalux.augmentation.background import doubt, signal_shares
 from kalux.augmentation.bridge import BridgedSegment, BridgeNoise, Latent, Thresholds, UnshownMemory
 from kalux.augmentation.deblur import EXPOSED, EXPOSURE_FIELDS, Exposure, relative_levels
 from kalux.augmentation.highlights import (
@@ -297,12 +298,15 @@ class BridgedFrames(Method):
         start, end = shot.middle, following.middle
         on, off, at_middle = self.follow(events, start, end, memory.followed)
         trail, grown = self._trail_between(memory, shot, following, at_middle)
+        signal = self._signal_shares(on, off, (end - start) * 1e-6)
         joined, learned = bridge.bridge(
-            memory.latent, second, on, off, memory.thresholds, self.noise, start, end, grown
+            memory.latent, second, on, off, memory.thresholds, self.noise, start, end, grown, signal
         )
+        if signal is not None:
+            joined = joined._replace(doubt=doubt(signal, self.noise.step_variance, self.on * self.off))
         change = self._silent_change(joined)
         share, silent = half_way(memory.silent, joined, self.noise.quantisation_variance, self.on * self.off)
-        joined, far_on, far_off = self._with_drift(joined, memory, second, (on, off), change)
+        joined, far_on, far_off = self._with_drift(joined, memory, second, (on, off), change, signal)
         change = self._with_black_change(change, memory.latent, second)
         assert joined.net is not None
         unshown = self._follow_unshown(memory, second, following, joined.net)
@@ -413,6 +417,11 @@ class BridgedFrames(Method):
     def _trail_at(self, followed: Followed, t: int, scale: float) -> NDArray[np.float32]:
         return trail_at(followed.newest, t, (scale, *self._trail_heights))
 
+    def _signal_shares(self, on: Floats, off: Floats, seconds: float) -> tuple[Floats, Floats] | None:
+        """Which share of the pixels' events is signal (K5); None where the noise of events is not known."""
+        rate = self.settings.events.noise_rate
+        return None if rate is None else signal_shares(on, off, rate * seconds)
+
     @property
     def _trail_heights(self) -> tuple[float, float]:
         height = self.settings.events.trail
@@ -436,18 +445,17 @@ class BridgedFrames(Method):
         second: Latent,
         counts: tuple[Floats, Floats],
         change: Floats,
+        signal: tuple[Floats, Floats] | None = None,
     ) -> tuple[BridgedSegment, Floats, Floats]:
         """The segment with the drift of its pixels (K10), and the events since they were last measured, at its end.
 
-        ``counts`` are its on and off events, ``change`` is the mean square change of silent pixels around each (K11).
+        ``counts`` are its on and off events, of which ``signal`` is the share that is signal (None: all), ``change`` is
+        the mean square change of silent pixels around each (K11).
         """
+        far, (on, off) = self._events_since_measured(memory, segment), counts
+        steps = counts if signal is None else (on * signal[0], off * signal[1])
         grown, far_on, far_off = bridge.drift(
-            memory.latent,
-            second,
-            memory.thresholds,
-            self.noise,
-            self._events_since_measured(memory, segment),
-            counts,
+            memory.latent, second, memory.thresholds, self.noise, far, steps
         )
         add_missed_change(grown, segment, second, counts, change, self.noise.quantisation_variance)
         if second.ceiling is not None:
