@@ -14,7 +14,6 @@ from kalux.calibration.frame_noise import (
     _not_negative,
     estimate_frame_noise,
     photon_transfer,
-    rounding_error,
     trimmed_variance,
     usual_noise,
 )
@@ -194,12 +193,6 @@ def test_frames_in_floats_without_read_noise_can_be_reconstructed(electrons):
     images = list(reconstruct(recording, at="frames"))
     assert len(images) == len(frames)
     assert all(np.isfinite(image.intensity).all() for image in images)
-
-
-def test_rounding():
-    assert rounding_error(Frame(np.zeros((1, 1), np.uint8), 0, 1)) == 0.5 / 255
-    assert rounding_error(Frame(np.zeros((1, 1), np.uint16), 0, 1, 1023)) == 0.5 / 1023
-    assert rounding_error(Frame(np.zeros((1, 1)), 0, 1)) == 0.0
 
 
 def test_outliers_do_not_make_variance():

@@ -20,7 +20,7 @@ from kalux.compiled import empty, event_column, event_row, event_words, loop, sm
 from kalux.event_slices import all_between
 from kalux.events import EventArray
 from kalux.filters.shots import Shot
-from kalux.frames import Frame
+from kalux.models.camera import rounding_error
 from kalux.recording import Recording
 from kalux.settings import CameraSettings
 
@@ -174,15 +174,6 @@ def usual_noise(recording: Recording, camera: CameraSettings) -> tuple[float, fl
     rounding = rounding_error(next(iter(recording.frames()))) / 3**0.5
     read = min(max(changes, rounding, _LEAST_READ), usual)
     return read, (usual**2 - read**2) / 0.5
-
-
-def rounding_error(frame: Frame) -> float:
-    """Half a level, white = 1; 0 for images of floating point.
-
-    The most that rounding can change, not its standard deviation, 1 / sqrt(12): where noise is less than a level it is
-    the same error in every frame, which no mean takes away.
-    """
-    return 0.0 if frame.image.dtype.kind == "f" else 0.5 / frame.white_value
 
 
 def _enough_frames(sensor_size: tuple[int, int]) -> int:

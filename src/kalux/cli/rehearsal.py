@@ -71,7 +71,7 @@ def rehearse_images() -> None:
         unshown=Unshown(some, ones, ones, ones),
         unmeasured=some,
     )
-    view = View(0.02, 0.04, 0.1, 1.0, 0.3, 1.0, 0.0, None, (1.0, 1.0, 1.0))
+    view = View(0.02, 0.04, 0.1, 1.0, 0.3, 1.0, 0.0, 0.001, None, (1.0, 1.0, 1.0))
     make_image(estimate, view, with_variance=False)
     make_image(estimate, view)  # as where motion is followed
 
