@@ -54,7 +54,7 @@ _HEARD: Final = np.float32((1.0 - ALIKE) / (1.0 - SHARED))
 
 REPEATED_ROUNDING: Final = 0.5
 """Part of the variance of rounding that all frames of a still pixel have in common, where their noise is less than half
-a level: 0.4 to 0.8 of five photographs, each panned over three times."""
+a level: such pixels err by 0.4 to 1.0 times its standard deviation on five photographs, three recordings of each."""
 
 
 class Around(NamedTuple):
