@@ -712,6 +712,15 @@ def known(pixel, variance, t, settings, c2, left):
     return max(1 / (1 / variance + 1 / following), common) + wrong
 
 
+def with_rounding(variance, intensity, moving, level, offset):
+    """K11: a still pixel's frames, with less noise than half a ``level``, have half of their rounding in common."""
+    given = variance.copy()
+    for place in np.ndindex(variance.shape):
+        if not moving[place]:
+            given[place] = max(given[place], level**2 / 24 / (intensity[place] + offset) ** 2)
+    return given
+
+
 def regularised(level, variance, moving, difference):
     """K12, of whole images: L and its variance."""
     out, doubt = level.copy(), variance.copy()

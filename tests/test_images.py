@@ -16,6 +16,7 @@ GREY = View(
     highlight_spread=0.1,
     unknown_variance=9.0,
     fixed_pattern=0.0,
+    rounding=0.0,
     mosaic=None,
     gains=(1.0, 1.0, 1.0),
 )
@@ -47,6 +48,18 @@ def test_the_variance_counts_the_fixed_pattern_of_the_frames():
     np.testing.assert_array_equal(image.intensity, make_image(known, GREY).intensity)
     longer = dataclasses.replace(known, white=float(np.log(2.05)))
     assert make_image(longer, view).fixed_pattern == pytest.approx(0.02)
+
+
+def test_still_pixels_are_no_surer_than_the_rounding_that_their_frames_share():
+    """A half of 0.01^2 of white beside I + I_0 of 0.1; events make it another one in every frame."""
+    view = dataclasses.replace(GREY, rounding=0.01)
+    moving = np.array([[False, False, True]])
+    known = estimate([[0.05, 0.95, 0.05]], moving=moving, silent_change=np.zeros((1, 3), np.float32))
+    image, before = make_image(known, view), make_image(known, GREY)
+    np.testing.assert_allclose(image.variance[0, 0], 0.1**2 / 2, rtol=1e-4)
+    np.testing.assert_array_equal(image.variance[0, 1:], before.variance[0, 1:])
+    np.testing.assert_array_equal(image.intensity, before.intensity)
+    assert np.isinf(make_image(known, view, with_variance=False).variance).all()
 
 
 def test_a_doubtful_highlight_is_drawn_towards_white_and_no_other_pixel():

@@ -20,7 +20,14 @@ from kalux.augmentation.motion import Paths
 from kalux.augmentation.unseen import UNKNOWN_CHANGE
 from kalux.filters.highlights import keep_white, lifted, read_unshown, tempered
 from kalux.filters.readout import HighlightPrior, read_out
-from kalux.filters.uncertainty import Around, add_pattern, alone, given_variance, hidden_variance
+from kalux.filters.uncertainty import (
+    Around,
+    add_pattern,
+    alone,
+    given_variance,
+    hidden_variance,
+    keep_rounding,
+)
 from kalux.frames import Mosaic
 from kalux.models.colour import Gains, calm_highlights, demosaic, luminance
 
@@ -159,6 +166,8 @@ class View:
         P of a pixel that has not been measured.
     fixed_pattern
         Standard deviation of the pixels' offsets in the frames (K11), white = 1.
+    rounding
+        Standard deviation of the rounding that all frames of a still pixel share (K11), white = 1; 0: none.
     mosaic, gains
         Pattern of a Bayer sensor, None of others, and its white balance.
     """
@@ -170,6 +179,7 @@ class View:
     highlight_spread: float
     unknown_variance: float
     fixed_pattern: float
+    rounding: float
     mosaic: Mosaic | None
     gains: Gains
 
@@ -216,7 +226,8 @@ def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) ->
         read_unshown(intensity, levels, estimate.log_intensity, unshown, view.log_offset, prior)
     if estimate.unmeasured is not None:
         keep_white(intensity, estimate.log_intensity, estimate.unmeasured, view.log_offset, prior)
-    pattern = view.fixed_pattern * (np.exp(estimate.white) - view.log_offset)
+    white = float(np.exp(estimate.white) - view.log_offset)
+    pattern = view.fixed_pattern * white
     if not needs_variance:
         total = _infinite(intensity.shape)
     elif moving is not None and change is not None:
@@ -231,7 +242,9 @@ def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) ->
         _look_along(intensity, total, along, view.log_offset)
         if not with_variance:
             total = _infinite(intensity.shape)
-    image = Image(estimate.t, intensity, total, view.log_offset, estimate.final, fixed_pattern=float(pattern))
+    if with_variance and moving is not None and view.rounding > 0:
+        keep_rounding(total, intensity, moving, view.log_offset, view.rounding * white)
+    image = Image(estimate.t, intensity, total, view.log_offset, estimate.final, fixed_pattern=pattern)
     colour = _coloured(image, estimate, view)
     return image if colour is None else dataclasses.replace(image, colour=colour)
 

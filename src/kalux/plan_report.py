@@ -79,7 +79,7 @@ def _of_frames(recording: Recording, plan: Plan, asked: Settings) -> Iterator[tu
     yield "exposure", f"{(camera.reference_exposure or 0) * 1e-3:g} ms makes a saturated pixel 1.0 ({how})"
     if camera.frame_noise is not None:
         read, shot = camera.noise
-        how = _GIVEN if asked.camera.frame_noise is not None else "estimated" if plan.frame_noise else _USUAL
+        how = _noise_origin(plan, asked)
         half = np.sqrt(read**2 + shot / 2)
         yield "noise", f"of frames {read:.2g} of white in the dark, {half:.2g} at half of it ({how})"
     if camera.fixed_pattern is not None:
@@ -154,6 +154,17 @@ def _refractory_origin(plan: Plan, asked: Settings) -> str:
     if plan.estimate is None:
         return _USUAL
     return f"estimated from {how_many(plan.estimate.samples, 'sample')}"
+
+
+def _noise_origin(plan: Plan, asked: Settings) -> str:
+    if asked.camera.frame_noise is not None:
+        return _GIVEN
+    if plan.frame_noise is not None:
+        return "estimated"
+    by_events = plan.event_model is not None and plan.event_model.frame_noise is not None
+    return (
+        "in the dark as much as events do not explain, at half of white twice that" if by_events else _USUAL
+    )
 
 
 def _delay_origin(plan: Plan, asked: Settings) -> str:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from kalux.calibration.delay import DelayEstimate, estimate_delay
 from kalux.calibration.event_model import EventModel, estimate_event_model
 from kalux.calibration.fixed_pattern import USUAL_PATTERN, FixedPattern, estimate_fixed_pattern
-from kalux.calibration.frame_noise import FrameNoise, estimate_frame_noise, usual_noise
+from kalux.calibration.frame_noise import FrameNoise, UsualNoise, estimate_frame_noise, usual_noise
 from kalux.calibration.global_thresholds import (
     ROUGH_SAMPLES,
     ThresholdEstimate,
@@ -158,10 +158,10 @@ def plan(
     reference = chosen.camera.reference_exposure or median_exposure(lengths)
     chosen = altered(chosen, "camera", reference_exposure=reference, response=response)
     chosen = _with_white_balance(recording, chosen)
-    chosen, noise = _with_frame_noise(recording, chosen)
+    chosen, noise, doubted = _with_frame_noise(recording, chosen)
     chosen, pattern = _with_fixed_pattern(recording, chosen)
     chosen, period = _with_dead_time(recording, chosen)
-    chosen, origin, estimate, delay, model = _with_event_steps(recording, chosen)
+    chosen, origin, estimate, delay, model = _with_event_steps(recording, chosen, doubt_noise=doubted)
     threshold_error = estimate.spread if estimate is not None and origin in ESTIMATED_ORIGINS else 0.0
     chosen, mismatch = _with_mismatch(recording, chosen, threshold_error)
     chosen, background = _with_background(recording, chosen, known.pixels, lookahead)
@@ -292,17 +292,21 @@ def _with_delay(
     return altered(settings, "events", delay=delay.delay), delay
 
 
-def _with_frame_noise(recording: Recording, settings: Settings) -> tuple[Settings, FrameNoise | None]:
-    """Fill in the frames' noise, where the filter uses it: from the settings, else an estimate, else the usual."""
+def _with_frame_noise(recording: Recording, settings: Settings) -> tuple[Settings, FrameNoise | None, bool]:
+    """Fill in the frames' noise, where the filter uses it: from the settings, else an estimate, else the usual.
+
+    Returned is also whether it is more than pixels without events tell, so that events may contradict.
+    """
     camera = settings.camera
     if camera.frame_noise is not None or not settings.filter.joins_frames:
-        return settings, None
+        return settings, None, False
     found = estimate_frame_noise(recording, camera)
     if found is not None and not found.is_reliable:
         found = None
-    read, shot = usual_noise(recording, camera) if found is None else (found.read, found.shot)
-    shot = shot if camera.shot_noise is None else camera.shot_noise
-    return altered(settings, "camera", frame_noise=read, shot_noise=shot), found
+    noise = usual_noise(recording, camera) if found is None else found
+    shot = noise.shot if camera.shot_noise is None else camera.shot_noise
+    doubted = isinstance(noise, UsualNoise) and not noise.silent and camera.shot_noise is None
+    return altered(settings, "camera", frame_noise=noise.read, shot_noise=shot), found, doubted
 
 
 def _with_fixed_pattern(recording: Recording, settings: Settings) -> tuple[Settings, FixedPattern | None]:
@@ -336,15 +340,17 @@ class _EventSteps(NamedTuple):
     model: EventModel | None
 
 
-def _with_event_steps(recording: Recording, settings: Settings) -> _EventSteps:
+def _with_event_steps(recording: Recording, settings: Settings, *, doubt_noise: bool = False) -> _EventSteps:
     """Fill in what an event's step is: thresholds, refractory period and delay, then I_0 and the step's variance.
+
+    With ``doubt_noise`` also the frames' noise, where it is less than was taken.
 
     Thresholds depend on I_0 a little, and it on them: they are estimated once more with the I_0 that is found.
     """
     delay = estimate_delay(recording, settings.camera) if settings.events.delay is None else None
     filled, origin, estimate = _with_thresholds(recording, settings, delay)
     filled, delay = _with_delay(recording, filled, delay, estimate)
-    filled, model = _with_event_model(recording, filled)
+    filled, model = _with_event_model(recording, filled, doubt_noise=doubt_noise)
     if estimate is not None and settings.camera.log_offset is None:
         estimated = origin in ESTIMATED_ORIGINS
         if estimated or (estimate.may_lose and settings.camera.offset != filled.camera.offset):
@@ -420,7 +426,9 @@ def _steps_log_offset(settings: Settings) -> bool:
     return settings.filter.augmentation == "paper"
 
 
-def _with_event_model(recording: Recording, settings: Settings) -> tuple[Settings, EventModel | None]:
+def _with_event_model(
+    recording: Recording, settings: Settings, *, doubt_noise: bool
+) -> tuple[Settings, EventModel | None]:
     """Fill in I_0 and the variance of steps: from the settings, else an estimate, else the usual."""
     camera, events = settings.camera, settings.events
     if camera.log_offset is not None and (
@@ -428,10 +436,13 @@ def _with_event_model(recording: Recording, settings: Settings) -> tuple[Setting
     ):
         return settings, None
     used = dataclasses.replace(events, refractory_period=_refractory_period(settings))
-    model = estimate_event_model(recording, camera, used)
+    model = estimate_event_model(recording, camera, used, doubt_noise=doubt_noise)
     if model is not None:
         if camera.log_offset is None:
             camera = dataclasses.replace(camera, log_offset=model.log_offset)
+        if model.frame_noise is not None:
+            read, shot = model.frame_noise
+            camera = dataclasses.replace(camera, frame_noise=read, shot_noise=shot)
         if events.step_variance is None:
             events = dataclasses.replace(events, step_variance=model.step_variance)
     # What could not be estimated is filled in with the usual value, so that the settings tell what was used.

@@ -38,7 +38,7 @@ from kalux.filters.shots import Shot, take_shot
 from kalux.filters.uncertainty import changed_within, hidden_variance
 from kalux.frames import Frame, check_frame
 from kalux.images import Estimate, Image, View, make_image
-from kalux.models.camera import Camera, beyond_white, count_bright
+from kalux.models.camera import Camera, beyond_white, count_bright, repeated_rounding
 from kalux.models.colour import Gains, white_balance
 from kalux.models.pixels import PixelCalibration, require_size
 from kalux.moments import Moment
@@ -412,6 +412,7 @@ class Reconstructor:
             highlight_spread=spread,
             unknown_variance=filtered.initial_variance,
             fixed_pattern=self.settings.camera.fixed_pattern or 0.0,
+            rounding=0.0 if frame is None else repeated_rounding(frame, self.settings.camera),
             mosaic=mosaic,
             gains=(1.0, 1.0, 1.0) if frame is None or mosaic is None else self._gains_of(frame),
         )

@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 import kalux
-from kalux import PRESETS, Recording
+from kalux import PRESETS, Recording, planning
 from kalux.calibration import event_model
 from kalux.calibration.event_model import (
     ErrorModel,
@@ -18,10 +18,12 @@ from kalux.calibration.event_model import (
     estimate_event_model,
     negative_log_likelihood,
 )
+from kalux.calibration.frame_noise import UsualNoise
 from kalux.datasets import SensorSettings, pan, photograph_scene, simulate
 from kalux.datasets.ahdr import ArtificialCamera, artificial_hdr
+from kalux.plan_report import plan_report
 from kalux.planning import plan
-from kalux.settings import CameraSettings, EventSettings
+from kalux.settings import CameraSettings, EventSettings, altered
 
 from builders import dark_scene
 
@@ -89,6 +91,44 @@ def test_noise_says_nothing_of_the_offset(recordings):
     )
     found = estimate_event_model(others, CameraSettings(), EVENTS)
     assert found is None or 0.02 < found.log_offset < 0.045
+
+
+@pytest.mark.parametrize("read", [0.0, 0.002, 0.004])
+def test_dark_pixels_tell_noise_by_what_events_leave(read):
+    """No less than there is, with the rounding, and no more than half as much again and half a level."""
+    recording, usual = recorded(log_offset=0.03, read_noise=read), CameraSettings()
+    assert estimate_event_model(recording, usual, EVENTS).frame_noise is None
+    found = estimate_event_model(recording, usual, EVENTS, doubt_noise=True)
+    true = np.hypot(read, 1 / 255 / 12**0.5)
+    assert found.frame_noise is not None
+    dark, shot = found.frame_noise
+    assert true <= dark < 1.5 * true + 0.5 / 255
+    assert np.sqrt(dark**2 + shot / 2) == pytest.approx(min(2 * dark, usual.usual_frame_noise))
+
+
+@pytest.mark.parametrize("silent", [False, True])
+def test_a_plan_takes_it_where_nothing_else_tells_noise(monkeypatch, recordings, silent):
+    """Stated noise stays, and so does what pixels without events tell."""
+    usual = UsualNoise(0.006, 0.0, silent=silent)
+    monkeypatch.setattr(planning, "estimate_frame_noise", lambda *_: None)
+    monkeypatch.setattr(planning, "usual_noise", lambda *_: usual)
+    made = plan(recordings[0.03], at="frames", settings=PRESETS["default"])
+    assert made.frame_noise is None
+    if silent:
+        assert made.event_model.frame_noise is None
+        assert made.settings.camera.noise == usual[:2]
+    else:
+        assert made.settings.camera.noise == made.event_model.frame_noise < usual[:2]
+        told = dict(plan_report(recordings[0.03], made, PRESETS["default"]))["noise"]
+        assert "as much as events do not explain" in told
+    stated = altered(PRESETS["default"], "camera", shot_noise=1e-4)
+    kept = plan(recordings[0.03], at="frames", settings=stated)
+    assert kept.settings.camera.noise == (0.006, 1e-4)
+
+
+def test_noise_that_is_usual_stays():
+    noisy = recorded(log_offset=0.03, read_noise=0.012)
+    assert estimate_event_model(noisy, CameraSettings(), EVENTS, doubt_noise=True).frame_noise is None
 
 
 def test_a_still_scene_says_nothing():

@@ -14,7 +14,6 @@ from kalux.calibration.frame_noise import (
     _not_negative,
     estimate_frame_noise,
     photon_transfer,
-    rounding_error,
     trimmed_variance,
     usual_noise,
 )
@@ -153,14 +152,14 @@ def test_dark_pixels_bound_the_noise_that_is_not_known():
     """Whatever moves elsewhere; at half of white it is the usual."""
     usual, dark = CAMERA.usual_frame_noise, np.where(np.arange(200) < 100, 0.015, RAMP)
     moving = 0.1 * np.random.default_rng(6).random(RAMP.shape) * (np.arange(200) >= 100)
-    read, shot = usual_noise(still(dark, 0.003, 0.0, changes=moving), CAMERA)
+    read, shot, _ = usual_noise(still(dark, 0.003, 0.0, changes=moving), CAMERA)
     assert read == pytest.approx(np.hypot(0.003, LEVEL), rel=0.1)
     assert read**2 + shot / 2 == pytest.approx(usual**2)
     assert usual_noise(still(dark, 1e-5, 0.0), CAMERA)[0] == pytest.approx(
         LEVEL
     )  # no less than rounding makes
-    assert usual_noise(still(dark, 0.012, 0.0), CAMERA) == (usual, 0.0)
-    assert usual_noise(still(RAMP + 0.02, 0.003, 0.0), CAMERA) == (usual, 0.0)  # nothing is dark
+    assert usual_noise(still(dark, 0.012, 0.0), CAMERA) == (usual, 0.0, True)
+    assert usual_noise(still(RAMP + 0.02, 0.003, 0.0), CAMERA) == (usual, 0.0, False)  # nothing is dark
 
 
 def test_of_dark_pixels_those_without_events_bound_the_noise():
@@ -171,12 +170,15 @@ def test_of_dark_pixels_those_without_events_bound_the_noise():
     y, x = np.nonzero(np.broadcast_to(columns, dark.shape))
     t = np.arange(12).repeat(len(x)) * 40_000 + 20_000
     events = make_events(t, np.tile(x, 12), np.tile(y, 12), np.ones(len(t), np.int64))
-    read, _ = usual_noise(still(dark, 0.002, 0.0, changes=moving, events=events), CAMERA)
+    read, _, silent = usual_noise(still(dark, 0.002, 0.0, changes=moving, events=events), CAMERA)
+    assert silent
     assert read == pytest.approx(np.hypot(0.002, LEVEL), rel=0.05)
     few = np.s_[:, 99:]  # the column that is still has an event beside it
     busy = make_events(t, np.tile(x - 99, 12), np.tile(y, 12), np.ones(len(t), np.int64))
     all_move = still(dark[few], 0.002, 0.0, changes=moving[few], events=busy)
-    assert usual_noise(all_move, CAMERA)[0] > 1.2 * read
+    of_all = usual_noise(all_move, CAMERA)
+    assert of_all.read > 1.2 * read
+    assert not of_all.silent
 
 
 @pytest.mark.parametrize("electrons", [0, 5000], ids=["no noise", "shot noise only"])
@@ -194,12 +196,6 @@ def test_frames_in_floats_without_read_noise_can_be_reconstructed(electrons):
     images = list(reconstruct(recording, at="frames"))
     assert len(images) == len(frames)
     assert all(np.isfinite(image.intensity).all() for image in images)
-
-
-def test_rounding():
-    assert rounding_error(Frame(np.zeros((1, 1), np.uint8), 0, 1)) == 0.5 / 255
-    assert rounding_error(Frame(np.zeros((1, 1), np.uint16), 0, 1, 1023)) == 0.5 / 1023
-    assert rounding_error(Frame(np.zeros((1, 1)), 0, 1)) == 0.0
 
 
 def test_outliers_do_not_make_variance():

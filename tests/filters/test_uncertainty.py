@@ -18,6 +18,7 @@ from kalux.filters.uncertainty import (
     changed_within,
     given_variance,
     hidden_variance,
+    keep_rounding,
     known_variance,
 )
 
@@ -64,6 +65,14 @@ def test_offsets_of_pixels_count_as_the_light_they_are_beside():
     variance = np.array([[0.25, 0.5]], np.float32)
     add_pattern(variance, np.array([[0.0, 0.3]], np.float32), 0.1, 0.02)
     np.testing.assert_allclose(variance, [[0.25 + 0.2**2, 0.5 + 0.05**2]], rtol=1e-5)
+
+
+def test_rounding_that_frames_share_bounds_the_variance_of_still_pixels():
+    """A half of that of one frame, beside I + I_0 of 0.1 and 0.4."""
+    variance = np.array([[1e-4, 1e-4, 1e-4, 0.5]], np.float32)
+    intensity = np.array([[0.0, 0.3, 0.0, 0.0]], np.float32)
+    keep_rounding(variance, intensity, np.array([[False, False, True, False]]), 0.1, 0.02)
+    np.testing.assert_allclose(variance, [[0.2**2 / 2, 0.05**2 / 2, 1e-4, 0.5]], rtol=1e-5)
 
 
 @given(variances, variances, st.floats(0.0, 30.0), st.floats(0.0, 0.1))

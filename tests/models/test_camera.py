@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kalux.errors import SettingsError
+from kalux.frames import Frame
 from kalux.models.camera import (
     BrightTail,
     Camera,
@@ -22,7 +23,10 @@ from kalux.models.camera import (
     log_covariance,
     log_intensity,
     noise_variance,
+    repeated_rounding,
+    rounding_error,
 )
+from kalux.settings import CameraSettings
 
 RESPONSES = {
     "linear": Response.linear(),
@@ -254,6 +258,24 @@ def test_covariance_of_a_frame_by_hand():
     expected = 1e-4 / np.array([0.045, 0.045, 0.045, 0.53]) ** 2 / weight
     found = frame_log_covariance(intensity, weight, (0.01, 0.0), 1.0, 0.03)
     np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
+def test_rounding():
+    assert rounding_error(Frame(np.zeros((1, 1), np.uint8), 0, 1)) == 0.5 / 255
+    assert rounding_error(Frame(np.zeros((1, 1), np.uint16), 0, 1, 1023)) == 0.5 / 1023
+    assert rounding_error(Frame(np.zeros((1, 1)), 0, 1)) == 0.0
+
+
+def test_rounding_repeats_where_noise_is_less_than_half_a_level():
+    """A standard deviation of a level over the root of 12; of no other response, of no floats, of no colours."""
+    octets, half = Frame(np.zeros((2, 2), np.uint8), 0, 1), 0.5 / 255
+    quiet = CameraSettings(frame_noise=half)
+    assert repeated_rounding(octets, quiet) == pytest.approx(1 / 255 / 12**0.5)
+    assert repeated_rounding(octets, CameraSettings(frame_noise=1.01 * half)) == 0
+    assert repeated_rounding(octets, CameraSettings()) == 0
+    assert repeated_rounding(octets, CameraSettings(frame_noise=half, response="srgb")) == 0
+    assert repeated_rounding(Frame(np.zeros((2, 2)), 0, 1), quiet) == 0
+    assert repeated_rounding(Frame(np.zeros((2, 2, 3), np.uint8), 0, 1), quiet) == 0
 
 
 def test_dark_pixels_are_not_made_brighter_by_their_noise():

@@ -15,6 +15,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.calibration.frame_noise import quiet_noise, trimmed_variance
 from kalux.calibration.intervals import counted_intervals, spread
 from kalux.calibration.regression import products
 from kalux.models.camera import (
@@ -43,6 +44,15 @@ _MIN_SAMPLES: Final = 1_000
 _MAX_FRAMES: Final = 80
 _LEAST_NET: Final = 2  # a net count of one may be noise
 DARKEST: Final = 0.01  # two to three levels of 8 bits: below, a frame's log is rounding
+_DARK: Final = 3 * DARKEST
+"""Mean of I at both ends up to which noise is that of the dark."""
+
+_FEW_EVENTS: Final = 4
+"""Of a dark pixel between two frames: with more, errors of events hide the noise of frames."""
+
+_MIN_DARK: Final = 50
+"""Dark pixels from which the standard deviation of their noise is known within a tenth."""
+
 _CORRELATED: Final = 50.0
 """Samples that count as one independent observation: pixels along one edge have the same errors in an interval."""
 
@@ -61,11 +71,14 @@ class EventModel(NamedTuple):
         Variance of one event's step, in units of c^2.
     samples
         Pixels and frame intervals used.
+    frame_noise
+        Read and shot noise of frames, where they were in doubt and there is less in the dark than was taken; else None.
     """
 
     log_offset: float
     step_variance: float
     samples: int
+    frame_noise: tuple[float, float] | None = None
 
 
 class Samples(NamedTuple):
@@ -123,7 +136,7 @@ class ErrorModel(NamedTuple):
 
 
 def estimate_event_model(
-    recording: Recording, camera: CameraSettings, events: EventSettings
+    recording: Recording, camera: CameraSettings, events: EventSettings, *, doubt_noise: bool = False
 ) -> EventModel | None:
     """I_0 and the variance of an event's step, from the first 80 frames.
 
@@ -135,6 +148,8 @@ def estimate_event_model(
         Response, saturation, frame noise, and I_0 if it is known.
     events
         Thresholds, delay, refractory period, threshold spread and quantisation variance.
+    doubt_noise
+        Whether nothing has told the camera's frame noise: in the dark it is no more than events leave unexplained.
 
     Returns None where fewer than 1000 pixels changed by two events between two frames that show them well enough.
 
@@ -149,19 +164,41 @@ def estimate_event_model(
     signals = Samples(*(values[chosen] for values in samples))
     if len(signals.before) < _MIN_SAMPLES:
         return None
+    # Frames that show the dark range over a hundred to one: what is beyond matters little, and lost events, of
+    # which the model knows nothing, would count for more.
+    of_signals = FrameLimits(*(limit[chosen] for limit in limits)) if limits.least.any() else None
+
+    def fitted(model: ErrorModel) -> tuple[float, float]:
+        log_offset = camera.log_offset or _log_offset(signals, of_signals, model)
+        # Single events, most of them noise where nothing moves, say much of the step and nothing of I_0; so do those of
+        # pixels that go black, whose steps are the least sure. Without these artificial HDR of slider_depth errs a
+        # seventh more: they make up for what is not modelled of events where no frame checks them.
+        return log_offset, model.best_fit(samples, None, log_offset)[1]
+
     model = ErrorModel(events.thresholds, camera.noise, events.mismatch, events.quantisation_variance)
-    if camera.log_offset is None:
-        # Frames that show the dark range over a hundred to one: what is beyond matters little, and lost events, of
-        # which the model knows nothing, would count for more.
-        of_signals = FrameLimits(*(limit[chosen] for limit in limits)) if limits.least.any() else None
-        log_offset = _log_offset(signals, of_signals, model)
-    else:
-        log_offset = camera.log_offset
-    # Single events, most of them noise where nothing moves, say much of the step and nothing of I_0; so do those of
-    # pixels that go black, whose steps are the least sure. Without these artificial HDR of slider_depth errs a seventh
-    # more: they make up for what is not modelled of events where no frame checks them.
-    _, step_variance = model.best_fit(samples, None, log_offset)
-    return EventModel(log_offset, step_variance, len(samples.before))
+    found = fitted(model)
+    dark = dark_noise(samples, model, *found) if doubt_noise and of_signals is None else None
+    if dark is None or dark >= camera.noise[0]:
+        return EventModel(*found, len(samples.before))
+    noise = quiet_noise(recording, camera, dark)
+    return EventModel(*fitted(model._replace(frame_noise=noise)), len(samples.before), noise)
+
+
+def dark_noise(samples: Samples, model: ErrorModel, log_offset: float, step_variance: float) -> float | None:
+    """Standard deviation of the frames' noise in the dark, white = 1, by what events leave unexplained there.
+
+    Half of the variance of what dark pixels with few events changed beyond these, less what the events' own errors make
+    of it, without what lies beyond four standard deviations. With noise of 0.003 to 0.012 it is 1.1 to 1.3 times as
+    much as there is; where there is only the rounding of 8 bits, 0.0011, it is 0.0009 to 0.0025. None: too few pixels.
+    """
+    level = (samples.before + samples.after) / 2
+    chosen = (level > DARKEST) & (level < _DARK) & (samples.on + samples.off <= _FEW_EVENTS)
+    if np.count_nonzero(chosen) < _MIN_DARK:
+        return None
+    dark, scale = Samples(*(values[chosen] for values in samples)), level[chosen] + log_offset
+    mismatch, of_events = mismatch_of(dark, model._replace(frame_noise=(0.0, 0.0)), log_offset, step_variance)
+    unexplained = trimmed_variance(mismatch * scale) - float(np.mean(of_events * scale**2))
+    return float(np.sqrt(max(unexplained, 0.0) / 2))
 
 
 def _log_offset(samples: Samples, limits: FrameLimits | None, model: ErrorModel) -> float:

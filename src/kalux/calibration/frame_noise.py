@@ -20,7 +20,7 @@ from kalux.compiled import empty, event_column, event_row, event_words, loop, sm
 from kalux.event_slices import all_between
 from kalux.events import EventArray
 from kalux.filters.shots import Shot
-from kalux.frames import Frame
+from kalux.models.camera import rounding_error
 from kalux.recording import Recording
 from kalux.settings import CameraSettings
 
@@ -47,6 +47,9 @@ _DARKEST: Final = 0.01  # two to three levels of 8 bits: below, black cuts the n
 
 _LEAST_READ: Final = 0.5 / 65535
 """Least read noise of frames in floats, white = 1: the rounding of 16 bits, finer than any camera's."""
+
+_AT_HALF: Final = 2.0
+"""Noise at half of white in units of that in the dark, where only the latter is told."""
 
 _SPAN: Final = 3.0  # largest over smallest level, below which read and shot noise cannot be told apart
 _LARGEST_ERROR: Final = 0.3  # relative: beyond it the points are no photon transfer curve
@@ -132,7 +135,23 @@ def estimate_frame_noise(
     return found._replace(read=read, shot=found.shot if found.shot > _LEAST_READ**2 else 0.0)
 
 
-def usual_noise(recording: Recording, camera: CameraSettings) -> tuple[float, float]:
+class UsualNoise(NamedTuple):
+    """Noise of frames where no photon transfer tells it, white = 1.
+
+    Attributes
+    ----------
+    read, shot
+        As of `FrameNoise`.
+    silent
+        Whether ``read`` is what pixels without events change by: those with events, or none, say too much.
+    """
+
+    read: float
+    shot: float
+    silent: bool
+
+
+def usual_noise(recording: Recording, camera: CameraSettings) -> UsualNoise:
     """Read and shot noise where nothing tells them: the usual at half of white, in the dark what its pixels allow.
 
     Whatever moves, pixels change by their noise at least: from 0.01 to 0.02 of white it is no more than those do that
@@ -169,20 +188,24 @@ def usual_noise(recording: Recording, camera: CameraSettings) -> tuple[float, fl
                 into.append(trimmed_variance(difference[chosen]) / 2)
     found = of_silent or of_all
     if not found:
-        return usual, 0.0
-    changes = float(np.sqrt(np.median(found)))
-    rounding = rounding_error(next(iter(recording.frames()))) / 3**0.5
-    read = min(max(changes, rounding, _LEAST_READ), usual)
-    return read, (usual**2 - read**2) / 0.5
+        return UsualNoise(usual, 0.0, silent=False)
+    read = _possible_read(recording, camera, float(np.sqrt(np.median(found))))
+    return UsualNoise(read, (usual**2 - read**2) / 0.5, silent=bool(of_silent))
 
 
-def rounding_error(frame: Frame) -> float:
-    """Half a level, white = 1; 0 for images of floating point.
+def quiet_noise(recording: Recording, camera: CameraSettings, dark: float) -> tuple[float, float]:
+    """Read and shot noise of frames that have less than the usual noise in the dark: ``dark``, white = 1.
 
-    The most that rounding can change, not its standard deviation, 1 / sqrt(12): where noise is less than a level it is
-    the same error in every frame, which no mean takes away.
+    At half of white it is taken to be twice that, but no more than the usual: three DAVIS sensors have 1 to 1.85 times.
     """
-    return 0.0 if frame.image.dtype.kind == "f" else 0.5 / frame.white_value
+    read = _possible_read(recording, camera, dark)
+    return read, (min(_AT_HALF * read, camera.usual_frame_noise) ** 2 - read**2) / 0.5
+
+
+def _possible_read(recording: Recording, camera: CameraSettings, dark: float) -> float:
+    """Noise in the dark: no more than the usual, and no less than the standard deviation of rounding."""
+    rounding = rounding_error(next(iter(recording.frames()))) / 3**0.5
+    return min(max(dark, rounding, _LEAST_READ), camera.usual_frame_noise)
 
 
 def _has_one_exposure(interval: Interval) -> bool:

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.errors import SettingsError
-from kalux.settings import CameraSettings
+from kalux.frames import Frame
+from kalux.settings import AUTO, CameraSettings
 
 Array = NDArray[np.float64]
 
@@ -412,6 +413,26 @@ def noise_variance(intensity: Array, noise: tuple[float, float], white: float) -
     """
     read, shot = noise
     return (read * white) ** 2 + shot * white * np.maximum(intensity, 0.0)
+
+
+def rounding_error(frame: Frame) -> float:
+    """Half a level, white = 1; 0 for images of floating point.
+
+    The most that rounding can change, not its standard deviation, 1 / sqrt(12): where noise is less than a level it is
+    the same error in every frame, which no mean takes away.
+    """
+    return 0.0 if frame.image.dtype.kind == "f" else 0.5 / frame.white_value
+
+
+def repeated_rounding(frame: Frame, camera: CameraSettings) -> float:
+    """Standard deviation, white = 1, of rounding that is the same in all frames of a still pixel (K11); 0: none is.
+
+    Noise of more than half a level makes it another one in every frame. Levels of a response that is not linear have
+    another width each, and colours have been demosaiced: nothing is said of them.
+    """
+    half_level = rounding_error(frame)
+    repeats = camera.noise[0] <= half_level and camera.response in (AUTO, "linear") and frame.image.ndim == 2
+    return half_level / 3**0.5 if repeats else 0.0
 
 
 _DARK: Final = 1.5
