@@ -103,6 +103,15 @@ def remembering(recording: Recording, events: int, frame_bytes: int) -> Recordin
     return remembered
 
 
+def without_events_of(recording: Recording, pixels: NDArray[np.bool_]) -> Recording:
+    """The same recording without the events of ``pixels``, (H, W); how many events there are is not counted again."""
+    whole, made = recording.source.events, copy.copy(recording)
+    made.source = dataclasses.replace(
+        recording.source, events=lambda: (chunk[~pixels[chunk["y"], chunk["x"]]] for chunk in whole())
+    )
+    return made
+
+
 def no_frames(recording: Recording) -> FrameError:
     """What to raise where a recording without frames cannot be used."""
     return FrameError(
