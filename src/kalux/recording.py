@@ -222,6 +222,7 @@ class Recording:
         contrast_threshold: float | tuple[float, float] | None = None,
         inverse_covariance: NDArray[np.float64] | None = None,
         ground_truth: GroundTruth | None = None,
+        response: str | None = None,
         name: str = "arrays",
     ) -> Recording:
         """A recording in memory.
@@ -242,6 +243,8 @@ class Recording:
             (256,) 1 / R_bar per 8-bit value (the released ``f_Q``), if known.
         ground_truth
             Reference images, if any.
+        response
+            Of the frame camera, named as in `kalux.settings.CameraSettings`, if known.
         name
             Stands for the path in messages.
 
@@ -280,6 +283,7 @@ class Recording:
                 inverse_covariance=inverse_covariance,
                 ground_truth=None if ground_truth is None else lambda: ground_truth,
                 mosaic=frame_list[0].mosaic if frame_list else None,
+                response=response,
             ),
             exposure=exposure,
             stamp=stamp,
