@@ -143,7 +143,8 @@ def plan(
     if known.pixels is not None:
         require_size(known.pixels, recording.sensor_size)
     recording = remembering(recording, _REMEMBERED_EVENTS, _REMEMBERED_FRAMES)
-    hot = find_hot_pixels(recording, _NOISE_EVENTS) if _uses_steps(chosen) else None
+    looks_for_hot = _uses_steps(chosen) and chosen.events.leave_out_hot
+    hot = find_hot_pixels(recording, _NOISE_EVENTS) if looks_for_hot else None
     if hot is not None and hot.any():
         recording = without_events_of(recording, hot)
     chosen, ceiling = with_saturation(recording, chosen)
