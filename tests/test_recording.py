@@ -12,7 +12,7 @@ import pytest
 from kalux import readers, recording
 from kalux.errors import EventError, ExposureError, FormatError, FrameError, InputError
 from kalux.frames import Frame, GroundTruth
-from kalux.recording import Recording, with_cached_start
+from kalux.recording import Recording, with_cached_start, without_events_of
 from kalux.writers import hdf5
 from recordings import SIZE, same_frames, small_events, small_frames
 
@@ -335,3 +335,14 @@ def test_a_ground_truth_that_is_none():
         InputError, match=r"ground_truth is a tuple; a kalux\.frames\.GroundTruth is needed, from"
     ):
         recording.Recording.from_arrays([], [], sensor_size=(4, 5), ground_truth=truth)
+
+
+def test_events_of_single_pixels_can_be_left_out():
+    whole = Recording.from_arrays(small_events(), [], sensor_size=SIZE)
+    first = np.concatenate(list(whole.events()))
+    left_out = np.zeros(whole.sensor_size, np.bool_)
+    left_out[first["y"][0], first["x"][0]] = True
+    rest = np.concatenate(list(without_events_of(whole, left_out).events()))
+    assert 0 < len(rest) < len(first)
+    assert not left_out[rest["y"], rest["x"]].any()
+    assert len(np.concatenate(list(whole.events()))) == len(first)

@@ -71,6 +71,8 @@ def _of_events(plan: Plan, asked: Settings) -> Iterator[tuple[str, str]]:
         if plan.background_rate is not None and plan.background_rate < events.noise_rate:
             how = f"the least that is assumed; measured {plan.background_rate:.2g}"
         yield "background", f"{events.noise_rate:.2g} Hz per pixel of events without reason ({how})"
+    if plan.hot_pixels:
+        yield "hot pixels", f"{how_many(plan.hot_pixels, 'pixel')} whose events are left out (measured)"
 
 
 def _of_frames(recording: Recording, plan: Plan, asked: Settings) -> Iterator[tuple[str, str]]:

@@ -21,6 +21,7 @@ from kalux.calibration.global_thresholds import (
     refine_thresholds,
     with_true_delay,
 )
+from kalux.calibration.hot_pixels import find_hot_pixels
 from kalux.calibration.levels import Ceiling, exact_end, find_ceiling
 from kalux.calibration.mismatch import Mismatch, estimate_mismatch
 from kalux.calibration.noise import event_noise
@@ -32,8 +33,8 @@ from kalux.errors import InputError, require_type
 from kalux.frames import median_exposure
 from kalux.models.camera import BrightTail, Camera, count_bright
 from kalux.models.colour import white_balance
-from kalux.models.pixels import PixelCalibration, require_size
-from kalux.recording import RECORDING_NEEDED, Recording, no_frames, with_cached_start
+from kalux.models.pixels import PixelCalibration, require_size, with_hot
+from kalux.recording import RECORDING_NEEDED, Recording, no_frames, with_cached_start, without_events_of
 from kalux.schedule import image_times
 from kalux.settings import SETTINGS_NEEDED, Settings, altered, chosen_response
 from kalux.settings import preset as named_preset
@@ -86,7 +87,7 @@ class Plan:
     smooth
         Whether images use all of the recording after them.
     pixels
-        What a calibration says of single pixels.
+        What a calibration says of single pixels, and which ones are hot.
     frame_noise
         The fit of the frames' noise, where there was one.
     fixed_pattern
@@ -99,6 +100,8 @@ class Plan:
         Where the frames end at one level below the usual saturation while events go on.
     dead_time
         The refractory period that noise shows, us; 0 where it does not.
+    hot_pixels
+        How many event pixels were found to be hot, whose events are left out.
     """
 
     settings: Settings
@@ -116,6 +119,7 @@ class Plan:
     background_rate: float | None = None
     ceiling: Ceiling | None = None
     dead_time: int = 0
+    hot_pixels: int = 0
 
 
 def plan(
@@ -145,6 +149,10 @@ def plan(
     if known.pixels is not None:
         require_size(known.pixels, recording.sensor_size)
     recording = with_cached_start(recording, _CACHED_EVENTS, _CACHED_FRAME_BYTES)
+    looks_for_hot = chosen.filter.joins_frames and chosen.events.leave_out_hot
+    hot = find_hot_pixels(recording, _NOISE_EVENTS) if looks_for_hot else None
+    if hot is not None and hot.any():
+        recording = without_events_of(recording, hot)
     chosen, ceiling = with_saturation(recording, chosen)
     response = chosen_response(chosen.camera.response, recording.response)
     camera = Camera.named(response, chosen.camera.clipped_from)
@@ -179,7 +187,8 @@ def plan(
         times=wanted,
         lookahead=lookahead,
         smooth=smooth,
-        pixels=known.pixels,
+        pixels=known.pixels if hot is None else with_hot(known.pixels, hot, chosen.events.mismatch),
+        hot_pixels=0 if hot is None else int(np.count_nonzero(hot)),
         frame_noise=noise,
         fixed_pattern=pattern,
         mismatch=mismatch,

@@ -117,6 +117,15 @@ def with_cached_start(recording: Recording, events: int, frame_bytes: int) -> Re
     return cached
 
 
+def without_events_of(recording: Recording, pixels: NDArray[np.bool_]) -> Recording:
+    """The same recording without the events of ``pixels``, (H, W); how many events there are is not counted again."""
+    whole, made = recording.source.events, copy.copy(recording)
+    made.source = dataclasses.replace(
+        recording.source, events=lambda: (chunk[~pixels[chunk["y"], chunk["x"]]] for chunk in whole())
+    )
+    return made
+
+
 def no_frames(recording: Recording) -> FrameError:
     """What to raise where a recording without frames cannot be used."""
     return FrameError(
@@ -234,6 +243,7 @@ class Recording:
         contrast_threshold: float | tuple[float, float] | None = None,
         inverse_covariance: NDArray[np.float64] | None = None,
         ground_truth: GroundTruth | None = None,
+        response: str | None = None,
         name: str = "arrays",
     ) -> Recording:
         """A recording in memory.
@@ -254,6 +264,8 @@ class Recording:
             (256,) 1 / R_bar per 8-bit value (the released ``f_Q``), if known.
         ground_truth
             Reference images, if any.
+        response
+            Of the frame camera, named as in `kalux.settings.CameraSettings`, if known.
         name
             Stands for the path in messages.
 
@@ -293,6 +305,7 @@ class Recording:
                 inverse_covariance=inverse_covariance,
                 ground_truth=None if ground_truth is None else lambda: ground_truth,
                 mosaic=frame_list[0].mosaic if frame_list else None,
+                response=response,
             ),
             exposure=exposure,
             stamp=stamp,

@@ -133,6 +133,9 @@ class EventSettings:
     noise_rate
         Background noise, Hz per pixel, that makes isolated events doubtful. None: what is measured in the recording
         (`kalux.calibration.noise`), at least 0.5, in causal mode at least the usual; the usual in a live stream.
+    leave_out_hot
+        Whether pixels that leak all the time are looked for in the recording, and their events left out
+        (`kalux.calibration.hot_pixels`). True: their highlights grow without bound (docs/calibration.md).
     extrapolation_spread
         Where thresholds are only estimates: standard deviation of the log of their common error beyond white, where no
         frame corrects it; or threshold_spread, if that is known and less. 0.15: how well large changes between well
@@ -173,6 +176,7 @@ class EventSettings:
     quantisation_variance: float = 1 / 6
     deblur_variance: float = 0.05
     noise_rate: float | None = None
+    leave_out_hot: bool = True
     extrapolation_spread: float = 0.15
     trail: float = 0.4
     usual_threshold_on: float = 0.25

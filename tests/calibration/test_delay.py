@@ -45,6 +45,27 @@ def test_a_shift_of_the_events_is_found(simulation, by):
     assert estimate_delay(late(simulation, by), CAMERA).apparent == pytest.approx(trail + by, abs=600)
 
 
+@pytest.mark.parametrize("by", [-18_000, 20_000, 30_000])
+def test_so_is_a_clock_that_started_apart(simulation, by):
+    """Where no delay of a sensor is best."""
+    trail = estimate_delay(late(simulation, 0), CAMERA).apparent
+    found = estimate_delay(late(simulation, by), CAMERA)
+    assert found.apparent == pytest.approx(trail + by, abs=900)
+    assert found.improvement > 0.5
+
+
+@pytest.mark.parametrize("wrong", ["sign", "place"])
+def test_events_of_other_frames_are_not_made_to_fit_by_a_far_delay(simulation, wrong):
+    events = simulation.events.copy()
+    if wrong == "sign":
+        events["p"] = ~events["p"]
+    else:
+        events["x"] = events["x"].max() - events["x"]
+    recording = Recording.from_arrays(events, simulation.frames, sensor_size=simulation.frames[0].image.shape)
+    found = estimate_delay(recording, CAMERA)
+    assert found is None or abs(found.apparent) <= delay.LARGEST
+
+
 def test_long_exposures_are_no_delay():
     """Over fine texture a mean of the light is not its middle: if it were, events would seem to be 1.8 ms later."""
     noise = np.random.default_rng(0).standard_normal((50, 260))

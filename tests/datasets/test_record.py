@@ -11,6 +11,7 @@ import pytest
 import kalux
 from kalux.datasets import Scene, SensorSettings, moving_edge, sensor_preset, simulate
 from kalux.datasets.record import Watch, record
+from kalux.datasets.sensors import CameraResponse
 from kalux.datasets.simulate import truth_times
 from kalux.errors import InputError, SettingsError
 
@@ -38,6 +39,18 @@ def test_the_file_is_the_simulation(tmp_path: Path, exposures: list[int] | None)
     assert told[:4] == (len(events), int(events["p"].sum()), 25, len(truth.times))
     lengths = simulation.exposures.lengths
     assert told.exposures == (lengths.min(), lengths.max())
+
+
+@pytest.mark.parametrize(
+    ("response", "stated"), [("srgb", "srgb"), ("linear", None), (np.sqrt, None)], ids=str
+)
+def test_the_response_is_stated(tmp_path: Path, response: CameraResponse, stated: str | None) -> None:
+    """Unless it is the usual one, or has no name: a reconstruction would take its frames for linear."""
+    scene = moving_edge(0.05, 3.0, sensor_size=(12, 16))
+    sensor = SensorSettings(response=response)
+    record(tmp_path / "a.h5", scene, sensor)
+    assert kalux.open(tmp_path / "a.h5").response == stated
+    assert simulate(scene, sensor).recording().response == stated
 
 
 def test_the_same_bytes_again(tmp_path: Path) -> None:

@@ -23,6 +23,16 @@ STEP: Final = 1_000
 LARGEST: Final = 12_000
 """Largest delay that is tried, us: the photoreceptor's, in the dark, is some milliseconds (Lichtsteiner 2008)."""
 
+FARTHEST: Final = 36_000
+"""us: looked for only where no delay up to `LARGEST` is best. A sensor is never so late; clocks that started apart are,
+and frames of long exposures whose length is not known."""
+
+_FAR_STEP: Final = 3_000  # us: residuals have valleys 4 ms wide
+_FAR_AROUND: Final = 4  # steps of the fine grid, to either side
+_FAR_DEPTH: Final = 0.4
+"""Share of the median residual of all delays that a far one must take away to be believed. True ones of 15 to 20 ms
+take 0.55 to 0.8; where events do not belong to the frames (shifted by three pixels, of the wrong sign) it is 0.1."""
+
 _COARSE: Final = (
     3  # points of the grid from one delay tried first to the next: valleys of the residuals are wider
 )
@@ -82,7 +92,8 @@ def estimate_delay(recording: Recording, camera: CameraSettings) -> DelayEstimat
     Latency of the event pixels (which grows in the dark), a wrong stamp or a guessed exposure time all look alike,
     and are all mended by it. Looks at the first 60 frames.
 
-    Returns None where too few pixels change, or where no delay within 12 ms explains the frames best.
+    Returns None where too few pixels change, or where no delay within 12 ms explains the frames best, nor one within
+    36 ms far better than most.
 
     Raises
     ------
@@ -116,9 +127,36 @@ def estimate_delay(recording: Recording, camera: CameraSettings) -> DelayEstimat
         try_between(best - 1, best + 1)
     rough = best_delay(grid, residuals, len(samples[0].change))
     if rough is None:
+        grid, samples, rough = _far_delay(recording, camera)
+    if rough is None:
         return None
     fit = _fit(samples[int(np.argmin(np.abs(grid - rough.apparent)))])
     return rough if fit is None else _with_moving_exposures(recording, camera, rough, fit)
+
+
+def _far_delay(
+    recording: Recording, camera: CameraSettings
+) -> tuple[NDArray[np.int64], list[_Samples], DelayEstimate | None]:
+    """A delay up to `FARTHEST`, where none up to `LARGEST` is best: on a coarse grid, then on a fine one.
+
+    Where a fit fails, as thresholds come out negative, events do not belong to the frames: such a delay is not it.
+
+    Returns
+    -------
+    The fine grid, the samples under each of its delays, and the estimate; None if none is far better than most.
+    """
+    coarse = np.arange(-FARTHEST, FARTHEST + 1, _FAR_STEP, dtype=np.int64)
+    residuals = np.array([_residual(samples) for samples in _samples(recording, camera, coarse, (0.0, 0.0))])
+    fitted = residuals[~np.isnan(residuals)]
+    if not len(fitted) or fitted.min() > (1.0 - _FAR_DEPTH) * np.median(fitted):
+        return coarse, [], None
+    undelayed = float(residuals[len(coarse) // 2])
+    near = int(coarse[int(np.nanargmin(residuals))])
+    grid = near + STEP * np.arange(-_FAR_AROUND, _FAR_AROUND + 1, dtype=np.int64)
+    samples = _samples(recording, camera, grid, (0.0, 0.0))
+    around = np.array([_residual(s) for s in samples])
+    undelayed = float(np.median(fitted)) if np.isnan(undelayed) else undelayed
+    return grid, samples, best_delay(grid, around, len(samples[0].change), undelayed)
 
 
 def _with_moving_exposures(
@@ -156,11 +194,14 @@ def delays() -> NDArray[np.int64]:
     return np.arange(-LARGEST, LARGEST + 1, STEP, dtype=np.int64)
 
 
-def best_delay(grid: NDArray[np.int64], residuals: Array, samples: int) -> DelayEstimate | None:
+def best_delay(
+    grid: NDArray[np.int64], residuals: Array, samples: int, undelayed: float | None = None
+) -> DelayEstimate | None:
     """The minimum of the residuals over the grid, refined by a parabola through its neighbours.
 
     Of several that are about as deep (`_RIVAL`), the one nearest to no delay. Residuals are inf where nothing was
-    tried. None where the minimum is at an end of the grid, or where a fit failed.
+    tried; ``undelayed`` is that of no delay, if the grid has none. None where the minimum is at an end of the grid, or
+    where a fit failed.
     """
     if np.isnan(residuals).any():
         return None
@@ -171,7 +212,9 @@ def best_delay(grid: NDArray[np.int64], residuals: Array, samples: int) -> Delay
     best = int(rivals[np.argmin(np.abs(grid[rivals]))]) if len(rivals) else least
     if best in (0, len(grid) - 1):
         return None
-    improvement = 1.0 - residuals[best] / residuals[int(np.flatnonzero(grid == 0)[0])]
+    if undelayed is None:
+        undelayed = float(residuals[int(np.flatnonzero(grid == 0)[0])])
+    improvement = 1.0 - residuals[best] / undelayed
     apparent = float(grid[best]) + STEP * (vertex(*residuals[best - 1 : best + 2]) or 0.0)
     return DelayEstimate(round(apparent), float(improvement), samples)
 
@@ -217,7 +260,7 @@ def _samples(
     """
     parts: list[list[_Samples]] = []
     total = 0
-    margin = LARGEST + (recording.longest_exposure if any(thresholds) else 0)
+    margin = max(LARGEST, int(np.abs(grid).max())) + (recording.longest_exposure if any(thresholds) else 0)
     exposures = [(d, Exposures(recording.sensor_size, d, thresholds)) for d in grid.tolist()]
     for interval in intervals(recording, camera, margin=margin, most_frames=_MAX_FRAMES):
         events = sum(_counts(interval.events, recording.sensor_size))

@@ -114,6 +114,7 @@ def record(
         frames=watched(frame_stream(scene, settings, plan, seed=seed, sampling=sampling)),
         contrast_threshold=(settings.threshold_on, settings.threshold_off),
         ground_truth=hdf5.TruthStream(times, watched(truth_images(scene, plan, times))),
+        response=settings.stated_response,
     )
     lengths = plan.lengths
     return Recorded(counts[0], counts[1], len(lengths), len(times), (int(lengths.min()), int(lengths.max())))

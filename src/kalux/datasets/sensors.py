@@ -159,6 +159,11 @@ class SensorSettings:
         """
         return Response.named(self.response) if isinstance(self.response, str) else self.response
 
+    @property
+    def stated_response(self) -> str | None:
+        """The response that a recording states: its name; None of a function, and of ``linear``, which is the usual."""
+        return self.response if isinstance(self.response, str) and self.response != "linear" else None
+
 
 _RANGES: Final[Mapping[str, tuple[float, float, str]]] = {
     # Below a thousandth a pixel would have events without end; no scene changes by a factor of exp(100).

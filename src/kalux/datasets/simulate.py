@@ -94,6 +94,7 @@ class Simulation:
             sensor_size=self.scene.sensor_size,
             contrast_threshold=(self.settings.threshold_on, self.settings.threshold_off),
             ground_truth=self.truth(times),
+            response=self.settings.stated_response,
             name=self.scene.name,
         )
 

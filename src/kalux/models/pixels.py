@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,6 +53,21 @@ class PixelCalibration:
         """(height, width)."""
         height, width = self.on.shape
         return height, width
+
+
+def with_hot(
+    pixels: PixelCalibration | None, hot: NDArray[np.bool_], spread: float
+) -> PixelCalibration | None:
+    """A calibration in which these pixels, (H, W), are hot, too; the same where none is.
+
+    Where there was none, thresholds are the nominal ones, and pixels differ from them by the relative ``spread``.
+    """
+    if not hot.any():
+        return pixels
+    if pixels is not None:
+        return dataclasses.replace(pixels, hot=pixels.hot | hot)
+    factor, variance = np.ones(hot.shape), np.full(hot.shape, spread**2)
+    return PixelCalibration(factor, factor, variance, variance, hot)
 
 
 def require_size(pixels: PixelCalibration, sensor_size: tuple[int, int]) -> None:
