@@ -900,7 +900,7 @@ def joined_along(first, second, path, bend, share, level, variance, between):
         doubt[row, column] = (1 - share) ** 2 * a[1] + share**2 * b[1]
         apart[row, column] = (a[0] - b[0]) ** 2
     fine = (seen - around(seen, 1)) ** 2
-    doubt += 0.25 * around(apart, 1) + 5e-4 + 0.1 * around(fine, 1)
+    doubt += 0.15 * around(apart, 1) + 0.1 * around(fine, 1)
     unexplained = around(apart, 2) / np.maximum(around((first[0] - second[0]) ** 2, 2), 5e-4)
     doubt /= np.maximum(1 - unexplained, 1e-6)
     contradiction = around((level - seen) ** 2 / (variance + doubt), 2)
