@@ -16,9 +16,11 @@ from typing import Any, Final
 
 import cv2
 import numpy as np
+from numba.core import types
 from numpy.typing import NDArray
 
-from kalux.compiled import apart, loop, smaller
+from kalux.compiled import apart, larger, loop, smaller
+from kalux.formulas import Number, formula
 
 Floats = NDArray[np.floating[Any]]
 
@@ -28,8 +30,14 @@ _MOST: Final = 6
 _EXACT: Final = 4
 """Events of the neighbours up to which every number is a class of its own; then half octaves are."""
 
+_LARGEST: Final = 4096
+"""Of the neighbours' events: more are taken for as many."""
+
 _CLASSES: Final = 25
-"""Of the neighbours' events: up to 4096."""
+"""Of the neighbours' events."""
+
+_CELLS: Final = _CLASSES * (_MOST + 1)
+"""Of pixels with like events of their own and of their neighbours."""
 
 _PRIOR_PIXELS: Final = 4.0
 """Pixels by which every number is as likely as the next, beside those counted: a class with few says little."""
@@ -45,19 +53,20 @@ def signal_shares(on: Floats, off: Floats, expected: float) -> tuple[Floats, Flo
     expected
         Noise events of a pixel in that time, of both polarities.
     """
-    planes = tuple(np.rint(counts).astype(np.float32) for counts in (on, off))
-    around = tuple(_around(counts) for counts in planes)
-    pixels = np.full((_CLASSES, _MOST), _PRIOR_PIXELS)
-    for counts, near in zip(planes, around, strict=True):
-        _count(counts.reshape(-1), near.reshape(-1), _OF_NUMBER, pixels)
-    own = np.arange(1, _MOST)
-    noise = np.minimum(expected / 2.0 / own * pixels[:, :-1] / pixels[:, 1:], 1.0)
-    signal = np.ones((_CLASSES, _MOST), np.float32)  # also of no event
-    signal[:, 1:] = 1.0 - np.minimum.accumulate(noise, axis=1)  # no less for more events
+    counts = tuple(np.rint(events).astype(np.float32) for events in (on, off))
+    cells = tuple(np.empty(on.size, np.uint8) for _ in counts)
+    found = np.zeros((2, _CELLS), np.int64)
+    for own, cell in zip(counts, cells, strict=True):
+        _classify(own.reshape(-1), _around(own).reshape(-1), cell)
+        _count(cell, found)
+    pixels = found.sum(axis=0).reshape(_CLASSES, _MOST + 1)[:, :_MOST] + _PRIOR_PIXELS
+    own_events = np.arange(1, _MOST)
+    noise = np.minimum(expected / 2.0 / own_events * pixels[:, :-1] / pixels[:, 1:], 1.0)
+    signal = np.ones((_CLASSES, _MOST + 1), np.float32)  # also of no event
+    signal[:, 1:-1] = 1.0 - np.minimum.accumulate(noise, axis=1)  # no less for more events
     shares = apart(2, on.shape)
-    for counts, near, share in zip(planes, around, shares, strict=True):
-        half = np.float32(expected / 2.0)
-        _look_up(counts.reshape(-1), near.reshape(-1), _OF_NUMBER, signal, half, share.reshape(-1))
+    for own, cell, share in zip(counts, cells, shares, strict=True):
+        _look_up(own.reshape(-1), cell, signal.reshape(-1), np.float32(expected / 2.0), share.reshape(-1))
     return shares[0], shares[1]
 
 
@@ -80,31 +89,36 @@ def _around(counts: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(nearest + near - 2.0 * counts, np.float32)
 
 
-def _classes() -> NDArray[np.int64]:
-    """The class of every number of the neighbours' events."""
-    numbers = np.arange(_EXACT, 2 ** (_CLASSES // 2) + 1)
-    return np.concatenate([np.arange(_EXACT), np.floor(2.0 * np.log2(numbers)).astype(np.int64)])
+@loop
+def _classify(own, near, cells):  # type: ignore[no-untyped-def]
+    """The cell of every pixel: the class of its neighbours' events n, and its own, up to `_MOST`.
+
+    Half octaves are the exponent of n^2, which is exact in float32.
+    """
+    most, largest = np.float32(_MOST), np.float32(_LARGEST)
+    for i in range(np.uint64(len(cells))):
+        n = smaller(near[i], largest)
+        half_octave = np.int32(_exponent(n * n))
+        of_near = np.int32(n) if n < np.float32(_EXACT) else half_octave
+        cells[i] = np.uint8(of_near * np.int32(_MOST + 1) + np.int32(smaller(own[i], most)))
 
 
-_OF_NUMBER: Final = _classes()
+@formula(types.int32)
+def _exponent(x: Number) -> Number:
+    """floor(log2(x)) of a float32 from 1."""
+    return (x.bits_as(types.int32) >> np.int32(23)) - np.int32(127)
 
 
 @loop
-def _count(counts, near, classes, pixels):  # type: ignore[no-untyped-def]
-    """Add the pixels to their classes, by their own events: up to one less than counted."""
-    most, last = np.int64(pixels.shape[1]), np.int64(len(classes) - 1)
-    for i in range(len(counts)):
-        own = np.int64(counts[i])
-        if own < most:
-            pixels[classes[smaller(np.int64(near[i]), last)], own] += 1.0
+def _count(cells, found):  # type: ignore[no-untyped-def]
+    """Add pixels to their cells, by turns to either of two sums: most pixels' cell is that of the one before."""
+    for i in range(np.uint64(len(cells))):
+        found[i & np.uint64(1), cells[i]] += 1
 
 
 @loop
-def _look_up(counts, near, classes, signal, expected, shares):  # type: ignore[no-untyped-def]
-    most, last, one = np.int64(signal.shape[1]), np.int64(len(classes) - 1), np.float32(1.0)
-    for i in range(len(counts)):
-        own = np.int64(counts[i])
-        if own < most:
-            shares[i] = signal[classes[smaller(np.int64(near[i]), last)], own]
-        else:
-            shares[i] = one - smaller(expected / counts[i], one)
+def _look_up(own, cells, signal, expected, shares):  # type: ignore[no-untyped-def]
+    one, most = np.float32(1.0), np.float32(_MOST)
+    for i in range(np.uint64(len(shares))):
+        many = one - smaller(expected / larger(own[i], one), one)
+        shares[i] = signal[cells[i]] if own[i] < most else many
