@@ -34,7 +34,14 @@ from kalux.frames import median_exposure
 from kalux.models.camera import BrightTail, Camera, count_bright
 from kalux.models.colour import white_balance
 from kalux.models.pixels import PixelCalibration, require_size, with_hot
-from kalux.recording import RECORDING_NEEDED, Recording, no_frames, with_cached_start, without_events_of
+from kalux.recording import (
+    RECORDING_NEEDED,
+    Recording,
+    less_black,
+    no_frames,
+    with_cached_start,
+    without_events_of,
+)
 from kalux.schedule import image_times
 from kalux.settings import SETTINGS_NEEDED, Settings, altered, chosen_response
 from kalux.settings import preset as named_preset
@@ -153,6 +160,7 @@ def plan(
     hot = find_hot_pixels(recording, _NOISE_EVENTS) if looks_for_hot else None
     if hot is not None and hot.any():
         recording = without_events_of(recording, hot)
+    recording = less_black(recording, chosen.camera.black_level)
     chosen, ceiling = with_saturation(recording, chosen)
     response = chosen_response(chosen.camera.response, recording.response)
     camera = Camera.named(response, chosen.camera.clipped_from)
@@ -238,7 +246,7 @@ def _survey(recording: Recording, camera: Camera | None) -> tuple[NDArray[np.int
     for frame in recording.frames():
         exposures.append((frame.exposure_start, frame.exposure_end))
         if camera is not None:
-            tail = tail.joined(count_bright(camera, frame.image, frame.white_value))
+            tail = tail.joined(count_bright(camera, frame.image, frame.white_value, frame.black))
     if not exposures:
         raise no_frames(recording)
     return np.array(exposures, np.int64), None if camera is None else tail

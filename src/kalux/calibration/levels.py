@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from itertools import islice
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -152,8 +152,13 @@ def _changes(
 def exact_end(recording: Recording, below: float) -> float | None:
     """The response, if it is below ``below``, at which the first 80 frames end (`kalux.white.sharp_end`)."""
     frames = islice(recording.frames(), _MAX_FRAMES)
-    measured = ((f.image if f.valid is None else f.image[f.valid], f.white_value) for f in frames)
-    return sharp_end(measured, below)
+    return sharp_end((_measured(frame) for frame in frames), below)
+
+
+def _measured(frame: Frame) -> tuple[NDArray[Any], float]:
+    """Valid pixels above black, and what they are divided by."""
+    image = frame.image if frame.valid is None else frame.image[frame.valid]
+    return (image - frame.black if frame.black > 0 else image), frame.full_scale
 
 
 class ClippingLevels(NamedTuple):
