@@ -132,7 +132,7 @@ def less_black(recording: Recording, level: float | None) -> Recording:
     if level is None:
         return recording
     made = copy.copy(recording)
-    made._black_level = level  # noqa: SLF001
+    made._black_level = level
     return made
 
 
