@@ -75,8 +75,8 @@ _PARTS: Final = 6  # of the image along each side
 _LEAST_PARTS: Final = 4
 
 _AT_FLOOR: Final = 4 * _LEVEL
-"""How far below the floor of the frames the best level lies at most where that floor is black: the best level is too low
-by I_0 and by the blur of dark edges, one to three and a half levels of 255 on simulated scenes."""
+"""How far below the floor of the frames the best level lies at most where that floor is black: the best level is too
+low by I_0 and by the blur of dark edges, one to three and a half levels of 255 on simulated scenes."""
 
 
 class BlackLevel(NamedTuple):
