@@ -48,6 +48,9 @@ class Frame:
         (height, width) bool: False where the frame says nothing, e.g. outside the view of a second camera. The
         value of such a pixel is no measurement, not even of brightness beyond white; it should be a guess,
         because the first frame's is where the filter starts. None: all pixels are measured.
+    black
+        The value of a pixel in the dark, in the unit of the image: what every pixel reads on top of its light.
+        ``camera.black_level`` of the settings goes before it.
     """
 
     image: NDArray[Any]
@@ -56,6 +59,7 @@ class Frame:
     white: float | None = None
     mosaic: Mosaic | None = None
     valid: NDArray[np.bool_] | None = None
+    black: float = 0.0
 
     def __repr__(self) -> str:
         image = self.image
@@ -86,10 +90,23 @@ class Frame:
             return 1.0
         return float(np.iinfo(self.image.dtype).max)
 
+    @property
+    def full_scale(self) -> float:
+        """From black to white, in the unit of the image."""
+        return self.white_value - self.black
+
     def normalised(self) -> NDArray[np.float64]:
-        """The camera response as float64, 0 to 1 = saturated (a float image may exceed 1)."""
-        response = self.image.astype(np.float64) / self.white_value
-        return np.maximum(response, 0.0) if self.image.dtype.kind == "f" else response
+        """The camera response as float64, 0 = black to 1 = saturated (a float image may exceed 1)."""
+        value = self.image.astype(np.float64)
+        if self.black != 0:
+            value -= self.black
+        response = value / self.full_scale
+        return np.maximum(response, 0.0) if self.image.dtype.kind == "f" or self.black > 0 else response
+
+
+def with_black_level(frame: Frame, level: float | None) -> Frame:
+    """The frame with black at ``level``, a share of its white value; None: as it is."""
+    return frame if level is None else dataclasses.replace(frame, black=level * frame.white_value)
 
 
 GROUND_TRUTH_NEEDED: Final = (
@@ -213,6 +230,11 @@ def check_frame(
     if frame.white is not None and not is_white(frame.white):
         raise FrameError(
             f"{where}: frame {index} has the white value {frame.white!r}; the value of a saturated pixel is needed"
+        )
+    if not (isinstance(frame.black, Real) and 0 <= float(frame.black) < frame.white_value):
+        raise FrameError(
+            f"{where}: frame {index} has the black value {frame.black!r}; 0 to less than white, {frame.white_value:g}, "
+            "is possible"
         )
     if image.shape not in (sensor_size, (*sensor_size, 3)):
         size = "x".join(str(n) for n in (*image.shape[:2][::-1], *image.shape[2:]))

@@ -9,7 +9,7 @@ import numpy as np
 
 from kalux.calibration.delay import SHARE
 from kalux.calibration.levels import Ceiling, find_ceiling
-from kalux.recording import Recording
+from kalux.recording import Recording, less_black
 from kalux.settings import AUTO, Settings
 from kalux.wording import how_many
 
@@ -100,6 +100,8 @@ def _of_frames(recording: Recording, plan: Plan, asked: Settings) -> Iterator[tu
     yield "response", f"{response_text(camera.response)} ({how})"
     if recording.found_white is not None:
         yield "white", f"{recording.found_white}, where the 16-bit frames end"
+    if plan.black is not None or camera.black_level is not None:
+        yield "black", _black_text(plan)
     if plan.ceiling is not None:
         yield "saturation", f"from {camera.clipped_from:.2g} of white ({ceiling_text(plan.ceiling)})"
     if camera.white_balance != asked.camera.white_balance:
@@ -115,13 +117,29 @@ def saturation_text(recording: Recording, plan: Plan, asked: Settings) -> str:
     used = plan.settings.camera.clipped_from
     how = "the usual" if asked.camera.saturation is None else _GIVEN
     text = f"from {used:.2g} of white ({how}); "
-    ceiling = find_ceiling(recording, plan.settings.camera, plan.settings.events)
+    source = less_black(recording, plan.settings.camera.black_level)
+    ceiling = find_ceiling(source, plan.settings.camera, plan.settings.events)
     if ceiling is None:
         return text + "events do not go on where the frames end, or too few tell"
     text += ceiling_text(ceiling)
     if ceiling.level < used:
         text += f": --camera.saturation {ceiling.saturation:.2g} does not take that for measured"
     return text
+
+
+def _black_text(plan: Plan) -> str:
+    """The black level that is taken off, or why none is though no pixel is dark."""
+    level, found = plan.settings.camera.black_level or 0.0, plan.black
+    if found is None:
+        return f"{level:.3g} of white is taken off ({_GIVEN})"
+    begin = f"frames begin at {found.floor:.3g}"
+    if found.level:
+        why = f"it explains {100 * found.gain:.0f} % of what events and frames differ by"
+        return f"{level:.3g} of white is taken off ({begin}; {why})"
+    return (
+        f"0; {begin}, which events do not show to be black: if the camera reads that in the dark, "
+        f"--camera.black-level {found.floor:.2g}"
+    )
 
 
 def ceiling_text(ceiling: Ceiling) -> str:

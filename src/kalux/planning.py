@@ -9,6 +9,7 @@ from typing import Any, Final, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.calibration.black_level import BlackLevel, find_black_level
 from kalux.calibration.delay import DelayEstimate, estimate_delay
 from kalux.calibration.event_model import EventModel, estimate_event_model
 from kalux.calibration.fixed_pattern import USUAL_PATTERN, FixedPattern, estimate_fixed_pattern
@@ -34,7 +35,14 @@ from kalux.frames import median_exposure
 from kalux.models.camera import BrightTail, Camera, count_bright
 from kalux.models.colour import white_balance
 from kalux.models.pixels import PixelCalibration, require_size, with_hot
-from kalux.recording import RECORDING_NEEDED, Recording, no_frames, with_cached_start, without_events_of
+from kalux.recording import (
+    RECORDING_NEEDED,
+    Recording,
+    less_black,
+    no_frames,
+    with_cached_start,
+    without_events_of,
+)
 from kalux.schedule import image_times
 from kalux.settings import SETTINGS_NEEDED, Settings, altered, chosen_response
 from kalux.settings import preset as named_preset
@@ -70,8 +78,8 @@ class Plan:
     Attributes
     ----------
     settings
-        With thresholds, refractory period, delay, frame noise, fixed pattern, I_0, step variance, saturation, reference
-        exposure and white balance filled in.
+        With thresholds, refractory period, delay, frame noise, fixed pattern, I_0, step variance, black level,
+        saturation, reference exposure and white balance filled in.
     threshold_origin
         Whether the thresholds come from the settings, the recording, a calibration, an estimate, or are assumed.
     estimate
@@ -98,6 +106,8 @@ class Plan:
         The measured noise of events, Hz per pixel, where it was.
     ceiling
         Where the frames end at one level below the usual saturation while events go on.
+    black
+        What was looked for where the frames begin above 0: whether that is black.
     dead_time
         The refractory period that noise shows, us; 0 where it does not.
     hot_pixels
@@ -118,6 +128,7 @@ class Plan:
     mismatch: Mismatch | None = None
     background_rate: float | None = None
     ceiling: Ceiling | None = None
+    black: BlackLevel | None = None
     dead_time: int = 0
     hot_pixels: int = 0
 
@@ -153,6 +164,8 @@ def plan(
     hot = find_hot_pixels(recording, _NOISE_EVENTS) if looks_for_hot else None
     if hot is not None and hot.any():
         recording = without_events_of(recording, hot)
+    chosen, black = _with_black_level(recording, chosen)
+    recording = less_black(recording, chosen.camera.black_level)
     chosen, ceiling = with_saturation(recording, chosen)
     response = chosen_response(chosen.camera.response, recording.response)
     camera = Camera.named(response, chosen.camera.clipped_from)
@@ -194,6 +207,7 @@ def plan(
         mismatch=mismatch,
         background_rate=background,
         ceiling=ceiling,
+        black=black,
         dead_time=period,
     )
 
@@ -207,6 +221,16 @@ def _check_smooth(settings: Settings, lookahead: bool) -> None:
         raise InputError(
             "reconstruct: the complementary filter has no variance, so that it cannot be smoothed"
         )
+
+
+def _with_black_level(recording: Recording, settings: Settings) -> tuple[Settings, BlackLevel | None]:
+    """Fill in the black level where the frames begin above 0: from the settings, else what events say, else none."""
+    if settings.camera.black_level is not None or not settings.filter.joins_frames:
+        return settings, None
+    found = find_black_level(recording, settings.camera, settings.events)
+    if found is None or not found.level:
+        return settings, found
+    return altered(settings, "camera", black_level=found.level), found
 
 
 def with_saturation(recording: Recording, settings: Settings) -> tuple[Settings, Ceiling | None]:
@@ -238,7 +262,7 @@ def _survey(recording: Recording, camera: Camera | None) -> tuple[NDArray[np.int
     for frame in recording.frames():
         exposures.append((frame.exposure_start, frame.exposure_end))
         if camera is not None:
-            tail = tail.joined(count_bright(camera, frame.image, frame.white_value))
+            tail = tail.joined(count_bright(camera, frame.image, frame.white_value, frame.black))
     if not exposures:
         raise no_frames(recording)
     return np.array(exposures, np.int64), None if camera is None else tail

@@ -36,7 +36,7 @@ from kalux.filters.method import USUAL_INTERVAL, Method, Segment
 from kalux.filters.methods import make_method
 from kalux.filters.shots import Shot, take_shot
 from kalux.filters.uncertainty import changed_within, hidden_variance
-from kalux.frames import Frame, check_frame
+from kalux.frames import Frame, check_frame, with_black_level
 from kalux.images import Estimate, Image, View, make_image
 from kalux.models.camera import Camera, beyond_white, count_bright, repeated_rounding
 from kalux.models.colour import Gains, white_balance
@@ -176,9 +176,10 @@ class Reconstructor:
                 "push: end_frames() was called, no frame can be pushed after it; a new Reconstructor can begin with it"
             )
         check_frame(frame, self.sensor_size, index=self._frame_count, previous=self._last_frame)
+        frame = with_black_level(frame, self.settings.camera.black_level)
         self._reference_exposure = self._reference_exposure or frame.exposure
         if self._bright_tail is None:
-            self._bright_tail = count_bright(self._camera, frame.image, frame.white_value).scale
+            self._bright_tail = count_bright(self._camera, frame.image, frame.white_value, frame.black).scale
         shot = take_shot(frame, self._camera, self._reference_exposure, self._gains_of(frame))
         self._shots.append(shot._replace(trail=trail, bright_tail=self._bright_tail))
         self._last_frame = frame

@@ -40,6 +40,7 @@ from kalux.frames import (
     median_exposure,
     place_exposure,
     require_frame,
+    with_black_level,
 )
 from kalux.models.colour import sample_mosaic
 from kalux.readers import CHUNK_EVENTS, Source, joined
@@ -123,6 +124,15 @@ def without_events_of(recording: Recording, pixels: NDArray[np.bool_]) -> Record
     made.source = dataclasses.replace(
         recording.source, events=lambda: (chunk[~pixels[chunk["y"], chunk["x"]]] for chunk in whole())
     )
+    return made
+
+
+def less_black(recording: Recording, level: float | None) -> Recording:
+    """The same recording, the frames of which have black at ``level``, a share of white; None: as they state."""
+    if level is None:
+        return recording
+    made = copy.copy(recording)
+    made._black_level = level
     return made
 
 
@@ -228,6 +238,7 @@ class Recording:
         self._exposure = exposure
         self._stamp: Stamp = stamp
         self._longest: int | None = None
+        self._black_level: float | None = None
 
     @classmethod
     def from_arrays(
@@ -409,6 +420,7 @@ class Recording:
                 frame = dataclasses.replace(frame, white=white)
             if self._exposure is not None:
                 frame = place_exposure(frame, self._exposure, self._stamp)
+            frame = with_black_level(frame, self._black_level)
             if not as_stored:
                 frame = _with_mosaic(frame, self.mosaic)
             check_frame(

@@ -60,6 +60,11 @@ class CameraSettings:
     weight_floor
         Smallest f^w, which caps R_bar. 0.09 is the released code's; for augmentation "paper" only, since
         the other gives clipped pixels no weight at all.
+    black_level
+        What every pixel reads in the dark, on top of its light: a share of the white value, 0 to 0.5 (16 of 255 is
+        0.063). It is taken off the frames before the response is inverted, so that 0 is black and 1 still white. None:
+        where the recording's frames begin above 0, what its events say (`kalux.calibration.black_level`), else what
+        frames state, 0.
     saturation
         Response, 0 to 1, from which a pixel counts as clipped. None: where the recording's frames all end at one level
         while events go on (`kalux.calibration.levels`), else the usual one.
@@ -82,6 +87,7 @@ class CameraSettings:
     fixed_pattern: float | None = None
     confidence: float = 7e5
     weight_floor: float = 0.09
+    black_level: float | None = None
     saturation: float | None = None
     usual_saturation: float = 0.98
     reference_exposure: int | None = None
@@ -482,6 +488,7 @@ _LARGEST: Final = 1e10  # more than any value can mean, and its square is a numb
 _LEAST: Final = 1e-12  # but 0: less than any value can mean, and so is its square
 _LARGEST_OF: Final[Mapping[str, float]] = {
     **dict.fromkeys(("saturation", "usual_saturation", "weight_floor"), 1.0),
+    "black_level": 0.5,  # of white: no camera gives half of its range away
     "log_offset": 1e3,  # of white: its logarithm is then the same as its radiance
     **dict.fromkeys(
         ("frame_noise", "usual_frame_noise", "shot_noise", "fixed_pattern"), 10.0

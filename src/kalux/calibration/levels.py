@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from itertools import islice
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -123,7 +123,7 @@ def _brightest(recording: Recording) -> float | None:
     first = next(iter(recording.frames()), None)
     if first is None or first.image.ndim == 3:
         return None
-    histogram = _histogram(islice(recording.frames(), _MAX_FRAMES), _FINE)
+    histogram = response_histogram(islice(recording.frames(), _MAX_FRAMES), _FINE)
     reached = np.cumsum(histogram[::-1])[::-1] >= max(BRIGHTEST * histogram.sum(), 1)
     brightest = int(np.flatnonzero(reached)[-1]) if reached.any() else 0
     return brightest / (_FINE - 1) if brightest > 0 else None
@@ -152,8 +152,13 @@ def _changes(
 def exact_end(recording: Recording, below: float) -> float | None:
     """The response, if it is below ``below``, at which the first 80 frames end (`kalux.white.sharp_end`)."""
     frames = islice(recording.frames(), _MAX_FRAMES)
-    measured = ((f.image if f.valid is None else f.image[f.valid], f.white_value) for f in frames)
-    return sharp_end(measured, below)
+    return sharp_end((_measured(frame) for frame in frames), below)
+
+
+def _measured(frame: Frame) -> tuple[NDArray[Any], float]:
+    """Valid pixels above black, and what they are divided by."""
+    image = frame.image if frame.valid is None else frame.image[frame.valid]
+    return (image - frame.black if frame.black > 0 else image), frame.full_scale
 
 
 class ClippingLevels(NamedTuple):
@@ -172,7 +177,7 @@ def clipping_levels(recording: Recording, most_frames: int) -> ClippingLevels:
     A pile ends the histogram in its upper (lower) quarter and is at least four times as frequent as the levels
     inside it. Where the sensor has fixed pattern noise it spreads over some levels.
     """
-    histogram = _histogram(islice(recording.frames(), most_frames), 256)
+    histogram = response_histogram(islice(recording.frames(), most_frames), 256)
     if not histogram.any():
         return ClippingLevels(None, None)
     bottom, top = (_pile(values) for values in (histogram[::-1], histogram))
@@ -201,7 +206,7 @@ def _pile(histogram: NDArray[np.int64]) -> int | None:
     return edge + 1 if edge < end and histogram[edge + 1 :].max() >= _PILE * inside else None
 
 
-def _histogram(frames: Iterable[Frame], levels: int) -> NDArray[np.int64]:
+def response_histogram(frames: Iterable[Frame], levels: int) -> NDArray[np.int64]:
     """(levels,) how many valid pixels have each response from 0 to 1."""
     histogram = np.zeros(levels, np.int64)
     for frame in frames:

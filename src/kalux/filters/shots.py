@@ -142,7 +142,7 @@ def _leveled(frame: Frame, camera: Camera, ratio: float) -> _Leveled:
     else:
         levels = frame.image.copy()  # the caller's memory may be filled again
         values = np.arange(int(levels.max(initial=0)) + 1, dtype=levels.dtype)
-        response = Frame(values, 0, 1, frame.white).normalised()
+        response = Frame(values, 0, 1, frame.white, black=frame.black).normalised()
     if camera.colours is None:
         return _Leveled(levels, response, *_by_response(camera, response, ratio))
     if frame.mosaic is None:
@@ -174,7 +174,7 @@ def _colour_shot(frame: Frame, camera: Camera, ratio: float, gains: colour.Gains
     shares = [w * g for w, g in zip(colour.LUMINANCE, gains, strict=True)]
     spread = sum(s / np.sqrt(np.maximum(part[1], 1e-6)) for s, part in zip(shares, parts, strict=True))
     of_clipped = sum(s * part[0] * part[2] for s, part in zip(shares, parts, strict=True))
-    brightest = np.max(frame.image, axis=-1) / frame.white_value
+    brightest = (np.max(frame.image, axis=-1) - frame.black) / frame.full_scale
     room = max(camera.saturation - colour.RELIABLE, 1e-6)
     return Shot(
         start=frame.exposure_start,

@@ -330,15 +330,16 @@ ABOUT_WHITE: Final = 0.95
 """Intensity, white = 1, that counts as white for `BrightTail`: below where sensors clip unevenly."""
 
 
-def count_bright(camera: Camera, image: NDArray[Any], white: float = 1.0) -> BrightTail:
-    """`BrightTail` of one frame: (H, W), or (H, W, 3) of which the mean counts; full scale is ``white``.
+def count_bright(camera: Camera, image: NDArray[Any], white: float = 1.0, black: float = 0.0) -> BrightTail:
+    """`BrightTail` of one frame: (H, W), or (H, W, 3) of which the mean counts; full scale is ``black`` to ``white``.
 
     Where pixels count as clipped from lower on than usual, that far below lies what counts as white.
     """
     grey = image if image.ndim == 2 else image.mean(axis=-1)
     ends = (camera.saturation, CameraSettings.usual_saturation)
     end, usual = (float(camera.response.inverse(np.array(value))) for value in ends)
-    edges = camera.response(min(end / usual, 1.0) * np.array([ABOUT_WHITE / 2, ABOUT_WHITE])) * white
+    edges = camera.response(min(end / usual, 1.0) * np.array([ABOUT_WHITE / 2, ABOUT_WHITE]))
+    edges = edges * (white - black) + black
     if grey.dtype.kind in "iu":
         if edges[1] > np.iinfo(grey.dtype).max:  # white that no pixel can have
             return BrightTail(int(np.count_nonzero(grey >= edges[0])), 0)
@@ -421,7 +422,7 @@ def rounding_error(frame: Frame) -> float:
     The most that rounding can change, not its standard deviation, 1 / sqrt(12): where noise is less than a level it is
     the same error in every frame, which no mean takes away.
     """
-    return 0.0 if frame.image.dtype.kind == "f" else 0.5 / frame.white_value
+    return 0.0 if frame.image.dtype.kind == "f" else 0.5 / frame.full_scale
 
 
 def repeated_rounding(frame: Frame, camera: CameraSettings) -> float:

@@ -1,0 +1,103 @@
+"""The black level of frames: cameras that read something in the dark, and scenes that merely have nothing dark."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import kalux
+from kalux import Frame, Recording
+from kalux.calibration.black_level import find_black_level
+from kalux.planning import plan
+from kalux.recording import less_black
+from kalux.settings import PRESETS, altered
+
+from builders import passing_by, textured
+
+SETTINGS = PRESETS["default"]
+
+
+def lifted(source: Recording, black: int, *, stated: bool = False) -> Recording:
+    """The recording of a camera that reads ``black`` of 255 in the dark, and may state it."""
+    frames = [
+        dataclasses.replace(
+            frame,
+            image=np.rint(black + frame.image * ((255 - black) / 255)).astype(np.uint8),
+            black=float(black) if stated else 0.0,
+        )
+        for frame in source.frames()
+    ]
+    return Recording.from_arrays(
+        np.concatenate(list(source.events())), frames, sensor_size=source.sensor_size, name="lifted"
+    )
+
+
+def dark(noise_rate: float = 0.0) -> Recording:
+    """A scene from black, over half of it, to white."""
+    return passing_by(np.maximum(textured(1.3) - 0.25, 0), noise_rate=noise_rate)
+
+
+@pytest.mark.parametrize("noise_rate", [0.0, 3.0])
+@pytest.mark.parametrize("black", [8, 16, 32])
+def test_a_black_level_is_found(black, noise_rate):
+    found = find_black_level(lifted(dark(noise_rate), black), SETTINGS.camera, SETTINGS.events)
+    assert found is not None
+    assert 255 * found.level == pytest.approx(black, abs=3)
+
+
+@pytest.mark.parametrize("least", [0.05, 0.1, 0.3])
+def test_a_scene_that_has_nothing_dark_has_no_black_level(least):
+    """Its floor looks the same; its events do not."""
+    source = passing_by(np.maximum(textured(1.3) - 0.25, 0) + least)
+    found = find_black_level(source, SETTINGS.camera, SETTINGS.events)
+    assert found is not None
+    assert found.floor >= 0.9 * least
+    assert found.level == 0
+
+
+def test_frames_that_show_black_or_state_it_are_not_looked_at():
+    assert find_black_level(dark(), SETTINGS.camera, SETTINGS.events) is None
+    assert find_black_level(lifted(dark(), 16, stated=True), SETTINGS.camera, SETTINGS.events) is None
+
+
+def test_what_does_not_move_tells_nothing():
+    frames = [Frame(np.full((8, 8), 40, np.uint8), 1000 * i, 1000 * i + 500) for i in range(4)]
+    events = np.empty(0, kalux.EVENT_DTYPE)
+    source = Recording.from_arrays(events, frames, sensor_size=(8, 8))
+    found = find_black_level(source, SETTINGS.camera, SETTINGS.events)
+    assert found is not None
+    assert (found.level, found.samples) == (0, 0)
+
+
+def test_a_plan_takes_it_off_unless_it_is_given():
+    source = lifted(dark(), 16)
+    made = plan(source, at="frames")
+    assert made.settings.camera.black_level == pytest.approx(16 / 255, abs=3 / 255)
+    given = plan(source, at="frames", settings=altered(SETTINGS, "camera", black_level=0.0))
+    assert (given.settings.camera.black_level, given.black) == (0, None)
+    paper = plan(source, at="frames", preset="iccv2021")
+    assert (paper.settings.camera.black_level, paper.black) == (None, None)
+
+
+def test_frames_less_black_are_those_of_a_camera_without():
+    plain = next(iter(dark().frames())).normalised()
+    less = next(iter(less_black(lifted(dark(), 51), 0.2).frames()))
+    np.testing.assert_allclose(less.normalised(), plain, atol=1 / 204)
+    assert less.full_scale == 204
+
+
+def test_images_are_those_of_a_camera_without():
+    """Both ways in time, too: a black level that is given, that frames state, and none."""
+    settings = altered(SETTINGS, "events", threshold_on=0.2, threshold_off=0.2)
+    black = altered(settings, "camera", black_level=51 / 255)
+
+    def last(source, chosen):
+        *_, image = kalux.reconstruct(source, at="frames", settings=chosen, smooth=True)
+        return image.intensity
+
+    expected = last(dark(), settings)
+    given = last(lifted(dark(), 51), black)
+    assert np.median(np.abs(given - expected)) < 0.02
+    np.testing.assert_array_equal(last(lifted(dark(), 51, stated=True), settings), given)
