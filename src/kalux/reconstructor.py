@@ -397,7 +397,7 @@ class Reconstructor:
         filtered, events = self.settings.filter, self.settings.events
         # The prior on highlights needs a variance, which the complementary filter has not.
         scale = filtered.highlight_scale if filtered.kind == "akf" else 0.0
-        spread = events.mismatch
+        spread = events.believed_mismatch
         if self._thresholds_estimated:
             assert self._bright_tail is not None  # a frame has been pushed
             scale = min(scale, filtered.highlight_tail * beyond_white(self._bright_tail))

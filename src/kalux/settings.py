@@ -143,9 +143,9 @@ class EventSettings:
         Whether pixels that leak all the time are looked for in the recording, and their events left out
         (`kalux.calibration.hot_pixels`). True: their highlights grow without bound (docs/calibration.md).
     extrapolation_spread
-        Where thresholds are only estimates: standard deviation of the log of their common error beyond white, where no
-        frame corrects it; or threshold_spread, if that is known and less. 0.15: how well large changes between well
-        exposed frames agree with estimated thresholds, on three real and eleven simulated recordings.
+        Where thresholds are only estimates and threshold_spread is not known: standard deviation of the log of their
+        common error beyond white, where no frame corrects it. 0.15: how well large changes between well exposed
+        frames agree with estimated thresholds, on three real and eleven simulated recordings.
     trail
         By how much, in c, a pixel is on average beyond the level of its newest event, at most (docs/equations.md,
         K14): events trail the light. 0 turns it off. 0.4 (docs/tuning.md).
@@ -211,11 +211,17 @@ class EventSettings:
     def believed_extrapolation(self) -> float:
         """The spread of the events' scale beyond white where thresholds are estimated, as used.
 
-        A ``threshold_spread`` from a recording includes the uncertainty of its thresholds; where it is larger than
-        ``extrapolation_spread``, P accounts for the rest (K10).
+        A ``threshold_spread`` from a recording includes the uncertainty of its thresholds.
         """
-        spread = self.threshold_spread
-        return self.extrapolation_spread if spread is None else min(spread, self.extrapolation_spread)
+        return self.extrapolation_spread if self.threshold_spread is None else self.believed_mismatch
+
+    @property
+    def believed_mismatch(self) -> float:
+        """The part of ``mismatch`` by which the scale of events beyond white is doubted (K6).
+
+        No more than the usual one: pixels that differ by more tell so (K2), and P accounts for the rest (K10).
+        """
+        return min(self.mismatch, self.usual_threshold_spread)
 
     @property
     def background_rate(self) -> float:

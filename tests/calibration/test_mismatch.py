@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from kalux import PRESETS, Recording
-from kalux.calibration.mismatch import SPREADS, estimate_mismatch
+from kalux.calibration.mismatch import SPREADS, _solved, estimate_mismatch
 from kalux.datasets import SensorSettings, pan, photograph_scene, simulate
 from kalux.planning import plan
 from kalux.settings import CameraSettings
@@ -47,6 +47,21 @@ def test_the_spread_is_found(spread):
     assert np.sqrt(max(estimate.variance, 0.0)) == pytest.approx(spread, rel=0.2, abs=0.05)
     assert estimate.error < 0.002
     assert SPREADS[0] <= estimate.spread <= SPREADS[1]
+
+
+def test_more_than_usual_is_believed_where_it_is_certain():
+    assert found(0.175).spread == pytest.approx(0.175, rel=0.2)
+
+
+def test_more_than_usual_is_not_believed_where_few_pixels_say_so():
+    """As where moving texture is finer than the pixels."""
+    products = np.zeros((64, 64, 2, 3, 3))
+    products[..., 0, 0], products[..., 1, 0] = 0.1, 1.0
+    products[:16, :16, :, 0, 0] = 0.6
+    estimate = _solved(products, products.size, usual=0.1)
+    assert estimate is not None
+    assert estimate.variance > 0.02
+    assert estimate.spread == 0.1
 
 
 def test_blur_is_not_taken_for_it():
