@@ -265,6 +265,7 @@ class TestWhatIsSaid:
             "pattern",
             "bright",
             "response",
+            "black",
             "filter",
             "images",
             "wrote",
