@@ -145,17 +145,10 @@ def _flow(image: NDArray[np.uint8], other: NDArray[np.uint8], points: Plane) -> 
 
 
 class Paths:
-    """The paths of what moves between two frames, found when they are first asked for.
+    """The paths of what moves between two frames, found when they are first asked for; parameters are those of `bent`.
 
     Finding them takes about as long as all else that is done for a frame: the filter tells what it knows half-way and
     goes on, and whoever makes an image asks.
-
-    Parameters
-    ----------
-    first, second, path
-        The frames, and the path from `find_path`.
-    level, variance
-        (H, W): L half-way, and its variance.
     """
 
     def __init__(self, first: Latent, second: Latent, path: Plane, level: Floats, variance: Floats) -> None:

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import pairwise
-from typing import Any, Final
+from typing import Final
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.calibration.neighbours import sum_of_neighbours
 from kalux.event_slices import count_chunks
 from kalux.events import EventArray
 from kalux.recording import Recording
@@ -51,7 +51,7 @@ def find_hot_pixels(recording: Recording, most_events: int) -> NDArray[np.bool_]
     for binned in _bins(recording, most_events):
         on, off = count_chunks([binned], shape, weighed=False)
         fires = on + off > 0
-        quiet = _sum_around(fires) <= _COMPANIONS
+        quiet = sum_of_neighbours(fires.view(np.uint8)) <= _COMPANIONS
         alone += quiet
         firing += quiet & fires
         ups += np.where(quiet, on, 0).astype(np.int32)
@@ -80,10 +80,3 @@ def _bins(recording: Recording, most_events: int) -> Iterator[EventArray]:
     edges = np.searchsorted(events["t"], since + BIN * np.arange(whole + 1))
     for first, last in pairwise(edges.tolist()):
         yield events[first:last]
-
-
-def _sum_around(values: NDArray[Any]) -> NDArray[np.float32]:
-    """(H, W): how many of the eight neighbours are true."""
-    own = values.astype(np.float32)
-    total = cv2.boxFilter(own, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
-    return np.asarray(total - own, np.float32)

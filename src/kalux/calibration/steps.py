@@ -19,9 +19,8 @@ the time (nine simulated scenes; 4 % smaller to 1 % larger with the correction).
 
 from __future__ import annotations
 
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
-import cv2
 import numpy as np
 from numba.core import types
 from numpy.typing import NDArray
@@ -29,6 +28,7 @@ from numpy.typing import NDArray
 from kalux.augmentation.refractory import step_weight
 from kalux.calibration.exposures import Exposures
 from kalux.calibration.intervals import Interval, intervals
+from kalux.calibration.neighbours import sum_of_neighbours
 from kalux.compiled import empty, event_column, event_is_on, event_row, event_words, loop, smaller, zeros
 from kalux.event_slices import between, count_chunks
 from kalux.events import NEVER
@@ -239,7 +239,7 @@ class _StepSampler:
         eventful = _eventful(events)
         either = sum(int(np.count_nonzero(end.usable & eventful)) for end in interval.ends)
         lost = 1.0 - 2 * int(np.count_nonzero(interval.usable & eventful)) / max(either, 1)
-        neighbours = _sum_around(usable.view(np.uint8))
+        neighbours = sum_of_neighbours(usable.view(np.uint8))
         candidates = np.flatnonzero(eventful & usable & (neighbours >= _LEAST_NEIGHBOURS))
         return candidates[:: max(-(-len(candidates) // self._most), 1)], usable, lost
 
@@ -361,14 +361,8 @@ def _hot(events: NDArray[np.float32]) -> NDArray[np.bool_]:
 def _eventful(events: NDArray[np.float32]) -> NDArray[np.bool_]:
     """(H, W): pixels not at the border whose neighbours have enough events."""
     found = np.zeros(events.shape, np.bool_)
-    found[1:-1, 1:-1] = (_sum_around(events) >= _LEAST_AROUND)[1:-1, 1:-1]
+    found[1:-1, 1:-1] = (sum_of_neighbours(events) >= _LEAST_AROUND)[1:-1, 1:-1]
     return found
-
-
-def _sum_around(values: NDArray[Any]) -> NDArray[Any]:
-    """(H, W): sum over the eight neighbours."""
-    total = cv2.boxFilter(values, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
-    return np.asarray(total - values)
 
 
 @loop

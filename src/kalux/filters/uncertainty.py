@@ -274,11 +274,17 @@ def add_pattern(variance: NDArray[np.float32], intensity: Array, log_offset: flo
     _add_pattern(variance.reshape(-1), np.ascontiguousarray(intensity).reshape(-1), *scalars)
 
 
+@nb.njit(cache=True, inline="always", error_model="numpy")
+def _of_logarithm(deviation, intensity, log_offset):  # type: ignore[no-untyped-def]
+    """Variance of log(I + I_0) by an error of I with this standard deviation."""
+    relative = deviation / (intensity + log_offset)
+    return relative * relative
+
+
 @loop(fastmath=FUSED)
 def _add_pattern(variance, intensity, log_offset, deviation):  # type: ignore[no-untyped-def]
     for i in range(np.uint64(len(variance))):
-        relative = deviation / (intensity[i] + log_offset)
-        variance[i] += relative * relative
+        variance[i] += _of_logarithm(deviation, intensity[i], log_offset)
 
 
 def keep_rounding(
@@ -313,6 +319,5 @@ def keep_rounding(
 @loop(fastmath=FUSED)
 def _keep_rounding(variance, intensity, moving, log_offset, deviation):  # type: ignore[no-untyped-def]
     for i in range(np.uint64(len(variance))):
-        relative = deviation / (intensity[i] + log_offset)
-        least = larger(variance[i], relative * relative)
+        least = larger(variance[i], _of_logarithm(deviation, intensity[i], log_offset))
         variance[i] = variance[i] if moving[i] else least

@@ -89,9 +89,8 @@ def _pool(jobs: list[Job], processes: int) -> Generator[tuple[Job, Outcome | Non
 
 def _begin_worker() -> None:
     """Prepare a process of the pool: it leaves Ctrl-C to its parent, and does not outlive it."""
-    signal.signal(
-        signal.SIGINT, signal.SIG_IGN
-    )  # a terminal sends it to all processes; only the first answers
+    # A terminal sends Ctrl-C to all processes; only the first answers.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_exit_with_parent, name="kalux-parent", daemon=True).start()
 
 
