@@ -6,8 +6,10 @@ import re
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 import kalux
+from kalux.frames import GroundTruth
 from kalux.writers import hdf5
 
 from builders import moving_blocks
@@ -16,48 +18,54 @@ ROOT = Path(__file__).resolve().parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
-def test_the_python_example_runs(tmp_path, monkeypatch):
+@pytest.fixture
+def demonstration(tmp_path, monkeypatch):
+    """A small recording with truth, where `kalux demo` puts its own."""
     simulation = moving_blocks(0.05, 0.8, size=(24, 32))
-    frames = simulation.frames
+    times = np.array([frame.middle for frame in simulation.frames])
+    (tmp_path / "kalux-demo").mkdir()
     hdf5.write(
-        tmp_path / "night_drive.aedat4",  # recognised by its content
+        tmp_path / "kalux-demo" / "demo.h5",
         sensor_size=(24, 32),
         events=iter([simulation.events]),
-        frames=iter(frames),
+        frames=iter(simulation.frames),
+        ground_truth=GroundTruth(times, np.full((len(times), 24, 32), 0.5, np.float32)),
     )
     monkeypatch.chdir(tmp_path)
-    code = re.search(r"```python\n(.*?)```", README, re.DOTALL).group(1)
-    names = {
-        "pixels": np.zeros((260, 346), np.uint8),
-        "t0": 0,
-        "t1": 10_000,
-        "events": {"t": np.array([12_000]), "x": np.array([3]), "y": np.array([4]), "p": np.array([1])},
-        "t": 13_000,
-    }
+    return simulation
+
+
+def blocks(page):
+    """The Python on a page, block by block."""
+    return re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+
+
+def test_the_python_example_runs(demonstration):
+    (code,) = blocks(README)
+    names = {}
     exec(code, names)
     assert isinstance(names["image"], kalux.Image)
     assert names["image"].intensity.shape == (260, 346)
 
 
-def test_the_example_with_arrays_runs(tmp_path, monkeypatch):
-    simulation = moving_blocks(0.05, 0.4, size=(24, 32))
-    events = simulation.events
-    page = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
-    monkeypatch.chdir(tmp_path)
-    names = {
-        "images": [frame.image for frame in simulation.frames],
-        "starts": [frame.exposure_start for frame in simulation.frames],
-        "t": events["t"] * 1e-6,
-        "x": events["x"].astype(np.float64),
-        "y": events["y"],
-        "p": np.where(events["p"], 1, -1),
-        "truth_times": np.array([100_000]),
-        "truth": np.full((1, 24, 32), 0.5, np.float32),
-    }
-    exec(re.search(r"```python\n(.*?)```", page, re.DOTALL).group(1), names)
+def test_the_example_with_arrays_runs(demonstration, tmp_path):
+    (code,) = blocks((ROOT / "docs" / "api.md").read_text(encoding="utf-8"))
+    names = {}
+    exec(code, names)
     assert names["scores"]["default"] > 0
     assert len(list((tmp_path / "made").glob("*.exr"))) == len(names["made"])
-    assert np.array_equal(np.concatenate(list(kalux.open(tmp_path / "mine.h5").events())), events)
+    assert np.array_equal(
+        np.concatenate(list(kalux.open(tmp_path / "mine.h5").events())), demonstration.events
+    )
+
+
+def test_the_examples_of_outputs_run(demonstration, tmp_path):
+    """One after the other, as they are read."""
+    names = {}
+    for code in blocks((ROOT / "docs" / "outputs.md").read_text(encoding="utf-8")):
+        exec(code, names)
+    assert len(list(tmp_path.glob("uncertainty_*.png"))) == len(demonstration.frames)
+    assert names["sheet"].ndim == 3
 
 
 def test_its_links_lead_somewhere():
