@@ -383,7 +383,8 @@ class Recording:
         if not self.exposure_known:
             raise ExposureError(
                 f"{self.source.path}: no exposure times are recorded; give the exposure time in us "
-                "(--exposure 10000 or exposure=10000) and what the frame stamp marks (--stamp start, middle or end)"
+                "(--exposure 10000 or exposure=10000; a guess will do) and what the frame stamp marks (--stamp start, "
+                "middle or end)"
             )
         return self.stamped_frames()
 

@@ -63,7 +63,7 @@ def test_estimates_nothing_where_it_need_not(cli, recording, write_recording, tm
 def test_a_recording_without_exposures_is_described(cli, damaged):
     found = cli("info", damaged("no exposure times"))
     assert found.code == 0
-    assert found.out.splitlines()[-1].endswith("give --exposure")
+    assert found.out.splitlines()[-1].endswith("a guess will do")
 
 
 def test_exposures_that_are_replaced_are_told(cli, recording):
@@ -99,7 +99,7 @@ def test_a_still_scene_has_no_estimate(cli, write_recording, simulation, tmp_pat
 
 
 def test_without_frames_nothing_is_estimated(cli, write_recording, tmp_path):
-    assert cli("info", write_recording(tmp_path / "rec.h5", frames=[])).out.endswith("it needs frames\n")
+    assert cli("info", write_recording(tmp_path / "rec.h5", frames=[])).out.endswith("--frames joins images or a video\n")
 
 
 def test_a_calibration_is_used(cli, write_recording, tmp_path):

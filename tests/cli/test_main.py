@@ -91,6 +91,7 @@ def test_version(cli):
         (["info"], "still needed: REC"),
         (["info", "x", "--exposre", "3"], "did you mean --exposure?"),
         (["reconstruct", "x"], "still needed: -o"),
+        (["reconstruct", "x", "-o", "y", "--fps", "30"], "did you mean --rate?"),
     ],
 )
 def test_usage_errors_are_one_line(cli, arguments, told):

@@ -445,7 +445,7 @@ class TestBadOutput:
             assert told in found.error
         assert (tmp_path / "out" / "kalux.toml").read_text() == "mine"
 
-    @pytest.mark.parametrize("name", ["out.avi", "file", "file/out", "folder.mp4"])
+    @pytest.mark.parametrize("name", ["out.avi", "out.h5", "file", "file/out", "folder.mp4"])
     def test_names_that_cannot_be_used(self, cli, recording, tmp_path, name):
         (tmp_path / "file").write_text("")
         (tmp_path / "folder.mp4").mkdir()

@@ -99,4 +99,5 @@ def finish(
     if options.out is not None:
         written = save_calibration(made, options.out)
         if not options.quiet:
-            say("wrote " + " and ".join(str(path) for path in written[::-1]))
+            files = " and ".join(str(path) for path in written[::-1])
+            say(f"wrote {files}, for kalux reconstruct REC --calibration {written[-1]}")

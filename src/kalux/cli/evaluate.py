@@ -252,6 +252,9 @@ def table_row(scores: Scores, consistency: BlurConsistency | None) -> str:
     return row + ("" if consistency is None else f"{consistency.psnr:>14.2f}")
 
 
+_BETTER: Final = "better: less MSE and log-MSE, more PSNR and SSIM, rms z (error over stated uncertainty) near 1"
+
+
 def notes(found: list[Scores]) -> list[str]:
     """How many pixels, and what was done to images before they were compared."""
     first = found[0]
@@ -259,6 +262,7 @@ def notes(found: list[Scores]) -> list[str]:
     return [
         f"{how_many(len(first.images), 'image')}, {how_many(first.pixels, 'pixel')} compared; "
         f"data range {first.data_range:.4g}",
+        _BETTER,
         *(f"all: {text}" for text in everywhere),
         *(f"{s.method}: {text}" for s in found for text in s.adjustments() if text not in everywhere),
     ]

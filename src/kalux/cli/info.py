@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 
 _DESCRIPTION = """\
 Say what is in a recording: the sensor, frames and events, exposures, what is missing; and what reconstruct
-would find out from it: contrast thresholds, delay, and the noise of events, with units and origin."""
+would find out from it: contrast thresholds, delay, and the noise of events, with units and origin. What each line
+means: docs/cli.md, kalux info."""
 
 _EXAMPLES = """\
 examples:
@@ -73,9 +74,13 @@ def settled_lines(
 
     title = f"reconstruct would use, with the preset {name}"
     if not description.frames.count:
-        return [title, "  nothing: it needs frames"]
+        return [title, "  nothing: it needs frames; --frames joins images or a video"]
     if not recording.exposure_known:
-        return [title, "  nothing can be estimated without exposure times; give --exposure"]
+        return [
+            title,
+            "  nothing can be estimated without exposure times; give --exposure 10000 --stamp start, or what they are "
+            "(us); a guess will do",
+        ]
     asked = settings if calibration is None else calibration.apply(settings)
     made = plan(recording, at="frames", settings=asked, calibration=calibration)
     rows = plan_report(recording, made, asked)

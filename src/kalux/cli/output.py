@@ -22,7 +22,11 @@ DEFAULT_RATE: Final = 100.0
 """Images per second where nothing is said: several per frame, and a video that plays in real time."""
 
 FOLDER_FORMATS = ("png", "exr", "npy")
-_NOT_FOLDERS = {".avi", ".mkv", ".mov", ".webm", ".gif", ".m4v", ".png", ".exr", ".npy", ".tif", ".jpg"}
+_VIDEOS = {".avi", ".mkv", ".mov", ".webm", ".gif", ".m4v"}
+_IMAGES = {".png", ".exr", ".npy", ".npz", ".tif", ".jpg"}
+_RECORDINGS = {".h5", ".hdf5", ".aedat4", ".mat"}
+_NOT_FOLDERS = _VIDEOS | _IMAGES | _RECORDINGS
+"""Endings of names of files: an output of such a name is meant to be one, not a folder."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +109,10 @@ def chosen_output(options: argparse.Namespace) -> Output:
             f"--format {options.format}: {path} is a video; give a folder with -o, or no --format"
         )
     if not is_video and path.suffix.lower() in _NOT_FOLDERS and not path.is_dir():
-        raise UsageError(f"{path}: give a name that ends in .mp4 for a video, or the name of a folder")
+        raise UsageError(
+            f"{path}: give a name that ends in .mp4 for a video, or the name of a folder, {path.stem}, for a file per "
+            f"image (--format {', '.join(FOLDER_FORMATS)})"
+        )
     if path.name.lower() == ".mp4":
         raise UsageError(f"{path}: only the ending of a name; is a variable of the shell not set?")
     format = "mp4" if is_video else options.format or "png"

@@ -7,7 +7,7 @@ import re
 import textwrap
 from collections.abc import Callable, Sequence
 from itertools import groupby
-from typing import Any, Never
+from typing import Any, Final, Never
 
 from kalux.cli.terminal import say
 from kalux.errors import InputError, did_you_mean
@@ -136,11 +136,17 @@ def _no_such_choice(found: re.Match[str]) -> str:
     return f"there is no {found[1]!r}{did_you_mean(found[1], known)} (choose from {', '.join(known)})"
 
 
+_ELSEWHERE: Final = {"--fps": "--rate", "--output": "--out", "-q": "--quiet", "-j": "--threads"}
+"""What other programs call some flags."""
+
+
 def _unknown(argument: str, known: list[str]) -> str:
     flag = argument.partition("=")[0]
     if not flag.startswith("-"):
         return f"{argument}: one argument too many"
-    return f"unknown flag {flag}{did_you_mean(flag, known)}"
+    meant = _ELSEWHERE.get(flag)
+    hint = f", did you mean {meant}?" if meant in known else did_you_mean(flag, known)
+    return f"unknown flag {flag}{hint}"
 
 
 # Types of arguments: their names stand in messages ("'x' is not a number").

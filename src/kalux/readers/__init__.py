@@ -129,12 +129,16 @@ def _what_it_is(path: Path) -> str:
         if not names:
             return "an empty folder, "
         if any(name in IMAGES for name in names):
-            return "a folder of images, which --frames takes beside the recording of the events; "
+            return (
+                "a folder of images, which --frames takes beside the recording of the events, and kalux "
+                "hdr-reference if they are photographs at several exposures; "
+            )
         if "images.txt" in {file.name for file in path.iterdir()}:
             return "a folder of frames (images.txt) without their events (events.txt); "
         recordings = _recordings_in(path)
         return (
-            f"a folder of recordings ({', '.join(recordings)}), of which one can be opened; "
+            f"a folder of recordings ({', '.join(recordings)}), of which one is opened at a time, and kalux benchmark "
+            "takes all; "
             if recordings
             else ""
         )
