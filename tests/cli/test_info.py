@@ -99,7 +99,9 @@ def test_a_still_scene_has_no_estimate(cli, write_recording, simulation, tmp_pat
 
 
 def test_without_frames_nothing_is_estimated(cli, write_recording, tmp_path):
-    assert cli("info", write_recording(tmp_path / "rec.h5", frames=[])).out.endswith("--frames joins images or a video\n")
+    assert cli("info", write_recording(tmp_path / "rec.h5", frames=[])).out.endswith(
+        "--frames joins images or a video\n"
+    )
 
 
 def test_a_calibration_is_used(cli, write_recording, tmp_path):

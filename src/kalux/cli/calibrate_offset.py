@@ -120,7 +120,7 @@ def described(found: OffsetEstimate) -> Iterator[str]:
         f"offset {found.offset * 1e-3:.2f} ms, standard error {found.standard_error * 1e-3:.2f} ms: "
         "to be added to the frames' times"
     )
-    yield f"with events taken as whole steps, half a threshold late as they come: {found.apparent * 1e-3:.2f} ms"
+    yield f"with the half threshold in it by which events trail the light: {found.apparent * 1e-3:.2f} ms"
     yield f"correlation {found.coarse.peak:.2f}, {found.coarse.ratio:.2f} times the next peak"
 
 

@@ -252,7 +252,9 @@ def table_row(scores: Scores, consistency: BlurConsistency | None) -> str:
     return row + ("" if consistency is None else f"{consistency.psnr:>14.2f}")
 
 
-_BETTER: Final = "better: less MSE and log-MSE, more PSNR and SSIM, rms z (error over stated uncertainty) near 1"
+_BETTER: Final = (
+    "better: less MSE and log-MSE, more PSNR and SSIM, rms z (error over stated uncertainty) near 1"
+)
 
 
 def notes(found: list[Scores]) -> list[str]:
