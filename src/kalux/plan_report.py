@@ -123,7 +123,7 @@ def saturation_text(recording: Recording, plan: Plan, asked: Settings) -> str:
         return text + "events do not go on where the frames end, or too few tell"
     text += ceiling_text(ceiling)
     if ceiling.level < used:
-        text += f": --camera.saturation {ceiling.saturation:.2g} does not take that for measured"
+        text += f": if the camera saturates there, --camera.saturation {ceiling.saturation:.2g} says so"
     return text
 
 

@@ -43,10 +43,12 @@ class CameraSettings:
         I_0 of equation (8); white = 1. Events are steps of log I, so it must be small; below the dark current
         of the event pixels it only magnifies noise. None: an estimate from the recording
         (`kalux.calibration.event_model`), 0.03 where it cannot be told. The paper's code: 1.
-    frame_noise, shot_noise
-        sigma_im of equation (6) for one frame: standard deviation in the dark, and variance per intensity; white = 1.
-        None: an estimate from the recording (`kalux.calibration.frame_noise`); a shot noise beside a given frame noise
-        is 0.
+    frame_noise
+        sigma_im of equation (6) for one frame in the dark: standard deviation, white = 1. None: an estimate from the
+        recording (`kalux.calibration.frame_noise`).
+    shot_noise
+        What sigma_im^2 grows by with the intensity: variance per intensity, white = 1. None: an estimate as of
+        ``frame_noise``; 0 where that is given.
     usual_frame_noise
         The frame noise where the recording does not tell it, at half of white; all of it is read noise, unless dark
         pixels show less. 0.006 is what the paper's 7e5 1/s amounts to at 25 frames/s.

@@ -139,4 +139,4 @@ def test_says_where_the_sensor_saturates(cli, shared_data):
         r"saturation +from 0.98 of white \(the usual\); frames end at 0.4\d to 0.\d+, where events go on",
         said,
     )
-    assert re.search(r"by \d\d %: --camera.saturation 0.4\d ", said)
+    assert re.search(r"by \d\d %: if the camera saturates there, --camera.saturation 0.4\d ", said)

@@ -169,7 +169,9 @@ def described(flag: Flag) -> list[str]:
     kind = flag.kind.convert if isinstance(flag.kind, _OrAuto) else flag.kind
     value = "|".join(flag.choices) if flag.choices else _KINDS[kind]
     head = f"  {flag.name} {value}  (default {default})"
-    return [head, *textwrap.wrap(flag.text, _WIDTH, initial_indent=" " * 6, subsequent_indent=" " * 6)]
+    # What Python calls None is auto here.
+    text = flag.text.replace("None:", f"{AUTO}:") if isinstance(flag.kind, _OrAuto) else flag.text
+    return [head, *textwrap.wrap(text, _WIDTH, initial_indent=" " * 6, subsequent_indent=" " * 6)]
 
 
 def _shown(value: Any) -> str:
