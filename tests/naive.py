@@ -821,7 +821,7 @@ def unshown(split, settings, frames, t):
 def lifted(level, variance, excess, settings, top):
     """K15: where pixels are expected, the variance of that, the excess beyond white, and the noise of the events."""
     filtered = settings.filter
-    beyond = np.maximum(level - top, 0) / filtered.highlight_scale**2
+    beyond = settings.events.believed_gain * np.maximum(level - top, 0) / filtered.highlight_scale**2
     excess = np.nan_to_num(excess / (1 + excess * beyond), nan=-1.0)
     where, noise = excess >= 0, np.maximum(variance - filtered.initial_variance, 0)
     spread = np.where(where, np.maximum(excess, 0.3) ** 2 + noise, variance)
@@ -834,7 +834,8 @@ def intensity(log_intensity, variance, settings, white, stretch):
     top = np.log(white + i0)
     if scale2 > 0 and log_intensity > top:
         trust = scale2 / (scale2 + variance)
-        believed, left = (log_intensity - top) * trust, variance * trust
+        believed = settings.events.believed_gain * (log_intensity - top) * trust
+        left = variance * trust
         if stretch > 0:
             w = lambertw(stretch * believed).real
             believed, left = w / stretch, left * (np.exp(-w) / (1 + w)) ** 2

@@ -14,6 +14,7 @@ GREY = View(
     neighbours=0.0,
     highlight_scale=1.0,
     highlight_spread=0.1,
+    highlight_gain=1.0,
     unknown_variance=9.0,
     fixed_pattern=0.0,
     rounding=0.0,

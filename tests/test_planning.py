@@ -57,6 +57,53 @@ def test_then_those_of_the_recording():
     assert (half.settings.events.threshold_on, half.settings.events.threshold_off) == (0.4, 0.2)
 
 
+def stating(simulation, *, times=1.0, aside=0):
+    """A recording that states ``times`` the true thresholds, and whose frames are some columns aside."""
+    made = simulation.recording()
+    frames = [
+        dataclasses.replace(shown, image=np.roll(shown.image, aside, axis=1)) for shown in simulation.frames
+    ]
+    on, off = made.contrast_threshold
+    return Recording.from_arrays(
+        simulation.events,
+        frames,
+        sensor_size=made.sensor_size,
+        contrast_threshold=(times * on, times * off),
+    )
+
+
+@pytest.mark.parametrize("times", [0.6, 1.0, 1.4])
+def test_unless_its_frames_contradict_them(times):
+    made = plan(stating(moving_blocks(0.08, 0.9), times=times), rate_hz=10)
+    assert made.threshold_origin == ("recording" if times == 1.0 else "estimate")
+    assert made.contradicted == (None if times == 1.0 else (0.2 * times, 0.2 * times))
+    assert made.settings.events.threshold_on == pytest.approx(0.2, rel=0.12)
+    assert made.settings.events.threshold_off == pytest.approx(0.2, rel=0.12)
+    assert made.settings.events.extrapolation_gain == 1.0
+
+
+def test_thresholds_of_the_settings_are_kept_but_believed_less_beyond_white():
+    chosen = altered(PRESETS["default"], "events", threshold_on=0.3, threshold_off=0.3)
+    made = plan(stating(moving_blocks(0.08, 0.9)), rate_hz=10, settings=chosen)
+    assert (made.threshold_origin, made.settings.events.threshold_on) == ("settings", 0.3)
+    assert made.event_model.agreement.contradicts_thresholds
+    assert made.settings.events.extrapolation_gain == pytest.approx(0.67 / 0.88, rel=0.1)
+    given = plan(
+        stating(moving_blocks(0.08, 0.9)),
+        rate_hz=10,
+        settings=altered(chosen, "events", extrapolation_gain=0.4),
+    )
+    assert given.settings.events.extrapolation_gain == 0.4
+
+
+def test_frames_beside_the_events_change_no_thresholds():
+    """Estimated ones explain such frames no better than those that are stated."""
+    made = plan(stating(moving_blocks(0.08, 0.9), aside=6), rate_hz=10)
+    assert (made.threshold_origin, made.contradicted) == ("recording", None)
+    assert made.event_model.agreement.explained < 0.5
+    assert made.settings.events.extrapolation_gain < 0.7
+
+
 def test_then_an_estimate():
     made = plan(unlabelled(moving_blocks(0.08, 0.9)), rate_hz=10)
     assert made.threshold_origin == "estimate"

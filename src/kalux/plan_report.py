@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from kalux.calibration.delay import SHARE
+from kalux.calibration.event_model import Agreement
 from kalux.calibration.levels import Ceiling, find_ceiling
 from kalux.recording import Recording, less_black
 from kalux.settings import AUTO, Settings
@@ -49,6 +50,8 @@ def _of_events(plan: Plan, asked: Settings) -> Iterator[tuple[str, str]]:
         "thresholds",
         f"on {events.threshold_on:.3f}, off {events.threshold_off:.3f} log intensity ({_threshold_origin(plan)})",
     )
+    if plan.event_model is not None:
+        yield "agreement", _agreement_text(plan.event_model.agreement, plan.settings)
     yield "delay", f"events {events.lateness * 1e-3:g} ms late ({_delay_origin(plan, asked)})"
     yield (
         "I_0",
@@ -150,6 +153,16 @@ def ceiling_text(ceiling: Ceiling) -> str:
     return f"frames end at {level}, where events go on by {100 * np.expm1(ceiling.excess):.0f} %"
 
 
+def _agreement_text(agreement: Agreement, settings: Settings) -> str:
+    """How well events explain the frames, and how far they are believed where no frame checks them."""
+    text = (
+        f"events explain {100 * agreement.explained:.0f} % of how the frames change; where they say 1, frames "
+        f"change by {agreement.slope:.2f}"
+    )
+    gain = settings.events.believed_gain
+    return text if gain == 1.0 else f"{text}: beyond white {100 * gain:.0f} % is believed"
+
+
 def _threshold_origin(plan: Plan) -> str:
     found = plan.estimate
     if found is None or plan.threshold_origin not in ("estimate", "assumed"):
@@ -160,6 +173,8 @@ def _threshold_origin(plan: Plan) -> str:
             f"{100 * found.spread:.0f} %"
         )
     text = f"{ORIGINS['estimate']} from {how_many(found.samples, 'sample')}, residual {found.residual:.2f}"
+    if plan.contradicted is not None:
+        text = f"{text}; the recording states {plan.contradicted[0]:g} and {plan.contradicted[1]:g}"
     text += f": +- {100 * found.spread:.0f} %"
     if found.usual_share > _NOTABLE_SHARE:
         text += f"; {100 * found.usual_share:.0f} % is the usual of the preset, as frames show little change"

@@ -47,6 +47,9 @@ from kalux.schedule import image_times
 from kalux.settings import SETTINGS_NEEDED, Settings, altered, chosen_response
 from kalux.settings import preset as named_preset
 
+Thresholds = tuple[float, float]
+"""On and off, log intensity."""
+
 ThresholdOrigin = Literal["settings", "recording", "calibration", "estimate", "assumed"]
 
 ESTIMATED_ORIGINS: Final[tuple[ThresholdOrigin, ...]] = ("estimate", "assumed")
@@ -64,6 +67,13 @@ _NOISE_EVENTS: Final = 1_000_000
 _LEAST_NOISE: Final = 0.5
 """Least background noise with lookahead, Hz per pixel: events are isolated for other reasons, too (leak of bright
 pixels, flicker). slider_depth has 0.15 where nothing is seen, street 0.005 (docs/equations.md, K5)."""
+
+_REFUTED: Final = 3.0
+"""Standard deviations of estimated thresholds by which stated ones must differ from them to be wrong."""
+
+_LIKELIER: Final = 0.02
+"""Mean logarithm of the likelihood ratio of the frames by which they are so: 0.05 to 1.4 where stated thresholds are 10
+to 50 % off, 0.01 and less where they are right, and less than 0 where frames are beside the events or I_0 is large."""
 
 _CACHED_EVENTS: Final = 1 << 21
 _CACHED_FRAME_BYTES: Final = 1 << 25
@@ -88,6 +98,8 @@ class Plan:
         The fit of the events' delay, where there was one.
     event_model
         The fit of I_0 and the variance of an event's step, where there was one.
+    contradicted
+        Thresholds that the recording states, where its frames contradict them so that estimated ones are used.
     times
         (N,) int64 us, none before the one before it: the images to make.
     lookahead
@@ -129,6 +141,7 @@ class Plan:
     background_rate: float | None = None
     ceiling: Ceiling | None = None
     black: BlackLevel | None = None
+    contradicted: Thresholds | None = None
     dead_time: int = 0
     hot_pixels: int = 0
 
@@ -182,7 +195,9 @@ def plan(
     chosen, noise, doubted = _with_frame_noise(recording, chosen)
     chosen, pattern = _with_fixed_pattern(recording, chosen)
     chosen, period = _with_dead_time(recording, chosen)
-    chosen, origin, estimate, delay, model = _with_event_steps(recording, chosen, doubt_noise=doubted)
+    chosen, origin, estimate, delay, model, contradicted = _with_event_steps(
+        recording, chosen, doubt_noise=doubted
+    )
     threshold_error = estimate.spread if estimate is not None and origin in ESTIMATED_ORIGINS else 0.0
     chosen, mismatch = _with_mismatch(recording, chosen, threshold_error)
     chosen, background = _with_background(recording, chosen, known.pixels, lookahead)
@@ -197,6 +212,7 @@ def plan(
         estimate=estimate,
         delay_estimate=delay,
         event_model=model,
+        contradicted=contradicted,
         times=wanted,
         lookahead=lookahead,
         smooth=smooth,
@@ -364,16 +380,46 @@ def _with_dead_time(recording: Recording, settings: Settings) -> tuple[Settings,
 
 
 class _EventSteps(NamedTuple):
-    """Settings with the size and the time of an event's step filled in, and the estimates that these come from."""
+    """Settings with the size and the time of an event's step filled in, and the estimates that these come from.
+
+    ``contradicted`` are thresholds that the recording states and that were not taken, since its frames contradict.
+    """
 
     settings: Settings
     origin: ThresholdOrigin
     estimate: ThresholdEstimate | None
     delay: DelayEstimate | None
     model: EventModel | None
+    contradicted: Thresholds | None = None
 
 
 def _with_event_steps(recording: Recording, settings: Settings, *, doubt_noise: bool = False) -> _EventSteps:
+    """`_filled_event_steps` with the thresholds that the recording states, unless its own frames contradict them."""
+    stated = recording.contrast_threshold
+    found = _filled_event_steps(recording, settings, stated, doubt_noise)
+    if found.origin != "recording" or found.model is None or found.model.agreement.is_usual:
+        return found
+    estimated = _filled_event_steps(recording, settings, None, doubt_noise)
+    return estimated._replace(contradicted=stated) if _refutes(estimated, found) else found
+
+
+def _refutes(estimated: _EventSteps, stated: _EventSteps) -> bool:
+    """Whether frames are so much likelier by estimated thresholds, with their own I_0, that stated ones are wrong.
+
+    Frames beside the events make any thresholds look wrong: then they are no likelier by estimated ones.
+    """
+    if estimated.origin != "estimate" or estimated.model is None or estimated.estimate is None:
+        return False
+    assert stated.model is not None
+    gain = stated.model.agreement.loss - estimated.model.agreement.loss
+    thresholds = zip(estimated.settings.events.thresholds, stated.settings.events.thresholds, strict=True)
+    apart = max(abs(np.log(one / other)) for one, other in thresholds)
+    return bool(apart > _REFUTED * estimated.estimate.spread and gain > _LIKELIER)
+
+
+def _filled_event_steps(
+    recording: Recording, settings: Settings, stated: Thresholds | None, doubt_noise: bool
+) -> _EventSteps:
     """Fill in what an event's step is: thresholds, refractory period and delay, then I_0 and the step's variance.
 
     With ``doubt_noise`` also the frames' noise, where it is less than was taken.
@@ -381,7 +427,7 @@ def _with_event_steps(recording: Recording, settings: Settings, *, doubt_noise: 
     Thresholds depend on I_0 a little, and it on them: they are estimated once more with the I_0 that is found.
     """
     delay = estimate_delay(recording, settings.camera) if settings.events.delay is None else None
-    filled, origin, estimate = _with_thresholds(recording, settings, delay)
+    filled, origin, estimate = _with_thresholds(recording, settings, stated, delay)
     filled, delay = _with_delay(recording, filled, delay, estimate)
     filled, model = _with_event_model(recording, filled, doubt_noise=doubt_noise)
     if estimate is not None and settings.camera.log_offset is None:
@@ -389,11 +435,15 @@ def _with_event_steps(recording: Recording, settings: Settings, *, doubt_noise: 
         if estimated or (estimate.may_lose and settings.camera.offset != filled.camera.offset):
             events = filled.events
             unfilled = dataclasses.replace(
-                settings.events, delay=events.delay, step_variance=events.step_variance
+                settings.events,
+                delay=events.delay,
+                step_variance=events.step_variance,
+                extrapolation_gain=events.extrapolation_gain,
             )
             filled, origin, estimate = _with_thresholds(
                 recording,
                 dataclasses.replace(filled, events=unfilled),
+                stated,
                 delay,
                 estimate if estimated else None,
             )
@@ -403,17 +453,18 @@ def _with_event_steps(recording: Recording, settings: Settings, *, doubt_noise: 
 def _with_thresholds(
     recording: Recording,
     settings: Settings,
+    stated: Thresholds | None,
     delay: DelayEstimate | None,
     rough: ThresholdEstimate | None = None,
 ) -> tuple[Settings, ThresholdOrigin, ThresholdEstimate | None]:
-    """Fill in thresholds and refractory period: from the settings, else the recording, else an estimate, else usual.
+    """Fill in thresholds and refractory period: from the settings, else ``stated``, else an estimate, else usual.
 
     Events are counted under the apparent ``delay``, or that of the settings where it is None. With ``rough``, an
     estimate made before I_0 was known, only what depends on I_0 is estimated again.
     """
     events = settings.events
     origin: ThresholdOrigin = "settings" if events.has_thresholds else "recording"
-    known = events.with_thresholds(*(recording.contrast_threshold or (None, None)))
+    known = events.with_thresholds(*(stated or (None, None)))
     finds_period = _refractory_period(settings) is None
     if known.has_thresholds and not finds_period:
         return dataclasses.replace(settings, events=known), origin, None
@@ -462,11 +513,13 @@ def _steps_log_offset(settings: Settings) -> bool:
 def _with_event_model(
     recording: Recording, settings: Settings, *, doubt_noise: bool
 ) -> tuple[Settings, EventModel | None]:
-    """Fill in I_0 and the variance of steps: from the settings, else an estimate, else the usual."""
-    camera, events = settings.camera, settings.events
-    if camera.log_offset is not None and (
-        events.step_variance is not None or not settings.filter.joins_frames
-    ):
+    """Fill in I_0, the variance of steps and how far events are believed beyond white.
+
+    From the settings, else an estimate, else the usual.
+    """
+    camera, events, bridged = settings.camera, settings.events, settings.filter.joins_frames
+    of_events = events.step_variance, events.extrapolation_gain
+    if camera.log_offset is not None and (None not in of_events or not bridged):
         return settings, None
     used = dataclasses.replace(events, refractory_period=_refractory_period(settings))
     model = estimate_event_model(recording, camera, used, doubt_noise=doubt_noise)
@@ -478,6 +531,8 @@ def _with_event_model(
             camera = dataclasses.replace(camera, frame_noise=read, shot_noise=shot)
         if events.step_variance is None:
             events = dataclasses.replace(events, step_variance=model.step_variance)
+        if events.extrapolation_gain is None and bridged:
+            events = dataclasses.replace(events, extrapolation_gain=round(model.agreement.gain, 3))
     # What could not be estimated is filled in with the usual value, so that the settings tell what was used.
     camera = dataclasses.replace(camera, log_offset=camera.offset)
     events = dataclasses.replace(events, step_variance=events.step_noise)

@@ -411,6 +411,7 @@ class Reconstructor:
             neighbours=filtered.neighbours,
             highlight_scale=scale,
             highlight_spread=spread,
+            highlight_gain=events.believed_gain,
             unknown_variance=filtered.initial_variance,
             fixed_pattern=self.settings.camera.fixed_pattern or 0.0,
             rounding=0.0 if frame is None else repeated_rounding(frame, self.settings.camera),

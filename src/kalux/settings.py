@@ -148,6 +148,10 @@ class EventSettings:
         Where thresholds are only estimates and threshold_spread is not known: standard deviation of the log of their
         common error beyond white, where no frame corrects it. 0.15: how well large changes between well exposed
         frames agree with estimated thresholds, on three real and eleven simulated recordings.
+    extrapolation_gain
+        Share of the changes by events that is believed beyond white, where no frame corrects them (docs/equations.md,
+        K6), 0 to 1. None: as far as events explain how the frames change elsewhere
+        (`kalux.calibration.event_model`); 1 in a live stream.
     trail
         By how much, in c, a pixel is on average beyond the level of its newest event, at most (docs/equations.md,
         K14): events trail the light. 0 turns it off. 0.4 (docs/tuning.md).
@@ -186,6 +190,7 @@ class EventSettings:
     noise_rate: float | None = None
     leave_out_hot: bool = True
     extrapolation_spread: float = 0.15
+    extrapolation_gain: float | None = None
     trail: float = 0.4
     usual_threshold_on: float = 0.25
     usual_threshold_off: float = 0.25
@@ -216,6 +221,11 @@ class EventSettings:
         A ``threshold_spread`` from a recording includes the uncertainty of its thresholds.
         """
         return self.extrapolation_spread if self.threshold_spread is None else self.believed_mismatch
+
+    @property
+    def believed_gain(self) -> float:
+        """``extrapolation_gain``, or 1 while that is None."""
+        return 1.0 if self.extrapolation_gain is None else self.extrapolation_gain
 
     @property
     def believed_mismatch(self) -> float:
@@ -495,7 +505,7 @@ _LARGEST_WHOLE: Final = 10**18  # fits int64
 _LARGEST: Final = 1e10  # more than any value can mean, and its square is a number in single precision
 _LEAST: Final = 1e-12  # but 0: less than any value can mean, and so is its square
 _LARGEST_OF: Final[Mapping[str, float]] = {
-    **dict.fromkeys(("saturation", "usual_saturation", "weight_floor"), 1.0),
+    **dict.fromkeys(("saturation", "usual_saturation", "weight_floor", "extrapolation_gain"), 1.0),
     "black_level": 0.5,  # of white: no camera gives half of its range away
     "log_offset": 1e3,  # of white: its logarithm is then the same as its radiance
     **dict.fromkeys(

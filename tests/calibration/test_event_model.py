@@ -50,6 +50,27 @@ def test_the_offset_of_the_events_logarithm_is_found(recordings, offset, allowed
     assert found.samples > 5_000
 
 
+@pytest.mark.parametrize("times", [0.5, 1.0, 2.0])
+def test_the_slope_is_that_of_the_thresholds(recordings, times):
+    """Steps that are taken twice as large as they are explain as much, with half the slope."""
+    events = dataclasses.replace(EVENTS, threshold_on=0.2 * times, threshold_off=0.2 * times)
+    found = estimate_event_model(recordings[0.03], CameraSettings(log_offset=0.03), events).agreement
+    assert found.slope == pytest.approx(1 / times, rel=0.05)
+    assert found.explained > 0.9
+    assert found.gain == pytest.approx(min(0.5 / 0.88 if times == 2.0 else 1.0, 1.0), rel=0.05)
+    assert found.is_usual == (not found.contradicts_thresholds) == (times == 1.0)
+
+
+def test_events_of_another_scene_explain_nothing(recordings):
+    own = recordings[0.03]
+    inverted = np.concatenate([chunk.copy() for chunk in own.events()])
+    inverted["p"] = ~inverted["p"]
+    wrong = Recording.from_arrays(inverted, list(own.frames()), sensor_size=own.sensor_size)
+    found = estimate_event_model(wrong, CameraSettings(), EVENTS).agreement
+    assert (found.gain, found.explained) == (0.0, 0.0)
+    assert found.slope < 0.0
+
+
 def test_noise_makes_steps_less_certain(recordings):
     quiet = estimate_event_model(recordings[0.03], CameraSettings(), EVENTS)
     noisy = estimate_event_model(recorded(log_offset=0.03, noise_rate=20.0), CameraSettings(), EVENTS)
@@ -165,7 +186,9 @@ def test_a_plan_fills_in_what_is_not_given(recordings):
     given = dataclasses.replace(
         default,
         camera=dataclasses.replace(default.camera, log_offset=0.02),
-        events=dataclasses.replace(default.events, step_variance=0.3, refractory_period=700),
+        events=dataclasses.replace(
+            default.events, step_variance=0.3, refractory_period=700, extrapolation_gain=0.9
+        ),
     )
     kept = plan(recording, at="frames", settings=given)
     assert kept.event_model is None

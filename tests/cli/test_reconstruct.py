@@ -683,3 +683,17 @@ def test_events_that_contradict_the_frames_are_told(cli, write_recording, simula
         found = cli("reconstruct", path, "-o", tmp_path / name, "--at", "frames", "--quiet")
         assert found.code == 0
         assert ("do not explain how the frames change" in found.err) == (name == "inverted")
+
+
+def test_thresholds_that_contradict_the_frames_are_told(cli, write_recording, simulation, tmp_path):
+    """Those that the recording states are not used, those that are given are."""
+    stated = write_recording(tmp_path / "stated.h5", contrast_threshold=(0.4, 0.4))
+    found = cli("reconstruct", stated, "-o", tmp_path / "a", "--at", "frames")
+    assert (
+        "that the recording states, 0.4 on and 0.4 off, contradict its frames and are not used" in found.err
+    )
+    assert "; the recording states 0.4 and 0.4" in found.out
+    flags = ("--events.threshold-on", "0.4", "--events.threshold-off", "0.4")
+    found = cli("reconstruct", stated, "-o", tmp_path / "b", "--at", "frames", *flags)
+    assert "the given contrast thresholds contradict the frames" in found.err
+    assert "on 0.400, off 0.400 log intensity (given)" in found.out

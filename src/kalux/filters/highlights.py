@@ -42,7 +42,7 @@ def tempered(unshown: Unshown, bound: Floats, prior: HighlightPrior) -> Unshown:
     if prior.scale2 == 0:
         return unshown
     beyond = np.maximum(bound.reshape(-1)[unshown.pixels] - np.float32(prior.white), np.float32(0.0))
-    steeper = np.float32(1.0) + unshown.excess * beyond / np.float32(prior.scale2)
+    steeper = np.float32(1.0) + unshown.excess * (np.float32(prior.gain) * beyond) / np.float32(prior.scale2)
     return unshown._replace(excess=unshown.excess / steeper)
 
 
@@ -78,8 +78,8 @@ def read_unshown(
     least = bound.reshape(-1)[unshown.pixels]
     likely = np.maximum(least - _LIKELY * np.sqrt(unshown.noise), np.float32(prior.white))
     mean = np.maximum(level, np.minimum(least, likely)).astype(np.float32)
-    white, scale2, stretch = (np.float32(value) for value in prior)
-    _take_mean(unshown.excess, unshown.noise, np.float32(log_offset), white, scale2, stretch, mean)
+    scalars = tuple(np.float32(value) for value in prior)
+    _take_mean(unshown.excess, unshown.noise, np.float32(log_offset), scalars, mean)
     image.reshape(-1)[unshown.pixels] = mean
 
 
@@ -111,13 +111,15 @@ def _keep(log_intensity, unmeasured, white, log_offset, image):  # type: ignore[
 
 
 @loop
-def _take_mean(excess, noise, log_offset, white, scale2, stretch, mean):  # type: ignore[no-untyped-def]
+def _take_mean(excess, noise, log_offset, prior, mean):  # type: ignore[no-untyped-def]
     """From L to the mean of the intensity, in place, without branches, so that it becomes vector code."""
     half, zero = np.float32(0.5), np.float32(0.0)
+    white, scale2, stretch, gain = prior
     doubted = scale2 > zero
     for i in range(len(mean)):
         level = mean[i] + half * smaller(excess[i] * excess[i], excess[i])
-        believed = white + believed_highlight(larger(level - white, zero), noise[i], scale2, stretch)
+        beyond = larger(level - white, zero)
+        believed = white + believed_highlight(beyond, noise[i], scale2, stretch, gain)
         mean[i] = larger(exponential(believed if doubted and level > white else level) - log_offset, zero)
 
 

@@ -119,25 +119,28 @@ class HighlightPrior(NamedTuple):
         Variance of the log of highlights over white; 0 turns the prior off.
     stretch
         Variance of the log of the events' unknown scale there, divided by the standard deviation of highlights.
+    gain
+        Share of the change by events that is believed there.
     """
 
     white: float
     scale2: float
     stretch: float
+    gain: float
 
 
 @nb.njit(cache=True, inline="always", error_model="numpy")
-def believed_highlight(excess, variance, scale2, stretch):  # type: ignore[no-untyped-def]
+def believed_highlight(excess, variance, scale2, stretch, gain):  # type: ignore[no-untyped-def]
     """Posterior of L - white > 0, given its estimate ``excess`` and the filter's ``variance``; float32.
 
-    Additive noise: a normal prior of variance ``scale2`` shrinks the excess. Unknown scale of the events: with
-    a log-normal scale and an exponential prior the mode solves d exp(stretch d) = excess, i.e.
-    d = W(stretch excess) / stretch with Lambert's W. Returned is the log of the posterior mean intensity, half the
+    Of the excess the share ``gain`` is taken. Additive noise: a normal prior of variance ``scale2`` shrinks it. Unknown
+    scale of the events: with a log-normal scale and an exponential prior the mode solves d exp(stretch d) = excess,
+    i.e. d = W(stretch excess) / stretch with Lambert's W. Returned is the log of the posterior mean intensity, half the
     posterior variance above the mean of the log; that half is bounded by a part of d, so that it is 0 at white.
     """
     scale2, stretch = np.float32(scale2), np.float32(stretch)
     trust = scale2 / (scale2 + np.float32(variance))
-    believed = np.float32(excess) * trust
+    believed = np.float32(gain) * np.float32(excess) * trust
     left = np.float32(variance) * trust
     if stretch != np.float32(0.0):
         w = lambert_w(stretch * believed)
@@ -332,7 +335,7 @@ def _read_out(  # type: ignore[no-untyped-def]
     The state of a row is loaded two pitches before it is read out, since the patches around neighbours reach so far,
     and its moving pixels are marked three pitches before. Rows before the first one only load what is ahead.
     """
-    white, scale2, _ = prior
+    white, scale2, _, _ = prior
     height, width = log_intensity.shape
     knows_moving = moving.size > 0
     averages = knows_moving and allowed > np.float32(0.0)
@@ -627,7 +630,7 @@ def _shrink_highlights(  # type: ignore[no-untyped-def]
     level, variance, row, start, bright, prior, log_offset, places, excess, doubt, out
 ):
     """K6 of the bright pixels of a row, gathered so that they go through vector code and others cost nothing."""
-    white, scale2, stretch = prior
+    white, scale2, stretch, gain = prior
     count = np.uint64(0)
     for first in range(0, len(level), _BLOCK):
         if _any(bright, first, _BLOCK):
@@ -638,7 +641,7 @@ def _shrink_highlights(  # type: ignore[no-untyped-def]
         excess[k] = level[places[k]] - white
         doubt[k] = variance[places[k]]
     for k in range(count):
-        believed = believed_highlight(excess[k], doubt[k], scale2, stretch)
+        believed = believed_highlight(excess[k], doubt[k], scale2, stretch, gain)
         excess[k] = larger(exponential(white + believed) - log_offset, np.float32(0.0))
     for k in range(count):
         out[row, start + places[k]] = excess[k]
