@@ -68,6 +68,10 @@ _LEAST_NOISE: Final = 0.5
 """Least background noise with lookahead, Hz per pixel: events are isolated for other reasons, too (leak of bright
 pixels, flicker). slider_depth has 0.15 where nothing is seen, street 0.005 (docs/equations.md, K5)."""
 
+_USUAL_LOG_OFFSET: Final = 0.01
+"""I_0 beyond which stated thresholds are looked at again, white = 1: on 21 scenes 0.004 to 0.008; 0.015 to 0.12 where two
+thirds of the true thresholds are stated and the slope is usual all the same."""
+
 _REFUTED: Final = 3.0
 """Standard deviations of estimated thresholds by which stated ones must differ from them to be wrong."""
 
@@ -397,10 +401,15 @@ def _with_event_steps(recording: Recording, settings: Settings, *, doubt_noise: 
     """`_filled_event_steps` with the thresholds that the recording states, unless its own frames contradict them."""
     stated = recording.contrast_threshold
     found = _filled_event_steps(recording, settings, stated, doubt_noise)
-    if found.origin != "recording" or found.model is None or found.model.agreement.is_usual:
+    if found.origin != "recording" or found.model is None or _are_plausible(found.model):
         return found
     estimated = _filled_event_steps(recording, settings, None, doubt_noise)
     return estimated._replace(contradicted=stated) if _refutes(estimated, found) else found
+
+
+def _are_plausible(model: EventModel) -> bool:
+    """Whether nothing speaks against the thresholds. Those that are too small make I_0 large."""
+    return model.agreement.is_usual and model.log_offset <= _USUAL_LOG_OFFSET
 
 
 def _refutes(estimated: _EventSteps, stated: _EventSteps) -> bool:

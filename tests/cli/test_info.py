@@ -22,6 +22,7 @@ def test_says_all_that_reconstruct_would_settle(cli, write_recording, tmp_path):
     assert said.pop().split(maxsplit=1)[0] == "saturation"  # which takes another look at the frames
     assert [line.split("  ")[1].strip() for line in said] == [
         "thresholds",
+        "agreement",
         "delay",
         "I_0",
         "step",

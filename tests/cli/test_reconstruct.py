@@ -254,6 +254,7 @@ class TestWhatIsSaid:
         assert [line.split()[0] for line in lines] == [
             "recording",
             "thresholds",
+            "agreement",
             "delay",
             "I_0",
             "step",
@@ -273,12 +274,22 @@ class TestWhatIsSaid:
         assert "40x32 pixels" in lines[0]
         assert "from the recording" in lines[1]
 
-    def test_estimated_thresholds_are_a_warning(self, cli, write_recording, tmp_path):
+    @pytest.mark.parametrize(("spread", "warns"), [(0.12, True), (0.08, False)])
+    def test_estimated_thresholds_are_a_warning_unless_they_are_exact(
+        self, cli, write_recording, tmp_path, monkeypatch, spread, warns
+    ):
+        made = reconstruct_command.make_plan
+
+        def inexact(*arguments):
+            found = made(*arguments)
+            return dataclasses.replace(found, estimate=found.estimate._replace(spread=spread))
+
+        monkeypatch.setattr(reconstruct_command, "make_plan", inexact)
         recording = write_recording(tmp_path / "rec.h5", contrast_threshold=None)
         found = cli("reconstruct", recording, "-o", tmp_path / "out", "--at", "frames", "--quiet")
         assert (found.code, found.out) == (0, "")
-        assert found.err.startswith("kalux: warning: the contrast thresholds are estimated")
-        assert found.err.count("\n") == 1
+        assert found.err.startswith("kalux: warning: the contrast thresholds are estimated") == warns
+        assert found.err.count("\n") == warns
 
     @pytest.mark.parametrize(("preset", "hinted"), [("default", True), ("davis346", False)])
     def test_one_frame_tells_no_threshold_and_a_preset_is_hinted_at(

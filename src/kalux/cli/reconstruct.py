@@ -48,6 +48,9 @@ _LITTLE_EXPLAINED: Final = 0.5
 """Of how the frames change, by events: 0.89 and more on 35 simulated scenes and recordings, less than 0.4 with frames
 that are 3 pixels aside, or ON events alone."""
 
+_EXACT: Final = 0.1
+"""Standard deviation of estimated thresholds, relative, up to which there is nothing to warn of."""
+
 _GIVEN_ORIGINS: Final = ("settings", "calibration")
 """Of thresholds that are used though frames may contradict them."""
 
@@ -297,7 +300,7 @@ def plan_warnings(planned: Plan, contents: Contents, preset_name: str) -> Iterat
     gap = gap_warning(planned, contents)
     if gap is not None:
         yield gap
-    if planned.threshold_origin in ESTIMATED_ORIGINS:
+    if planned.threshold_origin in ESTIMATED_ORIGINS and not is_well_known(planned):
         yield threshold_warning(planned, preset_name)
     yield from agreement_warnings(planned)
 
@@ -313,8 +316,8 @@ def agreement_warnings(planned: Plan) -> Iterator[str]:
             f"are not used; to insist, give --events.threshold-on {on:g} --events.threshold-off {off:g}"
         )
     unexplained = agreement is not None and agreement.explained < _LITTLE_EXPLAINED
-    assumed = planned.threshold_origin == "assumed" and planned.estimate is not None
-    if unexplained or (assumed and contradicts(planned.estimate)):
+    assumed = planned.estimate if planned.threshold_origin == "assumed" else None
+    if unexplained or (assumed is not None and contradicts(assumed)):
         yield (
             "the events do not explain how the frames change; if much moves, do both see the same pixels (kalux "
             "register), do both have the same clock (kalux calibrate offset REC finds out), and is polarity 1 brighter?"
@@ -359,6 +362,11 @@ def gap_warning(planned: Plan, contents: Contents) -> str | None:
         f"there is no frame for {(end - begin) * 1e-6:,.0f} s, from {first:.3f} to {last:.3f} s: {images:,} of "
         f"{how_many(len(planned.times), 'image')} lie there; are the times right? --start and --end choose a part"
     )
+
+
+def is_well_known(planned: Plan) -> bool:
+    """Whether estimated thresholds are as exact as stated ones mostly are."""
+    return planned.estimate is not None and planned.estimate.spread <= _EXACT
 
 
 def contradicts(estimate: ThresholdEstimate) -> bool:
