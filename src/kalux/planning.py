@@ -69,8 +69,8 @@ _LEAST_NOISE: Final = 0.5
 pixels, flicker). slider_depth has 0.15 where nothing is seen, street 0.005 (docs/equations.md, K5)."""
 
 _USUAL_LOG_OFFSET: Final = 0.01
-"""I_0 beyond which stated thresholds are looked at again, white = 1: on 21 scenes 0.004 to 0.008; 0.015 to 0.12 where two
-thirds of the true thresholds are stated and the slope is usual all the same."""
+"""I_0, white = 1, beyond which stated thresholds are looked at again. It is 0.004 to 0.008 on 21 scenes, and 0.015 to
+0.12 where two thirds of their thresholds are stated and the slope is usual all the same."""
 
 _REFUTED: Final = 3.0
 """Standard deviations of estimated thresholds by which stated ones must differ from them to be wrong."""
