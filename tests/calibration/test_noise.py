@@ -15,7 +15,7 @@ from kalux.datasets import SensorSettings, demo_scene, simulate, static
 from kalux.events import make_events
 from kalux.settings import CameraSettings
 
-from builders import unlabelled
+from builders import from_black, lifted, unlabelled
 
 CAMERA = CameraSettings()
 SIZE = (64, 96)
@@ -120,3 +120,12 @@ def test_settings_of_a_noise_calibration():
     )
     assert still.delay is None
     assert still.events.rate == pytest.approx(1.0, rel=0.2)
+
+
+def test_a_black_level_is_taken_off_and_told():
+    plain = calibrate_noise(from_black(3.0), CAMERA)
+    found = calibrate_noise(lifted(from_black(3.0), 16), CAMERA)
+    assert found.calibration().settings["camera"]["black_level"] == pytest.approx(16 / 255, abs=1 / 255)
+    assert found.delay == pytest.approx(plain.delay, abs=200)
+    assert found.events.rate == plain.events.rate
+    assert "black_level" not in plain.calibration().settings.get("camera", {})

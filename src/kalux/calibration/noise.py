@@ -16,6 +16,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.calibration.black_level import with_known_black
 from kalux.calibration.delay import estimate_delay
 from kalux.calibration.fixed_pattern import FixedPattern, estimate_fixed_pattern
 from kalux.calibration.frame_noise import FrameNoise, estimate_frame_noise
@@ -79,6 +80,8 @@ class NoiseCalibration:
         Background events, hot and dead pixels.
     frames, pattern
         Read and shot noise of frames, and their fixed pattern.
+    black_level
+        What was taken off the frames, a share of white, given or found; None: nothing, or what they state themselves.
     levels
         Where frames clip.
     delay, apparent_delay
@@ -90,6 +93,7 @@ class NoiseCalibration:
     events: EventNoise | None
     frames: FrameNoise | None
     pattern: FixedPattern | None
+    black_level: float | None
     levels: ClippingLevels
     delay: int | None
     apparent_delay: int | None
@@ -132,7 +136,9 @@ class NoiseCalibration:
             if self.levels.saturation < CameraSettings.usual_saturation:  # else it is found out, or the usual
                 camera["saturation"] = self.levels.saturation
         if self.levels.black is not None:
-            measured["black_level"] = self.levels.black
+            measured["dark_level"] = self.levels.black
+        if self.black_level is not None:
+            camera["black_level"] = self.black_level
         settings = {"camera": camera, "events": events}
         return Calibration({g: v for g, v in settings.items() if v}, errors, measured, maps)
 
@@ -145,13 +151,14 @@ def calibrate_noise(recording: Recording, camera: CameraSettings) -> NoiseCalibr
     recording
         With frames and exposures; a still camera, or still parts of the scene, tell most.
     camera
-        Response and saturation.
+        Response, saturation and black level; where that is None and events show one, it is taken off.
 
     Raises
     ------
     ExposureError
         If the frames' exposures are not known.
     """
+    recording, _ = with_known_black(recording, camera, EventSettings())
     delay = estimate_delay(recording, camera)
     if delay is not None:
         period = dead_time(recording)
@@ -160,6 +167,7 @@ def calibrate_noise(recording: Recording, camera: CameraSettings) -> NoiseCalibr
         events=event_noise(recording),
         frames=estimate_frame_noise(recording, camera, most_frames=MAX_FRAMES),
         pattern=estimate_fixed_pattern(recording, camera),
+        black_level=recording.black_level or camera.black_level,
         levels=clipping_levels(recording, MAX_FRAMES),
         delay=None if delay is None else delay.delay,
         apparent_delay=None if delay is None else delay.apparent,
