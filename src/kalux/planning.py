@@ -161,7 +161,7 @@ def plan(
         require_size(known.pixels, recording.sensor_size)
     recording = with_cached_start(recording, _CACHED_EVENTS, _CACHED_FRAME_BYTES)
     looks_for_hot = chosen.filter.joins_frames and chosen.events.leave_out_hot
-    hot = find_hot_pixels(recording, _NOISE_EVENTS) if looks_for_hot else None
+    hot = find_hot_pixels(recording) if looks_for_hot else None
     if hot is not None and hot.any():
         recording = without_events_of(recording, hot)
     recording, chosen, black = _less_black(recording, chosen)
