@@ -98,7 +98,7 @@ def test_smoothing_is_two_filters_combined_by_information():
             a,
             log_intensity=level,
             variance=(sum(weights) + 2 * correlation * np.sqrt(weights[0] * weights[1])) / sum(weights) ** 2,
-            told=1 / sum(weights),
+            signalled_variance=1 / sum(weights),
             moving=np.where(change > 0.005 * 0.2 * 0.25, a.moving | b.moving, a.moving & b.moving),
             silent_change=change,
             around=around,
@@ -329,7 +329,7 @@ def test_what_two_filters_know_adds_up():
     forward, backward = estimates_around([0.01], [0.01])
     late = dataclasses.replace(backward, since=0.5)
     found = combine(forward, late)
-    assert found.told[0, 0] == pytest.approx(0.008)
+    assert found.signalled_variance[0, 0] == pytest.approx(0.008)
     assert found.around.counted == UNMEASURED
     assert found.since is None
     assert combine(dataclasses.replace(forward, since=0.2), late).since == 0.2
@@ -355,7 +355,7 @@ def test_black_tells_both_filters_the_same():
     """What it hides is the same before and after (K7), but it is not noise, which neighbours could take away."""
     forward, backward = estimates_around([0.01, 2.0], [0.02, 2.0], ends=[0.02, REPEATED])
     found = combine(forward, backward)
-    np.testing.assert_allclose(found.told[:, 0], [0.008, 0.0144], rtol=1e-6)
+    np.testing.assert_allclose(found.signalled_variance[:, 0], [0.008, 0.0144], rtol=1e-6)
     np.testing.assert_allclose(found.variance[:, 0], [0.0144, 0.008], rtol=1e-6)
 
 

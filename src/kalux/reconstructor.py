@@ -35,7 +35,7 @@ from kalux.filters.buffer import EventBuffer
 from kalux.filters.method import USUAL_INTERVAL, Method, Segment
 from kalux.filters.methods import make_method
 from kalux.filters.shots import Shot, take_shot
-from kalux.filters.uncertainty import changed_within, hidden_variance
+from kalux.filters.uncertainty import changed_within, subthreshold_variance
 from kalux.frames import Frame, check_frame, with_black_level
 from kalux.images import Estimate, Image, View, make_image
 from kalux.models.camera import Camera, beyond_white, count_bright, repeated_rounding
@@ -456,7 +456,7 @@ class Reconstructor:
         level, variance = self._method.read(segment, cursor, half_way)
         on, off = self.thresholds
         progress.paths = self._method.paths(
-            segment, path, level, variance + hidden_variance(1.0, on * off).moving
+            segment, path, level, variance + subthreshold_variance(1.0, on * off).moving
         )
 
     # Segments.

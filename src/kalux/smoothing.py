@@ -45,13 +45,13 @@ _WINDOW_BYTES: Final = 256 << 20
 
 _BLOCK_EVENTS: Final = 1 << 18
 
-_ALIKE: Final = 0.2
+_CORRELATION: Final = 0.2
 """Correlation of the errors of the two directions where each goes by events of its own, from a frame of its own: the
 thresholds are the same ones. -0.1 to 0.1 on noisy scenes, 0.3 to 0.6 on clean ones (docs/equations.md)."""
 
 _STANDS_STILL: Final = 0.005
 """Mean square change of silent pixels, in c^2, up to which nothing moves there: a tenth of the least under a moving
-camera (`kalux.augmentation.unseen`)."""
+camera (`kalux.augmentation.subthreshold`)."""
 
 
 def _reason(error: OSError) -> str:
@@ -369,13 +369,13 @@ def combine(
         (forward.log_intensity, forward.variance, forward.unshown),
         (behind, backward.variance, backward.unshown),
     )
-    variance, told = 1.0 / information, None
+    variance, signalled = 1.0 / information, None
     shared = shared_errors(forward.around, backward.around)
     if shared is not None:
         together = (information + 2.0 * shared * np.sqrt(first * second)) / information**2
         black = _black(forward.around, backward.around)
-        variance, told = np.where(black, variance, together), np.where(black, together, variance)
-    smoothed = (level, variance) if told is None else (level, variance, told)
+        variance, signalled = np.where(black, variance, together), np.where(black, together, variance)
+    smoothed = (level, variance) if signalled is None else (level, variance, signalled)
     obey_bounds(smoothed, *directions)
     obey_bounds(smoothed, *directions[::-1])
     unshown = smoothed_unshown(level, *directions)
@@ -395,7 +395,7 @@ def combine(
         unmeasured=forward.unmeasured,
         exposed=forward.exposed,
         since=_least(forward.since, backward.since),
-        told=told,
+        signalled_variance=signalled,
         paths=forward.paths,
         share=forward.share,
     )
@@ -423,7 +423,7 @@ def shared_errors(forward: Around | None, backward: Around | None) -> NDArray[np
     share = np.float32(forward.share)
     first, second = forward.first < UNMEASURED, forward.second < UNMEASURED
     same = (np.float32(1.0) - share) * first + share * second
-    return np.float32(_ALIKE) + np.float32(1.0 - _ALIKE) * same
+    return np.float32(_CORRELATION) + np.float32(1.0 - _CORRELATION) * same
 
 
 def _black(forward: Around | None, backward: Around | None) -> NDArray[np.bool_]:

@@ -44,6 +44,14 @@ _SCALE_BOUNDS: Final = (0.3, 3.0)
 _SCALE_DRIFT: Final = 1e-5  # variance per frame: a calibration never becomes certain, temperatures drift
 
 
+def bridge_variance(share: float) -> float:
+    """Variance of a random walk that is tied at both ends, a Brownian bridge, over that half-way: 4 s (1 - s).
+
+    ``share`` is s, of the way from the frame before to the one after: it is 0 at a frame, and 1 half-way.
+    """
+    return 4.0 * share * (1.0 - share)
+
+
 class Latent(NamedTuple):
     """A deblurred frame at one moment: (H, W) log intensity and its variance.
 
@@ -165,13 +173,14 @@ class BridgedSegment(NamedTuple):
     unshown
         Pixels that no frame has measured until the end, or until the start in causal mode (K15).
     silent_change
-        Mean square change of silent pixels around each between the frames (`unseen.silent_change`); None: not known.
+        Mean square change of silent pixels around each between the frames (`subthreshold.silent_change`); None: not
+        known.
     net
         Change of L by all events, and by K14, from start to end; None: not known.
     turns
-        How often the intensity of a pixel with events reverses, on average (`unseen.turns`).
+        How often the intensity of a pixel with events reverses, on average (`subthreshold.turns`).
     half_way
-        Variance of silent pixels about the mean of both frames (`unseen.half_way`).
+        Variance of silent pixels about the mean of both frames (`subthreshold.half_way`).
     latents
         The frames at both ends, where they are looked at along the paths of what moves (K16); else None.
     doubt

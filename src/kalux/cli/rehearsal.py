@@ -17,8 +17,8 @@ from kalux.augmentation.background import doubt, signal_shares
 from kalux.augmentation.bridge import BridgeNoise, Latent, bridge, drift, nominal_thresholds
 from kalux.augmentation.highlights import Unshown
 from kalux.augmentation.motion import Paths
+from kalux.augmentation.subthreshold import add_missed_change, half_way, silent_change, turns
 from kalux.augmentation.trail import Trail, nothing_followed, polarity_of, trail_between
-from kalux.augmentation.unseen import add_missed_change, half_way, silent_change, turns
 from kalux.cli.loops import prepare_loops
 from kalux.compiled import apart
 from kalux.display import Auto, DisplaySettings, fill_levels, measure, quantised

@@ -21,6 +21,14 @@ from kalux.augmentation.highlights import (
     follow_unshown,
 )
 from kalux.augmentation.motion import Paths, Plane, find_path
+from kalux.augmentation.subthreshold import (
+    UNKNOWN_CHANGE,
+    UNMEASURED_CHANGE,
+    add_missed_change,
+    half_way,
+    silent_change,
+    turns,
+)
 from kalux.augmentation.trail import (
     Followed,
     Trail,
@@ -30,14 +38,6 @@ from kalux.augmentation.trail import (
     polarity_of,
     trail_at,
     trail_between,
-)
-from kalux.augmentation.unseen import (
-    UNKNOWN_CHANGE,
-    UNMEASURED_CHANGE,
-    add_missed_change,
-    half_way,
-    silent_change,
-    turns,
 )
 from kalux.compiled import apart, empty, loop, smaller
 from kalux.event_slices import all_between
@@ -91,7 +91,7 @@ class BridgeMemory(NamedTuple):
     silent_change
         (H, W) mean square change of the silent pixels around each (K11).
     silent
-        (H, W) change of silent pixels in the latest interval, NaN of others (`unseen.half_way`).
+        (H, W) change of silent pixels in the latest interval, NaN of others (`subthreshold.half_way`).
     """
 
     latent: Latent
@@ -549,7 +549,7 @@ class BridgedFrames(Method):
     def around(self, segment: BridgedSegment, t: int) -> Around:
         assert segment.events is not None
         share = (t - segment.start) / (segment.end - segment.start)
-        between = 4.0 * share * (1.0 - share)
+        between = bridge.bridge_variance(share)
         second = segment.backward_variance
         if segment.bound is not None and segment.bound.ceiling is not None:
             second = np.where(np.isfinite(segment.bound.ceiling), np.float32(bridge.REPEATED), second)

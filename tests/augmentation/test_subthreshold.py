@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from kalux.augmentation.bridge import UNMEASURED, BridgeNoise, Latent, bridge, nominal_thresholds
-from kalux.augmentation.unseen import UNKNOWN_CHANGE, add_missed_change, half_way, silent_change, turns
+from kalux.augmentation.subthreshold import UNKNOWN_CHANGE, add_missed_change, half_way, silent_change, turns
 
 SHAPE = (40, 60)
 C2 = 0.04
