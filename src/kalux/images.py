@@ -216,12 +216,12 @@ def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) ->
         variance,
         view.log_offset,
         prior,
-        moving,
-        before_averaging(subthreshold),
-        change,
-        view.neighbours,
-        1 if view.mosaic is None else 2,  # to neighbours of the same colour
-        None if unshown is None else unshown.pixels,
+        moving=moving,
+        subthreshold=before_averaging(subthreshold),
+        silent_change=change,
+        difference=view.neighbours,
+        pitch=1 if view.mosaic is None else 2,  # to neighbours of the same colour
+        unshown=None if unshown is None else unshown.pixels,
         with_variance=needs_averaged,
     )
     if unshown is not None:

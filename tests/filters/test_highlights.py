@@ -24,7 +24,9 @@ def intensity(value, variance, offset, prior):
 def regularised(value, variance, moving, difference, pitch):
     """L after K12."""
     nothing = Subthreshold(0.0, 0.0)
-    image = read_out(value, variance, OFFSET, OFF, moving, nothing, None, difference, pitch)[0]
+    image = read_out(
+        value, variance, OFFSET, OFF, moving=moving, subthreshold=nothing, difference=difference, pitch=pitch
+    )[0]
     return np.log(image + OFFSET)
 
 
@@ -39,7 +41,15 @@ def read(level, where, difference=0.0, moving=None, pitch=1, prior=PRIOR):
     raised, spread = lifted(bound, np.full(bound.shape, 0.01, np.float32), where)
     subthreshold = Subthreshold(0.0, 0.0)
     image, _, heard = read_out(
-        raised, spread, OFFSET, prior, moving, subthreshold, None, difference, pitch, where.pixels
+        raised,
+        spread,
+        OFFSET,
+        prior,
+        moving=moving,
+        subthreshold=subthreshold,
+        difference=difference,
+        pitch=pitch,
+        unshown=where.pixels,
     )
     read_unshown(image, heard, bound, where, OFFSET, prior)
     return image
@@ -81,7 +91,7 @@ def test_neighbours_are_heard_as_by_other_pixels(pitch):
     raised, spread = lifted(level, np.full((6, 7), 0.05, np.float32), where)
     image = np.zeros_like(level)
     told = read_out(
-        raised, spread, OFFSET, PRIOR, moving, Subthreshold(0, 0), None, 0.3, pitch, where.pixels
+        raised, spread, OFFSET, PRIOR, moving=moving, difference=0.3, pitch=pitch, unshown=where.pixels
     )[2]
     read_unshown(image, told, level, where, OFFSET, PRIOR)
     heard = regularised(raised, spread, moving, 0.3, pitch).reshape(-1)[where.pixels]

@@ -318,12 +318,12 @@ def nominal_thresholds(shape: tuple[int, int], spread: float, dtype: Any = np.fl
 def bridge(
     first: Latent,
     second: Latent,
-    on: Array,
-    off: Array,
+    counts: tuple[Array, Array],
     thresholds: Thresholds,
     noise: BridgeNoise,
     start: int,
     end: int,
+    *,
     grown: Array | None = None,
     signal: tuple[Array, Array] | None = None,
 ) -> tuple[BridgedSegment, Thresholds]:
@@ -333,10 +333,12 @@ def bridge(
     ----------
     first, second
         The frames at ``start`` and ``end`` (us).
-    on, off
-        (H, W) number of events of each polarity between them.
+    counts
+        (H, W) number of on and of off events between them.
     thresholds
         What is known of the pixels' thresholds so far.
+    noise
+        Nominal thresholds, and variances of steps.
     grown
         (H, W) change of L between the frames in addition to the events' steps (K14); None: none.
     signal
@@ -371,7 +373,7 @@ def bridge(
     shares = (np.ones(shape, first.value.dtype),) * 2 if signal is None else signal
     given, known, filled, learned = (
         tuple(plane.reshape(-1) for plane in several)
-        for several in ((*first[:2], *second[:2], on, off, more, *shares), thresholds, planes, factors)
+        for several in ((*first[:2], *second[:2], *counts, more, *shares), thresholds, planes, factors)
     )
     _bridge(given, known, noise, seconds, filled, learned)
     return segment, Thresholds(*factors)

@@ -106,7 +106,7 @@ def rehearse_segment() -> None:
     newest = nothing_followed(_SIZE).newest
     start, grown = trail_between(newest, newest, (0, _PERIOD), (seconds, 0.1, 0.1))
     signal = signal_shares(on, off, 0.1)
-    joined, _ = bridge(first, second, on, off, thresholds, noise, 0, _PERIOD, grown, signal)
+    joined, _ = bridge(first, second, (on, off), thresholds, noise, 0, _PERIOD, grown=grown, signal=signal)
     of_silent = silent_change(joined, variance, variance)
     half_way(change, joined, variance, variance)
     drifted, _, _ = drift(first, second, thresholds, noise, (far_on, far_off), (on, off))

@@ -300,7 +300,15 @@ class BridgedFrames(Method):
         trail, grown = self._trail_between(memory, shot, following, at_middle)
         signal = self._signal_shares(on, off, (end - start) * 1e-6)
         joined, learned = bridge.bridge(
-            memory.latent, second, on, off, memory.thresholds, self.noise, start, end, grown, signal
+            memory.latent,
+            second,
+            (on, off),
+            memory.thresholds,
+            self.noise,
+            start,
+            end,
+            grown=grown,
+            signal=signal,
         )
         if signal is not None:
             joined = joined._replace(doubt=doubt(signal, self.noise.step_variance, self.on * self.off))
@@ -348,13 +356,12 @@ class BridgedFrames(Method):
         behind, learned = bridge.bridge(
             memory.latent,
             second,
-            on + memory.on,
-            off + memory.off,
+            (on + memory.on, off + memory.off),
             memory.thresholds,
             self.noise,
             shot.middle,
             following.middle,
-            grown,
+            grown=grown,
         )
         assert behind.net is not None
         tail_on, tail_off, followed = self.follow(events, following.middle, following.end, at_middle)

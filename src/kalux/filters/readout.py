@@ -202,13 +202,13 @@ def read_out(
     variance: Array,
     log_offset: float,
     prior: HighlightPrior,
+    *,
     moving: NDArray[np.bool_] | None = None,
     subthreshold: Subthreshold = _NO_SUBTHRESHOLD,
     silent_change: Array | None = None,
     difference: float = 0.0,
     pitch: int = 1,
     unshown: NDArray[np.int64] | None = None,
-    *,
     with_variance: bool = True,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """I of a state, and the variance of its logarithm, in one pass over the rows.
