@@ -207,7 +207,7 @@ class Reconstructor:
         self._push(as_events(events), weighed=False)
 
     def push_weighed(self, events: EventArray) -> None:
-        """The same with events that carry their weights (`kalux.augmentation.refractory`), as a backward pass has them.
+        """Add the next events, which carry weights (`kalux.augmentation.refractory`), as a backward pass has them.
 
         Raises
         ------
@@ -526,19 +526,25 @@ class Reconstructor:
             )
 
     def _provisional(self, t: int) -> _Progress:
-        """The same with what there is of the first exposure's events; made anew for every read."""
+        """As `_progress_to`, while events of the first exposure are still to come: by those that are here.
+
+        Nothing of it is kept, since the first state depends on all of them.
+        """
         shot, chunks = self._shots[0], self._events.chunks
         memory, lead_in, state = self._method.start(shot, chunks)
         segment, starts_frame = lead_in, False
         if segment is not None and t > segment.end:
-            lead = _Progress(segment, memory, self._method.begin(segment, state), False, starts_frame=False)
+            lead = _Progress(
+                segment, memory, self._method.begin(segment, state), ready=False, starts_frame=False
+            )
             lead.taken = self._events.number(segment.start)
             self._take(lead, segment.end)
             state, segment = self._method.end(lead.segment, lead.cursor), None
         if segment is None:
             segment, memory = self._method.segment(memory, shot, None, chunks)
             starts_frame = True
-        progress = _Progress(segment, memory, self._method.begin(segment, state), False, starts_frame)
+        cursor = self._method.begin(segment, state)
+        progress = _Progress(segment, memory, cursor, ready=False, starts_frame=starts_frame)
         progress.taken = self._events.number(segment.start)
         return progress
 
@@ -551,7 +557,7 @@ class Reconstructor:
                 self._memory, self._shots[0], self._shots[1] if complete else None, self._events.chunks
             )
             cursor = self._method.begin(segment, self._state)
-            self._progress = _Progress(segment, memory, cursor, complete, starts_frame=True)
+            self._progress = _Progress(segment, memory, cursor, ready=complete, starts_frame=True)
         return self._progress
 
     def _commit(self, progress: _Progress) -> None:
