@@ -181,6 +181,26 @@ def passing_by(picture: np.ndarray, cut: int = 255, **sensor) -> Recording:
     )
 
 
+def lifted(source: Recording, black: int, *, stated: bool = False) -> Recording:
+    """The recording of a camera that reads ``black`` of 255 in the dark, and may state it."""
+    frames = [
+        dataclasses.replace(
+            frame,
+            image=np.rint(black + frame.image * ((255 - black) / 255)).astype(np.uint8),
+            black=float(black) if stated else 0.0,
+        )
+        for frame in source.frames()
+    ]
+    return Recording.from_arrays(
+        np.concatenate(list(source.events())), frames, sensor_size=source.sensor_size, name="lifted"
+    )
+
+
+def from_black(noise_rate: float = 0.0) -> Recording:
+    """A scene from black, over half of it, to white."""
+    return passing_by(np.maximum(textured(1.3) - 0.25, 0), noise_rate=noise_rate)
+
+
 def printed_on_threads(code: str, *arguments: object) -> set[str]:
     """What a program prints where BLAS has one thread and where it has two."""
     command = [sys.executable, "-c", code, *map(str, arguments)]

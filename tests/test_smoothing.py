@@ -8,15 +8,13 @@ import numpy as np
 import pytest
 
 import kalux
-from kalux import PRESETS, Frame, Recording, smoothing
+from kalux import PRESETS, Frame, Recording, smoothing, spill
 from kalux.augmentation.bridge import REPEATED, UNMEASURED
 from kalux.augmentation.highlights import Unshown
-from kalux.augmentation.refractory import EventClock
 from kalux.calibration.values import Calibration
-from kalux.compiled import event_words
 from kalux.datasets import SensorSettings, demo_scene, simulate
 from kalux.datasets.ahdr import ArtificialCamera, artificial_hdr
-from kalux.errors import InputError, OutputError
+from kalux.errors import InputError
 from kalux.events import make_events
 from kalux.filters.shots import take_shot
 from kalux.filters.uncertainty import Around
@@ -25,36 +23,9 @@ from kalux.models.camera import Camera
 from kalux.planning import plan
 from kalux.reconstructor import Reconstructor
 from kalux.settings import altered
-from kalux.smoothing import Spill, Trails, combine, reversed_settings
-
-SIZE = (6, 8)
-
-
-def recording(seed=0, threshold=(0.2, 0.25), span=200_000, events=600):
-    rng = np.random.default_rng(seed)
-    t = np.sort(rng.integers(0, span, events))
-    array = make_events(
-        t, rng.integers(0, SIZE[1], events), rng.integers(0, SIZE[0], events), rng.random(events) < 0.5
-    )
-    starts = [0, 41_000, 80_001, 120_000, 163_000]
-    frames = [
-        Frame(rng.integers(0, 256, SIZE).astype(np.uint8), s, s + exposure)
-        for s, exposure in zip(starts, (9_001, 5_000, 9_000, 20_000, 9_000), strict=True)
-    ]
-    return Recording.from_arrays(array, frames, sensor_size=SIZE, contrast_threshold=threshold)
-
-
-def mirrored(source):
-    """The recording seen backward, made without the code under test."""
-    events = np.concatenate(list(source.events()))[::-1]
-    on, off = source.contrast_threshold
-    return Recording.from_arrays(
-        make_events(-events["t"], events["x"], events["y"], ~events["p"]),
-        [Frame(f.image, -f.exposure_end, -f.exposure_start) for f in list(source.frames())[::-1]],
-        sensor_size=SIZE,
-        contrast_threshold=(off, on),
-    )
-
+from kalux.smoothing import Trails, combine, reversed_settings
+from kalux.spill import Spill
+from mirrored import SIZE, mirrored, recording
 
 STEPS = altered(PRESETS["default"], "events", trail=0.0)
 """Nothing is known between two events (no K14), so that both directions of time are alike."""
@@ -98,7 +69,7 @@ def test_smoothing_is_two_filters_combined_by_information():
             a,
             log_intensity=level,
             variance=(sum(weights) + 2 * correlation * np.sqrt(weights[0] * weights[1])) / sum(weights) ** 2,
-            told=1 / sum(weights),
+            signalled_variance=1 / sum(weights),
             moving=np.where(change > 0.005 * 0.2 * 0.25, a.moving | b.moving, a.moving & b.moving),
             silent_change=change,
             around=around,
@@ -138,7 +109,7 @@ def test_windows_and_blocks_change_nothing(monkeypatch, window, block):
     times = np.sort(np.r_[np.arange(0, 172_000, 5_000), 45_000, 80_001])
     expected = list(kalux.reconstruct(source, times=times, smooth=True))
     monkeypatch.setattr(smoothing, "_WINDOW_BYTES", window)
-    monkeypatch.setattr(smoothing, "_BLOCK_EVENTS", block)
+    monkeypatch.setattr(spill, "_BLOCK_EVENTS", block)
     for one, other in zip(kalux.reconstruct(source, times=times, smooth=True), expected, strict=True):
         np.testing.assert_array_equal(one.intensity, other.intensity)
         np.testing.assert_array_equal(one.variance, other.variance)
@@ -257,43 +228,6 @@ def test_smoothing_is_closer_to_the_truth_of_a_real_recording(shared_data):
     assert errors[1] < 0.9 * errors[0]
 
 
-def test_the_spilled_recording_is_the_recording_reversed(tmp_path):
-    source, expected = recording(5), mirrored(recording(5))
-    spill = Spill(source, tmp_path)
-    events = [spill.reversed_events(first) for first in range(0, spill.count, 10**6)]
-    np.testing.assert_array_equal(np.concatenate(events), np.concatenate(list(expected.events())))
-    for index, frame in enumerate(expected.frames()):
-        found = spill.reversed_frame(index)
-        assert (found.exposure_start, found.exposure_end) == (frame.exposure_start, frame.exposure_end)
-        np.testing.assert_array_equal(found.image, frame.image)
-    assert len(spill.reversed_events(spill.count)) == 0
-
-
-def test_weights_of_spilled_events_are_those_of_time_going_forward(tmp_path):
-    source = recording(5)
-    spill = Spill(source, tmp_path, 2_000)
-    backward = [event_words(spill.reversed_events(first)) for first in range(0, spill.count, 10**6)]
-    clock = EventClock(source.sensor_size, 2_000)
-    forward = np.concatenate([event_words(clock.weighed(chunk)) for chunk in source.events()])
-    weights = forward[:, 1] >> 40
-    assert len(np.unique(weights)) > 3
-    np.testing.assert_array_equal(np.concatenate(backward)[::-1, 1] >> 40, weights)
-
-
-def test_the_spill_keeps_masks(tmp_path):
-    mask = np.arange(48).reshape(SIZE) % 3 == 0
-    whole = recording()
-    frames = [
-        dataclasses.replace(frame, valid=mask if i == 1 else None) for i, frame in enumerate(whole.frames())
-    ]
-    spill = Spill(
-        Recording.from_arrays(make_events(*[np.empty(0, int)] * 4), frames, sensor_size=SIZE), tmp_path
-    )
-    found = [spill.reversed_frame(i).valid for i in range(len(spill))]
-    assert [valid is None for valid in found] == [True, True, True, False, True]
-    np.testing.assert_array_equal(found[3], mask)
-
-
 def test_thresholds_change_sides():
     settings = PRESETS["default"]
     events = dataclasses.replace(settings.events, threshold_on=0.1, threshold_off=0.3)
@@ -329,7 +263,7 @@ def test_what_two_filters_know_adds_up():
     forward, backward = estimates_around([0.01], [0.01])
     late = dataclasses.replace(backward, since=0.5)
     found = combine(forward, late)
-    assert found.told[0, 0] == pytest.approx(0.008)
+    assert found.signalled_variance[0, 0] == pytest.approx(0.008)
     assert found.around.counted == UNMEASURED
     assert found.since is None
     assert combine(dataclasses.replace(forward, since=0.2), late).since == 0.2
@@ -355,7 +289,7 @@ def test_black_tells_both_filters_the_same():
     """What it hides is the same before and after (K7), but it is not noise, which neighbours could take away."""
     forward, backward = estimates_around([0.01, 2.0], [0.02, 2.0], ends=[0.02, REPEATED])
     found = combine(forward, backward)
-    np.testing.assert_allclose(found.told[:, 0], [0.008, 0.0144], rtol=1e-6)
+    np.testing.assert_allclose(found.signalled_variance[:, 0], [0.008, 0.0144], rtol=1e-6)
     np.testing.assert_allclose(found.variance[:, 0], [0.0144, 0.008], rtol=1e-6)
 
 
@@ -397,15 +331,6 @@ def test_where_one_filter_knows_only_a_bound_it_is_one():
 def test_what_cannot_be_smoothed(change, message):
     with pytest.raises(InputError, match=message):
         list(kalux.reconstruct(recording(), rate_hz=50, smooth=True, **change))
-
-
-def test_a_full_disk_is_one_line(tmp_path, monkeypatch):
-    def full(*_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(np, "save", full)
-    with pytest.raises(OutputError, match="backward pass: No space left"):
-        Spill(recording(), tmp_path)
 
 
 def test_black_hides_as_much_of_two_filters_as_of_one():

@@ -17,16 +17,16 @@ from kalux.augmentation.along import Along, joined_along
 from kalux.augmentation.bridge import RANDOM
 from kalux.augmentation.highlights import Unshown
 from kalux.augmentation.motion import Paths
-from kalux.augmentation.unseen import UNKNOWN_CHANGE
+from kalux.augmentation.subthreshold import UNKNOWN_CHANGE
 from kalux.filters.highlights import keep_white, lifted, read_unshown, tempered
 from kalux.filters.readout import HighlightPrior, read_out
 from kalux.filters.uncertainty import (
     Around,
     add_pattern,
-    alone,
+    before_averaging,
     given_variance,
-    hidden_variance,
     keep_rounding,
+    subthreshold_variance,
 )
 from kalux.frames import Mosaic
 from kalux.models.colour import Gains, calm_highlights, demosaic, luminance
@@ -119,9 +119,9 @@ class Estimate:
         (`kalux.filters.uncertainty.changed_within`).
     since
         Where the next frame is not known or not used: time to the only frame, in frame intervals; else None.
-    told
-        (H, W): variance due to frames and events alone, where that is not P; None: P. Both ways in time, P includes the
-        errors that both directions share: changes that no event has signalled, which K11 adds itself.
+    signalled_variance
+        (H, W): variance of what frames and events have signalled, where that is not P; None: P. Both ways in time, P
+        includes the errors that both directions share: subthreshold changes, which K11 adds itself.
     paths
         Of what moves between the frames around (K16); None: not looked for, or nothing moves.
     share
@@ -142,7 +142,7 @@ class Estimate:
     unmeasured: NDArray[np.int64] | None = None
     exposed: float = 0.0
     since: float | None = None
-    told: NDArray[np.floating[Any]] | None = None
+    signalled_variance: NDArray[np.floating[Any]] | None = None
     paths: Paths | None = None
     share: float = 0.0
 
@@ -199,12 +199,14 @@ def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) ->
     Where the variance is not wanted it is infinite: computing it (K11) takes a seventh of the time.
     """
     prior = view.prior(estimate.white)
-    log_intensity, variance, told, unshown = _above_bounds(estimate, prior)
+    log_intensity, variance, signalled, unshown = _above_bounds(estimate, prior)
     moving, change = estimate.moving, estimate.silent_change
     if change is None and moving is not None:  # K11 needs it only there
         change = np.full(log_intensity.shape, UNKNOWN_CHANGE * view.threshold2, np.float32)
     half_way = RANDOM if estimate.around is None else estimate.around.half_way
-    hidden = hidden_variance(estimate.between, view.threshold2, estimate.exposed, estimate.since, half_way)
+    subthreshold = subthreshold_variance(
+        estimate.between, view.threshold2, estimate.exposed, estimate.since, half_way
+    )
     # Colours of a mosaic's highlights depend on it, and how far the frames along the paths are believed.
     along = _along(estimate)
     needs_variance = with_variance or view.mosaic is not None or along is not None
@@ -217,12 +219,12 @@ def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) ->
         variance,
         view.log_offset,
         prior,
-        moving,
-        alone(hidden),
-        change,
-        view.neighbours,
-        1 if view.mosaic is None else 2,  # to neighbours of the same colour
-        None if unshown is None else unshown.pixels,
+        moving=moving,
+        subthreshold=before_averaging(subthreshold),
+        silent_change=change,
+        difference=view.neighbours,
+        pitch=1 if view.mosaic is None else 2,  # to neighbours of the same colour
+        unshown=None if unshown is None else unshown.pixels,
         with_variance=needs_averaged,
     )
     if unshown is not None:
@@ -235,7 +237,7 @@ def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) ->
         total = _infinite(intensity.shape)
     elif moving is not None and change is not None:
         total = given_variance(
-            told, moving, change, hidden, estimate.around, total if needs_averaged else None
+            signalled, moving, change, subthreshold, estimate.around, total if needs_averaged else None
         )
         if pattern > 0:
             add_pattern(total, intensity, view.log_offset, pattern)
@@ -277,14 +279,16 @@ def _look_along(
 def _above_bounds(
     estimate: Estimate, prior: HighlightPrior
 ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], Unshown | None]:
-    """L, P, `Estimate.told` and the unshown pixels, raised from their bounds to where they are expected (K15)."""
+    """L, P, the signalled variance, and the unshown pixels, raised from bounds to where they are expected (K15)."""
+    signalled = estimate.signalled_variance
     if estimate.unshown is None:
         variance = estimate.variance
-        return estimate.log_intensity, variance, variance if estimate.told is None else estimate.told, None
+        return estimate.log_intensity, variance, variance if signalled is None else signalled, None
     unshown = tempered(estimate.unshown, estimate.log_intensity, prior)
     level, variance = lifted(estimate.log_intensity, estimate.variance, unshown)
-    told = variance if estimate.told is None else lifted(estimate.log_intensity, estimate.told, unshown)[1]
-    return level, variance, told, unshown
+    if signalled is None:
+        return level, variance, variance, unshown
+    return level, variance, lifted(estimate.log_intensity, signalled, unshown)[1], unshown
 
 
 def _coloured(image: Image, estimate: Estimate, view: View) -> NDArray[np.float32] | None:

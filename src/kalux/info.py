@@ -16,7 +16,7 @@ from kalux.white import WhiteCheck
 
 _RATE_BIN: Final = 10_000  # us, over which the peak event rate is taken
 _SATURATED: Final = 0.99  # of white: DAVIS frames clip a few values below it
-_NEAR_BLACK: Final = 0.02  # of white
+_NEAR_BLACK: Final = 0.02  # of the way from black to white
 _LARGE_GAP: Final = 1.5  # of the median frame interval
 
 
@@ -67,7 +67,7 @@ class FrameSummary:
     saturated_share
         Share of pixels of at least 99 % of white; None without frames.
     near_black_share
-        Share of pixels of at most 2 % of white; None without frames.
+        Share of pixels of at most 2 % of the way from black to white; None without frames.
     gap_count
         Intervals longer than 1.5 times the median: frames that were dropped, perhaps.
     largest_gap
@@ -219,7 +219,7 @@ def summarise_frames(frames: Iterable[Frame], *, exposure_known: bool = True) ->
         image = frame.image if frame.valid is None else frame.image[frame.valid]
         pixels += image.size
         saturated += int(np.count_nonzero(image >= _SATURATED * frame.white_value))
-        near_black += int(np.count_nonzero(image <= _NEAR_BLACK * frame.white_value))
+        near_black += int(np.count_nonzero(image <= frame.black + _NEAR_BLACK * frame.full_scale))
     if not spans:
         return FrameSummary(0)
     exposures = np.array(spans, np.int64)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.augmentation.bridge import bridge_variance
 from kalux.filters.shots import Shot
 from kalux.models.colour import joined_chromaticity
 
@@ -33,8 +34,8 @@ class Moment(NamedTuple):
 
     @property
     def between(self) -> float:
-        """4 s (1 - s) at the share s of the way; 1 where there is only one frame."""
-        return 1.0 if self.after is None else 4.0 * self.share * (1.0 - self.share)
+        """`bridge_variance` of the share; 1 where there is only one frame."""
+        return 1.0 if self.after is None else bridge_variance(self.share)
 
     @property
     def exposed(self) -> float:

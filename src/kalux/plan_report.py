@@ -105,6 +105,8 @@ def _of_frames(recording: Recording, plan: Plan, asked: Settings) -> Iterator[tu
         yield "white", f"{recording.found_white}, where the 16-bit frames end"
     if plan.black is not None or camera.black_level is not None:
         yield "black", _black_text(plan)
+    elif (first := next(iter(recording.frames()))).black > 0:
+        yield "black", f"{first.black / first.white_value:.3g} of white is taken off (as recorded)"
     if plan.ceiling is not None:
         yield "saturation", f"from {camera.clipped_from:.2g} of white ({ceiling_text(plan.ceiling)})"
     if camera.white_balance != asked.camera.white_balance:

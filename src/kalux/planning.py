@@ -9,7 +9,7 @@ from typing import Any, Final, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.calibration.black_level import BlackLevel, find_black_level
+from kalux.calibration.black_level import BlackLevel, with_known_black
 from kalux.calibration.delay import DelayEstimate, estimate_delay
 from kalux.calibration.event_model import EventModel, estimate_event_model
 from kalux.calibration.fixed_pattern import USUAL_PATTERN, FixedPattern, estimate_fixed_pattern
@@ -178,11 +178,10 @@ def plan(
         require_size(known.pixels, recording.sensor_size)
     recording = with_cached_start(recording, _CACHED_EVENTS, _CACHED_FRAME_BYTES)
     looks_for_hot = chosen.filter.joins_frames and chosen.events.leave_out_hot
-    hot = find_hot_pixels(recording, _NOISE_EVENTS) if looks_for_hot else None
+    hot = find_hot_pixels(recording) if looks_for_hot else None
     if hot is not None and hot.any():
         recording = without_events_of(recording, hot)
-    chosen, black = _with_black_level(recording, chosen)
-    recording = less_black(recording, chosen.camera.black_level)
+    recording, chosen, black = _less_black(recording, chosen)
     chosen, ceiling = with_saturation(recording, chosen)
     response = chosen_response(chosen.camera.response, recording.response)
     camera = Camera.named(response, chosen.camera.clipped_from)
@@ -243,14 +242,17 @@ def _check_smooth(settings: Settings, lookahead: bool) -> None:
         )
 
 
-def _with_black_level(recording: Recording, settings: Settings) -> tuple[Settings, BlackLevel | None]:
-    """Fill in the black level where the frames begin above 0: from the settings, else what events say, else none."""
-    if settings.camera.black_level is not None or not settings.filter.joins_frames:
-        return settings, None
-    found = find_black_level(recording, settings.camera, settings.events)
-    if found is None or not found.level:
-        return settings, found
-    return altered(settings, "camera", black_level=found.level), found
+def _less_black(recording: Recording, settings: Settings) -> tuple[Recording, Settings, BlackLevel | None]:
+    """Take the black level off, and fill it in where the frames begin above 0 and events say that this is black.
+
+    The paper's filters take off what is given and look for nothing.
+    """
+    if not settings.filter.joins_frames:
+        return less_black(recording, settings.camera.black_level), settings, None
+    recording, found = with_known_black(recording, settings.camera, settings.events)
+    if found is not None and found.level:
+        settings = altered(settings, "camera", black_level=found.level)
+    return recording, settings, found
 
 
 def with_saturation(recording: Recording, settings: Settings) -> tuple[Settings, Ceiling | None]:

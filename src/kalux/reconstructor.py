@@ -35,7 +35,7 @@ from kalux.filters.buffer import EventBuffer
 from kalux.filters.method import USUAL_INTERVAL, Method, Segment
 from kalux.filters.methods import make_method
 from kalux.filters.shots import Shot, take_shot
-from kalux.filters.uncertainty import changed_within, hidden_variance
+from kalux.filters.uncertainty import changed_within, subthreshold_variance
 from kalux.frames import Frame, check_frame, with_black_level
 from kalux.images import Estimate, Image, View, make_image
 from kalux.models.camera import Camera, beyond_white, count_bright, repeated_rounding
@@ -207,7 +207,7 @@ class Reconstructor:
         self._push(as_events(events), weighed=False)
 
     def push_weighed(self, events: EventArray) -> None:
-        """The same with events that carry their weights (`kalux.augmentation.refractory`), as a backward pass has them.
+        """Add the next events, which carry weights (`kalux.augmentation.refractory`), as a backward pass has them.
 
         Raises
         ------
@@ -457,7 +457,7 @@ class Reconstructor:
         level, variance = self._method.read(segment, cursor, half_way)
         on, off = self.thresholds
         progress.paths = self._method.paths(
-            segment, path, level, variance + hidden_variance(1.0, on * off).moving
+            segment, path, level, variance + subthreshold_variance(1.0, on * off).moving
         )
 
     # Segments.
@@ -527,19 +527,25 @@ class Reconstructor:
             )
 
     def _provisional(self, t: int) -> _Progress:
-        """The same with what there is of the first exposure's events; made anew for every read."""
+        """As `_progress_to`, while events of the first exposure are still to come: by those that are here.
+
+        Nothing of it is kept, since the first state depends on all of them.
+        """
         shot, chunks = self._shots[0], self._events.chunks
         memory, lead_in, state = self._method.start(shot, chunks)
         segment, starts_frame = lead_in, False
         if segment is not None and t > segment.end:
-            lead = _Progress(segment, memory, self._method.begin(segment, state), False, starts_frame=False)
+            lead = _Progress(
+                segment, memory, self._method.begin(segment, state), ready=False, starts_frame=False
+            )
             lead.taken = self._events.number(segment.start)
             self._take(lead, segment.end)
             state, segment = self._method.end(lead.segment, lead.cursor), None
         if segment is None:
             segment, memory = self._method.segment(memory, shot, None, chunks)
             starts_frame = True
-        progress = _Progress(segment, memory, self._method.begin(segment, state), False, starts_frame)
+        cursor = self._method.begin(segment, state)
+        progress = _Progress(segment, memory, cursor, ready=False, starts_frame=starts_frame)
         progress.taken = self._events.number(segment.start)
         return progress
 
@@ -552,7 +558,7 @@ class Reconstructor:
                 self._memory, self._shots[0], self._shots[1] if complete else None, self._events.chunks
             )
             cursor = self._method.begin(segment, self._state)
-            self._progress = _Progress(segment, memory, cursor, complete, starts_frame=True)
+            self._progress = _Progress(segment, memory, cursor, ready=complete, starts_frame=True)
         return self._progress
 
     def _commit(self, progress: _Progress) -> None:

@@ -128,12 +128,28 @@ def without_events_of(recording: Recording, pixels: NDArray[np.bool_]) -> Record
 
 
 def less_black(recording: Recording, level: float | None) -> Recording:
-    """The same recording, the frames of which have black at ``level``, a share of white; None: as they state."""
+    """The same recording, the frames of which have black at ``level``, a share of white; None: as before."""
     if level is None:
         return recording
     made = copy.copy(recording)
     made._black_level = level
     return made
+
+
+def with_frames(recording: Recording, frames: Callable[[], Iterator[Frame]]) -> Recording:
+    """The recording with some of its own frames, or with others; their exposures are known, it has no ground truth."""
+    chosen = Recording(
+        dataclasses.replace(
+            recording.source,
+            events=lambda: iter(recording.events()),
+            frames=frames,
+            count_frames=lambda: sum(1 for _ in frames()),
+            exposure_known=True,
+            ground_truth=None,
+            mosaic=recording.mosaic,
+        )
+    )
+    return less_black(chosen, recording.black_level)
 
 
 def no_frames(recording: Recording) -> FrameError:
@@ -337,6 +353,14 @@ class Recording:
     def __repr__(self) -> str:
         height, width = self.sensor_size
         return f"<kalux.Recording {str(self.source.path)!r}: {self.source.format}, {width} x {height} pixels>"
+
+    @property
+    def black_level(self) -> float | None:
+        """What pixels read in the dark, a share of white, where that is known from elsewhere (`less_black`).
+
+        None: not so; frames may state where their black is (`Frame.black`).
+        """
+        return self._black_level
 
     @property
     def contrast_threshold(self) -> tuple[float, float] | None:

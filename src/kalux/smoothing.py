@@ -9,15 +9,16 @@ L' and P' of the backward one, the estimate is the two-filter smoother (Fraser a
 Where one of them knows no more than a bound, it counts as one (docs/equations.md, K15). Where a frame around the image
 measures the pixel, both go along the same bridge, and err alike (`shared_errors`).
 
-Memory is bounded: the recording is spilled to disk, where it can be read backward, and the backward pass is done
-twice, first to save its state before every window of images, then window by window for the images themselves.
+Memory is bounded: the recording is spilled to disk (`kalux.spill`), where it can be read backward, and the backward
+pass is done twice, first to save its state before every window of images, then window by window for the images
+themselves.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import pickle
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
@@ -25,157 +26,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.bridge import REPEATED, UNMEASURED
-from kalux.augmentation.refractory import EventClock
 from kalux.augmentation.trail import FrameTrail, follow, nothing_followed, trail_at
-from kalux.compiled import event_words
-from kalux.errors import OutputError
-from kalux.event_slices import between
-from kalux.events import EVENT_DTYPE, EventArray
 from kalux.filters.highlights import obey_bounds, smoothed_unshown
 from kalux.filters.uncertainty import Around
-from kalux.frames import Frame
 from kalux.images import Estimate
 from kalux.models.pixels import PixelCalibration
 from kalux.reconstructor import Reconstructor
 from kalux.recording import Recording
 from kalux.settings import Settings
+from kalux.spill import Spill, spilling
 
 _WINDOW_BYTES: Final = 256 << 20
 """Estimates of the backward pass that are held in memory at a time."""
 
-_BLOCK_EVENTS: Final = 1 << 18
-
-_ALIKE: Final = 0.2
+_CORRELATION: Final = 0.2
 """Correlation of the errors of the two directions where each goes by events of its own, from a frame of its own: the
 thresholds are the same ones. -0.1 to 0.1 on noisy scenes, 0.3 to 0.6 on clean ones (docs/equations.md)."""
 
 _STANDS_STILL: Final = 0.005
 """Mean square change of silent pixels, in c^2, up to which nothing moves there: a tenth of the least under a moving
-camera (`kalux.augmentation.unseen`)."""
-
-
-def _reason(error: OSError) -> str:
-    """Why something cannot be spilled; NumPy reports a full disk without saying so."""
-    return f"{error.strerror or 'no space is left on the disk'}; set TMPDIR to a folder with more"
-
-
-class Spill:
-    """A recording on disk, in a form that can be read backward.
-
-    Parameters
-    ----------
-    recording
-        Copied when the spill is made: events into one file, every frame into one.
-    refractory_period
-        us; the events are weighed as time goes forward (`kalux.augmentation.refractory`).
-    folder
-        An existing folder, the caller's to remove.
-
-    Raises
-    ------
-    OutputError
-        The disk is full or the folder cannot be written.
-    """
-
-    def __init__(self, recording: Recording, folder: Path, refractory_period: float = 0.0) -> None:
-        self._folder = folder
-        self._events = folder / "events.bin"
-        self._frames: list[Frame] = []  # without their pixels
-        self.sensor_size = recording.sensor_size
-        self.count = 0
-        try:
-            with self._events.open("wb") as file:
-                clock = EventClock(recording.sensor_size, refractory_period)
-                for chunk in recording.events():
-                    event_words(clock.weighed(chunk)).tofile(file)
-                    self.count += len(chunk)
-            for index, frame in enumerate(recording.frames()):
-                np.save(self._frame_path(index), frame.image)
-                if frame.valid is not None:
-                    np.save(self._mask_path(index), frame.valid)
-                none = np.empty(0, np.bool_)
-                valid = None if frame.valid is None else none
-                self._frames.append(dataclasses.replace(frame, image=none, valid=valid))
-        except OSError as error:
-            raise OutputError(
-                f"{folder}: the recording cannot be spilled for the backward pass: {_reason(error)}"
-            ) from error
-
-    def __len__(self) -> int:
-        """Number of frames."""
-        return len(self._frames)
-
-    @property
-    def start(self) -> int:
-        """Start of the first exposure, us."""
-        return self._frames[0].exposure_start
-
-    @property
-    def end(self) -> int:
-        """End of the last exposure, us: before it, reversed, the backward pass knows nothing."""
-        return self._frames[-1].exposure_end
-
-    def reversed_frame(self, index: int) -> Frame:
-        """The frame ``index`` of the reversed recording."""
-        forward = len(self) - 1 - index
-        frame = self._frames[forward]
-        return dataclasses.replace(
-            frame,
-            image=np.load(self._frame_path(forward)),
-            exposure_start=-frame.exposure_end,
-            exposure_end=-frame.exposure_start,
-            valid=None if frame.valid is None else np.load(self._mask_path(forward)),
-        )
-
-    def reversed_events(self, first: int) -> EventArray:
-        """A block of the reversed recording's events, from its event ``first`` on; empty at the end."""
-        last = min(first + _BLOCK_EVENTS, self.count)
-        words = np.fromfile(
-            self._events,
-            np.int64,
-            count=2 * (last - first),
-            offset=(self.count - last) * EVENT_DTYPE.itemsize,
-        ).reshape(-1, 2)
-        block: EventArray = words[::-1].copy().reshape(-1).view(EVENT_DTYPE)  # as words, with their weights
-        block["t"] = -block["t"]
-        block["p"] = ~block["p"]
-        return block
-
-    def middle(self, index: int) -> int:
-        """The middle of a frame's exposure, us."""
-        return self._frames[index].middle
-
-    def events_between(self, start: int, end: int, without: NDArray[np.bool_] | None) -> Iterator[EventArray]:
-        """The events with ``start`` < t <= ``end`` (us), in blocks, but for those of some pixels, (H, W) bool."""
-        if self.count == 0:
-            return
-        inside = between(np.memmap(self._events, EVENT_DTYPE, "r"), start, end)
-        for first in range(0, len(inside), _BLOCK_EVENTS):
-            events = np.array(inside[first : first + _BLOCK_EVENTS])
-            yield events if without is None else events[~without[events["y"], events["x"]]]
-
-    def save_newest(self, index: int, newest: NDArray[np.int64]) -> None:
-        """Keep what is known of the newest events at the middle of a frame."""
-        try:
-            np.save(self._newest_path(index), newest)
-        except OSError as error:
-            raise OutputError(
-                f"{self._folder}: the backward pass cannot be spilled: {_reason(error)}"
-            ) from error
-
-    def load_newest(self, index: int) -> NDArray[np.int64]:
-        """What was kept."""
-        newest: NDArray[np.int64] = np.load(self._newest_path(index))
-        return newest
-
-    def _newest_path(self, index: int) -> Path:
-        return self._folder / f"newest_{index:06d}.npy"
-
-    def _frame_path(self, index: int) -> Path:
-        return self._folder / f"frame_{index:06d}.npy"
-
-    def _mask_path(self, index: int) -> Path:
-        return self._folder / f"valid_{index:06d}.npy"
+camera (`kalux.augmentation.subthreshold`)."""
 
 
 class Trails:
@@ -205,14 +75,14 @@ class Trails:
             end = spill.middle(index)
             chunks = spill.events_between(start + delay, end + delay, hot)
             _, _, followed = follow(chunks, followed, start + delay, end + delay)
-            spill.save_newest(index, followed.newest - 2 * delay)
+            spill.save_newest_events(index, followed.newest - 2 * delay)
             self._scales.append(followed.scale)
             start = end
 
     def reversed_trail(self, index: int) -> FrameTrail:
         """Of the frame ``index`` of the reversed recording."""
         forward = len(self._spill) - 1 - index
-        newest = self._spill.load_newest(forward)
+        newest = self._spill.newest_events(forward)
         middle = self._spill.middle(forward)
         after = min(forward + 1, len(self._spill) - 1)
         return FrameTrail(
@@ -337,12 +207,8 @@ class Backward:
         self._next_window += 1
 
     def _save(self, index: int, backward: BackwardPass) -> None:
-        try:
+        with spilling(self._folder):
             self._state_path(index).write_bytes(pickle.dumps(backward, pickle.HIGHEST_PROTOCOL))
-        except OSError as error:
-            raise OutputError(
-                f"{self._folder}: the backward pass cannot be spilled: {_reason(error)}"
-            ) from error
 
     def _state_path(self, index: int) -> Path:
         return self._folder / f"state_{index:06d}.pickle"
@@ -354,10 +220,17 @@ def combine(
     trail: NDArray[np.floating[Any]] | None = None,
     threshold2: float = 0.0,
 ) -> Estimate:
-    """The smoothed estimate of two filters, in the forward one's time; the forward one where it is alone.
+    """The smoothed estimate of two filters, in the forward one's time.
 
-    ``trail`` is how far the light is ahead of its events (K14), which the backward filter's reads are without;
-    ``threshold2`` is c^2.
+    Parameters
+    ----------
+    forward, backward
+        Estimates of one moment. None, after the last frame: the forward one stands alone.
+    trail
+        (H, W) how far, in log intensity, the light is ahead of its events (K14), which the backward filter's estimates
+        are without; None: nowhere.
+    threshold2
+        c^2.
     """
     if backward is None:
         return forward
@@ -369,13 +242,13 @@ def combine(
         (forward.log_intensity, forward.variance, forward.unshown),
         (behind, backward.variance, backward.unshown),
     )
-    variance, told = 1.0 / information, None
+    variance, signalled = 1.0 / information, None
     shared = shared_errors(forward.around, backward.around)
     if shared is not None:
         together = (information + 2.0 * shared * np.sqrt(first * second)) / information**2
         black = _black(forward.around, backward.around)
-        variance, told = np.where(black, variance, together), np.where(black, together, variance)
-    smoothed = (level, variance) if told is None else (level, variance, told)
+        variance, signalled = np.where(black, variance, together), np.where(black, together, variance)
+    smoothed = (level, variance) if signalled is None else (level, variance, signalled)
     obey_bounds(smoothed, *directions)
     obey_bounds(smoothed, *directions[::-1])
     unshown = smoothed_unshown(level, *directions)
@@ -394,8 +267,8 @@ def combine(
         around=_around(forward.around, backward.around),
         unmeasured=forward.unmeasured,
         exposed=forward.exposed,
-        since=_least(forward.since, backward.since),
-        told=told,
+        since=_shorter(forward.since, backward.since),
+        signalled_variance=signalled,
         paths=forward.paths,
         share=forward.share,
     )
@@ -423,7 +296,7 @@ def shared_errors(forward: Around | None, backward: Around | None) -> NDArray[np
     share = np.float32(forward.share)
     first, second = forward.first < UNMEASURED, forward.second < UNMEASURED
     same = (np.float32(1.0) - share) * first + share * second
-    return np.float32(_ALIKE) + np.float32(1.0 - _ALIKE) * same
+    return np.float32(_CORRELATION) + np.float32(1.0 - _CORRELATION) * same
 
 
 def _black(forward: Around | None, backward: Around | None) -> NDArray[np.bool_]:
@@ -455,8 +328,8 @@ def _moving(
     return (first & second) | ((first | second) & (change > _STANDS_STILL * threshold2))
 
 
-def _least(first: float | None, second: float | None) -> float | None:
-    """Where there is only one frame, one of them may not know the usual interval yet."""
+def _shorter(first: float | None, second: float | None) -> float | None:
+    """`Estimate.since` of both: where there is only one frame, one filter may not know the usual interval yet."""
     return None if first is None or second is None else min(first, second)
 
 

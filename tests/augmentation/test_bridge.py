@@ -36,7 +36,7 @@ def counts(*values):
 
 def join(first, second, on, off, thresholds=None, noise=NOISE):
     thresholds = thresholds or nominal_thresholds(first.value.shape, 0.1)
-    return bridge(first, second, on, off, thresholds, noise, START, END)
+    return bridge(first, second, (on, off), thresholds, noise, START, END)
 
 
 def reached(segment, on, off):
@@ -61,7 +61,7 @@ def test_events_that_are_all_signal_are_what_they_were():
     sure = np.ones((1, 2))
     plain, learned = join(first, second, on, off)
     told, as_well = bridge(
-        first, second, on, off, nominal_thresholds((1, 2), 0.1), NOISE, START, END, None, (sure, sure)
+        first, second, (on, off), nominal_thresholds((1, 2), 0.1), NOISE, START, END, signal=(sure, sure)
     )
     for one, other in zip(
         (*learned, plain.step_on, plain.slope), (*as_well, told.step_on, told.slope), strict=True
@@ -74,7 +74,7 @@ def test_events_of_noise_move_nothing():
     first, second, none = latent(0.0, 0.01), latent(0.1, 0.02), np.zeros((1, 1))
     thresholds = nominal_thresholds((1, 1), 0.1)
     noisy, learned = bridge(
-        first, second, counts(2), counts(1), thresholds, NOISE, START, END, None, (none, none)
+        first, second, (counts(2), counts(1)), thresholds, NOISE, START, END, signal=(none, none)
     )
     silent, _ = join(first, second, none, none)
     assert noisy.step_on == noisy.step_off == 0.0
@@ -90,9 +90,9 @@ def test_an_event_in_doubt_takes_what_the_frames_leave_to_it():
     noise = BridgeNoise(0.2, 0.2, 0.1 * 0.04, 1e-6)
     thresholds = nominal_thresholds((1, 1), 0.0)
     one, none = counts(1), counts(0)
-    told, _ = bridge(sure, sure, one, none, thresholds, noise, START, END, None, (half, half))
+    told, _ = bridge(sure, sure, (one, none), thresholds, noise, START, END, signal=(half, half))
     free = latent(0.0, UNMEASURED)
-    untold, _ = bridge(sure, free, one, none, thresholds, noise, START, END, None, (half, half))
+    untold, _ = bridge(sure, free, (one, none), thresholds, noise, START, END, signal=(half, half))
     assert untold.step_on[0, 0] == pytest.approx(0.1)
     assert abs(told.step_on[0, 0]) < 1e-4
 
@@ -115,7 +115,7 @@ def test_the_mismatch_is_shared_out_to_the_last_bit(values, spreads, on, off, sc
     on, off = counts(on), counts(off)
     thresholds = Thresholds(*(np.full((1, 1), v) for v in (*scales, *doubts)))
     scalars = BridgeNoise(0.3, 0.2, *noise)
-    segment, _ = bridge(first, second, on, off, thresholds, scalars, START, END)
+    segment, _ = bridge(first, second, (on, off), thresholds, scalars, START, END)
     gain = (segment.slope * SECONDS) / scalars.quantisation_variance
     np.testing.assert_allclose(segment.augmented, first.value + gain * first.variance, rtol=1e-9, atol=1e-9)
     if spreads[1] < UNMEASURED:
@@ -281,7 +281,7 @@ def test_thresholds_of_the_pixels_are_learned():
         change = 0.3 * true_on * on - 0.2 * true_off * off
         unseen = np.sqrt(noise.quantisation_variance) * rng.standard_normal(shape)
         seen = latent(level, 1e-4), latent(level + change + unseen, 1e-4)
-        _, thresholds = bridge(*seen, on, off, thresholds, noise, START, END)
+        _, thresholds = bridge(*seen, (on, off), thresholds, noise, START, END)
         spreads.append(thresholds.on_variance.mean())
     assert np.abs(thresholds.on - true_on).mean() < np.abs(1 - true_on).mean() / 2.5
     assert np.abs(thresholds.off - true_off).mean() < np.abs(1 - true_off).mean() / 2.5
@@ -299,7 +299,7 @@ def test_the_learned_variance_tells_the_error():
         on = rng.integers(1, 6, shape).astype(float)
         error = np.sqrt(2 * 1e-3 + 0.005 * on + 0.01) * rng.standard_normal(shape)
         second = latent(0.3 * true_on * on + error, 1e-3)
-        _, thresholds = bridge(latent(none, 1e-3), second, on, none, thresholds, noise, START, END)
+        _, thresholds = bridge(latent(none, 1e-3), second, (on, none), thresholds, noise, START, END)
     z2 = (thresholds.on - true_on) ** 2 / thresholds.on_variance
     assert 0.85 < z2.mean() < 1.15
 

@@ -2,47 +2,25 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 
 import kalux
 from kalux import Frame, Recording
-from kalux.calibration.black_level import find_black_level
+from kalux.calibration.black_level import find_black_level, with_known_black
 from kalux.planning import plan
 from kalux.recording import less_black
 from kalux.settings import PRESETS, altered
 
-from builders import passing_by, textured
+from builders import from_black, lifted, passing_by, textured
 
 SETTINGS = PRESETS["default"]
-
-
-def lifted(source: Recording, black: int, *, stated: bool = False) -> Recording:
-    """The recording of a camera that reads ``black`` of 255 in the dark, and may state it."""
-    frames = [
-        dataclasses.replace(
-            frame,
-            image=np.rint(black + frame.image * ((255 - black) / 255)).astype(np.uint8),
-            black=float(black) if stated else 0.0,
-        )
-        for frame in source.frames()
-    ]
-    return Recording.from_arrays(
-        np.concatenate(list(source.events())), frames, sensor_size=source.sensor_size, name="lifted"
-    )
-
-
-def dark(noise_rate: float = 0.0) -> Recording:
-    """A scene from black, over half of it, to white."""
-    return passing_by(np.maximum(textured(1.3) - 0.25, 0), noise_rate=noise_rate)
 
 
 @pytest.mark.parametrize("noise_rate", [0.0, 3.0])
 @pytest.mark.parametrize("black", [8, 16, 32])
 def test_a_black_level_is_found(black, noise_rate):
-    found = find_black_level(lifted(dark(noise_rate), black), SETTINGS.camera, SETTINGS.events)
+    found = find_black_level(lifted(from_black(noise_rate), black), SETTINGS.camera, SETTINGS.events)
     assert found is not None
     assert 255 * found.level == pytest.approx(black, abs=3)
 
@@ -58,8 +36,8 @@ def test_a_scene_that_has_nothing_dark_has_no_black_level(least):
 
 
 def test_frames_that_show_black_or_state_it_are_not_looked_at():
-    assert find_black_level(dark(), SETTINGS.camera, SETTINGS.events) is None
-    assert find_black_level(lifted(dark(), 16, stated=True), SETTINGS.camera, SETTINGS.events) is None
+    assert find_black_level(from_black(), SETTINGS.camera, SETTINGS.events) is None
+    assert find_black_level(lifted(from_black(), 16, stated=True), SETTINGS.camera, SETTINGS.events) is None
 
 
 def test_what_does_not_move_tells_nothing():
@@ -72,7 +50,7 @@ def test_what_does_not_move_tells_nothing():
 
 
 def test_a_plan_takes_it_off_unless_it_is_given():
-    source = lifted(dark(), 16)
+    source = lifted(from_black(), 16)
     made = plan(source, at="frames")
     assert made.settings.camera.black_level == pytest.approx(16 / 255, abs=3 / 255)
     given = plan(source, at="frames", settings=altered(SETTINGS, "camera", black_level=0.0))
@@ -82,8 +60,8 @@ def test_a_plan_takes_it_off_unless_it_is_given():
 
 
 def test_frames_less_black_are_those_of_a_camera_without():
-    plain = next(iter(dark().frames())).normalised()
-    less = next(iter(less_black(lifted(dark(), 51), 0.2).frames()))
+    plain = next(iter(from_black().frames())).normalised()
+    less = next(iter(less_black(lifted(from_black(), 51), 0.2).frames()))
     np.testing.assert_allclose(less.normalised(), plain, atol=1 / 204)
     assert less.full_scale == 204
 
@@ -97,7 +75,21 @@ def test_images_are_those_of_a_camera_without():
         *_, image = kalux.reconstruct(source, at="frames", settings=chosen, smooth=True)
         return image.intensity
 
-    expected = last(dark(), settings)
-    given = last(lifted(dark(), 51), black)
+    expected = last(from_black(), settings)
+    given = last(lifted(from_black(), 51), black)
     assert np.median(np.abs(given - expected)) < 0.02
-    np.testing.assert_array_equal(last(lifted(dark(), 51, stated=True), settings), given)
+    np.testing.assert_array_equal(last(lifted(from_black(), 51, stated=True), settings), given)
+
+
+def test_what_is_known_of_black_is_asked_for_once():
+    """Settings go before what is known already, that before what events say; frames that state it are left alone."""
+    source = lifted(from_black(), 16)
+    found, looked = with_known_black(source, SETTINGS.camera, SETTINGS.events)
+    assert found.black_level == looked.level == pytest.approx(16 / 255, abs=3 / 255)
+    assert with_known_black(found, SETTINGS.camera, SETTINGS.events) == (found, None)
+    given = altered(SETTINGS, "camera", black_level=0.1).camera
+    assert with_known_black(found, given, SETTINGS.events)[0].black_level == 0.1
+    stated, looked = with_known_black(lifted(from_black(), 16, stated=True), SETTINGS.camera, SETTINGS.events)
+    assert (stated.black_level, looked) == (None, None)
+    assert next(iter(stated.frames())).black == 16
+    assert with_known_black(from_black(), SETTINGS.camera, SETTINGS.events)[0].black_level == 0

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kalux import EVENT_DTYPE, Recording
-from kalux.calibration.hot_pixels import BIN, find_hot_pixels
+from kalux.calibration.hot_pixels import find_hot_pixels
 
 SIZE = (12, 16)
 SECOND = 1_000_000
@@ -51,6 +51,11 @@ def test_two_side_by_side_do_not_hide_one_another():
     assert found(passing_edge(), fires(5, 7, 100), fires(6, 7, 200)) == [(5, 7), (6, 7)]
 
 
+def test_between_textures_short_bins_find_it():
+    """Edges every 15 ms, so that there is no bin of 20 ms in which it is alone."""
+    assert found(passing_edge(15_000), fires(5, 7, 500)) == [(5, 7)]
+
+
 def test_at_the_border_of_the_sensor():
     assert found(fires(0, 0, 100), fires(15, 11, 100)) == [(0, 0), (15, 11)]
 
@@ -61,11 +66,12 @@ def test_at_the_border_of_the_sensor():
         (),
         (passing_edge(),),
         (passing_edge(), fires(5, 7, 20)),  # too slow to matter
+        (fires(5, 7, 200, until=SECOND // 2), fires(5, 7, 200, p=False)[100:]),  # up and down again
         (fires(5, 7, 100), fires(5, 7, 100, p=False)),  # a lamp that flickers
         (fires(5, 7, 100), fires(6, 7, 100), fires(6, 8, 100)),  # light that has an extent
         (passing_edge(), fires(5, 7, 100, until=SECOND // 3)),  # for a while only
     ],
-    ids=["nothing", "an edge", "slow", "both signs", "a patch", "for a while"],
+    ids=["nothing", "an edge", "slow", "up and down", "both signs", "a patch", "for a while"],
 )
 def test_what_light_can_do_is_not_hot(parts):
     assert found(*parts) == []
@@ -73,9 +79,9 @@ def test_what_light_can_do_is_not_hot(parts):
 
 def test_what_is_not_looked_at_or_too_short_tells_nothing():
     leaking = fires(5, 7, 100)
-    assert found(leaking, most_events=14) == []  # 0.13 s, six whole bins
-    assert found(leaking[leaking["t"] < 8 * BIN]) == []
-    assert found(leaking[leaking["t"] <= 9 * BIN]) == [(5, 7)]
+    assert found(leaking, most_events=15) == []  # 0.14 s, seven of the longest bins
+    assert found(leaking[:15]) == []
+    assert found(leaking[:17]) == found(leaking, most_events=17) == [(5, 7)]
 
 
 def test_the_cut_into_chunks_changes_nothing(monkeypatch):

@@ -13,9 +13,10 @@ from kalux.calibration.noise import (
 )
 from kalux.datasets import SensorSettings, demo_scene, simulate, static
 from kalux.events import make_events
+from kalux.planning import plan
 from kalux.settings import CameraSettings
 
-from builders import unlabelled
+from builders import from_black, lifted, unlabelled
 
 CAMERA = CameraSettings()
 SIZE = (64, 96)
@@ -41,7 +42,6 @@ def test_the_rate_of_pure_noise(rate):
     found = event_noise(Recording.from_arrays(noise_events(rate, seconds=2.0), [], sensor_size=SIZE))
     assert found.rate == pytest.approx(rate, rel=0.08)
     assert found.rate_error < 0.1 * rate
-    assert not found.hot.any()
     assert found.rates.mean() == pytest.approx(rate, rel=0.1)
 
 
@@ -60,10 +60,9 @@ def test_noise_beside_motion_is_not_much_overestimated():
     assert 2.7 < found.rate < 5.0
 
 
-def test_hot_pixels_are_found_and_are_not_counted_in_the_rate():
-    hot = [(10, 10), (30, 50), (63, 95)]
-    found = event_noise(Recording.from_arrays(noise_events(1.0, hot=hot), [], sensor_size=SIZE))
-    assert sorted(zip(*(i.tolist() for i in np.nonzero(found.hot)), strict=True)) == hot
+def test_pixels_that_fire_far_more_often_are_not_counted_in_the_rate():
+    busy = [(10, 10), (30, 50), (63, 95)]
+    found = event_noise(Recording.from_arrays(noise_events(1.0, hot=busy), [], sensor_size=SIZE))
     assert found.rate == pytest.approx(1.0, rel=0.15)
     assert found.rates[30, 50] > 50
 
@@ -120,3 +119,23 @@ def test_settings_of_a_noise_calibration():
     )
     assert still.delay is None
     assert still.events.rate == pytest.approx(1.0, rel=0.2)
+
+
+def test_hot_pixels_are_those_of_a_reconstruction():
+    sensor = SensorSettings(noise_rate=1.0, hot_pixels=0.002, hot_rate=200.0)
+    recording = unlabelled(simulate(SCENE, sensor))
+    found = calibrate_noise(recording, CAMERA)
+    hot = plan(recording, at="frames").pixels.hot
+    assert hot.sum() > 10
+    np.testing.assert_array_equal(found.calibration().maps["hot"], hot)
+    assert found.calibration().measured["hot_pixels"] == hot.sum()
+    assert not (found.events.dead & hot).any()
+
+
+def test_a_black_level_is_taken_off_and_told():
+    plain = calibrate_noise(from_black(3.0), CAMERA)
+    found = calibrate_noise(lifted(from_black(3.0), 16), CAMERA)
+    assert found.calibration().settings["camera"]["black_level"] == pytest.approx(16 / 255, abs=1 / 255)
+    assert found.delay == pytest.approx(plain.delay, abs=200)
+    assert found.events.rate == plain.events.rate
+    assert "black_level" not in plain.calibration().settings.get("camera", {})

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -11,7 +13,7 @@ from kalux.calibration.pixel_thresholds import calibrate_contrast, shrunk
 from kalux.datasets import SensorSettings, demo_scene, simulate, static
 from kalux.settings import CameraSettings
 
-from builders import unlabelled
+from builders import from_black, lifted, unlabelled
 
 CAMERA = CameraSettings()
 SCENE = demo_scene(sensor_size=(90, 120))
@@ -130,3 +132,17 @@ def test_shrinkage_finds_mean_and_covariance():
     np.testing.assert_allclose(left[:500, 0], covariance[0, 0], rtol=0.01)
     error = (values - truth)[500:]
     np.testing.assert_allclose((error**2 / left[500:]).mean(axis=0), 1.0, atol=0.1)
+
+
+def test_a_black_level_is_taken_off_and_told():
+    """Left in, thresholds come out a third too small: frames change too little in the dark."""
+    plain = calibrate_contrast(from_black(), CAMERA)
+    source = lifted(from_black(), 16)
+    found = calibrate_contrast(source, CAMERA)
+    assert (found.on, found.off) == pytest.approx((plain.on, plain.off), rel=0.05)
+    told = found.calibration().settings["camera"]["black_level"]
+    assert told == found.black_level == pytest.approx(16 / 255, abs=1 / 255)
+    left = calibrate_contrast(source, dataclasses.replace(CAMERA, black_level=0.0))
+    assert left.on < 0.8 * plain.on
+    assert left.calibration().settings["camera"] == {"black_level": 0}
+    assert "camera" not in plain.calibration().settings

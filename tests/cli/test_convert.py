@@ -348,6 +348,20 @@ def test_the_white_value_goes_into_the_copy(cli, write_recording, simulation, tm
     assert "--white" not in cli("info", tmp_path / "copy.h5", "--no-estimate").out
 
 
+def test_the_black_level_goes_into_the_copy(cli, recording, tmp_path):
+    copy, again = tmp_path / "copy.h5", tmp_path / "again.h5"
+    assert cli("convert", recording, copy, "--black-level", 0.05).code == 0
+    assert {frame.black for frame in kalux.open(copy).frames()} == {0.05 * 255}
+    assert "0.05 of white is taken off (as recorded)" in cli("info", copy).out
+    save_calibration(Calibration({"camera": {"black_level": 0.1}}), tmp_path / "dark.toml")
+    assert cli("convert", copy, again, "--calibration", tmp_path / "dark.toml").code == 0
+    assert {frame.black for frame in kalux.open(again).frames()} == {0.1 * 255}
+    lost = cli("convert", again, tmp_path / "copy.aedat4")
+    assert lost.code == 0
+    assert "no place for contrast thresholds, the black value 25.5:" in lost.err
+    assert "at most 0.5" in cli("convert", recording, copy, "--black-level", 0.7, "--overwrite").error
+
+
 @pytest.mark.parametrize(
     "name", ["newton_davis346.aedat4", "slider_depth", "hdr_pan/Oxford_Church_noisy.mat"]
 )

@@ -10,10 +10,12 @@ import sys
 import numpy as np
 import pytest
 
+from kalux.calibration.values import Calibration
 from kalux.evaluation.baselines import OPTIONAL, methods
 from kalux.evaluation.held_out import evaluate_held_out, hold_out_frames
 from kalux.recording import open as open_recording
 from kalux.writers import hdf5
+from kalux.writers.calibration import save_calibration
 
 from builders import colour_blocks, moving_blocks
 
@@ -258,3 +260,14 @@ def test_weights_of_lpips_that_are_wrong_are_told_before_the_work(
     assert found.code == 2
     assert told in found.error
     assert "hold the last frame" not in found.out
+
+
+def test_a_black_level_is_taken_off_and_told(cli, recording, tmp_path):
+    """The one of a flag, else that of a calibration, else what events say."""
+    said = cli("evaluate", recording, "--methods", "hold", "--black-level", 0.01)
+    assert "; black level of 0.01 of white taken off all frames" in said.out.splitlines()[0]
+    save_calibration(Calibration({"camera": {"black_level": 0.02}}), tmp_path / "dark.toml")
+    flags = ("--methods", "hold", "--calibration", tmp_path / "dark.toml")
+    assert "black level of 0.02" in cli("evaluate", recording, *flags).out
+    assert "black level of 0.01" in cli("evaluate", recording, *flags, "--black-level", 0.01).out
+    assert "black level" not in cli("evaluate", recording, "--methods", "hold").out

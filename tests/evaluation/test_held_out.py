@@ -22,7 +22,7 @@ from kalux.evaluation.held_out import (
 )
 from kalux.evaluation.method import Estimated, Method
 
-from builders import frame, moving_blocks, passing_by, pixel_events, textured
+from builders import frame, from_black, lifted, moving_blocks, passing_by, pixel_events, textured
 
 
 def still(levels, exposures=None, size=(12, 12)):
@@ -270,3 +270,22 @@ class TestBlurConsistency:
             blur_consistency(still([255] * 4), constant(1.0))
         with pytest.raises(FrameError, match="three frames"):
             blur_consistency(still([102] * 2), constant(1.0))
+
+
+@pytest.mark.parametrize("name", ["hold", "edi", "default"])
+def test_a_black_level_is_taken_off_what_is_compared_and_what_methods_are_given(name):
+    """Scores in light, not in what a camera adds to it: those of a camera without one."""
+    plain, raised = hold_out_frames(from_black()), hold_out_frames(lifted(from_black(), 16))
+    assert raised.whole.black_level == raised.kept.black_level == pytest.approx(16 / 255, abs=1 / 255)
+    assert raised.scale == pytest.approx(plain.scale, rel=0.01)
+    expected = evaluate_held_out(plain, methods()[name])
+    found = evaluate_held_out(raised, methods()[name])
+    assert found.mse == pytest.approx(expected.mse, rel=0.1, abs=2e-5)
+    assert "black level of 0.0628 of white taken off" in found.protocol
+    assert "black" not in expected.protocol
+
+
+def test_a_black_level_that_is_given_is_not_looked_for():
+    held = hold_out_frames(lifted(from_black(), 16), black_level=0.0)
+    assert held.whole.black_level == held.kept.black_level == 0
+    assert next(held.frames()).black == 0

@@ -14,7 +14,7 @@ from kalux.evaluation.method import Estimated, Method
 from kalux.evaluation.truth import evaluate_truth, load_truth, prepare_reference
 from kalux.frames import GroundTruth
 
-from builders import moving_blocks
+from builders import from_black, lifted, moving_blocks
 
 
 @pytest.fixture(scope="module")
@@ -197,3 +197,16 @@ def test_ground_truth_of_a_simulated_pan(shared_data):
     found = {name: evaluate_truth(recording, reference, methods()[name]) for name in ("hold", "default")}
     assert (100 * found["hold"].mse, found["hold"].ssim) == pytest.approx((7.950, 0.935), abs=5e-4)
     assert found["default"].mse < found["hold"].mse / 2
+
+
+@pytest.mark.parametrize("name", ["hold", "default"])
+def test_all_methods_are_given_frames_without_their_black_level(name):
+    plain = from_black()
+    frames = list(plain.frames())
+    times = np.array([frame.middle for frame in frames], np.int64)
+    images = np.stack([frame.normalised() for frame in frames]).astype(np.float32)
+    reference = prepare_reference(plain, GroundTruth(times, images))
+    expected = evaluate_truth(plain, reference, methods()[name])
+    found = evaluate_truth(lifted(plain, 16), reference, methods()[name])
+    assert found.mse == pytest.approx(expected.mse, rel=0.1, abs=2e-5)
+    assert found.protocol.endswith("black level of 0.0628 of white taken off all frames")

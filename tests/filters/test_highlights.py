@@ -9,7 +9,7 @@ import kalux
 from kalux.augmentation.highlights import Unshown
 from kalux.events import make_events
 from kalux.filters.highlights import keep_white, lifted, obey_bounds, read_unshown, smoothed_unshown, tempered
-from kalux.filters.readout import Hidden, HighlightPrior, read_out
+from kalux.filters.readout import HighlightPrior, Subthreshold, read_out
 
 OFFSET = 0.03
 WHITE = float(np.log(1 + OFFSET))
@@ -23,8 +23,10 @@ def intensity(value, variance, offset, prior):
 
 def regularised(value, variance, moving, difference, pitch):
     """L after K12."""
-    nothing = Hidden(0.0, 0.0)
-    image = read_out(value, variance, OFFSET, OFF, moving, nothing, None, difference, pitch)[0]
+    nothing = Subthreshold(0.0, 0.0)
+    image = read_out(
+        value, variance, OFFSET, OFF, moving=moving, subthreshold=nothing, difference=difference, pitch=pitch
+    )[0]
     return np.log(image + OFFSET)
 
 
@@ -37,9 +39,17 @@ def unshown(pixels, excess, noise=0.0, doubt=0.0):
 def read(level, where, difference=0.0, moving=None, pitch=1, prior=PRIOR):
     bound = np.asarray(level, np.float32)
     raised, spread = lifted(bound, np.full(bound.shape, 0.01, np.float32), where)
-    hidden = Hidden(0.0, 0.0)
+    subthreshold = Subthreshold(0.0, 0.0)
     image, _, heard = read_out(
-        raised, spread, OFFSET, prior, moving, hidden, None, difference, pitch, where.pixels
+        raised,
+        spread,
+        OFFSET,
+        prior,
+        moving=moving,
+        subthreshold=subthreshold,
+        difference=difference,
+        pitch=pitch,
+        unshown=where.pixels,
     )
     read_unshown(image, heard, bound, where, OFFSET, prior)
     return image
@@ -80,7 +90,9 @@ def test_neighbours_are_heard_as_by_other_pixels(pitch):
     moving = rng.random((6, 7)) < 0.8
     raised, spread = lifted(level, np.full((6, 7), 0.05, np.float32), where)
     image = np.zeros_like(level)
-    told = read_out(raised, spread, OFFSET, PRIOR, moving, Hidden(0, 0), None, 0.3, pitch, where.pixels)[2]
+    told = read_out(
+        raised, spread, OFFSET, PRIOR, moving=moving, difference=0.3, pitch=pitch, unshown=where.pixels
+    )[2]
     read_unshown(image, told, level, where, OFFSET, PRIOR)
     heard = regularised(raised, spread, moving, 0.3, pitch).reshape(-1)[where.pixels]
     assert (heard != raised.reshape(-1)[where.pixels]).any()

@@ -135,7 +135,7 @@ def test_a_masked_pixel_is_no_bound():
     np.testing.assert_array_equal(level, [[-1.0, 0.0, -1.0]])
     clipped = Latent(np.zeros((1, 3)), np.full((1, 3), UNMEASURED))
     thresholds, noise = nominal_thresholds((1, 3), 0.1), BridgeNoise(0.5, 0.5, 0.05, 0.04)
-    joined, _ = bridge(clipped, frame, np.ones((1, 3)), np.zeros((1, 3)), thresholds, noise, 0, 40_000)
+    joined, _ = bridge(clipped, frame, (np.ones((1, 3)), np.zeros((1, 3))), thresholds, noise, 0, 40_000)
     np.testing.assert_allclose(joined.floor, [[-np.inf, -0.5, -np.inf]], atol=1e-6)
 
 

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from scipy.special import lambertw
 
 from kalux.filters.readout import (
-    Hidden,
     HighlightPrior,
+    Subthreshold,
     believed_highlight,
     edge,
     read_out,
@@ -20,7 +20,7 @@ from kalux.settings import altered, preset
 import naive
 
 OFF = HighlightPrior(white=np.inf, scale2=0.0, stretch=0.0, gain=1.0)
-NOTHING_HIDDEN = Hidden(0.0, 0.0)
+NO_SUBTHRESHOLD = Subthreshold(0.0, 0.0)
 excesses = st.floats(0.0, 12.0)
 stretches = st.floats(1e-4, 2.0)
 
@@ -31,7 +31,7 @@ def intensity(value, variance, offset, prior):
 
 def regularised(value, variance, moving, difference):
     """L after K12."""
-    return np.log(read_out(value, variance, 0.0, OFF, moving, NOTHING_HIDDEN, None, difference)[0])
+    return np.log(read_out(value, variance, 0.0, OFF, moving=moving, difference=difference)[0])
 
 
 def lambert(excess, variance, scale2, stretch):
@@ -167,7 +167,7 @@ def test_the_variance_falls_by_what_neighbours_do_not_share(neighbour):
     """To 0.7 of it and 0.3 of what independent errors would leave."""
     variance, moving = np.full((5, 5), neighbour, np.float32), np.zeros((5, 5), bool)
     variance[2, 2], moving[2, 2] = 0.04, True
-    left = read_out(np.zeros((5, 5)), variance, 0.0, OFF, moving, NOTHING_HIDDEN, None, 0.1)[1]
+    left = read_out(np.zeros((5, 5)), variance, 0.0, OFF, moving=moving, difference=0.1)[1]
     independent = 1 / (1 / 0.04 + 4 / (neighbour + 0.01) + 4 / (neighbour + 0.02))
     assert left[2, 2] == pytest.approx(0.028 + 0.3 * independent, rel=1e-5)
     np.testing.assert_array_equal(left[~moving], variance[~moving])
@@ -206,8 +206,8 @@ def test_pixels_that_no_frame_has_shown_are_told_as_they_are_read():
     """Their variance is not lessened."""
     truth, noisy = noisy_edge()
     variance, pixels = np.full(truth.shape, 0.01, np.float32), np.array([0, 29, 30, 444, 599])
-    given = noisy, variance, 0.0, OFF, np.ones(truth.shape, bool), NOTHING_HIDDEN, None, 0.1, 1
-    image, left, levels = read_out(*given, pixels)
+    moving = np.ones(truth.shape, bool)
+    image, left, levels = read_out(noisy, variance, 0.0, OFF, moving=moving, difference=0.1, unshown=pixels)
     np.testing.assert_allclose(np.exp(levels), image.reshape(-1)[pixels], rtol=1e-6)
     np.testing.assert_array_equal(left.reshape(-1)[pixels], variance.reshape(-1)[pixels])
     assert np.count_nonzero(left == variance) == len(pixels)
@@ -222,13 +222,25 @@ def test_images_are_the_oracles(shape, moves, pitch, gain):
     rng = np.random.default_rng(1)
     value, variance = rng.normal(-0.5, 1.0, shape), np.exp(rng.normal(-3.0, 2.0, shape))
     moving = rng.random(shape) < moves
-    hidden, chosen = Hidden(0.5, 0.03), altered(preset("default"), "events", extrapolation_gain=gain)
+    subthreshold, chosen = (
+        Subthreshold(0.5, 0.03),
+        altered(preset("default"), "events", extrapolation_gain=gain),
+    )
     change = rng.uniform(0, 0.05, shape).astype(np.float32)
     white, stretch, offset = 0.8, 0.7, chosen.camera.offset
     prior = HighlightPrior(np.log(white + offset), chosen.filter.highlight_scale**2, stretch, gain)
     given = value.astype(np.float32), variance.astype(np.float32)
-    found = read_out(*given, offset, prior, moving, hidden, change, 0.3, pitch)
-    total = variance + np.where(moving, hidden.moving, hidden.changing * change)
+    found = read_out(
+        *given,
+        offset,
+        prior,
+        moving=moving,
+        subthreshold=subthreshold,
+        silent_change=change,
+        difference=0.3,
+        pitch=pitch,
+    )
+    total = variance + np.where(moving, subthreshold.moving, subthreshold.silent * change)
     level = np.empty(shape)
     for part in np.ndindex(pitch, pitch):  # a mosaic's colours know nothing of each other
         own = np.s_[part[0] :: pitch, part[1] :: pitch]

@@ -8,24 +8,24 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kalux.augmentation.bridge import UNMEASURED
-from kalux.filters.readout import SHARED, Hidden
+from kalux.filters.readout import CORRELATED, Subthreshold
 from kalux.filters.uncertainty import (
-    ALIKE,
-    ALONE,
+    BEFORE_AVERAGING,
+    CORRELATED_UNMEASURED,
     Around,
     add_pattern,
-    alone,
+    before_averaging,
     changed_within,
     given_variance,
-    hidden_variance,
     keep_rounding,
     known_variance,
+    subthreshold_variance,
 )
 
 C2 = 0.04
 STILL = np.zeros((1, 2), bool)
 NO_CHANGE = np.zeros((1, 2), np.float32)
-NOTHING = Hidden(0.0, 0.0)
+NOTHING = Subthreshold(0.0, 0.0)
 variances = st.floats(1e-5, 1.0)
 
 
@@ -112,34 +112,34 @@ def test_more_is_hidden_between_frames_in_long_exposures_and_where_things_move()
     moving = np.array([[True, False]])
     change = plane(0.1 * C2)
 
-    def hidden(between, threshold2=C2, exposed=0.0):
-        given = hidden_variance(between, threshold2, exposed)
+    def subthreshold(between, threshold2=C2, exposed=0.0):
+        given = subthreshold_variance(between, threshold2, exposed)
         return given_variance(plane(0.0), moving, change * threshold2 / C2, given, None)
 
-    assert (hidden(0.0) == 0).all()
-    assert (hidden(1.0) > hidden(0.5)).all()
-    assert hidden(1.0)[0, 0] > hidden(1.0)[0, 1] > 0
-    assert (hidden(0.0, exposed=0.5) > 0).all()
-    np.testing.assert_array_equal(hidden(1.0, exposed=0.5), hidden(1.0))
-    np.testing.assert_allclose(hidden(1.0, 4 * C2), 4 * hidden(1.0), rtol=1e-5)
+    assert (subthreshold(0.0) == 0).all()
+    assert (subthreshold(1.0) > subthreshold(0.5)).all()
+    assert subthreshold(1.0)[0, 0] > subthreshold(1.0)[0, 1] > 0
+    assert (subthreshold(0.0, exposed=0.5) > 0).all()
+    np.testing.assert_array_equal(subthreshold(1.0, exposed=0.5), subthreshold(1.0))
+    np.testing.assert_allclose(subthreshold(1.0, 4 * C2), 4 * subthreshold(1.0), rtol=1e-5)
 
 
 def test_still_pixels_hide_what_silent_ones_around_them_show():
     change = np.array([[0.0, 0.02]], np.float32)
     for half_way in (0.0, 0.25, 0.7):
-        hidden = hidden_variance(1.0, C2, half_way=half_way)
-        found = given_variance(plane(0.01), STILL, change, hidden, None) - 0.01
+        subthreshold = subthreshold_variance(1.0, C2, half_way=half_way)
+        found = given_variance(plane(0.01), STILL, change, subthreshold, None) - 0.01
         np.testing.assert_allclose(found, [[0.0, half_way * 0.02]], atol=1e-8)
 
 
 def test_a_pixel_that_waits_for_its_next_event_lies_between_still_and_moving_ones():
     """One with an event of late, none in this interval; or silent, and measured by one of the frames alone."""
     moving, change, p = np.array([[True, False]]), plane(0.02), plane(0.01)
-    hidden = Hidden(0.5, 0.004)
+    subthreshold = Subthreshold(0.5, 0.004)
 
     def found(first, second, events):
         told = around(first, second, events, counted=UNMEASURED, quantisation_variance=0.0)
-        return given_variance(p, moving, change, hidden, told) - p
+        return given_variance(p, moving, change, subthreshold, told) - p
 
     waits = 0.5 * 0.5 * 0.02 + 0.25 * 0.004
     np.testing.assert_allclose(found(1e-6, 1e-6, 0.0), [[waits, 0.01]], rtol=1e-4)
@@ -150,20 +150,24 @@ def test_a_pixel_that_waits_for_its_next_event_lies_between_still_and_moving_one
 
 def test_without_a_next_frame_nothing_holds_the_other_end():
     """Of a change that goes on from the frame, at most all."""
-    changing = [hidden_variance(1.0, C2, 0.0, since).changing for since in (0.0, 0.5, 1.0, 8.0)]
-    assert changing == [0.0, 0.5, 1.0, 1.0]
+    silent = [subthreshold_variance(1.0, C2, 0.0, since).silent for since in (0.0, 0.5, 1.0, 8.0)]
+    assert silent == [0.0, 0.5, 1.0, 1.0]
 
 
-def test_neighbours_that_are_heard_take_a_part_of_it():
-    assert alone(Hidden(0.1, 0.2)) == pytest.approx((0.1 * ALONE, 0.2 * ALONE))
+def test_averaging_takes_a_part_of_it():
+    assert before_averaging(Subthreshold(0.1, 0.2)) == pytest.approx(
+        (0.1 * BEFORE_AVERAGING, 0.2 * BEFORE_AVERAGING)
+    )
 
 
 def test_what_neighbours_take_of_a_pixel_that_neither_frame_measures_is_not_given():
     """Errors of neighbours are less alike than highlights are doubted by."""
     p, mean = 0.2, 0.05  # of neighbours and pixel together
-    left = plane(SHARED * p + (1 - SHARED) * mean)
-    heard = given_variance(plane(p), STILL, NO_CHANGE, NOTHING, around(), left)
-    np.testing.assert_allclose(heard, ALIKE * p + (1 - ALIKE) * mean, rtol=1e-5)
+    left = plane(CORRELATED * p + (1 - CORRELATED) * mean)
+    averaged = given_variance(plane(p), STILL, NO_CHANGE, NOTHING, around(), left)
+    np.testing.assert_allclose(
+        averaged, CORRELATED_UNMEASURED * p + (1 - CORRELATED_UNMEASURED) * mean, rtol=1e-5
+    )
     for frames in ((0.01, UNMEASURED), (UNMEASURED, 0.01)):
         measured = around(*frames, counted=UNMEASURED)
         np.testing.assert_allclose(

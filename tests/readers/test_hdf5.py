@@ -70,6 +70,12 @@ def test_frames_keep_type_and_white(path, dtype, white):
     assert same_frames(readers.read(path).frames(), frames)
 
 
+def test_frames_keep_where_black_is(path):
+    frames = [dataclasses.replace(frame, black=16.5) for frame in small_frames()]
+    write_kalux(path, frames=frames)
+    assert [frame.black for frame in readers.read(path).frames()] == [16.5] * len(frames)
+
+
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 def test_frames_in_rgb(path, dtype):
     frames = colour_frames(dtype=dtype)

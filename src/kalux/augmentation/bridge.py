@@ -44,6 +44,14 @@ _SCALE_BOUNDS: Final = (0.3, 3.0)
 _SCALE_DRIFT: Final = 1e-5  # variance per frame: a calibration never becomes certain, temperatures drift
 
 
+def bridge_variance(share: float) -> float:
+    """Variance of a random walk that is tied at both ends, a Brownian bridge, over that half-way: 4 s (1 - s).
+
+    ``share`` is s, of the way from the frame before to the one after: it is 0 at a frame, and 1 half-way.
+    """
+    return 4.0 * share * (1.0 - share)
+
+
 class Latent(NamedTuple):
     """A deblurred frame at one moment: (H, W) log intensity and its variance.
 
@@ -165,13 +173,14 @@ class BridgedSegment(NamedTuple):
     unshown
         Pixels that no frame has measured until the end, or until the start in causal mode (K15).
     silent_change
-        Mean square change of silent pixels around each between the frames (`unseen.silent_change`); None: not known.
+        Mean square change of silent pixels around each between the frames (`subthreshold.silent_change`); None: not
+        known.
     net
         Change of L by all events, and by K14, from start to end; None: not known.
     turns
-        How often the intensity of a pixel with events reverses, on average (`unseen.turns`).
+        How often the intensity of a pixel with events reverses, on average (`subthreshold.turns`).
     half_way
-        Variance of silent pixels about the mean of both frames (`unseen.half_way`).
+        Variance of silent pixels about the mean of both frames (`subthreshold.half_way`).
     latents
         The frames at both ends, where they are looked at along the paths of what moves (K16); else None.
     doubt
@@ -309,12 +318,12 @@ def nominal_thresholds(shape: tuple[int, int], spread: float, dtype: Any = np.fl
 def bridge(
     first: Latent,
     second: Latent,
-    on: Array,
-    off: Array,
+    counts: tuple[Array, Array],
     thresholds: Thresholds,
     noise: BridgeNoise,
     start: int,
     end: int,
+    *,
     grown: Array | None = None,
     signal: tuple[Array, Array] | None = None,
 ) -> tuple[BridgedSegment, Thresholds]:
@@ -324,10 +333,12 @@ def bridge(
     ----------
     first, second
         The frames at ``start`` and ``end`` (us).
-    on, off
-        (H, W) number of events of each polarity between them.
+    counts
+        (H, W) number of on and of off events between them.
     thresholds
         What is known of the pixels' thresholds so far.
+    noise
+        Nominal thresholds, and variances of steps.
     grown
         (H, W) change of L between the frames in addition to the events' steps (K14); None: none.
     signal
@@ -362,7 +373,7 @@ def bridge(
     shares = (np.ones(shape, first.value.dtype),) * 2 if signal is None else signal
     given, known, filled, learned = (
         tuple(plane.reshape(-1) for plane in several)
-        for several in ((*first[:2], *second[:2], on, off, more, *shares), thresholds, planes, factors)
+        for several in ((*first[:2], *second[:2], *counts, more, *shares), thresholds, planes, factors)
     )
     _bridge(given, known, noise, seconds, filled, learned)
     return segment, Thresholds(*factors)

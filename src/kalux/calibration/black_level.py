@@ -19,7 +19,7 @@ from kalux.calibration.intervals import intervals, spread
 from kalux.calibration.levels import response_histogram
 from kalux.event_slices import between, count_events
 from kalux.models.camera import Camera, Response
-from kalux.recording import Recording
+from kalux.recording import Recording, less_black
 from kalux.settings import CameraSettings, EventSettings, chosen_response
 
 Array = NDArray[np.float64]
@@ -118,6 +118,31 @@ class _Samples(NamedTuple):
     def where(self, chosen: NDArray[np.bool_]) -> _Samples:
         """Some of them."""
         return _Samples(self.before[chosen], self.after[chosen], self.net[chosen], self.part[chosen])
+
+
+def with_known_black(
+    recording: Recording, camera: CameraSettings, events: EventSettings
+) -> tuple[Recording, BlackLevel | None]:
+    """The recording with its black level taken off: that of the settings, else one known before, else what events say.
+
+    Whatever goes by the intensity of frames has to come after it. `find_black_level` has the parameters and errors.
+
+    Returns
+    -------
+    The recording, whose ``black_level`` is known from now on, unless its frames state where black is; and what was
+    looked for, None where nothing was.
+    """
+    if camera.black_level is not None:
+        return less_black(recording, camera.black_level), None
+    if recording.black_level is not None or _states_black(recording):
+        return recording, None
+    found = find_black_level(recording, camera, events)
+    return less_black(recording, 0.0 if found is None else found.level), found
+
+
+def _states_black(recording: Recording) -> bool:
+    first = next(iter(recording.frames()), None)
+    return first is not None and first.black > 0
 
 
 def find_black_level(

@@ -44,14 +44,14 @@ _TRAILING: Final = (0, 2_000, 4_000, 6_000)
 _PERIOD_SAMPLES: Final = 30_000
 """Pixels for the refractory period: the standard error of the excess is then 0.02 on scenes where changes are lost."""
 
-_MODEL: Final = 0.02
+_COUNTS_ERROR: Final = 0.02
 """Relative error of thresholds from the neighbours' counts, beside the statistical one: -1.3 to 4.3 %, 1.6 % in the
 root mean square, on seventeen simulated scenes."""
 
-_SHARED: Final = 0.1
+_COMMON: Final = 0.1
 """Share of what frames do not explain in the neighbours' counts that may be common to neighbours."""
 
-_SUBTHRESHOLD: Final = 0.1
+_CHANGES_ERROR: Final = 0.1
 """Relative error of thresholds from the neighbours' changes in frames, beside the statistical one: they are 0 to 3 %
 larger than those from counts on seventeen simulated scenes, and 2 to 9 % on three real recordings."""
 
@@ -63,6 +63,11 @@ _NARROW_COUNTS: Final = 0.4
 """Relative error of thresholds from the neighbours' counts where frames change by one threshold in the root mean square
 and all pixels are lost from one to the next: by the share that is lost, times the third power of thresholds over
 changes. Of the same scenes, 0.10 there and 0.43 at half a threshold, where half or more is lost."""
+
+_ROUGH_INTERVALS: Final = 2
+_INTERVALS: Final = 4
+"""Least number of frame intervals that samples are taken from, if there are so many: what moves differs between them
+more than between pixels of one."""
 
 _PRIOR_REACH: Final = 6.0  # standard deviations, or a factor of 400
 _PRIOR_POINTS: Final = 1201  # 0.005 apart with the usual spread, a quarter of the least error
@@ -189,12 +194,13 @@ def estimate_thresholds(
         If the frames' exposures are not known.
     """
     shortest = 0 if refractory_period is not None else _shortest_with_reset(recording)
-    sampling = _Sampling(recording, camera, of_log_offset, delay - _TRAILING[1], shortest, (0.0, 0.0))
+    about_true = delay - _TRAILING[1]  # to begin with: trailing is mostly about so long
+    sampling = _Sampling(recording, camera, of_log_offset, about_true, shortest, (0.0, 0.0))
     period = refractory_period or 0
     if usual.spread == 0:
         sampling = sampling._replace(thresholds=(usual.on, usual.off))
     else:  # what the light does within exposures needs thresholds
-        rough = _by_information(sampling.samples(period, most=ROUGH_SAMPLES), usual, period, sampling, 0.0)
+        rough = _combined(sampling.samples(period, most=ROUGH_SAMPLES), usual, period, sampling, 0.0)
         sampling = sampling if rough is None else sampling._replace(thresholds=(rough.on, rough.off))
     sampling = sampling.without_trailing(delay, period)
     return _estimate(sampling, usual, refractory_period, most, delay)
@@ -203,7 +209,7 @@ def estimate_thresholds(
 def with_true_delay(
     recording: Recording,
     camera: CameraSettings,
-    late: DelayEstimate,
+    apparent: DelayEstimate,
     usual: Usual,
     *,
     of_log_offset: bool = False,
@@ -211,18 +217,19 @@ def with_true_delay(
 ) -> DelayEstimate:
     """A delay estimate completed by the true delay, where an estimate of the thresholds finds that.
 
-    ``late`` has the apparent delay. The other parameters are those of `estimate_thresholds`.
+    ``apparent`` is what `kalux.calibration.delay.estimate_delay` has found. The other parameters are those of
+    `estimate_thresholds`.
     """
     found = estimate_thresholds(
         recording,
         camera,
         usual,
         of_log_offset=of_log_offset,
-        delay=late.apparent,
+        delay=apparent.apparent,
         refractory_period=refractory_period,
         most=ROUGH_SAMPLES,
     )
-    return late if found is None else late._replace(true=found.delay)
+    return apparent if found is None else apparent._replace(true=found.delay)
 
 
 def _shortest_with_reset(recording: Recording) -> int:
@@ -252,8 +259,7 @@ def refine_thresholds(
         return _estimate(sampling, usual, refractory_period, MAX_SAMPLES, None) or rough
     period = _period_without_excess(sampling) or period
     return (
-        _by_information(sampling.samples(period, most=MAX_SAMPLES), usual, period, sampling, rough.doubt)
-        or rough
+        _combined(sampling.samples(period, most=MAX_SAMPLES), usual, period, sampling, rough.doubt) or rough
     )
 
 
@@ -270,11 +276,11 @@ def _estimate(
     if len(samples.steps.change) < _MIN_SAMPLES:
         return None
     if not 0 < sampling.shortest <= _LARGEST_SHORTEST:
-        return _by_information(samples, usual, period, sampling, 0.0)
+        return _combined(samples, usual, period, sampling, 0.0)
     excess = _measured_excess(samples)
     # Thresholds may be too large by this even where the excess is too uncertain to be corrected.
     doubt = _THRESHOLD_OF_EXCESS * max(excess.value - _USUAL_EXCESS, 0.0)
-    estimate = _by_information(samples, usual, period, sampling, doubt)
+    estimate = _combined(samples, usual, period, sampling, doubt)
     if estimate is None or not excess.value - 2 * excess.error > _LEAST_EXCESS:
         return estimate
     for _ in range(2 if delay is not None else 1):
@@ -283,7 +289,7 @@ def _estimate(
             return estimate
         sampling = sampling if delay is None else sampling.without_trailing(delay, period)
     doubt = _THRESHOLD_OF_EXCESS * float(np.hypot(excess.error, _USUAL_EXCESS))
-    return _by_information(sampling.samples(period, most=most), usual, period, sampling, doubt) or estimate
+    return _combined(sampling.samples(period, most=most), usual, period, sampling, doubt) or estimate
 
 
 class _Sampling(NamedTuple):
@@ -332,7 +338,7 @@ class _Sampling(NamedTuple):
 
     def _of_delays(self, delays: tuple[int, ...], periods: tuple[int, ...], most: int) -> list[_Samples]:
         """Samples under each of the delays, us."""
-        at_least = 2 if most <= ROUGH_SAMPLES else 4
+        at_least = _ROUGH_INTERVALS if most <= ROUGH_SAMPLES else _INTERVALS
         late = LATE * self.shortest if self.shortest else np.inf
         found = steps(
             self.recording,
@@ -386,10 +392,10 @@ class _LogThresholds(NamedTuple):
     variances: Array
 
 
-def _by_information(
+def _combined(
     samples: _Samples, usual: Usual, period: int, sampling: _Sampling, doubt: float
 ) -> ThresholdEstimate | None:
-    """Thresholds from either kind of instruments and the usual ones, weighted by the inverse of their variances.
+    """Thresholds from either kind of instruments and the usual ones, combined by Bayes' rule (`_posterior`).
 
     ``doubt`` is the relative error of the thresholds that is due to the error of the refractory ``period``.
     """
@@ -399,12 +405,10 @@ def _by_information(
     fits = [fit for fit in (by_counts, by_changes) if fit is not None]
     if not fits:
         return None
-    model = np.hypot(_MODEL, doubt)
-    common = np.log1p(_SHARED * _unexplained(samples, by_counts, counts)) if by_counts is not None else np.inf
-    of_counts = _log_thresholds(samples, by_counts, explained, counts, float(np.hypot(common, model)))
-    of_changes = _log_thresholds(
-        samples, by_changes, explained, changes, float(np.hypot(_SUBTHRESHOLD, doubt))
-    )
+    model = np.hypot(_COUNTS_ERROR, doubt)
+    common = np.log1p(_COMMON * _unexplained(samples, by_counts, counts)) if by_counts is not None else np.inf
+    of_counts = _fitted(samples, by_counts, explained, counts, float(np.hypot(common, model)))
+    of_changes = _fitted(samples, by_changes, explained, changes, float(np.hypot(_CHANGES_ERROR, doubt)))
     moved, lost = float(np.sqrt(np.mean(change**2))), float(np.mean(samples.steps.lost))
     known = _posterior(usual, of_counts, of_changes, moved, lost)
     on, off = np.exp(known.logs)
@@ -453,7 +457,7 @@ def _posterior(
     return _LogThresholds(mean, (weights * np.square(logs - mean[:, None])).sum(axis=1))
 
 
-def _log_thresholds(
+def _fitted(
     samples: _Samples, fit: Fit | None, explained: Array, instruments: Array, error: float
 ) -> _LogThresholds:
     """The thresholds of a regression, with ``error`` its relative error beside the statistical one."""
@@ -480,7 +484,12 @@ def _unexplained(samples: _Samples, fit: Fit, counts: Array) -> float:
 
 
 class _LateAndSoon(NamedTuple):
-    """A regression on late events and on those that follow soon, both in units of the thresholds."""
+    """A regression on late events and on those that follow soon, both in units of the thresholds.
+
+    An event is late if it comes `LATE` shortest intervals after the pixel's previous one, or more: the refractory
+    period was over long before it, and little of its step is lost. The step of one that follows soon has in it what the
+    light did in the refractory period before, and looks larger.
+    """
 
     explained: Array
     instruments: Array

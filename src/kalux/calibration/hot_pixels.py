@@ -1,82 +1,171 @@
-"""Event pixels that leak: they fire alone, always, and in one direction, whatever the light does.
+"""Event pixels that are hot: they fire alone, always, and mostly in one direction, whatever the light does.
 
 A leaking reset switch lets the reference fall, so that a pixel has ON events at a constant rate (Nozaki, Delbruck,
 "Temperature and Parasitic Photocurrent Effects in Dynamic Vision Sensors", 2017). Where frames are clipped nothing
 contradicts them, and its light would grow without bound.
+
+Light is never on one pixel alone for long. So time is cut into bins, and of every pixel those count in which at most
+one of its eight neighbours fires: how often it then fires itself is a rate of its own. Short bins find the pixel alone
+between the edges that pass by, long ones see a slower rate sooner, so that three lengths are looked at.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from itertools import pairwise
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.calibration.neighbours import sum_of_neighbours
-from kalux.event_slices import count_chunks
-from kalux.events import EventArray
+from kalux.compiled import empty, loop, zeros
+from kalux.events import EVENT_DTYPE, EventArray
 from kalux.recording import Recording
 
-BIN: Final = 20_000
-"""us: a pixel that fires in nearly every one has 50 Hz and more. At 20 Hz frames and the noise model (K5) suffice."""
+Counts = NDArray[np.int32]
 
-_MOST_BINS: Final = 100
+BINS: Final = (4_700, 9_300, 18_700)
+"""us. In the shortest a pixel between moving textures (a million events in 0.3 s of 160 x 120 pixels) is alone often
+enough; in the longest a pixel of 50 Hz fires nearly every time. None goes evenly into the periods of lamps, which would
+show one half of each to a pixel at the border of the light."""
 
-_LEAST_ALONE: Final = 8
-"""Bins in which a pixel is alone, from which they tell."""
-
-_FIRING: Final = 0.8
-"""Share of these in which a leaking pixel fires: what light does to a pixel alone it does in at most half of them."""
-
-_ONE_SIGN: Final = 0.9
-"""Share of its events there that have one sign: flicker has as many of the other."""
+MOST_EVENTS: Final = 1 << 21
+"""Looked at from the start, 32 MB: as many as a plan keeps in memory."""
 
 _COMPANIONS: Final = 1
-"""Neighbours that may fire as well: two leaking pixels side by side are alone, too."""
+"""Neighbours that may fire as well: two hot pixels side by side are alone, too."""
+
+_LEAST_RATE: Final = 30.0
+"""Hz, from which a pixel is hot. At 20 Hz frames and the noise model (K5) suffice."""
+
+_ONE_SIGN: Final = 0.85
+"""Share of a pixel's events while it is alone that have the more frequent sign; of a leak of 30 Hz and noise of 5 Hz it
+is 0.93. Where lamps flicker, pixels of small thresholds see it alone, at 200 Hz and with both signs (a recording of a
+still bench has hundreds)."""
+
+_LEAST_FIRING: Final = 24
+"""Bins in which a pixel fires alone, from which they tell. With 16, eleven pixels of 25 recordings without hot ones
+would be found, with 20 two, with 24 and 32 none."""
+
+_FEW: Final = 8
+_NEARLY_ALL: Final = 0.8
+"""So few of the longest bins tell where a pixel fires in so many of them: light does it in at most half."""
+
+_PARTS: Final = 4
+_LASTING: Final = 0.5
+"""Share of the least rate that a pixel has in every quarter of the time, but for one bin: leak does not pause."""
 
 
-def find_hot_pixels(recording: Recording, most_events: int) -> NDArray[np.bool_]:
-    """Pixels that fire in nearly all of the time in which their neighbours are silent, nearly always with one sign.
+def find_hot_pixels(recording: Recording, most_events: int = MOST_EVENTS) -> NDArray[np.bool_]:
+    """Pixels that fire often while their neighbours are silent, all the time, and nearly always with one sign.
 
-    Looks at the first ``most_events``, and at most at 2 s.
+    Looks at the first ``most_events``. Rates from 30 Hz on are found.
 
     Returns
     -------
-    (H, W) bool; none where fewer than 8 bins of 20 ms tell.
+    (H, W) bool; none where too few bins tell.
     """
-    shape = recording.sensor_size
-    alone, firing, ups, downs = (np.zeros(shape, np.int32) for _ in range(4))
-    for binned in _bins(recording, most_events):
-        on, off = count_chunks([binned], shape, weighed=False)
-        fires = on + off > 0
-        quiet = sum_of_neighbours(fires.view(np.uint8)) <= _COMPANIONS
-        alone += quiet
-        firing += quiet & fires
-        ups += np.where(quiet, on, 0).astype(np.int32)
-        downs += np.where(quiet, off, 0).astype(np.int32)
-    enough = (alone >= _LEAST_ALONE) & (firing >= _FIRING * alone)
-    return np.asarray(enough & (np.maximum(ups, downs) >= _ONE_SIGN * (ups + downs)), np.bool_)
+    events = _first_events(recording, most_events)
+    hot = np.zeros(recording.sensor_size, np.bool_)
+    for length in BINS:
+        alone = _counted_alone(events, recording.sensor_size, length)
+        one_sign = np.maximum(alone.on, alone.off) >= _ONE_SIGN * (alone.on + alone.off)
+        fires = _fires_often(alone, length)
+        if length == BINS[-1]:
+            fires |= _fires_nearly_always(alone)
+        hot |= one_sign & fires
+    return hot
 
 
-def _bins(recording: Recording, most_events: int) -> Iterator[EventArray]:
-    """The events of every whole bin of the first ``most_events``."""
-    chunks: list[EventArray] = []
-    seen, since = 0, None
+def _first_events(recording: Recording, most_events: int) -> EventArray:
+    chunks: list[EventArray] = [np.empty(0, EVENT_DTYPE)]
+    left = most_events
     for chunk in recording.events():
-        if seen >= most_events:
+        chunks.append(chunk[:left])
+        left -= len(chunks[-1])
+        if left <= 0:
             break
-        if len(chunk):
-            since = int(chunk["t"][0]) if since is None else since
-            chunks.append(chunk[: most_events - seen])
-            seen += len(chunks[-1])
-            if int(chunks[-1]["t"][-1]) - since >= _MOST_BINS * BIN:
-                break
-    if since is None:
-        return
-    events = np.concatenate(chunks)
-    whole = min(int(events["t"][-1] - since) // BIN, _MOST_BINS)
-    edges = np.searchsorted(events["t"], since + BIN * np.arange(whole + 1))
-    for first, last in pairwise(edges.tolist()):
-        yield events[first:last]
+    return np.concatenate(chunks)
+
+
+class _Alone(NamedTuple):
+    """What pixels do while at most one neighbour fires.
+
+    Attributes
+    ----------
+    bins, firing
+        (4, H, W) bins in which a pixel is alone, and those of them in which it fires, in every quarter of the time.
+    on, off
+        (H, W) its events in the latter.
+    """
+
+    bins: Counts
+    firing: Counts
+    on: Counts
+    off: Counts
+
+
+def _counted_alone(events: EventArray, shape: tuple[int, int], length: int) -> _Alone:
+    """Of the whole bins of ``length`` us, from the first event on."""
+    count = 0 if len(events) == 0 else int(events["t"][-1] - events["t"][0]) // length
+    edges = np.searchsorted(events["t"], events["t"][:1] + length * np.arange(count + 1))
+    crowded, firing = np.zeros((2, _PARTS, *shape), np.int32)
+    on, off = np.zeros((2, *shape), np.int32)
+    x, y, p = (events[name] for name in ("x", "y", "p"))
+    _count_alone(x, y, p, edges, crowded, firing, on, off)
+    parts = np.diff(-(-np.arange(_PARTS + 1) * count // _PARTS))
+    return _Alone(parts[:, None, None].astype(np.int32) - crowded, firing, on, off)
+
+
+@loop
+def _count_alone(x, y, p, edges, crowded, firing, on, off):  # type: ignore[no-untyped-def]
+    """Bins in which a pixel is not alone, in which it fires alone, and its events in those.
+
+    Only pixels that fire and their neighbours are visited: most bins are short, and hold few events.
+    """
+    height, width = on.shape
+    count = len(edges) - 1
+    rises, falls = zeros((height, width), np.int32), zeros((height, width), np.int32)
+    around = zeros((height + 2, width + 2), np.int32)  # neighbours that fire in this bin, with a border
+    fired = empty(height * width, np.int64)
+    for index in range(count):
+        part = index * _PARTS // count
+        firing_pixels = 0
+        for i in range(edges[index], edges[index + 1]):
+            row, column = np.int64(y[i]), np.int64(x[i])
+            if rises[row, column] + falls[row, column] == 0:
+                fired[firing_pixels] = row * width + column
+                firing_pixels += 1
+                for r in range(row, row + 3):
+                    for c in range(column, column + 3):
+                        around[r, c] += 1
+                around[row + 1, column + 1] -= 1
+            if p[i]:
+                rises[row, column] += 1
+            else:
+                falls[row, column] += 1
+        for k in range(firing_pixels):
+            row, column = fired[k] // width, fired[k] % width
+            if around[row + 1, column + 1] <= _COMPANIONS:
+                firing[part, row, column] += 1
+                on[row, column] += rises[row, column]
+                off[row, column] += falls[row, column]
+        for k in range(firing_pixels):
+            row, column = fired[k] // width, fired[k] % width
+            rises[row, column] = falls[row, column] = 0
+            for r in range(row, row + 3):
+                for c in range(column, column + 3):
+                    if around[r, c] > _COMPANIONS and 0 < r <= height and 0 < c <= width:
+                        crowded[part, r - 1, c - 1] += 1
+                    around[r, c] = 0
+
+
+def _fires_often(alone: _Alone, length: int) -> NDArray[np.bool_]:
+    """Whether a pixel fires alone in as many bins, of ``length`` us, as random events of the least rate would."""
+    share = 1.0 - np.exp(-_LEAST_RATE * length * 1e-6)
+    bins, firing = alone.bins.sum(axis=0), alone.firing.sum(axis=0)
+    lasting = (alone.firing >= _LASTING * share * alone.bins - 1.0).all(axis=0)
+    return np.asarray((firing >= _LEAST_FIRING) & (firing >= share * bins) & lasting, np.bool_)
+
+
+def _fires_nearly_always(alone: _Alone) -> NDArray[np.bool_]:
+    bins, firing = alone.bins.sum(axis=0), alone.firing.sum(axis=0)
+    return np.asarray((bins >= _FEW) & (firing >= _NEARLY_ALL * bins), np.bool_)

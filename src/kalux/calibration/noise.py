@@ -16,10 +16,12 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.calibration.black_level import with_known_black
 from kalux.calibration.delay import estimate_delay
 from kalux.calibration.fixed_pattern import FixedPattern, estimate_fixed_pattern
 from kalux.calibration.frame_noise import FrameNoise, estimate_frame_noise
 from kalux.calibration.global_thresholds import Usual, with_true_delay
+from kalux.calibration.hot_pixels import find_hot_pixels
 from kalux.calibration.levels import ClippingLevels, clipping_levels
 from kalux.calibration.refractory import dead_time, shortest_interval
 from kalux.calibration.regression import ratio_error
@@ -38,9 +40,9 @@ MAX_FRAMES: Final = 400
 _WINDOW: Final = 100_000  # us
 _BLOCK: Final = 16  # pixels
 _NEARLY: Final = 0.85
-_HOT_FACTOR: Final = 10.0  # times the typical rate
-_HOT_SIGNIFICANCE: Final = 8.0  # standard deviations above the typical count
-_HOT_LEAST: Final = 5  # events
+_UNUSUAL_FACTOR: Final = 10.0  # times the typical rate
+_UNUSUAL_SIGNIFICANCE: Final = 8.0  # standard deviations above the typical count
+_UNUSUAL_LEAST: Final = 5  # events
 _DEAD_EXPECTED: Final = 25.0  # events of the neighbours' median, of a pixel that says nothing
 
 
@@ -50,13 +52,13 @@ class EventNoise(NamedTuple):
     Attributes
     ----------
     rate
-        Hz per pixel, of pixels that are not hot.
+        Hz per pixel, of usual ones: a few that fire ten times as often do not count.
     rate_error
         Standard error from the spread over parts of the sensor and of time, Hz.
     rates
         (H, W) Hz: of every pixel, shrunk towards ``rate`` as far as it was seldom quiet.
-    hot, dead
-        (H, W) bool: pixels that fire without reason; pixels that say nothing where all neighbours do.
+    dead
+        (H, W) bool: pixels that say nothing where all neighbours do.
     quiet_share
         Share of the sensor's time that was quiet.
     """
@@ -64,7 +66,6 @@ class EventNoise(NamedTuple):
     rate: float
     rate_error: float
     rates: Array
-    hot: NDArray[np.bool_]
     dead: NDArray[np.bool_]
     quiet_share: float
 
@@ -75,10 +76,14 @@ class NoiseCalibration:
 
     Attributes
     ----------
+    hot
+        (H, W) bool: pixels that fire without reason (`kalux.calibration.hot_pixels`).
     events
-        Background events, hot and dead pixels.
+        Background events of the others, dead pixels.
     frames, pattern
         Read and shot noise of frames, and their fixed pattern.
+    black_level
+        What was taken off the frames, a share of white, given or found; None: nothing, or what they state themselves.
     levels
         Where frames clip.
     delay, apparent_delay
@@ -87,9 +92,11 @@ class NoiseCalibration:
         Shortest time between two events of a pixel that is not chance, us: no refractory period is longer.
     """
 
+    hot: NDArray[np.bool_]
     events: EventNoise | None
     frames: FrameNoise | None
     pattern: FixedPattern | None
+    black_level: float | None
     levels: ClippingLevels
     delay: int | None
     apparent_delay: int | None
@@ -100,17 +107,16 @@ class NoiseCalibration:
         events: dict[str, float | int] = {}
         camera: dict[str, float] = {}
         errors: dict[str, float] = {}
-        measured: dict[str, float | int] = {}
-        maps: dict[str, NDArray[np.generic]] = {}
+        measured: dict[str, float | int] = {"hot_pixels": int(self.hot.sum())}
+        maps: dict[str, NDArray[np.generic]] = {"hot": self.hot}
         if self.events is not None:
             events["noise_rate"] = self.events.rate
             errors["noise_rate"] = self.events.rate_error
             measured |= {
-                "hot_pixels": int(self.events.hot.sum()),
                 "dead_pixels": int(self.events.dead.sum()),
                 "quiet_share": self.events.quiet_share,
             }
-            maps |= {"hot": self.events.hot, "dead": self.events.dead, "noise_rate": self.events.rates}
+            maps |= {"dead": self.events.dead, "noise_rate": self.events.rates}
         if self.delay is not None and self.apparent_delay is not None:
             events["delay"] = self.delay
             measured["apparent_delay"] = self.apparent_delay
@@ -132,7 +138,9 @@ class NoiseCalibration:
             if self.levels.saturation < CameraSettings.usual_saturation:  # else it is found out, or the usual
                 camera["saturation"] = self.levels.saturation
         if self.levels.black is not None:
-            measured["black_level"] = self.levels.black
+            measured["dark_level"] = self.levels.black
+        if self.black_level is not None:
+            camera["black_level"] = self.black_level
         settings = {"camera": camera, "events": events}
         return Calibration({g: v for g, v in settings.items() if v}, errors, measured, maps)
 
@@ -145,21 +153,25 @@ def calibrate_noise(recording: Recording, camera: CameraSettings) -> NoiseCalibr
     recording
         With frames and exposures; a still camera, or still parts of the scene, tell most.
     camera
-        Response and saturation.
+        Response, saturation and black level; where that is None and events show one, it is taken off.
 
     Raises
     ------
     ExposureError
         If the frames' exposures are not known.
     """
+    recording, _ = with_known_black(recording, camera, EventSettings())
     delay = estimate_delay(recording, camera)
     if delay is not None:
         period = dead_time(recording)
         delay = with_true_delay(recording, camera, delay, Usual.of(EventSettings()), refractory_period=period)
+    hot = find_hot_pixels(recording)
     return NoiseCalibration(
-        events=event_noise(recording),
+        hot=hot,
+        events=event_noise(recording, known_hot=hot),
         frames=estimate_frame_noise(recording, camera, most_frames=MAX_FRAMES),
         pattern=estimate_fixed_pattern(recording, camera),
+        black_level=recording.black_level or camera.black_level,
         levels=clipping_levels(recording, MAX_FRAMES),
         delay=None if delay is None else delay.delay,
         apparent_delay=None if delay is None else delay.apparent,
@@ -173,7 +185,7 @@ def calibrate_noise(recording: Recording, camera: CameraSettings) -> NoiseCalibr
 def event_noise(
     recording: Recording, most_events: int | None = None, known_hot: NDArray[np.bool_] | None = None
 ) -> EventNoise | None:
-    """Background rate, hot and dead pixels, from the first ``most_events``, or all; ``known_hot`` ones do not count.
+    """Background rate and dead pixels, from the first ``most_events``, or all; ``known_hot`` ones do not count.
 
     Returns None without events, or where next to nothing is ever quiet (1 %).
     """
@@ -182,16 +194,16 @@ def event_noise(
     if first is None or last is None or last <= first:
         return None
     tally = _tallied(_chunks(recording, most_events, known), first, last, known)
-    hot = _hot_pixels(tally) | known
-    if (hot & ~known).any():  # again without them: their neighbours are quiet after all
-        tally = _tallied(_chunks(recording, most_events, known), first, last, hot)
-    share = float(tally.quiet.sum() / (hot.size * (last - first)))
+    unusual = _unusual_pixels(tally) | known
+    if (unusual & ~known).any():  # again without them: their neighbours are quiet after all
+        tally = _tallied(_chunks(recording, most_events, known), first, last, unusual)
+    share = float(tally.quiet.sum() / (unusual.size * (last - first)))
     if share < 0.01:
         return None
-    rate, error = _typical_rate(tally, hot)
+    rate, error = _typical_rate(tally, unusual)
     counts, quiet = tally.counts.sum(axis=0), tally.quiet.sum(axis=0) * 1e-6
-    dead = _dead_pixels(tally.all)
-    return EventNoise(rate, error, shrunk_rates(counts, quiet, rate, hot), hot, dead, share)
+    rates = shrunk_rates(counts, quiet, rate, unusual)
+    return EventNoise(rate, error, rates, _dead_pixels(tally.all) & ~known, share)
 
 
 def _chunks(
@@ -309,35 +321,38 @@ def _close(last, first, length, gap, busy_until, pending, counts, quiet):  # typ
                 _count_pending(pending, row, column, first, length, counts)
 
 
-def _hot_pixels(tally: _Tally) -> NDArray[np.bool_]:
-    """Pixels that fire in quiet time ten times as often as is typical, and far more often than chance has it."""
+def _unusual_pixels(tally: _Tally) -> NDArray[np.bool_]:
+    """Pixels that fire in quiet time ten times as often as is typical, and far more often than chance has it.
+
+    They say nothing of the typical rate. That does not make them hot: it may be far below what harms.
+    """
     counts, quiet = tally.counts.sum(axis=0), tally.quiet.sum(axis=0)
-    hot = np.zeros(counts.shape, np.bool_)
+    unusual = np.zeros(counts.shape, np.bool_)
     for _ in range(5):
-        rate = counts[~hot].sum() / max(quiet[~hot].sum(), 1)
+        rate = counts[~unusual].sum() / max(quiet[~unusual].sum(), 1)
         expected = rate * quiet
         excess = counts - expected
         found = (
-            (counts >= _HOT_LEAST)
-            & (counts > _HOT_FACTOR * expected)
-            & (excess > _HOT_SIGNIFICANCE * np.sqrt(expected + 0.25))
+            (counts >= _UNUSUAL_LEAST)
+            & (counts > _UNUSUAL_FACTOR * expected)
+            & (excess > _UNUSUAL_SIGNIFICANCE * np.sqrt(expected + 0.25))
         )
-        if (found == hot).all():
+        if (found == unusual).all():
             break
-        hot = found
-    return hot
+        unusual = found
+    return unusual
 
 
-def _typical_rate(tally: _Tally, hot: NDArray[np.bool_]) -> tuple[float, float]:
+def _typical_rate(tally: _Tally, unusual: NDArray[np.bool_]) -> tuple[float, float]:
     """Hz per pixel, and its standard error: of those blocks and windows of time that are nearly the quietest (85 %).
 
     Where something moves, faint edges make single events, too, so that the busier blocks say little. Noise itself
     makes all of them less quiet alike.
     """
-    height, width = hot.shape
+    height, width = unusual.shape
     rows, columns = -(-height // _BLOCK), -(-width // _BLOCK)
     index = (np.arange(height)[:, None] // _BLOCK) * columns + np.arange(width) // _BLOCK
-    good = ~hot
+    good = ~unusual
     size = rows * columns
     counts = np.array([np.bincount(index[good], c[good], size) for c in tally.counts]).ravel()
     quiet = np.array([np.bincount(index[good], q[good], size) for q in tally.quiet]).ravel() * 1e-6
@@ -351,7 +366,7 @@ def _typical_rate(tally: _Tally, hot: NDArray[np.bool_]) -> tuple[float, float]:
     return float(rate), ratio_error(by_block[by_block[:, 1] > 0])
 
 
-def shrunk_rates(counts: Array, quiet: Array, rate: float, hot: NDArray[np.bool_]) -> Array:
+def shrunk_rates(counts: Array, quiet: Array, rate: float, unusual: NDArray[np.bool_]) -> Array:
     """Noise rate of every pixel, Hz, by a gamma prior whose spread is that of the pixels (method of moments).
 
     Parameters
@@ -360,17 +375,17 @@ def shrunk_rates(counts: Array, quiet: Array, rate: float, hot: NDArray[np.bool_
         (H, W) events in quiet time, and that time, s.
     rate
         The typical one, Hz.
-    hot
-        Pixels that neither widen the prior nor are shrunk.
+    unusual
+        (H, W) bool: pixels that neither widen the prior nor are shrunk.
     """
-    good = ~hot & (quiet > 0)
+    good = ~unusual & (quiet > 0)
     expected = rate * quiet[good]
     if rate <= 0 or not good.any():
         return np.full(counts.shape, rate)
     extra = ((counts[good] - expected) ** 2 - expected).sum() / max((expected**2).sum(), 1e-12)
     shape = 1.0 / min(max(float(extra), 1e-3), 10.0)
     rates = (counts + shape) / (quiet + shape / rate)
-    return np.asarray(np.where(hot & (quiet > 0), counts / np.maximum(quiet, 1e-9), rates), np.float64)
+    return np.asarray(np.where(unusual & (quiet > 0), counts / np.maximum(quiet, 1e-9), rates), np.float64)
 
 
 def _dead_pixels(total: NDArray[np.int64]) -> NDArray[np.bool_]:

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 from kalux.augmentation.deblur import integrate_exposure, latent_middle, latent_peak
 from kalux.augmentation.refractory import step_weight
+from kalux.calibration.black_level import with_known_black
 from kalux.calibration.global_thresholds import Usual, estimate_thresholds
 from kalux.calibration.intervals import Interval, intervals
 from kalux.calibration.refractory import dead_time, shortest_interval
@@ -95,6 +96,8 @@ class ContrastCalibration:
         Shortest time between two events of a pixel that is not chance, us.
     refractory
         Refractory period, us, that the thresholds take account of; 0: none.
+    black_level
+        What was taken off the frames, a share of white, given or found; None: nothing, or what they state themselves.
     samples, intervals
         Pixels of the global fit, and frame intervals that were looked at.
     on_factor, off_factor, on_variance, off_variance
@@ -115,6 +118,7 @@ class ContrastCalibration:
     step_variance: float
     shortest_interval: int
     refractory: int
+    black_level: float | None
     samples: int
     intervals: int
     on_factor: Array
@@ -141,7 +145,10 @@ class ContrastCalibration:
             "threshold_off_variance": self.off_variance,
         }
         finite = {name: value for name, value in errors.items() if np.isfinite(value)}
-        return Calibration({"events": settings}, finite, {**measured, "trailing_delay": self.delay}, maps)
+        groups: dict[str, dict[str, Any]] = {"events": settings}
+        if self.black_level is not None:  # the thresholds hold for frames without it
+            groups["camera"] = {"black_level": self.black_level}
+        return Calibration(groups, finite, {**measured, "trailing_delay": self.delay}, maps)
 
 
 def calibrate_contrast(
@@ -154,7 +161,7 @@ def calibrate_contrast(
     recording
         With frames and exposures, and motion before well exposed pixels; five frames are enough for the mean.
     camera
-        Response and saturation.
+        Response, saturation and black level; where that is None and events show one, it is taken off.
     delay
         How late the events are, us. None: so that they trail the light by half a threshold, as those of an ideal
         pixel do.
@@ -170,6 +177,7 @@ def calibrate_contrast(
     ExposureError
         If the frames' exposures are not known.
     """
+    recording, _ = with_known_black(recording, camera, EventSettings(delay=delay))
     first = estimate_thresholds(recording, camera, Usual.of(EventSettings()), delay=delay or 0)
     if first is None or first.usual_share > _MOST_USUAL:
         return None
@@ -430,6 +438,7 @@ def _per_pixel(
         step_variance=variance.per_event / (fit.on * fit.off),
         shortest_interval=sampling.shortest,
         refractory=sampling.refractory,
+        black_level=recording.black_level or camera.black_level,
         samples=len(data.change),
         intervals=count,
         on_factor=np.clip(1 + offset[:, 0], 0.3, 3.0).reshape(shape),

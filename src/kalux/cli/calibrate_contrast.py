@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from kalux.cli.calibrations import add_result, check_result, finish
+from kalux.cli.calibrations import add_black_level, add_result, camera_calibration, check_result, finish
 from kalux.cli.parser import Parser, whole
 from kalux.cli.recordings import add_recording, open_recording
 
@@ -35,6 +35,7 @@ def add_command(commands: Any) -> None:
         default="auto",
         help="of the camera, as in --camera.response (default: what the recording states, else linear)",
     )
+    add_black_level(group)
     group.add_argument(
         "--delay", type=whole, metavar="US", help="how late the events are (default: from the recording)"
     )
@@ -53,18 +54,14 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     from kalux.calibration.pixel_thresholds import calibrate_contrast
     from kalux.errors import InputError
     from kalux.recording import no_frames
-    from kalux.settings import CameraSettings
+    from kalux.settings import preset
 
     check_result(options)
+    camera = camera_calibration(options.black_level, options.response).apply(preset("default")).camera
     recording = open_recording(options)
     if not len(recording.frames()):
         raise no_frames(recording)
-    found = calibrate_contrast(
-        recording,
-        CameraSettings(response=options.response),
-        delay=options.delay,
-        refractory=options.refractory,
-    )
+    found = calibrate_contrast(recording, camera, delay=options.delay, refractory=options.refractory)
     if found is None:
         raise InputError(
             f"{recording.source.path}: too little moves before well exposed pixels to measure thresholds; record "

@@ -5,7 +5,15 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from kalux.cli.calibrations import add_calibration, add_result, check_result, finish, given_calibration
+from kalux.cli.calibrations import (
+    add_black_level,
+    add_calibration,
+    add_result,
+    camera_calibration,
+    check_result,
+    finish,
+    given_calibration,
+)
 from kalux.cli.parser import Parser, whole
 from kalux.cli.recordings import add_recording, open_recording
 from kalux.cli.terminal import say
@@ -34,6 +42,7 @@ def add_command(commands: Any) -> None:
         "--response",
         help="of the camera, as in --camera.response (default: what the recording states, else linear)",
     )
+    add_black_level(group)
     add_calibration(group)
     group = parser.add_argument_group("fit")
     group.add_argument("--fit", action="store_true", help="fit the rest to held-out frames")
@@ -61,10 +70,10 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     from kalux.settings import preset
 
     check_result(options)
+    known = (given_calibration(options) or Calibration()).merged(
+        camera_calibration(options.black_level, options.response)
+    )
     recording = open_recording(options)
-    known = given_calibration(options) or Calibration()
-    if options.response is not None:
-        known = known.merged(Calibration({"camera": {"response": options.response}}))
     found = calibrate_noise(recording, known.apply(preset("default")).camera).calibration()
     if options.fit:
         from kalux.evaluation.fit import fit_settings

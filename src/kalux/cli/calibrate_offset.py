@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from kalux.cli.calibrations import add_black_level, camera_calibration
 from kalux.cli.parser import Parser, UsageError, number
 from kalux.cli.recordings import add_recording, open_recording
 from kalux.cli.terminal import say, warn
@@ -33,6 +34,7 @@ def add_command(subparsers: Any) -> None:
     )
     add_recording(parser)
     add_range(parser.add_argument_group("search"))
+    add_black_level(parser.add_argument_group("what is known"))
     group = parser.add_argument_group("output")
     group.add_argument(
         "-o", "--out", type=Path, metavar="OFFSET.toml", help="a file for kalux register --offset"
@@ -67,33 +69,29 @@ def checked_range(options: argparse.Namespace) -> tuple[float, int]:
 
 def run(options: argparse.Namespace, command: list[str]) -> None:
     """Run the command."""
-    import numpy as np
-
-    from kalux.calibration.offset import estimate_offset
+    from kalux.calibration.offset import offset_of_recording
     from kalux.calibration.pictures import correlation_plot
-    from kalux.calibration.registration import Registration
-    from kalux.calibration.rig import Lens
     from kalux.cli.output import check_file, check_picture, write_picture
-    from kalux.cli.progress import Progress, counted
+    from kalux.cli.progress import Progress
     from kalux.recording import no_frames
+    from kalux.settings import preset
     from kalux.writers.files import save
 
     centre, reach = checked_range(options)
+    camera = camera_calibration(options.black_level).apply(preset("default")).camera
     if options.out is not None:
         check_file(options.out, overwrite=options.overwrite)
     check_picture(options.plot, overwrite=options.overwrite)
     recording = open_recording(options)
     if not recording.source.count_frames():
         raise no_frames(recording)
-    lens = Lens.pinhole(recording.sensor_size)
-    same = Registration(lens, lens, np.eye(3))
     with Progress("correlating", quiet=options.quiet) as progress:
-        found = estimate_offset(
-            recording.stamped_frames,
-            lambda: counted(recording.events(), lambda chunk: progress.add(events=len(chunk))),
-            same,
+        found, black_level = offset_of_recording(
+            recording,
+            camera=camera,
             centre=centre,
             reach=reach,
+            on_events=lambda count: progress.add(events=count),
         )
     if not found.coarse.sure:
         warn(
@@ -105,6 +103,8 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     if not options.quiet:
         for line in described(found):
             say(line)
+        if black_level:
+            say(f"of frames without their black level, {black_level:.3g} of white")
     if options.plot is not None:
         write_picture(
             options.plot,

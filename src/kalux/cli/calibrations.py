@@ -8,7 +8,7 @@ import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from kalux.cli.parser import Parser, UsageError
+from kalux.cli.parser import Parser, UsageError, number
 from kalux.cli.terminal import say
 
 if TYPE_CHECKING:
@@ -25,6 +25,31 @@ def add_calibration(group: Any) -> None:
         metavar="FILE",
         help="of kalux calibrate; may be given more than once, the last wins",
     )
+
+
+def add_black_level(group: Any, otherwise: str = "as events say") -> None:
+    """Add the flag of commands that have no others for settings; ``otherwise`` says what holds without it."""
+    group.add_argument(
+        "--black-level",
+        type=number,
+        metavar="SHARE",
+        help=f"of white, what frames read in the dark, as --camera.black-level (default: {otherwise})",
+    )
+
+
+def camera_calibration(black_level: float | None, response: str | None = None) -> Calibration:
+    """What ``--black-level`` and ``--response`` (None or auto: nothing) say of the camera.
+
+    Raises
+    ------
+    SettingsError
+        One is out of its range.
+    """
+    from kalux.calibration.values import Calibration
+    from kalux.settings import AUTO
+
+    said = {"response": None if response == AUTO else response, "black_level": black_level}
+    return Calibration({"camera": {name: value for name, value in said.items() if value is not None}})
 
 
 def given_calibration(options: argparse.Namespace) -> Calibration | None:

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from kalux.cli.calibrations import add_calibration, given_calibration
+from kalux.cli.calibrations import add_black_level, add_calibration, camera_calibration, given_calibration
 from kalux.cli.parser import Parser, UsageError
 from kalux.cli.recordings import (
     HDF5,
@@ -29,7 +29,7 @@ T = TypeVar("T")
 
 _DESCRIPTION = """\
 Copy a recording of any format that kalux reads into one file. kalux HDF5 (.h5) holds events, frames with
-their exposures and white value, contrast thresholds, image noise and reference images, unchanged. AEDAT 4
+their exposures, white and black value, contrast thresholds, image noise and reference images, unchanged. AEDAT 4
 (.aedat4), for other programs, holds events and frames of 8 or 16 bits with their exposures, unchanged; what
 it has no place for is said. Every event and frame is checked."""
 
@@ -56,7 +56,9 @@ def add_command(commands: Any) -> None:
     group.add_argument("out", metavar="OUT", type=Path, help="kalux HDF5 (.h5) or AEDAT 4 (.aedat4)")
     group.add_argument("--overwrite", action="store_true", help="replace the file if it is there")
     group.add_argument("--quiet", action="store_true", help="print warnings and errors only")
-    add_calibration(parser.add_argument_group("calibration: thresholds and response go into OUT.h5"))
+    group = parser.add_argument_group("what OUT.h5 states in place of REC: thresholds, response, black level")
+    add_black_level(group, otherwise="as REC")
+    add_calibration(group)
     parser.set_defaults(run=run)
 
 
@@ -106,27 +108,31 @@ def _calibrated(options: argparse.Namespace) -> Stated:
     """
     from kalux.settings import AUTO, preset
 
+    said = camera_calibration(options.black_level)
     calibration = given_calibration(options)
-    if calibration is None:
+    if calibration is None and not said.settings["camera"]:
         return Stated()
     if options.out.suffix.lower() in _AEDAT4:
         raise UsageError(
-            "--calibration: AEDAT 4 has no place for what was measured; write kalux HDF5 (.h5), or give the "
-            "calibration to reconstruct"
+            "--calibration, --black-level: AEDAT 4 has no place for what was measured; write kalux HDF5 (.h5), or give "
+            "it to reconstruct"
         )
+    calibration = said if calibration is None else calibration.merged(said)
     settings = calibration.apply(preset("default"))
     on, off = settings.events.threshold_on, settings.events.threshold_off
     response = settings.camera.response
     found = Stated(
-        None if on is None or off is None else (float(on), float(off)), None if response == AUTO else response
+        None if on is None or off is None else (float(on), float(off)),
+        None if response == AUTO else response,
+        settings.camera.black_level,
     )
     if found == Stated():
         raise UsageError(
-            "--calibration: has neither contrast thresholds nor a response, and a recording can state nothing else; "
-            "give it to reconstruct, evaluate or info"
+            "--calibration: has neither contrast thresholds nor a response nor a black level, and a recording can "
+            "state nothing else; give it to reconstruct, evaluate or info"
         )
     others = [f"{group}.{name}" for group, values in calibration.settings.items() for name in values]
-    kept = [*(f"events.{name}" for name in _THRESHOLDS), "camera.response"]
+    kept = [*(f"events.{name}" for name in _THRESHOLDS), "camera.response", "camera.black_level"]
     left = [*(name for name in others if name not in kept), *(f"map {name}" for name in calibration.maps)]
     if left:
         warn(
@@ -141,12 +147,14 @@ def _not_in_aedat4(recording: Recording) -> list[str]:
     first = next(iter(recording.stored_frames()), None)
     usual = None if first is None else dataclasses.replace(first, white=None).white_value
     white = None if first is None or first.white_value == usual else first.white_value
+    black = None if first is None or first.black == 0 else first.black
     found = [
         ("contrast thresholds", recording.contrast_threshold),
         ("image noise", source.inverse_covariance),
         ("reference images", source.ground_truth),
         (f"the response {recording.response}", recording.response),
         (f"the white value {white:g}" if white is not None else "", white),
+        (f"the black value {black:g}" if black is not None else "", black),
         (f"the Bayer pattern (--bayer {recording.mosaic} opens the copy with it)", recording.mosaic),
     ]
     return [name for name, value in found if value is not None]

@@ -11,7 +11,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from kalux.cli.calibrations import add_calibration, given_calibration
+from kalux.cli.calibrations import (
+    add_black_level,
+    add_calibration,
+    camera_calibration,
+    given_calibration,
+)
 from kalux.cli.checking import check_recording
 from kalux.cli.loops import prepare_loops, tell_of_compiling
 from kalux.cli.metrics import add_metrics, lpips_weights, named_methods
@@ -74,6 +79,7 @@ def add_command(commands: Any) -> None:
         default=AUTO,
         help="of the camera: linear, srgb, gamma:EXPONENT (default: what the recording states, else linear)",
     )
+    add_black_level(group)
     add_calibration(group)
     group = parser.add_argument_group("what is computed")
     add_metrics(group)
@@ -146,13 +152,18 @@ class Protocol:
 
     def __init__(self, recording: Recording, options: argparse.Namespace, colours: str) -> None:
         from kalux.evaluation import held_out, specs, truth
+        from kalux.evaluation.exposures import compared_recording, of_black
 
-        self._recording, self._options = recording, options
+        self._options = options
         self._score: Callable[[Method, Callable[[], None]], Scores]
+        said = camera_calibration(options.black_level, options.response)
         calibration = given_calibration(options)
-        self._response: str = options.response
-        if calibration is not None and self._response == AUTO:
-            self._response = calibration.settings.get("camera", {}).get("response", AUTO)
+        if calibration is not None:
+            calibration = calibration.merged(said)
+        camera = (said if calibration is None else calibration).settings.get("camera", {})
+        self._response: str = camera.get("response", AUTO)
+        recording = compared_recording(recording, self._response, camera.get("black_level"))
+        self._recording = recording
         weights = lpips_weights(options)
         reference = None
         if options.hold_out_frames is None:
@@ -165,7 +176,8 @@ class Protocol:
                 held, method, clip=options.clip, hdr_vdp=options.hdrvdp, lpips=weights, on_image=count
             )
         else:
-            self.described, self._images = reference.described(origin), len(reference.times)
+            self.described = reference.described(origin) + of_black(recording)
+            self._images = len(reference.times)
             self._score = lambda method, count: truth.evaluate_truth(
                 recording, reference, method, hdr_vdp=options.hdrvdp, lpips=weights, on_image=count
             )

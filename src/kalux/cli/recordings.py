@@ -145,6 +145,7 @@ class Stated(NamedTuple):
 
     contrast_threshold: tuple[float, float] | None = None
     response: str | None = None
+    black_level: float | None = None
 
 
 def write_copy(recording: Recording, out: Path, progress: Any, stated: Stated | None = None) -> None:
@@ -157,9 +158,11 @@ def write_copy(recording: Recording, out: Path, progress: Any, stated: Stated | 
     OutputError
         If the file cannot be written.
     """
+    from kalux.recording import less_black
     from kalux.writers import hdf5
 
     stated = stated or Stated()
+    recording = less_black(recording, stated.black_level)
     write = partial(
         hdf5.write,
         out,

@@ -17,8 +17,8 @@ from kalux.augmentation.background import doubt, signal_shares
 from kalux.augmentation.bridge import BridgeNoise, Latent, bridge, drift, nominal_thresholds
 from kalux.augmentation.highlights import Unshown
 from kalux.augmentation.motion import Paths
+from kalux.augmentation.subthreshold import add_missed_change, half_way, silent_change, turns
 from kalux.augmentation.trail import Trail, nothing_followed, polarity_of, trail_between
-from kalux.augmentation.unseen import add_missed_change, half_way, silent_change, turns
 from kalux.cli.loops import prepare_loops
 from kalux.compiled import apart
 from kalux.display import Auto, DisplaySettings, fill_levels, measure, quantised
@@ -106,7 +106,7 @@ def rehearse_segment() -> None:
     newest = nothing_followed(_SIZE).newest
     start, grown = trail_between(newest, newest, (0, _PERIOD), (seconds, 0.1, 0.1))
     signal = signal_shares(on, off, 0.1)
-    joined, _ = bridge(first, second, on, off, thresholds, noise, 0, _PERIOD, grown, signal)
+    joined, _ = bridge(first, second, (on, off), thresholds, noise, 0, _PERIOD, grown=grown, signal=signal)
     of_silent = silent_change(joined, variance, variance)
     half_way(change, joined, variance, variance)
     drifted, _, _ = drift(first, second, thresholds, noise, (far_on, far_off), (on, off))

@@ -74,6 +74,25 @@ class RegisteredTruth:
     masks: NDArray[np.bool_]
 
 
+class _Reference(NamedTuple):
+    """The image that is registered: (H', W') linear luminance, and where it is valid."""
+
+    luminance: NDArray[Any]
+    valid: Mask
+
+
+class _Seen(NamedTuple):
+    """A frame as it is compared: (H, W) intensity, of RGB the luminance, and where it is measured and exposed well."""
+
+    intensity: Array
+    exposed: Mask
+
+    @property
+    def log_intensity(self) -> Array:
+        """(H, W), with an offset."""
+        return np.asarray(np.log(np.maximum(self.intensity, 0.0) + _LOG_OFFSET), np.float64)
+
+
 _LOG_OFFSET: Final = 0.02  # white = 1; the noise of dark pixels must not be magnified by the logarithm
 _EXPOSED: Final = (0.03, 0.96)  # of the frame's response
 _LEAST_CORRELATION: Final = 0.7  # of log intensities: blur and noise lower it to 0.9, a wrong place below 0.5
@@ -117,14 +136,16 @@ def register_frames(
     """
     camera = Camera(Response.named(response))
     exposure = reference_exposure(recording)
+    reference = _Reference(luminance, valid)
     found: list[RegisteredFrame] = []
     features: Features | None = None
     for index, frame in enumerate(recording.frames()):
+        seen = _seen(frame, camera, exposure)
         known = [f.scale for f in found if not f.failure]
         if features is None or len(known) in (0, 1):  # once more when the scale is known
-            features = _reference_features(luminance, valid, frame, camera, exposure, known)
+            features = _reference_features(reference, seen, known)
         guess = float(np.median(known)) if known else None
-        found.append(_register(luminance, valid, features, frame, index, camera, exposure, guess))
+        found.append(_registered(reference, features, seen, guess, number=index, time=frame.middle))
         on_frame()
     _require_any(recording, found)
     scale = float(np.median([f.scale for f in found if not f.failure]))
@@ -162,74 +183,61 @@ def _blurred(image: Image, mask: Mask, sigma: float) -> Image:
     return np.asarray(total / np.maximum(weight, 1e-6), np.float32)
 
 
-def _register(
-    luminance: NDArray[Any],
-    valid: Mask,
-    features: Features,
-    frame: Frame,
-    index: int,
-    camera: Camera,
-    exposure: int,
-    guess: float | None,
+def _registered(
+    reference: _Reference, features: Features, seen: _Seen, guess: float | None, *, number: int, time: int
 ) -> RegisteredFrame:
-    size = (frame.image.shape[0], frame.image.shape[1])
-    intensity, exposed = _seen(frame, camera, exposure)
+    """What becomes of a frame; ``guess`` is its scale, if that is about known."""
 
     def failed(why: str, inliers: int = 0) -> RegisteredFrame:
-        return RegisteredFrame(index, frame.middle, None, inliers, np.inf, np.nan, why)
+        return RegisteredFrame(number, time, None, inliers, np.inf, np.nan, why)
 
-    if exposed.mean() < _LEAST_MEASURED:
-        return failed(f"{100 * exposed.mean():.1f} % of its pixels are exposed well")
-    scale = guess or _guessed_scale(luminance, valid, intensity)
-    seen = np.log(np.maximum(intensity, 0.0) + _LOG_OFFSET)
-    picture = tone_compressed(seen, *_tone_range(seen))
+    if seen.exposed.mean() < _LEAST_MEASURED:
+        return failed(f"{100 * seen.exposed.mean():.1f} % of its pixels are exposed well")
+    scale = guess or _guessed_scale(reference, seen)
+    size = (seen.exposed.shape[0], seen.exposed.shape[1])
+    level = seen.log_intensity
+    picture = tone_compressed(level, *_tone_range(level))
     match = match_features(find_features(picture, np.ones(size, bool)), features)
     if match.matrix is None:
         return failed(f"{match.inliers} of {match.matches} common features agree", match.inliers)
     matrix, deviation = match.matrix, np.inf
     for _ in range(2):  # the logarithm has an offset, so the scale must be right for the refinement to be
-        scale = _fitted_scale(luminance, valid, intensity, exposed, matrix) or scale
-        relative = np.log(scale * luminance + _LOG_OFFSET)
-        matrix, deviation = refined(seen, relative, exposed, valid, matrix)
-    scale = _fitted_scale(luminance, valid, intensity, exposed, matrix) or 0.0
-    compared = exposed & warped_mask(valid, matrix, size)
+        scale = _fitted_scale(reference, seen, matrix) or scale
+        relative = np.log(scale * reference.luminance + _LOG_OFFSET)
+        matrix, deviation = refined(level, relative, seen.exposed, reference.valid, matrix)
+    scale = _fitted_scale(reference, seen, matrix) or 0.0
+    compared = seen.exposed & warped_mask(reference.valid, matrix, size)
     if not scale or compared.mean() < _LEAST_MEASURED:
         return failed("too little of it is both exposed well and in the reference", match.inliers)
-    placed = np.log(scale * np.nan_to_num(warped(luminance, matrix, size)) + _LOG_OFFSET)
-    correlation = float(np.corrcoef(placed[compared], seen[compared])[0, 1])
+    placed = np.log(scale * np.nan_to_num(warped(reference.luminance, matrix, size)) + _LOG_OFFSET)
+    correlation = float(np.corrcoef(placed[compared], level[compared])[0, 1])
     if not correlation >= _LEAST_CORRELATION:
         return failed(f"correlates by {correlation:.2f} with the reference", match.inliers)
-    return RegisteredFrame(index, frame.middle, matrix, match.inliers, deviation, scale, "")
+    return RegisteredFrame(number, time, matrix, match.inliers, deviation, scale, "")
 
 
-def _seen(frame: Frame, camera: Camera, exposure: int) -> tuple[Array, Mask]:
-    """(H, W) intensity of a frame, of RGB the luminance, at an exposure, us; where it is measured and exposed well."""
+def _seen(frame: Frame, camera: Camera, exposure: int) -> _Seen:
+    """A frame at an exposure, us."""
     level = frame.normalised()
     intensity = inverse_response(camera, level, exposure / frame.exposure)
     exposed = (level > _EXPOSED[0]) & (level < _EXPOSED[1])
     if level.ndim == 3:
         intensity, exposed = luminance_of(intensity), np.asarray(exposed.all(axis=2))
-    return intensity, exposed if frame.valid is None else exposed & frame.valid
+    return _Seen(intensity, exposed if frame.valid is None else exposed & frame.valid)
 
 
-def _reference_features(
-    luminance: NDArray[Any],
-    valid: Mask,
-    frame: Frame,
-    camera: Camera,
-    exposure: int,
-    known_scales: list[float],
-) -> Features:
+def _reference_features(reference: _Reference, seen: _Seen, known_scales: list[float]) -> Features:
     """Features of the reference, shown with the tones of a frame."""
-    intensity, _ = _seen(frame, camera, exposure)
-    scale = known_scales[0] if known_scales else _guessed_scale(luminance, valid, intensity)
-    seen = np.log(np.maximum(intensity, 0.0) + _LOG_OFFSET)
-    return find_features(tone_compressed(np.log(scale * luminance + _LOG_OFFSET), *_tone_range(seen)), valid)
+    scale = known_scales[0] if known_scales else _guessed_scale(reference, seen)
+    tones = _tone_range(seen.log_intensity)
+    shown = tone_compressed(np.log(scale * reference.luminance + _LOG_OFFSET), *tones)
+    return find_features(shown, reference.valid)
 
 
-def _guessed_scale(luminance: NDArray[Any], valid: Mask, intensity: Array) -> float:
+def _guessed_scale(reference: _Reference, seen: _Seen) -> float:
     """Until it is known from a frame: both show the same scene, so their medians are alike."""
-    return float(max(np.median(intensity), 1e-3) / max(np.median(luminance[valid]), 1e-12))
+    median = np.median(reference.luminance[reference.valid])
+    return float(max(np.median(seen.intensity), 1e-3) / max(median, 1e-12))
 
 
 def _tone_range(seen: Array) -> tuple[float, float]:
@@ -237,13 +245,12 @@ def _tone_range(seen: Array) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def _fitted_scale(
-    luminance: NDArray[Any], valid: Mask, intensity: Array, exposed: Mask, matrix: Array
-) -> float | None:
+def _fitted_scale(reference: _Reference, seen: _Seen, matrix: Array) -> float | None:
     """Median ratio of the frame's intensity to the reference's, where both are measured and not dark."""
+    intensity = seen.intensity
     size = (intensity.shape[0], intensity.shape[1])
-    image = np.nan_to_num(warped(luminance, matrix, size).astype(np.float64))
-    compared = exposed & warped_mask(valid, matrix, size) & (image > 0)
+    image = np.nan_to_num(warped(reference.luminance, matrix, size).astype(np.float64))
+    compared = seen.exposed & warped_mask(reference.valid, matrix, size) & (image > 0)
     if np.count_nonzero(compared) < 100:
         return None
     # The brighter half: noise and black level matter least there.

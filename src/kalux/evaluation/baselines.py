@@ -20,7 +20,7 @@ from kalux.frames import Frame
 from kalux.models.camera import log_intensity
 from kalux.pipeline import reconstruct
 from kalux.planning import plan
-from kalux.recording import Recording, reference_exposure
+from kalux.recording import Recording, less_black, reference_exposure
 from kalux.settings import AUTO, PRESETS, Settings, altered, chosen_response
 
 
@@ -51,6 +51,7 @@ def edi_video(recording: Recording, times: Times, *, settings: Settings | None =
     """
     chosen = plan(recording, times=times, settings=settings or PRESETS["default"]).settings
     on, off = (np.full(recording.sensor_size, c) for c in chosen.events.thresholds)
+    recording = less_black(recording, chosen.camera.black_level)
     camera, reference = chosen.camera, reference_exposure(recording)
     window = EventWindow(recording.events())
     for frame, wanted in nearest_frames(recording.frames(), times):

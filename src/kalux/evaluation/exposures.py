@@ -1,4 +1,4 @@
-"""What evaluations do with frames: one scale of intensity for all exposures, and reads spread over an exposure."""
+"""What evaluations do with frames: no black level, one scale for all exposures, reads spread over an exposure."""
 
 from __future__ import annotations
 
@@ -9,13 +9,36 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.calibration.black_level import with_known_black
 from kalux.evaluation.pairs import Array
 from kalux.filters.shots import take_shot
 from kalux.frames import Frame
 from kalux.models.camera import Camera
 from kalux.planning import with_saturation
 from kalux.recording import Recording
-from kalux.settings import CameraSettings, altered, preset
+from kalux.settings import CameraSettings, EventSettings, altered, preset
+
+
+def compared_recording(recording: Recording, response: str, black_level: float | None = None) -> Recording:
+    """The recording as every method is to see it: its frames without the black level, so that intensities are compared.
+
+    Parameters
+    ----------
+    recording
+        With known exposures.
+    response
+        As of `linear_frame`.
+    black_level
+        A share of white. None: what is known already, else what events say (`kalux.calibration.black_level`).
+    """
+    camera = CameraSettings(response=response, black_level=black_level)
+    return with_known_black(recording, camera, EventSettings())[0]
+
+
+def of_black(recording: Recording) -> str:
+    """What was taken off the frames that are compared, as the end of a sentence."""
+    level = recording.black_level
+    return f"; black level of {level:.3g} of white taken off all frames" if level else ""
 
 
 def linear_frame(frame: Frame, reference: int, response: str) -> Array:

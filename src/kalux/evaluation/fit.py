@@ -23,12 +23,12 @@ from scipy.special import log_ndtr
 
 from kalux.calibration.values import Calibration
 from kalux.errors import InputError
-from kalux.evaluation.held_out import HeldOut, hold_out_frames, with_frames
+from kalux.evaluation.held_out import HeldOut, hold_out_frames
 from kalux.filters.shots import Shot, take_shot
 from kalux.models.camera import Camera, frame_log_covariance
 from kalux.pipeline import reconstruct
 from kalux.planning import plan
-from kalux.recording import Recording
+from kalux.recording import Recording, with_frames
 from kalux.settings import Settings, altered, from_dict, preset
 
 Array = NDArray[np.float64]
@@ -151,7 +151,10 @@ def fit_settings(
     known = Calibration() if start is None else start
     settings = known.apply(preset("default"))
     held = hold_out_frames(
-        _first_frames(recording, most_frames), reads=READS, response=settings.camera.response
+        _first_frames(recording, most_frames),
+        reads=READS,
+        response=settings.camera.response,
+        black_level=settings.camera.black_level,
     )
     settings = _filled_in(held, settings)
     current = dict.fromkeys(STEPS, 1.0)

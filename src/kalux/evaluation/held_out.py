@@ -7,7 +7,6 @@ the held-out frame cannot show them. With ``clip`` the reconstruction is clipped
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,10 +19,12 @@ from kalux.calibration.frame_noise import estimate_frame_noise
 from kalux.errors import FrameError, InputError
 from kalux.evaluation.exposures import (
     End,
+    compared_recording,
     end_of_frames,
     exposure_times,
     linear_frame,
     means_of,
+    of_black,
 )
 from kalux.evaluation.lpips import LpipsWeights
 from kalux.evaluation.method import Method
@@ -32,7 +33,7 @@ from kalux.evaluation.scores import Scores, score
 from kalux.filters.shots import take_shot
 from kalux.frames import Frame
 from kalux.models.camera import Camera, frame_log_covariance
-from kalux.recording import Recording, reference_exposure
+from kalux.recording import Recording, reference_exposure, with_frames
 from kalux.settings import AUTO, CameraSettings, chosen_response
 from kalux.wording import how_many
 
@@ -53,7 +54,7 @@ class HeldOut:
     Attributes
     ----------
     whole, kept
-        The recording with all frames, and without every n-th.
+        The recording with all frames, and without every n-th; less the black level, if it has one.
     every
         n.
     compared
@@ -97,12 +98,17 @@ class HeldOut:
         return (
             f"held-out frames: every {_ordinal(self.every)} dropped, {len(self.compared)} of them compared "
             f"(numbers {self.compared[0]} to {self.compared[-1]}, from 0), mean of {self.times.shape[1]} reads "
-            "across each exposure"
+            f"across each exposure{of_black(self.whole)}"
         )
 
 
 def hold_out_frames(
-    recording: Recording, every: int = 2, *, reads: int = READS, response: str = AUTO
+    recording: Recording,
+    every: int = 2,
+    *,
+    reads: int = READS,
+    response: str = AUTO,
+    black_level: float | None = None,
 ) -> HeldOut:
     """Hold out every ``every``-th frame (numbers every - 1, 2 every - 1 ..., from 0).
 
@@ -116,6 +122,9 @@ def hold_out_frames(
         Reads across the exposure of every held-out frame, at least 2.
     response
         Of the camera, as in `kalux.settings.CameraSettings`.
+    black_level
+        A share of white, taken off the frames that are compared and those that methods are given alike. None: what is
+        known already, else what the events of the whole recording say.
 
     Raises
     ------
@@ -134,8 +143,9 @@ def hold_out_frames(
             f"{recording.source.path}: {how_many(count, 'frame')}, too few to hold out every {_ordinal(every)}: "
             f"a frame that is compared needs {MARGIN} before and {MARGIN} after it"
         )
-    kept = without_frames(recording, every)
     response = chosen_response(response, recording.response)
+    recording = compared_recording(recording, response, black_level)
+    kept = without_frames(recording, every)
     reference = reference_exposure(kept)
     chosen = {*compared.tolist()}
     times = [exposure_times(f, reads) for i, f in enumerate(recording.frames()) if i in chosen]
@@ -153,21 +163,6 @@ def without_frames(recording: Recording, every: int) -> Recording:
         return (frame for i, frame in enumerate(recording.frames()) if i % every != every - 1)
 
     return with_frames(recording, frames)
-
-
-def with_frames(recording: Recording, frames: Callable[[], Iterator[Frame]]) -> Recording:
-    """The recording with some of its own frames only, their exposures known, and without its ground truth."""
-    return Recording(
-        dataclasses.replace(
-            recording.source,
-            events=lambda: iter(recording.events()),
-            frames=frames,
-            count_frames=lambda: sum(1 for _ in frames()),
-            exposure_known=True,
-            ground_truth=None,
-            mosaic=recording.mosaic,
-        )
-    )
 
 
 def evaluate_held_out(

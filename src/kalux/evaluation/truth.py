@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.errors import FormatError, InputError, require_type
+from kalux.evaluation.exposures import compared_recording, of_black
 from kalux.evaluation.lpips import LpipsWeights
 from kalux.evaluation.method import Method
 from kalux.evaluation.pairs import Pair
@@ -135,7 +136,7 @@ def evaluate_truth(
     Parameters
     ----------
     recording
-        With known exposures.
+        With known exposures. Every method is given it less its black level, known or found: truth has none.
     reference
         From `prepare_reference`.
     method
@@ -157,11 +158,12 @@ def evaluate_truth(
     require_type(
         "evaluate_truth: reference", reference, Reference, "a Reference is needed, from prepare_reference"
     )
+    recording = compared_recording(recording, AUTO)
     return score(
         truth_pairs(recording, reference, method),
         method=method.label,
         notes=method.notes,
-        protocol=reference.described(),
+        protocol=reference.described() + of_black(recording),
         data_range=reference.data_range,
         hdr_vdp=hdr_vdp,
         lpips=lpips,

@@ -21,6 +21,14 @@ from kalux.augmentation.highlights import (
     follow_unshown,
 )
 from kalux.augmentation.motion import Paths, Plane, find_path
+from kalux.augmentation.subthreshold import (
+    UNKNOWN_CHANGE,
+    UNMEASURED_CHANGE,
+    add_missed_change,
+    half_way,
+    silent_change,
+    turns,
+)
 from kalux.augmentation.trail import (
     Followed,
     Trail,
@@ -30,14 +38,6 @@ from kalux.augmentation.trail import (
     polarity_of,
     trail_at,
     trail_between,
-)
-from kalux.augmentation.unseen import (
-    UNKNOWN_CHANGE,
-    UNMEASURED_CHANGE,
-    add_missed_change,
-    half_way,
-    silent_change,
-    turns,
 )
 from kalux.compiled import apart, empty, loop, smaller
 from kalux.event_slices import all_between
@@ -54,6 +54,9 @@ from kalux.settings import Settings
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating[Any]]
+
+Counts = tuple[Floats, Floats]
+"""(H, W) on and off events of every pixel."""
 
 _SHARES: Final = (np.arange(64) + 0.5) / 64
 """Quantiles at which the distribution of black pixels is sampled."""
@@ -77,11 +80,11 @@ class BridgeMemory(NamedTuple):
         The latest frame, deblurred, and the pixels' thresholds as learned so far.
     interval
         Between the latest two frames, s; the usual one until there are two.
-    on, off
-        (H, W) events from the middle of the latest exposure to its end; in causal mode only.
-    far_on, far_off
-        (H, W) events since a frame last measured a pixel, to the latest node; 0 where the latest one does.
-    since
+    since_middle
+        Events from the middle of the latest exposure to its end; in causal mode only.
+    since_measured
+        Events since a frame last measured a pixel, to the latest node; 0 where the latest frame does.
+    first_start
         Start of the first exposure, us.
     followed, at_middle
         The pixels' newest events (K14) at the latest node, and at the middle of the latest exposure; they differ in
@@ -90,24 +93,22 @@ class BridgeMemory(NamedTuple):
         Pixels that no frame has measured yet, and the distribution of highlights (K15).
     silent_change
         (H, W) mean square change of the silent pixels around each (K11).
-    silent
-        (H, W) change of silent pixels in the latest interval, NaN of others (`unseen.half_way`).
+    latest_change
+        (H, W) change of silent pixels in the latest interval, NaN of others (`subthreshold.half_way`).
     """
 
     latent: Latent
     thresholds: Thresholds
     interval: float
-    on: Floats
-    off: Floats
-    far_on: Floats
-    far_off: Floats
-    since: int
+    since_middle: Counts
+    since_measured: Counts
+    first_start: int
     followed: Followed
     at_middle: Followed
     unshown: UnshownMemory
     tail: Tail
     silent_change: Floats
-    silent: Floats
+    latest_change: Floats
 
 
 class BridgedFrames(Method):
@@ -215,7 +216,7 @@ class BridgedFrames(Method):
         thresholds = self._prior
         latent = self.latent(shot, events, thresholds)
         begin = self.begin_time(shot)
-        nothing, far = nothing_followed(self.shape), np.zeros(self.shape, np.float32)
+        nothing, none = nothing_followed(self.shape), np.zeros(self.shape, np.float32)
         tail = Tail(self.settings.filter.unshown_tail, beyond_white(shot.bright_tail))
         if self.lookahead:
             on, off, followed = self.follow(events, begin, shot.middle, nothing)
@@ -226,17 +227,15 @@ class BridgedFrames(Method):
             latent=latent,
             thresholds=thresholds,
             interval=USUAL_INTERVAL * 1e-6,
-            on=on,
-            off=off,
-            far_on=far,
-            far_off=far,
-            since=shot.start,
+            since_middle=(on, off),
+            since_measured=(none, none),
+            first_start=shot.start,
             followed=followed,
             at_middle=followed,
             unshown=begin_unshown(latent, frame_highlights(shot), tail),
             tail=tail,
             silent_change=np.full(self.shape, UNKNOWN_CHANGE * self.on * self.off, np.float32),
-            silent=np.full(self.shape, np.nan, np.float32),
+            latest_change=np.full(self.shape, np.nan, np.float32),
         )
         lead_in, value, variance = None, latent.value, latent.variance
         if not self.lookahead:
@@ -300,13 +299,23 @@ class BridgedFrames(Method):
         trail, grown = self._trail_between(memory, shot, following, at_middle)
         signal = self._signal_shares(on, off, (end - start) * 1e-6)
         joined, learned = bridge.bridge(
-            memory.latent, second, on, off, memory.thresholds, self.noise, start, end, grown, signal
+            memory.latent,
+            second,
+            (on, off),
+            memory.thresholds,
+            self.noise,
+            start,
+            end,
+            grown=grown,
+            signal=signal,
         )
         if signal is not None:
             joined = joined._replace(doubt=doubt(signal, self.noise.step_variance, self.on * self.off))
         change = self._silent_change(joined)
-        share, silent = half_way(memory.silent, joined, self.noise.quantisation_variance, self.on * self.off)
-        joined, far_on, far_off = self._with_drift(joined, memory, second, (on, off), change, signal)
+        share, latest_change = half_way(
+            memory.latest_change, joined, self.noise.quantisation_variance, self.on * self.off
+        )
+        joined, since_measured = self._with_drift(joined, memory, second, (on, off), change, signal)
         change = self._with_black_change(change, memory.latent, second)
         assert joined.net is not None
         unshown = self._follow_unshown(memory, second, following, joined.net)
@@ -314,13 +323,12 @@ class BridgedFrames(Method):
             latent=second,
             thresholds=learned,
             interval=(end - start) * 1e-6,
-            far_on=far_on,
-            far_off=far_off,
+            since_measured=since_measured,
             followed=at_middle,
             at_middle=at_middle,
             unshown=unshown,
             silent_change=change,
-            silent=silent,
+            latest_change=latest_change,
         )
         joined = joined._replace(
             trail=trail,
@@ -343,18 +351,18 @@ class BridgedFrames(Method):
         start = shot.end
         on, off, at_middle = self.follow(events, start, following.middle, memory.followed)
         scale = memory.followed.scale
+        since_on, since_off = memory.since_middle
         grown = self._trail_at(at_middle, following.middle, scale)
         grown -= self._trail_at(memory.at_middle, shot.middle, scale)
         behind, learned = bridge.bridge(
             memory.latent,
             second,
-            on + memory.on,
-            off + memory.off,
+            (on + since_on, off + since_off),
             memory.thresholds,
             self.noise,
             shot.middle,
             following.middle,
-            grown,
+            grown=grown,
         )
         assert behind.net is not None
         tail_on, tail_off, followed = self.follow(events, following.middle, following.end, at_middle)
@@ -362,8 +370,7 @@ class BridgedFrames(Method):
             latent=second,
             thresholds=learned,
             interval=(following.middle - shot.middle) * 1e-6,
-            on=tail_on,
-            off=tail_off,
+            since_middle=(tail_on, tail_off),
             followed=followed,
             at_middle=at_middle,
             unshown=self._follow_unshown(memory, second, following, behind.net),
@@ -379,10 +386,10 @@ class BridgedFrames(Method):
             self._latent_at_end(after, following),
         )
         counts, change = (on + tail_on, off + tail_off), memory.silent_change
-        forward, far_on, far_off = self._with_drift(forward, memory, second, counts, change)
+        forward, since_measured = self._with_drift(forward, memory, second, counts, change)
         trail = self._trail(memory.followed, start, scale)
         forward = forward._replace(trail=trail, unshown=memory.unshown, silent_change=change)
-        return forward, after._replace(far_on=far_on, far_off=far_off)
+        return forward, after._replace(since_measured=since_measured)
 
     def follow(
         self, events: Chunks, start: int, end: int, before: Followed
@@ -446,49 +453,50 @@ class BridgedFrames(Method):
         counts: tuple[Floats, Floats],
         change: Floats,
         signal: tuple[Floats, Floats] | None = None,
-    ) -> tuple[BridgedSegment, Floats, Floats]:
+    ) -> tuple[BridgedSegment, Counts]:
         """The segment with the drift of its pixels (K10), and the events since they were last measured, at its end.
 
         ``counts`` are its on and off events, of which ``signal`` is the share that is signal (None: all), ``change`` is
         the mean square change of silent pixels around each (K11).
         """
-        far, (on, off) = self._events_since_measured(memory, segment), counts
+        since_measured, (on, off) = self._events_since_measured(memory, segment), counts
         steps = counts if signal is None else (on * signal[0], off * signal[1])
         grown, far_on, far_off = bridge.drift(
-            memory.latent, second, memory.thresholds, self.noise, far, steps
+            memory.latent, second, memory.thresholds, self.noise, since_measured, steps
         )
         add_missed_change(grown, segment, second, counts, change, self.noise.quantisation_variance)
         if second.ceiling is not None:
             black = np.isfinite(second.ceiling)
             grown[black] = second.variance[black] / (_BLACK_FRAMES * (_BLACK_FRAMES + 1))
         segment = segment._replace(drift=grown, still_since=_still_since(memory, segment.start))
-        return segment, far_on, far_off
+        return segment, (far_on, far_off)
 
-    def _events_since_measured(self, memory: BridgeMemory, segment: BridgedSegment) -> tuple[Floats, Floats]:
-        """(H, W) on and off events since a frame measured each pixel.
+    def _events_since_measured(self, memory: BridgeMemory, segment: BridgedSegment) -> Counts:
+        """On and off events since a frame measured each pixel.
 
         Of a pixel that no frame has measured, at most as many as raise its bound above those by the frames (K15).
         """
         pixels, known = memory.unshown.pixels, memory.thresholds
         if len(pixels) == 0:
-            return memory.far_on, memory.far_off
+            return memory.since_measured
         above = above_frames(segment, pixels, memory.unshown.bound)
-        far = memory.far_on.copy(), memory.far_off.copy()
+        on, off = (counts.copy() for counts in memory.since_measured)
         steps = (self.on, known.on_variance), (self.off, known.off_variance)
-        for counts, (threshold, variance) in zip(far, steps, strict=True):
+        for counts, (threshold, variance) in zip((on, off), steps, strict=True):
             each = np.maximum(threshold * np.sqrt(variance.reshape(-1)[pixels]), _LEAST_ERROR)
             counts.reshape(-1)[pixels] = np.minimum(counts.reshape(-1)[pixels], above / each)
-        return far
+        return on, off
 
     def _latent_at_end(self, memory: BridgeMemory, shot: Shot) -> Latent:
         """The latest frame, ``shot``, at the end of its exposure: moved there from its middle by events (10)."""
-        step = self.on * memory.thresholds.on * memory.on - self.off * memory.thresholds.off * memory.off
+        on, off = memory.since_middle
+        step = self.on * memory.thresholds.on * on - self.off * memory.thresholds.off * off
         scale = memory.followed.scale
         step += self._trail_at(memory.followed, shot.end, scale)
         step -= self._trail_at(memory.at_middle, shot.middle, scale)
         return Latent(
             memory.latent.value + step,
-            memory.latent.variance + self.noise.step_variance * (memory.on + memory.off),
+            memory.latent.variance + self.noise.step_variance * (on + off),
             None if memory.latent.ceiling is None else memory.latent.ceiling + step,
         )
 
@@ -549,7 +557,7 @@ class BridgedFrames(Method):
     def around(self, segment: BridgedSegment, t: int) -> Around:
         assert segment.events is not None
         share = (t - segment.start) / (segment.end - segment.start)
-        between = 4.0 * share * (1.0 - share)
+        between = bridge.bridge_variance(share)
         second = segment.backward_variance
         if segment.bound is not None and segment.bound.ceiling is not None:
             second = np.where(np.isfinite(segment.bound.ceiling), np.float32(bridge.REPEATED), second)
@@ -585,7 +593,7 @@ def frame_highlights(shot: Shot) -> FrameHighlights:
 def _still_since(memory: BridgeMemory, start: int) -> int:
     """us: pixels without an event since then are still; one frame interval before the segment that begins at ``start``,
     but not before the first exposure."""
-    return max(start - round(memory.interval * 1e6), memory.since)
+    return max(start - round(memory.interval * 1e6), memory.first_start)
 
 
 def latent_frame(

@@ -101,7 +101,7 @@ class Method(ABC):
         return None
 
     def silent_change(self, segment: Any) -> Floats | None:
-        """(H, W): `kalux.augmentation.unseen.silent_change` of the segment, if known."""
+        """(H, W): `kalux.augmentation.subthreshold.silent_change` of the segment, if known."""
         return None
 
     def turns(self, segment: Any) -> float:
@@ -113,7 +113,7 @@ class Method(ABC):
         return None
 
     def path(self, segment: Any) -> Plane | None:
-        """(H, W, 2) by how much pixels move between the frames of a segment (K16); None: not told, or nothing does."""
+        """(2, H, W) by how much pixels move between the frames of a segment (K16); None: not told, or nothing does."""
         return None
 
     def paths(self, segment: Any, path: Plane, level: Floats, variance: Floats) -> Paths | None:

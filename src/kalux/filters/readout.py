@@ -57,7 +57,7 @@ that rows stay aligned to lines of the cache."""
 
 _ROW: Final = _STRIP + 2 * _MARGIN
 
-SHARED: Final = np.float32(0.7)
+CORRELATED: Final = np.float32(0.7)
 """Part of the variance that averaging does not reduce, since errors of neighbours are correlated. Correlations are 0.1
 to 0.5 on eleven simulated scenes, whose relative MSE is 1 % less at 0.5; real sensors, with errors of thresholds and
 bandwidth that are common to all pixels, need more (docs/equations.md, K12)."""
@@ -169,18 +169,23 @@ def lambert_w(x: Number) -> Number:
     return w * (ONE + z / (ONE + w) * (q - z) / (q - two * z))  # type: ignore[no-any-return]
 
 
-class Hidden(NamedTuple):
-    """Variance of changes that no event has signalled yet (docs/equations.md, K11).
+class Subthreshold(NamedTuple):
+    """Variance of subthreshold changes, which no event has signalled yet (docs/equations.md, K11).
 
-    Of a still pixel: ``changing`` times the mean square change of the silent pixels around it. Of a moving one, with
-    recent or imminent events: ``moving``.
+    Attributes
+    ----------
+    silent
+        Of a pixel without recent or imminent events, in units of the mean square change, from one frame to the next, of
+        the silent pixels around it.
+    moving
+        Of a pixel with such events, log intensity^2.
     """
 
-    changing: float
+    silent: float
     moving: float
 
 
-_NOTHING_HIDDEN: Final = Hidden(0.0, 0.0)
+_NO_SUBTHRESHOLD: Final = Subthreshold(0.0, 0.0)
 
 
 def edge(distance: Number) -> Number:
@@ -200,13 +205,13 @@ def read_out(
     variance: Array,
     log_offset: float,
     prior: HighlightPrior,
+    *,
     moving: NDArray[np.bool_] | None = None,
-    hidden: Hidden = _NOTHING_HIDDEN,
+    subthreshold: Subthreshold = _NO_SUBTHRESHOLD,
     silent_change: Array | None = None,
     difference: float = 0.0,
     pitch: int = 1,
     unshown: NDArray[np.int64] | None = None,
-    *,
     with_variance: bool = True,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """I of a state, and the variance of its logarithm, in one pass over the rows.
@@ -227,11 +232,11 @@ def read_out(
     moving
         (H, W): pixels with recent or imminent events, which are averaged; None: not known, so that neither K11 nor K12
         is applied.
-    hidden
+    subthreshold
         Variance that is added to P.
     silent_change
-        (H, W): mean square change of silent pixels around each, from one frame to the next, of which ``hidden`` takes a
-        part; None: 0.
+        (H, W): mean square change of silent pixels around each, from one frame to the next, the unit of
+        ``subthreshold.silent``; None: 0.
     difference
         Standard deviation of the difference of L between pixels one apart where there is no edge; 0: no averaging.
     pitch
@@ -264,7 +269,7 @@ def read_out(
         known,
         np.empty((0, 0), np.bool_) if moving is None else moving,
         known[:0, :0] if moving is None else _plane(silent_change, out.shape),
-        tuple(np.float32(value) for value in hidden),
+        tuple(np.float32(value) for value in subthreshold),
         np.float32(difference * difference),
         pitch,
         tuple(np.float32(value) for value in prior),
@@ -313,7 +318,7 @@ def _read_out(  # type: ignore[no-untyped-def]
     variance,
     moving,
     change,
-    hidden,
+    subthreshold,
     allowed,
     pitch,
     prior,
@@ -356,7 +361,9 @@ def _read_out(  # type: ignore[no-untyped-def]
         # The columns with moving pixels. Typed, since for literals all functions that take them are compiled once more.
         first, last = np.int64(_STRIP), np.int64(0)
         if knows_moving:
-            _load_row(log_intensity, variance, moving, change, hidden, row + 2 * pitch, begin, count, states)
+            _load_row(
+                log_intensity, variance, moving, change, subthreshold, row + 2 * pitch, begin, count, states
+            )
         if averages:
             _mark_moving(moving, row + 3 * pitch, begin, marked, spans)
             for place in range(count):
@@ -415,7 +422,7 @@ def _any(octets, first, count):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, inline="always")
 def _load_row(  # type: ignore[no-untyped-def]
-    log_intensity, variance, moving, change, hidden, row, begin, count, states
+    log_intensity, variance, moving, change, subthreshold, row, begin, count, states
 ):
     """Load L of a row, and its variance with that of changes that no event has signalled yet (K11)."""
     height, width = log_intensity.shape
@@ -426,14 +433,14 @@ def _load_row(  # type: ignore[no-untyped-def]
         for i in range(np.uint64(_ROW)):
             states[place + _VARIANCE + i] = _UNKNOWN
         return
-    changing, of_moving = hidden
+    of_silent, of_moving = subthreshold
     first = larger(begin - _MARGIN, 0)
     size = np.uint64(smaller(begin + _STRIP + _MARGIN, width) - first)
     at, start, into = np.uint64(row), np.uint64(first), place + np.uint64(first - begin + _MARGIN)
     for i in range(size):
         states[into + _LEVEL + i] = log_intensity[at, start + i]
     for i in range(size):
-        unsignalled = of_moving if moving[at, start + i] else changing * change[at, start + i]
+        unsignalled = of_moving if moving[at, start + i] else of_silent * change[at, start + i]
         total = variance[at, start + i] + unsignalled
         states[into + _VARIANCE + i] = total if total < _UNKNOWN else _UNKNOWN
 
@@ -579,7 +586,7 @@ def _average(
         information = there + back_there if information is None else information + (there + back_there)
     independent = variance / (ONE + variance * information)  # 1 / (1 / variance + information)
     averaged[into] = value + deviation * independent
-    averaged[into + _ONE] = SHARED * variance + (ONE - SHARED) * independent
+    averaged[into + _ONE] = CORRELATED * variance + (ONE - CORRELATED) * independent
 
 
 @nb.njit(cache=True, inline="always")

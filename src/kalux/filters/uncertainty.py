@@ -1,7 +1,8 @@
 """The variance that is given out with an image (docs/equations.md, K11).
 
 The filter's P counts what it has seen. Missing are what the next frame tells of the image before it, which its level
-has through the bridge; the noise of frames that all images share; and what no event has told.
+has through the bridge; the noise of frames that all images share; and subthreshold changes, which no event has
+signalled.
 """
 
 from __future__ import annotations
@@ -15,22 +16,22 @@ from numpy.typing import NDArray
 
 from kalux.augmentation.bridge import RANDOM, UNMEASURED
 from kalux.compiled import FUSED, empty, larger, loop, smaller, zeros
-from kalux.filters.readout import SHARED, Hidden
+from kalux.filters.readout import CORRELATED, Subthreshold
 
 Array = NDArray[np.floating[Any]]
 
-HIDDEN_MOVING: Final = 0.08
-"""Variance, in c^2, of what a pixel does between its events, half-way between two frames, where events have come of
-late: by the errors of images, forward and both ways in time, of eleven simulated scenes and of the held-out frames of
-three real recordings."""
+SUBTHRESHOLD_MOVING: Final = 0.08
+"""Variance, in c^2, of the subthreshold change of a pixel with recent events, half-way between two frames: by the
+errors of images, forward and both ways in time, of eleven simulated scenes and of the held-out frames of three real
+recordings."""
 
-HIDDEN_EXPOSED: Final = 0.2
-"""What share of this, and of what silent pixels hide, is hidden at a frame that is exposed all the time, the mean of
-which is not the middle: fifty simulated scenes, exposed for a twentieth to three quarters of the time."""
+SUBTHRESHOLD_EXPOSED: Final = 0.2
+"""Share of these variances, of moving and of silent pixels, that is left at a frame that is exposed all the time, the
+mean of which is not the middle: fifty simulated scenes, exposed for a twentieth to three quarters of the time."""
 
-WAITING: Final = (0.5, 0.25)
-"""What is hidden of a pixel that waits for its next event, in units of what one without an event of late hides and of
-what one with an event in this frame interval does: the same scenes, and the held-out frames."""
+SUBTHRESHOLD_INTERMITTENT: Final = (0.5, 0.25)
+"""Variance of an intermittent pixel's subthreshold change (`_mark_intermittent`), in units of that of a silent pixel
+and of that of one with an event in this frame interval, which are added: the same scenes, and the held-out frames."""
 
 WRONG_STEPS: Final = 0.002
 """Variance, in c^2 per squared number of events between two frames, half-way, of steps that are all wrong alike: the
@@ -38,19 +39,20 @@ same scenes. A fifth of what thresholds that are 10 % off amount to (K10) where 
 
 _FEW_TURNS: Final = 1e-2  # in an exposure: what they change is less than the digits of their exponentials
 
-ALONE: Final = 1.6
-"""What is hidden of a pixel before its neighbours are heard (K12), in units of what is after it. Their mean takes a
-fifth to a third of the squared errors."""
+BEFORE_AVERAGING: Final = 1.6
+"""Variance of the subthreshold change before spatial averaging (K12), in units of that after it: the mean over
+neighbours takes a fifth to a third of the squared errors."""
 
-ALIKE: Final = 0.4
-"""Part of P that its neighbours leave of a pixel that neither frame around measures: there, errors of neighbours have
-correlations of 0.1 to 0.5 (K12). `kalux.filters.readout.SHARED`, by which highlights are doubted, is more."""
+CORRELATED_UNMEASURED: Final = 0.4
+"""Part of P that spatial averaging does not reduce, of a pixel that neither frame around measures: there, errors of
+neighbours have correlations of 0.1 to 0.5 (K12). `kalux.filters.readout.CORRELATED`, by which highlights are doubted,
+is more."""
 
 _BLOCK: Final = 4096
 """Pixels that all steps to the variance are taken of at a time."""
 
-_HEARD: Final = np.float32((1.0 - ALIKE) / (1.0 - SHARED))
-
+_REDUCTION: Final = np.float32((1.0 - CORRELATED_UNMEASURED) / (1.0 - CORRELATED))
+"""By how much more averaging reduces P under the former correlation than under the latter."""
 
 REPEATED_ROUNDING: Final = 0.5
 """Part of the variance of rounding that all frames of a still pixel have in common, where their noise is less than half
@@ -79,7 +81,7 @@ class Around(NamedTuple):
     share
         Of the way from the frame before to the one after.
     half_way
-        How far silent pixels are off the mean of both frames there (`kalux.augmentation.unseen.half_way`).
+        How far silent pixels are off the mean of both frames there (`kalux.augmentation.subthreshold.half_way`).
     """
 
     first: Array
@@ -99,26 +101,36 @@ class Around(NamedTuple):
         return bool(np.minimum(self.first, self.second).max() >= UNMEASURED)
 
 
-def hidden_variance(
+def subthreshold_variance(
     between: float,
     threshold2: float,
     exposed: float = 0.0,
     since: float | None = None,
     half_way: float = RANDOM,
-) -> Hidden:
-    """What no event has told at ``between``, 0 at a frame and 1 half-way between two, with ``threshold2`` = c^2.
+) -> Subthreshold:
+    """Variance of the changes that no event has signalled, at a time between two frames.
 
-    ``exposed`` is the share of the time for which frames are exposed; ``since`` the time since the latest frame, in
-    intervals, where no next one is used: nothing then holds the other end of a silent pixel's change. ``half_way`` is
-    that of `Around`.
+    Parameters
+    ----------
+    between
+        `kalux.augmentation.bridge.bridge_variance` of the time: 0 at a frame, 1 half-way.
+    threshold2
+        c^2.
+    exposed
+        Share of the time for which frames are exposed.
+    since
+        Where no next frame is used, time since the latest one, in frame intervals: nothing then holds the other end of
+        a silent pixel's change. Else None.
+    half_way
+        That of `Around`.
     """
-    hidden = between + (1.0 - between) * HIDDEN_EXPOSED * exposed**2
-    still = hidden * half_way if since is None else min(since, 1.0)
-    return Hidden(still, threshold2 * hidden * HIDDEN_MOVING)
+    unsignalled = between + (1.0 - between) * SUBTHRESHOLD_EXPOSED * exposed**2
+    silent = unsignalled * half_way if since is None else min(since, 1.0)
+    return Subthreshold(silent, threshold2 * unsignalled * SUBTHRESHOLD_MOVING)
 
 
 def changed_within(exposed: float, turns: float) -> float:
-    """What share of the time frames would be exposed if a pixel went at random and hid as much in their exposures.
+    """What share of the time frames would be exposed if a pixel went at random and changed as much within exposures.
 
     ``exposed`` is the share of the time for which they are, ``turns`` how often the light turns from frame to frame.
     What turns n times has correlations exp(-n a) over a share a of the time: with x = n ``exposed``, its mean over an
@@ -133,17 +145,18 @@ def changed_within(exposed: float, turns: float) -> float:
     return -12.0 * off / (2.0 * math.expm1(-turns))
 
 
-def alone(hidden: Hidden) -> Hidden:
-    """The same of a pixel that has not heard its neighbours."""
-    return Hidden(*(ALONE * value for value in hidden))
+def before_averaging(subthreshold: Subthreshold) -> Subthreshold:
+    """The same before spatial averaging (K12)."""
+    return Subthreshold(*(BEFORE_AVERAGING * value for value in subthreshold))
 
 
 @nb.njit(cache=True, inline="always", error_model="numpy")
 def known_variance(variance, first, second, events, around):  # type: ignore[no-untyped-def]
-    """Variance of what frames and events have told, from P and the variances of the frames around.
+    """Variance of L given all frames and events around, from P and the variances of the frames around.
 
-    The next frame, seen through the events that are to come, tells of L besides P. As far as the slope follows the
-    frames, the share q_0 / V of their mismatch (K1), their noise is in every image, however many have been seen.
+    The next frame, seen through the events that are to come, is information about L besides P. As far as the slope
+    follows the frames, the share q_0 / V of their mismatch (K1), their noise is in every image, however many have been
+    seen.
     """
     coming, counted, q0, repeated, wrong = around
     following = counted + second + coming * events
@@ -158,7 +171,7 @@ def given_variance(
     variance: Array,
     moving: NDArray[np.bool_],
     silent_change: Array,
-    hidden: Hidden,
+    subthreshold: Subthreshold,
     around: Around | None,
     left: Array | None = None,
 ) -> NDArray[np.float32]:
@@ -172,12 +185,13 @@ def given_variance(
         (H, W): pixels with an event of late.
     silent_change
         (H, W): mean square change of silent pixels around each.
-    hidden
-        From `hidden_variance`.
+    subthreshold
+        From `subthreshold_variance`.
     around
-        None: nothing is said, P is what is known.
+        None: not known, P stands alone.
     left
-        (H, W): what neighbours leave of P and what is hidden (`kalux.filters.readout.read_out`); None: all of it.
+        (H, W): P and the variance of subthreshold changes after averaging (`kalux.filters.readout.read_out`); None: it
+        is not averaged.
     """
     given = np.empty(variance.shape, np.float32)
     nothing = np.empty(0, np.float32)
@@ -187,8 +201,8 @@ def given_variance(
         tuple(np.float32(value) for value in ((0.0,) * 5 if around is None else around[3:-2])),
         nothing if left is None else left.reshape(-1),
         moving.reshape(-1),
-        tuple(np.float32(value) for value in hidden),
-        np.float32(alone(hidden).moving),
+        tuple(np.float32(value) for value in subthreshold),
+        np.float32(before_averaging(subthreshold).moving),
         given.reshape(-1),
     )
     return given
@@ -196,62 +210,72 @@ def given_variance(
 
 @loop
 def _give(  # type: ignore[no-untyped-def]
-    variance, change, first, second, events, around, left, moving, hidden, before, given
+    variance, change, first, second, events, around, left, moving, subthreshold, before, given
 ):
     """`given_variance`, a few pixels at a time: what one step leaves is in the nearer caches for the next.
 
     No step writes over what it reads, or it would be no vector code.
     """
-    heard, told, waiting = empty(_BLOCK, np.float32), empty(_BLOCK, np.float32), zeros(_BLOCK, np.bool_)
+    averaged, informed = empty(_BLOCK, np.float32), empty(_BLOCK, np.float32)
+    intermittent = zeros(_BLOCK, np.bool_)
     for start in range(0, len(given), _BLOCK):
         here = slice(start, min(start + _BLOCK, len(given)))
         known, count = variance[here], len(given[here])
         if len(events):
             if len(left):
-                _hear(known, left[here], first[here], second[here], before, heard[:count])
-                known = heard[:count]
-            _know(known, first[here], second[here], events[here], around, told[:count])
-            _wait(moving[here], first[here], second[here], events[here], waiting[:count])
-            known = told[:count]
-        _hide(known, moving[here], waiting, change[here], hidden, given[here])
+                _average_unmeasured(known, left[here], first[here], second[here], before, averaged[:count])
+                known = averaged[:count]
+            _inform(known, first[here], second[here], events[here], around, informed[:count])
+            _mark_intermittent(moving[here], first[here], second[here], events[here], intermittent[:count])
+            known = informed[:count]
+        _add_subthreshold(known, moving[here], intermittent, change[here], subthreshold, given[here])
 
 
 @loop(fastmath=FUSED)
-def _know(variance, first, second, events, around, known):  # type: ignore[no-untyped-def]
+def _inform(variance, first, second, events, around, known):  # type: ignore[no-untyped-def]
+    """`known_variance` of every pixel."""
     for i in range(np.uint64(len(known))):
         known[i] = known_variance(variance[i], first[i], second[i], events[i], around)
 
 
 @loop(fastmath=FUSED)
-def _hear(variance, left, first, second, hidden, heard):  # type: ignore[no-untyped-def]
-    """P of pixels that neither frame measures, after their neighbours are heard.
+def _average_unmeasured(variance, left, first, second, subthreshold, averaged):  # type: ignore[no-untyped-def]
+    """P after spatial averaging (K12) where neither frame measures the pixel; as it is elsewhere.
 
-    By `SHARED` they leave ``left`` of P and what is ``hidden``: they take more of P, as much as `ALIKE` is less.
+    ``left`` is what averaging makes of P + ``subthreshold`` under the correlation `CORRELATED`. That relative reduction
+    times `_REDUCTION` is the one under `CORRELATED_UNMEASURED`.
     """
-    one, unmeasured, hidden = np.float32(1.0), np.float32(UNMEASURED), np.float32(hidden)
-    for i in range(np.uint64(len(heard))):
-        lost = one - np.float32(left[i]) / (variance[i] + hidden)
+    one, unmeasured, subthreshold = np.float32(1.0), np.float32(UNMEASURED), np.float32(subthreshold)
+    for i in range(np.uint64(len(averaged))):
+        reduction = one - np.float32(left[i]) / (variance[i] + subthreshold)
         neither = smaller(first[i], second[i]) >= unmeasured
-        heard[i] = variance[i] * (one - _HEARD * larger(lost, np.float32(0.0)) if neither else one)
+        averaged[i] = variance[i] * (
+            one - _REDUCTION * larger(reduction, np.float32(0.0)) if neither else one
+        )
 
 
 @loop
-def _wait(moving, first, second, events, waiting):  # type: ignore[no-untyped-def]
-    """Pixels without an event between the frames, but with one of late, or measured by one of the frames alone."""
+def _mark_intermittent(moving, first, second, events, intermittent):  # type: ignore[no-untyped-def]
+    """Pixels without an event between the frames, but with one just before, or measured by one of the frames alone."""
     unmeasured = np.float32(UNMEASURED)
-    for i in range(np.uint64(len(waiting))):
-        late = moving[i] | (larger(first[i], second[i]) >= unmeasured)
-        waiting[i] = late & (events[i] == np.float32(0.0)) & (smaller(first[i], second[i]) < unmeasured)
+    for i in range(np.uint64(len(intermittent))):
+        doubtful = moving[i] | (larger(first[i], second[i]) >= unmeasured)
+        measured = smaller(first[i], second[i]) < unmeasured
+        intermittent[i] = doubtful & (events[i] == np.float32(0.0)) & measured
 
 
 @loop(fastmath=FUSED)
-def _hide(known, moving, waiting, change, hidden, given):  # type: ignore[no-untyped-def]
-    changing, of_moving = hidden
-    part, of_waiting = np.float32(WAITING[0]), np.float32(WAITING[1]) * of_moving
+def _add_subthreshold(known, moving, intermittent, change, subthreshold, given):  # type: ignore[no-untyped-def]
+    """The known variance and that of the subthreshold change: of a silent, an intermittent or a moving pixel."""
+    share, of_moving = subthreshold
+    part, of_intermittent = (
+        np.float32(SUBTHRESHOLD_INTERMITTENT[0]),
+        np.float32(SUBTHRESHOLD_INTERMITTENT[1]) * of_moving,
+    )
     for i in range(np.uint64(len(given))):
-        still = changing * change[i]
-        late = of_waiting + part * still if waiting[i] else of_moving
-        given[i] = known[i] + (late if moving[i] | waiting[i] else still)
+        silent = share * change[i]
+        active = of_intermittent + part * silent if intermittent[i] else of_moving
+        given[i] = known[i] + (active if moving[i] | intermittent[i] else silent)
 
 
 def add_pattern(variance: NDArray[np.float32], intensity: Array, log_offset: float, deviation: float) -> None:

@@ -208,11 +208,12 @@ def _frames(path: Path) -> Iterator[Frame]:
     with opened(path) as file:
         group = file["frames"]
         white = float(group.attrs["white"]) if "white" in group.attrs else None
+        black = float(group.attrs.get("black", 0.0))
         starts, ends = group["exposure_start"][...], group["exposure_end"][...]
         images, masks = group["image"], group.get("valid")
         for index, (start, end) in enumerate(zip(starts, ends, strict=True)):
             valid = None if masks is None else masks[index].astype(bool)
-            yield Frame(images[index], int(start), int(end), white, valid=valid)
+            yield Frame(images[index], int(start), int(end), white, valid=valid, black=black)
 
 
 def _ground_truth(path: Path) -> GroundTruth:

@@ -64,7 +64,7 @@ def write(
     events
         Chunks of `EVENT_DTYPE` in time order, of any length.
     frames
-        In time order, of one dtype, shape and white value.
+        In time order, of one dtype, shape, white and black value.
     exposure_known
         Whether the frames carry their exposure, or only a stamp (start and end equal).
     contrast_threshold
@@ -81,7 +81,7 @@ def write(
     Raises
     ------
     FrameError
-        If frames differ in dtype, size or white value.
+        If frames differ in dtype, size, white or black value.
     OutputError
         If the file cannot be written.
     """
@@ -222,10 +222,13 @@ def _write_frames(
             first = frame
             if frame.white is not None:
                 group.attrs["white"] = frame.white
+            if frame.black:
+                group.attrs["black"] = float(frame.black)
             mosaic = mosaic or frame.mosaic
         if _kind(frame) != _kind(first):
             raise FrameError(
-                f"frame {index} has another size, dtype, mosaic or white value than frame 0; the file holds one of each"
+                f"frame {index} has another size, dtype, mosaic, white or black value than frame 0; the file holds one "
+                "of each"
             )
         images.resize(index + 1, axis=0)
         images[index] = frame.image
@@ -247,7 +250,7 @@ def _write_frames(
 
 
 def _kind(frame: Frame) -> tuple[Any, ...]:
-    return frame.image.shape, frame.image.dtype, frame.white, frame.mosaic
+    return frame.image.shape, frame.image.dtype, frame.white, frame.black, frame.mosaic
 
 
 def _create_images(

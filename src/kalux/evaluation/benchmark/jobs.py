@@ -18,7 +18,7 @@ import kalux
 from kalux.errors import InputError, KaluxError
 from kalux.evaluation.baselines import frames_around
 from kalux.evaluation.benchmark.sequences import EVERY, Options, Sequence, files_under
-from kalux.evaluation.exposures import linear_frame
+from kalux.evaluation.exposures import compared_recording, linear_frame, of_black
 from kalux.evaluation.held_out import held_out_pairs, hold_out_frames
 from kalux.evaluation.lpips import load_lpips
 from kalux.evaluation.method import Method
@@ -313,7 +313,12 @@ class _Comparison:
 def _comparison(job: Job, recording: Recording) -> _Comparison:
     options = job.sequence.options
     if job.held_out and options.ahdr is None:
-        held = hold_out_frames(recording, options.hold_out_frames or EVERY, response=job.sequence.response)
+        held = hold_out_frames(
+            recording,
+            options.hold_out_frames or EVERY,
+            response=job.sequence.response,
+            black_level=job.sequence.black_level,
+        )
         return _Comparison(
             held.described(),
             held.kept,
@@ -326,8 +331,10 @@ def _comparison(job: Job, recording: Recording) -> _Comparison:
     if truth is None:
         raise InputError(f"{recording.source.path}: its ground truth has gone; start again")
     reference = prepare_reference(recording, truth, mask)
+    recording = compared_recording(recording, job.sequence.response, job.sequence.black_level)
+    said = reference.described("" if options.ahdr is None else _artificial_described(options))
     return _Comparison(
-        reference.described("" if options.ahdr is None else _artificial_described(options)),
+        said + of_black(recording),
         recording,
         len(reference.times),
         reference.data_range,

@@ -150,6 +150,12 @@ class Sequence:
         return AUTO if self.options.ahdr is not None else self._camera_response()
 
     @property
+    def black_level(self) -> float | None:
+        """That of a calibration, a share of white; None: as found."""
+        known = None if self.calibration is None else self.calibration.settings.get("camera", {})
+        return None if known is None else known.get("black_level")
+
+    @property
     def calibration(self) -> Calibration | None:
         """What was measured of the sensor; None: nothing.
 

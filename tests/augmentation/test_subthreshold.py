@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from kalux.augmentation.bridge import UNMEASURED, BridgeNoise, Latent, bridge, nominal_thresholds
-from kalux.augmentation.unseen import UNKNOWN_CHANGE, add_missed_change, half_way, silent_change, turns
+from kalux.augmentation.subthreshold import UNKNOWN_CHANGE, add_missed_change, half_way, silent_change, turns
 
 SHAPE = (40, 60)
 C2 = 0.04
@@ -28,8 +28,7 @@ def joined(change, *, on=None, variance=1e-4, clipped=None):
     segment, _ = bridge(
         Latent(nothing, variances),
         Latent(level, second),
-        on,
-        nothing,
+        (on, nothing),
         nominal_thresholds(SHAPE, 0.1, np.float32),
         NOISE,
         0,
@@ -57,7 +56,7 @@ def forgotten(variance, change, on, after=None):
     nothing = np.zeros(SHAPE, np.float32)
     frame = Latent(nothing, np.full(SHAPE, variance, np.float32))
     thresholds = nominal_thresholds(SHAPE, 0.1, np.float32)
-    segment, _ = bridge(frame, frame, nothing, nothing, thresholds, NOISE, 0, SECOND)
+    segment, _ = bridge(frame, frame, (nothing, nothing), thresholds, NOISE, 0, SECOND)
     grown, plane = nothing.copy(), np.full(SHAPE, change, np.float32)
     second = frame if after is None else Latent(nothing, after)
     add_missed_change(grown, segment, second, (on, nothing), plane, NOISE.quantisation_variance)
