@@ -181,7 +181,12 @@ def plan(
     chosen, noise, doubted = _with_frame_noise(recording, chosen)
     chosen, pattern = _with_fixed_pattern(recording, chosen)
     chosen, period = _with_dead_time(recording, chosen)
-    chosen, origin, estimate, delay, model = _with_event_steps(recording, chosen, doubt_noise=doubted)
+    seen_delay = None
+    if black is not None and not black.level and ceiling is None and lengths[0] == reference:
+        seen_delay = black.delay  # estimated while black was looked for, and not found: of these very frames
+    chosen, origin, estimate, delay, model = _with_event_steps(
+        recording, chosen, seen_delay, doubt_noise=doubted
+    )
     threshold_error = estimate.spread if estimate is not None and origin in ESTIMATED_ORIGINS else 0.0
     chosen, mismatch = _with_mismatch(recording, chosen, threshold_error)
     chosen, background = _with_background(recording, chosen, known.pixels, lookahead)
@@ -375,14 +380,22 @@ class _EventSteps(NamedTuple):
     model: EventModel | None
 
 
-def _with_event_steps(recording: Recording, settings: Settings, *, doubt_noise: bool = False) -> _EventSteps:
+def _with_event_steps(
+    recording: Recording,
+    settings: Settings,
+    delay: DelayEstimate | None = None,
+    *,
+    doubt_noise: bool = False,
+) -> _EventSteps:
     """Fill in what an event's step is: thresholds, refractory period and delay, then I_0 and the step's variance.
 
-    With ``doubt_noise`` also the frames' noise, where it is less than was taken.
+    ``delay`` is the apparent one, if it has been estimated from the same frames already. With ``doubt_noise`` also the
+    frames' noise is filled in, where it is less than was taken.
 
     Thresholds depend on I_0 a little, and it on them: they are estimated once more with the I_0 that is found.
     """
-    delay = estimate_delay(recording, settings.camera) if settings.events.delay is None else None
+    if delay is None and settings.events.delay is None:
+        delay = estimate_delay(recording, settings.camera)
     filled, origin, estimate = _with_thresholds(recording, settings, delay)
     filled, delay = _with_delay(recording, filled, delay, estimate)
     filled, model = _with_event_model(recording, filled, doubt_noise=doubt_noise)
