@@ -198,8 +198,11 @@ def plan(
     chosen, noise, doubted = _with_frame_noise(recording, chosen)
     chosen, pattern = _with_fixed_pattern(recording, chosen)
     chosen, period = _with_dead_time(recording, chosen)
+    seen_delay = None
+    if black is not None and not black.level and ceiling is None and lengths[0] == reference:
+        seen_delay = black.delay  # estimated while black was looked for, and not found: of these very frames
     chosen, origin, estimate, delay, model, contradicted = _with_event_steps(
-        recording, chosen, doubt_noise=doubted
+        recording, chosen, seen_delay, doubt_noise=doubted
     )
     threshold_error = estimate.spread if estimate is not None and origin in ESTIMATED_ORIGINS else 0.0
     chosen, mismatch = _with_mismatch(recording, chosen, threshold_error)
@@ -399,13 +402,24 @@ class _EventSteps(NamedTuple):
     contradicted: Thresholds | None = None
 
 
-def _with_event_steps(recording: Recording, settings: Settings, *, doubt_noise: bool = False) -> _EventSteps:
-    """`_filled_event_steps` with the thresholds that the recording states, unless its own frames contradict them."""
+def _with_event_steps(
+    recording: Recording,
+    settings: Settings,
+    delay: DelayEstimate | None = None,
+    *,
+    doubt_noise: bool = False,
+) -> _EventSteps:
+    """`_filled_event_steps` with the thresholds that the recording states, unless its own frames contradict them.
+
+    ``delay`` is the apparent one, where it has been estimated.
+    """
+    if delay is None and settings.events.delay is None:
+        delay = estimate_delay(recording, settings.camera)
     stated = recording.contrast_threshold
-    found = _filled_event_steps(recording, settings, stated, doubt_noise)
+    found = _filled_event_steps(recording, settings, stated, delay, doubt_noise)
     if found.origin != "recording" or found.model is None or _are_plausible(found.model):
         return found
-    estimated = _filled_event_steps(recording, settings, None, doubt_noise)
+    estimated = _filled_event_steps(recording, settings, None, delay, doubt_noise)
     return estimated._replace(contradicted=stated) if _refutes(estimated, found) else found
 
 
@@ -429,15 +443,19 @@ def _refutes(estimated: _EventSteps, stated: _EventSteps) -> bool:
 
 
 def _filled_event_steps(
-    recording: Recording, settings: Settings, stated: Thresholds | None, doubt_noise: bool
+    recording: Recording,
+    settings: Settings,
+    stated: Thresholds | None,
+    delay: DelayEstimate | None,
+    doubt_noise: bool,
 ) -> _EventSteps:
     """Fill in what an event's step is: thresholds, refractory period and delay, then I_0 and the step's variance.
 
-    With ``doubt_noise`` also the frames' noise, where it is less than was taken.
+    ``stated`` are the recording's thresholds, ``delay`` is the apparent one; None: not known. With ``doubt_noise`` the
+    frames' noise is filled in, too, where it is less than was taken.
 
     Thresholds depend on I_0 a little, and it on them: they are estimated once more with the I_0 that is found.
     """
-    delay = estimate_delay(recording, settings.camera) if settings.events.delay is None else None
     filled, origin, estimate = _with_thresholds(recording, settings, stated, delay)
     filled, delay = _with_delay(recording, filled, delay, estimate)
     filled, model = _with_event_model(recording, filled, doubt_noise=doubt_noise)

@@ -65,8 +65,8 @@ class CameraSettings:
     black_level
         What every pixel reads in the dark, on top of its light: a share of the white value, 0 to 0.5 (16 of 255 is
         0.063). It is taken off the frames before the response is inverted, so that 0 is black and 1 still white. None:
-        where the recording's frames begin above 0, what its events say (`kalux.calibration.black_level`), else what
-        frames state, 0.
+        what frames state; where they state nothing and begin above 0, what the recording's events say
+        (`kalux.calibration.black_level`); else 0.
     saturation
         Response, 0 to 1, from which a pixel counts as clipped. None: where the recording's frames all end at one level
         while events go on (`kalux.calibration.levels`), else the usual one.

@@ -8,6 +8,7 @@ import pytest
 import kalux
 from kalux import Frame, Recording
 from kalux.calibration.black_level import find_black_level, with_known_black
+from kalux.calibration.delay import estimate_delay
 from kalux.planning import plan
 from kalux.recording import less_black
 from kalux.settings import PRESETS, altered
@@ -93,3 +94,25 @@ def test_what_is_known_of_black_is_asked_for_once():
     assert (stated.black_level, looked) == (None, None)
     assert next(iter(stated.frames())).black == 16
     assert with_known_black(from_black(), SETTINGS.camera, SETTINGS.events)[0].black_level == 0
+
+
+def test_the_delay_is_estimated_once_where_there_is_no_black_level(monkeypatch):
+    """The search for black needs it, too; of frames less a black level it is another one."""
+    source, asked = passing_by(np.maximum(textured(1.3) - 0.25, 0) + 0.1), []
+    expected = plan(source, at="frames")
+
+    def counted(*arguments):
+        asked.append(estimate_delay(*arguments))
+        return asked[-1]
+
+    for module in ("planning", "calibration.black_level"):
+        monkeypatch.setattr(f"kalux.{module}.estimate_delay", counted)
+    again = plan(source, at="frames")
+    assert expected.delay_estimate is not None
+    assert len(asked) == 1
+    assert again.settings == expected.settings
+    alone = estimate_delay(source, SETTINGS.camera)
+    assert alone.apparent == expected.delay_estimate.apparent
+    asked.clear()
+    plan(lifted(from_black(), 16), at="frames")
+    assert len(asked) == 2

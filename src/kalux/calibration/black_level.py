@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.calibration.delay import estimate_delay
+from kalux.calibration.delay import DelayEstimate, estimate_delay
 from kalux.calibration.intervals import intervals, spread
 from kalux.calibration.levels import response_histogram
 from kalux.event_slices import between, count_events
@@ -92,12 +92,15 @@ class BlackLevel(NamedTuple):
         Share of what events and frames differ by that taking ``level`` off removes.
     samples
         Pixels and frame intervals compared.
+    delay
+        That of the events against the frames as they are, where it was estimated.
     """
 
     floor: float
     level: float = 0.0
     gain: float = 0.0
     samples: int = 0
+    delay: DelayEstimate | None = None
 
 
 class _Samples(NamedTuple):
@@ -169,14 +172,12 @@ def find_black_level(
     floor = _floor(recording)
     if floor is None or not _LEAST_FLOOR <= floor <= _LARGEST_FLOOR:
         return None
-    delay = events.delay
-    if delay is None:
-        found = estimate_delay(recording, camera)
-        delay = 0 if found is None else found.apparent
+    estimate = estimate_delay(recording, camera) if events.delay is None else None
+    delay = (events.delay or 0) if estimate is None else estimate.apparent
     response = Camera.named(
         chosen_response(camera.response, recording.response), camera.clipped_from
     ).response
-    return _decided(_samples(recording, camera, floor, delay), response, floor)
+    return _decided(_samples(recording, camera, floor, delay), response, floor)._replace(delay=estimate)
 
 
 def _floor(recording: Recording) -> float | None:

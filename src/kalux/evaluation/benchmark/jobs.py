@@ -31,7 +31,7 @@ from kalux.recording import Recording, reference_exposure
 from kalux.settings import chosen_response, to_dict
 from kalux.writers.settings_file import versions
 
-LAYOUT: Final = 3
+LAYOUT: Final = 4
 """Of the files of jobs; part of every key, so that others are not taken for one's own."""
 
 MOMENTS: Final = 3
