@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from kalux.calibration.delay import SHARE
+from kalux.calibration.frame_faults import FrameFaults
 from kalux.calibration.levels import Ceiling, find_ceiling
 from kalux.recording import Recording, less_black
 from kalux.settings import AUTO, Settings
@@ -98,6 +99,10 @@ def _of_frames(recording: Recording, plan: Plan, asked: Settings) -> Iterator[tu
     stated = "usual, the recording does not state it" if recording.response is None else "as recorded"
     how = stated if asked.camera.response == AUTO else _GIVEN
     yield "response", f"{response_text(camera.response)} ({how})"
+    if plan.frame_faults is not None and plan.frame_faults.steps:
+        yield "gain", f"{gain_text(plan.frame_faults)}: evened out"
+    if plan.frame_faults is not None and (plan.frame_faults.copies or plan.frame_faults.empty):
+        yield "left out", left_out_text(plan.frame_faults)
     if recording.found_white is not None:
         yield "white", f"{recording.found_white}, where the 16-bit frames end"
     if plan.black is not None or camera.black_level is not None:
@@ -140,6 +145,28 @@ def _black_text(plan: Plan) -> str:
         f"0; {begin}, which events do not show to be black: if the camera reads that in the dark, "
         f"--camera.black-level {found.floor:.2g}"
     )
+
+
+def gain_text(faults: FrameFaults) -> str:
+    """By how much the frames' brightness steps, and where first."""
+    spans = float(faults.gains.max() / faults.gains.min())
+    return (
+        f"the brightness of the frames steps at {how_many(len(faults.steps), 'frame')}, first at frame "
+        f"{faults.steps[0]}, by up to a factor of {spans:.2g} in all, and events show no such change"
+    )
+
+
+def left_out_text(faults: FrameFaults) -> str:
+    """Which frames are not used, and why."""
+    parts = []
+    if faults.copies:
+        copies = how_many(len(faults.copies), "frame")
+        parts.append(
+            f"{copies}, first frame {faults.copies[0]}: the same as the one before, though events show motion"
+        )
+    if faults.empty:
+        parts.append(f"{how_many(len(faults.empty), 'frame')}, first frame {faults.empty[0]}: empty")
+    return "; ".join(parts)
 
 
 def ceiling_text(ceiling: Ceiling) -> str:

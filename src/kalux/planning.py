@@ -13,6 +13,7 @@ from kalux.calibration.black_level import BlackLevel, find_black_level
 from kalux.calibration.delay import DelayEstimate, estimate_delay
 from kalux.calibration.event_model import EventModel, estimate_event_model
 from kalux.calibration.fixed_pattern import USUAL_PATTERN, FixedPattern, estimate_fixed_pattern
+from kalux.calibration.frame_faults import FrameFaults, FrameWatch, find_frame_faults
 from kalux.calibration.frame_noise import FrameNoise, UsualNoise, estimate_frame_noise, usual_noise
 from kalux.calibration.global_thresholds import (
     ROUGH_SAMPLES,
@@ -37,14 +38,16 @@ from kalux.models.colour import white_balance
 from kalux.models.pixels import PixelCalibration, require_size, with_hot
 from kalux.recording import (
     RECORDING_NEEDED,
+    FrameCorrections,
     Recording,
     less_black,
     no_frames,
     with_cached_start,
+    with_corrected_frames,
     without_events_of,
 )
 from kalux.schedule import image_times
-from kalux.settings import SETTINGS_NEEDED, Settings, altered, chosen_response
+from kalux.settings import SETTINGS_NEEDED, CameraSettings, Settings, altered, chosen_response
 from kalux.settings import preset as named_preset
 
 ThresholdOrigin = Literal["settings", "recording", "calibration", "estimate", "assumed"]
@@ -112,6 +115,10 @@ class Plan:
         The refractory period that noise shows, us; 0 where it does not.
     hot_pixels
         How many event pixels were found to be hot, whose events are left out.
+    frame_faults
+        Frames that are left out, or whose gain is not that of others.
+    corrections
+        What is done about these.
     """
 
     settings: Settings
@@ -131,6 +138,8 @@ class Plan:
     black: BlackLevel | None = None
     dead_time: int = 0
     hot_pixels: int = 0
+    frame_faults: FrameFaults | None = None
+    corrections: FrameCorrections = FrameCorrections()
 
 
 def plan(
@@ -169,12 +178,20 @@ def plan(
     chosen, ceiling = with_saturation(recording, chosen)
     response = chosen_response(chosen.camera.response, recording.response)
     camera = Camera.named(response, chosen.camera.clipped_from)
-    exposures, tail = _survey(recording, camera if _measures_tail(chosen) else None)
-    begin = _begin_time(exposures[0], chosen, lookahead)
+    watch = FrameWatch(camera) if chosen.filter.joins_frames else None
+    exposures, tail = _survey(recording, camera if _measures_tail(chosen) else None, watch)
     if chosen.filter.motion == "auto":
         follows = smooth or chosen.filter.follows_motion(recording.sensor_size)
         chosen = altered(chosen, "filter", motion="on" if follows else "off")
-    wanted = image_times(recording, exposures, begin, rate_hz=rate_hz, times=times, at=at)
+    faults = None if watch is None else _frame_faults(recording, chosen.camera, watch)
+    first = 0 if faults is None else faults.first
+    begin = _begin_time(exposures[first], chosen, lookahead)
+    earliest = begin if times is None else _begin_time(exposures[0], chosen, lookahead)
+    wanted = image_times(recording, exposures, earliest, rate_hz=rate_hz, times=times, at=at)
+    corrections = FrameCorrections()
+    if faults is not None:
+        corrections = faults.corrections(with_first=bool(len(wanted)) and int(wanted[0]) < begin)
+        recording = with_corrected_frames(recording, corrections)
     lengths = exposures[:, 1] - exposures[:, 0]
     reference = chosen.camera.reference_exposure or median_exposure(lengths)
     chosen = altered(chosen, "camera", reference_exposure=reference, response=response)
@@ -209,6 +226,8 @@ def plan(
         ceiling=ceiling,
         black=black,
         dead_time=period,
+        frame_faults=faults,
+        corrections=corrections,
     )
 
 
@@ -256,13 +275,30 @@ def with_saturation(recording: Recording, settings: Settings) -> tuple[Settings,
     return (clipped, found) if found is not None and found.is_at(end) else (usual, None)
 
 
-def _survey(recording: Recording, camera: Camera | None) -> tuple[NDArray[np.int64], BrightTail | None]:
-    """(K, 2) starts and ends, us, of all exposures, and, given a camera, the frames' bright tail, in one pass."""
+def _frame_faults(recording: Recording, camera: CameraSettings, watch: FrameWatch) -> FrameFaults | None:
+    """What is wrong with frames, of what the settings let be mended; None where nothing is."""
+    faults = find_frame_faults(recording, camera, watch)
+    if faults is not None and not camera.even_gain:
+        faults = faults._replace(steps=(), gains=np.ones(faults.frames))
+    if faults is not None and not camera.leave_out_faulty:
+        faults = faults._replace(copies=(), empty=())
+    return faults if faults is not None and (faults.steps or faults.copies or faults.empty) else None
+
+
+def _survey(
+    recording: Recording, camera: Camera | None, watch: FrameWatch | None
+) -> tuple[NDArray[np.int64], BrightTail | None]:
+    """(K, 2) starts and ends, us, of all exposures, and, given a camera, the frames' bright tail, in one pass.
+
+    A watch sees all frames.
+    """
     exposures, tail = [], BrightTail()
     for frame in recording.frames():
         exposures.append((frame.exposure_start, frame.exposure_end))
         if camera is not None:
             tail = tail.joined(count_bright(camera, frame.image, frame.white_value, frame.black))
+        if watch is not None:
+            watch.see(frame)
     if not exposures:
         raise no_frames(recording)
     return np.array(exposures, np.int64), None if camera is None else tail

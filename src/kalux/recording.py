@@ -10,7 +10,7 @@ from functools import cached_property
 from itertools import islice
 from numbers import Real
 from pathlib import Path
-from typing import Any, Final, Generic, Literal, TypeVar
+from typing import Any, Final, Generic, Literal, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +54,9 @@ both starts and stops them together."""
 
 _WHITE_FRAMES: Final = 80
 """Frames, some 3 s of them, that tell the white value where it is not stated."""
+
+
+_CLIPPED: Final = 0.98  # of the response
 
 
 class Stream(Generic[T]):
@@ -134,6 +137,63 @@ def less_black(recording: Recording, level: float | None) -> Recording:
     made = copy.copy(recording)
     made._black_level = level
     return made
+
+
+class FrameCorrections(NamedTuple):
+    """What is to be done with the frames of a recording before they are used (`kalux.calibration.frame_faults`).
+
+    Attributes
+    ----------
+    left_out
+        Indices of frames that show nothing new, in order.
+    empty
+        As many frames at the beginning show nothing, but are needed, as images are wanted there.
+    gains
+        (K,) `Frame.gain` of every frame of the recording; None: as they state.
+    """
+
+    left_out: tuple[int, ...] = ()
+    empty: int = 0
+    gains: NDArray[np.float64] | None = None
+
+    def __bool__(self) -> bool:
+        """Whether there is anything to do."""
+        return bool(self.left_out or self.empty or self.gains is not None)
+
+
+def with_corrected_frames(recording: Recording, corrections: FrameCorrections) -> Recording:
+    """The same recording, with its frames corrected."""
+    if not corrections:
+        return recording
+    whole, count, made = recording.source.frames, recording.source.count_frames, copy.copy(recording)
+    made.source = dataclasses.replace(
+        recording.source,
+        frames=lambda: _corrected(whole(), corrections),
+        count_frames=lambda: count() - len(corrections.left_out),
+    )
+    return made
+
+
+def _corrected(frames: Iterator[Frame], corrections: FrameCorrections) -> Iterator[Frame]:
+    """The frames that are left. Where the first are empty, the next one's image is where the filter starts.
+
+    Nothing of it counts as measured there, but what is clipped: to take that for white would cost more.
+    """
+    left_out, waiting = {*corrections.left_out}, list[Frame]()
+    for index, frame in enumerate(frames):
+        if index in left_out:
+            continue
+        if corrections.gains is not None:
+            frame = dataclasses.replace(frame, gain=frame.gain * float(corrections.gains[index]))
+        if index < corrections.empty:
+            waiting.append(frame)
+            continue
+        for empty in waiting:
+            bright = frame.normalised() >= _CLIPPED
+            clipped = bright if bright.ndim == 2 else bright.all(axis=-1)
+            yield dataclasses.replace(empty, image=frame.image, gain=frame.gain, valid=clipped)
+        waiting = []
+        yield frame
 
 
 def no_frames(recording: Recording) -> FrameError:

@@ -73,6 +73,12 @@ class CameraSettings:
         levels below 255, for sensors with fixed pattern noise at the top.
     reference_exposure
         Exposure time, us, at which a saturated pixel has intensity 1; None: the recording's median.
+    even_gain
+        Whether the brightness of frames is evened out where it steps though events say that the light does not
+        (`kalux.calibration.frame_faults`): exposure or amplification that nobody states. Not in a live stream.
+    leave_out_faulty
+        Whether frames are left out that are copies of the one before though events say that something moved, or that
+        are empty. Not in a live stream.
     white_balance
         Of recordings in colour: ``"as-recorded"``, ``"grey-world"`` (gains that make the mean of well exposed pixels
         grey; one set for a recording), or gains of red, green and blue, ``"1.8;1;1.4"``. As recorded: what is grey is
@@ -91,6 +97,8 @@ class CameraSettings:
     saturation: float | None = None
     usual_saturation: float = 0.98
     reference_exposure: int | None = None
+    even_gain: bool = True
+    leave_out_faulty: bool = True
     white_balance: str = "as-recorded"
 
     @property

@@ -28,7 +28,7 @@ from kalux.cli.times import load_times
 from kalux.display import CURVES
 from kalux.errors import InputError
 from kalux.pipeline import execute
-from kalux.plan_report import ORIGINS, plan_report
+from kalux.plan_report import ORIGINS, gain_text, left_out_text, plan_report
 from kalux.planning import ESTIMATED_ORIGINS, Plan, plan
 from kalux.reconstructor import Reconstructor
 from kalux.recording import Recording
@@ -37,6 +37,7 @@ from kalux.threads import default_threads
 from kalux.wording import how_many
 
 if TYPE_CHECKING:
+    from kalux.calibration.frame_faults import FrameFaults
     from kalux.calibration.global_thresholds import ThresholdEstimate
     from kalux.writers import Writer
 
@@ -290,6 +291,8 @@ def plan_warnings(planned: Plan, contents: Contents, preset_name: str) -> Iterat
     gap = gap_warning(planned, contents)
     if gap is not None:
         yield gap
+    if planned.frame_faults is not None:
+        yield from fault_warnings(planned.frame_faults)
     if planned.threshold_origin in ESTIMATED_ORIGINS:
         yield threshold_warning(planned, preset_name)
     if (
@@ -317,6 +320,17 @@ def threshold_warning(planned: Plan, preset_name: str) -> str:
         f"the contrast thresholds are {how}, so brightness above white is uncertain; "
         f"if you know them, give --events.threshold-on and --events.threshold-off{sensor}"
     )
+
+
+def fault_warnings(faults: FrameFaults) -> Iterator[str]:
+    """What of the frames is not used as it is, and how to use it."""
+    if faults.steps:
+        yield (
+            f"{gain_text(faults)}: taken for the camera's exposure or gain, and evened out (--camera.even-gain false "
+            "does not)"
+        )
+    if faults.copies or faults.empty:
+        yield f"left out: {left_out_text(faults)} (--camera.leave-out-faulty false keeps them)"
 
 
 def gap_warning(planned: Plan, contents: Contents) -> str | None:
