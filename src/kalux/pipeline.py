@@ -20,7 +20,7 @@ from kalux.events import EventArray
 from kalux.images import Estimate, Image
 from kalux.planning import UNCERTAIN_ORIGINS, Plan, plan
 from kalux.reconstructor import Reconstructor
-from kalux.recording import Recording, with_corrected_frames
+from kalux.recording import Recording, with_corrected_frames, with_event_layout
 from kalux.settings import Settings
 from kalux.smoothing import Backward, combine, reversed_pixels, reversed_settings
 from kalux.threads import ahead
@@ -123,6 +123,8 @@ def execute(
     """
     memory.give_back()  # that planning and checking have used
     recording = with_corrected_frames(recording, plan.corrections)
+    if plan.agreement is not None:
+        recording = with_event_layout(recording, plan.agreement.layout)
     engine = _engine(recording, plan)
     several = threads > 1
     if plan.smooth:

@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from kalux.calibration.agreement import Agreement
 from kalux.calibration.delay import SHARE
 from kalux.calibration.frame_faults import FrameFaults
 from kalux.calibration.levels import Ceiling, find_ceiling
-from kalux.recording import Recording, less_black
+from kalux.recording import AS_STORED, Recording, less_black
 from kalux.settings import AUTO, Settings
 from kalux.wording import how_many
 
@@ -72,6 +73,8 @@ def _of_events(plan: Plan, asked: Settings) -> Iterator[tuple[str, str]]:
         if plan.background_rate is not None and plan.background_rate < events.noise_rate:
             how = f"the least that is assumed; measured {plan.background_rate:.2g}"
         yield "background", f"{events.noise_rate:.2g} Hz per pixel of events without reason ({how})"
+    if plan.agreement is not None and plan.agreement.layout != AS_STORED:
+        yield "layout", f"{layout_text(plan.agreement)}: put right"
     if plan.hot_pixels:
         yield "hot pixels", f"{how_many(plan.hot_pixels, 'pixel')} whose events are left out (measured)"
 
@@ -145,6 +148,21 @@ def _black_text(plan: Plan) -> str:
         f"0; {begin}, which events do not show to be black: if the camera reads that in the dark, "
         f"--camera.black-level {found.floor:.2g}"
     )
+
+
+def layout_text(agreement: Agreement) -> str:
+    """What of the events is the wrong way round."""
+    layout = agreement.layout
+    wrong = [
+        text
+        for is_so, text in (
+            (layout.mirrored_x, "their x counts from the other side"),
+            (layout.mirrored_y, "their y counts from the other side"),
+            (layout.swapped, "their polarity 1 is darker"),
+        )
+        if is_so
+    ]
+    return f"events follow the frames if {' and '.join(wrong)} (correlation {agreement.correlation:.2f})"
 
 
 def gain_text(faults: FrameFaults) -> str:

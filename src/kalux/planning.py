@@ -9,6 +9,7 @@ from typing import Any, Final, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.calibration.agreement import Agreement, find_agreement
 from kalux.calibration.black_level import BlackLevel, find_black_level
 from kalux.calibration.delay import DelayEstimate, estimate_delay
 from kalux.calibration.event_model import EventModel, estimate_event_model
@@ -37,6 +38,7 @@ from kalux.models.camera import BrightTail, Camera, count_bright
 from kalux.models.colour import white_balance
 from kalux.models.pixels import PixelCalibration, require_size, with_hot
 from kalux.recording import (
+    AS_STORED,
     RECORDING_NEEDED,
     FrameCorrections,
     Recording,
@@ -44,6 +46,7 @@ from kalux.recording import (
     no_frames,
     with_cached_start,
     with_corrected_frames,
+    with_event_layout,
     without_events_of,
 )
 from kalux.schedule import image_times
@@ -119,6 +122,8 @@ class Plan:
         Frames that are left out, or whose gain is not that of others.
     corrections
         What is done about these.
+    agreement
+        How events and frames agree, where that can be told.
     """
 
     settings: Settings
@@ -140,6 +145,7 @@ class Plan:
     hot_pixels: int = 0
     frame_faults: FrameFaults | None = None
     corrections: FrameCorrections = FrameCorrections()
+    agreement: Agreement | None = None
 
 
 def plan(
@@ -169,6 +175,10 @@ def plan(
     if known.pixels is not None:
         require_size(known.pixels, recording.sensor_size)
     recording = with_cached_start(recording, _CACHED_EVENTS, _CACHED_FRAME_BYTES)
+    agreement = find_agreement(recording, chosen.camera) if chosen.filter.joins_frames else None
+    if agreement is not None:
+        agreement = agreement if chosen.events.mend_layout else agreement._replace(layout=AS_STORED)
+        recording = with_event_layout(recording, agreement.layout)
     looks_for_hot = chosen.filter.joins_frames and chosen.events.leave_out_hot
     hot = find_hot_pixels(recording, _NOISE_EVENTS) if looks_for_hot else None
     if hot is not None and hot.any():
@@ -228,6 +238,7 @@ def plan(
         dead_time=period,
         frame_faults=faults,
         corrections=corrections,
+        agreement=agreement,
     )
 
 

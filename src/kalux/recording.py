@@ -130,6 +130,47 @@ def without_events_of(recording: Recording, pixels: NDArray[np.bool_]) -> Record
     return made
 
 
+class EventLayout(NamedTuple):
+    """How stored events lie to the frames.
+
+    Attributes
+    ----------
+    mirrored_x, mirrored_y
+        Whether their columns, or rows, count from the other side.
+    swapped
+        Whether polarity 1 is darker.
+    """
+
+    mirrored_x: bool = False
+    mirrored_y: bool = False
+    swapped: bool = False
+
+
+AS_STORED: Final = EventLayout()
+
+
+def with_event_layout(recording: Recording, layout: EventLayout) -> Recording:
+    """The same recording, whose events are put as the frames are, from a ``layout`` in which they are not."""
+    if layout == AS_STORED:
+        return recording
+    whole, made = recording.source.events, copy.copy(recording)
+    height, width = recording.sensor_size
+
+    def turned(chunk: EventArray) -> EventArray:
+        check_events(chunk, recording.sensor_size, where=str(recording.source.path))
+        events = chunk.copy()
+        if layout.mirrored_x:
+            events["x"] = width - 1 - chunk["x"]
+        if layout.mirrored_y:
+            events["y"] = height - 1 - chunk["y"]
+        if layout.swapped:
+            events["p"] = ~chunk["p"]
+        return events
+
+    made.source = dataclasses.replace(recording.source, events=lambda: map(turned, whole()))
+    return made
+
+
 def less_black(recording: Recording, level: float | None) -> Recording:
     """The same recording, the frames of which have black at ``level``, a share of white; None: as they state."""
     if level is None:

@@ -150,6 +150,9 @@ class EventSettings:
     leave_out_hot
         Whether pixels that leak all the time are looked for in the recording, and their events left out
         (`kalux.calibration.hot_pixels`). True: their highlights grow without bound (docs/calibration.md).
+    mend_layout
+        Whether events that are mirrored, or whose polarities are swapped, are put right where their counts follow the
+        frames so, and not as they are (`kalux.calibration.agreement`). Not in a live stream.
     extrapolation_spread
         Where thresholds are only estimates and threshold_spread is not known: standard deviation of the log of their
         common error beyond white, where no frame corrects it. 0.15: how well large changes between well exposed
@@ -191,6 +194,7 @@ class EventSettings:
     deblur_variance: float = 0.05
     noise_rate: float | None = None
     leave_out_hot: bool = True
+    mend_layout: bool = True
     extrapolation_spread: float = 0.15
     trail: float = 0.4
     usual_threshold_on: float = 0.25

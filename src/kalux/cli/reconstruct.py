@@ -28,10 +28,10 @@ from kalux.cli.times import load_times
 from kalux.display import CURVES
 from kalux.errors import InputError
 from kalux.pipeline import execute
-from kalux.plan_report import ORIGINS, gain_text, left_out_text, plan_report
+from kalux.plan_report import ORIGINS, gain_text, layout_text, left_out_text, plan_report
 from kalux.planning import ESTIMATED_ORIGINS, Plan, plan
 from kalux.reconstructor import Reconstructor
-from kalux.recording import Recording
+from kalux.recording import AS_STORED, Recording
 from kalux.settings import PRESETS, Settings, from_dict, load, preset, read_toml, to_dict
 from kalux.threads import default_threads
 from kalux.wording import how_many
@@ -295,14 +295,13 @@ def plan_warnings(planned: Plan, contents: Contents, preset_name: str) -> Iterat
         yield from fault_warnings(planned.frame_faults)
     if planned.threshold_origin in ESTIMATED_ORIGINS:
         yield threshold_warning(planned, preset_name)
-    if (
-        planned.threshold_origin == "assumed"
-        and planned.estimate is not None
-        and contradicts(planned.estimate)
-    ):
+    if planned.agreement is not None and planned.agreement.layout != AS_STORED:
+        yield f"{layout_text(planned.agreement)}, and are put right (--events.mend-layout false leaves them as they are)"
+    is_contradicted = planned.agreement is not None and planned.agreement.contradicts
+    if is_contradicted or (planned.threshold_origin == "assumed" and contradicts(planned.estimate)):
         yield (
             "the events do not explain how the frames change; if much moves, do both have the same clock (kalux "
-            "calibrate offset REC finds out), and is polarity 1 brighter?"
+            "calibrate offset REC finds out) and the same view, and is polarity 1 brighter?"
         )
 
 
@@ -348,9 +347,9 @@ def gap_warning(planned: Plan, contents: Contents) -> str | None:
     )
 
 
-def contradicts(estimate: ThresholdEstimate) -> bool:
+def contradicts(estimate: ThresholdEstimate | None) -> bool:
     """Whether many samples have next to no information of the thresholds."""
-    return estimate.samples >= _MANY_SAMPLES and estimate.usual_share > _NEARLY_ALL
+    return estimate is not None and estimate.samples >= _MANY_SAMPLES and estimate.usual_share > _NEARLY_ALL
 
 
 def decided(
