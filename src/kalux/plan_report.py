@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from kalux.calibration.agreement import Agreement
 from kalux.calibration.delay import SHARE
@@ -106,6 +107,8 @@ def _of_frames(recording: Recording, plan: Plan, asked: Settings) -> Iterator[tu
         yield "gain", f"{gain_text(plan.frame_faults)}: evened out"
     if plan.frame_faults is not None and (plan.frame_faults.copies or plan.frame_faults.empty):
         yield "left out", left_out_text(plan.frame_faults)
+    if plan.frame_faults is not None and plan.frame_faults.stuck is not None:
+        yield "stuck", f"{stuck_text(plan.frame_faults.stuck)}: the median of their neighbours is taken"
     if recording.found_white is not None:
         yield "white", f"{recording.found_white}, where the 16-bit frames end"
     if plan.black is not None or camera.black_level is not None:
@@ -172,6 +175,11 @@ def gain_text(faults: FrameFaults) -> str:
         f"the brightness of the frames steps at {how_many(len(faults.steps), 'frame')}, first at frame "
         f"{faults.steps[0]}, by up to a factor of {spans:.2g} in all, and events show no such change"
     )
+
+
+def stuck_text(stuck: NDArray[np.bool_]) -> str:
+    """How many pixels of frames are stuck."""
+    return f"{how_many(int(np.count_nonzero(stuck)), 'pixel')} of the frames always show the same though light changes"
 
 
 def left_out_text(faults: FrameFaults) -> str:

@@ -289,11 +289,13 @@ def with_saturation(recording: Recording, settings: Settings) -> tuple[Settings,
 def _frame_faults(recording: Recording, camera: CameraSettings, watch: FrameWatch) -> FrameFaults | None:
     """What is wrong with frames, of what the settings let be mended; None where nothing is."""
     faults = find_frame_faults(recording, camera, watch)
-    if faults is not None and not camera.even_gain:
-        faults = faults._replace(steps=(), gains=np.ones(faults.frames))
-    if faults is not None and not camera.leave_out_faulty:
+    if not camera.even_gain:
+        faults = faults._replace(steps=())
+    if not camera.leave_out_faulty:
         faults = faults._replace(copies=(), empty=())
-    return faults if faults is not None and (faults.steps or faults.copies or faults.empty) else None
+    if not camera.mend_stuck:
+        faults = faults._replace(stuck=None)
+    return faults or None
 
 
 def _survey(

@@ -43,6 +43,7 @@ from kalux.frames import (
     with_black_level,
 )
 from kalux.models.colour import sample_mosaic
+from kalux.models.frame_pixels import without_stuck
 from kalux.readers import CHUNK_EVENTS, Source, joined
 from kalux.white import WhiteCheck, white_of_bits
 
@@ -191,15 +192,18 @@ class FrameCorrections(NamedTuple):
         As many frames at the beginning show nothing, but are needed, as images are wanted there.
     gains
         (K,) `Frame.gain` of every frame of the recording; None: as they state.
+    stuck
+        (H, W) pixels that show nothing, instead of which their neighbours are taken; None: none.
     """
 
     left_out: tuple[int, ...] = ()
     empty: int = 0
     gains: NDArray[np.float64] | None = None
+    stuck: NDArray[np.bool_] | None = None
 
     def __bool__(self) -> bool:
         """Whether there is anything to do."""
-        return bool(self.left_out or self.empty or self.gains is not None)
+        return bool(self.left_out or self.empty or self.gains is not None or self.stuck is not None)
 
 
 def with_corrected_frames(recording: Recording, corrections: FrameCorrections) -> Recording:
@@ -209,13 +213,13 @@ def with_corrected_frames(recording: Recording, corrections: FrameCorrections) -
     whole, count, made = recording.source.frames, recording.source.count_frames, copy.copy(recording)
     made.source = dataclasses.replace(
         recording.source,
-        frames=lambda: _corrected(whole(), corrections),
+        frames=lambda: _corrected(whole(), corrections, 1 if recording.mosaic is None else 2),
         count_frames=lambda: count() - len(corrections.left_out),
     )
     return made
 
 
-def _corrected(frames: Iterator[Frame], corrections: FrameCorrections) -> Iterator[Frame]:
+def _corrected(frames: Iterator[Frame], corrections: FrameCorrections, pitch: int) -> Iterator[Frame]:
     """The frames that are left. Where the first are empty, the next one's image is where the filter starts.
 
     Nothing of it counts as measured there, but what is clipped: to take that for white would cost more.
@@ -229,6 +233,8 @@ def _corrected(frames: Iterator[Frame], corrections: FrameCorrections) -> Iterat
         if index < corrections.empty:
             waiting.append(frame)
             continue
+        if corrections.stuck is not None:
+            frame = dataclasses.replace(frame, image=without_stuck(frame.image, corrections.stuck, pitch))
         for empty in waiting:
             bright = frame.normalised() >= _CLIPPED
             clipped = bright if bright.ndim == 2 else bright.all(axis=-1)

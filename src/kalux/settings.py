@@ -79,6 +79,9 @@ class CameraSettings:
     leave_out_faulty
         Whether frames are left out that are copies of the one before though events say that something moved, or that
         are empty. Not in a live stream.
+    mend_stuck
+        Whether pixels of frames that always show the same, though their events and their neighbours say that their
+        light changes, are taken for the median of these (`kalux.calibration.stuck_pixels`). Not in a live stream.
     white_balance
         Of recordings in colour: ``"as-recorded"``, ``"grey-world"`` (gains that make the mean of well exposed pixels
         grey; one set for a recording), or gains of red, green and blue, ``"1.8;1;1.4"``. As recorded: what is grey is
@@ -99,6 +102,7 @@ class CameraSettings:
     reference_exposure: int | None = None
     even_gain: bool = True
     leave_out_faulty: bool = True
+    mend_stuck: bool = True
     white_balance: str = "as-recorded"
 
     @property

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from kalux.calibration.intervals import Interval, intervals, spread
 from kalux.calibration.neighbours import sum_of_neighbours
 from kalux.calibration.regression import two_stage
+from kalux.calibration.stuck_pixels import RangeWatch
 from kalux.event_slices import all_between, count_chunks
 from kalux.frames import Frame
 from kalux.models.camera import Camera
@@ -54,6 +55,10 @@ _FLICKER: Final = 0.5
 """Where the light of the median pixel goes up and down again by more than this share of the step between two frames, a
 step may be flicker that a frame catches at another moment than its events say."""
 
+_SEEN: Final = 0.2
+"""Where the median pixel has events for more than this share of the step, it is the light that changes: so fast that
+most of it is lost in the pixels' refractory period."""
+
 _SMALL_OFFSET: Final = 1e-3
 """I_0 for comparing frames: with a larger one, steps of dark pixels would come out too small."""
 
@@ -88,6 +93,8 @@ class FrameFaults(NamedTuple):
         Indices of the frames from which on another gain holds, and
     gains
         (K,) the gain of every frame, 1 that of the median frame.
+    stuck
+        (H, W) pixels that always show the same; None: none.
     """
 
     frames: int
@@ -95,6 +102,7 @@ class FrameFaults(NamedTuple):
     empty: tuple[int, ...] = ()
     steps: tuple[int, ...] = ()
     gains: Array = np.ones(0)
+    stuck: NDArray[np.bool_] | None = None
 
     @property
     def first(self) -> int:
@@ -105,7 +113,11 @@ class FrameFaults(NamedTuple):
         """What is to be done about it; whether empty frames at the beginning are needed."""
         kept = self.first if with_first else 0
         left_out = sorted({*self.copies, *self.empty[kept:]})
-        return FrameCorrections(tuple(left_out), kept, self.gains if self.steps else None)
+        return FrameCorrections(tuple(left_out), kept, self.gains if self.steps else None, self.stuck)
+
+    def __bool__(self) -> bool:
+        """Whether anything was."""
+        return bool(self.copies or self.empty or self.steps or self.stuck is not None)
 
 
 class FrameWatch:
@@ -125,6 +137,7 @@ class FrameWatch:
         self.copies: list[int] = []
         self.empty: list[int] = []
         self.suspects: list[int] = []
+        self.ranges = RangeWatch()
 
     def see(self, frame: Frame) -> None:
         """Look at the next frame."""
@@ -136,7 +149,10 @@ class FrameWatch:
         low, high = np.quantile(response, (0.01, 0.99))
         if high - low < _CONTRAST:
             self.empty.append(index)
-        elif self._last_image is not None and np.array_equal(frame.image, self._last_image):
+            self._last_image = frame.image
+            return
+        self.ranges.see(frame)
+        if self._last_image is not None and np.array_equal(frame.image, self._last_image):
             self.copies.append(index)
         else:
             self._compare(index, frame, response)
@@ -160,8 +176,8 @@ def _inside(response: Array) -> NDArray[np.bool_]:
     return (response > low) & (response < high)
 
 
-def find_frame_faults(recording: Recording, camera: CameraSettings, watch: FrameWatch) -> FrameFaults | None:
-    """Judge the frames that a watch has noticed by their events. None where nothing is wrong.
+def find_frame_faults(recording: Recording, camera: CameraSettings, watch: FrameWatch) -> FrameFaults:
+    """Judge the frames that a watch has noticed by their events.
 
     Parameters
     ----------
@@ -180,13 +196,12 @@ def find_frame_faults(recording: Recording, camera: CameraSettings, watch: Frame
     empty = watch.empty if len(watch.empty) <= _MOST_EMPTY * watch.frames else []
     copies = watch.copies if len(watch.copies) <= _MOST_COPIES * watch.frames else []
     asked = {*empty, *copies, *watch.suspects}
+    found = FrameFaults(watch.frames, stuck=watch.ranges.stuck(recording))
     if not asked:
-        return None
+        return found
     compared = dataclasses.replace(camera, log_offset=_SMALL_OFFSET)
     certain_copies, certain_empty, steps = list[int](), list[int](), dict[int, float]()
-    last = max(asked) + 2
-    # The frames that are wrong stand between those that can be compared.
-    for index, interval in _intervals(recording, compared, last, {*empty}, asked):
+    for index, interval in _intervals(recording, compared, {*empty}, asked):
         on, off = count_chunks(
             all_between(interval.chunks, interval.start, interval.end), recording.sensor_size, weighed=False
         )
@@ -198,23 +213,22 @@ def find_frame_faults(recording: Recording, camera: CameraSettings, watch: Frame
                 certain_empty.append(index)
         elif (step := _step(interval, on, off)) is not None:
             steps[index] = step
-    if not (certain_copies or certain_empty or steps):
-        return None
-    if len(certain_empty) == watch.frames:
-        certain_empty = []
-    return FrameFaults(
-        watch.frames,
-        tuple(certain_copies),
-        tuple(certain_empty),
-        tuple(sorted(steps)),
-        _gains(watch.frames, steps),
+    return found._replace(
+        copies=tuple(certain_copies),
+        empty=tuple(certain_empty),
+        steps=tuple(sorted(steps)),
+        gains=_gains(watch.frames, steps),
     )
 
 
 def _intervals(
-    recording: Recording, camera: CameraSettings, most: int, empty: set[int], asked: set[int]
+    recording: Recording, camera: CameraSettings, empty: set[int], asked: set[int]
 ) -> Iterator[tuple[int, Interval]]:
-    """Intervals that end with a frame that is asked for; those from the first frames on, where these are empty."""
+    """Frames that are asked for, with the interval that ends there; where the first are empty, that which begins there.
+
+    What is beside an empty frame cannot be compared with it.
+    """
+    most = max(asked) + 2
     for before, interval in enumerate(intervals(recording, camera, margin=0, most_frames=most)):
         if before in empty and all(i in empty for i in range(before)):
             yield before, interval
@@ -223,7 +237,7 @@ def _intervals(
 
 
 def _shows_motion(on: NDArray[Any], off: NDArray[Any], usable: NDArray[np.bool_]) -> bool:
-    """Whether neighbouring pixels had events of one sign in places that frames show well: noise has them alone."""
+    """Whether neighbouring pixels had events of one sign, in places that frames show well: noise has them alone."""
     net = on - off
     rising, falling = net > 0, net < 0
     moved = (rising & (sum_of_neighbours(rising.view(np.uint8)) > 0)) | (
@@ -261,8 +275,10 @@ def _step(interval: Interval, on: NDArray[Any], off: NDArray[Any]) -> float | No
     step = float(np.median(middles))
     if abs(step) < _LEAST_STEP or np.mean(np.abs(middles - step) < _ALIKE * abs(step)) < _MOST_PARTS:
         return None
-    back_and_forth = float(np.median(np.minimum(ups, downs))) * max(thresholds, default=0.0)
-    return step if back_and_forth < _FLICKER * abs(step) else None
+    largest = max(thresholds, default=0.0)
+    back_and_forth = float(np.median(np.minimum(ups, downs))) * largest
+    lit = float(np.median(ups - downs)) * np.sign(step) * largest
+    return step if back_and_forth < _FLICKER * abs(step) and lit < _SEEN * abs(step) else None
 
 
 def _gains(frames: int, steps: dict[int, float]) -> Array:
