@@ -232,7 +232,9 @@ def check_frame(
     image = frame.image
     _check_times(frame, where, index)
     if not (isinstance(frame.gain, Real) and 1e-6 <= float(frame.gain) <= 1e6):
-        raise FrameError(f"{where}: frame {index} has a gain of {frame.gain!r}; 0.000001 to 1000000 is possible")
+        raise FrameError(
+            f"{where}: frame {index} has a gain of {frame.gain!r}; 0.000001 to 1000000 is possible"
+        )
     if frame.white is not None and not is_white(frame.white):
         raise FrameError(
             f"{where}: frame {index} has the white value {frame.white!r}; the value of a saturated pixel is needed"

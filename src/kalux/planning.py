@@ -40,6 +40,7 @@ from kalux.models.pixels import PixelCalibration, require_size, with_hot
 from kalux.recording import (
     AS_STORED,
     RECORDING_NEEDED,
+    UNCHANGED,
     FrameCorrections,
     Recording,
     less_black,
@@ -144,7 +145,7 @@ class Plan:
     dead_time: int = 0
     hot_pixels: int = 0
     frame_faults: FrameFaults | None = None
-    corrections: FrameCorrections = FrameCorrections()
+    corrections: FrameCorrections = UNCHANGED
     agreement: Agreement | None = None
 
 
@@ -198,7 +199,7 @@ def plan(
     begin = _begin_time(exposures[first], chosen, lookahead)
     earliest = begin if times is None else _begin_time(exposures[0], chosen, lookahead)
     wanted = image_times(recording, exposures, earliest, rate_hz=rate_hz, times=times, at=at)
-    corrections = FrameCorrections()
+    corrections = UNCHANGED
     if faults is not None:
         corrections = faults.corrections(with_first=bool(len(wanted)) and int(wanted[0]) < begin)
         recording = with_corrected_frames(recording, corrections)

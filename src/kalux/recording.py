@@ -206,6 +206,10 @@ class FrameCorrections(NamedTuple):
         return bool(self.left_out or self.empty or self.gains is not None or self.stuck is not None)
 
 
+UNCHANGED: Final = FrameCorrections()
+"""Frames as they are."""
+
+
 def with_corrected_frames(recording: Recording, corrections: FrameCorrections) -> Recording:
     """The same recording, with its frames corrected."""
     if not corrections:
@@ -236,8 +240,9 @@ def _corrected(frames: Iterator[Frame], corrections: FrameCorrections, pitch: in
         if corrections.stuck is not None:
             frame = dataclasses.replace(frame, image=without_stuck(frame.image, corrections.stuck, pitch))
         for empty in waiting:
-            bright = frame.normalised() >= _CLIPPED
-            clipped = bright if bright.ndim == 2 else bright.all(axis=-1)
+            response = frame.normalised()
+            least = response if response.ndim == 2 else response.min(axis=-1)
+            clipped = np.asarray(least >= _CLIPPED, np.bool_)
             yield dataclasses.replace(empty, image=frame.image, gain=frame.gain, valid=clipped)
         waiting = []
         yield frame

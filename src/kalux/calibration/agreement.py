@@ -31,14 +31,14 @@ _LEAST: Final = 500
 _LARGEST_COUNT: Final = 5.0  # of a pixel between two frames: more are those of hot ones
 _LARGEST_CHANGE: Final = 1.0  # of the log intensity: more are those of broken ones
 
-_AGREE: Final = 0.3
-"""Correlation from which on nothing is doubted: three real recordings have 0.58 to 0.78, 60 simulated ones 0.47 to 0.98,
-one where light flickers by 80 % the least."""
+_AGREE: Final = 0.5
+"""Correlation from which on nothing is doubted: three real recordings have 0.58 to 0.78, 60 simulated ones 0.47 (light
+that flickers by 80 %) to 0.98."""
 
 _CERTAIN: Final = 0.4
-_TIMES: Final = 3.0
+_TIMES: Final = 2.5
 """Correlation of another layout from which it is the right one, and how many times that of the layout as stored: of
-wrong ones it is up to 0.3, as some motion looks much the same in a mirror."""
+wrong ones it is up to 0.34, as some motion looks much the same in a mirror."""
 
 _NOTHING: Final = 0.1
 """Correlation below which frames and events have nothing to do with each other."""
@@ -84,7 +84,7 @@ def find_agreement(recording: Recording, camera: CameraSettings) -> Agreement | 
     seen, active = list[tuple[Array, Array, NDArray[np.bool_]]](), 0
     for interval in intervals(recording, camera, margin=0, most_frames=_MOST_FRAMES):
         seen.append((*_change_and_count(interval, recording.sensor_size), interval.usable))
-        active += np.count_nonzero(seen[-1][1][interval.usable])
+        active += int(np.count_nonzero(seen[-1][1][interval.usable]))
         if active >= _ENOUGH:
             break
     if active < _LEAST:
@@ -100,17 +100,17 @@ def find_agreement(recording: Recording, camera: CameraSettings) -> Agreement | 
     (x, y), best = max(found.items(), key=lambda item: abs(item[1]))
     if abs(best) >= max(_CERTAIN, _TIMES * stored):
         return Agreement(EventLayout(x, y, swapped=best < 0), abs(best))
-    apart = abs(best) < _NOTHING and all(
-        _correlation((p[k], sum_of_neighbours(p[k]), p[2]) for p in seen) >= _COHERENT for k in (0, 1)
+    coherent = (
+        _correlation((c, sum_of_neighbours(c), u) for c, _, u in seen),
+        _correlation((n, sum_of_neighbours(n), u) for _, n, u in seen),
     )
+    apart = abs(best) < _NOTHING and min(coherent) >= _COHERENT
     return Agreement(AS_STORED, stored, contradicts=apart)
 
 
 def _change_and_count(interval: Interval, size: tuple[int, int]) -> tuple[Array, Array]:
     """(H, W) change of the log intensity, less its median, and net count of events."""
-    on, off = count_chunks(
-        all_between(interval.chunks, interval.start, interval.end), size, weighed=False
-    )
+    on, off = count_chunks(all_between(interval.chunks, interval.start, interval.end), size, weighed=False)
     usable = interval.usable
     middle = float(np.median(interval.change[usable])) if usable.any() else 0.0
     change = np.clip(interval.change - middle, -_LARGEST_CHANGE, _LARGEST_CHANGE)
@@ -118,7 +118,7 @@ def _change_and_count(interval: Interval, size: tuple[int, int]) -> tuple[Array,
 
 
 def _correlation(pairs: Iterator[tuple[Array, Array, NDArray[Any]]]) -> float:
-    """Of two images in the pixels of a third, over all intervals, in each about its own mean; 0 where one is constant."""
+    """Of two images in the pixels of a third, over all intervals, about their means; 0 where one is constant."""
     sums = np.zeros(3)
     for first, second, chosen in pairs:
         a, b = first[chosen], second[chosen]

@@ -1,4 +1,4 @@
-"""Pixels of frames that always show the same, while their neighbours and their own events show that the light changes."""
+"""Pixels of frames that always show the same, while neighbours and their own events show that the light changes."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ always on has none."""
 
 
 class RangeWatch:
-    """Sees frames go by, and keeps the darkest and the brightest response of every pixel of the first 80 with contrast."""
+    """Sees frames go by, and keeps the darkest and the brightest value of every pixel of the first 80."""
 
     def __init__(self) -> None:
         self._low: NDArray[Any] | None = None
@@ -77,7 +77,7 @@ class RangeWatch:
         if not suspects.any():
             return None
         counts = self._counts(recording)
-        usual = np.median(around(counts, self._pitch, 0), axis=0)
+        usual = np.nanmedian(around(counts, self._pitch, np.nan), axis=0)
         stuck = suspects & (usual >= _LEAST_EVENTS) & (counts >= _SHARE * usual)
         return stuck if stuck.any() else None
 
@@ -93,4 +93,3 @@ class RangeWatch:
             if len(inside) < len(chunk) or seen >= _MOST_EVENTS:
                 break
         return total
-

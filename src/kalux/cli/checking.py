@@ -182,8 +182,8 @@ class _Changes:
     def see(self, frame: Frame) -> None:
         """Look at the next frame."""
         image = frame.image if frame.image.ndim == 2 else frame.image[..., 1]
-        blocks = cv2.resize(np.asarray(image, np.float32), _BLOCKS, interpolation=cv2.INTER_AREA)
-        blocks /= np.float32(frame.white_value)
+        resized = cv2.resize(image.astype(np.float32), _BLOCKS, interpolation=cv2.INTER_AREA)
+        blocks = np.asarray(resized / frame.white_value, np.float32)
         if self._blocks is not None:
             self._changes.append(float(np.sqrt(np.mean(np.square(blocks - self._blocks)))))
         self._blocks = blocks

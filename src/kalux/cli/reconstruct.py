@@ -296,7 +296,7 @@ def plan_warnings(planned: Plan, contents: Contents, preset_name: str) -> Iterat
     if planned.threshold_origin in ESTIMATED_ORIGINS:
         yield threshold_warning(planned, preset_name)
     if planned.agreement is not None and planned.agreement.layout != AS_STORED:
-        yield f"{layout_text(planned.agreement)}, and are put right (--events.mend-layout false leaves them as they are)"
+        yield f"{layout_text(planned.agreement)}: put right (--events.mend-layout false leaves them as they are)"
     is_contradicted = planned.agreement is not None and planned.agreement.contradicts
     if is_contradicted or (planned.threshold_origin == "assumed" and contradicts(planned.estimate)):
         yield (
