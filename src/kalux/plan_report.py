@@ -179,7 +179,7 @@ def gain_text(faults: FrameFaults) -> str:
 
 def stuck_text(stuck: NDArray[np.bool_]) -> str:
     """How many pixels of frames are stuck."""
-    return f"{how_many(int(np.count_nonzero(stuck)), 'pixel')} of the frames always show the same though light changes"
+    return f"{how_many(int(np.count_nonzero(stuck)), 'pixel')} always the same though the light changes"
 
 
 def left_out_text(faults: FrameFaults) -> str:

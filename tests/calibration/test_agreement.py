@@ -52,7 +52,9 @@ def test_images_are_those_of_events_as_they_should_be():
     spoilt = with_event_layout(source, wrong)
     for options in ({}, {"smooth": True}):
         for right, mended in zip(
-            reconstruct(source, at="frames", **options), reconstruct(spoilt, at="frames", **options), strict=True
+            reconstruct(source, at="frames", **options),
+            reconstruct(spoilt, at="frames", **options),
+            strict=True,
         ):
             assert np.array_equal(right.intensity, mended.intensity)
     kept = plan(spoilt, at="frames", settings=altered(SETTINGS, "events", mend_layout=False))

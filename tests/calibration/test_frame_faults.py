@@ -28,7 +28,10 @@ def filmed(motion=None, light=lambda t: 1.0, exposures=None, **sensor):
     seen = photograph_scene(blocks(), motion or pan(60.0), sensor_size=SIZE, duration=500_000)
     lit = Scene(lambda t: seen.at(t) * light(t), SIZE, seen.start, seen.end)
     made = simulate(
-        lit, SensorSettings(**{"threshold_on": 0.2, "threshold_off": 0.2, **sensor}), seed=1, exposures=exposures
+        lit,
+        SensorSettings(**{"threshold_on": 0.2, "threshold_off": 0.2, **sensor}),
+        seed=1,
+        exposures=exposures,
     )
     return made.events, made.frames
 
@@ -179,7 +182,8 @@ def test_a_plan_evens_out_gains_unless_told_not_to():
     assert made.corrections.gains is not None
     right = recorded(events, frames)
     evened, true = (
-        np.array([np.median(image.intensity) for image in reconstruct(each, at="frames")]) for each in (source, right)
+        np.array([np.median(image.intensity) for image in reconstruct(each, at="frames")])
+        for each in (source, right)
     )
     assert np.ptp(np.log(evened / true)) < 0.1
     kept = plan(source, at="frames", settings=altered(SETTINGS, "camera", even_gain=False))

@@ -50,7 +50,10 @@ def test_none_is_found_where_none_is_stuck():
 @pytest.mark.parametrize("value", [0, 128, 255])
 def test_a_stuck_pixel_is_found(value, channels):
     events, frames = moving()
-    assert found(events, with_pixels(frames, value, (20, 16), (0, 0), channels=channels)) == [(0, 0), (20, 16)]
+    assert found(events, with_pixels(frames, value, (20, 16), (0, 0), channels=channels)) == [
+        (0, 0),
+        (20, 16),
+    ]
 
 
 def test_two_side_by_side_are_found():
