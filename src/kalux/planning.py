@@ -38,7 +38,6 @@ from kalux.models.camera import BrightTail, Camera, count_bright
 from kalux.models.colour import white_balance
 from kalux.models.pixels import PixelCalibration, require_size, with_hot
 from kalux.recording import (
-    AS_STORED,
     RECORDING_NEEDED,
     UNCHANGED,
     FrameCorrections,
@@ -176,9 +175,9 @@ def plan(
     if known.pixels is not None:
         require_size(known.pixels, recording.sensor_size)
     recording = with_cached_start(recording, _CACHED_EVENTS, _CACHED_FRAME_BYTES)
-    agreement = find_agreement(recording, chosen.camera) if chosen.filter.joins_frames else None
+    looks_for_layout = chosen.filter.joins_frames and chosen.events.mend_layout
+    agreement = find_agreement(recording, chosen.camera) if looks_for_layout else None
     if agreement is not None:
-        agreement = agreement if chosen.events.mend_layout else agreement._replace(layout=AS_STORED)
         recording = with_event_layout(recording, agreement.layout)
     looks_for_hot = chosen.filter.joins_frames and chosen.events.leave_out_hot
     hot = find_hot_pixels(recording, _NOISE_EVENTS) if looks_for_hot else None

@@ -34,7 +34,7 @@ _LEAST_MISSED: Final = 100
 """Events that are missing in a silence at the usual rate, at least: by chance it is none."""
 
 _LEAST_INTERVALS: Final = 2  # between frames: in less of them, little is lost
-_ALIKE: Final = 0.5
+_ALIKE: Final = 0.25
 """Share of the usual change from frame to frame from which something moved in a silence, too."""
 
 _BLOCKS: Final = (16, 16)
