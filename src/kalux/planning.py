@@ -188,12 +188,12 @@ def plan(
     chosen, ceiling = with_saturation(recording, chosen)
     response = chosen_response(chosen.camera.response, recording.response)
     camera = Camera.named(response, chosen.camera.clipped_from)
-    watch = FrameWatch(camera) if chosen.filter.joins_frames else None
+    watch = _frame_watch(chosen, camera)
     exposures, tail = _survey(recording, camera if _measures_tail(chosen) else None, watch)
     if chosen.filter.motion == "auto":
         follows = smooth or chosen.filter.follows_motion(recording.sensor_size)
         chosen = altered(chosen, "filter", motion="on" if follows else "off")
-    faults = None if watch is None else _frame_faults(recording, chosen.camera, watch)
+    faults = None if watch is None else find_frame_faults(recording, chosen.camera, watch) or None
     first = 0 if faults is None else faults.first
     begin = _begin_time(exposures[first], chosen, lookahead)
     earliest = begin if times is None else _begin_time(exposures[0], chosen, lookahead)
@@ -286,16 +286,14 @@ def with_saturation(recording: Recording, settings: Settings) -> tuple[Settings,
     return (clipped, found) if found is not None and found.is_at(end) else (usual, None)
 
 
-def _frame_faults(recording: Recording, camera: CameraSettings, watch: FrameWatch) -> FrameFaults | None:
-    """What is wrong with frames, of what the settings let be mended; None where nothing is."""
-    faults = find_frame_faults(recording, camera, watch)
-    if not camera.even_gain:
-        faults = faults._replace(steps=())
-    if not camera.leave_out_faulty:
-        faults = faults._replace(copies=(), empty=())
-    if not camera.mend_stuck:
-        faults = faults._replace(stuck=None)
-    return faults or None
+def _frame_watch(settings: Settings, camera: Camera) -> FrameWatch | None:
+    """What sees the frames go by, for as much as the settings let be mended; None for nothing."""
+    chosen = settings.camera
+    asked = (chosen.even_gain, chosen.leave_out_faulty, chosen.mend_stuck)
+    if not settings.filter.joins_frames or not any(asked):
+        return None
+    gain, faulty, stuck = asked
+    return FrameWatch(camera, gain=gain, faulty=faulty, stuck=stuck)
 
 
 def _survey(

@@ -131,9 +131,12 @@ class FrameWatch:
     ----------
     camera
         By which responses are compared.
+    gain, faulty, stuck
+        Whether to look for steps of the gain, for copies and empty frames, and for stuck pixels.
     """
 
-    def __init__(self, camera: Camera) -> None:
+    def __init__(self, camera: Camera, *, gain: bool = True, faulty: bool = True, stuck: bool = True) -> None:
+        self._gain, self._faulty, self._stuck = gain, faulty, stuck
         self._response = camera.of_channel(1).response
         self._previous: tuple[Frame, Array, Array] | None = None
         self._last_image: NDArray[Any] | None = None
@@ -151,16 +154,18 @@ class FrameWatch:
         image = np.ascontiguousarray(image if image.ndim == 2 else image[..., 1])
         response = dataclasses.replace(frame, image=image, valid=None).normalised()
         low, high = np.quantile(response, (0.01, 0.99))
-        if high - low < _CONTRAST:
-            self.empty.append(index)
-            self._last_image = frame.image
-            return
-        self.ranges.see(frame)
-        if self._last_image is not None and np.array_equal(frame.image, self._last_image):
-            self.copies.append(index)
-        else:
-            self._compare(index, frame, response)
+        is_copy = self._last_image is not None and np.array_equal(frame.image, self._last_image)
         self._last_image = frame.image
+        if high - low < _CONTRAST:
+            if self._faulty:
+                self.empty.append(index)
+            return
+        if self._stuck:
+            self.ranges.see(frame)
+        if is_copy and self._faulty:
+            self.copies.append(index)
+        elif not is_copy and self._gain:
+            self._compare(index, frame, response)
 
     def _compare(self, index: int, frame: Frame, response: Array) -> None:
         """Whether most of the image is brighter, or darker, than in the frame before, exposure times accounted for."""
