@@ -50,7 +50,7 @@ from kalux.recording import (
     without_events_of,
 )
 from kalux.schedule import image_times
-from kalux.settings import SETTINGS_NEEDED, CameraSettings, Settings, altered, chosen_response
+from kalux.settings import SETTINGS_NEEDED, Settings, altered, chosen_response
 from kalux.settings import preset as named_preset
 
 ThresholdOrigin = Literal["settings", "recording", "calibration", "estimate", "assumed"]
