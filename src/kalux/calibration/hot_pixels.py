@@ -44,8 +44,8 @@ _STEADY: Final = 0.75
 0.74, 0.78 and more in leaking ones of 200 Hz over fine texture that moves."""
 
 _TIMES: Final = 2.5
-"""How many times that of its neighbours its net count over all bins is, at least: light changes alike beside. The second
-largest of the eight counts, so that one of them may leak, too."""
+"""How many times that of its neighbours its net count over all bins is, at least: light changes alike beside. The
+second largest of the eight counts, so that one of them may leak, too."""
 
 
 def find_hot_pixels(recording: Recording, most_events: int) -> NDArray[np.bool_]:
