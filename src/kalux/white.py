@@ -104,7 +104,7 @@ class WhiteCheck:
         if self._largest > _SMALL_FLOAT * white:
             return None
         return (
-            f"no pixel of the frames, which are floats, is above {self._largest:.3g}, and {white:g} is taken for white; if "
+            f"no pixel of the frames, floats, is above {self._largest:.3g}, and {white:g} is taken for white; if "
             "they are in units of white, give --white 1 (white=1)"
         )
 
