@@ -190,3 +190,10 @@ def test_a_placed_exposure_keeps_the_mask():
     masked = Frame(np.ones((3, 4), np.uint8), 100, 100, valid=mask)
     assert place_exposure(masked, 10, "start").valid is mask
     check_frame(masked, (3, 4), exposure_known=False)
+
+
+@pytest.mark.parametrize("gain", [0.0, -1.0, float("nan"), float("inf"), "2"])
+def test_a_gain_that_cannot_be_is_refused(gain):
+    frame = Frame(np.zeros((2, 2), np.uint8), 0, 10, gain=gain)
+    with pytest.raises(FrameError, match="frame 3 has a gain of"):
+        check_frame(frame, (2, 2), index=3)

@@ -56,3 +56,25 @@ def test_what_a_recording_without_events_does_not_tell_is_the_usual():
     for label in ("thresholds", "delay", "I_0", "step", "spread", "background"):
         assert "usual" in rows[label], (label, rows[label])
     assert rows["exposure"].endswith("(median of the frames)")
+
+
+def test_says_what_is_wrong_with_frames_and_events():
+    made = moving_blocks(0.02, 1.5, duration=1_000_000)
+    frames = [dataclasses.replace(frame, image=frame.image.copy()) for frame in made.frames]
+    frames[3].image[:] = frames[2].image
+    for index, frame in enumerate(frames):
+        frame.image[16, 20] = 0
+        if index >= 12:
+            frame.image[:] = frame.image // 2
+    mirrored = made.events.copy()
+    mirrored["x"] = 39 - mirrored["x"]
+    rows = rows_of(Recording.from_arrays(mirrored, frames, sensor_size=(32, 40), name="wrong"))
+    assert rows["left out"] == "1 frame, first frame 3: the same as the one before, though events show motion"
+    assert rows["gain"].startswith(
+        "the brightness of the frames steps at 1 frame, first at frame 12, by up to a factor"
+    )
+    assert rows["stuck"].startswith("1 pixel always the same though the light changes")
+    assert re.fullmatch(
+        r"events follow the frames if their x counts from the other side \(correlation 0.\d\d\): put right",
+        rows["layout"],
+    )

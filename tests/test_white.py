@@ -58,3 +58,19 @@ def test_a_few_broken_pixels_are_no_white(count, found):
     image.flat[:count] = 4095
     assert white_of_bits([Frame(image, 0, 1)]) == found
     assert white_of_bits([Frame(image, t, t + 1) for t in range(3)]) == found
+
+
+@pytest.mark.parametrize(
+    ("largest", "white", "doubted"), [(1.0, 255.0, True), (40.0, 255.0, False), (1.0, 1.0, False)]
+)
+def test_floats_of_another_unit_than_the_stated_white_are_doubted(largest, white, doubted):
+    """As `.mat` files of the authors' layout, where 255 is white, with images from 0 to 1."""
+    check = WhiteCheck()
+    image = np.linspace(0, largest, 64).reshape(8, 8)
+    assert len([*check.watched([Frame(image, 0, 10, white=white)])]) == 1
+    told = check.doubt()
+    assert (told is not None) == doubted
+    assert (
+        not doubted
+        or "255 is taken for white; if they are in units of white, give --white 1 (white=1)" in told
+    )

@@ -51,6 +51,9 @@ class Frame:
     black
         The value of a pixel in the dark, in the unit of the image: what every pixel reads on top of its light.
         ``camera.black_level`` of the settings goes before it.
+    gain
+        How many times brighter the same light is in this frame than its exposure time alone makes it: amplification,
+        or an exposure that is not as stated.
     """
 
     image: NDArray[Any]
@@ -60,6 +63,7 @@ class Frame:
     mosaic: Mosaic | None = None
     valid: NDArray[np.bool_] | None = None
     black: float = 0.0
+    gain: float = 1.0
 
     def __repr__(self) -> str:
         image = self.image
@@ -227,6 +231,10 @@ def check_frame(
     require_frame(frame, where=where, index=index)
     image = frame.image
     _check_times(frame, where, index)
+    if not (isinstance(frame.gain, Real) and 1e-6 <= float(frame.gain) <= 1e6):
+        raise FrameError(
+            f"{where}: frame {index} has a gain of {frame.gain!r}; 0.000001 to 1000000 is possible"
+        )
     if frame.white is not None and not is_white(frame.white):
         raise FrameError(
             f"{where}: frame {index} has the white value {frame.white!r}; the value of a saturated pixel is needed"

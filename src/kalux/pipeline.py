@@ -20,7 +20,7 @@ from kalux.events import EventArray
 from kalux.images import Estimate, Image
 from kalux.planning import UNCERTAIN_ORIGINS, Plan, plan
 from kalux.reconstructor import Reconstructor
-from kalux.recording import Recording
+from kalux.recording import Recording, with_corrected_frames, with_event_layout
 from kalux.settings import Settings
 from kalux.smoothing import Backward, combine, reversed_pixels, reversed_settings
 from kalux.threads import ahead
@@ -122,6 +122,9 @@ def execute(
         Without, grey images have an infinite variance and are made faster.
     """
     memory.give_back()  # that planning and checking have used
+    recording = with_corrected_frames(recording, plan.corrections)
+    if plan.layout is not None:
+        recording = with_event_layout(recording, plan.layout.found)
     engine = _engine(recording, plan)
     several = threads > 1
     if plan.smooth:

@@ -6,11 +6,14 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from kalux.calibration.delay import SHARE
+from kalux.calibration.event_layout import LayoutFit
 from kalux.calibration.event_model import Agreement
+from kalux.calibration.frame_faults import FrameFaults
 from kalux.calibration.levels import Ceiling, find_ceiling
-from kalux.recording import Recording, less_black
+from kalux.recording import AS_STORED, Recording, less_black
 from kalux.settings import AUTO, Settings
 from kalux.wording import how_many
 
@@ -74,6 +77,8 @@ def _of_events(plan: Plan, asked: Settings) -> Iterator[tuple[str, str]]:
         if plan.background_rate is not None and plan.background_rate < events.noise_rate:
             how = f"the least that is assumed; measured {plan.background_rate:.2g}"
         yield "background", f"{events.noise_rate:.2g} Hz per pixel of events without reason ({how})"
+    if plan.layout is not None and plan.layout.found != AS_STORED:
+        yield "layout", f"{layout_text(plan.layout)}: put right"
     if plan.hot_pixels:
         yield "hot pixels", f"{how_many(plan.hot_pixels, 'pixel')} whose events are left out (measured)"
 
@@ -101,6 +106,12 @@ def _of_frames(recording: Recording, plan: Plan, asked: Settings) -> Iterator[tu
     stated = "usual, the recording does not state it" if recording.response is None else "as recorded"
     how = stated if asked.camera.response == AUTO else _GIVEN
     yield "response", f"{response_text(camera.response)} ({how})"
+    if plan.frame_faults is not None and plan.frame_faults.steps:
+        yield "gain", f"{gain_text(plan.frame_faults)}: evened out"
+    if plan.frame_faults is not None and (plan.frame_faults.copies or plan.frame_faults.empty):
+        yield "left out", left_out_text(plan.frame_faults)
+    if plan.frame_faults is not None and plan.frame_faults.stuck is not None:
+        yield "stuck", f"{stuck_text(plan.frame_faults.stuck)}: the median of their neighbours is taken"
     if recording.found_white is not None:
         yield "white", f"{recording.found_white}, where the 16-bit frames end"
     if plan.black is not None or camera.black_level is not None:
@@ -145,6 +156,48 @@ def _black_text(plan: Plan) -> str:
         f"0; {begin}, which events do not show to be black: if the camera reads that in the dark, "
         f"--camera.black-level {found.floor:.2g}"
     )
+
+
+def layout_text(fit: LayoutFit) -> str:
+    """What of the events is the wrong way round."""
+    layout = fit.found
+    wrong = [
+        text
+        for is_so, text in (
+            (layout.mirrored_x, "their x counts from the other side"),
+            (layout.mirrored_y, "their y counts from the other side"),
+            (layout.swapped, "their polarity 1 is darker"),
+        )
+        if is_so
+    ]
+    return f"events follow the frames if {' and '.join(wrong)} (correlation {fit.correlation:.2f})"
+
+
+def gain_text(faults: FrameFaults) -> str:
+    """By how much the frames' brightness steps, and where first."""
+    spans = float(faults.gains.max() / faults.gains.min())
+    return (
+        f"the brightness of the frames steps at {how_many(len(faults.steps), 'frame')}, first at frame "
+        f"{faults.steps[0]}, by up to a factor of {spans:.2g} in all, and events show no such change"
+    )
+
+
+def stuck_text(stuck: NDArray[np.bool_]) -> str:
+    """How many pixels of frames are stuck."""
+    return f"{how_many(int(np.count_nonzero(stuck)), 'pixel')} always the same though the light changes"
+
+
+def left_out_text(faults: FrameFaults) -> str:
+    """Which frames are not used, and why."""
+    parts = []
+    if faults.copies:
+        copies = how_many(len(faults.copies), "frame")
+        parts.append(
+            f"{copies}, first frame {faults.copies[0]}: the same as the one before, though events show motion"
+        )
+    if faults.empty:
+        parts.append(f"{how_many(len(faults.empty), 'frame')}, first frame {faults.empty[0]}: empty")
+    return "; ".join(parts)
 
 
 def ceiling_text(ceiling: Ceiling) -> str:

@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 
 from kalux.calibration.black_level import BlackLevel, with_known_black
 from kalux.calibration.delay import DelayEstimate, estimate_delay
+from kalux.calibration.event_layout import LayoutFit, find_layout
 from kalux.calibration.event_model import EventModel, estimate_event_model
 from kalux.calibration.fixed_pattern import USUAL_PATTERN, FixedPattern, estimate_fixed_pattern
+from kalux.calibration.frame_faults import FrameFaults, FrameWatch, find_frame_faults
 from kalux.calibration.frame_noise import FrameNoise, UsualNoise, estimate_frame_noise, usual_noise
 from kalux.calibration.global_thresholds import (
     ROUGH_SAMPLES,
@@ -37,10 +39,14 @@ from kalux.models.colour import white_balance
 from kalux.models.pixels import PixelCalibration, require_size, with_hot
 from kalux.recording import (
     RECORDING_NEEDED,
+    UNCHANGED,
+    FrameCorrections,
     Recording,
     less_black,
     no_frames,
     with_cached_start,
+    with_corrected_frames,
+    with_event_layout,
     without_events_of,
 )
 from kalux.schedule import image_times
@@ -128,6 +134,12 @@ class Plan:
         The refractory period that noise shows, us; 0 where it does not.
     hot_pixels
         How many event pixels were found to be hot, whose events are left out.
+    frame_faults
+        Frames that are left out, or whose gain is not that of others.
+    corrections
+        What is done about these.
+    layout
+        How events lie to the frames, where that is looked for and can be told.
     """
 
     settings: Settings
@@ -148,6 +160,9 @@ class Plan:
     contradicted: Thresholds | None = None
     dead_time: int = 0
     hot_pixels: int = 0
+    frame_faults: FrameFaults | None = None
+    corrections: FrameCorrections = UNCHANGED
+    layout: LayoutFit | None = None
 
 
 def plan(
@@ -177,6 +192,10 @@ def plan(
     if known.pixels is not None:
         require_size(known.pixels, recording.sensor_size)
     recording = with_cached_start(recording, _CACHED_EVENTS, _CACHED_FRAME_BYTES)
+    looks_for_layout = chosen.filter.joins_frames and chosen.events.mend_layout
+    layout = find_layout(recording, chosen.camera) if looks_for_layout else None
+    if layout is not None:
+        recording = with_event_layout(recording, layout.found)
     looks_for_hot = chosen.filter.joins_frames and chosen.events.leave_out_hot
     hot = find_hot_pixels(recording) if looks_for_hot else None
     if hot is not None and hot.any():
@@ -185,12 +204,20 @@ def plan(
     chosen, ceiling = with_saturation(recording, chosen)
     response = chosen_response(chosen.camera.response, recording.response)
     camera = Camera.named(response, chosen.camera.clipped_from)
-    exposures, tail = _survey(recording, camera if _measures_tail(chosen) else None)
-    begin = _begin_time(exposures[0], chosen, lookahead)
+    watch = _frame_watch(chosen, camera)
+    exposures, tail = _survey(recording, camera if _measures_tail(chosen) else None, watch)
     if chosen.filter.motion == "auto":
         follows = smooth or chosen.filter.follows_motion(recording.sensor_size)
         chosen = altered(chosen, "filter", motion="on" if follows else "off")
-    wanted = image_times(recording, exposures, begin, rate_hz=rate_hz, times=times, at=at)
+    faults = None if watch is None else find_frame_faults(recording, chosen.camera, watch) or None
+    first = 0 if faults is None else faults.first
+    begin = _begin_time(exposures[first], chosen, lookahead)
+    earliest = begin if times is None else _begin_time(exposures[0], chosen, lookahead)
+    wanted = image_times(recording, exposures, earliest, rate_hz=rate_hz, times=times, at=at)
+    corrections = UNCHANGED
+    if faults is not None:
+        corrections = faults.corrections(with_first=bool(len(wanted)) and int(wanted[0]) < begin)
+        recording = with_corrected_frames(recording, corrections)
     lengths = exposures[:, 1] - exposures[:, 0]
     reference = chosen.camera.reference_exposure or median_exposure(lengths)
     chosen = altered(chosen, "camera", reference_exposure=reference, response=response)
@@ -231,6 +258,9 @@ def plan(
         ceiling=ceiling,
         black=black,
         dead_time=period,
+        frame_faults=faults,
+        corrections=corrections,
+        layout=layout,
     )
 
 
@@ -281,13 +311,30 @@ def with_saturation(recording: Recording, settings: Settings) -> tuple[Settings,
     return (clipped, found) if found is not None and found.is_at(end) else (usual, None)
 
 
-def _survey(recording: Recording, camera: Camera | None) -> tuple[NDArray[np.int64], BrightTail | None]:
-    """(K, 2) starts and ends, us, of all exposures, and, given a camera, the frames' bright tail, in one pass."""
+def _frame_watch(settings: Settings, camera: Camera) -> FrameWatch | None:
+    """What sees the frames go by, for as much as the settings let be mended; None for nothing."""
+    chosen = settings.camera
+    asked = (chosen.even_gain, chosen.leave_out_faulty, chosen.mend_stuck)
+    if not settings.filter.joins_frames or not any(asked):
+        return None
+    gain, faulty, stuck = asked
+    return FrameWatch(camera, gain=gain, faulty=faulty, stuck=stuck)
+
+
+def _survey(
+    recording: Recording, camera: Camera | None, watch: FrameWatch | None
+) -> tuple[NDArray[np.int64], BrightTail | None]:
+    """(K, 2) starts and ends, us, of all exposures, and, given a camera, the frames' bright tail, in one pass.
+
+    A watch sees all frames.
+    """
     exposures, tail = [], BrightTail()
     for frame in recording.frames():
         exposures.append((frame.exposure_start, frame.exposure_end))
         if camera is not None:
             tail = tail.joined(count_bright(camera, frame.image, frame.white_value, frame.black))
+        if watch is not None:
+            watch.see(frame)
     if not exposures:
         raise no_frames(recording)
     return np.array(exposures, np.int64), None if camera is None else tail

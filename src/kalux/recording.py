@@ -10,7 +10,7 @@ from functools import cached_property
 from itertools import islice
 from numbers import Real
 from pathlib import Path
-from typing import Any, Final, Generic, Literal, TypeVar
+from typing import Any, Final, Generic, Literal, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +43,7 @@ from kalux.frames import (
     with_black_level,
 )
 from kalux.models.colour import sample_mosaic
+from kalux.models.frame_pixels import without_stuck
 from kalux.readers import CHUNK_EVENTS, Source, joined
 from kalux.white import WhiteCheck, white_of_bits
 
@@ -54,6 +55,9 @@ both starts and stops them together."""
 
 _WHITE_FRAMES: Final = 80
 """Frames, some 3 s of them, that tell the white value where it is not stated."""
+
+
+_CLIPPED: Final = 0.98  # of the response
 
 
 class Stream(Generic[T]):
@@ -127,6 +131,47 @@ def without_events_of(recording: Recording, pixels: NDArray[np.bool_]) -> Record
     return made
 
 
+class EventLayout(NamedTuple):
+    """How stored events lie to the frames.
+
+    Attributes
+    ----------
+    mirrored_x, mirrored_y
+        Whether their columns, or rows, count from the other side.
+    swapped
+        Whether polarity 1 is darker.
+    """
+
+    mirrored_x: bool = False
+    mirrored_y: bool = False
+    swapped: bool = False
+
+
+AS_STORED: Final = EventLayout()
+
+
+def with_event_layout(recording: Recording, layout: EventLayout) -> Recording:
+    """The same recording, whose events are put as the frames are, from a ``layout`` in which they are not."""
+    if layout == AS_STORED:
+        return recording
+    whole, made = recording.source.events, copy.copy(recording)
+    height, width = recording.sensor_size
+
+    def turned(chunk: EventArray) -> EventArray:
+        check_events(chunk, recording.sensor_size, where=str(recording.source.path))
+        events = chunk.copy()
+        if layout.mirrored_x:
+            events["x"] = width - 1 - chunk["x"]
+        if layout.mirrored_y:
+            events["y"] = height - 1 - chunk["y"]
+        if layout.swapped:
+            events["p"] = ~chunk["p"]
+        return events
+
+    made.source = dataclasses.replace(recording.source, events=lambda: map(turned, whole()))
+    return made
+
+
 def less_black(recording: Recording, level: float | None) -> Recording:
     """The same recording, the frames of which have black at ``level``, a share of white; None: as before."""
     if level is None:
@@ -150,6 +195,73 @@ def with_frames(recording: Recording, frames: Callable[[], Iterator[Frame]]) -> 
         )
     )
     return less_black(chosen, recording.black_level)
+
+
+class FrameCorrections(NamedTuple):
+    """What is to be done with the frames of a recording before they are used (`kalux.calibration.frame_faults`).
+
+    Attributes
+    ----------
+    left_out
+        Indices of frames that show nothing new, in order.
+    empty
+        As many frames at the beginning show nothing, but are needed, as images are wanted there.
+    gains
+        (K,) `Frame.gain` of every frame of the recording; None: as they state.
+    stuck
+        (H, W) pixels that show nothing, instead of which their neighbours are taken; None: none.
+    """
+
+    left_out: tuple[int, ...] = ()
+    empty: int = 0
+    gains: NDArray[np.float64] | None = None
+    stuck: NDArray[np.bool_] | None = None
+
+    def __bool__(self) -> bool:
+        """Whether there is anything to do."""
+        return bool(self.left_out or self.empty or self.gains is not None or self.stuck is not None)
+
+
+UNCHANGED: Final = FrameCorrections()
+"""Frames as they are."""
+
+
+def with_corrected_frames(recording: Recording, corrections: FrameCorrections) -> Recording:
+    """The same recording, with its frames corrected."""
+    if not corrections:
+        return recording
+    whole, count, made = recording.source.frames, recording.source.count_frames, copy.copy(recording)
+    made.source = dataclasses.replace(
+        recording.source,
+        frames=lambda: _corrected(whole(), corrections, 1 if recording.mosaic is None else 2),
+        count_frames=lambda: count() - len(corrections.left_out),
+    )
+    return made
+
+
+def _corrected(frames: Iterator[Frame], corrections: FrameCorrections, pitch: int) -> Iterator[Frame]:
+    """The frames that are left. Where the first are empty, the next one's image is where the filter starts.
+
+    Nothing of it counts as measured there, but what is clipped: to take that for white would cost more.
+    """
+    left_out, waiting = {*corrections.left_out}, list[Frame]()
+    for index, frame in enumerate(frames):
+        if index in left_out:
+            continue
+        if corrections.gains is not None:
+            frame = dataclasses.replace(frame, gain=frame.gain * float(corrections.gains[index]))
+        if index < corrections.empty:
+            waiting.append(frame)
+            continue
+        if corrections.stuck is not None:
+            frame = dataclasses.replace(frame, image=without_stuck(frame.image, corrections.stuck, pitch))
+        for empty in waiting:
+            response = frame.normalised()
+            least = response if response.ndim == 2 else response.min(axis=-1)
+            clipped = np.asarray(least >= _CLIPPED, np.bool_)
+            yield dataclasses.replace(empty, image=frame.image, gain=frame.gain, valid=clipped)
+        waiting = []
+        yield frame
 
 
 def no_frames(recording: Recording) -> FrameError:

@@ -75,6 +75,15 @@ class CameraSettings:
         levels below 255, for sensors with fixed pattern noise at the top.
     reference_exposure
         Exposure time, us, at which a saturated pixel has intensity 1; None: the recording's median.
+    even_gain
+        Whether the brightness of frames is evened out where it steps though events say that the light does not
+        (`kalux.calibration.frame_faults`): exposure or amplification that nobody states. Not in a live stream.
+    leave_out_faulty
+        Whether frames are left out that are copies of the one before though events say that something moved, or that
+        are empty. Not in a live stream.
+    mend_stuck
+        Whether pixels of frames that always show the same, though their events and their neighbours say that their
+        light changes, are taken for the median of these (`kalux.calibration.stuck_pixels`). Not in a live stream.
     white_balance
         Of recordings in colour: ``"as-recorded"``, ``"grey-world"`` (gains that make the mean of well exposed pixels
         grey; one set for a recording), or gains of red, green and blue, ``"1.8;1;1.4"``. As recorded: what is grey is
@@ -93,6 +102,9 @@ class CameraSettings:
     saturation: float | None = None
     usual_saturation: float = 0.98
     reference_exposure: int | None = None
+    even_gain: bool = True
+    leave_out_faulty: bool = True
+    mend_stuck: bool = True
     white_balance: str = "as-recorded"
 
     @property
@@ -144,6 +156,9 @@ class EventSettings:
     leave_out_hot
         Whether pixels that leak all the time are looked for in the recording, and their events left out
         (`kalux.calibration.hot_pixels`). True: their highlights grow without bound (docs/calibration.md).
+    mend_layout
+        Whether events that are mirrored, or whose polarities are swapped, are put right where their counts follow the
+        frames so, and not as they are (`kalux.calibration.event_layout`). Not in a live stream.
     extrapolation_spread
         Where thresholds are only estimates and threshold_spread is not known: standard deviation of the log of their
         common error beyond white, where no frame corrects it. 0.15: how well large changes between well exposed
@@ -189,6 +204,7 @@ class EventSettings:
     deblur_variance: float = 0.05
     noise_rate: float | None = None
     leave_out_hot: bool = True
+    mend_layout: bool = True
     extrapolation_spread: float = 0.15
     extrapolation_gain: float | None = None
     trail: float = 0.4

@@ -13,6 +13,9 @@ from kalux.frames import Frame
 _LARGE_FLOAT: Final = 16.0
 """Of frames in floats: more than a camera's highlights in units of white can be expected to have."""
 
+_SMALL_FLOAT: Final = 0.01
+"""Of frames in floats that state white: less than any camera's brightest pixels have, in all frames."""
+
 _BITS: Final = (8, 10, 12, 14)
 """Of cameras whose frames may be stored in 16."""
 
@@ -69,12 +72,14 @@ class WhiteCheck:
     def __init__(self) -> None:
         self._frame: Frame | None = None
         self._largest = 0.0
+        self._stated: float | None = None  # white of frames in floats
 
     def watched(self, frames: Iterable[Frame]) -> Iterator[Frame]:
         """The same frames."""
         for frame in frames:
-            if frame.white is None and frame.image.dtype != np.uint8:
-                self._frame = frame
+            floats = frame.image.dtype.kind == "f"
+            if floats or (frame.white is None and frame.image.dtype != np.uint8):
+                self._frame, self._stated = frame, frame.white
                 self._largest = max(self._largest, float(frame.image.max()))
             yield frame
 
@@ -82,6 +87,8 @@ class WhiteCheck:
         """What makes the white value doubtful, in one line; None if nothing does."""
         if self._frame is None or not self._largest > 0:
             return None
+        if self._stated is not None:
+            return self._doubt_of_stated(self._stated)
         if self._frame.image.dtype.kind == "f":
             return self._doubt_of_floats()
         bits = next((bits for bits in _BITS if self._largest < 1 << bits), None)
@@ -91,6 +98,14 @@ class WhiteCheck:
         return (
             f"no pixel of the 16-bit frames is above {self._largest:.0f}, and 65535 is taken for white; if the camera "
             f"has {bits} bits, give --white {white} (white={white})"
+        )
+
+    def _doubt_of_stated(self, white: float) -> str | None:
+        if self._largest > _SMALL_FLOAT * white:
+            return None
+        return (
+            f"no pixel of the frames, floats, is above {self._largest:.3g}, and {white:g} is taken for white; if "
+            "they are in units of white, give --white 1 (white=1)"
         )
 
     def _doubt_of_floats(self) -> str | None:

@@ -47,6 +47,18 @@ def test_a_pixel_that_leaks_is_found_though_the_scene_moves(p):
     assert found(passing_edge(), fires(5, 7, 100, p)) == [(5, 7)]
 
 
+@pytest.mark.parametrize("p", [True, False])
+def test_it_is_found_where_its_neighbours_are_never_silent(p):
+    """Fine texture that moves: an event of either sign in every bin, everywhere."""
+    busy = [passing_edge(40_000)]
+    for shift in (10_000, 20_000, 30_000):
+        busy.append(passing_edge(40_000))
+        busy[-1]["t"] += shift
+        busy[-1]["p"] = ~busy[-1]["p"] if shift == 20_000 else busy[-1]["p"]
+    assert found(*busy) == []
+    assert found(*busy, fires(5, 7, 200, p), fires(6, 7, 200, p)) == [(5, 7), (6, 7)]
+
+
 def test_two_side_by_side_do_not_hide_one_another():
     assert found(passing_edge(), fires(5, 7, 100), fires(6, 7, 200)) == [(5, 7), (6, 7)]
 

@@ -12,7 +12,7 @@ from kalux import Recording
 from kalux.cli.checking import check_beside, check_recording
 from kalux.errors import EventError, InputError
 
-from builders import events, frame, random_stream
+from builders import events, frame, moving_blocks, random_stream
 
 STREAM = random_stream(5)
 WHOLE = Recording.from_arrays(STREAM.events, STREAM.frames, sensor_size=STREAM.sensor_size)
@@ -87,6 +87,30 @@ def test_a_long_time_without_a_frame_is_told():
     slow = (0, 60_000_000, 120_000_000, 300_000_000)  # a picture a minute, two missed
     assert check_recording(frames(*slow), lambda _: None).gap is None
     assert check_recording(frames(0), lambda _: None).gap is None
+
+
+def test_events_that_are_missing_while_frames_change_are_told():
+    made = moving_blocks(duration=1_000_000)
+    t = made.events["t"]
+
+    def silence(missing, frames=made.frames):
+        source = Recording.from_arrays(made.events[~missing], frames, sensor_size=made.scene.sensor_size)
+        found = check_recording(source, lambda _: None)
+        return found.silence, list(found.warnings())
+
+    assert silence(t < 0) == (None, [])
+    for first, last in ((0, 0.4), (0.3, 0.7), (0.6, 1.0)):
+        (begin, end), told = silence((t >= 1e6 * first) & (t <= 1e6 * last))
+        assert (begin, end) == (
+            pytest.approx(max(1e6 * first, made.frames[0].exposure_start), abs=10_000),
+            pytest.approx(min(1e6 * last, made.frames[-1].exposure_end), abs=10_000),
+        )
+        assert "there is no event from" in told[0]
+    still = [
+        dataclasses.replace(f, image=made.frames[7].image) if 300_000 < f.middle < 700_000 else f
+        for f in made.frames
+    ]
+    assert silence((t >= 300_000) & (t <= 700_000), still) == (None, [])
 
 
 @pytest.mark.parametrize("threads", [1, 2])

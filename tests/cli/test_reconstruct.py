@@ -685,15 +685,22 @@ def test_a_recording_that_is_a_folder_is_not_written_into(cli, tmp_path):
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_events_that_contradict_the_frames_are_told(cli, write_recording, simulation, tmp_path):
-    """Of the wrong polarity, or of another clock."""
-    inverted = simulation.events.copy()
+@pytest.mark.parametrize("threshold", [None, (0.2, 0.2)])
+def test_events_that_contradict_the_frames_are_told(cli, write_recording, simulation, tmp_path, threshold):
+    """Of the wrong polarity, or of another view."""
+    inverted, apart = simulation.events.copy(), simulation.events.copy()
     inverted["p"] = ~inverted["p"]
-    for name, events in (("right", simulation.events), ("inverted", inverted)):
-        path = write_recording(tmp_path / f"{name}.h5", events=[events], contrast_threshold=None)
+    apart["y"], apart["x"] = apart["x"] * 31 // 39, apart["y"] * 39 // 31
+    for name, events, told in (
+        ("right", simulation.events, None),
+        ("inverted", inverted, "their polarity 1 is darker (correlation 0.9"),
+        ("apart", apart, "do not explain how the frames change"),
+    ):
+        path = write_recording(tmp_path / f"{name}.h5", events=[events], contrast_threshold=threshold)
         found = cli("reconstruct", path, "-o", tmp_path / name, "--at", "frames", "--quiet")
         assert found.code == 0
-        assert ("do not explain how the frames change" in found.err) == (name == "inverted")
+        assert told is None or told in found.err
+        assert ("do not explain" in found.err) == (name == "apart")
 
 
 def test_thresholds_that_contradict_the_frames_are_told(cli, write_recording, simulation, tmp_path):
@@ -708,3 +715,23 @@ def test_thresholds_that_contradict_the_frames_are_told(cli, write_recording, si
     found = cli("reconstruct", stated, "-o", tmp_path / "b", "--at", "frames", *flags)
     assert "the given contrast thresholds contradict the frames" in found.err
     assert "on 0.400, off 0.400 log intensity (given)" in found.out
+
+
+def test_what_is_wrong_with_frames_is_told(cli, write_recording, simulation, tmp_path):
+    frames = [dataclasses.replace(frame, image=frame.image.copy()) for frame in simulation.frames]
+    frames[3].image[:] = frames[2].image
+    frames[6].image[:] = 0
+    for index in range(8, len(frames)):
+        frames[index].image[:] = frames[index].image // 2
+    path = write_recording(tmp_path / "wrong.h5", frames=frames)
+    found = cli("reconstruct", path, "-o", tmp_path / "out", "--at", "frames")
+    assert found.code == 0
+    for told in (
+        "left out: 1 frame, first frame 3: the same as the one before, though events show motion; 1 frame, first "
+        "frame 6: empty (--camera.leave-out-faulty false keeps them)",
+        "the brightness of the frames steps at 1 frame, first at frame 8, by up to a factor of 2",
+    ):
+        assert told in found.err
+    kept = ["--camera.leave-out-faulty", "false", "--camera.even-gain", "false", "--quiet"]
+    found = cli("reconstruct", path, "-o", tmp_path / "kept", "--at", "frames", *kept)
+    assert (found.code, found.err) == (0, "")

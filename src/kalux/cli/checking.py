@@ -7,11 +7,12 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from typing import Final, NamedTuple, TypeVar
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from kalux.event_slices import between, events_until
-from kalux.frames import exposure_doubt
+from kalux.frames import Frame, exposure_doubt
 from kalux.recording import Recording, clock_doubt, no_frames
 from kalux.white import WhiteCheck
 
@@ -27,6 +28,17 @@ _LONG_GAP: Final = 10_000_000
 
 _MANY_INTERVALS: Final = 100
 """As many times longer than usual: pictures of a slow series are not missed."""
+
+
+_LEAST_MISSED: Final = 100
+"""Events that are missing in a silence at the usual rate, at least: by chance it is none."""
+
+_LEAST_INTERVALS: Final = 2  # between frames: in less of them, little is lost
+_ALIKE: Final = 0.25
+"""Share of the usual change from frame to frame from which something moved in a silence, too."""
+
+_BLOCKS: Final = (16, 16)
+"""Means of so many blocks of a frame tell how much it changes: of single pixels, noise would."""
 
 
 class Contents(NamedTuple):
@@ -48,6 +60,8 @@ class Contents(NamedTuple):
         Whether these are all events, or only the first ones.
     gap
         (start, end) us of the longest time without a frame, where it is far longer than usual.
+    silence
+        (start, end) us of the longest time without an event, where events are missing.
     """
 
     frames: int
@@ -59,6 +73,7 @@ class Contents(NamedTuple):
     doubts: tuple[str, ...] = ()
     complete: bool = True
     gap: tuple[int, int] | None = None
+    silence: tuple[int, int] | None = None
 
     @property
     def seconds(self) -> float:
@@ -74,6 +89,15 @@ class Contents(NamedTuple):
             doubt = clock_doubt(self.events, self.events_between, CHECKED_FIRST)
             if doubt is not None:
                 yield doubt
+            elif self.silence is not None:
+                yield self._silence_doubt(*self.silence)
+
+    def _silence_doubt(self, begin: int, end: int) -> str:
+        first, last = ((t - self.start) * 1e-6 for t in (begin, end))
+        return (
+            f"there is no event from {first:.3f} to {last:.3f} s, though the frames change there as elsewhere: were "
+            "events lost? Images between the frames do not move there"
+        )
 
 
 def check_recording(
@@ -96,16 +120,18 @@ def check_recording(
         Whatever is wrong with the recording, or it has no frames.
     """
     spans, colours = [], "grey"
-    white = WhiteCheck()
+    white, changes = WhiteCheck(), _Changes()
     for frame in white.watched(recording.frames()):
         spans.append((frame.exposure_start, frame.exposure_end))
         colours = frame.colours
+        changes.see(frame)
     if not spans:
         raise no_frames(recording)
     exposures = np.array(spans, np.int64)
     start, end = (int(t) for t in (exposures[0, 0], exposures[-1, 1]))
     count = events_between = events_from = 0
     complete = True
+    last_event, silences = start, [(start, start)]
     for chunk in recording.events():
         if most is not None and events_from >= most:
             complete = False
@@ -113,11 +139,63 @@ def check_recording(
         count += len(chunk)
         events_between += len(between(chunk, start - 1, end))
         events_from += len(chunk) - events_until(chunk, start - 1)
+        silences.append(_longest_silence(between(chunk, start - 1, end)["t"], last_event))
+        last_event = max(last_event, min(int(chunk["t"][-1]), end))
         on_events(len(chunk))
+    if complete:
+        silences.append((last_event, end))
     doubts = tuple(filter(None, (white.doubt(), exposure_doubt(exposures))))
+    longest = max(silences, key=lambda silence: silence[1] - silence[0])
+    seen = (end if complete else last_event) - start
+    usual = (seen - (longest[1] - longest[0])) / max(events_between, 1)
+    silent = longest[1] - longest[0] >= _LEAST_MISSED * usual and changes.go_on(exposures, *longest)
     return Contents(
-        len(exposures), count, start, end, events_between, colours, doubts, complete, _gap(exposures)
+        len(exposures),
+        count,
+        start,
+        end,
+        events_between,
+        colours,
+        doubts,
+        complete,
+        _gap(exposures),
+        longest if events_between and silent else None,
     )
+
+
+def _longest_silence(times: NDArray[np.int64], before: int) -> tuple[int, int]:
+    """(start, end) us of the longest time without one of the events at ``times``, which follow one at ``before``."""
+    if not len(times):
+        return before, before
+    waits = np.diff(times, prepend=before)
+    longest = int(np.argmax(waits))
+    return int(times[longest] - waits[longest]), int(times[longest])
+
+
+class _Changes:
+    """How much each frame differs from the one before: root mean square of the means of blocks, white = 1."""
+
+    def __init__(self) -> None:
+        self._blocks: NDArray[np.float32] | None = None
+        self._changes: list[float] = []
+
+    def see(self, frame: Frame) -> None:
+        """Look at the next frame."""
+        image = frame.image if frame.image.ndim == 2 else frame.image[..., 1]
+        resized = cv2.resize(image.astype(np.float32), _BLOCKS, interpolation=cv2.INTER_AREA)
+        blocks = np.asarray(resized / frame.white_value, np.float32)
+        if self._blocks is not None:
+            self._changes.append(float(np.sqrt(np.mean(np.square(blocks - self._blocks)))))
+        self._blocks = blocks
+
+    def go_on(self, exposures: NDArray[np.int64], begin: int, end: int) -> bool:
+        """Whether frames from ``begin`` to ``end`` (us) change about as much as the others."""
+        inside = (exposures[:-1, 1] >= begin) & (exposures[1:, 0] <= end)
+        changes = np.array(self._changes)
+        if np.count_nonzero(inside) < _LEAST_INTERVALS or inside.all():
+            return False
+        usual = float(np.median(changes[~inside]))
+        return usual > 0 and bool(np.median(changes[inside]) >= _ALIKE * usual)
 
 
 def _gap(exposures: NDArray[np.int64]) -> tuple[int, int] | None:

@@ -28,15 +28,16 @@ from kalux.cli.times import load_times
 from kalux.display import CURVES
 from kalux.errors import InputError
 from kalux.pipeline import execute
-from kalux.plan_report import ORIGINS, plan_report
+from kalux.plan_report import ORIGINS, gain_text, layout_text, left_out_text, plan_report
 from kalux.planning import ESTIMATED_ORIGINS, Plan, plan
 from kalux.reconstructor import Reconstructor
-from kalux.recording import Recording
+from kalux.recording import AS_STORED, Recording
 from kalux.settings import PRESETS, Settings, from_dict, load, preset, read_toml, to_dict
 from kalux.threads import default_threads
 from kalux.wording import how_many
 
 if TYPE_CHECKING:
+    from kalux.calibration.frame_faults import FrameFaults
     from kalux.calibration.global_thresholds import ThresholdEstimate
     from kalux.writers import Writer
 
@@ -300,6 +301,8 @@ def plan_warnings(planned: Plan, contents: Contents, preset_name: str) -> Iterat
     gap = gap_warning(planned, contents)
     if gap is not None:
         yield gap
+    if planned.frame_faults is not None:
+        yield from fault_warnings(planned.frame_faults)
     if planned.threshold_origin in ESTIMATED_ORIGINS and not is_well_known(planned):
         yield threshold_warning(planned, preset_name)
     yield from agreement_warnings(planned)
@@ -308,6 +311,9 @@ def plan_warnings(planned: Plan, contents: Contents, preset_name: str) -> Iterat
 def agreement_warnings(planned: Plan) -> Iterator[str]:
     """That events and frames, or the thresholds and both, contradict each other, and what to do."""
     agreement = None if planned.event_model is None else planned.event_model.agreement
+    layout = planned.layout
+    if layout is not None and layout.found != AS_STORED:
+        yield f"{layout_text(layout)}: put right (--events.mend-layout false leaves them as they are)"
     if planned.contradicted is not None:
         assert agreement is not None
         on, off = planned.contradicted
@@ -316,8 +322,8 @@ def agreement_warnings(planned: Plan) -> Iterator[str]:
             f"are not used; to insist, give --events.threshold-on {on:g} --events.threshold-off {off:g}"
         )
     unexplained = agreement is not None and agreement.explained < _LITTLE_EXPLAINED
-    assumed = planned.estimate if planned.threshold_origin == "assumed" else None
-    if unexplained or (assumed is not None and contradicts(assumed)):
+    unrelated = layout is not None and layout.contradicts
+    if unexplained or unrelated or (planned.threshold_origin == "assumed" and contradicts(planned.estimate)):
         yield (
             "the events do not explain how the frames change; if much moves, do both see the same pixels (kalux "
             "register), do both have the same clock (kalux calibrate offset REC finds out), and is polarity 1 brighter?"
@@ -349,6 +355,17 @@ def threshold_warning(planned: Plan, preset_name: str) -> str:
     )
 
 
+def fault_warnings(faults: FrameFaults) -> Iterator[str]:
+    """What of the frames is not used as it is, and how to use it."""
+    if faults.steps:
+        yield (
+            f"{gain_text(faults)}: taken for the camera's exposure or gain, and evened out (--camera.even-gain false "
+            "does not)"
+        )
+    if faults.copies or faults.empty:
+        yield f"left out: {left_out_text(faults)} (--camera.leave-out-faulty false keeps them)"
+
+
 def gap_warning(planned: Plan, contents: Contents) -> str | None:
     """How many images lie where there is no frame for long; None where there is no such time, or no image in it."""
     if contents.gap is None:
@@ -369,9 +386,9 @@ def is_well_known(planned: Plan) -> bool:
     return planned.estimate is not None and planned.estimate.spread <= _EXACT
 
 
-def contradicts(estimate: ThresholdEstimate) -> bool:
+def contradicts(estimate: ThresholdEstimate | None) -> bool:
     """Whether many samples have next to no information of the thresholds."""
-    return estimate.samples >= _MANY_SAMPLES and estimate.usual_share > _NEARLY_ALL
+    return estimate is not None and estimate.samples >= _MANY_SAMPLES and estimate.usual_share > _NEARLY_ALL
 
 
 def decided(

@@ -33,7 +33,7 @@ class Shot(NamedTuple):
     level_clipped
         (N,) bool: saturated, so that the value is no measurement.
     white
-        Intensity of a saturated pixel of this frame: the reference exposure over the frame's own.
+        Intensity of a saturated pixel of this frame: the reference exposure over the frame's own times its gain.
     level_ceiling
         (N,) the most that I can be at levels that are black; inf at others.
     chroma, chroma_weight
@@ -104,7 +104,7 @@ def take_shot(
     SettingsError
         If the camera has a response per colour and the frame is grey.
     """
-    ratio = reference_exposure / frame.exposure
+    ratio = reference_exposure / (frame.exposure * frame.gain)
     if frame.image.ndim == 3:
         return _colour_shot(frame, camera, ratio, gains)
     levels, response, intensity, weight, ceiling = _leveled(frame, camera, ratio)

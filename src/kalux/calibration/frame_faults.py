@@ -1,0 +1,307 @@
+"""Frames that are not what they say: copies, empty ones, and brightness that steps though the light does not.
+
+Frame grabbers and video encoders repeat a frame where one is late, cameras begin with a black one, and change exposure
+or amplification without a word. Events tell such frames from those of a scene that stands still, is dark, or is lit
+anew: light that changes makes events. What a frame shows on top of what events explain is common to the whole image
+only where it is the camera's.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux.calibration.intervals import Interval, intervals, spread
+from kalux.calibration.neighbours import sum_of_neighbours
+from kalux.calibration.regression import two_stage
+from kalux.calibration.stuck_pixels import RangeWatch
+from kalux.event_slices import all_between, count_chunks
+from kalux.frames import Frame
+from kalux.models.camera import Camera
+from kalux.recording import FrameCorrections, Recording
+from kalux.settings import CameraSettings
+
+Array = NDArray[np.float64]
+
+_SAMPLE: Final = 4096
+"""Pixels of a frame, about, that tell whether it has to be looked at together with events."""
+
+_WELL_EXPOSED: Final = (0.05, 0.95)  # of the response, as of `kalux.calibration.intervals`
+
+_SUSPECT: Final = 0.08
+"""Median change of the log intensity from one frame to the next from which it is looked at."""
+
+_LEAST_STEP: Final = 0.1
+"""Least step of the log gain that is taken for one. On 65 recordings without any, what frames show beyond their events
+is common to the image up to 0.075."""
+
+_SAME: Final = 0.1
+"""Difference of log gains that is within their errors: steps of a factor of 2 are found to 0.03 where a half of the
+pixels have no events, to 0.1 where nearly all have."""
+
+_ALIKE: Final = 0.5
+"""Share of the step by which parts of the image may differ from it."""
+
+_MOST_PARTS: Final = 0.8
+"""Share of the parts that have to agree so far: they do in a step of the camera's; what motion, blur and lost events
+leave unexplained differs from place to place."""
+
+_LEAST_PARTS: Final = 6
+_PARTS: Final = 6  # of the image along each side
+_LEAST_IN_PART: Final = 20
+_MOST_SAMPLES: Final = 20_000
+
+_FLICKER: Final = 1.0
+"""Where the light of the median pixel goes up and down again by more than this share of the step between two frames, a
+step may be flicker that a frame catches at another moment than its events say."""
+
+_SEEN: Final = 0.4
+"""Where the median pixel has events for more than this share of the step, it is the light that changes: so fast that
+most of it is lost in the pixels' refractory period."""
+
+_SMALL_OFFSET: Final = 1e-3
+"""I_0 for comparing frames: with a larger one, steps of dark pixels would come out too small."""
+
+_CONTRAST: Final = 0.02
+"""Of the response, between the darkest and the brightest hundredth of the pixels: with less, a frame is empty."""
+
+_MOST_EMPTY: Final = 0.1
+_MOST_COPIES: Final = 0.8
+"""Shares of the frames above which they are what the recording is: a scene without contrast, or one that stands still.
+Frames of 24 Hz in a video of 120 Hz are copies to 80 %."""
+
+_LIT: Final = 2.0
+"""Events of one sign in the median pixel from which the light itself went out, or came."""
+
+_MOVED: Final = 0.01
+"""Share of the pixels whose events agree with a neighbour's, above which something moved: background noise of 3 Hz at
+24 frames/s has 0.004."""
+
+_LEAST_USABLE: Final = 200  # pixels
+
+
+class FrameFaults(NamedTuple):
+    """What was found.
+
+    Attributes
+    ----------
+    frames
+        The number of all frames.
+    copies, empty
+        Indices of frames, in order.
+    steps
+        Indices of the frames from which on another gain holds, and
+    gains
+        (K,) the gain of every frame, 1 that of the median frame.
+    stuck
+        (H, W) pixels that always show the same; None: none.
+    """
+
+    frames: int
+    copies: tuple[int, ...] = ()
+    empty: tuple[int, ...] = ()
+    steps: tuple[int, ...] = ()
+    gains: Array = np.ones(0)
+    stuck: NDArray[np.bool_] | None = None
+
+    @property
+    def first(self) -> int:
+        """The first frame that is not empty."""
+        return next(i for i, index in enumerate((*self.empty, -1)) if index != i)
+
+    def corrections(self, *, with_first: bool) -> FrameCorrections:
+        """What is to be done about it; whether empty frames at the beginning are needed."""
+        kept = self.first if with_first else 0
+        left_out = sorted({*self.copies, *self.empty[kept:]})
+        return FrameCorrections(tuple(left_out), kept, self.gains if self.steps else None, self.stuck)
+
+    def __bool__(self) -> bool:
+        """Whether anything was."""
+        return bool(self.copies or self.empty or self.steps or self.stuck is not None)
+
+
+class FrameWatch:
+    """Sees all frames of a recording go by, and tells which ones are to be looked at together with events.
+
+    Parameters
+    ----------
+    camera
+        By which responses are compared.
+    gain, faulty, stuck
+        Whether to look for steps of the gain, for copies and empty frames, and for stuck pixels.
+    """
+
+    def __init__(self, camera: Camera, *, gain: bool = True, faulty: bool = True, stuck: bool = True) -> None:
+        self._gain, self._faulty, self._stuck = gain, faulty, stuck
+        self._response = camera.of_channel(1).response
+        self._previous: tuple[Frame, Array, Array] | None = None
+        self._last_image: NDArray[Any] | None = None
+        self.frames = 0
+        self.copies: list[int] = []
+        self.empty: list[int] = []
+        self.suspects: list[int] = []
+        self.ranges = RangeWatch()
+
+    def see(self, frame: Frame) -> None:
+        """Look at the next frame."""
+        index, self.frames = self.frames, self.frames + 1
+        step = max(round((frame.image.shape[0] * frame.image.shape[1] / _SAMPLE) ** 0.5), 1)
+        image = frame.image[::step, ::step]
+        image = np.ascontiguousarray(image if image.ndim == 2 else image[..., 1])
+        response = dataclasses.replace(frame, image=image, valid=None).normalised()
+        low, high = np.quantile(response, (0.01, 0.99))
+        is_copy = self._last_image is not None and np.array_equal(frame.image, self._last_image)
+        self._last_image = frame.image
+        if high - low < _CONTRAST:
+            if self._faulty:
+                self.empty.append(index)
+            return
+        if self._stuck:
+            self.ranges.see(frame)
+        if is_copy and self._faulty:
+            self.copies.append(index)
+        elif not is_copy and self._gain:
+            self._compare(index, frame, response)
+
+    def _compare(self, index: int, frame: Frame, response: Array) -> None:
+        """Whether most of the image is brighter, or darker, than in the frame before, exposure times accounted for."""
+        intensity = self._response.inverse(response) / (frame.exposure * frame.gain)
+        if self._previous is not None:
+            before, earlier = self._previous[1:]
+            both = _inside(response) & _inside(before)
+            if np.count_nonzero(both):
+                change = np.median(np.log(intensity[both] / earlier[both]))
+                if abs(change) >= _SUSPECT:
+                    self.suspects.append(index)
+        self._previous = frame, response, intensity
+
+
+def _inside(response: Array) -> NDArray[np.bool_]:
+    low, high = _WELL_EXPOSED
+    return (response > low) & (response < high)
+
+
+def find_frame_faults(recording: Recording, camera: CameraSettings, watch: FrameWatch) -> FrameFaults:
+    """Judge the frames that a watch has noticed by their events.
+
+    Parameters
+    ----------
+    recording
+        With frames and exposures. Its events are read up to the last of those frames.
+    camera
+        Response, saturation and black level.
+    watch
+        Which has seen all frames of the recording.
+
+    Raises
+    ------
+    ExposureError
+        If the frames' exposures are not known.
+    """
+    empty = watch.empty if len(watch.empty) <= _MOST_EMPTY * watch.frames else []
+    copies = watch.copies if len(watch.copies) <= _MOST_COPIES * watch.frames else []
+    asked = {*empty, *copies, *watch.suspects}
+    found = FrameFaults(watch.frames, stuck=watch.ranges.stuck(recording))
+    if not asked:
+        return found
+    compared = dataclasses.replace(camera, log_offset=_SMALL_OFFSET)
+    certain_copies, certain_empty, steps = list[int](), list[int](), dict[int, float]()
+    for index, interval in _intervals(recording, compared, {*empty}, asked):
+        on, off = count_chunks(
+            all_between(interval.chunks, interval.start, interval.end), recording.sensor_size, weighed=False
+        )
+        if index in copies:
+            if _shows_motion(on, off, interval.usable):
+                certain_copies.append(index)
+        elif index in empty:
+            if abs(float(np.median(on - off))) < _LIT:
+                certain_empty.append(index)
+        elif (step := _step(interval, on, off)) is not None:
+            steps[index] = step
+    return found._replace(
+        copies=tuple(certain_copies),
+        empty=tuple(certain_empty),
+        steps=tuple(sorted(steps)),
+        gains=_gains(watch.frames, steps),
+    )
+
+
+def _intervals(
+    recording: Recording, camera: CameraSettings, empty: set[int], asked: set[int]
+) -> Iterator[tuple[int, Interval]]:
+    """Frames that are asked for, with the interval that ends there; where the first are empty, that which begins there.
+
+    What is beside an empty frame cannot be compared with it.
+    """
+    most = max(asked) + 2
+    for before, interval in enumerate(intervals(recording, camera, margin=0, most_frames=most)):
+        if before in empty and all(i in empty for i in range(before)):
+            yield before, interval
+        elif before + 1 in asked and not (before in empty and before + 1 not in empty):
+            yield before + 1, interval
+
+
+def _shows_motion(on: NDArray[Any], off: NDArray[Any], usable: NDArray[np.bool_]) -> bool:
+    """Whether neighbouring pixels had events of one sign, in places that frames show well: noise has them alone."""
+    net = on - off
+    rising, falling = net > 0, net < 0
+    moved = (rising & (sum_of_neighbours(rising.view(np.uint8)) > 0)) | (
+        falling & (sum_of_neighbours(falling.view(np.uint8)) > 0)
+    )
+    count = np.count_nonzero(usable)
+    return bool(count >= _LEAST_USABLE and np.count_nonzero(moved & usable) >= _MOVED * count)
+
+
+def _step(interval: Interval, on: NDArray[Any], off: NDArray[Any]) -> float | None:
+    """The step of the log gain between two frames; None where there is none that is certain."""
+    if np.count_nonzero(interval.usable) < _LEAST_USABLE:
+        return None
+    chosen = spread(interval.usable, _MOST_SAMPLES)
+    ups, downs = (counts.ravel()[chosen].astype(np.float64) for counts in (on, off))
+    change = interval.change.ravel()[chosen]
+    columns = [column for column in (ups, -downs) if np.count_nonzero(column) > len(column) // 100]
+    explained = np.column_stack([*columns, np.ones(len(change))])
+    fit = two_stage(change, explained, explained)
+    if fit is None or (fit.solution[:-1] < 0).any():
+        return None
+    thresholds = fit.solution[:-1].tolist()
+    rest = change - sum(c * column for c, column in zip(thresholds, columns, strict=True))
+    height, width = interval.change.shape
+    rows, across = np.divmod(chosen, width)
+    part = (rows * _PARTS // height) * _PARTS + across * _PARTS // width
+    middles = np.array(
+        [
+            np.median(rest[part == i])
+            for i in np.flatnonzero(np.bincount(part, minlength=_PARTS**2) >= _LEAST_IN_PART)
+        ]
+    )
+    if len(middles) < _LEAST_PARTS:
+        return None
+    step = float(np.median(middles))
+    if abs(step) < _LEAST_STEP or np.mean(np.abs(middles - step) < _ALIKE * abs(step)) < _MOST_PARTS:
+        return None
+    largest = max(thresholds, default=0.0)
+    back_and_forth = float(np.median(np.minimum(ups, downs))) * largest
+    lit = float(np.median(ups - downs)) * np.sign(step) * largest
+    return step if back_and_forth < _FLICKER * abs(step) and lit < _SEEN * abs(step) else None
+
+
+def _gains(frames: int, steps: dict[int, float]) -> Array:
+    """(K,) gains, that of the median frame 1.
+
+    A log gain that is as good as one before is that one: cameras go back to where they were, and errors of steps do not
+    add up.
+    """
+    logs, known = np.zeros(frames), [0.0]
+    for index, step in sorted(steps.items()):
+        reached = float(logs[index - 1]) + step
+        nearest = min(known, key=lambda level: abs(level - reached))
+        if abs(nearest - reached) > _SAME:
+            known.append(reached)
+            nearest = reached
+        logs[index:] = nearest
+    return np.asarray(np.exp(logs - np.sort(logs)[frames // 2]), np.float64)
