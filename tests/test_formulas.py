@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numba.core import types
 
-from kalux.formulas import choose, formula
+from kalux.formulas import LANES, Number, Pixels, choose, formula, row_formula
 
 
 @formula(types.float32)
@@ -76,3 +76,36 @@ def test_rows_with_gaps_are_refused() -> None:
 def test_numbers_of_different_types_are_refused() -> None:
     with pytest.raises((TypeError, nb.core.errors.NumbaError), match="float64 and float32 in one operation"):
         called(of_floats)(1.0, 2.0)
+
+
+@row_formula
+def smoothed(out: Pixels, whole: Pixels, row: Pixels, factor: Number) -> None:
+    mean = (row[-1] + row[0] + row[1]) * factor
+    mean = choose(mean < np.float32(0.0), np.float32(1.0) - mean, mean) + factor
+    out[0] = mean
+    whole[0] = mean.to(types.int32)
+
+
+@nb.njit
+def along(count, out, whole, at, row, factor):
+    smoothed(count, out, at, whole, np.uint64(0), row, np.uint64(1), factor)
+
+
+@pytest.mark.parametrize("count", [0, 1, LANES - 1, LANES, LANES + 1, 3 * LANES + 5])
+def test_a_row_formula_is_its_operations_at_every_pixel_of_a_row_and_no_other(count) -> None:
+    row = np.random.default_rng(count).normal(0.0, 100.0, count + 2).astype(np.float32)
+    out, whole = np.full(count + 5, 7.0, np.float32), np.full(count + 3, 7, np.int32)
+    factor = np.float32(0.25)
+    along(np.uint64(count), out, whole, np.uint64(2), row, factor)
+    mean = (row[:-2] + row[1:-1] + row[2:]) * factor
+    mean = np.where(mean < 0.0, np.float32(1.0) - mean, mean) + factor
+    np.testing.assert_array_equal(out, [7.0, 7.0, *mean, 7.0, 7.0, 7.0])
+    np.testing.assert_array_equal(whole, [*mean.astype(np.int32), 7, 7, 7])
+
+
+def test_rows_of_a_row_formula_are_flat_and_begin_at_whole_numbers() -> None:
+    row, whole, factor = np.zeros(20, np.float32), np.zeros(20, np.int32), np.float32(1.0)
+    with pytest.raises((TypeError, nb.core.errors.NumbaError), match="without gaps"):
+        along(np.uint64(3), row[::2], whole, np.uint64(0), row, factor)
+    with pytest.raises((TypeError, nb.core.errors.NumbaError), match="places uint64"):
+        along(np.uint64(3), row, whole, 0.0, row, factor)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from kalux.augmentation.along import joined_along
+from kalux.augmentation.along import join_along
 from kalux.augmentation.bridge import Latent
 
 SHAPE = (72, 96)
@@ -24,8 +24,7 @@ def frame_of(value, variance=1e-4):
 
 
 def whole(along, level, variance):
-    """`joined_along` of the whole image."""
+    """What `join_along` makes of an image."""
     level, variance = level.copy(), variance.copy()
-    for window, seen, left in list(joined_along(along, level, variance)):
-        level[window], variance[window] = seen, left
+    join_along(along, level, variance)
     return level, variance

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from kalux import memory
 from kalux.events import EventArray
-from kalux.formulas import Number, choose, formula
+from kalux.formulas import LANES, Number, choose, formula
 from kalux.kernel_cache import check_variables
 from kalux.memory import PAGE
 
@@ -242,10 +242,6 @@ largest_around: Any = intrinsic(_largest_around)
 
 Both are uint64; all nine lie inside the plane. One by one they would be a fifth of the filter's instructions.
 """
-
-
-LANES: Final = 16
-"""Records that `unpack` and `pack` take at a time: what the widest vector instructions hold of float32."""
 
 
 class _Rows:

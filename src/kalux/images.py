@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.along import Along, joined_along
+from kalux.augmentation.along import Along, join_along
 from kalux.augmentation.bridge import RANDOM
 from kalux.augmentation.highlights import Unshown
 from kalux.augmentation.motion import Paths
@@ -270,10 +270,12 @@ def _look_along(
 ) -> None:
     """Join an image with what the frames around show along the paths of what moves (K16). In place."""
     offset = np.float32(log_offset)
-    # All before any is changed: windows look at pixels beside them.
-    for window, level, left in list(joined_along(along, np.log(intensity + offset), variance)):
-        intensity[window] = np.maximum(np.exp(level) - offset, np.float32(0.0))
-        variance[window] = left
+    level = np.empty_like(intensity)
+    for window in along.looked_at:
+        level[window] = np.log(intensity[window] + offset)
+    join_along(along, level, variance)
+    for window in along.motion.windows:
+        intensity[window] = np.maximum(np.exp(level[window]) - offset, np.float32(0.0))
 
 
 def _above_bounds(

@@ -6,16 +6,20 @@ finds, they are one more estimate of the image, the better the better they agree
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Iterator
 from typing import Any, Final, NamedTuple
 
 import cv2
+import numba as nb
 import numpy as np
+from numba.core import types
 from numpy.typing import NDArray
 
-from kalux.augmentation.bridge import UNMEASURED, Latent
-from kalux.compiled import FUSED, larger, loop
+from kalux import memory
+from kalux.augmentation.bridge import UNMEASURED, Latent, bridge_variance
+from kalux.augmentation.resampling import BORDER, read_row
+from kalux.compiled import FUSED, ONE, empty, loop
+from kalux.formulas import Number, Pixels, Row, choose, formula, row_formula
 
 Floats = NDArray[np.floating[Any]]
 Plane = NDArray[np.float32]
@@ -38,11 +42,20 @@ _DISTRUST: Final = np.float32(0.5)
 _LEAST_MOVING: Final = np.float32(1e-6)
 """Share of the frames' difference that motion explains where it explains nothing: a division."""
 
-_TEXTURE: Final = (3, 3)
-"""Pixels over which texture and the frames' disagreement are averaged, to tell how uncertain a pixel is."""
-
 _EVIDENCE: Final = (5, 5)
 """Pixels over which is averaged what speaks for a path: how far it explains the frames, and the image."""
+
+BESIDE: Final = 2
+"""Pixels on either side of a row of sums, so that means need no special case: half of `_EVIDENCE`."""
+
+FIRST: Final = np.uint64(BESIDE)
+"""The first pixel of such a row."""
+
+_NOTHING: Final = np.empty((0, 0), np.float32)
+"""In place of an image."""
+
+_LEAST: Final = np.float32(1 - BORDER)
+"""The least column, or row, of a frame that is read: there as further outside."""
 
 _MARGIN: Final = 4
 """Pixels around a window that what is seen in it depends on: half of `_EVIDENCE`, twice."""
@@ -57,7 +70,7 @@ class Motion(NamedTuple):
     Attributes
     ----------
     first, second
-        The frames, without blur, float32: from `as_seen`.
+        (H + 6, W + 6, 2) float32: the frames, without blur, from `as_seen` and `readable`.
     path
         (2, H, W) float32: columns and rows from ``first`` to ``second`` of what is at a pixel half-way.
     bend
@@ -68,8 +81,8 @@ class Motion(NamedTuple):
         Rows and columns, no pixel twice, outside which nothing is seen that is not known.
     """
 
-    first: Latent
-    second: Latent
+    first: Plane
+    second: Plane
     path: Plane
     bend: Plane
     unmoved: Plane
@@ -85,7 +98,12 @@ class Along(NamedTuple):
     @property
     def between(self) -> float:
         """0 at a frame, 1 half-way."""
-        return 4.0 * self.share * (1.0 - self.share)
+        return bridge_variance(self.share)
+
+    @property
+    def looked_at(self) -> list[Window]:
+        """Where an image is looked at: the windows with their margins."""
+        return [_widened(window, self.motion.unmoved.shape)[0] for window in self.motion.windows]
 
 
 def as_seen(frame: Latent) -> Latent:
@@ -101,135 +119,291 @@ def unmoved_difference(first: Latent, second: Latent) -> Plane:
     return mean_around(np.square(first.value - second.value), _EVIDENCE)
 
 
+def mean_around(values: Floats, patch: tuple[int, int]) -> Plane:
+    """Of the pixels around every pixel."""
+    return np.asarray(cv2.blur(values, patch), np.float32)
+
+
 def seen_along(along: Along, window: Window) -> tuple[Plane, Plane]:
     """What both frames show along the paths, in a window: log intensity, and its variance.
 
     With s the share, the mean of both is weighted by 1 - s and s. It is the less certain the more the frames disagree
     there, the finer the texture is that is read between its pixels, and the better they agree where nothing moves.
     """
-    motion, share = along.motion, np.float32(along.share)
-    rows, columns = (part.stop - part.start for part in window)
-    flat = np.empty((7, rows * columns), np.float32)
-    x, other_x, y, other_y, seen, difference, doubt = flat.reshape(7, rows, columns)
-    here = _places(*motion.path.shape[1:])
-    for axis in (0, 1):
-        paths = (_flat(plane[axis][window]) for plane in (here, motion.path, motion.bend))
-        _follow(*paths, *flat[2 * axis : 2 * axis + 2], share, np.float32(along.between))
-    frames = *_read(motion.first, x, y), *_read(motion.second, other_x, other_y)
-    _see(*map(_flat, frames), *flat[4:], share)
-    fine = np.square(seen - mean_around(seen, _TEXTURE))
-    local = mean_around(_DISAGREEMENT * difference + _FINE_RESAMPLING * fine, _TEXTURE)
-    _doubt(*map(_flat, (local, mean_around(difference, _EVIDENCE), motion.unmoved[window])), flat[6])
-    return seen, doubt
+    return next(_look(along, (window,)))
 
 
-@functools.lru_cache(maxsize=4)
-def _places(height: int, width: int) -> Plane:
-    """(2, H, W): column and row of every pixel."""
-    places = np.stack(np.meshgrid(np.arange(width), np.arange(height))).astype(np.float32)
-    places.flags.writeable = False
-    return places
+def join_along(along: Along, level: Plane, variance: Plane) -> None:
+    """Join an image with what is seen along the paths, by information, where anything is. In place.
 
-
-def _flat(plane: Plane) -> Plane:
-    """As loops take it."""
-    return np.ascontiguousarray(plane).reshape(-1)
-
-
-@loop(fastmath=FUSED)
-def _follow(here, path, bend, first, second, share, between):  # type: ignore[no-untyped-def]
-    """Columns, or rows, at which what is at a pixel is in either frame."""
-    rest = np.float32(1.0) - share
-    for i in range(np.uint64(len(first))):
-        shifted = here[i] + between * bend[i]
-        first[i] = shifted - share * path[i]
-        second[i] = shifted + rest * path[i]
-
-
-def _read(frame: Latent, columns: Plane, rows: Plane) -> tuple[Plane, Plane]:
-    """Log intensity of a frame between its pixels, and its variance: nothing is known outside."""
-    level = cv2.remap(frame.value, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    variance = cv2.remap(
-        frame.variance,
-        columns,
-        rows,
-        cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_CONSTANT,
-        borderValue=UNMEASURED,
-    )
-    return np.asarray(level, np.float32), np.asarray(variance, np.float32)
-
-
-@loop(fastmath=FUSED)
-def _see(first, first_variance, second, second_variance, seen, difference, doubt, share):  # type: ignore[no-untyped-def]
-    """The mean of both frames, their squared difference, and the variance of the mean by the frames' own."""
-    rest = np.float32(1.0) - share
-    for i in range(np.uint64(len(seen))):
-        seen[i] = rest * first[i] + share * second[i]
-        error = first[i] - second[i]
-        difference[i] = error * error
-        doubt[i] = rest * rest * first_variance[i] + share * share * second_variance[i]
-
-
-@loop(fastmath=FUSED)
-def _doubt(local, difference, unmoved, doubt):  # type: ignore[no-untyped-def]
-    """The variance of what is seen, in place of that by the frames' own: the larger the less the motion explains."""
-    for i in range(np.uint64(len(doubt))):
-        explained = np.float32(1.0) - difference[i] / larger(unmoved[i], _LEAST_UNMOVED)
-        doubt[i] = (doubt[i] + local[i]) / larger(explained, _LEAST_MOVING)
-
-
-def mean_around(values: Floats, patch: tuple[int, int]) -> Plane:
-    """Of the pixels around every pixel."""
-    return np.asarray(cv2.blur(values, patch), np.float32)
-
-
-def joined(seen: Plane, doubt: Plane, level: Plane, variance: Plane, between: float) -> tuple[Plane, Plane]:
-    """An image joined with what is seen along the paths, by information: log intensity, and its variance.
-
-    What is seen counts ``between`` times (`Along.between`): at a frame the filter knows the frame itself.
-    """
-    flat = np.empty((2, seen.size), np.float32)
-    both = flat.reshape(2, *seen.shape)
-    planes = [_flat(plane) for plane in (seen, doubt, level, variance)]
-    _contradict(*planes, flat[0])
-    _join(_flat(mean_around(both[0], _EVIDENCE)), *planes, *flat, np.float32(between))
-    return both[0], both[1]
-
-
-@loop(fastmath=FUSED)
-def _contradict(seen, doubt, level, variance, contradiction):  # type: ignore[no-untyped-def]
-    """Squared difference of an image and what is seen, in units of its variance."""
-    for i in range(np.uint64(len(seen))):
-        error = level[i] - seen[i]
-        contradiction[i] = error * error / (variance[i] + doubt[i])
-
-
-@loop(fastmath=FUSED)
-def _join(contradiction, seen, doubt, level, variance, joined, left, between):  # type: ignore[no-untyped-def]
-    one = np.float32(1.0)
-    for i in range(np.uint64(len(seen))):
-        distrust = one + _DISTRUST * contradiction[i]
-        doubted = doubt[i] * (distrust * distrust)
-        told = between * variance[i]
-        joined[i] = level[i] + (seen[i] - level[i]) * (told / (told + doubted))
-        left[i] = variance[i] * (doubted / (told + doubted))
-
-
-def joined_along(along: Along, level: Plane, variance: Plane) -> Iterator[tuple[Window, Plane, Plane]]:
-    """An image joined with what is seen along the paths, where anything is: log intensity, and its variance.
+    What is seen counts `Along.between` times: at a frame the filter knows the frame itself.
 
     Parameters
     ----------
     along
         The paths, and the share.
     level, variance
-        (H, W): log intensity and its variance.
+        (H, W) float32: log intensity and its variance, looked at in `Along.looked_at` only.
     """
-    for window in along.motion.windows:
-        wider, inside = _widened(window, level.shape)
-        found, left = joined(*seen_along(along, wider), level[wider], variance[wider], along.between)
-        yield window, found[inside], left[inside]
+    windows = along.motion.windows
+    wider, inside = zip(*(_widened(window, level.shape) for window in windows), strict=True)
+    # All before any is changed: windows look at pixels beside them.
+    for window, part, found in list(zip(windows, inside, _look(along, wider, level, variance), strict=True)):
+        level[window], variance[window] = (plane[part] for plane in found)
+
+
+def _look(
+    along: Along, windows: tuple[Window, ...], level: Plane = _NOTHING, variance: Plane = _NOTHING
+) -> Iterator[tuple[Plane, Plane]]:
+    """What is seen in windows, joined with an image where there is one."""
+    motion = along.motion
+    height, width = motion.unmoved.shape
+    shapes = [(rows.stop - rows.start, columns.stop - columns.start) for rows, columns in windows]
+    sizes = [rows * columns for rows, columns in shapes]
+    ends = np.cumsum(sizes)
+    seen, doubt = memory.empty((2, int(ends[-1])))
+    difference, local, contradiction = memory.empty((3, max(sizes)))
+    bounds = np.array([(part.start, part.stop) for window in windows for part in window], np.uint64)
+    planes = motion.first, motion.second, motion.path, motion.bend, motion.unmoved, level, variance, bounds
+    _look_along(
+        *(plane.reshape(-1) for plane in planes),
+        (np.uint64(height), np.uint64(width)),
+        np.float32(along.share),
+        np.float32(along.between),
+        np.arange(width, dtype=np.float32),
+        difference,
+        local,
+        contradiction,
+        seen,
+        doubt,
+    )
+    for shape, size, end in zip(shapes, sizes, ends, strict=True):
+        part = slice(end - size, end)
+        yield seen[part].reshape(shape), doubt[part].reshape(shape)
+
+
+_ZERO, _ONE, _TWO, _THREE, _FOUR = (np.uint64(number) for number in range(5))
+
+
+@loop(fastmath=FUSED)
+def _look_along(  # type: ignore[no-untyped-def]
+    first,
+    second,
+    path,
+    bend,
+    unmoved,
+    level,
+    variance,
+    windows,
+    shape,
+    share,
+    between,
+    numbers,
+    difference,
+    local,
+    contradiction,
+    seen,
+    doubt,
+):
+    """Fill ``seen`` and ``doubt``, window after window; ``windows`` holds the first and last row and column of each.
+
+    The rows around another one come before what is made of them, and that at once, while they are in the nearest cache.
+    ``numbers`` are those of all columns; ``difference``, ``local`` and ``contradiction`` have room for a window each.
+    """
+    height, width = shape
+    stride, down, joins = _TWO * (width + np.uint64(2 * BORDER)), height * width, len(level) > 0
+    begin = _ZERO
+    for window in range(_ZERO, np.uint64(len(windows)), _FOUR):
+        top, left = windows[window], windows[window + _TWO]
+        rows, count = windows[window + _ONE] - top, windows[window + _THREE] - left
+        # Of both frames, one after the other: columns, or log intensity; then rows, or variance.
+        pixels, fractions = empty(_FOUR * count, np.int32), empty(_FOUR * count, np.float32)
+        read, apart = empty(_FOUR * count, np.float32), _TWO * count
+        sums, wider = empty(count + _FOUR, np.float32), empty(count + _FOUR, np.float32)
+        for step in range(rows + _FOUR):
+            if step < rows:
+                at, place = step * count, (top + step) * width + left
+                # fmt: off
+                for frame in range(_TWO):
+                    x, y = frame * count, frame * count + apart
+                    _follow(
+                        count, pixels, x, fractions, x, pixels, y, fractions, y, numbers, left,
+                        path, place, bend, place, path, place + down, bend, place + down,
+                        np.float32(top + step), share - np.float32(frame), between,
+                        np.float32(width), np.float32(height),
+                    )
+                read_row(count, first, stride, pixels, fractions, _ZERO, apart, read)
+                read_row(count, second, stride, pixels, fractions, count, apart, read)
+                _compare(
+                    count, seen, begin + at, difference, at, doubt, begin + at,
+                    read, _ZERO, read, count, read, apart, read, apart + count, share,
+                )
+                # fmt: on
+            if _ONE <= step < rows + _ONE:
+                row = step - _ONE
+                at = row * count
+                _add_three(seen, begin, row, rows, count, sums)
+                _roughen(count, local, at, seen, begin + at, difference, at, sums, FIRST)
+            if _TWO <= step < rows + _TWO:
+                row = step - _TWO
+                at, here, place = row * count, begin + row * count, (top + row) * width + left
+                _add_three(local, _ZERO, row, rows, count, sums)
+                _add_five(difference, row, rows, count, wider)
+                _doubt(count, doubt, here, sums, FIRST, wider, FIRST, unmoved, place)
+                if joins:
+                    _contradict(
+                        count, contradiction, at, seen, here, doubt, here, level, place, variance, place
+                    )
+            if step >= _FOUR and joins:
+                row = step - _FOUR
+                here, place = begin + row * count, (top + row) * width + left
+                _add_five(contradiction, row, rows, count, sums)
+                _join(count, seen, here, doubt, here, sums, FIRST, level, place, variance, place, between)
+        begin += rows * count
+
+
+@row_formula
+def _follow(
+    left: Pixels,
+    from_left: Pixels,
+    above: Pixels,
+    from_above: Pixels,
+    column: Pixels,
+    path_x: Pixels,
+    bend_x: Pixels,
+    path_y: Pixels,
+    bend_y: Pixels,
+    row: Number,
+    back: Number,
+    between: Number,
+    width: Number,
+    height: Number,
+) -> None:
+    """Where what is at a pixel is in a frame: the pixels left and above, and how far beyond them."""
+    across, down = bend_x[0] * between - path_x[0] * back, bend_y[0] * between - path_y[0] * back
+    left[0], from_left[0] = _place(across + column[0], width)
+    above[0], from_above[0] = _place(down + row, height)
+
+
+def _place(at: Number, most: Number) -> tuple[Number, Number]:
+    """The last pixel up to a place, and how far that is beyond it; far outside it is like there."""
+    at = choose(at < most, at, most)
+    at = choose(at > _LEAST, at, at.like(_LEAST))
+    below = (at - _LEAST).to(types.int32) + np.int32(_LEAST)
+    return below, at - below.to(types.float32)
+
+
+@row_formula
+def _compare(
+    seen: Pixels,
+    difference: Pixels,
+    doubt: Pixels,
+    first: Pixels,
+    second: Pixels,
+    first_variance: Pixels,
+    second_variance: Pixels,
+    share: Number,
+) -> None:
+    """The mean of both frames, their squared difference, and the variance of the mean by the frames' own."""
+    rest = np.float32(1.0) - share
+    error = first[0] - second[0]
+    seen[0] = rest * first[0] + share * second[0]
+    difference[0] = error * error
+    doubt[0] = rest * rest * first_variance[0] + share * share * second_variance[0]
+
+
+@row_formula
+def _roughen(local: Pixels, seen: Pixels, difference: Pixels, seen_around: Pixels) -> None:
+    """What the frames disagree by, and what texture loses between its pixels."""
+    fine = seen[0] - _mean_of_three(seen_around)
+    local[0] = _DISAGREEMENT * difference[0] + _FINE_RESAMPLING * (fine * fine)
+
+
+@row_formula
+def _doubt(doubt: Pixels, local_around: Pixels, difference_around: Pixels, unmoved: Pixels) -> None:
+    """The variance of what is seen, in place of that by the frames' own: the larger the less the motion explains."""
+    explained = ONE - _mean_of_five(difference_around) / _larger(unmoved[0], _LEAST_UNMOVED)
+    doubt[0] = (doubt[0] + _mean_of_three(local_around)) / _larger(explained, _LEAST_MOVING)
+
+
+@row_formula
+def _contradict(contradiction: Pixels, seen: Pixels, doubt: Pixels, level: Pixels, variance: Pixels) -> None:
+    """Squared difference of an image and what is seen, in units of its variance."""
+    error = level[0] - seen[0]
+    contradiction[0] = error * error / (variance[0] + doubt[0])
+
+
+@row_formula
+def _join(
+    seen: Pixels,
+    doubt: Pixels,
+    contradiction_around: Pixels,
+    level: Pixels,
+    variance: Pixels,
+    between: Number,
+) -> None:
+    """The image joined with what is seen, and its variance, in place of this."""
+    distrust = ONE + _DISTRUST * _mean_of_five(contradiction_around)
+    doubted = doubt[0] * (distrust * distrust)
+    kept = doubted / (between * variance[0] + doubted)
+    seen[0] = seen[0] + kept * (level[0] - seen[0])
+    doubt[0] = kept * variance[0]
+
+
+def _larger(one: Number, other: np.float32) -> Number:
+    return choose(one > other, one, one.like(other))
+
+
+def _mean_of_three(sums: Pixels) -> Number:
+    """Around a pixel, of sums of three rows."""
+    return (sums[-1] + sums[0] + sums[1]) * np.float32(1 / 9)
+
+
+def _mean_of_five(sums: Pixels) -> Number:
+    return (sums[-2] + sums[-1] + sums[0] + sums[1] + sums[2]) * np.float32(1 / 25)
+
+
+@nb.njit(cache=True, inline="always", error_model="numpy")
+def _add_three(plane, begin, row, rows, count, sums):  # type: ignore[no-untyped-def]
+    """The sum of three rows around one."""
+    above, below = mirrored(row - _ONE, rows) * count, mirrored(row + _ONE, rows) * count
+    _three(count, sums, FIRST, plane, begin + above, plane, begin + row * count, plane, begin + below)
+    mirror_ends(sums, count)
+
+
+@nb.njit(cache=True, inline="always", error_model="numpy")
+def _add_five(plane, row, rows, count, sums):  # type: ignore[no-untyped-def]
+    far, above = mirrored(row - _TWO, rows) * count, mirrored(row - _ONE, rows) * count
+    below, beyond = mirrored(row + _ONE, rows) * count, mirrored(row + _TWO, rows) * count
+    _five(count, sums, FIRST, plane, far, plane, above, plane, row * count, plane, below, plane, beyond)
+    mirror_ends(sums, count)
+
+
+@row_formula
+def _three(sums: Pixels, above: Pixels, here: Pixels, below: Pixels) -> None:
+    sums[0] = above[0] + here[0] + below[0]
+
+
+@row_formula
+def _five(sums: Pixels, far: Pixels, above: Pixels, here: Pixels, below: Pixels, beyond: Pixels) -> None:
+    sums[0] = far[0] + above[0] + here[0] + below[0] + beyond[0]
+
+
+@formula(types.uint64)
+def mirrored(row: Number, rows: Number) -> Number:
+    """The row of a plane that stands for one a little outside, as if it were mirrored at its outermost pixels."""
+    row, last = row.to(types.int64), rows.to(types.int64) - np.int64(1)
+    row = choose(row < np.int64(0), np.int64(0) - row, row)
+    return choose(row > last, last + last - row, row)
+
+
+@formula()
+def mirror_ends(row: Row, count: Number) -> None:
+    """Two pixels on either side of a row that begins at `FIRST`: the same."""
+    for aside in (1, 2):
+        first, last = count.like(FIRST), count + (FIRST - _ONE)
+        row[first - np.uint64(aside)] = row[first + np.uint64(aside)]
+        row[last + np.uint64(aside)] = row[last - np.uint64(aside)]
 
 
 def _widened(window: Window, shape: tuple[int, ...]) -> tuple[Window, Window]:

@@ -15,16 +15,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.along import (
+    BESIDE,
+    FIRST,
     Along,
     Motion,
     Window,
     as_seen,
-    joined,
+    join_along,
     mean_around,
+    mirror_ends,
+    mirrored,
     seen_along,
     unmoved_difference,
 )
 from kalux.augmentation.bridge import Latent
+from kalux.augmentation.resampling import readable
+from kalux.compiled import FUSED, ONE, empty, loop, smaller
+from kalux.formulas import Pixels, row_formula
 
 Floats = NDArray[np.floating[Any]]
 Plane = NDArray[np.float32]
@@ -61,6 +68,9 @@ _BENDS: Final = 2
 
 _MOST_BENT: Final = 4.0
 """Pixels that a path is bent by at most, half-way."""
+
+_CELLS: Final = 9
+"""Of a tile's side: sums over pixels are taken of cells first, and the bend is linear between them."""
 
 _ALIKE: Final = np.float32(1.0 / 20.0)
 """Of the pixels of a tile so many tell something of their own, since errors of neighbours are alike."""
@@ -182,16 +192,21 @@ def bent(first: Latent, second: Latent, path: Plane, level: Floats, variance: Fl
         return None
     side = 4 * (path.shape[2] // _columns(path.shape[2])) - 1
     window = _around(moving, side)
-    level, variance = np.asarray(level[window], np.float32), np.asarray(variance[window], np.float32)
+    level, variance = (np.ascontiguousarray(plane, np.float32) for plane in (level, variance))
     first, second = as_seen(first), as_seen(second)
-    motion = Motion(first, second, path, np.zeros_like(path), unmoved_difference(first, second), (window,))
-    half_way, bend = Along(motion, 0.5), motion.bend[:, *window]
+    unmoved = unmoved_difference(first, second)
+    motion = Motion(readable(first), readable(second), path, np.zeros_like(path), unmoved, (window,))
+    half_way, cell = Along(motion, 0.5), max(round((side + 1) / _CELLS), 1)
+    rows, columns = (part.stop - part.start for part in window)
+    bend = np.zeros((2, -(-rows // cell), -(-columns // cell)), np.float32)
     for _ in range(_BENDS):
-        seen, doubt = seen_along(half_way, window)
-        bend[:] = _bent_further(bend, seen, level - seen, variance + doubt, (side, side))
-    _, left = joined(*seen_along(half_way, window), level, variance, 1.0)
-    gain = np.zeros(moving.shape, np.float32)
-    gain[window] = np.where(moving[window], 1.0 - left / variance, np.float32(0.0))
+        bend = _bent_further(bend, *seen_along(half_way, window), level[window], variance[window], cell)
+        for plane, of_cells in zip(motion.bend, bend, strict=True):
+            whole = (cell * bend.shape[2], cell * bend.shape[1])
+            plane[window] = cv2.resize(of_cells, whole, interpolation=cv2.INTER_LINEAR)[:rows, :columns]
+    left = variance.copy()
+    join_along(half_way, level.copy(), left)
+    gain = np.where(moving, 1.0 - left / variance, np.float32(0.0))
     windows = tuple(_windows(gain))
     return motion._replace(windows=windows) if windows else None
 
@@ -209,11 +224,13 @@ def _windows(gain: Plane) -> list[Window]:
     (height, width), (rows, columns) = gain.shape, _TILE
     found: list[Window] = []
     above: dict[tuple[int, int], int] = {}  # of windows that reach down to the strip: first row, by columns
-    for top in [*range(0, height, rows), height]:
-        strip = gain[top : top + rows]
-        lefts = range(0, width, columns)
-        counting = [len(strip) > 0 and strip[:, left : left + columns].mean() > _LEAST_GAIN for left in lefts]
-        edges = np.flatnonzero(np.diff([False, *counting, False])) * columns
+    tops, lefts = (np.arange(0, length, side) for length, side in ((height, rows), (width, columns)))
+    sums = np.add.reduceat(np.add.reduceat(gain, tops, axis=0), lefts, axis=1)
+    pixels = np.outer(np.minimum(rows, height - tops), np.minimum(columns, width - lefts))
+    counting = np.zeros((len(tops) + 1, len(lefts) + 2), np.bool_)
+    counting[:-1, 1:-1] = sums > _LEAST_GAIN * pixels
+    for top, strip in zip([*tops.tolist(), height], counting, strict=True):
+        edges = np.flatnonzero(np.diff(strip)) * columns
         runs = {
             (int(begin), min(int(end), width)) for begin, end in zip(edges[::2], edges[1::2], strict=True)
         }
@@ -222,17 +239,89 @@ def _windows(gain: Plane) -> list[Window]:
     return found
 
 
-def _bent_further(bend: Plane, seen: Plane, error: Plane, variance: Plane, tile: tuple[int, int]) -> Plane:
-    """A step of Gauss and Newton: what is seen is shifted, tile by tile, so that its ``error`` becomes least."""
-    weight = _ALIKE / (variance * np.square(1.0 + error * error / (_OUTLIER * variance)))
-    of_x, of_y = (cv2.Sobel(seen, cv2.CV_32F, *axis, scale=1.0 / 8.0) for axis in ((1, 0), (0, 1)))
-    pixels = np.float32(tile[0] * tile[1])
-    weighted_x, weighted_y = weight * of_x * pixels, weight * of_y * pixels
-    xx = mean_around(weighted_x * of_x, tile) + _BEND_INFORMATION
-    yy = mean_around(weighted_y * of_y, tile) + _BEND_INFORMATION
-    xy = mean_around(weighted_x * of_y, tile)
-    x = mean_around(weighted_x * error, tile) - _BEND_INFORMATION * bend[0]
-    y = mean_around(weighted_y * error, tile) - _BEND_INFORMATION * bend[1]
+def _bent_further(bend: Plane, seen: Plane, doubt: Plane, level: Plane, variance: Plane, cell: int) -> Plane:
+    """A step of Gauss and Newton: what is seen is shifted, tile by tile, so that its error becomes least.
+
+    ``bend`` is that of every cell of ``cell`` x ``cell`` pixels.
+    """
+    sums = np.zeros((5, *bend.shape[1:]), np.float32)
+    _sum_cells(
+        *(np.ascontiguousarray(plane).reshape(-1) for plane in (seen, doubt, level, variance)),
+        (np.uint64(seen.shape[0]), np.uint64(seen.shape[1])),
+        np.uint64(cell),
+        sums.reshape(-1),
+    )
+    xx, yy, xy, x, y = (np.float32(_CELLS**2) * mean_around(part, (_CELLS, _CELLS)) for part in sums)
+    xx, yy = xx + _BEND_INFORMATION, yy + _BEND_INFORMATION
+    x, y = x - _BEND_INFORMATION * bend[0], y - _BEND_INFORMATION * bend[1]
     step = np.stack([yy * x - xy * y, xx * y - xy * x]) / (xx * yy - xy * xy)
     further: Plane = np.clip(bend + step, -_MOST_BENT, _MOST_BENT)
     return further
+
+
+@loop(fastmath=FUSED)
+def _sum_cells(seen, doubt, level, variance, shape, cell, sums):  # type: ignore[no-untyped-def]
+    """Add up, cell by cell, the weighted products of slopes across and down, and of slopes with the error.
+
+    ``sums`` are those of all cells, one product after the other.
+    """
+    rows, count = shape
+    smooth, steep = (
+        empty(count + np.uint64(2 * BESIDE), np.float32),
+        empty(count + np.uint64(2 * BESIDE), np.float32),
+    )
+    products = empty(np.uint64(5) * count, np.float32)
+    across = (count + cell - np.uint64(1)) // cell
+    cells = np.uint64(len(sums)) // np.uint64(5)
+    xx = np.uint64(0)
+    yy, xy, x, y = count, count + count, np.uint64(3) * count, np.uint64(4) * count
+    for row in range(rows):
+        at = row * count
+        above, below = mirrored(row - np.uint64(1), rows) * count, mirrored(row + np.uint64(1), rows) * count
+        _blend(count, smooth, FIRST, steep, FIRST, seen, above, seen, at, seen, below)
+        mirror_ends(smooth, count)
+        mirror_ends(steep, count)
+        # fmt: off
+        _multiply(
+            count, products, xx, products, yy, products, xy, products, x, products, y,
+            smooth, FIRST, steep, FIRST, seen, at, doubt, at, level, at, variance, at,
+        )
+        # fmt: on
+        for part in range(np.uint64(5)):
+            place = part * cells + row // cell * across
+            for first in range(np.uint64(0), count, cell):
+                for k in range(first, smaller(first + cell, count)):
+                    sums[place] += products[part * count + k]
+                place += np.uint64(1)
+
+
+@row_formula
+def _blend(smooth: Pixels, steep: Pixels, above: Pixels, here: Pixels, below: Pixels) -> None:
+    """Sobel's, of three rows: for slopes across, and down."""
+    smooth[0] = above[0] + np.float32(2.0) * here[0] + below[0]
+    steep[0] = below[0] - above[0]
+
+
+@row_formula
+def _multiply(
+    xx: Pixels,
+    yy: Pixels,
+    xy: Pixels,
+    x: Pixels,
+    y: Pixels,
+    smooth: Pixels,
+    steep: Pixels,
+    seen: Pixels,
+    doubt: Pixels,
+    level: Pixels,
+    variance: Pixels,
+) -> None:
+    """Of weighted slopes, and with the error, at every pixel of a row."""
+    across = (smooth[1] - smooth[-1]) * np.float32(1 / 8)
+    down = (steep[-1] + np.float32(2.0) * steep[0] + steep[1]) * np.float32(1 / 8)
+    error, doubted = level[0] - seen[0], variance[0] + doubt[0]
+    outlying = ONE + error * error / (_OUTLIER * doubted)
+    weight = _ALIKE / (doubted * (outlying * outlying))
+    weighted_x, weighted_y = weight * across, weight * down
+    xx[0], yy[0], xy[0] = weighted_x * across, weighted_y * down, weighted_x * down
+    x[0], y[0] = weighted_x * error, weighted_y * error
