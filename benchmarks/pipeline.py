@@ -43,7 +43,16 @@ OUTPUTS = {
 }
 INPUTS = ("h5", "aedat4")
 GIVEN = (
-    *("--events.delay", "0", "--camera.log-offset", "0.05", "--events.step-variance", "0.2"),
+    *(
+        "--events.delay",
+        "0",
+        "--camera.log-offset",
+        "0.05",
+        "--events.step-variance",
+        "0.2",
+        "--events.extrapolation-gain",
+        "1",
+    ),
     *("--events.threshold-on", "0.2", "--events.threshold-off", "0.2"),
     *("--events.refractory-period", "0", "--events.threshold-spread", "0.1", "--events.noise-rate", "0.1"),
 )
