@@ -7,7 +7,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kalux.augmentation.refractory import EventClock
-from kalux.event_slices import all_between, between, count_chunks, count_events, events_until
+from kalux.event_slices import (
+    all_between,
+    between,
+    count_chunks,
+    count_events,
+    events_until,
+    first_events,
+)
 
 from builders import events, pixel_events, random_stream
 
@@ -33,6 +40,18 @@ def test_slices_are_open_at_the_start_and_closed_at_the_end():
         [20],
         [20],
     ]
+
+
+def test_the_first_events_are_read_no_further_than_they_go():
+    array = pixel_events([10, 20, 30, 40], [1, 0, 1, 0])
+
+    def chunks():
+        yield from (array[:0], array[:3], array[3:])
+        raise AssertionError("one chunk too many")
+
+    assert [part["t"].tolist() for part in first_events(chunks(), 2)] == [[10, 20]]
+    assert [part["t"].tolist() for part in first_events(chunks(), 4)] == [[10, 20, 30], [40]]
+    assert [len(part) for part in first_events([array[:3], array[3:]], None)] == [3, 1]
 
 
 def test_counts_by_polarity():

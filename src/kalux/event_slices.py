@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,19 @@ def all_between(chunks: Sequence[EventArray], start: int, end: int) -> list[Even
     """The same of events in several arrays."""
     inside = (between(chunk, start, end) for chunk in chunks)
     return [events for events in inside if len(events)]
+
+
+def first_events(chunks: Iterable[EventArray], most: int | None) -> Iterator[EventArray]:
+    """The first ``most`` events, None for all, in their chunks, none of which is empty; no further chunk is read."""
+    left = most
+    for chunk in chunks:
+        part = chunk if left is None else chunk[:left]
+        if len(part):
+            yield part
+        if left is not None:
+            left -= len(part)
+            if left <= 0:
+                return
 
 
 def events_until(events: EventArray, t: int) -> int:

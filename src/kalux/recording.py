@@ -45,6 +45,7 @@ from kalux.frames import (
 from kalux.models.colour import sample_mosaic
 from kalux.models.frame_pixels import without_stuck
 from kalux.readers import CHUNK_EVENTS, Source, joined
+from kalux.settings import CameraSettings
 from kalux.white import WhiteCheck, white_of_bits
 
 T = TypeVar("T")
@@ -55,9 +56,6 @@ both starts and stops them together."""
 
 _WHITE_FRAMES: Final = 80
 """Frames, some 3 s of them, that tell the white value where it is not stated."""
-
-
-_CLIPPED: Final = 0.98  # of the response
 
 
 class Stream(Generic[T]):
@@ -258,7 +256,7 @@ def _corrected(frames: Iterator[Frame], corrections: FrameCorrections, pitch: in
         for empty in waiting:
             response = frame.normalised()
             least = response if response.ndim == 2 else response.min(axis=-1)
-            clipped = np.asarray(least >= _CLIPPED, np.bool_)
+            clipped = np.asarray(least >= CameraSettings.usual_saturation, np.bool_)
             yield dataclasses.replace(empty, image=frame.image, gain=frame.gain, valid=clipped)
         waiting = []
         yield frame

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.calibration.delay import DelayEstimate, estimate_delay
-from kalux.calibration.intervals import intervals, spread
+from kalux.calibration.intervals import WELL_EXPOSED, intervals, spread
 from kalux.calibration.levels import response_histogram
 from kalux.event_slices import between, count_events
 from kalux.models.camera import Camera, Response
@@ -43,8 +43,6 @@ _ABOVE: Final = 2 * _LEVEL
 _CHANGE: Final = 4 * _LEVEL
 """Least change of samples: several times the noise of frames, so that what events say is compared with a known one.
 It is a difference of responses, which no black level changes."""
-
-_BRIGHTEST: Final = 0.95  # as of well exposed pixels elsewhere
 
 _LEAST_EVENTS: Final = 1.0
 """Least number of events that the change of frames stands for: of smaller ones many make none."""
@@ -202,7 +200,7 @@ def _samples(recording: Recording, camera: CameraSettings, floor: float, delay: 
     for interval in intervals(recording, camera, margin=margin, most_frames=_MAX_FRAMES):
         before, after = (end.frame.normalised() for end in interval.ends)
         low, high = np.minimum(before, after), np.maximum(before, after)
-        usable = (low >= floor + _ABOVE) & (high < _BRIGHTEST) & (high - low >= _CHANGE)
+        usable = (low >= floor + _ABOVE) & (high < WELL_EXPOSED[1]) & (high - low >= _CHANGE)
         for end in interval.ends:
             usable &= ~end.shot.clipped & (True if end.frame.valid is None else end.frame.valid)
         chosen = spread(usable, _PER_INTERVAL)

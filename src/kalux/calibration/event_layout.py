@@ -7,7 +7,7 @@ which an event of value 1 is a darker one.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -89,7 +89,7 @@ def find_layout(recording: Recording, camera: CameraSettings) -> LayoutFit | Non
             break
     if active < _LEAST:
         return None
-    stored = _correlation((c, n, u) for c, n, u in seen)
+    stored = _correlation(seen)
     if stored >= _AGREE:
         return LayoutFit(AS_STORED, stored)
     found = {
@@ -117,7 +117,7 @@ def _change_and_count(interval: Interval, size: tuple[int, int]) -> tuple[Array,
     return change, np.clip(on - off, -_LARGEST_COUNT, _LARGEST_COUNT).astype(np.float64)
 
 
-def _correlation(pairs: Iterator[tuple[Array, Array, NDArray[Any]]]) -> float:
+def _correlation(pairs: Iterable[tuple[Array, Array, NDArray[Any]]]) -> float:
     """Of two images in the pixels of a third, over all intervals, about their means; 0 where one is constant."""
     sums = np.zeros(3)
     for first, second, chosen in pairs:

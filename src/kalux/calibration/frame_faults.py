@@ -15,7 +15,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.calibration.intervals import Interval, intervals, spread
+from kalux.calibration.intervals import WELL_EXPOSED, Interval, intervals, spread
 from kalux.calibration.neighbours import sum_of_neighbours
 from kalux.calibration.regression import two_stage
 from kalux.calibration.stuck_pixels import RangeWatch
@@ -29,8 +29,6 @@ Array = NDArray[np.float64]
 
 _SAMPLE: Final = 4096
 """Pixels of a frame, about, that tell whether it has to be looked at together with events."""
-
-_WELL_EXPOSED: Final = (0.05, 0.95)  # of the response, as of `kalux.calibration.intervals`
 
 _SUSPECT: Final = 0.08
 """Median change of the log intensity from one frame to the next from which it is looked at."""
@@ -181,7 +179,7 @@ class FrameWatch:
 
 
 def _inside(response: Array) -> NDArray[np.bool_]:
-    low, high = _WELL_EXPOSED
+    low, high = WELL_EXPOSED
     return (response > low) & (response < high)
 
 

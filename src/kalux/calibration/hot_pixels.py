@@ -19,8 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.compiled import empty, loop, zeros
-from kalux.event_slices import count_chunks
+from kalux.event_slices import count_chunks, first_events
 from kalux.events import EVENT_DTYPE, EventArray
+from kalux.models.frame_pixels import around
 from kalux.recording import Recording
 
 Counts = NDArray[np.int32]
@@ -79,7 +80,7 @@ def find_hot_pixels(recording: Recording, most_events: int = MOST_EVENTS) -> NDA
     -------
     (H, W) bool; none where too few bins tell.
     """
-    events = _first_events(recording, most_events)
+    events = np.concatenate([np.empty(0, EVENT_DTYPE), *first_events(recording.events(), most_events)])
     hot = np.zeros(recording.sensor_size, np.bool_)
     for length in BINS:
         alone = _counted_alone(events, recording.sensor_size, length)
@@ -89,17 +90,6 @@ def find_hot_pixels(recording: Recording, most_events: int = MOST_EVENTS) -> NDA
             fires |= _fires_nearly_always(alone)
         hot |= one_sign & fires
     return hot | _outruns_neighbours(events, recording.sensor_size)
-
-
-def _first_events(recording: Recording, most_events: int) -> EventArray:
-    chunks: list[EventArray] = [np.empty(0, EVENT_DTYPE)]
-    left = most_events
-    for chunk in recording.events():
-        chunks.append(chunk[:left])
-        left -= len(chunks[-1])
-        if left <= 0:
-            break
-    return np.concatenate(chunks)
 
 
 def _bins_of(events: EventArray, length: int) -> NDArray[np.int64]:
@@ -206,18 +196,5 @@ def _outruns_neighbours(events: EventArray, shape: tuple[int, int]) -> NDArray[n
         net += on - off
     bins = len(edges) - 1
     steady = (np.maximum(rising, falling) >= _STEADY * bins) & (bins >= _MANY)
-    return np.asarray(steady & (np.abs(net) >= _TIMES * (_second_largest_around(np.abs(net)) + 1)), np.bool_)
-
-
-def _second_largest_around(values: Counts) -> Counts:
-    """(H, W) the second largest of every pixel's eight neighbours."""
-    height, width = values.shape
-    padded = np.pad(values, 1)
-    largest, second = np.zeros((2, height, width), values.dtype)
-    for row in range(3):
-        for column in range(3):
-            if (row, column) != (1, 1):
-                beside = padded[row : row + height, column : column + width]
-                second = np.maximum(second, np.minimum(largest, beside))
-                largest = np.maximum(largest, beside)
-    return second
+    second_largest = np.partition(around(np.abs(net), 1, 0), -2, axis=0)[-2]
+    return np.asarray(steady & (np.abs(net) >= _TIMES * (second_largest + 1)), np.bool_)

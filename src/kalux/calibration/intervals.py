@@ -25,7 +25,8 @@ from kalux.settings import CameraSettings, EventSettings, chosen_response
 
 Array = NDArray[np.float64]
 
-_WELL_EXPOSED: Final = (0.05, 0.95)  # of the response: away from black, noise and saturation
+WELL_EXPOSED: Final = (0.05, 0.95)
+"""Of the response: away from black, noise and saturation."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +59,7 @@ class End:
     @cached_property
     def usable(self) -> NDArray[np.bool_]:
         """(H, W): valid and well exposed, also where a stated saturation lies below what that usually is."""
-        low, high = _WELL_EXPOSED
+        low, high = WELL_EXPOSED
         level = self.frame.normalised()
         inside = (level > low) & (level < high)
         usable = np.asarray(inside.all(axis=-1) if inside.ndim == 3 else inside, np.bool_)

@@ -27,6 +27,7 @@ from kalux.calibration.refractory import dead_time, shortest_interval
 from kalux.calibration.regression import ratio_error
 from kalux.calibration.values import Calibration
 from kalux.compiled import inner, larger, loop, smaller
+from kalux.event_slices import first_events
 from kalux.events import NEVER, EventArray
 from kalux.recording import Recording
 from kalux.settings import CameraSettings, EventSettings
@@ -209,17 +210,10 @@ def event_noise(
 def _chunks(
     recording: Recording, most_events: int | None, ignored: NDArray[np.bool_]
 ) -> Iterator[EventArray]:
-    left = most_events
-    skip = bool(ignored.any())
-    for chunk in recording.events():
-        seen = chunk[~ignored[chunk["y"], chunk["x"]]] if skip else chunk
-        seen = seen if left is None else seen[:left]
-        if len(seen):
-            yield seen
-        if left is not None:
-            left -= len(seen)
-            if left <= 0:
-                return
+    chunks: Iterator[EventArray] = iter(recording.events())
+    if ignored.any():
+        chunks = (chunk[~ignored[chunk["y"], chunk["x"]]] for chunk in recording.events())
+    return first_events(chunks, most_events)
 
 
 def _span(

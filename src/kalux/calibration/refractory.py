@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.compiled import empty, loop
+from kalux.event_slices import first_events
 from kalux.events import NEVER
 from kalux.recording import Recording
 
@@ -167,13 +168,8 @@ def _of_first_events(recording: Recording, most_events: int) -> Iterator[tuple[N
     """Of chunks of the first events: intervals, us, and whether both events of each differ in polarity."""
     last = np.full(recording.sensor_size, NEVER, np.int64)
     seen = np.zeros(recording.sensor_size, np.int32)
-    read = 0
-    for chunk in recording.events():
-        part = chunk[: most_events - read]
+    for part in first_events(recording.events(), most_events):
         yield _intervals_of(part["t"], part["x"], part["y"], part["p"], last, seen)
-        read += len(part)
-        if read >= most_events:
-            break
 
 
 @loop

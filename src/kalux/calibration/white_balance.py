@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.calibration.intervals import WELL_EXPOSED
 from kalux.errors import FrameError
 from kalux.frames import Frame
 from kalux.models.camera import Camera
@@ -16,7 +17,6 @@ from kalux.recording import Recording
 from kalux.settings import CameraSettings
 
 _MOST_FRAMES: Final = 60
-_WELL_EXPOSED: Final = (0.05, 0.95)
 
 
 def grey_world(recording: Recording, camera: CameraSettings) -> Gains:
@@ -33,7 +33,7 @@ def grey_world(recording: Recording, camera: CameraSettings) -> Gains:
     total = np.zeros(3)
     for frame in islice(recording.frames(), _MOST_FRAMES):
         cells = _cells(frame)
-        low, high = _WELL_EXPOSED
+        low, high = WELL_EXPOSED
         chosen = cells[((cells > low) & (cells < high)).all(axis=-1)]
         total += [model.of_channel(c).response.inverse(chosen[:, c]).sum() / frame.exposure for c in range(3)]
     if not (total > 0).all():
