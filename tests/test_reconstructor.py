@@ -362,6 +362,26 @@ def test_an_image_becomes_final_one_frame_later():
     assert live.read(10**9).final
 
 
+def test_an_estimates_image_does_not_depend_on_what_came_after_it():
+    """Another thread makes images while the filter goes on: here, to a frame of finer levels, which round less."""
+    settings = altered(VARIANTS["default"], "camera", frame_noise=0.0005)
+    out = Reconstructor((6, 8), settings=settings, contrast_threshold=THRESHOLD)
+    image = np.full((6, 8), 100, np.uint8)
+    for number in range(2):
+        out.push_frame(Frame(image, exposure_start=20_000 * number, exposure_end=20_000 * number + 10_000))
+    out.advance(40_000)
+    estimate = out.estimate(15_000)
+    at_once = out.image(estimate)
+    out.push_frame(Frame(image.astype(np.uint16) * 257, exposure_start=40_000, exposure_end=50_000))
+    assert_same(out.image(estimate), at_once)
+
+
+def test_no_image_without_a_frame():
+    estimate = filled(random_stream(0)).estimate(target_times(random_stream(0))[0])
+    with pytest.raises(InputError, match="no frame has been pushed"):
+        engine(random_stream(0).sensor_size).image(estimate)
+
+
 def test_a_later_frame_changes_what_was_provisional():
     live = engine((1, 1), reference_exposure=1_000)
     live.push_frame(frame(100, 0, 1000))

@@ -148,6 +148,7 @@ class Reconstructor:
         self._frame_count = 0
         self._frame_interval = USUAL_INTERVAL  # between the latest two frames whose segment is committed, us
         self._bright_tail = self.settings.filter.bright_tail  # None: that of the first frame
+        self._view: View | None = None  # once there is a frame
         self._event_count = 0
         self._last_event: int | None = None
         self._complete_until: int | None = None
@@ -180,6 +181,8 @@ class Reconstructor:
         self._reference_exposure = self._reference_exposure or frame.exposure
         if self._bright_tail is None:
             self._bright_tail = count_bright(self._camera, frame.image, frame.white_value, frame.black).scale
+        if self._view is None:
+            self._view = self._view_by(frame, self._bright_tail)
         shot = take_shot(frame, self._camera, self._reference_exposure, self._gains_of(frame))
         self._shots.append(shot._replace(trail=trail, bright_tail=self._bright_tail))
         self._last_frame = frame
@@ -388,23 +391,30 @@ class Reconstructor:
     def image(self, estimate: Estimate, *, with_variance: bool = True) -> Image:
         """The image of an estimate, with the prior on highlights (K6, K15) and averaging of neighbours (K12).
 
-        Where the variance is not wanted it is infinite: computing it (K11) takes a seventh of the time.
-        """
-        return make_image(estimate, self._view(), with_variance=with_variance)
+        Where the variance is not wanted it is infinite: computing it (K11) takes a seventh of the time. Nothing that
+        is pushed after the first frame changes the image, so that another thread may make it.
 
-    def _view(self) -> View:
-        """The settings and the camera's properties by which images are made."""
+        Raises
+        ------
+        InputError
+            If no frame has been pushed.
+        """
+        if self._view is None:
+            raise InputError(
+                "image: no frame has been pushed yet, so that the camera's properties are not known"
+            )
+        return make_image(estimate, self._view, with_variance=with_variance)
+
+    def _view_by(self, frame: Frame, bright_tail: float) -> View:
+        """The settings and the camera's properties, of its first frame, by which images are made."""
         filtered, events = self.settings.filter, self.settings.events
         # The prior on highlights needs a variance, which the complementary filter has not.
         scale = filtered.highlight_scale if filtered.kind == "akf" else 0.0
         spread = events.believed_mismatch
         if self._thresholds_estimated:
-            assert self._bright_tail is not None  # a frame has been pushed
-            scale = min(scale, filtered.highlight_tail * beyond_white(self._bright_tail))
+            scale = min(scale, filtered.highlight_tail * beyond_white(bright_tail))
             spread = events.believed_extrapolation
         on, off = self.thresholds
-        frame = self._last_frame
-        mosaic = None if frame is None else frame.mosaic
         return View(
             log_offset=self.settings.camera.offset,
             threshold2=on * off,
@@ -414,9 +424,9 @@ class Reconstructor:
             highlight_gain=events.believed_gain,
             unknown_variance=filtered.initial_variance,
             fixed_pattern=self.settings.camera.fixed_pattern or 0.0,
-            rounding=0.0 if frame is None else repeated_rounding(frame, self.settings.camera),
-            mosaic=mosaic,
-            gains=(1.0, 1.0, 1.0) if frame is None or mosaic is None else self._gains_of(frame),
+            rounding=repeated_rounding(frame, self.settings.camera),
+            mosaic=frame.mosaic,
+            gains=(1.0, 1.0, 1.0) if frame.mosaic is None else self._gains_of(frame),
         )
 
     def _unshown(self, progress: _Progress, variance: NDArray[np.floating[Any]]) -> Unshown | None:
