@@ -80,11 +80,12 @@ class _Lent:
     which it does not leave out for what is below, as it does with arrays of its own.
     """
 
-    piece: NDArray[np.uint8]
+    piece: NDArray[np.uint8] | None = None  # where an interrupt comes before it is known
     give: Callable[[NDArray[np.uint8]], None]
 
     def __del__(self) -> None:
-        self.give(self.piece)
+        if self.piece is not None:
+            self.give(self.piece)
 
 
 @functools.cache
@@ -102,7 +103,7 @@ def empty(shape: tuple[int, ...], dtype: Any = np.float32) -> NDArray[Any]:
     else:
         piece = _free.take(size)
         lent = _lent_bytes(len(piece)).from_buffer(piece)
-        lent.piece, lent.give = piece, _free.give
+        lent.give, lent.piece = _free.give, piece
     array: NDArray[Any] = np.ndarray(shape, kind, lent)
     return array
 

@@ -12,6 +12,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 
 import pytest
 
@@ -323,6 +324,19 @@ class TestSignals:
         with termination_as_interrupt():
             assert signal.getsignal(signal.SIGTERM) != before[0]
         assert (signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT)) == before
+
+    def test_an_interrupt_while_an_object_is_collected_comes_again(self):
+        class Collected:
+            def __del__(self):
+                signal.raise_signal(signal.SIGINT)
+
+        def work():
+            Collected()
+            for _ in range(500):
+                time.sleep(0.01)
+
+        with termination_as_interrupt(), pytest.raises(KeyboardInterrupt):
+            work()
 
     def test_other_threads_have_no_signals(self):
         done = []
