@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,10 @@ from hypothesis import settings
 # The first call of a compiled function compiles it, which takes longer than any deadline.
 settings.register_profile("kalux", deadline=None)
 settings.load_profile("kalux")
+
+# A shell starts what runs in the background with Ctrl-C ignored, which many tests send.
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")

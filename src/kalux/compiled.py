@@ -24,6 +24,7 @@ from kalux import memory
 from kalux.events import EventArray
 from kalux.formulas import LANES, Number, choose, formula
 from kalux.kernel_cache import check_variables
+from kalux.loop_files import kept
 from kalux.memory import PAGE
 
 check_variables()
@@ -42,9 +43,17 @@ FUSED: Final = {"contract"}
 instruction, which rounds once instead of twice."""
 
 
-loop: Any = functools.partial(nb.njit, cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True)
-"""Decorates a loop. All have the same options, since numba compiles its own helpers once for every set of options;
-without the wrapper for C they compile a twentieth faster."""
+_OPTIONS: Final = {"cache": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+"""numba's, of all loops, since it compiles its own helpers once for every set of options; without the wrapper for C
+they compile a twentieth faster."""
+
+
+def loop(function: Any = None, **options: Any) -> Any:
+    """Decorates a loop. ``options`` are further ones of numba's."""
+    if function is None:
+        return functools.partial(loop, **options)
+    return kept(nb.njit(**{**_OPTIONS, **options})(function))
+
 
 inner: Any = functools.partial(loop, no_cpython_wrapper=True)
 """Decorates functions that only loops call: without the wrapper for Python they compile a tenth faster."""

@@ -516,11 +516,14 @@ class TestThreads:
             out = tmp_path / f"{threads}" / ("o.mp4" if kind == "mp4" else "o")
             flags = () if kind == "mp4" else ("--format", kind)
             done = cli("reconstruct", recording, "-o", out, "--rate", 200, "--threads", threads, *flags)
-            assert done.code == 0
+            assert done.code == 0, done.err
             files = [out] if kind == "mp4" else sorted(out.glob(f"*.{kind}"))
             assert len(files) == (1 if kind == "mp4" else len(times_in(out)))
-            contents[threads] = [file.read_bytes() for file in files]
-        assert contents[1] == contents[2] == contents[4]
+            contents[threads] = {file.name: file.read_bytes() for file in files}
+        for threads in (2, 4):
+            assert contents[threads].keys() == contents[1].keys()
+            differing = [name for name, data in contents[1].items() if contents[threads][name] != data]
+            assert not differing, (threads, tmp_path)
 
     @pytest.mark.parametrize("threads", ["0", "-1", "two"])
     def test_at_least_one(self, cli, recording, tmp_path, threads):
@@ -614,6 +617,8 @@ class TestInterrupt:
         [(signal.SIGINT, 1), (signal.SIGINT, 4), (signal.SIGTERM, 4), (signal.SIGHUP, 4)],
     )
     def test_what_is_finished_stays_valid(self, start_cli, recording, tmp_path, number, threads):
+        if signal.getsignal(number) == signal.SIG_IGN:
+            pytest.skip("the signal is ignored, as under nohup")
         out = tmp_path / "out"
         process = start_cli(
             "reconstruct", recording, "-o", out, "--rate", 100_000, "--format", "npy", "--threads", threads

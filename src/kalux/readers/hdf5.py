@@ -6,12 +6,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
 from kalux import memory
-from kalux.compiled import event_words
+from kalux.compiled import event_words, loop
 from kalux.errors import FormatError, InputError
 from kalux.events import EVENT_DTYPE, EventArray, checked_thresholds
 from kalux.frames import MOSAICS, Frame, GroundTruth, Mosaic
@@ -196,7 +195,7 @@ def _events(path: Path) -> Iterator[EventArray]:
             yield events
 
 
-@nb.njit(cache=True, nogil=True)
+@loop
 def _join(t, x, y, p, words):  # type: ignore[no-untyped-def]
     """Events of columns that are at least as long. NumPy would go over their memory once for every column."""
     for i in range(len(words)):

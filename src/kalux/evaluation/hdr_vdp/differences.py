@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from kalux.compiled import loop
 from kalux.evaluation.hdr_vdp import constants as c
 from kalux.evaluation.hdr_vdp import pyramid
 from kalux.evaluation.hdr_vdp.pathway import perceive
@@ -67,7 +67,7 @@ def mutual_masking(test: Array, reference: Array) -> Array:
     return masking
 
 
-@nb.njit(cache=True, nogil=True)
+@loop(error_model="python")
 def _mutual_masking(test, reference):  # type: ignore[no-untyped-def]
     rows, columns = test.shape
     common = np.zeros((rows + 2, columns + 2))
@@ -98,7 +98,7 @@ def band_noise(frequency: float, log_luminance: Array) -> Array:
     return noise
 
 
-@nb.njit(cache=True, nogil=True)
+@loop(error_model="python")
 def _band_noise(table, log_luminance, low, high, exponent):  # type: ignore[no-untyped-def]
     noise = np.empty_like(log_luminance)
     steps = (len(table) - 1) / (high - low)
@@ -129,7 +129,7 @@ def dominant_frequency(image: Array, pixels_per_degree: float) -> float:
     return float(np.hypot(vertical, horizontal) * pixels_per_degree)
 
 
-@nb.njit(cache=True, nogil=True)
+@loop(error_model="python")
 def _pooled_error(test, reference, masking, neighbours, noise, counted, p, q, own, other, pooling):  # type: ignore[no-untyped-def]
     """Minkowski mean of D = |B_T - B_R|^p / sqrt(N_CSF^(2p) + N_mask^2), each times the share of it that counts."""
     total = 0.0

@@ -5,11 +5,11 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import Final, NamedTuple
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 
+from kalux.compiled import loop
 from kalux.evaluation.hdr_vdp import constants as c
 from kalux.evaluation.hdr_vdp.sensitivity import LOG_LUMINANCE, modulation_transfer, response_tables
 
@@ -114,7 +114,7 @@ def photoreceptors(log_retinal: Array, pupil: float) -> Array:
     return response
 
 
-@nb.njit(cache=True, nogil=True)
+@loop(error_model="python")
 def _sum_responses(log_retinal, shifts, cones, rods, low, high):  # type: ignore[no-untyped-def]
     response = np.empty_like(log_retinal)
     for i in range(log_retinal.shape[0]):
@@ -128,7 +128,7 @@ def _sum_responses(log_retinal, shifts, cones, rods, low, high):  # type: ignore
     return response
 
 
-@nb.njit(cache=True, nogil=True)
+@loop(error_model="python")
 def _look_up(table, level, low, high):  # type: ignore[no-untyped-def]
     """Linear in a table of equal steps from low to high; levels beyond are taken to its ends."""
     place = (min(max(level, low), high) - low) * ((len(table) - 1) / (high - low))

@@ -5,10 +5,10 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import Final
 
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.compiled import loop
 from kalux.evaluation.hdr_vdp import constants as c
 
 Array = NDArray[np.float64]
@@ -63,7 +63,7 @@ def _quadrant(name: str) -> Array:
     return np.array(getattr(c, name))
 
 
-@nb.njit(cache=True, nogil=True)
+@loop(error_model="python")
 def _correlate(padded, quadrant, step, out):  # type: ignore[no-untyped-def]
     """Rows at equal distance from the centre are added first, then columns, so each tap is multiplied once."""
     reach = len(quadrant) - 1
