@@ -76,6 +76,14 @@ def test_a_last_exposure_longer_than_every_frame_interval_is_doubted():
     )
 
 
+def test_exposures_in_milliseconds_are_doubted():
+    starts = np.arange(5) * 38_760
+    doubt = exposure_doubt(np.stack([starts, starts + 10], axis=1))
+    assert "every 38,760 us and are exposed for 10 us" in doubt
+    assert "if that was meant in ms, it is 10,000 us" in doubt
+    assert exposure_doubt(np.stack([starts, starts + 39], axis=1)) is None
+
+
 def test_colours():
     assert frame().colours == "grey"
     assert frame(shape=(3, 4, 3)).colours == "RGB"

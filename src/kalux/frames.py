@@ -147,8 +147,15 @@ def median_exposure(exposures: Iterable[int]) -> int:
     return round(float(np.median([*exposures])))
 
 
+_UNITS: Final = 1000
+"""Of a unit of time to the next smaller one. Exposures so much shorter than the frames' interval are rare: 30 us."""
+
+_SLOWEST: Final = 1_000_000
+"""us from frame to frame beyond which it is no video, and exposures may be as short."""
+
+
 def exposure_doubt(exposures: NDArray[np.int64]) -> str | None:
-    """A warning if the last exposure ends later than it can be expected to, else None.
+    """A warning if exposures are far too short, or the last one ends later than it can be expected to, else None.
 
     Every other exposure has to end before the next one begins (`check_frame`). Nothing follows the last one: it is
     doubted where it is longer than the longest interval between two frames.
@@ -161,7 +168,14 @@ def exposure_doubt(exposures: NDArray[np.int64]) -> str | None:
     if len(exposures) < 2:
         return None
     start, end = (int(t) for t in exposures[-1])
-    interval = int(np.diff(exposures[:, 0]).max())
+    intervals = np.diff(exposures[:, 0])
+    usual, exposure = (int(np.median(lengths)) for lengths in (intervals, exposures[:, 1] - exposures[:, 0]))
+    if 0 < _UNITS * exposure < usual <= _SLOWEST:
+        return (
+            f"frames follow each other every {usual:,} us and are exposed for {exposure:,} us; if that was meant in "
+            f"ms, it is {_UNITS * exposure:,} us"
+        )
+    interval = int(intervals.max())
     if end - start <= interval:
         return None
     return (
