@@ -715,7 +715,11 @@ def test_thresholds_that_contradict_the_frames_are_told(cli, write_recording, si
     assert (
         "that the recording states, 0.4 on and 0.4 off, contradict its frames and are not used" in found.err
     )
+    assert "give --camera.response srgb" in found.err  # these would come out at half of the true ones, too
     assert "; the recording states 0.4 and 0.4" in found.out
+    half = write_recording(tmp_path / "half.h5", contrast_threshold=(0.1, 0.1))
+    found = cli("reconstruct", half, "-o", tmp_path / "c", "--at", "frames")
+    assert "contradict its frames and are not used; to insist" in found.err
     flags = ("--events.threshold-on", "0.4", "--events.threshold-off", "0.4")
     found = cli("reconstruct", stated, "-o", tmp_path / "b", "--at", "frames", *flags)
     assert "the given contrast thresholds contradict the frames" in found.err

@@ -52,6 +52,10 @@ that are 3 pixels aside, or ON events alone."""
 _EXACT: Final = 0.1
 """Standard deviation of estimated thresholds, relative, up to which there is nothing to warn of."""
 
+_ENCODED: Final = (0.38, 0.6)
+"""Times the true thresholds are what frames tell that are encoded for a display: by an exponent of 1 / 2.2, or less in
+the dark."""
+
 _GIVEN_ORIGINS: Final = ("settings", "calibration")
 """Of thresholds that are used though frames may contradict them."""
 
@@ -319,7 +323,8 @@ def agreement_warnings(planned: Plan) -> Iterator[str]:
         on, off = planned.contradicted
         yield (
             f"the contrast thresholds that the recording states, {on:g} on and {off:g} off, contradict its frames and "
-            f"are not used; to insist, give --events.threshold-on {on:g} --events.threshold-off {off:g}"
+            f"are not used{_encoding_hint(planned)}; to insist, give --events.threshold-on {on:g} "
+            f"--events.threshold-off {off:g}"
         )
     unexplained = agreement is not None and agreement.explained < _LITTLE_EXPLAINED
     unrelated = layout is not None and layout.contradicts
@@ -337,6 +342,21 @@ def agreement_warnings(planned: Plan) -> Iterator[str]:
             f"the given contrast thresholds contradict the frames, which change by {agreement.slope:.2f} where "
             "events say 1; without them they are estimated"
         )
+
+
+def _encoding_hint(planned: Plan) -> str:
+    """What else may be wrong where both thresholds come out at about half of what the recording states."""
+    events, stated = planned.settings.events, planned.contradicted
+    if stated is None or planned.settings.camera.response != "linear":
+        return ""
+    shares = [found / said for found, said in zip(events.thresholds, stated, strict=True)]
+    low, high = _ENCODED
+    if not (low < min(shares) and max(shares) < high):
+        return ""
+    return (
+        f" ({shares[0]:.2f} and {shares[1]:.2f} times these fit, as where frames are encoded for a display: if they "
+        "are, give --camera.response srgb, or bt709 of videos)"
+    )
 
 
 def threshold_warning(planned: Plan, preset_name: str) -> str:
