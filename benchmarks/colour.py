@@ -7,8 +7,8 @@ docs/colour.md has the tables.
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
-import sys
 from collections.abc import Callable
 
 import cv2
@@ -161,7 +161,13 @@ def held(made, times):
 
 def main() -> None:
     """Print the tables."""
-    picture = cv2.imread(sys.argv[1], cv2.IMREAD_UNCHANGED)[..., ::-1]
+    parser = argparse.ArgumentParser(description="Demosaicing, and images in colour, on an HDR photograph.")
+    parser.add_argument("picture", help="in colour, of a kind that OpenCV reads: Radiance HDR")
+    name = parser.parse_args().picture
+    read = cv2.imread(name, cv2.IMREAD_UNCHANGED)
+    if read is None or read.ndim != 3:
+        parser.error(f"{name}: OpenCV reads no colours from it")
+    picture = read[..., 2::-1]
     small = cv2.resize(picture, None, fx=0.34, fy=0.34, interpolation=cv2.INTER_AREA)
     compare_demosaicing(small / np.percentile(small, 80))
     half = cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)

@@ -102,7 +102,7 @@ def segment_of(size, events):
     thresholds = nominal_thresholds(size, 0.1, np.float32)
     noise = BridgeNoise(THRESHOLD, THRESHOLD, 0.2 * THRESHOLD**2, THRESHOLD**2 / 2)
     on, off = count_chunks([events], size, weighed=True)
-    segment, _ = join(*frames, on, off, thresholds, noise, 0, int(events["t"][-1]) + 1)
+    segment, _ = join(*frames, (on, off), thresholds, noise, 0, int(events["t"][-1]) + 1)
     return segment, State(frames[0].value, frames[0].variance, make_clock(size, 0))
 
 
@@ -296,7 +296,9 @@ def show_engine(count, rounds):
                         found[rate] = seconds, images, events
             base, base_images, _ = found[None]
             for rate, (seconds, images, events) in found.items():
-                each = "" if rate is None else f"{1e3 * (seconds - base) / (images - base_images):.2f}"
+                each = (
+                    f"{1e3 * (seconds - base) / (images - base_images):.2f}" if images > base_images else ""
+                )
                 shown = "frames" if rate is None else rate
                 print(
                     f"{name:10} {preset:10} {shown:>9} {events / seconds / 1e6:11.1f} {each:>13}", flush=True
