@@ -13,7 +13,7 @@ from kalux.calibration.event_layout import LayoutFit
 from kalux.calibration.event_model import Agreement
 from kalux.calibration.frame_faults import FrameFaults
 from kalux.calibration.levels import Ceiling, find_ceiling
-from kalux.recording import AS_STORED, Recording, less_black
+from kalux.recording import Recording, less_black
 from kalux.settings import AUTO, Settings
 from kalux.wording import how_many
 
@@ -77,7 +77,7 @@ def _of_events(plan: Plan, asked: Settings) -> Iterator[tuple[str, str]]:
         if plan.background_rate is not None and plan.background_rate < events.noise_rate:
             how = f"the least that is assumed; measured {plan.background_rate:.2g}"
         yield "background", f"{events.noise_rate:.2g} Hz per pixel of events without reason ({how})"
-    if plan.mends.layout is not None and plan.mends.layout.found != AS_STORED:
+    if plan.mends.layout is not None and plan.mends.moves_events:
         yield "layout", f"{layout_text(plan.mends.layout)}: put right"
     if plan.mends.hot_pixels:
         yield "hot pixels", f"{how_many(plan.mends.hot_pixels, 'pixel')} whose events are left out (measured)"

@@ -9,11 +9,10 @@ import numpy as np
 
 from kalux.plan_report import gain_text, layout_text, left_out_text
 from kalux.planning import ESTIMATED_ORIGINS, Plan
-from kalux.recording import AS_STORED
+from kalux.planning.mending import Mends
 from kalux.wording import how_many
 
 if TYPE_CHECKING:
-    from kalux.calibration.frame_faults import FrameFaults
     from kalux.calibration.global_thresholds import ThresholdEstimate
     from kalux.cli.checking import Contents
 
@@ -32,13 +31,18 @@ _GIVEN_ORIGINS: Final = ("settings", "calibration")
 """Of thresholds that are used though frames may contradict them."""
 
 
+_UNRELATED: Final = (
+    "the events do not explain how the frames change; if much moves, do both see the same pixels (kalux register), do "
+    "both have the same clock (kalux calibrate offset REC finds out), and is polarity 1 brighter?"
+)
+
+
 def plan_warnings(planned: Plan, contents: Contents, preset_name: str) -> Iterator[str]:
     """Warnings of images in gaps between frames, of unknown thresholds, and of events that contradict the frames."""
     gap = gap_warning(planned, contents)
     if gap is not None:
         yield gap
-    if planned.mends.faults is not None:
-        yield from fault_warnings(planned.mends.faults)
+    yield from mend_warnings(planned.mends)
     if planned.threshold_origin in ESTIMATED_ORIGINS and not is_well_known(planned):
         yield threshold_warning(planned, preset_name)
     yield from agreement_warnings(planned)
@@ -48,8 +52,6 @@ def agreement_warnings(planned: Plan) -> Iterator[str]:
     """That events and frames, or the thresholds and both, contradict each other, and what to do."""
     agreement = None if planned.steps.model is None else planned.steps.model.agreement
     layout = planned.mends.layout
-    if layout is not None and layout.found != AS_STORED:
-        yield f"{layout_text(layout)}: put right (--events.mend-layout false leaves them as they are)"
     if planned.steps.contradicted is not None:
         assert agreement is not None
         on, off = planned.steps.contradicted
@@ -64,10 +66,7 @@ def agreement_warnings(planned: Plan) -> Iterator[str]:
         or unrelated
         or (planned.threshold_origin == "assumed" and contradicts(planned.steps.thresholds))
     ):
-        yield (
-            "the events do not explain how the frames change; if much moves, do both see the same pixels (kalux "
-            "register), do both have the same clock (kalux calibrate offset REC finds out), and is polarity 1 brighter?"
-        )
+        yield _UNRELATED
     elif (
         planned.threshold_origin in _GIVEN_ORIGINS
         and agreement is not None
@@ -95,15 +94,25 @@ def threshold_warning(planned: Plan, preset_name: str) -> str:
     )
 
 
-def fault_warnings(faults: FrameFaults) -> Iterator[str]:
-    """What of the frames is not used as it is, and how to use it."""
-    if faults.steps:
-        yield (
-            f"{gain_text(faults)}: taken for the camera's exposure or gain, and evened out (--camera.even-gain false "
-            "does not)"
-        )
-    if faults.copies or faults.empty:
-        yield f"left out: {left_out_text(faults)} (--camera.leave-out-faulty false keeps them)"
+def mend_warnings(mends: Mends, *, with_flags: bool = True) -> Iterator[str]:
+    """What of a recording is not used as it is; ``with_flags`` of `kalux reconstruct` that would use it."""
+    faults, layout = mends.faults, mends.layout
+    if faults is not None and faults.steps:
+        flag = " (--camera.even-gain false does not)" if with_flags else ""
+        yield f"{gain_text(faults)}: taken for the camera's exposure or gain, and evened out{flag}"
+    if faults is not None and (faults.copies or faults.empty):
+        flag = " (--camera.leave-out-faulty false keeps them)" if with_flags else ""
+        yield f"left out: {left_out_text(faults)}{flag}"
+    if layout is not None and mends.moves_events:
+        flag = " (--events.mend-layout false leaves them as they are)" if with_flags else ""
+        yield f"{layout_text(layout)}: put right{flag}"
+
+
+def calibration_warnings(mends: Mends) -> Iterator[str]:
+    """What of a recording is not measured as it is, by commands without settings, and that it contradicts itself."""
+    yield from mend_warnings(mends, with_flags=False)
+    if mends.layout is not None and mends.layout.contradicts:
+        yield _UNRELATED
 
 
 def gap_warning(planned: Plan, contents: Contents) -> str | None:

@@ -18,7 +18,9 @@ from kalux.calibration.frame_faults import FrameFaults
 from kalux.calibration.hot_pixels import find_hot_pixels
 from kalux.calibration.levels import Ceiling
 from kalux.planning.levels import with_saturation, without_black
+from kalux.planning.survey import survey
 from kalux.recording import (
+    AS_STORED,
     UNCHANGED,
     FrameCorrections,
     Recording,
@@ -54,6 +56,17 @@ class Mends(NamedTuple):
     ceiling: Ceiling | None = None
     faults: FrameFaults | None = None
     corrections: FrameCorrections = UNCHANGED
+
+    @property
+    def moves_events(self) -> bool:
+        """Whether events are not where, or of the sign that, the recording says."""
+        return self.layout is not None and self.layout.found != AS_STORED
+
+    @property
+    def changes(self) -> bool:
+        """Whether frames or events are others than as recorded."""
+        less_black = self.black is not None and self.black.level > 0
+        return self.moves_events or self.hot_pixels > 0 or less_black or bool(self.corrections)
 
     @property
     def hot_pixels(self) -> int:
@@ -97,3 +110,19 @@ def mend_events_and_levels(recording: Recording, settings: Settings) -> Mended:
     recording, settings, black = without_black(recording, settings)
     settings, ceiling = with_saturation(recording, settings)
     return Mended(recording, settings, Mends(layout, hot, black, ceiling))
+
+
+def mend(recording: Recording, settings: Settings) -> Mended:
+    """Mend all of a recording, as far as the settings ask, as a plan does where no image is made in an empty frame.
+
+    A recording without frames is mended of its hot pixels alone.
+
+    Raises
+    ------
+    ExposureError
+        If the frames' exposures are not known.
+    """
+    found = mend_events_and_levels(recording, settings)
+    if not recording.source.count_frames():
+        return found
+    return found.with_frames(survey(found.recording, found.settings).faults)
