@@ -181,6 +181,21 @@ def passing_by(picture: np.ndarray, cut: int = 255, **sensor) -> Recording:
     )
 
 
+def damaged(source: Recording) -> Recording:
+    """The recording with a frame that is the one before once more, a step of the gain, and a stuck pixel."""
+    frames = list(source.frames())
+    frames[3] = dataclasses.replace(frames[3], image=frames[2].image)
+    row, column = (side // 2 for side in source.sensor_size)
+    half = len(frames) // 2
+    for index, frame in enumerate(frames):
+        image = np.rint(frame.image * (1.0 if index < half else 0.5)).astype(np.uint8)
+        image[row, column] = 0
+        frames[index] = dataclasses.replace(frame, image=image)
+    return Recording.from_arrays(
+        np.concatenate(list(source.events())), frames, sensor_size=source.sensor_size, name="damaged"
+    )
+
+
 def lifted(source: Recording, black: int, *, stated: bool = False) -> Recording:
     """The recording of a camera that reads ``black`` of 255 in the dark, and may state it."""
     frames = [

@@ -5,13 +5,23 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kalux import Recording, reconstruct
+from kalux import PRESETS, Reconstructor, Recording, reconstruct
 from kalux.errors import InputError
 from kalux.pipeline import plan
+from kalux.schedule import begin_time
 
 from builders import VARIANTS, events, frame, random_stream, recording
 
 every_variant = pytest.mark.parametrize("variant", VARIANTS)
+
+
+@pytest.mark.parametrize(("preset", "lookahead"), [("default", True), ("default", False), ("cf", True)])
+def test_images_begin_where_the_engine_can_read_first(preset, lookahead):
+    settings, first = PRESETS[preset], frame(9, 1_000, 9_000)
+    engine = Reconstructor((1, 1), settings=settings, lookahead=lookahead)
+    engine.push_frame(first)
+    exposure = np.array([first.exposure_start, first.exposure_end])
+    assert begin_time(exposure, settings.filter, lookahead) == engine.begin_time
 
 
 @pytest.mark.parametrize("rate", [1.0, 24.0, 30.0, 300.0, 59.94, 12_345.6])

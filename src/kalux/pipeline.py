@@ -122,9 +122,9 @@ def execute(
         Without, grey images have an infinite variance and are made faster.
     """
     memory.give_back()  # that planning and checking have used
-    recording = with_corrected_frames(recording, plan.corrections)
-    if plan.layout is not None:
-        recording = with_event_layout(recording, plan.layout.found)
+    recording = with_corrected_frames(recording, plan.mends.corrections)
+    if plan.mends.layout is not None:
+        recording = with_event_layout(recording, plan.mends.layout.found)
     engine = _engine(recording, plan)
     several = threads > 1
     if plan.smooth:

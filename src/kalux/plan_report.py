@@ -13,7 +13,7 @@ from kalux.calibration.event_layout import LayoutFit
 from kalux.calibration.event_model import Agreement
 from kalux.calibration.frame_faults import FrameFaults
 from kalux.calibration.levels import Ceiling, find_ceiling
-from kalux.recording import AS_STORED, Recording, less_black
+from kalux.recording import Recording, less_black
 from kalux.settings import AUTO, Settings
 from kalux.wording import how_many
 
@@ -27,7 +27,7 @@ ORIGINS: Final = {
     "estimate": "estimated",
     "assumed": "usual of the preset, the recording does not tell",
 }
-"""What to call where thresholds come from (`kalux.planning.ThresholdOrigin`)."""
+"""What to call where thresholds come from (`kalux.planning.event_steps.ThresholdOrigin`)."""
 
 _NOTABLE_SHARE: Final = 0.05
 _GIVEN: Final = "given"
@@ -53,8 +53,8 @@ def _of_events(plan: Plan, asked: Settings) -> Iterator[tuple[str, str]]:
         "thresholds",
         f"on {events.threshold_on:.3f}, off {events.threshold_off:.3f} log intensity ({_threshold_origin(plan)})",
     )
-    if plan.event_model is not None:
-        yield "agreement", _agreement_text(plan.event_model.agreement, plan.settings)
+    if plan.steps.model is not None:
+        yield "agreement", _agreement_text(plan.steps.model.agreement, plan.settings)
     yield "delay", f"events {events.lateness * 1e-3:g} ms late ({_delay_origin(plan, asked)})"
     yield (
         "I_0",
@@ -77,10 +77,10 @@ def _of_events(plan: Plan, asked: Settings) -> Iterator[tuple[str, str]]:
         if plan.background_rate is not None and plan.background_rate < events.noise_rate:
             how = f"the least that is assumed; measured {plan.background_rate:.2g}"
         yield "background", f"{events.noise_rate:.2g} Hz per pixel of events without reason ({how})"
-    if plan.layout is not None and plan.layout.found != AS_STORED:
-        yield "layout", f"{layout_text(plan.layout)}: put right"
-    if plan.hot_pixels:
-        yield "hot pixels", f"{how_many(plan.hot_pixels, 'pixel')} whose events are left out (measured)"
+    if plan.mends.layout is not None and plan.mends.moves_events:
+        yield "layout", f"{layout_text(plan.mends.layout)}: put right"
+    if plan.mends.hot_pixels:
+        yield "hot pixels", f"{how_many(plan.mends.hot_pixels, 'pixel')} whose events are left out (measured)"
 
 
 def _of_frames(recording: Recording, plan: Plan, asked: Settings) -> Iterator[tuple[str, str]]:
@@ -106,20 +106,20 @@ def _of_frames(recording: Recording, plan: Plan, asked: Settings) -> Iterator[tu
     stated = "usual, the recording does not state it" if recording.response is None else "as recorded"
     how = stated if asked.camera.response == AUTO else _GIVEN
     yield "response", f"{response_text(camera.response)} ({how})"
-    if plan.frame_faults is not None and plan.frame_faults.steps:
-        yield "gain", f"{gain_text(plan.frame_faults)}: evened out"
-    if plan.frame_faults is not None and (plan.frame_faults.copies or plan.frame_faults.empty):
-        yield "left out", left_out_text(plan.frame_faults)
-    if plan.frame_faults is not None and plan.frame_faults.stuck is not None:
-        yield "stuck", f"{stuck_text(plan.frame_faults.stuck)}: the median of their neighbours is taken"
+    if plan.mends.faults is not None and plan.mends.faults.steps:
+        yield "gain", f"{gain_text(plan.mends.faults)}: evened out"
+    if plan.mends.faults is not None and (plan.mends.faults.copies or plan.mends.faults.empty):
+        yield "left out", left_out_text(plan.mends.faults)
+    if plan.mends.faults is not None and plan.mends.faults.stuck is not None:
+        yield "stuck", f"{stuck_text(plan.mends.faults.stuck)}: the median of their neighbours is taken"
     if recording.found_white is not None:
         yield "white", f"{recording.found_white}, where the 16-bit frames end"
-    if plan.black is not None or camera.black_level is not None:
+    if plan.mends.black is not None or camera.black_level is not None:
         yield "black", _black_text(plan)
     elif (first := next(iter(recording.frames()))).black > 0:
         yield "black", f"{first.black / first.white_value:.3g} of white is taken off (as recorded)"
-    if plan.ceiling is not None:
-        yield "saturation", f"from {camera.clipped_from:.2g} of white ({ceiling_text(plan.ceiling)})"
+    if plan.mends.ceiling is not None:
+        yield "saturation", f"from {camera.clipped_from:.2g} of white ({ceiling_text(plan.mends.ceiling)})"
     if camera.white_balance != asked.camera.white_balance:
         yield "white balance", f"{camera.white_balance} for red, green, blue (measured)"
 
@@ -145,7 +145,7 @@ def saturation_text(recording: Recording, plan: Plan, asked: Settings) -> str:
 
 def _black_text(plan: Plan) -> str:
     """The black level that is taken off, or why none is though no pixel is dark."""
-    level, found = plan.settings.camera.black_level or 0.0, plan.black
+    level, found = plan.settings.camera.black_level or 0.0, plan.mends.black
     if found is None:
         return f"{level:.3g} of white is taken off ({_GIVEN})"
     begin = f"frames begin at {found.floor:.3g}"
@@ -219,7 +219,7 @@ def _agreement_text(agreement: Agreement, settings: Settings) -> str:
 
 
 def _threshold_origin(plan: Plan) -> str:
-    found = plan.estimate
+    found = plan.steps.thresholds
     if found is None or plan.threshold_origin not in ("estimate", "assumed"):
         return ORIGINS[plan.threshold_origin]
     if plan.threshold_origin == "assumed":
@@ -228,8 +228,10 @@ def _threshold_origin(plan: Plan) -> str:
             f"{100 * found.spread:.0f} %"
         )
     text = f"{ORIGINS['estimate']} from {how_many(found.samples, 'sample')}, residual {found.residual:.2f}"
-    if plan.contradicted is not None:
-        text = f"{text}; the recording states {plan.contradicted[0]:g} and {plan.contradicted[1]:g}"
+    if plan.steps.contradicted is not None:
+        text = (
+            f"{text}; the recording states {plan.steps.contradicted[0]:g} and {plan.steps.contradicted[1]:g}"
+        )
     text += f": +- {100 * found.spread:.0f} %"
     if found.usual_share > _NOTABLE_SHARE:
         text += f"; {100 * found.usual_share:.0f} % is the usual of the preset, as frames show little change"
@@ -241,9 +243,9 @@ def _refractory_origin(plan: Plan, asked: Settings) -> str:
         return _GIVEN
     if plan.dead_time:
         return "measured: noise follows other events no sooner"
-    if plan.estimate is None:
+    if plan.steps.thresholds is None:
         return _USUAL
-    return f"estimated from {how_many(plan.estimate.samples, 'sample')}"
+    return f"estimated from {how_many(plan.steps.thresholds.samples, 'sample')}"
 
 
 def _noise_origin(plan: Plan, asked: Settings) -> str:
@@ -251,14 +253,14 @@ def _noise_origin(plan: Plan, asked: Settings) -> str:
         return _GIVEN
     if plan.frame_noise is not None:
         return "estimated"
-    by_events = plan.event_model is not None and plan.event_model.frame_noise is not None
+    by_events = plan.steps.model is not None and plan.steps.model.frame_noise is not None
     return (
         "in the dark as much as events do not explain, at half of white twice that" if by_events else _USUAL
     )
 
 
 def _delay_origin(plan: Plan, asked: Settings) -> str:
-    found = plan.delay_estimate
+    found = plan.steps.delay
     if found is None:
         return _USUAL if asked.events.delay is None else _GIVEN
     seem = (
@@ -275,8 +277,8 @@ def _model_origin(plan: Plan, asked: float | None) -> str:
         return _GIVEN
     return (
         _USUAL
-        if plan.event_model is None
-        else f"estimated from {how_many(plan.event_model.samples, 'sample')}"
+        if plan.steps.model is None
+        else f"estimated from {how_many(plan.steps.model.samples, 'sample')}"
     )
 
 

@@ -10,9 +10,18 @@ from numpy.typing import NDArray
 
 from kalux.errors import InputError
 from kalux.recording import Recording
+from kalux.settings import FilterSettings
 
 MOST_IMAGES: Final = 100_000_000
 """Times of one rate: 0.8 GB. An hour at 10 kHz has a third of them; of more, a time in the recording is wrong."""
+
+
+def begin_time(first: NDArray[np.int64], filtered: FilterSettings, lookahead: bool) -> int:
+    """The first time that can be read, us, given the ``first`` exposure; the same as `Reconstructor.begin_time`."""
+    start, end = (int(t) for t in first)
+    if not lookahead:
+        return end
+    return start + (end - start) // 2 if filtered.kind == "cf" else start
 
 
 def image_times(

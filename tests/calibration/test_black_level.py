@@ -55,9 +55,9 @@ def test_a_plan_takes_it_off_unless_it_is_given():
     made = plan(source, at="frames")
     assert made.settings.camera.black_level == pytest.approx(16 / 255, abs=3 / 255)
     given = plan(source, at="frames", settings=altered(SETTINGS, "camera", black_level=0.0))
-    assert (given.settings.camera.black_level, given.black) == (0, None)
+    assert (given.settings.camera.black_level, given.mends.black) == (0, None)
     paper = plan(source, at="frames", preset="iccv2021")
-    assert (paper.settings.camera.black_level, paper.black) == (None, None)
+    assert (paper.settings.camera.black_level, paper.mends.black) == (None, None)
 
 
 def test_frames_less_black_are_those_of_a_camera_without():
@@ -105,14 +105,14 @@ def test_the_delay_is_estimated_once_where_there_is_no_black_level(monkeypatch):
         asked.append(estimate_delay(*arguments))
         return asked[-1]
 
-    for module in ("planning", "calibration.black_level"):
+    for module in ("planning.event_steps", "calibration.black_level"):
         monkeypatch.setattr(f"kalux.{module}.estimate_delay", counted)
     again = plan(source, at="frames")
-    assert expected.delay_estimate is not None
+    assert expected.steps.delay is not None
     assert len(asked) == 1
     assert again.settings == expected.settings
     alone = estimate_delay(source, SETTINGS.camera)
-    assert alone.apparent == expected.delay_estimate.apparent
+    assert alone.apparent == expected.steps.delay.apparent
     asked.clear()
     plan(lifted(from_black(), 16), at="frames")
     assert len(asked) == 2

@@ -134,9 +134,9 @@ def test_the_plan_fills_it_in(simulation, known):
     """With what of it is trailing, also where it needs no thresholds."""
     recording = late(simulation, 4_000)
     found = plan(recording, rate_hz=10, settings=altered(PRESETS["default"], "events", **known))
-    assert found.settings.events.delay == found.delay_estimate.delay
-    assert found.delay_estimate.true == pytest.approx(4_000, abs=900)
-    assert found.delay_estimate.true < found.settings.events.delay < found.delay_estimate.apparent
+    assert found.settings.events.delay == found.steps.delay.delay
+    assert found.steps.delay.true == pytest.approx(4_000, abs=900)
+    assert found.steps.delay.true < found.settings.events.delay < found.steps.delay.apparent
 
 
 def test_a_stated_delay_is_not_looked_for(simulation):
@@ -144,7 +144,7 @@ def test_a_stated_delay_is_not_looked_for(simulation):
     assert plan(recording, rate_hz=10, preset="iccv2021").settings.events.delay == 0
     given = altered(PRESETS["default"], "events", delay=-7)
     assert plan(recording, rate_hz=10, settings=given).settings.events.delay == -7
-    assert plan(recording, rate_hz=10, settings=given).delay_estimate is None
+    assert plan(recording, rate_hz=10, settings=given).steps.delay is None
 
 
 def test_long_recordings_are_not_read_to_the_end(simulation, monkeypatch):

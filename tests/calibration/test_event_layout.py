@@ -58,7 +58,7 @@ def test_images_are_those_of_events_as_they_should_be():
         ):
             assert np.array_equal(right.intensity, mended.intensity)
     kept = plan(spoilt, at="frames", settings=altered(SETTINGS, "events", mend_layout=False))
-    assert kept.layout is None
+    assert kept.mends.layout is None
 
 
 def test_events_of_another_scene_contradict():

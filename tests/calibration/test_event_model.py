@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 import kalux
-from kalux import PRESETS, Recording, planning
+from kalux import PRESETS, Recording
 from kalux.calibration import event_model
 from kalux.calibration.event_model import (
     ErrorModel,
@@ -131,15 +131,15 @@ def test_dark_pixels_tell_noise_by_what_events_leave(read):
 def test_a_plan_takes_it_where_nothing_else_tells_noise(monkeypatch, recordings, silent):
     """Stated noise stays, and so does what pixels without events tell."""
     usual = UsualNoise(0.006, 0.0, silent=silent)
-    monkeypatch.setattr(planning, "estimate_frame_noise", lambda *_: None)
-    monkeypatch.setattr(planning, "usual_noise", lambda *_: usual)
+    monkeypatch.setattr("kalux.planning.sensor_noise.estimate_frame_noise", lambda *_: None)
+    monkeypatch.setattr("kalux.planning.sensor_noise.usual_noise", lambda *_: usual)
     made = plan(recordings[0.03], at="frames", settings=PRESETS["default"])
     assert made.frame_noise is None
     if silent:
-        assert made.event_model.frame_noise is None
+        assert made.steps.model.frame_noise is None
         assert made.settings.camera.noise == usual[:2]
     else:
-        assert made.settings.camera.noise == made.event_model.frame_noise < usual[:2]
+        assert made.settings.camera.noise == made.steps.model.frame_noise < usual[:2]
         told = dict(plan_report(recordings[0.03], made, PRESETS["default"]))["noise"]
         assert "as much as events do not explain" in told
     stated = altered(PRESETS["default"], "camera", shot_noise=1e-4)
@@ -179,9 +179,9 @@ def test_likelihood_compares_densities_of_the_intensity():
 def test_a_plan_fills_in_what_is_not_given(recordings):
     recording = recordings[0.06]
     made = plan(recording, at="frames")
-    assert made.settings.camera.log_offset == made.event_model.log_offset >= 0.05
-    assert made.settings.events.step_variance == made.event_model.step_variance
-    assert made.settings.events.refractory_period == made.estimate.refractory_period == 0
+    assert made.settings.camera.log_offset == made.steps.model.log_offset >= 0.05
+    assert made.settings.events.step_variance == made.steps.model.step_variance
+    assert made.settings.events.refractory_period == made.steps.thresholds.refractory_period == 0
     default = PRESETS["default"]
     given = dataclasses.replace(
         default,
@@ -191,7 +191,7 @@ def test_a_plan_fills_in_what_is_not_given(recordings):
         ),
     )
     kept = plan(recording, at="frames", settings=given)
-    assert kept.event_model is None
+    assert kept.steps.model is None
     assert (kept.settings.camera.log_offset, kept.settings.events.step_variance) == (0.02, 0.3)
     assert kept.settings.events.refractory_period == 700
 
@@ -202,7 +202,7 @@ def test_where_it_cannot_be_told_the_usual_is_written_down(recordings):
         next(iter(recording.events()))[:0], recording.frames(), sensor_size=recording.sensor_size
     )
     made = plan(silent, at="frames")
-    assert made.event_model is None
+    assert made.steps.model is None
     assert (made.settings.camera.log_offset, made.settings.events.step_variance) == (0.03, 0.2)
 
 

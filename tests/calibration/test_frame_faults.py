@@ -152,8 +152,8 @@ def test_images_are_as_if_nothing_had_happened():
     good = recorded(events, frames)
     wrong = [with_image(frames[0], 0), *repeated(frames, 5)[1:]]
     made = plan(recorded(events, wrong), at="frames")
-    assert made.frame_faults is not None
-    assert (made.frame_faults.empty, made.frame_faults.copies) == ((0,), (5,))
+    assert made.mends.faults is not None
+    assert (made.mends.faults.empty, made.mends.faults.copies) == ((0,), (5,))
     times = made.times
     assert len(times) == len(frames) - 1
 
@@ -179,7 +179,7 @@ def test_a_plan_evens_out_gains_unless_told_not_to():
     events, frames = filmed(exposures=exposures)
     source = recorded(events, [stated(frame, 6_000) for frame in frames])
     made = plan(source, at="frames")
-    assert made.corrections.gains is not None
+    assert made.mends.corrections.gains is not None
     right = recorded(events, frames)
     evened, true = (
         np.array([np.median(image.intensity) for image in reconstruct(each, at="frames")])
@@ -187,5 +187,5 @@ def test_a_plan_evens_out_gains_unless_told_not_to():
     )
     assert np.ptp(np.log(evened / true)) < 0.1
     kept = plan(source, at="frames", settings=altered(SETTINGS, "camera", even_gain=False))
-    assert (kept.frame_faults, bool(kept.corrections)) == (None, False)
-    assert plan(source, at="frames", preset="iccv2021").frame_faults is None
+    assert (kept.mends.faults, bool(kept.mends.corrections)) == (None, False)
+    assert plan(source, at="frames", preset="iccv2021").mends.faults is None

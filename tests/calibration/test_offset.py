@@ -7,37 +7,17 @@ import dataclasses
 import numpy as np
 import pytest
 
-import kalux
-from kalux.calibration.offset import busiest, correlate, estimate_offset, frame_changes, offset_of_recording
+from kalux.calibration.offset import busiest, correlate, estimate_offset, frame_changes
 from kalux.calibration.registration import Registration
 from kalux.calibration.rig import Lens
-from kalux.datasets import SensorSettings, pan, photograph_scene, simulate
 from kalux.errors import InputError
 from kalux.settings import CameraSettings
 from rigs import DISTANCE, OFFSET, distant_recording, small_rig
 
-from builders import blocks, frame, lifted, pixel_events
+from builders import frame, pixel_events
 
 CAMERA = CameraSettings()
 TRUTH = Registration.of_rig(small_rig(), DISTANCE)
-
-
-@pytest.mark.parametrize(
-    ("name", "options", "expected"),
-    [
-        # ../shared/data/README.md: the events agree best with 8 ms added to slider_depth's stamps,
-        ("slider_depth", {"exposure": 10_000, "stamp": "middle"}, 8_000),
-        # and with newton 6 ms after the middle of the exposure.
-        ("newton_davis346.aedat4", {}, 6_000),
-    ],
-)
-def test_the_measured_offsets_of_real_recordings(shared_data, name, options, expected):
-    """Within 2 ms, with whole event steps, as they were measured; without the half threshold it is less."""
-    found, _ = offset_of_recording(kalux.open(shared_data / name, **options), reach=500_000)
-    assert found.apparent == pytest.approx(expected, abs=2_000)
-    assert found.offset < found.apparent - 1_000
-    assert found.standard_error < 500
-    assert found.coarse.sure
 
 
 @pytest.mark.parametrize("shift", [0, 400_000, -1_300_000])
@@ -102,23 +82,3 @@ def test_what_cannot_be_told():
     changes = frame_changes(seen.frames, None, CAMERA)
     with pytest.raises(InputError, match="no events from"):
         correlate(changes, [seen.events], (120, 160), centre=9e7)
-
-
-def test_a_black_level_is_taken_off():
-    """Though events say where it is only in the clock of the frames. Left in, it moves the offset by 350 us."""
-    picture = np.maximum(blocks(0.03, 1.0, shape=(170, 220)) - 0.05, 0)
-    scene = photograph_scene(picture, pan(60.0), sensor_size=(120, 160), duration=500_000)
-    made = simulate(scene, SensorSettings())
-    expected, none = offset_of_recording(made.recording(), reach=200_000)
-    frames = [
-        dataclasses.replace(f, exposure_start=f.exposure_start - 70_000, exposure_end=f.exposure_end - 70_000)
-        for f in lifted(made.recording(), 16).frames()
-    ]
-    raised = kalux.Recording.from_arrays(made.events, frames, sensor_size=(120, 160))
-    found, level = offset_of_recording(raised, reach=200_000)
-    assert none is None
-    assert level == pytest.approx(16 / 255, abs=1 / 255)
-    assert found.offset == pytest.approx(expected.offset + 70_000, abs=50)
-    left, none = offset_of_recording(raised, camera=CameraSettings(black_level=0.0), reach=200_000)
-    assert none == 0
-    assert abs(left.offset - found.offset) > 200

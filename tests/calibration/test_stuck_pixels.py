@@ -82,8 +82,8 @@ def test_a_plan_takes_the_neighbours_for_it():
     events, frames = moving()
     source = Recording.from_arrays(events, with_pixels(frames, 0, (20, 16)), sensor_size=SIZE)
     made = plan(source, at="frames")
-    assert made.frame_faults is not None
-    assert np.argwhere(made.frame_faults.stuck).tolist() == [[16, 20]]
+    assert made.mends.faults is not None
+    assert np.argwhere(made.mends.faults.stuck).tolist() == [[16, 20]]
     good = Recording.from_arrays(events, frames, sensor_size=SIZE)
     clean, mended = (
         np.stack([image.intensity[16, 20] for image in kalux.reconstruct(each, at="frames")])

@@ -7,11 +7,14 @@ import numpy as np
 import pytest
 
 from kalux import load_calibration
+from kalux.datasets import SensorSettings
 from kalux.models.camera import Response
+from kalux.recording import EventLayout, with_event_layout
+from kalux.settings import read_toml
 from kalux.writers import hdf5
 from recordings import SIZE, small_events
 
-from builders import blocks
+from builders import blocks, damaged, moving_blocks
 
 
 @pytest.fixture
@@ -73,6 +76,56 @@ def test_fit_says_before_and_after(cli, unlabelled_file, tmp_path):
     measured = load_calibration(out).measured
     assert measured["nll_after"] <= measured["nll_before"]
     assert measured["held_out_mse_after"] <= measured["held_out_mse_before"]
+
+
+@pytest.fixture(scope="module")
+def sound_and_damaged(tmp_path_factory):
+    """Two files of one scene: as it is, and mirrored, with polarities swapped, faulty frames and a stuck pixel."""
+    sensor = SensorSettings(threshold_on=0.2, threshold_off=0.2, noise_rate=1.0, read_noise=0.004)
+    sound = moving_blocks(0.02, 1.2, sensor=sensor, duration=1_000_000, size=(48, 64)).recording()
+    wrong = damaged(with_event_layout(sound, EventLayout(mirrored_x=True, swapped=True)))
+    folder, paths = tmp_path_factory.mktemp("mended"), []
+    for name, source in (("sound.h5", sound), ("damaged.h5", wrong)):
+        paths.append(folder / name)
+        hdf5.write(paths[-1], sensor_size=source.sensor_size, events=source.events(), frames=source.frames())
+    return paths
+
+
+MENDED = (
+    "the brightness of the frames steps at 1 frame",
+    "left out: 1 frame",
+    "their x counts from the other",
+)
+
+
+@pytest.mark.parametrize(
+    ("what", "names"),
+    [
+        ("contrast", ["events.threshold_on", "events.threshold_off"]),
+        ("noise", ["events.delay", "events.noise_rate"]),
+    ],
+)
+def test_a_damaged_recording_is_mended_before_it_is_measured(cli, sound_and_damaged, tmp_path, what, names):
+    found = []
+    for path in sound_and_damaged:
+        done = cli("calibrate", what, path, "-o", tmp_path / "o.toml", "--overwrite", "--quiet")
+        assert done.code == 0, done.err
+        settings = load_calibration(tmp_path / "o.toml").settings
+        found.append([settings[group][name] for group, name in (name.split(".") for name in names)])
+        assert all(text in done.err for text in MENDED) == (path == sound_and_damaged[1])
+    assert "--camera" not in done.err  # there are no such flags here
+    np.testing.assert_allclose(found[1], found[0], rtol=0.2)
+
+
+def test_an_offset_is_that_of_the_mended_recording(cli, sound_and_damaged, tmp_path):
+    offsets = []
+    for path in sound_and_damaged:
+        done = cli("calibrate", "offset", path, "-o", tmp_path / "o.toml", "--overwrite", "--range", 0.2)
+        assert done.code == 0, done.err
+        offsets.append(read_toml(tmp_path / "o.toml")["offset_us"])
+    assert all(text in done.err for text in MENDED)
+    assert "the offset may be another" not in done.err
+    assert offsets[1] == pytest.approx(offsets[0], abs=200)
 
 
 def test_response_from_images_with_given_times(cli, tmp_path):

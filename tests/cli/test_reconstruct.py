@@ -282,7 +282,8 @@ class TestWhatIsSaid:
 
         def inexact(*arguments):
             found = made(*arguments)
-            return dataclasses.replace(found, estimate=found.estimate._replace(spread=spread))
+            thresholds = found.steps.thresholds._replace(spread=spread)
+            return dataclasses.replace(found, steps=found.steps._replace(thresholds=thresholds))
 
         monkeypatch.setattr(reconstruct_command, "make_plan", inexact)
         recording = write_recording(tmp_path / "rec.h5", contrast_threshold=None)

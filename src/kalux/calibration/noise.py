@@ -146,7 +146,9 @@ class NoiseCalibration:
         return Calibration({g: v for g, v in settings.items() if v}, errors, measured, maps)
 
 
-def calibrate_noise(recording: Recording, camera: CameraSettings) -> NoiseCalibration:
+def calibrate_noise(
+    recording: Recording, camera: CameraSettings, hot: NDArray[np.bool_] | None = None
+) -> NoiseCalibration:
     """Measure the noise of a recording's sensor.
 
     Parameters
@@ -155,18 +157,20 @@ def calibrate_noise(recording: Recording, camera: CameraSettings) -> NoiseCalibr
         With frames and exposures; a still camera, or still parts of the scene, tell most.
     camera
         Response, saturation and black level; where that is None and events show one, it is taken off.
+    hot
+        (H, W): pixels that are hot, whose events may be left out of the recording; None: they are looked for.
 
     Raises
     ------
     ExposureError
         If the frames' exposures are not known.
     """
+    hot = find_hot_pixels(recording) if hot is None else hot
     recording, _ = with_known_black(recording, camera, EventSettings())
     delay = estimate_delay(recording, camera)
     if delay is not None:
         period = dead_time(recording)
         delay = with_true_delay(recording, camera, delay, Usual.of(EventSettings()), refractory_period=period)
-    hot = find_hot_pixels(recording)
     return NoiseCalibration(
         hot=hot,
         events=event_noise(recording, known_hot=hot),

@@ -7,7 +7,6 @@ pixel by pixel.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Iterable, Iterator
 from itertools import islice
 from typing import Any, Final, NamedTuple
@@ -17,15 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.calibration.alignment import MOST_FRAMES, Shots, align, take_shots, well_exposed
-from kalux.calibration.black_level import with_known_black
 from kalux.calibration.registration import Registration
-from kalux.calibration.rig import Lens
 from kalux.errors import InputError
 from kalux.event_slices import between
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.frames import Frame
-from kalux.recording import Recording, less_black, with_frames
-from kalux.settings import CameraSettings, EventSettings
+from kalux.settings import CameraSettings
 from kalux.wording import how_many
 
 Array = NDArray[np.float64]
@@ -335,77 +331,3 @@ def estimate_offset(
     fine = align(shots, inside, registration, offset=coarse.offset, free_homography=False)
     whole = align(shots, inside, registration, offset=fine.offset, free_homography=False, spread=False)
     return OffsetEstimate(fine.offset, fine.standard_error, whole.offset, coarse)
-
-
-def offset_of_recording(
-    recording: Recording,
-    *,
-    camera: CameraSettings | None = None,
-    centre: float = 0.0,
-    reach: int = RANGE,
-    on_events: Callable[[int], None] = lambda count: None,
-) -> tuple[OffsetEstimate, float | None]:
-    """The offset of the frames' clock where frames and events have the same pixels, of frames less their black level.
-
-    Left in, it makes the dark change too little, and moves the offset by up to 0.8 ms (docs/calibration.md). Events say
-    where black is (`kalux.calibration.black_level`) only once they have the clock of the frames: of frames that
-    begin above 0, the offset is estimated twice.
-
-    Parameters
-    ----------
-    recording
-        With frames; of unknown exposures no black level is looked for.
-    camera
-        Response, I_0 and black level.
-    centre, reach
-        us: where to look.
-    on_events
-        Called with the number of events of every chunk that is read.
-
-    Returns
-    -------
-    The offset, and the black level that was taken off, a share of white; None: none was given nor found.
-
-    Raises
-    ------
-    InputError
-        If frames or events are too few, or do not go together.
-    """
-    camera = camera if camera is not None else CameraSettings()
-    lens = Lens.pinhole(recording.sensor_size)
-    same = Registration(lens, lens, np.eye(3))
-
-    def estimated(source: Recording) -> OffsetEstimate:
-        return estimate_offset(
-            source.stamped_frames,
-            lambda: _counted(source.events(), on_events),
-            same,
-            camera=camera,
-            centre=centre,
-            reach=reach,
-        )
-
-    recording = less_black(recording, camera.black_level)
-    found = estimated(recording)
-    if camera.black_level is not None or not recording.exposure_known:
-        return found, camera.black_level
-    in_time, _ = with_known_black(_later(recording, round(found.apparent)), camera, EventSettings(delay=0))
-    level = in_time.black_level
-    return (estimated(less_black(recording, level)), level) if level else (found, None)
-
-
-def _counted(chunks: Iterable[EventArray], on_events: Callable[[int], None]) -> Iterator[EventArray]:
-    for chunk in chunks:
-        on_events(len(chunk))
-        yield chunk
-
-
-def _later(recording: Recording, offset: int) -> Recording:
-    """The recording with ``offset``, us, added to the times of its frames."""
-
-    def frames() -> Iterator[Frame]:
-        for frame in recording.frames():
-            start, end = frame.exposure_start + offset, frame.exposure_end + offset
-            yield dataclasses.replace(frame, exposure_start=start, exposure_end=end)
-
-    return with_frames(recording, frames)

@@ -46,10 +46,6 @@ _LEAST_AROUND: Final = 8  # events of the eight neighbours: fewer may be noise
 _LEAST_NEIGHBOURS: Final = 4  # neighbours that frames show well
 _PATCH: Final = tuple((row, column) for row in (-1, 0, 1) for column in (-1, 0, 1))
 
-_HOT_LEAST: Final = 10
-_HOT_FACTOR: Final = 4
-"""Pixels with more events between two frames than ten plus four times those of any neighbour are hot."""
-
 _SAME_EDGE: Final = 0.3
 """Log intensity by which the changes of neighbours at the same edge differ. Others have less weight: a slow edge comes
 to one pixel after the other, which would make thresholds a quarter too large."""
@@ -110,7 +106,7 @@ def steps(
     Parameters
     ----------
     recording
-        With frames and exposures.
+        With frames and exposures, without the events of hot pixels (`kalux.calibration.hot_pixels`).
     camera
         Response and I_0.
     delays
@@ -230,13 +226,12 @@ class _StepSampler:
     def _chosen(self, interval: Interval) -> tuple[NDArray[np.int64], NDArray[np.bool_], float]:
         """Which pixels are sampled: indices, (H, W) all usable pixels, and `Steps.lost`.
 
-        Usable pixels are well exposed and not hot. Of those with enough events around, evenly spread ones are sampled.
+        Usable pixels are well exposed. Of those with enough events around, evenly spread ones are sampled.
         """
         start, end = interval.start + self._delay, interval.end + self._delay
         on, off = count_chunks([between(interval.events, start, end)], self._shape, weighed=False)
         events = on + off
-        usable = interval.usable & ~_hot(events)
-        eventful = _eventful(events)
+        usable, eventful = interval.usable, _eventful(events)
         either = sum(int(np.count_nonzero(end.usable & eventful)) for end in interval.ends)
         lost = 1.0 - 2 * int(np.count_nonzero(interval.usable & eventful)) / max(either, 1)
         neighbours = sum_of_neighbours(usable.view(np.uint8))
@@ -347,15 +342,6 @@ def _count(words, order, starts, latest, sign, exposures, periods, late, counts)
         step = 0.5 * _ramp_difference(*exposures, before, before + 0.5 * pace_before)
         for k in range(len(periods)):
             counts[at, k, 0, np.uint64(sign_before < 0)] += step
-
-
-def _hot(events: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """(H, W): pixels with far more events than any of their neighbours."""
-    found, bordered = np.zeros(events.shape, np.bool_), np.pad(events, 1)
-    busy = np.nonzero(events > _HOT_LEAST)
-    beside = [bordered[busy[0] + 1 + i, busy[1] + 1 + j] for i, j in _PATCH if (i, j) != (0, 0)]
-    found[busy] = events[busy] > _HOT_LEAST + _HOT_FACTOR * np.max(beside, axis=0)
-    return found
 
 
 def _eventful(events: NDArray[np.float32]) -> NDArray[np.bool_]:

@@ -123,7 +123,7 @@ def _warn_of_saturation(original: Recording, response: str) -> None:
 
     made = plan(original, at="frames", settings=altered(PRESETS["default"], "camera", response=response))
     settings = made.settings
-    found = made.ceiling or find_ceiling(original, settings.camera, settings.events)
+    found = made.mends.ceiling or find_ceiling(original, settings.camera, settings.events)
     if found is not None and found.level < settings.camera.usual_saturation:
         warn(
             f"the original {ceiling_text(found)}: from there on they are no truth; "

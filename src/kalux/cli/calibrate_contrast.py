@@ -5,7 +5,14 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from kalux.cli.calibrations import add_black_level, add_result, camera_calibration, check_result, finish
+from kalux.cli.calibrations import (
+    add_black_level,
+    add_result,
+    camera_calibration,
+    check_result,
+    finish,
+    mended_recording,
+)
 from kalux.cli.parser import Parser, whole
 from kalux.cli.recordings import add_recording, open_recording
 
@@ -54,14 +61,16 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     from kalux.calibration.pixel_thresholds import calibrate_contrast
     from kalux.errors import InputError
     from kalux.recording import no_frames
-    from kalux.settings import preset
+    from kalux.settings import altered, preset
 
     check_result(options)
-    camera = camera_calibration(options.black_level, options.response).apply(preset("default")).camera
+    settings = camera_calibration(options.black_level, options.response).apply(preset("default"))
+    settings = altered(settings, "events", delay=options.delay, refractory_period=options.refractory)
     recording = open_recording(options)
     if not len(recording.frames()):
         raise no_frames(recording)
-    found = calibrate_contrast(recording, camera, delay=options.delay, refractory=options.refractory)
+    recording, settings, _ = mended_recording(recording, settings)
+    found = calibrate_contrast(recording, settings.camera, delay=options.delay, refractory=options.refractory)
     if found is None:
         raise InputError(
             f"{recording.source.path}: too little moves before well exposed pixels to measure thresholds; record "

@@ -13,6 +13,7 @@ from kalux.cli.calibrations import (
     check_result,
     finish,
     given_calibration,
+    mended_recording,
 )
 from kalux.cli.parser import Parser, whole
 from kalux.cli.recordings import add_recording, open_recording
@@ -73,8 +74,8 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     known = (given_calibration(options) or Calibration()).merged(
         camera_calibration(options.black_level, options.response)
     )
-    recording = open_recording(options)
-    found = calibrate_noise(recording, known.apply(preset("default")).camera).calibration()
+    recording, settings, mends = mended_recording(open_recording(options), known.apply(preset("default")))
+    found = calibrate_noise(recording, settings.camera, mends.hot).calibration()
     if options.fit:
         from kalux.evaluation.fit import fit_settings
 

@@ -69,16 +69,17 @@ def checked_range(options: argparse.Namespace) -> tuple[float, int]:
 
 def run(options: argparse.Namespace, command: list[str]) -> None:
     """Run the command."""
-    from kalux.calibration.offset import offset_of_recording
     from kalux.calibration.pictures import correlation_plot
     from kalux.cli.output import check_file, check_picture, write_picture
+    from kalux.cli.plan_warnings import mend_warnings
     from kalux.cli.progress import Progress
+    from kalux.planning.clock import offset_of_recording
     from kalux.recording import no_frames
     from kalux.settings import preset
     from kalux.writers.files import save
 
     centre, reach = checked_range(options)
-    camera = camera_calibration(options.black_level).apply(preset("default")).camera
+    settings = camera_calibration(options.black_level).apply(preset("default"))
     if options.out is not None:
         check_file(options.out, overwrite=options.overwrite)
     check_picture(options.plot, overwrite=options.overwrite)
@@ -86,13 +87,15 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     if not recording.source.count_frames():
         raise no_frames(recording)
     with Progress("correlating", quiet=options.quiet) as progress:
-        found, black_level = offset_of_recording(
+        found, mends = offset_of_recording(
             recording,
-            camera=camera,
+            settings,
             centre=centre,
             reach=reach,
             on_events=lambda count: progress.add(events=count),
         )
+    for text in mend_warnings(mends, with_flags=False):
+        warn(text)
     if not found.coarse.sure:
         warn(
             f"the correlation is {found.coarse.peak:.2f}, {found.coarse.ratio:.2f} times the next peak: the offset "
@@ -103,6 +106,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     if not options.quiet:
         for line in described(found):
             say(line)
+        black_level = options.black_level if mends.black is None else mends.black.level
         if black_level:
             say(f"of frames without their black level, {black_level:.3g} of white")
     if options.plot is not None:

@@ -9,11 +9,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from kalux.cli.parser import Parser, UsageError, number
-from kalux.cli.terminal import say
+from kalux.cli.terminal import say, warn
 
 if TYPE_CHECKING:
     from kalux.calibration.values import Calibration
+    from kalux.planning.mending import Mended
     from kalux.recording import Recording
+    from kalux.settings import Settings
 
 
 def add_calibration(group: Any) -> None:
@@ -50,6 +52,17 @@ def camera_calibration(black_level: float | None, response: str | None = None) -
 
     said = {"response": None if response == AUTO else response, "black_level": black_level}
     return Calibration({"camera": {name: value for name, value in said.items() if value is not None}})
+
+
+def mended_recording(recording: Recording, settings: Settings) -> Mended:
+    """The recording as a reconstruction would mend it before it measures anything, with its warnings."""
+    from kalux.cli.plan_warnings import calibration_warnings
+    from kalux.planning.mending import mend
+
+    mended = mend(recording, settings)
+    for text in calibration_warnings(mended.mends):
+        warn(text)
+    return mended
 
 
 def given_calibration(options: argparse.Namespace) -> Calibration | None:

@@ -84,7 +84,7 @@ def settled_lines(
     asked = settings if calibration is None else calibration.apply(settings)
     made = plan(recording, at="frames", settings=asked, calibration=calibration)
     rows = plan_report(recording, made, asked)
-    if made.ceiling is None:
+    if made.mends.ceiling is None:
         rows.append(("saturation", saturation_text(recording, made, asked)))
     width = max(len(label) for label, _ in rows)
     return [title, *(f"  {label:<{width}}  {text}" for label, text in rows)]

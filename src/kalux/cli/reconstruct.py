@@ -8,9 +8,8 @@ import dataclasses
 import importlib.metadata
 import itertools
 import shlex
-from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -21,6 +20,7 @@ from kalux.cli.flags import HelpSettings, add_display, add_settings, given_setti
 from kalux.cli.loops import OF_ALL, OF_IMAGES, compiling_beside, prepare_loops, tell_of_compiling
 from kalux.cli.output import DEFAULT_RATE, FOLDER_FORMATS, Output, check_output, chosen_output, image_rate
 from kalux.cli.parser import Parser, UsageError, number, whole
+from kalux.cli.plan_warnings import plan_warnings
 from kalux.cli.progress import Progress, short_number
 from kalux.cli.recordings import add_recording, open_recording
 from kalux.cli.terminal import say, warn
@@ -28,36 +28,16 @@ from kalux.cli.times import load_times
 from kalux.display import CURVES
 from kalux.errors import InputError
 from kalux.pipeline import execute
-from kalux.plan_report import ORIGINS, gain_text, layout_text, left_out_text, plan_report
-from kalux.planning import ESTIMATED_ORIGINS, Plan, plan
+from kalux.plan_report import ORIGINS, plan_report
+from kalux.planning import Plan, plan
 from kalux.reconstructor import Reconstructor
-from kalux.recording import AS_STORED, Recording
+from kalux.recording import Recording
 from kalux.settings import PRESETS, Settings, from_dict, load, preset, read_toml, to_dict
 from kalux.threads import default_threads
 from kalux.wording import how_many
 
 if TYPE_CHECKING:
-    from kalux.calibration.frame_faults import FrameFaults
-    from kalux.calibration.global_thresholds import ThresholdEstimate
     from kalux.writers import Writer
-
-_MANY_SAMPLES: Final = 1000
-_NEARLY_ALL: Final = 0.95
-"""Of many samples, whose thresholds are nearly all the usual ones: the events contradict the frames, or are noise."""
-
-_LITTLE_EXPLAINED: Final = 0.5
-"""Of how the frames change, by events: 0.89 and more on 35 simulated scenes and recordings, less than 0.4 with frames
-that are 3 pixels aside, or ON events alone."""
-
-_EXACT: Final = 0.1
-"""Standard deviation of estimated thresholds, relative, up to which there is nothing to warn of."""
-
-_ENCODED: Final = (0.38, 0.6)
-"""Times the true thresholds are what frames tell that are encoded for a display: by an exponent of 1 / 2.2, or less in
-the dark."""
-
-_GIVEN_ORIGINS: Final = ("settings", "calibration")
-"""Of thresholds that are used though frames may contradict them."""
 
 _DESCRIPTION = """\
 Reconstruct HDR images, at any rate, from a recording of events and frames. All frames and the first 4 million events
@@ -300,117 +280,6 @@ def _origin(planned: Plan, options: argparse.Namespace) -> Any:
 # Say.
 
 
-def plan_warnings(planned: Plan, contents: Contents, preset_name: str) -> Iterator[str]:
-    """Warnings of images in gaps between frames, of unknown thresholds, and of events that contradict the frames."""
-    gap = gap_warning(planned, contents)
-    if gap is not None:
-        yield gap
-    if planned.frame_faults is not None:
-        yield from fault_warnings(planned.frame_faults)
-    if planned.threshold_origin in ESTIMATED_ORIGINS and not is_well_known(planned):
-        yield threshold_warning(planned, preset_name)
-    yield from agreement_warnings(planned)
-
-
-def agreement_warnings(planned: Plan) -> Iterator[str]:
-    """That events and frames, or the thresholds and both, contradict each other, and what to do."""
-    agreement = None if planned.event_model is None else planned.event_model.agreement
-    layout = planned.layout
-    if layout is not None and layout.found != AS_STORED:
-        yield f"{layout_text(layout)}: put right (--events.mend-layout false leaves them as they are)"
-    if planned.contradicted is not None:
-        assert agreement is not None
-        on, off = planned.contradicted
-        yield (
-            f"the contrast thresholds that the recording states, {on:g} on and {off:g} off, contradict its frames and "
-            f"are not used{_encoding_hint(planned)}; to insist, give --events.threshold-on {on:g} "
-            f"--events.threshold-off {off:g}"
-        )
-    unexplained = agreement is not None and agreement.explained < _LITTLE_EXPLAINED
-    unrelated = layout is not None and layout.contradicts
-    if unexplained or unrelated or (planned.threshold_origin == "assumed" and contradicts(planned.estimate)):
-        yield (
-            "the events do not explain how the frames change; if much moves, do both see the same pixels (kalux "
-            "register), do both have the same clock (kalux calibrate offset REC finds out), and is polarity 1 brighter?"
-        )
-    elif (
-        planned.threshold_origin in _GIVEN_ORIGINS
-        and agreement is not None
-        and agreement.contradicts_thresholds
-    ):
-        yield (
-            f"the given contrast thresholds contradict the frames, which change by {agreement.slope:.2f} where "
-            "events say 1; without them they are estimated"
-        )
-
-
-def _encoding_hint(planned: Plan) -> str:
-    """What else may be wrong where both thresholds come out at about half of what the recording states."""
-    events, stated = planned.settings.events, planned.contradicted
-    if stated is None or planned.settings.camera.response != "linear":
-        return ""
-    shares = [found / said for found, said in zip(events.thresholds, stated, strict=True)]
-    low, high = _ENCODED
-    if not (low < min(shares) and max(shares) < high):
-        return ""
-    return (
-        f" ({shares[0]:.2f} and {shares[1]:.2f} times these fit, as where frames are encoded for a display: if they "
-        "are, give --camera.response srgb, or bt709 of videos)"
-    )
-
-
-def threshold_warning(planned: Plan, preset_name: str) -> str:
-    """That thresholds are not known, what follows, and how to state them."""
-    how = "estimated from the recording" if planned.threshold_origin == "estimate" else "unknown and assumed"
-    sensor = (
-        ", or the sensor's --preset"
-        if planned.threshold_origin == "assumed" and preset_name == "default"
-        else ""
-    )
-    if planned.estimate is not None:
-        how += f" (+- {100 * planned.estimate.spread:.0f} %)"
-    return (
-        f"the contrast thresholds are {how}, so brightness above white is uncertain; "
-        f"if you know them, give --events.threshold-on and --events.threshold-off{sensor}"
-    )
-
-
-def fault_warnings(faults: FrameFaults) -> Iterator[str]:
-    """What of the frames is not used as it is, and how to use it."""
-    if faults.steps:
-        yield (
-            f"{gain_text(faults)}: taken for the camera's exposure or gain, and evened out (--camera.even-gain false "
-            "does not)"
-        )
-    if faults.copies or faults.empty:
-        yield f"left out: {left_out_text(faults)} (--camera.leave-out-faulty false keeps them)"
-
-
-def gap_warning(planned: Plan, contents: Contents) -> str | None:
-    """How many images lie where there is no frame for long; None where there is no such time, or no image in it."""
-    if contents.gap is None:
-        return None
-    begin, end = contents.gap
-    images = int(np.count_nonzero((planned.times > begin) & (planned.times < end)))
-    if not images:
-        return None
-    first, last = ((t - contents.start) * 1e-6 for t in contents.gap)
-    return (
-        f"there is no frame for {(end - begin) * 1e-6:,.0f} s, from {first:.3f} to {last:.3f} s: {images:,} of "
-        f"{how_many(len(planned.times), 'image')} lie there; are the times right? --start and --end choose a part"
-    )
-
-
-def is_well_known(planned: Plan) -> bool:
-    """Whether estimated thresholds are as exact as stated ones mostly are."""
-    return planned.estimate is not None and planned.estimate.spread <= _EXACT
-
-
-def contradicts(estimate: ThresholdEstimate | None) -> bool:
-    """Whether many samples have next to no information of the thresholds."""
-    return estimate is not None and estimate.samples >= _MANY_SAMPLES and estimate.usual_share > _NEARLY_ALL
-
-
 def decided(
     recording: Recording,
     contents: Contents,
@@ -460,7 +329,7 @@ def metadata(
 ) -> dict[str, Any]:
     """What `kalux.toml` tells of the run; `kalux reconstruct --settings` reads the settings from it."""
     height, width = recording.sensor_size
-    estimate = None if planned.estimate is None else planned.estimate._asdict()
+    estimate = None if planned.steps.thresholds is None else planned.steps.thresholds._asdict()
     return {
         "command": shlex.join(command),
         "preset": options.preset,

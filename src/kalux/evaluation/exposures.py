@@ -14,7 +14,7 @@ from kalux.evaluation.pairs import Array
 from kalux.filters.shots import take_shot
 from kalux.frames import Frame
 from kalux.models.camera import Camera
-from kalux.planning import with_saturation
+from kalux.planning.levels import with_saturation
 from kalux.recording import Recording
 from kalux.settings import CameraSettings, EventSettings, altered, preset
 

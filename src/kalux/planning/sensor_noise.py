@@ -1,0 +1,110 @@
+"""What frames and events show without any change of the light, and by how much pixels differ, filled in."""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from kalux.calibration.fixed_pattern import USUAL_PATTERN, FixedPattern, estimate_fixed_pattern
+from kalux.calibration.frame_noise import FrameNoise, UsualNoise, estimate_frame_noise, usual_noise
+from kalux.calibration.mismatch import Mismatch, estimate_mismatch
+from kalux.calibration.noise import event_noise
+from kalux.calibration.refractory import dead_time
+from kalux.models.pixels import PixelCalibration
+from kalux.recording import Recording
+from kalux.settings import Settings, altered
+
+_NOISE_EVENTS: Final = 1_000_000
+"""Number of events from which the background noise is estimated: at 15 million events/s, those of 70 ms."""
+
+_LEAST_NOISE: Final = 0.5
+"""Least background noise with lookahead, Hz per pixel: events are isolated for other reasons, too (leak of bright
+pixels, flicker). slider_depth has 0.15 where nothing is seen, street 0.005 (docs/equations.md, K5)."""
+
+
+class FilledFrameNoise(NamedTuple):
+    """Settings with the frames' noise.
+
+    Attributes
+    ----------
+    settings
+        With frame noise and shot noise.
+    estimate
+        The fit of the noise, where there was one.
+    doubted
+        Whether the noise is more than pixels without events tell, so that events may contradict.
+    """
+
+    settings: Settings
+    estimate: FrameNoise | None = None
+    doubted: bool = False
+
+
+def with_frame_noise(recording: Recording, settings: Settings) -> FilledFrameNoise:
+    """Fill in the frames' noise, where the filter uses it: from the settings, else an estimate, else the usual."""
+    camera = settings.camera
+    if camera.frame_noise is not None or not settings.filter.joins_frames:
+        return FilledFrameNoise(settings)
+    found = estimate_frame_noise(recording, camera)
+    if found is not None and not found.is_reliable:
+        found = None
+    noise = usual_noise(recording, camera) if found is None else found
+    shot = noise.shot if camera.shot_noise is None else camera.shot_noise
+    doubted = isinstance(noise, UsualNoise) and not noise.silent and camera.shot_noise is None
+    filled = altered(settings, "camera", frame_noise=noise.read, shot_noise=shot)
+    return FilledFrameNoise(filled, found, doubted)
+
+
+def with_fixed_pattern(recording: Recording, settings: Settings) -> tuple[Settings, FixedPattern | None]:
+    """Fill in the frames' fixed pattern, where the variance counts it: from the settings, else an estimate.
+
+    Where the recording cannot tell, because nothing moves, the usual one; 0 of frames that have been processed.
+    """
+    if settings.camera.fixed_pattern is not None or not settings.filter.joins_frames:
+        return settings, None
+    found = estimate_fixed_pattern(recording, settings.camera)
+    if found is not None and not found.is_measured:
+        return altered(settings, "camera", fixed_pattern=USUAL_PATTERN), None
+    return altered(settings, "camera", fixed_pattern=0.0 if found is None else found.deviation), found
+
+
+def with_dead_time(recording: Recording, settings: Settings) -> tuple[Settings, int]:
+    """Fill in the refractory period where noise events show it. Returned as well, us; 0 where they do not."""
+    if settings.events.refractory_period is not None or not settings.filter.joins_frames:
+        return settings, 0
+    period = dead_time(recording)
+    return altered(settings, "events", refractory_period=period or None), period
+
+
+def with_mismatch(
+    recording: Recording, settings: Settings, threshold_error: float
+) -> tuple[Settings, Mismatch | None]:
+    """Fill in the thresholds' spread between pixels: from the settings, else an estimate, else the usual.
+
+    The relative error of estimated thresholds, 0 of others, is a part of it.
+    """
+    events = settings.events
+    if events.threshold_spread is not None or not settings.filter.joins_frames:
+        return settings, None
+    found = estimate_mismatch(recording, settings.camera, events)
+    spread = float(np.hypot(events.mismatch if found is None else found.spread, threshold_error))
+    return altered(settings, "events", threshold_spread=spread), found
+
+
+def with_background(
+    recording: Recording, settings: Settings, pixels: PixelCalibration | None, *, lookahead: bool
+) -> tuple[Settings, float | None]:
+    """Fill in the background noise: from the settings, else what is measured, at least the least, else the usual.
+
+    With lookahead neighbours tell what is noise, by its rate; else ages of events do, for which the usual is the least.
+    Returned as well is what was measured, Hz per pixel.
+    """
+    events = settings.events
+    if events.noise_rate is not None or not settings.filter.joins_frames:
+        return settings, None
+    found = event_noise(recording, _NOISE_EVENTS, None if pixels is None else pixels.hot)
+    if found is None:
+        return altered(settings, "events", noise_rate=events.background_rate), None
+    least = min(_LEAST_NOISE, events.usual_noise_rate) if lookahead else events.usual_noise_rate
+    return altered(settings, "events", noise_rate=max(found.rate, least)), found.rate

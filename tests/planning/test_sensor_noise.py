@@ -1,0 +1,91 @@
+"""Noise of frames and events, from the recording or given."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kalux import PRESETS, Frame, Recording
+from kalux.datasets import SensorSettings, demo_scene, simulate
+from kalux.events import EVENT_DTYPE
+from kalux.plan_report import plan_report
+from kalux.planning import plan
+from kalux.settings import altered
+
+from builders import passing_by, recording, textured
+
+
+def test_the_frame_noise_comes_from_the_frames_and_can_be_given():
+    rng = np.random.default_rng(0)
+    ramp = np.broadcast_to(np.linspace(20, 200, 80), (60, 80))
+    frames = [
+        Frame((ramp + rng.normal(0, 2, ramp.shape)).round().astype(np.uint8), t, t + 1000)
+        for t in range(0, 400_000, 50_000)
+    ]
+    source = Recording.from_arrays(np.empty(0, EVENT_DTYPE), frames, sensor_size=ramp.shape)
+    made = plan(source, at="frames")
+    assert made.frame_noise.read == made.settings.camera.frame_noise == pytest.approx(2 / 255, rel=0.1)
+    assert made.frame_noise.shot == made.settings.camera.shot_noise
+    for given, expected in (
+        ({"frame_noise": 0.004}, (0.004, 0.0)),
+        ({"frame_noise": 0.004, "shot_noise": 1e-4}, (0.004, 1e-4)),
+        ({"shot_noise": 1e-4}, (made.frame_noise.read, 1e-4)),
+    ):
+        settings = altered(PRESETS["default"], "camera", **given)
+        assert plan(source, at="frames", settings=settings).settings.camera.noise == expected
+    unknown = plan(recording(), at="frames")  # its pixels are too few to tell
+    assert unknown.frame_noise is None
+    assert unknown.settings.camera.noise == (unknown.settings.camera.usual_frame_noise, 0.0)
+    paper = plan(source, at="frames", preset="iccv2021").settings
+    assert paper.camera.frame_noise is None  # it has a confidence instead
+
+
+def test_the_fixed_pattern_comes_from_the_frames_and_can_be_given():
+    rng = np.random.default_rng(0)
+    ramp, offset = np.linspace(20, 150, 60), rng.normal(0, 2, (60, 80))
+    frames = [
+        Frame(
+            (np.roll(ramp, 9 * k)[:, None] + offset).round().astype(np.uint8), 50_000 * k, 50_000 * k + 1000
+        )
+        for k in range(10)
+    ]
+    source = Recording.from_arrays(np.empty(0, EVENT_DTYPE), frames, sensor_size=offset.shape)
+    made = plan(source, at="frames")
+    assert (
+        made.settings.camera.fixed_pattern == made.fixed_pattern.deviation == pytest.approx(2 / 255, rel=0.1)
+    )
+    none = altered(PRESETS["default"], "camera", fixed_pattern=0.0)
+    assert plan(source, at="frames", settings=none).settings.camera.fixed_pattern == 0
+    few = plan(recording(), at="frames")  # its pixels are too few to tell: the usual one
+    assert (few.settings.camera.fixed_pattern, few.fixed_pattern) == (0.005, None)
+    assert plan(source, at="frames", preset="iccv2021").settings.camera.fixed_pattern is None
+
+
+def test_the_refractory_period_comes_from_noise_and_can_be_given():
+    """`iccv2021` knows none, and is not given any."""
+    sensor = SensorSettings(noise_rate=20.0, noise_resets=True, refractory=600.0)
+    seen = simulate(demo_scene(sensor_size=(90, 120)), sensor).recording()
+    found, given = plan(seen, at="frames"), plan(seen, at="frames", settings=refractory(700))
+    assert found.dead_time == found.settings.events.refractory_period == pytest.approx(600, rel=0.02)
+    assert (given.dead_time, given.settings.events.refractory_period) == (0, 700)
+    assert not plan(seen, at="frames", preset="iccv2021").settings.events.refractory_period
+    told = dict(plan_report(seen, found, PRESETS["default"]))
+    assert told["refractory"].endswith("ms (measured: noise follows other events no sooner)")
+
+
+def test_the_background_is_measured_and_at_least_the_least():
+    """With lookahead neighbours tell what is noise, by its rate; else ages do, and the usual rate is the least."""
+    quiet = passing_by(textured(1.2), 102, noise_rate=0.0)
+    loud = passing_by(textured(1.2), 102, noise_rate=6.0)
+    made = plan(quiet, at="frames")
+    assert made.background_rate < made.settings.events.noise_rate == 0.5
+    told = dict(plan_report(quiet, made, PRESETS["default"]))["background"]
+    assert "the least that is assumed; measured" in told
+    assert plan(quiet, at="frames", lookahead=False).settings.events.noise_rate == 3.0
+    for lookahead in (True, False):
+        rate = plan(loud, at="frames", lookahead=lookahead).settings.events.noise_rate
+        assert rate == pytest.approx(6.0, rel=0.2)
+
+
+def refractory(period):
+    return altered(PRESETS["default"], "events", refractory_period=period)
