@@ -121,6 +121,16 @@ def test_what_was_saved_is_loaded(files):
     assert (files.load("float32"), files.load("float64")) == (("code", 1), ("code", 2))
 
 
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.9])
+def test_what_is_not_whole_is_compiled_again(tmp_path, files, share):
+    files.save("float32", ["code"] * 100 + [np.arange(100)])
+    (kept,) = tmp_path.iterdir()
+    kept.write_bytes(kept.read_bytes()[: int(share * kept.stat().st_size)])
+    assert files.load("float32") is None
+    files.save("float32", "code")
+    assert files.load("float32") == "code"
+
+
 def test_two_processes_that_save_at_a_time_do_not_mix_their_types(tmp_path):
     """Neither of them knows of the other's: numba's list would give one the name of the other."""
     one, other = (_Files(tmp_path / "loop", lambda x: x + 1) for _ in range(2))

@@ -49,10 +49,10 @@ class _Files:
         self._base, self._function = base, function
 
     def load(self, key: Any) -> Any:
-        """What was saved for a key, types and processor; None if nothing was."""
+        """What was saved for a key, types and processor; None if nothing was, or a power cut has left a part of it."""
         try:
             return pickle.loads(self._path(key).read_bytes())
-        except FileNotFoundError:
+        except (FileNotFoundError, EOFError, pickle.UnpicklingError):
             return None
 
     def save(self, key: Any, data: Any) -> None:
