@@ -101,6 +101,13 @@ def test_a_change_of_what_a_loop_uses_compiles_it_again(project, part):
     assert len(project.files) == 1
 
 
+def test_other_options_are_another_loop(tmp_path):
+    plain, fused = loop(abs_of), loop(abs_of, fastmath={"contract"})
+    _Files(tmp_path / "loop", plain).save("float32", "plain")
+    assert _Files(tmp_path / "loop", fused).load("float32") is None
+    assert _Files(tmp_path / "loop", loop(abs_of)).load("float32") == "plain"
+
+
 def test_what_changes_no_instruction_compiles_nothing(project):
     """As a new time stamp, which an installation gives to all files."""
     project.run()

@@ -30,7 +30,7 @@ _WRITERS: Final = ("compiled.py", "formulas.py")
 def kept(dispatcher: Any) -> Any:
     """The same loop of numba's, compiled with ``cache=True``, whose files have such names."""
     numbas = dispatcher._cache._cache_file
-    dispatcher._cache._cache_file = _Files(Path(numbas._index_path).with_suffix(""), dispatcher.py_func)
+    dispatcher._cache._cache_file = _Files(Path(numbas._index_path).with_suffix(""), dispatcher)
     return dispatcher
 
 
@@ -41,12 +41,12 @@ class _Files:
     ----------
     base
         Folder, and what the names begin with.
-    function
-        The loop in Python.
+    loop
+        numba's, or the function in Python.
     """
 
-    def __init__(self, base: Path, function: types.FunctionType) -> None:
-        self._base, self._function = base, function
+    def __init__(self, base: Path, loop: Any) -> None:
+        self._base, self._loop = base, loop
 
     def load(self, key: Any) -> Any:
         """What was saved for a key, types and processor; None if nothing was, or a power cut has left a part of it."""
@@ -84,7 +84,7 @@ class _Files:
     @functools.cached_property
     def _source(self) -> str:
         """Of all that the loop is compiled from."""
-        return _short(_writers() + b"".join(_parts(self._function, set())))
+        return _short(_writers() + b"".join(_parts(self._loop, set())))
 
 
 def _short(data: bytes) -> str:
@@ -99,7 +99,11 @@ def _writers() -> bytes:
 
 
 def _parts(value: Any, seen: set[int]) -> Iterator[bytes]:
-    """What a loop is compiled from: the instructions and constants of functions, and of those that they name."""
+    """What a loop is compiled from: options, instructions and constants of functions, and of those that they name."""
+    options = getattr(value, "targetoptions", {})
+    yield repr(
+        [(name, sorted(o) if isinstance(o, set) else o) for name, o in sorted(options.items())]
+    ).encode()
     value = getattr(value, "py_func", getattr(value, "_defn", value))  # of numba's loops and intrinsics
     if isinstance(value, types.FunctionType):
         if id(value) in seen:
