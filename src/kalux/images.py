@@ -211,9 +211,7 @@ def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) ->
     along = _along(estimate)
     needs_variance = with_variance or view.mosaic is not None or along is not None
     # That after averaging counts only for pixels that neither frame measures (K11).
-    needs_averaged = needs_variance and (
-        moving is None or (estimate.around is not None and estimate.around.misses_some)
-    )
+    needs_averaged = needs_variance and (moving is None or _misses_some(estimate))
     intensity, total, levels = read_out(
         log_intensity,
         variance,
@@ -252,6 +250,12 @@ def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) ->
     image = Image(estimate.t, intensity, total, view.log_offset, estimate.final, fixed_pattern=pattern)
     colour = _coloured(image, estimate, view)
     return image if colour is None else dataclasses.replace(image, colour=colour)
+
+
+def _misses_some(estimate: Estimate) -> bool:
+    """Whether there are pixels that neither frame around is known to measure."""
+    around, unmeasured = estimate.around, estimate.unmeasured
+    return around is not None and unmeasured is not None and around.misses_some(unmeasured)
 
 
 def _infinite(shape: tuple[int, ...]) -> NDArray[np.float32]:
