@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.along import Along, join_along
+from kalux.augmentation.along import Along, joined_along, put, taken
 from kalux.augmentation.bridge import RANDOM
 from kalux.augmentation.highlights import Unshown
 from kalux.augmentation.motion import Paths
@@ -274,12 +274,14 @@ def _look_along(
 ) -> None:
     """Join an image with what the frames around show along the paths of what moves (K16). In place."""
     offset = np.float32(log_offset)
-    level = np.empty_like(intensity)
-    for window in along.looked_at:
-        level[window] = np.log(intensity[window] + offset)
-    join_along(along, level, variance)
-    for window in along.motion.windows:
-        intensity[window] = np.maximum(np.exp(level[window]) - offset, np.float32(0.0))
+    level = taken(along, intensity)
+    level += offset
+    np.log(level, out=level)
+    joined, doubt = joined_along(along, level, taken(along, variance))
+    np.exp(joined, out=joined)
+    joined -= offset
+    put(along, intensity, np.maximum(joined, np.float32(0.0), out=joined))
+    put(along, variance, doubt)
 
 
 def _above_bounds(
