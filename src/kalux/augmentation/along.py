@@ -221,12 +221,14 @@ def _look(
 
 
 def _places(looked_at: Sequence[Window], changed: Sequence[Window]) -> Places:
-    ends = (
-        np.array([end for window in windows for part in window for end in (part.start, part.stop)], np.uint64)
-        for windows in (looked_at, changed)
-    )
     pixels = sum((rows.stop - rows.start) * (columns.stop - columns.start) for rows, columns in looked_at)
-    return Places(*ends, pixels)
+    return Places(_ends(looked_at), _ends(changed), pixels)
+
+
+def _ends(windows: Sequence[Window]) -> NDArray[np.uint64]:
+    """First and last row and column of every window."""
+    ends = [end for window in windows for part in window for end in (part.start, part.stop)]
+    return np.array(ends, np.uint64)
 
 
 _ZERO, _ONE, _TWO, _THREE, _FOUR = (np.uint64(number) for number in range(5))
