@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.along import Along, join_along
+from kalux.augmentation.along import Along, joined_along, put, taken
 from kalux.augmentation.bridge import RANDOM
 from kalux.augmentation.highlights import Unshown
 from kalux.augmentation.motion import Paths
@@ -211,9 +211,7 @@ def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) ->
     along = _along(estimate)
     needs_variance = with_variance or view.mosaic is not None or along is not None
     # That after averaging counts only for pixels that neither frame measures (K11).
-    needs_averaged = needs_variance and (
-        moving is None or (estimate.around is not None and estimate.around.misses_some)
-    )
+    needs_averaged = needs_variance and (moving is None or _misses_some(estimate))
     intensity, total, levels = read_out(
         log_intensity,
         variance,
@@ -254,6 +252,12 @@ def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) ->
     return image if colour is None else dataclasses.replace(image, colour=colour)
 
 
+def _misses_some(estimate: Estimate) -> bool:
+    """Whether there are pixels that neither frame around is known to measure."""
+    around, unmeasured = estimate.around, estimate.unmeasured
+    return around is not None and unmeasured is not None and around.misses_some(unmeasured)
+
+
 def _infinite(shape: tuple[int, ...]) -> NDArray[np.float32]:
     """The variance of an image that is not wanted, in no memory."""
     return np.ndarray(shape, np.float32, _INFINITE, strides=(0, 0))
@@ -270,12 +274,14 @@ def _look_along(
 ) -> None:
     """Join an image with what the frames around show along the paths of what moves (K16). In place."""
     offset = np.float32(log_offset)
-    level = np.empty_like(intensity)
-    for window in along.looked_at:
-        level[window] = np.log(intensity[window] + offset)
-    join_along(along, level, variance)
-    for window in along.motion.windows:
-        intensity[window] = np.maximum(np.exp(level[window]) - offset, np.float32(0.0))
+    level = taken(along, intensity)
+    level += offset
+    np.log(level, out=level)
+    joined, doubt = joined_along(along, level, taken(along, variance))
+    np.exp(joined, out=joined)
+    joined -= offset
+    put(along, intensity, np.maximum(joined, np.float32(0.0), out=joined))
+    put(along, variance, doubt)
 
 
 def _above_bounds(

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kalux.augmentation.along import Along, Motion, as_seen, unmoved_difference
+from kalux.augmentation.along import Along, Motion, as_seen, put, taken, unmoved_difference
 from kalux.augmentation.bridge import UNMEASURED, Latent
 from kalux.augmentation.resampling import readable
 from textures import SHAPE, frame_of, texture, whole
@@ -75,6 +75,22 @@ def test_windows_show_what_the_whole_image_does(windows):
     ]
     for one, other in zip(*found, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-6)
+
+
+def test_windows_are_taken_with_their_margins_and_put_back_without():
+    """Of two that lie beside each other the margins overlap, and end with the image."""
+    image = np.arange(20 * 30, dtype=np.float32).reshape(20, 30)
+    windows = (slice(0, 8), slice(10, 20)), (slice(8, 20), slice(10, 14))
+    nothing = np.zeros((2, *image.shape), np.float32)
+    along = Along(Motion(nothing, nothing, nothing, nothing, image, windows), 0.5)
+    values = taken(along, image)
+    np.testing.assert_array_equal(values, np.concatenate([image[:12, 6:24].ravel(), image[4:, 6:18].ravel()]))
+    found = -image
+    put(along, found, values)
+    expected = -image
+    for window in windows:
+        expected[window] = image[window]
+    np.testing.assert_array_equal(found, expected)
 
 
 def test_a_black_pixel_measures_nothing_and_a_frame_may_be_in_float64():

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kalux.augmentation.bridge import UNMEASURED
+from kalux.augmentation.bridge import REPEATED, UNMEASURED
 from kalux.filters.readout import CORRELATED, Subthreshold
 from kalux.filters.uncertainty import (
     BEFORE_AVERAGING,
@@ -173,5 +173,6 @@ def test_what_neighbours_take_of_a_pixel_that_neither_frame_measures_is_not_give
         np.testing.assert_allclose(
             given_variance(plane(p), STILL, NO_CHANGE, NOTHING, measured, left), p, rtol=1e-5
         )
-        assert not measured.misses_some
-    assert around().misses_some
+    for second, missed in ((UNMEASURED, True), (REPEATED, False)):
+        assert around(second=second).misses_some(np.arange(2)) is missed
+    assert not around().misses_some(np.arange(0))

@@ -6,7 +6,9 @@ finds, they are one more estimate of the image, the better the better they agree
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Final, NamedTuple
 
 import cv2
@@ -51,7 +53,7 @@ BESIDE: Final = 2
 FIRST: Final = np.uint64(BESIDE)
 """The first pixel of such a row."""
 
-_NOTHING: Final = np.empty((0, 0), np.float32)
+_NOTHING: Final = np.empty(0, np.float32)
 """In place of an image."""
 
 _LEAST: Final = np.float32(1 - BORDER)
@@ -60,11 +62,34 @@ _LEAST: Final = np.float32(1 - BORDER)
 _MARGIN: Final = 4
 """Pixels around a window that what is seen in it depends on: half of `_EVIDENCE`, twice."""
 
+_RING: Final = np.uint64(8)
+"""Rows of what is looked at around every pixel that are kept: more than lie between the first and the last in use, so
+that they stay in the nearest cache; a power of two."""
+
 Window = tuple[slice, slice]
 """Rows and columns."""
 
 
-class Motion(NamedTuple):
+class Places(NamedTuple):
+    """Windows as loops take them.
+
+    Attributes
+    ----------
+    looked_at
+        (4 N,) uint64: first and last row and column, by Python's counting, of every window with its margin.
+    changed
+        (4 N,) uint64: the same of the windows.
+    pixels
+        Number of all pixels that are looked at.
+    """
+
+    looked_at: NDArray[np.uint64]
+    changed: NDArray[np.uint64]
+    pixels: int
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
     """Two frames, and the paths of what moves from one to the other.
 
     Attributes
@@ -88,6 +113,11 @@ class Motion(NamedTuple):
     unmoved: Plane
     windows: tuple[Window, ...]
 
+    @cached_property
+    def places(self) -> Places:
+        """Of the windows."""
+        return _places([_widened(window, self.unmoved.shape) for window in self.windows], self.windows)
+
 
 class Along(NamedTuple):
     """What moves, at a share of the way from the first frame to the second."""
@@ -99,11 +129,6 @@ class Along(NamedTuple):
     def between(self) -> float:
         """0 at a frame, 1 half-way."""
         return bridge_variance(self.share)
-
-    @property
-    def looked_at(self) -> list[Window]:
-        """Where an image is looked at: the windows with their margins."""
-        return [_widened(window, self.motion.unmoved.shape)[0] for window in self.motion.windows]
 
 
 def as_seen(frame: Latent) -> Latent:
@@ -130,56 +155,80 @@ def seen_along(along: Along, window: Window) -> tuple[Plane, Plane]:
     With s the share, the mean of both is weighted by 1 - s and s. It is the less certain the more the frames disagree
     there, the finer the texture is that is read between its pixels, and the better they agree where nothing moves.
     """
-    return next(_look(along, (window,)))
+    seen, doubt = _look(along, _places([window], [window]))
+    rows, columns = (part.stop - part.start for part in window)
+    return seen.reshape(rows, columns), doubt.reshape(rows, columns)
 
 
 def join_along(along: Along, level: Plane, variance: Plane) -> None:
     """Join an image with what is seen along the paths, by information, where anything is. In place.
-
-    What is seen counts `Along.between` times: at a frame the filter knows the frame itself.
 
     Parameters
     ----------
     along
         The paths, and the share.
     level, variance
-        (H, W) float32: log intensity and its variance, looked at in `Along.looked_at` only.
+        (H, W) float32: log intensity and its variance.
     """
-    windows = along.motion.windows
-    wider, inside = zip(*(_widened(window, level.shape) for window in windows), strict=True)
-    # All before any is changed: windows look at pixels beside them.
-    for window, part, found in list(zip(windows, inside, _look(along, wider, level, variance), strict=True)):
-        level[window], variance[window] = (plane[part] for plane in found)
+    joined = joined_along(along, taken(along, level), taken(along, variance))
+    for plane, values in zip((level, variance), joined, strict=True):
+        put(along, plane, values)
+
+
+def joined_along(along: Along, level: Plane, variance: Plane) -> tuple[Plane, Plane]:
+    """Log intensity and its variance where they are `taken`, joined with what is seen along the paths.
+
+    What is seen counts `Along.between` times: at a frame the filter knows the frame itself.
+    """
+    return _look(along, along.motion.places, level, variance)
+
+
+def taken(along: Along, plane: Plane) -> Plane:
+    """(N,) float32: the pixels of the windows with their margins, one window after the other; some may come twice."""
+    places = along.motion.places
+    values = memory.empty((places.pixels,))
+    _take(plane.reshape(-1), np.uint64(plane.shape[1]), places.looked_at, values)
+    return values
+
+
+def put(along: Along, plane: Plane, values: Plane) -> None:
+    """Fill the windows of a plane with values that were `taken`. In place."""
+    places = along.motion.places
+    _put(plane.reshape(-1), np.uint64(plane.shape[1]), places.looked_at, places.changed, values)
 
 
 def _look(
-    along: Along, windows: tuple[Window, ...], level: Plane = _NOTHING, variance: Plane = _NOTHING
-) -> Iterator[tuple[Plane, Plane]]:
-    """What is seen in windows, joined with an image where there is one."""
+    along: Along, places: Places, level: Plane = _NOTHING, variance: Plane = _NOTHING
+) -> tuple[Plane, Plane]:
+    """What is seen in windows, one after the other, joined with an image where there is one."""
     motion = along.motion
     height, width = motion.unmoved.shape
-    shapes = [(rows.stop - rows.start, columns.stop - columns.start) for rows, columns in windows]
-    sizes = [rows * columns for rows, columns in shapes]
-    ends = np.cumsum(sizes)
-    seen, doubt = memory.empty((2, int(ends[-1])))
-    difference, local, contradiction = memory.empty((3, max(sizes)))
-    bounds = np.array([(part.start, part.stop) for window in windows for part in window], np.uint64)
-    planes = motion.first, motion.second, motion.path, motion.bend, motion.unmoved, level, variance, bounds
+    seen, doubt = memory.empty((2, places.pixels))
+    planes = motion.first, motion.second, motion.path, motion.bend, motion.unmoved
     _look_along(
         *(plane.reshape(-1) for plane in planes),
+        level,
+        variance,
+        places.looked_at,
         (np.uint64(height), np.uint64(width)),
         np.float32(along.share),
         np.float32(along.between),
         np.arange(width, dtype=np.float32),
-        difference,
-        local,
-        contradiction,
         seen,
         doubt,
     )
-    for shape, size, end in zip(shapes, sizes, ends, strict=True):
-        part = slice(end - size, end)
-        yield seen[part].reshape(shape), doubt[part].reshape(shape)
+    return seen, doubt
+
+
+def _places(looked_at: Sequence[Window], changed: Sequence[Window]) -> Places:
+    pixels = sum((rows.stop - rows.start) * (columns.stop - columns.start) for rows, columns in looked_at)
+    return Places(_ends(looked_at), _ends(changed), pixels)
+
+
+def _ends(windows: Sequence[Window]) -> NDArray[np.uint64]:
+    """First and last row and column of every window."""
+    ends = [end for window in windows for part in window for end in (part.start, part.stop)]
+    return np.array(ends, np.uint64)
 
 
 _ZERO, _ONE, _TWO, _THREE, _FOUR = (np.uint64(number) for number in range(5))
@@ -199,16 +248,13 @@ def _look_along(  # type: ignore[no-untyped-def]
     share,
     between,
     numbers,
-    difference,
-    local,
-    contradiction,
     seen,
     doubt,
 ):
     """Fill ``seen`` and ``doubt``, window after window; ``windows`` holds the first and last row and column of each.
 
     The rows around another one come before what is made of them, and that at once, while they are in the nearest cache.
-    ``numbers`` are those of all columns; ``difference``, ``local`` and ``contradiction`` have room for a window each.
+    ``numbers`` are those of all columns.
     """
     height, width = shape
     stride, down, joins = _TWO * (width + np.uint64(2 * BORDER)), height * width, len(level) > 0
@@ -220,9 +266,11 @@ def _look_along(  # type: ignore[no-untyped-def]
         pixels, fractions = empty(_FOUR * count, np.int32), empty(_FOUR * count, np.float32)
         read, apart = empty(_FOUR * count, np.float32), _TWO * count
         sums, wider = empty(count + _FOUR, np.float32), empty(count + _FOUR, np.float32)
+        difference, local = empty(_RING * count, np.float32), empty(_RING * count, np.float32)
+        contradiction = empty(_RING * count, np.float32)
         for step in range(rows + _FOUR):
             if step < rows:
-                at, place = step * count, (top + step) * width + left
+                here, place = begin + step * count, (top + step) * width + left
                 # fmt: off
                 for frame in range(_TWO):
                     x, y = frame * count, frame * count + apart
@@ -235,30 +283,31 @@ def _look_along(  # type: ignore[no-untyped-def]
                 read_row(count, first, stride, pixels, fractions, _ZERO, apart, read)
                 read_row(count, second, stride, pixels, fractions, count, apart, read)
                 _compare(
-                    count, seen, begin + at, difference, at, doubt, begin + at,
+                    count, seen, here, difference, step % _RING * count, doubt, here,
                     read, _ZERO, read, count, read, apart, read, apart + count, share,
                 )
                 # fmt: on
             if _ONE <= step < rows + _ONE:
                 row = step - _ONE
-                at = row * count
-                _add_three(seen, begin, row, rows, count, sums)
-                _roughen(count, local, at, seen, begin + at, difference, at, sums, FIRST)
+                at = row % _RING * count
+                _add_three(seen, begin, row, rows, rows, count, sums)
+                _roughen(count, local, at, seen, begin + row * count, difference, at, sums, FIRST)
             if _TWO <= step < rows + _TWO:
                 row = step - _TWO
-                at, here, place = row * count, begin + row * count, (top + row) * width + left
-                _add_three(local, _ZERO, row, rows, count, sums)
+                here, place = begin + row * count, (top + row) * width + left
+                _add_three(local, _ZERO, row, rows, _RING, count, sums)
                 _add_five(difference, row, rows, count, wider)
                 _doubt(count, doubt, here, sums, FIRST, wider, FIRST, unmoved, place)
                 if joins:
+                    at = row % _RING * count
                     _contradict(
-                        count, contradiction, at, seen, here, doubt, here, level, place, variance, place
+                        count, contradiction, at, seen, here, doubt, here, level, here, variance, here
                     )
             if step >= _FOUR and joins:
                 row = step - _FOUR
-                here, place = begin + row * count, (top + row) * width + left
+                here = begin + row * count
                 _add_five(contradiction, row, rows, count, sums)
-                _join(count, seen, here, doubt, here, sums, FIRST, level, place, variance, place, between)
+                _join(count, seen, here, doubt, here, sums, FIRST, level, here, variance, here, between)
         begin += rows * count
 
 
@@ -364,18 +413,21 @@ def _mean_of_five(sums: Pixels) -> Number:
 
 
 @nb.njit(cache=True, inline="always", error_model="numpy")
-def _add_three(plane, begin, row, rows, count, sums):  # type: ignore[no-untyped-def]
-    """The sum of three rows around one."""
-    above, below = mirrored(row - _ONE, rows) * count, mirrored(row + _ONE, rows) * count
-    _three(count, sums, FIRST, plane, begin + above, plane, begin + row * count, plane, begin + below)
+def _add_three(plane, begin, row, rows, kept, count, sums):  # type: ignore[no-untyped-def]
+    """The sum of three rows around one, of a plane that holds each row at its number modulo ``kept``."""
+    above, below = mirrored(row - _ONE, rows) % kept * count, mirrored(row + _ONE, rows) % kept * count
+    here = row % kept * count
+    _three(count, sums, FIRST, plane, begin + above, plane, begin + here, plane, begin + below)
     mirror_ends(sums, count)
 
 
 @nb.njit(cache=True, inline="always", error_model="numpy")
 def _add_five(plane, row, rows, count, sums):  # type: ignore[no-untyped-def]
-    far, above = mirrored(row - _TWO, rows) * count, mirrored(row - _ONE, rows) * count
-    below, beyond = mirrored(row + _ONE, rows) * count, mirrored(row + _TWO, rows) * count
-    _five(count, sums, FIRST, plane, far, plane, above, plane, row * count, plane, below, plane, beyond)
+    """The sum of five rows around one, of the `_RING` latest."""
+    far, above = mirrored(row - _TWO, rows) % _RING * count, mirrored(row - _ONE, rows) % _RING * count
+    below, beyond = mirrored(row + _ONE, rows) % _RING * count, mirrored(row + _TWO, rows) % _RING * count
+    here = row % _RING * count
+    _five(count, sums, FIRST, plane, far, plane, above, plane, here, plane, below, plane, beyond)
     mirror_ends(sums, count)
 
 
@@ -406,10 +458,35 @@ def mirror_ends(row: Row, count: Number) -> None:
         row[last + np.uint64(aside)] = row[last - np.uint64(aside)]
 
 
-def _widened(window: Window, shape: tuple[int, ...]) -> tuple[Window, Window]:
-    """A window with its margin, as far as the image goes, and the window within that."""
-    wider = [
+@loop
+def _take(plane, width, windows, values):  # type: ignore[no-untyped-def]
+    at = _ZERO
+    for window in range(_ZERO, np.uint64(len(windows)), _FOUR):
+        count = windows[window + _THREE] - windows[window + _TWO]
+        for row in range(windows[window], windows[window + _ONE]):
+            place = row * width + windows[window + _TWO]
+            for i in range(count):
+                values[at + i] = plane[place + i]
+            at += count
+
+
+@loop
+def _put(plane, width, windows, changed, values):  # type: ignore[no-untyped-def]
+    begin = _ZERO
+    for window in range(_ZERO, np.uint64(len(windows)), _FOUR):
+        top, left = windows[window], windows[window + _TWO]
+        rows, count = windows[window + _ONE] - top, windows[window + _THREE] - left
+        first, last = changed[window + _TWO], changed[window + _THREE]
+        for row in range(changed[window], changed[window + _ONE]):
+            at, place = begin + (row - top) * count + first - left, row * width + first
+            for i in range(last - first):
+                plane[place + i] = values[at + i]
+        begin += rows * count
+
+
+def _widened(window: Window, shape: tuple[int, ...]) -> Window:
+    """A window with its margin, as far as the image goes."""
+    rows, columns = (
         slice(max(s.start - _MARGIN, 0), min(s.stop + _MARGIN, n)) for s, n in zip(window, shape, strict=True)
-    ]
-    inside = [slice(s.start - w.start, s.stop - w.start) for s, w in zip(window, wider, strict=True)]
-    return (wider[0], wider[1]), (inside[0], inside[1])
+    )
+    return rows, columns

@@ -7,6 +7,7 @@ along these paths is in `kalux.augmentation.along`.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from typing import Any, Final
 
@@ -208,7 +209,7 @@ def bent(first: Latent, second: Latent, path: Plane, level: Floats, variance: Fl
     join_along(half_way, level.copy(), left)
     gain = np.where(moving, 1.0 - left / variance, np.float32(0.0))
     windows = tuple(_windows(gain))
-    return motion._replace(windows=windows) if windows else None
+    return dataclasses.replace(motion, windows=windows) if windows else None
 
 
 def _around(places: NDArray[np.bool_], margin: int) -> Window:

@@ -15,10 +15,11 @@ from __future__ import annotations
 from itertools import pairwise
 from typing import Final, NamedTuple
 
+import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.compiled import empty, loop, zeros
+from kalux.compiled import empty, event_column, event_is_on, event_row, event_words, loop, zeros
 from kalux.event_slices import count_chunks, first_events
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.models.frame_pixels import around
@@ -36,6 +37,10 @@ MOST_EVENTS: Final = 1 << 21
 
 _COMPANIONS: Final = 1
 """Neighbours that may fire as well: two hot pixels side by side are alone, too."""
+
+_ONE: Final = np.uint64(1)
+_OFF, _ON = np.int32(1), np.int32(1 << 16)
+"""An event as it is counted in a bin: no pixel has as many as a half of the bits can count, one a microsecond."""
 
 _LEAST_RATE: Final = 30.0
 """Hz, from which a pixel is hot. At 20 Hz frames and the noise model (K5) suffice."""
@@ -119,55 +124,65 @@ def _counted_alone(events: EventArray, shape: tuple[int, int], length: int) -> _
     """Of the whole bins of ``length`` us, from the first event on."""
     edges = _bins_of(events, length)
     count = max(len(edges) - 1, 0)
-    crowded, firing = np.zeros((2, _PARTS, *shape), np.int32)
-    on, off = np.zeros((2, *shape), np.int32)
-    x, y, p = (events[name] for name in ("x", "y", "p"))
-    _count_alone(x, y, p, edges, crowded, firing, on, off)
+    bordered = shape[0] + 2, shape[1] + 2
+    crowded, firing = np.zeros((2, _PARTS, *bordered), np.int32)
+    off, on = counts = np.zeros((2, *bordered), np.int32)
+    planes = (plane.reshape(len(plane), -1) for plane in (crowded, firing, counts))
+    _count_alone(event_words(events), edges, np.uint64(bordered[1]), *planes)
+    crowded, firing, on, off = (plane[..., 1:-1, 1:-1] for plane in (crowded, firing, on, off))
     parts = np.diff(-(-np.arange(_PARTS + 1) * count // _PARTS))
     return _Alone(parts[:, None, None].astype(np.int32) - crowded, firing, on, off)
 
 
 @loop
-def _count_alone(x, y, p, edges, crowded, firing, on, off):  # type: ignore[no-untyped-def]
+def _count_alone(words, edges, stride, crowded, firing, counts):  # type: ignore[no-untyped-def]
     """Bins in which a pixel is not alone, in which it fires alone, and its events in those.
 
-    Only pixels that fire and their neighbours are visited: most bins are short, and hold few events.
+    Planes are flat, with a border of a pixel and rows of ``stride``. Only pixels that fire and their neighbours are
+    visited: most bins are short, and hold few events.
     """
-    height, width = on.shape
-    count = len(edges) - 1
-    rises, falls = zeros((height, width), np.int32), zeros((height, width), np.int32)
-    around = zeros((height + 2, width + 2), np.int32)  # neighbours that fire in this bin, with a border
-    fired = empty(height * width, np.int64)
-    for index in range(count):
-        part = index * _PARTS // count
-        firing_pixels = 0
+    cells = counts.shape[1]
+    here = zeros(cells, np.int32)  # events in this bin: those on in the upper half of the bits
+    beside = zeros(cells, np.uint8)  # neighbours that fire in it
+    fired, company = empty(cells, np.uint32), empty(cells + 1, np.uint32)
+    bins = len(edges) - 1
+    for index in range(bins):
+        part = np.uint64(index * _PARTS // bins)
+        firing_pixels, crowded_pixels = np.uint64(0), np.uint64(0)
         for i in range(edges[index], edges[index + 1]):
-            row, column = np.int64(y[i]), np.int64(x[i])
-            if rises[row, column] + falls[row, column] == 0:
-                fired[firing_pixels] = row * width + column
-                firing_pixels += 1
-                for r in range(row, row + 3):
-                    for c in range(column, column + 3):
-                        around[r, c] += 1
-                around[row + 1, column + 1] -= 1
-            if p[i]:
-                rises[row, column] += 1
-            else:
-                falls[row, column] += 1
+            word = words[i, 1]
+            cell = (event_row(word) + _ONE) * stride + event_column(word) + _ONE
+            before = here[cell]
+            here[cell] = before + (_ON if event_is_on(word) else _OFF)
+            if before == 0:
+                fired[firing_pixels] = cell
+                firing_pixels += _ONE
+                for place in (cell - stride, cell + stride):
+                    crowded_pixels = _join(place - _ONE, beside, company, crowded_pixels)
+                    crowded_pixels = _join(place, beside, company, crowded_pixels)
+                    crowded_pixels = _join(place + _ONE, beside, company, crowded_pixels)
+                crowded_pixels = _join(cell - _ONE, beside, company, crowded_pixels)
+                crowded_pixels = _join(cell + _ONE, beside, company, crowded_pixels)
+        for k in range(crowded_pixels):
+            crowded[part, company[k]] += 1
         for k in range(firing_pixels):
-            row, column = fired[k] // width, fired[k] % width
-            if around[row + 1, column + 1] <= _COMPANIONS:
-                firing[part, row, column] += 1
-                on[row, column] += rises[row, column]
-                off[row, column] += falls[row, column]
+            cell = fired[k]
+            if beside[cell] <= _COMPANIONS:
+                firing[part, cell] += 1
+                counts[0, cell] += here[cell] % _ON
+                counts[1, cell] += here[cell] // _ON
+            here[cell] = 0
         for k in range(firing_pixels):
-            row, column = fired[k] // width, fired[k] % width
-            rises[row, column] = falls[row, column] = 0
-            for r in range(row, row + 3):
-                for c in range(column, column + 3):
-                    if around[r, c] > _COMPANIONS and 0 < r <= height and 0 < c <= width:
-                        crowded[part, r - 1, c - 1] += 1
-                    around[r, c] = 0
+            for place in (fired[k] - stride, np.uint64(fired[k]), fired[k] + stride):
+                beside[place - _ONE] = beside[place] = beside[place + _ONE] = 0
+
+
+@nb.njit(cache=True, inline="always", error_model="numpy")
+def _join(cell, beside, company, count):  # type: ignore[no-untyped-def]
+    """A neighbour of a pixel fires; ``company`` are the ``count`` pixels that have too many for being alone."""
+    beside[cell] += np.uint8(1)
+    company[count] = cell  # without a branch: the next one takes its place
+    return count + np.uint64(beside[cell] == _COMPANIONS + 1)
 
 
 def _fires_often(alone: _Alone, length: int) -> NDArray[np.bool_]:

@@ -95,10 +95,9 @@ class Around(NamedTuple):
     share: float
     half_way: float = RANDOM
 
-    @property
-    def misses_some(self) -> bool:
-        """Whether there are pixels that neither frame measures."""
-        return bool(np.minimum(self.first, self.second).max() >= UNMEASURED)
+    def misses_some(self, unmeasured: NDArray[np.int64]) -> bool:
+        """Whether of pixels without a measurement some are not known to be black either (K7)."""
+        return bool((self.second.reshape(-1)[unmeasured] >= UNMEASURED).any())
 
 
 def subthreshold_variance(
