@@ -13,7 +13,7 @@ from kalux.planning import plan
 from kalux.recording import less_black
 from kalux.settings import PRESETS, altered
 
-from builders import from_black, lifted, passing_by, textured
+from builders import damaged, from_black, lifted, passing_by, textured
 
 SETTINGS = PRESETS["default"]
 
@@ -115,4 +115,7 @@ def test_the_delay_is_estimated_once_where_there_is_no_black_level(monkeypatch):
     assert alone.apparent == expected.steps.delay.apparent
     asked.clear()
     plan(lifted(from_black(), 16), at="frames")
+    assert len(asked) == 2
+    asked.clear()
+    plan(damaged(source), at="frames")  # that of copies of frames, and of gains that step, is another one
     assert len(asked) == 2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path
@@ -10,10 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 from kalux.cli.calibrate_offset import add_range, checked_range, read_offset
 from kalux.cli.calibrate_rig import add_frames
+from kalux.cli.calibrations import add_black_level, camera_calibration
 from kalux.cli.parser import Parser, UsageError, number, whole
 from kalux.cli.recordings import add_exposure, check_stamp, write_streams
 from kalux.cli.terminal import say, warn
-from kalux.settings import AUTO, chosen_response
+from kalux.settings import AUTO, chosen_response, preset
 from kalux.wording import how_many
 
 if TYPE_CHECKING:
@@ -52,6 +54,7 @@ def add_command(commands: Any) -> None:
         metavar="NAME",
         help="of the frames: linear, srgb, bt709 or gamma:2.2 (default: what they state, else linear)",
     )
+    add_black_level(group, otherwise="as the frames state, else 0")
     group = parser.add_argument_group("space")
     group.add_argument("--rig", type=Path, metavar="RIG.toml", help="calibration of both cameras")
     group.add_argument(
@@ -100,10 +103,11 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     from kalux.calibration.two_cameras import open_frames, register
     from kalux.cli.output import check_file, check_picture, write_picture
     from kalux.cli.recordings import check_name
-    from kalux.settings import CameraSettings
+    from kalux.recording import less_black
 
     timing = _timing(options)
     centre, reach = checked_range(options)
+    camera = camera_calibration(options.black_level).apply(preset("default")).camera
     check_name(options.out, options.events)
     check_file(options.out, overwrite=options.overwrite)
     for path in (options.overlay, options.plot):
@@ -118,6 +122,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
         exposure=None if by_trigger else options.exposure,
         stamp=options.stamp or "start",
     )
+    other = less_black(other, camera.black_level)
     response = chosen_response(options.response, other.response)
     frames, exposure_known = _timed_frames(options, events, other, by_trigger)
     size = events.sensor_size
@@ -134,7 +139,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
         offset=_known_offset(options, timing),
         centre=centre,
         reach=reach,
-        camera=CameraSettings(response=response),
+        camera=dataclasses.replace(camera, response=response),
     )
     if not options.quiet:
         for line in described(found, by_trigger):

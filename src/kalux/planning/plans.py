@@ -231,7 +231,7 @@ def _with_white_balance(recording: Recording, settings: Settings) -> Settings:
 def _delay_of_black(mends: Mends, settings: Settings, exposures: NDArray[np.int64]) -> DelayEstimate | None:
     """The apparent delay that was estimated while black was looked for and not found, if it is of these very frames."""
     black, (start, end) = mends.black, exposures[0]
-    if black is None or black.level or mends.ceiling is not None:
+    if black is None or black.level or mends.ceiling is not None or mends.corrections:
         return None
     return black.delay if end - start == settings.camera.reference_exposure else None
 
