@@ -225,6 +225,7 @@ def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) ->
         difference=view.neighbours,
         pitch=1 if view.mosaic is None else 2,  # to neighbours of the same colour
         unshown=None if unshown is None else unshown.pixels,
+        surface=_surface(estimate),
         with_variance=needs_averaged,
     )
     if unshown is not None:
@@ -252,6 +253,15 @@ def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) ->
     image = Image(estimate.t, intensity, total, view.log_offset, estimate.final, fixed_pattern=pattern)
     colour = _coloured(image, estimate, view)
     return image if colour is None else dataclasses.replace(image, colour=colour)
+
+
+def _surface(estimate: Estimate) -> NDArray[np.int64] | None:
+    """(N,) pixels that neither frame around measures, but another one has shown; None: not known."""
+    if estimate.unmeasured is None or estimate.unshown is None:
+        return estimate.unmeasured
+    bounded = np.zeros(estimate.log_intensity.size, np.bool_)
+    bounded[estimate.unshown.pixels] = True
+    return estimate.unmeasured[~bounded[estimate.unmeasured]]
 
 
 def _infinite(shape: tuple[int, ...]) -> NDArray[np.float32]:
