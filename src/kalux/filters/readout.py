@@ -66,9 +66,9 @@ bandwidth that are common to all pixels, need more (docs/equations.md, K12)."""
 _SLACK: Final = np.float32(1 / 8)
 """Part of the variance of neighbours' differences by which patches of one surface differ beyond their noise."""
 
-_FARTHER: Final = np.float32(10.0)
+_FARTHER: Final = np.float32(20.0)
 """By how much more neighbours on one surface differ twice as far away than in proportion to their squared distance: it
-bends. 5 is better for skies and 20 for textures (docs/equations.md, K12)."""
+bends. 10 is better for skies and worse for textures (docs/equations.md, K12)."""
 
 _HALF_OF_PATCH: Final = np.float32(1 / 18)
 """Factor from the sum over a patch of nine pixels to half its mean."""
@@ -673,10 +673,11 @@ def _compare_row(  # type: ignore[no-untyped-def]
     size, step, aside = np.uint64(last - first + 2 * _ASIDE), np.uint64(pitch), np.uint64(patch)
     begin = np.uint64(_MARGIN - _ASIDE + first)
     own, other = below * _TWO + begin, under * _TWO + begin
+    ahead = np.uint64((row + pitch) % count) * _TWO + begin
     for i in range(size):
         _compare_pixels(states, allowed, own + i, other + i, step, differences, begin + i)
     for i in range(size):
-        _weigh_pixel(states, allowed, own + i, weights)
+        _weigh_pixel(states, allowed, ahead + i, weights)
     into = below * _FOUR + begin
     for k in range(np.uint64(4)):
         start = begin + k * _ONE
