@@ -721,28 +721,65 @@ def with_rounding(variance, intensity, moving, level, offset):
     return given
 
 
-def regularised(level, variance, moving, difference):
-    """K12, of whole images: L and its variance."""
-    out, doubt = level.copy(), variance.copy()
+def averaged(level, variance, hears, rough, apart=1):
+    """K12, of whole images: L, and its variance if errors were independent, of the pixels that hear neighbours.
+
+    ``rough`` is the variance by which pixels one apart differ on one surface; neighbours are ``apart``.
+    """
+    out, left = level.copy(), variance.copy()
     around = [(down, right) for down in (-1, 0, 1) for right in (-1, 0, 1)]
     inside = set(np.ndindex(level.shape))
-    for row, column in zip(*np.nonzero(moving), strict=True):
+    for row, column in zip(*np.nonzero(hears), strict=True):
         information, total = 1 / variance[row, column], level[row, column] / variance[row, column]
-        for down, right in around:
-            other, differs = (row + down, column + right), difference**2 * (down**2 + right**2)
-            if differs == 0 or other not in inside:
+        for down, right in [(apart * i, apart * j) for i, j in around if (i, j) != (0, 0)]:
+            other, distance2 = (row + down, column + right), down**2 + right**2
+            if other not in inside:
                 continue
             unlike = 0.0
             for i, j in around:
                 one, two = (row + i, column + j), (row + down + i, column + right + j)
                 if one in inside and two in inside:
-                    noise = variance[one] + variance[two] + differs / 8
+                    noise = variance[one] + variance[two] + rough[min(one, two)] * distance2 / 8
                     unlike += (level[two] - level[one]) ** 2 / noise
-            weight = (1 + unlike / 18) ** -2 / (variance[other] + differs)
+            weight = (1 + unlike / 18) ** -2 / (variance[other] + rough[other] * distance2)
             information, total = information + weight, total + weight * level[other]
-        out[row, column] = total / information
-        doubt[row, column] = 0.7 * variance[row, column] + 0.3 / information
-    return out, doubt
+        out[row, column], left[row, column] = total / information, 1 / information
+    return out, left
+
+
+def regularised(level, variance, moving, difference):
+    """K12, of whole images: L and its variance."""
+    out, left = averaged(level, variance, moving, np.full(level.shape, difference**2))
+    return out, 0.7 * variance + 0.3 * left
+
+
+def roughness(level, variance, surface, usual):
+    """K12: the variance by which pixels one apart differ on a surface and beside it. Of a sensor of one part."""
+    more, sure = 6 / usual, 6 / usual**2
+    for one in np.ndindex(level.shape):
+        for down, right in ((0, 1), (1, -1), (1, 0), (1, 1)):
+            two = one[0] + down, one[1] + right
+            if two not in set(np.ndindex(level.shape)) or not (surface[one] or surface[two]):
+                continue
+            distance2, noise = down**2 + right**2, variance[one] + variance[two]
+            expected = noise + usual * distance2
+            square = min((level[one] - level[two]) ** 2, 4 * expected)
+            more += distance2 * (square - 0.7 * noise) / expected**2
+            sure += distance2**2 / expected**2
+    found = np.clip(more / sure, 0.01 * usual, 1.25**2 * usual)
+    rough = np.full(level.shape, usual)
+    for row, column in zip(*np.nonzero(surface), strict=True):
+        rough[max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3] = (found + usual) / 2
+    rough[surface] = found
+    return rough
+
+
+def smoothed_surfaces(level, variance, surface, difference):
+    """K12, of whole images: L and its variance on surfaces that no frame around measures."""
+    rough = roughness(level, variance, surface, difference**2)
+    near, left = averaged(level, variance, surface, rough)
+    far, independent = averaged(near, left, surface, 20 * rough, apart=2)
+    return far, 0.7 * variance + 0.3 * independent
 
 
 def steps(rows, columns):

@@ -110,7 +110,16 @@ def test_engine_agrees_with_the_oracle(name, data):
         given = total
         if chosen.filter.neighbours > 0:
             known, told = total + 1.6 * hidden[0, i], total  # before neighbours are heard
-            value, total = naive.regularised(value, known, moving[i], chosen.filter.neighbours)
+            raised = value
+            value, total = naive.regularised(raised, known, moving[i], chosen.filter.neighbours)
+            surface = np.zeros(unshown.shape, bool)
+            for place, pixel in pixels.items():
+                surface[place] = naive.is_unmeasured(pixel, t) and not unshown[place]
+            if surface.any():
+                smooth = naive.smoothed_surfaces(raised, known, surface, chosen.filter.neighbours)
+                value, total = (
+                    np.where(surface, *planes) for planes in zip(smooth, (value, total), strict=True)
+                )
             total = np.where(unshown, known, total)
             given, left = hidden[1, i].copy(), total / known
             for place, pixel in pixels.items():

@@ -223,6 +223,7 @@ def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) ->
         difference=view.neighbours,
         pitch=1 if view.mosaic is None else 2,  # to neighbours of the same colour
         unshown=None if unshown is None else unshown.pixels,
+        surface=_surface(estimate),
         with_variance=needs_averaged,
     )
     if unshown is not None:
@@ -256,6 +257,15 @@ def _misses_some(estimate: Estimate) -> bool:
     """Whether there are pixels that neither frame around is known to measure."""
     around, unmeasured = estimate.around, estimate.unmeasured
     return around is not None and unmeasured is not None and around.misses_some(unmeasured)
+
+
+def _surface(estimate: Estimate) -> NDArray[np.int64] | None:
+    """(N,) pixels that neither frame around measures, but another one has shown; None: not known."""
+    if estimate.unmeasured is None or estimate.unshown is None:
+        return estimate.unmeasured
+    bounded = np.zeros(estimate.log_intensity.size, np.bool_)
+    bounded[estimate.unshown.pixels] = True
+    return estimate.unmeasured[~bounded[estimate.unmeasured]]
 
 
 def _infinite(shape: tuple[int, ...]) -> NDArray[np.float32]:

@@ -280,8 +280,8 @@ def test_a_bound_is_too_high_by_what_it_is_above_the_frames_at_most():
 
 _SUMS = """
 import numpy as np
-from kalux.augmentation.highlights import _weighted_sums
-print(_weighted_sums(np.random.default_rng(0).random((90, 160))).tobytes().hex())
+from kalux.augmentation.parts import weighted_sums
+print(weighted_sums(np.random.default_rng(0).random((90, 160))).tobytes().hex())
 """
 
 

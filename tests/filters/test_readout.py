@@ -249,3 +249,32 @@ def test_images_are_the_oracles(shape, moves, pitch, gain):
     np.testing.assert_allclose(found[1], total, rtol=1e-5)
     np.testing.assert_allclose(found[0], expected, rtol=1e-5, atol=1e-6)
     assert (value > prior.white).sum() > 2
+
+
+@pytest.mark.parametrize(("step", "share"), [(0.0, 0.9), (1.5, 1.0)])
+def test_surfaces_that_no_frame_measures_are_smooth_and_their_edges_stay(step, share):
+    """K12: neighbours count, and those twice as far away, where they differ by their noise alone."""
+    rng = np.random.default_rng(3)
+    truth = 0.5 + step * (np.arange(40) >= 20) * np.ones((30, 1))
+    noisy, variance = truth + rng.normal(0.0, 0.2, truth.shape), np.full(truth.shape, 0.04)
+    everywhere, pixels = np.ones(truth.shape, bool), np.arange(truth.size)
+    usual, even = (
+        np.log(read_out(noisy, variance, 0.0, OFF, moving=everywhere, difference=0.2, surface=surface)[0])
+        for surface in (None, pixels)
+    )
+    assert (even - truth).std() < share * (usual - truth).std()
+    np.testing.assert_allclose(np.diff(even, axis=1)[:, 19].mean(), step, atol=0.2)
+
+
+def test_surfaces_are_the_oracles():
+    """K12 of surfaces, pixel by pixel, among moving and still pixels that frames measure."""
+    rng = np.random.default_rng(4)
+    level, variance = rng.normal(-1.0, 0.3, (8, 8)), np.exp(rng.normal(-3.0, 1.0, (8, 8)))
+    moving, surface = rng.random((2, 8, 8)) < 0.5
+    read = {"moving": moving | surface, "difference": 0.2}
+    image, left, _ = read_out(level, variance, 0.0, OFF, **read, surface=np.flatnonzero(surface))
+    expected, doubt = naive.smoothed_surfaces(level, variance, surface, 0.2)
+    np.testing.assert_allclose(np.log(image)[surface], expected[surface], atol=1e-5)
+    np.testing.assert_allclose(left[surface], doubt[surface], rtol=1e-4)
+    others = read_out(level, variance, 0.0, OFF, **read)[0]
+    np.testing.assert_array_equal(image[~surface], others[~surface])

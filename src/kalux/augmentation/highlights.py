@@ -9,7 +9,6 @@ for every part of the image, since a window is brighter than the floor that it l
 
 from __future__ import annotations
 
-import functools
 from typing import Any, Final, NamedTuple
 
 import cv2
@@ -17,16 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.bridge import MASKED, UNMEASURED, BridgedSegment, Latent, Revealed, UnshownMemory
-from kalux.compiled import larger, loop, smaller
+from kalux.augmentation.parts import PART, interpolated, part_sums, weighted_area, weighted_sums
+from kalux.compiled import larger, loop
 
 Floats = NDArray[np.floating[Any]]
-
-_PART: Final = 8
-"""Side of the parts of the image for which distances are collected, pixels."""
-
-_RANGE: Final = 8.0
-"""Standard deviation, pixels, of the normal weights by which parts count for each other. 4, 8 and 12 explain the excess
-of clipped pixels of 48 simulated scenes equally well."""
 
 _NEAR: Final = 0.2
 """Log intensity below white up to which a pixel counts as just below it: levels of 0.8 to 0.98."""
@@ -122,7 +115,7 @@ def begin_unshown(first: Latent, highlights: FrameHighlights, tail: Tail) -> Uns
     """The pixels that the first frame clips, and what it makes expect of them."""
     pixels = np.flatnonzero((first.variance >= UNMEASURED) & (first.variance < MASKED))
     bound = first.value.reshape(-1)[pixels].astype(np.float32)
-    parts = tuple(-(-side // _PART) for side in first.value.shape)
+    parts = tuple(-(-side // PART) for side in first.value.shape)
     revealed = Revealed(np.zeros(parts), np.zeros(parts), np.zeros(parts), 0.0, 0.0)
     near, clipped = _counts(highlights)
     excess = excess_from_surroundings(highlights, pixels, near / max(clipped, 1), tail)
@@ -204,17 +197,17 @@ def excess_from_surroundings(
     """
     distance, rim, hardness = _borders(highlights)
     of_parts = (
-        _weighted_sums(_part_sums(plane))
+        weighted_sums(part_sums(plane))
         for plane in (highlights.clipped, highlights.just_below, rim, hardness)
     )
     clipped, below, rims, hard = of_parts
-    area = _weighted_area(highlights.darker.shape)
+    area = weighted_area(highlights.darker.shape)
     scale = _NEAR * (clipped + _WHOLE * area) / (below + (_WHOLE * near + _LEAST) * area)
     hard = np.where(rims > 0.0, hard / np.maximum(rims, 1e-300), 1.0)
     level = tail.most * -np.expm1(-tail.share * scale / tail.most) * hard
     inside = -np.expm1(-distance.reshape(-1)[pixels])
     excess: NDArray[np.float32] = (
-        _interpolated(level.astype(np.float32), pixels, highlights.darker.shape[1]) * inside
+        interpolated(level.astype(np.float32), pixels, highlights.darker.shape[1]) * inside
     )
     return excess
 
@@ -256,7 +249,7 @@ def _with_revealed(
     """
     known, shape = memory.revealed, memory.revealed.excess.shape
     row, column = np.divmod(memory.pixels[left], memory.shape[1])
-    part = row // _PART * shape[1] + column // _PART
+    part = row // PART * shape[1] + column // PART
 
     def more(weights: Floats | None) -> Floats:
         sums: Floats = np.bincount(part, weights, known.excess.size).reshape(shape).astype(np.float64)
@@ -281,13 +274,13 @@ def _corrected(
     """
     certainty = revealed.moved_expected / (revealed.moved_expected + _PRIOR_OF_ALL)
     scale = ((revealed.moved_excess + _PRIOR_EXCESS) / (revealed.moved_expected + _PRIOR_EXCESS)) ** certainty
-    found, expected, count = (_weighted_sums(values) for values in revealed[:3])
+    found, expected, count = (weighted_sums(values) for values in revealed[:3])
     expected *= scale
     factor = (found + _PRIOR_EXCESS) / (expected + _PRIOR_EXCESS)
     surplus = np.maximum(found - expected, 0.0) / (count + _PRIOR_PIXELS)
     unknown = _UNKNOWN_SCALE**2 * _PRIOR_EXCESS / (expected + _PRIOR_EXCESS)
     times, plus, left = (
-        _interpolated(values.astype(np.float32), pixels, width) for values in (factor, surplus, unknown)
+        interpolated(values.astype(np.float32), pixels, width) for values in (factor, surplus, unknown)
     )
     scaled = np.float32(scale) * excess
     return np.minimum(times * scaled, scaled + plus), left * scaled**2
@@ -327,66 +320,3 @@ def above_frames(segment: BridgedSegment, pixels: NDArray[np.int64], bound: Floa
     if segment.floor is not None:
         least = np.maximum(least, segment.floor.reshape(-1)[pixels])
     return np.maximum(bound - least, 0.0)
-
-
-def _interpolated(parts: NDArray[np.float32], pixels: NDArray[np.int64], width: int) -> NDArray[np.float32]:
-    """(N,) values of the ``parts`` at pixels, interpolated linearly between the middles of the parts."""
-    values = np.empty(len(pixels), np.float32)
-    _at_pixels(pixels, width, parts, values)
-    return values
-
-
-@loop
-def _at_pixels(pixels, width, parts, values):  # type: ignore[no-untyped-def]
-    one, zero = np.float32(1.0), np.float32(0.0)
-    last_row, last_column = parts.shape[0] - 1, parts.shape[1] - 1
-    for i in range(len(pixels)):
-        row, column = divmod(pixels[i], width)
-        y = larger((np.float32(row) + np.float32(0.5)) / np.float32(_PART) - np.float32(0.5), zero)
-        x = larger((np.float32(column) + np.float32(0.5)) / np.float32(_PART) - np.float32(0.5), zero)
-        top, left = smaller(np.int64(y), last_row), smaller(np.int64(x), last_column)
-        below, beside = smaller(top + 1, last_row), smaller(left + 1, last_column)
-        down, right = y - np.float32(top), x - np.float32(left)
-        upper = parts[top, left] * (one - right) + parts[top, beside] * right
-        lower = parts[below, left] * (one - right) + parts[below, beside] * right
-        values[i] = upper * (one - down) + lower * down
-
-
-def _part_sums(values: NDArray[Any]) -> Floats:
-    """Sums over the pixels of every part."""
-    height, width = values.shape
-    below, right = -height % _PART, -width % _PART
-    plane: NDArray[Any] = values.astype(np.float32, copy=False)
-    if below or right:
-        plane = cv2.copyMakeBorder(plane, 0, below, 0, right, cv2.BORDER_CONSTANT, value=0.0)
-    size = (plane.shape[1] // _PART, plane.shape[0] // _PART)
-    means = cv2.resize(plane, size, interpolation=cv2.INTER_AREA)
-    return np.asarray(means, np.float64) * (_PART * _PART)
-
-
-@functools.cache
-def _weighted_area(shape: tuple[int, int]) -> Floats:
-    """Weighted number of pixels around every part. Not to be changed, since it is cached."""
-    return _weighted_sums(_part_sums(np.ones(shape, np.float32)))
-
-
-def _weighted_sums(parts: Floats) -> Floats:
-    """For every part, the sum over all parts, weighted by their nearness.
-
-    Not as a product of matrices: the last bits of BLAS depend on the number of threads.
-    """
-    below, beside = (_weights(n) for n in parts.shape)
-    near = cv2.sepFilter2D(parts, cv2.CV_64F, beside, below, borderType=cv2.BORDER_CONSTANT)
-    return np.asarray(near, np.float64)
-
-
-@functools.cache
-def _weights(parts: int) -> Floats:
-    """Weights of the parts on both sides of one, along an axis of so many ``parts``.
-
-    The farthest are those whose weights double precision tells from 0.
-    """
-    reach = min(parts, 39)
-    distance = _PART * np.arange(1 - reach, reach)
-    nearness: Floats = np.exp(-0.5 * (distance / _RANGE) ** 2)
-    return nearness

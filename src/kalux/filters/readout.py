@@ -27,6 +27,7 @@ from kalux.compiled import (
     word_at,
     zeros,
 )
+from kalux.filters.surfaces import surface_variance
 from kalux.formulas import Number, Row, choose, formula
 
 Array = NDArray[np.floating[Any]]
@@ -34,8 +35,8 @@ Array = NDArray[np.floating[Any]]
 _UNKNOWN: Final = np.float32(1e9)
 """Variance of a pixel without information. The product of four sums of two such variances is finite in float32."""
 
-_LEAST_VARIANCE: Final = np.float32(1e-9)
-"""Least value that is added to a variance, so that the inverse of such a product is finite as well."""
+_LEAST_ALLOWED: Final = np.float32(8e-9)
+"""Least variance by which neighbours differ, so that the inverse of such a product is finite as well."""
 
 _BLOCK: Final = 32
 """Pixels of a row in a block: blocks without highlights, or without moving pixels, are skipped."""
@@ -65,6 +66,10 @@ bandwidth that are common to all pixels, need more (docs/equations.md, K12)."""
 _SLACK: Final = np.float32(1 / 8)
 """Part of the variance of neighbours' differences by which patches of one surface differ beyond their noise."""
 
+_FARTHER: Final = np.float32(20.0)
+"""By how much more neighbours on one surface differ twice as far away than in proportion to their squared distance: it
+bends. 10 is better for skies and worse for textures (docs/equations.md, K12)."""
+
 _HALF_OF_PATCH: Final = np.float32(1 / 18)
 """Factor from the sum over a patch of nine pixels to half its mean."""
 
@@ -81,6 +86,9 @@ class _Ring(NamedTuple):
     ----------
     states
         (R 2 _ROW,): L and its variance of every row.
+    allowed
+        (R 2 _ROW,): variance by which a pixel differs from one straight beside it, and from one diagonally, on one
+        surface.
     weights
         (R 2 _ROW,): weight of a pixel in the mean of one straight beside it, and of one diagonally, without an edge.
     distances
@@ -99,6 +107,7 @@ class _Ring(NamedTuple):
     """
 
     states: NDArray[np.float32]
+    allowed: NDArray[np.float32]
     weights: NDArray[np.float32]
     distances: NDArray[np.float32]
     similarities: NDArray[np.float32]
@@ -212,6 +221,7 @@ def read_out(
     difference: float = 0.0,
     pitch: int = 1,
     unshown: NDArray[np.int64] | None = None,
+    surface: NDArray[np.int64] | None = None,
     with_variance: bool = True,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """I of a state, and the variance of its logarithm, in one pass over the rows.
@@ -244,6 +254,9 @@ def read_out(
     unshown
         (N,) indices in the flattened image, ascending, of pixels that no frame has measured: their L is returned as
         well, and averaging does not reduce their variance, since their errors (K15) are the same.
+    surface
+        (N,) such indices of pixels that no frame around measures, but one has shown: they are averaged by how rough the
+        surface around them is (`_smooth_surfaces`), whether they move or not.
     with_variance
         Whether to compute the variance; else it is empty.
 
@@ -259,46 +272,95 @@ def read_out(
     height, width = log_intensity.shape
     unshown = np.empty(0, np.int64) if unshown is None else unshown
     levels = np.empty(len(unshown), np.float32)
-    known = variance.astype(np.float32, copy=False)
+    known, level = (plane.astype(np.float32, copy=False) for plane in (variance, log_intensity))
     out = np.empty(log_intensity.shape, np.float32)
     total = np.empty(out.shape if with_variance and moving is not None else (0, 0), np.float32)
     ends = np.searchsorted(unshown, np.arange(height + 1) * width)
     next_unshown = ends[:-1].copy()  # of every row, in strips from left to right
+    difference2 = np.float32(difference * difference)
+    of_silent, of_moving = (np.float32(value) for value in subthreshold)
+    change = known[:0, :0] if moving is None else _plane(silent_change, out.shape)
+    scalars = tuple(np.float32(value) for value in prior), np.float32(log_offset)
     given = (
-        log_intensity.astype(np.float32, copy=False),
+        level,
         known,
         np.empty((0, 0), np.bool_) if moving is None else moving,
-        known[:0, :0] if moving is None else _plane(silent_change, out.shape),
-        tuple(np.float32(value) for value in subthreshold),
-        np.float32(difference * difference),
+        change,
+        (of_silent, of_moving),
+        difference > 0,
         pitch,
-        tuple(np.float32(value) for value in prior),
-        np.float32(log_offset),
+        *scalars,
         unshown,
         ends,
     )
     for begin in range(0, width, _STRIP):
-        ring = _ring(0 if moving is None else pitch)
+        ring = _ring(0 if moving is None else pitch, difference2)
         _read_out(*given, next_unshown, begin, ring, out, total, levels)
+    if moving is not None and difference > 0 and surface is not None and len(surface):
+        doubt = known + np.where(moving, of_moving, of_silent * change)
+        smoothed = _smooth_surfaces(level, np.minimum(doubt, _UNKNOWN), surface, difference2, pitch)
+        _read_pixels(*smoothed, surface, *scalars, out.reshape(-1), total.reshape(-1))
     return out, known if with_variance and moving is None else total, levels
 
 
-def _ring(pitch: int) -> _Ring:
+def _smooth_surfaces(
+    level: NDArray[np.float32],
+    variance: NDArray[np.float32],
+    pixels: NDArray[np.int64],
+    usual: np.float32,
+    pitch: int,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """(N,) L of ``pixels`` and its variance, averaged by how rough the surface around them is.
+
+    They are averaged with their eight neighbours, and then with those twice as far away.
+    """
+    surface = np.zeros(level.shape, np.bool_)
+    surface.reshape(-1)[pixels] = True
+    rough = surface_variance(level, variance, surface, pixels, usual, pitch)
+    near, left = _averaged(level, variance, rough, surface, pitch, pitch)
+    far, independent = (
+        plane.reshape(-1)[pixels]
+        for plane in _averaged(near, left, _FARTHER * rough, surface, 2 * pitch, pitch)
+    )
+    return far, CORRELATED * variance.reshape(-1)[pixels] + (ONE - CORRELATED) * independent
+
+
+def _averaged(
+    level: NDArray[np.float32],
+    variance: NDArray[np.float32],
+    allowed: NDArray[np.float32],
+    hears: NDArray[np.bool_],
+    pitch: int,
+    patch: int,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """L and its variance, if errors were independent, after averaging of the pixels of ``hears``.
+
+    Neighbours are ``pitch`` apart, the pixels of the patches around them ``patch``.
+    """
+    out, left = level.copy(), variance.copy()
+    for begin in range(0, level.shape[1], _STRIP):
+        _average_planes(level, variance, allowed, hears, pitch, patch, begin, _ring(pitch, ONE), out, left)
+    return out, left
+
+
+def _ring(pitch: int, difference2: np.float32) -> _Ring:
     """Empty buffers, as before the first row of a strip."""
     # A row's neighbours, and the patches around them, reach two pitches ahead and one behind; moving pixels are marked
     # one pitch further ahead.
     count = 4 * pitch + 1
-    rows = 0, 2 * count, 4 * count, 8 * count, 12 * count, 12 * count + 4, 12 * count + 6
+    rows = 0, 2 * count, 4 * count, 6 * count, 10 * count, 14 * count, 14 * count + 4, 14 * count + 6
     buffer = memory.empty((rows[-1] * _ROW,))  # aligned, so that all rows begin with a cache line
     buffer[:] = 0.0
-    states, weights, distances, similarities, differences, averaged = (
+    states, allowed, weights, distances, similarities, differences, averaged = (
         buffer[begin * _ROW : end * _ROW] for begin, end in itertools.pairwise(rows)
     )
     states.reshape(count, 2, _ROW)[:, 1] = _UNKNOWN
+    near = np.float32(difference2) * np.float32(pitch * pitch)
+    allowed.reshape(count, 2, _ROW)[:] = np.maximum([[near], [2 * near]], _LEAST_ALLOWED)
     spans = np.empty((count, 2), np.int64)
     spans[:] = _STRIP, 0
     moving = np.zeros((count, _STRIP), np.uint8)
-    return _Ring(states, weights, distances, similarities, moving, spans, differences, averaged)
+    return _Ring(states, allowed, weights, distances, similarities, moving, spans, differences, averaged)
 
 
 def _plane(values: Array | None, shape: tuple[int, ...]) -> NDArray[np.float32]:
@@ -319,7 +381,7 @@ def _read_out(  # type: ignore[no-untyped-def]
     moving,
     change,
     subthreshold,
-    allowed,
+    averages,
     pitch,
     prior,
     log_offset,
@@ -334,8 +396,8 @@ def _read_out(  # type: ignore[no-untyped-def]
 ):
     """Fill ``out``, ``total`` and ``levels`` in the columns of the strip that begins with ``begin``.
 
-    ``allowed`` is the variance of the difference of pixels one apart, ``ends`` how many of the ``unshown`` pixels lie
-    before each row, ``next_unshown`` how many before the strip's.
+    ``averages`` tells whether moving pixels are averaged, ``ends`` how many of the ``unshown`` pixels lie before each
+    row, ``next_unshown`` how many before the strip's.
 
     The state of a row is loaded two pitches before it is read out, since the patches around neighbours reach so far,
     and its moving pixels are marked three pitches before. Rows before the first one only load what is ahead.
@@ -343,8 +405,9 @@ def _read_out(  # type: ignore[no-untyped-def]
     white, scale2, _, _ = prior
     height, width = log_intensity.shape
     knows_moving = moving.size > 0
-    averages = knows_moving and allowed > np.float32(0.0)
-    states, weights, distances, similarities = ring.states, ring.weights, ring.distances, ring.similarities
+    averages = knows_moving and averages
+    states, allowed, weights = ring.states, ring.allowed, ring.weights
+    distances, similarities = ring.distances, ring.similarities
     differences, averaged, marked, spans = ring.differences, ring.averaged, ring.moving, ring.spans
     count = len(spans)
     level, left = zeros(_STRIP, np.float32), zeros(_STRIP, np.float32)
@@ -370,7 +433,7 @@ def _read_out(  # type: ignore[no-untyped-def]
                 first, last = smaller(first, spans[place, 0]), larger(last, spans[place, 1])
         if first < last and row + pitch >= 0:
             _compare_row(
-                row, first, last, allowed, pitch, states, weights, distances, similarities, differences
+                row, first, last, pitch, pitch, states, allowed, weights, distances, similarities, differences
             )
         if row < 0:
             continue
@@ -409,6 +472,79 @@ def _read_out(  # type: ignore[no-untyped-def]
                 total[at, start + i] = left[i]
         if has_highlights:
             _shrink_highlights(level, left, at, start, bright, prior, log_offset, places, excess, doubt, out)
+
+
+@loop(fastmath=FUSED)
+def _average_planes(level, variance, allowed, hears, pitch, patch, begin, ring, out, left):  # type: ignore[no-untyped-def]
+    """K12 of the pixels of ``hears`` in the columns of the strip that begins with ``begin``: `_averaged`."""
+    states, weights, distances, similarities = ring.states, ring.weights, ring.distances, ring.similarities
+    differences, averaged, marked, spans = ring.differences, ring.averaged, ring.moving, ring.spans
+    height, count = level.shape[0], len(spans)
+    heard = zeros(_STRIP, np.float32)
+    for row in range(-3 * pitch, height):
+        _load_surface(level, variance, allowed, row + 2 * pitch, begin, pitch, count, states, ring.allowed)
+        _mark_moving(hears, row + 3 * pitch, begin, marked, spans)
+        first, last = np.int64(_STRIP), np.int64(0)
+        for place in range(count):
+            first, last = smaller(first, spans[place, 0]), larger(last, spans[place, 1])
+        if first >= last or row + pitch < 0:
+            continue
+        _compare_row(
+            row,
+            first,
+            last,
+            pitch,
+            patch,
+            states,
+            ring.allowed,
+            weights,
+            distances,
+            similarities,
+            differences,
+        )
+        if row < 0:
+            continue
+        _average_row(row, first, last, pitch, states, weights, similarities, marked, averaged, heard)
+        for column in range(first, smaller(last, level.shape[1] - begin)):
+            if marked[row % count, column]:
+                out[row, begin + column] = averaged[_MARGIN + column]
+                left[row, begin + column] = averaged[_ROW + _MARGIN + column]
+
+
+@loop
+def _read_pixels(level, left, pixels, prior, log_offset, out, total):  # type: ignore[no-untyped-def]
+    """I of single pixels, and its variance where that is wanted, from L and what is left of its variance."""
+    white, scale2, stretch, gain = prior
+    for i in range(len(pixels)):
+        pixel, value = pixels[i], level[i]
+        if scale2 > np.float32(0.0) and value > white:
+            value = white + believed_highlight(value - white, left[i], scale2, stretch, gain)
+        out[pixel] = larger(exponential(value) - log_offset, np.float32(0.0))
+        if len(total) > 0:
+            total[pixel] = left[i]
+
+
+@nb.njit(cache=True, inline="always")
+def _load_surface(level, variance, allowed, row, begin, pitch, count, states, rough):  # type: ignore[no-untyped-def]
+    """Load L of a row, its variance, and by how much its pixels differ from neighbours on one surface."""
+    height, width = level.shape
+    if row < 0:
+        return
+    place = np.uint64(row % count) * np.uint64(2 * _ROW)
+    if row >= height:
+        for i in range(np.uint64(_ROW)):
+            states[place + _VARIANCE + i] = _UNKNOWN
+        return
+    first = larger(begin - _MARGIN, 0)
+    size = np.uint64(smaller(begin + _STRIP + _MARGIN, width) - first)
+    at, start, into = np.uint64(row), np.uint64(first), place + np.uint64(first - begin + _MARGIN)
+    for i in range(size):
+        states[into + _LEVEL + i] = level[at, start + i]
+        states[into + _VARIANCE + i] = variance[at, start + i]
+    for i in range(size):
+        near = larger(allowed[at, start + i] * np.float32(pitch * pitch), _LEAST_ALLOWED)
+        rough[into + _STRAIGHT + i] = near
+        rough[into + _DIAGONAL + i] = near + near
 
 
 @nb.njit(cache=True, inline="always")
@@ -467,11 +603,10 @@ def _mark_moving(moving, row, begin, marked, spans):  # type: ignore[no-untyped-
 @formula()
 def _compare_pixels(
     states: Row,
+    allowed: Row,
     own: Number,
     other: Number,
     step: Number,
-    near_slack: Number,
-    far_slack: Number,
     differences: Row,
     into: Number,
 ) -> None:
@@ -481,6 +616,7 @@ def _compare_pixels(
     left_under = states[other + _LEVEL - step] - level
     straight_under = states[other + _LEVEL] - level
     right_under = states[other + _LEVEL + step] - level
+    near_slack, far_slack = allowed[own + _STRAIGHT] * _SLACK, allowed[own + _DIAGONAL] * _SLACK
     a = variance + states[own + _VARIANCE + step] + near_slack
     b = variance + states[other + _VARIANCE - step] + far_slack
     c = variance + states[other + _VARIANCE] + near_slack
@@ -495,9 +631,9 @@ def _compare_pixels(
 
 
 @formula()
-def _weigh_pixel(states: Row, own: Number, near: Number, far: Number, weights: Row) -> None:
+def _weigh_pixel(states: Row, allowed: Row, own: Number, weights: Row) -> None:
     """Weights of a pixel in the means of its neighbours, 1 / (P' + s^2), where there is no edge."""
-    a, b = states[own + _VARIANCE] + near, states[own + _VARIANCE] + far
+    a, b = (states[own + _VARIANCE] + allowed[own + place] for place in (_STRAIGHT, _DIAGONAL))
     inverse = ONE / (a * b)
     weights[own + _STRAIGHT] = b * inverse
     weights[own + _DIAGONAL] = a * inverse
@@ -521,35 +657,33 @@ def _compare_patches(distances: Row, before: Number, own: Number, after: Number,
 
 @nb.njit(cache=True, inline="always")
 def _compare_row(  # type: ignore[no-untyped-def]
-    row, first, last, allowed, pitch, states, weights, distances, similarities, differences
+    row, first, last, pitch, patch, states, allowed, weights, distances, similarities, differences
 ):
     """Similarities of a row's pixels to their four neighbours in `_Ring`, for columns ``first`` to ``last``.
 
-    Patches reach into the next row: that is compared first.
+    Patches are of pixels ``patch`` apart, and reach into the row so far below: that is compared first.
     """
     count = 4 * pitch + 1
     above, here, below, under = (
-        np.uint64((row - pitch) % count),
+        np.uint64((row - patch) % count),
         np.uint64(row % count),
-        np.uint64((row + pitch) % count),
-        np.uint64((row + 2 * pitch) % count),
+        np.uint64((row + patch) % count),
+        np.uint64((row + patch + pitch) % count),
     )
-    size, step = np.uint64(last - first + 2 * _ASIDE), np.uint64(pitch)
+    size, step, aside = np.uint64(last - first + 2 * _ASIDE), np.uint64(pitch), np.uint64(patch)
     begin = np.uint64(_MARGIN - _ASIDE + first)
-    near, far = allowed * np.float32(pitch * pitch), allowed * np.float32(2 * pitch * pitch)
-    near_slack, far_slack = larger(near * _SLACK, _LEAST_VARIANCE), larger(far * _SLACK, _LEAST_VARIANCE)
-    near, far = larger(near, _LEAST_VARIANCE), larger(far, _LEAST_VARIANCE)
     own, other = below * _TWO + begin, under * _TWO + begin
+    ahead = np.uint64((row + pitch) % count) * _TWO + begin
     for i in range(size):
-        _compare_pixels(states, own + i, other + i, step, near_slack, far_slack, differences, begin + i)
+        _compare_pixels(states, allowed, own + i, other + i, step, differences, begin + i)
     for i in range(size):
-        _weigh_pixel(states, own + i, near, far, weights)
+        _weigh_pixel(states, allowed, ahead + i, weights)
     into = below * _FOUR + begin
     for k in range(np.uint64(4)):
         start = begin + k * _ONE
         for i in range(size):
             distances[into + k * _ONE + i] = (
-                differences[start - step + i] + differences[start + i] + differences[start + step + i]
+                differences[start - aside + i] + differences[start + i] + differences[start + aside + i]
             )
     before, own = above * _FOUR + begin, here * _FOUR + begin
     for i in range(size):
@@ -570,7 +704,7 @@ def _average(
     averaged: Row,
     into: Number,
 ) -> None:
-    """K12 of a pixel: the weighted mean of itself and its eight neighbours, and its variance."""
+    """K12 of a pixel: the weighted mean of it and its eight neighbours, and its variance if errors were independent."""
     value, variance = states[own + _LEVEL], states[own + _VARIANCE]
     information, deviation = None, None
     for onward, back, ahead, behind, distance in (
@@ -586,7 +720,7 @@ def _average(
         information = there + back_there if information is None else information + (there + back_there)
     independent = variance / (ONE + variance * information)  # 1 / (1 / variance + information)
     averaged[into] = value + deviation * independent
-    averaged[into + _ONE] = CORRELATED * variance + (ONE - CORRELATED) * independent
+    averaged[into + _ONE] = independent
 
 
 @nb.njit(cache=True, inline="always")
@@ -628,7 +762,8 @@ def _take_averaged_variance(row, first, last, ring, left):  # type: ignore[no-un
     """``left``, the variances of a row, after averaging of the moving pixels."""
     here, column, two = np.uint64(row % len(ring.spans)), np.uint64(first), np.uint64(_ROW + _MARGIN + first)
     for i in range(np.uint64(last - first)):
-        alone, together = left[column + i], ring.averaged[two + i]
+        alone = left[column + i]
+        together = CORRELATED * alone + (ONE - CORRELATED) * ring.averaged[two + i]
         left[column + i] = together if ring.moving[here, column + i] else alone
 
 

@@ -1,0 +1,84 @@
+"""Parts of an image, squares of 8x8 pixels, over which what is rare is summed; they count for each other if near."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux.compiled import larger, loop, smaller
+
+Floats = NDArray[np.floating[Any]]
+
+PART: Final = 8
+"""Side of the parts, pixels."""
+
+_RANGE: Final = 8.0
+"""Standard deviation, pixels, of the normal weights by which parts count for each other. 4, 8 and 12 explain the excess
+of clipped pixels of 48 simulated scenes equally well."""
+
+
+def interpolated(parts: NDArray[np.float32], pixels: NDArray[np.int64], width: int) -> NDArray[np.float32]:
+    """(N,) values of the ``parts`` at pixels, interpolated linearly between the middles of the parts."""
+    values = np.empty(len(pixels), np.float32)
+    _at_pixels(pixels, width, parts, values)
+    return values
+
+
+@loop
+def _at_pixels(pixels, width, parts, values):  # type: ignore[no-untyped-def]
+    one, zero = np.float32(1.0), np.float32(0.0)
+    last_row, last_column = parts.shape[0] - 1, parts.shape[1] - 1
+    for i in range(len(pixels)):
+        row, column = divmod(pixels[i], width)
+        y = larger((np.float32(row) + np.float32(0.5)) / np.float32(PART) - np.float32(0.5), zero)
+        x = larger((np.float32(column) + np.float32(0.5)) / np.float32(PART) - np.float32(0.5), zero)
+        top, left = smaller(np.int64(y), last_row), smaller(np.int64(x), last_column)
+        below, beside = smaller(top + 1, last_row), smaller(left + 1, last_column)
+        down, right = y - np.float32(top), x - np.float32(left)
+        upper = parts[top, left] * (one - right) + parts[top, beside] * right
+        lower = parts[below, left] * (one - right) + parts[below, beside] * right
+        values[i] = upper * (one - down) + lower * down
+
+
+def part_sums(values: NDArray[Any]) -> Floats:
+    """Sums over the pixels of every part."""
+    height, width = values.shape
+    below, right = -height % PART, -width % PART
+    plane: NDArray[Any] = values.astype(np.float32, copy=False)
+    if below or right:
+        plane = cv2.copyMakeBorder(plane, 0, below, 0, right, cv2.BORDER_CONSTANT, value=0.0)
+    size = (plane.shape[1] // PART, plane.shape[0] // PART)
+    means = cv2.resize(plane, size, interpolation=cv2.INTER_AREA)
+    return np.asarray(means, np.float64) * (PART * PART)
+
+
+@functools.cache
+def weighted_area(shape: tuple[int, int]) -> Floats:
+    """Weighted number of pixels around every part. Not to be changed, since it is cached."""
+    return weighted_sums(part_sums(np.ones(shape, np.float32)))
+
+
+def weighted_sums(parts: Floats) -> Floats:
+    """For every part, the sum over all parts, weighted by their nearness.
+
+    Not as a product of matrices: the last bits of BLAS depend on the number of threads.
+    """
+    below, beside = (_weights(n) for n in parts.shape)
+    near = cv2.sepFilter2D(parts, cv2.CV_64F, beside, below, borderType=cv2.BORDER_CONSTANT)
+    return np.asarray(near, np.float64)
+
+
+@functools.cache
+def _weights(parts: int) -> Floats:
+    """Weights of the parts on both sides of one, along an axis of so many ``parts``.
+
+    The farthest are those whose weights double precision tells from 0.
+    """
+    reach = min(parts, 39)
+    distance = PART * np.arange(1 - reach, reach)
+    nearness: Floats = np.exp(-0.5 * (distance / _RANGE) ** 2)
+    return nearness

@@ -1,0 +1,100 @@
+"""How rough surfaces are that no frame around an image measures (docs/equations.md, K12)."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux.augmentation.parts import PART, interpolated, weighted_sums
+from kalux.compiled import loop, smaller
+
+_INDEPENDENT: Final = np.float32(0.7)
+"""Part of the variances of two neighbours that is in their difference: their errors have correlations of 0.1 to 0.5."""
+
+_EDGE: Final = np.float32(4.0)
+"""Squared differences count up to this many times their usual expectation: beyond, there is an edge between."""
+
+_PRIOR_PAIRS: Final = 6.0
+"""Pairs of pixels, one apart and exactly known, as which the usual roughness counts."""
+
+_LEAST: Final = 0.1
+_MOST: Final = 1.25
+"""Least and most standard deviation of neighbours' differences, in units of the usual one: of no surface is it known
+that it is even, and what differs by more is seldom texture."""
+
+
+def surface_variance(
+    level: NDArray[np.float32],
+    variance: NDArray[np.float32],
+    surface: NDArray[np.bool_],
+    pixels: NDArray[np.int64],
+    usual: np.float32,
+    pitch: int,
+) -> NDArray[np.float32]:
+    """Variance by which neighbours one apart differ on the surface around each pixel.
+
+    It is what the squared differences of neighbours, of which at least one is on the surface, are more than the
+    variances explain: their mean, weighted by how much each tells, over the parts of the image around.
+
+    Parameters
+    ----------
+    level, variance
+        (H, W) L and its variance.
+    surface
+        (H, W): the pixels.
+    pixels
+        (N,) the same, as indices in the flattened image, ascending.
+    usual
+        What it is where nothing else is known, log intensity^2.
+    pitch
+        Distance of the neighbours, pixels.
+
+    Returns
+    -------
+    (H, W) float32, log intensity^2. Of pixels beside the surface it is half-way to what it is usually, which it is
+    elsewhere.
+    """
+    height, width = level.shape
+    shape = -(-height // PART), -(-width // PART)
+    excess, certainty = np.zeros(shape), np.zeros(shape)
+    _compare_neighbours(level, variance, surface, pixels, usual, pitch, excess, certainty)
+    prior = _PRIOR_PAIRS / float(usual) ** 2
+    found = (weighted_sums(excess) + prior * float(usual)) / (weighted_sums(certainty) + prior)
+    limited = np.clip(found, _LEAST**2 * usual, _MOST**2 * usual).astype(np.float32)
+    near = cv2.dilate(surface.view(np.uint8), np.ones((4 * pitch + 1, 4 * pitch + 1), np.uint8))
+    around = np.flatnonzero(near)
+    of_surface = surface.reshape(-1)[around]
+    local = interpolated(limited, around, width)
+    variances = np.full(level.shape, usual, np.float32)
+    variances.reshape(-1)[around] = np.where(of_surface, local, (local + usual) / np.float32(2.0))
+    return variances
+
+
+@loop
+def _compare_neighbours(level, variance, surface, pixels, usual, pitch, excess, certainty):  # type: ignore[no-untyped-def]
+    """Sums over pairs, in every part: by how much squares exceed the noise, and what they would for a variance of 1."""
+    height, width = level.shape
+    for pixel in pixels:
+        row, column = divmod(pixel, width)
+        one, noise = level[row, column], variance[row, column]
+        more, sure = 0.0, 0.0
+        for k in range(9):
+            down, right = k // 3 - 1, k % 3 - 1
+            other, beside = row + down * pitch, column + right * pitch
+            if k == 4 or other < 0 or beside < 0 or other >= height or beside >= width:
+                continue
+            if k < 4 and surface[other, beside]:  # this pair has been counted
+                continue
+            distance2 = np.float32((down * down + right * right) * pitch * pitch)
+            explained = noise + variance[other, beside]
+            expected = explained + usual * distance2
+            difference = level[other, beside] - one
+            square = smaller(difference * difference, _EDGE * expected)
+            weight = distance2 / (expected * expected)
+            more += np.float64(weight * (square - _INDEPENDENT * explained))
+            sure += np.float64(weight * distance2)
+        excess[row // PART, column // PART] += more
+        certainty[row // PART, column // PART] += sure
