@@ -14,6 +14,7 @@ from numba.core import types
 from numpy.typing import NDArray
 
 from kalux import memory
+from kalux.augmentation.parts import PART
 from kalux.compiled import (
     FUSED,
     ONE,
@@ -69,6 +70,10 @@ _SLACK: Final = np.float32(1 / 8)
 _FARTHER: Final = np.float32(20.0)
 """By how much more neighbours on one surface differ twice as far away than in proportion to their squared distance: it
 bends. 10 is better for skies and worse for textures (docs/equations.md, K12)."""
+
+_SURROUNDINGS: Final = 8
+"""Pixels around a surface that its means look at, at most: neighbours twice as far away, and the patches around them,
+in a Bayer mosaic."""
 
 _HALF_OF_PATCH: Final = np.float32(1 / 18)
 """Factor from the sum over a patch of nine pixels to half its mean."""
@@ -297,50 +302,80 @@ def read_out(
         ring = _ring(0 if moving is None else pitch, difference2)
         _read_out(*given, next_unshown, begin, ring, out, total, levels)
     if moving is not None and difference > 0 and surface is not None and len(surface):
-        doubt = known + np.where(moving, of_moving, of_silent * change)
-        smoothed = _smooth_surfaces(level, np.minimum(doubt, _UNKNOWN), surface, difference2, pitch)
+        state = level, known, moving, change
+        smoothed = _smooth_surfaces(state, (of_silent, of_moving), surface, difference2, pitch)
         _read_pixels(*smoothed, surface, *scalars, out.reshape(-1), total.reshape(-1))
     return out, known if with_variance and moving is None else total, levels
 
 
 def _smooth_surfaces(
-    level: NDArray[np.float32],
-    variance: NDArray[np.float32],
+    state: tuple[NDArray[Any], ...],
+    subthreshold: tuple[np.float32, np.float32],
     pixels: NDArray[np.int64],
     usual: np.float32,
     pitch: int,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """(N,) L of ``pixels`` and its variance, averaged by how rough the surface around them is.
 
-    They are averaged with their eight neighbours, and then with those twice as far away.
+    They are averaged with their eight neighbours, and then with those twice as far away. ``state`` holds L, P, what
+    moves, and the change of silent pixels.
     """
-    surface = np.zeros(level.shape, np.bool_)
-    surface.reshape(-1)[pixels] = True
-    rough = surface_variance(level, variance, surface, pixels, usual, pitch)
-    near, left = _averaged(level, variance, rough, surface, pitch, pitch)
-    far, independent = (
-        plane.reshape(-1)[pixels]
-        for plane in _averaged(near, left, _FARTHER * rough, surface, 2 * pitch, pitch)
+    width = state[0].shape[1]
+    rows, columns = _window_around(pixels, state[0].shape)
+    shape = rows.stop - rows.start, columns.stop - columns.start
+    level, variance = memory.empty((2, *shape))
+    _cut_out(
+        *(plane.reshape(-1) for plane in state),
+        *subthreshold,
+        width,
+        rows.start,
+        columns.start,
+        level,
+        variance,
     )
-    return far, CORRELATED * variance.reshape(-1)[pixels] + (ONE - CORRELATED) * independent
+    row, column = np.divmod(pixels, width)
+    inside = (row - rows.start) * shape[1] + column - columns.start
+    surface = np.zeros(shape, np.bool_)
+    surface.reshape(-1)[inside] = True
+    rough = surface_variance(level, variance, surface, inside, usual, pitch)
+    near, left = level.copy(), variance.copy()
+    _average_surface(level, variance, rough, surface, pitch, pitch, near, left)
+    far, independent = memory.empty((2, *shape))  # filled where they are looked at
+    _average_surface(near, left, _FARTHER * rough, surface, 2 * pitch, pitch, far, independent)
+    of_pixels = (plane.reshape(-1)[inside] for plane in (far, variance, independent))
+    averaged, alone, together = of_pixels
+    return averaged, CORRELATED * alone + (ONE - CORRELATED) * together
 
 
-def _averaged(
+def _window_around(pixels: NDArray[np.int64], shape: tuple[int, ...]) -> tuple[slice, slice]:
+    """Rows and columns of whole parts of the image that hold all pixels, and all that their means look at."""
+    row, column = np.divmod(pixels, shape[1])
+    rows, columns = (
+        slice(
+            max((int(at.min()) - _SURROUNDINGS) // PART * PART, 0),
+            min(-(-(int(at.max()) + 1 + _SURROUNDINGS) // PART) * PART, side),
+        )
+        for at, side in zip((row, column), shape, strict=True)
+    )
+    return rows, columns
+
+
+def _average_surface(
     level: NDArray[np.float32],
     variance: NDArray[np.float32],
     allowed: NDArray[np.float32],
-    hears: NDArray[np.bool_],
+    surface: NDArray[np.bool_],
     pitch: int,
     patch: int,
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """L and its variance, if errors were independent, after averaging of the pixels of ``hears``.
+    out: NDArray[np.float32],
+    left: NDArray[np.float32],
+) -> None:
+    """Fill L and its variance, if errors were independent, after averaging, at the pixels of the surface.
 
     Neighbours are ``pitch`` apart, the pixels of the patches around them ``patch``.
     """
-    out, left = level.copy(), variance.copy()
     for begin in range(0, level.shape[1], _STRIP):
-        _average_planes(level, variance, allowed, hears, pitch, patch, begin, _ring(pitch, ONE), out, left)
-    return out, left
+        _average_planes(level, variance, allowed, surface, pitch, patch, begin, _ring(pitch, ONE), out, left)
 
 
 def _ring(pitch: int, difference2: np.float32) -> _Ring:
@@ -476,7 +511,7 @@ def _read_out(  # type: ignore[no-untyped-def]
 
 @loop(fastmath=FUSED)
 def _average_planes(level, variance, allowed, hears, pitch, patch, begin, ring, out, left):  # type: ignore[no-untyped-def]
-    """K12 of the pixels of ``hears`` in the columns of the strip that begins with ``begin``: `_averaged`."""
+    """K12 of the pixels of ``hears`` in the columns of the strip that begins with ``begin``: `_average_surface`."""
     states, weights, distances, similarities = ring.states, ring.weights, ring.distances, ring.similarities
     differences, averaged, marked, spans = ring.differences, ring.averaged, ring.moving, ring.spans
     height, count = level.shape[0], len(spans)
@@ -509,6 +544,21 @@ def _average_planes(level, variance, allowed, hears, pitch, patch, begin, ring, 
             if marked[row % count, column]:
                 out[row, begin + column] = averaged[_MARGIN + column]
                 left[row, begin + column] = averaged[_ROW + _MARGIN + column]
+
+
+@loop
+def _cut_out(  # type: ignore[no-untyped-def]
+    level, known, moving, change, of_silent, of_moving, width, top, left, cut_level, cut_variance
+):
+    """Fill a window of L, and of P with the variance of subthreshold changes."""
+    rows, columns = cut_level.shape
+    for row in range(rows):
+        place = (top + row) * width + left
+        for i in range(columns):
+            at = np.uint64(place + i)
+            doubt = known[at] + (of_moving if moving[at] else of_silent * change[at])
+            cut_level[row, i] = level[at]
+            cut_variance[row, i] = smaller(doubt, _UNKNOWN)
 
 
 @loop

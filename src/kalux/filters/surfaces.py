@@ -65,7 +65,7 @@ def surface_variance(
     found = (weighted_sums(excess) + prior * float(usual)) / (weighted_sums(certainty) + prior)
     limited = np.clip(found, _LEAST**2 * usual, _MOST**2 * usual).astype(np.float32)
     near = cv2.dilate(surface.view(np.uint8), np.ones((4 * pitch + 1, 4 * pitch + 1), np.uint8))
-    around = np.flatnonzero(near)
+    around = np.flatnonzero(near.view(np.bool_))
     of_surface = surface.reshape(-1)[around]
     local = interpolated(limited, around, width)
     variances = np.full(level.shape, usual, np.float32)
