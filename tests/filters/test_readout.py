@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import lambertw
 
+from kalux.filters import readout
 from kalux.filters.readout import (
     HighlightPrior,
     Subthreshold,
@@ -266,11 +267,12 @@ def test_surfaces_that_no_frame_measures_are_smooth_and_their_edges_stay(step, s
     np.testing.assert_allclose(np.diff(even, axis=1)[:, 19].mean(), step, atol=0.2)
 
 
-def test_surfaces_are_the_oracles():
+@pytest.mark.parametrize("shape", [(8, 8), (5, 7)])
+def test_surfaces_are_the_oracles(shape):
     """K12 of surfaces, pixel by pixel, among moving and still pixels that frames measure."""
     rng = np.random.default_rng(4)
-    level, variance = rng.normal(-1.0, 0.3, (8, 8)), np.exp(rng.normal(-3.0, 1.0, (8, 8)))
-    moving, surface = rng.random((2, 8, 8)) < 0.5
+    level, variance = rng.normal(-1.0, 0.3, shape), np.exp(rng.normal(-3.0, 1.0, shape))
+    moving, surface = rng.random((2, *shape)) < 0.5
     read = {"moving": moving | surface, "difference": 0.2}
     image, left, _ = read_out(level, variance, 0.0, OFF, **read, surface=np.flatnonzero(surface))
     expected, doubt = naive.smoothed_surfaces(level, variance, surface, 0.2)
@@ -278,3 +280,21 @@ def test_surfaces_are_the_oracles():
     np.testing.assert_allclose(left[surface], doubt[surface], rtol=1e-4)
     others = read_out(level, variance, 0.0, OFF, **read)[0]
     np.testing.assert_array_equal(image[~surface], others[~surface])
+
+
+@pytest.mark.parametrize("pitch", [1, 2])
+def test_surfaces_depend_on_nothing_beyond_what_their_means_look_at(pitch, monkeypatch):
+    """They are averaged in a window around them: in the whole image they are the same to the last bit."""
+    rng = np.random.default_rng(5)
+    level, variance = rng.normal(-1.0, 0.3, (62, 75)), np.exp(rng.normal(-3.0, 1.0, (62, 75)))
+    surface = np.zeros(level.shape, bool)
+    surface[25:37, 30:47] = rng.random((12, 17)) < 0.7
+
+    def found():
+        options = {"moving": surface, "difference": 0.2, "pitch": pitch}
+        return read_out(level, variance, 0.0, OFF, **options, surface=np.flatnonzero(surface))[:2]
+
+    of_window = found()
+    monkeypatch.setattr(readout, "_window_around", lambda pixels, shape: tuple(slice(0, n) for n in shape))
+    for plane, expected in zip(of_window, found(), strict=True):
+        np.testing.assert_array_equal(plane, expected)
