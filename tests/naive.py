@@ -753,6 +753,11 @@ def regularised(level, variance, moving, difference):
     return out, 0.7 * variance + 0.3 * left
 
 
+def is_surface(pixels):
+    """K12: whether pixels that no frame around measures make up a surface. Of a sensor of one part."""
+    return np.count_nonzero(pixels) >= 16
+
+
 def roughness(level, variance, surface, usual):
     """K12: the variance by which pixels one apart differ on a surface and beside it. Of a sensor of one part."""
     more, sure = 6 / usual, 6 / usual**2

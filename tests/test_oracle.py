@@ -115,7 +115,7 @@ def test_engine_agrees_with_the_oracle(name, data):
             surface = np.zeros(unshown.shape, bool)
             for place, pixel in pixels.items():
                 surface[place] = naive.is_unmeasured(pixel, t) and not unshown[place]
-            if surface.any():
+            if naive.is_surface(surface):
                 smooth = naive.smoothed_surfaces(raised, known, surface, chosen.filter.neighbours)
                 value, total = (
                     np.where(surface, *planes) for planes in zip(smooth, (value, total), strict=True)

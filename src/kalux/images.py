@@ -223,7 +223,7 @@ def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) ->
         difference=view.neighbours,
         pitch=1 if view.mosaic is None else 2,  # to neighbours of the same colour
         unshown=None if unshown is None else unshown.pixels,
-        surface=_surface(estimate),
+        unmeasured=_shown_before(estimate),
         with_variance=needs_averaged,
     )
     if unshown is not None:
@@ -259,7 +259,7 @@ def _misses_some(estimate: Estimate) -> bool:
     return around is not None and unmeasured is not None and around.misses_some(unmeasured)
 
 
-def _surface(estimate: Estimate) -> NDArray[np.int64] | None:
+def _shown_before(estimate: Estimate) -> NDArray[np.int64] | None:
     """(N,) pixels that neither frame around measures, but another one has shown; None: not known."""
     if estimate.unmeasured is None or estimate.unshown is None:
         return estimate.unmeasured

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.bridge import MASKED, UNMEASURED, BridgedSegment, Latent, Revealed, UnshownMemory
-from kalux.augmentation.parts import PART, interpolated, part_sums, weighted_area, weighted_sums
+from kalux.augmentation.parts import PART, interpolated, part_sums, parts_of, weighted_area, weighted_sums
 from kalux.compiled import larger, loop
 
 Floats = NDArray[np.floating[Any]]
@@ -248,8 +248,7 @@ def _with_revealed(
     ``distance`` is how far above its bound each pixel was, (N,) as the masks.
     """
     known, shape = memory.revealed, memory.revealed.excess.shape
-    row, column = np.divmod(memory.pixels[left], memory.shape[1])
-    part = row // PART * shape[1] + column // PART
+    part, _ = parts_of(memory.pixels[left], memory.shape)
 
     def more(weights: Floats | None) -> Floats:
         sums: Floats = np.bincount(part, weights, known.excess.size).reshape(shape).astype(np.float64)

@@ -20,6 +20,17 @@ _RANGE: Final = 8.0
 """Standard deviation, pixels, of the normal weights by which parts count for each other. 4, 8 and 12 explain the excess
 of clipped pixels of 48 simulated scenes equally well."""
 
+ALL: Final = 39
+"""Parts on one side, with the one itself, whose weights double precision tells from 0."""
+
+
+def parts_of(pixels: NDArray[np.int64], shape: tuple[int, ...]) -> tuple[NDArray[np.int64], tuple[int, int]]:
+    """(N,) numbers of the parts that pixels of an image of ``shape`` lie in, row after row, and rows and columns of
+    parts."""
+    rows, columns = (-(-side // PART) for side in shape)
+    row, column = np.divmod(pixels, shape[1])
+    return row // PART * columns + column // PART, (rows, columns)
+
 
 def interpolated(parts: NDArray[np.float32], pixels: NDArray[np.int64], width: int) -> NDArray[np.float32]:
     """(N,) values of the ``parts`` at pixels, interpolated linearly between the middles of the parts."""
@@ -62,23 +73,19 @@ def weighted_area(shape: tuple[int, int]) -> Floats:
     return weighted_sums(part_sums(np.ones(shape, np.float32)))
 
 
-def weighted_sums(parts: Floats) -> Floats:
-    """For every part, the sum over all parts, weighted by their nearness.
+def weighted_sums(parts: Floats, farthest: int = ALL) -> Floats:
+    """For every part, the sum over the parts up to the ``farthest`` one, weighted by their nearness.
 
     Not as a product of matrices: the last bits of BLAS depend on the number of threads.
     """
-    below, beside = (_weights(n) for n in parts.shape)
+    below, beside = (_weights(min(n, farthest)) for n in parts.shape)
     near = cv2.sepFilter2D(parts, cv2.CV_64F, beside, below, borderType=cv2.BORDER_CONSTANT)
     return np.asarray(near, np.float64)
 
 
 @functools.cache
-def _weights(parts: int) -> Floats:
-    """Weights of the parts on both sides of one, along an axis of so many ``parts``.
-
-    The farthest are those whose weights double precision tells from 0.
-    """
-    reach = min(parts, 39)
+def _weights(reach: int) -> Floats:
+    """Weights of a part and of those on both sides of it, of each ``reach`` with itself."""
     distance = PART * np.arange(1 - reach, reach)
     nearness: Floats = np.exp(-0.5 * (distance / _RANGE) ** 2)
     return nearness

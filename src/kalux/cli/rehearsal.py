@@ -72,7 +72,7 @@ def rehearse_images() -> None:
         moving=level > 0.0,
         silent_change=np.abs(level),
         unshown=Unshown(some, ones, ones, ones),
-        unmeasured=np.arange(200),
+        unmeasured=np.arange(5000),
     )
     view = View(0.02, 0.04, 0.1, 1.0, 0.3, 1.0, 1.0, 0.0, 0.001, None, (1.0, 1.0, 1.0))
     make_image(estimate, view, with_variance=False)

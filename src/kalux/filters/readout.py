@@ -28,7 +28,7 @@ from kalux.compiled import (
     word_at,
     zeros,
 )
-from kalux.filters.surfaces import surface_variance
+from kalux.filters.surfaces import surface_pixels, surface_variance
 from kalux.formulas import Number, Row, choose, formula
 
 Array = NDArray[np.floating[Any]]
@@ -226,7 +226,7 @@ def read_out(
     difference: float = 0.0,
     pitch: int = 1,
     unshown: NDArray[np.int64] | None = None,
-    surface: NDArray[np.int64] | None = None,
+    unmeasured: NDArray[np.int64] | None = None,
     with_variance: bool = True,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """I of a state, and the variance of its logarithm, in one pass over the rows.
@@ -259,9 +259,9 @@ def read_out(
     unshown
         (N,) indices in the flattened image, ascending, of pixels that no frame has measured: their L is returned as
         well, and averaging does not reduce their variance, since their errors (K15) are the same.
-    surface
-        (N,) such indices of pixels that no frame around measures, but one has shown: they are averaged by how rough the
-        surface around them is (`_smooth_surfaces`), whether they move or not.
+    unmeasured
+        (N,) such indices of pixels that no frame around measures, but one has shown: those that make up a surface are
+        averaged by how rough it is (`_smooth_surfaces`), whether they move or not.
     with_variance
         Whether to compute the variance; else it is empty.
 
@@ -301,10 +301,12 @@ def read_out(
     for begin in range(0, width, _STRIP):
         ring = _ring(0 if moving is None else pitch, difference2)
         _read_out(*given, next_unshown, begin, ring, out, total, levels)
-    if moving is not None and difference > 0 and surface is not None and len(surface):
-        state = level, known, moving, change
-        smoothed = _smooth_surfaces(state, (of_silent, of_moving), surface, difference2, pitch)
-        _read_pixels(*smoothed, surface, *scalars, out.reshape(-1), total.reshape(-1))
+    if moving is not None and difference > 0 and unmeasured is not None:
+        surface = surface_pixels(unmeasured, out.shape)
+        if len(surface):
+            state = level, known, moving, change
+            smoothed = _smooth_surfaces(state, (of_silent, of_moving), surface, difference2, pitch)
+            _read_pixels(*smoothed, surface, *scalars, out.reshape(-1), total.reshape(-1))
     return out, known if with_variance and moving is None else total, levels
 
 

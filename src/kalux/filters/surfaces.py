@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.parts import PART, interpolated, weighted_sums
+from kalux.augmentation.parts import PART, interpolated, parts_of, weighted_sums
 from kalux.compiled import loop, smaller
 
 _INDEPENDENT: Final = np.float32(0.7)
@@ -24,6 +24,23 @@ _LEAST: Final = 0.1
 _MOST: Final = 1.25
 """Least and most standard deviation of neighbours' differences, in units of the usual one: of no surface is it known
 that it is even, and what differs by more is seldom texture."""
+
+_FARTHEST: Final = 6
+"""Parts on one side, with the one itself, that count for each other: farther ones have less than 1e-7 of its weight."""
+
+_LEAST_PIXELS: Final = 16
+"""Of a part that belongs to a surface: a quarter. Single pixels have no neighbours on it to be averaged with."""
+
+
+def surface_pixels(unmeasured: NDArray[np.int64], shape: tuple[int, ...]) -> NDArray[np.int64]:
+    """Those of the pixels that make up a surface: many in their part of the image, or in one beside it.
+
+    Both are indices in the flattened image, ascending.
+    """
+    part, parts = parts_of(unmeasured, shape)
+    many = np.bincount(part, minlength=parts[0] * parts[1]).reshape(parts) >= _LEAST_PIXELS
+    near = cv2.dilate(many.view(np.uint8), np.ones((3, 3), np.uint8)).view(np.bool_)
+    return unmeasured[near.reshape(-1)[part]]
 
 
 def surface_variance(
@@ -62,7 +79,9 @@ def surface_variance(
     excess, certainty = np.zeros(shape), np.zeros(shape)
     _compare_neighbours(level, variance, surface, pixels, usual, pitch, excess, certainty)
     prior = _PRIOR_PAIRS / float(usual) ** 2
-    found = (weighted_sums(excess) + prior * float(usual)) / (weighted_sums(certainty) + prior)
+    found = (weighted_sums(excess, _FARTHEST) + prior * float(usual)) / (
+        weighted_sums(certainty, _FARTHEST) + prior
+    )
     limited = np.clip(found, _LEAST**2 * usual, _MOST**2 * usual).astype(np.float32)
     near = cv2.dilate(surface.view(np.uint8), np.ones((4 * pitch + 1, 4 * pitch + 1), np.uint8))
     around = np.flatnonzero(near.view(np.bool_))
