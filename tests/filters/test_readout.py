@@ -297,6 +297,6 @@ def test_surfaces_depend_on_nothing_beyond_what_their_means_look_at(pitch, monke
         return read_out(level, variance, 0.0, OFF, **options, unmeasured=np.flatnonzero(surface))[:2]
 
     of_window = found()
-    monkeypatch.setattr(readout, "_window_around", lambda pixels, shape: tuple(slice(0, n) for n in shape))
+    monkeypatch.setattr(readout, "_window_around", lambda places, shape: tuple(slice(0, n) for n in shape))
     for plane, expected in zip(of_window, found(), strict=True):
         np.testing.assert_array_equal(plane, expected)

@@ -16,7 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.bridge import MASKED, UNMEASURED, BridgedSegment, Latent, Revealed, UnshownMemory
-from kalux.augmentation.parts import PART, interpolated, part_sums, parts_of, weighted_area, weighted_sums
+from kalux.augmentation.parts import (
+    interpolated,
+    part_grid,
+    part_sums,
+    parts_of,
+    weighted_area,
+    weighted_sums,
+)
 from kalux.compiled import larger, loop
 
 Floats = NDArray[np.floating[Any]]
@@ -115,7 +122,7 @@ def begin_unshown(first: Latent, highlights: FrameHighlights, tail: Tail) -> Uns
     """The pixels that the first frame clips, and what it makes expect of them."""
     pixels = np.flatnonzero((first.variance >= UNMEASURED) & (first.variance < MASKED))
     bound = first.value.reshape(-1)[pixels].astype(np.float32)
-    parts = tuple(-(-side // PART) for side in first.value.shape)
+    parts = part_grid(first.value.shape)
     revealed = Revealed(np.zeros(parts), np.zeros(parts), np.zeros(parts), 0.0, 0.0)
     near, clipped = _counts(highlights)
     excess = excess_from_surroundings(highlights, pixels, near / max(clipped, 1), tail)
@@ -248,7 +255,7 @@ def _with_revealed(
     ``distance`` is how far above its bound each pixel was, (N,) as the masks.
     """
     known, shape = memory.revealed, memory.revealed.excess.shape
-    part, _ = parts_of(memory.pixels[left], memory.shape)
+    part = parts_of(memory.pixels[left], memory.shape)
 
     def more(weights: Floats | None) -> Floats:
         sums: Floats = np.bincount(part, weights, known.excess.size).reshape(shape).astype(np.float64)

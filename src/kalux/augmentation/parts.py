@@ -24,12 +24,17 @@ ALL: Final = 39
 """Parts on one side, with the one itself, whose weights double precision tells from 0."""
 
 
-def parts_of(pixels: NDArray[np.int64], shape: tuple[int, ...]) -> tuple[NDArray[np.int64], tuple[int, int]]:
-    """(N,) numbers of the parts that pixels of an image of ``shape`` lie in, row after row, and rows and columns of
-    parts."""
-    rows, columns = (-(-side // PART) for side in shape)
+def part_grid(shape: tuple[int, ...]) -> tuple[int, int]:
+    """Rows and columns of parts of an image of ``shape``."""
+    height, width = shape
+    return -(-height // PART), -(-width // PART)
+
+
+def parts_of(pixels: NDArray[np.int64], shape: tuple[int, ...]) -> NDArray[np.int64]:
+    """(N,) numbers of the parts, row after row, that pixels of an image of ``shape`` lie in."""
     row, column = np.divmod(pixels, shape[1])
-    return row // PART * columns + column // PART, (rows, columns)
+    part: NDArray[np.int64] = row // PART * part_grid(shape)[1] + column // PART
+    return part
 
 
 def interpolated(parts: NDArray[np.float32], pixels: NDArray[np.int64], width: int) -> NDArray[np.float32]:

@@ -10,6 +10,7 @@ import numpy as np
 from kalux.plan_report import gain_text, layout_text, left_out_text
 from kalux.planning import ESTIMATED_ORIGINS, Plan
 from kalux.planning.mending import Mends
+from kalux.settings import Settings
 from kalux.wording import how_many
 
 if TYPE_CHECKING:
@@ -59,9 +60,10 @@ def agreement_warnings(planned: Plan) -> Iterator[str]:
     if planned.steps.contradicted is not None:
         assert agreement is not None
         on, off = planned.steps.contradicted
+        hint = _encoding_hint(planned.settings, planned.steps.contradicted)
         yield (
             f"the contrast thresholds that the recording states, {on:g} on and {off:g} off, contradict its frames and "
-            f"are not used{_encoding_hint(planned)}; to insist, give --events.threshold-on {on:g} "
+            f"are not used{hint}; to insist, give --events.threshold-on {on:g} "
             f"--events.threshold-off {off:g}"
         )
     unexplained = agreement is not None and agreement.explained < _LITTLE_EXPLAINED
@@ -83,12 +85,11 @@ def agreement_warnings(planned: Plan) -> Iterator[str]:
         )
 
 
-def _encoding_hint(planned: Plan) -> str:
-    """What else may be wrong where both thresholds come out at about half of what the recording states."""
-    events, stated = planned.settings.events, planned.steps.contradicted
-    if stated is None or planned.settings.camera.response != "linear":
+def _encoding_hint(settings: Settings, stated: tuple[float, float]) -> str:
+    """What else may be wrong where both thresholds come out at about half of the ``stated`` ones."""
+    if settings.camera.response != "linear":
         return ""
-    shares = [found / said for found, said in zip(events.thresholds, stated, strict=True)]
+    shares = [found / said for found, said in zip(settings.events.thresholds, stated, strict=True)]
     low, high = _ENCODED
     if not (low < min(shares) and max(shares) < high):
         return ""

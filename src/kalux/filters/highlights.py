@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.highlights import Unshown
-from kalux.compiled import ONE, exponential, larger, loop, smaller
-from kalux.filters.readout import HighlightPrior, believed_highlight
+from kalux.compiled import ONE, exponential, larger, loop
+from kalux.filters.readout import HighlightPrior, read_levels
 
 Floats = NDArray[np.floating[Any]]
 
@@ -78,8 +78,9 @@ def read_unshown(
     least = bound.reshape(-1)[unshown.pixels]
     likely = np.maximum(least - _LIKELY * np.sqrt(unshown.noise), np.float32(prior.white))
     mean = np.maximum(level, np.minimum(least, likely)).astype(np.float32)
-    scalars = tuple(np.float32(value) for value in prior)
-    _take_mean(unshown.excess, unshown.noise, np.float32(log_offset), scalars, mean)
+    # Of the intensity, not of its logarithm.
+    mean += np.float32(0.5) * np.minimum(np.square(unshown.excess), unshown.excess)
+    read_levels(mean, unshown.noise, tuple(np.float32(value) for value in prior), np.float32(log_offset))
     image.reshape(-1)[unshown.pixels] = mean
 
 
@@ -108,19 +109,6 @@ def _keep(log_intensity, unmeasured, white, log_offset, image):  # type: ignore[
             below = larger(white - level, np.float32(0.0))
             least = exponential(white - below - below * below / _ABOUT_WHITE) - log_offset
             image[i] = larger(image[i], least)
-
-
-@loop
-def _take_mean(excess, noise, log_offset, prior, mean):  # type: ignore[no-untyped-def]
-    """From L to the mean of the intensity, in place, without branches, so that it becomes vector code."""
-    half, zero = np.float32(0.5), np.float32(0.0)
-    white, scale2, stretch, gain = prior
-    doubted = scale2 > zero
-    for i in range(len(mean)):
-        level = mean[i] + half * smaller(excess[i] * excess[i], excess[i])
-        beyond = larger(level - white, zero)
-        believed = white + believed_highlight(beyond, noise[i], scale2, stretch, gain)
-        mean[i] = larger(exponential(believed if doubted and level > white else level) - log_offset, zero)
 
 
 def smoothed_unshown(

@@ -305,8 +305,11 @@ def read_out(
         surface = surface_pixels(unmeasured, out.shape)
         if len(surface):
             state = level, known, moving, change
-            smoothed = _smooth_surfaces(state, (of_silent, of_moving), surface, difference2, pitch)
-            _read_pixels(*smoothed, surface, *scalars, out.reshape(-1), total.reshape(-1))
+            smooth, left = _smooth_surfaces(state, (of_silent, of_moving), surface, difference2, pitch)
+            read_levels(smooth, left, *scalars)
+            out.reshape(-1)[surface] = smooth
+            if total.size:
+                total.reshape(-1)[surface] = left
     return out, known if with_variance and moving is None else total, levels
 
 
@@ -323,7 +326,8 @@ def _smooth_surfaces(
     moves, and the change of silent pixels.
     """
     width = state[0].shape[1]
-    rows, columns = _window_around(pixels, state[0].shape)
+    row, column = np.divmod(pixels, width)
+    rows, columns = _window_around((row, column), state[0].shape)
     shape = rows.stop - rows.start, columns.stop - columns.start
     level, variance = memory.empty((2, *shape))
     _cut_out(
@@ -335,29 +339,26 @@ def _smooth_surfaces(
         level,
         variance,
     )
-    row, column = np.divmod(pixels, width)
     inside = (row - rows.start) * shape[1] + column - columns.start
     surface = np.zeros(shape, np.bool_)
     surface.reshape(-1)[inside] = True
-    rough = surface_variance(level, variance, surface, inside, usual, pitch)
+    rough = surface_variance(level, variance, surface, usual, pitch)
     near, left = level.copy(), variance.copy()
     _average_surface(level, variance, rough, surface, pitch, pitch, near, left)
     far, independent = memory.empty((2, *shape))  # filled where they are looked at
     _average_surface(near, left, _FARTHER * rough, surface, 2 * pitch, pitch, far, independent)
-    of_pixels = (plane.reshape(-1)[inside] for plane in (far, variance, independent))
-    averaged, alone, together = of_pixels
+    averaged, alone, together = (plane.reshape(-1)[inside] for plane in (far, variance, independent))
     return averaged, CORRELATED * alone + (ONE - CORRELATED) * together
 
 
-def _window_around(pixels: NDArray[np.int64], shape: tuple[int, ...]) -> tuple[slice, slice]:
-    """Rows and columns of whole parts of the image that hold all pixels, and all that their means look at."""
-    row, column = np.divmod(pixels, shape[1])
+def _window_around(places: tuple[NDArray[np.int64], ...], shape: tuple[int, ...]) -> tuple[slice, slice]:
+    """Rows and columns of whole parts of the image that hold all places, and all that their means look at."""
     rows, columns = (
         slice(
             max((int(at.min()) - _SURROUNDINGS) // PART * PART, 0),
             min(-(-(int(at.max()) + 1 + _SURROUNDINGS) // PART) * PART, side),
         )
-        for at, side in zip((row, column), shape, strict=True)
+        for at, side in zip(places, shape, strict=True)
     )
     return rows, columns
 
@@ -564,32 +565,42 @@ def _cut_out(  # type: ignore[no-untyped-def]
 
 
 @loop
-def _read_pixels(level, left, pixels, prior, log_offset, out, total):  # type: ignore[no-untyped-def]
-    """I of single pixels, and its variance where that is wanted, from L and what is left of its variance."""
+def read_levels(level, doubt, prior, log_offset):  # type: ignore[no-untyped-def]
+    """From L of single pixels, of the variance ``doubt``, to I, with the prior on highlights (K6). In place.
+
+    Without branches, so that it becomes vector code.
+    """
+    zero = np.float32(0.0)
     white, scale2, stretch, gain = prior
-    for i in range(len(pixels)):
-        pixel, value = pixels[i], level[i]
-        if scale2 > np.float32(0.0) and value > white:
-            value = white + believed_highlight(value - white, left[i], scale2, stretch, gain)
-        out[pixel] = larger(exponential(value) - log_offset, np.float32(0.0))
-        if len(total) > 0:
-            total[pixel] = left[i]
+    doubted = scale2 > zero
+    for i in range(len(level)):
+        beyond = larger(level[i] - white, zero)
+        believed = white + believed_highlight(beyond, doubt[i], scale2, stretch, gain)
+        level[i] = larger(
+            exponential(believed if doubted and level[i] > white else level[i]) - log_offset, zero
+        )
+
+
+@nb.njit(cache=True, inline="always")
+def _part_of_row(plane, row, begin, count, states):  # type: ignore[no-untyped-def]
+    """A row, the first of its pixels that a strip needs, their place in the ring and their number: 0 outside the image.
+
+    Below the image nothing is known.
+    """
+    height, width = plane.shape
+    place = np.uint64(row % count) * np.uint64(2 * _ROW)
+    if row >= height:
+        for i in range(np.uint64(_ROW)):
+            states[place + _VARIANCE + i] = _UNKNOWN
+    first = larger(begin - _MARGIN, 0)
+    size = np.uint64(smaller(begin + _STRIP + _MARGIN, width) - first) if 0 <= row < height else np.uint64(0)
+    return np.uint64(row), np.uint64(first), place + np.uint64(first - begin + _MARGIN), size
 
 
 @nb.njit(cache=True, inline="always")
 def _load_surface(level, variance, allowed, row, begin, pitch, count, states, rough):  # type: ignore[no-untyped-def]
     """Load L of a row, its variance, and by how much its pixels differ from neighbours on one surface."""
-    height, width = level.shape
-    if row < 0:
-        return
-    place = np.uint64(row % count) * np.uint64(2 * _ROW)
-    if row >= height:
-        for i in range(np.uint64(_ROW)):
-            states[place + _VARIANCE + i] = _UNKNOWN
-        return
-    first = larger(begin - _MARGIN, 0)
-    size = np.uint64(smaller(begin + _STRIP + _MARGIN, width) - first)
-    at, start, into = np.uint64(row), np.uint64(first), place + np.uint64(first - begin + _MARGIN)
+    at, start, into, size = _part_of_row(level, row, begin, count, states)
     for i in range(size):
         states[into + _LEVEL + i] = level[at, start + i]
         states[into + _VARIANCE + i] = variance[at, start + i]
@@ -613,18 +624,8 @@ def _load_row(  # type: ignore[no-untyped-def]
     log_intensity, variance, moving, change, subthreshold, row, begin, count, states
 ):
     """Load L of a row, and its variance with that of changes that no event has signalled yet (K11)."""
-    height, width = log_intensity.shape
-    if row < 0:
-        return
-    place = np.uint64(row % count) * np.uint64(2 * _ROW)
-    if row >= height:
-        for i in range(np.uint64(_ROW)):
-            states[place + _VARIANCE + i] = _UNKNOWN
-        return
+    at, start, into, size = _part_of_row(log_intensity, row, begin, count, states)
     of_silent, of_moving = subthreshold
-    first = larger(begin - _MARGIN, 0)
-    size = np.uint64(smaller(begin + _STRIP + _MARGIN, width) - first)
-    at, start, into = np.uint64(row), np.uint64(first), place + np.uint64(first - begin + _MARGIN)
     for i in range(size):
         states[into + _LEVEL + i] = log_intensity[at, start + i]
     for i in range(size):

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.parts import PART, interpolated, parts_of, weighted_sums
+from kalux.augmentation.parts import PART, interpolated, part_grid, parts_of, weighted_sums
 from kalux.compiled import loop, smaller
 
 _INDEPENDENT: Final = np.float32(0.7)
@@ -37,8 +37,8 @@ def surface_pixels(unmeasured: NDArray[np.int64], shape: tuple[int, ...]) -> NDA
 
     Both are indices in the flattened image, ascending.
     """
-    part, parts = parts_of(unmeasured, shape)
-    many = np.bincount(part, minlength=parts[0] * parts[1]).reshape(parts) >= _LEAST_PIXELS
+    part, (rows, columns) = parts_of(unmeasured, shape), part_grid(shape)
+    many = np.bincount(part, minlength=rows * columns).reshape(rows, columns) >= _LEAST_PIXELS
     near = cv2.dilate(many.view(np.uint8), np.ones((3, 3), np.uint8)).view(np.bool_)
     return unmeasured[near.reshape(-1)[part]]
 
@@ -47,7 +47,6 @@ def surface_variance(
     level: NDArray[np.float32],
     variance: NDArray[np.float32],
     surface: NDArray[np.bool_],
-    pixels: NDArray[np.int64],
     usual: np.float32,
     pitch: int,
 ) -> NDArray[np.float32]:
@@ -61,9 +60,7 @@ def surface_variance(
     level, variance
         (H, W) L and its variance.
     surface
-        (H, W): the pixels.
-    pixels
-        (N,) the same, as indices in the flattened image, ascending.
+        (H, W): its pixels.
     usual
         What it is where nothing else is known, log intensity^2.
     pitch
@@ -74,9 +71,8 @@ def surface_variance(
     (H, W) float32, log intensity^2. Of pixels beside the surface it is half-way to what it is usually, which it is
     elsewhere.
     """
-    height, width = level.shape
-    shape = -(-height // PART), -(-width // PART)
-    excess, certainty = np.zeros(shape), np.zeros(shape)
+    excess, certainty = np.zeros((2, *part_grid(level.shape)))
+    pixels = np.flatnonzero(surface)
     _compare_neighbours(level, variance, surface, pixels, usual, pitch, excess, certainty)
     prior = _PRIOR_PAIRS / float(usual) ** 2
     found = (weighted_sums(excess, _FARTHEST) + prior * float(usual)) / (
@@ -86,7 +82,7 @@ def surface_variance(
     near = cv2.dilate(surface.view(np.uint8), np.ones((4 * pitch + 1, 4 * pitch + 1), np.uint8))
     around = np.flatnonzero(near.view(np.bool_))
     of_surface = surface.reshape(-1)[around]
-    local = interpolated(limited, around, width)
+    local = interpolated(limited, around, level.shape[1])
     variances = np.full(level.shape, usual, np.float32)
     variances.reshape(-1)[around] = np.where(of_surface, local, (local + usual) / np.float32(2.0))
     return variances
