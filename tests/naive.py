@@ -676,7 +676,7 @@ def hidden(pixels, place, moving, t, on, off, settings):
         between = 4 * share * (1 - share)
         exposed = exposed_as(pixels, middles[k], middles[k + 1], min(sum(exposures) / 2 / gap, 1))
         between += (1 - between) * 0.2 * exposed**2
-        of_moving = 0.08 * c2 * between
+        of_moving = 0.09 * c2 * between
         still = half_way(pixels, k, c2, settings.events.quantisation_variance * c2)
         still *= between * shown_change(pixels, place, k, c2, camera)
         used = of_moving if moving else still
@@ -684,7 +684,7 @@ def hidden(pixels, place, moving, t, on, off, settings):
         waits = silent and min(frames) < UNMEASURED and (moving or max(frames) >= UNMEASURED)
         return used, still / 2 + of_moving / 4 if waits else used
     if moving:
-        return 0.08 * c2, 0.08 * c2
+        return 0.09 * c2, 0.09 * c2
     gap = middles[-1] - middles[-2] if k > 0 else USUAL_INTERVAL
     change = shown_change(pixels, place, k - 1, c2, camera) if k > 0 else 0.1 * c2
     changed = min(abs(t - middles[max(k, 0)]) / gap, 1) * change
@@ -703,7 +703,7 @@ def known(pixel, variance, t, settings, c2, left):
         variance *= 1 - 0.6 * (1 - left) / 0.3
     events = sum(w for q, *_, w in pixel.events if a < q <= b)
     between = 4 * share * (1 - share)
-    wrong = 0.002 * c2 * between * events**2
+    wrong = 0.1 * ev.believed_mismatch**2 * c2 * between * events**2
     if is_crushed(pixel, k + 1, settings.camera):  # says what others have said
         return variance + wrong
     following = second + (1 - share) * events * ev.step_noise * c2

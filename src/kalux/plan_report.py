@@ -62,7 +62,9 @@ def _of_events(plan: Plan, asked: Settings) -> Iterator[tuple[str, str]]:
         f"({_model_origin(plan, asked.camera.log_offset)})",
     )
     if events.step_variance is not None:
-        how = _model_origin(plan, asked.events.step_variance)
+        asked_variance = asked.events.step_variance
+        of_steps = plan.mismatch is not None and plan.mismatch.per_event is not None
+        how = _estimated(asked_variance, of_steps) if of_steps else _model_origin(plan, asked_variance)
         yield "step", f"variance of one event {events.step_variance:g} c^2, c its threshold ({how})"
     if events.refractory_period is not None:
         what = (

@@ -140,7 +140,7 @@ class EventSettings:
         the recording (`kalux.calibration.mismatch`).
     step_variance
         Variance of one event's step in units of c^2. None: an estimate from the recording
-        (`kalux.calibration.event_model`).
+        (`kalux.calibration.mismatch`).
     refractory_period
         Time after an event in which a pixel produces no other, us: the change meanwhile is added to its next event
         (docs/equations.md, K13). None: an estimate from the recording, 0 where its frames show that no change is lost

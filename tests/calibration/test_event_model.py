@@ -180,7 +180,7 @@ def test_a_plan_fills_in_what_is_not_given(recordings):
     recording = recordings[0.06]
     made = plan(recording, at="frames")
     assert made.settings.camera.log_offset == made.steps.model.log_offset >= 0.05
-    assert made.settings.events.step_variance == made.steps.model.step_variance
+    assert made.steps.model.step_variance in event_model.STEP_VARIANCES
     assert made.settings.events.refractory_period == made.steps.thresholds.refractory_period == 0
     default = PRESETS["default"]
     given = dataclasses.replace(

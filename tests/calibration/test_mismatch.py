@@ -1,4 +1,4 @@
-"""The spread of thresholds between pixels, from recordings whose sensors are known."""
+"""The spread of thresholds between pixels and the variance of steps, from recordings whose sensors are known."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from kalux import PRESETS, Recording
-from kalux.calibration.mismatch import SPREADS, _solved, estimate_mismatch
+from kalux import PRESETS, Frame, Recording
+from kalux.calibration.mismatch import SPREADS, STEP_VARIANCES, _solved, estimate_mismatch
 from kalux.datasets import SensorSettings, pan, photograph_scene, simulate
+from kalux.events import EVENT_DTYPE
 from kalux.planning import plan
 from kalux.settings import CameraSettings
 
@@ -75,6 +76,55 @@ def test_noise_that_is_new_in_each_interval_is_not_taken_for_it():
     assert found(0.08, noise_rate=2.0, read_noise=0.01).variance == pytest.approx(0.08**2, rel=0.4)
 
 
+def unsteady(variance, spread=0.0, frames=24, shape=(40, 50)):
+    """Frames that change by the events between them, whose steps have this variance, in units of c^2."""
+    rng = np.random.default_rng(5)
+    own = 1.0 + spread * rng.standard_normal(shape)
+    level, shown, stream = rng.uniform(np.log(0.1), np.log(0.5), shape), [], []
+    for k in range(frames):
+        image = np.rint(65535 * (np.exp(level) - CAMERA.offset)).astype(np.uint16)
+        shown.append(Frame(image, 40_000 * k, 40_000 * k + 100))
+        upward = level < np.log(0.25)
+        events = rng.integers(1, 8, shape)
+        steps = 0.2 * (events * own + np.sqrt(variance * events) * rng.standard_normal(shape))
+        level = np.clip(level + np.where(upward, steps, -steps), np.log(0.03), np.log(0.95))
+        y, x = np.repeat(np.argwhere(np.ones(shape)), events.ravel(), axis=0).T
+        made = np.zeros(len(x), EVENT_DTYPE)
+        made["t"] = np.sort(rng.integers(1_000, 39_000, len(x))) + 40_000 * k
+        made["x"], made["y"], made["p"] = x, y, upward[y, x]
+        stream.append(made)
+    return Recording.from_arrays(np.concatenate(stream), shown, sensor_size=shape)
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.15])
+@pytest.mark.parametrize("variance", [0.05, 0.1, 0.3])
+def test_the_variance_of_steps_is_found(variance, spread):
+    camera = dataclasses.replace(CAMERA, frame_noise=1e-4, shot_noise=0.0)
+    estimate = estimate_mismatch(
+        unsteady(variance, spread), camera, dataclasses.replace(EVENTS, quantisation_variance=0.0)
+    )
+    assert estimate.step_variance(spread) == pytest.approx(variance, rel=0.15, abs=0.01)
+
+
+def test_steps_of_an_ideal_sensor_are_surer_than_others():
+    """However far its pixels' thresholds are apart; lost events and noise are errors of steps."""
+
+    def step_variance(**sensor):
+        settings = SensorSettings(threshold_on=0.2, threshold_off=0.2, log_offset=0.02, **sensor)
+        made = plan(simulate(scene(), settings, seed=3).recording(), at="frames")
+        return made.settings.events.step_variance
+
+    assert step_variance() < 1.5 * STEP_VARIANCES[0]
+    assert step_variance(threshold_mismatch=0.1) < 1.5 * STEP_VARIANCES[0]
+    assert step_variance(threshold_mismatch=0.1, noise_rate=3.0, refractory=2_000) > 2 * STEP_VARIANCES[0]
+
+
+def test_few_steps_tell_nothing():
+    recording = unsteady(0.1, frames=5, shape=(12, 16))
+    estimate = estimate_mismatch(recording, CAMERA, EVENTS)
+    assert estimate.step_variance(0.1) is None
+
+
 def test_the_plan_settles_it():
     """The spread as found; the noise as found, or without lookahead where there is more of it than usual."""
     for rate in (1.0, 6.0):
@@ -82,6 +132,8 @@ def test_the_plan_settles_it():
         recording = simulate(scene(flat=0.5), sensor, seed=3).recording()
         made, causal = (plan(recording, at="frames", lookahead=ahead) for ahead in (True, False))
         assert made.mismatch.spread == made.settings.events.threshold_spread < 0.08
+        measured = made.mismatch.step_variance(made.mismatch.spread)
+        assert made.settings.events.step_variance == pytest.approx(measured, abs=1e-3)
         assert made.background_rate == pytest.approx(rate, rel=0.6)
         assert made.settings.events.noise_rate == made.background_rate
         assert causal.settings.events.noise_rate == max(made.background_rate, 3.0)
@@ -90,6 +142,11 @@ def test_the_plan_settles_it():
     again = plan(recording, at="frames", settings=dataclasses.replace(made.settings, events=given))
     assert (again.mismatch, again.background_rate) == (None, None)
     assert (again.settings.events.threshold_spread, again.settings.events.noise_rate) == (0.07, 2.0)
+    assert again.settings.events.step_variance == made.settings.events.step_variance
+    unsure = dataclasses.replace(given, step_variance=None)
+    again = plan(recording, at="frames", settings=dataclasses.replace(made.settings, events=unsure))
+    assert again.settings.events.threshold_spread == 0.07
+    assert again.settings.events.step_variance == pytest.approx(again.mismatch.step_variance(0.07), abs=1e-3)
 
 
 def test_two_frames_tell_nothing():

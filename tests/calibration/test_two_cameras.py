@@ -56,8 +56,8 @@ def test_without_any_calibration_the_lenses_remain():
 
 
 def test_the_reconstruction_is_nearly_that_of_a_shared_sensor(refined):
-    """Within 45 % of its MSE at this size; most of the difference is pixels at highlights, which are masked. A shared
-    sensor's pixels are seen to be more alike (6 % instead of 10), which is 15 % of its MSE."""
+    """Within 60 % of its MSE at this size; most of the difference is pixels at highlights, which are masked. A shared
+    sensor's pixels are seen to be more alike (6 % instead of 8), and its steps to be more exact (K9)."""
     seen = distant_recording()
     pair = Recording.from_arrays(seen.events, refined.frames(seen.frames), sensor_size=(120, 160))
     shared_frames = list(
@@ -72,9 +72,9 @@ def test_the_reconstruction_is_nearly_that_of_a_shared_sensor(refined):
         errors.append(
             np.mean([((i.intensity - seen.scene.at(float(i.t))) ** 2)[mask].mean() for i in images])
         )
-    assert errors[0] < 1.45 * errors[1]  # of larger images less: benchmarks/rig.py
-    assert errors[0] < 0.004
-    assert errors[1] < 0.01
+    assert errors[0] < 1.6 * errors[1]  # of larger images less: benchmarks/rig.py
+    assert errors[0] < 0.0037
+    assert errors[1] < 0.0026
 
 
 def test_a_calibrated_rig_and_a_known_offset_need_no_fit():

@@ -36,8 +36,9 @@ LOG_OFFSETS: Final = (0.004, 0.008, 0.015, 0.03, 0.06, 0.12)
 that are exposed four times as long as they ought to be."""
 
 STEP_VARIANCES: Final = (0.07, 0.1, 0.2, 0.4)
-"""Variances of an event's step that are tried, in units of c^2. The likelihood often asks for less than the first, but
-what is not modelled counts, too: over 50 scenes 0.05 to 0.1 as the least are within 3 %, in opposite directions."""
+"""Variances of an event's step that are tried with every I_0, in units of c^2. The likelihood often asks for less than
+the first, but what is not modelled counts, too. Steps are judged by their mean square, where enough of them can be seen
+(`kalux.calibration.mismatch`)."""
 
 MAX_SAMPLES: Final = 100_000
 _MIN_SAMPLES: Final = 1_000
@@ -114,7 +115,7 @@ class EventModel(NamedTuple):
     log_offset
         I_0, white = 1.
     step_variance
-        Variance of one event's step, in units of c^2.
+        Likeliest variance of one event's step, in units of c^2, of `STEP_VARIANCES`.
     samples
         Pixels and frame intervals used.
     agreement

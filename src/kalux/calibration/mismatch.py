@@ -1,9 +1,12 @@
-"""By how much the contrast threshold differs between a recording's pixels.
+"""By how much the contrast threshold differs between a recording's pixels, and the steps of one pixel from each other.
 
 The mismatch of a pixel's events and frames has many causes. The deviation of its threshold is the same in all frame
 intervals, while frame noise, the noise of single steps and changes below the threshold are independent. So the mean
 product of the mismatches of two *different* intervals is due to the threshold alone, and no model of the rest is
 needed. Neighbouring intervals have a frame, and its noise, in common and are left out.
+
+What the mean *square* of an interval's mismatch has beyond that, and beyond the noise of its frames, is the variance of
+its steps.
 """
 
 from __future__ import annotations
@@ -35,9 +38,20 @@ MAX_SAMPLES: Final = 1_000_000
 _MAX_FRAMES: Final = 80
 _CLIP: Final = 3.0  # standard deviations of a mismatch: flicker and occlusions say nothing of thresholds
 
+STEP_VARIANCES: Final = (0.03, 0.4)
+"""What is believed of a step's variance, in units of c^2. The steps of simulated sensors without noise have none; but
+what is not modelled of events counts, too, where no frame checks them (docs/equations.md, K9)."""
+
+_FEWEST_EVENTS: Final = 2.0
+"""Of a pixel in an interval whose steps count: single ones are noise more often, which has a variance of its own (K5),
+and changes below the threshold hide what they say."""
+
+_MIN_STEPS: Final = 1_000
+"""Pixels and intervals from which the variance of steps is known within a tenth of c^2."""
+
 
 class Mismatch(NamedTuple):
-    """What a recording says of its pixels' thresholds.
+    """What a recording says of its pixels' thresholds and of their steps.
 
     Attributes
     ----------
@@ -47,12 +61,25 @@ class Mismatch(NamedTuple):
         Its square as measured, which noise may make negative, and the standard error of that.
     samples
         Pixels and frame intervals used.
+    per_event
+        Mean square mismatch per event, in units of c^2, that frames and changes below the threshold do not explain;
+        None: too few pixels had two events.
+    by_spread
+        What a relative variance of 1 between pixels' thresholds makes of it.
     """
 
     spread: float
     variance: float
     error: float
     samples: int
+    per_event: float | None = None
+    by_spread: float = 0.0
+
+    def step_variance(self, spread: float) -> float | None:
+        """Variance of a step, in units of c^2, given the ``spread``: within `STEP_VARIANCES`. None: unknown."""
+        if self.per_event is None:
+            return None
+        return float(np.clip(self.per_event - spread**2 * self.by_spread, *STEP_VARIANCES))
 
 
 def estimate_mismatch(recording: Recording, camera: CameraSettings, events: EventSettings) -> Mismatch | None:
@@ -62,7 +89,9 @@ def estimate_mismatch(recording: Recording, camera: CameraSettings, events: Even
     threshold and w = 1 / Var m, the sum over pairs of intervals j, k at least two apart of w_j m_j c n_j w_k m_k c n_k
     is on average the squared spread times that of w_j w_k c n_j c n_k (c n_j c n_k + c' n'_j c' n'_k), primes for the
     other polarity. What is measured is drawn towards the usual spread as far as it is uncertain, and exceeds that only
-    as far as it is certain.
+    as far as it is certain. Where both of a pixel's events of an interval and more, n + n', tell of single steps, their
+    variance is the sum of v (m^2 - Var' m) over that of v c c' (n + n'), v = (n + n') w^2: what m has beyond the
+    variance Var' by frames, changes below the threshold and the spread.
 
     Parameters
     ----------
@@ -87,19 +116,77 @@ def estimate_mismatch(recording: Recording, camera: CameraSettings, events: Even
         events.usual_threshold_spread,
         events.quantisation_variance,
     )
+    of_steps = events.usual_threshold_spread**2, events.step_noise * threshold_on * threshold_off
     products: Array = np.zeros((*recording.sensor_size, *_PRODUCTS))
+    sums: Array = np.zeros(4)
     samples = 0
     for interval, on, off, bend in counted_intervals(recording, camera, events, most_frames=_MAX_FRAMES):
         first, second = interval.ends
         seen = Samples(first.intensity, second.intensity, on, off, bend)
         bright = np.minimum(seen.before, seen.after) > DARKEST
-        usable = ~first.shot.clipped & ~second.shot.clipped & bright & (on + off > 0)
+        measured = ~first.shot.clipped & ~second.shot.clipped
+        usable = measured & bright & (on + off > 0)
         mismatch, variance = mismatch_of(seen, model, camera.offset, events.step_noise)
         _add(mismatch, variance, usable, threshold_on * on, threshold_off * off, products)
+        _add_steps(mismatch, variance, measured, (on, off), events.thresholds, of_steps, sums)
         samples += int(np.count_nonzero(usable))
         if samples >= MAX_SAMPLES:
             break
-    return _solved(products, samples, events.usual_threshold_spread)
+    found = _solved(products, samples, events.usual_threshold_spread)
+    return None if found is None else _with_steps(found, _Sums(*sums), threshold_on * threshold_off)
+
+
+class _Sums(NamedTuple):
+    """Of pixels and intervals with `_FEWEST_EVENTS` and more, and the weights of `estimate_mismatch`.
+
+    Attributes
+    ----------
+    unexplained
+        Of the squared mismatch less its variance by frames and changes below the threshold.
+    spread
+        Of what a relative variance of 1 between pixels makes of it.
+    events
+        Of their number.
+    used
+        Pixels and intervals.
+    """
+
+    unexplained: float
+    spread: float
+    events: float
+    used: float
+
+
+def _with_steps(found: Mismatch, sums: _Sums, threshold2: float) -> Mismatch:
+    if sums.used < _MIN_STEPS:
+        return found
+    one = threshold2 * sums.events
+    return found._replace(per_event=sums.unexplained / one, by_spread=sums.spread / one)
+
+
+@loop
+def _add_steps(mismatches, variances, measured, events, thresholds, of_steps, sums):  # type: ignore[no-untyped-def]
+    """Add one interval to the fields of `_Sums`, in place.
+
+    ``of_steps``: the squared spread and the variance of a step that ``variances`` count.
+    """
+    events_on, events_off = events
+    spread2, per_event = of_steps
+    for row in range(measured.shape[0]):
+        for column in range(measured.shape[1]):
+            i = row, column
+            count = events_on[i] + events_off[i]
+            if not measured[i] or count < _FEWEST_EVENTS:
+                continue
+            variance, on, off = variances[i], thresholds[0] * events_on[i], thresholds[1] * events_off[i]
+            by_spread = on * on + off * off
+            of_frames = variance - spread2 * by_spread - per_event * count
+            square = smaller(mismatches[i] * mismatches[i], _CLIP * _CLIP * variance)
+            weight = count / (variance * variance)
+            sums[0] += weight * (square - of_frames)
+            sums[1] += weight * by_spread
+            sums[2] += weight * count
+            sums[3] += 1.0
 
 
 _PRODUCTS: Final = (2, 3, 3)

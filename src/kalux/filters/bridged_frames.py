@@ -134,6 +134,7 @@ class BridgedFrames(Method):
             events.quantisation_variance * c2,
             scale2 if scale2 > 0 else bridge.UNMEASURED,
         )
+        self._spread2 = events.believed_mismatch**2  # K11
         self._follows_motion = settings.filter.follows_motion(shape)
         self._event_noise = akf_bridged.Noise(events.background_rate, events.step_noise, c2)
         self._prior = (
@@ -569,7 +570,7 @@ class BridgedFrames(Method):
             counted=0.0,
             quantisation_variance=self.noise.quantisation_variance,
             repeated=1.0 - between / 2.0,
-            wrong=WRONG_STEPS * between * self.on * self.off,
+            wrong=WRONG_STEPS * self._spread2 * between * self.on * self.off,
             share=share,
             half_way=segment.half_way,
         )

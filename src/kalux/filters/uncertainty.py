@@ -20,9 +20,9 @@ from kalux.filters.readout import CORRELATED, Subthreshold
 
 Array = NDArray[np.floating[Any]]
 
-SUBTHRESHOLD_MOVING: Final = 0.08
+SUBTHRESHOLD_MOVING: Final = 0.09
 """Variance, in c^2, of the subthreshold change of a pixel with recent events, half-way between two frames: by the
-errors of images, forward and both ways in time, of eleven simulated scenes and of the held-out frames of three real
+errors of images, forward and both ways in time, of thirty simulated scenes and of the held-out frames of three real
 recordings."""
 
 SUBTHRESHOLD_EXPOSED: Final = 0.2
@@ -33,9 +33,9 @@ SUBTHRESHOLD_INTERMITTENT: Final = (0.5, 0.25)
 """Variance of an intermittent pixel's subthreshold change (`_mark_intermittent`), in units of that of a silent pixel
 and of that of one with an event in this frame interval, which are added: the same scenes, and the held-out frames."""
 
-WRONG_STEPS: Final = 0.002
-"""Variance, in c^2 per squared number of events between two frames, half-way, of steps that are all wrong alike: the
-same scenes. A fifth of what thresholds that are 10 % off amount to (K10) where no frame ties them."""
+WRONG_STEPS: Final = 0.1
+"""Variance half-way between two frames of steps that are all wrong alike, in units of what the thresholds' spread makes
+of as many events where no frame ties them (K10): the same scenes."""
 
 _FEW_TURNS: Final = 1e-2  # in an exposure: what they change is less than the digits of their exponentials
 

@@ -31,7 +31,7 @@ from kalux.planning.sensor_noise import (
     with_dead_time,
     with_fixed_pattern,
     with_frame_noise,
-    with_mismatch,
+    with_step_errors,
 )
 from kalux.planning.survey import survey
 from kalux.recording import RECORDING_NEEDED, Recording, with_cached_start
@@ -143,7 +143,7 @@ def plan(
     chosen, dead_time = with_dead_time(recording, chosen)
     apparent_delay = _delay_of_black(mended.mends, chosen, seen.exposures)
     steps = with_event_steps(recording, chosen, apparent_delay, doubt_noise=of_frames.doubted)
-    chosen, mismatch = with_mismatch(recording, steps.settings, steps.threshold_error)
+    chosen, mismatch = with_step_errors(recording, steps.settings, steps.threshold_error, known=chosen.events)
     chosen, background = with_background(recording, chosen, known.pixels, lookahead=lookahead)
     origin = steps.origin
     if origin == "settings" and _are_calibrated(chosen, known):

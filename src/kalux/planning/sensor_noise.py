@@ -13,7 +13,7 @@ from kalux.calibration.noise import event_noise
 from kalux.calibration.refractory import dead_time
 from kalux.models.pixels import PixelCalibration
 from kalux.recording import Recording
-from kalux.settings import Settings, altered
+from kalux.settings import EventSettings, Settings, altered
 
 _NOISE_EVENTS: Final = 1_000_000
 """Number of events from which the background noise is estimated: at 15 million events/s, those of 70 ms."""
@@ -77,19 +77,30 @@ def with_dead_time(recording: Recording, settings: Settings) -> tuple[Settings, 
     return altered(settings, "events", refractory_period=period or None), period
 
 
-def with_mismatch(
-    recording: Recording, settings: Settings, threshold_error: float
+def with_step_errors(
+    recording: Recording, settings: Settings, threshold_error: float, *, known: EventSettings
 ) -> tuple[Settings, Mismatch | None]:
-    """Fill in the thresholds' spread between pixels: from the settings, else an estimate, else the usual.
+    """Fill in the thresholds' spread between pixels and the variance of a step, as far as they are not ``known``.
 
-    The relative error of estimated thresholds, 0 of others, is a part of it.
+    From an estimate, else what the settings have: the usual spread, and the variance that goes with I_0. The relative
+    error of estimated thresholds, 0 of others, is a part of the spread.
     """
     events = settings.events
-    if events.threshold_spread is not None or not settings.filter.joins_frames:
+    assumed = (
+        events.threshold_spread != known.threshold_spread
+    )  # as wide as thresholds are that nothing tells
+    wanted = None in (known.threshold_spread, known.step_variance)
+    if assumed or not wanted or not settings.filter.joins_frames:
         return settings, None
     found = estimate_mismatch(recording, settings.camera, events)
-    spread = float(np.hypot(events.mismatch if found is None else found.spread, threshold_error))
-    return altered(settings, "events", threshold_spread=spread), found
+    spread = events.threshold_spread
+    if spread is None:
+        spread = float(np.hypot(events.mismatch if found is None else found.spread, threshold_error))
+    step_variance = events.step_variance
+    if found is not None and known.step_variance is None:
+        measured = found.step_variance(spread)
+        step_variance = step_variance if measured is None else round(measured, 3)
+    return altered(settings, "events", threshold_spread=spread, step_variance=step_variance), found
 
 
 def with_background(
