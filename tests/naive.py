@@ -947,8 +947,9 @@ def joined_along(first, second, path, bend, share, level, variance, between):
     unexplained = around(apart, 2) / np.maximum(around((first[0] - second[0]) ** 2, 2), 5e-4)
     doubt /= np.maximum(1 - unexplained, 1e-6)
     contradiction = around((level - seen) ** 2 / (variance + doubt), 2)
-    trust = between / (doubt * (1 + 0.5 * contradiction) ** 2)
-    return (level / variance + seen * trust) / (1 / variance + trust), 1 / (1 / variance + trust)
+    believed = between / (doubt * (1 + np.maximum(contradiction - 1, 0)) ** 2)
+    trust = between / (doubt * (1 + 0.45 * contradiction) ** 2)
+    return (level / variance + seen * believed) / (1 / variance + believed), 1 / (1 / variance + trust)
 
 
 def resampled(value, variance, x, y):

@@ -167,6 +167,11 @@ def choose(condition: Number, one: Number, other: Number) -> Number:
     return Number(one.builder, one.kind, value)
 
 
+def squared(value: Number) -> Number:
+    """The value times itself, computed once where it is an expression."""
+    return value * value
+
+
 def _machine_type(kind: Any, lanes: int = 1) -> Any:
     if isinstance(kind, types.Float):
         machine: Any = {32: ir.FloatType(), 64: ir.DoubleType()}[kind.bitwidth]

@@ -21,7 +21,7 @@ from kalux import memory
 from kalux.augmentation.bridge import UNMEASURED, Latent, bridge_variance
 from kalux.augmentation.resampling import BORDER, read_row
 from kalux.compiled import FUSED, ONE, empty, loop
-from kalux.formulas import Number, Pixels, Row, choose, formula, row_formula
+from kalux.formulas import Number, Pixels, Row, choose, formula, row_formula, squared
 
 Floats = NDArray[np.floating[Any]]
 Plane = NDArray[np.float32]
@@ -38,8 +38,9 @@ Measured: 0.09 to 0.12 (docs/equations.md, K16)."""
 _LEAST_UNMOVED: Final = np.float32(5e-4)
 """Mean squared difference of the frames, in log intensity^2, below which they are alike wherever they are read."""
 
-_DISTRUST: Final = np.float32(0.5)
-"""How much less is believed where the filter contradicts, per mean squared difference in units of its variance."""
+_DISTRUST: Final = np.float32(0.45)
+"""How much less the variance falls where the filter contradicts, per mean squared difference in units of its variance:
+what looks right is not always, so that it tells less of its own error than it is worth (docs/equations.md, K16)."""
 
 _LEAST_MOVING: Final = np.float32(1e-6)
 """Share of the frames' difference that motion explains where it explains nothing: a division."""
@@ -392,11 +393,13 @@ def _join(
     between: Number,
 ) -> None:
     """The image joined with what is seen, and its variance, in place of this."""
-    distrust = ONE + _DISTRUST * _mean_of_five(contradiction_around)
-    doubted = doubt[0] * (distrust * distrust)
-    kept = doubted / (between * variance[0] + doubted)
+    contradicted = _mean_of_five(contradiction_around)
+    own = between * variance[0]
+    believed = doubt[0] * squared(ONE + _larger(contradicted - ONE, np.float32(0.0)))
+    kept = believed / (own + believed)
     seen[0] = seen[0] + kept * (level[0] - seen[0])
-    doubt[0] = kept * variance[0]
+    doubted = doubt[0] * squared(ONE + _DISTRUST * contradicted)
+    doubt[0] = doubted / (own + doubted) * variance[0]
 
 
 def _larger(one: Number, other: np.float32) -> Number:

@@ -29,7 +29,7 @@ from kalux.compiled import (
     zeros,
 )
 from kalux.filters.surfaces import surface_pixels, surface_variance
-from kalux.formulas import Number, Row, choose, formula
+from kalux.formulas import Number, Row, choose, formula, squared
 
 Array = NDArray[np.floating[Any]]
 
@@ -208,10 +208,6 @@ def edge(distance: Number) -> Number:
     The distance is the sum of e^2 / (P + P' + slack) over the nine differences e. Weights are divided by edge^2.
     """
     return ONE + distance * _HALF_OF_PATCH
-
-
-def _squared(value: Number) -> Number:
-    return value * value
 
 
 def read_out(
@@ -702,10 +698,10 @@ def _compare_patches(distances: Row, before: Number, own: Number, after: Number,
     ab, cd = a * b, c * d
     inverse = ONE / (ab * cd)
     of_ab, of_cd = inverse * cd, inverse * ab
-    similarities[own] = _squared(of_ab * b)
-    similarities[own + _ONE] = _squared(of_ab * a)
-    similarities[own + _TWO] = _squared(of_cd * d)
-    similarities[own + _THREE] = _squared(of_cd * c)
+    similarities[own] = squared(of_ab * b)
+    similarities[own + _ONE] = squared(of_ab * a)
+    similarities[own + _TWO] = squared(of_cd * d)
+    similarities[own + _THREE] = squared(of_cd * c)
 
 
 @nb.njit(cache=True, inline="always")
