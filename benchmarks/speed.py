@@ -72,12 +72,8 @@ def stream(size, count, start=0, seed=0, rate=RATE):
 
 def scattered(size, count):
     """Events of a texture all over the sensor, of which no cache holds much: each at any pixel."""
-    height, width = size
-    rng = np.random.default_rng(0)
-    events = np.zeros(count, EVENT_DTYPE)
-    events["t"] = np.sort(rng.integers(1, count * 1_000_000 // RATE, count))
-    events["x"], events["y"] = rng.integers(0, width, count), rng.integers(0, height, count)
-    events["p"] = rng.random(count) < 0.5
+    events = stream(size, count)
+    events["x"] = np.random.default_rng(1).integers(0, size[1], count)
     return events
 
 

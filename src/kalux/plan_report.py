@@ -62,9 +62,7 @@ def _of_events(plan: Plan, asked: Settings) -> Iterator[tuple[str, str]]:
         f"({_model_origin(plan, asked.camera.log_offset)})",
     )
     if events.step_variance is not None:
-        asked_variance = asked.events.step_variance
-        of_steps = plan.mismatch is not None and plan.mismatch.per_event is not None
-        how = _estimated(asked_variance, of_steps) if of_steps else _model_origin(plan, asked_variance)
+        how = _step_origin(plan, asked.events.step_variance)
         yield "step", f"variance of one event {events.step_variance:g} c^2, c its threshold ({how})"
     if events.refractory_period is not None:
         what = (
@@ -282,6 +280,12 @@ def _model_origin(plan: Plan, asked: float | None) -> str:
         if plan.steps.model is None
         else f"estimated from {how_many(plan.steps.model.samples, 'sample')}"
     )
+
+
+def _step_origin(plan: Plan, asked: float | None) -> str:
+    if plan.mismatch is None or plan.mismatch.per_event is None:
+        return _model_origin(plan, asked)
+    return _estimated(asked, True)
 
 
 def _estimated(asked: float | None, found: bool) -> str:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from kalux import PRESETS, Frame, Recording
-from kalux.calibration.mismatch import SPREADS, STEP_VARIANCES, _solved, estimate_mismatch
+from kalux.calibration.mismatch import BELIEVED_STEPS, SPREADS, _solved, estimate_mismatch
 from kalux.datasets import SensorSettings, pan, photograph_scene, simulate
 from kalux.events import EVENT_DTYPE
 from kalux.planning import plan
@@ -114,9 +114,9 @@ def test_steps_of_an_ideal_sensor_are_surer_than_others():
         made = plan(simulate(scene(), settings, seed=3).recording(), at="frames")
         return made.settings.events.step_variance
 
-    assert step_variance() < 1.5 * STEP_VARIANCES[0]
-    assert step_variance(threshold_mismatch=0.1) < 1.5 * STEP_VARIANCES[0]
-    assert step_variance(threshold_mismatch=0.1, noise_rate=3.0, refractory=2_000) > 2 * STEP_VARIANCES[0]
+    assert step_variance() < 1.5 * BELIEVED_STEPS[0]
+    assert step_variance(threshold_mismatch=0.1) < 1.5 * BELIEVED_STEPS[0]
+    assert step_variance(threshold_mismatch=0.1, noise_rate=3.0, refractory=2_000) > 2 * BELIEVED_STEPS[0]
 
 
 def test_few_steps_tell_nothing():

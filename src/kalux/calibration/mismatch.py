@@ -38,7 +38,7 @@ MAX_SAMPLES: Final = 1_000_000
 _MAX_FRAMES: Final = 80
 _CLIP: Final = 3.0  # standard deviations of a mismatch: flicker and occlusions say nothing of thresholds
 
-STEP_VARIANCES: Final = (0.03, 0.4)
+BELIEVED_STEPS: Final = (0.03, 0.4)
 """What is believed of a step's variance, in units of c^2. The steps of simulated sensors without noise have none; but
 what is not modelled of events counts, too, where no frame checks them (docs/equations.md, K9)."""
 
@@ -76,10 +76,10 @@ class Mismatch(NamedTuple):
     by_spread: float = 0.0
 
     def step_variance(self, spread: float) -> float | None:
-        """Variance of a step, in units of c^2, given the ``spread``: within `STEP_VARIANCES`. None: unknown."""
+        """Variance of a step, in units of c^2, given the ``spread``: within `BELIEVED_STEPS`. None: unknown."""
         if self.per_event is None:
             return None
-        return float(np.clip(self.per_event - spread**2 * self.by_spread, *STEP_VARIANCES))
+        return float(np.clip(self.per_event - spread**2 * self.by_spread, *BELIEVED_STEPS))
 
 
 def estimate_mismatch(recording: Recording, camera: CameraSettings, events: EventSettings) -> Mismatch | None:
@@ -89,9 +89,9 @@ def estimate_mismatch(recording: Recording, camera: CameraSettings, events: Even
     threshold and w = 1 / Var m, the sum over pairs of intervals j, k at least two apart of w_j m_j c n_j w_k m_k c n_k
     is on average the squared spread times that of w_j w_k c n_j c n_k (c n_j c n_k + c' n'_j c' n'_k), primes for the
     other polarity. What is measured is drawn towards the usual spread as far as it is uncertain, and exceeds that only
-    as far as it is certain. Where both of a pixel's events of an interval and more, n + n', tell of single steps, their
-    variance is the sum of v (m^2 - Var' m) over that of v c c' (n + n'), v = (n + n') w^2: what m has beyond the
-    variance Var' by frames, changes below the threshold and the spread.
+    as far as it is certain. The variance of a step is what m^2 has, per event, beyond the variance Var' by frames,
+    changes below the threshold and the spread: over pixels with two events and more in an interval, the sum of
+    v (m^2 - Var' m) over that of v c c' (n + n'), with v = (n + n') w^2.
 
     Parameters
     ----------
@@ -118,7 +118,7 @@ def estimate_mismatch(recording: Recording, camera: CameraSettings, events: Even
     )
     of_steps = events.usual_threshold_spread**2, events.step_noise * threshold_on * threshold_off
     products: Array = np.zeros((*recording.sensor_size, *_PRODUCTS))
-    sums: Array = np.zeros(4)
+    sums: Array = np.zeros(len(_Sums._fields))
     samples = 0
     for interval, on, off, bend in counted_intervals(recording, camera, events, most_frames=_MAX_FRAMES):
         first, second = interval.ends
@@ -133,7 +133,7 @@ def estimate_mismatch(recording: Recording, camera: CameraSettings, events: Even
         if samples >= MAX_SAMPLES:
             break
     found = _solved(products, samples, events.usual_threshold_spread)
-    return None if found is None else _with_steps(found, _Sums(*sums), threshold_on * threshold_off)
+    return None if found is None else _with_steps(found, _Sums(*sums.tolist()), threshold_on * threshold_off)
 
 
 class _Sums(NamedTuple):

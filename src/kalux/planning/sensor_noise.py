@@ -86,11 +86,12 @@ def with_step_errors(
     error of estimated thresholds, 0 of others, is a part of the spread.
     """
     events = settings.events
-    assumed = (
-        events.threshold_spread != known.threshold_spread
-    )  # as wide as thresholds are that nothing tells
     wanted = None in (known.threshold_spread, known.step_variance)
-    if assumed or not wanted or not settings.filter.joins_frames:
+    if not wanted or not settings.filter.joins_frames:
+        return settings, None
+    if (
+        events.threshold_spread != known.threshold_spread
+    ):  # as wide as thresholds are uncertain that nothing tells
         return settings, None
     found = estimate_mismatch(recording, settings.camera, events)
     spread = events.threshold_spread
