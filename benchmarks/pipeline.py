@@ -3,6 +3,7 @@
     python benchmarks/pipeline.py [--seconds 4 ...] [--rate 300] [--threads 1 2] [--only 346x260 mp4 aedat4 ...]
     python benchmarks/pipeline.py --seconds 10 60 --rounds 1 --threads 2     # does memory grow with the length?
     python benchmarks/pipeline.py --stages --threads 2                       # where the processor time goes
+    python benchmarks/pipeline.py --only 346x260 mp4 -- --filter.motion off  # with further flags of kalux reconstruct
 
 Writes synthetic recordings (the stream of benchmarks/speed.py) as kalux HDF5 or AEDAT4, and runs ``kalux reconstruct``
 on them in a process of its own, as a user would: start-up, checking, choosing settings and all. The settings that it
@@ -171,7 +172,7 @@ def command_for(recording, kind, options, threads):
     """The arguments of ``kalux``, and what they make."""
     out, *flags = OUTPUTS[kind]
     made = recording.with_name(out)
-    given = () if options.estimate else GIVEN
+    given = (*(() if options.estimate else GIVEN), *options.flags)
     arguments = ["reconstruct", recording, "-o", made, "--rate", options.rate, "--threads", threads]
     return [*arguments, *flags, *given], made
 
@@ -214,6 +215,7 @@ def main():
     parser.add_argument("--estimate", action="store_true", help="let kalux estimate thresholds, delay, noise")
     parser.add_argument("--stages", action="store_true", help="processor time of each step and thread")
     parser.add_argument("--only", nargs="+", choices=[*SENSORS, *OUTPUTS, *INPUTS], default=[])
+    parser.add_argument("flags", nargs="*", help="after --: further ones of kalux reconstruct")
     options = parser.parse_args()
     sensors = [name for name in SENSORS if name in options.only] or list(SENSORS)
     outputs = [name for name in OUTPUTS if name in options.only] or ["mp4", "png", "exr"]
