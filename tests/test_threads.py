@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from kalux.threads import MOST_THREADS, InOrder, ahead, default_threads
+from kalux.threads import MOST_THREADS, InOrder, ahead, default_threads, made_ahead
 
 
 @pytest.fixture(autouse=True)
@@ -135,6 +135,109 @@ def test_one_in_another():
     assert next(outer) == 0
     outer.close()
     inner.close()
+
+
+class TestMadeAhead:
+    @pytest.mark.parametrize("depth", [1, 2, 100])
+    @pytest.mark.parametrize("threads", [1, 3])
+    @pytest.mark.parametrize("count", [0, 1, 500])
+    def test_in_the_order_of_the_items_whichever_is_made_first(self, depth, threads, count):
+        def slowly(k):
+            time.sleep(0.0005 * (k % 3 == 0))
+            return k * k
+
+        assert list(made_ahead(range(count), slowly, depth, threads)) == [k * k for k in range(count)]
+
+    def test_none_is_an_item_and_can_be_made(self):
+        assert list(made_ahead([None, 1], lambda item: item, 2, 2)) == [None, 1]
+        assert list(made_ahead([1, 2], lambda item: None, 2, 2)) == [None, None]
+
+    def test_several_are_made_at_a_time(self):
+        """Each of two waits for the other."""
+        both = threading.Barrier(2)
+        assert sorted(made_ahead(range(2), lambda _: both.wait(timeout=20), 2, 2)) == [0, 1]
+
+    def test_items_are_made_in_one_thread_and_used_in_others(self):
+        def items():
+            for _ in range(50):
+                yield threading.current_thread()
+
+        made = list(made_ahead(items(), lambda item: (item, threading.current_thread()), 3, 2))
+        makers = {maker for maker, _ in made}
+        assert {maker.name for maker in makers} == {"kalux-items"}
+        assert {user.name for _, user in made} == {"kalux-made"}
+        assert len(makers) == 1
+
+    def test_not_more_items_are_taken_than_asked_for(self):
+        """Back-pressure: what is held, the item being made, and the one in use."""
+        taken = []
+
+        def items():
+            for k in range(100):
+                taken.append(k)
+                yield k
+
+        made = made_ahead(items(), str, 3, 2)
+        for k in range(5):
+            assert next(made) == str(k)
+            deadline = time.monotonic() + 5
+            while len(taken) < k + 5 and time.monotonic() < deadline:
+                time.sleep(0.001)
+            time.sleep(0.01)
+            assert len(taken) == k + 5
+        made.close()
+
+    @pytest.mark.parametrize("kind", [ValueError, KeyboardInterrupt, SystemExit])
+    @pytest.mark.parametrize("threads", [1, 3])
+    def test_an_error_in_making_comes_where_its_item_would_have(self, kind, threads):
+        def fail_at_three(k):
+            if k == 3:
+                raise kind("here")
+            return k
+
+        seen = []
+        with pytest.raises(kind, match="here"):
+            seen.extend(made_ahead(itertools.count(), fail_at_three, 10, threads))
+        assert seen == [0, 1, 2]
+
+    def test_an_error_of_the_items_comes_after_all_that_was_made(self):
+        def failing():
+            yield from range(3)
+            raise ValueError("no more")
+
+        seen = []
+        with pytest.raises(ValueError, match="no more"):
+            seen.extend(made_ahead(failing(), lambda k: time.sleep(0.01) or k, 10, 2))
+        assert seen == [0, 1, 2]
+
+    def test_closing_ends_the_items_and_gives_up_the_rest(self):
+        closed, made = [], []
+
+        def items():
+            try:
+                yield from itertools.count()
+            finally:
+                closed.append(threading.current_thread().name)
+
+        def make(k):
+            made.append(k)
+            time.sleep(0.02)
+            return k
+
+        images = made_ahead(items(), make, 50, 1)
+        assert next(images) == 0
+        images.close()
+        assert closed == ["kalux-items"]
+        assert len(made) <= 3
+
+    def test_an_exception_where_it_is_used_ends_all(self):
+        def use():
+            for k in made_ahead(itertools.count(), str, 2, 2):
+                if k == "3":
+                    raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            use()
 
 
 class TestInOrder:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import tempfile
 from collections import deque
 from collections.abc import Callable, Generator, Iterator
@@ -23,11 +24,17 @@ from kalux.reconstructor import Reconstructor
 from kalux.recording import Recording, with_corrected_frames, with_event_layout
 from kalux.settings import Settings
 from kalux.smoothing import Backward, combine, reversed_pixels, reversed_settings
-from kalux.threads import ahead
+from kalux.threads import ahead, made_ahead
 
-_IMAGES_AHEAD: Final = 4
-"""Images that wait to be written: for a new frame the filter takes as long as for ten images, and makes none meanwhile.
-With 2, which is 2.5 MB less at 640x480, two cores would take 2 % longer; more than 8 gain nothing."""
+_MOST_AHEAD: Final = 20
+"""Estimates, or images made of them, that wait to be written: at 300 images/s more than between two frames. While the
+filter looks for motion at a frame, which takes as long as some ten images, other cores have these to go on with."""
+
+_MOST_MAKERS: Final = 4
+"""Images that are made at a time: where all of a DAVIS346 moves an image takes 2.5 times as long as its estimate."""
+
+_AHEAD_BYTES: Final = 28 << 20
+"""Memory of these, at most: on a sensor of VGA or more there are fewer."""
 
 
 def reconstruct(
@@ -116,8 +123,8 @@ def execute(
         Called with the number of events of every chunk read, for progress: in the pass that makes the images, and in
         the backward pass of a smoothed reconstruction. With several threads, in the one that filters.
     threads
-        With more than one, reading, filtering and making images of the estimates have a thread each, which run ahead of
-        the caller. The images are the same.
+        With more than one, reading and filtering have a thread each, and so many, up to four, make images of the
+        estimates: all of them ahead of the caller. The images are the same.
     with_variance
         Without, grey images have an infinite variance and are made faster.
     """
@@ -131,16 +138,20 @@ def execute(
         estimates = _smoothed_estimates(recording, engine, plan, on_events, on_backward, several)
     else:
         estimates = _forward_estimates(recording, engine, plan, on_events, several)
-    images = _images(engine, ahead(estimates, name="filter") if several else estimates, with_variance)
-    yield from ahead(images, _IMAGES_AHEAD, "images") if several else images
+    make = functools.partial(engine.image, with_variance=with_variance)
+    if several:
+        makers = min(threads, _MOST_MAKERS)
+        yield from made_ahead(estimates, make, _ahead(recording.sensor_size), makers, ("filter", "images"))
+    else:
+        with contextlib.closing(estimates):
+            yield from map(make, estimates)
 
 
-def _images(
-    engine: Reconstructor, estimates: Generator[Estimate, None, None], with_variance: bool
-) -> Generator[Image, None, None]:
-    with contextlib.closing(estimates):
-        for estimate in estimates:
-            yield engine.image(estimate, with_variance=with_variance)
+def _ahead(sensor_size: tuple[int, int]) -> int:
+    """How many estimates or images wait."""
+    height, width = sensor_size
+    log_intensity_and_variance = 8 * height * width
+    return min(max(_AHEAD_BYTES // log_intensity_and_variance, 4), _MOST_AHEAD)
 
 
 def _smoothed_estimates(

@@ -5,15 +5,17 @@ Which thread does a thing never changes what comes out, only when. Standard libr
 
 from __future__ import annotations
 
+import contextlib
 import os
 import threading
 from collections import deque
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from queue import SimpleQueue
 from typing import Final, Generic, TypeVar
 
 T = TypeVar("T")
+U = TypeVar("U")
 
 MOST_THREADS: Final = 8
 """Used where nothing is said, at most: one filters, and even EXR images, the slowest to encode, are done by seven."""
@@ -57,6 +59,67 @@ def ahead(items: Iterable[T], depth: int = 2, name: str = "ahead") -> Generator[
     finally:
         queue.stop()
         thread.join()
+
+
+def made_ahead(
+    items: Iterable[T],
+    make: Callable[[T], U],
+    depth: int,
+    threads: int,
+    names: tuple[str, str] = ("items", "made"),
+) -> Generator[U, None, None]:
+    """What is made of each item, in the items' order, up to ``depth`` before it is asked for.
+
+    As `ahead`, but ``make`` is called in ``threads`` other threads, for as many items at a time.
+
+    Parameters
+    ----------
+    items
+        Made one by one, in a thread of their own.
+    make
+        Called once for each item; the calls must not depend on their order.
+    depth
+        How many items, or what is made of them, are held, beside the item being made and the one in use.
+    threads
+        Number of threads, at least 1.
+    names
+        Of the thread of the items, and of those that ``make``, after "kalux-".
+    """
+    given: SimpleQueue[tuple[T, SimpleQueue[_Item[U] | _End]] | None] = SimpleQueue()
+    ended = threading.Event()
+
+    def places() -> Generator[SimpleQueue[_Item[U] | _End], None, None]:
+        """Where what is made of each item will be."""
+        with _closed(items) as iterator:
+            for item in iterator:
+                place: SimpleQueue[_Item[U] | _End] = SimpleQueue()
+                given.put((item, place))
+                yield place
+
+    def work() -> None:
+        while (task := given.get()) is not None:
+            item, place = task
+            if not ended.is_set():
+                place.put(_outcome(make, item))
+
+    workers = [threading.Thread(target=work, name=f"kalux-{names[1]}", daemon=True) for _ in range(threads)]
+    for worker in workers:
+        worker.start()
+    ready = ahead(places(), depth, names[0])
+    try:
+        for place in ready:
+            made = place.get()
+            if isinstance(made, _Item):
+                yield made.value
+            elif made.error is not None:
+                raise made.error
+    finally:
+        ended.set()
+        ready.close()
+        for _ in workers:
+            given.put(None)
+        for worker in workers:
+            worker.join()
 
 
 class InOrder(Generic[T]):
@@ -160,15 +223,30 @@ class _BoundedQueue(Generic[T]):
 def _make(items: Iterable[T], queue: _BoundedQueue[T]) -> None:
     error: BaseException | None = None
     try:
-        iterator = iter(items)
-        try:
+        with _closed(items) as iterator:
             for value in iterator:
                 if not queue.put(value):
                     break
-        finally:
-            close = getattr(iterator, "close", None)
-            if close is not None:
-                close()
     except BaseException as failure:  # raised in the thread that takes
         error = failure
     queue.end(error)
+
+
+@contextlib.contextmanager
+def _closed(items: Iterable[T]) -> Generator[Iterator[T], None, None]:
+    """An iterator over items, which is closed afterwards, if it can be."""
+    iterator = iter(items)
+    try:
+        yield iterator
+    finally:
+        close = getattr(iterator, "close", None)
+        if close is not None:
+            close()
+
+
+def _outcome(make: Callable[[T], U], item: T) -> _Item[U] | _End:
+    """What is made of an item, or the error that kept it from being made."""
+    try:
+        return _Item(make(item))
+    except BaseException as failure:  # raised in the thread that takes
+        return _End(failure)

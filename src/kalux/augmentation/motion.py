@@ -8,7 +8,7 @@ along these paths is in `kalux.augmentation.along`.
 from __future__ import annotations
 
 import dataclasses
-import functools
+import threading
 from typing import Any, Final
 
 import cv2
@@ -159,16 +159,28 @@ class Paths:
     """The paths of what moves between two frames, found when they are first asked for; parameters are those of `bent`.
 
     Finding them takes about as long as all else that is done for a frame: the filter tells what it knows half-way and
-    goes on, and whoever makes an image asks.
+    goes on, and whoever makes an image asks. Several threads may.
     """
 
     def __init__(self, first: Latent, second: Latent, path: Plane, level: Floats, variance: Floats) -> None:
-        self._known = first, second, path, level, variance
+        self._lock = threading.Lock()
+        self._known: tuple[Latent, Latent, Plane, Floats, Floats] | None = (
+            first,
+            second,
+            path,
+            level,
+            variance,
+        )
+        self._motion: Motion | None = None
 
-    @functools.cached_property
+    @property
     def motion(self) -> Motion | None:
         """None: nothing is seen along the paths that is not known."""
-        return bent(*self._known)
+        with self._lock:
+            if self._known is not None:
+                self._motion = bent(*self._known)
+                self._known = None
+            return self._motion
 
 
 def bent(first: Latent, second: Latent, path: Plane, level: Floats, variance: Floats) -> Motion | None:
