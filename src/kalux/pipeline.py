@@ -30,10 +30,10 @@ _MOST_AHEAD: Final = 20
 """Estimates, or images made of them, that wait to be written: at 300 images/s more than between two frames. While the
 filter looks for motion at a frame, which takes as long as some ten images, other cores have these to go on with."""
 
-_MOST_MAKERS: Final = 4
+_MOST_MAKERS: Final = 3
 """Images that are made at a time: where all of a DAVIS346 moves an image takes 2.5 times as long as its estimate."""
 
-_AHEAD_BYTES: Final = 28 << 20
+_AHEAD_BYTES: Final = 20 << 20
 """Memory of these, at most: on a sensor of VGA or more there are fewer."""
 
 
@@ -123,7 +123,7 @@ def execute(
         Called with the number of events of every chunk read, for progress: in the pass that makes the images, and in
         the backward pass of a smoothed reconstruction. With several threads, in the one that filters.
     threads
-        With more than one, reading and filtering have a thread each, and so many, up to four, make images of the
+        With more than one, reading and filtering have a thread each, and so many, up to three, make images of the
         estimates: all of them ahead of the caller. The images are the same.
     with_variance
         Without, grey images have an infinite variance and are made faster.
