@@ -78,3 +78,27 @@ def test_says_what_is_wrong_with_frames_and_events():
         r"events follow the frames if their x counts from the other side \(correlation 0.\d\d\): put right",
         rows["layout"],
     )
+
+
+def test_whether_motion_is_followed():
+    """By the sensor's size, as asked for, and both ways in time always; where it could be, as not in causal mode."""
+    small = moving_blocks().recording()
+    events, frames = np.concatenate(list(small.events())), list(small.frames())
+    height, width = 400, 301
+    large = Recording.from_arrays(
+        events,
+        [dataclasses.replace(frame, image=np.resize(frame.image, (height, width))) for frame in frames],
+        sensor_size=(height, width),
+    )
+
+    def told(recording, motion="auto", **how):
+        asked = from_dict({"filter": {"motion": motion}}, PRESETS["default"])
+        made = plan(recording, at="frames", settings=asked, **how)
+        return dict(plan_report(recording, made, asked)).get("motion")
+
+    assert told(small) == "followed between frames (usual of sensors of this size)"
+    assert told(small, "off") == "not followed between frames (given)"
+    assert "--filter.motion on does" in told(large)
+    assert told(large, "on") == "followed between frames (given)"
+    assert told(large, smooth=True) == "followed between frames (as both ways in time always)"
+    assert told(small, lookahead=False) is None

@@ -44,7 +44,11 @@ def plan_report(recording: Recording, plan: Plan, asked: Settings) -> list[tuple
     asked
         The settings before the plan filled in what was missing; what they state is said to be given.
     """
-    return [*_of_events(plan, asked), *_of_frames(recording, plan, asked)]
+    return [
+        *_of_events(plan, asked),
+        *_of_frames(recording, plan, asked),
+        *_of_motion(recording, plan, asked),
+    ]
 
 
 def _of_events(plan: Plan, asked: Settings) -> Iterator[tuple[str, str]]:
@@ -122,6 +126,25 @@ def _of_frames(recording: Recording, plan: Plan, asked: Settings) -> Iterator[tu
         yield "saturation", f"from {camera.clipped_from:.2g} of white ({ceiling_text(plan.mends.ceiling)})"
     if camera.white_balance != asked.camera.white_balance:
         yield "white balance", f"{camera.white_balance} for red, green, blue (measured)"
+
+
+def _of_motion(recording: Recording, plan: Plan, asked: Settings) -> Iterator[tuple[str, str]]:
+    """Whether what moves is followed between frames (K16), where it could be."""
+    filtered = plan.settings.filter
+    if not (filtered.joins_frames and plan.lookahead) or next(iter(recording.frames())).mosaic is not None:
+        return
+    if filtered.motion == "on":
+        by_size = asked.filter.follows_motion(recording.sensor_size)
+        how = "usual of sensors of this size" if by_size else "as both ways in time always"
+        what = f"followed between frames ({_GIVEN if asked.filter.motion == 'on' else how})"
+    elif asked.filter.motion == "off":
+        what = f"not followed between frames ({_GIVEN})"
+    else:
+        what = (
+            "not followed between frames (the sensor has many pixels): --filter.motion on does, for less error "
+            "there, and images take two to five times as long"
+        )
+    yield "motion", what
 
 
 def saturation_text(recording: Recording, plan: Plan, asked: Settings) -> str:

@@ -35,6 +35,7 @@ def test_says_all_that_reconstruct_would_settle(cli, write_recording, tmp_path):
         "bright tail",
         "response",
         "black",  # the blocks have nothing dark
+        "motion",
     ]
     done = cli("reconstruct", path, "-o", tmp_path / "out", "--at", "frames").out
     assert [line.split() for line in said] == [

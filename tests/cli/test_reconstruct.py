@@ -267,6 +267,7 @@ class TestWhatIsSaid:
             "bright",
             "response",
             "black",
+            "motion",
             "filter",
             "images",
             "wrote",
