@@ -206,7 +206,8 @@ def event_noise(
     if share < 0.01:
         return None
     rate, error = _typical_rate(tally, unusual)
-    counts, quiet = tally.counts.sum(axis=0), tally.quiet.sum(axis=0) * 1e-6
+    counts = tally.counts.sum(axis=0).astype(np.float64)
+    quiet = (tally.quiet.sum(axis=0) * 1e-6).astype(np.float64, copy=False)
     rates = shrunk_rates(counts, quiet, rate, unusual)
     return EventNoise(rate, error, rates, _dead_pixels(tally.all) & ~known, share)
 
@@ -327,7 +328,7 @@ def _unusual_pixels(tally: _Tally) -> NDArray[np.bool_]:
     counts, quiet = tally.counts.sum(axis=0), tally.quiet.sum(axis=0)
     unusual = np.zeros(counts.shape, np.bool_)
     for _ in range(5):
-        rate = counts[~unusual].sum() / max(quiet[~unusual].sum(), 1)
+        rate = int(counts[~unusual].sum()) / max(int(quiet[~unusual].sum()), 1)
         expected = rate * quiet
         excess = counts - expected
         found = (

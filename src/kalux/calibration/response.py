@@ -136,7 +136,7 @@ def calibrate_response(
     _check(images, times)
     order = np.argsort(times, kind="stable")
     times = times[order]
-    stack = aligned(np.stack([np.atleast_3d(images[i]) for i in order]))  # (K, H, W, C)
+    stack = aligned(np.stack([np.atleast_3d(images[i]) for i in order.tolist()]))  # (K, H, W, C)
     if per_channel:
         channels = [stack[..., c] for c in range(stack.shape[-1])]
     else:

@@ -39,5 +39,5 @@ def map_drago(intensity: Float32, bias: float, average: float, bright: float) ->
     relative = np.minimum(intensity, np.float32(average * largest)) / np.float32(average)
     ratio = relative / np.float32(largest)
     below = np.log(2 + 8 * np.power(ratio, np.float32(exponent)))
-    mapped: Float32 = np.log1p(relative) / below / np.float32(math.log10(largest + 1))
-    return mapped
+    mapped = np.log1p(relative) / below / np.float32(math.log10(largest + 1))
+    return np.asarray(mapped, np.float32)

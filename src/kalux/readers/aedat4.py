@@ -17,11 +17,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import BinaryIO, Final, NamedTuple, TypeVar
+from typing import Any, BinaryIO, Final, NamedTuple, TypeVar
 
 import lz4.frame
 import numpy as np
 import zstandard
+from numpy.typing import NDArray
 
 from kalux.errors import FormatError
 from kalux.events import EVENT_DTYPE, EventArray
@@ -268,11 +269,12 @@ def _frame(table: _Table, where: str) -> Frame:
     start, size = table.vector(10)
     if width <= 0 or height <= 0 or size != width * height * channels * dtype.itemsize:
         raise ValueError(f"{size} bytes of pixels for {width}x{height}")
-    image = np.frombuffer(table.data, dtype, width * height * channels, start)
+    pixels = np.frombuffer(table.data, dtype, width * height * channels, start)
+    image: NDArray[Any]
     if channels == 1:
-        image = image.reshape(height, width).copy()
+        image = pixels.reshape(height, width).copy()
     else:
-        image = np.ascontiguousarray(image.reshape(height, width, channels)[..., 2::-1])
+        image = np.ascontiguousarray(pixels.reshape(height, width, channels)[..., 2::-1])
     stamp = table.scalar(0, "<q", 0)
     exposure_start = table.scalar(3, "<q", 0) or stamp
     exposure_end = table.scalar(4, "<q", 0) or exposure_start + table.scalar(11, "<q", 0)
