@@ -10,7 +10,7 @@ import os
 import threading
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from queue import SimpleQueue
 from typing import Final, Generic, TypeVar
 
@@ -83,43 +83,22 @@ def made_ahead(
     threads
         Number of threads, at least 1.
     names
-        Of the thread of the items, and of those that ``make``, after "kalux-".
+        Of the thread of the items, and before their numbers of those that ``make``, after "kalux-".
     """
-    given: SimpleQueue[tuple[T, SimpleQueue[_Item[U] | _End]] | None] = SimpleQueue()
-    ended = threading.Event()
+    pool = ThreadPoolExecutor(threads, f"kalux-{names[1]}")
 
-    def places() -> Generator[SimpleQueue[_Item[U] | _End], None, None]:
-        """Where what is made of each item will be."""
+    def given() -> Generator[Future[U], None, None]:
         with _closed(items) as iterator:
             for item in iterator:
-                place: SimpleQueue[_Item[U] | _End] = SimpleQueue()
-                given.put((item, place))
-                yield place
+                yield pool.submit(make, item)
 
-    def work() -> None:
-        while (task := given.get()) is not None:
-            item, place = task
-            if not ended.is_set():
-                place.put(_outcome(make, item))
-
-    workers = [threading.Thread(target=work, name=f"kalux-{names[1]}", daemon=True) for _ in range(threads)]
-    for worker in workers:
-        worker.start()
-    ready = ahead(places(), depth, names[0])
+    ready = ahead(given(), depth, names[0])
     try:
-        for place in ready:
-            made = place.get()
-            if isinstance(made, _Item):
-                yield made.value
-            elif made.error is not None:
-                raise made.error
+        for made in ready:
+            yield made.result()
     finally:
-        ended.set()
         ready.close()
-        for _ in workers:
-            given.put(None)
-        for worker in workers:
-            worker.join()
+        pool.shutdown(cancel_futures=True)
 
 
 class InOrder(Generic[T]):
@@ -242,11 +221,3 @@ def _closed(items: Iterable[T]) -> Generator[Iterator[T], None, None]:
         close = getattr(iterator, "close", None)
         if close is not None:
             close()
-
-
-def _outcome(make: Callable[[T], U], item: T) -> _Item[U] | _End:
-    """What is made of an item, or the error that kept it from being made."""
-    try:
-        return _Item(make(item))
-    except BaseException as failure:  # raised in the thread that takes
-        return _End(failure)

@@ -89,9 +89,8 @@ def with_step_errors(
     wanted = None in (known.threshold_spread, known.step_variance)
     if not wanted or not settings.filter.joins_frames:
         return settings, None
-    if (
-        events.threshold_spread != known.threshold_spread
-    ):  # as wide as thresholds are uncertain that nothing tells
+    # Filled in before: as wide as thresholds are uncertain that nothing tells.
+    if events.threshold_spread != known.threshold_spread:
         return settings, None
     found = estimate_mismatch(recording, settings.camera, events)
     spread = events.threshold_spread
