@@ -929,7 +929,7 @@ def reconstruct(events, frames, sensor_size, settings, times):
     return every, out[0], out[1], out[2:4], out[4].astype(bool), expected
 
 
-def joined_along(first, second, path, bend, share, level, variance, between):
+def joined_along(first, second, path, bend, share, level, variance, between, c2):
     """L and its variance joined with what both frames show along the paths (K16); ``first``, ``second``: L and V."""
     height, width = level.shape
     seen, doubt, apart = np.empty(level.shape), np.empty(level.shape), np.empty(level.shape)
@@ -946,9 +946,9 @@ def joined_along(first, second, path, bend, share, level, variance, between):
     doubt += 0.15 * around(apart, 1) + 0.1 * around(fine, 1)
     unexplained = around(apart, 2) / np.maximum(around((first[0] - second[0]) ** 2, 2), 5e-4)
     doubt /= np.maximum(1 - unexplained, 1e-6)
-    contradiction = around((level - seen) ** 2 / (variance + doubt), 2)
-    believed = between / (doubt * (1 + np.maximum(contradiction - 1, 0)) ** 2)
-    trust = between / (doubt * (1 + 0.45 * contradiction) ** 2)
+    contradiction = around((level - seen) ** 2 / (variance + doubt + c2 / 4), 2)
+    believed = 1.5 * between / (doubt * (1 + 4 * np.maximum(contradiction - 1, 0)) ** 2)
+    trust = between / (doubt * (1 + 1.2 * contradiction) ** 2)
     return (level / variance + seen * believed) / (1 / variance + believed), 1 / (1 / variance + trust)
 
 

@@ -31,7 +31,7 @@ def test_it_is_the_oracle(seed, share, moved):
     variance = rng.uniform(1e-4, 1e-2, shape).astype(np.float32)
     frames = Latent(first, variances[0]), Latent(second, variances[1])
     unmoved = naive.around((first.astype(float) - second) ** 2, 2).astype(np.float32)
-    motion = Motion(*map(readable, frames), path, bend, unmoved, ((slice(0, 14), slice(0, 17)),))
+    motion = Motion(*map(readable, frames), path, bend, unmoved, 0.04, ((slice(0, 14), slice(0, 17)),))
     found = whole(Along(motion, share), level, variance)
     between = 4 * share * (1 - share)
     expected = naive.joined_along(
@@ -42,6 +42,7 @@ def test_it_is_the_oracle(seed, share, moved):
         level.astype(float),
         variance.astype(float),
         between,
+        0.04,
     )
     np.testing.assert_allclose(found[0], expected[0], atol=1e-5)
     np.testing.assert_allclose(found[1], expected[1], rtol=3e-4)
@@ -67,7 +68,7 @@ def test_windows_show_what_the_whole_image_does(windows):
     all_of_it = (slice(0, 72), slice(0, 96))
     found = [
         whole(
-            Along(Motion(*readable_frames, path, bend, unmoved_difference(*frames), tuple(parts)), 0.4),
+            Along(Motion(*readable_frames, path, bend, unmoved_difference(*frames), 0.04, tuple(parts)), 0.4),
             level,
             variance,
         )
@@ -82,7 +83,7 @@ def test_windows_are_taken_with_their_margins_and_put_back_without():
     image = np.arange(20 * 30, dtype=np.float32).reshape(20, 30)
     windows = (slice(0, 8), slice(10, 20)), (slice(8, 20), slice(10, 14))
     nothing = np.zeros((2, *image.shape), np.float32)
-    along = Along(Motion(nothing, nothing, nothing, nothing, image, windows), 0.5)
+    along = Along(Motion(nothing, nothing, nothing, nothing, image, 0.04, windows), 0.5)
     values = taken(along, image)
     np.testing.assert_array_equal(values, np.concatenate([image[:12, 6:24].ravel(), image[4:, 6:18].ravel()]))
     found = -image

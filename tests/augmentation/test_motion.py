@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from kalux import PRESETS, Frame, Reconstructor
 from kalux.augmentation.along import Along
 from kalux.augmentation.bridge import UNMEASURED
-from kalux.augmentation.motion import _windows, bent, find_path
+from kalux.augmentation.motion import HalfWay, _windows, behind, bent, find_path
 from kalux.events import make_events
 from kalux.settings import altered
 from textures import SHAPE, frame_of, texture, whole
@@ -48,7 +48,7 @@ def test_the_path_is_bent_to_the_image_half_way(late):
     """A texture that moves by 4 pixels, but is not where 2 are half-way: the bend finds it, and it is seen there."""
     first, second = frame_of(texture(0)), frame_of(texture(0, 4.0))
     level, variance = texture(0, 2.0 + late), np.full(SHAPE, 1e-3, np.float32)
-    motion = bent(first, second, find_path(first, second, -3.5, 1.0), level, variance)
+    motion = bent(first, second, find_path(first, second, -3.5, 1.0), HalfWay(level, variance, 0.0, 0.04))
     np.testing.assert_allclose(np.median(motion.bend[0][INSIDE]), -late, atol=0.1)
     np.testing.assert_allclose(np.median(motion.bend[1][INSIDE]), 0.0, atol=0.05)
     noisy = level + np.random.default_rng(1).normal(0, 0.1, SHAPE).astype(np.float32)
@@ -58,12 +58,30 @@ def test_the_path_is_bent_to_the_image_half_way(late):
     assert (left <= 0.01).all()
 
 
+def test_an_image_that_is_behind_the_light_bends_no_path():
+    """Half-way it shows what was there a twentieth of the way before."""
+    first, second = frame_of(texture(0)), frame_of(texture(0, 8.0))
+    level, variance = texture(0, 3.6), np.full(SHAPE, 1e-3, np.float32)
+    path = find_path(first, second, -3.5, 1.0)
+    motion = bent(first, second, path, HalfWay(level, variance, 0.05, 0.04))
+    np.testing.assert_allclose(np.median(motion.bend[0][INSIDE]), 0.0, atol=0.05)
+    noisy = level + np.random.default_rng(1).normal(0, 0.1, SHAPE).astype(np.float32)
+    joined, _ = whole(Along(motion, 0.5), noisy, np.full(SHAPE, 0.03, np.float32))
+    assert np.sqrt(np.mean(np.square(joined - texture(0, 4.0))[INSIDE])) < 0.06
+
+
+def test_it_is_behind_by_a_share_of_the_time_between_events_as_far_as_frames_let_it():
+    assert behind(10_000, 40_000) == pytest.approx(0.02)
+    assert behind(20_000, 40_000) == pytest.approx(0.04)
+    assert behind(100_000, 40_000) == behind(1_000_000, 40_000) < 0.06
+
+
 def test_a_wrong_path_is_not_believed():
     """Frames that have nothing to do with the image leave it as it is."""
     first, second = frame_of(texture(0)), frame_of(texture(1))
     level, variance = texture(2), np.full(SHAPE, 1e-3, np.float32)
     path = find_path(first, second, -3.5, 1.0)
-    motion = bent(first, second, path, level, variance)
+    motion = bent(first, second, path, HalfWay(level, variance, 0.0, 0.04))
     if motion is not None:
         joined, _ = whole(Along(motion, 0.5), level, variance)
         assert np.sqrt(np.mean(np.square(joined - level))) < 0.01

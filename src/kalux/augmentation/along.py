@@ -38,9 +38,21 @@ Measured: 0.09 to 0.12 (docs/equations.md, K16)."""
 _LEAST_UNMOVED: Final = np.float32(5e-4)
 """Mean squared difference of the frames, in log intensity^2, below which they are alike wherever they are read."""
 
-_DISTRUST: Final = np.float32(0.45)
-"""How much less the variance falls where the filter contradicts, per mean squared difference in units of its variance:
-what looks right is not always, so that it tells less of its own error than it is worth (docs/equations.md, K16)."""
+_UNSIGNALLED: Final = 0.25
+"""Mean squared difference, in c^2, of an image from what is seen that says nothing against it: events tell no less, and
+what they miss is alike among neighbours (docs/equations.md, K16)."""
+
+_CAREFUL: Final = np.float32(1.5)
+"""Variance that is given to what is seen over that by which it is weighted: simulated and real errors differ by that
+much (docs/equations.md, K16)."""
+
+_CONTRADICTED: Final = np.float32(4.0)
+"""How steeply less is believed of what an image contradicts, per mean squared difference, in units of its variance,
+beyond 1."""
+
+_DISTRUST: Final = np.float32(1.2)
+"""How much less the variance falls where the filter contradicts, per such difference: what looks right is not always,
+so that it tells less of its own error than it is worth (docs/equations.md, K16)."""
 
 _LEAST_MOVING: Final = np.float32(1e-6)
 """Share of the frames' difference that motion explains where it explains nothing: a division."""
@@ -103,6 +115,8 @@ class Motion:
         (2, H, W) float32: how far both ends of the path are shifted for what is at a pixel half-way.
     unmoved
         (H, W) float32: mean squared difference of the frames around every pixel, at the same place.
+    threshold2
+        c^2: what events cannot tell of is measured by it.
     windows
         Rows and columns, no pixel twice, outside which nothing is seen that is not known.
     """
@@ -112,6 +126,7 @@ class Motion:
     path: Plane
     bend: Plane
     unmoved: Plane
+    threshold2: float
     windows: tuple[Window, ...]
 
     @cached_property
@@ -214,6 +229,7 @@ def _look(
         (np.uint64(height), np.uint64(width)),
         np.float32(along.share),
         np.float32(along.between),
+        np.float32(_UNSIGNALLED * motion.threshold2),
         np.arange(width, dtype=np.float32),
         seen,
         doubt,
@@ -248,6 +264,7 @@ def _look_along(  # type: ignore[no-untyped-def]
     shape,
     share,
     between,
+    unsignalled,
     numbers,
     seen,
     doubt,
@@ -301,9 +318,11 @@ def _look_along(  # type: ignore[no-untyped-def]
                 _doubt(count, doubt, here, sums, FIRST, wider, FIRST, unmoved, place)
                 if joins:
                     at = row % _RING * count
+                    # fmt: off
                     _contradict(
-                        count, contradiction, at, seen, here, doubt, here, level, here, variance, here
+                        count, contradiction, at, seen, here, doubt, here, level, here, variance, here, unsignalled,
                     )
+                    # fmt: on
             if step >= _FOUR and joins:
                 row = step - _FOUR
                 here = begin + row * count
@@ -377,10 +396,17 @@ def _doubt(doubt: Pixels, local_around: Pixels, difference_around: Pixels, unmov
 
 
 @row_formula
-def _contradict(contradiction: Pixels, seen: Pixels, doubt: Pixels, level: Pixels, variance: Pixels) -> None:
+def _contradict(
+    contradiction: Pixels,
+    seen: Pixels,
+    doubt: Pixels,
+    level: Pixels,
+    variance: Pixels,
+    unsignalled: Number,
+) -> None:
     """Squared difference of an image and what is seen, in units of its variance."""
     error = level[0] - seen[0]
-    contradiction[0] = error * error / (variance[0] + doubt[0])
+    contradiction[0] = error * error / (variance[0] + doubt[0] + unsignalled)
 
 
 @row_formula
@@ -395,8 +421,8 @@ def _join(
     """The image joined with what is seen, and its variance, in place of this."""
     contradicted = _mean_of_five(contradiction_around)
     own = between * variance[0]
-    believed = doubt[0] * squared(ONE + _larger(contradicted - ONE, np.float32(0.0)))
-    kept = believed / (own + believed)
+    believed = doubt[0] * squared(ONE + _CONTRADICTED * _larger(contradicted - ONE, np.float32(0.0)))
+    kept = believed / (_CAREFUL * own + believed)
     seen[0] = seen[0] + kept * (level[0] - seen[0])
     doubted = doubt[0] * squared(ONE + _DISTRUST * contradicted)
     doubt[0] = doubted / (own + doubted) * variance[0]

@@ -16,7 +16,7 @@ import numpy as np
 from kalux.augmentation.background import doubt, signal_shares
 from kalux.augmentation.bridge import BridgeNoise, Latent, bridge, drift, nominal_thresholds
 from kalux.augmentation.highlights import Unshown
-from kalux.augmentation.motion import Paths
+from kalux.augmentation.motion import HalfWay, Paths
 from kalux.augmentation.subthreshold import add_missed_change, half_way, silent_change, turns
 from kalux.augmentation.trail import Trail, nothing_followed, polarity_of, trail_between
 from kalux.cli.loops import prepare_loops
@@ -78,9 +78,8 @@ def rehearse_images() -> None:
     make_image(estimate, view, with_variance=False)
     even, known = np.zeros(_SIZE, np.float32), np.ones(_SIZE, np.float32)
     frame, aside = Latent(even, known), np.ones((2, *_SIZE), np.float32)
-    moving = dataclasses.replace(
-        estimate, log_intensity=even, variance=known, paths=Paths(frame, frame, aside, even, known), share=0.5
-    )
+    paths = Paths(frame, frame, aside, HalfWay(even, known, 0.0, 0.1))
+    moving = dataclasses.replace(estimate, log_intensity=even, variance=known, paths=paths, share=0.5)
     make_image(moving, view)
 
 

@@ -20,7 +20,7 @@ from kalux.augmentation.highlights import (
     expected_excess,
     follow_unshown,
 )
-from kalux.augmentation.motion import Paths, Plane, find_path
+from kalux.augmentation.motion import HalfWay, Paths, Plane, behind, find_path
 from kalux.augmentation.subthreshold import (
     UNKNOWN_CHANGE,
     UNMEASURED_CHANGE,
@@ -550,7 +550,9 @@ class BridgedFrames(Method):
 
     def paths(self, segment: BridgedSegment, path: Plane, level: Floats, variance: Floats) -> Paths:
         assert segment.latents is not None
-        return Paths(*segment.latents, path, level, variance)
+        assert segment.trail is not None
+        late = behind(1e6 * segment.trail.scale, segment.end - segment.start)
+        return Paths(*segment.latents, path, HalfWay(level, variance, late, self.on * self.off))
 
     def turns(self, segment: BridgedSegment) -> float:
         return segment.turns
