@@ -948,7 +948,7 @@ def joined_along(first, second, path, bend, share, level, variance, between, c2)
     doubt /= np.maximum(1 - unexplained, 1e-6)
     contradiction = around((level - seen) ** 2 / (variance + doubt + c2 / 4), 2)
     believed = 1.5 * between / (doubt * (1 + 4 * np.maximum(contradiction - 1, 0)) ** 2)
-    trust = between / (doubt * (1 + 1.2 * contradiction) ** 2)
+    trust = between / (doubt * (1 + 0.7 * contradiction) ** 2)
     return (level / variance + seen * believed) / (1 / variance + believed), 1 / (1 / variance + trust)
 
 
