@@ -125,18 +125,18 @@ class BridgedFrames(Method):
         pixels: PixelCalibration | None,
     ) -> None:
         super().__init__(settings, lookahead, shape)
-        events, c2 = settings.events, self.on * self.off
+        events, self._threshold2 = settings.events, self.on * self.off  # c^2
         scale2 = 2.0 * settings.filter.highlight_scale**2  # of the difference of two highlights
         self.noise = BridgeNoise(
             self.on,
             self.off,
-            events.step_noise * c2,
-            events.quantisation_variance * c2,
+            events.step_noise * self._threshold2,
+            events.quantisation_variance * self._threshold2,
             scale2 if scale2 > 0 else bridge.UNMEASURED,
         )
         self._spread2 = events.believed_mismatch**2  # K11
         self._follows_motion = settings.filter.follows_motion(shape)
-        self._event_noise = akf_bridged.Noise(events.background_rate, events.step_noise, c2)
+        self._event_noise = akf_bridged.Noise(events.background_rate, events.step_noise, self._threshold2)
         self._prior = (
             bridge.nominal_thresholds(shape, settings.events.mismatch, np.float32)
             if pixels is None
@@ -179,7 +179,7 @@ class BridgedFrames(Method):
             level_variance,
             exposure,
             duration=shot.end - shot.start,
-            event_variance=self.settings.events.deblur_variance * self.on * self.off,
+            event_variance=self.settings.events.deblur_variance * self._threshold2,
         )
         if shot.valid is not None:
             latent.variance[~shot.valid] = bridge.MASKED
@@ -235,7 +235,7 @@ class BridgedFrames(Method):
             at_middle=followed,
             unshown=begin_unshown(latent, frame_highlights(shot), tail),
             tail=tail,
-            silent_change=np.full(self.shape, UNKNOWN_CHANGE * self.on * self.off, np.float32),
+            silent_change=np.full(self.shape, UNKNOWN_CHANGE * self._threshold2, np.float32),
             latest_change=np.full(self.shape, np.nan, np.float32),
         )
         lead_in, value, variance = None, latent.value, latent.variance
@@ -311,10 +311,10 @@ class BridgedFrames(Method):
             signal=signal,
         )
         if signal is not None:
-            joined = joined._replace(doubt=doubt(signal, self.noise.step_variance, self.on * self.off))
+            joined = joined._replace(doubt=doubt(signal, self.noise.step_variance, self._threshold2))
         change = self._silent_change(joined)
         share, latest_change = half_way(
-            memory.latest_change, joined, self.noise.quantisation_variance, self.on * self.off
+            memory.latest_change, joined, self.noise.quantisation_variance, self._threshold2
         )
         joined, since_measured = self._with_drift(joined, memory, second, (on, off), change, signal)
         change = self._with_black_change(change, memory.latent, second)
@@ -436,13 +436,13 @@ class BridgedFrames(Method):
         return height * self.on, height * self.off
 
     def _silent_change(self, segment: BridgedSegment) -> Floats:
-        return silent_change(segment, self.noise.quantisation_variance, self.on * self.off)
+        return silent_change(segment, self.noise.quantisation_variance, self._threshold2)
 
     def _with_black_change(self, change: Floats, *frames: Latent) -> Floats:
         """The ``change`` of silent pixels, larger where a frame is black and cannot show that it is small (K11)."""
         for frame in frames:
             if frame.ceiling is not None:
-                unmeasured = np.float32(UNMEASURED_CHANGE * self.on * self.off)
+                unmeasured = np.float32(UNMEASURED_CHANGE * self._threshold2)
                 change = np.where(np.isfinite(frame.ceiling), unmeasured, change)
         return change
 
@@ -552,7 +552,7 @@ class BridgedFrames(Method):
         assert segment.latents is not None
         assert segment.trail is not None
         late = behind(1e6 * segment.trail.scale, segment.end - segment.start)
-        return Paths(*segment.latents, path, HalfWay(level, variance, late, self.on * self.off))
+        return Paths(*segment.latents, path, HalfWay(level, variance, late, self._threshold2))
 
     def turns(self, segment: BridgedSegment) -> float:
         return segment.turns
@@ -572,7 +572,7 @@ class BridgedFrames(Method):
             counted=0.0,
             quantisation_variance=self.noise.quantisation_variance,
             repeated=1.0 - between / 2.0,
-            wrong=WRONG_STEPS * self._spread2 * between * self.on * self.off,
+            wrong=WRONG_STEPS * self._spread2 * between * self._threshold2,
             share=share,
             half_way=segment.half_way,
         )
