@@ -894,7 +894,7 @@ def reconstruct(events, frames, sensor_size, settings, times):
         method = bridged if settings.filter.augmentation == "bridge" else paper
         begin = frames[0].exposure_start
     on, off = settings.events.threshold_on, settings.events.threshold_off
-    out = np.empty((5, len(times), *sensor_size))
+    out = np.zeros((5, len(times), *sensor_size))  # outside the bridge nothing is hidden and nobody moves
     every = pixels(events, frames, sensor_size, settings, begin)
     more = (trail_scales(every, settings),) if method is bridged else ()
     if method is bridged and settings.events.noise_rate is not None:
