@@ -929,9 +929,11 @@ def reconstruct(events, frames, sensor_size, settings, times):
     return every, out[0], out[1], out[2:4], out[4].astype(bool), expected
 
 
-def joined_along(first, second, path, bend, share, level, variance, between, c2):
+def joined_along(first, second, path, bend, share, level, variance, c2):
     """L and its variance joined with what both frames show along the paths (K16); ``first``, ``second``: L and V."""
     height, width = level.shape
+    of_second = share + ((1 - share) if share <= 0.5 else -share) * (1 - 2 * share) ** 2
+    of_second = min(max(of_second, 0.001), 0.999)
     seen, doubt, apart = np.empty(level.shape), np.empty(level.shape), np.empty(level.shape)
     for row, column in np.ndindex(height, width):
         x = column + 4 * share * (1 - share) * bend[0, row, column]
@@ -939,16 +941,16 @@ def joined_along(first, second, path, bend, share, level, variance, between, c2)
         step_x, step_y = path[0, row, column], path[1, row, column]
         a = resampled(*first, x - share * step_x, y - share * step_y)
         b = resampled(*second, x + (1 - share) * step_x, y + (1 - share) * step_y)
-        seen[row, column] = (1 - share) * a[0] + share * b[0]
-        doubt[row, column] = (1 - share) ** 2 * a[1] + share**2 * b[1]
+        seen[row, column] = (1 - of_second) * a[0] + of_second * b[0]
+        doubt[row, column] = (1 - of_second) ** 2 * a[1] + of_second**2 * b[1]
         apart[row, column] = (a[0] - b[0]) ** 2
     fine = (seen - around(seen, 1)) ** 2
     doubt += 0.15 * around(apart, 1) + 0.1 * around(fine, 1)
     unexplained = around(apart, 2) / np.maximum(around((first[0] - second[0]) ** 2, 2), 5e-4)
     doubt /= np.maximum(1 - unexplained, 1e-6)
     contradiction = around((level - seen) ** 2 / (variance + doubt + c2 / 4), 2)
-    believed = 1.5 * between / (doubt * (1 + 4 * np.maximum(contradiction - 1, 0)) ** 2)
-    trust = between / (doubt * (1 + 0.7 * contradiction) ** 2)
+    believed = 1.5 / (doubt * (1 + 4 * np.maximum(contradiction - 1, 0)) ** 2)
+    trust = (1.5 - 0.5 * 4 * share * (1 - share)) / (doubt * (1 + 0.7 * contradiction) ** 2)
     return (level / variance + seen * believed) / (1 / variance + believed), 1 / (1 / variance + trust)
 
 

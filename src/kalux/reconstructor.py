@@ -445,8 +445,8 @@ class Reconstructor:
         return Moment(t, self._shots[0], self._shots[1], share)
 
     def _paths(self, progress: _Progress, moment: Moment) -> Paths | None:
-        """Of what moves between the frames around an image (K16); None at a frame, and where there is one alone."""
-        if moment.after is None or not 0.0 < moment.share < 1.0:
+        """Of what moves between the frames around an image (K16); None where there is one alone."""
+        if moment.after is None or not 0.0 <= moment.share <= 1.0:
             return None
         self._look_for_motion(progress)
         return progress.paths

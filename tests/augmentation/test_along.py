@@ -15,10 +15,27 @@ from textures import SHAPE, frame_of, texture, whole
 import naive
 
 
+def moving_right(first, second):
+    """By 2 pixels, everywhere."""
+    path = np.zeros((2, *SHAPE), np.float32)
+    path[0] = 2.0
+    return Motion(
+        readable(first),
+        readable(second),
+        path,
+        np.zeros_like(path),
+        unmoved_difference(first, second),
+        0.04,
+        ((slice(0, SHAPE[0]), slice(0, SHAPE[1])),),
+    )
+
+
 @given(
-    seed=st.integers(0, 1000), share=st.sampled_from([0.25, 0.5, 0.75]), moved=st.sampled_from([0, 1, 2.5])
+    seed=st.integers(0, 1000),
+    share=st.sampled_from([0.0, 0.1, 0.25, 0.5, 0.75, 1.0]),
+    moved=st.sampled_from([0, 1, 2.5]),
 )
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=20, deadline=None)
 def test_it_is_the_oracle(seed, share, moved):
     """To what float32 leaves."""
     rng = np.random.default_rng(seed)
@@ -33,7 +50,6 @@ def test_it_is_the_oracle(seed, share, moved):
     unmoved = naive.around((first.astype(float) - second) ** 2, 2).astype(np.float32)
     motion = Motion(*map(readable, frames), path, bend, unmoved, 0.04, ((slice(0, 14), slice(0, 17)),))
     found = whole(Along(motion, share), level, variance)
-    between = 4 * share * (1 - share)
     expected = naive.joined_along(
         *((frame.value.astype(float), frame.variance.astype(float)) for frame in frames),
         path,
@@ -41,11 +57,34 @@ def test_it_is_the_oracle(seed, share, moved):
         share,
         level.astype(float),
         variance.astype(float),
-        between,
         0.04,
     )
     np.testing.assert_allclose(found[0], expected[0], atol=1e-5)
     np.testing.assert_allclose(found[1], expected[1], rtol=3e-4)
+
+
+@pytest.mark.parametrize(
+    ("share", "second"), [(0.0, 0.999), (0.25, 0.4375), (0.5, 0.5), (0.75, 0.5625), (1.0, 0.001)]
+)
+def test_at_a_frame_it_is_the_other_frame_that_tells_more(share, second):
+    assert Along(moving_right(frame_of(texture(0)), frame_of(texture(0, 2.0))), share).weight == second
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2, 0.5, 0.8, 1.0])
+def test_nothing_is_seen_of_what_either_frame_does_not_measure(share):
+    """At a frame, too, where the other one alone counts."""
+    noise = np.random.default_rng(0).normal(0.0, 0.1, SHAPE).astype(np.float32)
+    level = texture(0, 2 * share) + noise
+    frames = [frame_of(texture(0, x)) for x in (0.0, 2.0)]
+    clipped = [slice(32, 34), slice(60, 62)]  # of the image, at all shares
+    for frame, columns in zip(frames, (slice(30, 34), slice(60, 64)), strict=True):
+        frame.variance[30:34, columns] = UNMEASURED
+    along = Along(moving_right(*frames), share)
+    joined, left = whole(along, level, np.full(SHAPE, 0.01, np.float32))
+    assert np.abs(joined - level + noise)[10:25, 10:80].mean() < 0.3 * np.abs(noise[10:25, 10:80]).mean()
+    for columns in clipped:
+        np.testing.assert_allclose(joined[30:34, columns], level[30:34, columns], atol=1e-6)
+        np.testing.assert_allclose(left[30:34, columns], 0.01, rtol=1e-4)
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,8 @@
 """What two frames show along the paths of what moves between them (docs/equations.md, K16).
 
 Both frames around an image show what it shows, elsewhere. Read along the paths, which `kalux.augmentation.motion`
-finds, they are one more estimate of the image, the better the better they agree with each other.
+finds, they are one more estimate of the image, the better the better they agree with each other. The filter knows the
+frame at an image, or near it, itself: there it is the other one that tells more.
 """
 
 from __future__ import annotations
@@ -35,6 +36,10 @@ _DISAGREEMENT: Final = np.float32(0.15)
 quarter; errors of the path, by which one frame is read too far on and the other not far enough, cancel in the mean.
 Measured: 0.09 to 0.12 (docs/equations.md, K16)."""
 
+_LEAST_WEIGHT: Final = 1e-3
+"""Of a frame in the mean of both, so that nothing is seen of what it does not measure (K5): behind a white the other
+frame alone would bleach a highlight."""
+
 _LEAST_UNMOVED: Final = np.float32(5e-4)
 """Mean squared difference of the frames, in log intensity^2, below which they are alike wherever they are read."""
 
@@ -42,9 +47,9 @@ _UNSIGNALLED: Final = 0.25
 """Mean squared difference, in c^2, of an image from what is seen that says nothing against it: events tell no less, and
 what they miss is alike among neighbours (docs/equations.md, K16)."""
 
-_CAREFUL: Final = np.float32(1.5)
-"""Variance that is given to what is seen over that by which it is weighted: simulated and real errors differ by that
-much (docs/equations.md, K16)."""
+_CAREFUL: Final = 1.5
+"""How much more what is seen weighs than its variance says; half-way the variance that is given out has it that much
+larger, since simulated and real errors differ by that much there, and not at frames (docs/equations.md, K16)."""
 
 _CONTRADICTED: Final = np.float32(4.0)
 """How steeply less is believed of what an image contradicts, per mean squared difference, in units of its variance,
@@ -142,9 +147,24 @@ class Along(NamedTuple):
     share: float
 
     @property
-    def between(self) -> float:
-        """0 at a frame, 1 half-way."""
+    def bent(self) -> float:
+        """How much of the bend there is: none at a frame, all of it half-way."""
         return bridge_variance(self.share)
+
+    @property
+    def weight(self) -> float:
+        """Of the second frame in the mean of both, the first one's being what is left of 1.
+
+        Half-way it is the share of the way. At a frame it is that of the other one, but for `_LEAST_WEIGHT`.
+        """
+        nearer = 1.0 if self.share <= 0.5 else 0.0
+        weight = self.share + (nearer - self.share) * (1.0 - self.bent)
+        return min(max(weight, _LEAST_WEIGHT), 1.0 - _LEAST_WEIGHT)
+
+    @property
+    def trust(self) -> float:
+        """How much more than its variance says the image's own falls: as much at a frame as what is seen weighs."""
+        return _CAREFUL + (1.0 - _CAREFUL) * self.bent
 
 
 def as_seen(frame: Latent) -> Latent:
@@ -168,8 +188,8 @@ def mean_around(values: Floats, patch: tuple[int, int]) -> Plane:
 def seen_along(along: Along, window: Window) -> tuple[Plane, Plane]:
     """What both frames show along the paths, in a window: log intensity, and its variance.
 
-    With s the share, the mean of both is weighted by 1 - s and s. It is the less certain the more the frames disagree
-    there, the finer the texture is that is read between its pixels, and the better they agree where nothing moves.
+    The mean of both is weighted by `Along.weight`. It is the less certain the more the frames disagree there, the finer
+    the texture is that is read between its pixels, and the better they agree where nothing moves.
     """
     seen, doubt = _look(along, _places([window], [window]))
     rows, columns = (part.stop - part.start for part in window)
@@ -192,10 +212,7 @@ def join_along(along: Along, level: Plane, variance: Plane) -> None:
 
 
 def joined_along(along: Along, level: Plane, variance: Plane) -> tuple[Plane, Plane]:
-    """Log intensity and its variance where they are `taken`, joined with what is seen along the paths.
-
-    What is seen counts `Along.between` times: at a frame the filter knows the frame itself.
-    """
+    """Log intensity and its variance where they are `taken`, joined with what is seen along the paths."""
     return _look(along, along.motion.places, level, variance)
 
 
@@ -228,7 +245,9 @@ def _look(
         places.looked_at,
         (np.uint64(height), np.uint64(width)),
         np.float32(along.share),
-        np.float32(along.between),
+        np.float32(along.bent),
+        np.float32(along.weight),
+        np.float32(along.trust),
         np.float32(_UNSIGNALLED * motion.threshold2),
         np.arange(width, dtype=np.float32),
         seen,
@@ -263,7 +282,9 @@ def _look_along(  # type: ignore[no-untyped-def]
     windows,
     shape,
     share,
-    between,
+    bent,
+    weight,
+    trust,
     unsignalled,
     numbers,
     seen,
@@ -295,14 +316,14 @@ def _look_along(  # type: ignore[no-untyped-def]
                     _follow(
                         count, pixels, x, fractions, x, pixels, y, fractions, y, numbers, left,
                         path, place, bend, place, path, place + down, bend, place + down,
-                        np.float32(top + step), share - np.float32(frame), between,
+                        np.float32(top + step), share - np.float32(frame), bent,
                         np.float32(width), np.float32(height),
                     )
                 read_row(count, first, stride, pixels, fractions, _ZERO, apart, read)
                 read_row(count, second, stride, pixels, fractions, count, apart, read)
                 _compare(
                     count, seen, here, difference, step % _RING * count, doubt, here,
-                    read, _ZERO, read, count, read, apart, read, apart + count, share,
+                    read, _ZERO, read, count, read, apart, read, apart + count, weight,
                 )
                 # fmt: on
             if _ONE <= step < rows + _ONE:
@@ -327,7 +348,7 @@ def _look_along(  # type: ignore[no-untyped-def]
                 row = step - _FOUR
                 here = begin + row * count
                 _add_five(contradiction, row, rows, count, sums)
-                _join(count, seen, here, doubt, here, sums, FIRST, level, here, variance, here, between)
+                _join(count, seen, here, doubt, here, sums, FIRST, level, here, variance, here, trust)
         begin += rows * count
 
 
@@ -344,12 +365,12 @@ def _follow(
     bend_y: Pixels,
     row: Number,
     back: Number,
-    between: Number,
+    bent: Number,
     width: Number,
     height: Number,
 ) -> None:
     """Where what is at a pixel is in a frame: the pixels left and above, and how far beyond them."""
-    across, down = bend_x[0] * between - path_x[0] * back, bend_y[0] * between - path_y[0] * back
+    across, down = bend_x[0] * bent - path_x[0] * back, bend_y[0] * bent - path_y[0] * back
     left[0], from_left[0] = _place(across + column[0], width)
     above[0], from_above[0] = _place(down + row, height)
 
@@ -371,14 +392,14 @@ def _compare(
     second: Pixels,
     first_variance: Pixels,
     second_variance: Pixels,
-    share: Number,
+    weight: Number,
 ) -> None:
     """The mean of both frames, their squared difference, and the variance of the mean by the frames' own."""
-    rest = np.float32(1.0) - share
+    rest = np.float32(1.0) - weight
     error = first[0] - second[0]
-    seen[0] = rest * first[0] + share * second[0]
+    seen[0] = rest * first[0] + weight * second[0]
     difference[0] = error * error
-    doubt[0] = rest * rest * first_variance[0] + share * share * second_variance[0]
+    doubt[0] = rest * rest * first_variance[0] + weight * weight * second_variance[0]
 
 
 @row_formula
@@ -416,16 +437,15 @@ def _join(
     contradiction_around: Pixels,
     level: Pixels,
     variance: Pixels,
-    between: Number,
+    trust: Number,
 ) -> None:
     """The image joined with what is seen, and its variance, in place of this."""
     contradicted = _mean_of_five(contradiction_around)
-    own = between * variance[0]
     believed = doubt[0] * squared(ONE + _CONTRADICTED * _larger(contradicted - ONE, np.float32(0.0)))
-    kept = believed / (_CAREFUL * own + believed)
+    kept = believed / (np.float32(_CAREFUL) * variance[0] + believed)
     seen[0] = seen[0] + kept * (level[0] - seen[0])
     doubted = doubt[0] * squared(ONE + _DISTRUST * contradicted)
-    doubt[0] = doubted / (own + doubted) * variance[0]
+    doubt[0] = doubted / (trust * variance[0] + doubted) * variance[0]
 
 
 def _larger(one: Number, other: np.float32) -> Number:
