@@ -48,8 +48,8 @@ _UNSIGNALLED: Final = 0.25
 what they miss is alike among neighbours (docs/equations.md, K16)."""
 
 _CAREFUL: Final = 1.5
-"""How much more what is seen weighs than its variance says; half-way the variance that is given out has it that much
-larger, since simulated and real errors differ by that much there, and not at frames (docs/equations.md, K16)."""
+"""Weight of what is seen, in units of one over its variance. Half-way the variance that is given out counts it once:
+simulated and real errors differ by that much there (docs/equations.md, K16)."""
 
 _CONTRADICTED: Final = np.float32(4.0)
 """How steeply less is believed of what an image contradicts, per mean squared difference, in units of its variance,
@@ -155,15 +155,15 @@ class Along(NamedTuple):
     def weight(self) -> float:
         """Of the second frame in the mean of both, the first one's being what is left of 1.
 
-        Half-way it is the share of the way. At a frame it is that of the other one, but for `_LEAST_WEIGHT`.
+        Half-way it is the share of the way. At a frame the mean is the other one, but for `_LEAST_WEIGHT`.
         """
-        nearer = 1.0 if self.share <= 0.5 else 0.0
-        weight = self.share + (nearer - self.share) * (1.0 - self.bent)
+        beyond = 1.0 if self.share <= 0.5 else 0.0
+        weight = self.share + (beyond - self.share) * (1.0 - self.bent)
         return min(max(weight, _LEAST_WEIGHT), 1.0 - _LEAST_WEIGHT)
 
     @property
     def trust(self) -> float:
-        """How much more than its variance says the image's own falls: as much at a frame as what is seen weighs."""
+        """What is seen counts so many times for the variance that is given out: at a frame as many as it weighs."""
         return _CAREFUL + (1.0 - _CAREFUL) * self.bent
 
 
