@@ -37,7 +37,7 @@ quarter; errors of the path, by which one frame is read too far on and the other
 Measured: 0.09 to 0.12 (docs/equations.md, K16)."""
 
 _LEAST_WEIGHT: Final = 1e-3
-"""Of a frame in the mean of both, so that nothing is seen of what it does not measure (K6): behind a white the other
+"""Of a frame in the mean of both, so that nothing is seen of what it does not measure (K7): behind a white the other
 frame alone would bleach a highlight."""
 
 _LEAST_UNMOVED: Final = np.float32(5e-4)
