@@ -446,7 +446,7 @@ class Reconstructor:
 
     def _paths(self, progress: _Progress, moment: Moment) -> Paths | None:
         """Of what moves between the frames around an image (K16); None where there is one alone."""
-        if moment.after is None or not 0.0 <= moment.share <= 1.0:
+        if moment.after is None:
             return None
         self._look_for_motion(progress)
         return progress.paths
