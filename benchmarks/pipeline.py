@@ -53,6 +53,8 @@ GIVEN = (
         "0.2",
         "--events.extrapolation-gain",
         "1",
+        "--events.extrapolation-trust",
+        "1",
     ),
     *("--events.threshold-on", "0.2", "--events.threshold-off", "0.2"),
     *("--events.refractory-period", "0", "--events.threshold-spread", "0.1", "--events.noise-rate", "0.1"),

@@ -875,13 +875,15 @@ def intensity(log_intensity, variance, settings, white, stretch):
     i0, scale2 = settings.camera.offset, settings.filter.highlight_scale**2
     top = np.log(white + i0)
     if scale2 > 0 and log_intensity > top:
-        trust = scale2 / (scale2 + variance)
-        believed = settings.events.believed_gain * (log_intensity - top) * trust
+        excess = settings.events.believed_gain * (log_intensity - top)
+        spread = scale2 + settings.events.believed_trust * max(excess**2 - variance, 0)
+        trust = spread / (spread + variance)
+        believed = excess * trust
         left = variance * trust
         if stretch > 0:
             w = lambertw(stretch * believed).real
             believed, left = w / stretch, left * (np.exp(-w) / (1 + w)) ** 2
-        log_intensity = top + believed + min(left, believed * np.sqrt(left)) / 2
+        log_intensity = top + believed + scale2 / spread * min(left, believed * np.sqrt(left)) / 2
     return max(np.exp(log_intensity) - i0, 0.0)
 
 

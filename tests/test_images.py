@@ -15,6 +15,7 @@ GREY = View(
     highlight_scale=1.0,
     highlight_spread=0.1,
     highlight_gain=1.0,
+    highlight_growth=1.0,
     unknown_variance=9.0,
     fixed_pattern=0.0,
     rounding=0.0,

@@ -34,6 +34,9 @@ VARIANTS = {
     "default-quiet": dataclasses.replace(
         PRESETS["default"], camera=dataclasses.replace(PRESETS["default"].camera, frame_noise=0.0019)
     ),
+    "default-trusted": dataclasses.replace(
+        PRESETS["default"], events=dataclasses.replace(PRESETS["default"].events, extrapolation_trust=0.7)
+    ),
     "iccv2021": PRESETS["iccv2021"],
     "iccv2021-exact": dataclasses.replace(
         PRESETS["iccv2021"], filter=dataclasses.replace(PRESETS["iccv2021"].filter, solution="exact")

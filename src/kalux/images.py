@@ -162,8 +162,8 @@ class View:
     highlight_scale, highlight_spread
         Of the prior on what lies beyond white (K6): its standard deviation in log intensity, 0 for none, and that of
         the log of the thresholds' error where no frame corrects it.
-    highlight_gain
-        Share of what events say there that is believed (K6).
+    highlight_gain, highlight_growth
+        Share of what events say there that is believed, and how far highlights beyond that scale are (K6).
     unknown_variance
         P of a pixel that has not been measured.
     fixed_pattern
@@ -180,6 +180,7 @@ class View:
     highlight_scale: float
     highlight_spread: float
     highlight_gain: float
+    highlight_growth: float
     unknown_variance: float
     fixed_pattern: float
     rounding: float
@@ -190,7 +191,13 @@ class View:
         """The prior on highlights (K6) beyond ``white``, a log intensity."""
         scale = self.highlight_scale
         stretch = self.highlight_spread**2 / scale if scale > 0 else 0.0
-        return HighlightPrior(white=white, scale2=scale**2, stretch=stretch, gain=self.highlight_gain)
+        return HighlightPrior(
+            white=white,
+            scale2=scale**2,
+            stretch=stretch,
+            gain=self.highlight_gain,
+            growth=self.highlight_growth,
+        )
 
 
 def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) -> Image:

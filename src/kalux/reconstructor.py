@@ -410,9 +410,11 @@ class Reconstructor:
         filtered, events = self.settings.filter, self.settings.events
         # The prior on highlights needs a variance, which the complementary filter has not.
         scale = filtered.highlight_scale if filtered.kind == "akf" else 0.0
-        spread = events.believed_mismatch
+        spread, growth = events.believed_mismatch, events.believed_trust
         if self._thresholds_estimated:
-            scale = min(scale, filtered.highlight_tail * beyond_white(bright_tail))
+            likely = filtered.highlight_tail * beyond_white(bright_tail)
+            if likely < scale:  # a scene that does not go far beyond white tells nothing of far highlights
+                scale, growth = likely, growth * (likely / scale) ** 2
             spread = events.believed_extrapolation
         on, off = self.thresholds
         return View(
@@ -422,6 +424,7 @@ class Reconstructor:
             highlight_scale=scale,
             highlight_spread=spread,
             highlight_gain=events.believed_gain,
+            highlight_growth=growth,
             unknown_variance=filtered.initial_variance,
             fixed_pattern=self.settings.camera.fixed_pattern or 0.0,
             rounding=repeated_rounding(frame, self.settings.camera),

@@ -167,6 +167,10 @@ class EventSettings:
         Share of the changes by events that is believed beyond white, where no frame corrects them (docs/equations.md,
         K6), 0 to 1. None: as far as events explain how the frames change elsewhere
         (`kalux.calibration.event_model`); 1 in a live stream.
+    extrapolation_trust
+        How far highlights are believed to lie where they are, although they are much farther beyond white than
+        ``highlight_scale`` expects (docs/equations.md, K6), 0 to 1. None: 1 where events explain 85 % of how the frames
+        change elsewhere, 0 where 70 % or less (`kalux.calibration.event_model`); 0 in a live stream.
     trail
         By how much, in c, a pixel is on average beyond the level of its newest event, at most (docs/equations.md,
         K14): events trail the light. 0 turns it off. 0.4 (docs/tuning.md).
@@ -207,6 +211,7 @@ class EventSettings:
     mend_layout: bool = True
     extrapolation_spread: float = 0.15
     extrapolation_gain: float | None = None
+    extrapolation_trust: float | None = None
     trail: float = 0.4
     usual_threshold_on: float = 0.25
     usual_threshold_off: float = 0.25
@@ -242,6 +247,11 @@ class EventSettings:
     def believed_gain(self) -> float:
         """``extrapolation_gain``, or 1 while that is None."""
         return 1.0 if self.extrapolation_gain is None else self.extrapolation_gain
+
+    @property
+    def believed_trust(self) -> float:
+        """``extrapolation_trust``, or 0 while that is None: nothing has shown that events belong to the frames."""
+        return 0.0 if self.extrapolation_trust is None else self.extrapolation_trust
 
     @property
     def believed_mismatch(self) -> float:
@@ -521,7 +531,8 @@ _LARGEST_WHOLE: Final = 10**18  # fits int64
 _LARGEST: Final = 1e10  # more than any value can mean, and its square is a number in single precision
 _LEAST: Final = 1e-12  # but 0: less than any value can mean, and so is its square
 _LARGEST_OF: Final[Mapping[str, float]] = {
-    **dict.fromkeys(("saturation", "usual_saturation", "weight_floor", "extrapolation_gain"), 1.0),
+    **dict.fromkeys(("saturation", "usual_saturation", "weight_floor"), 1.0),
+    **dict.fromkeys(("extrapolation_gain", "extrapolation_trust"), 1.0),
     "black_level": 0.5,  # of white: no camera gives half of its range away
     "log_offset": 1e3,  # of white: its logarithm is then the same as its radiance
     **dict.fromkeys(

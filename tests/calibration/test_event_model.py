@@ -67,7 +67,7 @@ def test_events_of_another_scene_explain_nothing(recordings):
     inverted["p"] = ~inverted["p"]
     wrong = Recording.from_arrays(inverted, list(own.frames()), sensor_size=own.sensor_size)
     found = estimate_event_model(wrong, CameraSettings(), EVENTS).agreement
-    assert (found.gain, found.explained) == (0.0, 0.0)
+    assert (found.gain, found.explained, found.trust) == (0.0, 0.0, 0.0)
     assert found.slope < 0.0
 
 
@@ -187,7 +187,11 @@ def test_a_plan_fills_in_what_is_not_given(recordings):
         default,
         camera=dataclasses.replace(default.camera, log_offset=0.02),
         events=dataclasses.replace(
-            default.events, step_variance=0.3, refractory_period=700, extrapolation_gain=0.9
+            default.events,
+            step_variance=0.3,
+            refractory_period=700,
+            extrapolation_gain=0.9,
+            extrapolation_trust=0.5,
         ),
     )
     kept = plan(recording, at="frames", settings=given)

@@ -13,8 +13,8 @@ from kalux.filters.readout import HighlightPrior, Subthreshold, read_out
 
 OFFSET = 0.03
 WHITE = float(np.log(1 + OFFSET))
-PRIOR = HighlightPrior(WHITE, 2.25, 0.0, 1.0)
-OFF = HighlightPrior(WHITE, 0.0, 0.0, 1.0)
+PRIOR = HighlightPrior(WHITE, 2.25, 0.0, 1.0, 0.0)
+OFF = HighlightPrior(WHITE, 0.0, 0.0, 1.0, 0.0)
 
 
 def intensity(value, variance, offset, prior):
@@ -74,7 +74,7 @@ def test_noise_of_the_events_draws_to_white():
 
 
 def test_without_a_prior_events_are_not_doubted():
-    off = HighlightPrior(WHITE, 0.0, 0.0, 1.0)
+    off = HighlightPrior(WHITE, 0.0, 0.0, 1.0, 0.0)
     where, bound = unshown([0, 1], 0.4, 1.0), np.array([[WHITE, WHITE + 1.0]], np.float32)
     where.noise[0] = 0.0
     assert tempered(where, bound, off) is where

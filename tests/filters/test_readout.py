@@ -20,10 +20,11 @@ from kalux.settings import altered, preset
 
 import naive
 
-OFF = HighlightPrior(white=np.inf, scale2=0.0, stretch=0.0, gain=1.0)
+OFF = HighlightPrior(white=np.inf, scale2=0.0, stretch=0.0, gain=1.0, growth=0.0)
 NO_SUBTHRESHOLD = Subthreshold(0.0, 0.0)
 excesses = st.floats(0.0, 12.0)
 stretches = st.floats(1e-4, 2.0)
+growths = st.floats(0.0, 1.0)
 
 
 def intensity(value, variance, offset, prior):
@@ -35,32 +36,53 @@ def regularised(value, variance, moving, difference):
     return np.log(read_out(value, variance, 0.0, OFF, moving=moving, difference=difference)[0])
 
 
-def lambert(excess, variance, scale2, stretch):
-    """(mode, variance that is left) of a highlight."""
-    trust = scale2 / (scale2 + variance)
+def lambert(excess, variance, scale2, stretch, growth):
+    """Mode, variance that is left, and share of the normal prior in that of a highlight."""
+    spread = scale2 + growth * max(excess**2 - variance, 0.0)
+    trust = spread / (spread + variance)
     w = lambertw(stretch * excess * trust).real
-    return w / stretch, variance * trust * (np.exp(-w) / (1 + w)) ** 2
+    return w / stretch, variance * trust * (np.exp(-w) / (1 + w)) ** 2, scale2 / spread
 
 
-@given(excesses, st.floats(0.0, 3.0), st.floats(0.01, 9.0), stretches)
-def test_highlights_are_lamberts_w_and_half_the_variance_that_is_left(excess, variance, scale2, stretch):
-    mode, left = lambert(excess, variance, scale2, stretch)
-    expected = mode + min(left, mode * np.sqrt(left)) / 2
-    found = believed_highlight(excess, variance, scale2, stretch, 1.0)
+@given(excesses, st.floats(0.0, 3.0), st.floats(0.01, 9.0), stretches, growths)
+def test_highlights_are_lamberts_w_and_half_the_variance_that_is_left(
+    excess, variance, scale2, stretch, growth
+):
+    mode, left, normal = lambert(excess, variance, scale2, stretch, growth)
+    expected = mode + normal * min(left, mode * np.sqrt(left)) / 2
+    found = believed_highlight(excess, variance, scale2, stretch, 1.0, growth)
     assert found == pytest.approx(expected, rel=2e-6, abs=1e-12)
 
 
 @given(excesses, st.floats(0.01, 9.0), stretches)
 def test_the_mode_solves_its_equation(excess, scale2, stretch):
     """K6: without noise, d exp(stretch d) is the excess."""
-    d = believed_highlight(excess, 0.0, scale2, stretch, 1.0)
+    d = believed_highlight(excess, 0.0, scale2, stretch, 1.0, 1.0)
     assert d * np.exp(stretch * d) == pytest.approx(excess, rel=1e-4, abs=1e-9)
 
 
-@given(st.floats(1e-6, 12.0), st.floats(1e-3, 2.0), st.floats(0.0, 3.0), stretches)
-def test_more_excess_is_more_highlight(excess, more, variance, stretch):
-    low = believed_highlight(excess, variance, 1.0, stretch, 1.0)
-    assert 0.0 <= low < believed_highlight(excess + more, variance, 1.0, stretch, 1.0)
+@given(st.floats(1e-6, 12.0), st.floats(1e-3, 2.0), st.floats(0.0, 3.0), stretches, growths)
+def test_more_excess_is_more_highlight(excess, more, variance, stretch, growth):
+    low = believed_highlight(excess, variance, 1.0, stretch, 1.0, growth)
+    assert 0.0 <= low < believed_highlight(excess + more, variance, 1.0, stretch, 1.0, growth)
+
+
+@given(st.floats(0.0, 3.0), st.floats(0.01, 9.0), growths)
+def test_a_highlight_no_farther_than_its_noise_has_a_normal_prior(variance, scale2, growth):
+    """K6: the prior grows only by what noise does not explain."""
+    excess = 0.999 * np.sqrt(variance)
+    normal = believed_highlight(excess, variance, scale2, 0.0, 1.0, 0.0)
+    assert believed_highlight(excess, variance, scale2, 0.0, 1.0, growth) == normal
+
+
+@given(st.floats(4.0, 12.0), st.floats(0.0, 1.0))
+def test_far_highlights_are_hardly_shrunk(excess, variance):
+    """K6: one that lies far beyond white, for its noise, tells how far highlights like it go."""
+    spread = 4.0 + excess**2 - variance
+    shrunk = excess * variance / (spread + variance)
+    found = believed_highlight(excess, variance, 4.0, 0.0, 1.0, 1.0)
+    assert excess - shrunk <= found + 1e-5
+    assert found <= excess - shrunk + 2.0 * variance / spread + 1e-5
 
 
 @given(st.floats(0.5, 3.0), st.floats(0.01, 0.3))
@@ -70,27 +92,27 @@ def test_the_mean_intensity_of_a_normal_posterior(excess, variance):
     mean, left = excess * scale2 / (scale2 + variance), variance * scale2 / (scale2 + variance)
     draws = mean + np.sqrt(left) * np.random.default_rng(0).standard_normal(200_000)
     if mean > np.sqrt(left):
-        found = believed_highlight(excess, variance, scale2, 0.0, 1.0)
+        found = believed_highlight(excess, variance, scale2, 0.0, 1.0, 0.0)
         assert found == pytest.approx(np.log(np.exp(draws).mean()), abs=5e-3)
 
 
 def test_a_sure_estimate_is_believed():
     """No variance and no unknown scale: the estimate itself. Half where prior and noise are alike."""
-    assert believed_highlight(1.5, 0.0, 1.0, 0.0, 1.0) == 1.5
-    assert believed_highlight(1.5, 1.0, 1.0, 0.0, 1.0) == 0.75 + 0.5 * 0.5
-    assert believed_highlight(0.0, 1.0, 1.0, 1.7, 1.0) == pytest.approx(0.0, abs=1e-20)
+    assert believed_highlight(1.5, 0.0, 1.0, 0.0, 1.0, 0.0) == 1.5
+    assert believed_highlight(1.5, 1.0, 1.0, 0.0, 1.0, 0.0) == 0.75 + 0.5 * 0.5
+    assert believed_highlight(0.0, 1.0, 1.0, 1.7, 1.0, 1.0) == pytest.approx(0.0, abs=1e-20)
 
 
-@given(st.floats(0.0, 1.0), excesses, st.floats(0.0, 3.0), st.floats(0.01, 9.0), stretches)
-def test_of_events_that_explain_frames_half_half_is_believed(gain, excess, variance, scale2, stretch):
-    found = believed_highlight(excess, variance, scale2, stretch, gain)
+@given(st.floats(0.0, 1.0), excesses, st.floats(0.0, 3.0), st.floats(0.01, 9.0), stretches, growths)
+def test_of_events_that_explain_frames_half_half_is_believed(gain, excess, variance, scale2, stretch, growth):
+    found = believed_highlight(excess, variance, scale2, stretch, gain, growth)
     assert found == pytest.approx(
-        believed_highlight(gain * excess, variance, scale2, stretch, 1.0), rel=1e-5, abs=1e-9
+        believed_highlight(gain * excess, variance, scale2, stretch, 1.0, growth), rel=1e-5, abs=1e-9
     )
 
 
 def test_the_short_cut_for_a_small_stretch_is_seamless():
-    below, above = (believed_highlight(1.0, 0.0, 1.0, s, 1.0) for s in (0.99e-6, 1.01e-6))
+    below, above = (believed_highlight(1.0, 0.0, 1.0, s, 1.0, 0.0) for s in (0.99e-6, 1.01e-6))
     assert below == pytest.approx(above, rel=3e-6)
 
 
@@ -110,18 +132,18 @@ def test_intensity_is_never_negative_and_inverts_the_logarithm(value, variance, 
 
 
 def test_the_prior_only_concerns_highlights():
-    prior = HighlightPrior(white=np.log(1.03), scale2=1.0, stretch=1.0, gain=1.0)
+    prior = HighlightPrior(white=np.log(1.03), scale2=1.0, stretch=1.0, gain=1.0, growth=0.0)
     value, variance = np.log(np.array([[0.5, 1.03, 3.0]])), np.full((1, 3), 0.2)
     with_prior, without = intensity(value, variance, 0.03, prior), intensity(value, variance, 0.03, OFF)
     np.testing.assert_array_equal(with_prior[0, :2], without[0, :2])
-    believed = believed_highlight(np.log(3.0 / 1.03), 0.2, 1.0, 1.0, 1.0)
+    believed = believed_highlight(np.log(3.0 / 1.03), 0.2, 1.0, 1.0, 1.0, 0.0)
     assert with_prior[0, 2] == pytest.approx(1.03 * np.exp(believed) - 0.03, rel=1e-6)
     assert 1.0 < with_prior[0, 2] < without[0, 2]
 
 
 def test_white_is_that_of_the_shortest_exposure():
     """A short exposure measures more than 1: what it can show is no highlight."""
-    prior = HighlightPrior(white=np.log(4.03), scale2=1.0, stretch=1.0, gain=1.0)
+    prior = HighlightPrior(white=np.log(4.03), scale2=1.0, stretch=1.0, gain=1.0, growth=0.0)
     value, variance = np.log(np.array([[1.03, 2.0, 4.02]])), np.full((1, 3), 0.5)
     np.testing.assert_array_equal(
         intensity(value, variance, 0.03, prior), intensity(value, variance, 0.03, OFF)
@@ -129,7 +151,7 @@ def test_white_is_that_of_the_shortest_exposure():
 
 
 def test_the_white_level_is_continuous():
-    prior = HighlightPrior(white=0.0, scale2=1.0, stretch=1.7, gain=1.0)
+    prior = HighlightPrior(white=0.0, scale2=1.0, stretch=1.7, gain=1.0, growth=0.0)
     low, high = intensity(np.array([[-1e-7, 1e-7]]), np.ones((1, 2)), 0.03, prior)[0]
     assert high == pytest.approx(low, abs=1e-6)
 
@@ -225,11 +247,11 @@ def test_images_are_the_oracles(shape, moves, pitch, gain):
     moving = rng.random(shape) < moves
     subthreshold, chosen = (
         Subthreshold(0.5, 0.03),
-        altered(preset("default"), "events", extrapolation_gain=gain),
+        altered(preset("default"), "events", extrapolation_gain=gain, extrapolation_trust=0.8),
     )
     change = rng.uniform(0, 0.05, shape).astype(np.float32)
     white, stretch, offset = 0.8, 0.7, chosen.camera.offset
-    prior = HighlightPrior(np.log(white + offset), chosen.filter.highlight_scale**2, stretch, gain)
+    prior = HighlightPrior(np.log(white + offset), chosen.filter.highlight_scale**2, stretch, gain, 0.8)
     given = value.astype(np.float32), variance.astype(np.float32)
     found = read_out(
         *given,

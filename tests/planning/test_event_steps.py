@@ -55,6 +55,7 @@ def test_unless_its_frames_contradict_them(times):
     assert made.settings.events.threshold_on == pytest.approx(0.2, rel=0.12)
     assert made.settings.events.threshold_off == pytest.approx(0.2, rel=0.12)
     assert made.settings.events.extrapolation_gain == 1.0
+    assert made.settings.events.extrapolation_trust == 1.0
 
 
 def test_thresholds_of_the_settings_are_kept_but_believed_less_beyond_white():
@@ -66,9 +67,10 @@ def test_thresholds_of_the_settings_are_kept_but_believed_less_beyond_white():
     given = plan(
         stating(moving_blocks(0.08, 0.9)),
         rate_hz=10,
-        settings=altered(chosen, "events", extrapolation_gain=0.4),
+        settings=altered(chosen, "events", extrapolation_gain=0.4, extrapolation_trust=0.2),
     )
     assert given.settings.events.extrapolation_gain == 0.4
+    assert given.settings.events.extrapolation_trust == 0.2
 
 
 def test_frames_beside_the_events_change_no_thresholds():
@@ -77,6 +79,7 @@ def test_frames_beside_the_events_change_no_thresholds():
     assert (made.threshold_origin, made.steps.contradicted) == ("recording", None)
     assert made.steps.model.agreement.explained < 0.5
     assert made.settings.events.extrapolation_gain < 0.7
+    assert made.settings.events.extrapolation_trust == 0.0
 
 
 def test_then_an_estimate():

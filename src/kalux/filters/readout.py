@@ -135,33 +135,43 @@ class HighlightPrior(NamedTuple):
         Variance of the log of the events' unknown scale there, divided by the standard deviation of highlights.
     gain
         Share of the change by events that is believed there.
+    growth
+        By how much the variance of the prior of a highlight grows with its squared distance from white, as far as that
+        is more than its noise: 0 for a normal prior, 1 where each highlight tells how far highlights like it go.
     """
 
     white: float
     scale2: float
     stretch: float
     gain: float
+    growth: float
 
 
 @nb.njit(cache=True, inline="always", error_model="numpy")
-def believed_highlight(excess, variance, scale2, stretch, gain):  # type: ignore[no-untyped-def]
+def believed_highlight(excess, variance, scale2, stretch, gain, growth):  # type: ignore[no-untyped-def]
     """Posterior of L - white > 0, given its estimate ``excess`` and the filter's ``variance``; float32.
 
-    Of the excess the share ``gain`` is taken. Additive noise: a normal prior of variance ``scale2`` shrinks it. Unknown
-    scale of the events: with a log-normal scale and an exponential prior the mode solves d exp(stretch d) = excess,
-    i.e. d = W(stretch excess) / stretch with Lambert's W. Returned is the log of the posterior mean intensity, half the
-    posterior variance above the mean of the log; that half is bounded by a part of d, so that it is 0 at white.
+    Of the excess the share ``gain`` is taken. Additive noise: a normal prior shrinks it, of variance ``scale2`` and
+    ``growth`` times by how much the square of what is taken exceeds its noise. Unknown scale of the events: with a
+    log-normal scale and an exponential prior the mode solves d exp(stretch d) = excess, i.e. d = W(stretch excess) /
+    stretch with Lambert's W. Returned is the log of the posterior mean intensity, half the posterior variance above the
+    mean of the log; that half is bounded by a part of d, so that it is 0 at white, and it counts as far as the prior is
+    the normal one: of a highlight that makes its own, the median is returned.
     """
-    scale2, stretch = np.float32(scale2), np.float32(stretch)
-    trust = scale2 / (scale2 + np.float32(variance))
-    believed = np.float32(gain) * np.float32(excess) * trust
-    left = np.float32(variance) * trust
+    stretch, noise = np.float32(stretch), np.float32(variance)
+    believed = np.float32(gain) * np.float32(excess)
+    square = larger(believed * believed - noise, np.float32(0.0))
+    spread = np.float32(scale2) + np.float32(growth) * square
+    trust = spread / (spread + noise)
+    believed *= trust
+    left = noise * trust
     if stretch != np.float32(0.0):
         w = lambert_w(stretch * believed)
         believed = w / stretch
         slope = exponential(-w) / (ONE + w)  # of d in the shrunk excess
         left *= slope * slope
-    return believed + np.float32(0.5) * smaller(left, believed * np.sqrt(left))
+    normal = np.float32(scale2) / spread
+    return believed + np.float32(0.5) * normal * smaller(left, believed * np.sqrt(left))
 
 
 @formula(types.float32)
@@ -436,7 +446,7 @@ def _read_out(  # type: ignore[no-untyped-def]
     The state of a row is loaded two pitches before it is read out, since the patches around neighbours reach so far,
     and its moving pixels are marked three pitches before. Rows before the first one only load what is ahead.
     """
-    white, scale2, _, _ = prior
+    white, scale2 = prior[0], prior[1]
     height, width = log_intensity.shape
     knows_moving = moving.size > 0
     averages = knows_moving and averages
@@ -567,11 +577,11 @@ def read_levels(level, doubt, prior, log_offset):  # type: ignore[no-untyped-def
     Without branches, so that it becomes vector code.
     """
     zero = np.float32(0.0)
-    white, scale2, stretch, gain = prior
+    white, scale2, stretch, gain, growth = prior
     doubted = scale2 > zero
     for i in range(len(level)):
         beyond = larger(level[i] - white, zero)
-        believed = white + believed_highlight(beyond, doubt[i], scale2, stretch, gain)
+        believed = white + believed_highlight(beyond, doubt[i], scale2, stretch, gain, growth)
         level[i] = larger(
             exponential(believed if doubted and level[i] > white else level[i]) - log_offset, zero
         )
@@ -821,7 +831,7 @@ def _shrink_highlights(  # type: ignore[no-untyped-def]
     level, variance, row, start, bright, prior, log_offset, places, excess, doubt, out
 ):
     """K6 of the bright pixels of a row, gathered so that they go through vector code and others cost nothing."""
-    white, scale2, stretch, gain = prior
+    white, scale2, stretch, gain, growth = prior
     count = np.uint64(0)
     for first in range(0, len(level), _BLOCK):
         if _any(bright, first, _BLOCK):
@@ -832,7 +842,7 @@ def _shrink_highlights(  # type: ignore[no-untyped-def]
         excess[k] = level[places[k]] - white
         doubt[k] = variance[places[k]]
     for k in range(count):
-        believed = believed_highlight(excess[k], doubt[k], scale2, stretch, gain)
+        believed = believed_highlight(excess[k], doubt[k], scale2, stretch, gain, growth)
         excess[k] = larger(exponential(white + believed) - log_offset, np.float32(0.0))
     for k in range(count):
         out[row, start + places[k]] = excess[k]

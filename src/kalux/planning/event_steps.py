@@ -194,6 +194,7 @@ def _unfilled(settings: Settings, known: Settings) -> EventSettings:
         delay=events.delay,
         step_variance=events.step_variance,
         extrapolation_gain=events.extrapolation_gain,
+        extrapolation_trust=events.extrapolation_trust,
     )
 
 
@@ -282,7 +283,7 @@ def _with_event_model(
     From the settings, else an estimate, else the usual.
     """
     camera, events, bridged = settings.camera, settings.events, settings.filter.joins_frames
-    of_events = events.step_variance, events.extrapolation_gain
+    of_events = events.step_variance, events.extrapolation_gain, events.extrapolation_trust
     if camera.log_offset is not None and (None not in of_events or not bridged):
         return settings, None
     used = dataclasses.replace(events, refractory_period=_refractory_period(settings))
@@ -297,6 +298,8 @@ def _with_event_model(
             events = dataclasses.replace(events, step_variance=model.step_variance)
         if events.extrapolation_gain is None and bridged:
             events = dataclasses.replace(events, extrapolation_gain=round(model.agreement.gain, 3))
+        if events.extrapolation_trust is None and bridged:
+            events = dataclasses.replace(events, extrapolation_trust=round(model.agreement.trust, 3))
     # What could not be estimated is filled in with the usual value, so that the settings tell what was used.
     camera = dataclasses.replace(camera, log_offset=camera.offset)
     events = dataclasses.replace(events, step_variance=events.step_noise)
