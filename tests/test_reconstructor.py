@@ -600,6 +600,25 @@ def test_highlights_beyond_white_come_from_events():
     assert 1.0 < believed[1] < believed[0] <= 1.03 * np.exp(5 * 0.25)
 
 
+@pytest.mark.parametrize(("estimate", "tail"), [(False, 0.3), (True, 0.3), (True, 2.0)])
+def test_far_highlights_are_believed_where_events_are_trusted(estimate, tail):
+    """K6: twenty events beyond white; of a scene that hardly saturates, under thresholds that are a guess, no more."""
+    read = []
+    for trust in (0.0, 1.0):
+        chosen = altered(PRESETS["default"], "events", extrapolation_trust=trust)
+        chosen = altered(chosen, "filter", bright_tail=tail)
+        live = Reconstructor((1, 1), settings=chosen, contrast_threshold=0.3, threshold_is_estimate=estimate)
+        live.push_frame(frame(240, 0, 10_000))
+        live.push_events(pixel_events(range(15_000, 35_000, 1_000), [1] * 20))
+        live.push_frame(frame(255, 40_000, 50_000))
+        live.finish()
+        read.append(float(live.read(35_000).intensity[0, 0]))
+    if estimate and tail == 0.3:
+        assert read[1] == pytest.approx(read[0], rel=0.05)
+    else:
+        assert 1.1 * read[0] < read[1] < 1.1 * np.exp(20 * 0.3)
+
+
 @pytest.mark.parametrize("channels", [(), (3,)])
 def test_a_live_stream_takes_the_bright_tail_of_its_first_frame(channels):
     """As if it were stated; of colour, the mean of the channels counts, of which few are white here."""

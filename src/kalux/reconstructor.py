@@ -414,7 +414,7 @@ class Reconstructor:
         if self._thresholds_estimated:
             likely = filtered.highlight_tail * beyond_white(bright_tail)
             if likely < scale:  # a scene that does not go far beyond white tells nothing of far highlights
-                scale, growth = likely, growth * (likely / scale) ** 2
+                scale, growth = likely, growth * (likely / scale) ** 4
             spread = events.believed_extrapolation
         on, off = self.thresholds
         return View(
