@@ -80,6 +80,18 @@ def test_says_what_is_wrong_with_frames_and_events():
     )
 
 
+def test_says_how_far_events_are_believed_beyond_white():
+    made = moving_blocks(0.08, 0.9)
+    text = "events explain [0-9]+ % of how the frames change; where they say 1, frames change by [0-9.]+"
+    assert re.fullmatch(text, rows_of(made.recording())["agreement"])
+    doubted = rows_of(
+        made.recording(), events={"extrapolation_gain": 0.8, "extrapolation_trust": 0.3, "step_variance": 0.2}
+    )
+    assert re.fullmatch(
+        f"{text}: beyond white 80 % is believed, and far beyond it 30 %", doubted["agreement"]
+    )
+
+
 def test_whether_motion_is_followed():
     """By the sensor's size, as asked for, and both ways in time always; where it could be, as not in causal mode."""
     small = moving_blocks().recording()

@@ -237,7 +237,9 @@ def _agreement_text(agreement: Agreement, settings: Settings) -> str:
         f"events explain {100 * agreement.explained:.0f} % of how the frames change; where they say 1, frames "
         f"change by {agreement.slope:.2f}"
     )
-    gain = settings.events.believed_gain
+    gain, trust = settings.events.believed_gain, settings.events.believed_trust
+    if trust < 1.0 and settings.filter.joins_frames:
+        return f"{text}: beyond white {100 * gain:.0f} % is believed, and far beyond it {100 * trust:.0f} %"
     return text if gain == 1.0 else f"{text}: beyond white {100 * gain:.0f} % is believed"
 
 
