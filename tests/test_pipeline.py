@@ -190,7 +190,7 @@ def test_images_before_the_damage_are_returned(monkeypatch):
     chosen = altered(
         chosen, "events", threshold_spread=0.1, noise_rate=3.0, leave_out_hot=False, mend_layout=False
     )
-    chosen = altered(chosen, "events", extrapolation_gain=1.0)
+    chosen = altered(chosen, "events", extrapolation_gain=1.0, extrapolation_trust=1.0)
     chosen = altered(chosen, "camera", log_offset=0.03, frame_noise=0.006, black_level=0.0)
     chosen = altered(chosen, "camera", even_gain=False, leave_out_faulty=False, mend_stuck=False)
     good = list(reconstruct(recording(6), at="frames", settings=chosen))
