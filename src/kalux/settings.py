@@ -170,7 +170,7 @@ class EventSettings:
     extrapolation_trust
         How far highlights are believed to lie where they are, although they are much farther beyond white than
         ``highlight_scale`` expects (docs/equations.md, K6), 0 to 1. None: 1 where events explain 85 % of how the frames
-        change elsewhere, 0 where 70 % or less (`kalux.calibration.event_model`); 0 in a live stream.
+        change elsewhere, 0 where 70 % or less (`kalux.calibration.event_model`); 0 in causal mode and in a live stream.
     trail
         By how much, in c, a pixel is on average beyond the level of its newest event, at most (docs/equations.md,
         K14): events trail the light. 0 turns it off. 0.4 (docs/tuning.md).

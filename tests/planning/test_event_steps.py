@@ -82,6 +82,14 @@ def test_frames_beside_the_events_change_no_thresholds():
     assert made.settings.events.extrapolation_trust == 0.0
 
 
+def test_far_highlights_are_believed_in_causal_mode_if_asked_for():
+    seen = stating(moving_blocks(0.08, 0.9))
+    assert plan(seen, rate_hz=10, lookahead=False).settings.events.extrapolation_trust == 0.0
+    chosen = altered(PRESETS["default"], "events", extrapolation_trust=0.5)
+    asked = plan(seen, rate_hz=10, lookahead=False, settings=chosen)
+    assert asked.settings.events.extrapolation_trust == 0.5
+
+
 def test_then_an_estimate():
     made = plan(unlabelled(moving_blocks(0.08, 0.9)), rate_hz=10)
     assert made.threshold_origin == "estimate"
