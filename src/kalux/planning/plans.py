@@ -170,7 +170,7 @@ def plan(
 def _with_causal_trust(settings: Settings, lookahead: bool) -> Settings:
     """Without lookahead far highlights (K6) are believed only if asked for.
 
-    What is wrong of single pixels, P does not know before the next frame: of a DAVIS240C's simulated scenes one had nine
+    What is wrong of single pixels, P does not know before the next frame: one of eight scenes of a DAVIS240C had nine
     times the error.
     """
     if lookahead or settings.events.extrapolation_trust is not None:
