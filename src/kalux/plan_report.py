@@ -238,9 +238,11 @@ def _agreement_text(agreement: Agreement, settings: Settings) -> str:
         f"change by {agreement.slope:.2f}"
     )
     gain, trust = settings.events.believed_gain, settings.events.believed_trust
-    if trust < 1.0 and settings.filter.joins_frames:
-        return f"{text}: beyond white {100 * gain:.0f} % is believed, and far beyond it {100 * trust:.0f} %"
-    return text if gain == 1.0 else f"{text}: beyond white {100 * gain:.0f} % is believed"
+    doubts_far = trust < 1.0 and settings.filter.joins_frames
+    if gain == 1.0 and not doubts_far:
+        return text
+    text = f"{text}: beyond white {100 * gain:.0f} % is believed"
+    return f"{text}, and far beyond it {100 * trust:.0f} %" if doubts_far else text
 
 
 def _threshold_origin(plan: Plan) -> str:

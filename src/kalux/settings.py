@@ -531,8 +531,9 @@ _LARGEST_WHOLE: Final = 10**18  # fits int64
 _LARGEST: Final = 1e10  # more than any value can mean, and its square is a number in single precision
 _LEAST: Final = 1e-12  # but 0: less than any value can mean, and so is its square
 _LARGEST_OF: Final[Mapping[str, float]] = {
-    **dict.fromkeys(("saturation", "usual_saturation", "weight_floor"), 1.0),
-    **dict.fromkeys(("extrapolation_gain", "extrapolation_trust"), 1.0),
+    **dict.fromkeys(
+        ("saturation", "usual_saturation", "weight_floor", "extrapolation_gain", "extrapolation_trust"), 1.0
+    ),
     "black_level": 0.5,  # of white: no camera gives half of its range away
     "log_offset": 1e3,  # of white: its logarithm is then the same as its radiance
     **dict.fromkeys(

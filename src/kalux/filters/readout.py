@@ -446,7 +446,7 @@ def _read_out(  # type: ignore[no-untyped-def]
     The state of a row is loaded two pitches before it is read out, since the patches around neighbours reach so far,
     and its moving pixels are marked three pitches before. Rows before the first one only load what is ahead.
     """
-    white, scale2 = prior[0], prior[1]
+    white, scale2 = prior[:2]
     height, width = log_intensity.shape
     knows_moving = moving.size > 0
     averages = knows_moving and averages

@@ -167,17 +167,6 @@ def plan(
     )
 
 
-def _with_causal_trust(settings: Settings, lookahead: bool) -> Settings:
-    """Without lookahead far highlights (K6) are believed only if asked for.
-
-    What is wrong of single pixels, P does not know before the next frame: one of eight scenes of a DAVIS240C had nine
-    times the error.
-    """
-    if lookahead or settings.events.extrapolation_trust is not None:
-        return settings
-    return altered(settings, "events", extrapolation_trust=0.0)
-
-
 # What is asked for.
 
 
@@ -216,6 +205,17 @@ def _with_motion(settings: Settings, sensor_size: tuple[int, int], smooth: bool)
         return settings
     follows = smooth or settings.filter.follows_motion(sensor_size)
     return altered(settings, "filter", motion="on" if follows else "off")
+
+
+def _with_causal_trust(settings: Settings, lookahead: bool) -> Settings:
+    """Without lookahead far highlights (K6) are believed only if asked for.
+
+    What is wrong of single pixels, P does not know before the next frame: one of eight scenes of a DAVIS240C had nine
+    times the error.
+    """
+    if lookahead or settings.events.extrapolation_trust is not None:
+        return settings
+    return altered(settings, "events", extrapolation_trust=0.0)
 
 
 def _with_exposure_and_response(
