@@ -342,8 +342,9 @@ def bridged(pixel, settings, times, on, off, scales):
         told_on, told_off = signal[0] * n_on, signal[1] * n_off
         saturated = first[1] >= UNMEASURED and second[1] >= UNMEASURED and settings.filter.highlight_scale > 0
         mismatch = 0.0 if saturated else second[0] - first[0]
-        mismatch -= on * scale_on * told_on - off * scale_off * told_off + grown(k + 1, b)
-        total = 2 * settings.filter.highlight_scale**2 if saturated else first[1] + second[1]
+        change = on * scale_on * told_on - off * scale_off * told_off
+        mismatch -= change + grown(k + 1, b)
+        total = 4 * settings.filter.highlight_scale**2 if saturated else first[1] + second[1]
         total += var_on * (on * told_on) ** 2 + var_off * (off * told_off) ** 2
         total += q_on * n_on + q_off * n_off + ev.quantisation_variance * c2
         intervals.append(
@@ -356,8 +357,10 @@ def bridged(pixel, settings, times, on, off, scales):
             (noise < UNMEASURED, n_on + n_off == 0, squared, (first[1], second[1]), mismatch)
         )
         gain_on, gain_off = var_on * on * told_on / total, -var_off * off * told_off / total  # K2
-        scale_on = min(max(scale_on + gain_on * mismatch, 0.3), 3.0)
-        scale_off = min(max(scale_off + gain_off * mismatch, 0.3), 3.0)
+        hidden = 2.4 * q0
+        excess = mismatch + (change * hidden / (change**2 + hidden) if change else 0.0)
+        scale_on = min(max(scale_on + gain_on * excess, 0.3), 3.0)
+        scale_off = min(max(scale_off + gain_off * excess, 0.3), 3.0)
         var_on += 1e-5 - gain_on**2 * total
         var_off += 1e-5 - gain_off**2 * total
         learned.append((scale_on, scale_off))

@@ -37,11 +37,17 @@ REPEATED: Final = 2.0**39
 RANDOM: Final = 0.25
 """Of a random walk: variance of its middle about the mean of its ends, over the variance of its change."""
 
+_LEAST_SQUARE: Final = 1e-12  # log intensity^2: where events tell of no change, a division
+
 _BLOCK: Final = 64
 """Pixels in a block: blocks that frames measure completely are skipped where they may be."""
 
 _SCALE_BOUNDS: Final = (0.3, 3.0)
 _SCALE_DRIFT: Final = 1e-5  # variance per frame: a calibration never becomes certain, temperatures drift
+
+_NOT_SHOWN: Final = 2.4
+"""In units of the variance of the change that no event has told: a. Of changes that are C by the events, frames show
+C^2 / (C^2 + a) on average (docs/equations.md, K2)."""
 
 
 def bridge_variance(share: float) -> float:
@@ -401,6 +407,7 @@ def _bridge(given, thresholds, noise, seconds, planes, factors):  # type: ignore
     scale_on, scale_off, variance_on, variance_off = thresholds
     c_on, c_off, of_step = noise.threshold_on, noise.threshold_off, noise.step_variance
     unsignalled, of_saturated = noise.quantisation_variance, noise.saturated_variance
+    not_shown = _NOT_SHOWN * unsignalled
     s = empty(_SCRATCH * _BLOCK, np.float64)
     size = np.uint64(len(value))
     for first in range(np.uint64(0), size, np.uint64(_BLOCK)):
@@ -422,7 +429,8 @@ def _bridge(given, thresholds, noise, seconds, planes, factors):  # type: ignore
             in_doubt_on, in_doubt_off = (1.0 - f_on) * c_on * c_off, (1.0 - f_off) * c_on * c_off
             of_on, of_off = np.float64(scale_on[i]), np.float64(scale_off[i])
             nominal_on, nominal_off = c_on * of_on, c_off * of_off
-            mismatch = s[_CHANGE + k] - (nominal_on * n_on - nominal_off * n_off)
+            told = nominal_on * n_on - nominal_off * n_off
+            mismatch = s[_CHANGE + k] - told
             on_variance, off_variance = np.float64(variance_on[i]), np.float64(variance_off[i])
             on_covariance = on_variance * c_on * n_on
             off_covariance = -off_variance * c_off * n_off
@@ -442,8 +450,9 @@ def _bridge(given, thresholds, noise, seconds, planes, factors):  # type: ignore
             s[_STEP_OFF + k] = f_off * (
                 nominal_off + gain * (c_off * off_covariance - (of_step + in_doubt_off))
             )
-            s[_NEW_ON + k] = smaller(larger(of_on + gain * on_covariance, low), high)
-            s[_NEW_OFF + k] = smaller(larger(of_off + gain * off_covariance, low), high)
+            learned = gain + inverse * told * not_shown / larger(told * told + not_shown, _LEAST_SQUARE)
+            s[_NEW_ON + k] = smaller(larger(of_on + learned * on_covariance, low), high)
+            s[_NEW_OFF + k] = smaller(larger(of_off + learned * off_covariance, low), high)
             s[_LEFT_ON + k] = on_variance - on_covariance * on_covariance * inverse + _SCALE_DRIFT
             s[_LEFT_OFF + k] = off_variance - off_covariance * off_covariance * inverse + _SCALE_DRIFT
         for k in pixels:

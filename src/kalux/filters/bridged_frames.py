@@ -61,6 +61,10 @@ Counts = tuple[Floats, Floats]
 _SHARES: Final = (np.arange(64) + 0.5) / 64
 """Quantiles at which the distribution of black pixels is sampled."""
 
+_SATURATED: Final = 4.0
+"""Variance of the change between two frames that both clip a pixel, in units of the squared `highlight_scale`: twice that
+of the difference of two highlights, since some lie far out (docs/equations.md, K2)."""
+
 _BLACK_FRAMES: Final = 3.0
 """Black frames of a pixel that count as one measurement, since their errors are the same (docs/equations.md, K7)."""
 
@@ -126,7 +130,7 @@ class BridgedFrames(Method):
     ) -> None:
         super().__init__(settings, lookahead, shape)
         events, self._threshold2 = settings.events, self.on * self.off  # c^2
-        scale2 = 2.0 * settings.filter.highlight_scale**2  # of the difference of two highlights
+        scale2 = _SATURATED * settings.filter.highlight_scale**2
         self.noise = BridgeNoise(
             self.on,
             self.off,
