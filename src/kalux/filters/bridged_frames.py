@@ -62,8 +62,8 @@ _SHARES: Final = (np.arange(64) + 0.5) / 64
 """Quantiles at which the distribution of black pixels is sampled."""
 
 _SATURATED: Final = 4.0
-"""Variance of the change between two frames that both clip a pixel, in units of the squared `highlight_scale`: twice that
-of the difference of two highlights, since some lie far out (docs/equations.md, K2)."""
+"""Variance of the change between two frames that both clip a pixel, in units of the squared `highlight_scale`: twice
+that of the difference of two highlights, since some lie far out (docs/equations.md, K2)."""
 
 _BLACK_FRAMES: Final = 3.0
 """Black frames of a pixel that count as one measurement, since their errors are the same (docs/equations.md, K7)."""
