@@ -7,7 +7,7 @@ comes with them, I_0 and the variance are estimated with both, and thresholds on
 from __future__ import annotations
 
 import dataclasses
-from typing import Final, Literal, NamedTuple
+from typing import Any, Final, Literal, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from kalux.calibration.global_thresholds import (
 )
 from kalux.calibration.steps import MAX_SAMPLES
 from kalux.recording import Recording
-from kalux.settings import EventSettings, Settings, altered
+from kalux.settings import CameraSettings, EventSettings, Settings, altered
 
 Thresholds = tuple[float, float]
 """On and off, log intensity."""
@@ -289,21 +289,29 @@ def _with_event_model(
     used = dataclasses.replace(events, refractory_period=_refractory_period(settings))
     model = estimate_event_model(recording, camera, used, doubt_noise=doubt_noise)
     if model is not None:
-        if camera.log_offset is None:
-            camera = dataclasses.replace(camera, log_offset=model.log_offset)
         if model.frame_noise is not None:
             read, shot = model.frame_noise
             camera = dataclasses.replace(camera, frame_noise=read, shot_noise=shot)
-        if events.step_variance is None:
-            events = dataclasses.replace(events, step_variance=model.step_variance)
-        if events.extrapolation_gain is None and bridged:
-            events = dataclasses.replace(events, extrapolation_gain=round(model.agreement.gain, 3))
-        if events.extrapolation_trust is None and bridged:
-            events = dataclasses.replace(events, extrapolation_trust=round(model.agreement.trust, 3))
+        camera = _completed(camera, log_offset=model.log_offset)
+        events = _completed(events, step_variance=model.step_variance)
+        if bridged:
+            gain, trust = model.agreement.gain, model.agreement.trust
+            events = _completed(
+                events, extrapolation_gain=round(gain, 3), extrapolation_trust=round(trust, 3)
+            )
     # What could not be estimated is filled in with the usual value, so that the settings tell what was used.
-    camera = dataclasses.replace(camera, log_offset=camera.offset)
-    events = dataclasses.replace(events, step_variance=events.step_noise)
+    camera = _completed(camera, log_offset=camera.offset)
+    events = _completed(events, step_variance=events.step_noise)
     return dataclasses.replace(settings, camera=camera, events=events), model
+
+
+_Group = TypeVar("_Group", CameraSettings, EventSettings)
+
+
+def _completed(group: _Group, **found: float) -> _Group:
+    """A group of settings in which those that are open, None, are as they were found."""
+    new: dict[str, Any] = {name: value for name, value in found.items() if getattr(group, name) is None}
+    return dataclasses.replace(group, **new)
 
 
 def _refractory_period(settings: Settings) -> int | None:
