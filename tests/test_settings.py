@@ -13,7 +13,16 @@ from hypothesis import strategies as st
 
 from kalux import PRESETS, Reconstructor, Settings, preset
 from kalux.errors import InputError, KaluxError, SettingsError
-from kalux.settings import CameraSettings, EventSettings, FilterSettings, altered, from_dict, load, to_dict
+from kalux.settings import (
+    CameraSettings,
+    EventSettings,
+    FilterSettings,
+    altered,
+    completed,
+    from_dict,
+    load,
+    to_dict,
+)
 
 DEFAULT = PRESETS["default"]
 GROUPS = {"camera": CameraSettings, "events": EventSettings, "filter": FilterSettings}
@@ -187,6 +196,14 @@ def test_an_outputs_settings_tables_are_used(tmp_path):
     path = tmp_path / "kalux.toml"
     path.write_text("version = '0.1.0'\n[recording]\npath = 'x'\n[settings.events]\nnoise_rate = 7\n")
     assert load(path, DEFAULT) == altered(DEFAULT, "events", noise_rate=7)
+
+
+def test_what_is_open_is_completed_and_what_is_stated_stays():
+    stated = altered(DEFAULT, "events", threshold_on=0.3)
+    found = completed(stated, "events", threshold_on=0.1, threshold_off=0.2)
+    assert found == altered(stated, "events", threshold_off=0.2)
+    with pytest.raises(SettingsError, match=r"events.noise_rate"):
+        completed(DEFAULT, "events", noise_rate=-1.0)
 
 
 def test_none_is_auto_in_files():

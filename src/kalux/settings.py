@@ -421,6 +421,18 @@ def altered(settings: Settings, group: Literal["camera", "events", "filter"], **
     return dataclasses.replace(settings, **changed)
 
 
+def completed(settings: Settings, group: Literal["camera", "events", "filter"], **found: Any) -> Settings:
+    """The settings with what one group leaves open, None, as it was found; what it states stays.
+
+    Raises
+    ------
+    SettingsError
+        If a value is out of range.
+    """
+    stated = getattr(settings, group)
+    return altered(settings, group, **{name: found[name] for name in found if getattr(stated, name) is None})
+
+
 def to_dict(settings: Settings) -> dict[str, dict[str, Any]]:
     """As nested plain values, for TOML; None, which TOML has not, is ``"auto"``."""
     return {

@@ -279,12 +279,13 @@ def test_thresholds_of_the_pixels_are_learned():
     for _ in range(30):
         on, off = rng.integers(0, 8, (2, *shape)).astype(float)
         change = 0.3 * true_on * on - 0.2 * true_off * off
+        change *= change**2 / (change**2 + 2.4 * noise.quantisation_variance)  # what frames show of it
         unseen = np.sqrt(noise.quantisation_variance) * rng.standard_normal(shape)
         seen = latent(level, 1e-4), latent(level + change + unseen, 1e-4)
         _, thresholds = bridge(*seen, (on, off), thresholds, noise, START, END)
         spreads.append(thresholds.on_variance.mean())
-    assert np.abs(thresholds.on - true_on).mean() < np.abs(1 - true_on).mean() / 2
-    assert np.abs(thresholds.off - true_off).mean() < np.abs(1 - true_off).mean() / 2
+    assert np.abs(thresholds.on - true_on).mean() < np.abs(1 - true_on).mean() / 2.5
+    assert np.abs(thresholds.off - true_off).mean() < np.abs(1 - true_off).mean() / 2.5
     assert (np.diff(spreads) < 0).all()
 
 

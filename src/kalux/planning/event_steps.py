@@ -7,7 +7,7 @@ comes with them, I_0 and the variance are estimated with both, and thresholds on
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, Final, Literal, NamedTuple, TypeVar
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from kalux.calibration.global_thresholds import (
 )
 from kalux.calibration.steps import MAX_SAMPLES
 from kalux.recording import Recording
-from kalux.settings import CameraSettings, EventSettings, Settings, altered
+from kalux.settings import EventSettings, Settings, altered, completed
 
 Thresholds = tuple[float, float]
 """On and off, log intensity."""
@@ -291,27 +291,15 @@ def _with_event_model(
     if model is not None:
         if model.frame_noise is not None:
             read, shot = model.frame_noise
-            camera = dataclasses.replace(camera, frame_noise=read, shot_noise=shot)
-        camera = _completed(camera, log_offset=model.log_offset)
-        events = _completed(events, step_variance=model.step_variance)
+            settings = altered(settings, "camera", frame_noise=read, shot_noise=shot)
+        settings = completed(settings, "camera", log_offset=model.log_offset)
+        settings = completed(settings, "events", step_variance=model.step_variance)
         if bridged:
-            gain, trust = model.agreement.gain, model.agreement.trust
-            events = _completed(
-                events, extrapolation_gain=round(gain, 3), extrapolation_trust=round(trust, 3)
-            )
+            gain, trust = round(model.agreement.gain, 3), round(model.agreement.trust, 3)
+            settings = completed(settings, "events", extrapolation_gain=gain, extrapolation_trust=trust)
     # What could not be estimated is filled in with the usual value, so that the settings tell what was used.
-    camera = _completed(camera, log_offset=camera.offset)
-    events = _completed(events, step_variance=events.step_noise)
-    return dataclasses.replace(settings, camera=camera, events=events), model
-
-
-_Group = TypeVar("_Group", CameraSettings, EventSettings)
-
-
-def _completed(group: _Group, **found: float) -> _Group:
-    """A group of settings in which those that are open, None, are as they were found."""
-    new: dict[str, Any] = {name: value for name, value in found.items() if getattr(group, name) is None}
-    return dataclasses.replace(group, **new)
+    settings = completed(settings, "camera", log_offset=camera.offset)
+    return completed(settings, "events", step_variance=events.step_noise), model
 
 
 def _refractory_period(settings: Settings) -> int | None:

@@ -36,7 +36,7 @@ from kalux.planning.sensor_noise import (
 from kalux.planning.survey import survey
 from kalux.recording import RECORDING_NEEDED, Recording, with_cached_start
 from kalux.schedule import begin_time, image_times
-from kalux.settings import SETTINGS_NEEDED, Settings, altered, chosen_response
+from kalux.settings import SETTINGS_NEEDED, Settings, altered, chosen_response, completed
 from kalux.settings import preset as named_preset
 
 _CALIBRATION_NEEDED: Final = "a kalux.Calibration is needed, from kalux.load_calibration"
@@ -213,9 +213,7 @@ def _with_causal_trust(settings: Settings, lookahead: bool) -> Settings:
     What is wrong of single pixels, P does not know before the next frame: one of eight scenes of a DAVIS240C had nine
     times the error.
     """
-    if lookahead or settings.events.extrapolation_trust is not None:
-        return settings
-    return altered(settings, "events", extrapolation_trust=0.0)
+    return settings if lookahead else completed(settings, "events", extrapolation_trust=0.0)
 
 
 def _with_exposure_and_response(

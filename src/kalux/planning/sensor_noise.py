@@ -13,7 +13,7 @@ from kalux.calibration.noise import event_noise
 from kalux.calibration.refractory import dead_time
 from kalux.models.pixels import PixelCalibration
 from kalux.recording import Recording
-from kalux.settings import EventSettings, Settings, altered
+from kalux.settings import EventSettings, Settings, altered, completed
 
 _NOISE_EVENTS: Final = 1_000_000
 """Number of events from which the background noise is estimated: at 15 million events/s, those of 70 ms."""
@@ -50,9 +50,8 @@ def with_frame_noise(recording: Recording, settings: Settings) -> FilledFrameNoi
     if found is not None and not found.is_reliable:
         found = None
     noise = usual_noise(recording, camera) if found is None else found
-    shot = noise.shot if camera.shot_noise is None else camera.shot_noise
     doubted = isinstance(noise, UsualNoise) and not noise.silent and camera.shot_noise is None
-    filled = altered(settings, "camera", frame_noise=noise.read, shot_noise=shot)
+    filled = completed(settings, "camera", frame_noise=noise.read, shot_noise=noise.shot)
     return FilledFrameNoise(filled, found, doubted)
 
 
