@@ -37,8 +37,8 @@ class Frame:
         (height, width, 3), red, green, blue of a camera whose events see all colours. Values below 0, as of frames less
         a dark one, count as 0.
     exposure_start, exposure_end
-        First and last moment of the exposure, int microseconds, in the clock of the events. Equal where a
-        recording stores only one stamp per frame (see `Recording.exposure_known`).
+        First and last moment of the exposure, whole microseconds of any type (kept as int), in the clock of the events.
+        Equal where a recording stores only one stamp per frame (see `Recording.exposure_known`).
     white
         The value of a saturated pixel. Default: 255 for uint8, 65535 for uint16, 1.0 for floats. Sensors
         of 10 or 12 bits stored in uint16 need it (1023, 4095).
@@ -65,6 +65,13 @@ class Frame:
     black: float = 0.0
     gain: float = 1.0
 
+    def __post_init__(self) -> None:
+        # Times of NumPy's types would wrap round (`uint64`), or be written as something else than whole numbers.
+        for name in ("exposure_start", "exposure_end"):
+            time = getattr(self, name)
+            if _is_whole(time):
+                object.__setattr__(self, name, int(time))
+
     def __repr__(self) -> str:
         image = self.image
         kind = f"{image.dtype} {image.shape}" if isinstance(image, np.ndarray) else type(image).__name__
@@ -79,6 +86,11 @@ class Frame:
     def exposure(self) -> int:
         """Length of the exposure, us."""
         return self.exposure_end - self.exposure_start
+
+    @property
+    def amplified_exposure(self) -> float:
+        """Length of the exposure times the gain, us: what the same light's value is proportional to."""
+        return self.exposure * self.gain
 
     @property
     def middle(self) -> int:
@@ -306,12 +318,15 @@ def check_frame(
         )
 
 
+def _is_whole(time: object) -> bool:
+    if isinstance(time, (float, np.floating)):
+        return float(time).is_integer()
+    return isinstance(time, (int, np.integer))
+
+
 def _check_times(frame: Frame, where: str, index: int) -> None:
     for time in (frame.exposure_start, frame.exposure_end):
-        whole = isinstance(time, (int, np.integer)) or (
-            isinstance(time, (float, np.floating)) and float(time).is_integer()
-        )
-        if not whole or not -LATEST <= time <= LATEST:
+        if not _is_whole(time) or not -LATEST <= time <= LATEST:
             raise FrameError(
                 f"{where}: frame {index} has an exposure from {frame.exposure_start} to {frame.exposure_end}; whole "
                 "microseconds, at most 10^18, are needed"

@@ -10,7 +10,7 @@ import numpy as np
 HDF5_MAJOR_VERSION: Final = 1
 """Of kalux HDF5. Files with a greater one are refused; a minor version only adds."""
 
-HDF5_VERSION: Final = f"{HDF5_MAJOR_VERSION}.2"
+HDF5_VERSION: Final = f"{HDF5_MAJOR_VERSION}.3"
 """That is written."""
 
 HDF5_COLUMNS: Final = ("t", "x", "y", "p")

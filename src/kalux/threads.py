@@ -25,7 +25,7 @@ def cores() -> int:
     """How many processor cores this process may use."""
     try:
         return len(os.sched_getaffinity(0))
-    except AttributeError:  # not on macOS and Windows
+    except AttributeError:  # not on macOS
         return os.cpu_count() or 1
 
 

@@ -83,7 +83,7 @@ class ExposureIntegrals(NamedTuple):
     peak
         Largest E(s, t) within the exposure, at least 0.
     events
-        Number of events within the exposure.
+        Sum of the weights of the events within the exposure (`kalux.augmentation.refractory`).
     """
 
     log_mean: FloatArray

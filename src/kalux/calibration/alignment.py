@@ -30,7 +30,7 @@ from kalux.errors import InputError
 from kalux.event_slices import between
 from kalux.events import NEVER, EventArray
 from kalux.frames import Frame
-from kalux.models.camera import Response
+from kalux.models.camera import Camera
 from kalux.settings import CameraSettings
 from kalux.wording import how_many
 
@@ -95,7 +95,9 @@ class Alignment(NamedTuple):
 
 def take_shots(frames: Iterable[Frame], camera: CameraSettings) -> Shots:
     """Logarithms of frames, scaled to the first one's exposure where exposures are known."""
-    response = Response.named(camera.response)
+    response = Camera.named(
+        camera.response, camera.clipped_from
+    ).response  # of a camera in colour, that of green
     middles, logs, shares, usable = [], [], [], []
     reference = 0
     for frame in frames:
@@ -103,7 +105,7 @@ def take_shots(frames: Iterable[Frame], camera: CameraSettings) -> Shots:
         linear = np.maximum(response.inverse(grey), 0.0)
         if frame.exposure > 0:
             reference = reference or frame.exposure
-            linear = linear * (reference / frame.exposure)
+            linear = linear * (reference / frame.amplified_exposure)
         middles.append(frame.middle)
         logs.append(np.log(linear + camera.offset).astype(np.float32))
         shares.append((linear / (linear + camera.offset)).astype(np.float32))

@@ -51,7 +51,7 @@ class FixedPattern(NamedTuple):
     Attributes
     ----------
     deviation
-        Standard deviation of the pixels' offsets, white = 1; 0 where it cannot be is_measured from none.
+        Standard deviation of the pixels' offsets, white = 1; 0 where there is none to be measured.
     variance, error
         Its square as measured, which chance may make negative, and the standard error of that, infinite where too few
         pixels change.

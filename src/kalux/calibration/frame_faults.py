@@ -136,7 +136,7 @@ class FrameWatch:
     def __init__(self, camera: Camera, *, gain: bool = True, faulty: bool = True, stuck: bool = True) -> None:
         self._gain, self._faulty, self._stuck = gain, faulty, stuck
         self._response = camera.of_channel(1).response
-        self._previous: tuple[Frame, Array, Array] | None = None
+        self._previous: tuple[Array, Array] | None = None
         self._last_image: NDArray[Any] | None = None
         self.frames = 0
         self.copies: list[int] = []
@@ -167,15 +167,15 @@ class FrameWatch:
 
     def _compare(self, index: int, frame: Frame, response: Array) -> None:
         """Whether most of the image is brighter, or darker, than in the frame before, exposure times accounted for."""
-        intensity = self._response.inverse(response) / (frame.exposure * frame.gain)
+        intensity = self._response.inverse(response) / frame.amplified_exposure
         if self._previous is not None:
-            before, earlier = self._previous[1:]
+            before, earlier = self._previous
             both = _inside(response) & _inside(before)
             if np.count_nonzero(both):
                 change = np.median(np.log(intensity[both] / earlier[both]))
                 if abs(change) >= _SUSPECT:
                     self.suspects.append(index)
-        self._previous = frame, response, intensity
+        self._previous = response, intensity
 
 
 def _inside(response: Array) -> NDArray[np.bool_]:

@@ -262,13 +262,14 @@ def _count(t, x, y, p, last, sign, least, refractory, on, off, crowded):  # type
         since = t[i] - last[row, column]
         if since < least:
             crowded[row, column] = True
-        weight = step_weight(np.float32(since), refractory)  # K13
+        direction = 1.0 if p[i] else -1.0
+        goes_on = sign[row, column] == direction
+        weight = step_weight(np.float32(since), refractory) if goes_on else np.float32(1.0)  # K13
         if p[i]:
             on[row, column] += weight
-            sign[row, column] = 1.0
         else:
             off[row, column] += weight
-            sign[row, column] = -1.0
+        sign[row, column] = direction
         last[row, column] = t[i]
 
 

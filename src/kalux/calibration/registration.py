@@ -160,9 +160,11 @@ class Registration:
             valid &= self.resampled(~frame.valid) < _PART
         if frame.image.dtype.kind == "f":
             image: NDArray[Any] = values * np.float32(frame.white_value)
-            return Frame(image, frame.exposure_start, frame.exposure_end, frame.white, valid=valid)
+            return Frame(
+                image, frame.exposure_start, frame.exposure_end, frame.white, valid=valid, gain=frame.gain
+            )
         image = np.rint(np.clip(values, 0.0, 1.0) * 65535).astype(np.uint16)
-        return Frame(image, frame.exposure_start, frame.exposure_end, valid=valid)
+        return Frame(image, frame.exposure_start, frame.exposure_end, valid=valid, gain=frame.gain)
 
 
 def undistortion_maps(lens: Lens) -> Maps:

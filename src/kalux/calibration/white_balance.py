@@ -35,7 +35,10 @@ def grey_world(recording: Recording, camera: CameraSettings) -> Gains:
         cells = _cells(frame)
         low, high = WELL_EXPOSED
         chosen = cells[((cells > low) & (cells < high)).all(axis=-1)]
-        total += [model.of_channel(c).response.inverse(chosen[:, c]).sum() / frame.exposure for c in range(3)]
+        total += [
+            model.of_channel(c).response.inverse(chosen[:, c]).sum() / frame.amplified_exposure
+            for c in range(3)
+        ]
     if not (total > 0).all():
         raise FrameError(
             f"{recording.source.path}: no pixel is well exposed in all colours; give white_balance as gains"

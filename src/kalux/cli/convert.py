@@ -1,4 +1,4 @@
-"""``kalux convert``: any recording as kalux HDF5, with nothing lost, or as AEDAT 4."""
+"""``kalux convert``: any recording as kalux HDF5, with nothing lost but triggers, or as AEDAT 4."""
 
 from __future__ import annotations
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 from kalux.cli.parser import Parser, UsageError, number, whole
 from kalux.cli.recordings import check_stamp
 from kalux.cli.terminal import say, warn
+from kalux.settings import AUTO
 
 if TYPE_CHECKING:
     from kalux.datasets.radiance import HdrReference
@@ -65,9 +66,9 @@ def add_command(commands: Any) -> None:
     group.add_argument("--stamp", choices=("start", "middle", "end"), help="what its frames' stamps mark")
     group.add_argument(
         "--frame-response",
-        default="linear",
+        default=AUTO,
         metavar="NAME",
-        help="of its frames: linear, srgb, gamma:EXPONENT",
+        help="of its frames: linear, srgb, gamma:EXPONENT (what it states, else linear)",
     )
     group.add_argument(
         "--blur",
@@ -127,7 +128,7 @@ def _check_flags(options: argparse.Namespace) -> None:
     if options.register is None and suffix not in _RADIANCE:
         raise UsageError(f"{options.out}: a radiance image is written as .exr or .npz; give such a name")
     if options.register is None:
-        given = {"exposure": None, "stamp": None, "frame_response": "linear", "blur": 0.0}
+        given = {"exposure": None, "stamp": None, "frame_response": AUTO, "blur": 0.0}
         for name, default in given.items():
             if getattr(options, name) != default:
                 raise UsageError(f"--{name.replace('_', '-')} is for a recording; give --register REC, too")
@@ -136,9 +137,11 @@ def _check_flags(options: argparse.Namespace) -> None:
             raise UsageError(
                 f"{options.photos}: is a radiance image already; give --register REC, or a folder"
             )
-        if options.times or options.plot or options.keep_moving or options.align != "homography":
+        given = options.times or options.plot or options.keep_moving
+        if given or options.align != "homography" or options.response != "debevec":
             raise UsageError(
-                f"{options.photos}: --times, --plot, --align and --keep-moving are for a folder of photographs"
+                f"{options.photos}: --times, --plot, --response, --align and --keep-moving are for a folder of "
+                "photographs"
             )
     if not options.blur >= 0:
         raise UsageError(f"--blur {options.blur}: 0 or more pixels are possible")

@@ -129,14 +129,14 @@ def artificial_hdr(
             intensity = _intensity(frame, real, black, 1.0)
             level = artificial(np.minimum(intensity / camera.high, 1.0))
             levels = np.rint(255 * level).astype(np.uint8)
-            yield dataclasses.replace(frame, image=levels, white=None)
+            yield dataclasses.replace(frame, image=levels, white=None, black=0.0)
 
     reference = median_exposure(kept)
 
     def truth() -> GroundTruth:
         times, images, masks = [], [], []
         for frame in _truth_frames(recording, every):
-            image = _intensity(frame, real, black, reference / frame.exposure) / camera.high
+            image = _intensity(frame, real, black, reference / frame.amplified_exposure) / camera.high
             times.append(frame.middle)
             grey = image if image.ndim == 2 else luminance(image)
             images.append(np.maximum(grey, 0.0).astype(np.float32))

@@ -131,7 +131,7 @@ def check_bracket(pictures: Sequence[Picture], where: str = "bracket") -> None:
 
 def _listed_exposures(path: Path) -> dict[str, float]:
     try:
-        with path.open(newline="") as file:
+        with path.open(newline="", encoding="utf-8-sig") as file:
             rows = list(csv.DictReader(line for line in file if line.strip() and not line.startswith("#")))
             return {row["file"].strip(): parse_seconds(row["exposure_s"]) for row in rows}
     except OSError as error:

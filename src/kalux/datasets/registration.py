@@ -17,6 +17,7 @@ from kalux.frames import Frame, GroundTruth
 from kalux.models.camera import Camera, Response, inverse_response
 from kalux.models.colour import luminance as luminance_of
 from kalux.recording import Recording, reference_exposure
+from kalux.settings import AUTO, chosen_response
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -105,7 +106,7 @@ def register_frames(
     valid: Mask,
     recording: Recording,
     *,
-    response: str = "linear",
+    response: str = AUTO,
     blur: float = 0.0,
     on_frame: Callable[[], None] = lambda: None,
 ) -> RegisteredTruth:
@@ -122,7 +123,7 @@ def register_frames(
     recording
         With known exposures.
     response
-        Of its frame camera, as in `kalux.settings.CameraSettings`.
+        Of its frame camera, as in `kalux.settings.CameraSettings`; by default what the recording states.
     blur
         Standard deviation, pixels of the frame, by which the frames' lens blurs more than the reference's; the size
         of the frame's pixels is accounted for without it.
@@ -134,7 +135,7 @@ def register_frames(
     InputError
         If no frame can be registered, or each is of another brightness.
     """
-    camera = Camera(Response.named(response))
+    camera = Camera(Response.named(chosen_response(response, recording.response)))
     exposure = reference_exposure(recording)
     reference = _Reference(luminance, valid)
     found: list[RegisteredFrame] = []
@@ -219,7 +220,7 @@ def _registered(
 def _seen(frame: Frame, camera: Camera, exposure: int) -> _Seen:
     """A frame at an exposure, us."""
     level = frame.normalised()
-    intensity = inverse_response(camera, level, exposure / frame.exposure)
+    intensity = inverse_response(camera, level, exposure / frame.amplified_exposure)
     exposed = (level > _EXPOSED[0]) & (level < _EXPOSED[1])
     if level.ndim == 3:
         intensity, exposed = luminance_of(intensity), np.asarray(exposed.all(axis=2))

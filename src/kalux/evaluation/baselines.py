@@ -46,14 +46,14 @@ def mean_of_neighbours(recording: Recording, times: Times, *, response: str = AU
 def edi_video(recording: Recording, times: Times, *, settings: Settings | None = None) -> Iterator[Image]:
     """EDI: the nearest frame, deblurred by its events, and moved to the time by the events in between.
 
-    The thresholds are nominal, the same for all pixels: those of the settings, the recording, or an estimate.
-    Nothing is known of clipped pixels: they are taken as they are.
+    The thresholds are nominal, the same for all pixels: those of the settings, the recording, or an estimate; so is the
+    events' delay, which is taken off their times. Nothing is known of clipped pixels: they are taken as they are.
     """
     chosen = plan(recording, times=times, settings=settings or PRESETS["default"]).settings
     on, off = (np.full(recording.sensor_size, c) for c in chosen.events.thresholds)
     recording = less_black(recording, chosen.camera.black_level)
     camera, reference = chosen.camera, reference_exposure(recording)
-    window = EventWindow(recording.events())
+    window = EventWindow(_earlier(recording.events(), chosen.events.lateness))
     for frame, wanted in nearest_frames(recording.frames(), times):
         first = min(frame.exposure_start, int(wanted[0]))
         events = window.between(first, max(frame.exposure_end, int(wanted[-1])))
@@ -149,6 +149,14 @@ def nearest_frames(frames: Iterable[Frame], times: Times) -> Iterator[tuple[Fram
         if last > first:
             yield frame, times[first:last]
             first = last
+
+
+def _earlier(chunks: Iterable[EventArray], delay: int) -> Iterator[EventArray]:
+    """Copies of the events at the times of their light, ``delay`` us before their stamps."""
+    for chunk in chunks:
+        moved = chunk.copy()
+        moved["t"] -= delay
+        yield moved
 
 
 class EventWindow:

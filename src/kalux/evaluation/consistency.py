@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import islice
 from typing import Final
 
 import numpy as np
@@ -95,11 +96,11 @@ def blur_consistency(
     if not inner:
         raise FrameError(f"{recording.source.path}: blur consistency needs at least three frames")
     end = end_of_frames(recording, response)
-    images = means_of(method.images(recording, np.concatenate(inner)), READS)
+    made = method.estimated(recording, np.concatenate(inner))
+    images = means_of((one.intensity for one in made), READS)
     found, skipped = [], 0
-    frames = iter(recording.frames())
-    next(frames)
-    for image, frame in zip(images, frames, strict=False):
+    frames = islice(recording.frames(), 1, 1 + len(inner))
+    for image, frame in zip(images, frames, strict=True):
         valid = valid_pixels(frame, end.clipped_from)
         if valid.any():
             ratio = frame.exposure / reference

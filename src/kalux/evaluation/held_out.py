@@ -247,7 +247,7 @@ def held_out_pairs(held: HeldOut, method: Method, *, clip: bool = False) -> Iter
 
 def clipped_as(image: Array, frame: Frame, reference: int, end: End) -> Array:
     """An image (1 = white at the reference exposure, us) clipped where a frame of this exposure ends."""
-    return np.clip(image, 0.0, end.intensity * reference / frame.exposure)
+    return np.clip(image, 0.0, end.intensity * reference / frame.amplified_exposure)
 
 
 def intensity_percentile(recording: Recording, percent: float, reference: int, response: str) -> float:

@@ -104,7 +104,7 @@ def take_shot(
     SettingsError
         If the camera has a response per colour and the frame is grey.
     """
-    ratio = reference_exposure / (frame.exposure * frame.gain)
+    ratio = reference_exposure / frame.amplified_exposure
     if frame.image.ndim == 3:
         return _colour_shot(frame, camera, ratio, gains)
     levels, response, intensity, weight, ceiling = _leveled(frame, camera, ratio)
@@ -118,7 +118,7 @@ def take_shot(
         level_clipped=response >= camera.saturation,
         white=ratio,
         level_ceiling=ceiling,
-        valid=frame.valid,
+        valid=None if frame.valid is None else frame.valid.copy(),  # the caller's memory may be filled again
         pitch=1 if frame.mosaic is None else 2,
     )
 
@@ -190,7 +190,7 @@ def _colour_shot(frame: Frame, camera: Camera, ratio: float, gains: colour.Gains
         ).ravel(),
         chroma=colour.chromaticity(rgb, _CHROMA_FLOOR * ratio),
         chroma_weight=np.clip((camera.saturation - brightest) / room, 0, 1).astype(np.float32),
-        valid=frame.valid,
+        valid=None if frame.valid is None else frame.valid.copy(),  # the caller's memory may be filled again
     )
 
 

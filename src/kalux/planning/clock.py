@@ -36,7 +36,7 @@ from kalux.recording import (
     with_event_layout,
     with_frames,
 )
-from kalux.settings import CameraSettings, Settings, altered
+from kalux.settings import CameraSettings, Settings, altered, chosen_response
 
 _CERTAIN: Final = 0.4
 _TIMES: Final = 1.5
@@ -81,6 +81,9 @@ def offset_of_recording(
     """
     lens = Lens.pinhole(recording.sensor_size)
     same = Registration(lens, lens, np.eye(3))
+    settings = altered(
+        settings, "camera", response=chosen_response(settings.camera.response, recording.response)
+    )
 
     def estimated(source: Recording) -> OffsetEstimate:
         return estimate_offset(

@@ -1,4 +1,4 @@
-"""kalux's own HDF5 layout, described in ``docs/formats.md``: everything a `Source` can hold."""
+"""kalux's own HDF5 layout, described in ``docs/formats.md``: everything a `Source` can hold but triggers."""
 
 from __future__ import annotations
 
@@ -28,6 +28,7 @@ from kalux.readers.source import (
 
 _EVENT_COLUMNS: Final = tuple(f"events/{name}" for name in HDF5_COLUMNS)
 _EXPOSURES: Final = ("frames/exposure_start", "frames/exposure_end")
+_GAINS: Final = "frames/gain"
 _TIMES: Final = ("events/t", *_EXPOSURES)
 
 
@@ -55,7 +56,8 @@ def read(path: Path) -> Source:
     with opened(path) as file:
         _check_version(path, _text(file.attrs.get("version", "")))
         event_count = common_length(path, file, _EVENT_COLUMNS)
-        frame_count = common_length(path, file, ("frames/image", *_EXPOSURES))
+        gains = (_GAINS,) if _GAINS in file else ()
+        frame_count = common_length(path, file, ("frames/image", *_EXPOSURES, *gains))
         for column in (*_EVENT_COLUMNS, *_EXPOSURES):
             _check_column(path, column, file[column].dtype)
         _check_masks(path, file, frame_count)
@@ -210,9 +212,10 @@ def _frames(path: Path) -> Iterator[Frame]:
         black = float(group.attrs.get("black", 0.0))
         starts, ends = group["exposure_start"][...], group["exposure_end"][...]
         images, masks = group["image"], group.get("valid")
-        for index, (start, end) in enumerate(zip(starts, ends, strict=True)):
+        gains = file[_GAINS][...] if _GAINS in file else np.ones(len(starts))
+        for index, (start, end, gain) in enumerate(zip(starts, ends, gains, strict=True)):
             valid = None if masks is None else masks[index].astype(bool)
-            yield Frame(images[index], int(start), int(end), white, valid=valid, black=black)
+            yield Frame(images[index], start, end, white, valid=valid, black=black, gain=float(gain))
 
 
 def _ground_truth(path: Path) -> GroundTruth:

@@ -183,6 +183,11 @@ def _frame(path: Path, index: int, frame: Frame, exposure_known: bool) -> _Packe
             f"{path}: frame {index} has pixels that are not valid, which AEDAT 4 cannot say; write kalux HDF5 "
             "(a name that ends in .h5)"
         )
+    if frame.gain != 1.0:
+        raise FrameError(
+            f"{path}: frame {index} has a gain of {frame.gain:g}, which AEDAT 4 cannot say; write kalux HDF5 "
+            "(a name that ends in .h5)"
+        )
     height, width = image.shape[:2]
     stored = image if channels == 1 else image[..., ::-1]  # BGR
     pixels = np.ascontiguousarray(stored, image.dtype.newbyteorder("<")).tobytes()

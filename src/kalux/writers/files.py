@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import os
 import signal
 import threading
@@ -13,11 +14,6 @@ from types import FrameType
 
 from kalux.errors import OutputError
 from kalux.wording import one_line
-
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None  # type: ignore[assignment]
 
 _REASONS = {
     errno.ENOSPC: "no space is left on the disk",
@@ -137,9 +133,7 @@ class Claim:
 
 
 def _lock(descriptor: int) -> bool:
-    """Whether a file or folder is now locked, or cannot be: some file systems, and Windows, have no such locks."""
-    if fcntl is None:
-        return True
+    """Whether a file or folder is now locked, or cannot be: some file systems have no such locks."""
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

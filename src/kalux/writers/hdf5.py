@@ -216,6 +216,7 @@ def _write_frames(
     images = masks = None
     starts: list[int] = []
     ends: list[int] = []
+    gains: list[float] = []
     for index, frame in enumerate(frames):
         if images is None:
             images = _create_images(group, frame.image.shape, frame.image.dtype)
@@ -239,6 +240,7 @@ def _write_frames(
             masks[index] = frame.valid
         starts.append(frame.exposure_start)
         ends.append(frame.exposure_end)
+        gains.append(float(frame.gain))
     if images is None:
         _create_images(group, sensor_size, np.dtype(np.uint8))
     if mosaic is not None:
@@ -247,6 +249,8 @@ def _write_frames(
         masks.resize(len(starts), axis=0)
     group["exposure_start"] = np.array(starts, np.int64)
     group["exposure_end"] = np.array(ends, np.int64)
+    if any(gain != 1.0 for gain in gains):
+        group["gain"] = np.array(gains)
 
 
 def _kind(frame: Frame) -> tuple[Any, ...]:

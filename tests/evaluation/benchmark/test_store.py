@@ -72,4 +72,8 @@ def test_the_folder_is_of_a_benchmark_or_empty(tmp_path):
 
 
 def test_names_of_methods_become_names_of_files():
-    assert file_name("firenet:/a b/w.pth") == "firenet-a-b-w.pth"
+    assert file_name("default,smooth") != file_name("default-smooth") == "default-smooth"
+    name = file_name("firenet:/a b/w.pth")
+    assert name.startswith("firenet-a-b-w.pth-")
+    assert len(name) == len("firenet-a-b-w.pth-") + 8
+    assert file_name("ours=results/run3") != file_name("ours=results-run3")

@@ -398,7 +398,7 @@ def _is_recording(path: Path) -> bool:
 def _unique(sequences: list[Sequence]) -> tuple[Sequence, ...]:
     """Tell sequences of the same name apart by their folders, then by numbers."""
     counts = Counter(s.name.lower() for s in sequences)
-    seen: Counter[str] = Counter()
+    taken: set[str] = set()
     named = []
     for sequence in sequences:
         if counts[sequence.name.lower()] > 1:
@@ -408,11 +408,10 @@ def _unique(sequences: list[Sequence]) -> tuple[Sequence, ...]:
                 name=_file_name(f"{parent}-{sequence.name}"),
                 title=f"{parent}/{sequence.title}",
             )
-        seen[sequence.name.lower()] += 1
-        if seen[sequence.name.lower()] > 1:
-            number = seen[sequence.name.lower()]
-            sequence = dataclasses.replace(
-                sequence, name=f"{sequence.name}-{number}", title=f"{sequence.title} ({number})"
-            )
+        name, title, number = sequence.name, sequence.title, 1
+        while sequence.name.lower() in taken:
+            number += 1
+            sequence = dataclasses.replace(sequence, name=f"{name}-{number}", title=f"{title} ({number})")
+        taken.add(sequence.name.lower())
         named.append(sequence)
     return tuple(named)

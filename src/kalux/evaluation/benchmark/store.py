@@ -6,6 +6,7 @@ The JSON is written last and in one piece: a job whose JSON is there with the ri
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import io
 import json
 import re
@@ -85,8 +86,9 @@ class Store:
 
 
 def file_name(method: str) -> str:
-    """A method's name as that of a file."""
-    return re.sub(r"[^\w.-]+", "-", method).strip(".-")
+    """A method's name as that of a file; where it cannot be the same, with what tells it from others like it."""
+    plain = re.sub(r"[^\w.-]+", "-", method).strip(".-")
+    return plain if plain == method else f"{plain}-{hashlib.sha256(method.encode()).hexdigest()[:8]}"
 
 
 def prepare(out: Path) -> None:
