@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass, field
+from functools import lru_cache
+from math import erf
 
 import numpy as np
 from scipy.special import lambertw
@@ -111,6 +113,36 @@ def event_weight(since, settings):
 def event_sum(pixel, a, b, on, off):
     """int_a^b e(gamma) d gamma: the steps of the events with a < t <= b."""
     return sum(w * (on if p else -off) for t, p, _, _, w in pixel.events if a < t <= b)
+
+
+@lru_cache
+def dark_levels(read, shot, i0):
+    """K3: what is added to log(I + I_0) of the 8-bit levels of dark pixels, white = 1."""
+    clean = np.sqrt(max(read**2 - (1 / 255) ** 2 / 12, 0))
+    if clean < 0.5 / 255:
+        return [0.0], [0.0]
+    step = max(1, int(clean * 255 / 4)) / 255
+    levels = [k * step for k in range(int(12 * clean / step) + 1)]
+    weights = [(max(b, 1.5 * read) + i0) ** 2 / (read**2 + shot * b) for b in levels]
+    rows, wanted = [], []
+    for i in np.linspace(0, 8 * clean, 200):
+        deviation = np.sqrt(clean**2 + shot * i) * np.sqrt(2)
+        below = [0.0] + [(1 + erf((b + step / 2 - i) / deviation)) / 2 for b in levels[:-1]] + [1.0]
+        share = np.diff(below) * weights
+        share /= share.sum()
+        rows.append(share[None])
+        wanted.append([np.log(i + i0)])
+        rows.append(
+            np.sqrt(share / 10)[:, None] * (np.eye(len(levels)) - share)
+        )  # the noise of a mean of ten
+        wanted.append(np.zeros(len(levels)))
+    value = np.linalg.lstsq(np.concatenate(rows), np.concatenate(wanted), rcond=None)[0]
+    added = value - np.log(np.array(levels) + i0)
+    return levels, added * np.clip((8 * clean - np.array(levels)) / (2 * clean), 0, 1)
+
+
+def dark_correction(intensity, read, shot, i0):
+    return np.interp(intensity, *dark_levels(read, shot, i0))
 
 
 def edi(pixel, k, log_frame, on, off):
@@ -303,6 +335,8 @@ def bridged(pixel, settings, times, on, off, scales):
 
     def latent(k):  # K3
         log_frame = np.log(pixel.intensity[k] + i0)
+        if c.frame_noise is not None and chosen_response(c.response, None) == "linear":
+            log_frame += dark_correction(pixel.intensity[k] / pixel.white[k], *c.noise, i0 / pixel.white[k])
         if crushed(k):
             most = hidden_by_black * pixel.white[k]
             log_frame = black = np.log(most * np.exp(-pixel.dark[k]) + i0)

@@ -34,6 +34,10 @@ VARIANTS = {
     "default-quiet": dataclasses.replace(
         PRESETS["default"], camera=dataclasses.replace(PRESETS["default"].camera, frame_noise=0.0019)
     ),
+    "default-noisy": dataclasses.replace(
+        PRESETS["default"],
+        camera=dataclasses.replace(PRESETS["default"].camera, frame_noise=0.01, shot_noise=5e-4),
+    ),
     "default-trusted": dataclasses.replace(
         PRESETS["default"], events=dataclasses.replace(PRESETS["default"].events, extrapolation_trust=0.7)
     ),

@@ -257,6 +257,11 @@ def check_frame(
     require_frame(frame, where=where, index=index)
     image = frame.image
     _check_times(frame, where, index)
+    if image.dtype not in (np.uint8, np.uint16, np.float32, np.float64):
+        raise FrameError(
+            f"{where}: frame {index} has dtype {image.dtype}; uint8, uint16, float32 or float64 in this "
+            "machine's order of bytes is needed"
+        )
     if not (isinstance(frame.gain, Real) and 1e-6 <= float(frame.gain) <= 1e6):
         raise FrameError(
             f"{where}: frame {index} has a gain of {frame.gain!r}; 0.000001 to 1000000 is possible"
@@ -277,11 +282,6 @@ def check_frame(
             "frames must be grey or RGB and have the size of the sensor"
         )
     _check_colours(frame, where, index, previous)
-    if image.dtype not in (np.uint8, np.uint16, np.float32, np.float64):
-        raise FrameError(
-            f"{where}: frame {index} has dtype {image.dtype}; uint8, uint16, float32 or float64 in this "
-            "machine's order of bytes is needed"
-        )
     if image.dtype.kind == "u" and frame.white is not None and frame.white > np.iinfo(image.dtype).max:
         raise FrameError(
             f"{where}: frame {index} has the white value {frame.white:g}, but no pixel of {image.dtype} is above "

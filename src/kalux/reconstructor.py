@@ -20,7 +20,7 @@ from kalux.augmentation.motion import Paths
 from kalux.augmentation.refractory import EventClock
 from kalux.augmentation.trail import FrameTrail
 from kalux.compiled import event_words
-from kalux.errors import InputError, SettingsError, require_type
+from kalux.errors import EventError, InputError, SettingsError, require_type
 from kalux.events import (
     EVENT_DTYPE,
     NEVER,
@@ -225,6 +225,7 @@ class Reconstructor:
         if self._complete_until is not None:
             earliest = self._complete_until + 1 + self._delay
             previous = earliest if previous is None else max(previous, earliest)
+            self._require_not_complete(array)
         kept = array
         if self._hot is not None:
             check_events(array, self.sensor_size, first_index=self._event_count, previous_t=previous)
@@ -241,6 +242,17 @@ class Reconstructor:
         self.advance(self._last_event - 1)  # more events may carry the last one's time
         if self._needed_from is not None:
             self._events.drop(self._needed_from)
+
+    def _require_not_complete(self, array: EventArray) -> None:
+        """Refuse events of a time that `advance` has declared complete; others are told by `check_events`."""
+        if len(array) == 0 or self._complete_until is None:
+            return
+        complete, first = self._complete_until + self._delay, int(array["t"][0])
+        if first <= complete and (self._last_event is None or first >= self._last_event):
+            raise EventError(
+                f"events: event {self._event_count} is at {first} us, but advance() has declared all events up to "
+                f"{complete} us pushed"
+            )
 
     def advance(self, t: int) -> None:
         """Declare that all events stamped up to ``t`` (us) have been pushed: silence is information too.
@@ -337,7 +349,8 @@ class Reconstructor:
     def estimate(self, t: int) -> Estimate:
         """The filter's estimate at time ``t`` (us), for `image`. Never changes the result of any other read.
 
-        Reads may repeat, and go back as far as the newest frame that is final.
+        Reads may repeat, and go back as far as the newest frame that earlier reads have passed, to just after its middle
+        (its end in causal mode).
 
         Raises
         ------
@@ -579,6 +592,9 @@ class Reconstructor:
         self._state = self._method.end(progress.segment, progress.cursor)
         self._memory = progress.memory
         self._progress = None
+        # At the boundary itself the image was that of the closed segment, which is gone.
+        passed = progress.segment.end + 1
+        self._earliest = passed if self._earliest is None else max(self._earliest, passed)
         if progress.starts_frame:
             self._frame_interval = self._shots[1].middle - self._shots[0].middle
             self._shots.pop(0)

@@ -453,7 +453,7 @@ class Recording:
         spans = [(frame.exposure_start, frame.exposure_end) for frame in check.watched(recording.frames())]
         exposures = np.array(spans, np.int64).reshape(-1, 2)
         doubts = [check.doubt(), exposure_doubt(exposures)]
-        if len(exposures):
+        if len(exposures) > 1:  # of one frame the exposure alone lies between the first and the last
             first, last = np.searchsorted(array["t"], (exposures[0, 0], exposures[-1, 1] + 1))
             doubts.append(clock_doubt(len(array), int(last - first)))
         for doubt in filter(None, doubts):

@@ -86,7 +86,10 @@ def _axes(
     cv2.polylines(picture, [place(x, y).reshape(-1, 1, 2)], False, _LINE, 1, cv2.LINE_AA)
     for a in np.linspace(x[0], x[-1], 5):
         u, _ = place(a, low)
-        _write(picture, f"{a:.0f}", int(u) - 16, top + height + 18, 0.42)
+        label = f"{a:.0f}"
+        (wide, _), _ = cv2.getTextSize(label, cv2.FONT_HERSHEY_SIMPLEX, 0.42, 1)
+        cv2.line(picture, (int(u), top + height), (int(u), top + height + 4), _INK, 1)
+        _write(picture, label, int(u) - wide // 2, top + height + 18, 0.42)
     for b in np.linspace(low, high, 5):
         _, v = place(x[0], b)
         _write(picture, f"{b:.2f}", left - 48, int(v) + 4, 0.42)

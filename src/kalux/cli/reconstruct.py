@@ -174,7 +174,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
         for text in contents.warnings():
             warn(text)
         planned = part_of(planned, contents, options)
-        for text in plan_warnings(planned, contents, options.preset):
+        for text in (*plan_warnings(planned, contents, options.preset), *_other_mode(planned, options)):
             warn(text)
         if not options.quiet:
             say("\n".join(decided(recording, contents, planned, settings, output, options)))
@@ -275,6 +275,19 @@ def _origin(planned: Plan, options: argparse.Namespace) -> Any:
     former = read_toml(options.settings).get("thresholds", {})
     origin = former.get("origin") if isinstance(former, dict) else None
     return origin if origin in ORIGINS else planned.threshold_origin
+
+
+def _other_mode(planned: Plan, options: argparse.Namespace) -> list[str]:
+    """A warning where ``--settings`` is the `kalux.toml` of a run in another mode, which flags alone choose."""
+    if options.settings is None:
+        return []
+    former = read_toml(options.settings).get("images_wanted", {})
+    if not isinstance(former, dict) or not {"lookahead", "smooth"} <= {*former}:
+        return []
+    mode = "--smooth" if former["smooth"] else "one frame ahead" if former["lookahead"] else "--causal"
+    if (former["lookahead"], former["smooth"]) == (planned.lookahead, planned.smooth):
+        return []
+    return [f"{options.settings} is of a run {mode}; settings do not say so, and these images are others"]
 
 
 # Say.

@@ -249,7 +249,8 @@ def contents(name: str, folder: str | Path) -> Contents:
         if hidden or any(path.is_relative_to(inside) for inside in folders):
             continue
         beside = any(fnmatch.fnmatch(path.name.lower(), pattern) for pattern in published.beside)
-        if not beside and any(fnmatch.fnmatch(path.name.lower(), pattern) for pattern in published.files):
+        named = not published.sequences or path.stem.lower() in published.sequences
+        if not beside and named and any(fnmatch.fnmatch(path.name.lower(), p) for p in published.files):
             paths.append((_name(path, folder), path))
         elif not beside:
             unknown.append(str(path.relative_to(folder)))

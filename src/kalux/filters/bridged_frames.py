@@ -49,8 +49,9 @@ from kalux.filters.method import FAR_FUTURE, USUAL_INTERVAL, Chunks, Method, Seg
 from kalux.filters.shots import Shot
 from kalux.filters.uncertainty import WRONG_STEPS, Around
 from kalux.models.camera import CRUSHED, beyond_white, dark_scale, frame_log_covariance, log_intensity
+from kalux.models.dark_levels import dark_correction
 from kalux.models.pixels import PixelCalibration
-from kalux.settings import Settings
+from kalux.settings import AUTO, Settings
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating[Any]]
@@ -173,7 +174,7 @@ class BridgedFrames(Method):
         )
         level_variance = self.level_variance(shot)
         level_variance[shot.level_clipped] = bridge.UNMEASURED
-        level_log = log_intensity(shot.level_intensity, self.offset)
+        level_log = self.level_log(shot)
         crushed = self.crushed(shot)
         if crushed is not None:
             level_log[crushed], level_variance[crushed] = self.black(shot, crushed)
@@ -191,6 +192,17 @@ class BridgedFrames(Method):
             return latent
         room = np.where(crushed, np.log(shot.level_ceiling + self.offset) - level_log, np.inf)
         return latent._replace(ceiling=latent.value + room.astype(np.float32)[shot.levels])
+
+    def level_log(self, shot: Shot) -> Array:
+        """(N,) log(I + I_0) of each level, of dark ones such that the mean of noisy frames is right (K3).
+
+        As it is where the noise is not known, or is not that of the levels: of a response that bends, and of colours.
+        """
+        told = log_intensity(shot.level_intensity, self.offset)
+        camera = self.settings.camera
+        if camera.frame_noise is None or camera.response not in (AUTO, "linear") or shot.chroma is not None:
+            return told
+        return told + dark_correction(shot.level_intensity, camera.noise, shot.white, self.offset, shot.gap)
 
     def level_variance(self, shot: Shot) -> Array:
         """(N,) variance of log(I + I_0) of each level, by the noise of the frame alone."""

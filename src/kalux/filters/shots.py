@@ -47,6 +47,8 @@ class Shot(NamedTuple):
         `BrightTail.scale` of the recording's frames, in a live stream of the first; by default that without white.
     pitch
         Distance of pixels of one colour: 2 in a Bayer mosaic.
+    gap
+        Between the intensities of two successive levels, if the response is linear; 0 of floating point and of colours.
     """
 
     start: int
@@ -64,6 +66,7 @@ class Shot(NamedTuple):
     trail: FrameTrail | None = None
     bright_tail: float = BrightTail().scale
     pitch: int = 1
+    gap: float = 0.0
 
     @property
     def intensity(self) -> Array:
@@ -120,6 +123,7 @@ def take_shot(
         level_ceiling=ceiling,
         valid=None if frame.valid is None else frame.valid.copy(),  # the caller's memory may be filled again
         pitch=1 if frame.mosaic is None else 2,
+        gap=0.0 if frame.image.dtype.kind == "f" else ratio / frame.full_scale,
     )
 
 

@@ -1,0 +1,97 @@
+"""What dark levels of noisy frames say of log(I + I_0), so that a mean of many frames is right (docs/equations.md, K3).
+
+The logarithm of a dark pixel's own value is wrong in the mean: noise below black reads 0, the logarithm bends, and R
+(9) trusts a frame more the brighter its noise was. So a level b is taken for log(b + I_0) + d(b), with the d for which
+the weighted mean of the levels that an intensity gives is log(I + I_0).
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+
+from kalux.models.camera import frame_log_covariance, log_intensity, noise_variance
+
+Array = NDArray[np.float64]
+
+_REACH: Final = 8.0
+"""Standard deviations of the noise from black up to which d is sought: beyond, the mean is less than 2 % off."""
+
+_TAPER: Final = 2.0
+"""Standard deviations over which d then goes to 0."""
+
+_BEYOND: Final = 4.0
+"""Standard deviations beyond `_REACH` of levels that intensities up to there give."""
+
+_FRAMES: Final = 10.0
+"""Frames of which the mean is to be right: d trades what is left of its error against its noise, since what is wrong of
+levels that are hidden below black takes ever larger d. With 5, 10 and 20, log-MSE of six dark scenes is 0.93, 0.94,
+0.95 forward and 0.94, 0.93, 0.93 both ways of that without."""
+
+_LEAST_NOISE: Final = 0.5
+"""Of the distance of two levels: with less noise most frames show a pixel at the same level, and there is no mean."""
+
+_PER_DEVIATION: Final = 4
+"""Levels per standard deviation that are looked at, where frames have more."""
+
+_INTENSITIES: Final = 200
+"""At which the mean is to be right."""
+
+
+def dark_correction(
+    intensity: Array, noise: tuple[float, float], white: float, log_offset: float, gap: float
+) -> Array:
+    """(N,) d of levels, which is added to their log(I + I_0); 0 where they are not dark.
+
+    Parameters
+    ----------
+    intensity
+        (N,) I of the levels.
+    noise
+        (read, shot) as of `noise_variance`, rounding included.
+    white
+        Intensity of a saturated pixel.
+    log_offset
+        I_0.
+    gap
+        Between the intensities of two successive levels; 0: of floating point.
+    """
+    if noise[0] <= 0.0 or log_offset <= 0.0:
+        return np.zeros(np.shape(intensity))
+    nodes, added = _correction(noise, log_offset / white, gap / white)
+    if len(nodes) == 0:
+        return np.zeros(np.shape(intensity))
+    return np.asarray(np.interp(np.maximum(intensity, 0.0) / white, nodes, added), np.float64)
+
+
+@lru_cache(maxsize=64)
+def _correction(noise: tuple[float, float], log_offset: float, gap: float) -> tuple[Array, Array]:
+    """Levels, white = 1, and their d; none where there is no noise to correct for."""
+    read = np.sqrt(max(noise[0] ** 2 - gap**2 / 12.0, 0.0))  # without rounding
+    if read == 0.0 or read < _LEAST_NOISE * gap:
+        return np.empty(0), np.empty(0)
+    step = gap * max(1, int(read / (_PER_DEVIATION * gap))) if gap > 0 else read / _PER_DEVIATION
+    levels = np.arange(int((_REACH + _BEYOND) * read / step) + 1) * step
+    intensity = np.linspace(0.0, _REACH * read, _INTENSITIES)
+    told, wanted = log_intensity(levels, log_offset), log_intensity(intensity, log_offset)
+    share = _shares(intensity, levels, np.sqrt(noise_variance(intensity, (float(read), noise[1]), 1.0)))
+    share /= frame_log_covariance(levels, np.ones(len(levels)), noise, 1.0, log_offset)
+    share /= share.sum(axis=1, keepdims=True)
+    # The sum over intensities of the squared error of the mean and of its variance is least.
+    mean = share.T @ share
+    scatter = np.diag(share.sum(axis=0)) - mean
+    added = np.linalg.solve(mean + scatter / _FRAMES, share.T @ wanted - (mean + scatter / _FRAMES) @ told)
+    return levels, added * np.clip((_REACH * read - levels) / (_TAPER * read), 0.0, 1.0)
+
+
+def _shares(intensity: Array, levels: Array, deviation: Array) -> Array:
+    """(M, N) probability that an intensity of M, with noise of its standard deviation, reads each level of N.
+
+    All that is less reads the first.
+    """
+    edges = np.concatenate([[-np.inf], (levels[1:] + levels[:-1]) / 2.0, [np.inf]])
+    return np.diff(ndtr((edges - intensity[:, None]) / deviation[:, None]), axis=1)

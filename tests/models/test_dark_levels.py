@@ -1,0 +1,74 @@
+"""What dark levels are taken for (docs/equations.md, K3): means of noisy frames must be right."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kalux.models.camera import frame_log_covariance, log_intensity
+from kalux.models.dark_levels import dark_correction
+
+GAP = 1 / 255
+LEVELS = np.arange(256) * GAP
+OFFSET = 0.004
+
+
+def error_of_mean(intensity: float, noise: float, added: np.ndarray) -> float:
+    """Of log(I + I_0), as the mean of 100,000 frames of 8 bits in which each counts by its 1 / R tells it."""
+    rng = np.random.default_rng(5)
+    read = np.rint(np.maximum(rng.normal(intensity, noise, 100_000), 0.0) / GAP).astype(int)
+    told = log_intensity(LEVELS, OFFSET) + added
+    counted = 1.0 / frame_log_covariance(LEVELS, np.ones(256), (noise, 0.0), 1.0, OFFSET)
+    return float(np.average(told[read], weights=counted[read]) - np.log(intensity + OFFSET))
+
+
+@pytest.mark.parametrize("noise", [0.004, 0.008, 0.015])
+def test_the_mean_of_noisy_frames_is_right(noise):
+    """From twice the noise on as good as gone, of less light within a tenth; what is black stays too bright."""
+    added = dark_correction(LEVELS, (float(np.hypot(noise, GAP / 12**0.5)), 0.0), 1.0, OFFSET, GAP)
+    for share in (0.0, 0.25, 0.5, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0):
+        before, after = (error_of_mean(share * noise, noise, d) for d in (np.zeros(256), added))
+        assert before > 0.02
+        if share < 0.5:
+            assert 0 < after < 0.95 * before
+        else:
+            assert abs(after) < (0.1 if share < 2 else 0.02)
+
+
+def test_what_is_not_dark_stays():
+    added = dark_correction(LEVELS, (0.008, 0.0), 1.0, OFFSET, GAP)
+    assert (added[LEVELS >= 8 * 0.008] == 0).all()
+    assert (added[(LEVELS > 0) & (LEVELS < 6 * 0.008)] < -0.01).all()
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.2 * GAP, GAP / 12**0.5])
+def test_frames_that_are_only_rounded_stay(noise):
+    """They show the same level again and again: there is no mean to be put right."""
+    assert not dark_correction(LEVELS, (noise, 0.0), 1.0, OFFSET, GAP).any()
+
+
+def test_finer_levels_say_the_same():
+    """Of 16 bits and of floating point: rounding to 8 bits changes little where noise is two of their levels."""
+    coarse = dark_correction(LEVELS, (0.008, 0.001), 1.0, OFFSET, GAP)
+    for gap in (1 / 65535, 0.0):
+        np.testing.assert_allclose(
+            dark_correction(LEVELS, (0.008, 0.001), 1.0, OFFSET, gap)[:20], coarse[:20], atol=0.06
+        )
+
+
+@given(
+    st.floats(1e-4, 0.1),
+    st.floats(0, 0.01),
+    st.floats(1e-4, 0.2),
+    st.sampled_from([0.0, 1 / 65535, 1 / 255]),
+    st.floats(0.01, 100),
+)
+def test_brightness_has_no_unit(noise, shot, offset, gap, white):
+    """An exposure half as long is the same frame, twice as bright."""
+    intensity = np.linspace(-0.01, 1.0, 50)
+    added = dark_correction(intensity, (noise, shot), 1.0, offset, gap)
+    scaled = dark_correction(white * intensity, (noise, shot), white, white * offset, white * gap)
+    assert np.isfinite(added).all()
+    np.testing.assert_allclose(scaled, added, atol=1e-6)
