@@ -40,6 +40,26 @@ def test_exposure_and_middle():
     assert (one.exposure, one.middle) == (105, 152)
 
 
+@pytest.mark.parametrize("kind", [np.uint64, np.int32, np.float64])
+def test_times_of_any_type_are_kept_as_int(kind):
+    """Those of `numpy.uint64`, as a file may hold them, would wrap round below 0."""
+    one = frame(kind(100), kind(200))
+    assert [type(t) for t in (one.exposure_start, one.exposure_end, one.exposure, one.middle)] == [int] * 4
+    with pytest.raises(ExposureError, match="an exposure of -50 us"):
+        check_frame(frame(kind(100), kind(50)), (3, 4))
+
+
+def test_an_exposure_that_is_amplified():
+    one = Frame(np.ones((3, 4), np.uint8), 100, 300, gain=1.5)
+    assert one.amplified_exposure == 300.0
+
+
+@pytest.mark.parametrize("kind", [bool, object, complex, "U1"])
+def test_pixels_of_no_known_type_are_told(kind):
+    with pytest.raises(FrameError, match=r"has dtype .*; uint8, uint16, float32 or float64"):
+        check_frame(frame(dtype=kind), (3, 4))
+
+
 @pytest.mark.parametrize(("stamp", "start"), [("start", 100), ("middle", 95), ("end", 89)])
 def test_place_exposure(stamp, start):
     placed = place_exposure(frame(100, 100), 11, stamp)

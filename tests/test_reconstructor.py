@@ -941,3 +941,39 @@ def test_a_live_stream_takes_what_is_usual_of_the_sensor():
 def engine_without_threshold():
     """Without K14: the levels of the tests stand still between two events."""
     return Reconstructor((1, 1), settings=altered(PRESETS["default"], "events", trail=0.0))
+
+
+@every_variant
+@both_modes
+def test_a_moment_between_segments_that_was_read_stays_the_same_image(variant, lookahead):
+    """The next segment begins with the same state, but knows other frames around."""
+    stream = random_stream(7)
+    live = filled(stream, variant, lookahead)
+    moments = [t for f in stream.frames for t in (f.exposure_start, f.middle, f.exposure_end)]
+    for node in moments[3:-3]:
+        first = live.read(node)
+        live.read(node + 1)
+        assert_same(live.read(node), first)
+
+
+def test_the_mask_of_a_frame_may_be_filled_again():
+    images = []
+    for again in (False, True):
+        live, valid = engine((2, 3)), np.ones((2, 3), bool)
+        live.push_frame(Frame(np.full((2, 3), 50, np.uint8), 0, 1_000, valid=valid))
+        if again:
+            valid[:] = False
+        live.push_frame(frame(np.full((2, 3), 90, np.uint8), 40_000, 41_000))
+        live.finish()
+        images.append(live.read(30_000))
+    assert_same(*images)
+
+
+def test_events_of_a_time_that_was_declared_complete_are_told_so():
+    live = engine((1, 1))
+    live.push_frame(frame(50, 0, 10))
+    live.advance(1_000)
+    with pytest.raises(
+        EventError, match=r"event 0 at 500 us is late: advance\(\) has declared all events up to 1000 us"
+    ):
+        live.push_events(pixel_events([500], [True]))

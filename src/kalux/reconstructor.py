@@ -156,6 +156,9 @@ class Reconstructor:
         self._finished = False
         self._earliest: int | None = None  # what `forget` was told
         self._freed: int | None = None  # events of the current segment up to this time are gone
+        self._at_boundary: Estimate | None = (
+            None  # the latest that was read at the end of a segment, and is final
+        )
 
     # Pushing.
 
@@ -250,7 +253,7 @@ class Reconstructor:
         complete, first = self._complete_until + self._delay, int(array["t"][0])
         if first <= complete and (self._last_event is None or first >= self._last_event):
             raise EventError(
-                f"events: event {self._event_count} is at {first} us, but advance() has declared all events up to "
+                f"events: event {self._event_count} at {first} us is late: advance() has declared all events up to "
                 f"{complete} us pushed"
             )
 
@@ -349,8 +352,7 @@ class Reconstructor:
     def estimate(self, t: int) -> Estimate:
         """The filter's estimate at time ``t`` (us), for `image`. Never changes the result of any other read.
 
-        Reads may repeat, and go back as far as the newest frame that earlier reads have passed, to just after its middle
-        (its end in causal mode).
+        Reads may repeat, and go back as far as the newest frame that is final.
 
         Raises
         ------
@@ -367,13 +369,16 @@ class Reconstructor:
                 f"read: {t} us lies before {begin} us, the earliest time that can be read "
                 "(the first frame, or what later reads have passed or forget() has freed)"
             )
+        passed = self._at_boundary
+        if passed is not None and passed.t == t == self._start_time():
+            return passed
         progress = self._progress_to(t)
         self._take(progress, t)
         log_intensity, variance = self._method.read(progress.segment, progress.cursor, t)
         final_until = self.final_until
         final = final_until is not None and t <= final_until
         moment = self._moment(progress, t)
-        return Estimate(
+        estimate = Estimate(
             t,
             log_intensity,
             variance,
@@ -391,6 +396,9 @@ class Reconstructor:
             paths=self._paths(progress, moment),
             share=moment.share,
         )
+        if final and t == progress.segment.end:
+            self._at_boundary = estimate
+        return estimate
 
     def trail(self, t: int) -> NDArray[np.floating[Any]] | None:
         """(H, W) how far, in log intensity, the light is ahead of its events at ``t`` (us), K14.
@@ -592,9 +600,6 @@ class Reconstructor:
         self._state = self._method.end(progress.segment, progress.cursor)
         self._memory = progress.memory
         self._progress = None
-        # At the boundary itself the image was that of the closed segment, which is gone.
-        passed = progress.segment.end + 1
-        self._earliest = passed if self._earliest is None else max(self._earliest, passed)
         if progress.starts_frame:
             self._frame_interval = self._shots[1].middle - self._shots[0].middle
             self._shots.pop(0)

@@ -50,6 +50,13 @@ def test_events_in_another_unit_are_doubted():
     assert not list(check_recording(WHOLE, lambda count: None).warnings())
 
 
+def test_of_one_frame_no_clock_is_doubted():
+    """Nothing lies between the first frame and the last but its exposure."""
+    frames = list(WHOLE.frames())[:1]
+    one = Recording.from_arrays(STREAM.events, frames, sensor_size=WHOLE.sensor_size)
+    assert not list(check_recording(one, lambda count: None).warnings())
+
+
 def test_a_last_exposure_longer_than_the_frame_intervals_is_doubted():
     *others, last = STREAM.frames
     damaged = [*others, dataclasses.replace(last, exposure_end=last.exposure_end + 10**6)]

@@ -73,6 +73,7 @@ def test_from_photographs_to_scores(cli, data, tmp_path):
         (["x.exr", "-o", "x.npz"], "is a radiance image already"),
         (["none.exr", "-o", "x.npz", "--register", "rec.h5"], "no such file"),
         (["rec.h5", "-o", "x.exr"], "no such folder"),
+        (["a.exr", "-o", "x.npz", "--register", "rec.h5", "--response", "srgb"], "--response, --align"),
     ],
 )
 def test_errors_are_one_line(cli, data, tmp_path, monkeypatch, arguments, told):

@@ -63,6 +63,22 @@ def test_black_and_the_real_response_are_taken_off():
     assert np.allclose(found.ground_truth().images[0], expected, atol=2e-3)
 
 
+def test_black_and_gain_that_frames_state_are_taken_off_once():
+    camera = ArtificialCamera(0.0, 1.0)
+    stated = [
+        dataclasses.replace(frame(LEVELS, 10_000 * k, 10_000 * k + 1000), black=14.0, gain=gain)
+        for k, gain in enumerate([1.0, 2.0])
+    ]
+    source = kalux.Recording.from_arrays(np.empty(0, kalux.EVENT_DTYPE), stated, sensor_size=LEVELS.shape)
+    found = artificial_hdr(source, camera)
+    seen = np.clip((LEVELS - 14.0) / 241, 0, 1)
+    for one, truth, gain in zip(found.frames(), found.ground_truth().images, [1.0, 2.0], strict=True):
+        assert (one.black, one.gain) == (0.0, gain)
+        back = Response.named(found.response).inverse(one.normalised())
+        assert np.allclose(back[seen < 0.9], seen[seen < 0.9], atol=0.01)
+        assert np.allclose(truth, seen / gain, atol=1e-6)
+
+
 def test_held_out_frames_are_the_truth_alone():
     found = artificial_hdr(recording_of([LEVELS] * 7), ArtificialCamera.with_cut(50), every=3)
     assert [f.exposure_start for f in found.frames()] == [0, 10_000, 30_000, 40_000, 60_000]

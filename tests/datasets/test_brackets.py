@@ -28,7 +28,7 @@ def write(folder, pictures):
 def test_brackets_from_a_folder(scene, tmp_path):
     pictures = photographs(scene)
     folder = write(tmp_path / "b", pictures)
-    with (tmp_path / "times.csv").open("w", newline="") as file:
+    with (tmp_path / "times.csv").open("w", newline="", encoding="utf-8-sig") as file:  # as Excel writes it
         rows = csv.writer(file)
         rows.writerow(["file", "exposure_s"])
         rows.writerows([["3.png", "1/16"], ["0.png", 4], ["1.png", 1]])

@@ -85,13 +85,14 @@ def test_text_folders_as_published(payload, tmp_path):
         write_ijrr(tmp_path / name, events, frames)
     (tmp_path / "notes.pdf").write_bytes(b"")
     (tmp_path / "stray.dat").write_bytes(b"")
+    (tmp_path / "mine.bag").write_bytes(b"")
     (tmp_path / ".hidden").write_bytes(b"")
     found = contents("ijrr", tmp_path)
     assert [name for name, _ in found.found] == ["boxes_6dof", "slider_depth"]
     assert len(found.missing) == 25
     assert "slider_depth" not in found.missing
     assert found.incomplete == {"boxes_6dof": ("calib.txt",), "slider_depth": ("calib.txt",)}
-    assert found.unknown == ("stray.dat",)
+    assert found.unknown == ("mine.bag", "stray.dat")  # the names of all sequences are known
     opened = dict(sequences("ijrr", tmp_path, exposure=10_000))
     for recording in opened.values():
         assert len(recording.events()) == COUNT

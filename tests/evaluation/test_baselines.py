@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kalux import Frame, Recording, reconstruct
+from kalux import PRESETS, Frame, Recording, reconstruct
 from kalux.datasets import SensorSettings
 from kalux.evaluation.baselines import (
     EventWindow,
@@ -15,6 +15,7 @@ from kalux.evaluation.baselines import (
     methods,
     nearest_frames,
 )
+from kalux.settings import altered
 
 from builders import frame, moving_blocks, pixel_events
 
@@ -46,6 +47,24 @@ def test_edi_moves_the_nearest_frame_by_its_events_forward_and_backward():
     a, b = 100 / 255 + 0.03, 50 / 255 + 0.03
     expected = [a, a * np.exp(0.2), b * np.exp(0.2), b]
     assert np.array(found) + 0.03 == pytest.approx(expected, rel=1e-6)
+
+
+def test_edi_takes_events_at_the_time_of_their_light():
+    recording = moving_blocks().recording()
+    times = np.array([80_000, 120_000])
+    stamped = np.concatenate(list(recording.events()))
+    stamped["t"] += 3_000
+    late = Recording.from_arrays(
+        stamped, list(recording.frames()), sensor_size=recording.sensor_size, contrast_threshold=0.2
+    )
+    known = altered(PRESETS["default"], "events", threshold_on=0.2, threshold_off=0.2)
+    known = altered(known, "camera", log_offset=0.01)
+    on_time, put_right, left = (
+        np.stack([*edi_video(one, times, settings=altered(known, "events", delay=delay))])
+        for one, delay in ((recording, 0), (late, 3_000), (late, 0))
+    )
+    np.testing.assert_array_equal(put_right, on_time)
+    assert np.abs(left - on_time).max() > 0.05
 
 
 def test_edi_removes_blur():

@@ -266,6 +266,9 @@ class TestBlurConsistency:
 
     def test_frames_without_such_pixels_are_counted(self):
         assert blur_consistency(still([102, 255, 102, 102]), constant(0.4)).skipped == 1
+        few = Method("few", lambda recording, times: [np.full(recording.sensor_size, 0.4, np.float32)])
+        with pytest.raises(InputError, match="1 images for 18 times"):
+            blur_consistency(still([102] * 4), few)
         with pytest.raises(FrameError, match="clipped or black"):
             blur_consistency(still([255] * 4), constant(1.0))
         with pytest.raises(FrameError, match="three frames"):

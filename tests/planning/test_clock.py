@@ -11,6 +11,7 @@ import kalux
 from kalux import PRESETS, Recording
 from kalux.datasets import SensorSettings, pan, photograph_scene, simulate
 from kalux.errors import InputError
+from kalux.planning import clock
 from kalux.planning.clock import offset_of_recording
 from kalux.recording import AS_STORED, EventLayout, with_event_layout
 from kalux.settings import altered
@@ -73,6 +74,22 @@ def test_a_black_level_is_taken_off(seen, expected):
     left, mends = offset_of_recording(raised, given, reach=200_000)
     assert mends.black is None
     assert abs(left.offset - found.offset) > 200
+
+
+@pytest.mark.parametrize("stated", ["srgb", "gamma:1.5"])
+def test_the_response_that_the_recording_states_is_used(seen, expected, stated, monkeypatch):
+    asked = set()
+    whole = clock.estimate_offset
+
+    def watched(*args, camera, **options):
+        asked.add(camera.response)
+        return whole(*args, camera=camera, **options)
+
+    monkeypatch.setattr(clock, "estimate_offset", watched)
+    source = dataclasses.replace(later(seen, 0).source, response=stated)
+    found, _ = offset_of_recording(Recording(source), SETTINGS, reach=200_000)
+    assert asked == {stated}
+    assert found.offset == pytest.approx(expected, abs=300)
 
 
 @pytest.mark.parametrize("layout", [EventLayout(mirrored_x=True), EventLayout(False, True, True)])

@@ -172,6 +172,7 @@ def test_the_same_bytes_each_time(path, tmp_path):
     [
         ({"image": np.zeros(SIZE, np.float32)}, "frame 2 has pixels of float32"),
         ({"valid": np.zeros(SIZE, bool)}, "frame 2 has pixels that are not valid"),
+        ({"gain": 2.0}, "frame 2 has a gain of 2"),
     ],
 )
 def test_frames_that_cannot_be_held(path, changes, told):

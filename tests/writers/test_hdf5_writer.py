@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import resource
 
 import numpy as np
@@ -42,6 +43,15 @@ def test_frames_must_be_alike(path):
     with pytest.raises(FrameError, match="frame 2 has another size, dtype"):
         write_kalux(path, frames=frames)
     assert list(path.parent.iterdir()) == []
+
+
+def test_gains_come_back(path):
+    frames = [
+        dataclasses.replace(f, gain=gain)
+        for f, gain in zip(small_frames(), (1.0, 2.0, 0.5, 1.0), strict=True)
+    ]
+    write_kalux(path, frames=frames)
+    assert [f.gain for f in readers.read(path).frames()] == [1.0, 2.0, 0.5, 1.0]
 
 
 @pytest.mark.parametrize("kind", [KeyboardInterrupt, RuntimeError])

@@ -84,6 +84,15 @@ def test_sequences_of_one_name_are_told_apart(small_set, tmp_path):
     assert [s.name for s in gather(files).sequences] == ["set-a", "other-a", "other-a-2"]
 
 
+def test_a_number_gives_no_name_that_is_taken(small_set, tmp_path):
+    folder = tmp_path / "d"
+    folder.mkdir()
+    for name in ("d-run-2.h5", "run.h5", "run.hdf5"):
+        (folder / name).write_bytes((small_set.folder / "a.h5").read_bytes())
+    names = [s.name for s in gather([folder]).sequences]
+    assert len({*names}) == len(names) == 3
+
+
 def test_a_folder_without_recordings_is_refused(tmp_path):
     (tmp_path / "notes.txt").write_text("nothing")
     with pytest.raises(InputError, match="neither a recording nor a folder"):
