@@ -9,11 +9,12 @@ import pytest
 
 import kalux
 from kalux import Recording
+from kalux.calibration import pixel_thresholds
 from kalux.calibration.pixel_thresholds import calibrate_contrast, shrunk
 from kalux.datasets import SensorSettings, demo_scene, simulate, static
 from kalux.settings import CameraSettings
 
-from builders import from_black, lifted, unlabelled
+from builders import from_black, lifted, pixel_events, unlabelled
 
 CAMERA = CameraSettings()
 SCENE = demo_scene(sensor_size=(90, 120))
@@ -68,6 +69,13 @@ def test_the_refractory_period_is_made_up_for_where_it_is_known():
     assert plain.off > 1.04 * known.off
     assert known.calibration().settings["events"]["refractory_period"] == 500
     assert "refractory_period" not in plain.calibration().settings["events"]
+
+
+def test_where_the_direction_turns_nothing_is_added():
+    """K13: meanwhile the light may have moved either way."""
+    history = pixel_thresholds._History((1, 1), pixel_thresholds._Sampling((0.2, 0.2), 1000, 1000))
+    on, off, _ = history.counts(pixel_events([10_000, 13_500, 17_000], [True, False, False]))
+    assert (on[0, 0], off[0, 0]) == (1.0, pytest.approx(1.0 + 3.5 / 2.5))
 
 
 def test_the_spread_is_found_and_standard_errors_are_small(found):

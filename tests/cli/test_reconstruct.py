@@ -213,6 +213,18 @@ class TestSettings:
             "cf",
         )
 
+    def test_settings_of_a_run_in_another_mode_are_told(self, cli, write_recording, tmp_path):
+        """Flags alone choose the mode: without a word the images would be taken for the same."""
+        recording = write_recording(tmp_path / "rec.h5")
+        flags = ("--at", "frames", "--format", "npy")
+        cli("reconstruct", recording, "-o", tmp_path / "a", *flags, "--smooth")
+        again = (*flags, "--settings", tmp_path / "a" / "kalux.toml")
+        told = "is of a run --smooth; settings do not say so, and these images are others"
+        assert told in cli("reconstruct", recording, "-o", tmp_path / "b", *again).err
+        assert told not in cli("reconstruct", recording, "-o", tmp_path / "c", *again, "--smooth").err
+        for first, second in zip(images_in(tmp_path / "a"), images_in(tmp_path / "c"), strict=True):
+            np.testing.assert_array_equal(first, second)
+
     @pytest.mark.parametrize("threshold", [None, (0.2, 0.2)])
     def test_an_outputs_settings_reproduce_it(self, cli, write_recording, tmp_path, threshold):
         """Also where thresholds were estimated, which makes the engine believe highlights less."""

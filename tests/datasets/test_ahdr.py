@@ -75,7 +75,8 @@ def test_black_and_gain_that_frames_state_are_taken_off_once():
     for one, truth, gain in zip(found.frames(), found.ground_truth().images, [1.0, 2.0], strict=True):
         assert (one.black, one.gain) == (0.0, gain)
         back = Response.named(found.response).inverse(one.normalised())
-        assert np.allclose(back[seen < 0.9], seen[seen < 0.9], atol=0.01)
+        steep = (seen > 0.1) & (seen < 0.85)  # where a level is little light
+        assert np.allclose(back[steep], seen[steep], atol=0.005)
         assert np.allclose(truth, seen / gain, atol=1e-6)
 
 
