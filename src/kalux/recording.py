@@ -284,29 +284,6 @@ def reference_exposure(recording: Recording) -> int:
     return median_exposure(exposures)
 
 
-_COARSE: Final = 500
-"""us between different times of events from which somebody should hear of it: a filter that is exact between events
-then is not, and what moves 1000 pixels a second goes half a pixel at once."""
-
-_TOLD_FROM: Final = 1_000  # events
-_AT_ONCE: Final = 4  # of one time, in the mean: few events are far apart without having been rounded
-
-
-def rounding_doubt(times: NDArray[np.int64]) -> str | None:
-    """A warning if ``times`` of events (us, ascending) are all multiples of a long step, else None."""
-    steps = np.diff(times)
-    apart = steps[steps > 0]
-    if len(times) < _TOLD_FROM or not len(apart) or _AT_ONCE * (len(apart) + 1) > len(times):
-        return None
-    least = int(apart.min())
-    if least < _COARSE:
-        return None
-    return (
-        f"times of events differ by {least:,} us or not at all: were they rounded, as 32-bit floating point rounds "
-        "seconds? Whole microseconds are needed"
-    )
-
-
 RECORDING_NEEDED: Final = "a kalux.Recording is needed, from kalux.open or Recording.from_arrays"
 
 
@@ -479,7 +456,6 @@ class Recording:
         if len(exposures) > 1:  # of one frame the exposure alone lies between the first and the last
             first, last = np.searchsorted(array["t"], (exposures[0, 0], exposures[-1, 1] + 1))
             doubts.append(clock_doubt(len(array), int(last - first)))
-        doubts.append(rounding_doubt(array["t"]))
         for doubt in filter(None, doubts):
             warnings.warn(f"{name}: {doubt}", stacklevel=2)
         return recording

@@ -50,18 +50,6 @@ def test_events_in_another_unit_are_doubted():
     assert not list(check_recording(WHOLE, lambda count: None).warnings())
 
 
-def test_times_that_were_rounded_are_told():
-    """32-bit floating point tells seconds of a long recording apart by milliseconds."""
-    rounded = STREAM.events.copy()
-    t = rounded["t"]
-    rounded["t"] = t[0] + (t - t[0]) // 2_000 * 2_000
-    many = np.repeat(rounded, -(-5_000 // len(rounded)))
-    found = check_recording(in_parts([many]), lambda count: None)
-    assert any("differ by 2,000 us or not at all: were they rounded" in text for text in found.warnings())
-    exact = np.repeat(STREAM.events, -(-5_000 // len(rounded)))
-    assert not list(check_recording(in_parts([exact]), lambda count: None).warnings())
-
-
 def test_of_one_frame_no_clock_is_doubted():
     """Nothing lies between the first frame and the last but its exposure."""
     frames = list(WHOLE.frames())[:1]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from kalux.event_slices import between, events_until
 from kalux.frames import Frame, exposure_doubt
-from kalux.recording import Recording, clock_doubt, no_frames, rounding_doubt
+from kalux.recording import Recording, clock_doubt, no_frames
 from kalux.white import WhiteCheck
 
 T = TypeVar("T")
@@ -130,13 +130,12 @@ def check_recording(
     exposures = np.array(spans, np.int64)
     start, end = (int(t) for t in (exposures[0, 0], exposures[-1, 1]))
     count = events_between = events_from = 0
-    complete, rounded = True, None
+    complete = True
     last_event, silences = start, [(start, start)]
     for chunk in recording.events():
         if most is not None and events_from >= most:
             complete = False
             break
-        rounded = rounding_doubt(chunk["t"]) if count == 0 else rounded
         count += len(chunk)
         events_between += len(between(chunk, start - 1, end))
         events_from += len(chunk) - events_until(chunk, start - 1)
@@ -145,7 +144,7 @@ def check_recording(
         on_events(len(chunk))
     if complete:
         silences.append((last_event, end))
-    doubts = tuple(filter(None, (white.doubt(), exposure_doubt(exposures), rounded)))
+    doubts = tuple(filter(None, (white.doubt(), exposure_doubt(exposures))))
     longest = max(silences, key=lambda silence: silence[1] - silence[0])
     seen = (end if complete else last_event) - start
     usual = (seen - (longest[1] - longest[0])) / max(events_between, 1)
