@@ -156,9 +156,7 @@ class Reconstructor:
         self._finished = False
         self._earliest: int | None = None  # what `forget` was told
         self._freed: int | None = None  # events of the current segment up to this time are gone
-        self._at_boundary: Estimate | None = (
-            None  # the latest that was read at the end of a segment, and is final
-        )
+        self._at_boundary: Estimate | None = None  # the latest of the end of a segment, if it is final
 
     # Pushing.
 
@@ -228,7 +226,7 @@ class Reconstructor:
         if self._complete_until is not None:
             earliest = self._complete_until + 1 + self._delay
             previous = earliest if previous is None else max(previous, earliest)
-            self._require_not_complete(array)
+            self._require_not_complete(array, self._complete_until + self._delay)
         kept = array
         if self._hot is not None:
             check_events(array, self.sensor_size, first_index=self._event_count, previous_t=previous)
@@ -246,11 +244,11 @@ class Reconstructor:
         if self._needed_from is not None:
             self._events.drop(self._needed_from)
 
-    def _require_not_complete(self, array: EventArray) -> None:
-        """Refuse events of a time that `advance` has declared complete; others are told by `check_events`."""
-        if len(array) == 0 or self._complete_until is None:
+    def _require_not_complete(self, array: EventArray, complete: int) -> None:
+        """Refuse events up to ``complete`` (us), as `advance` was told; others are told by `check_events`."""
+        if len(array) == 0:
             return
-        complete, first = self._complete_until + self._delay, int(array["t"][0])
+        first = int(array["t"][0])
         if first <= complete and (self._last_event is None or first >= self._last_event):
             raise EventError(
                 f"events: event {self._event_count} at {first} us is late: advance() has declared all events up to "

@@ -287,19 +287,19 @@ def reference_exposure(recording: Recording) -> int:
 RECORDING_NEEDED: Final = "a kalux.Recording is needed, from kalux.open or Recording.from_arrays"
 
 
-def clock_doubt(events: int, between: int, enough: int = LATEST) -> str | None:
+def clock_doubt(frames: int, events: int, between: int, enough: int = LATEST) -> str | None:
     """A warning if events and frames hardly have the same clock, else None.
 
     Parameters
     ----------
-    events
-        Their number.
+    frames, events
+        Their numbers. Of one frame the exposure alone lies between the first and the last.
     between
-        How many of them lie from the first frame to the last.
+        How many of the events lie from the first frame to the last.
     enough
         With so many between the frames the clocks are believed, whatever the share.
     """
-    if between >= min(_LEAST_SHARE * events, enough):
+    if frames < 2 or between >= min(_LEAST_SHARE * events, enough):
         return None
     if between == 0:
         return (
@@ -453,9 +453,9 @@ class Recording:
         spans = [(frame.exposure_start, frame.exposure_end) for frame in check.watched(recording.frames())]
         exposures = np.array(spans, np.int64).reshape(-1, 2)
         doubts = [check.doubt(), exposure_doubt(exposures)]
-        if len(exposures) > 1:  # of one frame the exposure alone lies between the first and the last
+        if len(exposures):
             first, last = np.searchsorted(array["t"], (exposures[0, 0], exposures[-1, 1] + 1))
-            doubts.append(clock_doubt(len(array), int(last - first)))
+            doubts.append(clock_doubt(len(exposures), len(array), int(last - first)))
         for doubt in filter(None, doubts):
             warnings.warn(f"{name}: {doubt}", stacklevel=2)
         return recording

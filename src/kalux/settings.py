@@ -113,6 +113,11 @@ class CameraSettings:
         return UNKNOWN_LOG_OFFSET if self.log_offset is None else self.log_offset
 
     @property
+    def is_linear(self) -> bool:
+        """Whether values are proportional to the light."""
+        return chosen_response(self.response, None) == "linear"
+
+    @property
     def noise(self) -> tuple[float, float]:
         """(``frame_noise``, ``shot_noise``), or their usual values while they are None."""
         read = self.usual_frame_noise if self.frame_noise is None else self.frame_noise

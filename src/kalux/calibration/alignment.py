@@ -95,9 +95,8 @@ class Alignment(NamedTuple):
 
 def take_shots(frames: Iterable[Frame], camera: CameraSettings) -> Shots:
     """Logarithms of frames, scaled to the first one's exposure where exposures are known."""
-    response = Camera.named(
-        camera.response, camera.clipped_from
-    ).response  # of a camera in colour, that of green
+    green = Camera.named(camera.response, camera.clipped_from).of_channel(1)  # of colours that differ
+    response = green.response
     middles, logs, shares, usable = [], [], [], []
     reference = 0
     for frame in frames:

@@ -86,7 +86,7 @@ class Contents(NamedTuple):
         if self.events == 0:
             yield "there are no events; the images show the frames only"
         else:
-            doubt = clock_doubt(self.events, self.events_between, CHECKED_FIRST) if self.frames > 1 else None
+            doubt = clock_doubt(self.frames, self.events, self.events_between, CHECKED_FIRST)
             if doubt is not None:
                 yield doubt
             elif self.silence is not None:

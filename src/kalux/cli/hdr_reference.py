@@ -137,8 +137,8 @@ def _check_flags(options: argparse.Namespace) -> None:
             raise UsageError(
                 f"{options.photos}: is a radiance image already; give --register REC, or a folder"
             )
-        given = options.times or options.plot or options.keep_moving
-        if given or options.align != "homography" or options.response != "debevec":
+        joins = options.times or options.plot or options.keep_moving
+        if joins or options.align != "homography" or options.response != "debevec":
             raise UsageError(
                 f"{options.photos}: --times, --plot, --response, --align and --keep-moving are for a folder of "
                 "photographs"

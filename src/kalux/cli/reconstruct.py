@@ -272,17 +272,22 @@ def _origin(planned: Plan, options: argparse.Namespace) -> Any:
         or {"threshold_on", "threshold_off"} & {*flags}
     ):
         return planned.threshold_origin
-    former = read_toml(options.settings).get("thresholds", {})
-    origin = former.get("origin") if isinstance(former, dict) else None
+    origin = _former(options, "thresholds").get("origin")
     return origin if origin in ORIGINS else planned.threshold_origin
+
+
+def _former(options: argparse.Namespace, table: str) -> dict[str, Any]:
+    """A table of ``--settings``, if it is a former run's `kalux.toml`; else an empty one."""
+    former = read_toml(options.settings).get(table)
+    return former if isinstance(former, dict) else {}
 
 
 def _other_mode(planned: Plan, options: argparse.Namespace) -> list[str]:
     """A warning where ``--settings`` is the `kalux.toml` of a run in another mode, which flags alone choose."""
     if options.settings is None:
         return []
-    former = read_toml(options.settings).get("images_wanted", {})
-    if not isinstance(former, dict) or not {"lookahead", "smooth"} <= {*former}:
+    former = _former(options, "images_wanted")
+    if not {"lookahead", "smooth"} <= {*former}:
         return []
     mode = "--smooth" if former["smooth"] else "one frame ahead" if former["lookahead"] else "--causal"
     if (former["lookahead"], former["smooth"]) == (planned.lookahead, planned.smooth):

@@ -51,7 +51,7 @@ from kalux.filters.uncertainty import WRONG_STEPS, Around
 from kalux.models.camera import CRUSHED, beyond_white, dark_scale, frame_log_covariance, log_intensity
 from kalux.models.dark_levels import dark_correction
 from kalux.models.pixels import PixelCalibration
-from kalux.settings import AUTO, Settings
+from kalux.settings import Settings
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating[Any]]
@@ -200,7 +200,7 @@ class BridgedFrames(Method):
         """
         told = log_intensity(shot.level_intensity, self.offset)
         camera = self.settings.camera
-        if camera.frame_noise is None or camera.response not in (AUTO, "linear") or shot.chroma is not None:
+        if camera.frame_noise is None or not camera.is_linear or shot.chroma is not None:
             return told
         return told + dark_correction(shot.level_intensity, camera.noise, shot.white, self.offset, shot.gap)
 

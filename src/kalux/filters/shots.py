@@ -12,7 +12,7 @@ from kalux.augmentation.trail import FrameTrail
 from kalux.errors import SettingsError
 from kalux.frames import Frame
 from kalux.models import colour
-from kalux.models.camera import BrightTail, Camera, black_ceiling, inverse_response
+from kalux.models.camera import BrightTail, Camera, black_ceiling, inverse_response, rounding_error
 
 Array = NDArray[np.float64]
 
@@ -121,10 +121,15 @@ def take_shot(
         level_clipped=response >= camera.saturation,
         white=ratio,
         level_ceiling=ceiling,
-        valid=None if frame.valid is None else frame.valid.copy(),  # the caller's memory may be filled again
+        valid=_mask(frame),
         pitch=1 if frame.mosaic is None else 2,
-        gap=0.0 if frame.image.dtype.kind == "f" else ratio / frame.full_scale,
+        gap=2.0 * rounding_error(frame) * ratio,
     )
+
+
+def _mask(frame: Frame) -> NDArray[np.bool_] | None:
+    """A copy, since the caller's memory may be filled again."""
+    return None if frame.valid is None else frame.valid.copy()
 
 
 class _Leveled(NamedTuple):
@@ -194,7 +199,7 @@ def _colour_shot(frame: Frame, camera: Camera, ratio: float, gains: colour.Gains
         ).ravel(),
         chroma=colour.chromaticity(rgb, _CHROMA_FLOOR * ratio),
         chroma_weight=np.clip((camera.saturation - brightest) / room, 0, 1).astype(np.float32),
-        valid=None if frame.valid is None else frame.valid.copy(),  # the caller's memory may be filled again
+        valid=_mask(frame),
     )
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from kalux.errors import SettingsError
 from kalux.frames import Frame
-from kalux.settings import AUTO, CameraSettings
+from kalux.settings import CameraSettings
 
 Array = NDArray[np.float64]
 
@@ -432,7 +432,7 @@ def repeated_rounding(frame: Frame, camera: CameraSettings) -> float:
     another width each, and colours have been demosaiced: nothing is said of them.
     """
     half_level = rounding_error(frame)
-    repeats = camera.noise[0] <= half_level and camera.response in (AUTO, "linear") and frame.image.ndim == 2
+    repeats = camera.noise[0] <= half_level and camera.is_linear and frame.image.ndim == 2
     return half_level / 3**0.5 if repeats else 0.0
 
 

@@ -12,7 +12,6 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr
 
 from kalux.models.camera import frame_log_covariance, log_intensity, noise_variance
 
@@ -60,20 +59,16 @@ def dark_correction(
     gap
         Between the intensities of two successive levels; 0: of floating point.
     """
-    if noise[0] <= 0.0 or log_offset <= 0.0:
-        return np.zeros(np.shape(intensity))
-    nodes, added = _correction(noise, log_offset / white, gap / white)
-    if len(nodes) == 0:
-        return np.zeros(np.shape(intensity))
-    return np.asarray(np.interp(np.maximum(intensity, 0.0) / white, nodes, added), np.float64)
+    levels, added = _correction(noise, log_offset / white, gap / white)
+    return np.asarray(np.interp(np.maximum(intensity, 0.0) / white, levels, added), np.float64)
 
 
 @lru_cache(maxsize=64)
 def _correction(noise: tuple[float, float], log_offset: float, gap: float) -> tuple[Array, Array]:
-    """Levels, white = 1, and their d; none where there is no noise to correct for."""
+    """Levels, white = 1, and their d: 0 where there is no noise to correct for."""
     read = np.sqrt(max(noise[0] ** 2 - gap**2 / 12.0, 0.0))  # without rounding
     if read == 0.0 or read < _LEAST_NOISE * gap:
-        return np.empty(0), np.empty(0)
+        return np.zeros(1), np.zeros(1)
     step = gap * max(1, int(read / (_PER_DEVIATION * gap))) if gap > 0 else read / _PER_DEVIATION
     levels = np.arange(int((_REACH + _BEYOND) * read / step) + 1) * step
     intensity = np.linspace(0.0, _REACH * read, _INTENSITIES)
@@ -83,8 +78,8 @@ def _correction(noise: tuple[float, float], log_offset: float, gap: float) -> tu
     share /= share.sum(axis=1, keepdims=True)
     # The sum over intensities of the squared error of the mean and of its variance is least.
     mean = share.T @ share
-    scatter = np.diag(share.sum(axis=0)) - mean
-    added = np.linalg.solve(mean + scatter / _FRAMES, share.T @ wanted - (mean + scatter / _FRAMES) @ told)
+    normal = mean + (np.diag(share.sum(axis=0)) - mean) / _FRAMES
+    added = np.linalg.solve(normal, share.T @ wanted - normal @ told)
     return levels, added * np.clip((_REACH * read - levels) / (_TAPER * read), 0.0, 1.0)
 
 
@@ -93,5 +88,7 @@ def _shares(intensity: Array, levels: Array, deviation: Array) -> Array:
 
     All that is less reads the first.
     """
+    from scipy.special import ndtr  # a fifth of what it takes to import kalux, and only noisy frames need it
+
     edges = np.concatenate([[-np.inf], (levels[1:] + levels[:-1]) / 2.0, [np.inf]])
     return np.diff(ndtr((edges - intensity[:, None]) / deviation[:, None]), axis=1)
