@@ -62,7 +62,8 @@ def test_smoothing_is_two_filters_combined_by_information():
         if a.around is not None and b.around is not None:
             first, second = (variance < UNMEASURED for variance in a.around[:2])
             same = np.where(first, 1 - share, 0) + np.where(second, share, 0)
-            correlation = 0.2 + 0.8 * same
+            unsignalled = np.minimum(0.2 * 0.25 / 6 / np.sqrt(a.variance * b.variance), 1)  # c^2 / 6
+            correlation = unsignalled + (1 - unsignalled) * same
             half_way = (a.around.half_way + b.around.half_way) / 2
             around = a.around._replace(counted=UNMEASURED, half_way=half_way)
         either = dataclasses.replace(
@@ -271,18 +272,26 @@ def test_what_two_filters_know_adds_up():
 
 @pytest.mark.parametrize("share", [0.25, 0.5, 1.0])
 def test_filters_that_go_by_the_same_frames_err_alike(share):
-    """As far as a frame around measures a pixel; where none does, a fifth of their errors is that of thresholds."""
+    """As far as a frame around measures a pixel; of the rest both miss where the light is between two events."""
     clipped = UNMEASURED
     forward, backward = estimates_around(
         [0.01, 0.01, clipped, clipped], [0.02, clipped, 0.02, clipped], share
     )
-    found = combine(forward, backward).variance[:, 0]
+    found = combine(forward, backward, None, 6 * 0.2 * 0.1 * 0.2).variance[:, 0]
     errors = 0.8 * 0.1, 0.2 * 0.2  # by weights of 4 to 1
     expected = [
         errors[0] ** 2 + errors[1] ** 2 + 2 * (0.2 + 0.8 * same) * errors[0] * errors[1]
         for same in (1.0, 1 - share, share, 0.0)
     ]
     np.testing.assert_allclose(found, expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("threshold", "alike"), [(0.12, 0.12), (0.3, 0.75), (3.0, 1.0)])
+def test_filters_that_go_by_events_alone_miss_the_same_between_two_of_them(threshold, alike):
+    """Covariance c^2 / 6, the variance of a walk that starts in the middle between two walls, but no more than all."""
+    forward, backward = estimates_around([UNMEASURED], [UNMEASURED], 0.5)  # variances 0.01 and 0.04
+    found = combine(forward, backward, None, threshold**2).variance[0, 0]
+    np.testing.assert_allclose(found, 0.08**2 + 0.04**2 + 2 * alike * 0.08 * 0.04, rtol=1e-6)
 
 
 def test_black_tells_both_filters_the_same():
