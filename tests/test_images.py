@@ -98,6 +98,19 @@ def test_a_pixel_that_no_frame_has_shown_is_above_its_bound_and_doubtful():
     assert lifted.variance[0, 1] == pytest.approx(0.7**2 + 0.01 + 2.0)
 
 
+@pytest.mark.parametrize(("between", "alike"), [(0.0, False), (1.0, True)])
+def test_neighbours_tell_more_of_a_pixel_that_no_frame_ties(between, alike):
+    """At a frame it may be as far from where its events left it as half-way, where none is tied (K11, K12)."""
+    view = dataclasses.replace(GREY, neighbours=0.2, highlight_scale=0.0)
+    levels = [[0.5, 0.5, 0.5], [0.5, 0.51, 0.5], [0.5, 0.5, 0.5]]
+    told = estimate(levels, moving=np.ones((3, 3), np.bool_), between=between)
+    tied, untied = (
+        make_image(dataclasses.replace(told, unmeasured=np.array(of, np.int64)), view).intensity[1, 1]
+        for of in ([], [4])
+    )
+    assert (untied == tied) if alike else (0.5 < untied < tied - 1e-3)
+
+
 def test_frames_in_rgb_lend_their_ratios_to_the_intensity():
     chroma = np.array([[[2.0, 1.0, 0.5]]], np.float32)
     image = make_image(estimate([[0.3]], chroma=chroma), GREY)

@@ -19,7 +19,7 @@ from kalux.augmentation.highlights import Unshown
 from kalux.augmentation.motion import Paths
 from kalux.augmentation.subthreshold import UNKNOWN_CHANGE
 from kalux.filters.highlights import keep_white, lifted, read_unshown, tempered
-from kalux.filters.readout import HighlightPrior, read_out
+from kalux.filters.readout import HighlightPrior, Subthreshold, read_out
 from kalux.filters.uncertainty import (
     Around,
     add_pattern,
@@ -219,13 +219,14 @@ def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) ->
     needs_variance = with_variance or view.mosaic is not None or along is not None
     # That after averaging counts only for pixels that neither frame measures (K11).
     needs_averaged = needs_variance and (moving is None or _misses_some(estimate))
+    averaging = before_averaging(subthreshold)
     intensity, total, levels = read_out(
         log_intensity,
-        variance,
+        _untied(variance, estimate.unmeasured, averaging),
         view.log_offset,
         prior,
         moving=moving,
-        subthreshold=before_averaging(subthreshold),
+        subthreshold=averaging,
         silent_change=change,
         difference=view.neighbours,
         pitch=1 if view.mosaic is None else 2,  # to neighbours of the same colour
@@ -258,6 +259,17 @@ def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) ->
     image = Image(estimate.t, intensity, total, view.log_offset, estimate.final, fixed_pattern=pattern)
     colour = _coloured(image, estimate, view)
     return image if colour is None else dataclasses.replace(image, colour=colour)
+
+
+def _untied(
+    variance: NDArray[Any], unmeasured: NDArray[np.int64] | None, subthreshold: Subthreshold
+) -> NDArray[Any]:
+    """(H, W) P, and what pixels that neither frame around measures have above others, which a frame ties (K11)."""
+    if unmeasured is None or len(unmeasured) == 0 or subthreshold.above_moving == 0:
+        return variance
+    untied = variance.copy()
+    untied.reshape(-1)[unmeasured] += np.float32(subthreshold.above_moving)
+    return untied
 
 
 def _misses_some(estimate: Estimate) -> bool:

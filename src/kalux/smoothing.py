@@ -41,8 +41,8 @@ _WINDOW_BYTES: Final = 256 << 20
 
 _BETWEEN_EVENTS: Final = 1.0 / 6.0
 """Variance, in c^2, of where the light is between its latest event and its next, of which neither direction knows: of
-light that goes at random until it is c away from where it was. Covariances of both errors are 0.12 to 0.2 c^2 in nearly
-all of 32 scenes, clean and noisy, however large their variances (docs/equations.md)."""
+light that goes at random until it is c away from where it was. Covariances of both errors are 0.12 to 0.22 c^2 on 23 of
+30 scenes, clean and noisy, however large their variances (docs/equations.md)."""
 
 _STANDS_STILL: Final = 0.005
 """Mean square change of silent pixels, in c^2, up to which nothing moves there: a tenth of the least under a moving

@@ -154,9 +154,23 @@ def test_without_a_next_frame_nothing_holds_the_other_end():
     assert silent == [0.0, 0.5, 1.0, 1.0]
 
 
+@pytest.mark.parametrize("between", [0.0, 0.5, 1.0])
+def test_what_neither_frame_measures_hides_as_much_at_a_frame_as_half_way(between):
+    """Nothing ties it there; one that a frame measures is tied."""
+    subthreshold, moving = subthreshold_variance(between, C2), np.ones((1, 2), np.bool_)
+    left = plane(0.2 + before_averaging(subthreshold).untied)  # no neighbour tells anything
+
+    def hidden(first):
+        told = around(first, first, 1.0, counted=UNMEASURED)
+        return given_variance(plane(0.2), moving, NO_CHANGE, subthreshold, told, left) - 0.2
+
+    np.testing.assert_allclose(hidden(UNMEASURED), 0.09 * C2, rtol=1e-3)
+    np.testing.assert_allclose(hidden(1e-6), 0.09 * C2 * between, rtol=1e-3, atol=1e-7)
+
+
 def test_averaging_takes_a_part_of_it():
-    assert before_averaging(Subthreshold(0.1, 0.2)) == pytest.approx(
-        (0.1 * BEFORE_AVERAGING, 0.2 * BEFORE_AVERAGING)
+    assert before_averaging(Subthreshold(0.1, 0.2, 0.3)) == pytest.approx(
+        (0.1 * BEFORE_AVERAGING, 0.2 * BEFORE_AVERAGING, 0.3 * BEFORE_AVERAGING)
     )
 
 

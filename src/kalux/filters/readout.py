@@ -203,10 +203,18 @@ class Subthreshold(NamedTuple):
         the silent pixels around it.
     moving
         Of a pixel with such events, log intensity^2.
+    untied
+        Of a pixel that neither frame around measures, log intensity^2.
     """
 
     silent: float
     moving: float
+    untied: float = 0.0
+
+    @property
+    def above_moving(self) -> float:
+        """By how much more an untied pixel has than one that moves and is measured."""
+        return max(self.untied - self.moving, 0.0)
 
 
 _NO_SUBTHRESHOLD: Final = Subthreshold(0.0, 0.0)
@@ -254,7 +262,7 @@ def read_out(
         (H, W): pixels with recent or imminent events, which are averaged; None: not known, so that neither K11 nor K12
         is applied.
     subthreshold
-        Variance that is added to P.
+        Variance that is added to P; that of untied pixels is in it.
     silent_change
         (H, W): mean square change of silent pixels around each, from one frame to the next, the unit of
         ``subthreshold.silent``; None: 0.
@@ -289,7 +297,7 @@ def read_out(
     ends = np.searchsorted(unshown, np.arange(height + 1) * width)
     next_unshown = ends[:-1].copy()  # of every row, in strips from left to right
     difference2 = np.float32(difference * difference)
-    of_silent, of_moving = (np.float32(value) for value in subthreshold)
+    of_silent, of_moving = np.float32(subthreshold.silent), np.float32(subthreshold.moving)
     change = known[:0, :0] if moving is None else _plane(silent_change, out.shape)
     scalars = tuple(np.float32(value) for value in prior), np.float32(log_offset)
     given = (

@@ -125,7 +125,8 @@ def subthreshold_variance(
     """
     unsignalled = between + (1.0 - between) * SUBTHRESHOLD_EXPOSED * exposed**2
     silent = unsignalled * half_way if since is None else min(since, 1.0)
-    return Subthreshold(silent, threshold2 * unsignalled * SUBTHRESHOLD_MOVING)
+    moving = threshold2 * SUBTHRESHOLD_MOVING
+    return Subthreshold(silent, moving * unsignalled, moving)
 
 
 def changed_within(exposed: float, turns: float) -> float:
@@ -200,8 +201,8 @@ def given_variance(
         tuple(np.float32(value) for value in ((0.0,) * 5 if around is None else around[3:-2])),
         nothing if left is None else left.reshape(-1),
         moving.reshape(-1),
-        tuple(np.float32(value) for value in subthreshold),
-        np.float32(before_averaging(subthreshold).moving),
+        (np.float32(subthreshold.silent), np.float32(subthreshold.moving)),
+        (np.float32(before_averaging(subthreshold).untied), np.float32(subthreshold.above_moving)),
         given.reshape(-1),
     )
     return given
@@ -209,7 +210,7 @@ def given_variance(
 
 @loop
 def _give(  # type: ignore[no-untyped-def]
-    variance, change, first, second, events, around, left, moving, subthreshold, before, given
+    variance, change, first, second, events, around, left, moving, subthreshold, untied, given
 ):
     """`given_variance`, a few pixels at a time: what one step leaves is in the nearer caches for the next.
 
@@ -222,7 +223,7 @@ def _give(  # type: ignore[no-untyped-def]
         known, count = variance[here], len(given[here])
         if len(events):
             if len(left):
-                _average_unmeasured(known, left[here], first[here], second[here], before, averaged[:count])
+                _average_unmeasured(known, left[here], first[here], second[here], untied, averaged[:count])
                 known = averaged[:count]
             _inform(known, first[here], second[here], events[here], around, informed[:count])
             _mark_intermittent(moving[here], first[here], second[here], events[here], intermittent[:count])
@@ -238,19 +239,19 @@ def _inform(variance, first, second, events, around, known):  # type: ignore[no-
 
 
 @loop(fastmath=FUSED)
-def _average_unmeasured(variance, left, first, second, subthreshold, averaged):  # type: ignore[no-untyped-def]
+def _average_unmeasured(variance, left, first, second, untied, averaged):  # type: ignore[no-untyped-def]
     """P after spatial averaging (K12) where neither frame measures the pixel; as it is elsewhere.
 
-    ``left`` is what averaging makes of P + ``subthreshold`` under the correlation `CORRELATED`. That relative reduction
-    times `_REDUCTION` is the one under `CORRELATED_UNMEASURED`.
+    ``untied`` are the variance of its subthreshold change before averaging, and by how much that is above other moving
+    pixels' after it. ``left`` is what averaging makes of P and the former under the correlation `CORRELATED`. That
+    relative reduction times `_REDUCTION` is the one under `CORRELATED_UNMEASURED`.
     """
-    one, unmeasured, subthreshold = np.float32(1.0), np.float32(UNMEASURED), np.float32(subthreshold)
+    one, unmeasured, (before, above_moving) = np.float32(1.0), np.float32(UNMEASURED), untied
     for i in range(np.uint64(len(averaged))):
-        reduction = one - np.float32(left[i]) / (variance[i] + subthreshold)
+        reduction = one - np.float32(left[i]) / (variance[i] + before)
         neither = smaller(first[i], second[i]) >= unmeasured
-        averaged[i] = variance[i] * (
-            one - _REDUCTION * larger(reduction, np.float32(0.0)) if neither else one
-        )
+        reduced = variance[i] * (one - _REDUCTION * larger(reduction, np.float32(0.0))) + above_moving
+        averaged[i] = reduced if neither else variance[i]
 
 
 @loop
