@@ -10,11 +10,12 @@ import pytest
 from kalux import PRESETS, Recording, reconstruct
 from kalux.calibration import delay
 from kalux.calibration.delay import best_delay, delays, estimate_delay
-from kalux.datasets import SensorSettings, pan, photograph_scene, simulate
+from kalux.calibration.pixel_thresholds import calibrate_contrast
+from kalux.datasets import SensorSettings, demo_scene, pan, photograph_scene, simulate
 from kalux.planning import plan
 from kalux.settings import CameraSettings, altered
 
-from builders import moving_blocks
+from builders import moving_blocks, unlabelled
 
 CAMERA = CameraSettings()
 
@@ -52,6 +53,36 @@ def test_so_is_a_clock_that_started_apart(simulation, by):
     found = estimate_delay(late(simulation, by), CAMERA)
     assert found.apparent == pytest.approx(trail + by, abs=900)
     assert found.improvement > 0.5
+
+
+def test_slow_pixels_of_a_dim_scene_are_followed():
+    """They lag by 3 ms at white, and the more the darker: the valley is wide, no delay far better than others."""
+    sensor = SensorSettings(
+        threshold_on=0.2,
+        threshold_off=0.2,
+        threshold_mismatch=0.1,
+        cutoff=50.0,
+        noise_rate=1.0,
+        read_noise=0.005,
+    )
+    recording = unlabelled(simulate(demo_scene(sensor_size=(90, 120)), sensor))
+    assert estimate_delay(recording, CAMERA).apparent == pytest.approx(17_000, abs=2_000)
+    found = calibrate_contrast(recording, CAMERA)
+    assert found.delay == pytest.approx(17_000, abs=2_000)
+    assert np.sqrt(found.on * found.off) == pytest.approx(0.2, rel=0.1)  # without it 0.14
+
+
+@pytest.mark.parametrize(
+    ("residuals", "found"),
+    [
+        ([2.0, 1.5, 1.0, 1.1, 1.2], True),
+        ([np.nan, 1.3, 1.0, 1.3, np.nan], False),  # one wall must be higher than that
+        ([2.0, 1.5, 1.0, 1.05, 1.0], False),
+        ([2.0, 1.5, 1.2, 1.1, 1.0], False),  # goes on beyond the end
+    ],
+)
+def test_what_counts_as_a_valley(residuals, found):
+    assert delay._is_valley(np.array(residuals)) is found
 
 
 @pytest.mark.parametrize("wrong", ["sign", "place"])

@@ -56,6 +56,14 @@ MAX_FRAMES: Final = 1000
 _GLOBAL_SAMPLES: Final = 400_000  # pixels for the global fit; its standard error is then below 0.5 %
 _SEARCH_FRAMES: Final = 40
 _SEARCHED: Final = (-4_000, 0, 3_000, 6_000, 10_000)  # delays, us, at which the trailing is measured
+_SEARCHED_FAR: Final = (
+    10_000,
+    14_000,
+    18_000,
+    24_000,
+    30_000,
+    36_000,
+)  # where events still trail far behind at these
 _IN_TIME: Final = (0.7, 0.95, 1.15)
 """h over the mean threshold where events are in time: 1 in theory, 0.79 to 1.02 on five simulated scenes. Between the
 outer values no delay is corrected, beyond them until the middle one is reached."""
@@ -355,18 +363,31 @@ def _fit(data: _Samples) -> _Fit | None:
 
 def _delay_of_trailing(recording: Recording, camera: CameraSettings, sampling: _Sampling) -> int:
     """The delay, us, at which events trail the light by half a threshold; 0 where it cannot be told."""
-    parts = _samples(recording, camera, sampling, _SEARCHED, _SEARCH_FRAMES)
+    low, wanted, high = _IN_TIME
+    ratio = _trailing_at(recording, camera, sampling, _SEARCHED)
+    if ratio is None or low <= ratio[_SEARCHED.index(0)] <= high:
+        return 0
+    searched = _SEARCHED
+    if ratio[-1] > high:
+        searched, ratio = _SEARCHED_FAR, _trailing_at(recording, camera, sampling, _SEARCHED_FAR)
+    if ratio is None or not ratio[-1] <= wanted <= ratio[0]:
+        return 0
+    return round(float(np.interp(wanted, ratio[::-1], searched[::-1])))
+
+
+def _trailing_at(
+    recording: Recording, camera: CameraSettings, sampling: _Sampling, delays: tuple[int, ...]
+) -> Array | None:
+    """h over the mean threshold under each of the ascending ``delays``; None where a fit fails."""
+    parts = _samples(recording, camera, sampling, delays, _SEARCH_FRAMES)
     found = [_fit(data) for data in _gathered(parts, _GLOBAL_SAMPLES // 2)]
     fits = [fit for fit in found if fit is not None]
-    if len(fits) < len(_SEARCHED):
-        return 0
+    if len(fits) < len(delays):
+        return None
     # A longer delay leaves less trailing; what does not decrease is noise.
-    trailing = np.array([2 * fit.trailing / (fit.on + fit.off) for fit in fits], np.float64)
-    ratio = np.minimum.accumulate(trailing)
-    low, wanted, high = _IN_TIME
-    if low <= ratio[_SEARCHED.index(0)] <= high or not ratio[-1] <= wanted <= ratio[0]:
-        return 0
-    return round(float(np.interp(wanted, ratio[::-1], _SEARCHED[::-1])))
+    return np.minimum.accumulate(
+        np.array([2 * fit.trailing / (fit.on + fit.off) for fit in fits], np.float64)
+    )
 
 
 # --- single pixels --------------------------------------------------------------------------------------------
