@@ -50,6 +50,31 @@ def test_the_offset_of_the_events_logarithm_is_found(recordings, offset, allowed
     assert found.samples > 5_000
 
 
+def changes(offset, error, count=40_000):
+    """Of pixels between 0.01 and 0.9 whose events are steps of 0.2 of log(I + offset), wrong by ``error`` each."""
+    rng = np.random.default_rng(2)
+    steps = rng.integers(-12, 13, count)
+    before = np.exp(rng.uniform(np.log(0.01), np.log(0.9), count))
+    wrong = error * np.sqrt(np.abs(steps)) * rng.standard_normal(count)
+    after = (before + offset) * np.exp(0.2 * steps + wrong) - offset
+    kept = (after > 0.01) & (after < 0.95) & (np.abs(steps) >= 2)
+    told = (np.maximum(steps, 0), np.maximum(-steps, 0), np.zeros(count))
+    return Samples(before[kept], after[kept], *(values[kept] * 1.0 for values in told))
+
+
+@pytest.mark.parametrize(
+    ("offset", "error", "allowed"),
+    [
+        (0.001, 0.05, (0.001, 0.0014)),  # simulators have such
+        (0.004, 0.05, (0.0028, 0.0057)),
+        (0.001, 0.4, (0.004, 0.03)),  # what noise says of so small ones is not believed
+    ],
+)
+def test_offsets_of_less_than_a_level_need_certainty(offset, error, allowed):
+    found = event_model._log_offset(changes(offset, error), None, MODEL)
+    assert allowed[0] <= found <= allowed[1]
+
+
 @pytest.mark.parametrize("times", [0.5, 1.0, 2.0])
 def test_the_slope_is_that_of_the_thresholds(recordings, times):
     """Steps that are taken twice as large as they are explain as much, with half the slope."""
