@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +12,11 @@ import tomli_w
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kalux import PRESETS, Reconstructor, Settings, preset
+from kalux import PRESETS, Reconstructor, Settings, preset, reconstruct
+from kalux.datasets import SensorSettings
 from kalux.errors import InputError, KaluxError, SettingsError
 from kalux.settings import (
+    _USED_BY,
     CameraSettings,
     EventSettings,
     FilterSettings,
@@ -22,7 +25,10 @@ from kalux.settings import (
     from_dict,
     load,
     to_dict,
+    without_effect,
 )
+
+from builders import moving_blocks, unlabelled
 
 DEFAULT = PRESETS["default"]
 GROUPS = {"camera": CameraSettings, "events": EventSettings, "filter": FilterSettings}
@@ -315,3 +321,66 @@ def test_every_setting_is_explained():
         if f"`{group}.{field.name}`" not in text
     ]
     assert missing == []
+
+
+# --- settings of one filter -------------------------------------------------------------------------------
+
+OTHER_VALUES = {
+    "filter.cutoff": 3.0,
+    "filter.solution": "exact",
+    "filter.deblur": False,
+    "filter.initial_variance": 0.3,
+    "filter.highlight_scale": 0.5,
+    "filter.highlight_tail": 1.0,
+    "filter.unshown_tail": 0.1,
+    "filter.bright_tail": 0.1,
+    "filter.neighbours": 0.05,
+    "filter.motion": "off",
+    "camera.fixed_pattern": 0.03,
+    "camera.confidence": 1e5,
+    "camera.weight_floor": 0.9,
+    "events.step_variance": 0.4,
+    "events.refractory_period": 900,
+    "events.deblur_variance": 3.0,
+    "events.noise_rate": 9.0,
+    "events.extrapolation_spread": 0.9,
+    "events.extrapolation_gain": 0.5,
+    "events.extrapolation_trust": 0.1,
+    "events.trail": 0.0,
+    "events.sigma_proc2": 0.01,
+    "events.sigma_iso2": 0.3,
+    "events.sigma_ref2": 0.3,
+    "events.refractory_bound": 0.1,
+}
+
+
+NEED_MORE = {"filter.motion", "camera.weight_floor", "events.extrapolation_spread"}
+"""Settings that change nothing of a recording of 24x32 pixels of blocks."""
+
+
+@pytest.fixture(scope="module")
+def clipped():
+    return unlabelled(moving_blocks(0.05, 3.0, sensor=SensorSettings(noise_rate=2.0), size=(24, 32)))
+
+
+@functools.cache
+def images_of(recording, settings):
+    images = list(reconstruct(recording, rate_hz=60, settings=settings))
+    return np.array([image.intensity for image in images]), np.array([image.variance for image in images])
+
+
+def test_every_setting_of_one_filter_is_tried():
+    assert set(OTHER_VALUES) == set(_USED_BY)
+
+
+@pytest.mark.parametrize("filter", ["default", "iccv2021", "cf"])
+@pytest.mark.parametrize("key", OTHER_VALUES)
+def test_settings_that_a_filter_does_not_use_change_nothing_and_others_do(clipped, filter, key):
+    group, name = key.split(".")
+    changed = altered(PRESETS[filter], group, **{name: OTHER_VALUES[key]})
+    pairs = zip(images_of(clipped, PRESETS[filter]), images_of(clipped, changed), strict=True)
+    same = all(np.array_equal(one, other) for one, other in pairs)
+    if key in without_effect(PRESETS[filter], [key]):
+        assert same
+    elif key not in NEED_MORE:
+        assert not same

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -436,6 +436,54 @@ def completed(settings: Settings, group: Literal["camera", "events", "filter"], 
     """
     stated = getattr(settings, group)
     return altered(settings, group, **{name: found[name] for name in found if getattr(stated, name) is None})
+
+
+_USED_BY: Final[Mapping[str, tuple[str, ...]]] = {
+    **dict.fromkeys(
+        (
+            "filter.highlight_tail",
+            "filter.unshown_tail",
+            "filter.bright_tail",
+            "filter.neighbours",
+            "filter.motion",
+            "camera.fixed_pattern",
+            "events.step_variance",
+            "events.refractory_period",
+            "events.deblur_variance",
+            "events.noise_rate",
+            "events.extrapolation_spread",
+            "events.extrapolation_gain",
+            "events.extrapolation_trust",
+            "events.trail",
+        ),
+        ("default",),
+    ),
+    **dict.fromkeys(
+        (
+            "filter.solution",
+            "camera.confidence",
+            "camera.weight_floor",
+            "events.sigma_proc2",
+            "events.sigma_iso2",
+            "events.sigma_ref2",
+            "events.refractory_bound",
+        ),
+        ("iccv2021",),
+    ),
+    **dict.fromkeys(
+        ("filter.deblur", "filter.initial_variance", "filter.highlight_scale"), ("default", "iccv2021")
+    ),
+    "filter.cutoff": ("cf",),
+}
+"""Settings that not every filter has, and presets of the filters that do."""
+
+
+def without_effect(settings: Settings, keys: Iterable[str]) -> dict[str, tuple[str, ...]]:
+    """Of settings, as ``group.name``, those that the chosen filter has no use for, and the presets whose filters do."""
+    chosen = settings.filter
+    own = "default" if chosen.joins_frames else "cf" if chosen.kind == "cf" else "iccv2021"
+    users = {key: _USED_BY.get(key, (own,)) for key in keys}
+    return {key: presets for key, presets in users.items() if own not in presets}
 
 
 def to_dict(settings: Settings) -> dict[str, dict[str, Any]]:

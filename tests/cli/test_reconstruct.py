@@ -225,6 +225,12 @@ class TestSettings:
         for first, second in zip(images_in(tmp_path / "a"), images_in(tmp_path / "c"), strict=True):
             np.testing.assert_array_equal(first, second)
 
+    def test_flags_of_another_filter_are_told(self, cli, recording, tmp_path):
+        flags = ("--at", "frames", "--filter.cutoff", 3.0)
+        told = "--filter.cutoff has no effect: it is a setting of --preset cf"
+        assert told in cli("reconstruct", recording, "-o", tmp_path / "a", *flags).err
+        assert told not in cli("reconstruct", recording, "-o", tmp_path / "b", *flags, "--preset", "cf").err
+
     @pytest.mark.parametrize("threshold", [None, (0.2, 0.2)])
     def test_an_outputs_settings_reproduce_it(self, cli, write_recording, tmp_path, threshold):
         """Also where thresholds were estimated, which makes the engine believe highlights less."""

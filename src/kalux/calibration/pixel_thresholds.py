@@ -367,7 +367,7 @@ def _delay_of_trailing(recording: Recording, camera: CameraSettings, sampling: _
     ratio = _trailing_at(recording, camera, sampling, _SEARCHED)
     if ratio is None or low <= ratio[_SEARCHED.index(0)] <= high:
         return 0
-    searched = _SEARCHED
+    searched: tuple[int, ...] = _SEARCHED
     if ratio[-1] > high:
         searched, ratio = _SEARCHED_FAR, _trailing_at(recording, camera, sampling, _SEARCHED_FAR)
     if ratio is None or not ratio[-1] <= wanted <= ratio[0]:

@@ -32,7 +32,7 @@ from kalux.plan_report import ORIGINS, plan_report
 from kalux.planning import Plan, plan
 from kalux.reconstructor import Reconstructor
 from kalux.recording import Recording
-from kalux.settings import PRESETS, Settings, from_dict, load, preset, read_toml, to_dict
+from kalux.settings import PRESETS, Settings, from_dict, load, preset, read_toml, to_dict, without_effect
 from kalux.threads import default_threads
 from kalux.wording import how_many
 
@@ -174,7 +174,8 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
         for text in contents.warnings():
             warn(text)
         planned = part_of(planned, contents, options)
-        for text in (*plan_warnings(planned, contents, options.preset), *_other_mode(planned, options)):
+        told = plan_warnings(planned, contents, options.preset)
+        for text in (*told, *_other_mode(planned, options), *_without_effect(settings, options)):
             warn(text)
         if not options.quiet:
             say("\n".join(decided(recording, contents, planned, settings, output, options)))
@@ -293,6 +294,17 @@ def _other_mode(planned: Plan, options: argparse.Namespace) -> list[str]:
     if (former["lookahead"], former["smooth"]) == (planned.lookahead, planned.smooth):
         return []
     return [f"{options.settings} is of a run {mode}; settings do not say so, and these images are others"]
+
+
+def _without_effect(settings: Settings, options: argparse.Namespace) -> list[str]:
+    """Warnings of flags that the chosen filter has no use for."""
+    given = given_settings(options)
+    keys = (f"{group}.{name}" for group, values in given.items() for name in values)
+    unused = without_effect(settings, keys)
+    return [
+        f"--{key.replace('_', '-')} has no effect: it is a setting of --preset {' and '.join(presets)}"
+        for key, presets in unused.items()
+    ]
 
 
 # Say.
