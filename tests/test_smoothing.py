@@ -247,14 +247,14 @@ def test_where_one_filter_knows_nothing_the_other_is_taken():
     assert found.variance[0, 0] == pytest.approx(0.01, rel=1e-9)
 
 
-def estimates_around(first, second, share=0.5, ends=None):
+def estimates_around(first, second, share=0.5, ends=None, hidden=0.2 * 0.1 * 0.2):
     """Of both directions, P = 0.01 and 0.04, at the share of the way from one frame to the next, with the variances of
-    these; ``ends`` is the second's for the forward filter, where that is another."""
+    these; ``ends`` is the second's for the forward filter, where that is another. ``hidden``: q_0 of K1."""
     shape = len(first), 1
     first, second, ends = (np.reshape(v, shape) for v in (first, second, second if ends is None else ends))
     ones, level = np.ones(shape), np.zeros(shape)
     return tuple(
-        Estimate(t, level, p * ones, 0.0, True, around=Around(*frames, ones, 0.0, 0.0, 0.01, 1.0, 0.0, way))
+        Estimate(t, level, p * ones, 0.0, True, around=Around(*frames, ones, 0.0, 0.0, hidden, 1.0, 0.0, way))
         for t, p, frames, way in ((5, 0.01, (first, ends), share), (-5, 0.04, (second, first), 1 - share))
     )
 
@@ -277,7 +277,7 @@ def test_filters_that_go_by_the_same_frames_err_alike(share):
     forward, backward = estimates_around(
         [0.01, 0.01, clipped, clipped], [0.02, clipped, 0.02, clipped], share
     )
-    found = combine(forward, backward, None, 6 * 0.2 * 0.1 * 0.2).variance[:, 0]
+    found = combine(forward, backward).variance[:, 0]
     errors = 0.8 * 0.1, 0.2 * 0.2  # by weights of 4 to 1
     expected = [
         errors[0] ** 2 + errors[1] ** 2 + 2 * (0.2 + 0.8 * same) * errors[0] * errors[1]
@@ -289,8 +289,8 @@ def test_filters_that_go_by_the_same_frames_err_alike(share):
 @pytest.mark.parametrize(("threshold", "alike"), [(0.12, 0.12), (0.3, 0.75), (3.0, 1.0)])
 def test_filters_that_go_by_events_alone_miss_the_same_between_two_of_them(threshold, alike):
     """Covariance c^2 / 6, the variance of a walk that starts in the middle between two walls, but no more than all."""
-    forward, backward = estimates_around([UNMEASURED], [UNMEASURED], 0.5)  # variances 0.01 and 0.04
-    found = combine(forward, backward, None, threshold**2).variance[0, 0]
+    forward, backward = estimates_around([UNMEASURED], [UNMEASURED], hidden=threshold**2 / 6)
+    found = combine(forward, backward).variance[0, 0]
     np.testing.assert_allclose(found, 0.08**2 + 0.04**2 + 2 * alike * 0.08 * 0.04, rtol=1e-6)
 
 

@@ -39,11 +39,6 @@ from kalux.spill import Spill, spilling
 _WINDOW_BYTES: Final = 256 << 20
 """Estimates of the backward pass that are held in memory at a time."""
 
-_BETWEEN_EVENTS: Final = 1.0 / 6.0
-"""Variance, in c^2, of where the light is between its latest event and its next, of which neither direction knows: of
-light that goes at random until it is c away from where it was. Covariances of both errors are 0.12 to 0.22 c^2 on 23 of
-30 scenes, clean and noisy, however large their variances (docs/equations.md)."""
-
 _STANDS_STILL: Final = 0.005
 """Mean square change of silent pixels, in c^2, up to which nothing moves there: a tenth of the least under a moving
 camera (`kalux.augmentation.subthreshold`)."""
@@ -244,10 +239,10 @@ def combine(
         (behind, backward.variance, backward.unshown),
     )
     variance, signalled = 1.0 / information, None
-    unsignalled = np.float32(_BETWEEN_EVENTS * threshold2) * np.sqrt(first * second)
-    shared = shared_errors(forward.around, backward.around, np.minimum(unsignalled, np.float32(1.0)))
+    mean = np.sqrt(first * second)
+    shared = shared_errors(forward.around, backward.around, mean)
     if shared is not None:
-        together = (information + 2.0 * shared * np.sqrt(first * second)) / information**2
+        together = (information + 2.0 * shared * mean) / information**2
         black = _black(forward.around, backward.around)
         variance, signalled = np.where(black, variance, together), np.where(black, together, variance)
     smoothed = (level, variance) if signalled is None else (level, variance, signalled)
@@ -285,18 +280,22 @@ def _around(forward: Around | None, backward: Around | None) -> Around | None:
 
 
 def shared_errors(
-    forward: Around | None, backward: Around | None, unsignalled: NDArray[np.floating[Any]]
+    forward: Around | None, backward: Around | None, information: NDArray[np.floating[Any]]
 ) -> NDArray[np.floating[Any]] | None:
     """(H, W) correlation of the errors of the two directions: how far both go by the same frames.
 
     From the first frame around to the second both go along one bridge (K1), and each knows the one ahead of it through
     this bridge as well as the other knows it from behind. With s the share of the way to the second frame, their
     errors are the same by 1 - s where the first frame measures the pixel, and by s where the second does: all where
-    both do, and none where neither does and each direction comes from a frame of its own. The rest is alike by
-    ``unsignalled``, (H, W), which is what both miss since no event has told it. None: not told.
+    both do, and none where neither does and each direction comes from a frame of its own. In the rest they still have in
+    common where the light is between its latest event and its next, which neither is told: a variance of q_0 (K1) of
+    the inverse of ``information``, (H, W), the geometric mean of theirs. None: not told.
     """
     if forward is None or backward is None:
         return None
+    unsignalled: NDArray[Any] = np.minimum(
+        np.float32(forward.quantisation_variance) * information, np.float32(1.0)
+    )
     share = np.float32(forward.share)
     first, second = forward.first < UNMEASURED, forward.second < UNMEASURED
     same = (np.float32(1.0) - share) * first + share * second
