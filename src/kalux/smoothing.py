@@ -287,9 +287,9 @@ def shared_errors(
     From the first frame around to the second both go along one bridge (K1), and each knows the one ahead of it through
     this bridge as well as the other knows it from behind. With s the share of the way to the second frame, their
     errors are the same by 1 - s where the first frame measures the pixel, and by s where the second does: all where
-    both do, and none where neither does and each direction comes from a frame of its own. In the rest they still have in
-    common where the light is between its latest event and its next, which neither is told: a variance of q_0 (K1) of
-    the inverse of ``information``, (H, W), the geometric mean of theirs. None: not told.
+    both do, and none where neither does and each direction comes from a frame of its own. What else they know, neither
+    is told where the light is between its latest event and its next: a variance of q_0 (K1), out of one over
+    ``information``, (H, W), the geometric mean of both. None: not told.
     """
     if forward is None or backward is None:
         return None
