@@ -43,10 +43,9 @@ BEFORE_AVERAGING: Final = 1.6
 """Variance of the subthreshold change before spatial averaging (K12), in units of that after it: the mean over
 neighbours takes a fifth to a third of the squared errors."""
 
-CORRELATED_UNMEASURED: Final = 0.4
-"""Part of P that spatial averaging does not reduce, of a pixel that neither frame around measures: there, errors of
-neighbours have correlations of 0.1 to 0.5 (K12). `kalux.filters.readout.CORRELATED`, by which highlights are doubted,
-is more."""
+CORRELATED_UNMEASURED: Final = 0.1
+"""Part of P that spatial averaging does not reduce, of a pixel that neither frame around measures, by the errors of 91
+scenes (docs/equations.md, K11). `kalux.filters.readout.CORRELATED`, by which highlights are doubted, is more."""
 
 _BLOCK: Final = 4096
 """Pixels that all steps to the variance are taken of at a time."""
