@@ -56,14 +56,9 @@ MAX_FRAMES: Final = 1000
 _GLOBAL_SAMPLES: Final = 400_000  # pixels for the global fit; its standard error is then below 0.5 %
 _SEARCH_FRAMES: Final = 40
 _SEARCHED: Final = (-4_000, 0, 3_000, 6_000, 10_000)  # delays, us, at which the trailing is measured
-_SEARCHED_FAR: Final = (
-    10_000,
-    14_000,
-    18_000,
-    24_000,
-    30_000,
-    36_000,
-)  # where events still trail far behind at these
+_SEARCHED_FAR: Final = (10_000, 14_000, 18_000, 24_000, 30_000, 36_000)
+"""The same where events still trail too far behind at the last of these."""
+
 _IN_TIME: Final = (0.7, 0.95, 1.15)
 """h over the mean threshold where events are in time: 1 in theory, 0.79 to 1.02 on five simulated scenes. Between the
 outer values no delay is corrected, beyond them until the middle one is reached."""
