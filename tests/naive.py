@@ -719,7 +719,10 @@ def hidden(pixels, place, moving, t, on, off, settings):
         used = of_moving if moving else still
         _, silent, _, frames, _ = pixel.changes[k]
         waits = silent and min(frames) < UNMEASURED and (moving or max(frames) >= UNMEASURED)
-        return used, still / 2 + of_moving / 4 if waits else used
+        given = still / 2 + of_moving / 4 if waits else used
+        untied = 0.09 * c2  # no frame ties what neither measures
+        heard = untied if is_unmeasured(pixel, t) else used
+        return heard, untied if min(frames) >= UNMEASURED else given
     if moving:
         return 0.09 * c2, 0.09 * c2
     gap = middles[-1] - middles[-2] if k > 0 else USUAL_INTERVAL
@@ -737,7 +740,7 @@ def known(pixel, variance, t, settings, c2, left):
     a, b = middles[k], middles[k + 1]
     share, (first, second) = (t - a) / (b - a), pixel.changes[k][3]
     if min(first, second) >= UNMEASURED:
-        variance *= 1 - 0.6 * (1 - left) / 0.3
+        variance *= 1 - 0.9 * (1 - left) / 0.3
     events = sum(w for q, *_, w in pixel.events if a < q <= b)
     between = 4 * share * (1 - share)
     wrong = 0.1 * ev.believed_mismatch**2 * c2 * between * events**2
