@@ -305,19 +305,21 @@ def _log_offset(samples: Samples, limits: FrameLimits | None, model: ErrorModel)
         return float(prior) + count * model.best_fit(samples, limits, log_offset)[0]
 
     losses = {offset: loss(offset) for offset in LOG_OFFSETS}
-    if min(losses, key=lambda offset: losses[offset]) == LOG_OFFSETS[0]:
-        correlation, gain = _CERTAIN
+
+    def likeliest() -> float:
+        return min(losses, key=lambda offset: losses[offset])
+
+    correlation, gain = _CERTAIN
+    if explained >= correlation and likeliest() == LOG_OFFSETS[0]:
         smaller = {offset: loss(offset) for offset in SMALL_LOG_OFFSETS}
-        if explained >= correlation and min(smaller.values()) <= losses[LOG_OFFSETS[0]] - gain * count:
+        if min(smaller.values()) <= losses[LOG_OFFSETS[0]] - gain * count:
             losses |= smaller
     for _ in range(2):
         offsets = sorted(losses)
-        index = offsets.index(min(losses, key=lambda offset: losses[offset]))
+        index = offsets.index(likeliest())
         between = [float(np.sqrt(a * b)) for a, b in pairwise(offsets[max(index - 1, 0) : index + 2])]
         losses |= {offset: loss(offset) for offset in between}
-    offsets = sorted(losses)
-    index = offsets.index(min(losses, key=lambda offset: losses[offset]))
-    return float(f"{offsets[index]:.2g}")
+    return float(f"{likeliest():.2g}")
 
 
 def mismatch_of(
