@@ -720,7 +720,7 @@ def hidden(pixels, place, moving, t, on, off, settings):
         _, silent, _, frames, _ = pixel.changes[k]
         waits = silent and min(frames) < UNMEASURED and (moving or max(frames) >= UNMEASURED)
         given = still / 2 + of_moving / 4 if waits else used
-        untied = 0.09 * c2  # no frame ties what neither measures
+        untied = max(0.09 * c2, of_moving)  # no frame ties what neither measures
         heard = untied if is_unmeasured(pixel, t) else used
         return heard, untied if min(frames) >= UNMEASURED else given
     if moving:

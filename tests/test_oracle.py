@@ -87,7 +87,21 @@ def streams(draw):
 @settings(max_examples=40, deadline=None)
 def test_engine_agrees_with_the_oracle(name, data):
     """Log intensity to 1e-4 and 5e-5 of itself, variance to 2e-4 of itself."""
-    events, frames, times = data.draw(streams())
+    assert_agrees(name, *data.draw(streams()))
+
+
+def test_they_agree_where_frames_are_exposed_for_longer_than_between_their_middles():
+    """Of a pixel that both frames clip, whose b' of K11 is then more than 1."""
+    places = [(1, 0, 0), (1, 0, 1), (1, 1, 0), (1, 1, 1), (2, 0, 0), (2, 0, 0), (2, 0, 1), (2, 0, 1)]
+    x, y, polarity = np.array(places).T
+    events = make_events(np.full(len(places), 240_831), x, y, polarity)
+    image = np.array([[0, 0, 0], [0, 255, 0]], np.uint8)
+    frames = [Frame(image, 238_570, 243_089), Frame(image, 243_089, 248_933)]
+    assert_agrees("default-blurred", events, frames, [246_005, 246_011])
+
+
+def assert_agrees(name, events, frames, times):
+    """Compare every image of a stream, whose frames have exposures of any length."""
     chosen = VARIANTS[name]
     chosen = dataclasses.replace(
         chosen,
