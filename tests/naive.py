@@ -107,7 +107,7 @@ def event_weight(since, settings):
     period = settings.events.refractory
     if period == 0 or since <= 0.95 * period:
         return 1.0
-    return 6.0 if since <= period else min(since / (since - period), 6.0)
+    return since / np.hypot(since - period, 0.2 * period)
 
 
 def event_sum(pixel, a, b, on, off):
