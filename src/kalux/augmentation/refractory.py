@@ -39,8 +39,8 @@ from kalux.events import EVENT_DTYPE, NEVER, EventArray
 
 _UNSTEADY: Final = np.float32(0.2)
 """Refractory periods by which the time in which a pixel looked is taken to be longer, as the other side of a right
-triangle: events of light that come 1.2 to 1.3 periods after another stand for 2.9 to 4 thresholds on six simulated
-scenes, not 4.6 (docs/equations.md, K13)."""
+triangle: events of light that come 1.2 to 1.3 periods after another stand for 2.9 to 4.0 thresholds on simulated
+scenes, where it would be 4.5 to 4.8 without (docs/equations.md, K13)."""
 
 MOST: Final = np.sqrt(np.float32(1.0) + _UNSTEADY**-2)
 """Largest weight, that of an interval of 1.04 refractory periods: 5.1."""
