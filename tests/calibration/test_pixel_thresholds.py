@@ -75,7 +75,8 @@ def test_where_the_direction_turns_nothing_is_added():
     """K13: meanwhile the light may have moved either way."""
     history = pixel_thresholds._History((1, 1), pixel_thresholds._Sampling((0.2, 0.2), 1000, 1000))
     on, off, _ = history.counts(pixel_events([10_000, 13_500, 17_000], [True, False, False]))
-    assert (on[0, 0], off[0, 0]) == (1.0, pytest.approx(1.0 + 3.5 / 2.5))
+    going_on = 3.5 / np.hypot(2.5, 0.2)
+    assert (on[0, 0], off[0, 0]) == (1.0, pytest.approx(1.0 + going_on))
 
 
 def test_the_spread_is_found_and_standard_errors_are_small(found):
