@@ -107,7 +107,8 @@ def event_weight(since, settings):
     period = settings.events.refractory
     if period == 0 or since <= 0.95 * period:
         return 1.0
-    return since / np.hypot(since - period, 0.2 * period)
+    weight = since / np.hypot(since - period, 0.2 * period)
+    return 1 + round((weight - 1) * 4096) / 4096  # as events carry it
 
 
 def event_sum(pixel, a, b, on, off):
