@@ -3,7 +3,7 @@
 After an event a pixel is held in reset for its refractory period, and compares with the light at the end of that, not
 with the light at the event. What changed meanwhile is never reported. If the light goes on at one pace from one event
 to the next, it changes by the threshold in the time in which the pixel looks, so that from event to event it changes by
-the threshold times
+about the threshold times
 
     w = Delta / ((Delta - rho)^2 + (rho / 5)^2)^(1/2)                                       (docs/equations.md, K13)
 
@@ -41,9 +41,6 @@ _UNSTEADY: Final = np.float32(0.2)
 """Refractory periods by which the time in which a pixel looked is taken to be longer, as the other side of a right
 triangle: events of light that come 1.2 to 1.3 periods after another stand for 2.9 to 4.0 thresholds on simulated
 scenes, where it would be 4.5 to 4.8 without (docs/equations.md, K13)."""
-
-MOST: Final = np.sqrt(np.float32(1.0) + _UNSTEADY**-2)
-"""Largest weight, that of an interval of 1.04 refractory periods: 5.1."""
 
 _EARLY: Final = np.float32(0.95)
 """Shares of the refractory period from which on an event counts as one that came at its end: pixels differ. What comes
