@@ -128,6 +128,15 @@ def test_units_of_time(t, unit, expected):
     assert as_events(data, time_unit=unit)["t"].tolist() == expected
 
 
+def test_floating_point_times_too_large_for_their_precision_are_refused():
+    """Seconds since 1970 in single precision are 128 s apart: what order and distance events have is lost."""
+    fields = {"x": [0], "y": [0], "p": [0]}
+    with pytest.raises(EventError, match="float32, of which two that differ are 128 s apart"):
+        as_events(fields | {"t": np.array([1.6e9], np.float32)}, time_unit="s")
+    assert as_events(fields | {"t": np.array([1.6e9])}, time_unit="s")["t"] == 1_600_000_000_000_000
+    assert as_events(fields | {"t": np.array([4000], np.float32)}, time_unit="s")["t"] == 4_000_000_000
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

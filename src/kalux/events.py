@@ -41,6 +41,10 @@ _LARGEST_THRESHOLD: Final = 100.0
 _TIME_UNITS: Final = {"us": 1.0, "s": 1e6, "ms": 1e3, "ns": 1e-3}
 _UINT16_MAX: Final = np.iinfo(np.uint16).max
 
+_COARSEST: Final = 1000.0
+"""us: floating-point times that cannot tell less from each other are refused, such as seconds since 1970 in single
+precision, which are 128 s apart. Frames are some 10 ms apart."""
+
 
 def make_events(t: Any, x: Any, y: Any, p: Any) -> EventArray:
     """Join four columns into an event array.
@@ -91,7 +95,8 @@ def as_events(data: Any, *, columns: str | None = None, time_unit: str | None = 
     Raises
     ------
     EventError
-        If the layout is not recognised or a column has unusable values.
+        If the layout is not recognised or a column has unusable values, such as times in single precision that are
+        too large for it.
     """
     if isinstance(data, np.ndarray) and data.dtype == EVENT_DTYPE and time_unit in (None, "us"):
         return data if data.ndim == 1 else data.ravel()
@@ -110,8 +115,10 @@ def as_events(data: Any, *, columns: str | None = None, time_unit: str | None = 
         if not np.isfinite(t).all():
             index = int(np.flatnonzero(~np.isfinite(t))[0])
             raise EventError(f"events: time of event {index} is not finite")
-        microseconds = np.rint(t.astype(np.float64) * _TIME_UNITS[time_unit or "us"])
+        scale = _TIME_UNITS[time_unit or "us"]
+        microseconds = np.rint(t.astype(np.float64) * scale)
         _check_times(microseconds)
+        _check_precision(t, scale)
         t = microseconds.astype(np.int64)
     elif t.dtype.kind in "iu" and time_unit not in (None, "us"):
         scale = _TIME_UNITS[time_unit]
@@ -260,6 +267,17 @@ def _check_times(t: NDArray[Any], where: str = "events", first_index: int = 0) -
     if len(t) and (t.min() < -LATEST or t.max() > LATEST):
         i = int(np.flatnonzero((t < -LATEST) | (t > LATEST))[0])
         raise EventError(f"{where}: event {first_index + i} is at {t[i]} us; at most 10^18 us is possible")
+
+
+def _check_precision(t: NDArray[np.floating[Any]], scale: float) -> None:
+    """Refuse floating-point times, in units of ``scale`` us, that are too large for what their dtype can tell apart."""
+    latest = np.abs(t).max(initial=0.0)
+    apart = float(np.spacing(latest)) * scale
+    if apart > _COARSEST:
+        raise EventError(
+            f"events: times are {t.dtype}, of which two that differ are {apart / 1e6:.3g} s apart at {latest:.10g}; "
+            "store them as float64 or as integer microseconds"
+        )
 
 
 def _require_whole(name: str, values: NDArray[Any]) -> None:
