@@ -118,7 +118,7 @@ def as_events(data: Any, *, columns: str | None = None, time_unit: str | None = 
         scale = _TIME_UNITS[time_unit or "us"]
         microseconds = np.rint(t.astype(np.float64) * scale)
         _check_times(microseconds)
-        _check_precision(t, scale)
+        check_precision(t, scale)
         t = microseconds.astype(np.int64)
     elif t.dtype.kind in "iu" and time_unit not in (None, "us"):
         scale = _TIME_UNITS[time_unit]
@@ -269,8 +269,14 @@ def _check_times(t: NDArray[Any], where: str = "events", first_index: int = 0) -
         raise EventError(f"{where}: event {first_index + i} is at {t[i]} us; at most 10^18 us is possible")
 
 
-def _check_precision(t: NDArray[np.floating[Any]], scale: float) -> None:
-    """Refuse floating-point times, in units of ``scale`` us, that are too large for what their dtype can tell apart."""
+def check_precision(t: NDArray[np.floating[Any]], scale: float) -> None:
+    """Refuse floating-point times, in units of ``scale`` us, that are too large for what their dtype can tell apart.
+
+    Raises
+    ------
+    EventError
+        If the largest one and the next that there is are more than 1 ms apart.
+    """
     latest = np.abs(t).max(initial=0.0)
     apart = float(np.spacing(latest)) * scale
     if apart > _COARSEST:

@@ -338,6 +338,25 @@ class TestDsec:
             readers.read(folder)
 
 
+@pytest.mark.parametrize(
+    ("layout", "column"),
+    [("hqf", "events/ts"), ("mvsec", "davis/left/events"), ("mvsec", "davis/left/image_raw_ts")],
+)
+def test_seconds_since_1970_in_single_precision_are_refused(tmp_path, layout, column):
+    """They are 128 s apart."""
+    path = write(tmp_path, layout)
+    with h5py.File(path, "r+") as file:
+        values = file[column][...]
+        times = values[:, 2] if column == "davis/left/events" else values
+        times += 1.6e9
+        del file[column]
+        file[column] = values.astype(np.float32)
+    with pytest.raises(
+        FormatError, match=f"{path.name}: times are float32, of which two that differ are 128 s"
+    ):
+        all_events(readers.read(path))
+
+
 class TestHqf:
     @pytest.mark.parametrize("stated", [(30, 40), (40, 30)])
     def test_the_resolution_in_either_order(self, tmp_path, stated):

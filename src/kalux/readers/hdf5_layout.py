@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.errors import EventError, FormatError
-from kalux.events import EventArray, make_events
+from kalux.events import EventArray, check_precision, make_events
 from kalux.frames import Frame
 from kalux.readers.source import (
     CHUNK_EVENTS,
@@ -166,13 +166,26 @@ def microseconds(path: Path, seconds: NDArray[Any]) -> NDArray[np.int64]:
     Raises
     ------
     FormatError
-        If one is not finite, or too large.
+        If one is not finite, or too large, or too large for its precision.
     """
     scaled = np.rint(np.asarray(seconds, np.float64) * 1e6)
     # Also refuses NaN, of which no comparison is true.
     if scaled.size and not (np.abs(scaled).max() < 2.0**62):
         raise FormatError(f"{path}: has times that are not finite or out of range; copy or download it again")
+    refuse_coarse(path, seconds)
     return scaled.astype(np.int64)
+
+
+def refuse_coarse(path: Path, seconds: NDArray[Any]) -> None:
+    """As `kalux.events.check_precision`; what is wrong is a FormatError that names the file."""
+    if (
+        seconds.dtype.kind != "f" or seconds.dtype.itemsize > 4
+    ):  # in double precision all possible times are fine
+        return
+    try:
+        check_precision(seconds, 1e6)
+    except EventError as error:
+        raise FormatError(f"{path}: {str(error).removeprefix('events: ')}") from error
 
 
 def size_of(path: Path, shape: tuple[int, ...], *, grey: bool = False) -> tuple[int, int]:

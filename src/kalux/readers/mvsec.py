@@ -61,7 +61,9 @@ def _events(path: Path) -> Iterator[EventArray]:
     with hdf5_layout.opened(path) as file:
         table = file[_EVENTS]
         for part in hdf5_layout.slices(table, table.shape[0]):
-            rows = np.ascontiguousarray(table[part], np.float64)
+            stored = table[part]
+            hdf5_layout.refuse_coarse(path, stored[:, 2])
+            rows = np.ascontiguousarray(stored, np.float64)
             events: EventArray = np.empty(len(rows), EVENT_DTYPE)
             good = _convert(rows, events["t"], events["x"], events["y"], events["p"])
             if good < len(rows):
