@@ -181,7 +181,8 @@ class Reconstructor:
         frame = with_black_level(frame, self.settings.camera.black_level)
         self._reference_exposure = self._reference_exposure or frame.exposure
         if self._bright_tail is None:
-            self._bright_tail = count_bright(self._camera, frame.image, frame.white_value, frame.black).scale
+            bright = count_bright(self._camera, frame.image, frame.white_value, frame.black, frame.valid)
+            self._bright_tail = bright.scale
         if self._view is None:
             self._view = self._view_by(frame, self._bright_tail)
         shot = take_shot(frame, self._camera, self._reference_exposure, self._gains_of(frame))

@@ -96,6 +96,25 @@ def test_events_of_another_scene_explain_nothing(recordings):
     assert found.slope < 0.0
 
 
+def test_pixels_that_frames_do_not_measure_say_nothing(recordings):
+    """What stands there in the frames is a guess, and the events are right."""
+    own = recordings[0.03]
+    height, width = own.sensor_size
+    valid = np.broadcast_to(np.arange(width) < width // 2, (height, width)).copy()
+    masked = [
+        dataclasses.replace(frame, image=np.where(valid, frame.image, 90), valid=valid)
+        for frame in own.frames()
+    ]
+    hidden = Recording.from_arrays(np.concatenate(list(own.events())), masked, sensor_size=own.sensor_size)
+    found = estimate_event_model(hidden, CameraSettings(log_offset=0.03), EVENTS)
+    assert found.agreement.slope == pytest.approx(1.0, rel=0.05)
+    assert found.agreement.explained > 0.9
+    assert (
+        found.step_variance
+        == estimate_event_model(own, CameraSettings(log_offset=0.03), EVENTS).step_variance
+    )
+
+
 def test_noise_makes_steps_less_certain(recordings):
     quiet = estimate_event_model(recordings[0.03], CameraSettings(), EVENTS)
     noisy = estimate_event_model(recorded(log_offset=0.03, noise_rate=20.0), CameraSettings(), EVENTS)

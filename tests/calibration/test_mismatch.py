@@ -50,6 +50,26 @@ def test_the_spread_is_found(spread):
     assert SPREADS[0] <= estimate.spread <= SPREADS[1]
 
 
+def test_pixels_that_frames_do_not_measure_do_not_count():
+    """As beyond the view of a frame camera beside the event camera: the frames have some value there, events go on."""
+    sensor = SensorSettings(threshold_on=0.2, threshold_off=0.2, log_offset=0.02, threshold_mismatch=0.1)
+    made = simulate(scene(), sensor, seed=3).recording()
+    half = np.arange(60) < 30
+    frames = [
+        dataclasses.replace(
+            frame, image=np.where(half, frame.image, 90), valid=np.broadcast_to(half, (44, 60)).copy()
+        )
+        for frame in made.frames()
+    ]
+    all_events = np.concatenate(list(made.events()))
+    kept = all_events[all_events["x"] < 30]
+    every, left = (
+        estimate_mismatch(Recording.from_arrays(chosen, frames, sensor_size=(44, 60)), CAMERA, EVENTS)
+        for chosen in (all_events, kept)
+    )
+    assert every == left
+
+
 def test_more_than_usual_is_believed_where_it_is_certain():
     assert found(0.175).spread == pytest.approx(0.175, rel=0.2)
 

@@ -36,6 +36,23 @@ def test_still_pixels_of_a_recording_under_auto_exposure():
     assert float(found.curves[0].inverse(np.array([0.5]))[0]) == pytest.approx(0.25, abs=0.03)
 
 
+def test_gains_and_pixels_that_are_not_valid():
+    """A gain counts as so much more exposure; what is not valid has no exposure at all."""
+    truth, gains = Response.gamma(2.0), [1.0, 4.0, 1.0, 4.0, 1.0]
+    valid = np.broadcast_to(np.arange(96) >= 40, (80, 96)).copy()
+    frames = []
+    for k, (t, gain) in enumerate(zip([1_000, 800, 10_000, 8_000, 100_000], gains, strict=True)):
+        image = np.rint(255 * truth(np.minimum(picture() * gain * t * 1e-6, 1.0))).astype(np.uint8)
+        image[~valid] = 128
+        frames.append(Frame(image, 200_000 * k, 200_000 * k + t, gain=gain, valid=valid))
+    recording = Recording.from_arrays(events((0, 50, 0, 1)), frames, sensor_size=(80, 96))
+    images, times = still_pixels(recording)
+    assert times == pytest.approx([0.001, 0.0032, 0.01, 0.032, 0.1])
+    assert 80 * 56 - 9 <= images[0].size < 80 * 56
+    found = calibrate_response(images, times)
+    assert float(found.curves[0].inverse(np.array([0.5]))[0]) == pytest.approx(0.25, abs=0.03)
+
+
 def test_a_fixed_exposure_says_nothing():
     frames = [Frame(np.full((80, 96), 9, np.uint8), t, t + 5_000) for t in range(0, 200_000, 40_000)]
     recording = Recording.from_arrays(events((0, 0, 0, 1)), frames, sensor_size=(80, 96))

@@ -35,6 +35,19 @@ def test_grey_under_coloured_light_becomes_grey(mosaic):
     assert grey_world(recording(mosaic), CameraSettings()) == pytest.approx(scaled_gains(1 / CAST), rel=0.01)
 
 
+@pytest.mark.parametrize("mosaic", [None, "RGGB"])
+def test_pixels_that_are_not_valid_do_not_count(mosaic):
+    made, valid = recording(mosaic), np.ones((20, 24), np.bool_)
+    valid[:10] = False
+    images = [np.where(valid[..., None] if mosaic is None else valid, f.image, 200) for f in made.frames()]
+    frames = [
+        dataclasses.replace(f, image=image, valid=valid)
+        for f, image in zip(made.frames(), images, strict=True)
+    ]
+    masked = Recording.from_arrays(np.empty(0, kalux.EVENT_DTYPE), frames, sensor_size=(20, 24))
+    assert grey_world(masked, CameraSettings()) == pytest.approx(scaled_gains(1 / CAST), rel=0.01)
+
+
 def test_the_response_of_each_colour_is_undone():
     made = recording(level=255.0, response=lambda value: value ** np.array([1.0, 0.5, 1.0]))
     gains = grey_world(made, CameraSettings(response="linear;gamma:2;linear"))

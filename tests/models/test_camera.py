@@ -380,6 +380,14 @@ def test_the_scale_of_an_exponential_tail_is_found(scale):
     assert found == pytest.approx(scale, rel=0.03)
 
 
+def test_only_valid_pixels_count_as_bright():
+    image, valid = np.ones((4, 4)), np.zeros((4, 4), np.bool_)
+    image[:2], valid[:2] = 0.6, True
+    camera = Camera.named("linear", 0.98)
+    assert count_bright(camera, image, valid=valid) == BrightTail(8, 0)
+    assert count_bright(camera, np.repeat(image[..., None], 3, axis=-1), valid=valid) == BrightTail(8, 0)
+
+
 def test_frames_without_white_and_frames_all_white_are_at_the_bounds():
     dark, white = np.full((4, 4), 0.6), np.ones((4, 4))
     camera = Camera.named("linear", 0.98)

@@ -202,7 +202,7 @@ def _samples(recording: Recording, camera: CameraSettings, floor: float, delay: 
         low, high = np.minimum(before, after), np.maximum(before, after)
         usable = (low >= floor + _ABOVE) & (high < WELL_EXPOSED[1]) & (high - low >= _CHANGE)
         for end in interval.ends:
-            usable &= ~end.shot.clipped & (True if end.frame.valid is None else end.frame.valid)
+            usable &= end.shot.measured
         chosen = spread(usable, _PER_INTERVAL)
         inside = between(interval.events, interval.start + delay, interval.end + delay)
         on, off = count_events(inside, recording.sensor_size)

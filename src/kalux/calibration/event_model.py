@@ -371,7 +371,7 @@ def _student_t_share(t: Array) -> Array:
 def _samples(
     recording: Recording, camera: CameraSettings, events: EventSettings
 ) -> tuple[Samples, FrameLimits]:
-    """Pixels with events that no frame clips at either end, interval by interval, and what their frames could show."""
+    """Pixels with events that both frames measure, interval by interval, and what their frames could show."""
     found: list[tuple[Array, ...]] = []
     count = 0
     response = named_responses(chosen_response(camera.response, recording.response))
@@ -381,7 +381,7 @@ def _samples(
     black = black if black > CRUSHED else 0.0
     for interval, on, off, bend in counted_intervals(recording, camera, events, most_frames=_MAX_FRAMES):
         first, second = interval.first, interval.second
-        chosen = spread(~first.clipped & ~second.clipped & (on + off > 0), MAX_SAMPLES - count)
+        chosen = spread(first.measured & second.measured & (on + off > 0), MAX_SAMPLES - count)
         pixels = (*(end.intensity for end in interval.ends), on, off, bend)
         limits = (
             np.full(len(chosen), limit * second.white) for limit in (black, white)

@@ -63,8 +63,7 @@ class End:
         level = self.frame.normalised()
         inside = (level > low) & (level < high)
         usable = np.asarray(inside.all(axis=-1) if inside.ndim == 3 else inside, np.bool_)
-        usable &= ~self.shot.clipped
-        return usable if self.frame.valid is None else usable & self.frame.valid
+        return usable & self.shot.measured
 
 
 @dataclass(frozen=True, eq=False)

@@ -124,7 +124,7 @@ def estimate_mismatch(recording: Recording, camera: CameraSettings, events: Even
         first, second = interval.ends
         seen = Samples(first.intensity, second.intensity, on, off, bend)
         bright = np.minimum(seen.before, seen.after) > DARKEST
-        measured = ~first.shot.clipped & ~second.shot.clipped
+        measured = first.shot.measured & second.shot.measured
         usable = measured & bright & (on + off > 0)
         mismatch, variance = mismatch_of(seen, model, camera.offset, events.step_noise)
         _add(mismatch, variance, usable, threshold_on * on, threshold_off * off, products)

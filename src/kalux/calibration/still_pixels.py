@@ -26,8 +26,9 @@ _MOST_FRAMES: Final = 400
 def still_pixels(recording: Recording) -> tuple[list[ImageArray], list[float]]:
     """Pixels of one recording under auto-exposure that see no events, as images at several exposure times.
 
-    Looks for the longest run of frames that keeps enough pixels (2000) without an event in their 3x3
-    neighbourhood, and takes one frame for each exposure time in it, in steps of at least 10 %.
+    Looks for the longest run of frames that keeps enough valid pixels (2000) without an event in their 3x3
+    neighbourhood, and takes one frame for each exposure time in it, in steps of at least 10 %. Where frames state a
+    gain, their exposure times are multiplied by it.
 
     Returns
     -------
@@ -53,7 +54,7 @@ def still_pixels(recording: Recording) -> tuple[list[ImageArray], list[float]]:
     images = [
         np.rint(255 * frame.normalised()[best[1]]).clip(0, 255).astype(np.uint8)[None] for frame in best[0]
     ]
-    return images, [frame.exposure * 1e-6 for frame in best[0]]
+    return images, [frame.amplified_exposure * 1e-6 for frame in best[0]]
 
 
 def _still_runs(recording: Recording, frames: list[Frame]) -> Iterator[tuple[list[Frame], NDArray[np.bool_]]]:
@@ -75,10 +76,11 @@ def _still_runs(recording: Recording, frames: list[Frame]) -> Iterator[tuple[lis
             inside = between(chunk, start - 1, frame.exposure_end)
             seen[inside["y"], inside["x"]] = 1
         pending = [chunk for chunk in pending if chunk["t"][-1] > frame.exposure_end]
-        after = np.maximum(moved, cv2.dilate(seen, kernel))
+        hidden = np.zeros_like(moved) if frame.valid is None else (~frame.valid).view(np.uint8)
+        after = np.maximum(np.maximum(moved, hidden), cv2.dilate(seen, kernel))
         if run and np.count_nonzero(after == 0) < _STILL_PIXELS:
             yield run, moved == 0
-            run, after = [], np.zeros_like(moved)
+            run, after = [], hidden
         run.append(frame)
         moved = after
     if run:
@@ -88,7 +90,7 @@ def _still_runs(recording: Recording, frames: list[Frame]) -> Iterator[tuple[lis
 def _distinct(run: list[Frame]) -> list[Frame]:
     """One frame per exposure time, in steps of at least 10 %."""
     chosen: list[Frame] = []
-    for frame in sorted(run, key=lambda f: f.exposure):
-        if not chosen or frame.exposure >= 1.1 * chosen[-1].exposure:
+    for frame in sorted(run, key=lambda f: f.amplified_exposure):
+        if not chosen or frame.amplified_exposure >= 1.1 * chosen[-1].amplified_exposure:
             chosen.append(frame)
     return chosen

@@ -47,8 +47,13 @@ def grey_world(recording: Recording, camera: CameraSettings) -> Gains:
 
 
 def _cells(frame: Frame) -> NDArray[np.float64]:
-    """Responses of red, green and blue, (..., 3): of pixels, or of a mosaic's cells, green the mean of two."""
+    """Responses of red, green and blue, (..., 3): of pixels, or of a mosaic's cells, green the mean of two.
+
+    What is not valid is not a number.
+    """
     values = frame.normalised()
+    if frame.valid is not None:
+        values[~frame.valid] = np.nan
     if frame.mosaic is None:
         return values
     height, width = (n - n % 2 for n in values.shape)

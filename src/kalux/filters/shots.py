@@ -86,6 +86,12 @@ class Shot(NamedTuple):
         clipped: NDArray[np.bool_] = self.level_clipped[self.levels]
         return clipped
 
+    @property
+    def measured(self) -> NDArray[np.bool_]:
+        """(H, W) bool: valid, and not clipped."""
+        measured = ~self.clipped
+        return measured if self.valid is None else measured & self.valid
+
 
 _CLIPPED_SHARE: Final = 0.2
 """A clipped channel with a smaller share of the luminance (the blue of a sky) is an error of that share where it is

@@ -330,12 +330,20 @@ ABOUT_WHITE: Final = 0.95
 """Intensity, white = 1, that counts as white for `BrightTail`: below where sensors clip unevenly."""
 
 
-def count_bright(camera: Camera, image: NDArray[Any], white: float = 1.0, black: float = 0.0) -> BrightTail:
+def count_bright(
+    camera: Camera,
+    image: NDArray[Any],
+    white: float = 1.0,
+    black: float = 0.0,
+    valid: NDArray[np.bool_] | None = None,
+) -> BrightTail:
     """`BrightTail` of one frame: (H, W), or (H, W, 3) of which the mean counts; full scale is ``black`` to ``white``.
 
+    Only pixels that are ``valid``, (H, W), count; None: all.
     Where pixels count as clipped from lower on than usual, that far below lies what counts as white.
     """
     grey = image if image.ndim == 2 else image.mean(axis=-1)
+    grey = grey if valid is None else grey[valid]
     ends = (camera.saturation, CameraSettings.usual_saturation)
     end, usual = (float(camera.response.inverse(np.array(value))) for value in ends)
     edges = camera.response(min(end / usual, 1.0) * np.array([ABOUT_WHITE / 2, ABOUT_WHITE]))

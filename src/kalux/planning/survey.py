@@ -54,7 +54,8 @@ def survey(recording: Recording, settings: Settings, *, with_tail: bool = False)
     for frame in recording.frames():
         exposures.append((frame.exposure_start, frame.exposure_end))
         if with_tail:
-            tail = tail.joined(count_bright(camera, frame.image, frame.white_value, frame.black))
+            bright = count_bright(camera, frame.image, frame.white_value, frame.black, frame.valid)
+            tail = tail.joined(bright)
         if watch is not None:
             watch.see(frame)
     if not exposures:
