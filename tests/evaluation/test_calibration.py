@@ -29,6 +29,12 @@ def found(stated: float = 1.0):
     return collected.found()
 
 
+@pytest.mark.parametrize("stated", [0.3, 0.1, 1e-3])
+def test_the_median_of_methods_that_are_far_too_sure(stated):
+    """Half of the errors lie beyond the widest band of the coverage."""
+    assert found(stated)["median_z"] == pytest.approx(1 / stated, rel=0.03)
+
+
 @pytest.mark.parametrize("stated", [1.0, 0.5, 2.0])
 def test_gaussian_errors_are_within_a_band_as_often_as_they_must_be(stated):
     got = found(stated)

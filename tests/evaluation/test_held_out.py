@@ -81,6 +81,16 @@ def test_the_scale_is_the_percentile_of_all_frames():
         )
 
 
+def test_frames_of_which_no_pixel_is_valid():
+    frames = [
+        kalux.Frame(np.full((12, 12), 9, np.uint8), 100 * i, 100 * i + 10, valid=np.zeros((12, 12), np.bool_))
+        for i in range(8)
+    ]
+    recording = Recording.from_arrays(pixel_events([], []), frames, sensor_size=(12, 12))
+    with pytest.raises(FrameError, match="arrays: no pixel of any frame is valid"):
+        hold_out_frames(recording)
+
+
 def test_scores_by_hand():
     """Scale 0.8 (all frames 204 of 255), reconstruction 1.0: an error of (1.0 - 0.8) / 0.8."""
     held = hold_out_frames(still([204] * 8))
@@ -263,6 +273,16 @@ class TestBlurConsistency:
         assert np.count_nonzero(valid_pixels(frames[0], 0.98)) == 120
         found = blur_consistency(recording, constant(0.5))
         assert found.frames == ((105, 120, pytest.approx(20.0)),)
+
+    @pytest.mark.parametrize("gain", [0.5, 1.0, 2.0])
+    def test_the_range_ends_at_what_a_frame_with_a_gain_can_show(self, gain):
+        """A level of 0.4 and images that would be 0.5 of white, whatever white is."""
+        frames = [
+            kalux.Frame(np.full((12, 12), 102, np.uint8), 100 * i, 100 * i + 10, gain=gain) for i in range(3)
+        ]
+        recording = Recording.from_arrays(pixel_events([], []), frames, sensor_size=(12, 12))
+        found = blur_consistency(recording, constant(0.5 / gain))
+        assert found.frames == ((105, 144, pytest.approx(20.0)),)
 
     def test_frames_without_such_pixels_are_counted(self):
         assert blur_consistency(still([102, 255, 102, 102]), constant(0.4)).skipped == 1

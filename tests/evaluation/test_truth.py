@@ -183,6 +183,7 @@ class TestFiles:
             ({"gt": np.ones((1, 2, 2))}, "no array times_us or times"),
             ({"times": np.ones(1), "gt": np.ones((1, 2, 2))}, "whole us"),
             ({"times": np.ones(1, int), "gt": np.ones((2, 2))}, "T, H, W"),
+            ({"times": np.ones(1, int), "gt": np.full((1, 2, 2), 200, np.uint8)}, "uint8, up to 200; linear"),
             ({"times": np.array([None]), "gt": np.ones((1, 2, 2))}, "plain arrays"),
         ):
             np.savez(path, **arrays)

@@ -23,7 +23,9 @@ ONE_SIGMA: Final = float(stats.norm.cdf(1) - stats.norm.cdf(-1))
 _MEDIAN: Final = float(stats.norm.ppf(0.75))
 """Of |z| of Gaussian errors."""
 
-_WIDTHS: Final = np.asarray(stats.norm.ppf((1 + LEVELS) / 2))
+_WIDTHS: Final = np.concatenate([stats.norm.ppf((1 + LEVELS) / 2), np.geomspace(3.0, 3e6, 150)])
+"""Half widths of bands, in standard deviations: first those that are to hold `LEVELS`; the others are there for the
+median of methods that are far too sure."""
 _EDGES: Final = np.geomspace(1e-3, 1e1, 25)
 """Of the classes of the given standard deviation: six a decade."""
 
@@ -40,7 +42,7 @@ class Calibration:
     def __init__(self, log_offset: float) -> None:
         self._offset = log_offset
         self._pixels = self._unusable = self._within_one = 0
-        self._within = np.zeros(len(LEVELS), np.int64)
+        self._within = np.zeros(len(_WIDTHS), np.int64)
         self._sum_z2 = self._sum_error2 = self._sum_variance = 0.0
         self._class_count = np.zeros(len(_EDGES) + 1, np.int64)
         self._class_error2 = np.zeros(len(_EDGES) + 1)
@@ -84,7 +86,7 @@ class Calibration:
 
         Keys: ``pixels`` and ``unusable`` (without a finite, positive variance); ``one_sigma``, the share of errors
         within one standard deviation; ``rms_z``, and ``median_z``, the median of |z| over that of Gaussian errors,
-        0.674 (interpolated in ``coverage``); ``rms_error`` and ``rms_sigma``; ``coverage``, lists of
+        0.674 (interpolated between bands); ``rms_error`` and ``rms_sigma``; ``coverage``, lists of
         ``nominal`` and ``observed`` shares; ``by_sigma``, for classes of the given standard deviation with at least
         100 pixels: ``sigma`` (middle of the class), ``rms_error``, ``pixels``.
         """
@@ -94,15 +96,16 @@ class Calibration:
         middles = np.sqrt(_EDGES[1:] * _EDGES[:-1])
         count, error2 = self._class_count[1:-1], self._class_error2[1:-1]
         many = count >= 100
+        observed = self._within / n
         return {
             "pixels": n,
             "unusable": self._unusable,
             "one_sigma": self._within_one / n,
             "rms_z": float(np.sqrt(self._sum_z2 / n)),
-            "median_z": float(np.interp(0.5, [0.0, *(self._within / n)], [0.0, *_WIDTHS])) / _MEDIAN,
+            "median_z": float(np.interp(0.5, [0.0, *observed], [0.0, *_WIDTHS])) / _MEDIAN,
             "rms_error": float(np.sqrt(self._sum_error2 / n)),
             "rms_sigma": float(np.sqrt(self._sum_variance / n)),
-            "coverage": {"nominal": LEVELS.round(2).tolist(), "observed": (self._within / n).tolist()},
+            "coverage": {"nominal": LEVELS.round(2).tolist(), "observed": observed[: len(LEVELS)].tolist()},
             "by_sigma": {
                 "sigma": middles[many].tolist(),
                 "rms_error": np.sqrt(error2[many] / count[many]).tolist(),

@@ -103,8 +103,8 @@ def blur_consistency(
     for image, frame in zip(images, frames, strict=True):
         valid = valid_pixels(frame, end.clipped_from)
         if valid.any():
-            ratio = frame.exposure / reference
-            taken = linear_frame(frame, frame.exposure, response)
+            ratio = frame.amplified_exposure / reference
+            taken = linear_frame(frame, frame.amplified_exposure, response)
             decibel = psnr(np.clip(image * ratio, 0, 1), taken, data_range=1.0, mask=valid)
             found.append((frame.middle, int(np.count_nonzero(valid)), decibel))
         else:

@@ -41,7 +41,7 @@ def of_black(recording: Recording) -> str:
     return f"; black level of {level:.3g} of white taken off all frames" if level else ""
 
 
-def linear_frame(frame: Frame, reference: int, response: str) -> Array:
+def linear_frame(frame: Frame, reference: float, response: str) -> Array:
     """A frame's intensity, 1 = a saturated pixel at the reference exposure (us): (H, W) float64.
 
     Of a mosaic each pixel's own channel, of RGB the luminance: what images have as their intensity. ``response`` is the

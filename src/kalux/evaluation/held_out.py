@@ -251,13 +251,23 @@ def clipped_as(image: Array, frame: Frame, reference: int, end: End) -> Array:
 
 
 def intensity_percentile(recording: Recording, percent: float, reference: int, response: str) -> float:
-    """A percentile of the intensities of all frames, in little memory: frames repeat their values."""
+    """A percentile of the intensities of all frames, in little memory: frames repeat their values.
+
+    Raises
+    ------
+    FrameError
+        If no pixel of any frame is valid.
+    """
     values, counts = np.empty(0), np.empty(0, np.int64)
     for frame in recording.frames():
         linear = linear_frame(frame, reference, response)
         found, number = np.unique(linear if frame.valid is None else linear[frame.valid], return_counts=True)
         values, index = np.unique(np.concatenate([values, found]), return_inverse=True)
         counts = np.bincount(index, np.concatenate([counts, number])).astype(np.int64)
+    if not len(counts):
+        raise FrameError(
+            f"{recording.source.path}: no pixel of any frame is valid, so that nothing can be compared"
+        )
     return percentile_of_counts(values, counts, percent)
 
 

@@ -276,8 +276,16 @@ def load_truth(path: Path) -> tuple[GroundTruth, NDArray[np.bool_] | None]:
         raise FormatError(f"{path}: the times are {times.dtype} {times.shape}; whole us, (T,), are needed")
     if images.ndim != 3 or images.dtype.kind not in "fiu":
         raise FormatError(f"{path}: the images are {images.dtype} {images.shape}; (T, H, W) is needed")
+    if images.dtype.kind in "iu" and images.size and images.max() > _LARGEST_WHOLE:
+        raise FormatError(
+            f"{path}: the images are {images.dtype}, up to {images.max()}; linear intensity is needed, 1 = a saturated "
+            "pixel of a frame: floats"
+        )
     return GroundTruth(times.astype(np.int64), images.astype(np.float32)), arrays.get("mask")
 
+
+_LARGEST_WHOLE: Final = 16
+"""Times white: images of whole numbers that are larger are levels of 8 or 16 bits, not intensities."""
 
 _KEYS: Final = ("times_us", "times", "gt", "images", "mask")
 
