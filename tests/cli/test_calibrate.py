@@ -14,7 +14,7 @@ from kalux.settings import read_toml
 from kalux.writers import hdf5
 from recordings import SIZE, small_events
 
-from builders import blocks, damaged, moving_blocks
+from builders import blocks, damaged, moving_blocks, passing_by, sky, textured
 
 
 @pytest.fixture
@@ -48,6 +48,29 @@ def test_contrast_is_measured_written_and_used(cli, unlabelled_file, tmp_path):
         *("-o", tmp_path / "p", "--format", "npy", "--calibration", out, "--events.threshold-on", 0.3),
     )
     assert "on 0.300" in flagged.out
+
+
+@pytest.mark.parametrize(
+    ("picture", "cut", "saturation"), [(sky(0.8), 255, None), (textured(2.4), 200, 0.98 * 200 / 255)]
+)
+def test_a_saturation_is_written_only_if_events_go_on_there(cli, tmp_path, picture, cut, saturation):
+    """Of a sky pixels pile up as of a sensor that clips."""
+    made = passing_by(picture, cut)
+    recording, out = tmp_path / "rec.h5", tmp_path / "noise.toml"
+    hdf5.write(
+        recording,
+        sensor_size=made.sensor_size,
+        events=made.events(),
+        frames=made.frames(),
+        contrast_threshold=0.2,
+    )
+    done = cli("calibrate", "noise", recording, "-o", out)
+    assert done.code == 0, done.err
+    found = load_calibration(out)
+    assert found.settings.get("camera", {}).get("saturation") == (
+        None if saturation is None else pytest.approx(saturation)
+    )
+    assert found.measured["white_level"] == pytest.approx((0.8 * 255 if cut == 255 else cut) / 255, abs=0.01)
 
 
 def test_thresholds_need_frames(cli, tmp_path):

@@ -135,9 +135,8 @@ class NoiseCalibration:
             camera["fixed_pattern"] = self.pattern.deviation
             errors["fixed_pattern"] = self.pattern.error / (2 * self.pattern.deviation)
         if self.levels.saturation is not None:
+            # No setting: of a sky or a wall pixels pile up, too (`kalux.calibration.levels` asks events).
             measured["white_level"] = self.levels.saturation
-            if self.levels.saturation < CameraSettings.usual_saturation:  # else it is found out, or the usual
-                camera["saturation"] = self.levels.saturation
         if self.levels.black is not None:
             measured["dark_level"] = self.levels.black
         if self.black_level is not None:

@@ -21,7 +21,7 @@ from kalux.cli.terminal import say
 
 _DESCRIPTION = """\
 Measure the background noise of the events (rate, hot and dead pixels), the noise of the frames (read and shot), where
-they clip, and the events' delay. A still camera, or still parts of the scene, tell most.
+they clip if events say so, and the events' delay. A still camera, or still parts of the scene, tell most.
 
 With --fit, what is left (scale and spread of the thresholds, I_0, variances) is fitted to the recording's own frames:
 every second is held out, and the settings are chosen under which they are most likely."""
@@ -76,6 +76,8 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     )
     recording, settings, mends = mended_recording(open_recording(options), known.apply(preset("default")))
     found = calibrate_noise(recording, settings.camera, mends.hot).calibration()
+    if mends.ceiling is not None:
+        found = found.merged(Calibration({"camera": {"saturation": settings.camera.saturation}}))
     if options.fit:
         from kalux.evaluation.fit import fit_settings
 
