@@ -19,7 +19,7 @@ from kalux.datasets.warping import (
 )
 from kalux.errors import InputError
 
-from builders import blocks
+from builders import blocks, lifted
 
 SIZE = (100, 130)
 SCALE = 1.15  # below what is smoothed for the pixels' size, so that the truth is sampled as the scene is
@@ -112,6 +112,17 @@ def test_frames_of_which_none_is_as_bright_as_the_others_are_an_error(simulation
     recording = kalux.Recording.from_arrays(simulation.events, frames, sensor_size=SIZE)
     with pytest.raises(InputError, match=r"any of 2 frames \(0.6. times as bright as the other frames; 1.3"):
         register_frames(photograph, np.ones(photograph.shape, bool), recording)
+
+
+def test_a_black_level_that_events_tell_is_taken_off():
+    """It would be taken for light: the scale would come out several times as large."""
+    picture = cv2.GaussianBlur(blocks(0.003, 2.0, shape=(220, 300), count=900), (0, 0), 0.8).astype(
+        np.float32
+    )
+    scene = photograph_scene(picture, pan(60.0), sensor_size=SIZE, duration=700_000, scale=SCALE)
+    made = simulate(scene, SensorSettings(frame_rate=12.0)).recording()
+    everywhere = np.ones(picture.shape, bool)
+    assert register_frames(picture, everywhere, lifted(made, 20)).scale == pytest.approx(1.0, rel=0.05)
 
 
 def test_frames_in_rgb_are_registered_by_their_luminance(simulation, photograph):

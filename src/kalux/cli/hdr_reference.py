@@ -7,6 +7,7 @@ import io
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from kalux.cli.calibrations import add_black_level
 from kalux.cli.parser import Parser, UsageError, number, whole
 from kalux.cli.recordings import check_stamp
 from kalux.cli.terminal import say, warn
@@ -70,6 +71,7 @@ def add_command(commands: Any) -> None:
         metavar="NAME",
         help="of its frames: linear, srgb, gamma:EXPONENT (what it states, else linear)",
     )
+    add_black_level(group)
     group.add_argument(
         "--blur",
         type=number,
@@ -128,7 +130,7 @@ def _check_flags(options: argparse.Namespace) -> None:
     if options.register is None and suffix not in _RADIANCE:
         raise UsageError(f"{options.out}: a radiance image is written as .exr or .npz; give such a name")
     if options.register is None:
-        given = {"exposure": None, "stamp": None, "frame_response": AUTO, "blur": 0.0}
+        given = {"exposure": None, "stamp": None, "frame_response": AUTO, "black_level": None, "blur": 0.0}
         for name, default in given.items():
             if getattr(options, name) != default:
                 raise UsageError(f"--{name.replace('_', '-')} is for a recording; give --register REC, too")
@@ -194,9 +196,11 @@ def _truth(options: argparse.Namespace, reference: HdrReference) -> bytes:
     import kalux
     from kalux.cli.progress import Progress
     from kalux.datasets.registration import register_frames
+    from kalux.evaluation.exposures import compared_recording, of_black
 
     check_stamp(options)
     recording = kalux.open(options.register, exposure=options.exposure, stamp=options.stamp or "start")
+    recording = compared_recording(recording, options.frame_response, options.black_level)
     with Progress("registering", images=len(recording.frames()), quiet=options.quiet) as progress:
         found = register_frames(
             reference.luminance,
@@ -213,6 +217,7 @@ def _truth(options: argparse.Namespace, reference: HdrReference) -> bytes:
         f"{len(placed)} of {len(found.frames)} frames registered, {100 * found.masks.mean():.1f} % of their pixels "
         f"valid; frame and reference differ by {100 * np.median([f.deviation for f in placed]):.1f} % (median of "
         f"robust standard deviations), in scale by {100 * np.std([f.scale for f in placed]) / found.scale:.1f} %"
+        f"{of_black(recording)}"
     )
     file = io.BytesIO()
     np.savez_compressed(

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.calibration.black_level import with_known_black
 from kalux.calibration.homography import Features, find_features
 from kalux.datasets.warping import match_features, refined, tone_compressed, warped, warped_mask
 from kalux.errors import InputError
@@ -17,7 +18,7 @@ from kalux.frames import Frame, GroundTruth
 from kalux.models.camera import Camera, Response, inverse_response
 from kalux.models.colour import luminance as luminance_of
 from kalux.recording import Recording, reference_exposure
-from kalux.settings import AUTO, chosen_response
+from kalux.settings import AUTO, CameraSettings, EventSettings, chosen_response
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -121,7 +122,7 @@ def register_frames(
     valid
         (H, W) bool.
     recording
-        With known exposures.
+        With known exposures. The black level of its frames is taken off, if it is known or events tell it.
     response
         Of its frame camera, as in `kalux.settings.CameraSettings`; by default what the recording states.
     blur
@@ -135,6 +136,7 @@ def register_frames(
     InputError
         If no frame can be registered, or each is of another brightness.
     """
+    recording, _ = with_known_black(recording, CameraSettings(response=response), EventSettings())
     camera = Camera(Response.named(chosen_response(response, recording.response)))
     exposure = reference_exposure(recording)
     reference = _Reference(luminance, valid)
