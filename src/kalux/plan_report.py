@@ -162,8 +162,13 @@ def saturation_text(recording: Recording, plan: Plan, asked: Settings) -> str:
         return text + "events do not go on where the frames end, or too few tell"
     text += ceiling_text(ceiling)
     if ceiling.level < used:
-        text += f": if the camera saturates there, --camera.saturation {ceiling.saturation:.2g} says so"
+        text += f": {saturation_hint(ceiling)}"
     return text
+
+
+def saturation_hint(ceiling: Ceiling) -> str:
+    """What to do where frames end below what is taken for white."""
+    return f"if the camera saturates there, --camera.saturation {ceiling.saturation:.2g} says so"
 
 
 def _black_text(plan: Plan) -> str:

@@ -142,3 +142,16 @@ def test_says_where_the_sensor_saturates(cli, shared_data):
         said,
     )
     assert re.search(r"by \d\d %: if the camera saturates there, --camera.saturation 0.4\d ", said)
+
+
+def test_a_reconstruction_warns_where_pixels_end_unevenly(cli, shared_data, tmp_path):
+    """Unless it is told where they are clipped, or frames reach white."""
+    slider = (shared_data / "slider_depth", "--exposure", 10_000, "--stamp", "start", "--end", 0.2)
+    told = r"warning: frames end at 0.4\d to 0.4\d, where events go on by \d\d %: what they show there is taken for"
+    output = ("--at", "frames", "--format", "npy")
+    assert re.search(told, cli("reconstruct", *slider, "-o", tmp_path / "a", *output).err)
+    known = cli("reconstruct", *slider, "-o", tmp_path / "b", *output, "--camera.saturation", 0.43)
+    street = (shared_data / "street_davis346.aedat4", "--end", 0.2)
+    for done in (known, cli("reconstruct", *street, "-o", tmp_path / "c", *output)):
+        assert done.code == 0
+        assert "frames end at" not in done.err

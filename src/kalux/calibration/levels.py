@@ -80,7 +80,9 @@ class Ceiling(NamedTuple):
         return _SHARP * self.least
 
 
-def find_ceiling(recording: Recording, camera: CameraSettings, events: EventSettings) -> Ceiling | None:
+def find_ceiling(
+    recording: Recording, camera: CameraSettings, events: EventSettings, *, below: float = np.inf
+) -> Ceiling | None:
     """The level at which pixels of the first 80 frames end while their events go on.
 
     Parameters
@@ -91,6 +93,8 @@ def find_ceiling(recording: Recording, camera: CameraSettings, events: EventSett
         Response and I_0.
     events
         With both thresholds, the delay and the refractory period.
+    below
+        Not looked for where the frames reach this response.
 
     Returns None where events do not go on, or too few pixels tell, or the brightest end at different levels, or frames
     are in RGB.
@@ -101,7 +105,7 @@ def find_ceiling(recording: Recording, camera: CameraSettings, events: EventSett
         If the frames' exposures are not known.
     """
     brightest = _brightest(recording)
-    if brightest is None:
+    if brightest is None or brightest >= below:
         return None
     found = [*_changes(recording, camera, events, _BELOW[0] * brightest)]
     if not found:

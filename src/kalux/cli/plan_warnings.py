@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from kalux.plan_report import gain_text, layout_text, left_out_text
+from kalux.calibration.levels import find_ceiling
+from kalux.plan_report import ceiling_text, gain_text, layout_text, left_out_text, saturation_hint
 from kalux.planning import ESTIMATED_ORIGINS, Plan
 from kalux.planning.mending import Mends
+from kalux.recording import Recording, less_black
 from kalux.settings import Settings
 from kalux.wording import how_many
 
@@ -51,6 +53,25 @@ def plan_warnings(planned: Plan, contents: Contents, preset_name: str) -> Iterat
     if planned.threshold_origin in ESTIMATED_ORIGINS and not is_well_known(planned):
         yield threshold_warning(planned, preset_name)
     yield from agreement_warnings(planned)
+
+
+def saturation_warning(recording: Recording, planned: Plan, asked: Settings) -> str | None:
+    """That pixels seem to end at different levels below white, where they are taken for measured; None if not.
+
+    Of a recording whose frames reach white that is told by a look at some of them; else events are asked once more.
+    """
+    camera, events = planned.settings.camera, planned.settings.events
+    known = asked.camera.saturation is not None or planned.mends.ceiling is not None
+    if known or not planned.settings.filter.joins_frames:
+        return None
+    source = less_black(recording, camera.black_level)
+    found = find_ceiling(source, camera, events, below=camera.clipped_from)
+    if found is None or found.level >= camera.clipped_from:
+        return None
+    return (
+        f"{ceiling_text(found)}: what they show there is taken for measured, and its uncertainty comes out too small; "
+        f"{saturation_hint(found)}"
+    )
 
 
 def agreement_warnings(planned: Plan) -> Iterator[str]:

@@ -20,7 +20,7 @@ from kalux.cli.flags import HelpSettings, add_display, add_settings, given_setti
 from kalux.cli.loops import OF_ALL, OF_IMAGES, compiling_beside, prepare_loops, tell_of_compiling
 from kalux.cli.output import DEFAULT_RATE, FOLDER_FORMATS, Output, check_output, chosen_output, image_rate
 from kalux.cli.parser import Parser, UsageError, number, whole
-from kalux.cli.plan_warnings import plan_warnings
+from kalux.cli.plan_warnings import plan_warnings, saturation_warning
 from kalux.cli.progress import Progress, short_number
 from kalux.cli.recordings import add_recording, open_recording
 from kalux.cli.terminal import say, warn
@@ -175,7 +175,13 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
             warn(text)
         planned = part_of(planned, contents, options)
         told = plan_warnings(planned, contents, options.preset)
-        for text in (*told, *_other_mode(planned, options), *_without_effect(settings, options)):
+        saturated = saturation_warning(recording, planned, settings)
+        for text in (
+            *told,
+            *filter(None, [saturated]),
+            *_other_mode(planned, options),
+            *_without_effect(settings, options),
+        ):
             warn(text)
         if not options.quiet:
             say("\n".join(decided(recording, contents, planned, settings, output, options)))
