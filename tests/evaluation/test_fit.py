@@ -11,7 +11,7 @@ from kalux import PRESETS, Recording
 from kalux.calibration.values import Calibration
 from kalux.datasets import SensorSettings
 from kalux.errors import InputError
-from kalux.evaluation.fit import READS, fit_settings, score_settings
+from kalux.evaluation.fit import READS, _changed, fit_settings, score_settings
 from kalux.evaluation.held_out import hold_out_frames
 from kalux.settings import altered
 
@@ -45,6 +45,15 @@ def test_the_result_scores_as_it_says(recording, fit):
     reference = dataclasses.replace(settings.camera, reference_exposure=held.reference_exposure)
     again = score_settings(held, dataclasses.replace(settings, camera=reference))
     assert again == pytest.approx(fit.best)
+
+
+def test_frame_noise_stays_above_rounding():
+    """Likelihood may want less, of frames that hardly change: no frame has it."""
+    settings = altered(PRESETS["default"], "camera", frame_noise=0.01, shot_noise=1e-4)
+    changed = _changed(settings, {"camera.frame_noise": 1e-3}, 0.002)
+    assert changed.camera.noise == pytest.approx((0.002, 4e-6))
+    below = altered(settings, "camera", frame_noise=1e-3)
+    assert _changed(below, {"camera.frame_noise": 0.5}, 0.002) == below
 
 
 def test_one_evaluation_changes_nothing(recording):

@@ -25,7 +25,7 @@ from kalux.calibration.values import Calibration
 from kalux.errors import InputError
 from kalux.evaluation.held_out import HeldOut, hold_out_frames
 from kalux.filters.shots import Shot, take_shot
-from kalux.models.camera import Camera, frame_log_covariance
+from kalux.models.camera import Camera, frame_log_covariance, rounding_error
 from kalux.pipeline import reconstruct
 from kalux.planning import plan
 from kalux.recording import Recording, with_frames
@@ -48,7 +48,7 @@ STEPS: Final[Mapping[str, float]] = {
     "camera.log_offset": 1.5,
 }
 """What is fitted, and the factor of its first steps; ``threshold_scale`` is that of both thresholds, and shot noise
-goes with frame noise."""
+goes with frame noise, which does not become less than rounding."""
 
 _ROUNDS: Final = 4  # of steps, each the square root of the last
 
@@ -157,6 +157,7 @@ def fit_settings(
         black_level=settings.camera.black_level,
     )
     settings = _filled_in(held, settings)
+    rounding = rounding_error(next(iter(held.kept.frames())))
     current = dict.fromkeys(STEPS, 1.0)
     first = best = score_settings(held, settings, known)
     on_evaluation()
@@ -168,7 +169,7 @@ def fit_settings(
                 moved = False
                 while used < evaluations:  # on in the same direction as long as it helps
                     trial = {**current, name: current[name] * factor}
-                    found = score_settings(held, _changed(settings, trial), known)
+                    found = score_settings(held, _changed(settings, trial, rounding), known)
                     on_evaluation()
                     used += 1
                     if not (found.nll < best.nll - 1e-5 and found.mse <= first.mse):
@@ -177,7 +178,7 @@ def fit_settings(
                 if moved:
                     break
         steps = {name: float(np.sqrt(step)) for name, step in steps.items()}
-    chosen = _changed(settings, current)
+    chosen = _changed(settings, current, rounding)
     return Fit(_fitted_values(chosen), first, best, used, current)
 
 
@@ -190,7 +191,8 @@ def _filled_in(held: HeldOut, settings: Settings) -> Settings:
     return plan(held.kept, times=held.times.ravel(), settings=settings).settings
 
 
-def _changed(settings: Settings, factors: Mapping[str, float]) -> Settings:
+def _changed(settings: Settings, factors: Mapping[str, float], rounding: float) -> Settings:
+    """The settings times the factors; frame noise does not fall below ``rounding``, white = 1, if it is not there."""
     values: dict[str, dict[str, float]] = {"camera": {}, "events": {}}
     for name, factor in factors.items():
         if name == "threshold_scale":
@@ -198,6 +200,9 @@ def _changed(settings: Settings, factors: Mapping[str, float]) -> Settings:
                 values["events"][threshold] = getattr(settings.events, threshold) * factor
             continue
         group, field = name.split(".")
+        if field == "frame_noise":
+            read = settings.camera.noise[0]
+            factor = max(factor, min(rounding / read, 1.0)) if read > 0 else factor
         values[group][field] = getattr(getattr(settings, group), field) * factor
         if field == "frame_noise":
             values[group]["shot_noise"] = settings.camera.noise[1] * factor**2
