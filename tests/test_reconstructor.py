@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import warnings
 from functools import lru_cache
 
 import numpy as np
@@ -9,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kalux import PRESETS, Frame, Reconstructor
+from kalux import PRESETS, Calibration, Frame, Reconstructor
 from kalux.errors import EventError, ExposureError, FrameError, InputError, KaluxError, SettingsError
 from kalux.filters import bridged_frames
 from kalux.models.camera import Camera, count_bright
@@ -318,6 +320,16 @@ def test_events_in_any_layout():
         other[field] = stream.events[name]
     other["polarity"] = np.where(stream.events["p"], 1, -1)
     live = filled(stream._replace(events=other))
+    for t, image in reference(0, "default", True).items():
+        assert_same(live.read(t), image)
+
+
+def test_events_in_seconds_and_without_names():
+    stream = random_stream(0)
+    rows = np.stack([stream.events["t"] * 1e-6, *(stream.events[name] for name in "xyp")], axis=1)
+    live = filled(stream._replace(events=stream.events[:0]), finished=False)
+    live.push_events(rows, columns="txyp", time_unit="s")
+    live.finish()
     for t, image in reference(0, "default", True).items():
         assert_same(live.read(t), image)
 
@@ -923,6 +935,82 @@ def test_an_unknown_threshold_is_learned():
     thresholds = live._memory.thresholds
     assert 0.4 < thresholds.on[0, 0] < 0.75
     assert 0.4 < thresholds.off[0, 0] < 0.75
+
+
+def test_a_calibration_of_the_sensor_is_used():
+    """Its settings in place of the preset's, but not of those that are given; its pixels unless others are."""
+    hot = np.zeros((4, 6), np.bool_)
+    hot[1, 2] = True
+    known = Calibration({"events": {"threshold_on": 0.31, "threshold_off": 0.29}}, maps={"hot": hot})
+    live = Reconstructor((4, 6), preset="davis346", calibration=known)
+    assert live.thresholds == (0.31, 0.29)
+    assert live.settings == known.apply(PRESETS["davis346"])
+    same = Reconstructor((4, 6), settings=live.settings, pixels=known.pixels)
+    for each in (live, same):
+        each.push_frame(frame(90, 0, 10_000, (4, 6)))
+        each.push_events(events((12_000, 2, 1, True), (13_000, 3, 1, True)))
+    assert_same(live.read(20_000), same.read(20_000))
+    assert (
+        live.read(20_000).intensity[1, 2] < live.read(20_000).intensity[1, 3]
+    )  # a hot pixel's events say nothing
+    given = altered(PRESETS["default"], "events", threshold_on=0.2, threshold_off=0.2)
+    assert Reconstructor((4, 6), settings=given, calibration=known).thresholds == (0.2, 0.2)
+
+
+def test_the_fixed_pattern_of_a_live_stream_is_the_usual_one():
+    """Of raw frames: it is in every image, whatever is averaged."""
+    grey, colour = (np.full(shape, 9, np.uint8) for shape in ((4, 6), (4, 6, 3)))
+    for image, variant, expected in (
+        (grey, "default", 0.005),
+        (colour, "default", 0.0),
+        (grey, "iccv2021", 0.0),
+    ):
+        live = Reconstructor((4, 6), preset=variant)
+        live.push_frame(Frame(image, 0, 10_000))
+        assert live.read(10_000).fixed_pattern == expected
+    stated = Reconstructor((4, 6), settings=altered(PRESETS["default"], "camera", fixed_pattern=0.002))
+    stated.push_frame(Frame(grey, 0, 10_000))
+    assert stated.read(10_000).fixed_pattern == 0.002
+
+
+@pytest.mark.parametrize(
+    ("image", "white", "told"),
+    [
+        (np.full((4, 6), 1500, np.uint16), None, "if the camera has 12 bits, give --white 4095 .white=4095."),
+        (np.full((4, 6), 90.0), None, "which are floats, go up to 90"),
+        (np.full((4, 6), 1500, np.uint16), 4095, None),
+        (np.full((4, 6), 90, np.uint8), None, None),
+    ],
+)
+def test_a_white_that_can_hardly_be_right_is_told(image, white, told):
+    live, first = Reconstructor((4, 6)), Frame(image, 0, 10_000, white)
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        live.push_frame(first)
+        live.push_frame(Frame(image, 40_000, 50_000, white))
+    assert len(found) == (told is not None)
+    if told is not None:
+        assert re.match(f"frame 0: .*{told}", str(found[0].message))
+        assert found[0].filename == __file__
+
+
+@pytest.mark.parametrize("events_first", [True, False])
+def test_clocks_that_are_hardly_the_same_are_told(events_first):
+    for begin, count in ((3 * HOUR, 1), (HOUR // 2, 0)):
+        live = Reconstructor((4, 6))
+        pushes = [
+            lambda live=live, t=begin: live.push_events(events((t, 2, 1, True))),
+            lambda live=live: live.push_frame(frame(90, 0, 10_000, (4, 6))),
+        ]
+        with warnings.catch_warnings(record=True) as found:
+            warnings.simplefilter("always")
+            for push_one in pushes if events_first else pushes[::-1]:
+                push_one()
+            live.push_frame(frame(90, 40_000, 50_000, (4, 6)))
+        assert len(found) == count
+        if count:
+            assert "do both have the same clock?" in str(found[0].message)
+            assert found[0].filename == __file__
 
 
 def test_a_live_stream_takes_what_is_usual_of_the_sensor():

@@ -303,8 +303,8 @@ def check_frame(
         )
     if exposure_known and frame.exposure <= 0:
         raise ExposureError(
-            f"{where}: frame {index} has an exposure of {frame.exposure} us; give the real exposure time "
-            "(--exposure or exposure=, in us)"
+            f"{where}: frame {index} has an exposure of {frame.exposure} us; give the real exposure time, "
+            "in us (--exposure, or exposure= of a recording; exposure_end of a frame that is pushed)"
         )
     if previous is not None and frame.exposure_start < previous.exposure_end:
         if frame.exposure_start <= previous.exposure_start:

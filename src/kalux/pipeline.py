@@ -193,6 +193,7 @@ def _engine(recording: Recording, plan: Plan) -> Reconstructor:
         threshold_is_estimate=plan.threshold_origin in UNCERTAIN_ORIGINS,
         inverse_covariance=recording.source.inverse_covariance,
         pixels=plan.pixels,
+        tells_doubts=False,
     )
 
 

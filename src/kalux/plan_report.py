@@ -98,12 +98,11 @@ def _of_frames(recording: Recording, plan: Plan, asked: Settings) -> Iterator[tu
         yield "noise", f"of frames {read:.2g} of white in the dark, {half:.2g} at half of it ({how})"
     if camera.fixed_pattern is not None:
         how = _estimated(asked.camera.fixed_pattern, plan.fixed_pattern is not None)
-        what = (
-            f"fixed, of frames {camera.fixed_pattern:.2g} of white"
-            if camera.fixed_pattern
-            else "none that is fixed"
-        )
-        yield "pattern", f"{what} ({how})"
+        if camera.fixed_pattern:
+            yield "pattern", f"fixed, of frames {camera.fixed_pattern:.2g} of white ({how})"
+        else:
+            processed = "in colour, or not linear: processed"
+            yield "pattern", f"none that is fixed ({processed if how == _USUAL else how})"
     if plan.settings.filter.bright_tail is not None and plan.settings.filter.highlight_scale > 0:
         how = "measured" if asked.filter.bright_tail is None else _GIVEN
         yield "bright tail", f"{plan.settings.filter.bright_tail:.2f} log intensity ({how})"

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from typing import Any, Final
+import warnings
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,7 @@ from kalux.augmentation.highlights import Unshown
 from kalux.augmentation.motion import Paths
 from kalux.augmentation.refractory import EventClock
 from kalux.augmentation.trail import FrameTrail
+from kalux.calibration.values import CALIBRATION_NEEDED, Calibration
 from kalux.compiled import event_words
 from kalux.errors import EventError, InputError, SettingsError, require_type
 from kalux.events import (
@@ -42,12 +44,18 @@ from kalux.models.camera import Camera, beyond_white, count_bright, repeated_rou
 from kalux.models.colour import Gains, white_balance
 from kalux.models.pixels import PixelCalibration, require_size
 from kalux.moments import Moment
-from kalux.settings import SETTINGS_NEEDED, Settings
+from kalux.settings import SETTINGS_NEEDED, USUAL_PATTERN, Settings
 from kalux.settings import preset as named_preset
+from kalux.white import WhiteCheck
 
 _PIXELS_NEEDED: Final = (
     "a kalux.models.pixels.PixelCalibration is needed, from kalux.load_calibration(...).pixels"
 )
+
+
+_SAME_CLOCK: Final = 3_600_000_000
+"""us, an hour: by more than that the beginnings of events and frames hardly differ in one clock. Clocks of hosts and
+sensors are years apart."""
 
 
 class _Progress:
@@ -75,6 +83,9 @@ class Reconstructor:
         (height, width), pixels.
     preset, settings
         Name of a preset, or a whole `Settings`, which wins.
+    calibration
+        From `kalux.load_calibration`, as of `kalux.reconstruct`: what was measured replaces the preset's settings (not
+        those of ``settings``), and what is known of single pixels is used.
     lookahead
         True: an image uses the frame after it too (11)-(13), so that it is final one frame later. False: only
         the past, for robots.
@@ -89,7 +100,10 @@ class Reconstructor:
     inverse_covariance
         A released ``f_Q``: 1 / R_bar for each level of the response, its shape used as f^w (5).
     pixels
-        Calibration of single pixels: priors of their thresholds, and hot ones, whose events are left out.
+        Calibration of single pixels: priors of their thresholds, and hot ones, whose events are left out. Default:
+        those of ``calibration``.
+    tells_doubts
+        Whether to warn of what can hardly be right; of a `Recording` that has been told.
 
     Raises
     ------
@@ -97,6 +111,12 @@ class Reconstructor:
         If a setting or preset is unknown or out of range.
     InputError
         If ``pixels`` are of a sensor of another size, or an argument has a value or a type that cannot be.
+
+    Warns
+    -----
+    UserWarning
+        From `push_frame` and `push_events`: if what is taken for white of the first frame can hardly be right, or
+        frames and events begin more than an hour apart, which are hardly times of one clock.
     """
 
     def __init__(
@@ -105,16 +125,22 @@ class Reconstructor:
         *,
         preset: str = "default",
         settings: Settings | None = None,
+        calibration: Calibration | None = None,
         lookahead: bool = True,
         contrast_threshold: float | tuple[float, float] | None = None,
         threshold_is_estimate: bool = False,
         reference_exposure: int | None = None,
         inverse_covariance: NDArray[np.float64] | None = None,
         pixels: PixelCalibration | None = None,
+        tells_doubts: bool = True,
     ) -> None:
         self.sensor_size = checked_size(sensor_size)
         if settings is not None:
             require_type("settings", settings, Settings, SETTINGS_NEEDED)
+        if calibration is not None:
+            require_type("calibration", calibration, Calibration, CALIBRATION_NEEDED)
+            settings = settings or calibration.apply(named_preset(preset))
+            pixels = pixels or calibration.pixels
         if reference_exposure is not None and _whole(reference_exposure, "reference_exposure") <= 0:
             raise InputError(f"reference_exposure is {reference_exposure} us; it must be positive")
         self.settings = settings if settings is not None else named_preset(preset)
@@ -146,6 +172,8 @@ class Reconstructor:
         self._progress: _Progress | None = None
         self._last_frame: Frame | None = None
         self._frame_count = 0
+        self._tells_doubts = tells_doubts
+        self._begins: dict[str, int] = {}  # us, of events and of frames
         self._frame_interval = USUAL_INTERVAL  # between the latest two frames whose segment is committed, us
         self._bright_tail = self.settings.filter.bright_tail  # None: that of the first frame
         self._view: View | None = None  # once there is a frame
@@ -178,6 +206,9 @@ class Reconstructor:
                 "push: end_frames() was called, no frame can be pushed after it; a new Reconstructor can begin with it"
             )
         check_frame(frame, self.sensor_size, index=self._frame_count, previous=self._last_frame)
+        if self._frame_count == 0:
+            self._doubt_white(frame)
+            self._doubt_clock("frames", frame.exposure_start)
         frame = with_black_level(frame, self.settings.camera.black_level)
         self._reference_exposure = self._reference_exposure or frame.exposure
         if self._bright_tail is None:
@@ -201,15 +232,15 @@ class Reconstructor:
             )
         return self._gains
 
-    def push_events(self, events: Any) -> None:
-        """Add the next events, in any layout that `as_events` takes: times in us, 0-based coordinates.
+    def push_events(self, events: Any, *, columns: str | None = None, time_unit: str | None = None) -> None:
+        """Add the next events, in any layout that `as_events` takes, with its ``columns`` and ``time_unit``.
 
         Raises
         ------
         EventError
             Unknown layout, unsorted, older than what was pushed or declared complete, outside the sensor.
         """
-        self._push(as_events(events), weighed=False)
+        self._push(as_events(events, columns=columns, time_unit=time_unit), weighed=False)
 
     def push_weighed(self, events: EventArray) -> None:
         """Add the next events, which carry weights (`kalux.augmentation.refractory`), as a backward pass has them.
@@ -239,11 +270,32 @@ class Reconstructor:
             check_events(array, self.sensor_size, first_index=self._event_count, previous_t=previous)
         if len(array) == 0:
             return
+        if self._event_count == 0:
+            self._doubt_clock("events", int(array["t"][0]))
         self._event_count += len(array)
         self._last_event = int(array["t"][-1])
         self.advance(self._last_event - 1)  # more events may carry the last one's time
         if self._needed_from is not None:
             self._events.drop(self._needed_from)
+
+    def _doubt_white(self, first: Frame) -> None:
+        check = WhiteCheck()
+        check.see(first)
+        doubt = check.doubt()
+        if doubt is not None and self._tells_doubts:
+            warnings.warn(f"frame 0: {doubt}", stacklevel=3)
+
+    def _doubt_clock(self, what: Literal["events", "frames"], begin: int) -> None:
+        """Warn once both are there, ``what`` from ``begin`` (us) on, if they begin too far from each other."""
+        self._begins[what] = begin
+        events, frames = (self._begins.get(each) for each in ("events", "frames"))
+        if not self._tells_doubts or events is None or frames is None or abs(events - frames) <= _SAME_CLOCK:
+            return
+        warnings.warn(
+            f"events begin at {events} us and frames at {frames} us, more than an hour apart; do both have the same "
+            "clock?",
+            stacklevel=4 if what == "events" else 3,
+        )
 
     def _require_not_complete(self, array: EventArray, complete: int) -> None:
         """Refuse events up to ``complete`` (us), as `advance` was told; others are told by `check_events`."""
@@ -446,11 +498,19 @@ class Reconstructor:
             highlight_gain=events.believed_gain,
             highlight_growth=growth,
             unknown_variance=filtered.initial_variance,
-            fixed_pattern=self.settings.camera.fixed_pattern or 0.0,
+            fixed_pattern=self._pattern_of(frame),
             rounding=repeated_rounding(frame, self.settings.camera),
             mosaic=frame.mosaic,
             gains=(1.0, 1.0, 1.0) if frame.mosaic is None else self._gains_of(frame),
         )
+
+    def _pattern_of(self, frame: Frame) -> float:
+        """The fixed pattern that the variance counts: the usual one where no plan has looked for it in raw frames."""
+        camera = self.settings.camera
+        if camera.fixed_pattern is not None:
+            return camera.fixed_pattern
+        raw = camera.is_linear and frame.image.ndim == 2
+        return USUAL_PATTERN if raw and self.settings.filter.joins_frames else 0.0
 
     def _unshown(self, progress: _Progress, variance: NDArray[np.floating[Any]]) -> Unshown | None:
         """Pixels that no frame has measured yet (K15), where highlights are looked at."""

@@ -22,6 +22,10 @@ MotionName = Literal["auto", "on", "off"]
 UNKNOWN_LOG_OFFSET: Final = 0.03
 """I_0 where it is not known: what real recordings of DAVIS sensors agree with best (docs/tuning.md)."""
 
+USUAL_PATTERN: Final = 0.005
+"""Fixed pattern where nothing tells it: half a percent, as of DAVIS sensors (0.002 of slider_depth's, 0.008 of
+newton's, 0.009 of street's)."""
+
 
 def chosen_response(setting: str, stated: str | None) -> str:
     """The camera's response that a setting names, or, where that is ``"auto"``, the recording states."""
@@ -55,7 +59,7 @@ class CameraSettings:
     fixed_pattern
         Standard deviation of the offsets that pixels of frames keep from frame to frame, white = 1: the images have
         them, too, and their variance counts them (docs/equations.md, K11). None: an estimate from the recording
-        (`kalux.calibration.fixed_pattern`), 0.005 where it cannot tell; 0 in a live stream.
+        (`kalux.calibration.fixed_pattern`), `USUAL_PATTERN` where it cannot tell, and in a live stream.
     confidence
         1 / sigma_im^2 of equation (6) as the paper uses it, a rate in 1/s: 7e5 (DAVIS), 7e7 (FLIR). For
         augmentation "paper" only.

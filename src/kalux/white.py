@@ -77,11 +77,15 @@ class WhiteCheck:
     def watched(self, frames: Iterable[Frame]) -> Iterator[Frame]:
         """The same frames."""
         for frame in frames:
-            floats = frame.image.dtype.kind == "f"
-            if floats or (frame.white is None and frame.image.dtype != np.uint8):
-                self._frame, self._stated = frame, frame.white
-                self._largest = max(self._largest, float(frame.image.max()))
+            self.see(frame)
             yield frame
+
+    def see(self, frame: Frame) -> None:
+        """Look at the next frame."""
+        floats = frame.image.dtype.kind == "f"
+        if floats or (frame.white is None and frame.image.dtype != np.uint8):
+            self._frame, self._stated = frame, frame.white
+            self._largest = max(self._largest, float(frame.image.max()))
 
     def doubt(self) -> str | None:
         """What makes the white value doubtful, in one line; None if nothing does."""

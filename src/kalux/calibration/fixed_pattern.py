@@ -20,7 +20,7 @@ from kalux.compiled import larger, loop, smaller
 from kalux.filters.shots import Shot, take_shot
 from kalux.models.camera import Camera
 from kalux.recording import Recording
-from kalux.settings import CameraSettings, chosen_response
+from kalux.settings import USUAL_PATTERN, CameraSettings, chosen_response
 
 Array = NDArray[np.float64]
 
@@ -36,10 +36,6 @@ _TEXTURE: Final = 0.01  # of the light: the least by which surfaces differ, howe
 _WHITE: Final = 1 + 1 / 8  # variance of white noise, and of what a pixel of it has beyond the mean of eight
 _BELIEVED: Final = 6.0
 """Standard errors: 47 simulated scenes without a pattern say at most 4.3, with 0.005 at least 14."""
-
-USUAL_PATTERN: Final = 0.005
-"""Deviation where a recording cannot tell: half a percent, as of DAVIS sensors (0.002 of slider_depth's, 0.008 of
-newton's, 0.009 of street's)."""
 
 _MOST_FRAMES: Final = 32  # evenly among the first: more pairs say little more
 _LEAST_PARTS: Final = 8

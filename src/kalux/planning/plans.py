@@ -12,7 +12,7 @@ from kalux.calibration.delay import DelayEstimate
 from kalux.calibration.fixed_pattern import FixedPattern
 from kalux.calibration.frame_noise import FrameNoise
 from kalux.calibration.mismatch import Mismatch
-from kalux.calibration.values import Calibration
+from kalux.calibration.values import CALIBRATION_NEEDED, Calibration
 from kalux.calibration.white_balance import grey_world
 from kalux.errors import InputError, require_type
 from kalux.frames import median_exposure
@@ -38,8 +38,6 @@ from kalux.recording import RECORDING_NEEDED, Recording, with_cached_start
 from kalux.schedule import begin_time, image_times
 from kalux.settings import SETTINGS_NEEDED, Settings, altered, chosen_response, completed
 from kalux.settings import preset as named_preset
-
-_CALIBRATION_NEEDED: Final = "a kalux.Calibration is needed, from kalux.load_calibration"
 
 _CACHED_EVENTS: Final = 1 << 21
 _CACHED_FRAME_BYTES: Final = 1 << 25
@@ -175,7 +173,7 @@ def _check_types(recording: Recording, settings: Settings | None, calibration: C
     if settings is not None:
         require_type("reconstruct: settings", settings, Settings, SETTINGS_NEEDED)
     if calibration is not None:
-        require_type("reconstruct: calibration", calibration, Calibration, _CALIBRATION_NEEDED)
+        require_type("reconstruct: calibration", calibration, Calibration, CALIBRATION_NEEDED)
 
 
 def _check_smooth(settings: Settings, lookahead: bool) -> None:
