@@ -753,6 +753,11 @@ def known(pixel, variance, t, settings, c2, left):
     return max(1 / (1 / variance + 1 / following), common) + wrong
 
 
+def with_pattern(variance, intensity, white, offset):
+    """K11: the offsets that pixels keep in all frames, half a percent of ``white`` where nothing tells them."""
+    return variance + (0.005 * white / (intensity + offset)) ** 2
+
+
 def with_rounding(variance, intensity, moving, level, offset):
     """K11: a still pixel's frames, with less noise than half a ``level``, have half of their rounding in common."""
     given = variance.copy()

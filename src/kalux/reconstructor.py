@@ -20,7 +20,6 @@ from kalux.augmentation.highlights import Unshown
 from kalux.augmentation.motion import Paths
 from kalux.augmentation.refractory import EventClock
 from kalux.augmentation.trail import FrameTrail
-from kalux.calibration.values import CALIBRATION_NEEDED, Calibration
 from kalux.compiled import event_words
 from kalux.errors import EventError, InputError, SettingsError, require_type
 from kalux.events import (
@@ -42,7 +41,7 @@ from kalux.frames import Frame, check_frame, with_black_level
 from kalux.images import Estimate, Image, View, make_image
 from kalux.models.camera import Camera, beyond_white, count_bright, repeated_rounding
 from kalux.models.colour import Gains, white_balance
-from kalux.models.pixels import PixelCalibration, require_size
+from kalux.models.pixels import CALIBRATION_NEEDED, Measured, PixelCalibration, require_size
 from kalux.moments import Moment
 from kalux.settings import SETTINGS_NEEDED, USUAL_PATTERN, Settings
 from kalux.settings import preset as named_preset
@@ -84,7 +83,7 @@ class Reconstructor:
     preset, settings
         Name of a preset, or a whole `Settings`, which wins.
     calibration
-        From `kalux.load_calibration`, as of `kalux.reconstruct`: what was measured replaces the preset's settings (not
+        A `kalux.Calibration`, from `kalux.load_calibration`: what was measured replaces the preset's settings (not
         those of ``settings``), and what is known of single pixels is used.
     lookahead
         True: an image uses the frame after it too (11)-(13), so that it is final one frame later. False: only
@@ -125,7 +124,7 @@ class Reconstructor:
         *,
         preset: str = "default",
         settings: Settings | None = None,
-        calibration: Calibration | None = None,
+        calibration: Measured | None = None,
         lookahead: bool = True,
         contrast_threshold: float | tuple[float, float] | None = None,
         threshold_is_estimate: bool = False,
@@ -138,7 +137,7 @@ class Reconstructor:
         if settings is not None:
             require_type("settings", settings, Settings, SETTINGS_NEEDED)
         if calibration is not None:
-            require_type("calibration", calibration, Calibration, CALIBRATION_NEEDED)
+            require_type("calibration", calibration, Measured, CALIBRATION_NEEDED)
             settings = settings or calibration.apply(named_preset(preset))
             pixels = pixels or calibration.pixels
         if reference_exposure is not None and _whole(reference_exposure, "reference_exposure") <= 0:

@@ -24,9 +24,6 @@ from kalux.settings import Settings, from_dict, preset, read_toml
 VERSION: Final = 1
 """Of the file format."""
 
-CALIBRATION_NEEDED: Final = "a kalux.Calibration is needed, from kalux.load_calibration"
-"""Where a `Calibration` comes from, for messages."""
-
 _MAPS: Final = ("threshold_on", "threshold_off", "threshold_on_variance", "threshold_off_variance")
 _FACTORS: Final = {"threshold_on": 1.0, "threshold_off": 1.0}
 

@@ -4,13 +4,30 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kalux.errors import InputError
+from kalux.settings import Settings
 
 Array = NDArray[np.float64]
+
+CALIBRATION_NEEDED: Final = "a kalux.Calibration is needed, from kalux.load_calibration"
+"""Where what was measured of a sensor comes from, for messages."""
+
+
+@runtime_checkable
+class Measured(Protocol):
+    """What was measured of a sensor, as a `kalux.Calibration` holds it."""
+
+    @property
+    def pixels(self) -> PixelCalibration | None:
+        """What is known of single pixels; None: nothing."""
+
+    def apply(self, settings: Settings) -> Settings:
+        """The settings with what was measured in place of theirs."""
 
 
 @dataclass(frozen=True, eq=False)

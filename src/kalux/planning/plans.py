@@ -12,13 +12,13 @@ from kalux.calibration.delay import DelayEstimate
 from kalux.calibration.fixed_pattern import FixedPattern
 from kalux.calibration.frame_noise import FrameNoise
 from kalux.calibration.mismatch import Mismatch
-from kalux.calibration.values import CALIBRATION_NEEDED, Calibration
+from kalux.calibration.values import Calibration
 from kalux.calibration.white_balance import grey_world
 from kalux.errors import InputError, require_type
 from kalux.frames import median_exposure
 from kalux.models.camera import BrightTail
 from kalux.models.colour import white_balance
-from kalux.models.pixels import PixelCalibration, require_size, with_hot
+from kalux.models.pixels import CALIBRATION_NEEDED, PixelCalibration, require_size, with_hot
 from kalux.planning.event_steps import (
     UNCERTAIN_ORIGINS,
     StepEstimates,
