@@ -81,12 +81,12 @@ def colour_packet(frame, kind):
 def aedat4_file(
     packets, *, streams=(("EVTS", SIZE), ("FRME", SIZE)), compression=0, closed=True, camera="Unknown"
 ):
-    """A file of (stream, packet) pairs."""
+    """A file of (stream, packet) pairs. Streams are (kind, size), or with a camera of their own."""
     nodes = "".join(
         f'<node name="{i}"><attr key="typeIdentifier" type="string">{kind}</attr><node name="info">'
         f'<attr key="sizeX" type="int">{width}</attr><attr key="sizeY" type="int">{height}</attr>'
-        f'<attr key="source" type="string">{camera}</attr></node></node>'
-        for i, (kind, (height, width)) in enumerate(streams)
+        f'<attr key="source" type="string">{(*own, camera)[0]}</attr></node></node>'
+        for i, (kind, (height, width), *own) in enumerate(streams)
     )
     info = f'<dv version="2.0"><node name="outInfo">{nodes}</node></dv>'.encode()
     body = b"".join(
@@ -185,6 +185,78 @@ def test_of_several_streams_those_of_equal_size_are_read(path):
     source = readers.read(path)
     assert same_frames(source.frames(), small_frames())
     assert any("2 frame streams" in sentence and "stream 2" in sentence for sentence in source.missing)
+
+
+LEFT, RIGHT = "DAVIS346_00000001", "DAVIS346_00000002"
+
+
+def file_of(streams):
+    """A file of (kind, camera) streams of one size; contents are those of the stream's number, see `contents`."""
+    packets = []
+    for number, (kind, _) in enumerate(streams):
+        if kind == "EVTS":
+            packets.append((number, event_packet(small_events(seed=number))))
+        elif kind == "FRME":
+            packets += [(number, frame_packet(frame)) for frame in small_frames(seed=number)]
+        else:
+            packets.append((number, trigger_packet(1000 * number)))
+    return aedat4_file(packets, streams=[(kind, SIZE, camera) for kind, camera in streams])
+
+
+def trigger_packet(t):
+    """One rising edge: a vector of one offset, behind which lie the table of fields and the trigger itself."""
+    fields, trigger = struct.pack("<4H", 8, 16, 8, 4), struct.pack("<ib3xq", 8, 1, t)
+    return flatbuffer("TRIG", {0: ("vector", 1, struct.pack("<I", 12) + fields + trigger)})
+
+
+def contents(source):
+    """Numbers of the streams that events, frames and triggers are of."""
+    events, frames = all_events(source), list(source.frames())
+    of_events = [n for n in range(6) if np.array_equal(events, small_events(seed=n))]
+    of_frames = [n for n in range(6) if frames and same_frames(frames, small_frames(seed=n))]
+    of_triggers = (
+        [int(t) // 1000 for chunk in source.triggers() for t in chunk["t"]] if source.triggers else []
+    )
+    return of_events + of_frames + of_triggers
+
+
+@pytest.mark.parametrize(
+    ("streams", "read"),
+    [
+        ([("EVTS", LEFT), ("EVTS", RIGHT), ("FRME", RIGHT)], [1, 2]),
+        ([("EVTS", LEFT), ("FRME", RIGHT), ("FRME", LEFT)], [0, 2]),
+        ([("EVTS", LEFT), ("EVTS", RIGHT), ("FRME", LEFT), ("FRME", RIGHT)], [0, 2]),
+        ([("TRIG", RIGHT), ("TRIG", LEFT), ("EVTS", LEFT), ("FRME", LEFT)], [2, 3, 1]),
+        ([("TRIG", RIGHT), ("EVTS", LEFT), ("FRME", LEFT)], [1, 2]),
+        ([("EVTS", "filtered"), ("EVTS", LEFT), ("FRME", LEFT)], [1, 2]),
+    ],
+)
+def test_events_frames_and_triggers_are_of_one_camera(path, streams, read):
+    path.write_bytes(file_of(streams))
+    source = readers.read(path)
+    assert contents(source) == read
+    assert not any("taken for one" in sentence for sentence in source.missing)
+
+
+def test_frames_of_another_camera_are_not_read(path):
+    path.write_bytes(file_of([("EVTS", LEFT), ("FRME", RIGHT)]))
+    source = readers.read(path)
+    assert contents(source) == [0]
+    assert source.count_frames() == 0
+    assert source.missing == (
+        "The frames are not read: they are of DAVIS346_00000002, another camera than DAVIS346_00000001 of the events.",
+    )
+
+
+def test_streams_that_were_renamed_are_paired_by_their_size(path):
+    """Modules of DV that filter events or undistort frames may give their output a name of its own."""
+    path.write_bytes(file_of([("TRIG", LEFT), ("EVTS", "dvsnoisefilter"), ("FRME", LEFT)]))
+    source = readers.read(path)
+    assert contents(source) == [1, 2, 0]
+    assert source.missing == (
+        "The events are of the source 'dvsnoisefilter', the frames of 'DAVIS346_00000001'; they are taken for one "
+        "camera's.",
+    )
 
 
 def test_16_bit_frames(path):

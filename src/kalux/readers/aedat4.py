@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import re
 import struct
 import xml.etree.ElementTree as ElementTree
 from array import array
@@ -101,6 +102,9 @@ class _Container:
 
 _CHUNK_BYTES: Final = CHUNK_EVENTS * EVENT_DTYPE.itemsize
 _NAMES: Final = {"EVTS": "event", "FRME": "frame", "TRIG": "trigger"}
+# The sources of iniVation's cameras: model and serial number, as DAVIS346_00000391 and DVXplorer_DXB00010.
+_SERIAL: Final = re.compile(r"(DAVIS|DVX|DVS|EDVS)\w*?_[A-Z]{0,3}\d+", re.IGNORECASE)
+_SHOWN: Final = 40  # letters of a name, in a sentence
 _POLARITY: Final = EVENT_DTYPE.fields["p"][1]  # type: ignore[index]
 # Numbers of dv::TriggerType for edges of the external input; others are of the generator and of the sensor itself.
 _EDGES: Final = {1: True, 2: False}
@@ -114,9 +118,9 @@ def recognises(path: Path) -> bool:
 def read(path: Path) -> Source:
     """Open an AEDAT 4 file.
 
-    The first event stream and the first frame stream of equal size are read. Frames may be 8 or 16 bits,
-    grey or in colour; those in colour of a DAVIS come from a Bayer sensor. Times are absolute, us. Edges on the
-    external input are in ``triggers``, input 0.
+    The first event stream and the first frame stream of one camera are read, else those of equal size, but never
+    those of two cameras. Frames may be 8 or 16 bits, grey or in colour; those in colour of a DAVIS come from a Bayer
+    sensor. Times are absolute, us. Edges on the same camera's external input are in ``triggers``, input 0.
 
     Raises
     ------
@@ -135,7 +139,14 @@ def read(path: Path) -> Source:
     missing = _others("event", events, event_streams) + _others("frame", frames, frame_streams)
     if events is None:
         missing += ("The file has no event stream.",)
-    if frames is None:
+    if frames is not None:
+        missing += _doubts(events, frames)
+    elif frame_streams:
+        missing += (
+            f"The frames are not read: they are of {frame_streams[0].camera[:_SHOWN]}, another camera than "
+            f"{event_streams[0].camera[:_SHOWN]} of the events.",
+        )
+    else:
         missing += (NO_FRAMES,)
 
     exposure_known = True
@@ -157,11 +168,10 @@ def read(path: Path) -> Source:
         ordered = in_order(_stored_frames(container, frames))
         return ordered if exposure_known else map(_stamp_only, ordered)
 
-    triggers = [s for s in container.streams if s.kind == "TRIG"]
+    triggers = _triggers(container.streams, events or frames)  # type: ignore[arg-type]
 
     def read_triggers() -> Iterator[TriggerArray]:
-        for stream in triggers[:1]:
-            yield from container.read(stream, _edges)
+        return iter(()) if triggers is None else container.read(triggers, _edges)
 
     @cache
     def count_events() -> int:
@@ -176,7 +186,7 @@ def read(path: Path) -> Source:
         count_events=count_events,
         count_frames=lambda: 0 if frames is None else len(container.packets[frames.number]) // 2,
         exposure_known=exposure_known,
-        triggers=read_triggers if triggers else None,
+        triggers=None if triggers is None else read_triggers,
         missing=missing,
         mosaic=_DAVIS_FILTER if is_colour_davis else None,
     )
@@ -185,12 +195,42 @@ def read(path: Path) -> Source:
 def _choose(
     event_streams: list[_Stream], frame_streams: list[_Stream]
 ) -> tuple[_Stream | None, _Stream | None]:
-    """The first pair of streams of equal size, else the first of each."""
-    for events in event_streams:
-        for frames in frame_streams:
-            if events.size == frames.size:
-                return events, frames
-    return next(iter(event_streams), None), next(iter(frame_streams), None)
+    """The first pair of streams of equal size and of one camera, else of equal size, else of one camera.
+
+    Never a pair of two cameras: rather the events alone.
+    """
+    if not event_streams or not frame_streams:
+        return next(iter(event_streams), None), next(iter(frame_streams), None)
+    pairs = [(e, f) for e in event_streams for f in frame_streams if not _of_two_cameras(e, f)]
+    # The first of the best.
+    best = max(pairs, key=lambda pair: (pair[0].size == pair[1].size, _alike(*pair)), default=None)
+    return (event_streams[0], None) if best is None else best
+
+
+def _alike(first: _Stream, second: _Stream) -> bool:
+    return first.camera == second.camera
+
+
+def _of_two_cameras(first: _Stream, second: _Stream) -> bool:
+    """Whether both name a camera with its serial number, not the same. Modules that change a stream may rename it."""
+    named = all(_SERIAL.fullmatch(stream.camera) for stream in (first, second))
+    return named and not _alike(first, second)
+
+
+def _triggers(streams: tuple[_Stream, ...], read: _Stream) -> _Stream | None:
+    """The first trigger stream of the camera of the stream that is read, else the first that may be."""
+    found = [stream for stream in streams if stream.kind == "TRIG" and not _of_two_cameras(stream, read)]
+    return max(found, key=lambda stream: _alike(stream, read), default=None)
+
+
+def _doubts(events: _Stream | None, frames: _Stream) -> tuple[str, ...]:
+    """A sentence about streams that are paired for their size alone."""
+    if events is None or _alike(events, frames):
+        return ()
+    return (
+        f"The events are of the source {events.camera[:_SHOWN]!r}, the frames of {frames.camera[:_SHOWN]!r}; they are "
+        "taken for one camera's.",
+    )
 
 
 def _others(name: str, chosen: _Stream | None, streams: list[_Stream]) -> tuple[str, ...]:
