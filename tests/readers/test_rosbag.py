@@ -22,7 +22,7 @@ from kalux.errors import EventError, FormatError, InputError, MissingDependencyE
 from kalux.events import make_events
 from kalux.frames import Frame
 from kalux.models.colour import sample_mosaic
-from kalux.readers import CHUNK_EVENTS, ros_bags
+from kalux.readers import CHUNK_EVENTS, evt3_packets, ros_bags
 from kalux.readers.streams import rechunk
 from kalux.recording import Recording
 from recordings import (
@@ -105,9 +105,9 @@ def exposure(us, cdr):
     return bytes(Body(cdr).number("i", us).data)
 
 
-def event_packet(encoding, content, stamp, time_base, cdr, size=SIZE, big=False):
+def event_packet(encoding, content, stamp, time_base, cdr, size=SIZE, big=False, seq=3):
     body = Body(cdr).header(stamp).number("I", size[0]).number("I", size[1])
-    body.number("Q", 3).number("Q", time_base).text(encoding).number("B", big)
+    body.number("Q", seq).number("Q", time_base).text(encoding).number("B", big)
     return bytes(body.blob(content).data)
 
 
@@ -606,9 +606,105 @@ def test_evt3_packets_are_one_stream_and_times_those_of_ros(tmp_path):
         *(event_packet("evt3", part, EPOCH + 9_000 * i, 0, False) for i, part in enumerate(parts)),
     )
     source = readers.read(path)
-    start = EPOCH // 1000  # the stamp of the first packet is the time of the first event
+    start = EPOCH // 1000  # the stamp of the first packet is that of its first time
     assert all_events(source).tolist() == [(start, 2, 3, False), (start + 2, 4, 3, True)]
     assert [chunk.tolist() for chunk in source.triggers()] == [[(start + 2, 1, True)]]
+
+
+def evt3(t, *words):
+    """Words after those that state a time, us."""
+    return np.array([0x8000 | t >> 12 & 0xFFF, 0x6000 | t & 0xFFF, *words], "<u2").tobytes()
+
+
+EVENT = (0x0003, 0x2802)  # at x = 2, y = 3
+
+
+def evt3_times(path, parts):
+    """Times of the events, after EPOCH, us. Parts: (stamp after EPOCH in us, words), perhaps with a number."""
+    packed = [
+        event_packet("evt3", content, EPOCH + 1000 * stamp, 0, False, seq=number[0] if number else 3)
+        for stamp, content, *number in parts
+    ]
+    return (all_events(readers.read(packets(path, *packed)))["t"] - EPOCH // 1000).tolist()
+
+
+def test_the_stamp_of_an_evt3_packet_is_that_of_its_first_time(tmp_path):
+    """As event_camera_codecs has it. The first events may come much later, as with a cap on the lens."""
+    dark = [(100 * k, evt3(1_000_000 + 100 * k)) for k in range(5)]
+    late = (500, evt3(1_000_500, 0xA101, 0x6000 | (1_000_600 & 0xFFF), *EVENT))
+    assert evt3_times(tmp_path / "recording.bag", [*dark, late]) == [600]
+
+
+def test_a_time_high_without_a_time_low_is_a_time(tmp_path):
+    high = [np.array([0x8000 | k, 0x2001], "<u2").tobytes() for k in (7, 8)]
+    parts = [(0, high[0]), (4096, high[1]), (4098, evt3((8 << 12) + 3, *EVENT))]
+    assert evt3_times(tmp_path / "recording.bag", parts) == [4099]
+
+
+WRAP = 1 << 24  # us
+
+
+@pytest.mark.parametrize("numbered", [True, False])
+@pytest.mark.parametrize("joined", [1, 20, 1 << 16])
+@pytest.mark.parametrize("gap", [9_000_000, WRAP - 1, WRAP, 20_000_000, 3 * WRAP + 5, 3_600_000_000])
+def test_stamps_tell_the_time_after_a_gap(tmp_path, monkeypatch, gap, joined, numbered):
+    """EVT3 states times only to 16.8 s. Stamps are not exact; drivers may give all packets the same number."""
+    monkeypatch.setattr(evt3_packets, "_JOINED_WORDS", joined)
+    times = [0, 10_000, 20_000, gap + 20_000, gap + 30_000]
+    parts = [
+        (t + late, evt3(12_000_000 + t, *EVENT), 10 * k if numbered else 3)
+        for k, (t, late) in enumerate(zip(times, (0, 3000, -3000, 200_000, 3000), strict=True))
+    ]
+    assert evt3_times(tmp_path / "recording.bag", parts) == times
+
+
+def test_clocks_may_drift(tmp_path):
+    """By a thousandth, over 100 s."""
+    times = list(range(0, 100_000_000, 1_000_000))
+    parts = [(t + t // 1000, evt3(5 + t, *EVENT)) for t in times]
+    assert evt3_times(tmp_path / "recording.bag", parts) == times
+
+
+@pytest.mark.parametrize(
+    ("parts", "stamp"),
+    [
+        # the sensor's clock begins anew
+        ([(0, evt3(12_000_000)), (10_000, evt3(12_010_000)), (3_000_000, evt3(5_000))], "1600000003.000"),
+        # so it does, as the numbers show, though it fits the stamps
+        ([(0, evt3(0), 0), (10_000, evt3(10_000), 1), (WRAP, evt3(5_000), 0)], "1600000016.777"),
+        # the computer's clock was set
+        ([(0, evt3(0), 0), (2_010_000, evt3(10_000), 1)], "1600000002.010"),
+    ],
+)
+@pytest.mark.parametrize("joined", [1, 1 << 16])
+def test_a_clock_that_begins_anew_is_refused(tmp_path, monkeypatch, parts, stamp, joined):
+    monkeypatch.setattr(evt3_packets, "_JOINED_WORDS", joined)
+    with pytest.raises(FormatError, match=rf"'/events': the packet of {stamp} s .* cut the recording there"):
+        evt3_times(tmp_path / "recording.bag", parts)
+
+
+@pytest.mark.parametrize("joined", [1, 1 << 16])
+def test_after_lost_packets_row_column_and_time_are_unknown_until_stated(tmp_path, monkeypatch, joined):
+    monkeypatch.setattr(evt3_packets, "_JOINED_WORDS", joined)
+    contents = [
+        (0, evt3(0, 0x0003, 0x2802, 0x3004), 7),  # an event, and where a vector begins
+        (1, np.array([0x5001, 0x2802], "<u2").tobytes(), 8),
+        # Some are lost. The first words are of an unknown time.
+        (9, np.array([0x6008, 0x0005, 0x2802], "<u2").tobytes(), 12),
+        (20, np.array([0x2802, 0x6013], "<u2").tobytes() + evt3(20, 0x2802, 0x0006, 0x5001, 0x2803), 13),
+        (30, evt3(30, 0x3005, 0x5003, 0x2802), 14),
+    ]
+    packed = [event_packet("evt3", c, EPOCH + 1000 * t, 0, False, seq=seq) for t, c, seq in contents]
+    source = readers.read(packets(tmp_path / "recording.bag", *packed))
+    found = [(t - EPOCH // 1000, x, y) for t, x, y, _ in all_events(source).tolist()]
+    assert found == [(0, 2, 3), (0, 4, 3), (0, 2, 3), (20, 3, 6), (30, 5, 6), (30, 6, 6), (30, 2, 6)]
+    assert source.count_events() == 7
+
+
+def test_a_late_packet_that_goes_back_too_far_is_refused(tmp_path):
+    parts = [(100_000, evt3(100_000, *EVENT), 8), (0, evt3(0, *EVENT), 7)]
+    with pytest.raises(FormatError, match="clock goes back from 100000 to 0 us"):
+        evt3_times(tmp_path / "recording.bag", parts)
 
 
 @pytest.mark.parametrize(
@@ -801,7 +897,8 @@ def test_real_evt3_packets_agree_with_rosbags_and_faery(shared_data, tmp_path, n
     ours = all_events(source)
     assert (source.sensor_size, source.count_events(), source.count_frames()) == ((480, 640), 343_474, 0)
     assert source.missing == ("The recording has no frames.",)
-    assert (ours["t"][0], ours["t"][-1] - ours["t"][0]) == (1_675_956_550_318_678, 2_078_178)
+    # The first event is 5 us after the first time, whose stamp is that of the packet.
+    assert (ours["t"][0], ours["t"][-1] - ours["t"][0]) == (1_675_956_550_318_683, 2_078_178)
     assert sum(map(len, source.triggers())) == 4157
     faery = pytest.importorskip("faery")
     messages = by_rosbags(path)
@@ -812,7 +909,23 @@ def test_real_evt3_packets_agree_with_rosbags_and_faery(shared_data, tmp_path, n
         assert np.array_equal(ours[field], theirs[field])
     stamp = messages[0].header.stamp
     first = (stamp.sec * 10**9 + stamp.nanosec) // 1000
-    assert np.array_equal(ours["t"] - first, theirs["t"].astype(np.int64) - int(theirs["t"][0]))
+    assert np.array_equal(ours["t"] - first - 5, theirs["t"].astype(np.int64) - int(theirs["t"][0]))
+
+
+@pytest.mark.parametrize("lost", [range(100, 150), range(9, 517, 10)])
+def test_what_is_read_of_real_evt3_packets_after_a_loss_is_true(shared_data, tmp_path, lost):
+    """Real payload, our writer."""
+    path = shared_data / "formats" / "event_packet_ros1.bag"
+    with rosbag1.Reader(path) as bag:
+        messages = [
+            (time, "/events", "event_camera_msgs/msg/EventPacket", bytes(data))
+            for _, time, data in bag.messages()
+        ]
+    write_bag1(tmp_path / "lost.bag", [m for i, m in enumerate(messages) if i not in lost])
+    whole, found = all_events(readers.read(path)), all_events(readers.read(tmp_path / "lost.bag"))
+    assert {*found.tolist()} <= {*whole.tolist()}
+    assert len(found) > (1 - 1.1 * len(lost) / len(messages)) * len(whole)
+    assert np.array_equal(found[-100:], whole[-100:])
 
 
 def test_real_libcaer_packets_agree_with_the_codec_as_described(shared_data):

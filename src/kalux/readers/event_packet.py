@@ -17,7 +17,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from kalux.events import EventArray
-from kalux.readers import evt
+from kalux.readers import evt, evt3_packets
 from kalux.readers.evt import BACKWARDS_US, rows_as_events
 from kalux.readers.source import TriggerArray
 from kalux.readers.streams import rechunk
@@ -27,7 +27,6 @@ EVENT_PACKETS: Final = ("event_camera_msgs/EventPacket", "event_array_msgs/Event
 
 _RECORD: Final = 13  # bytes of an event of an EventArray in ROS 1: x, y, secs, nsecs, polarity
 _CDR_RECORD: Final = 16  # ... in ROS 2, aligned; the last one is 13
-_JOINED_WORDS: Final = 1 << 16
 
 
 @cache
@@ -201,9 +200,10 @@ def _decode_array(data, count, cdr, out):  # type: ignore[no-untyped-def]
 
 @dataclass(frozen=True)
 class _Packet:
-    """``stamp`` and ``time_base`` in ns."""
+    """``stamp`` and ``time_base`` in ns; ``number`` counts the packets that were sent."""
 
     stamp: int
+    number: int
     size: tuple[int, int]
     time_base: int
     encoding: str
@@ -216,12 +216,12 @@ class _Packet:
 
 def _packet(message: Message) -> _Packet:
     stamp = message.stamp()
-    height, width, _, time_base = message.numbers("IIQQ")
+    height, width, number, time_base = message.numbers("IIQQ")
     encoding = message.text()
     if message.number("B"):
         raise ValueError("its events are big-endian, which is not supported")
     start, length = message.sequence()
-    return _Packet(stamp, (height, width), time_base, encoding, message.data[start : start + length])
+    return _Packet(stamp, number, (height, width), time_base, encoding, message.data[start : start + length])
 
 
 def _open_packets(messages: Messages) -> EventTopic:
@@ -249,47 +249,20 @@ def _open_packets(messages: Messages) -> EventTopic:
     return EventTopic(first.size, events, lambda: sum(len(chunk) for chunk in events()))
 
 
-def _open_evt3(size: tuple[int, int], packets: Callable[[], Iterator[_Packet]]) -> EventTopic:
-    def words() -> Iterator[NDArray[Any]]:
-        # Joined: drivers send packets of a few hundred events, each a call of a compiled loop.
-        held: list[NDArray[Any]] = []
-        count = 0
-        for packet in packets():
-            held.append(packet.words("<u2"))
-            count += len(held[-1])
-            if count >= _JOINED_WORDS:
-                yield np.concatenate(held)
-                held, count = [], 0
-        if held:
-            yield np.concatenate(held)
+def _open_evt3(size: tuple[int, int], messages: Callable[[], Iterator[_Packet]]) -> EventTopic:
+    def packets() -> Iterator[evt3_packets.Packet]:
+        for packet in messages():
+            yield evt3_packets.Packet(packet.number, packet.stamp // 1000, packet.words("<u2"))
 
-    offset = _evt3_offset(size, packets())
+    offset = evt3_packets.time_offset(packets())
 
     def events() -> Iterator[EventArray]:
-        for chunk in evt.decode_events(evt.EVT3, words(), size):
-            chunk["t"] += offset
-            yield chunk
+        return evt3_packets.decode_events(packets(), size, offset)
 
     def triggers() -> Iterator[TriggerArray]:
-        for chunk in evt.decode_triggers(evt.EVT3, words(), size):
-            chunk["t"] += offset
-            yield chunk
+        return evt3_packets.decode_triggers(packets(), size, offset)
 
     return EventTopic(size, events, lambda: sum(len(chunk) for chunk in events()), triggers)
-
-
-def _evt3_offset(size: tuple[int, int], packets: Iterator[_Packet]) -> int:
-    """What makes ROS time of the sensor's time, us: the first packet's stamp is that of its first event."""
-    stamp = None
-    held: list[NDArray[Any]] = []
-    for packet in packets:
-        stamp = packet.stamp // 1000 if stamp is None else stamp
-        held.append(packet.words("<u2"))
-        found = next(evt.decode_events(evt.EVT3, held, size), None)
-        if found is not None:
-            return stamp - int(found["t"][0])
-        del held[:-1]  # a time or a row may be needed, of long ago it is not
-    return 0
 
 
 def _decoded(decode: _Decoder, packets: Iterator[_Packet], first: _Packet) -> Iterator[EventArray]:

@@ -35,6 +35,7 @@ STARTED, HIGH, _LOW, NOW, _Y, _X, _POLARITY, ERROR = range(8)
 _STATE_SIZE: Final = 8
 
 _NO_ROW: Final = 0xFFFF
+_NO_COLUMN: Final = 1 << 16
 ROOM: Final = 32  # events of one word, at most
 _TRIGGERS: Final = 4096  # room for trigger events
 BACKWARDS_US: Final = 10 << 12  # that the clock may go back: ten high times of EVT3
@@ -64,17 +65,32 @@ class Encoding:
     kernel: Callable[..., tuple[int, int, int]]
 
 
-def _new_state() -> NDArray[np.int64]:
-    """The state before the first word."""
+def new_state() -> NDArray[np.int64]:
+    """The state of a decoder before the first word."""
     state = np.zeros(_STATE_SIZE, np.int64)
     state[_Y] = _NO_ROW
     return state
+
+
+def resume(state: NDArray[np.int64], time: int) -> None:
+    """Let a decoder of EVT3 go on after words that are lost, at a TIME_HIGH of the given time, us.
+
+    Raises
+    ------
+    ClockError
+        If that is before what it has decoded.
+    """
+    state[HIGH], state[_LOW] = time >> 12 << 12, 0
+    state[_Y], state[_X] = _NO_ROW, _NO_COLUMN
+    if state[HIGH] + BACKWARDS_US < state[NOW]:
+        raise ClockError(f"the sensor's clock goes back from {state[NOW]} to {state[HIGH]} us")
 
 
 def decode_events(
     encoding: Encoding,
     blocks: Iterable[NDArray[Any]],
     sensor_size: tuple[int, int],
+    state: NDArray[np.int64] | None = None,
 ) -> Iterator[EventArray]:
     """The events of a stream of words.
 
@@ -86,6 +102,8 @@ def decode_events(
         Consecutive arrays of words, of any lengths.
     sensor_size
         (height, width), pixels. Used by EVT3 only.
+    state
+        A `new_state` that whoever makes the blocks may `resume` between two of them.
 
     Yields
     ------
@@ -98,7 +116,7 @@ def decode_events(
     """
     triggers = np.empty((_TRIGGERS, 2), np.uint64)
     out, count = _event_buffer(), 0
-    for found, _ in _run(encoding, blocks, sensor_size, triggers):
+    for found, _ in _run(encoding, blocks, sensor_size, triggers, state):
         while len(found):
             part = found[: CHUNK_EVENTS - count]
             out[count : count + len(part)] = part
@@ -112,12 +130,15 @@ def decode_events(
 
 
 def decode_triggers(
-    encoding: Encoding, blocks: Iterable[NDArray[Any]], sensor_size: tuple[int, int]
+    encoding: Encoding,
+    blocks: Iterable[NDArray[Any]],
+    sensor_size: tuple[int, int],
+    state: NDArray[np.int64] | None = None,
 ) -> Iterator[TriggerArray]:
     """The edges on the external trigger inputs in a stream of words, in bounded chunks; see `decode_events`."""
     triggers = np.empty((_TRIGGERS, 2), np.uint64)
     held: list[NDArray[np.uint64]] = []
-    for _, found in _run(encoding, blocks, sensor_size, triggers):
+    for _, found in _run(encoding, blocks, sensor_size, triggers, state):
         if len(found):
             held.append(found.copy())
         if sum(map(len, held)) >= _TRIGGERS:
@@ -132,10 +153,11 @@ def _run(
     blocks: Iterable[NDArray[Any]],
     sensor_size: tuple[int, int],
     triggers: NDArray[np.uint64],
+    state: NDArray[np.int64] | None,
 ) -> Iterator[tuple[NDArray[np.uint64], NDArray[np.uint64]]]:
     """Events and triggers of as many words as the buffers hold, which are used again and again."""
     events = np.empty((_WORK_EVENTS + ROOM, 2), np.uint64)
-    state = _new_state()
+    state = new_state() if state is None else state
     height, width = sensor_size
     position = 0
     for words in blocks:

@@ -7,6 +7,7 @@ that is not clear, the path says which: ``recording.bag?events=/dvs/events&frame
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from itertools import islice
@@ -22,6 +23,7 @@ from kalux.events import EventArray
 from kalux.frames import MOSAICS, Frame, Mosaic
 from kalux.readers import event_packet
 from kalux.readers.event_packet import EVENT_ARRAYS, EVENT_PACKETS, EventTopic, Message
+from kalux.readers.evt3_packets import RestartError
 from kalux.readers.images import in_colour, read_image
 from kalux.readers.ros_bags import BAG_MAGIC, DAMAGE, Bag, Topic, container, open_bag, parts
 from kalux.readers.source import EXPOSURE_UNKNOWN, Source, TriggerArray, reading
@@ -231,8 +233,14 @@ def _open_images(path: Path, bag: Bag, topic: Topic) -> _Images | None:
     return _Images(topic, (height, width), None, bool(found.order), found.mosaic)
 
 
-def _decoding(path: Path, topic: Topic) -> Any:
-    return reading(Path(f"{path}: topic {topic.name!r}"), *DAMAGE)
+@contextmanager
+def _decoding(path: Path, topic: Topic) -> Iterator[None]:
+    where = Path(f"{path}: topic {topic.name!r}")
+    with reading(where, *DAMAGE):
+        try:
+            yield
+        except RestartError as error:  # no damage, and no other copy is better
+            raise FormatError(f"{where}: {error}") from error
 
 
 def _unknown_encoding(path: Path, topic: Topic, encoding: str) -> FormatError:
