@@ -413,21 +413,52 @@ def test_unknown_encodings_are_refused_but_events_can_be_had(tmp_path):
     assert np.array_equal(all_events(source), shifted(small_events()))
 
 
-def test_compressed_images_in_colour(tmp_path):
-    """The first may be black, and is in colour like the others."""
+@pytest.mark.parametrize(
+    ("form", "red_first"),
+    [
+        ("png", False),
+        ("", False),
+        ("rgb8; png compressed bgr8", False),
+        ("rgb8; png compressed", False),
+        ("rgb8; png compressed rgb8", True),
+        ("bgr8; png compressed rgb8", True),
+    ],
+)
+def test_compressed_images_in_colour(tmp_path, form, red_first):
+    """The first may be black, and is in colour like the others. OpenCV writes red and blue as it gets them."""
     path = tmp_path / "recording.bag"
     frames = colour_frames()
     frames[0] = dataclasses.replace(frames[0], image=np.zeros_like(frames[0].image))
     messages = []
     for frame in frames:
-        png = cv2.imencode(".png", frame.image[..., ::-1])[1].tobytes()
-        data = bytes(Body(False).header(EPOCH + 1000 * frame.middle).text("png").blob(png).data)
+        png = cv2.imencode(".png", frame.image if red_first else frame.image[..., ::-1])[1].tobytes()
+        data = bytes(Body(False).header(EPOCH + 1000 * frame.middle).text(form).blob(png).data)
         messages.append(
             (EPOCH + 1000 * frame.middle, "/c/compressed", "sensor_msgs/msg/CompressedImage", data)
         )
     write_bag1(path, messages)
     for found, frame in zip(readers.read(path).frames(), frames, strict=True):
         assert np.array_equal(found.image, frame.image)
+
+
+@pytest.mark.parametrize(
+    ("form", "mosaic"),
+    [
+        ("bayer_rggb8; png compressed ", "RGGB"),
+        ("bayer_gbrg16; png compressed", "GBRG"),
+        ("mono8; png compressed ", None),
+        ("png", None),
+    ],
+)
+def test_compressed_mosaics_say_their_pattern(tmp_path, form, mosaic):
+    path = tmp_path / "recording.bag"
+    picture = small_frames()[0].image.astype(np.uint16 if "16" in form else np.uint8)
+    png = cv2.imencode(".png", picture)[1].tobytes()
+    data = bytes(Body(False).header(EPOCH).text(form).blob(png).data)
+    write_bag1(path, [(EPOCH, "/c/compressed", "sensor_msgs/msg/CompressedImage", data)])
+    recording = kalux.open(path)
+    assert recording.mosaic == mosaic
+    assert np.array_equal(next(iter(recording.stamped_frames())).image, picture)
 
 
 def test_drawings_of_events_alone_are_no_frames_unless_asked_for(tmp_path):

@@ -218,12 +218,13 @@ def _open_images(path: Path, bag: Bag, topic: Topic) -> _Images | None:
         return None
     with _decoding(path, topic):
         if topic.kind == _COMPRESSED:
+            compressed = _compressed(message)
             try:
                 colour = _compressed_in_colour(path, bag, topic)
-                size = _compressed_image(path, topic, message, colour)[1].shape
+                size = _compressed_image(path, topic, compressed, colour).shape
             except FormatError as fault:
                 return _Images(topic, (0, 0), fault)
-            return _Images(topic, (size[0], size[1]), None, colour)
+            return _Images(topic, (size[0], size[1]), None, colour, compressed.mosaic)
         message.stamp()
         height, width = message.numbers("II")
         encoding = message.text()
@@ -256,7 +257,8 @@ def _unknown_encoding(path: Path, topic: Topic, encoding: str) -> FormatError:
 def _image(path: Path, topic: Topic, message: Message, colour: bool) -> tuple[int, NDArray[Any]]:
     """(stamp in us, image)."""
     if topic.kind == _COMPRESSED:
-        return _compressed_image(path, topic, message, colour)
+        compressed = _compressed(message)
+        return compressed.stamp, _compressed_image(path, topic, compressed, colour)
     stamp = message.stamp() // 1000
     height, width = message.numbers("II")
     encoding = message.text()
@@ -279,23 +281,42 @@ def _image(path: Path, topic: Topic, message: Message, colour: bool) -> tuple[in
     return stamp, pixels
 
 
-def _compressed(message: Message) -> tuple[int, bytes]:
-    """(stamp in us, file)."""
+class _Compressed(NamedTuple):
+    """``stamp`` in us; ``data``, a file; ``red_first``: whether it has red where its format has blue."""
+
+    stamp: int
+    data: bytes
+    mosaic: Mosaic | None
+    red_first: bool
+
+
+def _compressed(message: Message) -> _Compressed:
+    """An image of compressed_image_transport, whose format is as "rgb8; png compressed bgr8", or of others: "jpeg".
+
+    The first part is what the image was, the last the order in which its channels were given to OpenCV, which takes
+    blue to be first.
+    """
     stamp = message.stamp() // 1000
-    message.text()  # what the data say better
+    original, _, codec = message.text().partition(";")
     start, length = message.sequence()
-    return stamp, message.data[start : start + length]
+    found = _ENCODINGS.get(original.strip())
+    return _Compressed(
+        stamp,
+        message.data[start : start + length],
+        None if found is None else found.mosaic,
+        "compressed rgb" in codec,
+    )
 
 
 def _compressed_in_colour(path: Path, bag: Bag, topic: Topic) -> bool:
     """Whether any of the first images is in colour: one alone may be black."""
-    first = [_compressed(message)[1] for message in islice(_messages(bag, topic), _FIRST_IMAGES)]
+    first = [_compressed(message).data for message in islice(_messages(bag, topic), _FIRST_IMAGES)]
     return in_colour(path, first, lambda data: (topic.name, data))
 
 
-def _compressed_image(path: Path, topic: Topic, message: Message, colour: bool) -> tuple[int, NDArray[Any]]:
-    stamp, data = _compressed(message)
-    return stamp, read_image(path, topic.name, data, colour=colour)
+def _compressed_image(path: Path, topic: Topic, compressed: _Compressed, colour: bool) -> NDArray[Any]:
+    image = read_image(path, topic.name, compressed.data, colour=colour)
+    return np.ascontiguousarray(image[..., ::-1]) if colour and compressed.red_first else image
 
 
 # Exposure times
