@@ -259,6 +259,9 @@ def test_integers_of_any_type_are_read(path, name, change):
     [
         ("events/t", lambda t: t * 1e-6, "events/t is float64; int64 is needed, in whole microseconds"),
         ("events/p", lambda p: p.astype(np.float32), "events/p is float32; bool is needed"),
+        ("events/p", lambda p: p.astype(np.uint8) * 255, "events/p has values from 0 to 255; 0 and 1, or -1"),
+        ("events/p", lambda p: p.astype(np.int8) + 1, "events/p has values from 1 to 2; 0 and 1, or -1"),
+        ("events/p", lambda p: p.astype(np.int16) - 2, "events/p has values from -2 to -1; 0 and 1, or -1"),
         ("events/x", lambda x: x.astype(np.int32) + 65536, "values from 65536 .*; uint16 is needed"),
         ("events/y", lambda y: y.astype(np.int16) - 1, "values from -1 .*; uint16 is needed"),
         (

@@ -357,6 +357,29 @@ def test_seconds_since_1970_in_single_precision_are_refused(tmp_path, layout, co
         all_events(readers.read(path))
 
 
+@pytest.mark.parametrize(
+    ("layout", "column"),
+    [("hqf", "events/ts"), ("mvsec", "davis/left/events"), ("mvsec", "davis/left/image_raw_ts")],
+)
+def test_whole_numbers_are_no_seconds(tmp_path, layout, column):
+    """Microseconds, as other programs write them, would be a million times as long."""
+    path = write(tmp_path, layout)
+    with h5py.File(path, "r+") as file:
+        values = file[column][...] * 1e6
+        del file[column]
+        file[column] = values.astype(np.int64)
+    with pytest.raises(FormatError, match=f"{path.name}: its times are int64.* floating-point seconds"):
+        readers.read(path)
+
+
+def test_whole_numbers_are_no_seconds_of_an_image(tmp_path):
+    path = write(tmp_path, "hqf")
+    with h5py.File(path, "r+") as file:
+        file["images/image000000001"].attrs["timestamp"] = 20_000
+    with pytest.raises(FormatError, match=f"{path.name}: its times are int64.* floating-point seconds"):
+        readers.read(path)
+
+
 class TestHqf:
     @pytest.mark.parametrize("stated", [(30, 40), (40, 30)])
     def test_the_resolution_in_either_order(self, tmp_path, stated):

@@ -129,7 +129,11 @@ def _as_stated(path: Path, name: str, values: NDArray[Any]) -> NDArray[Any]:
     if values.dtype == wanted:
         return values
     if name == "p":
-        return values > 0  # 0 and 1, or -1 and 1
+        if values.dtype.kind != "b" and len(values) and not -1 <= int(values.min()) <= int(values.max()) <= 1:
+            raise FormatError(
+                f"{path}: events/p has values from {values.min()} to {values.max()}; 0 and 1, or -1 and 1, are needed"
+            )
+        return values > 0
     limits = np.iinfo(wanted)
     if len(values) and not limits.min <= int(values.min()) <= int(values.max()) <= limits.max:
         raise FormatError(

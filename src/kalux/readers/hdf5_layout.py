@@ -160,14 +160,30 @@ def checked_events(path: Path, t: Any, x: Any, y: Any, p: Any) -> EventArray:
         raise FormatError(f"{path}: {str(error).removeprefix('events: ')}") from error
 
 
+def check_seconds(path: Path, dtype: np.dtype[Any]) -> None:
+    """Require times in seconds, with decimals.
+
+    Raises
+    ------
+    FormatError
+        If they are whole numbers, which other programs write in other units.
+    """
+    if dtype.kind != "f":
+        raise FormatError(
+            f"{path}: its times are {dtype}, but this layout has floating-point seconds; divide microseconds by 1e6 and "
+            "write it again"
+        )
+
+
 def microseconds(path: Path, seconds: NDArray[Any]) -> NDArray[np.int64]:
     """Floating-point seconds to the nearest microsecond.
 
     Raises
     ------
     FormatError
-        If one is not finite, or too large, or too large for its precision.
+        If they are whole numbers, or one is not finite, or too large, or too large for its precision.
     """
+    check_seconds(path, seconds.dtype)
     scaled = np.rint(np.asarray(seconds, np.float64) * 1e6)
     # Also refuses NaN, of which no comparison is true.
     if scaled.size and not (np.abs(scaled).max() < 2.0**62):
@@ -178,9 +194,7 @@ def microseconds(path: Path, seconds: NDArray[Any]) -> NDArray[np.int64]:
 
 def refuse_coarse(path: Path, seconds: NDArray[Any]) -> None:
     """As `kalux.events.check_precision`; what is wrong is a FormatError that names the file."""
-    if (
-        seconds.dtype.kind != "f" or seconds.dtype.itemsize > 4
-    ):  # in double precision all possible times are fine
+    if seconds.dtype.itemsize > 4:  # in double precision all possible times are fine
         return
     try:
         check_precision(seconds, 1e6)

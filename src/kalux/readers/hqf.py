@@ -43,6 +43,7 @@ def read(path: Path) -> Source:
     """
     with hdf5_layout.opened(path) as file:
         count = hdf5_layout.common_length(path, file, _COLUMNS)
+        hdf5_layout.check_seconds(path, file[_COLUMNS[0]].dtype)
         names = sorted(file["images"]) if "images" in file else []
         stamps = [_stamp(path, file["images"][name]) for name in names]
         size = hdf5_layout.size_of(path, file["images"][names[0]].shape) if names else None
@@ -68,9 +69,7 @@ def read(path: Path) -> Source:
 
 
 def _stamp(path: Path, image: Any) -> int:
-    return int(
-        hdf5_layout.microseconds(path, np.array([image.attrs["timestamp"]], np.float64).ravel()[:1])[0]
-    )
+    return int(hdf5_layout.microseconds(path, np.array([image.attrs["timestamp"]]).ravel()[:1])[0])
 
 
 def _without_images(needed: tuple[int, int], stated: list[int]) -> tuple[int, int]:

@@ -49,6 +49,7 @@ def read(path: Path) -> Source:
             raise FormatError(
                 f"{path}: {_EVENTS} has the shape {events.shape}; (N, 4) numbers x, y, t, p are needed"
             )
+        hdf5_layout.check_seconds(path, events.dtype)
         hdf5_layout.check_dataset(path, events)
         count = int(events.shape[0])
         stack = hdf5_layout.find_stack(path, file, _IMAGES, _STAMPS, partial(hdf5_layout.microseconds, path))
