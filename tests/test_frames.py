@@ -49,6 +49,14 @@ def test_times_of_any_type_are_kept_as_int(kind):
         check_frame(frame(kind(100), kind(50)), (3, 4))
 
 
+@pytest.mark.parametrize("kind", [np.uint8, np.float32])
+def test_values_of_any_type_are_kept_as_float(kind):
+    """A gain of `numpy.uint8` could not be multiplied by an exposure."""
+    one = Frame(np.full((3, 4), 21, np.uint8), 0, 10_000, kind(101), black=kind(1), gain=kind(2))
+    assert [type(value) for value in (one.white, one.black, one.gain, one.full_scale)] == [float] * 4
+    assert (one.amplified_exposure, one.normalised()[0, 0]) == (20_000.0, 0.2)
+
+
 def test_an_exposure_that_is_amplified():
     one = Frame(np.ones((3, 4), np.uint8), 100, 300, gain=1.5)
     assert one.amplified_exposure == 300.0

@@ -168,6 +168,18 @@ def test_exposures_given(stamped, stamp, start):
     assert {frame.exposure for frame in rec.frames()} == {1_000}
 
 
+@pytest.mark.parametrize("kind", [np.int32, np.uint16, np.uint64, np.float32])
+def test_an_exposure_of_any_type_is_given(stamped, kind):
+    """Times since 1970 are beyond `numpy.int32`; the other types have no negative numbers, or are not exact."""
+    epoch = 1_600_000_000_000_000
+    frames = [Frame(f.image, epoch + f.exposure_start, epoch + f.exposure_start) for f in small_frames()]
+    source = dataclasses.replace(readers.read(stamped), frames=lambda: iter(frames))
+    placed = list(Recording(source, exposure=kind(1_001), stamp="middle").frames())
+    assert [f.exposure_start for f in placed] == [f.exposure_start - 500 for f in frames]
+    assert [type(f.exposure) for f in placed] == [int] * 4
+    assert {f.exposure for f in placed} == {1_001}
+
+
 def test_impossible_exposures_are_refused(stamped):
     for exposure in (0, 0.5, np.nan, np.inf, "10 ms"):
         with pytest.raises(ExposureError, match="must be positive and whole"):

@@ -71,6 +71,11 @@ class Frame:
             time = getattr(self, name)
             if _is_whole(time):
                 object.__setattr__(self, name, int(time))
+        # So would products with those of these, or they would be less exact (`float32`).
+        for name in ("white", "black", "gain"):
+            value = getattr(self, name)
+            if isinstance(value, np.generic) and isinstance(value, Real):
+                object.__setattr__(self, name, float(value))
 
     def __repr__(self) -> str:
         image = self.image

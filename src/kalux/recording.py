@@ -361,7 +361,7 @@ class Recording:
         self.sensor_size = source.sensor_size
         self.exposure_known = source.exposure_known or exposure is not None
         self.white = white
-        self._exposure = exposure
+        self._exposure = None if exposure is None else int(exposure)  # NumPy's integers would wrap around
         self._stamp: Stamp = stamp
         self._longest: int | None = None
         self._black_level: float | None = None

@@ -273,6 +273,20 @@ class TestVideo:
         for _ in range(2):
             assert same_frames(rec.frames(), expected)
 
+    def test_start_and_rate_of_any_type(self, events_only, tmp_path):
+        """Times beyond `numpy.int32`, and to the microsecond where `numpy.float32` has some thousands of them."""
+        video = write_video(tmp_path / "v.mkv", self.images)
+        for start, rate in ((np.int32(2**31 - 1), 0.001), (np.uint32(2**32 - 1), np.float32(0.25))):
+            rec = kalux.open(events_only, frames=video, frames_start=start, frames_rate=rate)
+            stamps = [frame.exposure_start for frame in rec.stamped_frames()]
+            assert stamps == [int(start) + round(k * 1e6 / float(rate)) for k in range(6)]
+
+    def test_a_start_between_microseconds(self, events_only, tmp_path):
+        video = write_video(tmp_path / "v.mkv", self.images)
+        for start in (0.5, float("nan")):
+            with pytest.raises(InputError, match=r"the first frame is at .* us; whole microseconds"):
+                kalux.open(events_only, frames=video, frames_start=start, frames_rate=30)
+
     def test_more_than_8_bits(self, events_only, tmp_path):
         images = [image.astype(np.uint16) * 257 for image in self.images]
         video = write_video(tmp_path / "v.mkv", images, pixels="gray16le")

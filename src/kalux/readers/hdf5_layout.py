@@ -170,8 +170,8 @@ def check_seconds(path: Path, dtype: np.dtype[Any]) -> None:
     """
     if dtype.kind != "f":
         raise FormatError(
-            f"{path}: its times are {dtype}, but this layout has floating-point seconds; divide microseconds by 1e6 and "
-            "write it again"
+            f"{path}: its times are {dtype}, but this layout has floating-point seconds; divide microseconds by 1e6 "
+            "and write it again"
         )
 
 

@@ -197,6 +197,9 @@ def _video(path: Path, start: int | None, rate_hz: float | None) -> Source:
         )
     if not 0 < rate_hz < 1e6:  # also refuses NaN
         raise InputError(f"{path}: the rate of the frames is {rate_hz} Hz; it must be between 0 and 1 MHz")
+    if not float(start).is_integer():
+        raise InputError(f"{path}: the first frame is at {start} us; whole microseconds are needed")
+    start, rate_hz = int(start), float(rate_hz)  # NumPy's would wrap around, or be less exact
     beginning = list(islice(_pictures(path, colour=True), _FIRST_PICTURES))
     colour = any(map(_has_colour, beginning))
     first = next(iter(beginning), None)
