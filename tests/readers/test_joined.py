@@ -257,6 +257,18 @@ def write_video(path, images, *, codec="ffv1", pixels="gray", rate=25, transfer=
     return path
 
 
+def write_h264(path, images, reordered, **options):
+    """One key frame, and up to so many pictures in a row that are stored after later ones."""
+    with av.open(str(path), "w", options=options) as container:
+        stream = container.add_stream("libx264", 30)
+        stream.height, stream.width, stream.pix_fmt = *SIZE, "yuv420p"
+        stream.options = {"g": "100", "bf": str(reordered)}
+        for image in images:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="gray")))
+        container.mux(stream.encode())
+    return path
+
+
 class TestVideo:
     images = tuple(frame.image for frame in small_frames(6))
 
@@ -286,6 +298,39 @@ class TestVideo:
         for start in (0.5, float("nan")):
             with pytest.raises(InputError, match=r"the first frame is at .* us; whole microseconds"):
                 kalux.open(events_only, frames=video, frames_start=start, frames_rate=30)
+
+    @pytest.mark.parametrize("reordered", [0, 3])
+    def test_trimmed_without_encoding_anew(self, events_only, tmp_path, reordered):
+        """As ffmpeg -c copy does: pictures before the cut stay in the file, and its edit list hides them."""
+        levels = [np.full(SIZE, 8 * k, np.uint8) for k in range(30)]
+        whole = write_h264(tmp_path / "whole.mp4", levels, reordered)
+        with av.open(str(whole)) as source, av.open(str(tmp_path / "v.mp4"), "w") as target:
+            stream = target.add_stream_from_template(source.streams.video[0])
+            for packet in source.demux(source.streams.video[0]):
+                if packet.dts is not None:
+                    packet.pts -= round(10 / 30 / packet.time_base)
+                    packet.dts -= round(10 / 30 / packet.time_base)
+                    packet.stream = stream
+                    target.mux(packet)
+        rec = kalux.open(events_only, frames=tmp_path / "v.mp4", frames_start=0, frames_rate=30)
+        means = [frame.image.mean() for frame in rec.stamped_frames()]
+        assert means == pytest.approx([8 * k for k in range(10, 30)], abs=3)
+
+    @pytest.mark.parametrize("share", [0.5, 0.9, 0.999])
+    def test_an_mp4_cut_short_is_refused(self, events_only, tmp_path, share):
+        video = write_h264(tmp_path / "v.mp4", [f.image for f in small_frames(30)], 0, movflags="faststart")
+        data = video.read_bytes()
+        video.write_bytes(data[: int(share * len(data))])
+        with pytest.raises(FormatError, match=r"v\.mp4"):
+            list(kalux.open(events_only, frames=video, frames_start=0, frames_rate=30).stamped_frames())
+
+    @pytest.mark.parametrize("share", [0.5, 0.9])
+    def test_an_avi_cut_short_is_refused(self, events_only, tmp_path, share):
+        video = write_h264(tmp_path / "v.avi", [f.image for f in small_frames(30)], 0)
+        data = video.read_bytes()
+        video.write_bytes(data[: int(share * len(data))])
+        with pytest.raises(FormatError, match=r"v\.avi"):
+            list(kalux.open(events_only, frames=video, frames_start=0, frames_rate=30).stamped_frames())
 
     def test_more_than_8_bits(self, events_only, tmp_path):
         images = [image.astype(np.uint16) * 257 for image in self.images]

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from functools import cache
 from itertools import islice
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,9 @@ from kalux.readers.images import files_in_colour, load_image
 from kalux.readers.source import EXPOSURE_UNKNOWN, SIZE_NOT_STATED, Source, reading, smallest_size
 from kalux.readers.videos import opened_video
 from kalux.wording import how_many
+
+if TYPE_CHECKING:
+    from av.container import InputContainer
 
 _LISTS: Final = ("frames.csv", "timestamps.csv", "images.txt")
 _LARGEST_LIST: Final = 1 << 27  # bytes; it is read as a whole
@@ -271,7 +274,17 @@ def _pictures(path: Path, *, colour: bool) -> Iterator[NDArray[Any]]:
                 wanted = "gray16le" if deep else "gray"
             yield np.ascontiguousarray(picture.to_ndarray(format=wanted))
             count += 1
-        if count < stream.frames:
-            raise FormatError(
-                f"{path}: holds {count} of {stream.frames} pictures; copy it again, or encode it anew"
-            )
+        stated = _stated_count(container)
+        if count < stated:
+            raise FormatError(f"{path}: holds {count} of {stated} pictures; copy it again, or encode it anew")
+
+
+def _stated_count(container: InputContainer) -> int:
+    """How many pictures a video says that it shows; 0: it does not say.
+
+    MP4 and MOV that were trimmed without encoding anew hold more than their edit list shows.
+    """
+    stream = container.streams.video[0]
+    if stream.frames and "mp4" in container.format.name.split(","):
+        return sum(not entry.is_discard for entry in stream.index_entries)
+    return stream.frames
