@@ -224,9 +224,23 @@ def test_chunks_are_full_but_the_last(path):
     assert [len(chunk) for chunk in source.events()] == [CHUNK_EVENTS, 10]
 
 
+@pytest.mark.parametrize("encoding", ["latin-1", "utf-8", "gbk"])
+@pytest.mark.parametrize("before", [True, False])
+def test_a_header_may_have_letters_of_any_encoding(path, encoding, before):
+    """Java writes the names of users and folders in the computer's own."""
+    lines = header().splitlines(keepends=True)
+    name = "张伟" if encoding == "gbk" else "Müller"
+    lines.insert(1 if before else len(lines), f"# User name: {name}\r\n".encode(encoding))
+    events = small_events()
+    assert np.array_equal(all_events(write(path, event_words(events), head=b"".join(lines))), events)
+
+
 def test_an_event_may_begin_with_the_byte_of_a_header_line(path):
     first = words([0x23 << 24 | 9 << 12, 0x23 << 24 | 0x0A << 12], [5, 10])
     assert len(all_events(write(path, first))) == 2
+    # Of other bytes, too, that are no text but end as a line.
+    first = words([0x2320E90A], [0x0D0A0D0A])
+    assert len(all_events(write(path, first))) == 1
 
 
 @pytest.mark.parametrize(

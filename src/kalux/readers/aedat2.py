@@ -188,10 +188,11 @@ def _header(path: Path) -> _Header:
         while end < _LARGEST_HEADER:
             line = file.readline(_LONGEST_LINE)
             # Events may begin with the byte of a '#', too, but are not text.
-            if not line.startswith(b"#") or not line.endswith(b"\n") or not _is_text(line):
+            line_text = _text(line)
+            if not line.startswith(b"#") or not line.endswith(b"\n") or line_text is None:
                 break
             end += len(line)
-            text = line.decode("utf-8").strip("# \r\n\t")
+            text = line_text.strip("# ")
             if text.lower().startswith("aechip:"):
                 chip = text.partition(":")[2].strip().rpartition(".")[2]
             elif shutter := re.search(
@@ -203,11 +204,20 @@ def _header(path: Path) -> _Header:
     return _Header(chip, _rolling(chip, shutters), end)
 
 
-def _is_text(line: bytes) -> bool:
+def _text(line: bytes) -> str | None:
+    """A line as text; None if it is none.
+
+    Java writes the names of users and files in the computer's own encoding. Their letters mean nothing here, but what
+    is around them is text, which no event of so many bytes is likely to be.
+    """
     try:
-        return line.decode("utf-8").strip("\r\n").replace("\t", " ").isprintable()
+        text = line.decode("utf-8")
     except UnicodeDecodeError:
-        return False
+        if not line.startswith(b"# ") or len(line) <= _WORD.itemsize:
+            return None
+        text = line.decode("ascii", "replace")
+    text = text.strip("\r\n").replace("\t", " ")
+    return text if text.isprintable() else None
 
 
 def _rolling(chip: str, shutters: dict[str, bool]) -> bool | None:
