@@ -168,6 +168,12 @@ def test_lines_of_events_txt_need_no_names(path, header):
         all_events(readers.read(path))
 
 
+@pytest.mark.parametrize(("first", "t"), [("8.3e-05", 83), ("8e-05", 80), ("1.25E-4", 125)])
+def test_the_first_time_of_v2e_may_be_a_power_of_ten(path, first, t):
+    path.write_text(f"#!events.txt\n{first} 2 3 1\n0.2500005 4 5 0\n")
+    assert all_events(readers.read(path)).tolist() == [(t, 2, 3, True), (250_001, 4, 5, False)]
+
+
 def test_numbers_without_names_are_refused_with_a_hint(path):
     with pytest.raises(FormatError, match="put a line such as 't_us,x,y,p'"):
         parse(path, "1,2,3,1\n5,2,3,1\n")

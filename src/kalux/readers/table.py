@@ -44,8 +44,9 @@ from kalux.readers.source import (
 
 _MOST_COLUMNS: Final = 64
 _NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
-_IJRR_LINE: Final = re.compile(r"\s*\d+\.\d+\s+\d+\s+\d+\s+[01]\s*")
-"""Seconds with decimals, x, y, and polarity, which nothing else is likely to be."""
+_IJRR_LINE: Final = re.compile(r"\s*(\d+\.\d+|\d+(\.\d+)?[eE]-\d+)\s+\d+\s+\d+\s+[01]\s*")
+"""Seconds with decimals, or as Python prints small ones (8.3e-05), x, y, and polarity, which nothing else is likely to
+be."""
 _IJRR_ASSUMED: Final = (
     "The columns have no names; they are taken as t (s), x, y, p, as events.txt of IJRR has them."
 )
