@@ -150,15 +150,16 @@ def write_db3(path, messages, compression=None):
             writer.write(connections[topic, kind], time, data)
 
 
-def write_mcap(path, messages, compression=None, chunks=True):
+def write_mcap(path, messages, compression=None, chunks=True, encoding="cdr"):
     with path.open("wb") as file:
         writer = mcap_writer.Writer(file, chunk_size=20_000, use_chunking=chunks)
-        writer.start(profile="ros2")
+        writer.start(profile="ros1" if encoding == "ros1" else "ros2")
         channels = {}
         for time, topic, kind, data in messages:
             if (topic, kind) not in channels:
-                schema = writer.register_schema(kind, "ros2msg", b"")
-                channels[topic, kind] = writer.register_channel(topic, "cdr", schema)
+                kind_there = kind.replace("/msg/", "/") if encoding == "ros1" else kind
+                schema = writer.register_schema(kind_there, f"{encoding}msg", b"")
+                channels[topic, kind] = writer.register_channel(topic, encoding, schema)
             writer.add_message(channels[topic, kind], log_time=time, publish_time=time, data=data)
         writer.finish()
 
@@ -237,6 +238,22 @@ def test_mcap_is_not_loaded_as_a_whole(tmp_path, chunks):
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 20e6  # frames held back to order them included
+
+
+def test_an_mcap_that_was_made_of_a_ros_1_bag_is_read(tmp_path):
+    """As 'mcap convert' makes it: with the messages of the bag."""
+    path = tmp_path / "recording.mcap"
+    write_mcap(path, davis_messages(False), encoding="ros1")
+    source = readers.read(path)
+    assert np.array_equal(all_events(source), shifted(small_events()))
+    assert same_frames(source.frames(), shifted_frames(small_frames()))
+
+
+def test_an_mcap_with_messages_of_others_than_ros_is_refused(tmp_path):
+    path = tmp_path / "recording.mcap"
+    write_mcap(path, davis_messages(False), encoding="protobuf")
+    with pytest.raises(FormatError, match="neither events nor images, but no topics of ROS messages"):
+        readers.read(path)
 
 
 def test_files_compressed_as_a_whole_are_refused(tmp_path):

@@ -177,7 +177,7 @@ def _rosbags() -> Any:
 
 @dataclass(frozen=True)
 class _Mcap:
-    """An MCAP file with ROS 2 messages."""
+    """An MCAP file with messages of ROS 2, or of ROS 1 where it was made of a bag."""
 
     path: Path
 
@@ -196,8 +196,8 @@ class _Mcap:
         found = set()
         for channel in summary.channels.values():
             schema = summary.schemas.get(channel.schema_id)
-            if schema is not None and channel.message_encoding == "cdr":
-                found.add(Topic(channel.topic, _kind(schema.name), True))
+            if schema is not None and channel.message_encoding in ("cdr", "ros1"):
+                found.add(Topic(channel.topic, _kind(schema.name), channel.message_encoding == "cdr"))
         return tuple(sorted(found))
 
     def records(self, topic: Topic) -> Iterator[Record]:

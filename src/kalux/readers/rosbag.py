@@ -161,7 +161,7 @@ def _choose(path: Path, bag: Bag, chosen: dict[str, str]) -> tuple[_Events | Non
         if chosen.get(name) and not found:
             raise InputError(f"{path}: topic {chosen[name]!r} has no {name} that kalux reads")
     if not event_topics and not image_topics:
-        held = ", ".join(sorted({topic.kind for topic in bag.topics})) or "no topics"
+        held = ", ".join(sorted({topic.kind for topic in bag.topics})) or "no topics of ROS messages"
         raise FormatError(f"{path}: holds neither events nor images, but {held[:200]}")
     # Images that cannot be read, such as coloured drawings of the events, do not stand in the way of others.
     readable = [images for images in image_topics if images.fault is None]
