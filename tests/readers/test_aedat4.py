@@ -250,11 +250,11 @@ def test_frames_of_another_camera_are_not_read(path):
 
 def test_streams_that_were_renamed_are_paired_by_their_size(path):
     """Modules of DV that filter events or undistort frames may give their output a name of its own."""
-    path.write_bytes(file_of([("TRIG", LEFT), ("EVTS", "dvsnoisefilter"), ("FRME", LEFT)]))
+    path.write_bytes(file_of([("TRIG", LEFT), ("EVTS", "dvsnoisefilter_1"), ("FRME", LEFT)]))
     source = readers.read(path)
     assert contents(source) == [1, 2, 0]
     assert source.missing == (
-        "The events are of the source 'dvsnoisefilter', the frames of 'DAVIS346_00000001'; they are taken for one "
+        "The events are of the source 'dvsnoisefilter_1', the frames of 'DAVIS346_00000001'; they are taken for one "
         "camera's.",
     )
 

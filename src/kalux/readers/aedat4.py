@@ -102,8 +102,9 @@ class _Container:
 
 _CHUNK_BYTES: Final = CHUNK_EVENTS * EVENT_DTYPE.itemsize
 _NAMES: Final = {"EVTS": "event", "FRME": "frame", "TRIG": "trigger"}
-# The sources of iniVation's cameras: model and serial number, as DAVIS346_00000391 and DVXplorer_DXB00010.
-_SERIAL: Final = re.compile(r"(DAVIS|DVX|DVS|EDVS)\w*?_[A-Z]{0,3}\d+", re.IGNORECASE)
+# The sources of iniVation's cameras: model and serial number, as DAVIS346_00000391 and DVXplorer_DXB00010. Modules have
+# names like dvsnoisefilter_1.
+_SERIAL: Final = re.compile(r"(DAVIS|DVS|DVXplorer)\w*_[A-Z]*\d{4,}")
 _SHOWN: Final = 40  # letters of a name, in a sentence
 _POLARITY: Final = EVENT_DTYPE.fields["p"][1]  # type: ignore[index]
 # Numbers of dv::TriggerType for edges of the external input; others are of the generator and of the sensor itself.
