@@ -9,8 +9,11 @@ import numpy as np
 import pytest
 
 import kalux
+from kalux.evaluation.baselines import methods
+from kalux.evaluation.held_out import evaluate_held_out, hold_out_frames
+from kalux.evaluation.specs import outside_method
 from kalux.frames import GroundTruth
-from kalux.writers import hdf5
+from kalux.writers import hdf5, open_writer
 
 from builders import moving_blocks
 
@@ -66,6 +69,21 @@ def test_the_examples_of_outputs_run(demonstration, tmp_path):
         exec(code, names)
     assert len(list(tmp_path.glob("uncertainty_*.png"))) == len(demonstration.frames)
     assert names["sheet"].ndim == 3
+
+
+def test_the_input_of_another_method_is_what_the_default_is_given(demonstration, tmp_path):
+    """Images that are made of it score as those that an evaluation makes."""
+    exec(blocks((ROOT / "docs" / "baselines.md").read_text(encoding="utf-8"))[0], {})
+    kept, times = kalux.open(tmp_path / "kept.h5"), np.loadtxt(tmp_path / "times.txt", np.int64)
+    with open_writer(tmp_path / "mine", format="npy") as writer:
+        for image in kalux.reconstruct(kept, times=times):
+            writer.write(image)
+    held = hold_out_frames(kalux.open(tmp_path / "kalux-demo" / "demo.h5"))
+    default, mine = (
+        evaluate_held_out(held, method).mse
+        for method in (methods()["default"], outside_method(f"folder:{tmp_path / 'mine'}"))
+    )
+    assert mine == default
 
 
 def test_its_links_lead_somewhere():
