@@ -81,9 +81,14 @@ class Ceiling(NamedTuple):
 
 
 def find_ceiling(
-    recording: Recording, camera: CameraSettings, events: EventSettings, *, below: float = np.inf
+    recording: Recording,
+    camera: CameraSettings,
+    events: EventSettings,
+    *,
+    below: float = np.inf,
+    most_frames: int = _MAX_FRAMES,
 ) -> Ceiling | None:
-    """The level at which pixels of the first 80 frames end while their events go on.
+    """The level at which pixels of the first frames end while their events go on.
 
     Parameters
     ----------
@@ -95,6 +100,8 @@ def find_ceiling(
         With both thresholds, the delay and the refractory period.
     below
         Not looked for where the frames reach this response.
+    most_frames
+        So many frames are looked at, and the events between them.
 
     Returns None where events do not go on, or too few pixels tell, or the brightest end at different levels, or frames
     are in RGB.
@@ -104,10 +111,10 @@ def find_ceiling(
     ExposureError
         If the frames' exposures are not known.
     """
-    brightest = _brightest(recording)
+    brightest = _brightest(recording, most_frames)
     if brightest is None or brightest >= below:
         return None
-    found = [*_changes(recording, camera, events, _BELOW[0] * brightest)]
+    found = [*_changes(recording, camera, events, _BELOW[0] * brightest, most_frames)]
     if not found:
         return None
     ends, mismatches = np.concatenate(found, axis=1)
@@ -122,19 +129,19 @@ def find_ceiling(
     return Ceiling(level, 2 * level - most, excess, int(np.count_nonzero(top)))
 
 
-def _brightest(recording: Recording) -> float | None:
+def _brightest(recording: Recording, most_frames: int) -> float | None:
     """The response that a thousandth of the pixels of the first frames reach; None: frames are in RGB or all black."""
     first = next(iter(recording.frames()), None)
     if first is None or first.image.ndim == 3:
         return None
-    histogram = response_histogram(islice(recording.frames(), _MAX_FRAMES), _FINE)
+    histogram = response_histogram(islice(recording.frames(), most_frames), _FINE)
     reached = np.cumsum(histogram[::-1])[::-1] >= max(BRIGHTEST * histogram.sum(), 1)
     brightest = int(np.flatnonzero(reached)[-1]) if reached.any() else 0
     return brightest / (_FINE - 1) if brightest > 0 else None
 
 
 def _changes(
-    recording: Recording, camera: CameraSettings, events: EventSettings, least: float
+    recording: Recording, camera: CameraSettings, events: EventSettings, least: float, most_frames: int
 ) -> Iterator[Array]:
     """(2, N) of pixels that become brighter from one frame of an interval to the other, forward or backward in time.
 
@@ -142,7 +149,7 @@ def _changes(
     say that it changed, log(I + I_0).
     """
     threshold_on, threshold_off = events.thresholds
-    for interval, on, off, bend in counted_intervals(recording, camera, events, most_frames=_MAX_FRAMES):
+    for interval, on, off, bend in counted_intervals(recording, camera, events, most_frames=most_frames):
         beyond = threshold_on * on - threshold_off * off + bend - interval.change
         frames = [end.frame for end in interval.ends]
         for sign, frame in zip((-1, 1), frames, strict=True):
