@@ -239,6 +239,25 @@ def test_a_robot_sees_the_same_as_a_recording(variant, lookahead):
     assert len(images) == len(expected)
 
 
+def test_a_robot_whose_frames_stop_reads_on_and_forgets():
+    """It forgets what lies a little behind its reads, though these have gone on; memory stays as it is."""
+    live, held = engine((4, 4)), []
+    live.push_frame(frame(90, 0, 10_000, (4, 4)))
+    live.end_frames()
+    whole = engine((4, 4))
+    whole.push_frame(frame(90, 0, 10_000, (4, 4)))
+    for now in range(20_000, 400_000, 10_000):
+        some = pixel_events(range(now - 9_000, now + 1, 1_000), [1, 0] * 5)
+        for each in (live, whole):
+            each.push_events(some)
+            each.advance(now)
+        image = live.read(now)
+        live.forget(now - 7_500)
+        assert_same(image, whole.read(now))
+        held.append(live._events.number(now) - live._events.first)
+    assert max(held) <= 10
+
+
 @every_variant
 @both_modes
 def test_reading_more_often_changes_nothing(variant, lookahead):

@@ -358,6 +358,11 @@ class Reconstructor:
         limit = min(t, final_until)
         if begin is None or limit <= begin:
             return
+        if self._freed is not None and self._progress is not None and limit < self._progress.latest:
+            # What led to a read ahead of ``limit`` is gone: reads go on from there, and need no event before it.
+            self._earliest, self._freed = limit, self._progress.latest
+            self._events.drop(self._freed)
+            return
         progress = self._progress_to(limit)
         endless = self._frames_ended and len(self._shots) == 1
         if progress.ready or endless:  # no frame will change it
@@ -396,13 +401,15 @@ class Reconstructor:
         return self._start_time()
 
     def read(self, t: int) -> Image:
-        """The image at time ``t`` (us). Never changes the result of any other read. See `estimate`."""
+        """The image at time ``t`` (us). Does not change the result of another read. See `estimate`."""
         return self.image(self.estimate(t))
 
     def estimate(self, t: int) -> Estimate:
-        """The filter's estimate at time ``t`` (us), for `image`. Never changes the result of any other read.
+        """The filter's estimate at time ``t`` (us), for `image`. Does not change the result of another read.
 
-        Reads may repeat, and go back as far as the newest frame that is final.
+        Reads may repeat, and go back as far as the newest frame that is final. Only of the very moment at which two
+        segments meet (`kalux.filters.method`) the estimate depends on whether it is read before later ones: it is then
+        that of the segment which ends there, else of the one that begins.
 
         Raises
         ------

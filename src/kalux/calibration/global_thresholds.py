@@ -15,6 +15,7 @@ Each kind has a variance for its bias. The two results and the usual thresholds 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -39,7 +40,10 @@ more pixels. Also for the thresholds with which I_0 is estimated: they are then 
 so many pixels."""
 
 _TRAILING: Final = (0, 2_000, 4_000, 6_000)
-"""us by which the apparent delay may exceed the true one: 0.9 to 5.9 ms on forty scenes whose true delay is 0."""
+"""us by which the apparent delay mostly exceeds the true one: 0.9 to 5.9 ms on forty scenes whose true delay is 0."""
+
+_MOST_TRAILING: Final = 14_000
+"""us by which it may: events of slow light trail it for longer. Steps are spread over 15 ms at most."""
 
 _PERIOD_SAMPLES: Final = 30_000
 """Pixels for the refractory period: the standard error of the excess is then 0.02 on scenes where changes are lost."""
@@ -111,6 +115,8 @@ class ThresholdEstimate(NamedTuple):
         us; 0 where nothing is lost in it, or too little to tell.
     delay
         How much later than the frames' clock events were taken to be stamped, us.
+    delay_found
+        Whether that is what explains the frames best; else it is the apparent one less the usual trailing.
     doubt
         Relative error of thresholds that comes from that of the refractory period; a part of ``spread``.
     shortest_interval
@@ -126,6 +132,7 @@ class ThresholdEstimate(NamedTuple):
     usual_share: float
     refractory_period: int
     delay: int
+    delay_found: bool
     doubt: float
     shortest_interval: int
 
@@ -180,7 +187,7 @@ def estimate_thresholds(
         Steps of log(I + I_0) instead of log I, s = 1, as in the paper's model.
     delay
         How much later than the frames' clock events seem to be, us (`kalux.calibration.delay`): what of it is due to
-        the half threshold by which they trail the light, 0 to 6 ms, is found and taken off.
+        the half threshold by which they trail the light, 0 to 15 ms, is found and taken off.
     refractory_period
         Of the pixels, us: what is lost in it is added to the events (docs/equations.md, K13). None: to be found.
     most
@@ -195,7 +202,7 @@ def estimate_thresholds(
     """
     shortest = 0 if refractory_period is not None else _shortest_with_reset(recording)
     about_true = delay - _TRAILING[1]  # to begin with: trailing is mostly about so long
-    sampling = _Sampling(recording, camera, of_log_offset, about_true, shortest, (0.0, 0.0))
+    sampling = _Sampling(recording, camera, of_log_offset, about_true, False, shortest, (0.0, 0.0))
     period = refractory_period or 0
     if usual.spread == 0:
         sampling = sampling._replace(thresholds=(usual.on, usual.off))
@@ -229,7 +236,7 @@ def with_true_delay(
         refractory_period=refractory_period,
         most=ROUGH_SAMPLES,
     )
-    return apparent if found is None else apparent._replace(true=found.delay)
+    return apparent if found is None or not found.delay_found else apparent._replace(true=found.delay)
 
 
 def _shortest_with_reset(recording: Recording) -> int:
@@ -253,7 +260,9 @@ def refine_thresholds(
     Parameters are those of `estimate_thresholds`, by which ``rough`` was made with the same ``refractory_period``.
     """
     thresholds = rough.on, rough.off
-    sampling = _Sampling(recording, camera, of_log_offset, rough.delay, rough.shortest_interval, thresholds)
+    sampling = _Sampling(
+        recording, camera, of_log_offset, rough.delay, rough.delay_found, rough.shortest_interval, thresholds
+    )
     period = rough.refractory_period
     if refractory_period is not None or period == 0:
         return _estimate(sampling, usual, refractory_period, MAX_SAMPLES, None) or rough
@@ -299,8 +308,8 @@ class _Sampling(NamedTuple):
     ----------
     recording, camera, of_log_offset
         As in `estimate_thresholds`.
-    delay
-        Of the events, us.
+    delay, delay_found
+        Of the events, us, and whether it is known.
     shortest
         Shortest interval between two events of a pixel, us; 0 where the refractory period is not to be found.
     thresholds
@@ -311,6 +320,7 @@ class _Sampling(NamedTuple):
     camera: CameraSettings
     of_log_offset: bool
     delay: int
+    delay_found: bool
     shortest: int
     thresholds: tuple[float, float]
 
@@ -324,17 +334,25 @@ class _Sampling(NamedTuple):
         The apparent one includes the time that the light needs for half a threshold, by which events trail it. Steps
         that are spread over time (`steps`) do not trail: the delay under which they explain the frames best is true.
         """
-        delays = tuple(delay - trailing for trailing in _TRAILING)
-        residuals = [samples.residual() for samples in self._of_delays(delays, (period,), ROUGH_SAMPLES)]
+        tried, step = list(_TRAILING), _TRAILING[1]
+
+        def residuals_of(trailing: Sequence[int]) -> list[float]:
+            delays = tuple(delay - each for each in trailing)
+            return [samples.residual() for samples in self._of_delays(delays, (period,), ROUGH_SAMPLES)]
+
+        residuals = residuals_of(tried)
+        while np.isfinite(residuals).all() and residuals[-1] <= min(residuals) and tried[-1] < _MOST_TRAILING:
+            tried.append(tried[-1] + step)
+            residuals += residuals_of(tried[-1:])
         if not np.isfinite(residuals).all():
             return self
         least = int(np.argmin(residuals))
-        middle = min(max(least, 1), len(_TRAILING) - 2)
+        middle = min(max(least, 1), len(tried) - 2)
         found = vertex(*residuals[middle - 1 : middle + 2])
-        best = _TRAILING[least] if found is None else _TRAILING[middle] + _TRAILING[1] * found
-        if best >= _TRAILING[-1] + _TRAILING[1] / 2:  # no delay explains the frames
+        best = tried[least] if found is None else tried[middle] + step * found
+        if best >= tried[-1] + step / 2:  # no delay explains the frames
             return self
-        return self._replace(delay=delay - round(max(best, 0.0)))
+        return self._replace(delay=delay - round(max(best, 0.0)), delay_found=True)
 
     def _of_delays(self, delays: tuple[int, ...], periods: tuple[int, ...], most: int) -> list[_Samples]:
         """Samples under each of the delays, us."""
@@ -421,6 +439,7 @@ def _combined(
         usual_share=float(np.mean(np.minimum(known.variances / max(usual.spread**2, 1e-12), 1.0))),
         refractory_period=period,
         delay=sampling.delay,
+        delay_found=sampling.delay_found,
         doubt=doubt,
         shortest_interval=sampling.shortest,
     )

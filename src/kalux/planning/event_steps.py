@@ -262,7 +262,7 @@ def _with_delay(
     if apparent is None:
         return altered(settings, "events", delay=events.usual_delay), None
     if filled.estimate is not None:
-        delay = apparent._replace(true=filled.estimate.delay)
+        delay = apparent._replace(true=filled.estimate.delay) if filled.estimate.delay_found else apparent
     else:
         delay = with_true_delay(
             recording,
