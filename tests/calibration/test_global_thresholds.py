@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 import kalux
 from kalux import Frame, Recording
-from kalux.calibration.delay import estimate_delay
-from kalux.calibration.global_thresholds import Usual, estimate_thresholds, refine_thresholds
+from kalux.calibration.delay import DelayEstimate, estimate_delay
+from kalux.calibration.global_thresholds import (
+    Usual,
+    estimate_thresholds,
+    refine_thresholds,
+    with_true_delay,
+)
 from kalux.datasets import SensorSettings, demo_scene, simulate, static
 from kalux.datasets.ahdr import ArtificialCamera, artificial_hdr
 from kalux.datasets.scenes import Scene
@@ -291,6 +298,40 @@ def test_the_half_threshold_by_which_events_trail_is_not_taken_for_delay(late):
         found = estimate_thresholds(recording, camera, USUAL, delay=seeming)
         assert found.delay == pytest.approx(late, abs=400)
         np.testing.assert_allclose([found.on, found.off], 0.2, rtol=0.04)
+
+
+def slowed(recording, times):
+    """The recording of the same light that takes so many times as long."""
+    moved = np.concatenate([*recording.events()])
+    moved["t"] *= times
+    frames = [
+        dataclasses.replace(
+            frame, exposure_start=times * frame.exposure_start, exposure_end=times * frame.exposure_end
+        )
+        for frame in recording.frames()
+    ]
+    return Recording.from_arrays(moved, frames, sensor_size=recording.sensor_size)
+
+
+@pytest.mark.parametrize("times", [1, 3])
+def test_events_of_slow_light_trail_it_for_longer(times):
+    recording, camera = slowed(textured(), times), CameraSettings(log_offset=0.004)
+    apparent = estimate_delay(recording, camera)
+    assert apparent.apparent > 1_500 * times
+    found = with_true_delay(recording, camera, apparent, USUAL)
+    assert found.true == pytest.approx(0, abs=400 * times)
+
+
+def test_where_no_delay_explains_the_frames_none_is_taken_for_the_true_one():
+    """Events of other pixels."""
+    whole = textured()
+    moved = np.concatenate([*whole.events()])
+    moved["x"] = moved["x"][np.random.default_rng(0).permutation(len(moved))]
+    recording = Recording.from_arrays(moved, [*whole.frames()], sensor_size=whole.sensor_size)
+    apparent = DelayEstimate(3_000, 0.1, 5_000)
+    found = with_true_delay(recording, CameraSettings(log_offset=0.004), apparent, USUAL)
+    assert found.true is None
+    assert found.delay == pytest.approx(0.7 * 3_000, abs=1)
 
 
 def test_of_a_rough_estimate_delay_and_period_are_kept(monkeypatch):

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
+from kalux import Recording
 from kalux.calibration.steps import steps
 from kalux.datasets import SensorSettings, simulate
 from kalux.datasets.scenes import Scene
@@ -32,6 +35,22 @@ def told(recording, period=0):
     (found,) = steps(recording, CAMERA, delays=(0,), periods=(period,), late=np.inf, thresholds=(0.2, 0.25))
     on, off = found.events.sum(axis=(1, 2)).T
     return found.change, (0.2 * on - 0.25 * off) * found.share
+
+
+def test_the_origin_of_time_does_not_matter():
+    """Microseconds since 1970 have no room for halves in float64."""
+    recording, origin = swinging(6.0), 1_700_000_000_000_000
+    moved = np.concatenate([*recording.events()])
+    moved["t"] += origin
+    frames = [
+        dataclasses.replace(
+            frame, exposure_start=frame.exposure_start + origin, exposure_end=frame.exposure_end + origin
+        )
+        for frame in recording.frames()
+    ]
+    later = Recording.from_arrays(moved, frames, sensor_size=SIZE)
+    for one, other in zip(told(recording), told(later), strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 @pytest.mark.parametrize("hertz", [2.0, 6.0])

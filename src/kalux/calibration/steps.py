@@ -199,12 +199,13 @@ class _StepSampler:
         words = event_words(between(interval.events, begin, end))
         order, starts = _by_pixel(words, np.uint64(width), _with_neighbours(chosen, height, width))
         exposures = tuple(
-            float(t + self._delay)
+            float(t + self._delay - begin)
             for shot in (first, second)
             for t in (shot.start, max(shot.end, shot.start + 1))
         )
         counts = np.zeros((height * width, len(self._periods), 2, 2), np.float32)
-        _count(words, order, starts, self._latest, self._sign, exposures, self._periods, self._late, counts)
+        events = words, order, starts, self._latest, self._sign, begin
+        _count(*events, exposures, self._periods, self._late, counts)
         shape = len(chosen), len(self._periods), 2, 2
         share = interval.level / np.maximum(interval.level + self._log_offset, 1e-9)
         # To second order, log(I + I_0) bends by the square of its share in the steps.
@@ -299,21 +300,24 @@ def _ramp_difference(
 
 
 @loop
-def _count(words, order, starts, latest, sign, exposures, periods, late, counts):  # type: ignore[no-untyped-def]
-    """Add to ``counts`` the part of every event's step that lies between the two exposures."""
+def _count(words, order, starts, latest, sign, origin, exposures, periods, late, counts):  # type: ignore[no-untyped-def]
+    """Add to ``counts`` the part of every event's step that lies between the two exposures.
+
+    Times are taken from the ``origin`` on, us: those since 1970 are no whole number of us in float64.
+    """
     for at in range(len(starts) - 1):
         if starts[at] == starts[at + 1]:
             continue
-        before, sign_before = float(latest[at]), sign[at]
+        before, sign_before = float(latest[at] - origin), sign[at]
         pace_before = _SLOWEST  # us for a threshold
         for j in range(starts[at], starts[at + 1]):
-            t, on = float(words[order[j], 0]), event_is_on(words[order[j], 1])
+            t, on = float(words[order[j], 0] - origin), event_is_on(words[order[j], 1])
             own_sign = 1 if on else -1
             since = t - before
             if t > exposures[0] and before < exposures[3]:
                 pace_after = _SLOWEST
                 if j + 1 < starts[at + 1] and event_is_on(words[order[j + 1], 1]) == on:
-                    pace_after = smaller(_SLOWEST, float(words[order[j + 1], 0]) - t)
+                    pace_after = smaller(_SLOWEST, float(words[order[j + 1], 0] - origin) - t)
                 soon, column = np.uint64(since < late), np.uint64(not on)
                 if own_sign == -sign_before:
                     # At one pace, the way out takes a quarter of the time and the way back the rest.
