@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import os
 import signal
-import threading
 import time
 
 import numpy as np
@@ -14,7 +13,6 @@ import pytest
 import kalux
 from kalux import readers
 from kalux.calibration.values import Calibration
-from kalux.cli.signals import interrupts_held
 from kalux.frames import Frame, GroundTruth
 from kalux.models.colour import sample_mosaic
 from kalux.writers.calibration import save_calibration
@@ -285,47 +283,6 @@ class TestCalibration:
         assert found.code == 2
         assert "neither contrast thresholds nor a response" in found.error
         assert not (tmp_path / "copy.h5").exists()
-
-
-class TestInterruptsHeld:
-    def test_until_they_are_let_through(self):
-        done = []
-
-        def work():
-            with interrupts_held() as let_through:
-                let_through()
-                signal.raise_signal(signal.SIGINT)
-                done.append("held")
-                let_through()
-                done.append("never")
-
-        before = signal.getsignal(signal.SIGINT)
-        with pytest.raises(KeyboardInterrupt):
-            work()
-        assert done == ["held"]
-        assert signal.getsignal(signal.SIGINT) == before
-
-    def test_at_the_latest_until_the_end(self):
-        with pytest.raises(KeyboardInterrupt), interrupts_held():
-            signal.raise_signal(signal.SIGINT)
-
-    def test_what_was_finished_meanwhile_is_told(self):
-        with pytest.raises(KeyboardInterrupt) as caught, interrupts_held(done="it was finished"):
-            signal.raise_signal(signal.SIGINT)
-        assert caught.value.__notes__ == ["it was finished"]
-
-    def test_other_threads_have_no_signals(self):
-        done = []
-
-        def work():
-            with interrupts_held() as let_through:
-                let_through()
-                done.append(True)
-
-        thread = threading.Thread(target=work)
-        thread.start()
-        thread.join()
-        assert done
 
 
 @pytest.mark.parametrize("suffix", [".h5", ".aedat4"])

@@ -10,7 +10,7 @@ import pytest
 
 import kalux
 from kalux.datasets import Scene, SensorSettings, moving_edge, sensor_preset, simulate
-from kalux.datasets.record import Watch, record
+from kalux.datasets.record import record
 from kalux.datasets.sensors import CameraResponse
 from kalux.datasets.simulate import truth_times
 from kalux.errors import InputError, SettingsError
@@ -76,7 +76,7 @@ def test_short_recordings_have_truth_too() -> None:
 
 def test_progress_reaches_the_end(tmp_path: Path) -> None:
     told: list[float] = []
-    record(tmp_path / "a.h5", moving_edge(duration=200_000), watch=Watch(on_time=told.append))
+    record(tmp_path / "a.h5", moving_edge(duration=200_000), on_time=told.append)
     assert told[-1] == 200_000
 
 

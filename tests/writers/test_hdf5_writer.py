@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import resource
+import signal
 
 import numpy as np
 import pytest
@@ -65,6 +66,66 @@ def test_an_interruption_leaves_the_old_file(path, kind):
         write_kalux(path, events=interrupted())
     assert list(path.parent.iterdir()) == [path]
     assert readers.read(path).count_events() == 500
+
+
+@pytest.mark.parametrize("call", ["first", "middle", "last"])
+def test_an_interrupt_while_hdf5_writes_waits_and_leaves_the_old_file(path, monkeypatch, call):
+    """Raised in what HDF5 calls, it would crash the process, or be lost and leave a damaged file."""
+    write_kalux(path, frames=small_frames()[:1])
+    calls, write = [], writer._Sink.write
+
+    def counting(sink, data):
+        calls.append(len(calls))
+        return write(sink, data)
+
+    def interrupted(sink, data):
+        if next(numbers) == chosen:
+            signal.raise_signal(signal.SIGINT)
+        return write(sink, data)
+
+    monkeypatch.setattr(writer._Sink, "write", counting)
+    write_kalux(path.with_name("other.h5"))
+    path.with_name("other.h5").unlink()
+    chosen, numbers = {"first": 0, "middle": len(calls) // 2, "last": len(calls) - 1}[call], iter(calls)
+    monkeypatch.setattr(writer._Sink, "write", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write_kalux(path)
+    assert list(path.parent.iterdir()) == [path]
+    assert len(list(readers.read(path).frames())) == 1
+
+
+def test_an_interrupt_waits_for_the_chunk_at_work_only(path, monkeypatch):
+    made, interrupts, write = [], [], writer._Sink.write
+
+    def interrupted(sink, data):
+        if made and not interrupts:
+            interrupts.append(len(made))
+            signal.raise_signal(signal.SIGINT)
+        return write(sink, data)
+
+    def many():
+        for _ in range(10_000):
+            made.append(small_events())
+            yield made[-1]
+
+    monkeypatch.setattr(writer, "_EVENTS_PER_CHUNK", 500)
+    monkeypatch.setattr(writer._Sink, "write", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write_kalux(path, events=many())
+    assert interrupts == [len(made)]
+    assert len(made) < 10_000
+    assert list(path.parent.iterdir()) == []
+
+
+def test_an_interrupt_comes_at_once_while_events_are_made(path):
+    def slow():
+        yield small_events()
+        signal.raise_signal(signal.SIGINT)
+        pytest.fail("not interrupted")
+
+    with pytest.raises(KeyboardInterrupt):
+        write_kalux(path, events=slow())
+    assert list(path.parent.iterdir()) == []
 
 
 def test_unwritable(path):

@@ -11,9 +11,10 @@ from collections.abc import Callable, Sequence
 from types import ModuleType
 
 from kalux.cli.parser import Parser, UsageError, normalised
-from kalux.cli.signals import interrupts_held, termination_as_interrupt
+from kalux.cli.signals import termination_as_interrupt
 from kalux.cli.terminal import close_output, error_line, hold_closed_streams
 from kalux.errors import InternalError, KaluxError
+from kalux.interrupts import interrupts_held
 from kalux.kernel_cache import VARIABLE, check_variables
 from kalux.wording import one_line
 

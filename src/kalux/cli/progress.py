@@ -104,12 +104,9 @@ class Progress:
             print(f"kalux: {self._title}: {text}", file=sys.stderr, flush=True)
 
 
-def counted(
-    items: Iterable[T], count: Callable[[T], None], let_through: Callable[[], None] = lambda: None
-) -> Iterator[T]:
-    """The same items; interrupts are let through before each, and each is counted when it has been used."""
+def counted(items: Iterable[T], count: Callable[[T], None]) -> Iterator[T]:
+    """The same items, each of which is counted when it has been used."""
     for item in items:
-        let_through()
         yield item
         count(item)
 

@@ -180,14 +180,8 @@ def write_copy(recording: Recording, out: Path, progress: Any, stated: Stated | 
 def write_streams(
     write: Callable[..., None], events: Iterable[EventArray], frames: Iterable[Frame], progress: Any
 ) -> None:
-    """Have a writer, which takes ``events`` and ``frames``, write them, with progress.
-
-    An interrupt inside HDF5 would crash it: it waits for the next chunk or frame.
-    """
-    from kalux.cli.signals import interrupts_held
-
-    with interrupts_held(done="the file was finished, and is whole") as let_through:
-        write(
-            events=counted(events, lambda chunk: progress.add(events=len(chunk)), let_through),
-            frames=counted(frames, lambda _: progress.add(images=1), let_through),
-        )
+    """Have a writer, which takes ``events`` and ``frames``, write them, with progress."""
+    write(
+        events=counted(events, lambda chunk: progress.add(events=len(chunk))),
+        frames=counted(frames, lambda _: progress.add(images=1)),
+    )

@@ -65,39 +65,3 @@ def termination_as_interrupt() -> Iterator[Callable[[], bool]]:
         sys.unraisablehook = previous_hook
         for number, handler in previous.items():
             signal.signal(number, handler if handler is not None else signal.SIG_DFL)
-
-
-@contextlib.contextmanager
-def interrupts_held(*, done: str = "") -> Iterator[Callable[[], None]]:
-    """Inside the block, an interrupt waits until the function that the block gets is called, or for its end.
-
-    For libraries that cannot bear an exception in the middle of their work. ``done`` says what is there where the
-    interrupt waited for the end.
-    """
-    received = False
-
-    def hold(number: int, frame: FrameType | None) -> None:
-        nonlocal received
-        received = True
-
-    def let_through() -> None:
-        if received:
-            raise KeyboardInterrupt
-
-    previous = signal.getsignal(signal.SIGINT)
-    in_main = threading.current_thread() is threading.main_thread()
-    if not in_main or previous is None or previous == signal.SIG_IGN:
-        yield let_through
-        return
-    signal.signal(signal.SIGINT, hold)
-    try:
-        yield let_through
-    finally:
-        signal.signal(signal.SIGINT, previous)
-    if received:
-        try:
-            signal.raise_signal(signal.SIGINT)
-        except KeyboardInterrupt as interrupt:
-            if done:
-                interrupt.add_note(done)
-            raise

@@ -66,8 +66,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     from kalux.cli.output import check_file
     from kalux.cli.progress import Progress
     from kalux.cli.recordings import check_name
-    from kalux.cli.signals import interrupts_held
-    from kalux.datasets.record import Watch, record
+    from kalux.datasets.record import record
     from kalux.writers.settings_file import beside, require_ours
 
     check_name(options.out, options.source)
@@ -76,14 +75,9 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     settings, size = chosen_sensor(options)
     scene, white = chosen_scene(options, size)
     total = scene.duration // 1000
-    # An interrupt inside HDF5 would crash it: it waits for the next chunk or frame.
-    with (
-        Progress("simulating", images=total, quiet=options.quiet, unit="ms") as progress,
-        interrupts_held(done=f"{options.out} was finished, and is whole") as let_through,
-    ):
+    with Progress("simulating", images=total, quiet=options.quiet, unit="ms") as progress:
 
         def on_time(t: float) -> None:
-            let_through()
             progress.add(images=int((t - scene.start) / 1000) - progress.images)
 
         recorded = record(
@@ -92,7 +86,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
             settings,
             seed=options.seed,
             truth_rate=options.truth_rate,
-            watch=Watch(on_time, let_through),
+            on_time=on_time,
         )
     write_settings(options, command, settings, scene, white, recorded)
     if not options.quiet:

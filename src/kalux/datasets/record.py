@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 from kalux.datasets.event_stream import event_chunks
 from kalux.datasets.exposure import frame_stream, plan_exposures
@@ -14,8 +14,6 @@ from kalux.datasets.simulate import check_seed, truth_images, truth_times
 from kalux.errors import InputError
 from kalux.events import EventArray
 from kalux.writers import hdf5
-
-T = TypeVar("T")
 
 
 class Recorded(NamedTuple):
@@ -36,21 +34,6 @@ class Recorded(NamedTuple):
     exposures: tuple[int, int]
 
 
-class Watch(NamedTuple):
-    """Functions that are called while a simulation is written.
-
-    Attributes
-    ----------
-    on_time
-        Up to which time, us, the events are simulated.
-    between
-        Before every image and chunk: the place to raise KeyboardInterrupt, if one is being held back.
-    """
-
-    on_time: Callable[[float], None] = lambda t: None
-    between: Callable[[], None] = lambda: None
-
-
 def record(
     path: str | Path,
     scene: Scene,
@@ -60,7 +43,7 @@ def record(
     exposures: Sequence[int] | None = None,
     sampling: Sampling | None = None,
     truth_rate: float | None = None,
-    watch: Watch | None = None,
+    on_time: Callable[[float], None] = lambda t: None,
 ) -> Recorded:
     """Simulate, as `kalux.datasets.simulate` does, into a kalux HDF5 file with ground truth.
 
@@ -73,8 +56,8 @@ def record(
     truth_rate
         Images of ground truth per second. Default: in the middle of the frames and halfway between, see
         `kalux.datasets.simulate.truth_times`.
-    watch
-        Told of the progress.
+    on_time
+        Told up to which time, us, the events are simulated.
 
     Raises
     ------
@@ -85,7 +68,6 @@ def record(
     """
     settings = settings if settings is not None else SensorSettings()
     sampling = sampling if sampling is not None else Sampling()
-    watch = watch if watch is not None else Watch()
     check_seed(seed)
     plan = plan_exposures(scene, settings, exposures)
     if not len(plan.intervals):
@@ -97,23 +79,18 @@ def record(
     counts = [0, 0]
 
     def counted() -> Iterator[EventArray]:
-        for chunk in event_chunks(scene, settings, seed=seed, sampling=sampling, on_time=watch.on_time):
+        for chunk in event_chunks(scene, settings, seed=seed, sampling=sampling, on_time=on_time):
             counts[0] += len(chunk)
             counts[1] += int(chunk["p"].sum())
             yield chunk
 
-    def watched(items: Iterator[T]) -> Iterator[T]:
-        for item in items:
-            watch.between()
-            yield item
-
     hdf5.write(
         path,
         sensor_size=scene.sensor_size,
-        events=watched(counted()),
-        frames=watched(frame_stream(scene, settings, plan, seed=seed, sampling=sampling)),
+        events=counted(),
+        frames=frame_stream(scene, settings, plan, seed=seed, sampling=sampling),
         contrast_threshold=(settings.threshold_on, settings.threshold_off),
-        ground_truth=hdf5.TruthStream(times, watched(truth_images(scene, plan, times))),
+        ground_truth=hdf5.TruthStream(times, truth_images(scene, plan, times)),
         response=settings.stated_response,
     )
     lengths = plan.lengths

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple, TypeVar
 
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from kalux.errors import FrameError
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.frames import Frame, GroundTruth, Mosaic
+from kalux.interrupts import interrupts_held
 from kalux.layouts import HDF5_COLUMNS, HDF5_VERSION
 from kalux.writers.files import output_errors, replacing
 
@@ -53,7 +55,8 @@ def write(
 ) -> None:
     """Write a recording, chunk by chunk, in bounded memory.
 
-    The file appears under its name only when it is complete.
+    The file appears under its name only when it is complete. An interrupt (Ctrl-C) waits while HDF5 is at work, which
+    it would crash: at most for the chunk, frame or image that is being written.
 
     Parameters
     ----------
@@ -86,7 +89,12 @@ def write(
         If the file cannot be written.
     """
     path = Path(path)
-    with output_errors(path), replacing(path) as temporary, _Sink(temporary) as sink:
+    with (
+        interrupts_held(done=f"{path} was finished, and is whole") as allowed,
+        output_errors(path),
+        replacing(path) as temporary,
+        _Sink(temporary, allowed) as sink,
+    ):
         # Of all layouts of HDF5, this one has a checksum on every piece of metadata, except on strings of
         # variable length: damage is then reported, where HDF5 otherwise may crash or never return.
         with h5py.File(sink, "w", libver=("v110", "v110")) as file:
@@ -106,14 +114,21 @@ def write(
                 group.attrs["response"] = np.bytes_(response)
             _write_frames(group, sink.checked(frames), sensor_size, exposure_known, mosaic)
         sink.check()
+        with allowed():
+            pass
 
 
 class _Sink(io.FileIO):
-    """A file whose failures are reported by `check`, not to HDF5: it crashes when a disk is full."""
+    """A file whose failures are reported by `check`, not to HDF5: it crashes when a disk is full.
 
-    def __init__(self, path: Path) -> None:
+    ``allowed`` is of `interrupts_held`: an interrupt in `write` would crash HDF5, too, or leave a file with a hole.
+    """
+
+    def __init__(self, path: Path, allowed: Callable[[], AbstractContextManager[None]]) -> None:
         super().__init__(path, "w+")
+        self._allowed = allowed
         self._error: OSError | None = None
+        self._not_made: BaseException | None = None
 
     def write(self, data: Any, /) -> int:
         view = memoryview(data).cast("B")
@@ -144,14 +159,23 @@ class _Sink(io.FileIO):
     def check(self) -> None:
         if self._error is not None:
             raise self._error
+        if self._not_made is not None:
+            raise self._not_made
 
     def checked(self, items: Iterable[T]) -> Iterator[T]:
-        """The same items, as long as the file takes them.
+        """The same items, as long as they can be made and the file takes them; interrupts are allowed in their making.
 
         Ends early rather than raise: an error on its way through an open h5py file disturbs its closing.
         """
-        for item in items:
-            if self._error is not None:
+        iterator = iter(items)
+        while self._error is None and self._not_made is None:
+            try:
+                with self._allowed():
+                    item = next(iterator)
+            except StopIteration:
+                return
+            except BaseException as error:
+                self._not_made = error
                 return
             yield item
 
