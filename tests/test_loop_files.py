@@ -182,3 +182,36 @@ def test_all_loops_of_kalux_are_kept_so():
 
 def abs_of(x):
     return np.abs(x)
+
+
+LOCKED = """
+import signal, sys, threading
+import numpy as np
+from llvmlite.binding import ffi
+
+from kalux.compiled import magnitude_bits
+
+enter, waits = ffi._LLVMLock.__enter__, [True]
+
+def interrupted(lock):
+    enter(lock)
+    if waits.pop():
+        signal.raise_signal(signal.SIGINT)
+        waits[:] = [False] * 100_000
+
+ffi._LLVMLock.__enter__ = interrupted
+try:
+    magnitude_bits(np.ones(3, np.float32))
+except KeyboardInterrupt:
+    print("interrupted")
+other = threading.Thread(target=lambda: ffi.lib._lock._lock.acquire(timeout=10) and print("unlocked"))
+other.start()
+other.join()
+"""
+
+
+def test_an_interrupt_while_a_loop_is_loaded_leaves_no_lock_behind() -> None:
+    """Just after LLVM's lock was taken, before it is known that it has to be given back."""
+    compiled.magnitude_bits(np.ones(3, np.float32))
+    done = subprocess.run([sys.executable, "-c", LOCKED], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, "interrupted\nunlocked\n"), done.stderr

@@ -15,7 +15,7 @@ import hashlib
 import os
 import pickle
 import types
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,15 +23,35 @@ import numba
 import numpy as np
 from numba.core.serialize import dumps
 
+from kalux.interrupts import interrupts_held
+
 _WRITERS: Final = ("compiled.py", "formulas.py")
 """Modules that write machine code down: any change of them counts."""
 
 
 def kept(dispatcher: Any) -> Any:
-    """The same loop of numba's, compiled with ``cache=True``, whose files have such names."""
+    """The same loop of numba's, compiled with ``cache=True``, whose files have such names.
+
+    An interrupt waits until it is loaded or compiled.
+    """
     numbas = dispatcher._cache._cache_file
     dispatcher._cache._cache_file = _Files(Path(numbas._index_path).with_suffix(""), dispatcher)
+    dispatcher.compile = _uninterrupted(dispatcher.compile)
     return dispatcher
+
+
+def _uninterrupted(make: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """The same, with an interrupt held until its end, 3 s at most of the largest loop, and mostly 0.01 s.
+
+    LLVM's lock would never be released where one comes just after it was taken: other threads would wait for ever.
+    """
+
+    @functools.wraps(make)
+    def uninterrupted(signature: Any) -> Any:
+        with interrupts_held():
+            return make(signature)
+
+    return uninterrupted
 
 
 class _Files:

@@ -12,6 +12,7 @@ from collections.abc import Callable, Generator, Sequence
 from typing import Any, Final
 
 from kalux.cli.terminal import error_line
+from kalux.interrupts import interrupts_held
 
 _BLAS: Final = "scipy.linalg.cython_blas"
 
@@ -39,8 +40,11 @@ def _load_without_compiler() -> None:
     from numba.core.runtime.nrt import rtsys
 
     def load(cache: Any, signature: Any, context: Any) -> Any:
-        rtsys.initialize(context)  # memory of arrays
-        with cache._guard_against_spurious_io_errors():
+        with (
+            interrupts_held(),
+            cache._guard_against_spurious_io_errors(),
+        ):  # as `kept` does, of readers' loops, too
+            rtsys.initialize(context)  # memory of arrays
             return cache._load_overload(signature, context)
 
     if {"_guard_against_spurious_io_errors", "_load_overload"} <= {*dir(caching.Cache)}:
