@@ -70,13 +70,14 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     """Run the command."""
     import numpy as np
 
-    from kalux.cli.output import check_file
+    from kalux.cli.output import check_apart, check_file
     from kalux.cli.progress import Progress
     from kalux.cli.recordings import check_name, write_copy
     from kalux.datasets.ahdr import artificial_hdr
     from kalux.settings import CameraSettings
 
     check_name(options.out, Path(options.recording))
+    check_apart([options.out], [options.recording, options.frames])
     check_file(options.out, overwrite=options.overwrite)
     camera = _camera(options)
     original = open_recording(options)

@@ -63,7 +63,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     from kalux.recording import no_frames
     from kalux.settings import altered, preset
 
-    check_result(options)
+    check_result(options, [options.recording, options.frames])
     settings = camera_calibration(options.black_level, options.response).apply(preset("default"))
     settings = altered(settings, "events", delay=options.delay, refractory_period=options.refractory)
     recording = open_recording(options)

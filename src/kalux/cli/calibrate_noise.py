@@ -70,7 +70,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     from kalux.cli.progress import Progress
     from kalux.settings import preset
 
-    check_result(options)
+    check_result(options, [options.recording, options.frames])
     known = (given_calibration(options) or Calibration()).merged(
         camera_calibration(options.black_level, options.response)
     )

@@ -70,7 +70,7 @@ def checked_range(options: argparse.Namespace) -> tuple[float, int]:
 def run(options: argparse.Namespace, command: list[str]) -> None:
     """Run the command."""
     from kalux.calibration.pictures import correlation_plot
-    from kalux.cli.output import check_file, check_picture, write_picture
+    from kalux.cli.output import check_apart, check_file, check_picture, write_picture
     from kalux.cli.plan_warnings import mend_warnings
     from kalux.cli.progress import Progress
     from kalux.planning.clock import offset_of_recording
@@ -80,6 +80,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
 
     centre, reach = checked_range(options)
     settings = camera_calibration(options.black_level).apply(preset("default"))
+    check_apart([options.out, options.plot], [options.recording, options.frames])
     if options.out is not None:
         check_file(options.out, overwrite=options.overwrite)
     check_picture(options.plot, overwrite=options.overwrite)

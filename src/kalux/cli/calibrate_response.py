@@ -59,11 +59,12 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     """Run the command."""
     from kalux.calibration.response import calibrate_response
 
-    check_result(options)
+    check_result(options, options.inputs)
     if options.plot is not None:
         from kalux.calibration.figures import require_matplotlib
-        from kalux.cli.output import check_picture
+        from kalux.cli.output import check_apart, check_picture
 
+        check_apart([options.plot], options.inputs)
         require_matplotlib()
         check_picture(options.plot, overwrite=options.overwrite)
     images, times, recording = _inputs(options)

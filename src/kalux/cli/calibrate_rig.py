@@ -82,13 +82,14 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     )
     from kalux.calibration.rig import rig_toml
     from kalux.calibration.two_cameras import open_frames
-    from kalux.cli.output import check_file, check_picture, write_picture
+    from kalux.cli.output import check_apart, check_file, check_picture, write_picture
     from kalux.cli.progress import Progress, counted
     from kalux.writers.files import save
 
     columns, rows = board_size(options.board)
     marker = None if options.marker is None else options.marker * 1e-3
     board = Board(columns, rows, options.square * 1e-3, options.charuco, marker)
+    check_apart([options.out, options.sheet], [options.events, options.frames])
     check_file(options.out, overwrite=options.overwrite)
     check_picture(options.sheet, overwrite=options.overwrite)
     if options.window <= 0:

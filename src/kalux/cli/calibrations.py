@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import shlex
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -97,21 +98,23 @@ def add_result(parser: Parser) -> None:
     group.add_argument("--quiet", action="store_true", help="print warnings and errors only")
 
 
-def check_result(options: argparse.Namespace) -> None:
-    """Check that the result can be written, before the work.
+def check_result(options: argparse.Namespace, inputs: Iterable[Path | str | None]) -> None:
+    """Check that the result can be written, and replaces none of the command's ``inputs``, before the work.
 
     Raises
     ------
     UsageError, OutputError
         It is no TOML file, is there already, or its folder cannot be written.
     """
-    from kalux.cli.output import check_file
+    from kalux.cli.output import check_apart, check_file
 
     if options.out is None:
         return
     if options.out.suffix.lower() != ".toml":
         raise UsageError(f"{options.out}: a calibration is a TOML file; give a name that ends in .toml")
-    for path in (options.out, options.out.with_suffix(".npz")):
+    paths = options.out, options.out.with_suffix(".npz")
+    check_apart(paths, inputs)
+    for path in paths:
         check_file(path, overwrite=options.overwrite)
 
 

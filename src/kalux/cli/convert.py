@@ -64,10 +64,11 @@ def add_command(commands: Any) -> None:
 
 def run(options: argparse.Namespace, command: list[str]) -> None:
     """Run the command."""
-    from kalux.cli.output import check_file
+    from kalux.cli.output import check_apart, check_file
     from kalux.cli.progress import Progress, short_number
 
     check_name(options.out, Path(options.recording), (*HDF5, *_AEDAT4))
+    check_apart([options.out], [options.recording, options.frames])
     check_file(options.out, overwrite=options.overwrite)
     stated = _calibrated(options)
     recording = open_recording(options)

@@ -97,13 +97,15 @@ def add_command(commands: Any) -> None:
 
 def run(options: argparse.Namespace, command: list[str]) -> None:
     """Run the command."""
-    from kalux.cli.output import check_file
+    from kalux.cli.output import check_apart, check_file
     from kalux.cli.progress import Progress
     from kalux.evaluation.scores import require_dependencies
 
     if options.out is not None:
         if options.out.suffix.lower() not in _SUFFIXES:
             raise UsageError(f"{options.out}: the output is a table; give a name that ends in .csv or .json")
+        truth = None if options.truth == _OWN else options.truth
+        check_apart([options.out], [options.recording, options.frames, truth])
         check_file(options.out, overwrite=options.overwrite)
     if options.clip and options.truth is not None:
         raise UsageError("--clip is for held-out frames, which clip; ground truth does not")

@@ -98,7 +98,7 @@ def add_command(commands: Any) -> None:
 
 def run(options: argparse.Namespace, command: list[str]) -> None:
     """Run the command."""
-    from kalux.cli.output import check_file, check_picture, write_picture
+    from kalux.cli.output import check_apart, check_file, check_picture, write_picture
     from kalux.datasets.hdr_plot import response_plot
     from kalux.datasets.radiance import encode_radiance
     from kalux.writers.files import save
@@ -106,6 +106,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     _check_flags(options)
     is_image = options.photos.suffix.lower() in _RADIANCE_INPUT
     plot = None if is_image else options.plot or options.out.with_name(f"{options.out.stem}_response.png")
+    check_apart([options.out, plot], [options.photos, options.register, options.times])
     check_file(options.out, overwrite=options.overwrite)
     check_picture(plot, overwrite=options.overwrite)
     reference = _reference(options, is_image)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -156,6 +156,32 @@ def check_output(output: Output) -> None:
             what = "the folder is not empty" if is_folder else "there already"
             raise OutputError(f"{path}: {what}; choose another name, or replace it with --overwrite")
         _check_writable(path if is_folder else path.absolute().parent)
+
+
+def check_apart(outputs: Iterable[Path | None], inputs: Iterable[Path | str | None]) -> None:
+    """Refuse to replace what the command reads: an input, or a file in a folder that is one.
+
+    A TOML file is no part of a recording: a calibration may lie in its folder, and be replaced.
+
+    Raises
+    ------
+    UsageError
+        With what to do instead.
+    """
+    given = [Path(name) for name in inputs if name is not None and os.path.exists(name)]
+    for out in outputs:
+        if out is None or not os.path.exists(out):
+            continue
+        for name in given:
+            if out.samefile(name):
+                raise UsageError(f"{out}: this is an input itself; choose another name for the output")
+            if out.suffix.lower() != ".toml" and name.is_dir() and lies_in(out, name):
+                raise UsageError(f"{out}: lies in {name}, an input; choose another place for the output")
+
+
+def lies_in(path: Path, folder: Path) -> bool:
+    """Whether something is a folder, or would be in it, by whatever names."""
+    return path.resolve().is_relative_to(folder.resolve())
 
 
 def check_file(path: Path, *, overwrite: bool) -> None:

@@ -18,7 +18,16 @@ from kalux.cli.calibrations import add_calibration, given_calibration
 from kalux.cli.checking import Contents, check_beside
 from kalux.cli.flags import HelpSettings, add_display, add_settings, given_settings
 from kalux.cli.loops import OF_ALL, OF_IMAGES, compiling_beside, prepare_loops, tell_of_compiling
-from kalux.cli.output import DEFAULT_RATE, FOLDER_FORMATS, Output, check_output, chosen_output, image_rate
+from kalux.cli.output import (
+    DEFAULT_RATE,
+    FOLDER_FORMATS,
+    Output,
+    check_apart,
+    check_output,
+    chosen_output,
+    image_rate,
+    lies_in,
+)
 from kalux.cli.parser import Parser, UsageError, number, whole
 from kalux.cli.plan_warnings import plan_warnings, saturation_warning
 from kalux.cli.progress import Progress, short_number
@@ -151,8 +160,8 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
         raise UsageError(f"--threads is {options.threads}; it must be 1 or more")
     output = chosen_output(options)
     settings = chosen_settings(options)
+    _check_apart(output, Path(options.recording), options.frames)
     check_output(output)
-    _check_apart(output, Path(options.recording))
     times = None if options.times is None else load_times(options.times)
     if times is not None and output.format == "mp4" and not np.diff(times).all():
         raise UsageError(
@@ -199,12 +208,14 @@ def _compiled_later(settings: Settings) -> tuple[str, ...]:
     return OF_ALL if settings.filter.joins_frames else OF_IMAGES
 
 
-def _check_apart(output: Output, recording: Path) -> None:
-    """Refuse to write into the folder that is the recording."""
-    if recording.is_dir() and output.path.resolve().is_relative_to(recording.resolve()):
-        raise UsageError(
-            f"{output.path}: lies in the recording {recording}; choose another place for the output"
-        )
+def _check_apart(output: Output, recording: Path, frames: Path | None) -> None:
+    """Refuse to replace what is read, and to write into a folder that is the recording, or its frames."""
+    for what, folder in (("recording", recording), ("frames", frames)):
+        if folder is not None and folder.is_dir() and lies_in(output.path, folder):
+            raise UsageError(
+                f"{output.path}: lies in the {what} {folder}; choose another place for the output"
+            )
+    check_apart([output.path], [recording, frames])
 
 
 # Decide.

@@ -101,7 +101,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     from kalux.calibration.pictures import correlation_plot
     from kalux.calibration.rig import load_rig
     from kalux.calibration.two_cameras import open_frames, register
-    from kalux.cli.output import check_file, check_picture, write_picture
+    from kalux.cli.output import check_apart, check_file, check_picture, write_picture
     from kalux.cli.recordings import check_name
     from kalux.recording import less_black
 
@@ -109,6 +109,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     centre, reach = checked_range(options)
     camera = camera_calibration(options.black_level).apply(preset("default")).camera
     check_name(options.out, options.events)
+    check_apart([options.out, options.overlay, options.plot], [options.events, options.frames])
     check_file(options.out, overwrite=options.overwrite)
     for path in (options.overlay, options.plot):
         check_picture(path, overwrite=options.overwrite)
