@@ -12,7 +12,7 @@ import pytest
 
 from kalux import kernel_cache
 from kalux.cli.app import main
-from kalux.errors import SettingsError
+from kalux.errors import OutputError, SettingsError
 from kalux.kernel_cache import VARIABLE, check_variables, ensure_writable
 
 
@@ -58,6 +58,22 @@ def test_else_a_folder_for_this_process(installed, tmp_path, monkeypatch):
     assert place.is_dir()
     ends[0]()
     assert not place.exists()
+
+
+def test_where_there_is_no_folder_at_all_one_line_says_so(installed, tmp_path, monkeypatch, capsys):
+    """`import kalux` itself needs none."""
+
+    def none(**options):
+        raise FileNotFoundError(2, "No usable temporary directory found")
+
+    monkeypatch.setattr(kernel_cache.tempfile, "mkdtemp", none)
+    (tmp_path / "cache").write_text("not a folder")
+    ensure_writable(installed)
+    assert VARIABLE not in os.environ
+    with pytest.raises(OutputError, match=f"name a folder in {VARIABLE}"):
+        check_variables()
+    assert main(["info", "none.h5"]) == 2
+    assert "compiled loops cannot be kept: " in capsys.readouterr().err
 
 
 @pytest.mark.skipif(shutil.which("setpriv") is None, reason="setpriv is not installed")

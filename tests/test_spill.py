@@ -12,7 +12,7 @@ from kalux.augmentation.refractory import EventClock
 from kalux.compiled import event_words
 from kalux.errors import OutputError
 from kalux.events import make_events
-from kalux.spill import Spill
+from kalux.spill import Spill, temporary_folder
 from mirrored import SIZE, mirrored, recording
 
 
@@ -60,3 +60,21 @@ def test_a_full_disk_is_one_line(tmp_path, monkeypatch):
     monkeypatch.setattr(np, "save", full)
     with pytest.raises(OutputError, match="backward pass: No space left"):
         Spill(recording(), tmp_path)
+
+
+def test_without_a_folder_for_temporary_files_one_line_says_what_to_do(monkeypatch):
+    def none(**options):
+        raise FileNotFoundError(2, "No usable temporary directory found in ['/tmp']")
+
+    monkeypatch.setattr("tempfile.TemporaryDirectory", none)
+    with (
+        pytest.raises(OutputError, match=r"No usable temporary directory .*; set TMPDIR to"),
+        temporary_folder(),
+    ):
+        pass
+
+
+def test_the_folder_is_removed():
+    with temporary_folder() as folder:
+        (folder / "file").touch()
+    assert not folder.exists()

@@ -15,7 +15,7 @@ import tempfile
 from pathlib import Path
 from typing import Final
 
-from kalux.errors import SettingsError
+from kalux.errors import OutputError, SettingsError
 
 VARIABLE: Final = "NUMBA_CACHE_DIR"
 """numba's environment variable for that folder; kalux sets it only if it is not set and needed."""
@@ -24,24 +24,34 @@ VARIABLE: Final = "NUMBA_CACHE_DIR"
 def ensure_writable(package: Path) -> None:
     """Make sure that numba has a folder to write to: the package, ``~/.cache/kalux``, or one for this process.
 
-    ``XDG_CACHE_HOME`` stands for ``~/.cache`` where it is set.
+    ``XDG_CACHE_HOME`` stands for ``~/.cache`` where it is set. Where none can be made, `check_variables` says so: much
+    of kalux does without loops.
     """
     if os.environ.get(VARIABLE) or _is_writable(package):
         return
     place = _user_folder() or _temporary_folder()
+    if place is None:
+        return
     os.environ[VARIABLE] = str(place)
     if "numba" in sys.modules:  # it has read its environment already
         sys.modules["numba"].config.CACHE_DIR = str(place)
 
 
 def check_variables() -> None:
-    """Refuse variables with which numba does not start, or does not compile.
+    """Refuse variables with which numba does not start, or does not compile, or has no folder to write to.
 
     Raises
     ------
     SettingsError
         That names the variable.
+    OutputError
+        There is no folder.
     """
+    if not os.environ.get(VARIABLE) and not _is_writable(Path(__file__).parent):
+        raise OutputError(
+            "compiled loops cannot be kept: neither the folder of kalux nor one for caches or temporary files can be "
+            f"written; name a folder in {VARIABLE}"
+        )
     threads = _number("NUMBA_NUM_THREADS")
     if threads is not None and threads < 1:
         raise SettingsError(f"NUMBA_NUM_THREADS={threads}: it must be 1 or more; change it, or unset it")
@@ -76,8 +86,12 @@ def _user_folder() -> Path | None:
     return place if os.access(place, os.W_OK | os.X_OK) else None
 
 
-def _temporary_folder() -> Path:
-    place, owner = Path(tempfile.mkdtemp(prefix="kalux-")), os.getpid()
+def _temporary_folder() -> Path | None:
+    try:
+        place = Path(tempfile.mkdtemp(prefix="kalux-"))
+    except OSError:
+        return None
+    owner = os.getpid()
 
     def remove() -> None:
         if os.getpid() == owner:  # not in a forked child

@@ -5,11 +5,9 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
-import tempfile
 from collections import deque
 from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager
-from pathlib import Path
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -24,6 +22,7 @@ from kalux.reconstructor import Reconstructor
 from kalux.recording import Recording, with_corrected_frames, with_event_layout
 from kalux.settings import Settings
 from kalux.smoothing import Backward, combine, reversed_pixels, reversed_settings
+from kalux.spill import temporary_folder
 from kalux.threads import ahead, made_ahead
 
 _MOST_AHEAD: Final = 20
@@ -168,9 +167,9 @@ def _smoothed_estimates(
         plan, settings=reversed_settings(plan.settings), pixels=reversed_pixels(plan.pixels)
     )
     on, off = engine.thresholds
-    with tempfile.TemporaryDirectory(prefix="kalux-") as folder:
+    with temporary_folder() as folder:
         backward = Backward(
-            recording, _engine(recording, reverse), plan.times, Path(folder), on_backward, trail=trail
+            recording, _engine(recording, reverse), plan.times, folder, on_backward, trail=trail
         )
         for estimate in _forward_estimates(recording, engine, plan, on_events, read_ahead):
             ahead_of_events = None if trail is None else engine.trail(estimate.t)

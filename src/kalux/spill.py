@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
@@ -39,6 +40,26 @@ def spilling(folder: Path) -> Iterator[None]:
         raise OutputError(
             f"{folder}: the recording cannot be spilled for the backward pass: {why}; set TMPDIR to a folder with more"
         ) from error
+
+
+@contextlib.contextmanager
+def temporary_folder() -> Iterator[Path]:
+    """An empty folder for a spill, removed at the end.
+
+    Raises
+    ------
+    OutputError
+        There is no folder for temporary files that can be written.
+    """
+    try:
+        folder = tempfile.TemporaryDirectory(prefix="kalux-")
+    except OSError as error:
+        raise OutputError(
+            f"no folder for the backward pass can be made: {error.strerror or error}; set TMPDIR to a folder that can "
+            "be written"
+        ) from error
+    with folder as name:
+        yield Path(name)
 
 
 class Spill:
