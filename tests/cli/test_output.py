@@ -76,3 +76,25 @@ def test_what_is_not_there_or_elsewhere_may_be_written(tmp_path):
 def test_a_calibration_in_the_folder_of_its_recording_may_be_replaced(tmp_path):
     (tmp_path / "cal.toml").write_text("former")
     check_apart([tmp_path / "cal.toml"], [tmp_path])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "suffix", "length"),
+    [
+        ("reconstruct none.h5 -o", ".mp4", 240),
+        ("calibrate contrast none.h5 -o", ".toml", 250),
+        ("evaluate none.h5 -o", ".csv", 250),
+        ("simulate none.png -o", ".h5", 240),
+    ],
+)
+def test_a_name_that_is_too_long_while_it_is_written_is_told_before_the_work(
+    cli, tmp_path, arguments, suffix, length
+):
+    found = cli(*arguments.split(), tmp_path / ("a" * (length - len(suffix)) + suffix))
+    assert (found.code, found.error.endswith("File name too long")) == (2, True)
+    assert not any(tmp_path.iterdir())
+
+
+def test_images_further_apart_than_a_video_can_say_are_refused_before_the_work(cli, tmp_path):
+    found = cli("reconstruct", "none.h5", "-o", tmp_path / "v.mp4", "--rate", 0.5, "--slow-motion", 1e6)
+    assert (found.code, "more than MP4 can say" in found.error) == (2, True)

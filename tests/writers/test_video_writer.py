@@ -349,6 +349,71 @@ def test_a_long_recording_stays_on_the_grid():
 
 
 @pytest.mark.parametrize(
+    ("rate", "slow"),
+    [
+        (29.97, 1.001),
+        (99.99999, 999.999),
+        (1e6 / 7.1, 123.457),
+        (0.00123457, 0.123),
+        (999_983.25, 0.001),
+        (3e-3, 300.0),
+    ],
+)
+def test_any_rate_and_slow_motion_have_a_clock(tmp_path, rate, slow):
+    """Also where their product is a fraction of more than 32 bits: true to 1e-9, and no time twice."""
+    slow_motion = VideoSettings(slow_motion=slow)
+    ticks = video.make_ticks(rate, slow_motion)
+    assert max(ticks.time_base.as_integer_ratio()) < 2**31
+    exact = ticks.slow_motion / ticks.rate
+    assert abs(ticks.time_base / exact - 1) < Fraction(1, 10**9)
+    with open_writer(tmp_path / "v.mp4", rate_hz=rate, video=slow_motion) as writer:
+        stamps = [round(k * 1e6 / rate) for k in range(4)]
+        for t in stamps:
+            writer.write(make_image(t))
+    times, _, _ = decoded(tmp_path / "v.mp4")
+    np.testing.assert_allclose(times, [float(k * exact) for k in range(4)], rtol=1e-6, atol=1e-7)
+
+
+def test_a_fraction_that_fits_is_exact():
+    ticks = video.make_ticks(29.97, VideoSettings(slow_motion=3.5))
+    assert ticks.time_base == Fraction(100, 2997) * Fraction(7, 2)
+
+
+def test_images_further_apart_than_mp4_can_say_are_refused_before_the_work(tmp_path):
+    with pytest.raises(
+        SettingsError, match=r"are 2e\+06 s apart, more than MP4 can say; choose a higher rate"
+    ):
+        open_writer(tmp_path / "v.mp4", rate_hz=0.5, video=VideoSettings(slow_motion=1e6))
+    assert names(tmp_path) == set()
+
+
+def test_a_gap_that_mp4_cannot_say_is_told_at_its_image(tmp_path):
+    writer = open_writer(tmp_path / "v.mp4", video=VideoSettings(slow_motion=1e6))
+    writer.write(make_image(0))
+    writer.write(make_image(100_000))
+    with pytest.raises(
+        InputError, match="the image at 300000 us would be shown 200000 s after the one before it"
+    ):
+        writer.write(make_image(300_000))
+    writer.stop()
+    times, _, _ = decoded(tmp_path / "v.mp4")
+    np.testing.assert_allclose(times, [0, 100_000])
+
+
+@pytest.mark.parametrize("length", [230, 240, 251, 260])
+def test_a_name_that_is_too_long_is_told_before_the_first_image(tmp_path, length):
+    """Its settings file has a longer one, and a still longer one until it is whole."""
+    path = tmp_path / ("v" * (length - 4) + ".mp4")
+    if length == 230:
+        with open_writer(path) as writer:
+            writer.write(make_image(0))
+        return
+    with pytest.raises(OutputError, match="File name too long; the video cannot be written"):
+        open_writer(path)
+    assert names(tmp_path) == set()
+
+
+@pytest.mark.parametrize(
     "options",
     [
         {"rate_hz": 0},

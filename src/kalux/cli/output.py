@@ -99,8 +99,11 @@ def chosen_output(options: argparse.Namespace) -> Output:
     ------
     UsageError
         Flags contradict each other or the name.
+    SettingsError
+        A value is out of its range.
     """
     from kalux.writers import VideoSettings
+    from kalux.writers.video import make_ticks
 
     path: Path = options.out
     is_video = path.suffix.lower() == ".mp4"
@@ -122,6 +125,8 @@ def chosen_output(options: argparse.Namespace) -> Output:
         crf=18.0 if options.crf is None else options.crf,
         slow_motion=1.0 if options.slow_motion is None else options.slow_motion,
     )
+    if is_video:
+        make_ticks(rate, video)  # refuses what MP4 cannot say, before the work
     return Output(
         path, format, given_display(options), video, options.png_bits or 16, rate, options.overwrite
     )
@@ -142,10 +147,14 @@ def check_output(output: Output) -> None:
     Raises
     ------
     OutputError
-        It is there already, or its folder cannot be written.
+        It is there already, its folder cannot be written, or its name is too long.
     """
+    from kalux.writers.files import check_length
+
     path = output.path
     with _system_errors(path):
+        if output.format == "mp4":
+            check_length(output.settings_path)  # the longest name of those to be made
         is_folder = path.is_dir()
         if is_folder and output.format == "mp4":
             raise OutputError(f"{path}: a folder of this name is there; choose another name for the video")
@@ -190,9 +199,12 @@ def check_file(path: Path, *, overwrite: bool) -> None:
     Raises
     ------
     OutputError
-        It is there already, or its folder is not there or cannot be written.
+        It is there already, its folder is not there or cannot be written, or its name is too long.
     """
+    from kalux.writers.files import check_length
+
     with _system_errors(path):
+        check_length(path)
         if path.is_dir():
             raise OutputError(f"{path}: a folder of this name is there; choose another name for the file")
         if path.exists() and not overwrite:

@@ -67,11 +67,14 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     from kalux.cli.progress import Progress
     from kalux.cli.recordings import check_name
     from kalux.datasets.record import record
+    from kalux.writers.files import check_length, output_errors
     from kalux.writers.settings_file import beside, require_ours
 
     check_name(options.out, options.source)
     check_file(options.out, overwrite=options.overwrite)
     require_ours(beside(options.out))
+    with output_errors(options.out):
+        check_length(beside(options.out))
     settings, size = chosen_sensor(options)
     scene, white = chosen_scene(options, size)
     total = scene.duration // 1000

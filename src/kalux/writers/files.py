@@ -69,6 +69,21 @@ def temporary_path(path: Path) -> Path:
     return path.with_name(f".{path.name}.part")
 
 
+def check_length(path: Path) -> None:
+    """Check that a file of this name, and its temporary one, may have such long names.
+
+    Raises
+    ------
+    OSError
+        A name is too long.
+    """
+    try:
+        os.lstat(temporary_path(path))
+    except OSError as error:
+        if error.errno == errno.ENAMETOOLONG:
+            raise
+
+
 class Claim:
     """The right to write an output, which one writer has at a time; the system ends it with the process.
 

@@ -34,7 +34,7 @@ from kalux.models.colour import LUMINANCE, luminance
 from kalux.threads import InOrder
 from kalux.wording import how_many
 from kalux.writers.base import ImageLike, Writer
-from kalux.writers.files import Claim, output_errors
+from kalux.writers.files import Claim, check_length, output_errors
 from kalux.writers.settings_file import SettingsFile, require_ours
 
 PRESETS = (
@@ -52,6 +52,12 @@ _FAST: Final = PRESETS[:3]
 _THREADS: Final = 4
 """Of x264 with slower presets. A fixed number, because the bits of the video depend on it. The fast ones keep up with
 one, which needs less processor time than several."""
+
+_LARGEST: Final = 2**31 - 1
+"""Of whole numbers in FFmpeg's fractions, and of units of time from image to image in MP4."""
+
+_LEAST_SCALE: Final = 10_000
+"""Units of time per second in MP4, at least: FFmpeg doubles them until there are so many."""
 
 _BT709 = 1
 MICROSECOND = Fraction(1, 1_000_000)
@@ -102,8 +108,17 @@ class Ticks:
 
     @cached_property
     def time_base(self) -> Fraction:
-        """Length of a tick in the video, seconds."""
-        return (1 / self.rate if self.rate else MICROSECOND) * self.slow_motion
+        """Length of a tick in the video, seconds; to 1e-9 of it where FFmpeg has no such fraction."""
+        exact = (1 / self.rate if self.rate else MICROSECOND) * self.slow_motion
+        return exact.limit_denominator(max(int(_LARGEST / max(exact, Fraction(1))), 1))
+
+    @cached_property
+    def most(self) -> int:
+        """Ticks from image to image, at most; 0: not even one fits into MP4."""
+        scale = self.time_base.denominator
+        while scale < _LEAST_SCALE:
+            scale *= 2
+        return int(_LARGEST / (self.time_base * scale))
 
     def count(self, microseconds: int) -> int:
         """The ticks in a time since the first image.
@@ -176,6 +191,12 @@ class VideoWriter(Writer):
             raise InputError(
                 f"video: the image at {t} us is not later than the one before it; "
                 "the images of a video must be in time order"
+            )
+        if self._last >= 0 and pts - self._last > self._ticks.most:
+            tick = float(self._ticks.time_base)
+            raise InputError(
+                f"video: the image at {t} us would be shown {(pts - self._last) * tick:g} s after the one before it, "
+                f"and MP4 holds {self._ticks.most * tick:g} s; make it less slow"
             )
         self._state = following = next_state(image, self._display, self._state, checked=True)
         self._last = pts
@@ -264,12 +285,18 @@ def make_ticks(rate_hz: float | None, video: VideoSettings) -> Ticks:
     Raises
     ------
     SettingsError
-        The rate is not positive, or above 1 MHz.
+        The rate is not positive, or above 1 MHz; or images would be further apart than MP4 can say.
     """
     if rate_hz is not None and not (math.isfinite(rate_hz) and 1e-3 <= rate_hz <= 1e6):
         raise SettingsError(f"rate: {rate_hz} images per second; it must be 0.001 to 1000000")
     rate = None if rate_hz is None else Fraction(rate_hz).limit_denominator(100_000)
-    return Ticks(rate, Fraction(video.slow_motion).limit_denominator(1000))
+    ticks = Ticks(rate, Fraction(video.slow_motion).limit_denominator(1000))
+    if rate_hz is not None and ticks.most == 0:
+        raise SettingsError(
+            f"video: {rate_hz:g} images per second, {video.slow_motion:g} times slower, are "
+            f"{float(ticks.time_base):g} s apart, more than MP4 can say; choose a higher rate, or less slow motion"
+        )
+    return ticks
 
 
 def check_replaceable(path: Path, settings: Path, *, overwrite: bool) -> None:
@@ -279,6 +306,8 @@ def check_replaceable(path: Path, settings: Path, *, overwrite: bool) -> None:
     ------
     OutputError
         One is there and ``overwrite`` is False, or it is not a file, or the settings are not of kalux.
+    OSError
+        The name of one is too long.
     """
     if os.path.lexists(path) and not path.is_file():
         raise OutputError(f"{path}: not a file; choose another name for the video")
@@ -286,6 +315,7 @@ def check_replaceable(path: Path, settings: Path, *, overwrite: bool) -> None:
         if os.path.lexists(existing) and not overwrite:
             raise OutputError(f"{existing}: there already; choose another name, or allow overwriting")
     require_ours(settings)
+    check_length(settings)
 
 
 def open_container(
@@ -300,7 +330,7 @@ def open_container(
     OSError
         The file cannot be opened.
     """
-    rate = ticks.rate / ticks.slow_motion if ticks.rate else Fraction(30)
+    rate = 1 / ticks.time_base if ticks.rate else Fraction(30)
     container = av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"})
     try:
         stream = container.add_stream("libx264", rate=rate)
