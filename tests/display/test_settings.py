@@ -27,6 +27,8 @@ from kalux.errors import SettingsError
         lambda: Percentile(low=50, high=50),
         lambda: Percentile(low=-1),
         lambda: Reinhard(key=0),
+        lambda: Reinhard(key=1e-308),
+        lambda: Reinhard(white=1e308),
         lambda: Reinhard(white=0),
         lambda: Drago(bias=0.5),
         lambda: Clahe(clip=0.5),

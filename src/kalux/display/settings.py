@@ -63,7 +63,9 @@ class Linear:
 
     def __post_init__(self) -> None:
         usable = abs(self.black) < 1e30 and abs(self.white) < 1e30
-        _require(usable and self.white > self.black, "white", self.white, f"above black ({self.black})")
+        _require(
+            usable and self.white > self.black, "white", self.white, f"above black ({self.black}), below 1e30"
+        )
 
 
 @dataclass(frozen=True)
@@ -106,9 +108,9 @@ class Reinhard:
     high: float = 99.5
 
     def __post_init__(self) -> None:
-        _require(0 < self.key <= 10, "key", self.key, "above 0 and at most 10")
+        _require(1e-6 <= self.key <= 10, "key", self.key, "1e-6 to 10")  # so far float32 is exact enough
         if self.white is not None:
-            _require(0 < self.white < math.inf, "white", self.white, "above 0")
+            _require(0 < self.white < 1e30, "white", self.white, "above 0 and below 1e30")
         _require_percentile("high", self.high)
 
 
