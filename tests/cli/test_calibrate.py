@@ -162,6 +162,17 @@ def test_response_from_images_with_given_times(cli, tmp_path):
     assert done.code == 0, done.err
     found = Response.named(load_calibration(out).settings["camera"]["response"])
     assert float(found.inverse(np.array([0.5]))[0]) == pytest.approx(0.25, abs=0.03)
+    again = tmp_path / "again.toml"  # of the folder, in the order of the names' numbers
+    assert cli("calibrate", "response", tmp_path, "--times", "0.001,1/250,0.016,0.064", "-o", again).code == 0
+    assert load_calibration(again).settings == load_calibration(out).settings
+
+
+def test_a_folder_of_photographs_without_times_asks_for_them(cli, tmp_path):
+    """Not for a recording, though only one thing was given."""
+    for k in range(3):
+        cv2.imwrite(str(tmp_path / f"{k}.png"), np.full((8, 8), 50 * k, np.uint8))
+    found = cli("calibrate", "response", tmp_path)
+    assert (found.code, "0.png" in found.error, "--times" in found.error) == (2, True, True)
 
 
 @pytest.mark.parametrize(

@@ -92,16 +92,15 @@ def _inputs(options: argparse.Namespace) -> tuple[Any, list[float], Recording | 
     from kalux.calibration.photographs import read_exposure, read_photograph
     from kalux.calibration.still_pixels import still_pixels
     from kalux.cli.times import exposure_times
-    from kalux.readers.images import IMAGES
+    from kalux.readers.images import IMAGES, images_in
 
     paths = [Path(name) for name in options.inputs]
     if len(paths) == 1 and paths[0].suffix.lower() not in IMAGES:
-        import kalux
-
-        if options.times is not None:
-            raise UsageError("--times is for images; a recording has exposure times")
-        recording = kalux.open(paths[0])
-        return *still_pixels(recording), recording
+        images = images_in(paths[0]) if paths[0].is_dir() else []
+        recording = _recording(paths[0], options, may_be_none=bool(images))
+        if recording is not None:
+            return *still_pixels(recording), recording
+        paths = images
     if options.times is None:
         stated = [read_exposure(path) for path in paths]
         # Seconds at the sensitivity and aperture of the first, where these differ.
@@ -109,3 +108,19 @@ def _inputs(options: argparse.Namespace) -> tuple[Any, list[float], Recording | 
     else:
         times = exposure_times(options.times)
     return [read_photograph(path) for path in paths], times, None
+
+
+def _recording(path: Path, options: argparse.Namespace, *, may_be_none: bool) -> Recording | None:
+    """The recording that is to be measured; None, where there ``may_be_none``: a folder of photographs."""
+    import kalux
+    from kalux.errors import FormatError
+
+    try:
+        recording = kalux.open(path)
+    except FormatError:
+        if may_be_none:
+            return None
+        raise
+    if options.times is not None:
+        raise UsageError("--times is for images; a recording has exposure times")
+    return recording
