@@ -16,11 +16,13 @@ import numpy as np
 import pytest
 
 import kalux
+from kalux.calibration.values import Calibration
 from kalux.cli import reconstruct as reconstruct_command
 from kalux.datasets import SensorSettings, colour_photograph, pan, simulate_colour
 from kalux.errors import InputError
 from kalux.models.colour import luminance
 from kalux.writers import folder
+from kalux.writers.calibration import save_calibration
 
 from builders import own_threads
 
@@ -138,6 +140,12 @@ class TestOutput:
         assert cli("reconstruct", recording, "-o", tmp_path / "out", "--at", "frames").code == 0
         assert times_in(tmp_path / "out") == [frame.middle for frame in simulation.frames]
 
+    def test_times_come_from_a_table_by_the_name_of_their_column(self, cli, recording, tmp_path):
+        """As baselines.md asks for, and evaluate takes."""
+        (tmp_path / "t.csv").write_text("file, t_us\na.png,100000\nb.png,300000\n")
+        assert cli("reconstruct", recording, "-o", tmp_path / "a", "--times", tmp_path / "t.csv").code == 0
+        assert times_in(tmp_path / "a") == [100_000, 300_000]
+
     def test_times_come_from_text_npy_or_a_former_output(self, cli, recording, tmp_path):
         wanted = [100_000, 150_001, 150_001, 300_000]
         (tmp_path / "t.txt").write_text("# us\n100000\n150001\n150001\n\n300000\n")
@@ -152,6 +160,7 @@ class TestOutput:
         ("name", "content", "told"),
         [
             ("t.csv", b"index,t_us,file\n5\n", "line 2: '' is not a whole number"),
+            ("t.csv", b"t_us,file\n5,a\nx,b\n", "line 3: 'x' is not a whole number"),
             ("t.npy", b"PK\x03\x04", "not a NumPy array"),
             ("t.npy", np.array([1 << 63], np.uint64), "times[0] is 9223372036854775808; whole microseconds"),
         ],
@@ -222,6 +231,24 @@ class TestSettings:
         told = "is of a run --smooth; settings do not say so, and these images are others"
         assert told in cli("reconstruct", recording, "-o", tmp_path / "b", *again).err
         assert told not in cli("reconstruct", recording, "-o", tmp_path / "c", *again, "--smooth").err
+        for first, second in zip(images_in(tmp_path / "a"), images_in(tmp_path / "c"), strict=True):
+            np.testing.assert_array_equal(first, second)
+
+    def test_settings_of_a_run_with_a_calibration_are_told_where_it_is_missing(
+        self, cli, recording, tmp_path
+    ):
+        """Its maps of pixels are no settings: without a word the images would be taken for the same."""
+        hot = np.zeros((32, 40), bool)
+        hot[3, 5] = True
+        calibration = tmp_path / "cal.toml"
+        save_calibration(Calibration({"events": {"threshold_on": 0.21}}, maps={"hot": hot}), calibration)
+        flags = ("--at", "frames")
+        cli("reconstruct", recording, "-o", tmp_path / "a", *flags, "--calibration", calibration)
+        again = (*flags, "--settings", tmp_path / "a" / "kalux.toml")
+        told = f"is of a run with --calibration {calibration}; settings have no maps of pixels"
+        assert told in cli("reconstruct", recording, "-o", tmp_path / "b", *again).err
+        also = ("--calibration", calibration)
+        assert told not in cli("reconstruct", recording, "-o", tmp_path / "c", *again, *also).err
         for first, second in zip(images_in(tmp_path / "a"), images_in(tmp_path / "c"), strict=True):
             np.testing.assert_array_equal(first, second)
 

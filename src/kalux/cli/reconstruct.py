@@ -189,6 +189,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
             *told,
             *filter(None, [saturated]),
             *_other_mode(planned, options),
+            *_left_out_calibration(options),
             *_without_effect(settings, options),
         ):
             warn(text)
@@ -311,6 +312,20 @@ def _other_mode(planned: Plan, options: argparse.Namespace) -> list[str]:
     if (former["lookahead"], former["smooth"]) == (planned.lookahead, planned.smooth):
         return []
     return [f"{options.settings} is of a run {mode}; settings do not say so, and these images are others"]
+
+
+def _left_out_calibration(options: argparse.Namespace) -> list[str]:
+    """A warning where ``--settings`` is of a run with ``--calibration``: it lacks the maps of pixels."""
+    if options.settings is None or options.calibration:
+        return []
+    former = read_toml(options.settings).get("calibration")
+    if not isinstance(former, list) or not former:
+        return []
+    flags = " ".join(f"--calibration {name}" for name in former)
+    return [
+        f"{options.settings} is of a run with {flags}; settings have no maps of pixels, and without it these images "
+        "may be others"
+    ]
 
 
 def _without_effect(settings: Settings, options: argparse.Namespace) -> list[str]:

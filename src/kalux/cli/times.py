@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.lib.format import read_array
@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 
 from kalux.cli.parser import UsageError
 from kalux.schedule import checked_times
+
+_COLUMN: Final = "t_us"
+"""Of tables with times: their first line names the columns."""
 
 
 def exposure_times(text: str) -> list[float]:
@@ -35,8 +38,8 @@ def load_times(path: Path) -> NDArray[np.int64]:
     Parameters
     ----------
     path
-        A ``.npy`` file; or text with a time per line, us, in which ``#`` begins a comment; or the
-        ``timestamps.csv`` of an output of kalux.
+        A ``.npy`` file; or text with a time per line, us, in which ``#`` begins a comment; or a table with a column
+        ``t_us``, such as the ``timestamps.csv`` of an output of kalux.
 
     Raises
     ------
@@ -66,8 +69,9 @@ def _from_text(path: Path) -> NDArray[np.int64]:
     except UnicodeDecodeError as error:
         raise UsageError(f"{path}: neither text nor .npy; one time per line is needed, in us") from error
     column = 0
-    if lines and lines[0].startswith("index,t_us"):
-        lines[0], column = "", 1
+    heads = [head.strip() for head in lines[0].lstrip("\ufeff").split(",")] if lines else []
+    if _COLUMN in heads:
+        lines[0], column = "", heads.index(_COLUMN)
     times = [
         _whole(_field(line, column), path, number)
         for number, line in enumerate((line.partition("#")[0] for line in lines), start=1)
