@@ -213,6 +213,19 @@ def test_progress_counts_every_event(monkeypatch):
     assert told == [40, 40, 40, 30]
 
 
+def test_progress_of_what_comes_before_a_smoothed_reconstruction(monkeypatch):
+    """Copying tells of every event, before anything is filtered; following and the backward pass tell, too."""
+    monkeypatch.setattr("kalux.recording.CHUNK_EVENTS", 40)
+    told: list[int] = []
+    rec = recording()
+    next(execute(rec, plan(rec, at="frames", smooth=True), None, told.append))
+    count = sum(len(chunk) for chunk in rec.events())
+    copied = int(np.searchsorted(np.cumsum(told), count)) + 1
+    assert sum(told[:copied]) == count
+    assert max(told[:copied]) == 40
+    assert count < sum(told) <= 3 * count
+
+
 # --- memory ---------------------------------------------------------------------------------------------
 
 

@@ -12,7 +12,7 @@ import pytest
 from kalux import readers, recording
 from kalux.errors import EventError, ExposureError, FormatError, FrameError, InputError
 from kalux.frames import Frame, GroundTruth
-from kalux.recording import Recording, with_cached_start, without_events_of
+from kalux.recording import Recording, with_cached_start, with_counted_events, without_events_of
 from kalux.writers import hdf5
 from recordings import SIZE, same_frames, small_events, small_frames
 
@@ -358,3 +358,14 @@ def test_events_of_single_pixels_can_be_left_out():
     assert 0 < len(rest) < len(first)
     assert not left_out[rest["y"], rest["x"]].any()
     assert len(np.concatenate(list(whole.events()))) == len(first)
+
+
+def test_events_are_counted_as_often_as_they_are_read():
+    told: list[int] = []
+    rec = Recording.from_arrays(small_events(), small_frames(), sensor_size=SIZE)
+    watched = with_counted_events(rec, told.append)
+    assert not told
+    for times in (1, 2):
+        for chunk, expected in zip(watched.events(), rec.events(), strict=True):
+            assert np.array_equal(chunk, expected)
+        assert sum(told) == times * len(small_events())

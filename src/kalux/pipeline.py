@@ -119,8 +119,8 @@ def execute(
     recording, plan
         From `kalux.planning.plan`, with the same recording.
     on_events, on_backward
-        Called with the number of events of every chunk read, for progress: in the pass that makes the images, and in
-        the backward pass of a smoothed reconstruction. With several threads, in the one that filters.
+        Called with the number of events of every chunk read, for progress: in the pass that makes the images, and, if
+        it is smoothed, in the backward pass and those that prepare it. With several threads, in the one that filters.
     threads
         With more than one, reading and filtering have a thread each, and so many, up to three, make images of the
         estimates: all of them ahead of the caller. The images are the same.

@@ -129,6 +129,19 @@ def without_events_of(recording: Recording, pixels: NDArray[np.bool_]) -> Record
     return made
 
 
+def with_counted_events(recording: Recording, on_events: Callable[[int], None]) -> Recording:
+    """The same recording; ``on_events`` is told the number of events of every chunk that is read, however often."""
+    whole, made = recording.source.events, copy.copy(recording)
+
+    def events() -> Iterator[EventArray]:
+        for chunk in whole():
+            yield chunk
+            on_events(len(chunk))
+
+    made.source = dataclasses.replace(recording.source, events=events)
+    return made
+
+
 class EventLayout(NamedTuple):
     """How stored events lie to the frames.
 

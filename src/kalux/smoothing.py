@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import dataclasses
 import pickle
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Final
 
@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from kalux.augmentation.bridge import REPEATED, UNMEASURED
 from kalux.augmentation.trail import FrameTrail, follow, nothing_followed, trail_at
+from kalux.events import EventArray
 from kalux.filters.highlights import obey_bounds, smoothed_unshown
 from kalux.filters.uncertainty import Around
 from kalux.images import Estimate
@@ -57,9 +58,17 @@ class Trails:
         Of the forward filter, with its thresholds and its delay.
     hot
         (H, W) bool: pixels whose events are left out; None: none.
+    on_events
+        Told the number of events of every block that has been followed.
     """
 
-    def __init__(self, spill: Spill, settings: Settings, hot: NDArray[np.bool_] | None) -> None:
+    def __init__(
+        self,
+        spill: Spill,
+        settings: Settings,
+        hot: NDArray[np.bool_] | None,
+        on_events: Callable[[int], None] | None = None,
+    ) -> None:
         events = settings.events
         on, off = events.thresholds
         self._spill = spill
@@ -70,6 +79,8 @@ class Trails:
         for index in range(len(spill)):
             end = spill.middle(index)
             chunks = spill.events_between(start + delay, end + delay, hot)
+            if on_events is not None:
+                chunks = _counted(chunks, on_events)
             _, _, followed = follow(chunks, followed, start + delay, end + delay)
             spill.save_newest_events(index, followed.newest - 2 * delay)
             self._scales.append(followed.scale)
@@ -84,6 +95,12 @@ class Trails:
         return FrameTrail(
             *(trail_at(newest, middle, (self._scales[k], *self._heights)) for k in (forward, after))
         )
+
+
+def _counted(chunks: Iterator[EventArray], on_events: Callable[[int], None]) -> Iterator[EventArray]:
+    for chunk in chunks:
+        yield chunk
+        on_events(len(chunk))
 
 
 class BackwardPass:
@@ -148,7 +165,8 @@ class Backward:
     folder
         An existing folder for what is spilled, the caller's to remove.
     on_events
-        Told the number of events of every block that the first pass has taken.
+        Told the number of events of every block that is copied, that is followed, and that the first pass has taken: of
+        each event up to three times.
     trail
         Settings and hot pixels of the forward filter, if it tells how far the light is ahead of its events (K14).
 
@@ -169,8 +187,8 @@ class Backward:
         trail: tuple[Settings, NDArray[np.bool_] | None] | None = None,
     ) -> None:
         height, width = recording.sensor_size
-        self._spill = Spill(recording, folder, engine.settings.events.refractory)
-        self._trails = None if trail is None else Trails(self._spill, *trail)
+        self._spill = Spill(recording, folder, engine.settings.events.refractory, on_events)
+        self._trails = None if trail is None else Trails(self._spill, *trail, on_events)
         times = times[times <= self._spill.end]
         window = max(1, _WINDOW_BYTES // (16 * height * width))
         self._windows = [times[i : i + window] for i in range(0, len(times), window)]

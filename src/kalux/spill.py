@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final
 
@@ -73,6 +73,8 @@ class Spill:
         us; the events are weighed as time goes forward (`kalux.augmentation.refractory`).
     folder
         An existing folder, the caller's to remove.
+    on_events
+        Told the number of events of every chunk that is copied.
 
     Raises
     ------
@@ -80,20 +82,30 @@ class Spill:
         The disk is full or the folder cannot be written.
     """
 
-    def __init__(self, recording: Recording, folder: Path, refractory_period: float = 0.0) -> None:
+    def __init__(
+        self,
+        recording: Recording,
+        folder: Path,
+        refractory_period: float = 0.0,
+        on_events: Callable[[int], None] | None = None,
+    ) -> None:
         self._folder = folder
         self._events = folder / "events.bin"
         self._frames: list[Frame] = []  # without their pixels
         self.sensor_size = recording.sensor_size
         self.count = 0
         with spilling(folder):
-            self._write(recording, refractory_period)
+            self._write(recording, refractory_period, on_events)
 
-    def _write(self, recording: Recording, refractory_period: float) -> None:
+    def _write(
+        self, recording: Recording, refractory_period: float, on_events: Callable[[int], None] | None
+    ) -> None:
         with self._events.open("wb") as file:
             clock = EventClock(recording.sensor_size, refractory_period)
             for chunk in recording.events():
                 event_words(clock.weighed(chunk)).tofile(file)
+                if on_events is not None:
+                    on_events(len(chunk))
                 self.count += len(chunk)
         for index, frame in enumerate(recording.frames()):
             np.save(self._frame_path(index), frame.image)

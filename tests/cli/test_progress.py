@@ -59,3 +59,30 @@ def test_texts():
     assert progress_text(0, 0, 5_000_000, 0, 2.0) == "5M events, 2.5M events/s"
     assert [short_number(n) for n in (0.5, 12, 999.9, 12_345, 1e9)] == ["0.5", "12", "1k", "12.3k", "1G"]
     assert (clock(5), clock(65), clock(3700)) == ("0:05", "1:05", "1:01:40")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "titles"),
+    [
+        ("info REC", ["reading", "estimating"]),
+        ("calibrate contrast REC", ["checking", "measuring thresholds"]),
+        ("calibrate noise REC", ["checking", "measuring noise"]),
+        ("ahdr REC -o OUT --cut 0.25", ["counting", "writing"]),
+        ("reconstruct REC -o OUTDIR --smooth --at frames", ["checking", "backward pass", "reconstructing"]),
+    ],
+)
+def test_commands_show_their_progress_from_the_start(
+    cli, write_recording, tmp_path, monkeypatch, arguments, titles
+):
+    recording = write_recording(tmp_path / "rec.h5", contrast_threshold=None)
+    monkeypatch.setattr(progress, "LINE_EVERY", 0.0)
+    words = {"REC": recording, "OUT": tmp_path / "out.h5", "OUTDIR": tmp_path / "out"}
+    found = cli(*[words.get(word, word) for word in arguments.split()])
+    assert found.code == 0, found.err
+    lines = [line.split(": ")[1] for line in found.err.splitlines() if "warning" not in line]
+    assert list(dict.fromkeys(lines)) == titles
+
+
+def test_no_quiet_command_shows_progress(cli, recording, monkeypatch):
+    monkeypatch.setattr(progress, "LINE_EVERY", 0.0)
+    assert cli("calibrate", "noise", recording, "--quiet").err == ""

@@ -92,10 +92,12 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
         every=options.hold_out_frames,
     )
     white, black, pixels = 0, 0, 0
-    for frame in recording.frames():
-        white += int(np.count_nonzero(frame.image == 255))
-        black += int(np.count_nonzero(frame.image == 0))
-        pixels += frame.image.size
+    with Progress("counting", images=len(recording.frames()), quiet=options.quiet, unit="frames") as progress:
+        for frame in recording.frames():
+            white += int(np.count_nonzero(frame.image == 255))
+            black += int(np.count_nonzero(frame.image == 0))
+            pixels += frame.image.size
+            progress.add(images=1)
     with Progress("writing", quiet=options.quiet) as progress:
         write_copy(recording, options.out, progress)
     if white == 0:

@@ -59,6 +59,7 @@ def add_command(commands: Any) -> None:
 def run(options: argparse.Namespace, command: list[str]) -> None:
     """Run the command."""
     from kalux.calibration.pixel_thresholds import calibrate_contrast
+    from kalux.cli.progress import Stages
     from kalux.errors import InputError
     from kalux.recording import no_frames
     from kalux.settings import altered, preset
@@ -69,8 +70,12 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     recording = open_recording(options)
     if not len(recording.frames()):
         raise no_frames(recording)
-    recording, settings, _ = mended_recording(recording, settings)
-    found = calibrate_contrast(recording, settings.camera, delay=options.delay, refractory=options.refractory)
+    stages = Stages(quiet=options.quiet)
+    recording, settings, _ = mended_recording(recording, settings, stages)
+    with stages.stage("measuring thresholds"):
+        found = calibrate_contrast(
+            recording, settings.camera, delay=options.delay, refractory=options.refractory
+        )
     if found is None:
         raise InputError(
             f"{recording.source.path}: too little moves before well exposed pixels to measure thresholds; record "

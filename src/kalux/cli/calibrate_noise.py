@@ -67,15 +67,18 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
 
     from kalux.calibration.noise import calibrate_noise
     from kalux.calibration.values import Calibration
-    from kalux.cli.progress import Progress
+    from kalux.cli.progress import Progress, Stages
     from kalux.settings import preset
 
     check_result(options, [options.recording, options.frames])
     known = (given_calibration(options) or Calibration()).merged(
         camera_calibration(options.black_level, options.response)
     )
-    recording, settings, mends = mended_recording(open_recording(options), known.apply(preset("default")))
-    found = calibrate_noise(recording, settings.camera, mends.hot).calibration()
+    stages = Stages(quiet=options.quiet)
+    asked = known.apply(preset("default"))
+    recording, settings, mends = mended_recording(open_recording(options), asked, stages)
+    with stages.stage("measuring noise"):
+        found = calibrate_noise(recording, settings.camera, mends.hot).calibration()
     if mends.ceiling is not None:
         found = found.merged(Calibration({"camera": {"saturation": settings.camera.saturation}}))
     if options.fit:

@@ -14,6 +14,7 @@ from kalux.cli.terminal import say, warn
 
 if TYPE_CHECKING:
     from kalux.calibration.values import Calibration
+    from kalux.cli.progress import Stages
     from kalux.planning.mending import Mended
     from kalux.recording import Recording
     from kalux.settings import Settings
@@ -55,12 +56,13 @@ def camera_calibration(black_level: float | None, response: str | None = None) -
     return Calibration({"camera": {name: value for name, value in said.items() if value is not None}})
 
 
-def mended_recording(recording: Recording, settings: Settings) -> Mended:
-    """The recording as a reconstruction would mend it before it measures anything, with its warnings."""
+def mended_recording(recording: Recording, settings: Settings, stages: Stages) -> Mended:
+    """The recording as a reconstruction would mend it before it measures anything, with its warnings and progress."""
     from kalux.cli.plan_warnings import calibration_warnings
     from kalux.planning.mending import mend
 
-    mended = mend(recording, settings)
+    with stages.stage("checking"):
+        mended = mend(stages.watched(recording), settings)
     for text in calibration_warnings(mended.mends):
         warn(text)
     return mended

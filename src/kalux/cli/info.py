@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from kalux.cli.calibrations import add_calibration, calibration_lines, given_calibration
 from kalux.cli.loops import prepare_loops, tell_of_compiling
 from kalux.cli.parser import Parser
+from kalux.cli.progress import Stages
 from kalux.cli.recordings import add_recording, open_recording
 from kalux.cli.terminal import say
 from kalux.settings import PRESETS, Settings, preset
@@ -51,14 +52,18 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     settings = preset(options.preset)
     prepare_loops()
     tell_of_compiling()
-    recording = open_recording(options)
+    stages = Stages()
+    recording = stages.watched(open_recording(options))
     calibration = given_calibration(options)
-    description = describe(recording)
+    with stages.stage("reading"):
+        description = describe(recording)
     say(format_description(description))
     if calibration is not None:
         say("\n".join(calibration_lines(calibration)))
     if not options.no_estimate:
-        say("\n".join(settled_lines(recording, description, settings, calibration, options.preset)))
+        with stages.stage("estimating"):
+            settled = settled_lines(recording, description, settings, calibration, options.preset)
+        say("\n".join(settled))
 
 
 def settled_lines(

@@ -13,6 +13,8 @@ from typing import IO, TYPE_CHECKING, Any, Self, TextIO, TypeVar, cast
 if TYPE_CHECKING:
     from rich.progress import Progress as Bar
 
+    from kalux.recording import Recording
+
 T = TypeVar("T")
 
 LINE_EVERY = 5.0
@@ -102,6 +104,40 @@ class Progress:
             return
         with contextlib.suppress(OSError):
             print(f"kalux: {self._title}: {text}", file=sys.stderr, flush=True)
+
+
+class Stages:
+    """Progress of one stage after another over the same recording, each of which reads its events anew.
+
+    Parameters
+    ----------
+    quiet
+        Draw nothing.
+    """
+
+    def __init__(self, *, quiet: bool = False) -> None:
+        self._quiet = quiet
+        self._current: Progress | None = None
+
+    def watched(self, recording: Recording) -> Recording:
+        """The same recording, whose events count for the stage that is going on when they are read."""
+        from kalux.recording import with_counted_events
+
+        return with_counted_events(recording, self._add)
+
+    @contextlib.contextmanager
+    def stage(self, title: str) -> Iterator[None]:
+        """Inside the block, a stage goes on."""
+        with Progress(title, quiet=self._quiet) as self._current:
+            try:
+                yield
+            finally:
+                self._current = None
+
+    def _add(self, events: int) -> None:
+        current = self._current
+        if current is not None:
+            current.add(events=events)
 
 
 def counted(items: Iterable[T], count: Callable[[T], None]) -> Iterator[T]:
