@@ -10,10 +10,11 @@ import pytest
 import kalux
 from kalux import Recording
 from kalux.calibration.registration import Registration
-from kalux.calibration.two_cameras import open_frames, register, triggered
+from kalux.calibration.rig import Lens
+from kalux.calibration.two_cameras import events_size, open_frames, register, triggered
 from kalux.datasets import Sampling
 from kalux.datasets.exposure import frame_stream, plan_exposures
-from kalux.errors import ExposureError, InputError
+from kalux.errors import EventError, ExposureError, InputError
 from kalux.readers.source import TRIGGER_DTYPE
 from kalux.writers import hdf5
 from rigs import DISTANCE, OFFSET, SENSOR, distant_recording, misplaced, small_rig
@@ -100,6 +101,28 @@ def test_what_does_not_fit(options, told):
     seen = distant_recording()
     with pytest.raises(InputError, match=told):
         register(lambda: seen.frames, lambda: [seen.events], **(SIZES | options))
+
+
+@pytest.mark.parametrize("options", [{}, {"offset": OFFSET}])
+def test_events_outside_the_event_camera_are_refused(options):
+    """Loops that are compiled would write them anywhere."""
+    seen = distant_recording()
+    events = seen.events.copy()
+    events["x"][len(events) // 2] = 160
+    with pytest.raises(EventError, match=r"at x=160, .* outside the sensor of 160x120"):
+        register(lambda: seen.frames, lambda: [events], rig=small_rig(), reach=50_000, **SIZES, **options)
+
+
+def test_a_size_that_is_not_stated_is_that_of_the_rig():
+    """Unless events lie outside it; what a reader assumed may be larger than they need."""
+    events = Recording.from_arrays(distant_recording().events, [], sensor_size=(200, 200))
+    assert events_size(events, small_rig()) == (200, 200)
+    unknown = Recording(dataclasses.replace(events.source, sensor_size_known=False))
+    assert events_size(unknown, None) == (200, 200)
+    assert events_size(unknown, small_rig()) == (120, 160)
+    smaller = dataclasses.replace(small_rig(), events=Lens.pinhole((119, 160)))
+    with pytest.raises(InputError, match=r"a sensor of 160x120 pixels at least, the rig's .* 160x119; is"):
+        events_size(unknown, smaller)
 
 
 def test_a_still_scene_tells_no_offset():

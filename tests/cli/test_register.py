@@ -187,6 +187,29 @@ def test_calibrate_needs_to_know_what(cli):
     assert "calibrate what?" in done.error
 
 
+@pytest.mark.parametrize("flags", [[], ["--homography", "rig", "--offset", "0"]])
+def test_events_outside_the_rigs_camera_are_refused(cli, files, tmp_path, flags):
+    """Of a recording that does not state its size."""
+    events, out = tmp_path / "events.npz", tmp_path / "both.h5"
+    array = distant_recording().events.copy()
+    array["x"][-1] = 300
+    np.savez(events, **{name: array[name] for name in "txyp"})
+    done = cli(
+        "register",
+        events,
+        "--frames",
+        files / "scene_frames.h5",
+        "--rig",
+        files / "true.toml",
+        "-o",
+        out,
+        *flags,
+    )
+    assert done.code == 2
+    assert "of a sensor of 301x120 pixels at least, the rig's event camera has 160x120" in done.error
+    assert not out.exists()
+
+
 def test_nothing_is_overwritten(cli, files, tmp_path):
     out = tmp_path / "both.h5"
     out.write_text("mine")

@@ -28,7 +28,7 @@ from kalux.calibration.regression import huber_weights, products
 from kalux.compiled import loop, zeros
 from kalux.errors import InputError
 from kalux.event_slices import between
-from kalux.events import NEVER, EventArray
+from kalux.events import NEVER, EventArray, check_events
 from kalux.frames import Frame
 from kalux.models.camera import Camera
 from kalux.settings import CameraSettings
@@ -147,7 +147,13 @@ def levels(
     Returns
     -------
     Two (Q, height, width) float32, from any common origin per pixel.
+
+    Raises
+    ------
+    EventError
+        If an event lies outside the sensor.
     """
+    check_events(events, sensor_size)
     on = np.zeros((len(times), *sensor_size), np.float32)
     off = np.zeros_like(on)
     _levels(events["t"], events["x"], events["y"], events["p"], times, spread, _SPREAD, on, off)

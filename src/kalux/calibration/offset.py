@@ -19,7 +19,7 @@ from kalux.calibration.alignment import MOST_FRAMES, Shots, align, take_shots, w
 from kalux.calibration.registration import Registration
 from kalux.errors import InputError
 from kalux.event_slices import between
-from kalux.events import EVENT_DTYPE, EventArray
+from kalux.events import EVENT_DTYPE, EventArray, check_events
 from kalux.frames import Frame
 from kalux.settings import CameraSettings
 from kalux.wording import how_many
@@ -162,6 +162,8 @@ def correlate(
     ------
     InputError
         If there are no events in reach, or nothing changes.
+    EventError
+        If an event lies outside the sensor.
     """
     middles = changes.middles
     shift = round(centre)
@@ -212,6 +214,7 @@ def _levels(
     total = 0
     for chunk in chunks:
         inside = between(chunk, first, last)
+        check_events(inside, sensor_size)
         if len(inside):
             row = inside["y"].astype(np.int64) * cells[0] // sensor_size[0]
             column = inside["x"].astype(np.int64) * cells[1] // sensor_size[1]

@@ -20,6 +20,7 @@ from kalux.errors import InputError
 from kalux.events import EventArray
 from kalux.frames import Frame, Stamp
 from kalux.readers import READERS, Source, joined
+from kalux.readers.source import size_needed
 from kalux.recording import Recording
 from kalux.settings import CameraSettings
 
@@ -86,6 +87,27 @@ def open_frames(
     if not source.count_frames():
         raise InputError(f"{path}: has no frames")
     return Recording(source, exposure=exposure, stamp=stamp)
+
+
+def events_size(events: Recording, rig: Rig | None) -> tuple[int, int]:
+    """(height, width) of the event camera: what the recording states, else what the rig does, if that holds all events.
+
+    Raises
+    ------
+    InputError
+        If the recording has events outside the rig's event camera.
+    """
+    source = events.source
+    if rig is None or source.sensor_size_known:
+        return events.sensor_size
+    size = rig.events.sensor_size
+    least = size_needed(source, size)
+    if least is not None:
+        raise InputError(
+            f"{source.path}: has events of a sensor of {least[1]}x{least[0]} pixels at least, the rig's event camera "
+            f"has {size[1]}x{size[0]}; is the rig file that of this camera?"
+        )
+    return size
 
 
 def triggered(
@@ -174,6 +196,8 @@ def register(
     ------
     InputError
         If cameras and rig do not fit together, or no registration or offset can be told from the recording.
+    EventError
+        If an event that is looked at lies outside the event camera.
     """
     camera = camera if camera is not None else CameraSettings()
     if rig is None and (homography in ("rig", "refine") or distance is not None):

@@ -100,7 +100,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     import kalux
     from kalux.calibration.pictures import correlation_plot
     from kalux.calibration.rig import load_rig
-    from kalux.calibration.two_cameras import open_frames, register
+    from kalux.calibration.two_cameras import events_size, open_frames, register
     from kalux.cli.output import check_apart, check_file, check_picture, write_picture
     from kalux.cli.recordings import check_name
     from kalux.recording import less_black
@@ -115,6 +115,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
         check_picture(path, overwrite=options.overwrite)
     rig = None if options.rig is None else load_rig(options.rig)
     events = kalux.open(options.events)
+    size = events_size(events, rig)
     by_trigger = timing == "triggers"
     other = open_frames(
         options.frames,
@@ -126,9 +127,6 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     other = less_black(other, camera.black_level)
     response = chosen_response(options.response, other.response)
     frames, exposure_known = _timed_frames(options, events, other, by_trigger)
-    size = events.sensor_size
-    if rig is not None and not events.source.sensor_size_known:
-        size = rig.events.sensor_size  # of which the recording knows no more than which pixels had events
     found = register(
         frames,
         events.events,

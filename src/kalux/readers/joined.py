@@ -22,7 +22,7 @@ from kalux.errors import FormatError, FrameError, InputError
 from kalux.frames import Frame
 from kalux.readers.image_lists import WANTED, Listed, read_csv, read_ijrr, read_listed
 from kalux.readers.images import files_in_colour, load_image
-from kalux.readers.source import EXPOSURE_UNKNOWN, SIZE_NOT_STATED, Source, reading, smallest_size
+from kalux.readers.source import EXPOSURE_UNKNOWN, SIZE_NOT_STATED, Source, reading, size_needed
 from kalux.readers.videos import opened_video
 from kalux.wording import how_many
 
@@ -114,20 +114,15 @@ def _joint_size(source: Source, frames: Path, joined: Source) -> tuple[int, int]
     if size == (height, width):
         return size
     if not source.sensor_size_known:
-        if not _holds(size, (height, width)):
-            # What was assumed, as of DSEC's layout, may be more than the events need.
-            height, width = smallest_size(source.path, source.events())
-        if _holds(size, (height, width)):
+        least = size_needed(source, size)
+        if least is None:
             return size
+        height, width = least
     needed = "is" if source.sensor_size_known else "is at least"
     raise FrameError(
         f"{frames}: its frames have {size[1]}x{size[0]} pixels, but the sensor of {source.path} {needed} "
         f"{width}x{height}; resize, crop or warp them to the events' pixels first"
     )
-
-
-def _holds(size: tuple[int, int], least: tuple[int, int]) -> bool:
-    return size[0] >= least[0] and size[1] >= least[1]
 
 
 def _frames_only(place: Path, format: str, **found: Any) -> Source:

@@ -121,6 +121,22 @@ def smallest_size(path: Path, chunks: Iterable[EventArray]) -> tuple[int, int]:
     return height, width
 
 
+def size_needed(source: Source, size: tuple[int, int]) -> tuple[int, int] | None:
+    """The (height, width) that a recording's events need, where a sensor of ``size`` does not hold them all; else None.
+
+    For recordings that do not state their sensor size.
+    """
+    if _holds(size, source.sensor_size):
+        return None
+    # What was assumed, as of DSEC's layout, may be more than the events need.
+    least = smallest_size(source.path, source.events())
+    return None if _holds(size, least) else least
+
+
+def _holds(size: tuple[int, int], least: tuple[int, int]) -> bool:
+    return size[0] >= least[0] and size[1] >= least[1]
+
+
 def checked_inverse_covariance(path: Path, name: str, values: NDArray[Any]) -> NDArray[np.float64]:
     """The released datasets' ``f_Q``, (256,), 1/s, which the file holds as ``name``.
 
