@@ -119,6 +119,21 @@ def test_events_of_another_scene_are_refused(shots):
         align(shots, other, truth, offset=float(OFFSET), free_homography=False)
 
 
+@pytest.mark.parametrize("free_homography", [True, False])
+def test_what_explains_nothing_moves_nothing(shots, free_homography):
+    """An offset that is said to be known, and is wrong by 0.4 s: the homography would be moved by 5 pixels."""
+    begin = Registration.of_rig(small_rig())
+    with pytest.raises(InputError, match=r"do not explain .* [01] % explained"):
+        align(
+            shots,
+            distant_recording().events,
+            begin,
+            offset=OFFSET - 400_000.0,
+            free_homography=free_homography,
+            free_offset=False,
+        )
+
+
 def test_what_is_too_little():
     with pytest.raises(InputError, match="2 frames, too few"):
         take_shots([frame(5, 0, 1), frame(5, 2, 3)], CAMERA)

@@ -125,6 +125,12 @@ def test_a_size_that_is_not_stated_is_that_of_the_rig():
         events_size(unknown, smaller)
 
 
+@pytest.mark.parametrize("homography", ["refine", "auto"])
+def test_frames_without_events_around_them_are_refused(homography):
+    with pytest.raises(InputError, match=r"no events from 60\.\d+ to 60\.\d+ s, .*\(with 60000\.0 ms added"):
+        found(rig=small_rig(), homography=homography, offset=60e6)
+
+
 def test_a_still_scene_tells_no_offset():
     seen = distant_recording()
     still = [dataclasses.replace(f, image=seen.frames[0].image) for f in seen.frames]

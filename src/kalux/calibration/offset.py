@@ -289,13 +289,24 @@ def aligned_stretch(
     """The frames of the busiest stretch, fewer of large ones, and its events.
 
     ``sensor_size`` is the event camera's (height, width), ``offset`` us.
+
+    Raises
+    ------
+    InputError
+        If there are no events while the frames were taken.
     """
     first = next(iter(frames()))
     most = _LARGEST // max(first.image[..., 0].size if first.image.ndim == 3 else first.image.size, 1)
     most = int(np.clip(min(most, _LARGEST // (2 * sensor_size[0] * sensor_size[1])), 8, MOST_FRAMES))
     shots = take_shots(some_frames(frames(), busiest(changes, most)), camera)
-    begin, end = int(shots.middles[0]) + offset - MARGIN, int(shots.middles[-1]) + offset + MARGIN
-    return shots, some_events(events(), begin, end)
+    begin, end = int(shots.middles[0]) + offset, int(shots.middles[-1]) + offset
+    found = some_events(events(), begin - MARGIN, end + MARGIN)
+    if not len(between(found, round(begin), round(end))):
+        raise InputError(
+            f"alignment: no events from {begin * 1e-6:.3f} to {end * 1e-6:.3f} s, while the frames that change most were "
+            f"taken (with {offset * 1e-3:.1f} ms added to their times); is that their offset?"
+        )
+    return shots, found
 
 
 def estimate_offset(
