@@ -92,6 +92,53 @@ def test_a_missing_one_is_found_by_the_intervals(at, many):
     assert f"{30 if many == 'triggers' else 29} trigger exposures" in found.notes[0]
 
 
+def drifting(times):
+    """The same in another clock."""
+    return (times * 1.00005 + 12_345).astype(np.int64)
+
+
+@pytest.mark.parametrize("many", [1, 2])
+def test_equal_numbers_are_shifted_where_the_intervals_say_so(many):
+    """Missing: triggers at the beginning and frames at the end, or the other way round."""
+    whole = jittered(40)
+    found = match(whole[many:], whole[many:] + 9, drifting(whole[:-many]), 40 - many)
+    np.testing.assert_array_equal(found.starts, whole[many:-many])
+    assert (found.first_frame, len(found.notes)) == (many, 1)
+    found = match(whole[:-many], whole[:-many] + 9, drifting(whole[many:]), 40 - many)
+    np.testing.assert_array_equal(found.starts, whole[many:-many])
+    np.testing.assert_array_equal(found.ends, whole[many:-many] + 9)
+    assert found.first_frame == 0
+    assert f"the first {many} exposure" in found.notes[0]
+    found = match(whole[:-many], whole[:-many] + 9, drifting(whole[many:]), 40 - many, skip_frames=0)
+    assert (found.first_frame, len(found.starts), found.notes) == (0, 40 - many, ())
+
+
+def test_frames_lost_within_are_told():
+    """The first trigger and the twentieth frame are missing: each frame before has the exposure of the next."""
+    whole = jittered(40)
+    with pytest.raises(ExposureError, match=r"39 trigger.* before frame \d+ .* lost within the recording"):
+        match(whole[1:], whole[1:] + 9, drifting(np.delete(whole, 20)), 39)
+
+
+def test_intervals_that_agree_nowhere_are_told():
+    found = match(jittered(40), jittered(40) + 9, jittered(40, seed=1), 40)
+    assert (found.first_frame, len(found.starts)) == (0, 40)
+    assert "are not those of the triggers" in found.notes[0]
+
+
+@pytest.mark.parametrize("jitter", [0, 1, 500])
+@pytest.mark.parametrize("count", [12, 40, 300])
+def test_stamps_that_jitter_by_themselves_shift_nothing(count, jitter):
+    """Nor do odd ones: a first frame that is late, and a clock that is set."""
+    starts = np.arange(count) * 33_333
+    for seed in range(20):
+        stamps = starts + np.random.default_rng(seed).integers(-jitter, jitter + 1, count)
+        stamps[0] -= 20_000
+        stamps[count // 2 :] += 1_000_000 * (seed % 2)
+        found = match(starts, starts + 9, stamps, count)
+        assert (found.first_frame, len(found.starts), found.notes) == (0, count, ())
+
+
 def test_even_intervals_do_not_tell():
     starts = np.arange(10) * 33_333
     for stamps in (None, np.arange(9) * 33_333):

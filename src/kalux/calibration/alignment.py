@@ -52,9 +52,9 @@ _SPREAD: Final = 200_000
 """us: a step is spread over no longer than this: what is older than that has mostly been still."""
 
 _LEAST_EXPLAINED: Final = 0.1
-"""Share of the changes' variance. At the right offset events explain 0.75 to 0.99 of it in ten simulated scenes, 0.41 to
-0.88 in three recordings of DAVIS sensors. At offsets wrong by 0.1 to 0.7 s, fits of scenes that are shaken explain at most
-0.01, if they end at all, and move the homography by 4 pixels for it."""
+"""Share of the changes' variance. At the right offset events explain 0.75 to 0.99 of it in ten simulated scenes, 0.41
+to 0.88 in three recordings of DAVIS sensors. At offsets wrong by 0.1 to 0.7 s, fits of scenes that are shaken explain
+at most 0.01, if they end at all, and move the homography by 4 pixels for it."""
 
 
 class Shots(NamedTuple):

@@ -303,8 +303,8 @@ def aligned_stretch(
     found = some_events(events(), begin - MARGIN, end + MARGIN)
     if not len(between(found, round(begin), round(end))):
         raise InputError(
-            f"alignment: no events from {begin * 1e-6:.3f} to {end * 1e-6:.3f} s, while the frames that change most were "
-            f"taken (with {offset * 1e-3:.1f} ms added to their times); is that their offset?"
+            f"alignment: no events from {begin * 1e-6:.3f} to {end * 1e-6:.3f} s, while the frames that change most "
+            f"were taken (with {offset * 1e-3:.1f} ms added to their times); is that their offset?"
         )
     return shots, found
 

@@ -7,6 +7,7 @@ Where one edge only is recorded (a pulse, a strobe), the exposure time is given.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from itertools import permutations
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
@@ -23,6 +24,16 @@ MOST_MISSING: Final = 2
 """Triggers or frames that may be missing at the ends: the one under way when a recording begins, and when it ends."""
 
 _CLEARER: Final = 2.0  # how much better the best matching must fit than the next
+
+_SURER: Final = 4.0
+"""How much better than in order another matching of equal numbers must fit: as good by chance are fewer than one in a
+thousand of 13 frames whose stamps jitter by themselves."""
+
+_LEAST_PART: Final = 4  # intervals before and after a loss: fewer fit something by chance
+_UNLIKE: Final = (
+    1.2  # intervals differ from the triggers' by more than they vary by themselves: 1.4 if unrelated
+)
+_IRREGULAR: Final = 0.01  # of an interval; stamps that vary less are as good as even, and tell nothing
 
 
 class TriggeredExposures(NamedTuple):
@@ -136,13 +147,14 @@ def match(
     stamps: Times | None,
     count: int,
     *,
-    skip_triggers: int = 0,
-    skip_frames: int = 0,
+    skip_triggers: int | None = None,
+    skip_frames: int | None = None,
 ) -> TriggeredExposures:
     """Which frame each exposure is of.
 
     Where the numbers differ by one or two, some are missing at the beginning or the end; where follows from the
-    intervals between the frames' own stamps, if these vary enough.
+    intervals between the frames' own stamps, if these vary enough. Where the numbers are the same, the intervals may
+    still tell that one is missing at the beginning and another at the end.
 
     Parameters
     ----------
@@ -153,13 +165,15 @@ def match(
     count
         Number of frames.
     skip_triggers, skip_frames
-        What to leave out at the beginning, where that is known.
+        What to leave out at the beginning, where that is known: 0 of the one that is not given. None: it is found.
 
     Raises
     ------
     ExposureError
-        If the numbers do not match, or it cannot be told which belong together.
+        If the numbers do not match, it cannot be told which belong together, or some were lost within the recording.
     """
+    known = not (skip_triggers is None and skip_frames is None)
+    skip_triggers, skip_frames = skip_triggers or 0, skip_frames or 0
     if min(skip_triggers, skip_frames) < 0:
         raise InputError("triggers: a number to skip is negative")
     starts, ends = starts[skip_triggers:], ends[skip_triggers:]
@@ -169,17 +183,16 @@ def match(
         raise ExposureError(f"triggers: there are {said}")
     missing = len(starts) - frames
     if missing == 0:
-        return TriggeredExposures(starts, ends, skip_frames, ())
-    if abs(missing) > MOST_MISSING and not (skip_triggers or skip_frames):
+        shift, notes = (0, ()) if known else _shift_of_equal(starts, stamps, said)
+        kept = slice(max(shift, 0), frames + min(shift, 0))
+        return TriggeredExposures(starts[kept], ends[kept], skip_frames + max(-shift, 0), notes)
+    if abs(missing) > MOST_MISSING and not known:
         raise ExposureError(
             f"triggers: there are {said}; more than {MOST_MISSING} are missing, so that frames were lost within the "
             "recording or other things were triggered. Record again, or say how many to leave out at the beginning "
             "(--skip-triggers, --skip-frames)"
         )
-    if skip_triggers or skip_frames:
-        shift = 0
-    else:
-        shift = _best_shift(starts, None if stamps is None else stamps[skip_frames:], missing, said)
+    shift = 0 if known else _best_shift(starts, stamps, missing, said)
     many = "exposures" if missing > 0 else "frames"
     note = f"there are {said}: {shift} {many} at the beginning and {abs(missing) - shift} at the end are left out"
     if missing > 0:
@@ -187,6 +200,67 @@ def match(
             starts[shift : shift + frames], ends[shift : shift + frames], skip_frames, (note,)
         )
     return TriggeredExposures(starts, ends, skip_frames + shift, (note,))
+
+
+def _shift_of_equal(starts: Times, stamps: Times | None, said: str) -> tuple[int, tuple[str, ...]]:
+    """Number of the trigger that belongs to the first frame, and what to say of it; negative: so many frames have none.
+
+    Every shift is judged by the same intervals between stamps, so that an odd one at an end speaks for none of them.
+    """
+    if stamps is None or len(stamps) < 2 * (MOST_MISSING + _LEAST_PART + 1):
+        return 0, ()
+    inner = np.diff(stamps[MOST_MISSING:-MOST_MISSING])
+    shifts = range(-MOST_MISSING, MOST_MISSING + 1)
+    least, count = MOST_MISSING, len(inner)
+    squares = {s: (np.diff(starts)[least + s : least + s + count] - inner) ** 2.0 for s in shifts}
+    varies = float(np.std(inner))
+    in_order = _root_mean(squares[0])
+    best = min(shifts, key=lambda s: _root_mean(squares[s]))
+    if _clearly(_root_mean(squares[best]), in_order, varies):
+        first, last = ("frame", "exposure") if best < 0 else ("exposure", "frame")
+        return best, (
+            f"there are {said}, but their intervals agree if the first {how_many(abs(best), first)} and the last "
+            f"{how_many(abs(best), last)} are left out, as they are here; --skip-frames 0 keeps them",
+        )
+    lost, broken, whole = _broken(squares)
+    if _clearly(broken, whole, varies):
+        raise ExposureError(
+            f"triggers: there are {said}, but their intervals agree with one shift before frame {MOST_MISSING + lost} "
+            "and with another after it: some were lost within the recording. Record again"
+        )
+    if varies > _IRREGULAR * float(np.median(inner)) and in_order > _UNLIKE * varies:
+        return 0, (
+            f"there are {said}, and the intervals between the frames' own times are not those of the triggers: were "
+            "frames or triggers lost?",
+        )
+    return 0, ()
+
+
+def _clearly(error: float, other: float, varies: float) -> bool:
+    """Whether a matching with this error explains how the stamps' intervals vary, and another one does not."""
+    return min(other, varies) >= _SURER * error + 1
+
+
+def _root_mean(squares: NDArray[np.float64]) -> float:
+    return float(np.sqrt(np.mean(squares)))
+
+
+def _broken(squares: dict[int, NDArray[np.float64]]) -> tuple[int, float, float]:
+    """Where one shift best gives way to another: the interval, left out, the error then, and that of one shift alone.
+
+    One shift alone may leave out its worst interval, too.
+    """
+    count = len(next(iter(squares.values())))
+    sums = {shift: np.append(0.0, np.cumsum(each)) for shift, each in squares.items()}
+    lost = np.arange(_LEAST_PART, count - _LEAST_PART)
+    ways = [
+        sums[before][lost] + sums[after][-1] - sums[after][lost + 1]
+        for before, after in permutations(squares, 2)
+    ]
+    least = np.maximum(np.min(ways, axis=0), 0.0)
+    whole = min(max(sums[shift][-1] - each.max(), 0.0) for shift, each in squares.items())
+    at = int(np.argmin(least))
+    return int(lost[at]), float(np.sqrt(least[at] / (count - 1))), float(np.sqrt(whole / (count - 1)))
 
 
 def _best_shift(starts: Times, stamps: Times | None, missing: int, said: str) -> int:

@@ -117,8 +117,8 @@ def triggered(
     edge: triggers.Edge = "both",
     exposure: int | None = None,
     input_id: int | None = None,
-    skip_triggers: int = 0,
-    skip_frames: int = 0,
+    skip_triggers: int | None = None,
+    skip_frames: int | None = None,
 ) -> tuple[Callable[[], Iterator[Frame]], tuple[str, ...]]:
     """Frames with the exposures that the event camera's trigger input saw, and what was assumed.
 

@@ -191,8 +191,8 @@ def _timed_frames(
         edge=options.trigger_edge or "both",
         exposure=options.exposure,
         input_id=options.trigger_input,
-        skip_triggers=options.skip_triggers or 0,
-        skip_frames=options.skip_frames or 0,
+        skip_triggers=options.skip_triggers,
+        skip_frames=options.skip_frames,
     )
     for note in notes:
         warn(f"triggers: {note}")
