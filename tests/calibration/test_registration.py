@@ -10,6 +10,7 @@ from kalux import Frame
 from kalux.calibration.registration import Registration, require_overlap, undistortion_maps
 from kalux.calibration.rig import Lens
 from kalux.errors import FrameError, InputError
+from kalux.models.camera import Camera
 from rig_scene import example_rig
 from rigs import DISTANCE, SENSOR, distant_recording, small_rig
 
@@ -80,6 +81,45 @@ def test_fine_detail_does_not_alias():
     image = registration.frame(Frame(stripes, 0, 1)).image / 65535
     assert registration.scale == pytest.approx(4, rel=1e-3)
     np.testing.assert_allclose(image[:, 1:-1], 100 / 255, atol=0.01)
+
+
+LARGE = Registration(LENS, Lens.pinhole((120, 160), focal=160.0), np.diag([4.0, 4.0, 1.0]))
+"""Event pixels four times as large as those of the frame."""
+
+
+@pytest.mark.parametrize("response", ["srgb", "bt709", "gamma:2.2", "s-curve:0.1"])
+def test_light_is_averaged_whatever_the_response(response):
+    """Stripes of 0.02 and 0.8 are 0.41 together; the mean of their sRGB values is that of 0.25."""
+    camera = Camera.named(response, 1.0)
+    light = np.tile(np.array([0.02, 0.02, 0.8, 0.8]), (120, 40))
+    coded = Frame(camera.response(light).astype(np.float32), 0, 1)
+    plain = Frame(light.astype(np.float32), 0, 1)
+    found = camera.response.inverse(LARGE.frame(coded, camera=camera).normalised())
+    np.testing.assert_allclose(found, LARGE.frame(plain).normalised(), atol=1e-4)
+
+
+def test_every_channel_has_a_response_of_its_own():
+    camera = Camera.named("srgb;linear;gamma:2.2", 1.0)
+    light = np.random.default_rng(0).uniform(0, 0.9, (120, 160, 3))
+    channels = [camera.of_channel(c).response for c in range(3)]
+    coded = np.stack([r(light[..., c]) for c, r in enumerate(channels)], axis=2)
+    found = LARGE.frame(Frame(coded, 0, 1), camera=camera).image
+    expected = LARGE.frame(Frame(light, 0, 1)).image
+    for c, response in enumerate(channels):
+        np.testing.assert_allclose(response.inverse(found[..., c]), expected[..., c], atol=1e-5)
+
+
+def test_a_response_leaves_what_is_not_averaged_as_it_is():
+    """Also beyond white, of floats."""
+    camera = Camera.named("srgb", 1.0)
+    image = noise()
+    np.testing.assert_array_equal(
+        shifted(0, 0).frame(Frame(image, 5, 9), camera=camera).image, image.astype(np.uint16) * 257
+    )
+    bright = np.random.default_rng(0).uniform(0, 3, SIZE).astype(np.float32)
+    np.testing.assert_allclose(
+        shifted(0, 0).frame(Frame(bright, 0, 1), camera=camera).image, bright, rtol=1e-5
+    )
 
 
 def test_undistortion_is_that_of_opencv():

@@ -12,6 +12,7 @@ import pytest
 import kalux
 from kalux.calibration.registration import Registration
 from kalux.calibration.rig import load_rig, rig_toml
+from kalux.models.camera import Camera
 from kalux.writers import hdf5
 from rigs import DISTANCE, OFFSET, board_recording, distant_recording, misplaced, small_rig
 
@@ -71,7 +72,10 @@ def test_an_offset_file_is_taken(cli, files, tmp_path):
         recording = kalux.open(out)
         assert recording.response == "srgb"
         frame = next(iter(recording.frames()))
-        expected = Registration.of_rig(small_rig(), DISTANCE).frame(distant_recording().frames[0])
+        camera = Camera.named("srgb", 1.0)
+        expected = Registration.of_rig(small_rig(), DISTANCE).frame(
+            distant_recording().frames[0], camera=camera
+        )
         np.testing.assert_array_equal(frame.image, expected.image)
         np.testing.assert_array_equal(frame.valid, expected.valid)
         assert frame.exposure_start == distant_recording().frames[0].exposure_start + OFFSET

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from kalux.calibration.rig import Lens, Rig
 from kalux.errors import FrameError, InputError
 from kalux.frames import Frame
+from kalux.models.camera import Camera, Response
 from kalux.settings import CameraSettings
 
 Array = NDArray[np.float64]
@@ -127,9 +128,10 @@ class Registration:
         """An image (H', W') or (H', W', channels) of the frame camera at the event camera's pixels, float32."""
         return self.sampled(self.filtered(image))
 
-    def frame(self, frame: Frame, *, index: int = 0) -> Frame:
+    def frame(self, frame: Frame, *, index: int = 0, camera: Camera | None = None) -> Frame:
         """A frame in the event camera's pixels, with the mask of those that are measured.
 
+        Light is averaged, not what the response of the ``camera`` (None: linear) makes of it, which is put on again.
         Integer images become uint16 with white at 65535, because the mean of several pixels has more levels than they;
         floats stay floats. Not measured is what lies outside the frame, and what was resampled from clipped and
         unclipped pixels together: its value is too dark, by how much nobody knows.
@@ -150,7 +152,7 @@ class Registration:
                 f"frame {index} is a raw mosaic, which cannot be resampled; demosaic the frames first"
             )
         response = frame.normalised()
-        values = self.resampled(response)
+        values = self._resampled_light(response, camera or Camera.named("linear", 1.0))
         clipped = np.asarray(response >= CameraSettings.usual_saturation)
         if clipped.ndim == 3:
             clipped = np.asarray(clipped.any(axis=2))
@@ -165,6 +167,26 @@ class Registration:
             )
         image = np.rint(np.clip(values, 0.0, 1.0) * 65535).astype(np.uint16)
         return Frame(image, frame.exposure_start, frame.exposure_end, valid=valid, gain=frame.gain)
+
+    def _resampled_light(self, values: Array, camera: Camera) -> NDArray[Any]:
+        """Coded values, resampled as the light that they stand for, and coded again."""
+        if all(_is_linear(response) for response in camera.colours or (camera.response,)):
+            return self.resampled(values)
+        if values.ndim == 2:
+            return _coded(self.resampled(camera.of_channel(1).response.inverse(values)), camera.of_channel(1))
+        light = [camera.of_channel(c).response.inverse(values[..., c]) for c in range(3)]
+        mixed = self.resampled(np.stack(light, axis=2))
+        return np.stack([_coded(mixed[..., c], camera.of_channel(c)) for c in range(3)], axis=2)
+
+
+def _is_linear(response: Response) -> bool:
+    return bool(np.array_equal(response.irradiance, response.response))
+
+
+def _coded(light: NDArray[np.float32], camera: Camera) -> NDArray[np.float32]:
+    # Floats may be brighter than white, where the inverse is continued with a slope of 1.
+    exact = light.astype(np.float64)
+    return np.asarray(camera.response(exact) + np.maximum(exact - 1.0, 0.0), np.float32)
 
 
 def undistortion_maps(lens: Lens) -> Maps:

@@ -19,6 +19,7 @@ from kalux.calibration.rig import Lens, Rig
 from kalux.errors import InputError
 from kalux.events import EventArray
 from kalux.frames import Frame, Stamp
+from kalux.models.camera import Camera
 from kalux.readers import READERS, Source, joined
 from kalux.readers.source import size_needed
 from kalux.recording import Recording
@@ -42,6 +43,8 @@ class Registered(NamedTuple):
         The features found; None where a rig was given and used.
     alignment
         The fit; None where nothing was left to fit.
+    camera
+        Response of the frames.
     """
 
     registration: Registration
@@ -50,12 +53,13 @@ class Registered(NamedTuple):
     coarse: Correlation | None
     matched: Matched | None
     alignment: Alignment | None
+    camera: Camera
 
     def frames(self, frames: Iterable[Frame]) -> Iterator[Frame]:
         """The frames in the events' clock and pixels, with the mask of those that are measured."""
         shift = round(self.offset)
         for index, frame in enumerate(frames):
-            warped = self.registration.frame(frame, index=index)
+            warped = self.registration.frame(frame, index=index, camera=self.camera)
             yield dataclasses.replace(
                 warped,
                 exposure_start=warped.exposure_start + shift,
@@ -200,6 +204,7 @@ def register(
         If an event that is looked at lies outside the event camera.
     """
     camera = camera if camera is not None else CameraSettings()
+    model = Camera.named(camera.response, camera.clipped_from)
     if rig is None and (homography in ("rig", "refine") or distance is not None):
         raise InputError("register: without a rig file there is no pose and no use for a distance")
     chosen = homography or ("auto" if rig is None else "refine")
@@ -214,7 +219,7 @@ def register(
             require_overlap(first)
     if chosen == "rig" and offset is not None:
         assert first is not None
-        return Registered(first, offset, 0.0, None, None, None)
+        return Registered(first, offset, 0.0, None, None, None, model)
     changes = frame_changes(frames(), first, camera)
     coarse = None
     if offset is None:
@@ -235,7 +240,7 @@ def register(
         free_offset=offset is None,
     )
     require_overlap(found.registration)
-    return Registered(found.registration, found.offset, found.standard_error, coarse, matched, found)
+    return Registered(found.registration, found.offset, found.standard_error, coarse, matched, found, model)
 
 
 def _check_size(lens: Lens, size: tuple[int, int], name: str) -> None:
