@@ -9,7 +9,8 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from kalux.datasets import SensorSettings, pan, photograph_scene, simulate, still
+from kalux.datasets import Pose, SensorSettings, pan, photograph_scene, simulate, static, still
+from kalux.datasets.foreground import Sprite, with_foreground
 from kalux.datasets.sources import (
     exposed,
     fitting_scale,
@@ -90,6 +91,28 @@ def test_alpha_of_a_png(tmp_path: Path) -> None:
     found = read_photograph(tmp_path / "a.png")
     assert np.allclose(found.alpha, 0.2)
     assert np.allclose(found.radiance, 1.0)
+
+
+def test_alpha_of_an_exr_is_in_its_colours_already(tmp_path: Path) -> None:
+    """A pane of radiance 0.8 that covers half of what is behind it (0.2)."""
+    flat = np.full((32, 32), 0.4)
+    pane = read_photograph(write_exr(tmp_path / "a.exr", R=flat, G=flat, B=flat, A=np.full((32, 32), 0.5)))
+    pixels = np.full((32, 32, 4), round(255 * float(srgb(np.array(0.8)))), np.uint8)
+    pixels[..., 3] = 128
+    cv2.imwrite(str(tmp_path / "a.png"), pixels)
+    straight = read_photograph(tmp_path / "a.png")
+    for image in (pane, straight):
+        assert image.alpha is not None
+        sprite = Sprite(image.radiance, image.alpha, image.premultiplied)
+        scene = with_foreground(static(0.2, sensor_size=(40, 40)), sprite, lambda t: Pose(20, 20), size=20)
+        assert scene.at(0.0)[20, 20] == pytest.approx(0.5, abs=0.005)
+
+
+@pytest.mark.parametrize("dtype", [np.int8, np.int16, np.int32])
+def test_numbers_with_a_sign_are_refused(tmp_path: Path, dtype: type) -> None:
+    cv2.imwrite(str(tmp_path / "a.tif"), np.full((4, 5), -1, dtype))
+    with pytest.raises(FormatError, match=rf"a\.tif: its values are {dtype.__name__}; .* are needed"):
+        read_photograph(tmp_path / "a.tif")
 
 
 @pytest.mark.parametrize("name", ["a.hdr", "a.exr", "a.png"])

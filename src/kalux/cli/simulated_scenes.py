@@ -264,7 +264,8 @@ def _with_foreground(options: argparse.Namespace, scene: Scene) -> Scene:
         sprite = ball()
     else:
         image = _photograph(Path(options.foreground))
-        sprite = Sprite(image.radiance, np.ones_like(image.radiance) if image.alpha is None else image.alpha)
+        alpha = np.ones_like(image.radiance) if image.alpha is None else image.alpha
+        sprite = Sprite(image.radiance, alpha, image.premultiplied)
     size = _or(options.foreground_size, 0.25 * scene.sensor_size[0])
     reach = 0.6 * size * max(1.0, sprite.alpha.shape[1] / sprite.alpha.shape[0])
     path = crossing(

@@ -21,10 +21,14 @@ _BRIGHTEST: Final = 1e9
 
 
 class Sprite(NamedTuple):
-    """A thing to lay over a scene: (H, W) linear radiance, 1 = frame white, and (H, W) alpha, 0 to 1."""
+    """A thing to lay over a scene: (H, W) linear radiance, 1 = frame white, and (H, W) alpha, 0 to 1.
+
+    ``premultiplied``: whether the radiance is already times alpha. So is that of a glow, which hides nothing.
+    """
 
     radiance: NDArray[Any]
     alpha: NDArray[Any]
+    premultiplied: bool = False
 
 
 def ball(
@@ -111,7 +115,8 @@ def with_foreground(scene: Scene, sprite: Sprite, path: Motion, *, size: float, 
         raise InputError(f"foreground: level is {level}; it must be 0 to {_BRIGHTEST:g}, white = 1")
     scale = radiance.shape[0] / size
     # Premultiplied, so that smoothing and interpolation keep the edge's colour.
-    paint = blurred(_padded(radiance * alpha * np.float32(level)), 0.5 * scale)
+    shining = radiance if sprite.premultiplied else radiance * alpha
+    paint = blurred(_padded(shining * np.float32(level)), 0.5 * scale)
     shape = blurred(_padded(alpha), 0.5 * scale)
     middle = np.array([(paint.shape[1] - 1) / 2, (paint.shape[0] - 1) / 2])
 

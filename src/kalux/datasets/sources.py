@@ -48,12 +48,15 @@ class Photograph(NamedTuple):
         Whether it was stored as linear radiance. Otherwise it was decoded from sRGB, and 1.0 is its white.
     doubt
         How many pixels were negative, a sentence; None if none was.
+    premultiplied
+        Whether the radiance is already times alpha, as OpenEXR has it.
     """
 
     radiance: Image
     alpha: Image | None
     is_hdr: bool
     doubt: str | None = None
+    premultiplied: bool = False
 
 
 class ImageSequence(NamedTuple):
@@ -91,8 +94,8 @@ def read_photograph(path: Path) -> Photograph:
     InputError
         If the file cannot be read.
     FormatError
-        If it is no image that can be decoded, has values that are not finite, or is negative in half of its pixels or
-        more.
+        If it is no image that can be decoded, has whole numbers with a sign or of more than 16 bits, values that are
+        not finite, or is negative in half of its pixels or more.
     """
     with reading(path):
         data = path.read_bytes()
@@ -106,6 +109,10 @@ def read_photograph(path: Path) -> Photograph:
             raise FormatError(f"{path}: not an image, or damaged; .hdr, .exr, .png, .jpg or .tif is needed")
         colour, alpha = _split_alpha(pixels)
     is_hdr = colour.dtype.kind == "f"
+    if not is_hdr and colour.dtype not in (np.uint8, np.uint16):
+        raise FormatError(
+            f"{path}: its values are {colour.dtype}; whole numbers of 8 or 16 bits without a sign, or floats are needed"
+        )
     linear = colour.astype(np.float32) if is_hdr else _from_srgb(colour)
     radiance = linear if linear.ndim == 2 else np.asarray(linear @ LUMINANCE, np.float32)
     if min(radiance.shape) < 2:
@@ -119,7 +126,7 @@ def read_photograph(path: Path) -> Photograph:
     if negative.any():
         doubt = f"{path}: {_part(negative)} negative, down to {radiance.min():.2g}, and taken as black"
         radiance = np.maximum(radiance, np.float32(0))
-    return Photograph(np.ascontiguousarray(radiance), alpha, is_hdr, doubt)
+    return Photograph(np.ascontiguousarray(radiance), alpha, is_hdr, doubt, premultiplied=is_exr(data))
 
 
 def _part(which: NDArray[np.bool_]) -> str:
