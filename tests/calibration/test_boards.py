@@ -10,6 +10,7 @@ from kalux import Frame
 from kalux.calibration.boards import (
     Board,
     Corners,
+    View,
     calibrate_rig,
     contact_sheet,
     coverage,
@@ -68,6 +69,52 @@ def test_a_view_that_does_not_agree_is_dropped(views):
     found = calibrate_rig(BOARD, [wrong, *views[1:]], **SIZES)
     assert found.dropped == 1
     assert len(found.views) == len(views) - 1
+
+
+CHARUCO = Board(9, 6, 0.03, "5X5_100", 0.022)
+ALL = range(54)
+
+
+def projected(seed, events=ALL, frames=ALL):
+    """A view of the ChArUco board by the small rig; of either camera some corners, 0.05 pixels off."""
+    rng, rig = np.random.default_rng(seed), small_rig()
+    turn, place = rng.uniform(-0.5, 0.5, 3), np.array([-0.13, -0.09, 0.55]) + rng.uniform(-0.03, 0.03, 3)
+    world = CHARUCO.points() @ cv2.Rodrigues(turn)[0].T + place
+    corners = []
+    for lens, seen, points in (
+        (rig.events, events, world),
+        (rig.frames, frames, world @ rig.rotation.T + rig.translation),
+    ):
+        pixels = lens.pixels(points[:, :2] / points[:, 2:]) + rng.normal(0, 0.05, (54, 2))
+        corners.append(Corners(np.array(seen), pixels[list(seen)]))
+    blank = np.zeros((4, 4), np.uint8)
+    return View(seed, seed + 1, *corners, blank, blank)
+
+
+@pytest.mark.parametrize(
+    ("events", "frames"),
+    [
+        (range(18), range(36, 54)),
+        (range(20), range(18, 54)),
+        (range(21), range(18, 54)),
+        (range(9), ALL),
+        (ALL, range(6)),
+        (ALL, [*range(6), 20]),
+        (ALL, range(0, 54, 10)),
+    ],
+    ids=["none", "two", "three", "a row", "a row of frames", "one beside a row", "a diagonal"],
+)
+def test_a_view_of_too_little_of_the_board_is_dropped(events, frames):
+    good = [projected(seed) for seed in range(8)]
+    found = calibrate_rig(CHARUCO, [projected(20, events, frames), *good], **SIZES)
+    assert (len(found.views), found.dropped) == (8, 1)
+    assert found.rig.baseline == pytest.approx(0.04, abs=0.003)
+
+
+def test_a_view_of_a_part_of_the_board_is_used():
+    good = [projected(seed) for seed in range(8)]
+    found = calibrate_rig(CHARUCO, [projected(20, [0, 1, 9, 10, 11, 12], ALL), *good], **SIZES)
+    assert (len(found.views), found.dropped) == (9, 0)
 
 
 def test_a_board_that_moves_within_a_view_is_none(views):

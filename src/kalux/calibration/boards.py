@@ -129,7 +129,7 @@ class RigCalibration(NamedTuple):
     views
         Those used.
     dropped
-        How many more were found, but did not agree.
+        How many more were found, but did not agree, or show too little of the board.
     """
 
     rig: Rig
@@ -289,8 +289,8 @@ def calibrate_rig(
     """Intrinsics of both cameras (k1, k2, p1, p2; k3 = 0, which boards seldom determine) and their pose.
 
     Each camera by itself first (Zhang 2000), then all together, by which the frames, whose corners are sharper, make
-    the event camera's lens better known. Views with more than three times the median error are dropped, and all is
-    done again.
+    the event camera's lens better known. Views that fix no pose of the board are dropped before; those with more than
+    three times the median error are dropped then, and all is done again.
 
     Parameters
     ----------
@@ -306,7 +306,9 @@ def calibrate_rig(
     InputError
         If there are fewer than 6 views.
     """
-    found = list(views)
+    given = list(views)
+    found = [view for view in given if _fixes_poses(board, view)]
+    useless = len(given) - len(found)
     if len(found) > most_views:
         found = [found[i] for i in np.linspace(0, len(found) - 1, most_views).round().astype(int)]
     _require(found)
@@ -331,8 +333,22 @@ def calibrate_rig(
         "board": f"{board.columns}x{board.rows} inner corners, squares of {1e3 * board.square:g} mm",
     }
     return RigCalibration(
-        Rig(joint[0], joint[1], rotation, translation, about), tuple(kept), len(found) - len(kept)
+        Rig(joint[0], joint[1], rotation, translation, about), tuple(kept), useless + len(found) - len(kept)
     )
+
+
+def _fixes_poses(board: Board, view: View) -> bool:
+    """Whether either camera's corners fix its pose, and those that both see the pose between them."""
+    seen = view.events.ids, view.frames.ids
+    return all(_fix_a_homography(board.points()[ids]) for ids in (*seen, np.intersect1d(*seen)))
+
+
+def _fix_a_homography(points: Array) -> bool:
+    """Whether four of the points of a plane lie so that no three are on a line: where no line holds all but one."""
+    if len(points) < 4:
+        return False
+    others = (np.delete(points, k, axis=0) for k in range(len(points)))
+    return all(np.linalg.matrix_rank(some - some[0]) == 2 for some in others)
 
 
 def _require(views: list[View]) -> None:

@@ -122,7 +122,10 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
 def described(found: RigCalibration) -> Iterator[str]:
     """What was found, a line each."""
     about = found.rig.about
-    yield f"views        {about['views']} used, {found.dropped} dropped because they did not agree"
+    yield (
+        f"views        {about['views']} used, {found.dropped} dropped because they did not agree, or showed too little "
+        "of the board"
+    )
     for name, lens in (("events", found.rig.events), ("frames", found.rig.frames)):
         f = lens.matrix
         yield (
