@@ -7,10 +7,12 @@ import dataclasses
 import numpy as np
 import pytest
 
+from kalux import Frame
 from kalux.calibration.offset import busiest, correlate, estimate_offset, frame_changes
 from kalux.calibration.registration import Registration
 from kalux.calibration.rig import Lens
 from kalux.errors import InputError
+from kalux.models.camera import Response
 from kalux.settings import CameraSettings
 from rigs import DISTANCE, OFFSET, distant_recording, small_rig
 
@@ -41,6 +43,27 @@ def test_registered_frames_give_it_finely():
     assert found.coarse.offset == pytest.approx(OFFSET, abs=5_000)
     assert found.coarse.per_pixel
     assert found.apparent > found.offset
+
+
+@pytest.mark.parametrize("registration", [None, TRUTH], ids=["activity", "pixels"])
+def test_exposures_and_responses_change_nothing(registration):
+    """Every other frame exposed a quarter as long, its values a quarter; and all coded in sRGB."""
+    seen, srgb = distant_recording(), dataclasses.replace(CAMERA, response="srgb")
+    # What is well exposed does not depend on the coding here.
+    plain = [dataclasses.replace(f, valid=(f.image > 8) & (f.image < 240)) for f in seen.frames]
+    coded = []
+    for k, f in enumerate(plain):
+        shorter = f.exposure * 3 // 8 if k % 2 else 0  # at either end, so that the middle stays
+        light = f.normalised() * (1 - 2 * shorter / f.exposure)
+        start, end = f.exposure_start + shorter, f.exposure_end - shorter
+        coded.append(Frame(Response.srgb()(light), start, end, valid=f.valid))
+    one, other = (
+        correlate(frame_changes(frames, registration, camera), [seen.events], (120, 160), reach=100_000)
+        for frames, camera in ((plain, CAMERA), (coded, srgb))
+    )
+    assert one.peak > 0.8
+    assert other.peak == pytest.approx(one.peak, abs=0.01)
+    assert other.offset == pytest.approx(one.offset, abs=500)
 
 
 def test_chunks_change_nothing():

@@ -47,7 +47,7 @@ _STEPS: Final = 6
 _CLOSE: Final = 0.01  # pixels, and ms: steps below it end a round
 _MOST_SAMPLES: Final = 200_000  # neighbouring pixels, blurred, say the same
 _HALF_STEP: Final = 1_000  # us, of the derivative by the offset
-_WELL_EXPOSED: Final = (0.03, 0.95)
+_EXPOSED: Final = (0.03, 0.95)
 _SPREAD: Final = 200_000
 """us: a step is spread over no longer than this: what is older than that has mostly been still."""
 
@@ -99,17 +99,9 @@ class Alignment(NamedTuple):
 
 
 def take_shots(frames: Iterable[Frame], camera: CameraSettings) -> Shots:
-    """Logarithms of frames, scaled to the first one's exposure where exposures are known."""
-    green = Camera.named(camera.response, camera.clipped_from).of_channel(1)  # of colours that differ
-    response = green.response
+    """Logarithms of frames, from `intensities`."""
     middles, logs, shares, usable = [], [], [], []
-    reference = 0
-    for frame in frames:
-        grey, good = well_exposed(frame)
-        linear = np.maximum(response.inverse(grey), 0.0)
-        if frame.exposure > 0:
-            reference = reference or frame.exposure
-            linear = linear * (reference / frame.amplified_exposure)
+    for frame, linear, good in intensities(frames, camera):
         middles.append(frame.middle)
         logs.append(np.log(linear + camera.offset).astype(np.float32))
         shares.append((linear / (linear + camera.offset)).astype(np.float32))
@@ -121,11 +113,26 @@ def take_shots(frames: Iterable[Frame], camera: CameraSettings) -> Shots:
     return Shots(np.array(middles, np.int64), np.stack(logs), np.stack(shares), np.stack(usable))
 
 
-def well_exposed(frame: Frame) -> tuple[Array, NDArray[np.bool_]]:
+def intensities(
+    frames: Iterable[Frame], camera: CameraSettings
+) -> Iterator[tuple[Frame, Array, NDArray[np.bool_]]]:
+    """Frames, their intensity (at the exposure of the first, where exposures are known), and what is well exposed."""
+    green = Camera.named(camera.response, camera.clipped_from).of_channel(1)  # of colours that differ
+    reference = 0
+    for frame in frames:
+        grey, good = _well_exposed(frame)
+        linear = np.maximum(green.response.inverse(grey), 0.0)
+        if frame.exposure > 0:
+            reference = reference or frame.exposure
+            linear = linear * (reference / frame.amplified_exposure)
+        yield frame, linear, good
+
+
+def _well_exposed(frame: Frame) -> tuple[Array, NDArray[np.bool_]]:
     """The response of a frame, of RGB the mean, and where it is measured and well exposed; (H', W')."""
     values = frame.normalised()
     grey = values if values.ndim == 2 else values.mean(axis=2)
-    low, high = _WELL_EXPOSED
+    low, high = _EXPOSED
     good = (grey > low) & (grey < high)
     return grey, good if frame.valid is None else good & frame.valid
 

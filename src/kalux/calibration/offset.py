@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.calibration.alignment import MOST_FRAMES, Shots, align, take_shots, well_exposed
+from kalux.calibration.alignment import MOST_FRAMES, Shots, align, intensities, take_shots
 from kalux.calibration.registration import Registration
 from kalux.errors import InputError
 from kalux.event_slices import between
@@ -117,9 +117,8 @@ def frame_changes(
     middles: list[int] = []
     rows: list[Array] = []
     before: tuple[NDArray[Any], NDArray[Any]] | None = None
-    for frame in islice(frames, _COARSE_FRAMES):
-        grey, usable = well_exposed(frame)
-        log, good = np.log(grey + camera.offset).astype(np.float32), usable.astype(np.float32)
+    for frame, linear, usable in intensities(islice(frames, _COARSE_FRAMES), camera):
+        log, good = np.log(linear + camera.offset).astype(np.float32), usable.astype(np.float32)
         now: tuple[NDArray[Any], NDArray[Any]]
         if registration is None:
             scale = max(1, frame.image.shape[1] // 160)
