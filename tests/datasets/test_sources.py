@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -9,7 +10,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from kalux.datasets import Pose, SensorSettings, pan, photograph_scene, simulate, static, still
+from kalux.datasets import Pose, SensorSettings, pan, photograph_scene, simulate, sources, static, still
 from kalux.datasets.foreground import Sprite, with_foreground
 from kalux.datasets.sources import (
     exposed,
@@ -240,6 +241,26 @@ def test_a_video_forwards_and_backwards(video: Path) -> None:
     expected = [((v / 255 + 0.055) / 1.055) ** 2.4 for v in 40 + 20 * np.arange(10)]
     for index in (0, 3, 4, 9, 2, 0, 8):
         assert sequence.image(index).mean() == pytest.approx(expected[index], rel=0.05)
+
+
+def test_a_fast_video_is_read_once_in_a_pass(video: Path, monkeypatch) -> None:
+    """Steps that are halved go back in time, by 4 ms and less: 4 pictures here."""
+    decoded, decode = [], sources._decoded_video
+
+    def counted(path: Path) -> Iterator[np.ndarray]:
+        decoded.append(0)
+        for image in decode(path):
+            decoded[-1] += 1
+            yield image
+
+    monkeypatch.setattr(sources, "_decoded_video", counted)
+    monkeypatch.setattr(sources, "_VIDEO_BYTES", 0)  # as of pictures that are so large
+    sequence = open_sequence(video)
+    scene = sequence_scene(sequence, still(), sensor_size=(24, 32), rate_hz=1000.0)
+    made = simulate(scene, SensorSettings(threshold_on=0.05, frame_rate=200, exposure=2000))
+    assert len(made.events) > 20_000
+    assert len(decoded) == 2  # events and frames
+    assert max(decoded) <= 10
 
 
 def test_a_video_makes_a_recording(video: Path) -> None:

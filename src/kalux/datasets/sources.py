@@ -6,7 +6,7 @@ are decoded as sRGB, 1.0 = their white, above which they know nothing. Colour be
 
 from __future__ import annotations
 
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -25,10 +25,16 @@ from kalux.readers.source import reading
 from kalux.readers.videos import opened_video
 from kalux.wording import how_many
 
-_KEPT: Final = 4  # decoded images
+_KEPT: Final = 4  # images of an interpolation
 _MOMENTS: Final = 16  # of a scene, by which white is chosen
 _DARKEST: Final = 1e-4
 """Added before the logarithm of interpolation, as part of white: black pixels have one, too."""
+
+_VIDEO_BYTES: Final = 1 << 28
+"""Of a video's pictures that are kept: 32 of 1920x1080. A simulation goes back by up to 4 ms again and again, which are
+five pictures at 1000 Hz, and by the rows of a rolling shutter."""
+
+_VIDEO_LEAST: Final = 8  # pictures, if they are so large that fewer fill that
 
 _LEAST_WHITE: Final = 1e-30
 _LARGEST_WHITE: Final = 1e30
@@ -211,25 +217,33 @@ def _video(path: Path) -> ImageSequence:
             size, count = (picture.height, picture.width), count + 1
     if size is None or count < 2:
         raise FormatError(f"{path}: has {count} pictures; a sequence needs two or more")
-    return ImageSequence(path, count, size, _VideoPictures(path), False, rate)
+    return ImageSequence(path, count, size, _VideoPictures(path, size), False, rate)
 
 
 class _VideoPictures:
-    """Pictures of a video by index: decoded onwards from the last one; from the start again to go back."""
+    """Pictures of a video by index: decoded onwards from the last one.
 
-    def __init__(self, path: Path) -> None:
+    The last 256 MiB of pictures (8 at least) are kept. To go further back is to decode from the start again.
+    """
+
+    def __init__(self, path: Path, size: tuple[int, int]) -> None:
         self._path = path
         self._pictures: Iterator[Image] = iter(())
         self._next = 0
+        picture = size[0] * size[1] * np.dtype(np.float32).itemsize
+        self._kept: deque[Image] = deque(maxlen=max(_VIDEO_BYTES // picture, _VIDEO_LEAST))
 
     def __call__(self, index: int) -> Image:
-        if index < self._next or self._next == 0:
+        if index < self._next - len(self._kept) or self._next == 0:
             self._pictures, self._next = _decoded_video(self._path), 0
-        for image in self._pictures:
+            self._kept.clear()
+        while self._next <= index:
+            image = next(self._pictures, None)
+            if image is None:
+                raise FormatError(f"{self._path}: picture {index} cannot be decoded; copy it again")
+            self._kept.append(image)
             self._next += 1
-            if self._next > index:
-                return image
-        raise FormatError(f"{self._path}: picture {index} cannot be decoded; copy it again")
+        return self._kept[index - self._next]
 
 
 def _decoded_video(path: Path) -> Iterator[Image]:
