@@ -26,8 +26,8 @@ MOST_MISSING: Final = 2
 _CLEARER: Final = 2.0  # how much better the best matching must fit than the next
 
 _SURER: Final = 4.0
-"""How much better than in order another matching of equal numbers must fit: as good by chance are fewer than one in a
-thousand of 13 frames whose stamps jitter by themselves."""
+"""How much better than in order another matching of equal numbers must fit: by chance none did in 16,000 trains of 14
+triggers and frames, the fewest that are judged, with stamps that jitter by 0 to 1 ms."""
 
 _LEAST_PART: Final = 4  # intervals before and after a loss: fewer fit something by chance
 _UNLIKE: Final = (
