@@ -977,7 +977,7 @@ def reconstruct(events, frames, sensor_size, settings, times):
     return every, out[0], out[1], out[2:4], out[4].astype(bool), expected
 
 
-def joined_along(first, second, path, bend, share, level, variance, c2):
+def joined_along(first, second, path, bend, unsure, share, level, variance, c2):
     """L and its variance joined with what both frames show along the paths (K16); ``first``, ``second``: L and V."""
     height, width = level.shape
     of_second = share + ((1 - share) if share <= 0.5 else -share) * (1 - 2 * share) ** 2
@@ -998,7 +998,11 @@ def joined_along(first, second, path, bend, share, level, variance, c2):
     doubt /= np.maximum(1 - unexplained, 1e-6)
     contradiction = around((level - seen) ** 2 / (variance + doubt + c2 / 4), 2)
     believed = 1.5 / (doubt * (1 + 4 * np.maximum(contradiction - 1, 0)) ** 2)
-    trust = (1.5 - 0.5 * 4 * share * (1 - share)) / (doubt * (1 + 0.7 * contradiction) ** 2)
+    wide = np.pad(seen, 1, mode="reflect")
+    rows = wide[:-2] + wide[1:-1] + wide[2:]
+    across, down = (rows[:, 2:] - rows[:, :-2]) / 6, (wide[2:, 1:-1] - wide[:-2, 1:-1]) / 2
+    strayed = (4 * share * (1 - share)) ** 2 * unsure * (across**2 + down**2)
+    trust = (1.5 - 0.5 * 4 * share * (1 - share)) / ((doubt + strayed) * (1 + 0.7 * contradiction) ** 2)
     return (level / variance + seen * believed) / (1 / variance + believed), 1 / (1 / variance + trust)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -24,6 +26,7 @@ def moving_right(first, second):
         readable(second),
         path,
         np.zeros_like(path),
+        np.zeros_like(path[0]),
         unmoved_difference(first, second),
         0.04,
         ((slice(0, SHAPE[0]), slice(0, SHAPE[1])),),
@@ -48,12 +51,15 @@ def test_it_is_the_oracle(seed, share, moved):
     variance = rng.uniform(1e-4, 1e-2, shape).astype(np.float32)
     frames = Latent(first, variances[0]), Latent(second, variances[1])
     unmoved = naive.around((first.astype(float) - second) ** 2, 2).astype(np.float32)
-    motion = Motion(*map(readable, frames), path, bend, unmoved, 0.04, ((slice(0, 14), slice(0, 17)),))
+    unsure = rng.uniform(0.0, 0.3, shape).astype(np.float32)
+    windows = ((slice(0, 14), slice(0, 17)),)
+    motion = Motion(*map(readable, frames), path, bend, unsure, unmoved, 0.04, windows)
     found = whole(Along(motion, share), level, variance)
     expected = naive.joined_along(
         *((frame.value.astype(float), frame.variance.astype(float)) for frame in frames),
         path,
         bend,
+        unsure.astype(float),
         share,
         level.astype(float),
         variance.astype(float),
@@ -102,12 +108,16 @@ def test_windows_show_what_the_whole_image_does(windows):
     path = np.zeros((2, *SHAPE), np.float32)
     path[0] = 3.0
     bend = rng.normal(0, 0.3, path.shape).astype(np.float32)
+    unsure = rng.uniform(0.0, 0.3, SHAPE).astype(np.float32)
     level, variance = texture(0, 1.2), np.full(SHAPE, 1e-3, np.float32)
     readable_frames = [readable(frame) for frame in frames]
     all_of_it = (slice(0, 72), slice(0, 96))
     found = [
         whole(
-            Along(Motion(*readable_frames, path, bend, unmoved_difference(*frames), 0.04, tuple(parts)), 0.4),
+            Along(
+                Motion(*readable_frames, path, bend, unsure, unmoved_difference(*frames), 0.04, tuple(parts)),
+                0.4,
+            ),
             level,
             variance,
         )
@@ -117,12 +127,25 @@ def test_windows_show_what_the_whole_image_does(windows):
         np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-6)
 
 
+def test_a_bend_that_is_not_known_leaves_slopes_less_known():
+    """Half-way only the variance tells of it, and at the frames nothing: there is no bend."""
+    sure = moving_right(frame_of(texture(0)), frame_of(texture(0, 2.0)))
+    unsure = dataclasses.replace(sure, unsure=np.full(SHAPE, 0.2, np.float32))
+    variance = np.full(SHAPE, 0.01, np.float32)
+    for share, differs in ((0.0, False), (0.5, True), (1.0, False)):
+        level = texture(0, 2 * share)
+        one, other = (whole(Along(motion, share), level, variance) for motion in (sure, unsure))
+        np.testing.assert_array_equal(one[0], other[0])
+        assert (other[1] >= one[1]).all()
+        assert (other[1] > 1.5 * one[1]).mean() > 0.5 if differs else np.array_equal(one[1], other[1])
+
+
 def test_windows_are_taken_with_their_margins_and_put_back_without():
     """Of two that lie beside each other the margins overlap, and end with the image."""
     image = np.arange(20 * 30, dtype=np.float32).reshape(20, 30)
     windows = (slice(0, 8), slice(10, 20)), (slice(8, 20), slice(10, 14))
     nothing = np.zeros((2, *image.shape), np.float32)
-    along = Along(Motion(nothing, nothing, nothing, nothing, image, 0.04, windows), 0.5)
+    along = Along(Motion(nothing, nothing, nothing, nothing, image, image, 0.04, windows), 0.5)
     values = taken(along, image)
     np.testing.assert_array_equal(values, np.concatenate([image[:12, 6:24].ravel(), image[4:, 6:18].ravel()]))
     found = -image

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from kalux import PRESETS, Frame, Reconstructor
 from kalux.augmentation.along import Along
 from kalux.augmentation.bridge import UNMEASURED
-from kalux.augmentation.motion import HalfWay, _windows, behind, bent, find_path
+from kalux.augmentation.motion import HalfWay, _windows, behind, bent, find_path, unknown_bend
 from kalux.events import make_events
 from kalux.settings import altered
 from textures import SHAPE, frame_of, texture, whole
@@ -48,7 +48,9 @@ def test_the_path_is_bent_to_the_image_half_way(late):
     """A texture that moves by 4 pixels, but is not where 2 are half-way: the bend finds it, and it is seen there."""
     first, second = frame_of(texture(0)), frame_of(texture(0, 4.0))
     level, variance = texture(0, 2.0 + late), np.full(SHAPE, 1e-3, np.float32)
-    motion = bent(first, second, find_path(first, second, -3.5, 1.0), HalfWay(level, variance, 0.0, 0.04))
+    motion = bent(
+        first, second, find_path(first, second, -3.5, 1.0), HalfWay(level, variance, 0.0, 0.04, 0.04)
+    )
     np.testing.assert_allclose(np.median(motion.bend[0][INSIDE]), -late, atol=0.1)
     np.testing.assert_allclose(np.median(motion.bend[1][INSIDE]), 0.0, atol=0.05)
     noisy = level + np.random.default_rng(1).normal(0, 0.1, SHAPE).astype(np.float32)
@@ -63,11 +65,21 @@ def test_an_image_that_is_behind_the_light_bends_no_path():
     first, second = frame_of(texture(0)), frame_of(texture(0, 8.0))
     level, variance = texture(0, 3.6), np.full(SHAPE, 1e-3, np.float32)
     path = find_path(first, second, -3.5, 1.0)
-    motion = bent(first, second, path, HalfWay(level, variance, 0.05, 0.04))
+    motion = bent(first, second, path, HalfWay(level, variance, 0.05, 0.04, 0.04))
     np.testing.assert_allclose(np.median(motion.bend[0][INSIDE]), 0.0, atol=0.05)
     noisy = level + np.random.default_rng(1).normal(0, 0.1, SHAPE).astype(np.float32)
     joined, _ = whole(Along(motion, 0.5), noisy, np.full(SHAPE, 0.03, np.float32))
     assert np.sqrt(np.mean(np.square(joined - texture(0, 4.0))[INSIDE])) < 0.06
+
+
+def test_what_is_not_known_of_a_bend():
+    """At most what accelerations make of the time between frames; across an edge as much as its slopes tell."""
+    nothing, edge, texture_both = ([0.0, 0.0, 0.0], [100.0, 0.0, 0.0], [100.0, 100.0, 0.0])
+    told = np.array([nothing, edge, texture_both], np.float32).T
+    at_25, at_12 = (unknown_bend(told, interval) for interval in (0.04, 0.08))
+    assert at_25[0] == pytest.approx((500 * 0.04**2 / 8) ** 2, rel=1e-4)
+    assert at_12[0] == pytest.approx(16 * at_25[0], rel=1e-4)
+    np.testing.assert_allclose(at_12[1:], 1 / (100 + 1 / at_12[0]), rtol=1e-3)
 
 
 def test_it_is_behind_by_a_share_of_the_time_between_events_as_far_as_frames_let_it():
@@ -81,7 +93,7 @@ def test_a_wrong_path_is_not_believed():
     first, second = frame_of(texture(0)), frame_of(texture(1))
     level, variance = texture(2), np.full(SHAPE, 1e-3, np.float32)
     path = find_path(first, second, -3.5, 1.0)
-    motion = bent(first, second, path, HalfWay(level, variance, 0.0, 0.04))
+    motion = bent(first, second, path, HalfWay(level, variance, 0.0, 0.04, 0.04))
     if motion is not None:
         joined, _ = whole(Along(motion, 0.5), level, variance)
         assert np.sqrt(np.mean(np.square(joined - level))) < 0.01

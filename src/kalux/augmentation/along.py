@@ -59,6 +59,8 @@ _DISTRUST: Final = np.float32(0.7)
 """How much less the variance falls where the filter contradicts, per such difference: what looks right is not always,
 so that it tells less of its own error than it is worth (docs/equations.md, K16)."""
 
+_HALF: Final = np.float32(1 / 2)
+
 _LEAST_MOVING: Final = np.float32(1e-6)
 """Share of the frames' difference that motion explains where it explains nothing: a division."""
 
@@ -118,6 +120,8 @@ class Motion:
         (2, H, W) float32: columns and rows from ``first`` to ``second`` of what is at a pixel half-way.
     bend
         (2, H, W) float32: how far both ends of the path are shifted for what is at a pixel half-way.
+    unsure
+        (H, W) float32: variance of either part of the bend, pixel^2.
     unmoved
         (H, W) float32: mean squared difference of the frames around every pixel, at the same place.
     threshold2
@@ -130,6 +134,7 @@ class Motion:
     second: Plane
     path: Plane
     bend: Plane
+    unsure: Plane
     unmoved: Plane
     threshold2: float
     windows: tuple[Window, ...]
@@ -237,7 +242,7 @@ def _look(
     motion = along.motion
     height, width = motion.unmoved.shape
     seen, doubt = memory.empty((2, places.pixels))
-    planes = motion.first, motion.second, motion.path, motion.bend, motion.unmoved
+    planes = motion.first, motion.second, motion.path, motion.bend, motion.unsure, motion.unmoved
     _look_along(
         *(plane.reshape(-1) for plane in planes),
         level,
@@ -276,6 +281,7 @@ def _look_along(  # type: ignore[no-untyped-def]
     second,
     path,
     bend,
+    unsure,
     unmoved,
     level,
     variance,
@@ -306,7 +312,7 @@ def _look_along(  # type: ignore[no-untyped-def]
         read, apart = empty(_FOUR * count, np.float32), _TWO * count
         sums, wider = empty(count + _FOUR, np.float32), empty(count + _FOUR, np.float32)
         difference, local = empty(_RING * count, np.float32), empty(_RING * count, np.float32)
-        contradiction = empty(_RING * count, np.float32)
+        contradiction, strayed = empty(_RING * count, np.float32), empty(_RING * count, np.float32)
         for step in range(rows + _FOUR):
             if step < rows:
                 here, place = begin + step * count, (top + step) * width + left
@@ -331,6 +337,12 @@ def _look_along(  # type: ignore[no-untyped-def]
                 at = row % _RING * count
                 _add_three(seen, begin, row, rows, rows, count, sums)
                 _roughen(count, local, at, seen, begin + row * count, difference, at, sums, FIRST)
+                if joins:
+                    above = begin + mirrored(row - _ONE, rows) * count
+                    below, place = begin + mirrored(row + _ONE, rows) * count, (top + row) * width + left
+                    _stray(
+                        count, strayed, at, sums, FIRST, seen, above, seen, below, unsure, place, bent * bent
+                    )
             if _TWO <= step < rows + _TWO:
                 row = step - _TWO
                 here, place = begin + row * count, (top + row) * width + left
@@ -346,9 +358,13 @@ def _look_along(  # type: ignore[no-untyped-def]
                     # fmt: on
             if step >= _FOUR and joins:
                 row = step - _FOUR
-                here = begin + row * count
+                here, at = begin + row * count, row % _RING * count
                 _add_five(contradiction, row, rows, count, sums)
-                _join(count, seen, here, doubt, here, sums, FIRST, level, here, variance, here, trust)
+                # fmt: off
+                _join(
+                    count, seen, here, doubt, here, sums, FIRST, strayed, at, level, here, variance, here, trust,
+                )
+                # fmt: on
         begin += rows * count
 
 
@@ -410,6 +426,18 @@ def _roughen(local: Pixels, seen: Pixels, difference: Pixels, seen_around: Pixel
 
 
 @row_formula
+def _stray(
+    strayed: Pixels, seen_around: Pixels, above: Pixels, below: Pixels, unsure: Pixels, bent: Number
+) -> None:
+    """The variance that slopes have of a bend that is not known: both frames are read too far to one side.
+
+    ``bent`` is the square of how much of it there is.
+    """
+    across, down = (seen_around[1] - seen_around[-1]) * np.float32(1 / 6), (below[0] - above[0]) * _HALF
+    strayed[0] = bent * unsure[0] * (across * across + down * down)
+
+
+@row_formula
 def _doubt(doubt: Pixels, local_around: Pixels, difference_around: Pixels, unmoved: Pixels) -> None:
     """The variance of what is seen, in place of that by the frames' own: the larger the less the motion explains."""
     explained = ONE - _mean_of_five(difference_around) / _larger(unmoved[0], _LEAST_UNMOVED)
@@ -435,6 +463,7 @@ def _join(
     seen: Pixels,
     doubt: Pixels,
     contradiction_around: Pixels,
+    strayed: Pixels,
     level: Pixels,
     variance: Pixels,
     trust: Number,
@@ -444,7 +473,7 @@ def _join(
     believed = doubt[0] * squared(ONE + _CONTRADICTED * _larger(contradicted - ONE, np.float32(0.0)))
     kept = believed / (np.float32(_CAREFUL) * variance[0] + believed)
     seen[0] = seen[0] + kept * (level[0] - seen[0])
-    doubted = doubt[0] * squared(ONE + _DISTRUST * contradicted)
+    doubted = (doubt[0] + strayed[0]) * squared(ONE + _DISTRUST * contradicted)
     doubt[0] = doubted / (trust * variance[0] + doubted) * variance[0]
 
 

@@ -79,6 +79,13 @@ _ALIKE: Final = np.float32(1.0 / 20.0)
 _BEND_INFORMATION: Final = np.float32(1.0)
 """1 / pixel^2: what is known of a bend beforehand."""
 
+_ACCELERATION: Final = 500.0
+"""pixels/s^2, in either direction: of what moves, by which its path bends, as far as the image does not tell by how much
+(docs/equations.md, K16)."""
+
+_LEAST_TOLD: Final = np.float32(1e-6)
+"""1 / pixel^2, added where nothing may be told: a division."""
+
 _OUTLIER: Final = np.float32(4.0)
 """Squared error, in units of its variance, at which a pixel counts for a quarter."""
 
@@ -174,12 +181,15 @@ class HalfWay(NamedTuple):
         By how much it is behind the light: a share of the way from one frame to the other, from `behind`.
     threshold2
         c^2.
+    interval
+        Time from one frame to the other, s.
     """
 
     level: Floats
     variance: Floats
     behind: float
     threshold2: float
+    interval: float
 
 
 def behind(scale: float, interval: float) -> float:
@@ -238,20 +248,27 @@ def bent(first: Latent, second: Latent, path: Plane, image: HalfWay) -> Motion |
     level, variance = (np.ascontiguousarray(plane, np.float32) for plane in image[:2])
     first, second = as_seen(first), as_seen(second)
     frames, unmoved = (readable(first), readable(second)), unmoved_difference(first, second)
-    motion = Motion(*frames, path, np.zeros_like(path), unmoved, image.threshold2, (window,))
+    bends, unsure = np.zeros_like(path), np.zeros_like(path[0])
+    motion = Motion(*frames, path, bends, unsure, unmoved, image.threshold2, (window,))
     # Where the light was then that the image shows; what would be bent otherwise is no bend.
     shown, cell = Along(motion, 0.5 - image.behind), max(round((side + 1) / _CELLS), 1)
     rows, columns = (part.stop - part.start for part in window)
     bend = np.zeros((2, -(-rows // cell), -(-columns // cell)), np.float32)
+    whole = cell * bend.shape[2], cell * bend.shape[1]
+
+    def fill(plane: Plane, of_cells: Plane) -> None:
+        plane[window] = cv2.resize(of_cells, whole, interpolation=cv2.INTER_LINEAR)[:rows, :columns]
+
     for _ in range(_BENDS):
-        bend = _bent_further(bend, *seen_along(shown, window), level[window], variance[window], cell)
-        for plane, of_cells in zip(motion.bend, bend, strict=True):
-            whole = (cell * bend.shape[2], cell * bend.shape[1])
-            plane[window] = cv2.resize(of_cells, whole, interpolation=cv2.INTER_LINEAR)[:rows, :columns]
+        seen = seen_along(shown, window)
+        bend, told = _bent_further(bend, *seen, level[window], variance[window], cell)
+        for plane, of_cells in zip(bends, bend, strict=True):
+            fill(plane, of_cells)
     left = variance.copy()
     join_along(Along(motion, 0.5), level.copy(), left)
     gain = np.where(moving, 1.0 - left / variance, np.float32(0.0))
     windows = tuple(_windows(gain))
+    fill(unsure, unknown_bend(told, image.interval))  # only now, as it changes nothing of the image
     return dataclasses.replace(motion, windows=windows) if windows else None
 
 
@@ -283,10 +300,27 @@ def _windows(gain: Plane) -> list[Window]:
     return found
 
 
-def _bent_further(bend: Plane, seen: Plane, doubt: Plane, level: Plane, variance: Plane, cell: int) -> Plane:
+def unknown_bend(told: Plane, interval: float) -> Plane:
+    """Variance of a bend in the direction of the slopes of what is seen, pixel^2, on average.
+
+    Beforehand it is that of what accelerates, half-way through the ``interval``, s, between both frames; ``told`` is
+    what the image tells, (3, ...) 1 / pixel^2: across, down, and of both together.
+    """
+    before = np.float32((_ACCELERATION * interval**2 / 8) ** -2)
+    across, down, both = told
+    product, slopes = both * both, across + down
+    determinant = (across + before) * (down + before) - product
+    along_slopes = (across * (down + before) + down * (across + before) - 2 * product) / determinant
+    return np.asarray((along_slopes + _LEAST_TOLD / before) / (slopes + _LEAST_TOLD), np.float32)
+
+
+def _bent_further(
+    bend: Plane, seen: Plane, doubt: Plane, level: Plane, variance: Plane, cell: int
+) -> tuple[Plane, Plane]:
     """A step of Gauss and Newton: what is seen is shifted, tile by tile, so that its error becomes least.
 
-    ``bend`` is that of every cell of ``cell`` x ``cell`` pixels.
+    ``bend`` is that of every cell of ``cell`` x ``cell`` pixels. Also returned is what the image tells of it, as
+    `unknown_bend` takes it.
     """
     sums = np.zeros((5, *bend.shape[1:]), np.float32)
     _sum_cells(
@@ -296,11 +330,12 @@ def _bent_further(bend: Plane, seen: Plane, doubt: Plane, level: Plane, variance
         sums.reshape(-1),
     )
     xx, yy, xy, x, y = (np.float32(_CELLS**2) * mean_around(part, (_CELLS, _CELLS)) for part in sums)
+    told = np.stack([xx, yy, xy])
     xx, yy = xx + _BEND_INFORMATION, yy + _BEND_INFORMATION
     x, y = x - _BEND_INFORMATION * bend[0], y - _BEND_INFORMATION * bend[1]
     step = np.stack([yy * x - xy * y, xx * y - xy * x]) / (xx * yy - xy * xy)
     further: Plane = np.clip(bend + step, -_MOST_BENT, _MOST_BENT)
-    return further
+    return further, told
 
 
 @loop(fastmath=FUSED)

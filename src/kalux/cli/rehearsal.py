@@ -78,7 +78,7 @@ def rehearse_images() -> None:
     make_image(estimate, view, with_variance=False)
     even, known = np.zeros(_SIZE, np.float32), np.ones(_SIZE, np.float32)
     frame, aside = Latent(even, known), np.ones((2, *_SIZE), np.float32)
-    paths = Paths(frame, frame, aside, HalfWay(even, known, 0.0, 0.1))
+    paths = Paths(frame, frame, aside, HalfWay(even, known, 0.0, 0.1, 0.04))
     moving = dataclasses.replace(estimate, log_intensity=even, variance=known, paths=paths, share=0.5)
     make_image(moving, view)
 

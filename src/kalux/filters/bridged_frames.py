@@ -567,8 +567,10 @@ class BridgedFrames(Method):
     def paths(self, segment: BridgedSegment, path: Plane, level: Floats, variance: Floats) -> Paths:
         assert segment.latents is not None
         assert segment.trail is not None
-        late = behind(1e6 * segment.trail.scale, segment.end - segment.start)
-        return Paths(*segment.latents, path, HalfWay(level, variance, late, self._threshold2))
+        interval = segment.end - segment.start
+        late = behind(1e6 * segment.trail.scale, interval)
+        image = HalfWay(level, variance, late, self._threshold2, 1e-6 * interval)
+        return Paths(*segment.latents, path, image)
 
     def turns(self, segment: BridgedSegment) -> float:
         return segment.turns
