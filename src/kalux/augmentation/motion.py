@@ -80,8 +80,8 @@ _BEND_INFORMATION: Final = np.float32(1.0)
 """1 / pixel^2: what is known of a bend beforehand."""
 
 _ACCELERATION: Final = 500.0
-"""pixels/s^2, in either direction: of what moves, by which its path bends, as far as the image does not tell by how much
-(docs/equations.md, K16)."""
+"""pixels/s^2, in either direction: of what moves, by which its path bends, as far as the image does not tell by how
+much (docs/equations.md, K16)."""
 
 _LEAST_TOLD: Final = np.float32(1e-6)
 """1 / pixel^2, added where nothing may be told: a division."""
