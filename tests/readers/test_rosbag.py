@@ -324,6 +324,15 @@ def test_compressed_images(tmp_path):
     assert same_frames(source.frames(), shifted_frames(small_frames()))
 
 
+def test_an_exposure_that_was_recorded_beyond_the_end_of_time_is_damage(tmp_path):
+    messages = davis_messages(True)
+    place = next(i for i, message in enumerate(messages) if message[1] == "/dvs/exposure")
+    messages[place] = (1 << 63, *messages[place][1:])
+    write_mcap(tmp_path / "recording.mcap", messages)
+    with pytest.raises(FormatError, match="'/dvs/exposure': damaged"):
+        readers.read(tmp_path / "recording.mcap")
+
+
 def test_unknown_exposure_is_said(tmp_path):
     path = tmp_path / "recording.bag"
     write_bag1(path, davis_messages(False, exposures=False))

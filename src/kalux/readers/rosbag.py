@@ -350,9 +350,9 @@ def _exposures(path: Path, bag: Bag, images: Topic, name: str | None) -> _Exposu
         records = [
             (record.time, Message(record.data, found[0].cdr).number("i")) for record in bag.records(found[0])
         ]
+        table = np.array(sorted(records), np.int64).reshape(-1, 2)  # MCAP has room for times beyond an int64
     if not records:
         return None
-    table = np.array(sorted(records), np.int64)
     return _Exposures(found[0], table[:, 0], table[:, 1])
 
 
