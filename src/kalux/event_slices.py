@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,13 @@ def all_between(chunks: Sequence[EventArray], start: int, end: int) -> list[Even
     """The same of events in several arrays."""
     inside = (between(chunk, start, end) for chunk in chunks)
     return [events for events in inside if len(events)]
+
+
+def counted(chunks: Iterable[EventArray], on_events: Callable[[int], None]) -> Iterator[EventArray]:
+    """The same chunks; ``on_events`` is told the number of events of each when it has been used."""
+    for chunk in chunks:
+        yield chunk
+        on_events(len(chunk))
 
 
 def first_events(chunks: Iterable[EventArray], most: int | None) -> Iterator[EventArray]:

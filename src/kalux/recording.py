@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from kalux import readers
 from kalux.compiled import event_column, event_row, event_words, loop
 from kalux.errors import ExposureError, FormatError, FrameError, InputError, require_type
+from kalux.event_slices import counted
 from kalux.events import (
     LARGEST_SIDE,
     LATEST,
@@ -132,13 +133,7 @@ def without_events_of(recording: Recording, pixels: NDArray[np.bool_]) -> Record
 def with_counted_events(recording: Recording, on_events: Callable[[int], None]) -> Recording:
     """The same recording; ``on_events`` is told the number of events of every chunk that is read, however often."""
     whole, made = recording.source.events, copy.copy(recording)
-
-    def events() -> Iterator[EventArray]:
-        for chunk in whole():
-            yield chunk
-            on_events(len(chunk))
-
-    made.source = dataclasses.replace(recording.source, events=events)
+    made.source = dataclasses.replace(recording.source, events=lambda: counted(whole(), on_events))
     return made
 
 

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import dataclasses
 import pickle
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from kalux.augmentation.bridge import REPEATED, UNMEASURED
 from kalux.augmentation.trail import FrameTrail, follow, nothing_followed, trail_at
-from kalux.events import EventArray
+from kalux.event_slices import counted
 from kalux.filters.highlights import obey_bounds, smoothed_unshown
 from kalux.filters.uncertainty import Around
 from kalux.images import Estimate
@@ -80,7 +80,7 @@ class Trails:
             end = spill.middle(index)
             chunks = spill.events_between(start + delay, end + delay, hot)
             if on_events is not None:
-                chunks = _counted(chunks, on_events)
+                chunks = counted(chunks, on_events)
             _, _, followed = follow(chunks, followed, start + delay, end + delay)
             spill.save_newest_events(index, followed.newest - 2 * delay)
             self._scales.append(followed.scale)
@@ -95,12 +95,6 @@ class Trails:
         return FrameTrail(
             *(trail_at(newest, middle, (self._scales[k], *self._heights)) for k in (forward, after))
         )
-
-
-def _counted(chunks: Iterator[EventArray], on_events: Callable[[int], None]) -> Iterator[EventArray]:
-    for chunk in chunks:
-        yield chunk
-        on_events(len(chunk))
 
 
 class BackwardPass:

@@ -338,36 +338,41 @@ class TestDsec:
             readers.read(folder)
 
 
-@pytest.mark.parametrize(
+in_seconds = pytest.mark.parametrize(
     ("layout", "column"),
     [("hqf", "events/ts"), ("mvsec", "davis/left/events"), ("mvsec", "davis/left/image_raw_ts")],
 )
+
+
+def with_column(path, column, change):
+    """The file, in which a column is replaced by what ``change`` makes of it."""
+    with h5py.File(path, "r+") as file:
+        values = change(file[column][...])
+        del file[column]
+        file[column] = values
+    return path
+
+
+@in_seconds
 def test_seconds_since_1970_in_single_precision_are_refused(tmp_path, layout, column):
     """They are 128 s apart."""
-    path = write(tmp_path, layout)
-    with h5py.File(path, "r+") as file:
-        values = file[column][...]
+
+    def later(values):
         times = values[:, 2] if column == "davis/left/events" else values
         times += 1.6e9
-        del file[column]
-        file[column] = values.astype(np.float32)
+        return values.astype(np.float32)
+
+    path = with_column(write(tmp_path, layout), column, later)
     with pytest.raises(
         FormatError, match=f"{path.name}: times are float32, of which two that differ are 128 s"
     ):
         all_events(readers.read(path))
 
 
-@pytest.mark.parametrize(
-    ("layout", "column"),
-    [("hqf", "events/ts"), ("mvsec", "davis/left/events"), ("mvsec", "davis/left/image_raw_ts")],
-)
+@in_seconds
 def test_whole_numbers_are_no_seconds(tmp_path, layout, column):
     """Microseconds, as other programs write them, would be a million times as long."""
-    path = write(tmp_path, layout)
-    with h5py.File(path, "r+") as file:
-        values = file[column][...] * 1e6
-        del file[column]
-        file[column] = values.astype(np.int64)
+    path = with_column(write(tmp_path, layout), column, lambda values: (values * 1e6).astype(np.int64))
     with pytest.raises(FormatError, match=f"{path.name}: its times are int64.* floating-point seconds"):
         readers.read(path)
 

@@ -59,8 +59,6 @@ _DISTRUST: Final = np.float32(0.7)
 """How much less the variance falls where the filter contradicts, per such difference: what looks right is not always,
 so that it tells less of its own error than it is worth (docs/equations.md, K16)."""
 
-_HALF: Final = np.float32(1 / 2)
-
 _LEAST_MOVING: Final = np.float32(1e-6)
 """Share of the frames' difference that motion explains where it explains nothing: a division."""
 
@@ -433,7 +431,8 @@ def _stray(
 
     ``bent`` is the square of how much of it there is.
     """
-    across, down = (seen_around[1] - seen_around[-1]) * np.float32(1 / 6), (below[0] - above[0]) * _HALF
+    across = (seen_around[1] - seen_around[-1]) * np.float32(1 / 6)
+    down = (below[0] - above[0]) * np.float32(1 / 2)
     strayed[0] = bent * unsure[0] * (across * across + down * down)
 
 

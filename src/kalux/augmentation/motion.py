@@ -268,8 +268,10 @@ def bent(first: Latent, second: Latent, path: Plane, image: HalfWay) -> Motion |
     join_along(Along(motion, 0.5), level.copy(), left)
     gain = np.where(moving, 1.0 - left / variance, np.float32(0.0))
     windows = tuple(_windows(gain))
+    if not windows:
+        return None
     fill(unsure, unknown_bend(told, image.interval))  # only now, as it changes nothing of the image
-    return dataclasses.replace(motion, windows=windows) if windows else None
+    return dataclasses.replace(motion, windows=windows)
 
 
 def _around(places: NDArray[np.bool_], margin: int) -> Window:

@@ -152,7 +152,7 @@ class Registration:
                 f"frame {index} is a raw mosaic, which cannot be resampled; demosaic the frames first"
             )
         response = frame.normalised()
-        values = self._resampled_light(response, camera or Camera.named("linear", 1.0))
+        values = self.resampled(response) if camera is None else self._resampled_light(response, camera)
         clipped = np.asarray(response >= CameraSettings.usual_saturation)
         if clipped.ndim == 3:
             clipped = np.asarray(clipped.any(axis=2))

@@ -30,9 +30,9 @@ _SURER: Final = 4.0
 triggers and frames, the fewest that are judged, with stamps that jitter by 0 to 1 ms."""
 
 _LEAST_PART: Final = 4  # intervals before and after a loss: fewer fit something by chance
-_UNLIKE: Final = (
-    1.2  # intervals differ from the triggers' by more than they vary by themselves: 1.4 if unrelated
-)
+_UNLIKE: Final = 1.2
+"""Times by which intervals vary: they differ by more from the triggers' that are not theirs, 1.4 if unrelated."""
+
 _IRREGULAR: Final = 0.01  # of an interval; stamps that vary less are as good as even, and tell nothing
 
 

@@ -9,7 +9,7 @@ import importlib.metadata
 import itertools
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import cv2
 import numpy as np
@@ -47,6 +47,8 @@ from kalux.wording import how_many
 
 if TYPE_CHECKING:
     from kalux.writers import Writer
+
+T = TypeVar("T", dict[str, Any], list[Any])
 
 _DESCRIPTION = """\
 Reconstruct HDR images, at any rate, from a recording of events and frames. All frames and the first 4 million events
@@ -291,21 +293,21 @@ def _origin(planned: Plan, options: argparse.Namespace) -> Any:
         or {"threshold_on", "threshold_off"} & {*flags}
     ):
         return planned.threshold_origin
-    origin = _former(options, "thresholds").get("origin")
+    origin = _former(options, "thresholds", dict[str, Any]).get("origin")
     return origin if origin in ORIGINS else planned.threshold_origin
 
 
-def _former(options: argparse.Namespace, table: str) -> dict[str, Any]:
-    """A table of ``--settings``, if it is a former run's `kalux.toml`; else an empty one."""
-    former = read_toml(options.settings).get(table)
-    return former if isinstance(former, dict) else {}
+def _former(options: argparse.Namespace, name: str, kind: type[T]) -> T:
+    """A table or list of ``--settings``, if it is a former run's `kalux.toml`; else an empty one."""
+    former, empty = read_toml(options.settings).get(name), kind()
+    return former if isinstance(former, type(empty)) else empty
 
 
 def _other_mode(planned: Plan, options: argparse.Namespace) -> list[str]:
     """A warning where ``--settings`` is the `kalux.toml` of a run in another mode, which flags alone choose."""
     if options.settings is None:
         return []
-    former = _former(options, "images_wanted")
+    former = _former(options, "images_wanted", dict[str, Any])
     if not {"lookahead", "smooth"} <= {*former}:
         return []
     mode = "--smooth" if former["smooth"] else "one frame ahead" if former["lookahead"] else "--causal"
@@ -318,8 +320,8 @@ def _left_out_calibration(options: argparse.Namespace) -> list[str]:
     """A warning where ``--settings`` is of a run with ``--calibration``: it lacks the maps of pixels."""
     if options.settings is None or options.calibration:
         return []
-    former = read_toml(options.settings).get("calibration")
-    if not isinstance(former, list) or not former:
+    former = _former(options, "calibration", list[Any])
+    if not former:
         return []
     flags = " ".join(f"--calibration {name}" for name in former)
     return [

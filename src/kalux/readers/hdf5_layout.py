@@ -154,10 +154,8 @@ def column_events(
 
 def checked_events(path: Path, t: Any, x: Any, y: Any, p: Any) -> EventArray:
     """As `make_events`; what is wrong is a FormatError that names the file."""
-    try:
+    with _events_of(path):
         return make_events(t, x, y, p)
-    except EventError as error:
-        raise FormatError(f"{path}: {str(error).removeprefix('events: ')}") from error
 
 
 def check_seconds(path: Path, dtype: np.dtype[Any]) -> None:
@@ -196,8 +194,15 @@ def refuse_coarse(path: Path, seconds: NDArray[Any]) -> None:
     """As `kalux.events.check_precision`; what is wrong is a FormatError that names the file."""
     if seconds.dtype.itemsize > 4:  # in double precision all possible times are fine
         return
-    try:
+    with _events_of(path):
         check_precision(seconds, 1e6)
+
+
+@contextmanager
+def _events_of(path: Path) -> Iterator[None]:
+    """What is wrong with events becomes a FormatError that names the file."""
+    try:
+        yield
     except EventError as error:
         raise FormatError(f"{path}: {str(error).removeprefix('events: ')}") from error
 
