@@ -696,6 +696,21 @@ def exposed_as(pixels, start, end, exposed):
     return 12 * off / (2 * (1 - np.exp(-n)))
 
 
+def blurred(pixels, place, t, c2, camera):
+    """K11: how far the middle of the exposures around is off their mean, as no event tells."""
+    pixel = pixels[place]
+    middles = pixel.middles
+    k = sum(m < t for m in middles) - 1
+    if not 0 <= k < len(middles) - 1 or min(pixel.changes[k][3]) >= UNMEASURED:
+        return 0.0
+    gap, share = middles[k + 1] - middles[k], (t - middles[k]) / (middles[k + 1] - middles[k])
+    exposed = min(sum(pixel.ends[i] - pixel.starts[i] for i in (k, k + 1)) / 2 / gap, 1)
+    exposed = exposed_as(pixels, middles[k], middles[k + 1], exposed)
+    silent = pixel.changes[k][1]
+    change = shown_change(pixels, place, k, c2, camera) if silent else 0.1 * c2
+    return 0.1 * exposed**2 * change * (1 - 4 * share * (1 - share))
+
+
 def shown_change(pixels, place, interval, c2, camera):
     """K11: the same for images: of a pixel that one of the frames shows black, no frame says that it changes little."""
     black = any(is_crushed(pixels[place], k, camera) for k in (interval, interval + 1))

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from kalux.augmentation.highlights import Unshown
+from kalux.filters.uncertainty import Around
 from kalux.images import Estimate, View, make_image
 
 GREY = View(
@@ -50,6 +51,18 @@ def test_the_variance_counts_the_fixed_pattern_of_the_frames():
     np.testing.assert_array_equal(image.intensity, make_image(known, GREY).intensity)
     longer = dataclasses.replace(known, white=float(np.log(2.05)))
     assert make_image(longer, view).fixed_pattern == pytest.approx(0.02)
+
+
+def test_what_exposures_take_off_a_frame_is_not_known_there():
+    """The image is the same, and a variance that is not wanted stays infinite."""
+    plane = np.full((1, 2), 0.02, np.float32)
+    told = Around(plane, plane, 0 * plane, 0.0, 0.0, 0.01, 1.0, 0.0, share=1.0)
+    seen = estimate([[0.2, 0.4]], moving=np.array([[False, True]]), silent_change=plane, around=told)
+    blurred = dataclasses.replace(seen, exposed=0.8)
+    image, before = make_image(blurred, GREY), make_image(seen, GREY)
+    assert (image.variance > before.variance + 0.1 * 0.8**2 * 0.02).all()
+    np.testing.assert_array_equal(image.intensity, before.intensity)
+    assert np.isinf(make_image(blurred, GREY, with_variance=False).variance).all()
 
 
 def test_still_pixels_are_no_surer_than_the_rounding_that_their_frames_share():

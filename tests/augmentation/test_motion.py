@@ -146,9 +146,10 @@ def moving():
     return moving_recording()
 
 
-def engine(moving, motion="on", **kwargs):
+def engine(moving, motion="on", reference=None, **kwargs):
     frames, events, _ = moving
     chosen = altered(PRESETS["default"], "filter", motion=motion)
+    chosen = altered(chosen, "camera", reference_exposure=reference)
     made = Reconstructor(
         SHAPE, settings=altered(chosen, "events", threshold_on=0.3, threshold_off=0.3, delay=0), **kwargs
     )
@@ -170,6 +171,19 @@ def test_images_between_frames_are_nearer_to_the_truth(moving):
     made, without = engine(moving), engine(moving, motion="off")
     for t in (46_000, 51_000, 56_000):
         assert error(made, moving[2], t) < 0.8 * error(without, moving[2], t)
+
+
+@pytest.mark.parametrize("exposures", [0.25, 1, 8])
+def test_what_moves_is_followed_whatever_the_reference_exposure(moving, exposures):
+    """Frames of an eighth of it are up to eight times as bright as its white, which is no highlight of theirs."""
+    made = engine(moving, reference=round(1_000 * exposures))
+    without = engine(moving, motion="off", reference=round(1_000 * exposures))
+
+    def off(engine):
+        found = np.log(np.maximum(engine.read(51_000).intensity / exposures, 1e-3))[INSIDE]
+        return np.sqrt(np.mean(np.square(found - moving[2][50][INSIDE])))
+
+    assert off(made) < 0.8 * off(without)
 
 
 def test_images_at_frames_are_nearer_to_the_truth(moving):

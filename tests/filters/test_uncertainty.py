@@ -13,6 +13,7 @@ from kalux.filters.uncertainty import (
     BEFORE_AVERAGING,
     CORRELATED_UNMEASURED,
     Around,
+    add_blurred,
     add_pattern,
     before_averaging,
     changed_within,
@@ -59,6 +60,21 @@ def test_light_that_does_not_turn_is_a_random_walk():
     assert changed_within(0.3, 0.0) == 0.3
     assert changed_within(0.3, 0.04) == pytest.approx(0.3, rel=0.03)
     assert changed_within(0.0, 5.0) == 0.0
+
+
+def test_what_exposures_hide_counts_at_frames_for_what_they_measure():
+    """With as much as silent pixels change, or usually do where there are events, and the square of the exposure."""
+    change = np.array([[0.0, 0.01, 0.02, 0.02, 0.02]], np.float32)
+    first = np.array([[0.1, 0.1, UNMEASURED, 0.1, UNMEASURED]], np.float32)
+    second = np.array([[0.1, 0.1, 0.1, 0.1, UNMEASURED]], np.float32)
+    events = np.array([[0.0, 0.0, 0.0, 3.0, 0.0]], np.float32)
+    full = np.array([[0.0, 0.01, 0.02, 0.1 * C2, 0.0]])
+    for share, counts in ((0.0, 1.0), (0.25, 0.25), (0.5, 0.0), (1.0, 1.0)):
+        told = around()._replace(first=first, second=second, events=events, share=share)
+        for exposed in (0.0, 0.5, 1.2):
+            variance = np.full((1, 5), 0.5, np.float32)
+            add_blurred(variance, change, told, exposed, C2)
+            np.testing.assert_allclose(variance - 0.5, 0.1 * exposed**2 * counts * full, atol=1e-7)
 
 
 def test_offsets_of_pixels_count_as_the_light_they_are_beside():

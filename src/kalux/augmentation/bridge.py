@@ -189,6 +189,8 @@ class BridgedSegment(NamedTuple):
         Variance of silent pixels about the mean of both frames (`subthreshold.half_way`).
     latents
         The frames at both ends, where they are looked at along the paths of what moves (K16); else None.
+    brightest
+        I of a pixel that is saturated in the frame of them that is exposed for less.
     doubt
         By how much the variance of an on and of an off event's step is more than a sure event's
         (`kalux.augmentation.background`); the steps are then those that are expected. None: every event is weighed by
@@ -217,6 +219,7 @@ class BridgedSegment(NamedTuple):
     turns: float = 0.0
     half_way: float = RANDOM
     latents: tuple[Latent, Latent] | None = None
+    brightest: float = 1.0
     doubt: tuple[Array, Array] | None = None
 
 

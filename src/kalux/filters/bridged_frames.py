@@ -354,6 +354,7 @@ class BridgedFrames(Method):
             turns=turns(on, off),
             half_way=share,
             latents=(memory.latent, second) if self._follows_motion and shot.pitch == 1 else None,
+            brightest=max(shot.white, following.white),
         )
         return joined, after
 
@@ -562,7 +563,8 @@ class BridgedFrames(Method):
     def path(self, segment: BridgedSegment) -> Plane | None:
         if segment.latents is None:
             return None
-        return find_path(*segment.latents, *(float(np.log(i + self.offset)) for i in (0.0, 1.0)))
+        limits = (float(np.log(intensity + self.offset)) for intensity in (0.0, segment.brightest))
+        return find_path(*segment.latents, *limits)
 
     def paths(self, segment: BridgedSegment, path: Plane, level: Floats, variance: Floats) -> Paths:
         assert segment.latents is not None

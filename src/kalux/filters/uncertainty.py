@@ -14,7 +14,8 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.bridge import RANDOM, UNMEASURED
+from kalux.augmentation.bridge import RANDOM, UNMEASURED, bridge_variance
+from kalux.augmentation.subthreshold import UNKNOWN_CHANGE
 from kalux.compiled import FUSED, empty, larger, loop, smaller, zeros
 from kalux.filters.readout import CORRELATED, Subthreshold
 
@@ -28,6 +29,10 @@ recordings."""
 SUBTHRESHOLD_EXPOSED: Final = 0.2
 """Share of these variances, of moving and of silent pixels, that is left at a frame that is exposed all the time, the
 mean of which is not the middle: fifty simulated scenes, exposed for a twentieth to three quarters of the time."""
+
+BLURRED: Final = 0.1
+"""Variance at a frame by what its exposure hides, in units of the mean square change of silent pixels from frame to
+frame, if frames are exposed all the time: by the errors at frames of silent and of moving pixels of 152 scenes."""
 
 SUBTHRESHOLD_INTERMITTENT: Final = (0.5, 0.25)
 """Variance of an intermittent pixel's subthreshold change (`_mark_intermittent`), in units of that of a silent pixel
@@ -308,6 +313,43 @@ def _of_logarithm(deviation, intensity, log_offset):  # type: ignore[no-untyped-
 def _add_pattern(variance, intensity, log_offset, deviation):  # type: ignore[no-untyped-def]
     for i in range(np.uint64(len(variance))):
         variance[i] += _of_logarithm(deviation, intensity[i], log_offset)
+
+
+def add_blurred(
+    variance: NDArray[np.float32], silent_change: Array, around: Around, exposed: float, threshold2: float
+) -> None:
+    """Add to the variance of log(I + I_0) how far the middle of an exposure is off its mean. In place.
+
+    Neither neighbours nor the other frame along the paths (K16) know it: they lack the same detail. It counts in full
+    at a frame and not at all half-way between two: what silent pixels are off there includes it.
+
+    Parameters
+    ----------
+    variance
+        (H, W), contiguous.
+    silent_change
+        (H, W): mean square change of silent pixels around each. Of pixels with events it is taken to be the usual one,
+        since events deblur what they tell.
+    around
+        Of pixels that neither frame measures nothing is added.
+    exposed
+        From `changed_within`.
+    threshold2
+        c^2.
+    """
+    planes = np.ascontiguousarray(silent_change, np.float32), *around[:3]
+    share = BLURRED * exposed**2 * (1.0 - bridge_variance(around.share))
+    scalars = np.float32(share), np.float32(share * UNKNOWN_CHANGE * threshold2)
+    _add_blurred(variance.reshape(-1), *(plane.reshape(-1) for plane in planes), *scalars)
+
+
+@loop(fastmath=FUSED)
+def _add_blurred(variance, change, first, second, events, share, of_moving):  # type: ignore[no-untyped-def]
+    zero, unmeasured = np.float32(0.0), np.float32(UNMEASURED)
+    for i in range(np.uint64(len(variance))):
+        hidden = share * change[i] if events[i] == zero else of_moving
+        measured = smaller(np.float32(first[i]), np.float32(second[i])) < unmeasured
+        variance[i] += hidden if measured else zero
 
 
 def keep_rounding(
