@@ -59,7 +59,8 @@ def changes(offset, error, count=40_000):
     after = (before + offset) * np.exp(0.2 * steps + wrong) - offset
     kept = (after > 0.01) & (after < 0.95) & (np.abs(steps) >= 2)
     told = (np.maximum(steps, 0), np.maximum(-steps, 0), np.zeros(count))
-    return Samples(before[kept], after[kept], *(values[kept] * 1.0 for values in told))
+    ones = np.ones(int(kept.sum()))
+    return Samples(before[kept], after[kept], *(values[kept] * 1.0 for values in told), ones, ones)
 
 
 @pytest.mark.parametrize(
@@ -73,6 +74,24 @@ def changes(offset, error, count=40_000):
 def test_offsets_of_less_than_a_level_need_certainty(offset, error, allowed):
     found = event_model._log_offset(changes(offset, error), None, MODEL)
     assert allowed[0] <= found <= allowed[1]
+
+
+@pytest.mark.parametrize("white", [0.25, 4.0])
+def test_the_reference_exposure_is_only_a_unit_of_samples(white):
+    """Of the noise in the dark, and of what is likely."""
+    rng = np.random.default_rng(3)
+    level = rng.uniform(0.011, 0.029, (2, 4_000))
+    none, ones = np.zeros(4_000), np.ones(4_000)
+    dark = Samples(*level, none, none, none, ones, ones)
+    brighter = Samples(*(white * level), none, none, none, white * ones, white * ones)
+    found = event_model.dark_noise(dark, MODEL, 0.03, 0.1)
+    assert event_model.dark_noise(brighter, MODEL, white * 0.03, 0.1) == pytest.approx(found)
+    assert found > 0.0
+    (_, one), (_, other) = (
+        event_model.mismatch_of(samples, MODEL, offset, 0.1)
+        for samples, offset in ((dark, 0.03), (brighter, white * 0.03))
+    )
+    np.testing.assert_allclose(other, one)
 
 
 @pytest.mark.parametrize("times", [0.5, 1.0, 2.0])
@@ -215,6 +234,7 @@ def test_likelihood_compares_densities_of_the_intensity():
         np.maximum(steps, 0)[kept] * 1.0,
         np.maximum(-steps, 0)[kept] * 1.0,
         np.zeros(int(kept.sum())),
+        *np.ones((2, int(kept.sum()))),
     )
     losses = [negative_log_likelihood(samples, MODEL, offset, 0.05) for offset in event_model.LOG_OFFSETS]
     assert event_model.LOG_OFFSETS[int(np.argmin(losses))] == 0.03
@@ -267,6 +287,7 @@ def test_what_frames_cannot_show_says_nothing_of_the_offset():
         np.maximum(steps, 0)[kept] * 1.0,
         np.maximum(-steps, 0)[kept] * 1.0,
         np.zeros(int(kept.sum())),
+        *np.ones((2, int(kept.sum()))),
     )
     shown = FrameLimits(np.full(int(kept.sum()), 0.17), np.full(int(kept.sum()), 0.98))
     found = []

@@ -126,6 +126,20 @@ def test_the_variance_of_steps_is_found(variance, spread):
     assert estimate.step_variance(spread) == pytest.approx(variance, rel=0.15, abs=0.01)
 
 
+def test_the_reference_exposure_is_only_a_unit():
+    """Noise of the frames is a share of their own white, which is 4 where the reference is four exposures."""
+    recording, camera = unsteady(0.1), dataclasses.replace(CAMERA, frame_noise=0.02, shot_noise=0.001)
+    found = estimate_mismatch(recording, camera, EVENTS)
+    for white in (0.25, 4.0):
+        other = dataclasses.replace(
+            camera, reference_exposure=round(100 * white), log_offset=white * CAMERA.offset
+        )
+        again = estimate_mismatch(recording, other, EVENTS)
+        assert again.per_event == pytest.approx(found.per_event, rel=1e-6)
+        assert again.variance == pytest.approx(found.variance, rel=1e-6)
+        assert again.samples == found.samples
+
+
 def test_steps_of_an_ideal_sensor_are_surer_than_others():
     """However far its pixels' thresholds are apart; lost events and noise are errors of steps."""
 

@@ -155,7 +155,7 @@ class EventModel(NamedTuple):
 class Samples(NamedTuple):
     """Pixels of frame intervals: I before and after, and what events tell (`kalux.calibration.intervals.Counted`).
 
-    All (N,).
+    The whites are the I of a pixel that the frame before, or after, shows saturated. All (N,).
     """
 
     before: Array
@@ -163,6 +163,20 @@ class Samples(NamedTuple):
     on: Array
     off: Array
     bend: Array
+    white_before: Array
+    white_after: Array
+
+    @property
+    def darkest(self) -> Array:
+        """(N,) the lesser of both levels, each of a saturated pixel's."""
+        least: Array = np.minimum(self.before / self.white_before, self.after / self.white_after)
+        return least
+
+    @property
+    def white(self) -> Array:
+        """(N,) mean of the whites of both frames."""
+        mean: Array = (self.white_before + self.white_after) / 2
+        return mean
 
 
 class FrameLimits(NamedTuple):
@@ -230,8 +244,8 @@ def estimate_event_model(
         If the frames' exposures are not known.
     """
     samples, limits = _samples(recording, camera, events)
-    net, darkest = np.abs(samples.on - samples.off), np.minimum(samples.before, samples.after)
-    chosen = (net >= _LEAST_NET) & (darkest > np.maximum(limits.least, DARKEST))
+    net, darkest = np.abs(samples.on - samples.off), samples.darkest
+    chosen = (net >= _LEAST_NET) & (darkest > np.maximum(limits.least / samples.white_after, DARKEST))
     signals = Samples(*(values[chosen] for values in samples))
     if len(signals.before) < _MIN_SAMPLES:
         return None
@@ -282,10 +296,12 @@ def dark_noise(samples: Samples, model: ErrorModel, log_offset: float, step_vari
     much as there is; where there is only the rounding of 8 bits, 0.0011, it is 0.0009 to 0.0025. None: too few pixels.
     """
     level = (samples.before + samples.after) / 2
-    chosen = (level > DARKEST) & (level < _DARK) & (samples.on + samples.off <= _FEW_EVENTS)
+    of_white = level / samples.white
+    chosen = (of_white > DARKEST) & (of_white < _DARK) & (samples.on + samples.off <= _FEW_EVENTS)
     if np.count_nonzero(chosen) < _MIN_DARK:
         return None
-    dark, scale = Samples(*(values[chosen] for values in samples)), level[chosen] + log_offset
+    dark = Samples(*(values[chosen] for values in samples))
+    scale = (level[chosen] + log_offset) / dark.white
     mismatch, of_events = mismatch_of(dark, model._replace(frame_noise=(0.0, 0.0)), log_offset, step_variance)
     unexplained = trimmed_variance(mismatch * scale) - float(np.mean(of_events * scale**2))
     return float(np.sqrt(max(unexplained, 0.0) / 2))
@@ -322,14 +338,19 @@ def _log_offset(samples: Samples, limits: FrameLimits | None, model: ErrorModel)
     return float(f"{likeliest():.2g}")
 
 
+def _frame_variance(intensity: Array, white: Array, model: ErrorModel, log_offset: float) -> Array:
+    """(N,) V of log(I + I_0) of one of the frames, by its noise."""
+    return log_covariance(intensity, noise_variance(intensity, model.frame_noise, white), log_offset)
+
+
 def mismatch_of(
     samples: Samples, model: ErrorModel, log_offset: float, step_variance: float
 ) -> tuple[Array, Array]:
     """The mismatch: change of the frames less that by the events; and its variance in the model of the bridge (K1)."""
     on, off = model.thresholds
     variance = (
-        log_covariance(samples.before, noise_variance(samples.before, model.frame_noise, 1.0), log_offset)
-        + log_covariance(samples.after, noise_variance(samples.after, model.frame_noise, 1.0), log_offset)
+        _frame_variance(samples.before, samples.white_before, model, log_offset)
+        + _frame_variance(samples.after, samples.white_after, model, log_offset)
         + model.threshold_spread**2 * ((on * samples.on) ** 2 + (off * samples.off) ** 2)
         + on * off * (step_variance * (samples.on + samples.off) + model.quantisation_variance)
     )
@@ -383,14 +404,14 @@ def _samples(
         first, second = interval.first, interval.second
         chosen = spread(first.measured & second.measured & (on + off > 0), MAX_SAMPLES - count)
         pixels = (*(end.intensity for end in interval.ends), on, off, bend)
-        limits = (
-            np.full(len(chosen), limit * second.white) for limit in (black, white)
-        )  # of the frame after
-        found.append((*(values.ravel()[chosen] for values in pixels), *limits))
+        whites = (first.white, second.white)
+        limits = (black * second.white, white * second.white)  # of the frame after
+        of_frames = (np.full(len(chosen), value) for value in (*whites, *limits))
+        found.append((*(values.ravel()[chosen] for values in pixels), *of_frames))
         count += int(
             np.count_nonzero(np.minimum(pixels[0], pixels[1]).ravel()[chosen] >= black * second.white)
         )
         if count >= MAX_SAMPLES:
             break
-    columns = [np.concatenate(column) for column in zip(*found, strict=True)] if found else [np.empty(0)] * 7
-    return Samples(*columns[:5]), FrameLimits(*columns[5:])
+    columns = [np.concatenate(column) for column in zip(*found, strict=True)] if found else [np.empty(0)] * 9
+    return Samples(*columns[:7]), FrameLimits(*columns[7:])

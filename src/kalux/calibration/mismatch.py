@@ -122,8 +122,9 @@ def estimate_mismatch(recording: Recording, camera: CameraSettings, events: Even
     samples = 0
     for interval, on, off, bend in counted_intervals(recording, camera, events, most_frames=_MAX_FRAMES):
         first, second = interval.ends
-        seen = Samples(first.intensity, second.intensity, on, off, bend)
-        bright = np.minimum(seen.before, seen.after) > DARKEST
+        whites = (np.broadcast_to(np.float64(end.shot.white), on.shape) for end in interval.ends)
+        seen = Samples(first.intensity, second.intensity, on, off, bend, *whites)
+        bright = seen.darkest > DARKEST
         measured = first.shot.measured & second.shot.measured
         usable = measured & bright & (on + off > 0)
         mismatch, variance = mismatch_of(seen, model, camera.offset, events.step_noise)

@@ -408,7 +408,7 @@ def covariance(weight: Array, sigma_im2: float | Array, floor: float) -> Array:
     return sigma_im2 / np.maximum(weight, floor)
 
 
-def noise_variance(intensity: Array, noise: tuple[float, float], white: float) -> Array:
+def noise_variance(intensity: Array, noise: tuple[float, float], white: float | Array) -> Array:
     """sigma_im^2 of equation (6) for one frame: that of its read and shot noise.
 
     Parameters
