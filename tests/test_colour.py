@@ -120,6 +120,18 @@ def test_every_way_of_filtering_has_colours(mosaic, options):
         assert image.colour.min() >= 0
 
 
+def test_what_a_frame_does_not_measure_lends_no_colour():
+    """Under the mask of the second of three grey frames is red."""
+    images = [np.full((2, 2, 3), 100, np.uint8) for _ in range(3)]
+    images[1][:] = (200, 0, 0)
+    masks = (None, np.zeros((2, 2), np.bool_), None)
+    made = Reconstructor((2, 2), settings=altered(PRESETS["default"], "events", delay=0))
+    for k, (image, valid) in enumerate(zip(images, masks, strict=True)):
+        made.push_frame(Frame(image, 40_000 * k, 40_000 * k + 10_000, valid=valid))
+    made.finish()
+    np.testing.assert_allclose(made.read(45_000).colour, 100 / 255, rtol=1e-3)
+
+
 def test_a_clipped_frame_is_neutral_whatever_the_white_balance():
     """Gains would make magenta of what is white only because it is clipped."""
     image = np.full((4, 4, 3), 255, np.uint8)

@@ -191,6 +191,8 @@ def _colour_shot(frame: Frame, camera: Camera, ratio: float, gains: colour.Gains
     of_clipped = sum(s * part[0] * part[2] for s, part in zip(shares, parts, strict=True))
     brightest = (np.max(frame.image, axis=-1) - frame.black) / frame.full_scale
     room = max(camera.saturation - colour.RELIABLE, 1e-6)
+    reliable = np.clip((camera.saturation - brightest) / room, 0, 1).astype(np.float32)
+    valid = _mask(frame)
     return Shot(
         start=frame.exposure_start,
         middle=frame.middle,
@@ -204,8 +206,8 @@ def _colour_shot(frame: Frame, camera: Camera, ratio: float, gains: colour.Gains
             np.stack([g * part[3] for g, part in zip(gains, parts, strict=True)], -1)
         ).ravel(),
         chroma=colour.chromaticity(rgb, _CHROMA_FLOOR * ratio),
-        chroma_weight=np.clip((camera.saturation - brightest) / room, 0, 1).astype(np.float32),
-        valid=_mask(frame),
+        chroma_weight=reliable if valid is None else np.where(valid, reliable, np.float32(0.0)),
+        valid=valid,
     )
 
 
