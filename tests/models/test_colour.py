@@ -86,6 +86,15 @@ def test_highlights_lose_their_colour_where_they_are_doubtful():
     np.testing.assert_allclose(luminance(calmed), luminance(colour), rtol=1e-5)
 
 
+def test_highlights_begin_at_the_white_of_the_frames():
+    colour = np.array([[[8.0, 1.0, 1.0], [0.9, 0.1, 0.1], [0.2, 0.1, 0.1]]], np.float32)
+    variance = np.array([[2.0, 2.0, 2.0]], np.float32)
+    calmed = calm_highlights(colour, variance, (2.0, 1.0, 1.0))
+    for white in (0.25, 4.0):
+        scaled = calm_highlights(np.float32(white) * colour, variance, (2.0, 1.0, 1.0), white)
+        np.testing.assert_allclose(scaled, white * calmed, rtol=1e-6)
+
+
 def test_white_balance_leaves_the_luminance_of_white():
     assert white_balance("as-recorded") == (1, 1, 1)
     assert white_balance("grey-world") is None

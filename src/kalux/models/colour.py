@@ -184,7 +184,9 @@ def _demosaic(padded, pattern, edge, out):  # type: ignore[no-untyped-def]
             out[y, x, 2 - beside] = g + half * across
 
 
-def calm_highlights(colour: Float32, variance: Float32, gains: Gains = (1.0, 1.0, 1.0)) -> Float32:
+def calm_highlights(
+    colour: Float32, variance: Float32, gains: Gains = (1.0, 1.0, 1.0), white: float = 1.0
+) -> Float32:
     """Draw the colour of highlights towards neutral where it is not known.
 
     Beyond white each channel of a Bayer sensor is its own extrapolation by events, and an error of one is a colour; at
@@ -200,18 +202,21 @@ def calm_highlights(colour: Float32, variance: Float32, gains: Gains = (1.0, 1.0
         (H, W) P of the log intensity.
     gains
         The white balance that ``colour`` has.
+    white
+        Level of a saturated pixel, in units of ``colour``.
     """
     out = colour.copy()
-    _calm(out, variance, np.array(gains, np.float32))
+    _calm(out, variance, np.array(gains, np.float32) * np.float32(white))
     return out
 
 
 @loop(error_model="python")
-def _calm(colour, variance, gains):  # type: ignore[no-untyped-def]
+def _calm(colour, variance, whites):  # type: ignore[no-untyped-def]
+    """``whites``: levels of the channels' saturated pixels."""
     for y in range(colour.shape[0]):
         for x in range(colour.shape[1]):
             red, green, blue = colour[y, x, 0], colour[y, x, 1], colour[y, x, 2]
-            brightest = max(red / gains[0], green / gains[1], blue / gains[2])
+            brightest = max(red / whites[0], green / whites[1], blue / whites[2])
             if brightest <= RELIABLE:
                 continue
             share = min((brightest - RELIABLE) / (1.0 - RELIABLE), 1.0)
