@@ -138,3 +138,28 @@ def test_a_mosaic_has_colours_also_where_no_variance_is_wanted():
     np.testing.assert_array_equal(both[0].colour, both[1].colour)
     np.testing.assert_allclose(both[0].colour[2, 2], [0.4, 0.2, 0.3], rtol=1e-3)
     assert both[0].grey().colour is None
+
+
+def test_a_mosaics_colours_are_the_same_where_no_variance_is_wanted():
+    """Beyond white they depend on the variance, with what exposures hide and the rounding that frames share."""
+    view = dataclasses.replace(GREY, mosaic="RGGB", gains=(2.0, 1.0, 1.5), rounding=0.3, fixed_pattern=0.2)
+    plane = np.full((4, 4), 0.5, np.float32)
+    told = Around(plane, plane, 0 * plane, 0.0, 0.0, 0.01, 1.0, 0.0, share=0.0)
+    seen = estimate(
+        1.3 * np.ones((4, 4)), 0.2, moving=plane > 1, silent_change=plane, around=told, exposed=0.9
+    )
+    with_it, without = (make_image(seen, view, with_variance=wanted).colour for wanted in (True, False))
+    np.testing.assert_array_equal(with_it, without)
+
+
+def test_beyond_the_white_of_a_long_exposure_colours_are_doubtful():
+    """A wall that frames of four times the reference exposure clip is as grey as in frames of the reference."""
+    view = dataclasses.replace(GREY, mosaic="RGGB", gains=(1.8, 1.0, 1.4))
+    wall = np.ones((4, 4))
+    short = make_image(estimate(wall, 2.0), view).colour
+    long_view = dataclasses.replace(view, log_offset=0.05 / 4)
+    level = np.full((4, 4), np.log(0.25 + 0.05 / 4), np.float32)
+    seen = Estimate(7, level, np.full((4, 4), 2.0, np.float32), float(level[0, 0]), True)
+    long = make_image(seen, long_view).colour
+    np.testing.assert_allclose(long, short / 4, rtol=1e-3)
+    assert long[0, 0, 0] < 1.3 * long[0, 0, 1]

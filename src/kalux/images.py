@@ -22,6 +22,7 @@ from kalux.filters.highlights import keep_white, lifted, read_unshown, tempered
 from kalux.filters.readout import HighlightPrior, Subthreshold, read_out
 from kalux.filters.uncertainty import (
     Around,
+    add_blurred,
     add_pattern,
     before_averaging,
     given_variance,
@@ -216,7 +217,8 @@ def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) ->
     )
     # Colours of a mosaic's highlights depend on it, and how far the frames along the paths are believed.
     along = _along(estimate)
-    needs_variance = with_variance or view.mosaic is not None or along is not None
+    with_variance |= view.mosaic is not None
+    needs_variance = with_variance or along is not None
     # That after averaging counts only for pixels that neither frame measures (K11).
     needs_averaged = needs_variance and (moving is None or _misses_some(estimate))
     averaging = before_averaging(subthreshold)
@@ -254,6 +256,8 @@ def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) ->
         _look_along(intensity, total, along, view.log_offset)
         if not with_variance:
             total = _infinite(intensity.shape)
+    if with_variance and estimate.around is not None and change is not None:
+        add_blurred(total, change, estimate.around, estimate.exposed, view.threshold2)
     if with_variance and moving is not None and view.rounding > 0:
         keep_rounding(total, intensity, moving, view.log_offset, view.rounding * white)
     image = Image(estimate.t, intensity, total, view.log_offset, estimate.final, fixed_pattern=pattern)
@@ -338,4 +342,5 @@ def _coloured(image: Image, estimate: Estimate, view: View) -> NDArray[np.float3
     # The complementary filter has no variance: its highlights are treated as never measured.
     # An expected excess above a bound (K15) says nothing about the colour: there, P counts.
     known = np.maximum(image.variance, estimate.variance)
-    return calm_highlights(colour, np.minimum(known, np.float32(view.unknown_variance)), view.gains)
+    white = float(np.exp(estimate.white) - view.log_offset)
+    return calm_highlights(colour, np.minimum(known, np.float32(view.unknown_variance)), view.gains, white)
