@@ -198,3 +198,9 @@ def test_checks_name_the_event(values, previous_t, message):
 def test_good_events_pass():
     check_events(make_events(*columns([(5, 3, 2, True), (5, 0, 0, False)])), (3, 4), previous_t=5)
     check_events(make_events(*columns([])), (3, 4), previous_t=5)
+
+
+@pytest.mark.parametrize("unit", ["s", "us", None])
+def test_single_numbers_are_no_columns(unit):
+    with pytest.raises(EventError, match="1-D"):
+        as_events({"t": 5.0, "x": 1, "y": 1, "p": 1}, time_unit=unit)

@@ -393,6 +393,54 @@ def test_an_image_becomes_final_one_frame_later():
     assert live.read(10**9).final
 
 
+def test_an_image_at_a_first_exposure_of_one_microsecond_is_final_with_the_next_frame():
+    """No segment ends there: until the next frame is known, the one that begins there is not."""
+    live = engine((1, 1))
+    live.push_frame(frame(100, 0, 1))
+    live.push_events(pixel_events([5_000], [1]))
+    assert live.final_until is None
+    provisional = live.read(0)
+    assert not provisional.final
+    live.push_frame(frame(120, 40_000, 40_001))
+    live.advance(40_001)
+    assert live.final_until == 40_000
+    image = live.read(0)
+    assert image.final
+    live.finish()
+    assert_same(live.read(0), image)
+
+
+def test_what_moves_is_not_forgotten_after_eighteen_minutes():
+    """Then the clock's origin moves on; a read before that changes none after it."""
+    minute = 60_000_000
+
+    def late(*before):
+        made = engine((3, 3))
+        for start in (0, 40_000, 40_000 + 30 * minute):
+            made.push_frame(Frame(np.full((3, 3), 100, np.uint8), start, start + 10_000))
+        made.push_events(events((20_000, 0, 0, 1), (40_000 + 20 * minute, 2, 2, 1)))
+        made.finish()
+        for t in before:
+            made.read(t)
+        return made.read(25 * minute)
+
+    assert_same(late(), late(60_000))
+
+
+def test_light_that_is_ahead_of_its_event_goes_on_over_eighteen_minutes():
+    """As after a clock's origin has moved on, if none moves it since the sensor is silent."""
+
+    def rise(event):
+        made = engine((3, 3))
+        made.push_frame(Frame(np.full((3, 3), 100, np.uint8), 0, 10_000))
+        made.push_events(events((5_000 + event, 1, 1, 1)))
+        made.finish()
+        at, later = (made.read(5_000 + event + after).intensity[1, 1] for after in (1, 100_000))
+        return later / at
+
+    assert rise((1 << 30) - 10_000) == pytest.approx(rise((1 << 30) + 10_000), rel=1e-3) != 1.0
+
+
 def test_an_estimates_image_does_not_depend_on_what_came_after_it():
     """Another thread makes images while the filter goes on: here, to a frame of finer levels, which round less."""
     settings = altered(VARIANTS["default"], "camera", frame_noise=0.0005)

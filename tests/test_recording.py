@@ -12,7 +12,13 @@ import pytest
 from kalux import readers, recording
 from kalux.errors import EventError, ExposureError, FormatError, FrameError, InputError
 from kalux.frames import Frame, GroundTruth
-from kalux.recording import Recording, with_cached_start, with_counted_events, without_events_of
+from kalux.recording import (
+    FrameCorrections,
+    Recording,
+    with_cached_start,
+    with_counted_events,
+    without_events_of,
+)
 from kalux.writers import hdf5
 from recordings import SIZE, same_frames, small_events, small_frames
 
@@ -124,6 +130,27 @@ def test_clocks_that_can_hardly_be_the_same_are_warned_of(recwarn, start, told):
     assert [str(warning.message).split(" events")[0] for warning in recwarn] == [
         f"arrays: {text}" for text in told
     ]
+
+
+@pytest.mark.parametrize("mosaics", [("RGGB", "BGGR"), (None, "RGGB"), ("RGGB", None)])
+def test_arrays_of_frames_are_of_one_mosaic(mosaics):
+    """The first one's would make other colours of the others."""
+    frames = [
+        Frame(np.zeros((4, 6), np.uint8), 100 * k, 100 * k + 50, mosaic=mosaic)
+        for k, mosaic in enumerate(mosaics)
+    ]
+    with pytest.raises(FrameError, match=r"frame 1 is .* all must be alike"):
+        Recording.from_arrays(small_events()[:0], frames, sensor_size=(4, 6))
+
+
+def test_what_is_not_valid_is_no_bound_in_an_empty_frame_before_it():
+    """An empty first frame shows what the next one clips, if that measures it."""
+    image, valid = np.full((2, 2), 255, np.uint8), np.array([[True, False], [True, True]])
+    image[1, 1] = 100
+    empty = Frame(np.zeros((2, 2), np.uint8), 0, 50)
+    frames = [empty, Frame(image, 100, 150, valid=valid)]
+    corrected = recording._corrected(iter(frames), FrameCorrections(empty=1), 1)
+    np.testing.assert_array_equal(next(corrected).valid, [[True, False], [True, False]])
 
 
 def test_white_is_found_where_frames_of_16_bits_end(recwarn):

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kalux import PRESETS, Reconstructor, Recording, reconstruct
+from kalux import PRESETS, Frame, Reconstructor, Recording, reconstruct
 from kalux.errors import InputError
+from kalux.events import make_events
 from kalux.pipeline import plan
 from kalux.schedule import begin_time
 
@@ -47,6 +48,26 @@ def test_at_the_frames():
     assert plan(recording(), at="frames").times.tolist() == middles
     assert plan(recording(), at="frames", lookahead=False).times.tolist() == middles[1:]
     assert [image.t for image in reconstruct(recording(), at="frames")] == middles
+
+
+def test_given_times_may_reach_to_a_last_event_of_a_hot_pixel():
+    """Its events are left out, but the recording has them."""
+    rng = np.random.default_rng(0)
+    some, hot = np.sort(rng.integers(0, 2_000_000, 5_000)), np.arange(1_000, 2_100_000, 5_000)
+    t = np.concatenate([some, hot])
+    x, y = (np.concatenate([rng.integers(0, 32, len(some)), np.full(len(hot), at)]) for at in (3, 5))
+    p = np.concatenate([rng.random(len(some)) < 0.5, np.ones(len(hot), np.bool_)])
+    order = np.argsort(t, kind="stable")
+    stream = make_events(t[order], x[order], y[order], p[order])
+    frames = [
+        Frame(rng.integers(0, 256, (32, 32), np.uint8), 50_000 * k, 50_000 * k + 10_000) for k in range(38)
+    ]
+    filmed = Recording.from_arrays(stream, frames, sensor_size=(32, 32))
+    made = plan(filmed, times=[0, int(hot[-1])])
+    assert made.mends.hot_pixels == 1
+    assert made.times[-1] == hot[-1]
+    with pytest.raises(InputError, match="after the recording's end"):
+        plan(filmed, times=[0, int(hot[-1]) + 1])
 
 
 def test_given_times_may_repeat_and_reach_to_the_last_event():

@@ -59,11 +59,7 @@ def make_events(t: Any, x: Any, y: Any, p: Any) -> EventArray:
         polarity has other values.
     """
     t, x, y, p = (np.asarray(column) for column in (t, x, y, p))
-    if t.ndim != 1 or not t.shape == x.shape == y.shape == p.shape:
-        raise EventError(
-            f"events: columns t, x, y, p have shapes {t.shape}, {x.shape}, {y.shape}, {p.shape}; "
-            "they must be 1-D and equally long"
-        )
+    _check_shapes(t, x, y, p)
     if t.dtype.kind not in "iu":
         raise EventError(
             f"events: times are {t.dtype}, not integer microseconds; convert them or name time_unit='s'"
@@ -101,6 +97,7 @@ def as_events(data: Any, *, columns: str | None = None, time_unit: str | None = 
     if isinstance(data, np.ndarray) and data.dtype == EVENT_DTYPE and time_unit in (None, "us"):
         return data if data.ndim == 1 else data.ravel()
     found = _columns(data, columns)
+    _check_shapes(*(found[name] for name in ("t", "x", "y", "p")))
     t = found["t"]
     if time_unit is not None and time_unit not in _TIME_UNITS:
         raise EventError(f"events: unknown time_unit {time_unit!r}; known are {', '.join(_TIME_UNITS)}")
@@ -260,6 +257,14 @@ def _named(data: Any, names: list[str]) -> dict[str, NDArray[Any]]:
             )
         found[field] = np.asarray(data[match])
     return found
+
+
+def _check_shapes(t: NDArray[Any], x: NDArray[Any], y: NDArray[Any], p: NDArray[Any]) -> None:
+    if t.ndim != 1 or not t.shape == x.shape == y.shape == p.shape:
+        raise EventError(
+            f"events: columns t, x, y, p have shapes {t.shape}, {x.shape}, {y.shape}, {p.shape}; "
+            "they must be 1-D and equally long"
+        )
 
 
 def _check_times(t: NDArray[Any], where: str = "events", first_index: int = 0) -> None:

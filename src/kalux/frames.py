@@ -47,7 +47,8 @@ class Frame:
     valid
         (height, width) bool: False where the frame says nothing, e.g. outside the view of a second camera. The
         value of such a pixel is no measurement, not even of brightness beyond white; it should be a guess,
-        because the first frame's is where the filter starts. None: all pixels are measured.
+        because the first frame's is where the filter starts, and the last one's where it starts backward in time
+        (``smooth=True``). None: all pixels are measured.
     black
         The value of a pixel in the dark, in the unit of the image: what every pixel reads on top of its light.
         ``camera.black_level`` of the settings goes before it.
@@ -286,7 +287,7 @@ def check_frame(
             f"{where}: frame {index} is {size} pixels, the sensor is {sensor_size[1]}x{sensor_size[0]}; "
             "frames must be grey or RGB and have the size of the sensor"
         )
-    _check_colours(frame, where, index, previous)
+    check_colours(frame, where, index, previous)
     if image.dtype.kind == "u" and frame.white is not None and frame.white > np.iinfo(image.dtype).max:
         raise FrameError(
             f"{where}: frame {index} has the white value {frame.white:g}, but no pixel of {image.dtype} is above "
@@ -338,7 +339,14 @@ def _check_times(frame: Frame, where: str, index: int) -> None:
             )
 
 
-def _check_colours(frame: Frame, where: str, index: int, previous: Frame | None) -> None:
+def check_colours(frame: Frame, where: str, index: int, previous: Frame | None) -> None:
+    """Check that a frame's mosaic is known and fits its image, and is that of the ``previous`` one (None: the first).
+
+    Raises
+    ------
+    FrameError
+        If not.
+    """
     if frame.mosaic is not None:
         if frame.mosaic not in MOSAICS:
             raise FrameError(

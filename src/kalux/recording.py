@@ -35,6 +35,7 @@ from kalux.frames import (
     GroundTruth,
     Mosaic,
     Stamp,
+    check_colours,
     check_frame,
     exposure_doubt,
     is_white,
@@ -265,7 +266,8 @@ def _corrected(frames: Iterator[Frame], corrections: FrameCorrections, pitch: in
             response = frame.normalised()
             least = response if response.ndim == 2 else response.min(axis=-1)
             clipped = np.asarray(least >= CameraSettings.usual_saturation, np.bool_)
-            yield dataclasses.replace(empty, image=frame.image, gain=frame.gain, valid=clipped)
+            valid = clipped if frame.valid is None else clipped & frame.valid
+            yield dataclasses.replace(empty, image=frame.image, gain=frame.gain, valid=valid)
         waiting = []
         yield frame
 
@@ -554,9 +556,11 @@ class Recording:
             yield chunk
 
     def _checked_frames(self, *, as_stored: bool = False) -> Iterator[Frame]:
-        previous, longest = None, 0
+        previous, stored, longest = None, None, 0
         white = self.white
         for index, frame in enumerate(self.source.frames()):
+            check_colours(frame, str(self.source.path), index, stored)  # before all have one mosaic
+            stored = frame
             if index == 0 and frame.image.dtype == np.uint16 and white is None:
                 white = self.found_white
             if white is not None:

@@ -184,6 +184,17 @@ def test_what_neither_frame_measures_hides_as_much_at_a_frame_as_half_way(betwee
     np.testing.assert_allclose(hidden(1e-6), 0.09 * C2 * between, rtol=1e-3, atol=1e-7)
 
 
+def test_what_no_frame_ties_hides_more_in_long_exposures_of_light_that_turns():
+    """As much as other pixels where these hide more: that is what averaging began with."""
+    subthreshold, moving = subthreshold_variance(0.0, C2, 3.0), np.ones((1, 2), np.bool_)
+    assert subthreshold.moving > subthreshold.untied
+    before = before_averaging(subthreshold)
+    left = plane(0.2 + max(before.untied, before.moving))  # no neighbour tells anything
+    told = around(UNMEASURED, UNMEASURED, 1.0, counted=UNMEASURED)
+    given = given_variance(plane(0.2), moving, NO_CHANGE, subthreshold, told, left)
+    np.testing.assert_allclose(given, 0.2 + subthreshold.moving, rtol=1e-4)
+
+
 def test_averaging_takes_a_part_of_it():
     assert before_averaging(Subthreshold(0.1, 0.2, 0.3)) == pytest.approx(
         (0.1 * BEFORE_AVERAGING, 0.2 * BEFORE_AVERAGING, 0.3 * BEFORE_AVERAGING)

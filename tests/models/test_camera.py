@@ -229,7 +229,9 @@ def test_released_table_is_a_weight_with_largest_value_one():
     np.testing.assert_allclose(between, (table[10] + table[11]) / 2 / 7e5, rtol=1e-12)
 
 
-@pytest.mark.parametrize("table", [[], [1.0], [0.0, 0.0], [1.0, -0.1], [1.0, np.nan], [1.0, np.inf]])
+@pytest.mark.parametrize(
+    "table", [[], [1.0], [0.0, 0.0], [1.0, -0.1], [1.0, np.nan], [1.0, np.inf], "x", [[1.0], [1.0, 2.0]]]
+)
 def test_unusable_released_tables(table):
     with pytest.raises(SettingsError, match="f_Q"):
         Camera.from_inverse_covariance(table, Response.linear(), 0.98)

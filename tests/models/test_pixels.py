@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
+from kalux.errors import InputError
 from kalux.models.pixels import PixelCalibration, with_hot
 
 NONE = np.zeros((2, 3), np.bool_)
@@ -37,3 +39,10 @@ def test_hot_pixels_join_those_of_a_calibration():
     assert made is not None
     assert (made.hot == (ONE | other)).all()
     assert (made.on == 1.1).all()
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.int64, float])
+def test_hot_pixels_are_true_and_false(dtype):
+    """Numbers would choose events by their place."""
+    with pytest.raises(InputError, match=rf"hot is {np.dtype(dtype)}; True and False"):
+        calibration(ONE.astype(dtype))

@@ -281,22 +281,23 @@ def no_trail(shape: tuple[int, int]) -> Trail:
 
 
 def trail_by_clock(
-    trail: Trail, polarity: NDArray[np.int8], clock: NDArray[np.int32], now: int
+    trail: Trail, polarity: NDArray[np.int8], clock: NDArray[np.int32], now: int, beyond: float
 ) -> FloatArray:
-    """f at ``now`` (us after the clock's origin), (H, W) log intensity.
+    """f at ``beyond`` seconds after ``now`` (us after the clock's origin), (H, W) log intensity.
 
     ``polarity`` and ``clock`` are those of the newest events, with a frame of one pixel around the sensor.
     """
     out = memory.empty(trail.start.shape)
-    _trail_by_clock(polarity, clock, np.int32(now), trail.heights, out)
+    _trail_by_clock(polarity, clock, (np.int32(now), np.float32(beyond)), trail.heights, out)
     return out
 
 
 @loop
-def _trail_by_clock(polarity, clock, now, heights, out):  # type: ignore[no-untyped-def]
+def _trail_by_clock(polarity, clock, moment, heights, out):  # type: ignore[no-untyped-def]
     height, width = out.shape
+    now, beyond = moment
     for row in range(height):
         signs, times, ahead = polarity[row + 1, 1 : width + 1], clock[row + 1, 1 : width + 1], out[row]
         for column in range(width):
-            age = np.float32(np.int32(now - times[column])) * MICROSECOND32
+            age = np.float32(np.int32(now - times[column])) * MICROSECOND32 + beyond
             ahead[column] = ahead_of_event(signs[column], age, heights)

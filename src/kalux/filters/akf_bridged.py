@@ -168,6 +168,8 @@ def advance(segment: BridgedSegment, cursor: Cursor, events: EventArray, noise: 
             _advance_bridged(within, *arrays, cursor.origin, segment.rate, segment.step_variance, told)
         words = words[len(within) :]
         if len(words):
+            if segment.events is not None:  # while the clock still tells what came just before the segment
+                moving_pixels(segment, cursor)
             epochs = (int(words[0, 0]) - 1 - segment.start) // EPOCH
             _move_origin(cursor, segment.start + epochs * EPOCH)
 
@@ -187,7 +189,9 @@ def trail_ahead(segment: BridgedSegment, cursor: Cursor, t: int) -> FloatArray |
     """(H, W) how far the light is ahead of its events at ``t`` (us), K14; None where that is not followed."""
     if segment.trail is None:
         return None
-    return trail_by_clock(segment.trail, cursor.polarity, cursor.clock, min(t - cursor.origin, EPOCH))
+    within = min(t - cursor.origin, EPOCH)
+    beyond = (t - cursor.origin - within) * 1e-6
+    return trail_by_clock(segment.trail, cursor.polarity, cursor.clock, within, beyond)
 
 
 def _read(segment: BridgedSegment, cursor: Cursor, t: int) -> tuple[FloatArray, FloatArray]:
@@ -421,7 +425,7 @@ def _read_block(planes, first, count, newest, heights, moment, rows, ahead):  # 
     )
     for i in range(count):
         column = np.uint64(first) + np.uint64(i)
-        age = np.float32(np.int32(now - times[column])) * MICROSECOND32
+        age = np.float32(np.int32(now - times[column])) * MICROSECOND32 + beyond
         ahead[i] = ahead_of_event(signs[column], age, heights)  # K14
     for i in range(count):
         column = np.uint64(first) + np.uint64(i)

@@ -197,6 +197,7 @@ def given_variance(
         (H, W): P and the variance of subthreshold changes after averaging (`kalux.filters.readout.read_out`); None: it
         is not averaged.
     """
+    before, above_moving = before_averaging(subthreshold), subthreshold.above_moving
     given = np.empty(variance.shape, np.float32)
     nothing = np.empty(0, np.float32)
     planes = variance, silent_change, *((nothing,) * 3 if around is None else around[:3])
@@ -206,7 +207,7 @@ def given_variance(
         nothing if left is None else left.reshape(-1),
         moving.reshape(-1),
         (np.float32(subthreshold.silent), np.float32(subthreshold.moving)),
-        (np.float32(before_averaging(subthreshold).untied), np.float32(subthreshold.above_moving)),
+        (np.float32(before.moving + before.above_moving), np.float32(above_moving)),
         given.reshape(-1),
     )
     return given

@@ -260,7 +260,10 @@ class Camera:
         SettingsError
             If the table is not a finite, non-negative curve with a positive maximum.
         """
-        table = np.asarray(f_Q, dtype=np.float64).ravel()
+        try:
+            table = np.asarray(f_Q, dtype=np.float64).ravel()
+        except (TypeError, ValueError) as error:
+            raise SettingsError(f"f_Q: a table of numbers is needed, not {f_Q!r:.40}") from error
         if len(table) < 2 or not np.isfinite(table).all() or table.min() < 0 or not table.max() > 0:
             raise SettingsError("f_Q: 1/R_bar must be a finite, non-negative table with a positive maximum")
         return cls(response, table / table.max(), saturation)

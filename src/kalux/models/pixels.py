@@ -46,7 +46,7 @@ class PixelCalibration:
     Raises
     ------
     InputError
-        If the maps differ in size, are not finite, or factors are not positive.
+        If the maps differ in size, are not finite, factors are not positive, or ``hot`` is not bool.
     """
 
     on: Array
@@ -60,6 +60,8 @@ class PixelCalibration:
         for name, values in maps.items():
             if values.ndim != 2 or values.shape != self.on.shape:
                 raise InputError(f"pixel calibration: {name} is {values.shape}, on is {self.on.shape}")
+            if name == "hot" and values.dtype != np.bool_:
+                raise InputError(f"pixel calibration: hot is {values.dtype}; True and False are needed")
             if not np.isfinite(values).all():
                 raise InputError(f"pixel calibration: {name} is not finite")
             if (values < 0).any() or (name in ("on", "off") and (values == 0).any()):

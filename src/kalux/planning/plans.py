@@ -125,7 +125,7 @@ def plan(
     first = 0 if seen.faults is None else seen.faults.first
     begin, earliest = (begin_time(seen.exposures[index], chosen.filter, lookahead) for index in (first, 0))
     wanted = image_times(
-        mended.recording,
+        recording,  # with the events of hot pixels, which a recording may end with
         seen.exposures,
         begin if times is None else earliest,
         rate_hz=rate_hz,
