@@ -199,6 +199,16 @@ def test_malformed_image_list(folder):
         readers.read(folder)
 
 
+@pytest.mark.parametrize("header", ["# id timestamp image_name\n", ""])
+def test_the_images_of_uzh_fpv_have_numbers_before_their_times(folder, tmp_path, header):
+    lines = (folder / "images.txt").read_text().splitlines()
+    text = "".join(f"{number} {line}\n" for number, line in enumerate(lines))
+    (folder / "images.txt").write_text(header + text)
+    (folder / "events.txt").write_text("# timestamp x y polarity\n" + (folder / "events.txt").read_text())
+    assert_is_small(readers.read(folder))
+    assert_is_small(readers.read(zipped(folder, tmp_path / "recording.zip")))
+
+
 def test_images_in_colour(folder):
     name = folder / "images" / "frame_00000000.png"
     grey = small_frames()[0].image

@@ -1,7 +1,8 @@
 """The text layout of the IJRR 2017 event camera dataset (Mueggler et al.), as a folder or zipped.
 
 ``events.txt`` has a line ``t x y p`` per event, ``images.txt`` a line ``t file`` per frame; ``t`` is in
-seconds, ``x`` and ``y`` 0-based, ``p`` 0 or 1. See https://rpg.ifi.uzh.ch/davis_data.html.
+seconds, ``x`` and ``y`` 0-based, ``p`` 0 or 1. See https://rpg.ifi.uzh.ch/davis_data.html. UZH-FPV
+(https://fpv.ifi.uzh.ch) has a line ``id t file`` per frame.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import zipfile
 import zlib
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
@@ -311,8 +313,9 @@ def _image_list(path: Path, root: _Place) -> tuple[list[tuple[int, str]], tuple[
     """(stamp in us, file name) of each frame, and what is missing."""
     if not (root / _IMAGES).is_file():
         return [], (f"There is no {_IMAGES}, so there are no frames.",)
-    images = list(read_ijrr(root / _IMAGES, (root / _IMAGES).read_bytes().decode("utf-8-sig")))
-    absent = [name for _, name in images if not (root / name).is_file()]
+    exists = cache(lambda name: (root / name).is_file())
+    images = list(read_ijrr(root / _IMAGES, (root / _IMAGES).read_bytes().decode("utf-8-sig"), exists))
+    absent = [name for _, name in images if not exists(name)]
     if absent:
         raise FormatError(
             f"{path}: {len(absent)} of {len(images)} images listed in {_IMAGES} are missing, the first is "

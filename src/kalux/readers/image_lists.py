@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import re
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from decimal import ROUND_HALF_UP, Decimal
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -20,6 +20,8 @@ _EXPOSURE: Final = ("exposure", "exposure_time")
 _FILE: Final = ("file", "filename", "file_name", "image", "name", "path")
 _NUMBER: Final = re.compile(r"\d{1,18}(\.\d*)?|\.\d+")
 _PRINTED: Final = re.compile(r"(\d{1,18}(\.\d*)?|\.\d+)(e[+-]?\d{1,2})?", re.IGNORECASE)
+_NUMBERED: Final = re.compile(r"\s*\d+\s+\d+\.\d+\s+(?P<file>\S.*?)\s*")
+"""A line of an ``images.txt`` that may begin with a number of the image."""
 _PER_UNIT: Final = {"s": Decimal(10**6), "ms": Decimal(1000), "us": Decimal(1), "ns": Decimal("0.001")}
 
 WANTED: Final = (
@@ -77,21 +79,42 @@ def read_csv(path: Path, text: str) -> tuple[list[Listed], bool]:
     return listed, exposure is not None
 
 
-def read_ijrr(path: Path | zipfile.Path, text: str) -> Iterator[tuple[int, str]]:
+def read_ijrr(
+    path: Path | zipfile.Path, text: str, exists: Callable[[str], bool]
+) -> Iterator[tuple[int, str]]:
     """The times, us, and names of the images of an ``images.txt``: a line ``t file`` for each, t in seconds.
+
+    Or ``id t file``, as UZH-FPV has it, if a comment says so or ``exists`` says of every file that it is there.
 
     Raises
     ------
     FormatError
         If a line cannot be read.
     """
+    numbered = _has_ids(text, exists)
+    wanted = "id t file" if numbered else "t file"
     for number, line in enumerate(text.splitlines(), 1):
-        fields = line.split(maxsplit=1)
-        if not fields or fields[0].startswith("#"):
+        if _is_comment(line):
             continue
-        if len(fields) != 2:
-            raise FormatError(f"{path}: line {number}: {line[:60]!r} is not 't file' with t in seconds")
-        yield _microseconds(path, number, fields[0], "s"), fields[1].strip()
+        fields = line.split(maxsplit=len(wanted.split()) - 1)
+        if len(fields) != len(wanted.split()):
+            raise FormatError(f"{path}: line {number}: {line[:60]!r} is not {wanted!r} with t in seconds")
+        yield _microseconds(path, number, fields[-2], "s"), fields[-1].strip()
+
+
+def _has_ids(text: str, exists: Callable[[str], bool]) -> bool:
+    """Whether the lines of an ``images.txt`` begin with a number of the image, before its time."""
+    lines = text.splitlines()
+    names = [line.lstrip("# \t").lower().split() for line in lines if line.lstrip().startswith("#")]
+    if any(len(fields) == 3 and fields[0] == "id" for fields in names):
+        return True
+    matches = [_NUMBERED.fullmatch(line) for line in lines if not _is_comment(line)]
+    return bool(matches) and all(match is not None and exists(match["file"]) for match in matches)
+
+
+def _is_comment(line: str) -> bool:
+    """Whether a line is blank or begins with #."""
+    return not line.strip() or line.lstrip().startswith("#")
 
 
 def read_stamps(path: Path, text: str, unit: str) -> list[int]:

@@ -148,7 +148,8 @@ def _images(frames: Path, start: int | None, rate_hz: float | None) -> Source:
             raise FormatError(f"{path}: is too large for a list of images; {WANTED} is needed")
         text = path.read_text("utf-8-sig")
         if path.suffix.lower() == ".txt":
-            listed = [Listed(path.parent / name, stamp, stamp) for stamp, name in read_ijrr(path, text)]
+            images = read_ijrr(path, text, lambda name: (path.parent / name).is_file())
+            listed = [Listed(path.parent / name, stamp, stamp) for stamp, name in images]
             exposure_known = False
         else:
             listed, exposure_known = read_csv(path, text)
