@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from kalux import readers
 from kalux.errors import FormatError
-from kalux.readers import characters
+from kalux.readers import characters, ijrr
 from recordings import (
     SIZE,
     all_events,
@@ -197,6 +197,34 @@ def test_malformed_image_list(folder):
     (folder / "images.txt").write_text("0.1 images/frame_00000000.png\nimages/frame_00000001.png\n")
     with pytest.raises(FormatError, match=r"images\.txt: line 2"):
         readers.read(folder)
+
+
+@pytest.mark.parametrize("name", ["dynamic_6dof.txt", "data/dynamic_6dof.txt"])
+@pytest.mark.parametrize("header", ["40 30\n", ""])
+def test_a_zip_with_nothing_but_a_text_of_events(folder, tmp_path, name, header):
+    """As rpg_e2vid takes and publishes them; what other systems leave beside it does not count."""
+    text = header + (folder / "events.txt").read_text()
+    path = tmp_path / "recording.zip"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr(name, text)
+        archive.writestr(f"__MACOSX/._{name}", b"\0\5\x16\7")
+    source = readers.read(path)
+    assert (source.format, source.count_frames(), source.sensor_size_known) == ("ijrr", 0, bool(header))
+    assert source.sensor_size == SIZE
+    assert np.array_equal(all_events(source), small_events())
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr(name, text + "0.5 b 1 1\n")
+    with pytest.raises(FormatError, match=rf"dynamic_6dof\.txt, line {501 + len(header.splitlines())}: x is"):
+        all_events(readers.read(path))
+
+
+@pytest.mark.parametrize("texts", [["read me\n"], ["0 img.png\n"], ["1 2 3 1\n"], ["0.1 2 3 1\n"] * 2, []])
+def test_other_zips_are_not_recognised(tmp_path, texts):
+    with zipfile.ZipFile(tmp_path / "other.zip", "w") as archive:
+        archive.writestr("data.bin", b"0.1 2 3 1\n")
+        for number, text in enumerate(texts):
+            archive.writestr(f"{number}.txt", text)
+    assert not ijrr.recognises(tmp_path / "other.zip")
 
 
 @pytest.mark.parametrize("header", ["# id timestamp image_name\n", ""])

@@ -168,6 +168,29 @@ def test_lines_of_events_txt_need_no_names(path, header):
         all_events(readers.read(path))
 
 
+def test_a_first_line_of_two_numbers_is_the_size_of_the_sensor(path):
+    """The text of rpg_e2vid: width and height, then the lines of IJRR's events.txt; with names, too."""
+    for text in (
+        "40 30\n0.1 2 3 1\n0.2500005 4 5 0\n",
+        " 40\t30 \r\n# events\n0.1 2 3 1\r\n0.2500005 4 5 0",
+        "# a recording\n40 30\n0.1 2 3 1\n\n0.2500005 4 5 0\n",
+        "40 30\n# t_s x y p\n0.1 2 3 1\n0.2500005 4 5 0\n",
+        "40 30\nt_s,x,y,p\n0.1,2,3,1\n0.2500005,4,5,0\n",
+    ):
+        assert parse(path, text) == [(100_000, 2, 3, True), (250_001, 4, 5, False)]
+        source = readers.read(path)
+        assert (source.format, source.sensor_size, source.sensor_size_known) == ("table", (30, 40), True)
+        assert not any("sensor size" in sentence for sentence in source.missing)
+    with pytest.raises(FormatError, match="line 4: x is not"):
+        parse(path, "40 30\n# a comment\n0.1 2 3 1\n0.2 b 3 1\n")
+
+
+@pytest.mark.parametrize("text", ["40 30\n", "40 30\n40 30\n0.1 2 3 1\n", "0 30\n0.1 2 3 1\n", "40 30\na b c d\n"])
+def test_two_numbers_alone_are_no_table(path, text):
+    path.write_text(text)
+    assert not table.recognises(path)
+
+
 @pytest.mark.parametrize(("first", "t"), [("8.3e-05", 83), ("8e-05", 80), ("1.25E-4", 125)])
 def test_the_first_time_of_v2e_may_be_a_power_of_ten(path, first, t):
     path.write_text(f"#!events.txt\n{first} 2 3 1\n0.2500005 4 5 0\n")

@@ -2,11 +2,13 @@
 
 ``events.txt`` has a line ``t x y p`` per event, ``images.txt`` a line ``t file`` per frame; ``t`` is in
 seconds, ``x`` and ``y`` 0-based, ``p`` 0 or 1. See https://rpg.ifi.uzh.ch/davis_data.html. UZH-FPV
-(https://fpv.ifi.uzh.ch) has a line ``id t file`` per frame.
+(https://fpv.ifi.uzh.ch) has a line ``id t file`` per frame. The zips of rpg_e2vid (https://github.com/uzh-rpg/rpg_e2vid)
+hold the events alone, under another name.
 """
 
 from __future__ import annotations
 
+import re
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -48,6 +50,7 @@ from kalux.readers.source import (
 
 _EVENTS: Final = "events.txt"
 _IMAGES: Final = "images.txt"
+_EVENT: Final = re.compile(rb"\s*\d+\.\d+\s+\d+\s+\d+\s+[01]\s*")
 _ZIP_SIGNATURE: Final = b"PK\x03\x04"
 _DAMAGE: Final = (
     zipfile.BadZipFile,
@@ -63,13 +66,13 @@ _Place = Path | zipfile.Path
 
 
 def recognises(path: Path) -> bool:
-    """Whether the folder or zip has ``events.txt``, at its root or in its one folder; or is a broken zip."""
+    """Whether the folder or zip has events, at its root or in its one folder; or is a broken zip."""
     if path.is_dir():
         return (path / _EVENTS).is_file()
     if not begins_with(path, _ZIP_SIGNATURE):
         return False
     try:
-        return _root(path) is not None
+        return _find_events(path) is not None
     except _DAMAGE:
         return True  # so that the reader can say that it is damaged
 
@@ -89,10 +92,11 @@ def read(path: Path) -> Source:
         If a file cannot be read.
     """
     with reading(path, *_DAMAGE):
-        root = _root(path)
-        if root is None:
+        events = _find_events(path)
+        if events is None:
             raise FormatError(f"{path}: has no {_EVENTS}; give the folder or zip that contains it")
-        declared_size = _check_beginning(path, root)
+        root = events.parent
+        declared_size = _check_beginning(path, events)
         images, missing = _image_list(path, root)
     colour = False
     if images:
@@ -107,7 +111,7 @@ def read(path: Path) -> Source:
         missing += (SIZE_UNKNOWN,)
 
     def read_frames() -> Iterator[Frame]:
-        place = _root_again(path)
+        place = _find_events_again(path).parent
         for stamp, name in images:
             yield Frame(_load(path, place, name, colour), stamp, stamp)
 
@@ -125,34 +129,42 @@ def read(path: Path) -> Source:
     )
 
 
-def _root(path: Path) -> _Place | None:
-    """The folder that holds ``events.txt``, in the file system or inside a zip."""
+def _find_events(path: Path) -> _Place | None:
+    """The file ``events.txt``, in the file system or inside a zip; or the only text in a zip, if it begins like it."""
     if path.is_dir():
-        return path
+        return path / _EVENTS
     top = zipfile.Path(path)
-    if (top / _EVENTS).is_file():
-        return top
     folders = [entry for entry in top.iterdir() if entry.is_dir() and not entry.name.startswith("__MACOSX")]
-    if len(folders) == 1 and (folders[0] / _EVENTS).is_file():
-        return folders[0]
-    return None
+    for root in (top, *(folders if len(folders) == 1 else ())):
+        if (root / _EVENTS).is_file():
+            return root / _EVENTS
+    with zipfile.ZipFile(path) as archive:
+        texts = [name for name in archive.namelist() if name.endswith(".txt") and not name.startswith("__MACOSX")]
+    return top / texts[0] if len(texts) == 1 and _begins_with_events(top / texts[0]) else None
 
 
-def _root_again(path: Path) -> _Place:
+def _begins_with_events(place: _Place) -> bool:
+    with place.open("rb") as file:
+        lines = file.read(LONGEST_LINE).splitlines()
+    content = [line for line in lines if line.strip() and not line.lstrip().startswith(b"#")]
+    return any(_EVENT.fullmatch(line) for line in content[:2])  # the first may be width and height
+
+
+def _find_events_again(path: Path) -> _Place:
     """A handle of its own for each iteration, so that several may run at once."""
     with reading(path, *_DAMAGE):
-        root = _root(path)
-    if root is None:
+        events = _find_events(path)
+    if events is None:
         raise FormatError(f"{path}: {_EVENTS} has gone since the recording was opened")
-    return root
+    return events
 
 
 # Events
 
 
-def _check_beginning(path: Path, root: _Place) -> tuple[int, int] | None:
+def _check_beginning(path: Path, events: _Place) -> tuple[int, int] | None:
     """Check the unit of time; return (height, width) if the first line is a header ``width height``."""
-    with (root / _EVENTS).open("rb") as file:
+    with events.open("rb") as file:
         lines = [line.split() for line in file.read(LONGEST_LINE).splitlines()[:-1]]
     size = None
     if lines and len(lines[0]) == 2 and all(field.isdigit() for field in lines[0]):
@@ -161,7 +173,7 @@ def _check_beginning(path: Path, root: _Place) -> tuple[int, int] | None:
     times = [line[0] for line in lines if len(line) == 4]
     if times and all(time.isdigit() for time in times) and int(times[-1]) > 0:
         raise FormatError(
-            f"{path}: the times in {_EVENTS} have no decimal point ({times[-1][:20].decode()!r}), but this layout "
+            f"{path}: the times in {events.name} have no decimal point ({times[-1][:20].decode()!r}), but this layout "
             "is in seconds; convert them to seconds"
         )
     return size
@@ -170,12 +182,12 @@ def _check_beginning(path: Path, root: _Place) -> tuple[int, int] | None:
 def _read_events(path: Path) -> Iterator[EventArray]:
     def bad_line(number: int, fault: int, shown: str) -> FormatError:
         return FormatError(
-            f"{path}: {_EVENTS}, line {number}: {_FAULTS[fault]}: {shown!r}; a line is 't x y p', t in seconds as a "
+            f"{path}: {events.name}, line {number}: {_FAULTS[fault]}: {shown!r}; a line is 't x y p', t in seconds as a "
             "plain decimal, x and y from 0, p 0 or 1"
         )
 
-    root = _root_again(path)
-    with reading(path, *_DAMAGE), (root / _EVENTS).open("rb") as file:
+    events = _find_events_again(path)
+    with reading(path, *_DAMAGE), events.open("rb") as file:
         yield from parsed_events(file, _parse, bad_line)
 
 

@@ -2,7 +2,8 @@
 
 The columns may have any order and any of the names in `kalux.readers.columns`; others are skipped. Lines that begin
 with # are comments; the one with the names may begin with it, too (as ``numpy.savetxt`` writes it). Without names the
-lines may be those of ``events.txt`` in the IJRR layout, which other programs write alone.
+lines may be those of ``events.txt`` in the IJRR layout, which other programs write alone: v2e, and rpg_e2vid with a line
+``width height`` before them.
 """
 
 from __future__ import annotations
@@ -47,6 +48,8 @@ _NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 _IJRR_LINE: Final = re.compile(r"\s*(\d+\.\d+|\d+(\.\d+)?[eE]-\d+)\s+\d+\s+\d+\s+[01]\s*")
 """Seconds with decimals, or as Python prints small ones (8.3e-05), x, y, and polarity, which nothing else is likely to
 be."""
+_SIZE_LINE: Final = re.compile(r"\s*([1-9]\d{0,4})\s+([1-9]\d{0,4})\s*")
+"""Width and height, as rpg_e2vid has them before the events."""
 _IJRR_ASSUMED: Final = (
     "The columns have no names; they are taken as t (s), x, y, p, as events.txt of IJRR has them."
 )
@@ -55,7 +58,7 @@ _DECIMALS: Final = {"s": 6, "ms": 3, "us": 0, "ns": -3, None: 0}
 
 
 class _Header(NamedTuple):
-    """The first line: where the data begin (bytes, lines), what separates columns, which column is what.
+    """Where the data begin (bytes, lines), what separates columns, which column is what, and the sensor's size.
 
     ``assumed`` says what the file leaves open, for `Source.missing`.
     """
@@ -66,9 +69,28 @@ class _Header(NamedTuple):
     roles: tuple[int, ...]
     unit: str | None
     assumed: tuple[str, ...]
+    size: tuple[int, int] | None
 
 
-_IJRR: Final = _Header(0, 0, " ", (1, 2, 3, 4), "s", (_IJRR_ASSUMED,))
+class _Beginning(NamedTuple):
+    """The first lines of a file: comments, then the sensor's (height, width) if a line has it, then the others.
+
+    ``index`` is that of the first of ``others``, from 0.
+    """
+
+    comments: list[tuple[int, str]]
+    size: tuple[int, int] | None
+    index: int
+    others: list[str]
+
+
+class _Named(NamedTuple):
+    """A line that names columns: its index, what separates the names, the names, and which are an event's fields."""
+
+    index: int
+    separator: str
+    names: list[str]
+    columns: Columns
 
 
 def recognises(path: Path) -> bool:
@@ -76,10 +98,8 @@ def recognises(path: Path) -> bool:
     if not path.is_file():
         return False
     with path.open("rb") as file:
-        lines = _first_lines(file.read(LONGEST_LINE))
-    if not lines:
-        return False
-    return _columns_of(lines) is not None or _has_numbers(lines[-1])
+        beginning = _beginning(file.read(LONGEST_LINE))
+    return any(_named(beginning)) or any(_has_numbers(line) for line in beginning.others[:1])
 
 
 def read(path: Path) -> Source:
@@ -100,23 +120,37 @@ def read(path: Path) -> Source:
     return Source(
         path=path,
         format="table",
-        sensor_size=smallest_size(path, _events(path, header)),
+        sensor_size=header.size or smallest_size(path, _events(path, header)),
         events=lambda: _events(path, header),
         count_events=counted(lambda: _events(path, header)),
-        missing=(
-            NO_FRAMES,
-            *header.assumed,
-            SIZE_UNKNOWN,
-        ),
-        sensor_size_known=False,
+        missing=(NO_FRAMES, *header.assumed, *(() if header.size else (SIZE_UNKNOWN,))),
+        sensor_size_known=header.size is not None,
     )
 
 
 # The line with the names
 
 
-def _first_lines(data: bytes) -> list[str]:
-    """The lines up to the first that is neither blank nor a comment, which is the last; empty if not text."""
+def _beginning(data: bytes) -> _Beginning:
+    """The first lines; none if it is not text."""
+    comments: list[tuple[int, str]] = []
+    size = None
+    lines = _whole_lines(data)
+    for index, line in enumerate(lines):
+        if "\0" in line:
+            return _Beginning([], None, 0, [])
+        match = _SIZE_LINE.fullmatch(line)
+        if _is_comment(line):
+            comments.append((index, line))
+        elif match is not None and size is None:
+            size = (int(match[2]), int(match[1]))
+        else:
+            others = [other for other in lines[index:] if not _is_comment(other)]
+            return _Beginning(comments, size, index, others)
+    return _Beginning(comments, size, len(lines), [])
+
+
+def _whole_lines(data: bytes) -> list[str]:
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -124,66 +158,87 @@ def _first_lines(data: bytes) -> list[str]:
         if len(data) - error.start >= 4:  # more than a character that is cut off
             return []
     # Not splitlines, which also ends lines where the parser does not.
-    whole = text.removesuffix("\n").split("\n")
-    if len(data) == LONGEST_LINE:
-        whole = whole[:-1]
-    lines: list[str] = []
-    for line in whole:
-        if "\0" in line:
-            return []
-        lines.append(line)
-        if line.strip() and not line.lstrip().startswith("#"):
-            return lines
-    return lines
+    lines = text.removesuffix("\n").split("\n")
+    return lines[:-1] if len(data) == LONGEST_LINE else lines
+
+
+def _is_comment(line: str) -> bool:
+    """Whether a line is blank or begins with #."""
+    return not line.strip() or line.lstrip().startswith("#")
 
 
 def _separator(line: str) -> str:
     return next((c for c in ",;\t" if c in line), " ")
 
 
-def _names(line: str) -> list[str]:
-    line = line.strip().lstrip("#").strip()
-    separator = _separator(line)
+def _fields(line: str, separator: str) -> list[str]:
     fields = line.split() if separator == " " else line.split(separator)
     return [field.strip().strip("\"'").strip() for field in fields]
 
 
-def _columns_of(lines: list[str]) -> tuple[int, list[str], Columns] | None:
-    """Index of the line with names, its names, and which of them are an event's fields."""
-    for index, line in enumerate(lines):
-        names = _names(line)
+def _named(beginning: _Beginning) -> Iterator[_Named]:
+    """The lines that name columns: comments, and the first of the others."""
+    others = [(beginning.index, line) for line in beginning.others[:1]]
+    for index, line in (*beginning.comments, *others):
+        text = line.strip().lstrip("#").strip()
+        separator = _separator(text)
+        names = _fields(text, separator)
         columns = find_columns(names)
         if columns is not None:
-            return index, names, columns
-    return None
+            yield _Named(index, separator, names, columns)
 
 
 def _has_numbers(line: str) -> bool:
-    fields = _names(line)
+    fields = _fields(line.strip(), _separator(line.strip()))
     return len(fields) >= 4 and all(_NUMBER.fullmatch(field) for field in fields)
 
 
 def _read_header(path: Path, data: bytes) -> _Header:
-    lines = _first_lines(data)
-    found = _columns_of(lines)
-    if found is None and lines and _IJRR_LINE.fullmatch(lines[-1]):
-        return _IJRR
+    beginning = _beginning(data)
+    named = next(_named(beginning), None)
+    if named is not None:
+        return _header_of_names(path, data, beginning, named)
+    found = _nameless(beginning)
     if found is None:
         raise FormatError(
             f"{path}: its first line does not name the columns; put a line such as 't_us,x,y,p' there, in their order"
         )
-    index, names, columns = found
-    if len(names) > _MOST_COLUMNS:
+    return found._replace(begin=_place(data, beginning.index), lines=beginning.index, size=beginning.size)
+
+
+def _header_of_names(path: Path, data: bytes, beginning: _Beginning, named: _Named) -> _Header:
+    if len(named.names) > _MOST_COLUMNS:
         raise FormatError(
-            f"{path}: has {len(names)} columns, kalux reads up to {_MOST_COLUMNS}; leave some out"
+            f"{path}: has {len(named.names)} columns, kalux reads up to {_MOST_COLUMNS}; leave some out"
         )
-    begin = 0
-    for _ in range(index + 1):
-        begin = data.index(b"\n", begin) + 1 if b"\n" in data[begin:] else len(data)
-    roles = tuple(columns[:4].index(name) + 1 if name in columns[:4] else 0 for name in names)
-    separator = _separator(lines[index].strip().lstrip("#").strip())
+    columns = named.columns
+    roles = tuple(columns[:4].index(name) + 1 if name in columns[:4] else 0 for name in named.names)
     assumed = () if columns.unit else (UNIT_ASSUMED,)
-    return _Header(begin, index + 1, separator, _first_of_each(roles), columns.unit, assumed)
+    lines = max(beginning.index, named.index + 1)
+    return _Header(
+        _place(data, lines),
+        lines,
+        named.separator,
+        _first_of_each(roles),
+        columns.unit,
+        assumed,
+        beginning.size,
+    )
+
+
+def _nameless(beginning: _Beginning) -> _Header | None:
+    """Lines without names that can be told all the same."""
+    if beginning.others and _IJRR_LINE.fullmatch(beginning.others[0]):
+        return _Header(0, 0, " ", (1, 2, 3, 4), "s", (_IJRR_ASSUMED,), None)
+    return None
+
+
+def _place(data: bytes, lines: int) -> int:
+    """Where the line begins before which there are so many."""
+    begin = 0
+    for _ in range(lines):
+        begin = data.index(b"\n", begin) + 1 if b"\n" in data[begin:] else len(data)
+    return begin
 
 
 def _first_of_each(roles: tuple[int, ...]) -> tuple[int, ...]:
