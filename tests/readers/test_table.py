@@ -106,6 +106,75 @@ def test_times_with_decimals_need_a_unit(path):
         parse(path, "t,x,y,p\n1.0,2,3,1\n1.5,2,3,1\n")
 
 
+@pytest.mark.parametrize(
+    "header",
+    [
+        "# timestamp x y polarity\n",  # UZH-FPV, evlib
+        "timestamp x y polarity\n",
+        "# timestamp(float s) x y polarity(off/on=0/1)\n# format: t x y p\n",  # jAER
+        "t\tx\ty\tp\n",
+    ],
+)
+def test_decimals_without_a_unit_are_seconds_in_lines_like_those_of_events_txt(path, header):
+    """The same lines without names are taken so, too; the note says it."""
+    path.write_text(header + "0.0 2 3 1\n0.2500005 4 5 0\n")
+    source = readers.read(path)
+    assert all_events(source).tolist() == [(0, 2, 3, True), (250_001, 4, 5, False)]
+    assert any("their times taken as seconds" in text for text in source.missing)
+
+
+@pytest.mark.parametrize("first", ["1.5 1.0 2.0 1.0", "1.5 1 2 -1", "1.5 1 2 True", "1 1 2 0"])
+def test_decimals_without_a_unit_are_refused_in_other_lines(path, first):
+    with pytest.raises(FormatError, match="the time has decimals, but no unit"):
+        parse(path, f"t x y p\n{first}\n2.5 1 2 1\n")
+
+
+@pytest.mark.parametrize("header", ["t x y p", "# t x y p"])
+def test_whole_times_with_a_point_are_microseconds_all_the_same(path, header):
+    assert parse(path, f"{header}\n1.0 2 3 1\n2.0 2 3 0\n") == [(1, 2, 3, True), (2, 2, 3, False)]
+    assert parse(path, "x y t p\n2 3 1.0 1\n2 3 2.0 0\n") == [(1, 2, 3, True), (2, 2, 3, False)]
+
+
+@pytest.mark.parametrize("separator", [" ", ","])
+def test_the_header_that_jaer_writes(path, separator):
+    """Save As text: the names stand after "format:", in the last of several comments."""
+    header = "\n".join(
+        [
+            "# jAER DAVIS/DVS camera text file output",
+            "# source-file: /home/u/Davis346B-2026.aedat4",
+            f"# dvs-events: One event per line: {separator.join(['timestamp(int32 us)', 'x', 'y', 'polarity'])}",
+            f"# format: {separator.join('txyp')}",
+        ]
+    )
+    assert parse(path, written(header, separator=separator)) == EVENTS.tolist()
+
+
+def test_a_comment_with_fewer_or_more_names_than_there_are_columns_names_none(path):
+    assert parse(path, "# t x y p id\n# x y p t\n2 3 1 7\n") == [(7, 2, 3, True)]
+    assert parse(path, "# t x y p\nid x y p t\n9 2 3 1 7\n") == [(7, 2, 3, True)]
+    with pytest.raises(FormatError, match="line 2: it has fewer columns"):
+        parse(path, "# t x y p id\n7 2 3 1\n")
+
+
+def test_names_may_be_separated_by_other_characters_than_the_columns(path):
+    """As where somebody puts the names before lines that a program wrote."""
+    expected = [(7, 2, 3, True), (8, 2, 3, False)]
+    assert parse(path, "t_us,x,y,p\n7 2 3 1\n8 2 3 0\n") == expected
+    assert parse(path, "# t_us x y p\n7,2,3,1\n8,2,3,0\n") == expected
+    assert parse(path, "t_us;x;y;p;note\n7;2;3;1;a,b,c,d,e\n8;2;3;0;c\n") == expected
+
+
+def test_labels_of_signal_and_noise_are_skipped(path):
+    """v2e with --label_signal_noise."""
+    header = "#!events.txt\n# Format is time (float s), x, y, polarity (0=off, 1=on), signal/noise (1/0)\n# as at\n"
+    path.write_text(header + "0.0 2 3 1 0\n1e-05 4 5 0 1\n")
+    source = readers.read(path)
+    assert all_events(source).tolist() == [(0, 2, 3, True), (10, 4, 5, False)]
+    assert any("signal and noise, is not read" in text for text in source.missing)
+    with pytest.raises(FormatError, match="does not name the columns"):
+        parse(path, "# a comment\n0.0 2 3 1 0\n1e-05 4 5 0 1\n")
+
+
 def test_an_assumed_unit_is_told(path):
     path.write_text(written("t,x,y,p"))
     assert any("unit of time" in sentence for sentence in readers.read(path).missing)

@@ -44,14 +44,26 @@ from kalux.readers.source import (
 )
 
 _MOST_COLUMNS: Final = 64
+_TXYP: Final = (1, 2, 3, 4)
+"""Roles of columns in the order of IJRR."""
 _NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 _IJRR_LINE: Final = re.compile(r"\s*(\d+\.\d+|\d+(\.\d+)?[eE]-\d+)\s+\d+\s+\d+\s+[01]\s*")
 """Seconds with decimals, or as Python prints small ones (8.3e-05), x, y, and polarity, which nothing else is likely to
 be."""
+_LABELLED: Final = re.compile(_IJRR_LINE.pattern + r"\s[01]\s*")
+"""As v2e writes them with ``--label_signal_noise``."""
+_LABELS: Final = "signal/noise"
+"""What v2e calls the labels in a comment."""
+_LABELS_SKIPPED: Final = "The fifth column, v2e's labels of signal and noise, is not read."
 _SIZE_LINE: Final = re.compile(r"\s*([1-9]\d{0,4})\s+([1-9]\d{0,4})\s*")
 """Width and height, as rpg_e2vid has them before the events."""
 _IJRR_ASSUMED: Final = (
     "The columns have no names; they are taken as t (s), x, y, p, as events.txt of IJRR has them."
+)
+_FORMAT: Final = re.compile(r"format:\s*", re.IGNORECASE)
+"""What jAER writes before the names."""
+_SECONDS_ASSUMED: Final = (
+    "The unit of time is not stated; the lines are like those of events.txt of IJRR, and their times taken as seconds."
 )
 _DECIMALS: Final = {"s": 6, "ms": 3, "us": 0, "ns": -3, None: 0}
 """How many decimals of each unit a microsecond needs."""
@@ -177,10 +189,10 @@ def _fields(line: str, separator: str) -> list[str]:
 
 
 def _named(beginning: _Beginning) -> Iterator[_Named]:
-    """The lines that name columns: comments, and the first of the others."""
+    """The lines that name columns: the first that is no comment, and comments."""
     others = [(beginning.index, line) for line in beginning.others[:1]]
-    for index, line in (*beginning.comments, *others):
-        text = line.strip().lstrip("#").strip()
+    for index, line in (*others, *beginning.comments):
+        text = _FORMAT.sub("", line.strip().lstrip("#").strip())
         separator = _separator(text)
         names = _fields(text, separator)
         columns = find_columns(names)
@@ -195,15 +207,38 @@ def _has_numbers(line: str) -> bool:
 
 def _read_header(path: Path, data: bytes) -> _Header:
     beginning = _beginning(data)
-    named = next(_named(beginning), None)
+    all_named = list(_named(beginning))
+    named = next((named for named in all_named if _fits(beginning, named)), None)
     if named is not None:
         return _header_of_names(path, data, beginning, named)
     found = _nameless(beginning)
-    if found is None:
-        raise FormatError(
-            f"{path}: its first line does not name the columns; put a line such as 't_us,x,y,p' there, in their order"
-        )
-    return found._replace(begin=_place(data, beginning.index), lines=beginning.index, size=beginning.size)
+    if found is not None:
+        return found._replace(begin=_place(data, beginning.index), lines=beginning.index, size=beginning.size)
+    if all_named:  # a line will be found to have more or fewer columns
+        return _header_of_names(path, data, beginning, all_named[0])
+    raise FormatError(
+        f"{path}: its first line does not name the columns; put a line such as 't_us,x,y,p' there, in their order"
+    )
+
+
+def _data_lines(beginning: _Beginning, named: _Named) -> list[str]:
+    return beginning.others[1:] if named.index == beginning.index else beginning.others
+
+
+def _fits(beginning: _Beginning, named: _Named) -> bool:
+    """Whether it is no comment, or one with as many names as the first line after the comments has columns."""
+    if named.index == beginning.index or not beginning.others:
+        return True
+    line = beginning.others[0]
+    return any(len(_fields(line, by)) == len(named.names) for by in (named.separator, _separator(line)))
+
+
+def _data_separator(named: _Named, lines: list[str]) -> str:
+    """What separates columns: the same as the names, unless only what the lines have gives as many columns."""
+    if not lines or len(_fields(lines[0], named.separator)) == len(named.names):
+        return named.separator
+    own = _separator(lines[0])
+    return own if len(_fields(lines[0], own)) == len(named.names) else named.separator
 
 
 def _header_of_names(path: Path, data: bytes, beginning: _Beginning, named: _Named) -> _Header:
@@ -213,23 +248,35 @@ def _header_of_names(path: Path, data: bytes, beginning: _Beginning, named: _Nam
         )
     columns = named.columns
     roles = tuple(columns[:4].index(name) + 1 if name in columns[:4] else 0 for name in named.names)
-    assumed = () if columns.unit else (UNIT_ASSUMED,)
-    lines = max(beginning.index, named.index + 1)
+    lines = _data_lines(beginning, named)
+    unit, assumed = columns.unit, () if columns.unit else (UNIT_ASSUMED,)
+    if unit is None and roles == _TXYP and _are_seconds(lines):
+        unit, assumed = "s", (_SECONDS_ASSUMED,)
+    before = max(beginning.index, named.index + 1)
     return _Header(
-        _place(data, lines),
-        lines,
-        named.separator,
+        _place(data, before),
+        before,
+        _data_separator(named, lines),
         _first_of_each(roles),
-        columns.unit,
+        unit,
         assumed,
         beginning.size,
     )
 
 
+def _are_seconds(lines: list[str]) -> bool:
+    """Whether lines of t, x, y, p are like those of ``events.txt``; whole numbers with a point may be microseconds."""
+    matches = [_IJRR_LINE.fullmatch(line) for line in lines]
+    return bool(matches) and matches[0] is not None and any(m and float(m[1]) % 1 for m in matches)
+
+
 def _nameless(beginning: _Beginning) -> _Header | None:
-    """Lines without names that can be told all the same."""
-    if beginning.others and _IJRR_LINE.fullmatch(beginning.others[0]):
-        return _Header(0, 0, " ", (1, 2, 3, 4), "s", (_IJRR_ASSUMED,), None)
+    """Lines without names that can be told all the same; where they begin is not said."""
+    line = beginning.others[0] if beginning.others else ""
+    if _IJRR_LINE.fullmatch(line):
+        return _Header(0, 0, " ", _TXYP, "s", (_IJRR_ASSUMED,), None)
+    if _LABELLED.fullmatch(line) and any(_LABELS in comment for _, comment in beginning.comments):
+        return _Header(0, 0, " ", (*_TXYP, 0), "s", (_IJRR_ASSUMED, _LABELS_SKIPPED), None)
     return None
 
 
