@@ -272,6 +272,56 @@ def test_numbers_without_names_are_refused_with_a_hint(path):
 
 
 @pytest.mark.parametrize(
+    ("line", "names"),
+    [
+        ("7 2 3 1", "t_us x y p"),
+        ("7;2;3;1", "t_us;x;y;p"),
+        ("0.5,2,3,1", "t_s,x,y,p"),
+        ("7, 2, 3, 1, 8, 9", "t_us,x,y,p,other1,other2"),
+    ],
+)
+def test_the_hint_can_be_followed(path, line, names):
+    """Its names are separated as the columns are, and as many; with a unit that decimals may have."""
+    with pytest.raises(FormatError, match=f"put a line such as '{names}' there"):
+        parse(path, line + "\n")
+    assert parse(path, f"{names}\n{line}\n") == [(500_000 if "." in line else 7, 2, 3, True)]
+
+
+def test_names_may_state_the_size_of_the_sensor(path):
+    """As faery writes them."""
+    assert parse(path, "t,x@346,y@260,on\n7,2,3,1\n") == [(7, 2, 3, True)]
+    source = readers.read(path)
+    assert (source.sensor_size, source.sensor_size_known) == ((260, 346), True)
+    assert parse(path, "t,x@346,y,on\n7,2,3,1\n") == [(7, 2, 3, True)]
+    assert not readers.read(path).sensor_size_known
+
+
+@pytest.mark.parametrize("header", ["", "% date 2026\n", "x,y,polarity,timestamp_us\n", "t_us,x,y,p\n"])
+def test_geometry_is_the_size_of_the_sensor(path, header):
+    """Prophesee's standalone decoders: x, y, p, t unless there are names."""
+    line = "7,2,3,1" if header.startswith("t") else "2,3,1,7"
+    assert parse(path, f"%geometry:640,480\n{header}{line}\n") == [(7, 2, 3, True)]
+    source = readers.read(path)
+    assert (source.sensor_size, source.sensor_size_known) == ((480, 640), True)
+    assert source.missing == ("The file has no frames.",)
+    with pytest.raises(FormatError, match=rf"line {3 + len(header.splitlines())}: "):
+        parse(path, f"%geometry:640,480\n{header}{line}\n2,b,0,9\n")
+
+
+def test_lines_of_prophesee_need_no_names(path):
+    """metavision_file_to_csv: the polarity, then the time; what else they might be is refused."""
+    assert parse(path, "639,479,1,0\n2,3,0,7\n2,3,0,9\n") == [
+        (0, 639, 479, True),
+        (7, 2, 3, False),
+        (9, 2, 3, False),
+    ]
+    assert any("taken as x, y, p, t (us)" in text for text in readers.read(path).missing)
+    for text in ("9,3,0,1\n10,2,1,0\n", "2,3,1,9\n2,3,0,8\n", "2,3,1,9\n2,3,7,9\n", "2,3,1,9,0\n", "2 3 1 9\n"):
+        with pytest.raises(FormatError, match="does not name the columns"):
+            parse(path, text)
+
+
+@pytest.mark.parametrize(
     "text", ["events", "", "a,b,c,d\n1,2,3,4\n", "t,x,y\n1,2,3\n", "\0" * 50, b"\xff\xfe\x00t"]
 )
 def test_other_files_are_not_recognised(path, text):

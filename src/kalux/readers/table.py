@@ -3,7 +3,9 @@
 The columns may have any order and any of the names in `kalux.readers.columns`; others are skipped. Lines that begin
 with # are comments; the one with the names may begin with it, too (as ``numpy.savetxt`` writes it). Without names the
 lines may be those of ``events.txt`` in the IJRR layout, which other programs write alone: v2e, and rpg_e2vid with a line
-``width height`` before them.
+``width height`` before them; or those of Prophesee's programs, ``x,y,p,t`` in microseconds, some with a line
+``%geometry:width,height`` before them (``standalone_samples`` and ``metavision_file_to_csv`` of
+https://github.com/prophesee-ai/openeb).
 """
 
 from __future__ import annotations
@@ -46,6 +48,8 @@ from kalux.readers.source import (
 _MOST_COLUMNS: Final = 64
 _TXYP: Final = (1, 2, 3, 4)
 """Roles of columns in the order of IJRR."""
+_XYPT: Final = (2, 3, 4, 1)
+"""In that of Prophesee's programs."""
 _NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 _IJRR_LINE: Final = re.compile(r"\s*(\d+\.\d+|\d+(\.\d+)?[eE]-\d+)\s+\d+\s+\d+\s+[01]\s*")
 """Seconds with decimals, or as Python prints small ones (8.3e-05), x, y, and polarity, which nothing else is likely to
@@ -57,6 +61,14 @@ _LABELS: Final = "signal/noise"
 _LABELS_SKIPPED: Final = "The fifth column, v2e's labels of signal and noise, is not read."
 _SIZE_LINE: Final = re.compile(r"\s*([1-9]\d{0,4})\s+([1-9]\d{0,4})\s*")
 """Width and height, as rpg_e2vid has them before the events."""
+_GEOMETRY: Final = re.compile(r"\s*%\s*geometry:\s*([1-9]\d{0,4})\s*,\s*([1-9]\d{0,4})\s*")
+"""Width and height, as Prophesee's programs state them."""
+_PROPHESEE_LINE: Final = re.compile(r"\s*\d+,\d+,[01],(\d+)\s*")
+_PROPHESEE_ASSUMED: Final = (
+    "The columns have no names; they are taken as x, y, p, t (us), as metavision_file_to_csv writes them."
+)
+_SIZED: Final = re.compile(r"(.+)@([1-9]\d{0,4})")
+"""A name with the number of columns or rows of the sensor, as faery writes them."""
 _IJRR_ASSUMED: Final = (
     "The columns have no names; they are taken as t (s), x, y, p, as events.txt of IJRR has them."
 )
@@ -97,12 +109,16 @@ class _Beginning(NamedTuple):
 
 
 class _Named(NamedTuple):
-    """A line that names columns: its index, what separates the names, the names, and which are an event's fields."""
+    """A line that names columns: its index, what separates the names, the names, and which are an event's fields.
+
+    ``size`` is the sensor's (height, width), if the names state it.
+    """
 
     index: int
     separator: str
     names: list[str]
     columns: Columns
+    size: tuple[int, int] | None
 
 
 def recognises(path: Path) -> bool:
@@ -151,12 +167,12 @@ def _beginning(data: bytes) -> _Beginning:
     for index, line in enumerate(lines):
         if "\0" in line:
             return _Beginning([], None, 0, [])
-        match = _SIZE_LINE.fullmatch(line)
+        match = None if size else _SIZE_LINE.fullmatch(line) or _GEOMETRY.fullmatch(line)
+        if match is not None:
+            size = (int(match[2]), int(match[1]))
         if _is_comment(line):
             comments.append((index, line))
-        elif match is not None and size is None:
-            size = (int(match[2]), int(match[1]))
-        else:
+        elif match is None:
             others = [other for other in lines[index:] if not _is_comment(other)]
             return _Beginning(comments, size, index, others)
     return _Beginning(comments, size, len(lines), [])
@@ -175,8 +191,8 @@ def _whole_lines(data: bytes) -> list[str]:
 
 
 def _is_comment(line: str) -> bool:
-    """Whether a line is blank or begins with #."""
-    return not line.strip() or line.lstrip().startswith("#")
+    """Whether a line is blank or begins with #, or with %, as Prophesee's do."""
+    return not line.strip() or line.lstrip().startswith(("#", "%"))
 
 
 def _separator(line: str) -> str:
@@ -192,12 +208,16 @@ def _named(beginning: _Beginning) -> Iterator[_Named]:
     """The lines that name columns: the first that is no comment, and comments."""
     others = [(beginning.index, line) for line in beginning.others[:1]]
     for index, line in (*others, *beginning.comments):
-        text = _FORMAT.sub("", line.strip().lstrip("#").strip())
+        text = _FORMAT.sub("", line.strip().lstrip("#%").strip())
         separator = _separator(text)
-        names = _fields(text, separator)
+        matches = [(name, _SIZED.fullmatch(name)) for name in _fields(text, separator)]
+        names = [name if match is None else match[1] for name, match in matches]
+        lengths = {match[1]: int(match[2]) for _, match in matches if match is not None}
         columns = find_columns(names)
         if columns is not None:
-            yield _Named(index, separator, names, columns)
+            stated = columns.x in lengths and columns.y in lengths
+            size = (lengths[columns.y], lengths[columns.x]) if stated else None
+            yield _Named(index, separator, names, columns, size)
 
 
 def _has_numbers(line: str) -> bool:
@@ -217,8 +237,19 @@ def _read_header(path: Path, data: bytes) -> _Header:
     if all_named:  # a line will be found to have more or fewer columns
         return _header_of_names(path, data, beginning, all_named[0])
     raise FormatError(
-        f"{path}: its first line does not name the columns; put a line such as 't_us,x,y,p' there, in their order"
+        f"{path}: its first line does not name the columns; put a line such as {_example(beginning)!r} there, in "
+        "their order"
     )
+
+
+def _example(beginning: _Beginning) -> str:
+    """A line of names for columns that have none, as many and separated as they are."""
+    line = beginning.others[0].strip() if beginning.others else ""
+    separator = _separator(line) if line else ","
+    fields = _fields(line, separator)[:_MOST_COLUMNS]
+    time = "t_s" if "." in fields[0] else "t_us"
+    more = [f"other{number}" for number in range(1, len(fields) - 3)]
+    return separator.join([time, "x", "y", "p", *more])[:80]
 
 
 def _data_lines(beginning: _Beginning, named: _Named) -> list[str]:
@@ -260,7 +291,7 @@ def _header_of_names(path: Path, data: bytes, beginning: _Beginning, named: _Nam
         _first_of_each(roles),
         unit,
         assumed,
-        beginning.size,
+        named.size or beginning.size,
     )
 
 
@@ -277,7 +308,18 @@ def _nameless(beginning: _Beginning) -> _Header | None:
         return _Header(0, 0, " ", _TXYP, "s", (_IJRR_ASSUMED,), None)
     if _LABELLED.fullmatch(line) and any(_LABELS in comment for _, comment in beginning.comments):
         return _Header(0, 0, " ", (*_TXYP, 0), "s", (_IJRR_ASSUMED, _LABELS_SKIPPED), None)
+    stated = any(_GEOMETRY.fullmatch(comment) for _, comment in beginning.comments)
+    if _PROPHESEE_LINE.fullmatch(line) and (stated or _are_prophesee_lines(beginning.others)):
+        assumed = () if stated else (_PROPHESEE_ASSUMED,)
+        return _Header(0, 0, ",", _XYPT, "us", assumed, None)
     return None
+
+
+def _are_prophesee_lines(lines: list[str]) -> bool:
+    """Whether the third number is 0 or 1 in all lines, and the fourth a time in order, which goes beyond 1."""
+    matches = [_PROPHESEE_LINE.fullmatch(line) for line in lines]
+    times = [int(match[1]) for match in matches if match is not None]
+    return len(times) == len(lines) and times == sorted(times) and times[-1] > 1
 
 
 def _place(data: bytes, lines: int) -> int:
