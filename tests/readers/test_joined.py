@@ -122,6 +122,45 @@ def test_the_list_of_ijrr(events_only, tmp_path):
     ]
 
 
+TIMES_ALONE = {
+    "us": ("{t}", "whole numbers are taken as microseconds"),
+    "us, as floats": ("{t}.0", "whole numbers are taken as microseconds"),
+    "s": ("{s:.6f}", "decimals are taken as seconds"),
+    "s, as Python prints them": ("{s}", "decimals are taken as seconds"),
+}
+
+
+@pytest.mark.parametrize("kind", TIMES_ALONE)
+@pytest.mark.parametrize("name", ["timestamps.txt", "timestamp.txt", "timestamps.csv"])
+def test_times_alone_are_those_of_the_images_beside_them(events_only, tmp_path, kind, name):
+    """As jAER saves frames: images named by their times, which are in order of their numbers, and a comment."""
+    template, told = TIMES_ALONE[kind]
+    stamps = [f.exposure_start + 5 for f in small_frames()]
+    folder = tmp_path / "images"
+    write_images(folder, names=[f"{stamp}.png" for stamp in stamps])
+    lines = ["# jAER APS frame timestamps (microseconds), one per PNG"]
+    lines += [template.format(t=stamp, s=stamp / 1e6) for stamp in stamps]
+    (folder / name).write_text("\n".join(lines))
+    for place in (folder, folder / name):
+        rec = kalux.open(events_only, frames=place)
+        assert [frame.exposure_start for frame in rec.stamped_frames()] == stamps
+        assert all(
+            np.array_equal(ours.image, theirs.image)
+            for ours, theirs in zip(rec.stamped_frames(), small_frames(), strict=True)
+        )
+        assert any(told in sentence for sentence in rec.source.missing)
+        assert any("exposure times" in sentence for sentence in rec.source.missing)
+
+
+@pytest.mark.parametrize(("text", "told"), [("1\n2\n", "lists 2 times, but there are 4 images"), ("1\n1e99\n", "line 2")])
+def test_times_alone_must_be_possible_and_as_many_as_images(events_only, tmp_path, text, told):
+    folder = tmp_path / "images"
+    write_images(folder)
+    (folder / "timestamps.txt").write_text(text)
+    with pytest.raises(FormatError, match=told):
+        kalux.open(events_only, frames=folder)
+
+
 class TestSize:
     def test_another_size_is_refused(self, events_only, tmp_path):
         folder = tmp_path / "images"

@@ -1,4 +1,4 @@
-"""Lists of images with their times: a CSV with a line per image, or the ``images.txt`` of the IJRR layout."""
+"""Lists of images with their times: a CSV with a line per image, the ``images.txt`` of the IJRR layout, or times alone."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ _NUMBERED: Final = re.compile(r"\s*\d+\s+\d+\.\d+\s+(?P<file>\S.*?)\s*")
 _PER_UNIT: Final = {"s": Decimal(10**6), "ms": Decimal(1000), "us": Decimal(1), "ns": Decimal("0.001")}
 
 WANTED: Final = (
-    "a CSV named frames.csv with a line per image and the columns timestamp_us, perhaps exposure_us and file, or the "
-    "images.txt of the IJRR layout"
+    "a CSV named frames.csv with a line per image and the columns timestamp_us, perhaps exposure_us and file, the "
+    "images.txt of the IJRR layout, or a timestamps.txt with a time per line"
 )
 """What a list of images may be, for messages."""
 
@@ -136,6 +136,33 @@ def read_stamps(path: Path, text: str, unit: str) -> list[int]:
             raise FormatError(f"{path}: line {number}: {field[:40]!r} is not {wanted}")
         stamps.append(int(stamp.to_integral_value(ROUND_HALF_UP)))
     return stamps
+
+
+def are_stamps(text: str) -> bool:
+    """Whether a list has nothing but times, one a line."""
+    fields = [line.strip() for line in text.splitlines() if not _is_comment(line)]
+    return bool(fields) and all(_PRINTED.fullmatch(field) for field in fields)
+
+
+def read_images_with_stamps(path: Path, text: str) -> tuple[list[Listed], str]:
+    """The images beside a list of times alone, and what is to be said of the unit: us, or s if one has a fraction.
+
+    Raises
+    ------
+    FormatError
+        If there are not as many images as times, or a time is impossible.
+    """
+    times = [line.strip() for line in text.splitlines() if not _is_comment(line)]
+    unit = "us" if all(time == time.to_integral_value() for time in map(Decimal, times)) else "s"
+    stamps = read_stamps(path, text, unit)
+    files = images_in(path.parent)
+    if len(files) != len(stamps):
+        raise FormatError(
+            f"{path}: lists {len(stamps)} times, but there are {len(files)} images beside it; a time for each is needed"
+        )
+    taken = "whole numbers are taken as microseconds" if unit == "us" else "decimals are taken as seconds"
+    listed = [Listed(file, stamp, stamp) for file, stamp in zip(files, stamps, strict=True)]
+    return listed, f"{path.name} does not state the unit of the images' times; its {taken}."
 
 
 def read_listed(place: Path, listed: Sequence[Listed], *, colour: bool) -> Iterator[Frame]:

@@ -20,7 +20,15 @@ from numpy.typing import NDArray
 
 from kalux.errors import FormatError, FrameError, InputError
 from kalux.frames import Frame
-from kalux.readers.image_lists import WANTED, Listed, read_csv, read_ijrr, read_listed
+from kalux.readers.image_lists import (
+    WANTED,
+    Listed,
+    are_stamps,
+    read_csv,
+    read_ijrr,
+    read_images_with_stamps,
+    read_listed,
+)
 from kalux.readers.images import files_in_colour, load_image
 from kalux.readers.source import EXPOSURE_UNKNOWN, SIZE_NOT_STATED, Source, reading, size_needed
 from kalux.readers.videos import opened_video
@@ -29,7 +37,7 @@ from kalux.wording import how_many
 if TYPE_CHECKING:
     from av.container import InputContainer
 
-_LISTS: Final = ("frames.csv", "timestamps.csv", "images.txt")
+_LISTS: Final = ("frames.csv", "timestamps.csv", "images.txt", "timestamps.txt", "timestamp.txt")
 _LARGEST_LIST: Final = 1 << 27  # bytes; it is read as a whole
 _FIRST_PICTURES: Final = 10  # of a video, which tell whether it is in colour
 _GREY_ROUNDING: Final = 0.03
@@ -57,7 +65,8 @@ def join(source: Source, frames: Path, *, start: int | None, rate_hz: float | No
     source
         The recording; its events stay as they are.
     frames
-        A folder of images with `frames.csv`, `timestamps.csv` or `images.txt` (or that file itself); or a video.
+        A folder of images with `frames.csv`, `timestamps.csv`, `images.txt` or `timestamps.txt` (or that file itself);
+        or a video.
     start, rate_hz
         For a video: the time of the first frame, us, in the clock of the events, and frames per second.
     replace
@@ -147,7 +156,12 @@ def _images(frames: Path, start: int | None, rate_hz: float | None) -> Source:
         if path.stat().st_size > _LARGEST_LIST:
             raise FormatError(f"{path}: is too large for a list of images; {WANTED} is needed")
         text = path.read_text("utf-8-sig")
-        if path.suffix.lower() == ".txt":
+        missing: tuple[str, ...] = ()
+        if are_stamps(text):
+            listed, unit = read_images_with_stamps(path, text)
+            missing = (unit,)
+            exposure_known = False
+        elif path.suffix.lower() == ".txt":
             images = read_ijrr(path, text, lambda name: (path.parent / name).is_file())
             listed = [Listed(path.parent / name, stamp, stamp) for stamp, name in images]
             exposure_known = False
@@ -169,7 +183,7 @@ def _images(frames: Path, start: int | None, rate_hz: float | None) -> Source:
         frames=lambda: read_listed(frames, listed, colour=colour),
         count_frames=lambda: len(listed),
         exposure_known=exposure_known,
-        missing=() if exposure_known else (EXPOSURE_UNKNOWN,),
+        missing=missing if exposure_known else (EXPOSURE_UNKNOWN, *missing),
     )
 
 
