@@ -100,6 +100,7 @@ def built_seeds(folder: Path) -> Iterator[Seed]:
     import test_aedat3
     import test_aedat4
     import test_es
+    import test_evreal
     import test_hdf5_layouts
     import test_ijrr
     import test_mat
@@ -165,6 +166,7 @@ def built_seeds(folder: Path) -> Iterator[Seed]:
     yield put("numpy", "plain.npy", lambda p: np.save(p, events))
     for name, write in test_npz_folder.WRITERS.items():
         yield put("npz-folder", name, lambda p, w=write: w(p, events, frames))
+    yield put("evreal", "evreal", lambda p: test_evreal.write_evreal(p, events, frames))
     ijrr = put("ijrr", "ijrr", test_ijrr.write_folder)
     yield ijrr
     yield put("ijrr", "ijrr.zip", lambda p: test_ijrr.zipped(ijrr.path, p))

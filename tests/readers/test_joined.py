@@ -152,7 +152,9 @@ def test_times_alone_are_those_of_the_images_beside_them(events_only, tmp_path, 
         assert any("exposure times" in sentence for sentence in rec.source.missing)
 
 
-@pytest.mark.parametrize(("text", "told"), [("1\n2\n", "lists 2 times, but there are 4 images"), ("1\n1e99\n", "line 2")])
+@pytest.mark.parametrize(
+    ("text", "told"), [("1\n2\n", "lists 2 times, but there are 4 images"), ("1\n1e99\n", "line 2")]
+)
 def test_times_alone_must_be_possible_and_as_many_as_images(events_only, tmp_path, text, told):
     folder = tmp_path / "images"
     write_images(folder)

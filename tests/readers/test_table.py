@@ -120,7 +120,7 @@ def test_decimals_without_a_unit_are_seconds_in_lines_like_those_of_events_txt(p
     path.write_text(header + "0.0 2 3 1\n0.2500005 4 5 0\n")
     source = readers.read(path)
     assert all_events(source).tolist() == [(0, 2, 3, True), (250_001, 4, 5, False)]
-    assert any("their times taken as seconds" in text for text in source.missing)
+    assert any("times taken as seconds" in text for text in source.missing)
 
 
 @pytest.mark.parametrize("first", ["1.5 1.0 2.0 1.0", "1.5 1 2 -1", "1.5 1 2 True", "1 1 2 0"])
@@ -254,7 +254,9 @@ def test_a_first_line_of_two_numbers_is_the_size_of_the_sensor(path):
         parse(path, "40 30\n# a comment\n0.1 2 3 1\n0.2 b 3 1\n")
 
 
-@pytest.mark.parametrize("text", ["40 30\n", "40 30\n40 30\n0.1 2 3 1\n", "0 30\n0.1 2 3 1\n", "40 30\na b c d\n"])
+@pytest.mark.parametrize(
+    "text", ["40 30\n", "40 30\n40 30\n0.1 2 3 1\n", "0 30\n0.1 2 3 1\n", "40 30\na b c d\n"]
+)
 def test_two_numbers_alone_are_no_table(path, text):
     path.write_text(text)
     assert not table.recognises(path)
@@ -316,7 +318,13 @@ def test_lines_of_prophesee_need_no_names(path):
         (9, 2, 3, False),
     ]
     assert any("taken as x, y, p, t (us)" in text for text in readers.read(path).missing)
-    for text in ("9,3,0,1\n10,2,1,0\n", "2,3,1,9\n2,3,0,8\n", "2,3,1,9\n2,3,7,9\n", "2,3,1,9,0\n", "2 3 1 9\n"):
+    for text in (
+        "9,3,0,1\n10,2,1,0\n",
+        "2,3,1,9\n2,3,0,8\n",
+        "2,3,1,9\n2,3,7,9\n",
+        "2,3,1,9,0\n",
+        "2 3 1 9\n",
+    ):
         with pytest.raises(FormatError, match="does not name the columns"):
             parse(path, text)
 

@@ -182,7 +182,8 @@ def microseconds(path: Path, seconds: NDArray[Any]) -> NDArray[np.int64]:
         If they are whole numbers, or one is not finite, or too large, or too large for its precision.
     """
     check_seconds(path, seconds.dtype)
-    scaled = np.rint(np.asarray(seconds, np.float64) * 1e6)
+    with np.errstate(over="ignore", invalid="ignore"):
+        scaled = np.rint(np.asarray(seconds, np.float64) * 1e6)
     # Also refuses NaN, of which no comparison is true.
     if scaled.size and not (np.abs(scaled).max() < 2.0**62):
         raise FormatError(f"{path}: has times that are not finite or out of range; copy or download it again")

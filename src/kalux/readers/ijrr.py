@@ -14,7 +14,7 @@ import zlib
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -65,6 +65,13 @@ _DAMAGE: Final = (
 _Place = Path | zipfile.Path
 
 
+class _Found(NamedTuple):
+    """The folder of a recording, in the file system or inside a zip, and the file of its events."""
+
+    root: _Place
+    events: _Place
+
+
 def recognises(path: Path) -> bool:
     """Whether the folder or zip has events, at its root or in its one folder; or is a broken zip."""
     if path.is_dir():
@@ -72,7 +79,7 @@ def recognises(path: Path) -> bool:
     if not begins_with(path, _ZIP_SIGNATURE):
         return False
     try:
-        return _find_events(path) is not None
+        return _find(path) is not None
     except _DAMAGE:
         return True  # so that the reader can say that it is damaged
 
@@ -92,11 +99,11 @@ def read(path: Path) -> Source:
         If a file cannot be read.
     """
     with reading(path, *_DAMAGE):
-        events = _find_events(path)
-        if events is None:
+        found = _find(path)
+        if found is None:
             raise FormatError(f"{path}: has no {_EVENTS}; give the folder or zip that contains it")
-        root = events.parent
-        declared_size = _check_beginning(path, events)
+        root = found.root
+        declared_size = _check_beginning(path, found.events)
         images, missing = _image_list(path, root)
     colour = False
     if images:
@@ -111,7 +118,7 @@ def read(path: Path) -> Source:
         missing += (SIZE_UNKNOWN,)
 
     def read_frames() -> Iterator[Frame]:
-        place = _find_events_again(path).parent
+        place = _find_again(path).root
         for stamp, name in images:
             yield Frame(_load(path, place, name, colour), stamp, stamp)
 
@@ -129,18 +136,22 @@ def read(path: Path) -> Source:
     )
 
 
-def _find_events(path: Path) -> _Place | None:
-    """The file ``events.txt``, in the file system or inside a zip; or the only text in a zip, if it begins like it."""
+def _find(path: Path) -> _Found | None:
+    """Where ``events.txt`` is; or the only text in a zip, if it begins like it."""
     if path.is_dir():
-        return path / _EVENTS
+        return _Found(path, path / _EVENTS)
     top = zipfile.Path(path)
     folders = [entry for entry in top.iterdir() if entry.is_dir() and not entry.name.startswith("__MACOSX")]
     for root in (top, *(folders if len(folders) == 1 else ())):
         if (root / _EVENTS).is_file():
-            return root / _EVENTS
+            return _Found(root, root / _EVENTS)
     with zipfile.ZipFile(path) as archive:
-        texts = [name for name in archive.namelist() if name.endswith(".txt") and not name.startswith("__MACOSX")]
-    return top / texts[0] if len(texts) == 1 and _begins_with_events(top / texts[0]) else None
+        texts = [
+            name for name in archive.namelist() if name.endswith(".txt") and not name.startswith("__MACOSX")
+        ]
+    if len(texts) != 1 or not _begins_with_events(top / texts[0]):
+        return None
+    return _Found(top, top / texts[0])
 
 
 def _begins_with_events(place: _Place) -> bool:
@@ -150,13 +161,13 @@ def _begins_with_events(place: _Place) -> bool:
     return any(_EVENT.fullmatch(line) for line in content[:2])  # the first may be width and height
 
 
-def _find_events_again(path: Path) -> _Place:
+def _find_again(path: Path) -> _Found:
     """A handle of its own for each iteration, so that several may run at once."""
     with reading(path, *_DAMAGE):
-        events = _find_events(path)
-    if events is None:
+        found = _find(path)
+    if found is None:
         raise FormatError(f"{path}: {_EVENTS} has gone since the recording was opened")
-    return events
+    return found
 
 
 # Events
@@ -180,13 +191,14 @@ def _check_beginning(path: Path, events: _Place) -> tuple[int, int] | None:
 
 
 def _read_events(path: Path) -> Iterator[EventArray]:
+    events = _find_again(path).events
+
     def bad_line(number: int, fault: int, shown: str) -> FormatError:
         return FormatError(
-            f"{path}: {events.name}, line {number}: {_FAULTS[fault]}: {shown!r}; a line is 't x y p', t in seconds as a "
-            "plain decimal, x and y from 0, p 0 or 1"
+            f"{path}: {events.name}, line {number}: {_FAULTS[fault]}: {shown!r}; a line is 't x y p', t in seconds as "
+            "a plain decimal, x and y from 0, p 0 or 1"
         )
 
-    events = _find_events_again(path)
     with reading(path, *_DAMAGE), events.open("rb") as file:
         yield from parsed_events(file, _parse, bad_line)
 

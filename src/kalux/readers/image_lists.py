@@ -1,4 +1,4 @@
-"""Lists of images with their times: a CSV with a line per image, the ``images.txt`` of the IJRR layout, or times alone."""
+"""Lists of images with their times: a CSV with a line per image, the ``images.txt`` of the IJRR layout, times alone."""
 
 from __future__ import annotations
 

@@ -272,6 +272,25 @@ def read_columns(path: Path, layout: Layout) -> Iterator[dict[str, NDArray[Any]]
             yield data
 
 
+def mapped(path: Path) -> NDArray[Any]:
+    """The numbers of an ``.npy``, mapped into memory: what is not used is not read.
+
+    Raises
+    ------
+    FormatError
+        If it holds anything else, or is cut short or damaged.
+    """
+    arrays = _list_arrays(path)  # which also checks that they are there in full
+    if len(arrays) != 1 or arrays[0].member is not None or arrays[0].dtype.kind not in "biuf":
+        raise FormatError(
+            f"{path}: holds {', '.join(map(_described, arrays[:8])) or 'nothing'}; an array of numbers is needed"
+        )
+    with reading(path, *DAMAGE, OverflowError):
+        if not math.prod(arrays[0].shape):  # nothing to map
+            return np.empty(arrays[0].shape, arrays[0].dtype)
+        return npy.open_memmap(path, mode="r")
+
+
 def _exactly(file: IO[bytes], size: int) -> bytes:
     data = file.read(size)
     if len(data) != size:

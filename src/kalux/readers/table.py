@@ -1,10 +1,10 @@
 """Events in a text table whose first line names its columns: CSV, TSV, or separated by blanks.
 
 The columns may have any order and any of the names in `kalux.readers.columns`; others are skipped. Lines that begin
-with # are comments; the one with the names may begin with it, too (as ``numpy.savetxt`` writes it). Without names the
-lines may be those of ``events.txt`` in the IJRR layout, which other programs write alone: v2e, and rpg_e2vid with a line
-``width height`` before them; or those of Prophesee's programs, ``x,y,p,t`` in microseconds, some with a line
-``%geometry:width,height`` before them (``standalone_samples`` and ``metavision_file_to_csv`` of
+with # are comments; the one with the names may begin with it, too (as ``numpy.savetxt`` writes it). Some lines need no
+names: those of ``events.txt`` in the IJRR layout, which other programs write alone (v2e, and rpg_e2vid with a line
+``width height`` before them), and ``x,y,p,t`` in microseconds, as Prophesee's programs write them, some with a line
+``%geometry:width,height`` before them (``metavision_file_to_csv`` and ``standalone_samples`` of
 https://github.com/prophesee-ai/openeb).
 """
 
@@ -72,10 +72,10 @@ _SIZED: Final = re.compile(r"(.+)@([1-9]\d{0,4})")
 _IJRR_ASSUMED: Final = (
     "The columns have no names; they are taken as t (s), x, y, p, as events.txt of IJRR has them."
 )
-_FORMAT: Final = re.compile(r"format:\s*", re.IGNORECASE)
+_FORMAT: Final = re.compile(r"^format:\s*", re.IGNORECASE)
 """What jAER writes before the names."""
 _SECONDS_ASSUMED: Final = (
-    "The unit of time is not stated; the lines are like those of events.txt of IJRR, and their times taken as seconds."
+    "The unit of time is not stated; lines are like those of events.txt of IJRR, and times taken as seconds."
 )
 _DECIMALS: Final = {"s": 6, "ms": 3, "us": 0, "ns": -3, None: 0}
 """How many decimals of each unit a microsecond needs."""
@@ -99,22 +99,22 @@ class _Header(NamedTuple):
 class _Beginning(NamedTuple):
     """The first lines of a file: comments, then the sensor's (height, width) if a line has it, then the others.
 
-    ``index`` is that of the first of ``others``, from 0.
+    ``before`` says how many lines there are before the others.
     """
 
     comments: list[tuple[int, str]]
     size: tuple[int, int] | None
-    index: int
+    before: int
     others: list[str]
 
 
 class _Named(NamedTuple):
-    """A line that names columns: its index, what separates the names, the names, and which are an event's fields.
+    """A line that names columns: what separates the names, the names, and which are an event's fields.
 
-    ``size`` is the sensor's (height, width), if the names state it.
+    ``before`` says how many lines there are before it, ``size`` is the sensor's (height, width) if the names state it.
     """
 
-    index: int
+    before: int
     separator: str
     names: list[str]
     columns: Columns
@@ -206,7 +206,7 @@ def _fields(line: str, separator: str) -> list[str]:
 
 def _named(beginning: _Beginning) -> Iterator[_Named]:
     """The lines that name columns: the first that is no comment, and comments."""
-    others = [(beginning.index, line) for line in beginning.others[:1]]
+    others = [(beginning.before, line) for line in beginning.others[:1]]
     for index, line in (*others, *beginning.comments):
         text = _FORMAT.sub("", line.strip().lstrip("#%").strip())
         separator = _separator(text)
@@ -233,7 +233,9 @@ def _read_header(path: Path, data: bytes) -> _Header:
         return _header_of_names(path, data, beginning, named)
     found = _nameless(beginning)
     if found is not None:
-        return found._replace(begin=_place(data, beginning.index), lines=beginning.index, size=beginning.size)
+        return found._replace(
+            begin=_place(data, beginning.before), lines=beginning.before, size=beginning.size
+        )
     if all_named:  # a line will be found to have more or fewer columns
         return _header_of_names(path, data, beginning, all_named[0])
     raise FormatError(
@@ -253,12 +255,12 @@ def _example(beginning: _Beginning) -> str:
 
 
 def _data_lines(beginning: _Beginning, named: _Named) -> list[str]:
-    return beginning.others[1:] if named.index == beginning.index else beginning.others
+    return beginning.others[1:] if named.before == beginning.before else beginning.others
 
 
 def _fits(beginning: _Beginning, named: _Named) -> bool:
     """Whether it is no comment, or one with as many names as the first line after the comments has columns."""
-    if named.index == beginning.index or not beginning.others:
+    if named.before == beginning.before or not beginning.others:
         return True
     line = beginning.others[0]
     return any(len(_fields(line, by)) == len(named.names) for by in (named.separator, _separator(line)))
@@ -283,7 +285,7 @@ def _header_of_names(path: Path, data: bytes, beginning: _Beginning, named: _Nam
     unit, assumed = columns.unit, () if columns.unit else (UNIT_ASSUMED,)
     if unit is None and roles == _TXYP and _are_seconds(lines):
         unit, assumed = "s", (_SECONDS_ASSUMED,)
-    before = max(beginning.index, named.index + 1)
+    before = max(beginning.before, named.before + 1)
     return _Header(
         _place(data, before),
         before,
