@@ -172,6 +172,12 @@ def built_seeds(folder: Path) -> Iterator[Seed]:
     yield put("ijrr", "ijrr.zip", lambda p: test_ijrr.zipped(ijrr.path, p))
     yield put("table", "events.csv", lambda p: p.write_text(test_table.written()))
     yield put("table", "events.txt", lambda p: p.write_text(test_table.written("# t x y p", separator=" ")))
+    lines = [f"{t / 1e6:.6f} {x} {y} {int(p)}\n" for t, x, y, p in events.tolist()]
+    yield put("table", "sized.txt", lambda p: p.write_text(f"{SIZE[1]} {SIZE[0]}\n{''.join(lines)}"))
+    rows = [f"{x},{y},{int(p)},{t}\n" for t, x, y, p in events.tolist()]
+    yield put(
+        "table", "geometry.csv", lambda p: p.write_text(f"%geometry:{SIZE[1]},{SIZE[0]}\n{''.join(rows)}")
+    )
 
 
 # Changes

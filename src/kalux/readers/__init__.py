@@ -87,7 +87,7 @@ READERS: tuple[Reader, ...] = (
         npz_folder.recognises,
         npz_folder.read,
     ),
-    Reader("evreal", "folder of .npy arrays of EVREAL", evreal.recognises, evreal.read),
+    Reader("evreal", "EVREAL folder", evreal.recognises, evreal.read),
     # Before IJRR, whose zips could also be .npz; a broken zip is left to IJRR to report.
     Reader("numpy", "NumPy .npz or .npy", numpy_files.recognises, numpy_files.read),
     Reader("ijrr", "IJRR text folder or zip (events.txt, images.txt)", ijrr.recognises, ijrr.read),
