@@ -111,7 +111,7 @@ def test_times_with_decimals_need_a_unit(path):
     [
         "# timestamp x y polarity\n",  # UZH-FPV, evlib
         "timestamp x y polarity\n",
-        "# timestamp(float s) x y polarity(off/on=0/1)\n# format: t x y p\n",  # jAER
+        "# a comment\n# format: t x y p\n",
         "t\tx\ty\tp\n",
     ],
 )
@@ -136,17 +136,25 @@ def test_whole_times_with_a_point_are_microseconds_all_the_same(path, header):
 
 
 @pytest.mark.parametrize("separator", [" ", ","])
-def test_the_header_that_jaer_writes(path, separator):
-    """Save As text: the names stand after "format:", in the last of several comments."""
-    header = "\n".join(
-        [
-            "# jAER DAVIS/DVS camera text file output",
-            "# source-file: /home/u/Davis346B-2026.aedat4",
-            f"# dvs-events: One event per line: {separator.join(['timestamp(int32 us)', 'x', 'y', 'polarity'])}",
-            f"# format: {separator.join('txyp')}",
-        ]
-    )
-    assert parse(path, written(header, separator=separator)) == EVENTS.tolist()
+@pytest.mark.parametrize("unit", ["float s", "int32 us"])
+@pytest.mark.parametrize("order", ["txyp", "xypt", "txyps"])
+def test_the_header_that_jaer_writes(path, separator, unit, order):
+    """Save As text: the names stand after "format:", the unit in the comment before; rows are told to be from below."""
+    legend = f"timestamp({unit}) x y polarity(off/on=-1/+1)".replace(" ", separator)
+    header = [
+        "# jAER DAVIS/DVS camera text file output",
+        "# source-file: /home/u/Davis346B-2026.aedat4",
+        f"# dvs-events: One event per line: {legend}",
+        f"# format: {separator.join(order)}",
+    ]
+    times = {"float s": ("0.0123", "1.0E-5"), "int32 us": ("12300", "10")}[unit]
+    rows = [{"t": times[1], "x": 2, "y": 3, "p": -1, "s": 0}, {"t": times[0], "x": 4, "y": 5, "p": 1, "s": 0}]
+    lines = [separator.join(str(row[name]) for name in order) for row in rows]
+    path.write_text("\n".join([*header, *lines]))
+    source = readers.read(path)
+    assert all_events(source).tolist() == [(10, 2, 3, False), (12_300, 4, 5, True)]
+    assert any("from the bottom" in text for text in source.missing)
+    assert not any("unit of time" in text for text in source.missing)
 
 
 def test_a_comment_with_fewer_or_more_names_than_there_are_columns_names_none(path):

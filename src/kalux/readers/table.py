@@ -74,6 +74,12 @@ _IJRR_ASSUMED: Final = (
 )
 _FORMAT: Final = re.compile(r"^format:\s*", re.IGNORECASE)
 """What jAER writes before the names."""
+_LEGEND: Final = re.compile(r"timestamp\((?:float|int32)[ ,](?P<unit>s|us)\)")
+"""How jAER states the unit of time, in a comment before that of the names."""
+_JAER: Final = "jAER"
+_ROWS_FROM_BELOW: Final = (
+    "jAER counts rows from the bottom, and y is read as it is there: the picture is upside down."
+)
 _SECONDS_ASSUMED: Final = (
     "The unit of time is not stated; lines are like those of events.txt of IJRR, and times taken as seconds."
 )
@@ -282,9 +288,12 @@ def _header_of_names(path: Path, data: bytes, beginning: _Beginning, named: _Nam
     columns = named.columns
     roles = tuple(columns[:4].index(name) + 1 if name in columns[:4] else 0 for name in named.names)
     lines = _data_lines(beginning, named)
-    unit, assumed = columns.unit, () if columns.unit else (UNIT_ASSUMED,)
+    unit = columns.unit or _unit_of_legend(beginning)
+    assumed: tuple[str, ...] = () if unit else (UNIT_ASSUMED,)
     if unit is None and roles == _TXYP and _are_seconds(lines):
         unit, assumed = "s", (_SECONDS_ASSUMED,)
+    if any(_JAER in comment for _, comment in beginning.comments):
+        assumed += (_ROWS_FROM_BELOW,)
     before = max(beginning.before, named.before + 1)
     return _Header(
         _place(data, before),
@@ -295,6 +304,11 @@ def _header_of_names(path: Path, data: bytes, beginning: _Beginning, named: _Nam
         assumed,
         named.size or beginning.size,
     )
+
+
+def _unit_of_legend(beginning: _Beginning) -> str | None:
+    matches = (_LEGEND.search(comment) for _, comment in beginning.comments)
+    return next((match["unit"] for match in matches if match is not None), None)
 
 
 def _are_seconds(lines: list[str]) -> bool:
