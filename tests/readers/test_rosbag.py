@@ -114,7 +114,12 @@ def event_packet(encoding, content, stamp, time_base, cdr, size=SIZE, big=False,
 DEFINITIONS = {
     "dvs_msgs/msg/EventArray": "Header header\nuint32 height\nuint32 width\nuint8[] events",
     "prophesee_event_msgs/msg/EventArray": "Header header\nuint32 height\nuint32 width\nuint8[] events",
+    "dv_ros_msgs/msg/EventArray": "Header header\nuint32 height\nuint32 width\nuint8[] events",
+    "dv_ros2_msgs/msg/EventArray": "Header header\nuint32 height\nuint32 width\nuint8[] events",
     "event_camera_msgs/msg/EventPacket": "uint8[] events",
+    "other_msgs/msg/EventArray": "uint8[] events",
+    "other_msgs/msg/CompressedEventsMsg": "uint8[] events",
+    "rcl_interfaces/msg/ParameterEvent": "uint8[] events",
     "event_array_msgs/msg/EventArray": "uint8[] events",
     "sensor_msgs/msg/Image": "uint8[] data",
     "sensor_msgs/msg/CompressedImage": "uint8[] data",
@@ -199,7 +204,15 @@ def shifted_frames(frames, us=EPOCH // 1000):
 
 
 @pytest.mark.parametrize("container", CONTAINERS)
-@pytest.mark.parametrize("kind", ["dvs_msgs/msg/EventArray", "prophesee_event_msgs/msg/EventArray"])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "dvs_msgs/msg/EventArray",
+        "dv_ros_msgs/msg/EventArray",
+        "dv_ros2_msgs/msg/EventArray",
+        "prophesee_event_msgs/msg/EventArray",
+    ],
+)
 def test_reads_what_was_written(tmp_path, container, kind):
     write, cdr = CONTAINERS[container]
     path = tmp_path / f"recording.{container}"
@@ -211,6 +224,23 @@ def test_reads_what_was_written(tmp_path, container, kind):
         assert np.array_equal(all_events(source), shifted(small_events()))
         assert same_frames(source.frames(), shifted_frames(small_frames()))
     assert (source.count_events(), source.count_frames()) == (500, 4)
+
+
+@pytest.mark.parametrize("kind", ["other_msgs/msg/EventArray", "other_msgs/msg/CompressedEventsMsg"])
+def test_topics_that_seem_to_hold_events_are_named(tmp_path, kind):
+    """A recording is not said to have no events where it only has some of an unknown type."""
+    path = tmp_path / "recording.bag"
+    others = [(EPOCH, "/odd/events", kind, b"odd"), (EPOCH, "/p", "rcl_interfaces/msg/ParameterEvent", b"")]
+    images = [message for message in davis_messages(False) if message[2] == "sensor_msgs/msg/Image"]
+    write_bag1(path, [*others, *images])
+    missing = readers.read(path).missing
+    assert missing[0] == f"Other topics are not read: /odd/events ({kind.replace('/msg/', '/')})."
+    assert "The recording has no events." not in missing
+    assert any(
+        "no events that kalux reads; known are dvs_msgs/EventArray" in sentence for sentence in missing
+    )
+    write_bag1(tmp_path / "both.bag", [*others, *davis_messages(False)])
+    assert "/odd/events" in readers.read(tmp_path / "both.bag").missing[0]
 
 
 @pytest.mark.parametrize("compression", ["BZ2", "LZ4"])

@@ -1,7 +1,7 @@
 """Events in ROS messages: ``dvs_msgs/EventArray`` and the encodings of ``event_camera_msgs/EventPacket``.
 
-The layouts are those of https://github.com/ros-event-camera/event_camera_msgs and of rpg_dvs_ros. Nothing is
-deserialised event by event: each kind has one loop over the bytes of a message.
+The layouts are those of https://github.com/ros-event-camera/event_camera_msgs and of rpg_dvs_ros, which
+those of dv-ros are, too. Nothing is deserialised event by event: each kind has one loop over the bytes of a message.
 """
 
 from __future__ import annotations
@@ -22,7 +22,12 @@ from kalux.readers.evt import BACKWARDS_US, rows_as_events
 from kalux.readers.source import TriggerArray
 from kalux.readers.streams import rechunk
 
-EVENT_ARRAYS: Final = ("dvs_msgs/EventArray", "prophesee_event_msgs/EventArray")
+EVENT_ARRAYS: Final = (
+    "dvs_msgs/EventArray",
+    "dv_ros_msgs/EventArray",
+    "dv_ros2_msgs/EventArray",
+    "prophesee_event_msgs/EventArray",
+)
 EVENT_PACKETS: Final = ("event_camera_msgs/EventPacket", "event_array_msgs/EventArray")
 
 _RECORD: Final = 13  # bytes of an event of an EventArray in ROS 1: x, y, secs, nsecs, polarity
@@ -136,7 +141,7 @@ def open_topic(kind: str, messages: Messages) -> EventTopic:
     return _open_arrays(messages) if kind in EVENT_ARRAYS else _open_packets(messages)
 
 
-# dvs_msgs/EventArray, prophesee_event_msgs/EventArray
+# EventArray of dvs_msgs and others, which are the same
 
 
 def _open_arrays(messages: Messages) -> EventTopic:

@@ -6,6 +6,7 @@ that is not clear, the path says which: ``recording.bag?events=/dvs/events&frame
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -56,6 +57,9 @@ _ENCODINGS: Final = {
 }
 _CHOICES: Final = ("events", "frames", "exposure")
 _FIRST_IMAGES: Final = 10
+# How types of many events may end; not ParameterEvent, which every ROS 2 recording may have.
+_EVENT_TYPE: Final = re.compile(r"(Events|Event(Array|Packet|Batch|Buffer|List|Stream|Struct))(Msg)?$")
+_SHOWN: Final = 60  # letters of a type, in a sentence
 
 
 def recognises(path: Path) -> bool:
@@ -390,7 +394,7 @@ def _source(
 
     missing = _unread(bag, events, images)
     if events is None:
-        missing += ("The recording has no events.",)
+        missing += (_without_events(bag),)
     if images is None:
         missing += ("The recording has no frames.",)
     elif exposures is None:
@@ -426,8 +430,22 @@ def _frames(path: Path, bag: Bag, images: _Images, exposures: _Exposures | None)
 
 
 def _unread(bag: Bag, events: _Events | None, images: _Images | None) -> tuple[str, ...]:
-    """A sentence about other topics that hold events or images, if there are any."""
+    """A sentence about other topics that hold events or images, or seem to, if there are any."""
     kinds = (*EVENT_ARRAYS, *EVENT_PACKETS, _IMAGE, _COMPRESSED)
     read = [found.topic for found in (events, images) if found is not None]
     others = [topic.name for topic in bag.topics if topic.kind in kinds and topic not in read]
+    others += [f"{topic.name} ({topic.kind[:_SHOWN]})" for topic in _of_unknown_events(bag)]
     return (f"Other topics are not read: {', '.join(others)}.",) if others else ()
+
+
+def _without_events(bag: Bag) -> str:
+    unknown = _of_unknown_events(bag)
+    if not unknown:
+        return "The recording has no events."
+    return f"The recording has no events that kalux reads; known are {', '.join((*EVENT_ARRAYS, *EVENT_PACKETS))}."
+
+
+def _of_unknown_events(bag: Bag) -> list[Topic]:
+    """Topics of messages that are not read, but whose type has a name as of many events."""
+    known = (*EVENT_ARRAYS, *EVENT_PACKETS)
+    return [topic for topic in bag.topics if topic.kind not in known and _EVENT_TYPE.search(topic.kind)]
