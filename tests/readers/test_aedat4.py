@@ -59,7 +59,7 @@ def event_packet(events):
     return flatbuffer("EVTS", {0: ("vector", len(events), events.tobytes())})
 
 
-def frame_packet(frame, *, kind=0, exposure="both"):
+def frame_packet(frame, *, kind=0, exposure="both", length=0):
     height, width = frame.image.shape[:2]
     fields = {0: ("<q", frame.exposure_start), 1: ("<q", 0), 2: ("<q", 0)}
     if exposure == "both":
@@ -67,7 +67,9 @@ def frame_packet(frame, *, kind=0, exposure="both"):
     content = frame.image.tobytes()
     fields |= {5: ("<b", kind), 6: ("<h", width), 7: ("<h", height), 10: ("vector", len(content), content)}
     if exposure == "duration":
-        fields[11] = ("<q", frame.exposure)
+        length = frame.exposure
+    if length:
+        fields[11] = ("<q", length)
     return flatbuffer("FRME", fields)
 
 
@@ -79,16 +81,24 @@ def colour_packet(frame, kind):
 
 
 def aedat4_file(
-    packets, *, streams=(("EVTS", SIZE), ("FRME", SIZE)), compression=0, closed=True, camera="Unknown"
+    packets,
+    *,
+    streams=(("EVTS", SIZE), ("FRME", SIZE)),
+    compression=0,
+    closed=True,
+    camera="Unknown",
+    module="capture",
+    info="",
 ):
     """A file of (stream, packet) pairs. Streams are (kind, size), or with a camera of their own."""
     nodes = "".join(
-        f'<node name="{i}"><attr key="typeIdentifier" type="string">{kind}</attr><node name="info">'
+        f'<node name="{i}"><attr key="originalModuleName" type="string">{module}</attr>'
+        f'<attr key="typeIdentifier" type="string">{kind}</attr><node name="info">{info}'
         f'<attr key="sizeX" type="int">{width}</attr><attr key="sizeY" type="int">{height}</attr>'
         f'<attr key="source" type="string">{(*own, camera)[0]}</attr></node></node>'
         for i, (kind, (height, width), *own) in enumerate(streams)
     )
-    info = f'<dv version="2.0"><node name="outInfo">{nodes}</node></dv>'.encode()
+    tree = f'<dv version="2.0"><node name="outInfo">{nodes}</node></dv>'.encode()
     body = b"".join(
         struct.pack("<ii", stream, len(packed)) + packed
         for stream, packed in ((stream, COMPRESS[compression](packet)) for stream, packet in packets)
@@ -96,7 +106,7 @@ def aedat4_file(
 
     def header(table_position):
         return b"#!AER-DAT4.0\r\n" + flatbuffer(
-            "IOHE", {0: ("<i", compression), 1: ("<q", table_position), 2: ("vector", len(info), info)}
+            "IOHE", {0: ("<i", compression), 1: ("<q", table_position), 2: ("vector", len(tree), tree)}
         )
 
     end = len(header(0)) + len(body)
@@ -161,6 +171,19 @@ def test_unknown_exposure_is_said(path):
     assert [(f.exposure_start, f.exposure_end) for f in source.frames()] == [
         (f.exposure_start, f.exposure_start) for f in frames
     ]
+
+
+def test_an_exposure_that_contradicts_its_length_is_noted(path):
+    """Start and end are taken, and a file that states both is read without a word where they agree."""
+    frame = Frame(small_frames()[0].image, 1_000, 1_500)
+    for stated, noted in ((300, True), (500, False), (0, False), (900, False)):
+        packet = frame_packet(frame, length=stated)
+        path.write_bytes(aedat4_file([(0, event_packet(small_events())), (1, packet)]))
+        source = readers.read(path)
+        assert same_frames(source.frames(), [frame])
+        assert (
+            any("exposure of 300 us, but one that takes 500 us" in text for text in source.missing) == noted
+        )
 
 
 def test_events_only_and_frames_only(path):
@@ -257,6 +280,98 @@ def test_streams_that_were_renamed_are_paired_by_their_size(path):
         "The events are of the source 'dvsnoisefilter_1', the frames of 'DAVIS346_00000001'; they are taken for one "
         "camera's.",
     )
+
+
+# jAER
+
+
+def jaer_events(events, height=SIZE[0]):
+    """Events with rows from the bottom."""
+    out = events.copy()
+    out["y"] = height - 1 - out["y"]
+    return out
+
+
+def jaer_packet(frame, read=4_000):
+    """A frame with rows from the bottom, whose fields for the exposure hold when reading its pixels begins and ends."""
+    turned = np.ascontiguousarray(frame.image[::-1])
+    stored = Frame(turned, frame.exposure_start - read, frame.exposure_end + read)
+    return frame_packet(stored, kind=2, length=frame.exposure)
+
+
+def jaer_frames(count=3, exposure=3_000):
+    rng = np.random.default_rng(5)
+    return [
+        Frame(
+            rng.integers(0, 900, SIZE, dtype=np.uint16), 50_000 + 20_000 * i, 50_000 + 20_000 * i + exposure
+        )
+        for i in range(count)
+    ]
+
+
+def jaer_file(frames, events=None, **options):
+    packets = [(0, event_packet(jaer_events(small_events() if events is None else events)))]
+    packets += [(1, jaer_packet(frame)) for frame in frames]
+    return aedat4_file(packets, **{"module": "jAER", "camera": "Davis346B", **options})
+
+
+def test_rows_of_jaer_are_counted_from_the_bottom(path):
+    frames = jaer_frames()
+    path.write_bytes(jaer_file(frames))
+    source = readers.read(path)
+    assert np.array_equal(all_events(source), small_events())
+    for found, frame in zip(source.frames(), frames, strict=True):
+        assert np.array_equal(found.image, frame.image)
+        assert found.white == 1023
+    assert source.mosaic is None
+
+
+def test_an_event_of_jaer_that_lies_outside_stays_there(path):
+    path.write_bytes(jaer_file([], make_events([5, 6], [3, 4], [SIZE[0] - 1, 0], [0, 1])))
+    assert all_events(readers.read(path))["y"].tolist() == [SIZE[0] - 1, 0]
+    outside = make_events([5], [3], [SIZE[0] + 2], [0])
+    path.write_bytes(aedat4_file([(0, event_packet(outside))], module="jAER"))
+    assert all_events(readers.read(path))["y"].tolist() == [SIZE[0] + 2]
+
+
+def test_exposures_of_jaer_are_in_the_middle_of_the_readout(path):
+    """Only their length is recorded: start and end are those of reading the pixels."""
+    frames = jaer_frames()
+    path.write_bytes(jaer_file(frames))
+    source = readers.read(path)
+    assert source.exposure_known
+    assert [(f.exposure_start, f.exposure_end) for f in source.frames()] == [
+        (f.exposure_start, f.exposure_end) for f in frames
+    ]
+    assert any("jAER" in text and "in the middle" in text for text in source.missing)
+    path.write_bytes(jaer_file(jaer_frames(exposure=0)))
+    source = readers.read(path)
+    assert not source.exposure_known
+    assert [(f.exposure_start, f.exposure_end) for f in source.frames()] == [
+        (f.exposure_start, f.exposure_start) for f in frames
+    ]
+
+
+@pytest.mark.parametrize(
+    ("camera", "mosaic", "said"),
+    [("Davis346redColor", "RGGB", False), ("Davis128Color", "GRBG", False), ("CDAVIS", None, True)],
+)
+def test_frames_of_jaer_of_a_sensor_in_colour_are_its_mosaic(path, camera, mosaic, said):
+    info = '<attr key="colorFilter" type="int">0</attr>'
+    path.write_bytes(jaer_file(jaer_frames(), camera=camera, info=info))
+    source = readers.read(path)
+    assert source.mosaic == mosaic
+    assert any("in no pattern that is known" in text for text in source.missing) == said
+
+
+def test_frames_that_jaer_made_brighter_are_not_of_ten_bits(path):
+    """It stretches frames of 8 bits, of other files, to 16."""
+    path.write_bytes(jaer_file([Frame(np.full(SIZE, 200 << 8, np.uint16), 50_000, 51_000)]))
+    assert [frame.white for frame in readers.read(path).frames()] == [None]
+
+
+def test_damage_of_a_file_of_jaer_gives_clear_errors(path):
+    assert_only_clear_errors(path, damaged(jaer_file(jaer_frames()), 300, header=900))
 
 
 def test_16_bit_frames(path):
@@ -397,6 +512,19 @@ def test_a_real_photograph_as_a_colour_davis_stores_it(shared_data, path):
     frame = next(iter(kalux.open(path).frames()))
     # OpenCV leaves measured values as they are, but for the outermost rows and columns, which it repeats.
     assert np.array_equal(frame.image[1:-1, 1:-1], raw[1:-1, 1:-1])
+
+
+def test_the_exposure_of_a_real_global_shutter_is_in_the_middle_of_the_readout(shared_data):
+    """What the exposures of jAER are taken for, as a DAVIS346 states it in frames that have all four times."""
+    path = shared_data / "street_davis346.aedat4"
+    with path.open("rb") as file:
+        container = aedat4._open(path, file)
+    frames = next(stream for stream in container.streams if stream.kind == "FRME")
+    for begin, end, start, stop in container.read(
+        frames, lambda t: [t.scalar(n, "<q", 0) for n in (1, 2, 3, 4)]
+    ):
+        assert abs((begin + end) - (start + stop)) < 2 * 50
+        assert end - stop > 9_000
 
 
 @pytest.mark.parametrize("share", [0.001, 0.1, 0.5, 0.9, 0.99])

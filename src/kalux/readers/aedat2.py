@@ -45,7 +45,9 @@ _WORD: Final = np.dtype(">u8")  # address and time
 _BLOCK_WORDS: Final = 1 << 16
 _LONGEST_LINE: Final = 1 << 16
 _LARGEST_HEADER: Final = 1 << 24
-_WHITE: Final = 1023  # the converter has 10 bits
+WHITE: Final = 1023
+"""White of a DAVIS, whose converter has 10 bits."""
+
 # Names of sensors of jAER with a Bayer mosaic, after "davis" and the size, and the mosaic seen from above: jAER's lists
 # go from the lower left pixel to the right and round, and rows are counted from the bottom.
 _MOSAICS: Final[dict[str, Mosaic]] = {
@@ -124,7 +126,7 @@ def read(path: Path) -> Source:
         count_frames=lambda: survey.frames,
         triggers=words.triggers,
         missing=_missing(survey, header, rolling),
-        mosaic=_mosaic(header.chip),
+        mosaic=mosaic_of(header.chip),
     )
 
 
@@ -164,7 +166,7 @@ class _Words:
         with reading(self.path, evt.ClockError):
             for image, state in decode_frames(self.blocks(), self.size):
                 start = state[_FIRST_RESET if rolling else _LAST_RESET]
-                yield Frame(image, int(start), int(state[_FIRST_SIGNAL]), _WHITE)
+                yield Frame(image, int(start), int(state[_FIRST_SIGNAL]), WHITE)
 
     def survey(self) -> _Survey:
         frames, interleaved = 0, False
@@ -228,7 +230,8 @@ def _rolling(chip: str, shutters: dict[str, bool]) -> bool | None:
     return said.pop() if len(said) == 1 else None
 
 
-def _mosaic(chip: str) -> Mosaic | None:
+def mosaic_of(chip: str) -> Mosaic | None:
+    """The Bayer mosaic of a sensor of jAER, seen from above, by its name there; None if it is grey or not known."""
     return _MOSAICS.get(chip.lower().removeprefix("davis"))
 
 
@@ -239,7 +242,7 @@ def _sensor_size(path: Path, chip: str) -> tuple[int, int]:
             "'# AEChip: eu.seebetter.ini.chips.davis.DAVIS240C'"
         )
     name = chip.lower()
-    if _mosaic(chip) is None and re.search(r"colou?r|rgb|cdavis", name):
+    if mosaic_of(chip) is None and re.search(r"colou?r|rgb|cdavis", name):
         raise FormatError(
             f"{path}: the sensor {chip[:40]} has colour pixels in no known Bayer mosaic; kalux does not read them"
         )

@@ -29,6 +29,7 @@ from kalux.errors import FormatError
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.frames import Frame, Mosaic
 from kalux.layouts import AEDAT4_MAGIC, AEDAT4_PACKET, AEDAT4_PIXELS
+from kalux.readers import aedat2
 from kalux.readers.source import (
     CHUNK_EVENTS,
     EXPOSURE_UNKNOWN,
@@ -48,6 +49,14 @@ _DEMOSAICED: Final = (
     f"The frames were made RGB from the Bayer mosaic of a DAVIS, taken as {_DAVIS_FILTER}; every pixel gets its own "
     "channel back (--bayer none: luminance and chromaticity)."
 )
+_JAER: Final = "jAER"  # what wrote a stream, which counts rows from the bottom
+_JAER_EXPOSURE: Final = (
+    "jAER records how long the exposures of the frames are, but not when they begin; they are taken to be in the "
+    "middle between the first read of a pixel's reset and the last of a signal, as with a global shutter."
+)
+_JAER_COLOURS: Final = (
+    "The sensor has filters of colours in no pattern that is known; its frames are taken as grey."
+)
 # Whatever a wrong offset, size or compressed byte can lead to.
 _DAMAGE: Final = (
     struct.error,
@@ -66,6 +75,12 @@ class _Stream:
     kind: str  # EVTS, FRME, IMUS, TRIG
     size: tuple[int, int]  # height, width
     camera: str
+    module: str = ""  # what wrote it
+    filters: bool = False  # whether colour filters are stated
+
+    @property
+    def by_jaer(self) -> bool:
+        return self.module == _JAER
 
 
 @dataclass(frozen=True)
@@ -121,7 +136,7 @@ def read(path: Path) -> Source:
 
     The first event stream and the first frame stream of one camera are read, else those of equal size, but never
     those of two cameras. Frames may be 8 or 16 bits, grey or in colour; those in colour of a DAVIS come from a Bayer
-    sensor. Times are absolute, us. Edges on the same camera's external input are in ``triggers``, input 0.
+    sensor. Files of jAER count rows from the bottom and place exposures elsewhere. Times are absolute, us. Edges on the same camera's external input are in ``triggers``, input 0.
 
     Raises
     ------
@@ -152,21 +167,34 @@ def read(path: Path) -> Source:
 
     exposure_known = True
     first = None if frames is None else next(_stored_frames(container, frames), None)
+    white = None
     if first is not None and first.exposure <= 0:
         exposure_known = False
         missing += (EXPOSURE_UNKNOWN,)
+    elif first is not None:
+        missing += _about_exposure(container, frames, first)  # type: ignore[arg-type]
     # Only those cameras have colour filters over pixels of events and frames alike.
     is_colour_davis = first is not None and first.image.ndim == 3 and "DAVIS" in frames.camera.upper()  # type: ignore[union-attr]
     if is_colour_davis:
         missing += (_DEMOSAICED,)
+    mosaic = _DAVIS_FILTER if is_colour_davis else None
+    if first is not None and frames.by_jaer:  # type: ignore[union-attr]
+        mosaic = aedat2.mosaic_of(frames.camera)  # type: ignore[union-attr]
+        # Of what it read from other files, jAER writes more bits.
+        white = aedat2.WHITE if first.image.max(initial=0) <= aedat2.WHITE else None
+        if mosaic is None and any(stream.filters for stream in container.streams):
+            missing += (_JAER_COLOURS,)
 
     def read_events() -> Iterator[EventArray]:
-        return iter(()) if events is None else _joined(container.read(events, _events))
+        if events is None:
+            return iter(())
+        chunks = _joined(container.read(events, _events))
+        return (_upright(chunk, events.size[0]) for chunk in chunks) if events.by_jaer else chunks
 
     def read_frames() -> Iterator[Frame]:
         if frames is None:
             return iter(())
-        ordered = in_order(_stored_frames(container, frames))
+        ordered = in_order(_stored_frames(container, frames, white))
         return ordered if exposure_known else map(_stamp_only, ordered)
 
     triggers = _triggers(container.streams, events or frames)  # type: ignore[arg-type]
@@ -189,7 +217,7 @@ def read(path: Path) -> Source:
         exposure_known=exposure_known,
         triggers=None if triggers is None else read_triggers,
         missing=missing,
-        mosaic=_DAVIS_FILTER if is_colour_davis else None,
+        mosaic=mosaic,
     )
 
 
@@ -244,6 +272,19 @@ def _others(name: str, chosen: _Stream | None, streams: list[_Stream]) -> tuple[
     )
 
 
+def _about_exposure(container: _Container, frames: _Stream, first: Frame) -> tuple[str, ...]:
+    """A sentence about exposures of which the file does not say enough, or too much."""
+    if frames.by_jaer:
+        return (_JAER_EXPOSURE,)
+    stated = next(container.read(frames, _stated_exposure))
+    if not 0 < stated < first.exposure:
+        return ()
+    return (
+        f"The first frame states an exposure of {stated} us, but one that takes {first.exposure} us from its start to "
+        "its end, which is taken (another: --exposure).",
+    )
+
+
 def _stamp_only(frame: Frame) -> Frame:
     return dataclasses.replace(frame, exposure_end=frame.exposure_start)
 
@@ -294,12 +335,19 @@ def _event_count(table: _Table) -> int:
     return table.vector(0)[1]
 
 
-def _stored_frames(container: _Container, stream: _Stream) -> Iterator[Frame]:
-    """Frames as stored. Start and end of the exposure are equal where it is not recorded."""
-    return container.read(stream, lambda table: _frame(table, str(container.path)))
+def _upright(events: EventArray, height: int) -> EventArray:
+    """Events whose rows were counted from the bottom. One that lies outside stays there."""
+    y = events["y"]
+    events["y"] = np.where(y < height, height - 1 - y.astype(np.int32), y)
+    return events
 
 
-def _frame(table: _Table, where: str) -> Frame:
+def _stored_frames(container: _Container, stream: _Stream, white: float | None = None) -> Iterator[Frame]:
+    """Frames as stored, row 0 on top. Start and end of the exposure are equal where it is not recorded."""
+    return container.read(stream, lambda table: _frame(table, str(container.path), stream.by_jaer, white))
+
+
+def _frame(table: _Table, where: str, by_jaer: bool, white: float | None) -> Frame:
     kind = table.scalar(5, "<b", 0)
     if kind not in AEDAT4_PIXELS:
         raise FormatError(
@@ -311,15 +359,35 @@ def _frame(table: _Table, where: str) -> Frame:
     if width <= 0 or height <= 0 or size != width * height * channels * dtype.itemsize:
         raise ValueError(f"{size} bytes of pixels for {width}x{height}")
     pixels = np.frombuffer(table.data, dtype, width * height * channels, start)
-    image: NDArray[Any]
-    if channels == 1:
-        image = pixels.reshape(height, width).copy()
-    else:
-        image = np.ascontiguousarray(pixels.reshape(height, width, channels)[..., 2::-1])
+    image: NDArray[Any] = pixels.reshape((height, width) if channels == 1 else (height, width, channels))
+    if channels > 1:
+        image = image[..., 2::-1]
+    start, end = _readout(table) if by_jaer else _exposure(table)
+    return Frame(np.array(image[::-1] if by_jaer else image, order="C"), start, end, white)
+
+
+def _exposure(table: _Table) -> tuple[int, int]:
+    """Start and end of the exposure, us."""
     stamp = table.scalar(0, "<q", 0)
-    exposure_start = table.scalar(3, "<q", 0) or stamp
-    exposure_end = table.scalar(4, "<q", 0) or exposure_start + table.scalar(11, "<q", 0)
-    return Frame(image, exposure_start, exposure_end)
+    start = table.scalar(3, "<q", 0) or stamp
+    return start, table.scalar(4, "<q", 0) or start + _stated_exposure(table)
+
+
+def _stated_exposure(table: _Table) -> int:
+    """The field for the length of the exposure, us; 0 if there is none."""
+    return table.scalar(11, "<q", 0)
+
+
+def _readout(table: _Table) -> tuple[int, int]:
+    """Start and end of the exposure of a frame of jAER, us.
+
+    What stands in their fields is when the first pixel's reset was read and when the last signal was. Reading all
+    resets takes as long as reading all signals, so that the exposure of a global shutter is in the middle.
+    """
+    first, last = table.scalar(3, "<q", 0), table.scalar(4, "<q", 0)
+    length = max(_stated_exposure(table), 0)
+    start = first + (last - first - length) // 2
+    return start, start + length
 
 
 # The container
@@ -361,7 +429,9 @@ def _streams(info: str) -> Iterator[_Stream]:
         if kind in ("EVTS", "FRME") and (width <= 0 or height <= 0):
             raise ValueError(f"the {_NAMES[kind]} stream has no size")
         camera = node.findtext("./node[@name='info']/attr[@key='source']", "")
-        yield _Stream(int(node.attrib["name"]), kind, (height, width), camera)
+        module = node.findtext("./attr[@key='originalModuleName']", "")
+        filters = node.find("./node[@name='info']/attr[@key='colorFilter']") is not None
+        yield _Stream(int(node.attrib["name"]), kind, (height, width), camera, module, filters)
 
 
 def _packets(path: Path, file: BinaryIO, position: int, end: int) -> dict[int, array[int]]:
