@@ -12,7 +12,7 @@ import zstandard
 
 import kalux
 from kalux import readers
-from kalux.errors import FormatError
+from kalux.errors import FormatError, FrameError
 from kalux.events import make_events
 from kalux.frames import Frame
 from kalux.models.colour import sample_mosaic
@@ -208,6 +208,36 @@ def test_of_several_streams_those_of_equal_size_are_read(path):
     source = readers.read(path)
     assert same_frames(source.frames(), small_frames())
     assert any("2 frame streams" in sentence and "stream 2" in sentence for sentence in source.missing)
+
+
+def test_of_several_streams_those_with_packets_are_read(path):
+    """A recorder may have declared an output that then had no events."""
+    streams = [("EVTS", (60, 80)), ("EVTS", SIZE), ("FRME", SIZE)]
+    path.write_bytes(aedat4_file([(1, event_packet(small_events()))], streams=streams))
+    source = readers.read(path)
+    assert source.sensor_size == SIZE
+    assert np.array_equal(all_events(source), small_events())
+    assert source.missing == ("The file has no frames.",)
+    path.write_bytes(aedat4_file([], streams=streams))
+    assert readers.read(path).count_events() == 0
+
+
+def test_frames_of_another_size_than_the_events_are_left_out(path):
+    """The events of such a file can be read all the same; a stream that contradicts its frames is an error, though."""
+    big = Frame(np.zeros((60, 80), np.uint8), 0, 10)
+    packets = [(0, event_packet(small_events())), (1, frame_packet(big))]
+    path.write_bytes(aedat4_file(packets, streams=[("EVTS", SIZE), ("FRME", (60, 80))]))
+    recording = kalux.open(path)
+    assert np.array_equal(np.concatenate(list(recording.events())), small_events())
+    assert list(recording.frames()) == []
+    assert recording.source.count_frames() == 0
+    assert any("have 80x60 pixels, the events 40x30" in text for text in recording.source.missing)
+    path.write_bytes(aedat4_file(packets))
+    with pytest.raises(FrameError, match="80x60 pixels, the sensor is 40x30"):
+        list(kalux.open(path).frames())
+    wrong = [("EVTS", SIZE), ("FRME", (60, 80))]
+    path.write_bytes(aedat4_file([packets[0], (1, frame_packet(small_frames()[0]))], streams=wrong))
+    assert len(list(kalux.open(path).frames())) == 1
 
 
 LEFT, RIGHT = "DAVIS346_00000001", "DAVIS346_00000002"

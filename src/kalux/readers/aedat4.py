@@ -135,8 +135,10 @@ def read(path: Path) -> Source:
     """Open an AEDAT 4 file.
 
     The first event stream and the first frame stream of one camera are read, else those of equal size, but never
-    those of two cameras. Frames may be 8 or 16 bits, grey or in colour; those in colour of a DAVIS come from a Bayer
-    sensor. Files of jAER count rows from the bottom and place exposures elsewhere. Times are absolute, us. Edges on the same camera's external input are in ``triggers``, input 0.
+    those of two cameras, and none without packets if another has some. Frames of another size than the events are
+    left out. Frames may be 8 or 16 bits, grey or in colour; those in colour of a DAVIS come from a Bayer
+    sensor. Files of jAER count rows from the bottom and place exposures elsewhere. Times are absolute, us.
+    Edges on the same camera's external input are in ``triggers``, input 0.
 
     Raises
     ------
@@ -148,14 +150,20 @@ def read(path: Path) -> Source:
     with reading(path, *_DAMAGE, ElementTree.ParseError, KeyError), path.open("rb") as file:
         container = _open(path, file)
     event_streams = [s for s in container.streams if s.kind == "EVTS"]
+    event_streams = [s for s in event_streams if container.packets.get(s.number)] or event_streams
     frame_streams = [s for s in container.streams if s.kind == "FRME" and container.packets.get(s.number)]
     if not event_streams and not frame_streams:
         raise FormatError(f"{path}: holds neither events nor frames; record with an events output in DV")
     events, frames = _choose(event_streams, frame_streams)
+    first = None if frames is None else next(_stored_frames(container, frames), None)
     missing = _others("event", events, event_streams) + _others("frame", frames, frame_streams)
     if events is None:
         missing += ("The file has no event stream.",)
-    if frames is not None:
+    # A stream that states the size of the events, with a frame of another, is damaged.
+    if frames is not None and first and events and events.size not in (frames.size, first.image.shape[:2]):
+        missing += (_of_other_size(first.image.shape, events.size),)
+        frames = first = None
+    elif frames is not None:
         missing += _doubts(events, frames)
     elif frame_streams:
         missing += (
@@ -166,7 +174,6 @@ def read(path: Path) -> Source:
         missing += (NO_FRAMES,)
 
     exposure_known = True
-    first = None if frames is None else next(_stored_frames(container, frames), None)
     white = None
     if first is not None and first.exposure <= 0:
         exposure_known = False
@@ -269,6 +276,13 @@ def _others(name: str, chosen: _Stream | None, streams: list[_Stream]) -> tuple[
     return (
         f"The file has {len(streams)} {name} streams; only stream {chosen.number} ({width}x{height}) "
         "is read.",
+    )
+
+
+def _of_other_size(frame: tuple[int, ...], events: tuple[int, int]) -> str:
+    return (
+        f"The frames are not read: they have {frame[1]}x{frame[0]} pixels, the events {events[1]}x{events[0]}; images "
+        "of the events' pixels can be joined (--frames)."
     )
 
 
