@@ -308,6 +308,22 @@ class TestDsec:
         assert source.count_frames() == 0
         assert source.missing[0] == "There are no images."
 
+    @pytest.mark.parametrize("place", ["/", "events"])
+    def test_a_size_in_attributes(self, tmp_path, place):
+        """As jAER writes it; the map that is published beside the events comes before."""
+        path = write(tmp_path, "dsec")
+        with h5py.File(path, "r+") as file:
+            file[place].attrs["height"], file[place].attrs["width"] = np.int32(50), np.int32(60)
+        assert readers.read(path).sensor_size == SIZE
+        path.with_name("rectify_map.h5").unlink()
+        source = readers.read(path)
+        assert (source.sensor_size, source.sensor_size_known) == ((50, 60), True)
+        assert source.missing == ("There are no images.",)
+        with h5py.File(path, "r+") as file:
+            file[place].attrs["width"] = 0
+        with pytest.raises(FormatError, match="says that the sensor has 0 x 50 pixels"):
+            readers.read(path)
+
     def test_images_in_colour(self, tmp_path):
         folder = write_dsec_folder(tmp_path / "s", small_events(), small_frames(), SIZE)
         colour = np.random.default_rng(0).integers(0, 256, (*SIZE, 3), np.uint8)

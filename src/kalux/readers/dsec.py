@@ -64,8 +64,9 @@ def recognises(path: Path) -> bool:
 def read(path: Path) -> Source:
     """Open a DSEC sequence (the left camera), or its ``events.h5`` alone.
 
-    The sensor has the size of ``rectify_map.h5`` beside the events; without it 640x480, as published, or the smallest
-    that holds all events if that is larger.
+    The sensor has the size of ``rectify_map.h5`` beside the events, or that of the attributes ``height`` and ``width``
+    of the file or its ``events``, as jAER writes them; without them 640x480, as published, or the smallest that holds
+    all events if that is larger.
 
     Raises
     ------
@@ -121,7 +122,8 @@ def _events(path: Path, offset: int) -> Iterator[EventArray]:
 def _stated_size(events_path: Path) -> tuple[int, int] | None:
     rectify = events_path.with_name("rectify_map.h5")
     if not rectify.is_file():
-        return None
+        with hdf5_layout.opened(events_path) as file:
+            return hdf5_layout.stated_size(events_path, file, file["events"])
     with hdf5_layout.opened(rectify) as file:
         return hdf5_layout.size_of(rectify, file["rectify_map"].shape[:2])
 

@@ -31,6 +31,9 @@ DAMAGE: Final = (KeyError, ValueError, TypeError, RuntimeError, AttributeError, 
 LARGEST_IMAGE: Final = 1 << 28
 """Pixels; more is damage, and would need much memory."""
 
+LARGEST_SIDE: Final = 1 << 16
+"""Pixels of a sensor in a row or column."""
+
 LARGEST_CHUNK: Final = 1 << 29
 """Bytes of a chunk of the file, which HDF5 unpacks as a whole; more is damage."""
 
@@ -223,6 +226,37 @@ def size_of(path: Path, shape: tuple[int, ...], *, grey: bool = False) -> tuple[
     if len(shape) != 2 or not 0 < shape[0] * shape[1] <= LARGEST_IMAGE:
         raise FormatError(f"{path}: its images have the shape {shape}; (height, width) is needed")
     return int(shape[0]), int(shape[1])
+
+
+def stated_size(path: Path, *places: Any) -> tuple[int, int] | None:
+    """(height, width) of the sensor in the attributes of the first group or dataset that states both; else None.
+
+    Raises
+    ------
+    FormatError
+        If they are no possible size.
+    """
+    for place in places:
+        if "height" in place.attrs and "width" in place.attrs:
+            return checked_sides(path, place.attrs["height"], place.attrs["width"])
+    return None
+
+
+def checked_sides(path: Path, height: Any, width: Any) -> tuple[int, int]:
+    """A sensor's height and width as whole numbers.
+
+    Raises
+    ------
+    FormatError
+        If they are none, or none that a sensor can have.
+    """
+    sides = [np.ravel(side) for side in (height, width)]
+    if not all(
+        len(side) == 1 and side.dtype.kind in "iuf" and 1 <= side[0] <= LARGEST_SIDE for side in sides
+    ):
+        shown = " x ".join(str(side)[:20] for side in (width, height))
+        raise FormatError(f"{path}: says that the sensor has {shown} pixels; write it again")
+    return int(sides[0][0]), int(sides[1][0])
 
 
 class Stack(NamedTuple):
