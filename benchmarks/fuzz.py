@@ -157,8 +157,10 @@ def built_seeds(folder: Path) -> Iterator[Seed]:
         ("mvsec", test_hdf5_layouts.write_mvsec),
         ("v2e", test_hdf5_layouts.write_v2e),
         ("metavision", test_hdf5_layouts.write_metavision),
+        ("hdf5", test_hdf5_layouts.write_plain),
+        ("hdf5", test_hdf5_layouts.write_plain_table),
     ):
-        yield put(name, f"{name}.h5", lambda p, w=write: w(p, events, frames, SIZE))
+        yield put(name, f"{write.__name__}.h5", lambda p, w=write: w(p, events, frames, SIZE))
     yield put("es", "stream.es", lambda p: p.write_bytes(test_es.encoded(events, SIZE, resets=7)))
     columns = {name: events[name] for name in "xyp"} | {"t_us": events["t"]}
     yield put("numpy", "packed.npz", lambda p: np.savez_compressed(p, **columns))

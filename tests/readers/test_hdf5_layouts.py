@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -13,7 +14,7 @@ import pytest
 
 import kalux
 from kalux import readers
-from kalux.errors import FormatError, FrameError
+from kalux.errors import FormatError, FrameError, InputError
 from kalux.frames import Frame
 from kalux.readers import hdf5_layout
 from recordings import SIZE, all_events, colour_frames, complaint, damaged, small_events, small_frames
@@ -119,7 +120,26 @@ def write_metavision(path, events, frames, size):
         file.attrs["geometry"] = f"{size[1]}x{size[0]}"
 
 
+def write_plain(path, events, frames, size, group="prophesee/left"):
+    with h5py.File(path, "w") as file:
+        there = file.require_group(group)
+        for name, dtype in (("t", np.int64), ("x", np.uint16), ("y", np.uint16), ("p", np.int8)):
+            there.create_dataset(name, data=events[name].astype(dtype), chunks=(100,), compression="lzf")
+        there["ms_map_idx"] = np.arange(20, dtype=np.uint64)
+        there.attrs["height"], there.attrs["width"] = size
+
+
+def write_plain_table(path, events, frames, size, name="events"):
+    with h5py.File(path, "w") as file:
+        kind = [("ts_us", "<i8"), ("x", "<u2"), ("y", "<i4"), ("pol", "?"), ("other", "<f4")]
+        rows = np.zeros(len(events), kind)
+        rows["ts_us"], rows["x"], rows["y"], rows["pol"] = (events[field] for field in "txyp")
+        file.create_dataset(name, data=rows, chunks=(100,))
+        file.attrs["resolution"] = size[::-1]
+
+
 LAYOUTS = {
+    "hdf5": Layout(write_plain, "m3ed_data.h5", has_frames=False),
     "dsec": Layout(write_dsec, "events.h5", has_frames=False),
     "hqf": Layout(write_hqf, "slow_hand.h5"),
     "mvsec": Layout(write_mvsec, "indoor_flying1_data.hdf5"),
@@ -540,6 +560,150 @@ class TestMetavision:
         assert any(
             "3 external trigger" in text for text in readers.read(write(tmp_path, "metavision hdf5")).missing
         )
+
+
+class TestPlain:
+    """Columns, or a table, of events anywhere in a file."""
+
+    def test_a_table(self, tmp_path):
+        path = tmp_path / "a.h5"
+        write_plain_table(path, small_events(), [], SIZE)
+        source = readers.read(path)
+        assert (source.format, source.sensor_size, source.sensor_size_known) == ("hdf5", SIZE, True)
+        assert np.array_equal(all_events(source), small_events())
+        assert source.missing == ("The file has no frames.",)
+        assert kalux.open(path).source.count_events() == 500
+
+    @pytest.mark.parametrize("group", ["/", "events", "a/b/c"])
+    def test_columns_in_any_group(self, tmp_path, group):
+        path = tmp_path / "a.h5"
+        write_plain(path, small_events(), [], SIZE, group)
+        with h5py.File(path, "r+") as file:
+            for name, new in (("t", "timestamps"), ("p", "Polarity")):  # not as in DSEC's layout
+                file[group].move(name, new)
+        assert np.array_equal(all_events(readers.read(path)), small_events())
+
+    def test_columns_too_deep_are_not_found(self, tmp_path):
+        path = tmp_path / "a.h5"
+        write_plain(path, small_events(), [], SIZE, "a/b/c/d")
+        with pytest.raises(FormatError, match="not a recording that kalux knows"):
+            readers.read(path)
+
+    def test_the_unit_is_in_the_name_or_microseconds(self, tmp_path):
+        for name, scale in (("t", 1), ("t_ns", 1000), ("t_s", 1e-6)):
+            path = tmp_path / f"{name}.h5"
+            write_plain(path, small_events(), [], SIZE)
+            with h5py.File(path, "r+") as file:
+                del file["prophesee/left/t"]
+                file[f"prophesee/left/{name}"] = small_events()["t"] * scale
+            source = readers.read(path)
+            assert np.array_equal(all_events(source), small_events())
+            assert any("taken as microseconds" in text for text in source.missing) == (name == "t")
+
+    def test_seconds_without_a_unit_are_refused(self, tmp_path):
+        path = write(tmp_path, "hdf5")
+        with h5py.File(path, "r+") as file:
+            del file["prophesee/left/t"]
+            file["prophesee/left/t"] = small_events()["t"] * 1e-6
+        with pytest.raises(FormatError, match=r"unit cannot be known; name the unit in the column"):
+            all_events(readers.read(path))
+
+    def test_the_size_is_stated_or_the_smallest(self, tmp_path):
+        """Beside the columns, as in M3ED, or in attributes, whichever of the sides comes first."""
+        path = write(tmp_path, "hdf5")
+        with h5py.File(path, "r+") as file:
+            del file["prophesee/left"].attrs["height"]
+        events = small_events()
+        source = readers.read(path)
+        assert source.sensor_size == (events["y"].max() + 1, events["x"].max() + 1)
+        assert not source.sensor_size_known
+        assert any("size is not recorded" in text for text in source.missing)
+        with h5py.File(path, "r+") as file:
+            file["prophesee/left/calib/resolution"] = [60, 50]
+        assert readers.read(path).sensor_size == (50, 60)
+        with h5py.File(path, "r+") as file:
+            file.attrs["sensor_resolution"] = [70, 80]
+        assert readers.read(path).sensor_size == (70, 80)
+        with h5py.File(path, "r+") as file:
+            file.attrs["sensor_resolution"] = [0, 80]
+        with pytest.raises(FormatError, match="80 x 0 pixels"):
+            readers.read(path)
+
+    def test_an_offset_of_the_times_is_added(self, tmp_path):
+        path = write(tmp_path, "hdf5")
+        with h5py.File(path, "r+") as file:
+            file["t_offset"] = np.int64(7_000)
+        assert np.array_equal(all_events(readers.read(path))["t"], small_events()["t"] + 7_000)
+        with h5py.File(path, "r+") as file:
+            file["t_offset"][...] = 1 << 61
+        with pytest.raises(FormatError, match="t_offset is 2305843009213693952"):
+            readers.read(path)
+
+    def test_of_two_cameras_the_left_one_is_read(self, tmp_path):
+        path = write(tmp_path, "hdf5")
+        with h5py.File(path, "r+") as file:
+            file.copy("prophesee/left", "prophesee/right")
+            file["prophesee/right/x"][...] = 0
+        source = readers.read(path)
+        assert np.array_equal(all_events(source), small_events())
+        assert any(
+            "others are prophesee/right ('m3ed_data.h5?events=NAME')" in text for text in source.missing
+        )
+        assert not all_events(readers.read(f"{path}?events=prophesee/right"))["x"].any()
+        with pytest.raises(
+            InputError, match="no events in 'middle'; they are in prophesee/left, prophesee/right"
+        ):
+            readers.read(f"{path}?events=middle")
+        with pytest.raises(InputError, match="after '\\?' goes events=NAME"):
+            readers.read(f"{path}?frames=")
+        with h5py.File(path, "r+") as file:
+            file.move("prophesee", "evk")
+            file.move("evk/left", "evk/first")
+        with pytest.raises(InputError, match="has events in evk/first, evk/right; choose with"):
+            readers.read(path)
+
+    def test_frames_that_are_not_read_are_named(self, tmp_path):
+        path = write(tmp_path, "hdf5")
+        with h5py.File(path, "r+") as file:
+            file["ovc/left/data"] = np.zeros((2, 3, 4, 1), np.uint8)
+        assert "ovc/left/data (2, 3, 4, 1)" in readers.read(path).missing[0]
+
+    def test_columns_of_different_lengths_or_of_objects_are_refused(self, tmp_path):
+        path = write(tmp_path, "hdf5")
+        with h5py.File(path, "r+") as file:
+            del file["prophesee/left/x"]
+            file["prophesee/left/x"] = np.zeros(499, np.uint16)
+        with pytest.raises(FormatError, match="different lengths"):
+            readers.read(path)
+        with h5py.File(path, "r+") as file:
+            del file["prophesee/left/x"]
+            file["prophesee/left/x"] = ["a"] * 500
+        with pytest.raises(FormatError, match="prophesee/left/x holds objects"):
+            readers.read(path)
+
+    def test_what_a_file_without_events_holds_is_said(self, tmp_path):
+        path = tmp_path / "rec.hdf5"
+        with h5py.File(path, "w") as file:
+            file["dvs/data"] = np.zeros((3, 1))
+            file["dvs/timestamp"] = np.zeros(3)
+            file["nowhere"] = h5py.SoftLink("/none")
+        with pytest.raises(
+            FormatError,
+            match=r"an HDF5 file, but .* holds dvs/data \(3, 1\), dvs/timestamp \(3,\); columns t",
+        ):
+            readers.read(path)
+
+    def test_only_so_many_groups_are_looked_at(self, tmp_path):
+        """A file may lead round in circles."""
+        path = tmp_path / "a.h5"
+        with h5py.File(path, "w") as file:
+            for name in range(60):
+                file[f"g{name}"] = h5py.SoftLink("/")
+            file["x"] = np.zeros(3)
+        begin = time.monotonic()
+        with pytest.raises(FormatError, match="not a recording that kalux knows"):
+            readers.read(path)
+        assert time.monotonic() - begin < 10
 
 
 def test_a_real_payload(shared_data, tmp_path, layout):

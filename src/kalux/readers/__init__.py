@@ -23,6 +23,7 @@ from kalux.readers import (
     mvsec,
     npz_folder,
     numpy_files,
+    plain_hdf5,
     prophesee,
     rosbag,
     table,
@@ -71,7 +72,7 @@ READERS: tuple[Reader, ...] = (
     Reader("aedat2", "AEDAT 2.0 (jAER, DAVIS)", aedat2.recognises, aedat2.read),
     Reader("aedat3", "AEDAT 3.1 (cAER, libcaer)", aedat3.recognises, aedat3.read),
     Reader("kalux", "kalux HDF5", hdf5.recognises, hdf5.read),
-    Reader("mat", "MATLAB file of the AKF authors' datasets (v5, v7.3)", mat.recognises, mat.read),
+    Reader("mat", "MATLAB file of the AKF authors (v5, v7.3)", mat.recognises, mat.read),
     Reader("raw", "Prophesee RAW (EVT 2.0, 2.1, 3.0)", prophesee.recognises_raw, prophesee.read_raw),
     Reader("dat", "Prophesee DAT", prophesee.recognises_dat, prophesee.read_dat),
     Reader("ros", "ROS 1 bag, ROS 2 db3 or MCAP", rosbag.recognises, rosbag.read, rosbag.read),
@@ -80,6 +81,8 @@ READERS: tuple[Reader, ...] = (
     Reader("mvsec", "HDF5 of MVSEC", mvsec.recognises, mvsec.read),
     Reader("v2e", "HDF5 of v2e", v2e.recognises, v2e.read),
     Reader("metavision", "Metavision HDF5", metavision_hdf5.recognises, metavision_hdf5.read),
+    # After all layouts of HDF5 that say more.
+    Reader("hdf5", "other HDF5 (t, x, y, p)", plain_hdf5.recognises, plain_hdf5.read, plain_hdf5.read),
     Reader("es", "Event Stream (.es, DVS)", es.recognises, es.read),
     Reader(
         "npz-folder",
@@ -113,6 +116,11 @@ def read(path: str | Path) -> Source:
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
     if reader is None:
+        if held := plain_hdf5.held(path):
+            raise FormatError(
+                f"{path}: an HDF5 file, but not a recording that kalux knows: it holds {held}; columns t, x, y and p, "
+                "or a table of them, are needed"
+            )
         known = "; ".join(reader.description for reader in READERS)
         raise FormatError(f"{path}: {_what_it_is(path)}not a recording that kalux knows. It reads: {known}")
     if not choice:
