@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+import kalux
 from kalux import readers
 from kalux.errors import EventError, FormatError
 from kalux.events import make_events
@@ -158,6 +159,41 @@ def test_reads_that_are_interleaved_are_of_a_rolling_shutter(path):
     source = write(path, *(samples(frame, rolling=True) for frame in frames))
     assert same_frames(source.frames(), frames)
     assert any("rolling" in sentence for sentence in source.missing)
+
+
+def at_one_time(frame):
+    """All reads of a frame at the time at which its exposure begins, as aedat4to2 writes them."""
+    reads = samples(frame)
+    reads[:, 1] = frame.exposure_start
+    return np.concatenate([reads[reads[:, 0] & 0xC00 == 0], reads[reads[:, 0] & 0xC00 == 0x400]])
+
+
+@pytest.mark.parametrize("stated", [None, "false", "true"])
+def test_reads_that_all_have_one_time_say_nothing_of_the_exposure(path, stated):
+    """It is unknown, not 0."""
+    frames = frames_of(3)
+    lines = [f'<entry key="DAVIS240C.APS.GlobalShutter" value="{stated}"/>'] if stated else []
+    source = write(path, event_words(small_events()), *map(at_one_time, frames), head=header(CHIP, *lines))
+    assert not source.exposure_known
+    assert source.missing == ("The exposure times of the frames are not recorded.",)
+    assert [(f.exposure_start, f.exposure_end) for f in source.frames()] == [
+        (f.exposure_start, f.exposure_start) for f in frames
+    ]
+    recording = kalux.open(path, exposure=3_000, stamp="start")
+    assert same_frames(recording.frames(), frames)
+
+
+def test_frames_that_may_be_of_eight_bits_are_noted(path):
+    frames = frames_of(2)
+    small = [Frame(f.image % 256, f.exposure_start, f.exposure_end, 1023) for f in frames]
+    noted = [
+        any(
+            "No pixel of the frames is above 255, and 1023 is taken for white" in text
+            for text in source.missing
+        )
+        for source in (write(path, *map(samples, frames)), write(path, *map(samples, small)))
+    ]
+    assert noted == [False, True]
 
 
 @pytest.mark.parametrize("cut", [1_000, SIZE[0] * SIZE[1] + 1_000])

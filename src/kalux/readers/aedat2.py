@@ -17,7 +17,7 @@ bit     meaning
 ======  =====================================================================================
 
 A pixel of a frame is its reset read less its signal read. No word marks the exposure: it is taken from the times of
-the reads, as jAER does.
+the reads, as jAER does. Other programs write all reads of a frame with one time, which says nothing of the exposure.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from kalux.events import EventArray
 from kalux.frames import Frame, Mosaic
 from kalux.readers import evt
 from kalux.readers.evt import BACKWARDS_US, ERROR, HIGH, NOW, ROOM, STARTED, place, put_trigger
-from kalux.readers.source import Source, TriggerArray, begins_with, reading
+from kalux.readers.source import EXPOSURE_UNKNOWN, Source, TriggerArray, begins_with, reading
 
 _MAGIC: Final = b"#!AER-DAT2."
 _WORD: Final = np.dtype(">u8")  # address and time
@@ -58,6 +58,11 @@ _MOSAICS: Final[dict[str, Mosaic]] = {
 }
 _SIZES: Final = {"128": (128, 128), "240": (180, 240), "346": (260, 346), "640": (480, 640)}
 
+_EIGHT_BITS: Final = 255
+_PERHAPS_OF_8_BITS: Final = (
+    f"No pixel of the frames is above {{}}, and {WHITE} is taken for white; if they were made of frames of 8 bits, "
+    f"give --white {_EIGHT_BITS} (white={_EIGHT_BITS})."
+)
 _NO_FRAMES: Final = "The file has no complete frames."
 _ROLLING: Final = (
     "The frames have a rolling shutter; their exposure is that of the first pixel that was read, "
@@ -86,6 +91,9 @@ class _Survey:
     frames: int
     incomplete_frames: int
     interleaved: bool
+    global_exposure: bool  # whether time goes by between resets and signals, in any frame
+    rolling_exposure: bool  # ... between the first reset and the signals
+    largest: int  # value of a pixel
 
 
 def recognises(path: Path) -> bool:
@@ -116,6 +124,7 @@ def read(path: Path) -> Source:
     words = _Words(path, header.end, size)
     survey = words.survey()
     rolling = survey.interleaved or bool(header.rolling)
+    exposed = survey.rolling_exposure if rolling else survey.global_exposure
     return Source(
         path=path,
         format="aedat2",
@@ -124,17 +133,24 @@ def read(path: Path) -> Source:
         frames=partial(words.frames, rolling),
         count_events=lambda: survey.events,
         count_frames=lambda: survey.frames,
+        exposure_known=exposed or not survey.frames,
         triggers=words.triggers,
-        missing=_missing(survey, header, rolling),
+        missing=_missing(survey, header, rolling, exposed),
         mosaic=mosaic_of(header.chip),
     )
 
 
-def _missing(survey: _Survey, header: _Header, rolling: bool) -> tuple[str, ...]:
+def _missing(survey: _Survey, header: _Header, rolling: bool, exposed: bool) -> tuple[str, ...]:
     lost = survey.incomplete_frames
-    missing = (f"{lost} incomplete frame{'s are' if lost > 1 else ' is'} left out.",) if lost else ()
+    missing: tuple[str, ...] = ()
+    if lost:
+        missing += (f"{lost} incomplete frame{'s are' if lost > 1 else ' is'} left out.",)
     if not survey.frames:
         return (*missing, _NO_FRAMES)
+    if 0 < survey.largest <= _EIGHT_BITS:
+        missing += (_PERHAPS_OF_8_BITS.format(survey.largest),)
+    if not exposed:
+        return (*missing, EXPOSURE_UNKNOWN)
     if rolling:
         return (*missing, _ROLLING)
     return (*missing, _SHUTTER_UNKNOWN) if header.rolling is None else missing
@@ -169,13 +185,19 @@ class _Words:
                 yield Frame(image, int(start), int(state[_FIRST_SIGNAL]), WHITE)
 
     def survey(self) -> _Survey:
-        frames, interleaved = 0, False
+        frames, largest = 0, 0
+        interleaved = of_global = of_rolling = False
         state = new_frame_state()
         with reading(self.path, evt.ClockError):
-            for _ in decode_frames(self.blocks(), self.size, state):
+            for image, _ in decode_frames(self.blocks(), self.size, state):
                 frames += 1
                 interleaved |= bool(state[_INTERLEAVED])
-        return _Survey(int(state[_EVENTS]), frames, int(state[_INCOMPLETE]), interleaved)
+                of_global |= bool(state[_LAST_RESET] < state[_FIRST_SIGNAL])
+                of_rolling |= bool(state[_FIRST_RESET] < state[_FIRST_SIGNAL])
+                largest = max(largest, int(image.max()))
+        return _Survey(
+            int(state[_EVENTS]), frames, int(state[_INCOMPLETE]), interleaved, of_global, of_rolling, largest
+        )
 
 
 # The header
