@@ -260,6 +260,30 @@ def test_chunks_are_full_but_the_last(path):
     assert [len(chunk) for chunk in source.events()] == [CHUNK_EVENTS, 10]
 
 
+V2E = (
+    b"#!AER-DAT2.0\r\n# This is a raw AE data file created by AEDat2Output in v2e (see https://github.com/SensorsINI/"
+    b"v2e) as specified at https://inivation.com\r\n# Timestamps tick is 1 us\r\n# User name: peer\r\n"
+)
+
+
+@pytest.mark.parametrize("size", [(180, 240), (260, 346)])
+def test_v2e_names_no_sensor_but_its_events_tell(path, size):
+    """It writes files for two, which differ in their size."""
+    events = small_events()
+    if size != SIZE:
+        events["x"][5], events["y"][5] = 3, 259
+    path.write_bytes(V2E + event_words(events, size).tobytes())
+    source = readers.read(path)
+    assert (source.sensor_size, source.count_events()) == (size, len(events))
+    assert np.array_equal(all_events(source), events)
+    assert any("of the two that v2e writes" in text for text in source.missing)
+
+
+def test_v2e_files_without_events_are_read(path):
+    path.write_bytes(V2E)
+    assert readers.read(path).count_events() == 0
+
+
 @pytest.mark.parametrize("encoding", ["latin-1", "utf-8", "gbk"])
 @pytest.mark.parametrize("before", [True, False])
 def test_a_header_may_have_letters_of_any_encoding(path, encoding, before):

@@ -38,7 +38,7 @@ from kalux.events import EventArray
 from kalux.frames import Frame, Mosaic
 from kalux.readers import evt
 from kalux.readers.evt import BACKWARDS_US, ERROR, HIGH, NOW, ROOM, STARTED, place, put_trigger
-from kalux.readers.source import EXPOSURE_UNKNOWN, Source, TriggerArray, begins_with, reading
+from kalux.readers.source import EXPOSURE_UNKNOWN, SIZE_NOT_STATED, Source, TriggerArray, begins_with, reading
 
 _MAGIC: Final = b"#!AER-DAT2."
 _WORD: Final = np.dtype(">u8")  # address and time
@@ -63,6 +63,11 @@ _PERHAPS_OF_8_BITS: Final = (
     f"No pixel of the frames is above {{}}, and {WHITE} is taken for white; if they were made of frames of 8 bits, "
     f"give --white {_EIGHT_BITS} (white={_EIGHT_BITS})."
 )
+_V2E: Final = "AEDat2Output in v2e"  # in the header
+_SIZE_OF_V2E: Final = (
+    SIZE_NOT_STATED
+    + "of the two that v2e writes, that of the DAVIS240 is taken, unless an event needs the DAVIS346."
+)
 _NO_FRAMES: Final = "The file has no complete frames."
 _ROLLING: Final = (
     "The frames have a rolling shutter; their exposure is that of the first pixel that was read, "
@@ -81,6 +86,7 @@ class _Header:
     chip: str
     rolling: bool | None
     end: int
+    by_v2e: bool
 
 
 @dataclass(frozen=True)
@@ -115,12 +121,13 @@ def read(path: Path) -> Source:
     """
     with reading(path):
         header = _header(path)
-        size = _sensor_size(path, header.chip)
+        stated = None if header.by_v2e and not header.chip else _sensor_size(path, header.chip)
         excess = (path.stat().st_size - header.end) % _WORD.itemsize
     if excess:
         raise FormatError(
             f"{path}: cut short: it ends {excess} bytes into an event of {_WORD.itemsize}; copy or download it again"
         )
+    size = stated or _needed_size(path, header.end)
     words = _Words(path, header.end, size)
     survey = words.survey()
     rolling = survey.interleaved or bool(header.rolling)
@@ -135,7 +142,7 @@ def read(path: Path) -> Source:
         count_frames=lambda: survey.frames,
         exposure_known=exposed or not survey.frames,
         triggers=words.triggers,
-        missing=_missing(survey, header, rolling, exposed),
+        missing=_missing(survey, header, rolling, exposed) + (() if stated else (_SIZE_OF_V2E,)),
         mosaic=mosaic_of(header.chip),
     )
 
@@ -205,7 +212,7 @@ class _Words:
 
 def _header(path: Path) -> _Header:
     """The lines at the beginning that are text and begin with ``#``."""
-    chip = ""
+    chip, by_v2e = "", False
     shutters: dict[str, bool] = {}
     end = 0
     with path.open("rb") as file:
@@ -225,7 +232,8 @@ def _header(path: Path) -> _Header:
                 shutters[shutter[1]] = shutter[2].lower() == "false"
             elif text.lower() == "end of ascii header":
                 break
-    return _Header(chip, _rolling(chip, shutters), end)
+            by_v2e |= _V2E in text
+    return _Header(chip, _rolling(chip, shutters), end, by_v2e)
 
 
 def _text(line: bytes) -> str | None:
@@ -275,6 +283,20 @@ def _sensor_size(path: Path, chip: str) -> tuple[int, int]:
             "and DAVIS640"
         )
     return _SIZES[model[1]]
+
+
+def _needed_size(path: Path, start: int) -> tuple[int, int]:
+    """The smaller of the sensors for which v2e writes files that has all events."""
+    small, large = _SIZES["240"], _SIZES["346"]
+    # Rows and columns are counted from the other side there.
+    first_row, first_column = large[0] - small[0], large[1] - small[1]
+    for chunk in _Words(path, start, large).events():
+        if (
+            chunk["y"].min(initial=first_row) < first_row
+            or chunk["x"].min(initial=first_column) < first_column
+        ):
+            return large
+    return small
 
 
 # The words
