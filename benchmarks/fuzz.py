@@ -125,6 +125,8 @@ def built_seeds(folder: Path) -> Iterator[Seed]:
     coloured = [(1, test_aedat4.colour_packet(frame, 16)) for frame in colour_frames()]
     data = test_aedat4.aedat4_file(coloured, camera="DAVIS346_1")
     yield put("aedat4", "colour.aedat4", lambda p, d=data: p.write_bytes(d))
+    data = test_aedat4.jaer_file(test_aedat4.jaer_frames())
+    yield put("aedat4", "jaer.aedat4", lambda p, d=data: p.write_bytes(d))
     words = test_aedat2.in_time(
         test_aedat2.event_words(test_aedat2.small_events()),
         *(test_aedat2.samples(frame) for frame in test_aedat2.frames_of(2)),
