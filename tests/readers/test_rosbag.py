@@ -354,6 +354,18 @@ def test_compressed_images(tmp_path):
     assert same_frames(source.frames(), shifted_frames(small_frames()))
 
 
+@pytest.mark.parametrize("topic", ["/dvs/events", "/dvs/image_raw", "/dvs/exposure"])
+def test_a_message_of_another_serialisation_is_damage(tmp_path, topic):
+    """Also the first of a topic, which tells what it holds."""
+    messages = [
+        (time, name, kind, b"\0\0" + data[2:] if name == topic else data)
+        for time, name, kind, data in davis_messages(True)
+    ]
+    write_mcap(tmp_path / "a.mcap", messages)
+    with pytest.raises(FormatError, match=rf"topic '{topic}': damaged .*not serialised as little-endian CDR"):
+        readers.read(tmp_path / "a.mcap")
+
+
 def test_an_exposure_that_was_recorded_beyond_the_end_of_time_is_damage(tmp_path):
     messages = davis_messages(True)
     place = next(i for i, message in enumerate(messages) if message[1] == "/dvs/exposure")

@@ -217,10 +217,10 @@ def _open_events(path: Path, bag: Bag, topic: Topic) -> EventTopic | None:
 
 
 def _open_images(path: Path, bag: Bag, topic: Topic) -> _Images | None:
-    message = next(_messages(bag, topic), None)
-    if message is None:
-        return None
     with _decoding(path, topic):
+        message = next(_messages(bag, topic), None)
+        if message is None:
+            return None
         if topic.kind == _COMPRESSED:
             compressed = _compressed(message)
             try:
