@@ -322,6 +322,24 @@ def clock_doubt(frames: int, events: int, between: int, enough: int = LATEST) ->
     )
 
 
+def check_stated(exposure: int | None, stamp: str, white: float | None) -> None:
+    """Require what is stated of frames to be possible; as of `open`.
+
+    Raises
+    ------
+    ExposureError, InputError
+        If it is not.
+    """
+    if exposure is not None and not (
+        isinstance(exposure, Real) and exposure > 0 and float(exposure).is_integer()
+    ):
+        raise ExposureError(f"exposure is {exposure} us; it must be positive and whole")
+    if white is not None and not is_white(white):
+        raise InputError(f"white is {white!r}; the value of a saturated pixel is needed")
+    if stamp not in ("start", "middle", "end"):
+        raise InputError(f"stamp is {stamp!r}; it must be 'start', 'middle' or 'end'")
+
+
 class Recording:
     """A hybrid recording, opened with `kalux.open` or made with `Recording.from_arrays`.
 
@@ -351,14 +369,7 @@ class Recording:
         mosaic: Mosaic | Literal["none"] | None = None,
         white: float | None = None,
     ) -> None:
-        if exposure is not None and not (
-            isinstance(exposure, Real) and exposure > 0 and float(exposure).is_integer()
-        ):
-            raise ExposureError(f"exposure is {exposure} us; it must be positive and whole")
-        if white is not None and not is_white(white):
-            raise InputError(f"white is {white!r}; the value of a saturated pixel is needed")
-        if stamp not in ("start", "middle", "end"):
-            raise InputError(f"stamp is {stamp!r}; it must be 'start', 'middle' or 'end'")
+        check_stated(exposure, stamp, white)
         if mosaic not in (None, "none", *MOSAICS):
             raise InputError(f"mosaic is {mosaic!r}; it must be one of {', '.join(MOSAICS)}, or 'none'")
         if not all(0 < n <= LARGEST_SIDE for n in source.sensor_size):

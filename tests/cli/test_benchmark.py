@@ -150,6 +150,8 @@ def test_a_toml_file_says_it_all(cli, ran, folder, tmp_path):
     ("arguments", "told"),
     [
         (["--methods", "e3vid"], "no method 'e3vid'"),
+        (["--methods", ","], "--methods ,: names no method"),
+        (["--hold-out-frames", "0"], "every is 0; at least 2"),
         (["--processes", "0"], "at least 1"),
         (["--stamp", "end"], "give --exposure, too"),
         (["--processes", "2", "--dask", "tcp://x"], "not allowed with"),

@@ -110,9 +110,10 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
         hold_out_frames=options.hold_out_frames,
     )
     lpips_weights(options)  # what is wrong with them is told before the work
+    names = named_methods(options)
     plan = make_plan(
-        gather(options.sets, common),
-        named_methods(options),
+        gather(options.sets, common, methods_of_files=names is None),
+        names,
         hdr_vdp=options.hdrvdp,
         lpips=lpips_files(options),
     )

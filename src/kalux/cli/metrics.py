@@ -25,10 +25,21 @@ def add_metrics(group: Any) -> None:
 
 
 def named_methods(options: argparse.Namespace) -> list[str] | None:
-    """The names that were given; None without."""
+    """The names that were given; None without.
+
+    Raises
+    ------
+    UsageError
+        If there is none between the commas.
+    """
     if options.methods is None:
         return None
-    return [name.strip() for name in options.methods.split(",") if name.strip()]
+    names = [name.strip() for name in options.methods.split(",") if name.strip()]
+    if not names:
+        raise UsageError(
+            f"--methods {options.methods}: names no method; give names with commas, or no --methods"
+        )
+    return names
 
 
 def lpips_files(options: argparse.Namespace) -> tuple[Path, ...]:

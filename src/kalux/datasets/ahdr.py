@@ -111,7 +111,8 @@ def artificial_hdr(
     FrameError
         If there are too few frames, or none that ``every`` leaves out, or all are black.
     """
-    _check(camera, black, saturation, every)
+    _check_every(every)
+    check_originals(camera, black, saturation)
     real = Camera(Response.named(chosen_response(response, recording.response)))
     artificial = Response.named(camera.response)
     kept = [frame.exposure for frame in _taken_frames(recording, every)]
@@ -166,16 +167,26 @@ def artificial_hdr(
     )
 
 
-def _check(camera: ArtificialCamera, black: float, saturation: float, every: int | None) -> None:
-    if every is not None and every < 2:
-        raise InputError(f"artificial HDR: every is {every}; at least 2 is needed")
+def check_originals(camera: ArtificialCamera, black: float, saturation: float) -> None:
+    """Require levels of the original frames, as of `artificial_hdr`, to be possible.
+
+    Raises
+    ------
+    InputError
+        If they are not.
+    """
     if not 0 <= black < 1:
-        raise InputError(f"artificial HDR: black is {black}; 0 to less than 1 is possible")
+        raise InputError(f"artificial HDR: black is {black:.4g} of full scale; 0 to less than 1 is possible")
     if not camera.low < saturation <= 1:
         raise InputError(
             f"artificial HDR: the original saturates at {saturation:g}; more than the artificial camera's black, "
             f"{camera.low:g}, and at most 1 is possible"
         )
+
+
+def _check_every(every: int | None) -> None:
+    if every is not None and every < 2:
+        raise InputError(f"artificial HDR: every is {every}; at least 2 is needed")
 
 
 def _taken_frames(recording: Recording, every: int | None) -> Iterator[Frame]:

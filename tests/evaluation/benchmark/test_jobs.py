@@ -97,6 +97,12 @@ def test_a_title_is_not_part_of_the_key(small_set):
     assert make_job(renamed, "hold", held_out=True, hdr_vdp=False).key == small_set.job("hold").key
 
 
+def test_zero_is_no_number_of_frames_to_hold_out(small_set):
+    """It is neither every second nor none."""
+    with pytest.raises(InputError, match="every is 0; at least 2 is needed"):
+        dataclasses.replace(small_set.with_truth, options=Options(hold_out_frames=0))
+
+
 def test_held_out_frames_are_used_where_there_is_no_truth(small_set):
     assert uses_held_out(small_set.without)
     assert not uses_held_out(small_set.with_truth)

@@ -67,6 +67,11 @@ def test_methods_given_win_over_those_of_the_file_and_none_is_run_twice(small_se
     assert make_plan(benchmark, ["hold", "mean", "hold"]).methods == ("hold", "mean")
 
 
+def test_a_list_of_no_methods_is_not_all_of_them(small_set):
+    with pytest.raises(InputError, match="no method is given"):
+        planned(small_set, [])
+
+
 def test_csv_is_tidy_and_holds_the_means(results):
     rows = list(csv.DictReader(io.StringIO(as_csv(results))))
     values = {(r["sequence"], r["method"], r["metric"]): r["value"] for r in rows}

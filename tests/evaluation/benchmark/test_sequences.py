@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -66,6 +68,14 @@ def test_a_toml_file_lists_sequences_relative_to_itself(small_set):
         ("[[sequence]]\npath = 'x'\ncalibration = 3", "str or list is needed"),
         ("[[sequence]]\npath = 'x'\ncalibration = [3]", "files of kalux calibrate"),
         ("methods = [3]\n[[sequence]]\npath = 'x'", "a list of names"),
+        ("methods = []\n[[sequence]]\npath = 'x'", "methods is []; a list of names is needed"),
+        ("[[sequence]]\npath = 'x'\nhold_out_frames = 0", "sequence 1: held-out frames: every is 0"),
+        ("[[sequence]]\npath = 'x'\nexposure = 0", "sequence 1: exposure is 0 us"),
+        ("[[sequence]]\npath = 'x'\nstamp = 'begin'", "sequence 1: stamp is 'begin'"),
+        ("[[sequence]]\npath = 'x'\nwhite = -3", "sequence 1: white is -3"),
+        ("[[sequence]]\npath = 'x'\nresponse = 'log'", "sequence 1: response: unknown response 'log'"),
+        ("[[sequence]]\npath = 'x'\nahdr = {cut = 20, black = nan}", "ahdr: artificial HDR: black is nan"),
+        ("[[sequence]]\npath = 'x'\nahdr = {cut = 20, saturation = 300}", "original saturates at 1.17"),
     ],
 )
 def test_what_is_wrong_in_a_toml_file_is_named(tmp_path, text, told):
@@ -74,6 +84,30 @@ def test_what_is_wrong_in_a_toml_file_is_named(tmp_path, text, told):
     with pytest.raises(InputError, match=r"bench\.toml") as caught:
         load(path)
     assert told in str(caught.value)
+
+
+def test_two_toml_files_have_the_methods_that_both_list(tmp_path):
+    """Those of one are for a file that lists none, too; a folder is another one in another folder."""
+    (tmp_path / "other").mkdir()
+    files = {
+        "a.toml": 'methods = ["hold", "m=r"]',
+        "b.toml": 'methods = ["hold", "m=r"]',
+        "c.toml": "",
+        "d.toml": 'methods = ["hold"]',
+        "other/e.toml": 'methods = ["hold", "m=r"]',
+    }
+    for name, methods in files.items():
+        (tmp_path / name).write_text(f'title = "{name}"\n{methods}\n[[sequence]]\npath = "x.h5"\n')
+    a, b, c, d, e = (tmp_path / name for name in files)
+    found = gather([c, a, b])
+    assert found.title == "c.toml, a.toml, b.toml"
+    assert (found.methods, found.folder) == (("hold", "m=r"), tmp_path)
+    told = "'a.toml' lists the methods hold, m=r, 'd.toml' lists hold; list the same, or give --methods"
+    with pytest.raises(InputError, match=re.escape(told)):
+        gather([a, d])
+    with pytest.raises(InputError, match="list the same"):
+        gather([a, e])
+    assert gather([a, d], methods_of_files=False).methods is None
 
 
 def test_sequences_of_one_name_are_told_apart(small_set, tmp_path):

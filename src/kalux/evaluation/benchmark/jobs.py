@@ -315,7 +315,7 @@ def _comparison(job: Job, recording: Recording) -> _Comparison:
     if job.held_out and options.ahdr is None:
         held = hold_out_frames(
             recording,
-            options.hold_out_frames or EVERY,
+            EVERY if options.hold_out_frames is None else options.hold_out_frames,
             response=job.sequence.response,
             black_level=job.sequence.black_level,
         )

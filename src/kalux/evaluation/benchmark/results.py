@@ -13,7 +13,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 import kalux
-from kalux.errors import KaluxError
+from kalux.errors import InputError, KaluxError
 from kalux.evaluation.benchmark.jobs import GROUPS, Failed, Job, make_job, uses_held_out
 from kalux.evaluation.benchmark.sequences import Benchmark, Sequence
 from kalux.evaluation.scores import METRICS, UNCERTAINTY
@@ -112,10 +112,13 @@ def make_plan(
     Raises
     ------
     InputError
-        If there is no such method.
+        If there is no such method, or none is named.
     """
-    folder = (Path() if methods else benchmark.folder).absolute()
-    names = tuple(dict.fromkeys(methods or benchmark.methods or DEFAULT_METHODS))
+    chosen = benchmark.methods if methods is None else tuple(methods)
+    if chosen is not None and not chosen:
+        raise InputError("benchmark: no method is given; name some, or leave the list out")
+    folder = (benchmark.folder if methods is None else Path()).absolute()
+    names = tuple(dict.fromkeys(DEFAULT_METHODS if chosen is None else chosen))
     fair_only_held_out = {
         name
         for name in names

@@ -12,12 +12,14 @@ from typing import Any, Final
 
 import kalux
 from kalux.calibration.values import Calibration, load_calibration
-from kalux.datasets.ahdr import ArtificialCamera, artificial_hdr
+from kalux.datasets.ahdr import ArtificialCamera, artificial_hdr, check_originals
 from kalux.errors import InputError
+from kalux.evaluation.specs import relocated
 from kalux.evaluation.truth import TRUTH_SUFFIX, truth_file
 from kalux.frames import Stamp
+from kalux.models.camera import named_responses
 from kalux.readers import READERS
-from kalux.recording import Recording
+from kalux.recording import Recording, check_stated
 from kalux.settings import AUTO, CameraSettings, read_toml
 
 EVERY: Final = 2
@@ -42,7 +44,7 @@ class ArtificialHdr:
     Raises
     ------
     InputError
-        If the levels are not in order.
+        If the levels are not in order, or not possible.
     """
 
     low: float
@@ -51,7 +53,7 @@ class ArtificialHdr:
     saturation: float = 255 * CameraSettings.usual_saturation
 
     def __post_init__(self) -> None:
-        _ = self.camera
+        check_originals(self.camera, self.black / 255, self.saturation / 255)
 
     @property
     def camera(self) -> ArtificialCamera:
@@ -76,12 +78,17 @@ class Options:
     truth
         File of reference images. Default: those beside the recording, or its own.
     hold_out_frames
-        Every n-th frame is held out, even where there is truth.
+        Every n-th frame is held out, even where there is truth; at least 2.
     ahdr
         The recording is made artificial HDR; the original frames are the truth, with ``hold_out_frames`` those that
         are held out.
     calibration
         Files of `kalux calibrate`, for all filters. What they say of the camera does not hold for an artificial one.
+
+    Raises
+    ------
+    InputError
+        If a value is not possible.
     """
 
     exposure: int | None = None
@@ -92,6 +99,14 @@ class Options:
     hold_out_frames: int | None = None
     ahdr: ArtificialHdr | None = None
     calibration: tuple[Path, ...] = ()
+
+    def __post_init__(self) -> None:
+        check_stated(self.exposure, self.stamp, self.white)
+        named_responses(self.response)
+        if self.hold_out_frames is not None and self.hold_out_frames < 2:
+            raise InputError(
+                f"held-out frames: every is {self.hold_out_frames}; at least 2 is needed, or leave it out"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -224,7 +239,9 @@ class Benchmark:
     folder: Path = Path()
 
 
-def gather(sets: Iterable[str | Path], options: Options | None = None) -> Benchmark:
+def gather(
+    sets: Iterable[str | Path], options: Options | None = None, *, methods_of_files: bool = True
+) -> Benchmark:
     """The sequences of recordings, of folders of recordings and of TOML files.
 
     Parameters
@@ -233,11 +250,13 @@ def gather(sets: Iterable[str | Path], options: Options | None = None) -> Benchm
         Paths. What a TOML file says, holds for its sequences.
     options
         For all sequences that are not from a TOML file.
+    methods_of_files
+        Whether the methods that TOML files list are wanted, for all sequences; else they may differ.
 
     Raises
     ------
     InputError
-        If something is missing, no recording, or a TOML file is wrong.
+        If something is missing, no recording, or a TOML file is wrong; if two TOML files list other methods.
     """
     common = options or Options()
     found: list[Sequence] = []
@@ -252,9 +271,35 @@ def gather(sets: Iterable[str | Path], options: Options | None = None) -> Benchm
             found += [_sequence(path, common) for path in _recordings(path)]
     if not found:
         raise InputError("benchmark: no sequence is given; give recordings, folders of them, or a TOML file")
-    if len(listings) != 1:
-        return Benchmark("Benchmark", _unique(found))
-    return dataclasses.replace(listings[0], sequences=_unique(found))
+    titles = dict.fromkeys(listed.title for listed in listings)
+    chosen = _common_methods(listings) if methods_of_files else None
+    return Benchmark(
+        ", ".join(titles) or "Benchmark",
+        _unique(found),
+        None if chosen is None else chosen.methods,
+        Path() if chosen is None else chosen.folder,
+    )
+
+
+def _common_methods(listings: list[Benchmark]) -> Benchmark | None:
+    """One of the TOML files that list methods, which all list the same; None: none does."""
+    listing = [listed for listed in listings if listed.methods is not None]
+    for other in listing[1:]:
+        if _absolute_methods(other) != _absolute_methods(listing[0]):
+            raise InputError(
+                f"benchmark: {listing[0].title!r} lists the methods {_joined(listing[0])}, {other.title!r} lists "
+                f"{_joined(other)}; list the same, or give --methods"
+            )
+    return listing[0] if listing else None
+
+
+def _absolute_methods(listed: Benchmark) -> list[str]:
+    """The methods of a TOML file, as they are the same for files in other folders."""
+    return [relocated(name, listed.folder) for name in listed.methods or ()]
+
+
+def _joined(listed: Benchmark) -> str:
+    return ", ".join(listed.methods or ())
 
 
 def load(path: Path) -> Benchmark:
@@ -272,7 +317,7 @@ def load(path: Path) -> Benchmark:
         raise InputError(f"{path}: lists no sequence; add a table [[sequence]] with a path")
     sequences = [_listed(f"{path}: sequence {i}", path.parent, entry) for i, entry in enumerate(entries, 1)]
     methods = values.get("methods")
-    if methods is not None and not all(isinstance(name, str) for name in methods):
+    if methods is not None and not (methods and all(isinstance(name, str) for name in methods)):
         raise InputError(f"{path}: methods is {methods!r}; a list of names is needed")
     return Benchmark(
         values.get("title", path.stem),
@@ -344,7 +389,10 @@ def _listed(where: str, folder: Path, entry: Any) -> Sequence:
             raise InputError(f"{where}: calibration is {files!r}; files of kalux calibrate are needed")
         options["calibration"] = tuple((folder / file).absolute() for file in files)
     path = (folder / entry["path"]).absolute()
-    plain = _sequence(path, Options(**options))
+    try:
+        plain = _sequence(path, Options(**options))
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
     return dataclasses.replace(
         plain,
         name=_file_name(entry["name"]) if "name" in entry else plain.name,
