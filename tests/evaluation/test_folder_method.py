@@ -10,6 +10,7 @@ from kalux import Recording, reconstruct
 from kalux.errors import FormatError, FrameError, InputError
 from kalux.evaluation.folder_method import images, listed
 from kalux.writers import open_writer
+from kalux.writers.exr import exr_file
 
 from builders import frame, moving_blocks, pixel_events
 
@@ -73,6 +74,72 @@ def test_what_kalux_writes_is_read_back_as_it_was(suffix, tmp_path):
             writer.write(image)
     found = list(images(simulation.recording(), times, folder=tmp_path / "out", tolerance=1))
     assert np.array_equal(found, [image.intensity for image in made])
+
+
+@pytest.mark.parametrize("kind", [np.int16, np.int32, np.uint32, np.float32, np.float64])
+def test_images_of_other_types_than_levels_of_8_and_16_bits_are_refused(kind, tmp_path):
+    """Divided by the largest number of 32 bits, an image would be black; floats have no largest."""
+    folder = write(tmp_path / "a", [np.full(SIZE, 1, kind)], [0], ".tif")
+    with pytest.raises(
+        FormatError, match=rf"0\.tif: holds {np.dtype(kind)}; images of 8 or 16-bit levels are"
+    ):
+        values(folder, [0])
+
+
+def test_a_radiance_picture_is_refused_by_what_it_holds(tmp_path):
+    folder = write(tmp_path / "a", [np.ones((*SIZE, 3), np.float32)], [0], ".hdr")
+    with pytest.raises(
+        FormatError, match=r"0\.hdr: holds float32; .* as \.npy, or as \.exr with the channel Y"
+    ):
+        values(folder, [0])
+
+
+def test_levels_in_an_npy_are_no_intensity(tmp_path):
+    """Whole numbers of intensity are small, as in a file of ground truth."""
+    folder = write(tmp_path / "a", [np.full(SIZE, 128, np.uint8), np.full(SIZE, 2, np.int64)], [0, 5])
+    assert values(folder, [5], tolerance=1) == [2.0]
+    with pytest.raises(
+        FormatError, match=r"0\.npy: the images are uint8, up to 128; linear intensity is needed"
+    ):
+        values(folder, [0], tolerance=1)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".npy", ".exr"])
+def test_colour_is_refused_with_what_writes_grey(suffix, tmp_path):
+    """The first image, too, before which there are no others."""
+    folder = write(tmp_path / "a", [], [])
+    name = f"0{suffix}"
+    if suffix == ".png":
+        cv2.imwrite(str(folder / name), np.full((*SIZE, 3), (1, 2, 3), np.uint8))
+    elif suffix == ".npy":
+        np.save(folder / name, np.zeros((4, *SIZE), np.float32))
+    else:
+        (folder / name).write_bytes(exr_file({c: np.zeros(SIZE, np.float32) for c in "RGB"}, {}))
+    (folder / "timestamps.csv").write_text(f"t_us,file\n0,{name}\n")
+    with pytest.raises(InputError, match=rf"0\{suffix}: .*--grey \(RGB frames\) or --bayer none") as caught:
+        values(folder, [0])
+    assert "before it" not in str(caught.value)
+
+
+def test_grey_that_is_stored_in_colour_is_grey(tmp_path):
+    folder = write(tmp_path / "a", [np.full((*SIZE, 3), 51, np.uint8)], [0], ".png")
+    assert values(folder, [0]) == pytest.approx([0.2])
+
+
+def test_times_may_be_negative_as_kalux_writes_them(tmp_path):
+    folder = write(tmp_path / "a", [np.full(SIZE, v) for v in (0.1, 0.2)], [-2000, 0])
+    assert values(folder, [-2000, 0], tolerance=1) == pytest.approx([0.1, 0.2])
+
+
+def test_a_list_that_is_wrong_is_told_what_it_should_be(tmp_path):
+    """Not the lists that only recordings have."""
+    folder = write(tmp_path / "a", [], [])
+    for text in ("", "a,b\n1,2\n"):
+        (folder / "timestamps.csv").write_text(text)
+        with pytest.raises(
+            FormatError, match="a CSV with a line per image and the columns t_us and file is needed"
+        ):
+            listed(folder)
 
 
 def test_errors(tmp_path):

@@ -61,6 +61,33 @@ def test_unknown_options_are_refused(spec, tmp_path):
         outside_method(spec.format(tmp_path))
 
 
+@pytest.mark.parametrize(
+    "spec", ["mine={}?tolerance=1e3", "folder:{}?tolerance=-5", "firenet:{}/w.pth?scaled=yes"]
+)
+def test_what_is_no_option_is_not_taken_for_a_name(spec, folder):
+    with pytest.raises(InputError, match="what follows \\? is no option; those of a folder are"):
+        outside_method(spec.format(folder))
+
+
+def test_a_folder_may_have_a_question_mark_in_its_name(folder):
+    other = folder.rename(folder.with_name("run?"))
+    assert outside_method(f"mine={other}").label == "mine"
+
+
+@pytest.mark.parametrize(
+    ("names", "told"),
+    [
+        (["hold", "cf", "hold"], "method 'hold': is given twice"),
+        (["a={}", "a={}?tolerance=5"], "method 'a=.*5': 'a=.*run3' is there already; give each once"),
+        (["hold", "hold={}"], "'hold' is there already"),
+    ],
+)
+def test_methods_of_one_name_are_refused(names, told, folder):
+    """In a table they could not be told apart."""
+    with pytest.raises(InputError, match=told):
+        chosen_methods([name.format(folder) for name in names])
+
+
 def test_other_texts_are_no_outside_methods():
     assert [outside_method(text) for text in ("blah", "x:y", "=y", "mine=", "")] == [None] * 5
 

@@ -1,8 +1,8 @@
 """Any other method, as a folder of its images with their times.
 
 The folder is as `kalux reconstruct` writes one: `timestamps.csv` with a time and a file per image. EXR (channel ``Y``)
-and NPY ((H, W), or (2, H, W) with the intensity first) hold linear intensity, 1 = white; PNG and other 8 and 16-bit
-images are taken as they are, 0 to 1, without undoing any tone curve.
+and NPY ((H, W), or (2, H, W) with the intensity first) hold linear intensity, 1 = white; PNG and other grey images of 8
+and 16-bit levels are taken as they are, 0 to 1, without undoing any tone curve.
 """
 
 from __future__ import annotations
@@ -19,12 +19,21 @@ from numpy.typing import NDArray
 from kalux.datasets.exr import exr_channels
 from kalux.errors import FormatError, FrameError, InputError
 from kalux.evaluation.method import Image, Times
+from kalux.evaluation.pairs import check_intensity
 from kalux.readers.image_lists import read_csv
 from kalux.readers.images import read_image
 from kalux.readers.source import reading
 from kalux.recording import Recording
 
 LISTING: Final = "timestamps.csv"
+
+_WANTED: Final = "a line per image and the columns t_us and file"
+"""What a list is, for messages."""
+
+_GREY: Final = (
+    "of a recording in colour kalux reconstruct writes it with --grey (RGB frames) or --bayer none (a mosaic)"
+)
+"""How to get one value for each pixel, for messages."""
 
 TOLERANCE: Final = 1000
 """us from a wanted time to that of the image for it: as EVREAL, 1 ms."""
@@ -85,12 +94,11 @@ def listed(folder: Path) -> tuple[Times, list[Path]]:
     """
     listing = folder / LISTING
     if not listing.is_file():
-        raise InputError(
-            f"{folder}: not a folder of images with a {LISTING}; it needs one with a line per image and the columns "
-            "t_us and file"
-        )
+        raise InputError(f"{folder}: not a folder of images with a {LISTING}; it needs one with {_WANTED}")
     with reading(listing, UnicodeError):
-        rows, _ = read_csv(listing, listing.read_text("utf-8-sig"))
+        rows, _ = read_csv(
+            listing, listing.read_text("utf-8-sig"), wanted=f"a CSV with {_WANTED}", signed=True
+        )
     if not rows:
         raise FormatError(f"{listing}: lists no images")
     rows.sort(key=lambda row: row.start)
@@ -114,6 +122,10 @@ def _load(folder: Path, file: Path, sensor_size: tuple[int, int]) -> Image:
         data = file.read_bytes()
     decode = {".exr": _exr, ".npy": _npy}.get(file.suffix.lower(), _display)
     image = decode(folder, file, data)
+    if image.ndim != 2:
+        raise FrameError(
+            f"{file}: is an array of {image.shape}; one intensity for each pixel, {sensor_size}, is needed; {_GREY}"
+        )
     if image.shape != sensor_size:
         raise FrameError(
             f"{file}: has {_size(image.shape)} pixels, but the sensor {_size(sensor_size)}; an image has a value for "
@@ -127,8 +139,16 @@ def _size(shape: tuple[int, ...]) -> str:
 
 
 def _display(folder: Path, file: Path, data: bytes) -> NDArray[Any]:
-    image = read_image(folder, file.name, data, colour=False)
-    displayed: NDArray[Any] = image / np.iinfo(image.dtype).max
+    image = read_image(folder, file.name, data, colour=True)
+    if image.dtype not in (np.uint8, np.uint16):
+        raise FormatError(
+            f"{file}: holds {image.dtype}; images of 8 or 16-bit levels are read, or linear intensity as .npy, or as "
+            ".exr with the channel Y"
+        )
+    grey = image[..., 0]
+    if (image != grey[..., np.newaxis]).any():
+        raise FormatError(f"{file}: is in colour; one value for each pixel is needed; {_GREY}")
+    displayed: NDArray[Any] = grey / np.iinfo(image.dtype).max
     return displayed
 
 
@@ -139,11 +159,15 @@ def _npy(folder: Path, file: Path, data: bytes) -> NDArray[Any]:
         raise FormatError(f"{file}: not an .npy file of plain numbers, or damaged") from error
     if image.dtype.kind not in "fiu":
         raise FormatError(f"{file}: holds {image.dtype}; linear intensity is needed")
-    return image[0] if image.ndim == 3 and len(image) == 2 else image
+    image = image[0] if image.ndim == 3 and len(image) == 2 else image
+    check_intensity(file, image)
+    return image
 
 
 def _exr(folder: Path, file: Path, data: bytes) -> NDArray[Any]:
     channels = exr_channels(file, data)
     if "Y" not in channels:
-        raise FormatError(f"{file}: has the channels {', '.join(channels)[:80]}; Y, the intensity, is needed")
+        raise FormatError(
+            f"{file}: has the channels {', '.join(channels)[:80]}; Y, the intensity, is needed; {_GREY}"
+        )
     return channels["Y"]

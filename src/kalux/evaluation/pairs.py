@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kalux.errors import InputError
+from kalux.errors import FormatError, InputError
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -46,6 +47,25 @@ class Pair(NamedTuple):
     log_offset: float = 0.0
     noise: NDArray[Any] | None = None
     given: NDArray[np.bool_] | None = None
+
+
+_LARGEST_WHOLE: Final = 16
+"""Times white: images of whole numbers that are larger are levels of 8 or 16 bits, not intensities."""
+
+
+def check_intensity(path: Path, images: NDArray[Any]) -> None:
+    """Require real numbers of a file to be intensities, not levels.
+
+    Raises
+    ------
+    FormatError
+        If they are whole numbers far beyond white.
+    """
+    if images.dtype.kind in "iu" and images.size and images.max() > _LARGEST_WHOLE:
+        raise FormatError(
+            f"{path}: the images are {images.dtype}, up to {images.max()}; linear intensity is needed, 1 = a saturated "
+            "pixel of a frame: floats"
+        )
 
 
 def checked_pair(

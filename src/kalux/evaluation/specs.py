@@ -64,13 +64,16 @@ def chosen_methods(
     Raises
     ------
     InputError
-        If a name is unknown, the method needs frames to be held out, or its weights or images are missing.
+        If a name is unknown or not distinct, the method needs frames to be held out, or its weights or images are
+        missing.
     MissingDependencyError
         If the method is a network, and PyTorch is not installed.
     """
     known = methods(response, calibration)
     if names is None:
         names = [n for n, m in known.items() if n not in OPTIONAL and (held_out or not m.needs_held_out)]
+    names = list(names)
+    check_distinct(names)
     chosen = []
     for name in names:
         method = known.get(name) or outside_method(name, response=response)
@@ -85,6 +88,26 @@ def chosen_methods(
     if not chosen:
         raise InputError(f"no method is given; known are {', '.join(known)}")
     return chosen
+
+
+def check_distinct(names: Iterable[str]) -> None:
+    """Require that methods can be told apart in tables.
+
+    Raises
+    ------
+    InputError
+        If one is named twice, or two folders have one name.
+    """
+    found: dict[str, str] = {}
+    for name in names:
+        match = _SPEC.fullmatch(name)
+        label = match["name"].strip() if match is not None and match["kind"] == "=" else name
+        if label in found:
+            other = f"{found[label]!r} is there already; " if found[label] != name else "is given twice; "
+            raise InputError(
+                f"method {name!r}: {other}give each once, and folders names that differ: NAME=FOLDER"
+            )
+        found[label] = name
 
 
 def spec_path(spec: str) -> Path | None:
@@ -122,15 +145,20 @@ def outside_method(spec: str, *, response: str = "linear") -> Method | None:
         return None
     name, path = match["name"].strip(), Path(match["path"])
     options = match["options"]
+    is_folder = match["kind"] == "=" or name == "folder"
+    if options is None and "?" in match["path"] and (is_folder or name in NETWORKS) and not path.exists():
+        raise InputError(
+            f"method {spec!r}: there is no {path}, and what follows ? is no option; those of a folder are "
+            "?tolerance=US, of a network ?window=US and ?scaled, joined by &, US in digits"
+        )
     if match["kind"] == ":" and name in NETWORKS:
         return _network(
             spec, name, path, response, **_read_options(spec, options, {"window": "=US", "scaled": ""})
         )
-    if match["kind"] == "=":
-        return _folder(name, path, **_read_options(spec, options, {"tolerance": "=US"}))
-    if name == "folder":
-        return _folder(path.resolve().name, path, **_read_options(spec, options, {"tolerance": "=US"}))
-    return None
+    if not is_folder:
+        return None
+    label = name if match["kind"] == "=" else path.resolve().name
+    return _folder(label, path, **_read_options(spec, options, {"tolerance": "=US"}))
 
 
 def _read_options(spec: str, text: str | None, known: dict[str, str]) -> dict[str, Any]:

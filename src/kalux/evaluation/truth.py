@@ -15,7 +15,7 @@ from kalux.errors import FormatError, InputError, require_type
 from kalux.evaluation.exposures import compared_recording, of_black
 from kalux.evaluation.lpips import LpipsWeights
 from kalux.evaluation.method import Method
-from kalux.evaluation.pairs import Pair
+from kalux.evaluation.pairs import Pair, check_intensity
 from kalux.evaluation.scores import Scores, score
 from kalux.filters.shots import take_shot
 from kalux.frames import GROUND_TRUTH_NEEDED, GroundTruth
@@ -276,16 +276,9 @@ def load_truth(path: Path) -> tuple[GroundTruth, NDArray[np.bool_] | None]:
         raise FormatError(f"{path}: the times are {times.dtype} {times.shape}; whole us, (T,), are needed")
     if images.ndim != 3 or images.dtype.kind not in "fiu":
         raise FormatError(f"{path}: the images are {images.dtype} {images.shape}; (T, H, W) is needed")
-    if images.dtype.kind in "iu" and images.size and images.max() > _LARGEST_WHOLE:
-        raise FormatError(
-            f"{path}: the images are {images.dtype}, up to {images.max()}; linear intensity is needed, 1 = a saturated "
-            "pixel of a frame: floats"
-        )
+    check_intensity(path, images)
     return GroundTruth(times.astype(np.int64), images.astype(np.float32)), arrays.get("mask")
 
-
-_LARGEST_WHOLE: Final = 16
-"""Times white: images of whole numbers that are larger are levels of 8 or 16 bits, not intensities."""
 
 _KEYS: Final = ("times_us", "times", "gt", "images", "mask")
 

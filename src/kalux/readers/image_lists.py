@@ -39,8 +39,12 @@ class Listed(NamedTuple):
     end: int
 
 
-def read_csv(path: Path, text: str) -> tuple[list[Listed], bool]:
+def read_csv(
+    path: Path, text: str, *, wanted: str = WANTED, signed: bool = False
+) -> tuple[list[Listed], bool]:
     """The images that a CSV lists, and whether it states their exposures.
+
+    ``wanted`` says in messages what it may be; ``signed``, whether times may be negative.
 
     Raises
     ------
@@ -49,13 +53,13 @@ def read_csv(path: Path, text: str) -> tuple[list[Listed], bool]:
     """
     lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
     if not lines or "\0" in text:
-        raise FormatError(f"{path}: is empty, or no text; {WANTED} is needed")
+        raise FormatError(f"{path}: is empty, or no text; {wanted} is needed")
     separator = next((c for c in ",;\t" if c in lines[0][1]), ",")
     header = [name.strip() for name in next(csv.reader([lines[0][1].lstrip("# ")], delimiter=separator))]
     time, exposure = find_time(header, FIELD_NAMES["t"]), find_time(header, _EXPOSURE)
     name = find_name(header, _FILE)
     if time is None:
-        raise FormatError(f"{path}: has the columns {', '.join(header)[:80]}; {WANTED} is needed")
+        raise FormatError(f"{path}: has the columns {', '.join(header)[:80]}; {wanted} is needed")
     rows = []
     for number, line in lines[1:]:
         if line.lstrip().startswith("#"):
@@ -73,7 +77,7 @@ def read_csv(path: Path, text: str) -> tuple[list[Listed], bool]:
         )
     listed = []
     for (number, row), file in zip(rows, files, strict=True):
-        stamp = _microseconds(path, number, row[time[0]], time[1])
+        stamp = _microseconds(path, number, row[time[0]], time[1], signed=signed)
         length = 0 if exposure is None else _microseconds(path, number, row[exposure[0]], exposure[1])
         listed.append(Listed(file, stamp, stamp + length))
     return listed, exposure is not None
@@ -171,11 +175,14 @@ def read_listed(place: Path, listed: Sequence[Listed], *, colour: bool) -> Itera
         yield Frame(load_image(place, image.file, colour=colour), image.start, image.end)
 
 
-def _microseconds(path: Path | zipfile.Path, number: int, text: str, unit: str | None) -> int:
+def _microseconds(
+    path: Path | zipfile.Path, number: int, text: str, unit: str | None, *, signed: bool = False
+) -> int:
     """A time, rounded to the nearest microsecond from its digits."""
     text = text.strip()
-    time = Decimal(text) * _PER_UNIT[unit or "us"] if _NUMBER.fullmatch(text) else None
-    if time is None or time >= LATEST:
+    digits = text.removeprefix("-") if signed else text
+    time = Decimal(text) * _PER_UNIT[unit or "us"] if _NUMBER.fullmatch(digits) else None
+    if time is None or abs(time) >= LATEST:
         raise FormatError(f"{path}: line {number}: {text[:40]!r} is not a plain number that can be a time")
     if unit is None and "." in text:
         raise FormatError(

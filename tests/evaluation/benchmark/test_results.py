@@ -72,6 +72,11 @@ def test_a_list_of_no_methods_is_not_all_of_them(small_set):
         planned(small_set, [])
 
 
+def test_two_folders_of_one_name_are_refused(small_set):
+    with pytest.raises(InputError, match=r"'a=y/\{sequence\}': 'a=x/\{sequence\}' is there already"):
+        planned(small_set, ["a=x/{sequence}", "a=y/{sequence}"])
+
+
 def test_csv_is_tidy_and_holds_the_means(results):
     rows = list(csv.DictReader(io.StringIO(as_csv(results))))
     values = {(r["sequence"], r["method"], r["metric"]): r["value"] for r in rows}

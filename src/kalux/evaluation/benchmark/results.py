@@ -17,7 +17,7 @@ from kalux.errors import InputError, KaluxError
 from kalux.evaluation.benchmark.jobs import GROUPS, Failed, Job, make_job, uses_held_out
 from kalux.evaluation.benchmark.sequences import Benchmark, Sequence
 from kalux.evaluation.scores import METRICS, UNCERTAINTY
-from kalux.evaluation.specs import chosen_methods, relocated
+from kalux.evaluation.specs import check_distinct, chosen_methods, relocated
 
 DEFAULT_METHODS: Final = ("hold", "mean", "edi", "cf", "iccv2021", "default", "smooth")
 """Two that use frames only, two that use events as well, the paper, and kalux."""
@@ -112,13 +112,14 @@ def make_plan(
     Raises
     ------
     InputError
-        If there is no such method, or none is named.
+        If there is no such method, none is named, or two cannot be told apart.
     """
     chosen = benchmark.methods if methods is None else tuple(methods)
     if chosen is not None and not chosen:
         raise InputError("benchmark: no method is given; name some, or leave the list out")
     folder = (benchmark.folder if methods is None else Path()).absolute()
     names = tuple(dict.fromkeys(DEFAULT_METHODS if chosen is None else chosen))
+    check_distinct(names)
     fair_only_held_out = {
         name
         for name in names
