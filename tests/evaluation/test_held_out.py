@@ -21,6 +21,8 @@ from kalux.evaluation.held_out import (
     percentile_of_counts,
 )
 from kalux.evaluation.method import Estimated, Method
+from kalux.evaluation.truth import evaluate_truth, prepare_reference
+from kalux.frames import GroundTruth
 
 from builders import frame, from_black, lifted, moving_blocks, passing_by, pixel_events, textured
 
@@ -54,6 +56,78 @@ def test_a_method_yields_one_array_per_time(images, told):
     held = hold_out_frames(still(range(100, 112)))
     with pytest.raises(InputError, match=told):
         evaluate_held_out(held, Method("odd", images))
+
+
+SMALL = np.full((12, 12), 0.5, np.float32)
+
+
+@pytest.mark.parametrize(
+    ("method", "told"),
+    [
+        (Method("odd", lambda rec, ts: None), "odd: what it makes is a NoneType; an image for every time"),
+        (
+            Method("odd", lambda rec, ts: [SMALL[1:]] * len(ts)),
+            r"odd: image 0 is float32 \(11, 12\); real numbers, ",
+        ),
+        (Method("odd", lambda rec, ts: [SMALL.astype(object)] * len(ts)), r"odd: image 0 is object"),
+        (
+            Method("odd", lambda *_: (), estimates=lambda rec, ts: [(SMALL, SMALL)] * len(ts)),
+            "odd: image 0 is a tuple; of estimates an Estimated is needed",
+        ),
+        (
+            Method(
+                "odd", lambda *_: (), estimates=lambda rec, ts: [Estimated(SMALL[1:], SMALL[1:])] * len(ts)
+            ),
+            r"odd: image 0 is float32 \(11, 12\)",
+        ),
+        (
+            Method("odd", lambda *_: (), estimates=lambda rec, ts: [Estimated(SMALL, SMALL[1:])] * len(ts)),
+            r"odd: image 0: its variance is float32 \(11, 12\)",
+        ),
+        ("default", "method is a str; a Method is needed"),
+    ],
+)
+@pytest.mark.parametrize(
+    "compare",
+    [
+        lambda rec, method: evaluate_held_out(hold_out_frames(rec), method),
+        lambda rec, method: evaluate_truth(
+            rec, prepare_reference(rec, GroundTruth(np.array([505]), SMALL[np.newaxis])), method
+        ),
+        blur_consistency,
+    ],
+)
+def test_what_a_method_of_ones_own_makes_is_checked(compare, method, told):
+    """Whatever it is compared with."""
+    with pytest.raises(InputError, match=told):
+        compare(still(range(100, 112)), method)
+
+
+def test_a_method_may_write_all_its_images_into_one_array():
+    recording, array = still(range(100, 112)), np.zeros((12, 12), np.float32)
+
+    def reused(rec, times):
+        for k in range(len(times)):
+            array[...] = 0.1 * (k % 7)
+            yield array
+
+    again = Method("reused", reused)
+    fresh = Method("fresh", lambda rec, times: (image.copy() for image in reused(rec, times)))
+    held = hold_out_frames(recording)
+    assert evaluate_held_out(held, again).mse == evaluate_held_out(held, fresh).mse
+    assert blur_consistency(recording, again).psnr == blur_consistency(recording, fresh).psnr
+
+
+def test_what_is_held_out_is_of_a_recording_and_whole_numbers():
+    recording = still([100] * 9)
+    for numbers in ({"every": 2.5}, {"every": "2"}, {"reads": 2.5}):
+        with pytest.raises(InputError, match="whole numbers, at least 2, are needed"):
+            hold_out_frames(recording, **numbers)
+    assert len(hold_out_frames(recording, np.int64(2)).compared) == 2
+    with pytest.raises(InputError, match="hold_out_frames: recording is a str"):
+        hold_out_frames("rec.h5")
+    with pytest.raises(InputError, match="held is a Recording; a HeldOut is needed, from hold_out_frames"):
+        evaluate_held_out(recording, methods()["hold"])
 
 
 def test_every_nth_frame_is_dropped_and_compared_if_three_from_either_end():

@@ -13,17 +13,17 @@ from typing import Final
 
 import numpy as np
 
-from kalux.errors import FrameError
+from kalux.errors import FrameError, require_type
 from kalux.evaluation.exposures import (
     end_of_frames,
     exposure_times,
     linear_frame,
     means_of,
 )
-from kalux.evaluation.method import Method
+from kalux.evaluation.method import METHOD_NEEDED, Method
 from kalux.evaluation.metrics import psnr
 from kalux.frames import Frame
-from kalux.recording import Recording, reference_exposure
+from kalux.recording import RECORDING_NEEDED, Recording, reference_exposure
 from kalux.settings import AUTO, chosen_response
 
 READS: Final = 9
@@ -85,11 +85,15 @@ def blur_consistency(
 
     Raises
     ------
+    InputError
+        If the recording or the method is something else.
     FrameError
         If there are fewer than three frames, or no pixel can be compared.
     KaluxError
         Whatever the method says.
     """
+    require_type("blur_consistency: recording", recording, Recording, RECORDING_NEEDED)
+    require_type("blur_consistency: method", method, Method, METHOD_NEEDED)
     reference = reference_exposure(recording)
     response = chosen_response(response, recording.response)
     inner = [exposure_times(frame, READS) for frame in recording.frames()][1:-1]

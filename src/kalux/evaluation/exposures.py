@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
@@ -82,6 +81,12 @@ def exposure_times(frame: Frame, reads: int) -> NDArray[np.int64]:
 
 def means_of(images: Iterable[NDArray[np.float32]], reads: int) -> Iterator[Array]:
     """The mean of every ``reads`` images: what an exposure saw."""
-    remaining = iter(images)
-    while group := list(islice(remaining, reads)):
-        yield np.mean(group, axis=0, dtype=np.float64)
+    total, count = None, 0
+    for image in images:  # added at once: a method may write the next image into the same array
+        total = np.asarray(image, np.float64) + (0.0 if total is None else total)
+        count += 1
+        if count == reads:
+            yield total / count
+            total, count = None, 0
+    if total is not None:
+        yield total / count

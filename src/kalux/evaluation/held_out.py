@@ -10,13 +10,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from numbers import Integral
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kalux.calibration.frame_noise import estimate_frame_noise
-from kalux.errors import FrameError, InputError
+from kalux.errors import FrameError, InputError, require_type
 from kalux.evaluation.exposures import (
     End,
     compared_recording,
@@ -27,13 +28,13 @@ from kalux.evaluation.exposures import (
     of_black,
 )
 from kalux.evaluation.lpips import LpipsWeights
-from kalux.evaluation.method import Method
+from kalux.evaluation.method import METHOD_NEEDED, Method
 from kalux.evaluation.pairs import Array, Pair
 from kalux.evaluation.scores import Scores, score
 from kalux.filters.shots import take_shot
 from kalux.frames import Frame
 from kalux.models.camera import Camera, frame_log_covariance
-from kalux.recording import Recording, reference_exposure, with_frames
+from kalux.recording import RECORDING_NEEDED, Recording, reference_exposure, with_frames
 from kalux.settings import AUTO, CameraSettings, chosen_response
 from kalux.wording import how_many
 
@@ -129,12 +130,15 @@ def hold_out_frames(
     Raises
     ------
     InputError
-        If ``every`` or ``reads`` is less than 2.
+        If ``every`` or ``reads`` is less than 2 or not whole, or the recording something else.
     FrameError
         If there are too few frames to compare any, or all are black.
     """
-    if every < 2 or reads < 2:
-        raise InputError(f"held-out frames: every is {every}, reads are {reads}; at least 2 are needed")
+    require_type("hold_out_frames: recording", recording, Recording, RECORDING_NEEDED)
+    if not all(isinstance(number, Integral) and number >= 2 for number in (every, reads)):
+        raise InputError(
+            f"held-out frames: every is {every!r}, reads are {reads!r}; whole numbers, at least 2, are needed"
+        )
     count = sum(1 for _ in recording.frames())
     compared = np.arange(MARGIN, count - MARGIN)
     compared = compared[compared % every == every - 1]
@@ -193,9 +197,13 @@ def evaluate_held_out(
 
     Raises
     ------
+    InputError
+        If ``held`` is not of `hold_out_frames`, or the method no `Method`.
     KaluxError
         Whatever the method or the metrics say.
     """
+    require_type("evaluate_held_out: held", held, HeldOut, "a HeldOut is needed, from hold_out_frames")
+    require_type("evaluate_held_out: method", method, Method, METHOD_NEEDED)
     return score(
         held_out_pairs(held, method, clip=clip),
         method=method.label,

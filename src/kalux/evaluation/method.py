@@ -8,14 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.errors import InputError
+from kalux.errors import InputError, require_type
 from kalux.recording import Recording
 from kalux.settings import Settings
+
+T = TypeVar("T")
 
 Image = NDArray[np.float32]
 Times = NDArray[np.int64]
@@ -48,6 +50,10 @@ class Estimated(NamedTuple):
             return self.variance
         shared = np.square(self.fixed_pattern / (self.intensity + self.log_offset))
         return np.asarray(np.maximum(self.variance - shared, 0.0), self.variance.dtype)
+
+
+METHOD_NEEDED: Final = "a Method is needed, e.g. kalux.evaluation.baselines.methods()['default']"
+"""Where a `Method` comes from, for messages."""
 
 
 @dataclass(frozen=True)
@@ -83,21 +89,34 @@ class Method:
         Raises
         ------
         InputError
-            If the method yields anything but one array per time.
+            If the method yields anything but one array of the sensor's size per time.
         """
         if self.estimates is not None:
-            made = iter(self.estimates(recording, times))
+            made = self._all(self.estimates(recording, times))
         else:
-            made = (Estimated(image, None) for image in self.images(recording, times))
+            made = (Estimated(image, None) for image in self._all(self.images(recording, times)))
         count = 0
         for count, one in enumerate(made, 1):
             if count > len(times):
                 raise InputError(f"{self.label}: more images than the {len(times)} times it was given")
-            if not isinstance(one.intensity, np.ndarray):
-                kind = type(one.intensity).__name__
-                raise InputError(
-                    f"{self.label}: image {count - 1} is of type {kind}; a NumPy array is needed"
-                )
+            where = f"{self.label}: image {count - 1}"
+            require_type(where, one, Estimated, "of estimates an Estimated is needed")
+            _check_array(where, one.intensity, recording.sensor_size)
+            if one.variance is not None:
+                _check_array(f"{where}: its variance", one.variance, recording.sensor_size)
             yield one
         if count < len(times):
             raise InputError(f"{self.label}: {count} images for {len(times)} times; one for each is needed")
+
+    def _all(self, made: Iterable[T]) -> Iterable[T]:
+        require_type(f"{self.label}: what it makes", made, Iterable, "an image for every time is needed")
+        return made
+
+
+def _check_array(where: str, image: Any, size: tuple[int, int]) -> None:
+    if not isinstance(image, np.ndarray):
+        raise InputError(f"{where} is of type {type(image).__name__}; a NumPy array is needed")
+    if image.dtype.kind not in "fiub" or image.shape != size:
+        raise InputError(
+            f"{where} is {image.dtype} {image.shape}; real numbers, {size} as the sensor, are needed"
+        )

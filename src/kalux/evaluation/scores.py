@@ -180,7 +180,6 @@ def score(
     images, negative, calibrations = [], 0, Calibrations()
     for pair in pairs:
         t, test, reference, mask, *_ = pair
-        calibrations.add(pair)
         test, reference = np.asarray(test) / scale, np.asarray(reference) / scale
         try:
             images.append(
@@ -188,6 +187,7 @@ def score(
             )
         except InputError as error:
             raise InputError(f"{method}, image at {t} us: {error}") from error
+        calibrations.add(pair)
         negative += int(np.count_nonzero(test < 0 if mask is None else (test < 0) & mask))
         on_image()
     if not images:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from kalux.errors import FormatError, InputError, require_type
 from kalux.evaluation.exposures import compared_recording, of_black
 from kalux.evaluation.lpips import LpipsWeights
-from kalux.evaluation.method import Method
+from kalux.evaluation.method import METHOD_NEEDED, Method
 from kalux.evaluation.pairs import Pair, check_intensity
 from kalux.evaluation.scores import Scores, score
 from kalux.filters.shots import take_shot
@@ -151,13 +151,14 @@ def evaluate_truth(
     Raises
     ------
     InputError
-        If the reference is not one of `prepare_reference`.
+        If the reference is not one of `prepare_reference`, or the method no `Method`.
     KaluxError
         Whatever the method or the metrics say.
     """
     require_type(
         "evaluate_truth: reference", reference, Reference, "a Reference is needed, from prepare_reference"
     )
+    require_type("evaluate_truth: method", method, Method, METHOD_NEEDED)
     recording = compared_recording(recording, AUTO)
     return score(
         truth_pairs(recording, reference, method),

@@ -15,10 +15,19 @@ from kalux.datasets.ahdr import ArtificialCamera, artificial_hdr
 from kalux.errors import InputError
 from kalux.evaluation.baselines import methods
 from kalux.evaluation.benchmark import jobs
-from kalux.evaluation.benchmark.jobs import Failed, Finished, make_job, moments, run_job, uses_held_out
+from kalux.evaluation.benchmark.jobs import (
+    Failed,
+    Finished,
+    Pictures,
+    make_job,
+    moments,
+    run_job,
+    uses_held_out,
+)
 from kalux.evaluation.benchmark.sequences import ArtificialHdr, Options, Sequence
 from kalux.evaluation.held_out import evaluate_held_out, hold_out_frames
 from kalux.evaluation.lpips import load_lpips
+from kalux.evaluation.pairs import Pair
 from kalux.evaluation.truth import evaluate_truth, load_truth, prepare_reference
 from kalux.writers import hdf5
 from kalux.writers.calibration import save_calibration
@@ -55,6 +64,17 @@ def test_pictures_are_of_the_middles_of_three_parts(small_set):
     assert np.array_equal(done.pictures["test"][0], image.intensity)
     assert np.array_equal(done.pictures["variance"][0], image.variance)
     assert (moments(9), moments(1), moments(2)) == ([1, 4, 7], [0], [0, 1])
+
+
+def test_pictures_are_kept_of_a_method_that_writes_all_images_into_one_array():
+    """With their variance."""
+    array, pictures = np.zeros((2, 3, 4), np.float32), Pictures([0, 2])
+    for k in range(4):
+        array[...] = k
+        pictures.add(k, Pair(k, array[0], np.zeros((3, 4)), variance=array[1]))
+    recording = moving_blocks(size=(12, 12)).recording()
+    kept = pictures.arrays(recording, 1, "linear")
+    assert kept["test"][:, 0, 0].tolist() == kept["variance"][:, 0, 0].tolist() == [0, 2]
 
 
 def test_what_only_some_methods_have_is_none_for_others(small_set):

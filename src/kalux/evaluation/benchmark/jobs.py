@@ -393,7 +393,9 @@ class Pictures:
     def add(self, number: int, pair: Pair) -> None:
         """Keep the pair if it is one of the chosen."""
         if number in self._chosen:
-            self._kept.append(pair)
+            # Copied: a method may write the next image into the same array.
+            variance = None if pair.variance is None else np.array(pair.variance)
+            self._kept.append(pair._replace(test=np.array(pair.test), variance=variance))
 
     def arrays(self, given: Recording, reference: int, response: str) -> dict[str, NDArray[Any]]:
         """As in `Finished.pictures`; ``frame`` is the last frame that the method was given."""
