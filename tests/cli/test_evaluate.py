@@ -7,6 +7,7 @@ import dataclasses
 import json
 import sys
 
+import cv2
 import numpy as np
 import pytest
 
@@ -82,6 +83,36 @@ def test_truth_beside_the_recording_is_found_and_told(cli, write_recording, simu
     assert f"ground truth of {tmp_path / 'pan_gt.npz'}: " in found
     assert cli("evaluate", path, "--truth", "--methods", "hold").out == found
     assert "held-out" in cli("evaluate", path, "--hold-out-frames", "3", "--methods", "hold").out
+
+
+@pytest.fixture
+def ijrr_folder(tmp_path, simulation):
+    """The recording as a folder of text and images, in which there is another folder, with its truth beside it."""
+    folder, truth = tmp_path / "slider", simulation.truth()
+    (folder / "images").mkdir(parents=True)
+    events = (f"{e['t'] / 1e6:.6f} {e['x']} {e['y']} {int(e['p'])}\n" for e in simulation.events)
+    (folder / "events.txt").write_text("".join(events))
+    lines = []
+    for i, shot in enumerate(simulation.frames):
+        cv2.imwrite(str(folder / "images" / f"{i}.png"), shot.image)
+        lines.append(f"{shot.exposure_start / 1e6:.6f} images/{i}.png\n")
+    (folder / "images.txt").write_text("".join(lines))
+    np.savez(tmp_path / "slider_gt.npz", times_us=truth.times, gt=truth.images)
+    return folder
+
+
+@pytest.mark.parametrize(("inside", "name"), [("", "."), ("images", "..")])
+def test_truth_beside_a_folder_is_found_from_within_it(cli, ijrr_folder, tmp_path, monkeypatch, inside, name):
+    """By the name of the folder, which . and .. do not tell; in a benchmark it is called by it, too."""
+    monkeypatch.chdir(ijrr_folder / inside)
+    arguments = ("--exposure", "10000", "--methods", "hold")
+    found = cli("evaluate", name, *arguments)
+    assert f"ground truth of {tmp_path / 'slider_gt.npz'}: " in found.out, found.err
+    assert cli("benchmark", name, *arguments, "-o", tmp_path / "bench", "--quiet").code == 0
+    (job,) = json.loads((tmp_path / "bench" / "results.json").read_text())["jobs"]
+    assert (job["sequence"]["name"], job["sequence"]["held_out"]) == ("slider", False)
+    named = cli("evaluate", name, *arguments, "--truth", tmp_path / "slider_gt.npz")
+    assert named.out == found.out
 
 
 def test_truth_beside_the_recording_comes_before_its_own(cli, write_recording, simulation, tmp_path):

@@ -224,16 +224,24 @@ TRUTH_SUFFIX: Final = "_gt.npz"
 """Reference images beside a recording: ``X_gt.npz`` beside ``X.mat`` or the folder ``X``."""
 
 
+def with_name_of_its_own(path: Path) -> Path:
+    """The same place; where the path ends in ``.`` or ``..``, as its folder is called."""
+    return path.resolve() if path.name in ("", "..") else path
+
+
 def truth_beside(path: Path) -> Path:
     """Where the ground truth of a recording lies, if it has any."""
+    path = with_name_of_its_own(path)
     name = path.name if path.is_dir() else path.stem
     return path.with_name(f"{name}{TRUTH_SUFFIX}")
 
 
 def truth_file(path: Path, named: Path | None = None) -> Path | None:
     """The file of reference images that is named, or else lies beside the recording at ``path``; None: neither."""
+    if named is not None:
+        return named
     beside = truth_beside(path)
-    return named or (beside if beside.is_file() else None)
+    return beside if beside.is_file() else None
 
 
 def find_truth(

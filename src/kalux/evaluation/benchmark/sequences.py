@@ -15,7 +15,7 @@ from kalux.calibration.values import Calibration, load_calibration
 from kalux.datasets.ahdr import ArtificialCamera, artificial_hdr, check_originals
 from kalux.errors import InputError
 from kalux.evaluation.specs import relocated
-from kalux.evaluation.truth import TRUTH_SUFFIX, truth_file
+from kalux.evaluation.truth import TRUTH_SUFFIX, truth_file, with_name_of_its_own
 from kalux.frames import Stamp
 from kalux.models.camera import named_responses
 from kalux.readers import READERS
@@ -262,7 +262,7 @@ def gather(
     found: list[Sequence] = []
     listings: list[Benchmark] = []
     for given in sets:
-        path = Path(given).absolute()
+        path = with_name_of_its_own(Path(given).absolute())
         if path.suffix.lower() == ".toml":
             listed = load(path)
             listings.append(listed)
@@ -388,7 +388,7 @@ def _listed(where: str, folder: Path, entry: Any) -> Sequence:
         if not files or not all(isinstance(file, str) for file in files):
             raise InputError(f"{where}: calibration is {files!r}; files of kalux calibrate are needed")
         options["calibration"] = tuple((folder / file).absolute() for file in files)
-    path = (folder / entry["path"]).absolute()
+    path = with_name_of_its_own((folder / entry["path"]).absolute())
     try:
         plain = _sequence(path, Options(**options))
     except InputError as error:
