@@ -171,6 +171,21 @@ def test_a_folder_of_something_else_is_left_alone(cli, recording, tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]
 
 
+def test_results_do_not_lie_in_what_is_read(cli, ran, recording, tmp_path):
+    """Each run would change what all jobs depend on."""
+    folder = tmp_path / "scene"
+    folder.mkdir()
+    (folder / "events.txt").write_text("0.000001 3 4 1\n")
+    (folder / "images.txt").write_text("")
+    (folder / "timestamps.csv").write_text("t_us,file\n1,0.npy\n")
+    (folder / "0.npy").write_text("")
+    for arguments in ((folder, "--methods", "hold"), (recording, "--methods", f"hold,{{sequence}}={folder}")):
+        found = cli("benchmark", *arguments, "-o", folder / "results")
+        assert (found.code, f"lies in {folder}, an input" in found.error) == (2, True), found.err
+    assert not (folder / "results").exists()
+    assert ran == []
+
+
 def test_without_dask_the_extra_is_named(cli, recording, tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "distributed", None)
     found = cli("benchmark", recording, "-o", tmp_path / "out", "--dask", "tcp://x", "--methods", "hold")

@@ -191,6 +191,18 @@ def test_a_folder_of_images_is_compared_and_what_it_says_is_its_own(cli, with_tr
     assert "all: " not in found.out
 
 
+@pytest.mark.parametrize("place", ["timestamps.csv", "scores.csv"])
+def test_nothing_in_a_folder_of_a_method_is_replaced(cli, recording, tmp_path, place):
+    """Its list of images is a .csv, as the table is."""
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    (folder / place).write_text("t_us,file")
+    methods = ("--methods", f"hold,mine={folder}?tolerance=5")
+    found = cli("evaluate", recording, *methods, "-o", folder / place, "--overwrite")
+    assert (found.code, f"lies in {folder}, an input" in found.error) == (2, True)
+    assert (folder / place).read_text() == "t_us,file"
+
+
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [

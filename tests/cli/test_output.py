@@ -73,6 +73,16 @@ def test_what_is_not_there_or_elsewhere_may_be_written(tmp_path):
     check_apart([folder / "new.png", beside / "out.png", tmp_path / "new.h5"], [folder, tmp_path / "no.h5"])
 
 
+def test_a_link_that_leads_nowhere_is_replaced_only_if_asked_for(cli, recording, tmp_path):
+    """It may be there for a disk that is not."""
+    for out in (tmp_path / "s.csv", tmp_path / "v.mp4", tmp_path / "images"):
+        out.symlink_to(tmp_path / "nowhere" / out.name)
+        command = "evaluate" if out.suffix == ".csv" else "reconstruct"
+        found = cli(command, recording, "-o", out, *(("--methods", "hold") if out.suffix == ".csv" else ()))
+        assert (found.code, "there" in found.error) == (2, True)
+        assert out.is_symlink()
+
+
 def test_a_calibration_in_the_folder_of_its_recording_may_be_replaced(tmp_path):
     (tmp_path / "cal.toml").write_text("former")
     check_apart([tmp_path / "cal.toml"], [tmp_path])

@@ -117,6 +117,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
         hdr_vdp=options.hdrvdp,
         lpips=lpips_files(options),
     )
+    _check_apart(options.out, plan)
     stores.prepare(options.out)
     store = stores.Store(options.out)
     records = (
@@ -139,6 +140,18 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
         say(line)
     say(f"wrote {options.out / CSV}, {options.out / JSON}, {options.out / REPORT}")
     _raise_failures(results, options.out)
+
+
+def _check_apart(out: Path, plan: Plan) -> None:
+    """Refuse to write into a folder that is read: what jobs depend on would change with every run."""
+    from kalux.cli.output import lies_in
+    from kalux.evaluation.benchmark.jobs import method_text
+    from kalux.evaluation.specs import spec_path
+
+    methods = (spec_path(method_text(job.method, job.sequence.name, job.folder)) for job in plan.jobs)
+    for place in (*(sequence.path for sequence in plan.sequences), *methods):
+        if place is not None and place.is_dir() and lies_in(out, place):
+            raise UsageError(f"{out}: lies in {place}, an input; choose another place for the output")
 
 
 def _work(plan: Plan, store: Store, jobs: list[Job], options: argparse.Namespace) -> dict[Job, Any]:

@@ -19,7 +19,7 @@ from kalux.cli.calibrations import (
 )
 from kalux.cli.checking import check_recording
 from kalux.cli.loops import prepare_loops, tell_of_compiling
-from kalux.cli.metrics import add_metrics, lpips_weights, named_methods
+from kalux.cli.metrics import add_metrics, lpips_files, lpips_weights, named_methods
 from kalux.cli.parser import Parser, UsageError, whole
 from kalux.cli.recordings import add_recording, open_recording
 from kalux.cli.terminal import say, warn
@@ -100,12 +100,16 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     from kalux.cli.output import check_apart, check_file
     from kalux.cli.progress import Progress
     from kalux.evaluation.scores import require_dependencies
+    from kalux.evaluation.specs import spec_path
 
     if options.out is not None:
         if options.out.suffix.lower() not in _SUFFIXES:
             raise UsageError(f"{options.out}: the output is a table; give a name that ends in .csv or .json")
         truth = None if options.truth == _OWN else options.truth
-        check_apart([options.out], [options.recording, options.frames, truth])
+        methods = [spec_path(name) for name in named_methods(options) or ()]
+        check_apart(
+            [options.out], [options.recording, options.frames, truth, *methods, *lpips_files(options)]
+        )
         check_file(options.out, overwrite=options.overwrite)
     if options.clip and options.truth is not None:
         raise UsageError("--clip is for held-out frames, which clip; ground truth does not")

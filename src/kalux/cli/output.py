@@ -158,9 +158,10 @@ def check_output(output: Output) -> None:
         is_folder = path.is_dir()
         if is_folder and output.format == "mp4":
             raise OutputError(f"{path}: a folder of this name is there; choose another name for the video")
-        if not is_folder and path.exists() and output.format != "mp4":
+        is_there = os.path.lexists(path)  # a link that leads nowhere, too, as the writers see it
+        if not is_folder and is_there and output.format != "mp4":
             raise OutputError(f"{path}: a file of this name is there; choose another name for the folder")
-        taken = any(path.iterdir()) if is_folder else path.exists()
+        taken = any(path.iterdir()) if is_folder else is_there
         if taken and not output.overwrite:
             what = "the folder is not empty" if is_folder else "there already"
             raise OutputError(f"{path}: {what}; choose another name, or replace it with --overwrite")
@@ -207,7 +208,7 @@ def check_file(path: Path, *, overwrite: bool) -> None:
         check_length(path)
         if path.is_dir():
             raise OutputError(f"{path}: a folder of this name is there; choose another name for the file")
-        if path.exists() and not overwrite:
+        if os.path.lexists(path) and not overwrite:
             raise OutputError(f"{path}: there already; choose another name, or replace it with --overwrite")
         folder = path.absolute().parent
         if not folder.exists():

@@ -26,6 +26,14 @@ def test_a_folder_gives_its_recordings_and_their_truth_but_not_the_truth_as_a_re
     assert found[0].files() == [small_set.folder / "a.h5", small_set.folder / "a_gt.npz"]
 
 
+def test_of_a_folder_numpy_files_are_recordings_if_they_hold_events(small_set):
+    """Not truth of another name, maps of a calibration, or images."""
+    np.savez(small_set.folder / "truth.npz", times_us=np.arange(3), gt=np.ones((3, 4, 5)))
+    np.save(small_set.folder / "image.npy", np.ones((4, 5)))
+    np.savez(small_set.folder / "c.npz", t=np.arange(3), x=np.arange(3), y=np.arange(3), p=np.ones(3, bool))
+    assert [s.name for s in gather([small_set.folder]).sequences] == ["a", "b", "c"]
+
+
 def test_held_out_frames_that_are_asked_for_win_over_truth(small_set):
     (found,) = gather([small_set.folder / "a.h5"], Options(hold_out_frames=3)).sequences
     assert found.truth_file() is None

@@ -13,12 +13,12 @@ from typing import Any, Final
 import kalux
 from kalux.calibration.values import Calibration, load_calibration
 from kalux.datasets.ahdr import ArtificialCamera, artificial_hdr, check_originals
-from kalux.errors import InputError
+from kalux.errors import FormatError, InputError
 from kalux.evaluation.specs import relocated
 from kalux.evaluation.truth import TRUTH_SUFFIX, truth_file, with_name_of_its_own
 from kalux.frames import Stamp
 from kalux.models.camera import named_responses
-from kalux.readers import READERS
+from kalux.readers import READERS, numpy_files
 from kalux.recording import Recording, check_stated
 from kalux.settings import AUTO, CameraSettings, read_toml
 
@@ -430,10 +430,21 @@ def _recordings(path: Path) -> list[Path]:
     if not path.is_dir() or _is_recording(path):
         return [path]
     inside = sorted(p for p in path.iterdir() if not p.name.endswith(TRUTH_SUFFIX))
-    found = [p for p in inside if not p.name.startswith(".") and _is_recording(p)]
+    found = [p for p in inside if not p.name.startswith(".") and _is_recording(p) and not _is_other_numpy(p)]
     if not found:
         raise InputError(f"{path}: neither a recording nor a folder with recordings that kalux knows")
     return found
+
+
+def _is_other_numpy(path: Path) -> bool:
+    """Whether it is a NumPy file that holds no events: truth, maps of a calibration, images."""
+    if path.is_dir() or not numpy_files.recognises(path):
+        return False
+    try:
+        numpy_files.find_events(path)
+    except FormatError:
+        return True
+    return False
 
 
 def _is_recording(path: Path) -> bool:
