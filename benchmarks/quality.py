@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import math
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -112,8 +113,9 @@ def main():
             start = time.perf_counter()
             found = score(method)
             seconds = time.perf_counter() - start
+            similarity = math.nan if found.ssim is None else found.ssim
             print(
-                f"{method.label:34} {100 * found.mse:9.3f} {found.ssim:6.3f} {100 * found.log_mse:13.2f} "
+                f"{method.label:34} {100 * found.mse:9.3f} {similarity:6.3f} {100 * found.log_mse:13.2f} "
                 f"{seconds:6.1f}",
                 flush=True,
             )

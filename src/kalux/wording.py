@@ -8,6 +8,12 @@ def how_many(count: int, noun: str) -> str:
     return f"{count:,} {noun}" if count == 1 else f"{count:,} {noun}s"
 
 
+def ordinal(number: int) -> str:
+    """``1st``, ``12th``, ``22nd``."""
+    last = 0 if number % 100 in (11, 12, 13) else number % 10
+    return f"{number}{ {1: 'st', 2: 'nd', 3: 'rd'}.get(last, 'th') }"
+
+
 def one_line(error: BaseException) -> str:
     """What another library's error says, on one line of printable characters."""
     text = " ".join(str(error).split()) or type(error).__name__

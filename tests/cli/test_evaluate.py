@@ -85,6 +85,26 @@ def test_truth_beside_the_recording_is_found_and_told(cli, write_recording, simu
     assert "held-out" in cli("evaluate", path, "--hold-out-frames", "3", "--methods", "hold").out
 
 
+def test_a_mask_without_a_window_leaves_ssim_empty_and_says_so(cli, recording, simulation, tmp_path):
+    """In table and files, and in a benchmark."""
+    truth = simulation.truth()
+    mask = np.zeros(truth.images.shape[1:], bool)
+    mask[:8, :8] = True
+    np.savez(tmp_path / "t.npz", times_us=truth.times, gt=truth.images, mask=mask)
+    told = f"SSIM without {len(truth.times)} images whose mask leaves no window of 11 x 11 pixels"
+    for name in ("s.csv", "s.json"):
+        found = cli(
+            "evaluate", recording, "--truth", tmp_path / "t.npz", "--methods", "hold", "-o", tmp_path / name
+        )
+        assert f"all: {told}" in found.out, found.err
+    assert next(csv.DictReader((tmp_path / "s.csv").open()))["ssim"] == ""
+    assert json.loads((tmp_path / "s.json").read_text())["methods"][0]["ssim"] is None
+    (tmp_path / "b.toml").write_text(f'[[sequence]]\npath = "{recording}"\ntruth = "t.npz"\n')
+    done = cli("benchmark", tmp_path / "b.toml", "--methods", "hold,cf", "-o", tmp_path / "bench", "--quiet")
+    assert done.code == 0, done.err
+    assert told in (tmp_path / "bench" / "results.json").read_text()
+
+
 @pytest.fixture
 def ijrr_folder(tmp_path, simulation):
     """The recording as a folder of text and images, in which there is another folder, with its truth beside it."""

@@ -143,6 +143,11 @@ def test_every_nth_frame_is_dropped_and_compared_if_three_from_either_end():
     assert held.times.tolist() == [[500, 502, 505, 507, 510], [800, 802, 805, 807, 810]]
 
 
+def test_one_frame_has_one_number():
+    assert "1 of them compared (number 3, from 0)" in hold_out_frames(still(range(100, 107))).described()
+    assert "every 22nd" in hold_out_frames(still(range(100, 126)), 22).described()
+
+
 def test_the_scale_is_the_percentile_of_all_frames():
     rng = np.random.default_rng(0)
     frames = [frame(rng.integers(0, 256, (9, 11)), 100 * i, 100 * i + 10) for i in range(8)]

@@ -131,6 +131,63 @@ def test_pixels_that_no_frame_sees_are_not_compared(simulation):
     assert evaluate_truth(recording, reference, perfect(simulation)).mse == 0
 
 
+def test_an_image_that_is_masked_altogether_is_left_out_and_counted(simulation, recording):
+    """It is no error: where a camera saturates, artificial HDR has such images."""
+    truth = simulation.truth()
+    mask = np.ones(truth.images.shape, bool)
+    mask[3] = False
+    brightest = truth.images.copy()
+    brightest[3] = 100.0
+    reference = prepare_reference(recording, GroundTruth(truth.times, brightest), mask)
+    assert reference.times.tolist() == np.delete(truth.times, 3).tolist()
+    assert (reference.masked, reference.left_out) == (1, 0)
+    assert reference.data_range == truth.images.max()
+    assert "not compared; 1 more is masked altogether" in reference.described()
+    found = evaluate_truth(recording, reference, methods()["hold"])
+    without = GroundTruth(np.delete(truth.times, 3), np.delete(truth.images, 3, 0))
+    assert (
+        found.means()
+        == evaluate_truth(recording, prepare_reference(recording, without), methods()["hold"]).means()
+    )
+
+
+def test_an_image_without_a_window_has_no_ssim_and_the_others_have(simulation, recording):
+    truth = simulation.truth()
+    mask = np.ones(truth.images.shape, bool)
+    mask[3], mask[3, :8, :8] = False, True
+    found = evaluate_truth(recording, prepare_reference(recording, truth, mask), methods()["hold"])
+    assert found.images[3].ssim is None
+    assert found.images[3].pixels == 64
+    assert found.ssim == pytest.approx(np.mean([i.ssim for i in np.delete(found.images, 3)]))
+    assert found.mse == pytest.approx(np.mean([i.mse for i in found.images]))
+    assert found.adjustments() == ["SSIM without 1 image whose mask leaves no window of 11 x 11 pixels"]
+    nowhere = prepare_reference(recording, truth, mask[3])
+    assert evaluate_truth(recording, nowhere, methods()["hold"]).ssim is None
+
+
+def test_one_image_that_is_left_out_is_one(recording, simulation):
+    truth = simulation.truth()
+    late = GroundTruth(np.append(truth.times, 10**9), np.concatenate([truth.images, truth.images[:1]]))
+    assert (
+        prepare_reference(recording, late)
+        .described()
+        .endswith("; 1 more lies before the first or after the last frame")
+    )
+
+
+def test_values_whose_squares_are_no_numbers_are_refused(simulation, recording, tmp_path):
+    truth = simulation.truth()
+    images = truth.images.astype(float)
+    images[0, 0, 0] = 1e300
+    with pytest.raises(
+        InputError, match=r"1 of \d+ values are negative, beyond 1e\+12 times white or not finite"
+    ):
+        prepare_reference(recording, GroundTruth(truth.times, images))
+    np.savez(tmp_path / "t.npz", times=truth.times, gt=images)
+    with pytest.raises(InputError, match="beyond"):
+        prepare_reference(recording, *load_truth(tmp_path / "t.npz"))
+
+
 def test_what_does_not_fit_is_refused(simulation, recording):
     truth = simulation.truth()
     for bad, mask, told in (

@@ -248,7 +248,7 @@ def _of_colours(colours: str) -> str:
 _COLUMNS: Final[tuple[tuple[str, Callable[[Scores], str]], ...]] = (
     ("MSE x100", lambda s: f"{100 * s.mse:.3f}"),
     ("PSNR dB", lambda s: f"{s.psnr:.2f}"),
-    ("SSIM", lambda s: f"{s.ssim:.3f}"),
+    ("SSIM", lambda s: "" if s.ssim is None else f"{s.ssim:.3f}"),
     ("log-MSE x100", lambda s: f"{100 * s.log_mse:.2f}"),
     ("rms z", lambda s: "" if (z := s.uncertainty()["rms_z"]) is None else f"{z:.2f}"),
 )

@@ -28,7 +28,7 @@ from kalux.models.camera import Camera, Response, inverse_response
 from kalux.models.colour import luminance
 from kalux.recording import Recording
 from kalux.settings import CameraSettings, chosen_response
-from kalux.wording import how_many
+from kalux.wording import how_many, ordinal
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,8 @@ def artificial_hdr(
         )
     if every is not None and len(kept) < every:
         raise FrameError(
-            f"{recording.source.path}: {how_many(len(kept), 'frame')}, too few to leave out every {every}th as truth"
+            f"{recording.source.path}: {how_many(len(kept), 'frame')}, too few to leave out every {ordinal(every)} as "
+            "truth"
         )
 
     def frames() -> Iterator[Frame]:

@@ -19,6 +19,7 @@ from kalux.calibration.photographs import parse_seconds, read_exposure, read_pho
 from kalux.errors import FormatError, InputError
 from kalux.models.camera import Response
 from kalux.readers.images import images_in
+from kalux.wording import how_many
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -112,7 +113,9 @@ def check_bracket(pictures: Sequence[Picture], where: str = "bracket") -> None:
         If there are fewer than two, exposures are not positive or all equal, or sizes or types differ.
     """
     if len(pictures) < 2:
-        raise InputError(f"{where}: {len(pictures)} photographs; at least two exposures are needed")
+        raise InputError(
+            f"{where}: {how_many(len(pictures), 'photograph')}; at least two exposures are needed"
+        )
     for picture in pictures:
         if not (np.isfinite(picture.exposure) and picture.exposure > 0):
             raise InputError(

@@ -21,7 +21,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.calibration.debevec import CLIPPED_HIGH, CLIPPED_LOW, LEAST_SHARED
+from kalux.calibration.debevec import CLIPPED_HIGH, CLIPPED_LOW, LEAST_SHARED, LEAST_SPREAD
 from kalux.calibration.response import CalibrationName, fit_response, side_by_side
 from kalux.datasets.bracket_alignment import Aligned, align
 from kalux.datasets.bracket_consistency import Consistency, ResponseTable, consistency, relative_spread
@@ -172,8 +172,14 @@ def hdr_reference(
     if found is not None:
         valid &= ~found.unsettled
     said = [_described(placed, stated, exposures, found, k) for k in range(len(photographs))]
-    said.append(f"exposures agree within {100 * spread:.1f} % (one standard deviation)")
+    said.append(_agreement(spread))
     return HdrReference(radiance, valid, reference, curve, tuple(said), tuple(photographs))
+
+
+def _agreement(spread: float) -> str:
+    if spread <= LEAST_SPREAD:  # or nothing tells how well
+        return f"exposures are taken to agree within {100 * LEAST_SPREAD:.0f} %, the least (one standard deviation)"
+    return f"exposures agree within {100 * spread:.1f} % (one standard deviation)"
 
 
 def _described(

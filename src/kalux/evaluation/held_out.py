@@ -36,7 +36,7 @@ from kalux.frames import Frame
 from kalux.models.camera import Camera, frame_log_covariance
 from kalux.recording import RECORDING_NEEDED, Recording, reference_exposure, with_frames
 from kalux.settings import AUTO, CameraSettings, chosen_response
-from kalux.wording import how_many
+from kalux.wording import how_many, ordinal
 
 READS: Final = 5
 """Reads across the exposure of a held-out frame."""
@@ -96,9 +96,11 @@ class HeldOut:
 
     def described(self) -> str:
         """The protocol in words."""
+        first, last = self.compared[0], self.compared[-1]
+        which = f"number {first}" if first == last else f"numbers {first} to {last}"
         return (
-            f"held-out frames: every {_ordinal(self.every)} dropped, {len(self.compared)} of them compared "
-            f"(numbers {self.compared[0]} to {self.compared[-1]}, from 0), mean of {self.times.shape[1]} reads "
+            f"held-out frames: every {ordinal(self.every)} dropped, {len(self.compared)} of them compared "
+            f"({which}, from 0), mean of {self.times.shape[1]} reads "
             f"across each exposure{of_black(self.whole)}"
         )
 
@@ -144,7 +146,7 @@ def hold_out_frames(
     compared = compared[compared % every == every - 1]
     if len(compared) == 0:
         raise FrameError(
-            f"{recording.source.path}: {how_many(count, 'frame')}, too few to hold out every {_ordinal(every)}: "
+            f"{recording.source.path}: {how_many(count, 'frame')}, too few to hold out every {ordinal(every)}: "
             f"a frame that is compared needs {MARGIN} before and {MARGIN} after it"
         )
     response = chosen_response(response, recording.response)
@@ -285,7 +287,3 @@ def percentile_of_counts(values: Array, counts: NDArray[np.int64], percent: floa
     position = percent / 100 * (int(last[-1]) - 1)
     below, above = values[np.searchsorted(last, [np.floor(position), np.ceil(position)], side="right")]
     return float(below + (above - below) * (position - np.floor(position)))
-
-
-def _ordinal(n: int) -> str:
-    return {2: "2nd", 3: "3rd"}.get(n, f"{n}th")

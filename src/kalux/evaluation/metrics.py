@@ -11,7 +11,7 @@ import importlib
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
 from kalux.errors import InputError, MissingDependencyError
@@ -20,7 +20,9 @@ from kalux.evaluation.pairs import Array, check_none, checked_pair
 __all__ = ["log_mse", "mse", "psnr", "ssim", "ssim_released"]
 
 _SSIM_SIGMA: Final = 1.5
-_SSIM_WINDOW: Final = 11
+SSIM_WINDOW: Final = 11
+"""Pixels along a side of its windows."""
+
 _K1: Final = 0.01
 _K2: Final = 0.03
 
@@ -117,11 +119,11 @@ def ssim(test: ArrayLike, reference: ArrayLike, *, data_range: float, mask: Arra
     """
     peak = _checked_range(data_range)
     first, second, counted = checked_pair(test, reference, mask)
-    if first.ndim != 2 or min(first.shape) < _SSIM_WINDOW:
+    if first.ndim != 2 or min(first.shape) < SSIM_WINDOW:
         raise InputError(f"ssim: images (H, W) of at least 11 x 11 pixels are needed, not {first.shape}")
     if counted is None:
         counted = np.ones(first.shape, bool)
-    whole = ndimage.binary_erosion(counted, np.ones((_SSIM_WINDOW, _SSIM_WINDOW)))
+    whole = whole_windows(counted)
     if not whole.any():
         raise InputError("ssim: no window of 11 x 11 counted pixels")
     _, similarity = _skimage_metrics().structural_similarity(
@@ -134,6 +136,11 @@ def ssim(test: ArrayLike, reference: ArrayLike, *, data_range: float, mask: Arra
         full=True,
     )
     return float(similarity[whole].mean())
+
+
+def whole_windows(counted: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Where the windows of `ssim` have their middles that hold counted pixels only: (H, W) bool."""
+    return np.asarray(ndimage.binary_erosion(counted, np.ones((SSIM_WINDOW, SSIM_WINDOW))), np.bool_)
 
 
 def ssim_released(test: ArrayLike, reference: ArrayLike, *, data_range: float) -> float:

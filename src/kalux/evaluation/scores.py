@@ -16,8 +16,9 @@ from kalux.evaluation.calibration import Calibrations
 from kalux.evaluation.hdr_vdp import hdrvdp
 from kalux.evaluation.lpips import LpipsWeights
 from kalux.evaluation.lpips import lpips as lpips_distance
-from kalux.evaluation.metrics import log_mse, mse, psnr, ssim
+from kalux.evaluation.metrics import SSIM_WINDOW, log_mse, mse, psnr, ssim, whole_windows
 from kalux.evaluation.pairs import Array, Pair
+from kalux.wording import how_many
 
 LOG_OFFSET: Final = 0.02
 """Of the log-MSE, in units of white."""
@@ -41,7 +42,8 @@ class ImageScores:
     pixels
         How many were compared.
     mse, psnr, ssim, log_mse
-        As in `kalux.evaluation.metrics`; psnr in dB, log_mse of log(I + 0.02).
+        As in `kalux.evaluation.metrics`; psnr in dB, log_mse of log(I + 0.02). ssim is None where a mask leaves no
+        whole window.
     q
         HDR-VDP's Q; None where it was not asked for.
     lpips
@@ -53,7 +55,7 @@ class ImageScores:
     pixels: int
     mse: float
     psnr: float
-    ssim: float
+    ssim: float | None
     log_mse: float
     q: float | None
     lpips: float | None = None
@@ -61,7 +63,7 @@ class ImageScores:
 
 @dataclass(frozen=True)
 class Scores:
-    """A method's images against their references. The means are over images.
+    """A method's images against their references. The means are over images, of SSIM over those that have one.
 
     Attributes
     ----------
@@ -112,9 +114,10 @@ class Scores:
         return self._mean("psnr")
 
     @property
-    def ssim(self) -> float:
-        """Mean of the images' SSIM."""
-        return self._mean("ssim")
+    def ssim(self) -> float | None:
+        """Mean of the images' SSIM; None where none has one."""
+        known = [image.ssim for image in self.images if image.ssim is not None]
+        return float(np.mean(known)) if known else None
 
     @property
     def log_mse(self) -> float:
@@ -147,6 +150,12 @@ class Scores:
             done.append(f"intensities divided by {self.scale:.4g}")
         if self.clipped:
             done.append("the reconstruction clipped where the camera clips")
+        lacking = sum(image.ssim is None for image in self.images)
+        if lacking:
+            done.append(
+                f"SSIM without {how_many(lacking, 'image')} whose mask leaves no window of {SSIM_WINDOW} x "
+                f"{SSIM_WINDOW} pixels"
+            )
         if self.negative:
             done.append(f"{self.negative} negative values taken as 0 in log-MSE, HDR-VDP and LPIPS")
         return [*done, *self.notes]
@@ -219,7 +228,7 @@ def score_image(
         pixels=test.size if mask is None else int(np.count_nonzero(mask)),
         mse=error,
         psnr=psnr(test, reference, data_range=data_range, mask=mask),
-        ssim=ssim(test, reference, data_range=data_range, mask=mask),
+        ssim=_similarity(test, reference, data_range, mask),
         log_mse=log_mse(lit, reference, offset=LOG_OFFSET, mask=mask),
         q=None if not hdr_vdp else _quality(*_compared(lit, reference, mask)),
         lpips=None if lpips is None else _perceptual(*_compared(lit, reference, mask), data_range, lpips),
@@ -232,6 +241,14 @@ def _compared(test: Array, reference: Array, mask: NDArray[np.bool_] | None) -> 
         return test, reference
     shown = np.where(mask, reference, 0.0)
     return np.where(mask, test, shown), shown
+
+
+def _similarity(
+    test: Array, reference: Array, data_range: float, mask: NDArray[np.bool_] | None
+) -> float | None:
+    if mask is not None and min(mask.shape) >= SSIM_WINDOW and mask.any() and not whole_windows(mask).any():
+        return None
+    return ssim(test, reference, data_range=data_range, mask=mask)
 
 
 def _quality(test: Array, reference: Array) -> float:

@@ -44,6 +44,8 @@ class Reference:
         The largest compared value: the data range of PSNR and SSIM.
     noise
         As of `kalux.frames.GroundTruth`.
+    masked
+        How many images of those within that time are left out because no pixel of theirs is compared.
     """
 
     times: NDArray[np.int64]
@@ -52,14 +54,18 @@ class Reference:
     left_out: int
     data_range: float
     noise: tuple[float, float] | None = None
+    masked: int = 0
 
     def described(self, origin: str = "") -> str:
         """The protocol in words; ``origin``, such as " of FILE", says whose truth it is."""
         said = f"ground truth{origin}: {how_many(len(self.times), 'image')}"
         if self.masks is not None:
             said += ", masked pixels and those that no frame sees not compared"
+        if self.masked:
+            said += f"; {self.masked} more {'is' if self.masked == 1 else 'are'} masked altogether"
         if self.left_out:
-            said += f"; {self.left_out} more lie before the first or after the last frame"
+            lie = "lies" if self.left_out == 1 else "lie"
+            said += f"; {self.left_out} more {lie} before the first or after the last frame"
         return said
 
 
@@ -67,6 +73,8 @@ def prepare_reference(
     recording: Recording, truth: GroundTruth, mask: NDArray[np.bool_] | None = None
 ) -> Reference:
     """Check reference images, put them in order, and leave out those before the first and after the last frame.
+
+    Those of which no pixel is compared are left out, too.
 
     Parameters
     ----------
@@ -106,20 +114,33 @@ def prepare_reference(
             f"ground truth: none of {len(times)} images lies within the frames, {first} to {last} us; "
             "is its clock that of the recording?"
         )
+    within = len(chosen)
+    if masks is not None:
+        chosen = chosen[masks[chosen].any(axis=(1, 2))]
     images = images[chosen]
     masks = None if masks is None else masks[chosen]
     compared = images if masks is None else images[masks]
-    bad = int(np.count_nonzero(~(compared >= 0) | ~np.isfinite(compared)))
+    bad = int(np.count_nonzero(~((compared >= 0) & (compared <= _LARGEST))))
     if bad:
         raise InputError(
-            f"ground truth: {bad} of {compared.size} values are negative or not finite; mend or mask them"
+            f"ground truth: {bad} of {compared.size} values are negative, beyond {_LARGEST:g} times white or not "
+            "finite; mend or mask them"
         )
     if compared.size == 0 or not compared.max() > 0:
         raise InputError("ground truth: nothing to compare, all of it is black or masked")
-    left_out = len(times) - len(chosen)
     return Reference(
-        times[chosen].astype(np.int64), images, masks, left_out, float(compared.max()), truth.noise
+        times[chosen].astype(np.int64),
+        images,
+        masks,
+        len(times) - within,
+        float(compared.max()),
+        truth.noise,
+        within - len(chosen),
     )
+
+
+_LARGEST: Final = 1e12
+"""Times white, as of frames: squares of such values are still numbers."""
 
 
 def evaluate_truth(
@@ -286,7 +307,9 @@ def load_truth(path: Path) -> tuple[GroundTruth, NDArray[np.bool_] | None]:
     if images.ndim != 3 or images.dtype.kind not in "fiu":
         raise FormatError(f"{path}: the images are {images.dtype} {images.shape}; (T, H, W) is needed")
     check_intensity(path, images)
-    return GroundTruth(times.astype(np.int64), images.astype(np.float32)), arrays.get("mask")
+    with np.errstate(over="ignore"):  # what is too large becomes infinite, and is refused unless it is masked
+        linear = images.astype(np.float32)
+    return GroundTruth(times.astype(np.int64), linear), arrays.get("mask")
 
 
 _KEYS: Final = ("times_us", "times", "gt", "images", "mask")
