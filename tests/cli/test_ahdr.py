@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 
 import kalux
@@ -61,6 +63,16 @@ def test_a_cut_that_leaves_no_highlights_is_told(cli, recording, tmp_path):
     found = cli("ahdr", recording, "-o", tmp_path / "a.h5", "--cut", 0, "--response", "gamma:0.2")
     assert found.code == 0
     assert ("no pixel of any frame is white" in found.err) == ("0.0 % of pixels white" in found.out)
+
+
+def test_a_recording_that_is_all_black_is_not_written(cli, write_recording, simulation, tmp_path):
+    """Nothing could be reconstructed of it, and the black of a camera is rarely above all that it has seen."""
+    dim = [dataclasses.replace(f, image=f.image // 2) for f in simulation.frames]
+    path = write_recording(tmp_path / "dim.h5", frames=dim)
+    found = cli("ahdr", path, "-o", tmp_path / "a.h5", "--black", 250, "--quiet")
+    assert found.code == 2
+    assert "dim.h5: every pixel of every frame would be black; give a smaller --black" in found.error
+    assert not (tmp_path / "a.h5").exists()
 
 
 @pytest.mark.parametrize(

@@ -439,6 +439,7 @@ class TestBadInput:
             (["--display", "bright"], "auto, linear"),
             (["--display", "linear", "--display.knee", "1"], "it has black, white"),
             (["--display.lift", "99"], "lift is 99"),
+            (["--display.gamma", "2"], "--display.gamma has no effect: it is for --display.encoding gamma"),
             (["--png-bits", "12"], "--png-bits"),
             (["--crf", "20"], "--crf is for mp4"),
             (["--format", "exr", "--display", "drago"], "--display is for png and mp4"),

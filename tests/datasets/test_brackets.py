@@ -53,6 +53,15 @@ def test_exposures_are_needed(scene, tmp_path, times, told):
         read_bracket(folder, times)
 
 
+def test_a_photograph_has_one_exposure(scene, tmp_path):
+    """The last of two would have been taken without a word."""
+    folder = write(tmp_path / "b", photographs(scene))
+    times = tmp_path / "times.csv"
+    times.write_text("file,exposure_s\n0.png,4\n1.png,1\n0.png,2\n")
+    with pytest.raises(FormatError, match=r"times\.csv: lists 0\.png twice; give each photograph one line"):
+        read_bracket(folder, times)
+
+
 def test_damaged_and_unequal_photographs(scene, tmp_path):
     folder = write(tmp_path / "b", photographs(scene))
     cv2.imwrite(str(folder / "1.png"), np.zeros((50, 60, 3), np.uint8))

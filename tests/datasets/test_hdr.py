@@ -60,6 +60,12 @@ def test_radiance_is_measured(scene):
     assert relative_error(hdr_reference(photographs(scene), response="robertson"), scene)[0] < 0.3
 
 
+def test_a_spread_that_is_only_the_least_is_not_said_to_be_measured(scene):
+    exact = [Picture(str(t), np.rint(65535 * np.clip(scene * t, 0, 1)).astype(np.uint16), t) for t in TIMES]
+    said = hdr_reference(exact, response=Response.linear(), aligned=False).said[-1]
+    assert said == "exposures are taken to agree within 3 %, the least (one standard deviation)"
+
+
 def test_grey_and_16_bits(scene):
     linear = [
         Picture(str(t), np.rint(65535 * np.clip(scene[..., 1] * t, 0, 1)).astype(np.uint16), t) for t in TIMES

@@ -237,7 +237,7 @@ class TestErrors:
         with pytest.raises(InputError, match=r"reference: 3 of 600"):
             hdrvdp(good, bad)
 
-    @pytest.mark.parametrize("pixels_per_degree", [0.0, 2.0, -30.0, np.nan, np.inf])
+    @pytest.mark.parametrize("pixels_per_degree", [0.0, 2.0, -30.0, np.nan, np.inf, 1001, 1e6, "26"])
     def test_resolution(self, pixels_per_degree):
         with pytest.raises(InputError, match="pixels_per_degree"):
             hdrvdp(np.ones((20, 30)), np.ones((20, 30)), pixels_per_degree=pixels_per_degree)

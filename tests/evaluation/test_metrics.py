@@ -111,6 +111,14 @@ def test_shapes_and_types(metric, options, pair):
     assert metric(*whole, **options) == pytest.approx(of_floats, rel=1e-6)
 
 
+@pytest.mark.parametrize(("metric", "options"), ALL)
+def test_a_masked_array_is_refused(metric, options, pair):
+    """What it hides would be counted."""
+    for images in ((np.ma.masked_less(pair[0], 0.5), pair[1]), (pair[0], np.ma.array(pair[1]))):
+        with pytest.raises(InputError, match="a masked array; give its data, and mask="):
+            metric(*images, **options)
+
+
 @pytest.mark.parametrize(("metric", "options"), MASKED)
 def test_masks_are_checked(metric, options, pair):
     whole = np.ones(pair[0].shape, bool)
@@ -135,7 +143,7 @@ def test_ssim_needs_a_whole_window(pair):
 def test_the_data_range_must_be_given_and_positive(metric, pair):
     with pytest.raises(TypeError, match="data_range"):
         metric(*pair)
-    for bad in (0, -1, np.nan):
+    for bad in (0, -1, np.nan, None, "1"):
         with pytest.raises(InputError, match="data_range"):
             metric(*pair, data_range=bad)
 
@@ -147,6 +155,8 @@ def test_log_mse_needs_a_logarithm(pair):
         log_mse(test, reference)
     with pytest.raises(InputError, match="offset"):
         log_mse(*pair, offset=-1)
+    with pytest.raises(InputError, match="offset is None"):
+        log_mse(*pair, offset=None)
 
 
 def test_ssim_names_the_extra_that_brings_scikit_image(pair, monkeypatch):

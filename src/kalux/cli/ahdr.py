@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from kalux.cli.parser import Parser, UsageError, number, whole
 from kalux.cli.recordings import add_recording, open_recording
 from kalux.cli.terminal import say, warn
+from kalux.errors import InputError
 from kalux.wording import how_many
 
 if TYPE_CHECKING:
@@ -98,6 +99,10 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
             black += int(np.count_nonzero(frame.image == 0))
             pixels += frame.image.size
             progress.add(images=1)
+    if black == pixels:
+        raise InputError(
+            f"{options.recording}: every pixel of every frame would be black; give a smaller --black or --cut"
+        )
     with Progress("writing", quiet=options.quiet) as progress:
         write_copy(recording, options.out, progress)
     if white == 0:

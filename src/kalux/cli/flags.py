@@ -115,13 +115,17 @@ def given_display(options: argparse.Namespace) -> DisplaySettings:
     Raises
     ------
     SettingsError
-        A parameter is not one of the curve's, or out of its range.
+        A parameter is not one of the curve's, out of its range, or has no effect.
     """
     given = {
         key.removeprefix(_DISPLAY): value
         for key, value in vars(options).items()
         if key.startswith(_DISPLAY) and value is not None
     }
+    if "gamma" in given and given.get("encoding") != "gamma":
+        raise SettingsError(
+            "--display.gamma has no effect: it is for --display.encoding gamma; give that, too"
+        )
     common = {field.name for field in dataclasses.fields(DisplaySettings)}
     shared = {name: value for name, value in given.items() if name in common}
     try:

@@ -6,6 +6,7 @@ Values of pixels are called levels, 0 to 1.
 from __future__ import annotations
 
 import csv
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -136,13 +137,17 @@ def _listed_exposures(path: Path) -> dict[str, float]:
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             rows = list(csv.DictReader(line for line in file if line.strip() and not line.startswith("#")))
-            return {row["file"].strip(): parse_seconds(row["exposure_s"]) for row in rows}
+            listed = [(row["file"].strip(), parse_seconds(row["exposure_s"])) for row in rows]
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
     except (KeyError, ValueError, AttributeError, TypeError, csv.Error) as error:
         raise FormatError(
             f"{path}: not a CSV with the columns file and exposure_s (seconds, or 1/30)"
         ) from error
+    twice = [name for name, times in Counter(name for name, _ in listed).items() if times > 1]
+    if twice:
+        raise FormatError(f"{path}: lists {twice[0]} twice; give each photograph one line")
+    return dict(listed)
 
 
 def best_exposed(pictures: Sequence[Picture]) -> int:

@@ -8,6 +8,7 @@ touch the result. Computed in float64.
 from __future__ import annotations
 
 import importlib
+from numbers import Real
 from typing import Any, Final
 
 import numpy as np
@@ -80,8 +81,8 @@ def log_mse(
     InputError
         As in `mse`, and if a counted value plus the offset is not positive.
     """
-    if not (np.isfinite(offset) and offset >= 0):
-        raise InputError(f"offset is {offset}; a number of at least 0 is needed, e.g. 0.02")
+    if not (isinstance(offset, Real) and np.isfinite(offset) and offset >= 0):
+        raise InputError(f"offset is {offset!r}; a number of at least 0 is needed, e.g. 0.02")
     first, second, counted = checked_pair(test, reference, mask)
     if counted is not None:
         first, second = first[counted], second[counted]
@@ -175,9 +176,9 @@ def ssim_released(test: ArrayLike, reference: ArrayLike, *, data_range: float) -
 
 
 def _checked_range(data_range: float) -> float:
-    if not (np.isfinite(data_range) and data_range > 0):
+    if not (isinstance(data_range, Real) and np.isfinite(data_range) and data_range > 0):
         raise InputError(
-            f"data_range is {data_range}; a positive number is needed, e.g. the reference's range"
+            f"data_range is {data_range!r}; a positive number is needed, e.g. the reference's range"
         )
     return float(data_range)
 

@@ -108,6 +108,10 @@ def check_none(bad: Mask, image: str, what: str, counted: Mask | None = None) ->
 
 
 def _numbers(image: ArrayLike, name: str) -> Array:
+    if isinstance(image, np.ma.MaskedArray):
+        raise InputError(
+            f"{name}: a masked array; give its data, and mask=~numpy.ma.getmaskarray(...) where one is taken"
+        )
     given = np.asarray(image)
     if given.dtype.kind not in "fiub":
         raise InputError(f"{name}: an image of real numbers is needed, not {given.dtype}")

@@ -15,6 +15,7 @@ References
 from __future__ import annotations
 
 from dataclasses import dataclass
+from numbers import Real
 from typing import Final
 
 import numpy as np
@@ -61,8 +62,8 @@ def hdrvdp(
     test, reference
         (H, W) luminance, cd/m2, not negative; at least 9 pixels either way.
     pixels_per_degree
-        Pixels of the image in one degree of the visual field, more than 2; by default those of the paper's set-up,
-        a 21 inch display of 640 x 480 pixels seen from 1 m.
+        Pixels of the image in one degree of the visual field, more than 2, at most 1000; by default those of the
+        paper's set-up, a 21 inch display of 640 x 480 pixels seen from 1 m.
 
     Raises
     ------
@@ -86,8 +87,13 @@ def hdrvdp(
     >>> hdrvdp(image, image)
     HdrVdp(Q=10.0, Q_JOD=10.0)
     """
-    if not (np.isfinite(pixels_per_degree) and pixels_per_degree > pyramid.LOWEST_RESOLUTION):
-        raise InputError(f"pixels_per_degree is {pixels_per_degree}; more than 2 is needed, e.g. 26.4")
+    if not (
+        isinstance(pixels_per_degree, Real)
+        and pyramid.LOWEST_RESOLUTION < pixels_per_degree <= pyramid.HIGHEST_RESOLUTION
+    ):
+        raise InputError(
+            f"pixels_per_degree is {pixels_per_degree!r}; more than 2 and at most 1000 is needed, e.g. 26.4"
+        )
     first, second, _ = checked_pair(test, reference)
     _check_luminance(first, "test")
     _check_luminance(second, "reference")

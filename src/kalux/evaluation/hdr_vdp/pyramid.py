@@ -19,6 +19,9 @@ SMALLEST_SIDE: Final = 2 * len(c.HIGH_RESIDUAL) - 1
 LOWEST_RESOLUTION: Final = 2.0
 """Pixels per degree, beyond which there is a band below the high-frequency residual."""
 
+HIGHEST_RESOLUTION: Final = 1000.0
+"""Pixels per degree: the eye tells 60 apart, and filters of far more are too narrow to be numbers."""
+
 
 def height(shape: tuple[int, ...], pixels_per_degree: float) -> int:
     """Levels of band-pass filters: to 1 to 2 cycles per degree, or to where the low-pass filter no longer fits."""
