@@ -86,14 +86,14 @@ READERS: tuple[Reader, ...] = (
     Reader("es", "Event Stream (.es, DVS)", es.recognises, es.read),
     Reader(
         "npz-folder",
-        "folder of .npz event files and images (HS-ERGB, BS-ERGB, vid2e)",
+        "folder of .npz events and images (HS-ERGB, BS-ERGB, vid2e)",
         npz_folder.recognises,
         npz_folder.read,
     ),
     Reader("evreal", "EVREAL folder", evreal.recognises, evreal.read),
     # Before IJRR, whose zips could also be .npz; a broken zip is left to IJRR to report.
     Reader("numpy", "NumPy .npz or .npy", numpy_files.recognises, numpy_files.read),
-    Reader("ijrr", "IJRR text folder or zip (events.txt, images.txt)", ijrr.recognises, ijrr.read),
+    Reader("ijrr", "IJRR text folder or zip (events.txt)", ijrr.recognises, ijrr.read),
     Reader("table", "CSV or text with named columns", table.recognises, table.read),
 )
 
