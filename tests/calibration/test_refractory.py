@@ -123,3 +123,11 @@ def test_edges_that_are_all_alike_are_no_noise():
     alike["p"] = True
     assert dead_time(recording) == pytest.approx(800, rel=0.02)
     assert dead_time(Recording.from_arrays(alike, [], sensor_size=(10, 10))) == 0
+
+
+def test_a_dozen_intervals_of_noise_are_enough():
+    """Of 800 us, with some fifteen intervals within a tenth behind it."""
+    recording = random_intervals(lambda rng, shape: 800 + rng.exponential(60_000, shape))
+    events = np.concatenate(list(recording.events()))
+    few = Recording.from_arrays(events[: len(events) // 18], [], sensor_size=(10, 10))
+    assert dead_time(few) == pytest.approx(800, rel=0.05)
