@@ -67,6 +67,14 @@ def test_white_of_each_type_counts():
     assert (summary.near_black_share, summary.saturated_share) == (0.4, 0.4)
 
 
+def test_of_colours_pixels_count_not_channels():
+    """Saturated is a pixel with a channel that is; near black one of which all are."""
+    image = np.zeros((1, 4, 3), np.uint8)
+    image[0, 0], image[0, 1], image[0, 2] = (255, 255, 153), (0, 0, 255), (0, 0, 90)
+    summary = summarise_frames([Frame(image, 0, 1)])
+    assert (summary.near_black_share, summary.saturated_share) == (0.25, 0.5)
+
+
 def test_a_whole_recording():
     reference = GroundTruth(np.array([1]), np.ones((1, *SIZE), np.float32))
     rec = Recording.from_arrays(

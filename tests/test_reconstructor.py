@@ -702,7 +702,7 @@ def test_far_highlights_are_believed_where_events_are_trusted(estimate, tail, go
 
 @pytest.mark.parametrize("channels", [(), (3,)])
 def test_a_live_stream_takes_the_bright_tail_of_its_first_frame(channels):
-    """As if it were stated; of colour, the mean of the channels counts, of which few are white here."""
+    """As if it were stated; of colour, pixels count that are clipped, which are few here."""
     first = np.random.default_rng(0).integers(0, 240, (12, 14, *channels)).astype(np.uint8)
     first[3:9, 4:10] = 255
     tail = count_bright(Camera.named("linear", 0.98), first, 255.0).scale

@@ -65,9 +65,9 @@ class FrameSummary:
     exposure_min, exposure_median, exposure_max
         Exposure times, us; None where unknown.
     saturated_share
-        Share of pixels of at least 99 % of white; None without frames.
+        Share of pixels of at least 99 % of white, of RGB in any channel; None without frames.
     near_black_share
-        Share of pixels of at most 2 % of the way from black to white; None without frames.
+        Share of pixels of at most 2 % of the way from black to white, of RGB in all channels; None without frames.
     gap_count
         Intervals longer than 1.5 times the median: frames that were dropped, perhaps.
     largest_gap
@@ -217,6 +217,7 @@ def summarise_frames(frames: Iterable[Frame], *, exposure_known: bool = True) ->
     for frame in frames:
         spans.append((frame.exposure_start, frame.exposure_end))
         image = frame.image if frame.valid is None else frame.image[frame.valid]
+        image = image if frame.image.ndim == 2 else image.max(axis=-1)
         pixels += image.size
         saturated += int(np.count_nonzero(image >= _SATURATED * frame.white_value))
         near_black += int(np.count_nonzero(image <= frame.black + _NEAR_BLACK * frame.full_scale))

@@ -211,7 +211,9 @@ class Reconstructor:
         frame = with_black_level(frame, self.settings.camera.black_level)
         self._reference_exposure = self._reference_exposure or frame.exposure
         if self._bright_tail is None:
-            bright = count_bright(self._camera, frame.image, frame.white_value, frame.black, frame.valid)
+            bright = count_bright(
+                self._camera, frame.image, frame.white_value, frame.black, frame.valid, self._gains_of(frame)
+            )
             self._bright_tail = bright.scale
         if self._view is None:
             self._view = self._view_by(frame, self._bright_tail)

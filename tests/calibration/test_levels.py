@@ -30,6 +30,26 @@ def test_a_camera_that_clips_is_found(cut, noise_rate):
     assert found.excess > 0.3
 
 
+def in_light(recording, light):
+    """In RGB frames whose channels are clipped as those of a sensor in coloured light."""
+    frames = [
+        dataclasses.replace(frame, image=np.rint(np.multiply.outer(frame.image, light)).astype(np.uint8))
+        for frame in recording.frames()
+    ]
+    events = np.concatenate(list(recording.events()))
+    return Recording.from_arrays(events, frames, sensor_size=recording.sensor_size)
+
+
+@pytest.mark.parametrize("light", [(1, 1, 1), (1, 1, 0.4), (0.5, 1, 1)])
+def test_a_camera_in_colour_that_clips_is_found(light):
+    """By the channels that clip; a scene that merely ends there is none in colour, either."""
+    clips, ends = (in_light(passing_by(picture, 235), light) for picture in (textured(2.8), sky(0.9)))
+    found = find_ceiling(clips, SETTINGS.camera, EVENTS)
+    assert found is not None
+    assert 255 * found.level == pytest.approx(235, abs=0.5)
+    assert find_ceiling(ends, SETTINGS.camera, EVENTS) is None
+
+
 @pytest.mark.parametrize("picture", [sky(0.5), sky(0.9), textured(0.6)], ids=["sky", "bright sky", "texture"])
 @pytest.mark.parametrize("wrong", [0.75, 1.0, 1.3])
 def test_a_scene_that_ends_below_white_is_no_camera_that_clips(picture, wrong):

@@ -14,6 +14,7 @@ from kalux.models.camera import (
     Camera,
     Response,
     black_ceiling,
+    clipping_level,
     count_bright,
     covariance,
     dark_scale,
@@ -407,6 +408,34 @@ def test_the_tail_is_one_of_light_not_of_response():
         image = np.random.default_rng(1).integers(0, white + 1, (30, 40)).astype(np.uint8)
         assert count_bright(linear, image, white) == count_bright(linear, image / white)
     assert count_bright(gamma, levels ** (1 / 2.2)) == count_bright(linear, levels)
+
+
+@pytest.mark.parametrize("light", [(1, 1, 1), (1, 1, 0.3), (0.3, 1, 1), (1, 0.7, 0.3), (0.7, 1, 0.4)])
+@pytest.mark.parametrize("dtype", [np.uint8, np.float64])
+def test_in_coloured_light_as_many_pixels_are_bright_as_in_white(light, dtype):
+    """Channels that stay below white in clipped highlights say nothing of these; grey stored as RGB is grey."""
+    camera = Camera.named("linear", 0.98)
+    white = 255 if dtype == np.uint8 else 1
+    radiance = np.random.default_rng(3).exponential(0.5, (60, 80))
+
+    def seen(light):
+        image = np.minimum(white * np.multiply.outer(radiance, light), white)
+        return (np.rint(image) if white == 255 else image).astype(dtype)
+
+    expected = count_bright(camera, seen(1.0), white)
+    found = count_bright(camera, seen(light), white)
+    assert found.half == pytest.approx(expected.half, rel=0.01)
+    assert found.white == pytest.approx(expected.white, rel=0.01)
+    assert found.scale > 0.4
+
+
+def test_a_colour_is_clipped_by_the_channel_that_takes_a_fifth_of_its_luminance_along():
+    """Blue alone, 7 % of white's luminance, does not clip it, except where hardly anything else is; gains count."""
+    camera = Camera.named("linear", 0.98)
+    image = np.array([[[200, 200, 255], [255, 200, 60], [0, 20, 255], [7, 7, 7]]], np.uint8)
+    assert clipping_level(camera, image, 255).tolist() == [[200, 255, 255, 7]]
+    assert clipping_level(camera, image, 255, gains=(1.0, 1.0, 4.0)).tolist() == [[255, 255, 255, 7]]
+    assert clipping_level(camera, image, 255, 6).tolist() == [[200, 255, 255, 7]]
 
 
 def test_what_counts_as_white_lies_below_where_pixels_clip():

@@ -7,6 +7,7 @@ not clip. Comparing with other levels makes up for thresholds that are a little 
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable, Iterator
 from itertools import islice
 from typing import Any, Final, NamedTuple
@@ -16,8 +17,9 @@ from numpy.typing import NDArray
 
 from kalux.calibration.intervals import counted_intervals
 from kalux.frames import Frame
+from kalux.models.camera import Camera, clipping_level
 from kalux.recording import Recording
-from kalux.settings import CameraSettings, EventSettings
+from kalux.settings import CameraSettings, EventSettings, chosen_response
 from kalux.white import BRIGHTEST, sharp_end
 
 Array = NDArray[np.float64]
@@ -93,7 +95,7 @@ def find_ceiling(
     Parameters
     ----------
     recording
-        With frames, in grey or a mosaic, and exposures.
+        With frames and exposures; of RGB the channel counts by which a pixel is clipped (`clipping_level`).
     camera
         Response and I_0.
     events
@@ -103,18 +105,18 @@ def find_ceiling(
     most_frames
         So many frames are looked at, and the events between them.
 
-    Returns None where events do not go on, or too few pixels tell, or the brightest end at different levels, or frames
-    are in RGB.
+    Returns None where events do not go on, or too few pixels tell, or the brightest end at different levels.
 
     Raises
     ------
     ExposureError
         If the frames' exposures are not known.
     """
-    brightest = _brightest(recording, most_frames)
+    model = Camera.named(chosen_response(camera.response, recording.response), camera.clipped_from)
+    brightest = _brightest(recording, model, most_frames)
     if brightest is None or brightest >= below:
         return None
-    found = [*_changes(recording, camera, events, _BELOW[0] * brightest, most_frames)]
+    found = [*_changes(recording, camera, model, events, _BELOW[0] * brightest, most_frames)]
     if not found:
         return None
     ends, mismatches = np.concatenate(found, axis=1)
@@ -129,19 +131,30 @@ def find_ceiling(
     return Ceiling(level, 2 * level - most, excess, int(np.count_nonzero(top)))
 
 
-def _brightest(recording: Recording, most_frames: int) -> float | None:
-    """The response that a thousandth of the pixels of the first frames reach; None: frames are in RGB or all black."""
-    first = next(iter(recording.frames()), None)
-    if first is None or first.image.ndim == 3:
-        return None
-    histogram = response_histogram(islice(recording.frames(), most_frames), _FINE)
+def _brightest(recording: Recording, model: Camera, most_frames: int) -> float | None:
+    """The response that a thousandth of the pixels of the first frames reach; None: all are black."""
+    frames = (_in_grey(frame, model) for frame in islice(recording.frames(), most_frames))
+    histogram = response_histogram(frames, _FINE)
     reached = np.cumsum(histogram[::-1])[::-1] >= max(BRIGHTEST * histogram.sum(), 1)
     brightest = int(np.flatnonzero(reached)[-1]) if reached.any() else 0
     return brightest / (_FINE - 1) if brightest > 0 else None
 
 
+def _in_grey(frame: Frame, model: Camera) -> Frame:
+    """A frame of the channel by which each pixel is clipped, (H, W), where it is in RGB."""
+    if frame.image.ndim == 2:
+        return frame
+    level = clipping_level(model, frame.image, frame.white_value, frame.black)
+    return dataclasses.replace(frame, image=level)
+
+
 def _changes(
-    recording: Recording, camera: CameraSettings, events: EventSettings, least: float, most_frames: int
+    recording: Recording,
+    camera: CameraSettings,
+    model: Camera,
+    events: EventSettings,
+    least: float,
+    most_frames: int,
 ) -> Iterator[Array]:
     """(2, N) of pixels that become brighter from one frame of an interval to the other, forward or backward in time.
 
@@ -153,7 +166,7 @@ def _changes(
         beyond = threshold_on * on - threshold_off * off + bend - interval.change
         frames = [end.frame for end in interval.ends]
         for sign, frame in zip((-1, 1), frames, strict=True):
-            ends = frame.normalised()
+            ends = _in_grey(frame, model).normalised()
             chosen = (sign * (on - off) >= _LEAST_NET) & (ends >= least)
             for each in frames:
                 chosen &= True if each.valid is None else each.valid

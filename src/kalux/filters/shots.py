@@ -93,10 +93,6 @@ class Shot(NamedTuple):
         return measured if self.valid is None else measured & self.valid
 
 
-_CLIPPED_SHARE: Final = 0.2
-"""A clipped channel with a smaller share of the luminance (the blue of a sky) is an error of that share where it is
-twice as bright as it can show: as little as a few events are off."""
-
 _CHROMA_FLOOR: Final = 0.006
 """Noise of a pixel, white = 1, below which a ratio of channels says nothing; `CameraSettings.usual_frame_noise`."""
 
@@ -181,7 +177,7 @@ def _colour_shot(frame: Frame, camera: Camera, ratio: float, gains: colour.Gains
     """The luminance of an RGB frame, and its chromaticity (docs/colour.md).
 
     Errors of the channels are taken as common to them, as demosaicing and compression make them: standard deviations
-    add. A pixel is clipped where clipped channels carry more than `_CLIPPED_SHARE` of the luminance.
+    add. A pixel is clipped where clipped channels carry more than `colour.CLIPPED_SHARE` of the luminance.
     """
     parts = [_channel(frame, camera, ratio, c) for c in range(3)]
     rgb = np.stack([gain * part[0] for gain, part in zip(gains, parts, strict=True)], axis=-1)
@@ -200,7 +196,7 @@ def _colour_shot(frame: Frame, camera: Camera, ratio: float, gains: colour.Gains
         levels=np.arange(y.size, dtype=np.int32).reshape(y.shape),
         level_intensity=y.ravel(),
         level_weight=(1 / np.square(spread)).ravel(),
-        level_clipped=(of_clipped > _CLIPPED_SHARE * np.maximum(y, 0)).ravel(),
+        level_clipped=(of_clipped > colour.CLIPPED_SHARE * np.maximum(y, 0)).ravel(),
         white=ratio,
         level_ceiling=colour.luminance(
             np.stack([g * part[3] for g, part in zip(gains, parts, strict=True)], -1)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from kalux.errors import SettingsError
 from kalux.frames import Frame
+from kalux.models import colour
 from kalux.settings import CameraSettings
 
 Array = NDArray[np.float64]
@@ -339,13 +340,14 @@ def count_bright(
     white: float = 1.0,
     black: float = 0.0,
     valid: NDArray[np.bool_] | None = None,
+    gains: colour.Gains = (1.0, 1.0, 1.0),
 ) -> BrightTail:
-    """`BrightTail` of one frame: (H, W), or (H, W, 3) of which the mean counts; full scale is ``black`` to ``white``.
+    """`BrightTail` of one frame: (H, W), or (H, W, 3) of which `clipping_level` counts.
 
-    Only pixels that are ``valid``, (H, W), count; None: all.
+    Full scale is ``black`` to ``white``. Only pixels that are ``valid``, (H, W), count; None: all.
     Where pixels count as clipped from lower on than usual, that far below lies what counts as white.
     """
-    grey = image if image.ndim == 2 else image.mean(axis=-1)
+    grey = image if image.ndim == 2 else clipping_level(camera, image, white, black, gains)
     grey = grey if valid is None else grey[valid]
     ends = (camera.saturation, CameraSettings.usual_saturation)
     end, usual = (float(camera.response.inverse(np.array(value))) for value in ends)
@@ -357,6 +359,43 @@ def count_bright(
         edges = np.ceil(edges).astype(grey.dtype)  # compares as it is
     at_half, at_white = (int(np.count_nonzero(grey >= edge)) for edge in edges)
     return BrightTail(at_half, at_white)
+
+
+def clipping_level(
+    camera: Camera,
+    image: NDArray[Any],
+    white: float = 1.0,
+    black: float = 0.0,
+    gains: colour.Gains = (1.0, 1.0, 1.0),
+) -> NDArray[Any]:
+    """The value of the channel by which a pixel of an RGB frame, (H, W, 3), is clipped: (H, W).
+
+    The largest for which channels that are as large carry more than `colour.CLIPPED_SHARE` of the luminance, which
+    ``gains`` balance: in coloured light others stay below white. Full scale is ``black`` to ``white``.
+    """
+    values = np.moveaxis(image, -1, 0)
+    weights = (weight * gain for weight, gain in zip(colour.LUMINANCE, gains, strict=True))
+    shares = np.stack(
+        [
+            weight * _channel_intensity(camera.of_channel(channel), values[channel], white, black)
+            for channel, weight in enumerate(weights)
+        ]
+    )
+    least = colour.CLIPPED_SHARE * shares.sum(axis=0)
+    level = values.min(axis=0)
+    for value in values:
+        enough = (shares * (values >= value)).sum(axis=0) > least
+        level = np.where(enough, np.maximum(level, value), level)
+    return level
+
+
+def _channel_intensity(camera: Camera, values: NDArray[Any], white: float, black: float) -> Array:
+    """I of one channel, (H, W), 1 = white, 0 below black; of whole numbers taken once per level."""
+    if values.dtype.kind == "f":
+        return camera.response.inverse(np.maximum(values - black, 0.0) / (white - black))
+    levels = np.arange(int(values.max(initial=0)) + 1)
+    of_levels: Array = camera.response.inverse(np.maximum(levels - black, 0.0) / (white - black))
+    return of_levels[values]
 
 
 def dark_scale(intensity: Array, counts: NDArray[np.integer[Any]], ceiling: float, white: float) -> float:

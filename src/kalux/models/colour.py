@@ -34,6 +34,10 @@ DOUBT: Final = 3.0
 RELIABLE: Final = 0.9
 """Response up to which colours count in full; from there to saturation less and less."""
 
+CLIPPED_SHARE: Final = 0.2
+"""A clipped channel with a smaller share of the luminance (the blue of a sky) is an error of that share where it is
+twice as bright as it can show: as little as a few events are off."""
+
 _NEUTRAL: Final = 1e-3
 """Weight of neutral grey among the frames' chromaticities: it decides only where no frame has one."""
 

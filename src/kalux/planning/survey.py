@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from kalux.calibration.frame_faults import FrameFaults, FrameWatch, find_frame_faults
 from kalux.models.camera import BrightTail, Camera, count_bright
+from kalux.models.colour import white_balance
 from kalux.recording import Recording, no_frames
 from kalux.settings import Settings, chosen_response
 
@@ -50,11 +51,13 @@ def survey(recording: Recording, settings: Settings, *, with_tail: bool = False)
     """
     response = chosen_response(settings.camera.response, recording.response)
     camera = Camera.named(response, settings.camera.clipped_from)
+    # As recorded, where the white balance is not measured yet: which channel clips hardly depends on it.
+    gains = white_balance(settings.camera.white_balance) or (1.0, 1.0, 1.0)
     watch, exposures, tail = _watch(settings, camera), [], BrightTail()
     for frame in recording.frames():
         exposures.append((frame.exposure_start, frame.exposure_end))
         if with_tail:
-            bright = count_bright(camera, frame.image, frame.white_value, frame.black, frame.valid)
+            bright = count_bright(camera, frame.image, frame.white_value, frame.black, frame.valid, gains)
             tail = tail.joined(bright)
         if watch is not None:
             watch.see(frame)
