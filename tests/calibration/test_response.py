@@ -94,6 +94,12 @@ def test_knots_are_monotone_whatever_the_table():
             FrameError,
             "all must be alike",
         ),
+        (
+            exposed(Response.linear()),
+            TIMES[::-1],
+            InputError,
+            "no curve fits the images; do they show one still",
+        ),
         ([np.zeros((80, 96), np.uint8)] * 5, TIMES, InputError, "0 pixels are well exposed"),
     ],
 )

@@ -122,6 +122,28 @@ def test_the_last_of_several_wins_and_brings_its_error():
     assert "hot" in merged.maps
 
 
+def test_of_several_a_doubtful_white_is_kept_as_long_as_levels_are_shares_of_it():
+    """Thresholds are not; a level that is measured again is not any more."""
+    doubtful = Calibration(
+        {"camera": {"saturation": 0.03}}, provenance={"white": 65535.0, "white_is_doubtful": True}
+    )
+    sure = {"white": 4095.0, "white_is_doubtful": False}
+    thresholds = Calibration({"events": {"threshold_on": 0.2}}, provenance=sure)
+    black = Calibration({"camera": {"black_level": 0.1}}, provenance=sure)
+    better = Calibration({"camera": {"saturation": 0.9}}, provenance=sure)
+    whites = [
+        a.merged(b).provenance["white"]
+        for a, b in [
+            (doubtful, thresholds),
+            (thresholds, doubtful),
+            (doubtful, black),
+            (doubtful, better),
+            (black, doubtful),
+        ]
+    ]
+    assert whites == [65535, 65535, 65535, 4095, 65535]
+
+
 def test_text_has_values_errors_and_units():
     rows = dict(describe_calibration(full()))
     assert rows["threshold_on"] == "0.3 +- 0.01  (log intensity)"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import cv2
 import numpy as np
 import pytest
@@ -80,6 +82,85 @@ def test_thresholds_need_frames(cli, tmp_path):
     assert done.code == 2
     assert "no frames" in done.error
     assert "--frames" in done.error
+
+
+def moved(frames, by):
+    """The frames of a clock that is ahead by ``by`` us."""
+    return [
+        dataclasses.replace(f, exposure_start=f.exposure_start + by, exposure_end=f.exposure_end + by)
+        for f in frames
+    ]
+
+
+@pytest.mark.parametrize(
+    ("events", "frames", "told"),
+    [
+        (lambda e: e[:0], lambda f: f, "there are no events to measure thresholds of"),
+        (lambda e: e, lambda f: f[3:4], "there is one frame"),
+        (lambda e: e, lambda f: moved(f, 10**12), "there is no event between the frames"),
+        (lambda e: e[e["p"]], lambda f: f, "record both, ON and OFF"),
+        (lambda e: e, lambda f: moved(f, 150_000), "kalux calibrate offset REC"),
+        (lambda e: e, lambda f: [dataclasses.replace(g, image=g.image // 64) for g in f], "too little moves"),
+    ],
+    ids=["no events", "one frame", "another epoch", "ON only", "late frames", "dark"],
+)
+def test_why_thresholds_cannot_be_told_is_one_line(cli, tmp_path, events, frames, told):
+    """Not always that too little moves."""
+    made = passing_by(textured(0.6))
+    path = tmp_path / "rec.h5"
+    hdf5.write(
+        path,
+        sensor_size=made.sensor_size,
+        events=[events(np.concatenate(list(made.events())))],
+        frames=frames(list(made.frames())),
+    )
+    done = cli("calibrate", "contrast", path, "-o", tmp_path / "c.toml", "--quiet")
+    assert done.code == 2
+    (error,) = (line for line in done.err.splitlines() if "error" in line)
+    assert told in error
+
+
+def in_16_bits(path, made):
+    """A recording of 12 bits, none of which clips, that does not state white."""
+    frames = [dataclasses.replace(f, image=f.image.astype(np.uint16) * 8) for f in made.frames()]
+    hdf5.write(path, sensor_size=made.sensor_size, events=made.events(), frames=frames)
+    return path
+
+
+@pytest.mark.parametrize("what", ["contrast", "noise", "offset"])
+def test_white_that_is_doubtful_is_a_warning(cli, tmp_path, what):
+    recording = in_16_bits(tmp_path / "rec.h5", passing_by(textured(0.9)))
+    assert "give --white 4095" in cli("calibrate", what, recording).err
+    assert "--white" not in cli("calibrate", what, recording, "--white", 2040).err
+
+
+def test_levels_of_a_doubtful_white_are_not_taken_for_those_of_another(cli, tmp_path):
+    """What a calibration states as shares of 65535 says nothing of a recording whose white is 4095."""
+    recording, out = in_16_bits(tmp_path / "rec.h5", passing_by(textured(3), 200)), tmp_path / "noise.toml"
+    assert cli("calibrate", "noise", recording, "-o", out).code == 0
+    found = load_calibration(out)
+    assert (found.provenance["white"], found.provenance["white_is_doubtful"]) == (65535, True)
+    assert "saturation" in found.settings["camera"]
+    used = ["--calibration", out, "--white", 2040]
+    for command in (
+        ["reconstruct", recording, "-o", tmp_path / "images"],
+        ["calibrate", "noise", recording],
+        ["convert", recording, tmp_path / "copy.h5", "--black-level", 0.1],
+    ):
+        done = cli(*command, *used)
+        assert done.code == 2
+        assert "its saturation is a share of 65535 as white" in done.err
+        assert "calibrate again with --white 2040" in done.err
+    again = cli("calibrate", "noise", recording, "-o", out, "--overwrite", "--white", 2040)
+    assert again.code == 0, again.err
+    assert load_calibration(out).provenance["white_is_doubtful"] is False
+    assert cli("info", recording, *used).code == 0
+
+
+def test_the_hint_of_a_written_calibration_can_be_pasted(cli, unlabelled_file, tmp_path):
+    out = tmp_path / "my noise ö.toml"
+    done = cli("calibrate", "noise", unlabelled_file, "-o", out)
+    assert f"--calibration '{out}'" in done.out
 
 
 def test_a_calibration_is_not_overwritten(cli, unlabelled_file, tmp_path):
@@ -162,6 +243,10 @@ def test_response_from_images_with_given_times(cli, tmp_path):
     assert done.code == 0, done.err
     found = Response.named(load_calibration(out).settings["camera"]["response"])
     assert float(found.inverse(np.array([0.5]))[0]) == pytest.approx(0.25, abs=0.03)
+    swapped = cli(
+        "calibrate", "response", *paths, "--times", "0.064,0.016,1/250,0.001", "-o", out, "--overwrite"
+    )
+    assert "no curve fits the images; do they show one still scene, with these times?" in swapped.error
     again = tmp_path / "again.toml"  # of the folder, in the order of the names' numbers
     assert cli("calibrate", "response", tmp_path, "--times", "0.001,1/250,0.016,0.064", "-o", again).code == 0
     assert load_calibration(again).settings == load_calibration(out).settings

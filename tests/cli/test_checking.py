@@ -120,6 +120,38 @@ def test_events_that_are_missing_while_frames_change_are_told():
     assert silence((t >= 300_000) & (t <= 700_000), still) == (None, [])
 
 
+def test_every_silence_counts():
+    """The longest is named, the others are counted."""
+    made = moving_blocks(duration=1_000_000)
+    t = made.events["t"]
+    kept = made.events[((t < 100_000) | (t > 350_000)) & ((t < 500_000) | (t > 900_000))]
+    source = Recording.from_arrays(kept, made.frames, sensor_size=made.scene.sensor_size)
+    found = check_recording(source, lambda _: None)
+    assert found.more_silences == 1
+    (told,) = found.warnings()
+    assert ", nor in 1 more such time, though" in told
+    (told,) = found.warnings(of_images=False)
+    assert told.endswith("were events lost?")
+
+
+@pytest.mark.parametrize("polarity", [True, False])
+def test_events_of_one_polarity_alone_are_told(polarity):
+    made = moving_blocks()
+    kept = made.events[made.events["p"] == polarity]
+    source = Recording.from_arrays(kept, made.frames, sensor_size=made.scene.sensor_size)
+    (told,) = check_recording(source, lambda _: None).warnings()
+    assert told.startswith(f"all {len(kept):,} events are {'ON' if polarity else 'OFF'}")
+
+
+@pytest.mark.parametrize(("level", "shows"), [(0, False), (255, False), (252, False), (30, True)])
+def test_frames_that_are_all_black_or_all_white_show_nothing(level, shows):
+    made = moving_blocks()
+    flat = [dataclasses.replace(f, image=np.full_like(f.image, level)) for f in made.frames]
+    source = Recording.from_arrays(made.events, flat, sensor_size=made.scene.sensor_size)
+    told = [*check_recording(source, lambda _: None).warnings()]
+    assert any("no pixel of the frames lies between black and white" in text for text in told) != shows
+
+
 @pytest.mark.parametrize("threads", [1, 2])
 def test_both_results_come_back(threads):
     ran_in = []

@@ -300,7 +300,9 @@ def test_the_white_value_goes_into_the_copy(cli, write_recording, simulation, tm
     deep = [dataclasses.replace(f, image=f.image.astype(np.uint16) << 4) for f in simulation.frames]
     source = write_recording(tmp_path / "deep.h5", frames=deep)
     assert "--white 4095" in cli("info", source, "--no-estimate").out
-    assert cli("convert", source, tmp_path / "copy.h5", "--white", 4095).code == 0
+    assert "give --white 4095" in cli("convert", source, tmp_path / "other.h5").err
+    done = cli("convert", source, tmp_path / "copy.h5", "--white", 4095)
+    assert (done.code, "--white" in done.err) == (0, False)
     assert {frame.white_value for frame in kalux.open(tmp_path / "copy.h5").frames()} == {4095}
     assert "--white" not in cli("info", tmp_path / "copy.h5", "--no-estimate").out
 

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 
 import pytest
+
+from kalux.writers import hdf5
+
+from builders import passing_by, textured
 
 
 def test_estimates_thresholds_that_the_recording_does_not_state(cli, write_recording, tmp_path):
@@ -90,6 +95,21 @@ def test_damage_is_one_line(cli, damaged, damage):
     found = cli("info", damaged(damage))
     assert found.code == 2
     assert found.error
+
+
+@pytest.mark.parametrize("late", [0, 150_000])
+@pytest.mark.parametrize("command", [["info"], ["evaluate", "--methods", "hold", "--hold-out-frames", 2]])
+def test_events_that_contradict_the_frames_are_a_warning(cli, tmp_path, command, late):
+    """Of frames with a clock of their own; as of reconstruct."""
+    made = passing_by(textured(0.6))
+    frames = [
+        dataclasses.replace(f, exposure_start=f.exposure_start + late, exposure_end=f.exposure_end + late)
+        for f in made.frames()
+    ]
+    hdf5.write(tmp_path / "rec.h5", sensor_size=made.sensor_size, events=made.events(), frames=frames)
+    done = cli(command[0], tmp_path / "rec.h5", *command[1:])
+    assert done.code == 0
+    assert ("the events do not explain how the frames change" in done.err) == (late > 0)
 
 
 def test_a_still_scene_has_no_estimate(cli, write_recording, simulation, tmp_path):

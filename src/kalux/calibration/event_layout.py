@@ -65,6 +65,11 @@ class LayoutFit(NamedTuple):
     correlation: float
     contradicts: bool = False
 
+    @property
+    def agrees(self) -> bool:
+        """Whether changes of frames and events have anything to do with each other at the same time and place."""
+        return self.correlation >= _CERTAIN
+
 
 def find_layout(recording: Recording, camera: CameraSettings) -> LayoutFit | None:
     """In which layout events agree with the first frames; None where too few tell.

@@ -290,14 +290,15 @@ def _debevec(strip: ImageArray, times: Array) -> Array | None:
 
 
 def _robertson(strip: ImageArray, times: Array) -> Array | None:
-    """33 knots; None where it diverges."""
+    """33 knots; None where it diverges, or finds no curve that increases."""
     images = [cv2.merge([image] * 3) for image in strip]  # OpenCV 5.0 crashes on one channel
     calibrator = cv2.createCalibrateRobertson(max_iter=60, threshold=0.001)
     found = np.asarray(calibrator.process(images, times.astype(np.float32)), np.float64)
     table = found.reshape(_LEVELS, -1)[:, 0]
     if np.count_nonzero(np.isfinite(table) & (table > 0)) < _LEVELS // 2:
         return None
-    return smooth_knots(table, _level_counts(strip))
+    knots = smooth_knots(table, _level_counts(strip))
+    return knots if (np.diff(knots) > 0).all() else None
 
 
 def _level_counts(strip: ImageArray) -> Array:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from kalux.errors import FormatError, SettingsError
 from kalux.models.pixels import PixelCalibration
+from kalux.recording import Recording
 from kalux.settings import Settings, from_dict, preset, read_toml
 
 VERSION: Final = 1
@@ -61,6 +62,12 @@ UNITS: Final[Mapping[str, str]] = {
 }
 """Units of every quantity that a calibration may hold; numbers of things have none."""
 
+_OF_WHITE: Final = ("saturation", "black_level", "frame_noise", "shot_noise", "fixed_pattern", "log_offset")
+"""Settings that are wrong where white was."""
+
+_WHITE: Final = ("white", "white_is_doubtful")
+"""What the provenance says of the frames' white value."""
+
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
@@ -78,7 +85,8 @@ class Calibration:
         By name: (H, W) arrays. ``threshold_on``, ``threshold_off`` (factors of the settings') with
         ``threshold_on_variance``, ``threshold_off_variance``; ``hot``, ``dead`` (bool); ``noise_rate`` (Hz).
     provenance
-        What it was made from, and how.
+        What it was made from, and how. ``white`` is what was taken for the value of a saturated pixel, and
+        ``white_is_doubtful`` whether the frames made that doubtful.
 
     Raises
     ------
@@ -121,13 +129,43 @@ class Calibration:
         """Both; where both know something, the other wins, and its standard error, if any, with it."""
         groups = {*self.settings, *other.settings}
         replaced = {name for values in (*other.settings.values(), other.measured) for name in values}
+        doubted = self.provenance.get("white_is_doubtful") and not replaced >= {*self.shares_of_white}
+        of_white = self if doubted or not other.shares_of_white else other
+        provenance = {**self.provenance, **other.provenance}
+        white = {name: of_white.provenance[name] for name in _WHITE if name in of_white.provenance}
         return Calibration(
             {g: {**self.settings.get(g, {}), **other.settings.get(g, {})} for g in sorted(groups)},
             {**{n: e for n, e in self.errors.items() if n not in replaced}, **other.errors},
             {**self.measured, **other.measured},
             {**self.maps, **other.maps},
-            {**self.provenance, **other.provenance},
+            {**{n: v for n, v in provenance.items() if n not in _WHITE}, **white},
         )
+
+    @property
+    def shares_of_white(self) -> tuple[str, ...]:
+        """Names of its settings that are shares of the frames' white value."""
+        return tuple(name for name in _OF_WHITE if name in self.settings.get("camera", {}))
+
+
+def require_white(calibration: Calibration, recording: Recording) -> None:
+    """Check that levels of a calibration are not shares of a white value that was wrong.
+
+    Raises
+    ------
+    SettingsError
+        If its frames made their white doubtful, and the recording has another.
+    """
+    names, white = calibration.shares_of_white, calibration.provenance.get("white")
+    if not names or white is None or not calibration.provenance.get("white_is_doubtful"):
+        return
+    first = next(iter(recording.stamped_frames()), None)
+    if first is None or first.white_value == white:
+        return
+    raise SettingsError(
+        f"calibration: its {' and '.join(names)} {'is a share' if len(names) == 1 else 'are shares'} of {white:g} as "
+        f"white, which its recording hardly has, and {recording.source.path} has {first.white_value:g}; calibrate "
+        f"again with --white {first.white_value:g}"
+    )
 
 
 # --- files ----------------------------------------------------------------------------------------------------

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from kalux.cli.calibrations import (
     add_black_level,
@@ -15,6 +15,10 @@ from kalux.cli.calibrations import (
 )
 from kalux.cli.parser import Parser, whole
 from kalux.cli.recordings import add_recording, open_recording
+
+if TYPE_CHECKING:
+    from kalux.cli.checking import Contents
+    from kalux.planning.mending import Mends
 
 _DESCRIPTION = """\
 Measure the contrast thresholds, ON and OFF, on average and of every pixel, with their spread and standard errors,
@@ -71,14 +75,32 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     if not len(recording.frames()):
         raise no_frames(recording)
     stages = Stages(quiet=options.quiet)
-    recording, settings, _ = mended_recording(recording, settings, stages)
+    (recording, settings, mends), contents = mended_recording(recording, settings, stages)
     with stages.stage("measuring thresholds"):
         found = calibrate_contrast(
             recording, settings.camera, delay=options.delay, refractory=options.refractory
         )
     if found is None:
-        raise InputError(
-            f"{recording.source.path}: too little moves before well exposed pixels to measure thresholds; record "
-            "texture that moves, without saturation"
-        )
+        assert contents is not None
+        raise InputError(f"{recording.source.path}: {untold(contents, mends)}")
     finish(found.calibration(), recording, options, command)
+
+
+def untold(contents: Contents, mends: Mends) -> str:
+    """Why a recording does not tell the thresholds, and what to do."""
+    if contents.frames < 2:
+        return "there is one frame; thresholds are measured from how frames differ, and two are needed"
+    if contents.events_between == 0:
+        what = "are no events" if contents.events == 0 else "is no event between the frames"
+        return f"there {what} to measure thresholds of"
+    if contents.one_sided:
+        return "events of one polarity do not tell thresholds; record both, ON and OFF"
+    if mends.layout is not None and not mends.layout.agrees:
+        return (
+            "frames and events change, but not together, so that they do not tell thresholds; kalux calibrate offset "
+            "REC finds out whether both have the same clock, kalux register whether they see the same pixels"
+        )
+    return (
+        "too little moves before well exposed pixels to measure thresholds; record texture that moves, without "
+        "saturation"
+    )

@@ -66,7 +66,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     import dataclasses
 
     from kalux.calibration.noise import calibrate_noise
-    from kalux.calibration.values import Calibration
+    from kalux.calibration.values import Calibration, require_white
     from kalux.cli.progress import Progress, Stages
     from kalux.settings import preset
 
@@ -74,9 +74,10 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     known = (given_calibration(options) or Calibration()).merged(
         camera_calibration(options.black_level, options.response)
     )
+    opened = open_recording(options)
+    require_white(known, opened)
     stages = Stages(quiet=options.quiet)
-    asked = known.apply(preset("default"))
-    recording, settings, mends = mended_recording(open_recording(options), asked, stages)
+    (recording, settings, mends), _ = mended_recording(opened, known.apply(preset("default")), stages)
     with stages.stage("measuring noise"):
         found = calibrate_noise(recording, settings.camera, mends.hot).calibration()
     if mends.ceiling is not None:

@@ -76,6 +76,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     from kalux.planning.clock import offset_of_recording
     from kalux.recording import no_frames
     from kalux.settings import preset
+    from kalux.white import WhiteCheck
     from kalux.writers.files import save
 
     centre, reach = checked_range(options)
@@ -87,6 +88,11 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     recording = open_recording(options)
     if not recording.source.count_frames():
         raise no_frames(recording)
+    white = WhiteCheck()
+    for _ in white.watched(recording.stamped_frames()):
+        pass
+    if (doubt := white.doubt()) is not None:
+        warn(doubt)
     with Progress("correlating", quiet=options.quiet) as progress:
         found, mends = offset_of_recording(
             recording,

@@ -7,13 +7,14 @@ import dataclasses
 import shlex
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from kalux.cli.parser import Parser, UsageError, number
 from kalux.cli.terminal import say, warn
 
 if TYPE_CHECKING:
     from kalux.calibration.values import Calibration
+    from kalux.cli.checking import Contents
     from kalux.cli.progress import Stages
     from kalux.planning.mending import Mended
     from kalux.recording import Recording
@@ -56,16 +57,29 @@ def camera_calibration(black_level: float | None, response: str | None = None) -
     return Calibration({"camera": {name: value for name, value in said.items() if value is not None}})
 
 
-def mended_recording(recording: Recording, settings: Settings, stages: Stages) -> Mended:
+class Checked(NamedTuple):
+    """A recording that is mended, and what was found in it before; None of one without frames."""
+
+    mended: Mended
+    contents: Contents | None
+
+
+def mended_recording(recording: Recording, settings: Settings, stages: Stages) -> Checked:
     """The recording as a reconstruction would mend it before it measures anything, with its warnings and progress."""
+    from kalux.cli.checking import CHECKED_FIRST, check_recording
     from kalux.cli.plan_warnings import calibration_warnings
     from kalux.planning.mending import mend
 
+    contents = None
     with stages.stage("checking"):
-        mended = mend(stages.watched(recording), settings)
-    for text in calibration_warnings(mended.mends):
+        watched = stages.watched(recording)
+        if recording.source.count_frames():
+            contents = check_recording(watched, lambda _: None, CHECKED_FIRST)
+        mended = mend(watched, settings)
+    told = () if contents is None else contents.warnings(of_images=False)
+    for text in (*told, *calibration_warnings(mended.mends)):
         warn(text)
-    return mended
+    return Checked(mended, contents)
 
 
 def given_calibration(options: argparse.Namespace) -> Calibration | None:
@@ -135,6 +149,7 @@ def finish(
             "format": recording.source.format,
             "width": width,
             "height": height,
+            **_white_of(recording),
         }
     made = dataclasses.replace(calibration, provenance=provenance)
     if not options.quiet:
@@ -143,4 +158,14 @@ def finish(
         written = save_calibration(made, options.out)
         if not options.quiet:
             files = " and ".join(str(path) for path in written[::-1])
-            say(f"wrote {files}, for kalux reconstruct REC --calibration {written[-1]}")
+            say(f"wrote {files}, for kalux reconstruct REC --calibration {shlex.quote(str(written[-1]))}")
+
+
+def _white_of(recording: Recording) -> dict[str, Any]:
+    """For the provenance: what was taken for white, and whether the frames make that doubtful."""
+    from kalux.white import WhiteCheck
+
+    check, white = WhiteCheck(), None
+    for frame in check.watched(recording.stamped_frames()):
+        white = float(frame.white_value)
+    return {} if white is None else {"white": white, "white_is_doubtful": check.doubt() is not None}

@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 from kalux.event_slices import between, events_until
 from kalux.frames import Frame, exposure_doubt
 from kalux.recording import Recording, clock_doubt, no_frames
+from kalux.settings import CameraSettings
 from kalux.white import WhiteCheck
+from kalux.wording import how_many
 
 T = TypeVar("T")
 
@@ -33,6 +35,8 @@ _MANY_INTERVALS: Final = 100
 _LEAST_MISSED: Final = 100
 """Events that are missing in a silence at the usual rate, at least: by chance it is none."""
 
+_SILENCES: Final = 8  # the longest, of each chunk of events, that are looked at
+_LEAST_EVENTS: Final = 1_000  # of one polarity, without the other: fewer may be noise
 _LEAST_INTERVALS: Final = 2  # between frames: in less of them, little is lost
 _ALIKE: Final = 0.25
 """Share of the usual change from frame to frame from which something moved in a silence, too."""
@@ -62,6 +66,12 @@ class Contents(NamedTuple):
         (start, end) us of the longest time without a frame, where it is far longer than usual.
     silence
         (start, end) us of the longest time without an event, where events are missing.
+    more_silences
+        How many other times without an event there are, where events are missing.
+    on_share
+        Share of ON events; None without events.
+    exposed
+        Whether a pixel of any frame lies between black and white.
     """
 
     frames: int
@@ -74,29 +84,47 @@ class Contents(NamedTuple):
     complete: bool = True
     gap: tuple[int, int] | None = None
     silence: tuple[int, int] | None = None
+    more_silences: int = 0
+    on_share: float | None = None
+    exposed: bool = True
 
     @property
     def seconds(self) -> float:
         """From start to end."""
         return (self.end - self.start) * 1e-6
 
-    def warnings(self) -> Iterator[str]:
-        """What is allowed, but probably not meant."""
+    def warnings(self, *, of_images: bool = True) -> Iterator[str]:
+        """What is allowed, but probably not meant; ``of_images``: and what becomes of the images."""
         yield from self.doubts
+        if not self.exposed and not self.doubts:
+            yield "no pixel of the frames lies between black and white: they show nothing but the end of their range"
         if self.events == 0:
-            yield "there are no events; the images show the frames only"
-        else:
-            doubt = clock_doubt(self.frames, self.events, self.events_between, CHECKED_FIRST)
-            if doubt is not None:
-                yield doubt
-            elif self.silence is not None:
-                yield self._silence_doubt(*self.silence)
+            yield "there are no events" + ("; the images show the frames only" if of_images else "")
+            return
+        if self.one_sided and self.events >= _LEAST_EVENTS:
+            yield (
+                f"all {self.events:,} events are {'ON' if self.on_share else 'OFF'}: is their polarity read rightly, "
+                "or were the others lost?"
+            )
+        doubt = clock_doubt(self.frames, self.events, self.events_between, CHECKED_FIRST)
+        if doubt is not None:
+            yield doubt
+        elif self.silence is not None:
+            yield self._silence_doubt(*self.silence) + (
+                "? Images between the frames do not move there" if of_images else "?"
+            )
+
+    @property
+    def one_sided(self) -> bool:
+        """Whether all events have the same polarity."""
+        return self.on_share in (0.0, 1.0)
 
     def _silence_doubt(self, begin: int, end: int) -> str:
         first, last = ((t - self.start) * 1e-6 for t in (begin, end))
+        more = f", nor in {how_many(self.more_silences, 'more such time')}" if self.more_silences else ""
         return (
-            f"there is no event from {first:.3f} to {last:.3f} s, though the frames change there as elsewhere: were "
-            "events lost? Images between the frames do not move there"
+            f"there is no event from {first:.3f} to {last:.3f} s{more}, though the frames change there as elsewhere: "
+            "were events lost"
         )
 
 
@@ -120,16 +148,17 @@ def check_recording(
         Whatever is wrong with the recording, or it has no frames.
     """
     spans, colours = [], "grey"
-    white, changes = WhiteCheck(), _Changes()
+    white, changes, exposed = WhiteCheck(), _Changes(), False
     for frame in white.watched(recording.frames()):
         spans.append((frame.exposure_start, frame.exposure_end))
         colours = frame.colours
+        exposed = exposed or _is_exposed(frame)
         changes.see(frame)
     if not spans:
         raise no_frames(recording)
     exposures = np.array(spans, np.int64)
     start, end = (int(t) for t in (exposures[0, 0], exposures[-1, 1]))
-    count = events_between = events_from = 0
+    count = on = events_between = events_from = 0
     complete = True
     last_event, silences = start, [(start, start)]
     for chunk in recording.events():
@@ -137,18 +166,21 @@ def check_recording(
             complete = False
             break
         count += len(chunk)
+        on += int(np.count_nonzero(chunk["p"]))
         events_between += len(between(chunk, start - 1, end))
         events_from += len(chunk) - events_until(chunk, start - 1)
-        silences.append(_longest_silence(between(chunk, start - 1, end)["t"], last_event))
+        silences += _longest_silences(between(chunk, start - 1, end)["t"], last_event)
         last_event = max(last_event, min(int(chunk["t"][-1]), end))
         on_events(len(chunk))
     if complete:
         silences.append((last_event, end))
     doubts = tuple(filter(None, (white.doubt(), exposure_doubt(exposures))))
-    longest = max(silences, key=lambda silence: silence[1] - silence[0])
     seen = (end if complete else last_event) - start
-    usual = (seen - (longest[1] - longest[0])) / max(events_between, 1)
-    silent = longest[1] - longest[0] >= _LEAST_MISSED * usual and changes.go_on(exposures, *longest)
+    lost = [
+        silence
+        for silence in _with_events_missing(silences, seen, events_between)
+        if changes.go_on(exposures, *silence)
+    ]
     return Contents(
         len(exposures),
         count,
@@ -159,17 +191,41 @@ def check_recording(
         doubts,
         complete,
         _gap(exposures),
-        longest if events_between and silent else None,
+        lost[0] if lost else None,
+        max(len(lost) - 1, 0),
+        on / count if count else None,
+        exposed,
     )
 
 
-def _longest_silence(times: NDArray[np.int64], before: int) -> tuple[int, int]:
-    """(start, end) us of the longest time without one of the events at ``times``, which follow one at ``before``."""
+def _longest_silences(times: NDArray[np.int64], before: int) -> list[tuple[int, int]]:
+    """(start, end) us of the longest times without one of the events at ``times``, which follow one at ``before``."""
     if not len(times):
-        return before, before
+        return []
     waits = np.diff(times, prepend=before)
-    longest = int(np.argmax(waits))
-    return int(times[longest] - waits[longest]), int(times[longest])
+    longest = (
+        np.argpartition(waits, -_SILENCES)[-_SILENCES:] if len(waits) > _SILENCES else np.arange(len(waits))
+    )
+    return [(int(times[i] - waits[i]), int(times[i])) for i in longest]
+
+
+def _with_events_missing(
+    silences: list[tuple[int, int]], seen: int, events: int
+) -> Iterator[tuple[int, int]]:
+    """Silences, the longest first, in which events are missing at the usual rate of the rest of the time, ``seen``."""
+    rest = seen
+    for begin, end in sorted(silences, key=lambda silence: silence[0] - silence[1]):
+        rest -= end - begin
+        if events == 0 or end - begin < _LEAST_MISSED * rest / events:
+            return
+        yield begin, end
+
+
+def _is_exposed(frame: Frame) -> bool:
+    """Whether any pixel lies between black and white."""
+    image = frame.image if frame.valid is None else frame.image[frame.valid]
+    white = frame.black + CameraSettings.usual_saturation * frame.full_scale
+    return bool(((image > frame.black) & (image < white)).any())
 
 
 class _Changes:

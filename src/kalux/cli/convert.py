@@ -64,6 +64,7 @@ def add_command(commands: Any) -> None:
 
 def run(options: argparse.Namespace, command: list[str]) -> None:
     """Run the command."""
+    from kalux.calibration.values import load_calibration, require_white
     from kalux.cli.output import check_apart, check_file
     from kalux.cli.progress import Progress, short_number
 
@@ -72,6 +73,8 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     check_file(options.out, overwrite=options.overwrite)
     stated = _calibrated(options)
     recording = open_recording(options)
+    if options.calibration:
+        require_white(load_calibration(*options.calibration), recording)
     if not recording.exposure_known:
         warn(
             "the recording has no exposure times, and the copy will not have them either; "
@@ -88,9 +91,11 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
         warn(f"AEDAT 4 has no place for {', '.join(lost)}: not in the copy, kalux HDF5 (.h5) would keep all")
     with Progress("converting", quiet=options.quiet) as progress:
         if to_aedat4:
-            _write_aedat4(recording, options.out, progress)
+            doubt = _write_aedat4(recording, options.out, progress)
         else:
-            write_copy(recording, options.out, progress, stated)
+            doubt = write_copy(recording, options.out, progress, stated)
+    if doubt is not None:
+        warn(doubt)
     if not options.quiet:
         seconds = max(progress.seconds, 1e-3)
         say(
@@ -161,10 +166,10 @@ def _not_in_aedat4(recording: Recording) -> list[str]:
     return [name for name, value in found if value is not None]
 
 
-def _write_aedat4(recording: Recording, out: Path, progress: Any) -> None:
+def _write_aedat4(recording: Recording, out: Path, progress: Any) -> str | None:
     from kalux.writers import aedat4
 
     write = partial(
         aedat4.write, out, sensor_size=recording.sensor_size, exposure_known=recording.exposure_known
     )
-    write_streams(write, recording.events(), recording.stored_frames(), progress)
+    return write_streams(write, recording.events(), recording.stored_frames(), progress)

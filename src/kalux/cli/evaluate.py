@@ -122,6 +122,8 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     for text in contents.warnings():
         warn(text)
     protocol = Protocol(recording, options, contents.colours)
+    if contents.frames > 1 and contents.events_between and (doubt := protocol.doubt()) is not None:
+        warn(doubt)
     say(f"{recording.source.path}: {protocol.described}")
     say(table_head(options))
     found, consistent = [], []
@@ -166,7 +168,8 @@ class Protocol:
         calibration = given_calibration(options)
         if calibration is not None:
             calibration = calibration.merged(said)
-        camera = (said if calibration is None else calibration).settings.get("camera", {})
+        self._known = said if calibration is None else calibration
+        camera = self._known.settings.get("camera", {})
         self._response: str = camera.get("response", AUTO)
         recording = compared_recording(recording, self._response, camera.get("black_level"))
         self._recording = recording
@@ -194,6 +197,21 @@ class Protocol:
             held_out=reference is None,
             calibration=calibration,
         )
+
+    def doubt(self) -> str | None:
+        """That events do not explain the frames, as a reconstruction would warn; None where they do."""
+        from kalux.cli.plan_warnings import unrelated_warning
+        from kalux.cli.progress import Stages
+        from kalux.planning import plan
+        from kalux.settings import preset
+
+        stages = Stages(quiet=self._options.quiet)
+        with stages.stage("estimating"):
+            settings = self._known.apply(preset("default"))
+            made = plan(
+                stages.watched(self._recording), at="frames", settings=settings, calibration=self._known
+            )
+        return unrelated_warning(made)
 
     def score(self, method: Method) -> Scores:
         """Score one method, with progress."""

@@ -10,7 +10,7 @@ from kalux.cli.loops import prepare_loops, tell_of_compiling
 from kalux.cli.parser import Parser
 from kalux.cli.progress import Stages
 from kalux.cli.recordings import add_recording, open_recording
-from kalux.cli.terminal import say
+from kalux.cli.terminal import say, warn
 from kalux.settings import PRESETS, Settings, preset
 
 if TYPE_CHECKING:
@@ -62,8 +62,10 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
         say("\n".join(calibration_lines(calibration)))
     if not options.no_estimate:
         with stages.stage("estimating"):
-            settled = settled_lines(recording, description, settings, calibration, options.preset)
+            settled, doubt = settled_lines(recording, description, settings, calibration, options.preset)
         say("\n".join(settled))
+        if doubt is not None:
+            warn(doubt)
 
 
 def settled_lines(
@@ -72,24 +74,26 @@ def settled_lines(
     settings: Settings,
     calibration: Calibration | None,
     name: str,
-) -> list[str]:
-    """What a reconstruction would settle, a line each; why it could not, if it could not."""
+) -> tuple[list[str], str | None]:
+    """What a reconstruction would settle, a line each, or why it could not; and a warning, or None."""
+    from kalux.cli.plan_warnings import unrelated_warning
     from kalux.plan_report import plan_report, saturation_text
     from kalux.planning import plan
 
     title = f"reconstruct would use, with the preset {name}"
     if not description.frames.count:
-        return [title, "  nothing: it needs frames; --frames joins images or a video"]
+        return [title, "  nothing: it needs frames; --frames joins images or a video"], None
     if not recording.exposure_known:
         return [
             title,
             "  nothing can be estimated without exposure times; give --exposure 10000 --stamp start, or what they are "
             "(us); a guess will do",
-        ]
+        ], None
     asked = settings if calibration is None else calibration.apply(settings)
     made = plan(recording, at="frames", settings=asked, calibration=calibration)
     rows = plan_report(recording, made, asked)
     if made.mends.ceiling is None:
         rows.append(("saturation", saturation_text(recording, made, asked)))
     width = max(len(label) for label, _ in rows)
-    return [title, *(f"  {label:<{width}}  {text}" for label, text in rows)]
+    lines = [title, *(f"  {label:<{width}}  {text}" for label, text in rows)]
+    return lines, unrelated_warning(made)

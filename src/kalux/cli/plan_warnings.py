@@ -80,7 +80,7 @@ def saturation_warning(recording: Recording, planned: Plan, asked: Settings) -> 
 def agreement_warnings(planned: Plan) -> Iterator[str]:
     """That events and frames, or the thresholds and both, contradict each other, and what to do."""
     agreement = None if planned.steps.model is None else planned.steps.model.agreement
-    layout = planned.mends.layout
+    unrelated = unrelated_warning(planned)
     if planned.steps.contradicted is not None:
         assert agreement is not None
         on, off = planned.steps.contradicted
@@ -90,14 +90,8 @@ def agreement_warnings(planned: Plan) -> Iterator[str]:
             f"are not used{hint}; to insist, give --events.threshold-on {on:g} "
             f"--events.threshold-off {off:g}"
         )
-    unexplained = agreement is not None and agreement.explained < _LITTLE_EXPLAINED
-    unrelated = layout is not None and layout.contradicts
-    if (
-        unexplained
-        or unrelated
-        or (planned.threshold_origin == "assumed" and contradicts(planned.steps.thresholds))
-    ):
-        yield _UNRELATED
+    if unrelated is not None:
+        yield unrelated
     elif (
         planned.threshold_origin in _GIVEN_ORIGINS
         and agreement is not None
@@ -107,6 +101,15 @@ def agreement_warnings(planned: Plan) -> Iterator[str]:
             f"the given contrast thresholds contradict the frames, which change by {agreement.slope:.2f} where "
             "events say 1; without them they are estimated"
         )
+
+
+def unrelated_warning(planned: Plan) -> str | None:
+    """That events do not explain the frames, and what may be wrong; None where they do, or nothing tells."""
+    model, layout = planned.steps.model, planned.mends.layout
+    unexplained = model is not None and model.agreement.explained < _LITTLE_EXPLAINED
+    unrelated = layout is not None and layout.contradicts
+    untold = planned.threshold_origin == "assumed" and contradicts(planned.steps.thresholds)
+    return _UNRELATED if unexplained or unrelated or untold else None
 
 
 def _encoding_hint(settings: Settings, stated: tuple[float, float]) -> str:

@@ -323,7 +323,7 @@ def _left_out_calibration(options: argparse.Namespace) -> list[str]:
     former = _former(options, "calibration", list[Any])
     if not former:
         return []
-    flags = " ".join(f"--calibration {name}" for name in former)
+    flags = " ".join(f"--calibration {shlex.quote(str(name))}" for name in former)
     return [
         f"{options.settings} is of a run with {flags}; settings have no maps of pixels, and without it these images "
         "may be others"

@@ -148,8 +148,8 @@ class Stated(NamedTuple):
     black_level: float | None = None
 
 
-def write_copy(recording: Recording, out: Path, progress: Any, stated: Stated | None = None) -> None:
-    """Write all that a recording holds as kalux HDF5; the file appears when it is complete.
+def write_copy(recording: Recording, out: Path, progress: Any, stated: Stated | None = None) -> str | None:
+    """Write all that a recording holds as kalux HDF5; the file appears when it is complete. Returns as `write_streams`.
 
     Raises
     ------
@@ -174,14 +174,21 @@ def write_copy(recording: Recording, out: Path, progress: Any, stated: Stated | 
         mosaic=recording.mosaic,
         response=stated.response or recording.response,
     )
-    write_streams(write, recording.events(), recording.stored_frames(), progress)
+    return write_streams(write, recording.events(), recording.stored_frames(), progress)
 
 
 def write_streams(
     write: Callable[..., None], events: Iterable[EventArray], frames: Iterable[Frame], progress: Any
-) -> None:
-    """Have a writer, which takes ``events`` and ``frames``, write them, with progress."""
+) -> str | None:
+    """Have a writer, which takes ``events`` and ``frames``, write them, with progress.
+
+    Returns what makes the frames' white value doubtful; None if nothing does.
+    """
+    from kalux.white import WhiteCheck
+
+    white = WhiteCheck()
     write(
         events=counted(events, lambda chunk: progress.add(events=len(chunk))),
-        frames=counted(frames, lambda _: progress.add(images=1)),
+        frames=counted(white.watched(frames), lambda _: progress.add(images=1)),
     )
+    return white.doubt()

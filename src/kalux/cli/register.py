@@ -243,7 +243,9 @@ def _write(
         response=None if response == "linear" else response,
     )
     with Progress("registering", quiet=options.quiet) as progress:
-        write_streams(write, events.events(), frames, progress)
+        doubt = write_streams(write, events.events(), frames, progress)
+    if doubt is not None:
+        warn(doubt)
     if not options.quiet:
         say(
             f"wrote {how_many(progress.events, 'event')} and {how_many(progress.images, 'frame')} to {options.out}"

@@ -382,7 +382,7 @@ def clipping_level(
         ]
     )
     least = colour.CLIPPED_SHARE * shares.sum(axis=0)
-    level = values.min(axis=0)
+    level: NDArray[Any] = values.min(axis=0)
     for value in values:
         enough = (shares * (values >= value)).sum(axis=0) > least
         level = np.where(enough, np.maximum(level, value), level)
@@ -394,8 +394,8 @@ def _channel_intensity(camera: Camera, values: NDArray[Any], white: float, black
     if values.dtype.kind == "f":
         return camera.response.inverse(np.maximum(values - black, 0.0) / (white - black))
     levels = np.arange(int(values.max(initial=0)) + 1)
-    of_levels: Array = camera.response.inverse(np.maximum(levels - black, 0.0) / (white - black))
-    return of_levels[values]
+    intensity: Array = camera.response.inverse(np.maximum(levels - black, 0.0) / (white - black))[values]
+    return intensity
 
 
 def dark_scale(intensity: Array, counts: NDArray[np.integer[Any]], ceiling: float, white: float) -> float:

@@ -12,7 +12,7 @@ from kalux.calibration.delay import DelayEstimate
 from kalux.calibration.fixed_pattern import FixedPattern
 from kalux.calibration.frame_noise import FrameNoise
 from kalux.calibration.mismatch import Mismatch
-from kalux.calibration.values import Calibration
+from kalux.calibration.values import Calibration, require_white
 from kalux.calibration.white_balance import grey_world
 from kalux.errors import InputError, require_type
 from kalux.frames import median_exposure
@@ -117,6 +117,7 @@ def plan(
         _check_smooth(chosen, lookahead)
     if known.pixels is not None:
         require_size(known.pixels, recording.sensor_size)
+    require_white(known, recording)
     chosen = _with_causal_trust(chosen, lookahead)
     recording = with_cached_start(recording, _CACHED_EVENTS, _CACHED_FRAME_BYTES)
 
