@@ -109,7 +109,10 @@ def test_seconds_in_single_precision_are_multiplied_in_double():
     ],
 )
 def test_times_that_nothing_could_be_added_to_are_refused(t, unit):
-    with pytest.raises(EventError, match=r"events: event 1 is at .* us; at most 10\^18 us is possible"):
+    with pytest.raises(
+        EventError,
+        match=r"events: event 1 is at .* us; at most 10\^18 us is possible; if these are ns, .*t_ns",
+    ):
         as_events({"t": t, "x": [0, 1], "y": [0, 1], "p": [0, 1]}, time_unit=unit)
 
 

@@ -271,7 +271,10 @@ def _check_times(t: NDArray[Any], where: str = "events", first_index: int = 0) -
     """Refuse times, us, beyond 10^18, to which nothing can be added in an int64."""
     if len(t) and (t.min() < -LATEST or t.max() > LATEST):
         i = int(np.flatnonzero((t < -LATEST) | (t > LATEST))[0])
-        raise EventError(f"{where}: event {first_index + i} is at {t[i]} us; at most 10^18 us is possible")
+        raise EventError(
+            f"{where}: event {first_index + i} is at {t[i]} us; at most 10^18 us is possible; if these are ns, say so: "
+            "in arrays time_unit='ns', in files by a column t_ns"
+        )
 
 
 def check_precision(t: NDArray[np.floating[Any]], scale: float) -> None:

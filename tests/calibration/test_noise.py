@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from kalux import EVENT_DTYPE, Recording
+from kalux.calibration import noise
+from kalux.calibration.delay import DelayEstimate
 from kalux.calibration.noise import (
     calibrate_noise,
     event_noise,
@@ -43,6 +45,32 @@ def test_the_rate_of_pure_noise(rate):
     assert found.rate == pytest.approx(rate, rel=0.08)
     assert found.rate_error < 0.1 * rate
     assert found.rates.mean() == pytest.approx(rate, rel=0.1)
+
+
+def test_pixels_beyond_a_region_of_interest_are_not_quiet():
+    """They are off, and say nothing of the rate of those that are on: it is that of a sensor of this size."""
+    events = noise_events(3.0, seconds=2.0)
+    inside = (events["y"] >= 16) & (events["y"] < 40) & (events["x"] >= 30) & (events["x"] < 70)
+    found = event_noise(Recording.from_arrays(events[inside], [], sensor_size=SIZE))
+    cut = events[inside].copy()
+    cut["x"] -= 30
+    cut["y"] -= 16
+    small = event_noise(Recording.from_arrays(cut, [], sensor_size=(24, 40)))
+    assert found.rate == pytest.approx(small.rate)
+    assert found.rate > 2.0
+    assert found.quiet_share == pytest.approx(small.quiet_share)
+
+
+@pytest.mark.parametrize("improvement", [0.02, 0.04])
+def test_a_delay_that_explains_next_to_nothing_is_not_written(monkeypatch, improvement):
+    """The one that was best is told."""
+    found = DelayEstimate(3_000, improvement, 10_000, 2_000)
+    monkeypatch.setattr(noise, "estimate_delay", lambda *_: found)
+    monkeypatch.setattr(noise, "with_true_delay", lambda *_, **__: found)
+    measured = calibrate_noise(unlabelled(simulate(SCENE)), CAMERA)
+    calibration = measured.calibration()
+    assert calibration.settings["events"].get("delay") == (2_500 if improvement > 0.03 else None)
+    assert calibration.measured["apparent_delay"] == 3_000
 
 
 @pytest.mark.parametrize("shift", [2 * 10**16, -(10**9)])

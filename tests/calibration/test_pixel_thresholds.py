@@ -63,7 +63,7 @@ def test_the_refractory_period_is_made_up_for_where_it_is_known():
     sensor = SensorSettings(threshold_on=0.3, threshold_off=0.2, refractory=500.0)
     recording = unlabelled(simulate(SCENE, sensor))
     known = calibrate_contrast(recording, CAMERA, delay=0, refractory=500)
-    plain = calibrate_contrast(recording, CAMERA, delay=0)
+    plain = calibrate_contrast(recording, CAMERA, delay=0, refractory=0)
     assert known.on == pytest.approx(0.3, rel=0.05)
     assert known.off == pytest.approx(0.2, rel=0.05)
     assert plain.off > 1.04 * known.off
@@ -71,9 +71,41 @@ def test_the_refractory_period_is_made_up_for_where_it_is_known():
     assert "refractory_period" not in plain.calibration().settings["events"]
 
 
+@pytest.mark.parametrize(("period", "found"), [(500.0, (350, 550)), (0.0, (0, 0))])
+def test_a_refractory_period_that_no_noise_shows_is_found(period, found):
+    """By what explains the frames, and its own error is one of the thresholds."""
+    sensor = SensorSettings(threshold_on=0.3, threshold_off=0.2, refractory=period)
+    recording = unlabelled(simulate(SCENE, sensor))
+    told, known = (calibrate_contrast(recording, CAMERA, refractory=us) for us in (None, int(period)))
+    assert told.on == pytest.approx(0.3, rel=0.04)
+    assert told.off == pytest.approx(0.2, rel=0.04)
+    assert found[0] <= told.refractory <= found[1]
+    assert (told.on_error > 1.5 * known.on_error) == (period > 0)
+
+
+def test_a_region_of_interest_is_measured_as_a_sensor_of_its_size(simulation):
+    """Pixels beside it are off: that they change without events says nothing."""
+    events = simulation.events
+    inside = (events["y"] >= 20) & (events["y"] < 70) & (events["x"] >= 30) & (events["x"] < 100)
+    recording = Recording.from_arrays(events[inside], simulation.frames, sensor_size=(90, 120))
+    part = calibrate_contrast(recording, CAMERA)
+    cut = events[inside].copy()
+    cut["x"] -= 30
+    cut["y"] -= 20
+    frames = [dataclasses.replace(f, image=f.image[20:70, 30:100].copy()) for f in simulation.frames]
+    small = calibrate_contrast(Recording.from_arrays(cut, frames, sensor_size=(50, 70)), CAMERA)
+    assert part.on == pytest.approx(small.on, rel=0.003)
+    assert part.off == pytest.approx(small.off, rel=0.003)
+    beside = np.ones((90, 120), np.bool_)
+    beside[20:70, 30:100] = False
+    assert (part.on_factor[beside] == part.on_factor[0, 0]).all()
+
+
 def test_where_the_direction_turns_nothing_is_added():
     """K13: meanwhile the light may have moved either way."""
-    history = pixel_thresholds._History((1, 1), pixel_thresholds._Sampling((0.2, 0.2), 1000, 1000))
+    everywhere = np.ones((1, 1), np.bool_)
+    sampling = pixel_thresholds._Sampling((0.2, 0.2), 1000, 1000, everywhere)
+    history = pixel_thresholds._History((1, 1), sampling)
     on, off, _ = history.counts(pixel_events([10_000, 13_500, 17_000], [True, False, False]))
     going_on = 3.5 / np.hypot(2.5, 0.2)
     assert (on[0, 0], off[0, 0]) == (1.0, pytest.approx(1.0 + going_on))

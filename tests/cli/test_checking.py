@@ -143,6 +143,24 @@ def test_events_of_one_polarity_alone_are_told(polarity):
     assert told.startswith(f"all {len(kept):,} events are {'ON' if polarity else 'OFF'}")
 
 
+@pytest.mark.parametrize("moves_beside", [True, False])
+def test_events_of_a_part_of_the_sensor_are_told_if_frames_change_elsewhere(moves_beside):
+    """Of a region of interest; not where nothing else moves."""
+    made = moving_blocks()
+    e = made.events
+    kept = e[(e["y"] >= 8) & (e["y"] < 20) & (e["x"] >= 10) & (e["x"] < 25)]
+    frames = []
+    for each in made.frames:
+        image = each.image.copy() if moves_beside else np.full_like(each.image, 40)
+        image[8:20, 10:25] = each.image[8:20, 10:25]
+        frames.append(dataclasses.replace(each, image=image))
+    source = Recording.from_arrays(kept, frames, sensor_size=made.scene.sensor_size)
+    found = check_recording(source, lambda _: None)
+    told = [*found.warnings()]
+    assert (found.region is not None) == moves_beside
+    assert any("outside rows 8 to 19 and columns 10 to 24" in text for text in told) == moves_beside
+
+
 @pytest.mark.parametrize(("level", "shows"), [(0, False), (255, False), (252, False), (30, True)])
 def test_frames_that_are_all_black_or_all_white_show_nothing(level, shows):
     made = moving_blocks()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import re
 
+import numpy as np
 import pytest
 
 from kalux.writers import hdf5
@@ -110,6 +111,19 @@ def test_events_that_contradict_the_frames_are_a_warning(cli, tmp_path, command,
     done = cli(command[0], tmp_path / "rec.h5", *command[1:])
     assert done.code == 0
     assert ("the events do not explain how the frames change" in done.err) == (late > 0)
+
+
+def test_events_of_a_part_of_the_sensor_are_a_warning(cli, tmp_path):
+    made = passing_by(textured(0.6))
+    events = np.concatenate(list(made.events()))
+    hdf5.write(
+        tmp_path / "rec.h5",
+        sensor_size=made.sensor_size,
+        events=[events[events["y"] < 24]],
+        frames=made.frames(),
+    )
+    done = cli("info", tmp_path / "rec.h5", "--no-estimate")
+    assert "no event outside rows 0 to 23 and columns 0 to 63" in done.err
 
 
 def test_a_still_scene_has_no_estimate(cli, write_recording, simulation, tmp_path):

@@ -18,9 +18,10 @@ one another as fast as the pixel can are left out, since events may be lost ther
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, Self
 
 import cv2
 import numpy as np
@@ -29,9 +30,11 @@ from numpy.typing import NDArray
 from kalux.augmentation.deblur import integrate_exposure, latent_middle, latent_peak
 from kalux.augmentation.refractory import step_weight
 from kalux.calibration.black_level import with_known_black
+from kalux.calibration.delay import estimate_delay
 from kalux.calibration.global_thresholds import Usual, estimate_thresholds
 from kalux.calibration.intervals import Interval, intervals
 from kalux.calibration.refractory import dead_time, shortest_interval
+from kalux.calibration.region import event_region
 from kalux.calibration.regression import (
     HUBER,
     products,
@@ -129,6 +132,14 @@ class ContrastCalibration:
     on_variance: Array
     off_variance: Array
 
+    def doubted(self, doubt: float) -> Self:
+        """The same thresholds with a relative error more, that of both."""
+        on, off = (
+            float(np.hypot(error, doubt * value))
+            for error, value in ((self.on_error, self.on), (self.off_error, self.off))
+        )
+        return dataclasses.replace(self, on_error=on, off_error=off)
+
     def calibration(self) -> Calibration:
         """As settings with standard errors, and maps of the pixels."""
         settings: dict[str, Any] = {
@@ -169,7 +180,8 @@ def calibrate_contrast(
         How late the events are, us. None: so that they trail the light by half a threshold, as those of an ideal
         pixel do.
     refractory
-        Refractory period, us: what is lost in it is added to the events. None: that which noise shows, else 0.
+        Refractory period, us: what is lost in it is added to the events. None: that which noise shows, else that
+        under which events explain the frames best.
 
     Returns
     -------
@@ -184,8 +196,8 @@ def calibrate_contrast(
     first = estimate_thresholds(recording, camera, Usual.of(EventSettings()), delay=delay or 0)
     if first is None or first.usual_share > _MOST_USUAL:
         return None
-    period = dead_time(recording) if refractory is None else refractory
-    sampling = _Sampling((first.on, first.off), shortest_interval(recording), period)
+    period, doubt = (refractory, 0.0) if refractory is not None else _lost_period(recording, camera, delay)
+    sampling = _Sampling((first.on, first.off), shortest_interval(recording), period, event_region(recording))
     if delay is None:
         delay = _delay_of_trailing(recording, camera, sampling)
     fit, data = None, None
@@ -197,18 +209,38 @@ def calibrate_contrast(
         sampling = sampling._replace(thresholds=(fit.on, fit.off))
     assert fit is not None
     assert data is not None
-    return _per_pixel(recording, camera, sampling, fit, data[0], delay)
+    return _per_pixel(recording, camera, sampling, fit, data[0], delay).doubted(doubt)
+
+
+def _lost_period(recording: Recording, camera: CameraSettings, delay: int | None) -> tuple[int, float]:
+    """The refractory period, us, and the relative error of thresholds that comes from its own.
+
+    Noise shows it where there is enough of it: a part of a sensor, or of the time, may have too little.
+    """
+    shown = dead_time(recording)
+    if shown:
+        return shown, 0.0
+    if delay is None:
+        apparent = estimate_delay(recording, camera)
+        delay = 0 if apparent is None else apparent.apparent
+    usual = Usual.of(EventSettings())
+    found = estimate_thresholds(recording, camera, usual, delay=delay, refractory_period=None)
+    return (0, 0.0) if found is None else (found.refractory_period, found.doubt)
 
 
 # --- samples --------------------------------------------------------------------------------------------------
 
 
 class _Sampling(NamedTuple):
-    """How pixels are sampled: thresholds to deblur with, shortest inter-event interval and refractory period, us."""
+    """How pixels are sampled: thresholds to deblur with, shortest inter-event interval and refractory period, us.
+
+    And ``inside``, (H, W) bool: which pixels may have events.
+    """
 
     thresholds: tuple[float, float]
     shortest: int
     refractory: int
+    inside: NDArray[np.bool_]
 
 
 class _Samples(NamedTuple):
@@ -291,7 +323,8 @@ def _of_interval(
         _latent(shot, events, camera, sampling.thresholds) for shot in (interval.first, interval.second)
     )
     around = [_around(values) for values in (on, -off, turned)]
-    good = interval.usable & first_good & second_good & ~crowded & (_around(on + off) >= 1.0)
+    good = interval.usable & first_good & second_good & ~crowded & sampling.inside
+    good &= _around(on + off) >= 1.0
     return _Samples(
         (second - first)[good],
         np.column_stack([values[good] for values in (on, -off, turned)]),

@@ -54,7 +54,7 @@ def add_command(commands: Any) -> None:
         "--refractory",
         type=whole,
         metavar="US",
-        help="refractory period of the pixels (default: what noise shows, else 0)",
+        help="refractory period of the pixels (default: from the recording)",
     )
     add_result(parser)
     parser.set_defaults(run=run)

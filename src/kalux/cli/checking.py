@@ -11,7 +11,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.calibration.region import Region
 from kalux.event_slices import between, events_until
+from kalux.events import EventArray
 from kalux.frames import Frame, exposure_doubt
 from kalux.recording import Recording, clock_doubt, no_frames
 from kalux.settings import CameraSettings
@@ -45,6 +47,10 @@ _BLOCKS: Final = (16, 16)
 """Means of so many blocks of a frame tell how much it changes: of single pixels, noise would."""
 
 
+_LEAST_BEYOND: Final = 16
+"""Blocks without any event, that frames must have: a row of them."""
+
+
 class Contents(NamedTuple):
     """What a checked recording holds.
 
@@ -72,6 +78,8 @@ class Contents(NamedTuple):
         Share of ON events; None without events.
     exposed
         Whether a pixel of any frame lies between black and white.
+    region
+        Where all events lie, if frames change elsewhere as well.
     """
 
     frames: int
@@ -87,6 +95,7 @@ class Contents(NamedTuple):
     more_silences: int = 0
     on_share: float | None = None
     exposed: bool = True
+    region: Region | None = None
 
     @property
     def seconds(self) -> float:
@@ -96,6 +105,10 @@ class Contents(NamedTuple):
     def warnings(self, *, of_images: bool = True) -> Iterator[str]:
         """What is allowed, but probably not meant; ``of_images``: and what becomes of the images."""
         yield from self.doubts
+        yield from self.stream_warnings(of_images=of_images)
+
+    def stream_warnings(self, *, of_images: bool = True) -> Iterator[str]:
+        """`warnings` without the doubts."""
         if not self.exposed and not self.doubts:
             yield "no pixel of the frames lies between black and white: they show nothing but the end of their range"
         if self.events == 0:
@@ -112,6 +125,13 @@ class Contents(NamedTuple):
         elif self.silence is not None:
             yield self._silence_doubt(*self.silence) + (
                 "? Images between the frames do not move there" if of_images else "?"
+            )
+        if self.region is not None:
+            top, bottom, left, right, _ = self.region
+            yield (
+                f"there is no event outside rows {top} to {bottom - 1} and columns {left} to {right - 1}, though the "
+                "frames change there, too: was only a part of the sensor read out"
+                + ("? Images do not move there, and their uncertainty is too small" if of_images else "?")
             )
 
     @property
@@ -161,12 +181,14 @@ def check_recording(
     count = on = events_between = events_from = 0
     complete = True
     last_event, silences = start, [(start, start)]
+    region: Region | None = None
     for chunk in recording.events():
         if most is not None and events_from >= most:
             complete = False
             break
         count += len(chunk)
         on += int(np.count_nonzero(chunk["p"]))
+        region = _joined_region(region, chunk)
         events_between += len(between(chunk, start - 1, end))
         events_from += len(chunk) - events_until(chunk, start - 1)
         silences += _longest_silences(between(chunk, start - 1, end)["t"], last_event)
@@ -195,7 +217,15 @@ def check_recording(
         max(len(lost) - 1, 0),
         on / count if count else None,
         exposed,
+        region if region is not None and changes.go_on_beyond(region, recording.sensor_size) else None,
     )
+
+
+def _joined_region(region: Region | None, chunk: EventArray) -> Region | None:
+    if len(chunk) == 0:
+        return region
+    here = Region.of(chunk)
+    return here if region is None else region.joined(here)
 
 
 def _longest_silences(times: NDArray[np.int64], before: int) -> list[tuple[int, int]]:
@@ -234,6 +264,7 @@ class _Changes:
     def __init__(self) -> None:
         self._blocks: NDArray[np.float32] | None = None
         self._changes: list[float] = []
+        self._of_blocks: NDArray[np.float32] = np.zeros(_BLOCKS, np.float32)
 
     def see(self, frame: Frame) -> None:
         """Look at the next frame."""
@@ -241,7 +272,9 @@ class _Changes:
         resized = cv2.resize(image.astype(np.float32), _BLOCKS, interpolation=cv2.INTER_AREA)
         blocks = np.asarray(resized / frame.white_value, np.float32)
         if self._blocks is not None:
-            self._changes.append(float(np.sqrt(np.mean(np.square(blocks - self._blocks)))))
+            squares = np.square(blocks - self._blocks)
+            self._changes.append(float(np.sqrt(np.mean(squares))))
+            self._of_blocks += squares
         self._blocks = blocks
 
     def go_on(self, exposures: NDArray[np.int64], begin: int, end: int) -> bool:
@@ -252,6 +285,21 @@ class _Changes:
             return False
         usual = float(np.median(changes[~inside]))
         return usual > 0 and bool(np.median(changes[inside]) >= _ALIKE * usual)
+
+    def go_on_beyond(self, region: Region, sensor_size: tuple[int, int]) -> bool:
+        """Whether frames change beyond a region of events about as much as in it."""
+        if not region.is_part_of(sensor_size):
+            return False
+        sides = zip(_BLOCKS, sensor_size, (region[0:2], region[2:4]), strict=True)
+        rows, columns = (
+            (np.arange(blocks) * size < end * blocks) & ((np.arange(blocks) + 1) * size > begin * blocks)
+            for blocks, size, (begin, end) in sides
+        )
+        inside = rows[:, None] & columns
+        if np.count_nonzero(~inside) < _LEAST_BEYOND:
+            return False
+        usual, beyond = (float(np.sqrt(self._of_blocks[each].mean())) for each in (inside, ~inside))
+        return usual > 0 and beyond >= _ALIKE * usual
 
 
 def _gap(exposures: NDArray[np.int64]) -> tuple[int, int] | None:

@@ -47,6 +47,7 @@ def add_command(commands: Any) -> None:
 
 def run(options: argparse.Namespace, command: list[str]) -> None:
     """Run the command."""
+    from kalux.cli.checking import CHECKED_FIRST, check_recording
     from kalux.info import describe, format_description
 
     settings = preset(options.preset)
@@ -55,11 +56,16 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     stages = Stages()
     recording = stages.watched(open_recording(options))
     calibration = given_calibration(options)
+    contents = None
     with stages.stage("reading"):
         description = describe(recording)
+        if description.frames.count and description.exposure_known:
+            contents = check_recording(recording, lambda _: None, CHECKED_FIRST)
     say(format_description(description))
     if calibration is not None:
         say("\n".join(calibration_lines(calibration)))
+    for text in () if contents is None else contents.stream_warnings(of_images=False):
+        warn(text)
     if not options.no_estimate:
         with stages.stage("estimating"):
             settled, doubt = settled_lines(recording, description, settings, calibration, options.preset)

@@ -371,7 +371,7 @@ def _events(path: Path, header: _Header) -> Iterator[EventArray]:
 
 _T, _X, _Y, _P, _FEW, _MANY, _UNITLESS = range(1, 8)
 _FAULTS: Final = {
-    _T: "the time is not a number from 0 to 10^18 us",
+    _T: "the time is not a number from 0 to 10^18 us (of ns, name the column t_ns)",
     _X: "x is not a pixel coordinate",
     _Y: "y is not a pixel coordinate",
     _P: "the polarity is none of 0, 1, -1, true and false",
