@@ -207,26 +207,25 @@ def event_noise(
     if first is None or last is None or region is None or last <= first:
         return None
     inside = region.mask(recording.sensor_size)
-    tally = _tallied(_chunks(recording, most_events, known), first, last, known)
-    unusual = _unusual_pixels(tally) | known
-    if (unusual & ~known).any():  # again without them: their neighbours are quiet after all
-        tally = _tallied(_chunks(recording, most_events, known), first, last, unusual)
-    share = _quiet_share(tally, inside, last - first)
-    if share < _LEAST_QUIET and not inside.all():  # what is silent beyond may as well be still
-        inside = np.ones_like(inside)
-        share = _quiet_share(tally, inside, last - first)
+    for part in (
+        inside,
+        np.ones_like(inside),
+    ):  # where it is never quiet, the rest may be so because it is still
+        tally = _tallied(_chunks(recording, most_events, known), first, last, known)
+        unusual = _unusual_pixels(tally, part) | known
+        if (unusual & ~known).any():  # again without them: their neighbours are quiet after all
+            tally = _tallied(_chunks(recording, most_events, known), first, last, unusual)
+        tally = tally._replace(quiet=tally.quiet * part)
+        share = float(tally.quiet.sum() / (np.count_nonzero(part) * (last - first)))
+        if share >= _LEAST_QUIET or part.all():
+            break
     if share < _LEAST_QUIET:
         return None
-    tally = tally._replace(quiet=tally.quiet * inside)
-    rate, error = _typical_rate(tally, unusual, inside)
+    rate, error = _typical_rate(tally, unusual, part)
     counts = tally.counts.sum(axis=0).astype(np.float64)
     quiet = (tally.quiet.sum(axis=0) * 1e-6).astype(np.float64, copy=False)
     rates = shrunk_rates(counts, quiet, rate, unusual)
     return EventNoise(rate, error, rates, _dead_pixels(tally.all) & ~known, share)
-
-
-def _quiet_share(tally: _Tally, inside: NDArray[np.bool_], time: int) -> float:
-    return float(tally.quiet.sum(axis=0)[inside].sum() / (np.count_nonzero(inside) * time))
 
 
 def _chunks(
@@ -340,12 +339,12 @@ def _close(last, first, length, gap, busy_until, pending, counts, quiet):  # typ
                 _count_pending(pending, row, column, first, length, counts)
 
 
-def _unusual_pixels(tally: _Tally) -> NDArray[np.bool_]:
-    """Pixels that fire in quiet time ten times as often as is typical, and far more often than chance has it.
+def _unusual_pixels(tally: _Tally, inside: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Pixels that fire in quiet time ten times as often as is typical ``inside``, and far more often than chance has it.
 
     They say nothing of the typical rate. That does not make them hot: it may be far below what harms.
     """
-    counts, quiet = tally.counts.sum(axis=0), tally.quiet.sum(axis=0)
+    counts, quiet = tally.counts.sum(axis=0), tally.quiet.sum(axis=0) * inside
     unusual = np.zeros(counts.shape, np.bool_)
     for _ in range(5):
         rate = int(counts[~unusual].sum()) / max(int(quiet[~unusual].sum()), 1)
