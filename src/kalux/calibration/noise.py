@@ -340,7 +340,7 @@ def _close(last, first, length, gap, busy_until, pending, counts, quiet):  # typ
 
 
 def _unusual_pixels(tally: _Tally, inside: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Pixels that fire in quiet time ten times as often as is typical ``inside``, and far more often than chance has it.
+    """Pixels that fire in quiet time ten times as often as is typical ``inside``, and far more often than by chance.
 
     They say nothing of the typical rate. That does not make them hot: it may be far below what harms.
     """
