@@ -18,6 +18,7 @@ from kalux.datasets import (
     SensorSettings,
     Simulation,
     colour_photograph,
+    demo_scene,
     pan,
     photograph_scene,
     simulate,
@@ -121,6 +122,22 @@ def moving_blocks(
     """A camera that pans over `blocks`, ``speed`` in pixels/s; what is more than 1 saturates."""
     scene = photograph_scene(blocks(low, high), pan(speed), sensor_size=size, duration=duration)
     return simulate(scene, sensor, exposures=exposures)
+
+
+@lru_cache(maxsize=1)
+def quick_frames() -> Simulation:
+    """The demonstration's scene before a sensor whose frames come every 2 ms, its events 5 ms late."""
+    sensor = SensorSettings(
+        threshold_on=0.3,
+        threshold_off=0.35,
+        threshold_mismatch=0.1,
+        latency=5_000.0,
+        frame_rate=500.0,
+        exposure=1_000,
+        read_noise=0.002,
+        noise_rate=1.0,
+    )
+    return simulate(demo_scene(sensor_size=(60, 80), duration=500_000), sensor)
 
 
 def dark_scene(seed=0):

@@ -15,7 +15,7 @@ from kalux.datasets import SensorSettings, demo_scene, pan, photograph_scene, si
 from kalux.planning import plan
 from kalux.settings import CameraSettings, altered
 
-from builders import moving_blocks, unlabelled
+from builders import moving_blocks, quick_frames, unlabelled
 
 CAMERA = CameraSettings()
 
@@ -53,6 +53,13 @@ def test_so_is_a_clock_that_started_apart(simulation, by):
     found = estimate_delay(late(simulation, by), CAMERA)
     assert found.apparent == pytest.approx(trail + by, abs=900)
     assert found.improvement > 0.5
+
+
+def test_of_frames_every_two_milliseconds_too():
+    """A shift by more than their interval compares events with another change, which may fit as well or not at all."""
+    found = estimate_delay(unlabelled(quick_frames()), CAMERA)
+    assert 5_000 < found.apparent < 8_000
+    assert found.improvement > 0.2
 
 
 def test_slow_pixels_of_a_dim_scene_are_followed():
@@ -145,6 +152,28 @@ def test_of_valleys_about_as_deep_the_nearest_to_no_delay(depth, apparent):
 @pytest.mark.parametrize("residuals", [np.arange(25.0) + 1, np.arange(25.0, 0, -1), np.full(25, np.nan)])
 def test_no_minimum_inside_is_no_delay(residuals):
     assert best_delay(delays(), residuals, 1_000) is None
+
+
+def valley_with_failures(*failed):
+    """Residuals that are least at 2 ms, with fits that failed at these delays, ms."""
+    grid = delays()
+    residuals = 0.2 + 1e-9 * (grid - 2_000.0) ** 2
+    residuals[np.isin(grid, [1_000 * each for each in failed])] = np.nan
+    return best_delay(grid, residuals, 1_000)
+
+
+def test_fits_that_fail_far_from_the_best_delay_do_not_hide_it():
+    """Also under no delay: what is gained is then judged by the middle one of the others."""
+    found = valley_with_failures(-12, -11, -9, 9, 11, 12)
+    assert found == valley_with_failures()
+    assert valley_with_failures(0).apparent == 2_000
+    assert valley_with_failures(0).improvement == pytest.approx(1 - 0.2 / (0.2 + 1e-9 * 6_000**2), rel=0.2)
+
+
+@pytest.mark.parametrize("failed", [(1,), (3,), (*range(-12, 0), 4)], ids=["before", "after", "most"])
+def test_fits_that_fail_beside_it_or_mostly_leave_no_delay(failed):
+    """Of 25 delays 13 are more than half."""
+    assert valley_with_failures(*failed) is None
 
 
 @pytest.mark.parametrize("smooth", [False, True])

@@ -31,15 +31,17 @@ LEVEL = 1 / 255 / np.sqrt(12)
 RAMP = np.broadcast_to(np.linspace(0.02, 0.9, 200), (150, 200))
 
 
-def still(irradiance, read, shot, *, frames=12, response=lambda i: i, changes=None, events=NOTHING):
-    """Frames of 8 bits, 40 ms apart, of a still scene; ``changes`` is added to every second one."""
+def still(
+    irradiance, read, shot, *, frames=12, response=lambda i: i, changes=None, events=NOTHING, every=40_000
+):
+    """Frames of 8 bits, ``every`` us one, of a still scene; ``changes`` is added to every second one."""
     rng = np.random.default_rng(1)
     made = []
     for k in range(frames):
         now = irradiance if changes is None or k % 2 else irradiance + changes
         noise = np.sqrt(read**2 + shot * irradiance) * rng.standard_normal(irradiance.shape)
         values = np.rint(255 * response((now + noise).clip(0, 1))).astype(np.uint8)
-        made.append(Frame(values, 40_000 * k, 40_000 * k + 10_000))
+        made.append(Frame(values, every * k, every * k + every // 4))
     return Recording.from_arrays(events, made, sensor_size=irradiance.shape)
 
 
@@ -50,6 +52,14 @@ def test_read_and_shot_noise_of_a_still_ramp():
     assert found.read == pytest.approx(np.hypot(0.005, LEVEL), rel=0.1)
     assert found.at_half == pytest.approx(np.sqrt(found.read**2 + found.shot / 2))
     assert found.is_reliable
+
+
+def test_frames_that_follow_soon_tell_it_as_well():
+    """They are not passed over, as where their changes are compared with events: twelve are enough, in 24 ms."""
+    usual, soon = (
+        estimate_frame_noise(still(RAMP, 0.005, 1 / 5000, every=t), CAMERA) for t in (40_000, 2_000)
+    )
+    assert (soon.read, soon.shot) == (usual.read, usual.shot)
 
 
 def test_noise_of_less_than_half_a_level_is_the_rounding():

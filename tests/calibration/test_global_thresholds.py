@@ -23,7 +23,7 @@ from kalux.errors import ExposureError
 from kalux.events import make_events
 from kalux.settings import CameraSettings
 
-from builders import dark_scene, events, moving_blocks, unlabelled
+from builders import dark_scene, events, moving_blocks, quick_frames, unlabelled
 
 CAMERA = CameraSettings()
 USUAL = Usual(0.25, 0.25, 0.5)
@@ -51,6 +51,14 @@ def test_thresholds_of_a_well_lit_recording(name):
     sensor = SENSORS[name]
     found = estimate_thresholds(unlabelled(moving_blocks(0.08, 0.9, sensor=sensor, size=SIZE)), CAMERA, USUAL)
     np.testing.assert_allclose(ratios(found, sensor), 1.0, atol=0.12)
+
+
+def test_thresholds_by_frames_every_two_milliseconds():
+    """In so little time a pixel has an event or none: thresholds came out at twice what they are."""
+    found = estimate_thresholds(unlabelled(quick_frames()), CAMERA, USUAL, delay=6_500)
+    assert found.on == pytest.approx(0.3, rel=0.08)
+    assert found.off == pytest.approx(0.35, rel=0.08)
+    assert found.spread < 0.05
 
 
 def test_thresholds_in_spite_of_saturation():

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from kalux import Recording
-from kalux.calibration.intervals import intervals, spread
+from kalux.calibration.intervals import APART, frames_apart, intervals, spread
 from kalux.settings import CameraSettings
 
 from builders import frame, pixel_events, random_stream
@@ -35,6 +35,39 @@ def test_every_interval_has_its_events_whatever_the_chunks(chunk, margin):
         t = stream.events["t"]
         inside = (t > interval.start - margin) & (t <= interval.end + margin)
         np.testing.assert_array_equal(interval.events, stream.events[inside])
+
+
+def frames_at(*milliseconds):
+    """Frames with these middles."""
+    return [frame([[100]], 1_000 * t - 500, 1_000 * t + 500) for t in milliseconds]
+
+
+@pytest.mark.parametrize(
+    ("recorded", "left"),
+    [
+        (range(0, 200, 40), [0, 40, 80, 120, 160]),
+        (range(0, 100, 20), [0, 20, 40, 60, 80]),  # of 50 a second all
+        (range(0, 125, 10), [0, 40, 80, 120]),
+        (range(0, 125, 2), [0, 38, 76, 114]),
+        ([0, 2, 30, 32, 34, 60, 61], [0, 30, 60]),  # after a gap the next one
+        ([], []),
+    ],
+)
+def test_frames_that_follow_too_soon_are_passed_over(recorded, left):
+    found = frames_apart(frames_at(*recorded), APART)
+    assert [each.middle for each in found] == [1_000 * t for t in left]
+
+
+def test_intervals_of_frames_that_follow_soon_are_long_and_have_all_their_events():
+    """Events during the frames passed over, too; and only the frames that are left are counted."""
+    events = pixel_events(range(500, 200_000, 1_000), [1] * 200)
+    rec = Recording.from_arrays(events, frames_at(*range(1, 200, 2)), sensor_size=(1, 1))
+    found = list(intervals(rec, CAMERA, margin=0, most_frames=4))
+    assert [(i.start, i.end) for i in found] == [(1_000, 39_000), (39_000, 77_000), (77_000, 115_000)]
+    assert [len(i.events) for i in found] == [38, 38, 38]
+    assert len(list(intervals(rec, CAMERA, margin=0, most_frames=4, apart=18_000))) == 3
+    successive = list(intervals(rec, CAMERA, margin=0, most_frames=100, apart=0))
+    assert [i.end - i.start for i in successive] == [2_000] * 99
 
 
 def test_change_level_and_what_is_usable():

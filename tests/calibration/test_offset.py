@@ -16,7 +16,7 @@ from kalux.models.camera import Response
 from kalux.settings import CameraSettings
 from rigs import DISTANCE, OFFSET, distant_recording, small_rig
 
-from builders import frame, pixel_events
+from builders import frame, pixel_events, quick_frames
 
 CAMERA = CameraSettings()
 TRUTH = Registration.of_rig(small_rig(), DISTANCE)
@@ -43,6 +43,18 @@ def test_registered_frames_give_it_finely():
     assert found.coarse.offset == pytest.approx(OFFSET, abs=5_000)
     assert found.coarse.per_pixel
     assert found.apparent > found.offset
+
+
+def test_frames_every_two_milliseconds_have_one_peak():
+    """Beyond one and a half of their intervals the correlation is nearly as high as at its peak: they are thinned."""
+    seen = quick_frames()
+    lens = Lens.pinhole(seen.scene.sensor_size)
+    found = estimate_offset(
+        lambda: seen.frames, lambda: [seen.events], Registration(lens, lens, np.eye(3)), reach=50_000
+    )
+    assert found.offset == pytest.approx(5_000, abs=1_000)
+    assert found.coarse.sure
+    assert found.coarse.ratio > 1.5
 
 
 @pytest.mark.parametrize("registration", [None, TRUTH], ids=["activity", "pixels"])

@@ -14,7 +14,7 @@ from kalux.calibration.pixel_thresholds import calibrate_contrast, shrunk
 from kalux.datasets import SensorSettings, demo_scene, simulate, static
 from kalux.settings import CameraSettings
 
-from builders import from_black, lifted, pixel_events, unlabelled
+from builders import from_black, lifted, pixel_events, quick_frames, unlabelled
 
 CAMERA = CameraSettings()
 SCENE = demo_scene(sensor_size=(90, 120))
@@ -48,6 +48,13 @@ def test_within_five_percent_with_mismatch_noise_and_saturation(simulation, foun
     assert np.mean([frame.image == 255 for frame in simulation.frames]) > 0.02
     assert found.on == pytest.approx(0.25, rel=0.05)
     assert found.off == pytest.approx(0.2, rel=0.05)
+
+
+def test_within_fifteen_percent_by_frames_every_two_milliseconds():
+    """Between two of them too little moves."""
+    found = calibrate_contrast(unlabelled(quick_frames()), CAMERA)
+    assert found.on == pytest.approx(0.3, rel=0.15)
+    assert found.off == pytest.approx(0.35, rel=0.15)
 
 
 def test_within_fifteen_percent_from_five_frames(simulation):

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.calibration.delay import DelayEstimate, estimate_delay
-from kalux.calibration.intervals import WELL_EXPOSED, intervals, spread
+from kalux.calibration.intervals import APART, WELL_EXPOSED, frames_apart, intervals, spread
 from kalux.calibration.levels import response_histogram
 from kalux.event_slices import between, count_events
 from kalux.models.camera import Camera, Response
@@ -186,7 +186,8 @@ def _floor(recording: Recording) -> float | None:
     first = next(iter(recording.frames()), None)
     if first is None or first.image.ndim == 3 or first.black > 0:
         return None
-    below = np.cumsum(response_histogram(islice(recording.frames(), _MAX_FRAMES), _FINE))
+    compared = islice(frames_apart(recording.frames(), APART), _MAX_FRAMES)  # with events, by `_samples`
+    below = np.cumsum(response_histogram(compared, _FINE))
     return float(np.searchsorted(below, max(_DARKEST * below[-1], 1))) / (_FINE - 1)
 
 

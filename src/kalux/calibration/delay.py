@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.calibration.exposures import Exposures
-from kalux.calibration.intervals import Interval, intervals, spread
+from kalux.calibration.intervals import APART_IN_TIME, Interval, intervals, spread
 from kalux.calibration.regression import Fit, halves, two_stage
 from kalux.event_slices import between, count_chunks
 from kalux.events import EventArray
@@ -35,8 +35,9 @@ _FAR_WALLS: Final = (0.93, 0.72)
 have at most 0.83 and 0.64. Where events do not belong to the frames (of the wrong sign, from elsewhere, 300 ms off) and
 fits succeed at all, one of them is more on 53 of 53: the lower one at least 0.95, or the higher one 0.78."""
 
-_FAR_FITTED: Final = 0.5
-"""Share of the delays that must have thresholds at all: fits fail where events do not belong to the frames."""
+_FITTED: Final = 0.5
+"""Share of the delays tried that must have thresholds at all: fits fail where events do not belong to the frames, and
+under single delays that are far from the right one."""
 
 _COARSE: Final = (
     3  # points of the grid from one delay tried first to the next: valleys of the residuals are wider
@@ -95,7 +96,8 @@ def estimate_delay(recording: Recording, camera: CameraSettings) -> DelayEstimat
     change between the frames by robust least squares; the delay with the smallest residual wins. Around it, the
     thresholds found on the way tell what the light does within exposures, and delays are compared without that.
     Latency of the event pixels (which grows in the dark), a wrong stamp or a guessed exposure time all look alike,
-    and are all mended by it. Looks at the first 60 frames.
+    and are all mended by it. Looks at the first 60 frames, of those that
+    follow soon at 60 that are 18 ms apart.
 
     Returns None where too few pixels change, or where no delay within 12 ms explains the frames best, nor one within
     36 ms far better than others before and after it.
@@ -117,7 +119,7 @@ def estimate_delay(recording: Recording, camera: CameraSettings) -> DelayEstimat
                 residuals[index] = _residual(samples[index])
 
     def least() -> int:
-        return int(np.argmin(residuals))
+        return int(np.argmin(_or_inf(residuals)))
 
     for index in range(0, len(grid), _COARSE):
         try_between(index, index)
@@ -154,7 +156,7 @@ def _far_delay(
     coarse = np.arange(-FARTHEST, FARTHEST + 1, _FAR_STEP, dtype=np.int64)
     residuals = np.array([_residual(samples) for samples in _samples(recording, camera, coarse, (0.0, 0.0))])
     fitted = residuals[~np.isnan(residuals)]
-    if len(fitted) < _FAR_FITTED * len(coarse) or not _is_valley(residuals):
+    if len(fitted) < _FITTED * len(coarse) or not _is_valley(residuals):
         return coarse, [], None
     undelayed = float(residuals[len(coarse) // 2])
     near = int(coarse[int(np.nanargmin(residuals))])
@@ -213,23 +215,31 @@ def best_delay(
     """The minimum of the residuals over the grid, refined by a parabola through its neighbours.
 
     Of several that are about as deep (`_RIVAL`), the one nearest to no delay. Residuals are inf where nothing was
-    tried; ``undelayed`` is that of no delay, if the grid has none. None where the minimum is at an end of the grid, or
-    where a fit failed.
+    tried, and nan where a fit failed; ``undelayed`` is that of no delay, if the grid has none. None where the minimum
+    is at an end of the grid, or beside a fit that failed, or where most fits did.
     """
-    if np.isnan(residuals).any():
+    fitted = residuals[np.isfinite(residuals)]
+    if not len(fitted) or len(fitted) < _FITTED * np.count_nonzero(~np.isinf(residuals)):
         return None
+    residuals = _or_inf(residuals)
     least = int(np.argmin(residuals))
     lowest = (residuals[1:-1] <= residuals[:-2]) & (residuals[1:-1] <= residuals[2:])
     rivals = 1 + np.flatnonzero(lowest & (residuals[1:-1] <= _RIVAL * residuals[least]))
     rivals = rivals[np.abs(grid[rivals]) <= abs(int(grid[least])) - _VALLEY]
     best = int(rivals[np.argmin(np.abs(grid[rivals]))]) if len(rivals) else least
-    if best in (0, len(grid) - 1):
+    if best in (0, len(grid) - 1) or not np.isfinite(residuals[best - 1 : best + 2]).all():
         return None
     if undelayed is None:
         undelayed = float(residuals[int(np.flatnonzero(grid == 0)[0])])
+        undelayed = undelayed if np.isfinite(undelayed) else float(np.median(fitted))
     improvement = 1.0 - residuals[best] / undelayed
     apparent = float(grid[best]) + STEP * (vertex(*residuals[best - 1 : best + 2]) or 0.0)
     return DelayEstimate(round(apparent), float(improvement), samples)
+
+
+def _or_inf(residuals: Array) -> Array:
+    """Residuals, inf where a fit failed."""
+    return np.where(np.isnan(residuals), np.inf, residuals)
 
 
 def vertex(before: float, here: float, after: float) -> float | None:
@@ -275,7 +285,8 @@ def _samples(
     total = 0
     margin = max(LARGEST, int(np.abs(grid).max())) + (recording.longest_exposure if any(thresholds) else 0)
     exposures = [(d, Exposures(recording.sensor_size, d, thresholds)) for d in grid.tolist()]
-    for interval in intervals(recording, camera, margin=margin, most_frames=_MAX_FRAMES):
+    found = intervals(recording, camera, margin=margin, most_frames=_MAX_FRAMES, apart=APART_IN_TIME)
+    for interval in found:
         events = sum(_counts(interval.events, recording.sensor_size))
         chosen = spread(interval.usable & (events >= 2), _MAX_SAMPLES - total)
         parts.append(

@@ -236,7 +236,7 @@ def _intervals(
     What is beside an empty frame cannot be compared with it.
     """
     most = max(asked) + 2
-    for before, interval in enumerate(intervals(recording, camera, margin=0, most_frames=most)):
+    for before, interval in enumerate(intervals(recording, camera, margin=0, most_frames=most, apart=0)):
         if before in empty and all(i in empty for i in range(before)):
             yield before, interval
         elif before + 1 in asked and not (before in empty and before + 1 not in empty):

@@ -173,7 +173,8 @@ def usual_noise(recording: Recording, camera: CameraSettings) -> UsualNoise:
     usual, cross = camera.usual_frame_noise, _SURROUNDINGS[-1]
     of_silent: list[float] = []
     of_all: list[float] = []
-    for interval in intervals(recording, camera, margin=recording.longest_exposure, most_frames=_MIN_FRAMES):
+    margin = recording.longest_exposure
+    for interval in intervals(recording, camera, margin=margin, most_frames=_MIN_FRAMES, apart=0):
         if not _has_one_exposure(interval):
             continue
         level, difference, usable, dark = _beyond_neighbours(interval.first, interval.second)
@@ -259,7 +260,7 @@ def _points(
     Those of the smaller end where the larger are enough.
     """
     found: tuple[_Points, ...] = tuple([[] for _ in range(_BINS)] for _ in _SURROUNDINGS)
-    for interval in intervals(recording, camera, margin=margin, most_frames=most_frames):
+    for interval in intervals(recording, camera, margin=margin, most_frames=most_frames, apart=0):
         if not _has_one_exposure(interval):
             continue
         level, difference, usable, dark = _beyond_neighbours(interval.first, interval.second)

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.calibration.delay import DelayEstimate, in_thresholds, vertex
+from kalux.calibration.intervals import APART, APART_IN_TIME
 from kalux.calibration.refractory import LATE, intervals, possible_periods
 from kalux.calibration.regression import Fit, halves, products, standard_errors, two_stage
 from kalux.calibration.steps import MAX_SAMPLES, Steps, steps
@@ -326,7 +327,7 @@ class _Sampling(NamedTuple):
 
     def samples(self, *periods: int, most: int) -> _Samples:
         """Samples under refractory periods, us."""
-        return self._of_delays((self.delay,), periods, most)[0]
+        return self._of_delays((self.delay,), periods, most, APART)[0]
 
     def without_trailing(self, delay: int, period: int) -> _Sampling:
         """With the true delay in place of the apparent ``delay``, us.
@@ -338,7 +339,10 @@ class _Sampling(NamedTuple):
 
         def residuals_of(trailing: Sequence[int]) -> list[float]:
             delays = tuple(delay - each for each in trailing)
-            return [samples.residual() for samples in self._of_delays(delays, (period,), ROUGH_SAMPLES)]
+            return [
+                samples.residual()
+                for samples in self._of_delays(delays, (period,), ROUGH_SAMPLES, APART_IN_TIME)
+            ]
 
         residuals = residuals_of(tried)
         while np.isfinite(residuals).all() and residuals[-1] <= min(residuals) and tried[-1] < _MOST_TRAILING:
@@ -354,7 +358,9 @@ class _Sampling(NamedTuple):
             return self
         return self._replace(delay=delay - round(max(best, 0.0)), delay_found=True)
 
-    def _of_delays(self, delays: tuple[int, ...], periods: tuple[int, ...], most: int) -> list[_Samples]:
+    def _of_delays(
+        self, delays: tuple[int, ...], periods: tuple[int, ...], most: int, apart: int
+    ) -> list[_Samples]:
         """Samples under each of the delays, us."""
         at_least = _ROUGH_INTERVALS if most <= ROUGH_SAMPLES else _INTERVALS
         late = LATE * self.shortest if self.shortest else np.inf
@@ -368,6 +374,7 @@ class _Sampling(NamedTuple):
             of_log_offset=self.of_log_offset,
             most=most,
             at_least=at_least,
+            apart=apart,
         )
         return [_Samples(one, self.recording.sensor_size) for one in found]
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.calibration.alignment import MOST_FRAMES, Shots, align, intensities, take_shots
+from kalux.calibration.intervals import APART_IN_TIME, frames_apart
 from kalux.calibration.registration import Registration
 from kalux.errors import InputError
 from kalux.event_slices import between
@@ -109,6 +110,8 @@ def frame_changes(
 ) -> Changes:
     """Changes of the log intensity between at most 400 frames: of cells, or of the whole image without a sign.
 
+    Frames are those that `kalux.calibration.intervals.frames_apart` leaves.
+
     Raises
     ------
     InputError
@@ -117,7 +120,9 @@ def frame_changes(
     middles: list[int] = []
     rows: list[Array] = []
     before: tuple[NDArray[Any], NDArray[Any]] | None = None
-    for frame, linear, usable in intensities(islice(frames, _COARSE_FRAMES), camera):
+    for frame, linear, usable in intensities(
+        islice(frames_apart(frames, APART_IN_TIME), _COARSE_FRAMES), camera
+    ):
         log, good = np.log(linear + camera.offset).astype(np.float32), usable.astype(np.float32)
         now: tuple[NDArray[Any], NDArray[Any]]
         if registration is None:
@@ -297,7 +302,7 @@ def aligned_stretch(
     first = next(iter(frames()))
     most = _LARGEST // max(first.image[..., 0].size if first.image.ndim == 3 else first.image.size, 1)
     most = int(np.clip(min(most, _LARGEST // (2 * sensor_size[0] * sensor_size[1])), 8, MOST_FRAMES))
-    shots = take_shots(some_frames(frames(), busiest(changes, most)), camera)
+    shots = take_shots(some_frames(frames_apart(frames(), APART_IN_TIME), busiest(changes, most)), camera)
     begin, end = int(shots.middles[0]) + offset, int(shots.middles[-1]) + offset
     found = some_events(events(), begin - MARGIN, end + MARGIN)
     if not len(between(found, round(begin), round(end))):

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from kalux.augmentation.refractory import step_weight
 from kalux.calibration.exposures import Exposures
-from kalux.calibration.intervals import Interval, intervals
+from kalux.calibration.intervals import APART, Interval, intervals
 from kalux.calibration.neighbours import sum_of_neighbours
 from kalux.compiled import empty, event_column, event_is_on, event_row, event_words, loop, smaller, zeros
 from kalux.event_slices import between, count_chunks
@@ -100,6 +100,7 @@ def steps(
     of_log_offset: bool = False,
     most: int = MAX_SAMPLES,
     at_least: int = 4,
+    apart: int = APART,
 ) -> list[Steps]:
     """Well exposed pixels around which something happens, of the first 200 frames or as many as it takes.
 
@@ -124,6 +125,8 @@ def steps(
         Pixels that are enough.
     at_least
         Intervals that they are taken from, if there are as many: these differ more than pixels of one.
+    apart
+        us between frames that follow sooner than `kalux.calibration.intervals.SOON`.
 
     Raises
     ------
@@ -140,7 +143,7 @@ def steps(
     ]
     found: list[list[Steps]] = []
     count = 0
-    for interval in intervals(recording, camera, margin=margin, most_frames=_MAX_FRAMES):
+    for interval in intervals(recording, camera, margin=margin, most_frames=_MAX_FRAMES, apart=apart):
         found.append([sampler.sample(interval) for sampler in samplers])
         count += len(found[-1][0].change)
         if count >= most:
