@@ -708,7 +708,7 @@ def blurred(pixels, place, t, c2, camera):
     exposed = exposed_as(pixels, middles[k], middles[k + 1], exposed)
     silent = pixel.changes[k][1]
     change = shown_change(pixels, place, k, c2, camera) if silent else 0.1 * c2
-    return 0.1 * exposed**2 * change * (1 - 4 * share * (1 - share))
+    return 0.06 * exposed**2 * change * (1 - 4 * share * (1 - share))
 
 
 def shown_change(pixels, place, interval, c2, camera):

@@ -74,7 +74,7 @@ def test_what_exposures_hide_counts_at_frames_for_what_they_measure():
         for exposed in (0.0, 0.5, 1.2):
             variance = np.full((1, 5), 0.5, np.float32)
             add_blurred(variance, change, told, exposed, C2)
-            np.testing.assert_allclose(variance - 0.5, 0.1 * exposed**2 * counts * full, atol=1e-7)
+            np.testing.assert_allclose(variance - 0.5, 0.06 * exposed**2 * counts * full, atol=1e-7)
 
 
 def test_offsets_of_pixels_count_as_the_light_they_are_beside():

@@ -30,7 +30,7 @@ SUBTHRESHOLD_EXPOSED: Final = 0.2
 """Share of these variances, of moving and of silent pixels, that is left at a frame that is exposed all the time, the
 mean of which is not the middle: fifty simulated scenes, exposed for a twentieth to three quarters of the time."""
 
-BLURRED: Final = 0.1
+BLURRED: Final = 0.06
 """Variance at a frame by what its exposure hides, in units of the mean square change of silent pixels from frame to
 frame, if frames are exposed all the time: by the errors at frames of silent and of moving pixels of 152 scenes."""
 
