@@ -139,7 +139,7 @@ class Reconstructor:
         if calibration is not None:
             require_type("calibration", calibration, Measured, CALIBRATION_NEEDED)
             settings = settings or calibration.apply(named_preset(preset))
-            pixels = pixels or calibration.pixels
+            pixels = pixels or calibration.pixels_of(settings.events.mismatch)
         if reference_exposure is not None and _whole(reference_exposure, "reference_exposure") <= 0:
             raise InputError(f"reference_exposure is {reference_exposure} us; it must be positive")
         self.settings = settings if settings is not None else named_preset(preset)

@@ -8,8 +8,9 @@ import itertools
 import numpy as np
 import pytest
 
-from kalux import Recording
+from kalux import Frame, Recording
 from kalux.calibration.intervals import APART, frames_apart, intervals, spread
+from kalux.events import EVENT_DTYPE
 from kalux.settings import CameraSettings
 
 from builders import frame, pixel_events, random_stream
@@ -110,3 +111,14 @@ def test_of_many_pixels_some_are_taken_evenly():
     assert len(some) == 7
     assert set(np.diff(some)) == {12, 15}
     assert len(spread(chosen, 0)) == 0
+
+
+def test_what_a_response_that_is_steep_in_the_dark_shows_brightly_is_not_well_exposed():
+    """A twentieth of the light is 0.25 of an sRGB frame's white, and what it shows at 0.12 is lost in I_0 and noise."""
+    values = np.array([[10, 30, 70, 200, 250]], np.uint8)
+    frames = [Frame(values, t, t + 10_000) for t in (0, 40_000)]
+    silent = Recording.from_arrays(np.empty(0, EVENT_DTYPE), frames, sensor_size=values.shape)
+    for response, expected in (("linear", [0, 1, 1, 1, 0]), ("srgb", [0, 0, 1, 1, 0])):
+        camera = CameraSettings(response=response, log_offset=0.03, reference_exposure=10_000)
+        (interval,) = intervals(silent, camera, margin=0, most_frames=2)
+        np.testing.assert_array_equal(interval.usable[0], expected)

@@ -8,14 +8,16 @@ import numpy as np
 import pytest
 
 import kalux
-from kalux import PRESETS, Frame, Recording, load_calibration, settings
+from kalux import PRESETS, Frame, Reconstructor, Recording, load_calibration, settings
 from kalux.calibration.values import Calibration, describe_calibration
+from kalux.datasets import SensorSettings
 from kalux.errors import FormatError, InputError, SettingsError
+from kalux.pipeline import execute
 from kalux.planning import plan
 from kalux.settings import altered
 from kalux.writers.calibration import save_calibration
 
-from builders import events, pixel_events
+from builders import events, moving_blocks, pixel_events
 
 SHAPE = (3, 4)
 
@@ -177,6 +179,23 @@ def test_events_of_hot_pixels_change_nothing():
             for rows in (some, without)
         )
         np.testing.assert_array_equal(one, other)
+
+
+def test_pixels_whose_thresholds_are_not_mapped_differ_by_the_spread_that_is_found():
+    """A file of hot pixels changes no image: neither the spread that a recording shows, nor one that is stated."""
+    source = moving_blocks(sensor=SensorSettings(threshold_mismatch=0.15)).recording()
+    known = Calibration(maps={"hot": np.zeros(source.sensor_size, np.bool_)})
+    stated = altered(PRESETS["default"], "events", threshold_spread=0.03)
+    for chosen in (None, stated):
+        without, made = (plan(source, at="frames", settings=chosen, calibration=c) for c in (None, known))
+        assert made.settings == without.settings
+        assert (made.pixels.on_variance == made.settings.events.mismatch**2).all()
+        images = [list(execute(source, each)) for each in (without, made)]
+        for one, other in zip(*images, strict=True):
+            np.testing.assert_allclose(one.intensity, other.intensity, rtol=1e-5)
+    live = Reconstructor(source.sensor_size, settings=stated, calibration=known)
+    assert live.settings.events.mismatch == 0.03
+    assert known.pixels_of(0.03).off_variance.max() == 0.03**2
 
 
 def test_thresholds_of_pixels_are_the_priors():

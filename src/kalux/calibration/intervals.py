@@ -26,7 +26,8 @@ from kalux.settings import CameraSettings, EventSettings, chosen_response
 Array = NDArray[np.float64]
 
 WELL_EXPOSED: Final = (0.05, 0.95)
-"""Of the response: away from black, noise and saturation."""
+"""Of the response: away from black, noise and saturation. No less than the lower one of the intensity, too, which a
+response that is steep in the dark shows at several times the level."""
 
 SOON: Final = 18_000
 """us from a frame to the next below which that comes too soon to compare the change with events, so that frames are
@@ -77,7 +78,7 @@ class End:
         level = self.frame.normalised()
         inside = (level > low) & (level < high)
         usable = np.asarray(inside.all(axis=-1) if inside.ndim == 3 else inside, np.bool_)
-        return usable & self.shot.measured
+        return usable & (self.intensity > low * self.shot.white) & self.shot.measured
 
 
 @dataclass(frozen=True, eq=False)

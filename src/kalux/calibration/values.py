@@ -109,12 +109,18 @@ class Calibration:
 
     @property
     def pixels(self) -> PixelCalibration | None:
-        """What is known of single pixels; None without maps of thresholds or hot pixels."""
+        """`pixels_of` the spread that was measured, else the usual one."""
+        return self.pixels_of(self.apply(preset("default")).events.mismatch)
+
+    def pixels_of(self, spread: float) -> PixelCalibration | None:
+        """What is known of single pixels; None without maps of thresholds or hot pixels.
+
+        Where thresholds are not mapped they are the nominal ones, from which pixels differ by the relative ``spread``.
+        """
         known = [name for name in (*_MAPS, "hot") if name in self.maps]
         if not known:
             return None
         shape = self.maps[known[0]].shape
-        spread = self.apply(preset("default")).events.mismatch
         filled = {
             name: np.asarray(
                 self.maps.get(name, np.full(shape, _FACTORS.get(name, spread**2))), dtype=np.float64

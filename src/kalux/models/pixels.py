@@ -22,9 +22,8 @@ CALIBRATION_NEEDED: Final = "a kalux.Calibration is needed, from kalux.load_cali
 class Measured(Protocol):
     """What was measured of a sensor, as a `kalux.Calibration` holds it."""
 
-    @property
-    def pixels(self) -> PixelCalibration | None:
-        """What is known of single pixels; None: nothing."""
+    def pixels_of(self, spread: float) -> PixelCalibration | None:
+        """What is known of single pixels, whose thresholds differ by ``spread`` if not mapped; None: nothing."""
 
     def apply(self, settings: Settings) -> Settings:
         """The settings with what was measured in place of theirs."""

@@ -145,6 +145,7 @@ def plan(
     steps = with_event_steps(recording, chosen, apparent_delay, doubt_noise=of_frames.doubted)
     chosen, mismatch = with_step_errors(recording, steps.settings, steps.threshold_error, known=chosen.events)
     chosen, background = with_background(recording, chosen, known.pixels, lookahead=lookahead)
+    pixels = known.pixels_of(chosen.events.mismatch)
     origin = steps.origin
     if origin == "settings" and _are_calibrated(chosen, known):
         origin = "calibration"
@@ -155,7 +156,7 @@ def plan(
         times=wanted,
         lookahead=lookahead,
         smooth=smooth,
-        pixels=known.pixels if hot is None else with_hot(known.pixels, hot, chosen.events.mismatch),
+        pixels=pixels if hot is None else with_hot(pixels, hot, chosen.events.mismatch),
         mends=mended.mends,
         steps=steps.estimates,
         frame_noise=of_frames.estimate,
