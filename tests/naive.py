@@ -696,6 +696,13 @@ def exposed_as(pixels, start, end, exposed):
     return 12 * off / (2 * (1 - np.exp(-n)))
 
 
+def exposed_around(pixels, pixel, k):
+    """K11: E' between frame ``k`` of a pixel and the next."""
+    start, end = pixel.middles[k : k + 2]
+    exposures = [pixel.ends[i] - pixel.starts[i] for i in (k, k + 1)]
+    return exposed_as(pixels, start, end, min(sum(exposures) / 2 / (end - start), 1))
+
+
 def blurred(pixels, place, t, c2, camera):
     """K11: how far the middle of the exposures around is off their mean, as no event tells."""
     pixel = pixels[place]
@@ -703,9 +710,8 @@ def blurred(pixels, place, t, c2, camera):
     k = sum(m < t for m in middles) - 1
     if not 0 <= k < len(middles) - 1 or min(pixel.changes[k][3]) >= UNMEASURED:
         return 0.0
-    gap, share = middles[k + 1] - middles[k], (t - middles[k]) / (middles[k + 1] - middles[k])
-    exposed = min(sum(pixel.ends[i] - pixel.starts[i] for i in (k, k + 1)) / 2 / gap, 1)
-    exposed = exposed_as(pixels, middles[k], middles[k + 1], exposed)
+    share = (t - middles[k]) / (middles[k + 1] - middles[k])
+    exposed = exposed_around(pixels, pixel, k)
     silent = pixel.changes[k][1]
     change = shown_change(pixels, place, k, c2, camera) if silent else 0.1 * c2
     return 0.06 * exposed**2 * change * (1 - 4 * share * (1 - share))
@@ -725,9 +731,8 @@ def hidden(pixels, place, moving, t, on, off, settings):
     if 0 <= k < len(middles) - 1:
         gap = middles[k + 1] - middles[k]
         share = (t - middles[k]) / gap
-        exposures = [pixel.ends[i] - pixel.starts[i] for i in (k, k + 1)]
         between = 4 * share * (1 - share)
-        exposed = exposed_as(pixels, middles[k], middles[k + 1], min(sum(exposures) / 2 / gap, 1))
+        exposed = exposed_around(pixels, pixel, k)
         between += (1 - between) * 0.2 * exposed**2
         of_moving = 0.09 * c2 * between
         still = half_way(pixels, k, c2, settings.events.quantisation_variance * c2)

@@ -261,7 +261,7 @@ def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) ->
     if with_variance and moving is not None and view.rounding > 0:
         keep_rounding(total, intensity, moving, view.log_offset, view.rounding * white)
     image = Image(estimate.t, intensity, total, view.log_offset, estimate.final, fixed_pattern=pattern)
-    colour = _coloured(image, estimate, view)
+    colour = _coloured(image, estimate, view, white)
     return image if colour is None else dataclasses.replace(image, colour=colour)
 
 
@@ -332,7 +332,7 @@ def _above_bounds(
     return level, variance, lifted(estimate.log_intensity, signalled, unshown)[1], unshown
 
 
-def _coloured(image: Image, estimate: Estimate, view: View) -> NDArray[np.float32] | None:
+def _coloured(image: Image, estimate: Estimate, view: View, white: float) -> NDArray[np.float32] | None:
     """The image's colours: demosaiced, or the luminance with the frames' chromaticity; None where frames are grey."""
     if estimate.chroma is not None:
         return estimate.chroma * image.intensity[..., None]
@@ -342,5 +342,4 @@ def _coloured(image: Image, estimate: Estimate, view: View) -> NDArray[np.float3
     # The complementary filter has no variance: its highlights are treated as never measured.
     # An expected excess above a bound (K15) says nothing about the colour: there, P counts.
     known = np.maximum(image.variance, estimate.variance)
-    white = float(np.exp(estimate.white) - view.log_offset)
     return calm_highlights(colour, np.minimum(known, np.float32(view.unknown_variance)), view.gains, white)

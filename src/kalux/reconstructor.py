@@ -397,11 +397,11 @@ class Reconstructor:
             # A frame that is still to come ends after the last one, and changes images from there on.
             until = self._complete_until
             return None if until is None else min(until, self._shots[-1].end)
-        for index, shot in reversed([*enumerate(self._shots)]):
+        for shot in reversed(self._shots):
             if self._is_complete(shot):
                 node = self._method.node(shot)
                 # At the first frame of all no segment ends where the first one begins at its middle.
-                begins = index == 0 and self._frame_count == len(self._shots)
+                begins = shot is self._shots[0] and self._frame_count == len(self._shots)
                 return None if begins and self._method.begin_time(shot) == node else node
         return self._start_time()
 

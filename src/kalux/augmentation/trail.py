@@ -281,14 +281,14 @@ def no_trail(shape: tuple[int, int]) -> Trail:
 
 
 def trail_by_clock(
-    trail: Trail, polarity: NDArray[np.int8], clock: NDArray[np.int32], now: int, beyond: float
+    trail: Trail, polarity: NDArray[np.int8], clock: NDArray[np.int32], now: int, beyond: np.float32
 ) -> FloatArray:
     """f at ``beyond`` seconds after ``now`` (us after the clock's origin), (H, W) log intensity.
 
     ``polarity`` and ``clock`` are those of the newest events, with a frame of one pixel around the sensor.
     """
     out = memory.empty(trail.start.shape)
-    _trail_by_clock(polarity, clock, (np.int32(now), np.float32(beyond)), trail.heights, out)
+    _trail_by_clock(polarity, clock, (np.int32(now), beyond), trail.heights, out)
     return out
 
 

@@ -8,14 +8,13 @@ agree best leaves log(I + I_0): it is less than the camera's by I_0, never more.
 
 from __future__ import annotations
 
-from itertools import islice
 from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kalux.calibration.delay import DelayEstimate, estimate_delay
-from kalux.calibration.intervals import APART, WELL_EXPOSED, frames_apart, intervals, spread
+from kalux.calibration.intervals import WELL_EXPOSED, compared_frames, intervals, spread
 from kalux.calibration.levels import response_histogram
 from kalux.event_slices import between, count_events
 from kalux.models.camera import Camera, Response
@@ -186,8 +185,7 @@ def _floor(recording: Recording) -> float | None:
     first = next(iter(recording.frames()), None)
     if first is None or first.image.ndim == 3 or first.black > 0:
         return None
-    compared = islice(frames_apart(recording.frames(), APART), _MAX_FRAMES)  # with events, by `_samples`
-    below = np.cumsum(response_histogram(compared, _FINE))
+    below = np.cumsum(response_histogram(compared_frames(recording.frames(), _MAX_FRAMES), _FINE))
     return float(np.searchsorted(below, max(_DARKEST * below[-1], 1))) / (_FINE - 1)
 
 

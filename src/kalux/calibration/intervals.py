@@ -152,12 +152,17 @@ def frames_apart(frames: Iterable[Frame], apart: int) -> Iterator[Frame]:
         before = middle
 
 
+def compared_frames(frames: Iterable[Frame], most: int, apart: int = APART) -> Iterator[Frame]:
+    """The first ``most`` of the frames whose changes are compared with events: those that `frames_apart` leaves."""
+    return islice(frames_apart(frames, apart), most)
+
+
 def intervals(
     recording: Recording, camera: CameraSettings, *, margin: int, most_frames: int, apart: int = APART
 ) -> Iterator[Interval]:
     """The intervals between the first ``most_frames`` frames, with the events up to ``margin`` us around each.
 
-    Frames are those that `frames_apart` leaves; all with an ``apart`` of 0.
+    Frames are those of `compared_frames`; all with an ``apart`` of 0.
     """
     response = chosen_response(camera.response, recording.response)
     model = Camera.named(response, camera.clipped_from)
@@ -165,7 +170,7 @@ def intervals(
     held: list[EventArray] = []
     previous: End | None = None
     reference = float(camera.reference_exposure or 0)
-    for frame in islice(frames_apart(recording.frames(), apart), most_frames):
+    for frame in compared_frames(recording.frames(), most_frames, apart):
         reference = reference or float(frame.exposure)
         shot = take_shot(frame, model, reference)
         while not held or held[-1]["t"][-1] <= shot.middle + margin:

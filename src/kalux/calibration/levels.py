@@ -15,7 +15,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.calibration.intervals import APART, counted_intervals, frames_apart
+from kalux.calibration.intervals import compared_frames, counted_intervals
 from kalux.frames import Frame
 from kalux.models.camera import Camera, clipping_level
 from kalux.recording import Recording
@@ -133,8 +133,8 @@ def find_ceiling(
 
 def _brightest(recording: Recording, model: Camera, most_frames: int) -> float | None:
     """The response that a thousandth of the pixels of the first frames reach; None: all are black."""
-    compared = islice(frames_apart(recording.frames(), APART), most_frames)  # with events, by `_changes`
-    histogram = response_histogram((_in_grey(frame, model) for frame in compared), _FINE)
+    compared = (_in_grey(frame, model) for frame in compared_frames(recording.frames(), most_frames))
+    histogram = response_histogram(compared, _FINE)
     reached = np.cumsum(histogram[::-1])[::-1] >= max(BRIGHTEST * histogram.sum(), 1)
     brightest = int(np.flatnonzero(reached)[-1]) if reached.any() else 0
     return brightest / (_FINE - 1) if brightest > 0 else None

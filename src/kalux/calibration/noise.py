@@ -24,7 +24,7 @@ from kalux.calibration.global_thresholds import Usual, with_true_delay
 from kalux.calibration.hot_pixels import find_hot_pixels
 from kalux.calibration.levels import ClippingLevels, clipping_levels
 from kalux.calibration.refractory import dead_time, shortest_interval
-from kalux.calibration.region import Region
+from kalux.calibration.region import Region, widened
 from kalux.calibration.regression import ratio_error
 from kalux.calibration.values import Calibration
 from kalux.compiled import inner, larger, loop, smaller
@@ -207,11 +207,10 @@ def event_noise(
     if first is None or last is None or region is None or last <= first:
         return None
     inside = region.mask(recording.sensor_size)
-    for part in (
-        inside,
-        np.ones_like(inside),
-    ):  # where it is never quiet, the rest may be so because it is still
-        tally = _tallied(_chunks(recording, most_events, known), first, last, known)
+    of_all = _tallied(_chunks(recording, most_events, known), first, last, known)
+    # Where the region is never quiet, the rest may be so because it is still.
+    for part in (inside, np.ones_like(inside)):
+        tally = of_all
         unusual = _unusual_pixels(tally, part) | known
         if (unusual & ~known).any():  # again without them: their neighbours are quiet after all
             tally = _tallied(_chunks(recording, most_events, known), first, last, unusual)
@@ -245,8 +244,7 @@ def _span(
     for chunk in _chunks(recording, most_events, known):
         first = int(chunk["t"][0]) if first is None else first
         last = int(chunk["t"][-1])
-        here = Region.of(chunk)
-        region = here if region is None else region.joined(here)
+        region = widened(region, chunk)
     return first, last, region
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.calibration.alignment import MOST_FRAMES, Shots, align, intensities, take_shots
-from kalux.calibration.intervals import APART_IN_TIME, frames_apart
+from kalux.calibration.intervals import APART_IN_TIME, compared_frames, frames_apart
 from kalux.calibration.registration import Registration
 from kalux.errors import InputError
 from kalux.event_slices import between
@@ -120,9 +120,8 @@ def frame_changes(
     middles: list[int] = []
     rows: list[Array] = []
     before: tuple[NDArray[Any], NDArray[Any]] | None = None
-    for frame, linear, usable in intensities(
-        islice(frames_apart(frames, APART_IN_TIME), _COARSE_FRAMES), camera
-    ):
+    compared = compared_frames(frames, _COARSE_FRAMES, APART_IN_TIME)
+    for frame, linear, usable in intensities(compared, camera):
         log, good = np.log(linear + camera.offset).astype(np.float32), usable.astype(np.float32)
         now: tuple[NDArray[Any], NDArray[Any]]
         if registration is None:

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from kalux.events import EventArray
 from kalux.recording import Recording
 
-_LEAST_MISSED: Final = 100
-"""Events that are missing outside, at the density of the inside: by chance it is none."""
+LEAST_MISSED: Final = 100
+"""Events that are missing somewhere, or for some time, at the density or rate elsewhere: by chance it is none."""
 
 
 class Region(NamedTuple):
@@ -47,7 +47,7 @@ class Region(NamedTuple):
         """Whether events are missing elsewhere, at the density that they have here."""
         area = (self.bottom - self.top) * (self.right - self.left)
         beyond = sensor_size[0] * sensor_size[1] - area
-        return beyond * self.events >= _LEAST_MISSED * area
+        return beyond * self.events >= LEAST_MISSED * area
 
     def mask(self, sensor_size: tuple[int, int]) -> NDArray[np.bool_]:
         """(H, W) bool: the pixels that may have events; all of them where too few are missing elsewhere."""
@@ -58,12 +58,18 @@ class Region(NamedTuple):
         return inside
 
 
+def widened(region: Region | None, events: EventArray) -> Region | None:
+    """The least that holds a region, None for none, and some events, of which there may be none."""
+    if len(events) == 0:
+        return region
+    here = Region.of(events)
+    return here if region is None else region.joined(here)
+
+
 def event_region(recording: Recording) -> NDArray[np.bool_]:
     """`Region.mask` of all events of a recording; all pixels where there are none."""
     found: Region | None = None
     for chunk in recording.events():
-        if len(chunk):
-            here = Region.of(chunk)
-            found = here if found is None else found.joined(here)
+        found = widened(found, chunk)
     size = recording.sensor_size
     return np.ones(size, np.bool_) if found is None else found.mask(size)

@@ -11,9 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.calibration.region import Region
+from kalux.calibration.region import LEAST_MISSED, Region, widened
 from kalux.event_slices import between, events_until
-from kalux.events import EventArray
 from kalux.frames import Frame, exposure_doubt
 from kalux.recording import Recording, clock_doubt, no_frames
 from kalux.settings import CameraSettings
@@ -33,9 +32,6 @@ _LONG_GAP: Final = 10_000_000
 _MANY_INTERVALS: Final = 100
 """As many times longer than usual: pictures of a slow series are not missed."""
 
-
-_LEAST_MISSED: Final = 100
-"""Events that are missing in a silence at the usual rate, at least: by chance it is none."""
 
 _SILENCES: Final = 8  # the longest, of each chunk of events, that are looked at
 _LEAST_EVENTS: Final = 1_000  # of one polarity, without the other: fewer may be noise
@@ -188,7 +184,7 @@ def check_recording(
             break
         count += len(chunk)
         on += int(np.count_nonzero(chunk["p"]))
-        region = _joined_region(region, chunk)
+        region = widened(region, chunk)
         events_between += len(between(chunk, start - 1, end))
         events_from += len(chunk) - events_until(chunk, start - 1)
         silences += _longest_silences(between(chunk, start - 1, end)["t"], last_event)
@@ -221,13 +217,6 @@ def check_recording(
     )
 
 
-def _joined_region(region: Region | None, chunk: EventArray) -> Region | None:
-    if len(chunk) == 0:
-        return region
-    here = Region.of(chunk)
-    return here if region is None else region.joined(here)
-
-
 def _longest_silences(times: NDArray[np.int64], before: int) -> list[tuple[int, int]]:
     """(start, end) us of the longest times without one of the events at ``times``, which follow one at ``before``."""
     if not len(times):
@@ -246,7 +235,7 @@ def _with_events_missing(
     rest = seen
     for begin, end in sorted(silences, key=lambda silence: silence[0] - silence[1]):
         rest -= end - begin
-        if events == 0 or end - begin < _LEAST_MISSED * rest / events:
+        if events == 0 or end - begin < LEAST_MISSED * rest / events:
             return
         yield begin, end
 

@@ -189,17 +189,20 @@ def trail_ahead(segment: BridgedSegment, cursor: Cursor, t: int) -> FloatArray |
     """(H, W) how far the light is ahead of its events at ``t`` (us), K14; None where that is not followed."""
     if segment.trail is None:
         return None
+    return trail_by_clock(segment.trail, cursor.polarity, cursor.clock, *_on_clock(cursor, t))
+
+
+def _on_clock(cursor: Cursor, t: int) -> tuple[int, np.float32]:
+    """A time ``t`` (us) as the clock has it, us, and what is beyond its span, s."""
     within = min(t - cursor.origin, EPOCH)
-    beyond = (t - cursor.origin - within) * 1e-6
-    return trail_by_clock(segment.trail, cursor.polarity, cursor.clock, within, beyond)
+    return within, np.float32((t - cursor.origin - within) * 1e-6)
 
 
 def _read(segment: BridgedSegment, cursor: Cursor, t: int) -> tuple[FloatArray, FloatArray]:
     """The same, at the end of the segment with the trail, bounds (K7) and drift (K10) there."""
     shape = segment.augmented.shape
     log_intensity, variance = apart(2, shape)
-    within = min(t - cursor.origin, EPOCH)
-    beyond = np.float32((t - cursor.origin - within) * 1e-6)
+    within, beyond = _on_clock(cursor, t)
     since_start = np.float32((t - segment.start) * 1e-6)
     arrays = cursor.pixels, cursor.clock, cursor.polarity, segment.slope
     heights = NO_HEIGHTS if segment.trail is None else segment.trail.heights
