@@ -41,7 +41,7 @@ class Pixel:
     intensity: list[float]
     white: list[float]
     clipped: list[bool]
-    weight: list[float]
+    rounding: list[float]
     black: list[bool]
     dark: list[float]
     events: list[tuple[int, bool, int, int, float]]
@@ -94,12 +94,20 @@ def pixels(events, frames, sensor_size, settings, begin):
                 [r * float(camera.response.inverse(q)) for r, q in zip(ratio, response, strict=True)],
                 ratio,
                 [r >= settings.camera.clipped_from for r in response],
-                [float(camera.weight(r)) for r in response],
+                [r * half_rounded(camera.response, q) for r, q in zip(ratio, response, strict=True)],
                 [r == 0 for r in response],
                 [dark_scale(f, settings.camera) for f in frames],
                 own,
             )
     return out
+
+
+def half_rounded(response, level):
+    """K3: half of the irradiances that are rounded to a level of 8 bits; 0 where it is the same at all levels."""
+    if response.is_linear:
+        return 0.0
+    least, most = max(level - 0.5 / 255, 0.0), min(level + 0.5 / 255, 1.0)
+    return float(response.inverse(most) - response.inverse(least)) / 2
 
 
 def event_weight(since, settings):
@@ -330,8 +338,8 @@ def bridged(pixel, settings, times, on, off, scales):
     def frame_variance(k):  # K3, by the noise of the frame alone
         read, shot = c.noise
         variance = (read * pixel.white[k]) ** 2 + shot * pixel.white[k] * pixel.intensity[k]
+        variance = max(variance, pixel.rounding[k] ** 2)
         variance /= (max(pixel.intensity[k], 1.5 * read * pixel.white[k]) + i0) ** 2
-        variance /= max(pixel.weight[k], 1e-6)
         return variance
 
     def latent(k):  # K3

@@ -38,6 +38,10 @@ VARIANTS = {
         PRESETS["default"],
         camera=dataclasses.replace(PRESETS["default"].camera, frame_noise=0.01, shot_noise=5e-4),
     ),
+    "default-gamma": dataclasses.replace(
+        PRESETS["default"],
+        camera=dataclasses.replace(PRESETS["default"].camera, response="gamma:2.2", frame_noise=0.002),
+    ),
     "default-trusted": dataclasses.replace(
         PRESETS["default"], events=dataclasses.replace(PRESETS["default"].events, extrapolation_trust=0.7)
     ),

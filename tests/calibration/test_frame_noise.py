@@ -108,12 +108,23 @@ def test_unseen_motion_is_a_share_of_the_light():
 
 
 def test_a_response_that_is_not_linear():
-    """What (6) makes of it, sigma_im^2 / f^w, is the variance of the intensity; here 0.01^2 everywhere."""
+    """It is that of the intensity, here 0.01 everywhere, whatever the slope of the response."""
     camera = CameraSettings(response="gamma:1.5")
     irradiance = np.broadcast_to(np.linspace(0.1, 0.8, 200), (150, 200))
     found = estimate_frame_noise(still(irradiance, 0.01, 0.0, response=lambda i: i ** (1 / 1.5)), camera)
-    weight = Response.gamma(1.5).weight(found.levels ** (1 / 1.5))
-    np.testing.assert_allclose(found.variances / weight, 0.01**2, rtol=0.2)
+    np.testing.assert_allclose(found.variances, 0.01**2, rtol=0.1)
+    assert found.read == pytest.approx(0.01, rel=0.1)
+
+
+def test_rounding_of_a_response_that_is_not_linear():
+    """Of a scene without noise: what half a level over the root of three is in the light, at each level its own."""
+    response, half = Response.gamma(2.2), 0.5 / 255
+    found = estimate_frame_noise(
+        still(RAMP, 1e-5, 0.0, response=response), CameraSettings(response="gamma:2.2")
+    )
+    seen = np.sqrt(found.read**2 + found.shot * found.levels)
+    np.testing.assert_allclose(seen, half / 3**0.5 * 2.2 * found.levels ** (1.2 / 2.2), rtol=0.15)
+    assert found.read < 0.1 * half
 
 
 @pytest.mark.parametrize("read", [0.0, 0.004, 0.01])

@@ -15,6 +15,7 @@ from kalux.models.camera import (
     Response,
     black_ceiling,
     clipping_level,
+    common_rounding,
     count_bright,
     covariance,
     dark_scale,
@@ -261,6 +262,36 @@ def test_covariance_of_a_frame_by_hand():
     expected = 1e-4 / np.array([0.045, 0.045, 0.045, 0.53]) ** 2 / weight
     found = frame_log_covariance(intensity, weight, (0.01, 0.0), 1.0, 0.03)
     np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
+def test_noise_of_a_frame_is_no_less_than_the_rounding_of_its_levels():
+    intensity, rounding = np.array([0.1, 0.5]), np.array([0.004, 0.02])
+    found = frame_log_covariance(intensity, np.ones(2), (0.01, 0.0), 1.0, 0.03, rounding)
+    np.testing.assert_allclose(found, [1e-4 / 0.13**2, 4e-4 / 0.53**2], rtol=1e-12)
+
+
+def test_rounding_follows_the_slope_of_the_inverse_response():
+    """Of gamma 2.2 half a level is 2.2 v^1.2 halves of a level at v: nearly nothing in the dark, double near white."""
+    level, half = np.array([0.0, 0.1, 0.5, 0.9]), 0.5 / 255
+    found = Response.gamma(2.2).rounding(level, half)
+    np.testing.assert_allclose(found[1:], half * 2.2 * level[1:] ** 1.2, rtol=1e-2)
+    assert 0 < found[0] < 1e-5
+    np.testing.assert_array_equal(Response.linear().rounding(level, half), 0.0)
+    np.testing.assert_array_equal(Response.gamma(2.2).rounding(level, 0.0), 0.0)
+
+
+def test_rounding_that_all_levels_share():
+    octets = Frame(np.zeros((1, 1), np.uint8), 0, 1)
+    assert common_rounding(octets, Response.gamma(1.0)) == 0.5 / 255
+    assert common_rounding(octets, Response.srgb()) == 0.0
+
+
+def test_noise_of_a_measured_weight_only_is_divided_by_it():
+    """The slope of a response says how exact a level is, but noise is that of the intensity."""
+    level = np.linspace(0, 1, 5)
+    np.testing.assert_array_equal(Camera(RESPONSES["srgb"]).measured_weight(level), 1.0)
+    camera = Camera.from_inverse_covariance(np.linspace(1, 7e5, 256), Response.linear(), 0.98)
+    np.testing.assert_array_equal(camera.measured_weight(level), camera.weight(level))
 
 
 def test_rounding():

@@ -20,9 +20,9 @@ from kalux.compiled import empty, event_column, event_row, event_words, loop, sm
 from kalux.event_slices import all_between
 from kalux.events import EventArray
 from kalux.filters.shots import Shot
-from kalux.models.camera import rounding_error
+from kalux.models.camera import Camera, Response, common_rounding, rounding_error
 from kalux.recording import Recording
-from kalux.settings import CameraSettings
+from kalux.settings import CameraSettings, chosen_response
 
 Array = NDArray[np.float64]
 
@@ -67,7 +67,7 @@ class FrameNoise(NamedTuple):
         Relative standard error of the standard deviation, from the scatter of the points. Larger than 0.3, and the
         curve is not one: something else changes the frames.
     levels, variances
-        The points of the curve; of a response that is not linear, variances times f^w (5), by which (6) divides again.
+        The points of the curve.
     """
 
     read: float
@@ -96,7 +96,7 @@ def estimate_frame_noise(
     """Photon transfer curve of pixels without events nearby from one exposure's start to the next one's end.
 
     In units of the intensity of a saturated pixel of the frames, by levels; the median over frame pairs, so that pairs
-    with faint motion do not count. Read noise is no less than `rounding_error`, or that of 16 bits. None where fewer
+    with faint motion do not count. Read noise is no less than `common_rounding`, or that of 16 bits. None where fewer
     than two levels are seen, each by 200 pixels of a frame pair. Where noise leaves no such pixels, 50 without events
     of their own and of the four beside are enough, if they have more noise than usual: of less, they say too little.
 
@@ -124,10 +124,12 @@ def estimate_frame_noise(
     seen = [np.array(found) for found in points[chosen] if found]
     levels, variances = (np.array([np.median(found[:, i]) for found in seen]) for i in range(2))
     weights = np.array([np.sqrt(found[:, 2].sum()) for found in seen])
-    rounding = rounding_error(next(iter(recording.frames())))
+    frame, response = next(iter(recording.frames())), _response(recording, camera)
+    rounding = common_rounding(frame, response)
     # Noise of much less than a level shows as none, or as any.
+    least = np.maximum(rounding, response.rounding(response(levels), rounding_error(frame)))
     found = photon_transfer(
-        levels, np.maximum(variances, rounding**2 / 3), weights, motion=_SURROUNDINGS[chosen].moves
+        levels, np.maximum(variances, least**2 / 3), weights, motion=_SURROUNDINGS[chosen].moves
     )
     if _SURROUNDINGS[chosen].moves and found.read <= camera.usual_frame_noise:
         return None
@@ -205,8 +207,13 @@ def quiet_noise(recording: Recording, camera: CameraSettings, dark: float) -> tu
 
 def _possible_read(recording: Recording, camera: CameraSettings, dark: float) -> float:
     """Noise in the dark: no more than the usual, and no less than the standard deviation of rounding."""
-    rounding = rounding_error(next(iter(recording.frames()))) / 3**0.5
+    rounding = common_rounding(next(iter(recording.frames())), _response(recording, camera)) / 3**0.5
     return min(max(dark, rounding, _LEAST_READ), camera.usual_frame_noise)
+
+
+def _response(recording: Recording, camera: CameraSettings) -> Response:
+    """The camera's, or that of its green pixels."""
+    return Camera.named(chosen_response(camera.response, recording.response), camera.clipped_from).response
 
 
 def _has_one_exposure(interval: Interval) -> bool:
@@ -318,24 +325,22 @@ def _beyond_neighbours(
     return level, np.asarray(beyond, np.float64), usable, dark
 
 
-def _by_level(shot: Shot) -> tuple[NDArray[np.integer[Any]], Array, Array, NDArray[np.bool_]]:
-    """Levels of the pixels; of each level I in units of white, the weight and whether it is clipped."""
-    return shot.levels, shot.level_intensity / shot.white, shot.level_weight, shot.level_clipped
+def _by_level(shot: Shot) -> tuple[NDArray[np.integer[Any]], Array, NDArray[np.bool_]]:
+    """Levels of the pixels; of each level I in units of white, and whether it is clipped."""
+    return shot.levels, shot.level_intensity / shot.white, shot.level_clipped
 
 
 @loop
 def _compare(  # type: ignore[no-untyped-def]
-    before, intensity, weight, clipped, after, next_intensity, next_weight, next_clipped, level, change, bad
+    before, intensity, clipped, after, next_intensity, next_clipped, level, change, bad
 ):
-    """Of two frames: mean intensity, its change in units of the weight's root, and what clips."""
+    """Of two frames: mean intensity, its change, and what clips."""
     for row in range(level.shape[0]):
         for column in range(level.shape[1]):
             a, b = before[row, column], after[row, column]
             mean = (intensity[a] + next_intensity[b]) / 2
             level[row, column] = mean
-            change[row, column] = (next_intensity[b] - intensity[a]) * np.sqrt(
-                (weight[a] + next_weight[b]) / 2
-            )
+            change[row, column] = next_intensity[b] - intensity[a]
             bad[row, column] = clipped[a] | next_clipped[b]
 
 

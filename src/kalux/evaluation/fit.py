@@ -24,8 +24,8 @@ from scipy.special import log_ndtr
 from kalux.calibration.values import Calibration
 from kalux.errors import InputError
 from kalux.evaluation.held_out import HeldOut, hold_out_frames
-from kalux.filters.shots import Shot, take_shot
-from kalux.models.camera import Camera, frame_log_covariance, rounding_error
+from kalux.filters.shots import Shot, level_variance, take_shot
+from kalux.models.camera import Camera, common_rounding
 from kalux.pipeline import reconstruct
 from kalux.planning import plan
 from kalux.recording import Recording, with_frames
@@ -157,7 +157,8 @@ def fit_settings(
         black_level=settings.camera.black_level,
     )
     settings = _filled_in(held, settings)
-    rounding = rounding_error(next(iter(held.kept.frames())))
+    response = Camera.named(settings.camera.response, settings.camera.clipped_from).response
+    rounding = common_rounding(next(iter(held.kept.frames())), response)
     current = dict.fromkeys(STEPS, 1.0)
     first = best = score_settings(held, settings, known)
     on_evaluation()
@@ -246,7 +247,7 @@ def _negative_log_density(mean: Array, variance: Array, shot: Shot, settings: Se
     """(H, W) of every pixel of a frame, or the negative log probability of being clipped."""
     offset = settings.camera.offset
     observed = np.maximum(shot.intensity, 0.0)
-    total = variance + frame_log_covariance(observed, shot.weight, settings.camera.noise, shot.white, offset)
+    total = variance + level_variance(shot, settings.camera.noise, offset)[shot.levels]
     away = (np.log(observed + offset) - np.log(np.maximum(mean, 0.0) + offset)) / np.sqrt(total)
     narrow = np.log(1 - _OUTLIERS) - 0.5 * away**2
     wide = np.log(_OUTLIERS / _OUTLIER_SCALE) - 0.5 * (away / _OUTLIER_SCALE) ** 2

@@ -31,9 +31,9 @@ from kalux.evaluation.lpips import LpipsWeights
 from kalux.evaluation.method import METHOD_NEEDED, Method
 from kalux.evaluation.pairs import Array, Pair
 from kalux.evaluation.scores import Scores, score
-from kalux.filters.shots import take_shot
+from kalux.filters.shots import level_variance, take_shot
 from kalux.frames import Frame
-from kalux.models.camera import Camera, frame_log_covariance
+from kalux.models.camera import Camera
 from kalux.recording import RECORDING_NEEDED, Recording, reference_exposure, with_frames
 from kalux.settings import AUTO, CameraSettings, chosen_response
 from kalux.wording import how_many, ordinal
@@ -249,9 +249,7 @@ def held_out_pairs(held: HeldOut, method: Method, *, clip: bool = False) -> Iter
             variance=variance,
             clipped=clipped if clipped.ndim == 2 else np.asarray(clipped.any(axis=-1)),
             log_offset=offset,
-            noise=None
-            if variance is None
-            else frame_log_covariance(shot.intensity, shot.weight, held.noise, shot.white, offset),
+            noise=None if variance is None else level_variance(shot, held.noise, offset)[shot.levels],
         )
 
 

@@ -46,9 +46,9 @@ from kalux.filters import akf_bridged
 from kalux.filters.akf import State
 from kalux.filters.common import make_clock
 from kalux.filters.method import FAR_FUTURE, USUAL_INTERVAL, Chunks, Method, Segment
-from kalux.filters.shots import Shot
+from kalux.filters.shots import Shot, level_variance
 from kalux.filters.uncertainty import WRONG_STEPS, Around
-from kalux.models.camera import CRUSHED, beyond_white, dark_scale, frame_log_covariance, log_intensity
+from kalux.models.camera import CRUSHED, beyond_white, dark_scale, log_intensity
 from kalux.models.dark_levels import dark_correction
 from kalux.models.pixels import PixelCalibration
 from kalux.settings import Settings
@@ -206,9 +206,7 @@ class BridgedFrames(Method):
 
     def level_variance(self, shot: Shot) -> Array:
         """(N,) variance of log(I + I_0) of each level, by the noise of the frame alone."""
-        return frame_log_covariance(
-            shot.level_intensity, shot.level_weight, self.settings.camera.noise, shot.white, self.offset
-        )
+        return level_variance(shot, self.settings.camera.noise, self.offset)
 
     def crushed(self, shot: Shot) -> NDArray[np.bool_] | None:
         """(N,) black levels that cover more intensities than a linear response's; None: there are none.

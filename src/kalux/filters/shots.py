@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -12,7 +13,14 @@ from kalux.augmentation.trail import FrameTrail
 from kalux.errors import SettingsError
 from kalux.frames import Frame
 from kalux.models import colour
-from kalux.models.camera import BrightTail, Camera, black_ceiling, inverse_response, rounding_error
+from kalux.models.camera import (
+    BrightTail,
+    Camera,
+    black_ceiling,
+    frame_log_covariance,
+    inverse_response,
+    rounding_error,
+)
 
 Array = NDArray[np.float64]
 
@@ -30,6 +38,11 @@ class Shot(NamedTuple):
         (N,) I of equation (3) at the reference exposure; 1 = a saturated pixel there.
     level_weight
         (N,) f^w of the response.
+    level_measured_weight
+        (N,) f^w as far as it was measured, else 1 (K3).
+    level_rounding
+        (N,) half of what is rounded to the level, in units of I, where levels differ in that; else 0
+        (`kalux.models.camera.Response.rounding`).
     level_clipped
         (N,) bool: saturated, so that the value is no measurement.
     white
@@ -57,6 +70,8 @@ class Shot(NamedTuple):
     levels: NDArray[np.integer[Any]]
     level_intensity: Array
     level_weight: Array
+    level_measured_weight: Array
+    level_rounding: Array
     level_clipped: NDArray[np.bool_]
     white: float
     level_ceiling: Array
@@ -112,17 +127,19 @@ def take_shot(
     ratio = reference_exposure / frame.amplified_exposure
     if frame.image.ndim == 3:
         return _colour_shot(frame, camera, ratio, gains)
-    levels, response, intensity, weight, ceiling = _leveled(frame, camera, ratio)
+    levels, response, of_levels = _leveled(frame, camera, ratio)
     return Shot(
         start=frame.exposure_start,
         middle=frame.middle,
         end=frame.exposure_end,
         levels=levels,
-        level_intensity=intensity,
-        level_weight=weight,
+        level_intensity=of_levels.intensity,
+        level_weight=of_levels.weight,
+        level_measured_weight=of_levels.measured_weight,
+        level_rounding=of_levels.rounding,
         level_clipped=response >= camera.saturation,
         white=ratio,
-        level_ceiling=ceiling,
+        level_ceiling=of_levels.ceiling,
         valid=_mask(frame),
         pitch=1 if frame.mosaic is None else 2,
         gap=2.0 * rounding_error(frame) * ratio,
@@ -134,14 +151,34 @@ def _mask(frame: Frame) -> NDArray[np.bool_] | None:
     return None if frame.valid is None else frame.valid.copy()
 
 
+def level_variance(shot: Shot, noise: tuple[float, float], log_offset: float) -> Array:
+    """(N,) variance of log(I + I_0) of each level, by the noise of the frame alone (K3)."""
+    return frame_log_covariance(
+        shot.level_intensity,
+        shot.level_measured_weight,
+        noise,
+        shot.white,
+        log_offset,
+        shot.level_rounding,
+    )
+
+
+class _OfLevels(NamedTuple):
+    """Of every level I, f^w, both of its kinds, half of what is rounded to it, and, where black, the most it can be."""
+
+    intensity: Array
+    weight: Array
+    measured_weight: Array
+    rounding: Array
+    ceiling: Array
+
+
 class _Leveled(NamedTuple):
-    """Which level every pixel has, and of every level its response, I, f^w and, where black, the most it can be."""
+    """Which level every pixel has, every level's response, and what that says."""
 
     levels: NDArray[np.integer[Any]]
     response: Array
-    intensity: Array
-    weight: Array
-    ceiling: Array
+    of_levels: _OfLevels
 
 
 def _leveled(frame: Frame, camera: Camera, ratio: float) -> _Leveled:
@@ -155,20 +192,28 @@ def _leveled(frame: Frame, camera: Camera, ratio: float) -> _Leveled:
         values = np.arange(int(levels.max(initial=0)) + 1, dtype=levels.dtype)
         response = Frame(values, 0, 1, frame.white, black=frame.black).normalised()
     if camera.colours is None:
-        return _Leveled(levels, response, *_by_response(camera, response, ratio))
+        return _Leveled(levels, response, _by_response(camera, response, ratio, rounding_error(frame)))
     if frame.mosaic is None:
         raise SettingsError("response: three responses are for frames in colour or mosaics; these are grey")
     levels = levels.astype(np.int32)
     for row, column in np.ndindex(2, 2):
         levels[row::2, column::2] += "RGB".index(frame.mosaic[2 * row + column]) * len(response)
-    of_colours = zip(*(_by_response(camera.of_channel(c), response, ratio) for c in range(3)), strict=True)
-    return _Leveled(levels, np.tile(response, 3), *(np.concatenate(values) for values in of_colours))
+    half = rounding_error(frame)
+    of_colours = zip(
+        *(_by_response(camera.of_channel(c), response, ratio, half) for c in range(3)), strict=True
+    )
+    return _Leveled(
+        levels, np.tile(response, 3), _OfLevels(*(np.concatenate(values) for values in of_colours))
+    )
 
 
-def _by_response(camera: Camera, response: Array, ratio: float) -> tuple[Array, Array, Array]:
-    return (
+def _by_response(camera: Camera, response: Array, ratio: float, half_level: float) -> _OfLevels:
+    inside = np.clip(response, 0.0, 1.0)
+    return _OfLevels(
         inverse_response(camera, response, ratio),
-        camera.weight(np.clip(response, 0.0, 1.0)),
+        camera.weight(inside),
+        camera.measured_weight(inside),
+        camera.response.rounding(inside, half_level) * ratio,
         black_ceiling(camera, response, ratio),
     )
 
@@ -179,12 +224,19 @@ def _colour_shot(frame: Frame, camera: Camera, ratio: float, gains: colour.Gains
     Errors of the channels are taken as common to them, as demosaicing and compression make them: standard deviations
     add. A pixel is clipped where clipped channels carry more than `colour.CLIPPED_SHARE` of the luminance.
     """
-    parts = [_channel(frame, camera, ratio, c) for c in range(3)]
-    rgb = np.stack([gain * part[0] for gain, part in zip(gains, parts, strict=True)], axis=-1)
+    parts, clipped = zip(*(_channel(frame, camera, ratio, c) for c in range(3)), strict=True)
+    rgb = np.stack([gain * part.intensity for gain, part in zip(gains, parts, strict=True)], axis=-1)
     y = colour.luminance(rgb)
     shares = [w * g for w, g in zip(colour.LUMINANCE, gains, strict=True)]
-    spread = sum(s / np.sqrt(np.maximum(part[1], 1e-6)) for s, part in zip(shares, parts, strict=True))
-    of_clipped = sum(s * part[0] * part[2] for s, part in zip(shares, parts, strict=True))
+
+    def summed(values: Iterable[Array]) -> Array:
+        total: Array = np.sum([s * value for s, value in zip(shares, values, strict=True)], axis=0)
+        return total
+
+    def weight(values: Iterable[Array]) -> Array:
+        return 1 / np.square(summed(1 / np.sqrt(np.maximum(value, 1e-6)) for value in values))
+
+    of_clipped = summed(part.intensity * ends for part, ends in zip(parts, clipped, strict=True))
     brightest = (np.max(frame.image, axis=-1) - frame.black) / frame.full_scale
     room = max(camera.saturation - colour.RELIABLE, 1e-6)
     reliable = np.clip((camera.saturation - brightest) / room, 0, 1).astype(np.float32)
@@ -195,11 +247,13 @@ def _colour_shot(frame: Frame, camera: Camera, ratio: float, gains: colour.Gains
         end=frame.exposure_end,
         levels=np.arange(y.size, dtype=np.int32).reshape(y.shape),
         level_intensity=y.ravel(),
-        level_weight=(1 / np.square(spread)).ravel(),
+        level_weight=weight(part.weight for part in parts).ravel(),
+        level_measured_weight=weight(part.measured_weight for part in parts).ravel(),
+        level_rounding=summed(part.rounding for part in parts).ravel(),
         level_clipped=(of_clipped > colour.CLIPPED_SHARE * np.maximum(y, 0)).ravel(),
         white=ratio,
         level_ceiling=colour.luminance(
-            np.stack([g * part[3] for g, part in zip(gains, parts, strict=True)], -1)
+            np.stack([g * part.ceiling for g, part in zip(gains, parts, strict=True)], -1)
         ).ravel(),
         chroma=colour.chromaticity(rgb, _CHROMA_FLOOR * ratio),
         chroma_weight=reliable if valid is None else np.where(valid, reliable, np.float32(0.0)),
@@ -207,10 +261,8 @@ def _colour_shot(frame: Frame, camera: Camera, ratio: float, gains: colour.Gains
     )
 
 
-def _channel(
-    frame: Frame, camera: Camera, ratio: float, channel: int
-) -> tuple[Array, Array, NDArray[np.bool_], Array]:
-    """I, f^w, clipped, and the most that black can be, of one channel of an RGB frame, (H, W)."""
+def _channel(frame: Frame, camera: Camera, ratio: float, channel: int) -> tuple[_OfLevels, NDArray[np.bool_]]:
+    """What the levels of one channel of an RGB frame say, and where it is clipped, (H, W) each."""
     own = dataclasses.replace(frame, image=np.ascontiguousarray(frame.image[..., channel]))
-    levels, response, intensity, weight, ceiling = _leveled(own, camera.of_channel(channel), ratio)
-    return intensity[levels], weight[levels], (response >= camera.saturation)[levels], ceiling[levels]
+    levels, response, of_levels = _leveled(own, camera.of_channel(channel), ratio)
+    return _OfLevels(*(values[levels] for values in of_levels)), (response >= camera.saturation)[levels]

@@ -177,6 +177,11 @@ class Response:
             "and curve:NUMBERS"
         )
 
+    @property
+    def is_linear(self) -> bool:
+        """Whether the response is the irradiance itself."""
+        return np.array_equal(self.irradiance, self.response)
+
     def __call__(self, irradiance: Array) -> Array:
         """CRF: response, 0 to 1, of an irradiance; clipped at 1."""
         return np.interp(irradiance, self.irradiance, self.response)
@@ -200,6 +205,16 @@ class Response:
     def weight(self, response: Array) -> Array:
         """f^w of equation (5): the certainty as a function of the response."""
         return self.certainty(self.inverse(response))
+
+    def rounding(self, response: Array, half_level: float) -> Array:
+        """What ``half_level`` of the response is in irradiance there: half of what is rounded to this response.
+
+        0 of a linear response, all of whose levels are alike, so that the frames' read noise can count it.
+        """
+        if self.is_linear:
+            return np.zeros(np.shape(response))
+        low, high = (np.clip(response + side, 0.0, 1.0) for side in (-half_level, half_level))
+        return (self.inverse(high) - self.inverse(low)) / 2.0
 
 
 def named_responses(text: str) -> tuple[Response, ...]:
@@ -274,6 +289,10 @@ class Camera:
         if self.weight_table is None:
             return self.response.weight(response)
         return np.interp(response, np.linspace(0.0, 1.0, len(self.weight_table)), self.weight_table)
+
+    def measured_weight(self, response: Array) -> Array:
+        """f^w where it was measured, else 1: noise that is known as that of I needs no slope of the response (K3)."""
+        return np.ones(np.shape(response)) if self.weight_table is None else self.weight(response)
 
 
 def inverse_response(camera: Camera, response: Array, exposure_ratio: float) -> Array:
@@ -475,6 +494,11 @@ def rounding_error(frame: Frame) -> float:
     return 0.0 if frame.image.dtype.kind == "f" else 0.5 / frame.full_scale
 
 
+def common_rounding(frame: Frame, response: Response) -> float:
+    """The `rounding_error` of I where it is the same at all levels; 0 where each has its own (`Response.rounding`)."""
+    return rounding_error(frame) if response.is_linear else 0.0
+
+
 def repeated_rounding(frame: Frame, camera: CameraSettings) -> float:
     """Standard deviation, white = 1, of rounding that is the same in all frames of a still pixel (K11); 0: none is.
 
@@ -492,9 +516,14 @@ least 0, the variance of log(I + I_0) is the same within 20 % where the noise is
 
 
 def frame_log_covariance(
-    intensity: Array, weight: Array, noise: tuple[float, float], white: float, log_offset: float
+    intensity: Array,
+    weight: Array,
+    noise: tuple[float, float],
+    white: float,
+    log_offset: float,
+    rounding: float | Array = 0.0,
 ) -> Array:
-    """R of one frame's pixels, equations (6) and (9) with its read and shot noise.
+    """R of one frame's pixels, equations (6) and (9) with its read and shot noise, no less than its rounding (K3).
 
     Taken at its own value as printed, R of a pixel near black depends on its noise, and a mean of many frames gives
     most weight to those in which the noise was bright: a dark pixel becomes too bright by as much as I_0.
@@ -504,11 +533,13 @@ def frame_log_covariance(
     intensity, noise, white
         As in `noise_variance`.
     weight
-        f^w.
+        f^w, as far as it was measured.
     log_offset
         I_0.
+    rounding
+        Half of what is rounded to the same level, in units of I; 0 where the read noise counts it.
     """
-    r_bar = covariance(weight, noise_variance(intensity, noise, white), 1e-6)
+    r_bar = covariance(weight, np.maximum(noise_variance(intensity, noise, white), rounding**2), 1e-6)
     return log_covariance(np.maximum(intensity, _DARK * noise[0] * white), r_bar, log_offset)
 
 

@@ -448,10 +448,11 @@ def camera_curves(recording: Recording, method: Method) -> dict[str, Any] | None
         else Camera.from_inverse_covariance(table, response, saturation)
     )
     levels = np.linspace(0.0, 1.0, 256)
-    weight = camera.weight(levels)
     if settings.filter.augmentation == "paper":
+        weight = camera.weight(levels)
         usable, floor = np.ones(len(levels), bool), camera_settings.weight_floor
     else:
+        weight = camera.measured_weight(levels)
         usable, floor = levels < saturation, 1e-6
     r_bar = np.maximum(weight, floor) ** -1
     return {
