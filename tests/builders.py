@@ -125,6 +125,13 @@ def moving_blocks(
 
 
 @lru_cache(maxsize=1)
+def without_events(source: Recording, begin: int, end: int) -> Recording:
+    """A recording whose sensor has dropped its events from ``begin`` to ``end``, us."""
+    events = np.concatenate([*source.events()])
+    kept = events[(events["t"] < begin) | (events["t"] > end)]
+    return Recording.from_arrays(kept, [*source.frames()], sensor_size=source.sensor_size)
+
+
 def quick_frames() -> Simulation:
     """The demonstration's scene before a sensor whose frames come every 2 ms, its events 5 ms late."""
     sensor = SensorSettings(

@@ -22,7 +22,7 @@ from kalux.events import make_events
 from kalux.models.camera import Response
 from kalux.settings import CameraSettings
 
-from builders import unlabelled
+from builders import unlabelled, without_events
 
 CAMERA = CameraSettings()
 NOTHING = np.empty(0, EVENT_DTYPE)
@@ -76,14 +76,18 @@ def test_faint_motion_and_flicker_are_no_noise():
     assert found.read == pytest.approx(np.hypot(0.003, LEVEL), rel=0.1)
 
 
-def test_pixels_with_events_around_do_not_count():
-    """A half of the scene flickers pixel by pixel, and says so."""
+def flickering(where):
+    """A part of the scene flickers pixel by pixel, and says so; noise of 0.01."""
     rng = np.random.default_rng(3)
-    changes = np.where(np.arange(200) < 100, 0.2, 0.0) * rng.random(RAMP.shape)
+    changes = np.where(where, 0.2, 0.0) * rng.random(RAMP.shape)
     y, x = (i.ravel() for i in np.nonzero(changes))
     t = np.arange(0, 480_000, 20_000).repeat(len(x))
     events = make_events(t, np.tile(x, 24), np.tile(y, 24), np.ones(len(t), np.int64))
-    found = estimate_frame_noise(still(RAMP, 0.01, 0.0, changes=changes, events=events), CAMERA)
+    return still(RAMP, 0.01, 0.0, changes=changes, events=events)
+
+
+def test_pixels_with_events_around_do_not_count():
+    found = estimate_frame_noise(flickering(np.arange(200) < 100), CAMERA)
     assert found.read == pytest.approx(np.hypot(0.01, LEVEL), rel=0.1)
 
 
@@ -134,6 +138,13 @@ def test_frames_in_motion_have_hardly_more_noise_than_still_ones(read):
     seen = np.sqrt(found.read**2 + found.shot * found.levels)
     assert (seen > 0.85 * np.hypot(read, LEVEL)).all()
     assert (seen < np.hypot(read, LEVEL) + 0.003).all()
+
+
+def test_frames_between_which_events_are_lost_do_not_count():
+    """What moves there has no events, and would be taken for noise of the frames."""
+    recording = without_events(flickering(np.arange(150)[:, None] < 75), 90_000, 410_000)
+    found = estimate_frame_noise(recording, CAMERA)
+    assert found.read == pytest.approx(np.hypot(0.01, LEVEL), rel=0.1)
 
 
 def test_the_estimate_looks_at_the_first_frames_only():

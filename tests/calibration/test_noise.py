@@ -18,7 +18,7 @@ from kalux.events import make_events
 from kalux.planning import plan
 from kalux.settings import CameraSettings
 
-from builders import from_black, lifted, unlabelled
+from builders import from_black, lifted, unlabelled, without_events
 
 CAMERA = CameraSettings()
 SIZE = (64, 96)
@@ -86,6 +86,20 @@ def test_noise_beside_motion_is_not_much_overestimated():
     """Faint edges that make single events look like noise: an upper bound where everything moves."""
     found = event_noise(unlabelled(simulate(SCENE, SensorSettings(noise_rate=3.0))))
     assert 2.7 < found.rate < 5.0
+
+
+def test_a_time_in_which_events_are_lost_is_not_quiet():
+    """It would be the quietest of all, and the rate none."""
+    whole = unlabelled(simulate(SCENE, SensorSettings(noise_rate=3.0)))
+    found = event_noise(without_events(whole, 200_000, 450_000))
+    assert found.rate == pytest.approx(event_noise(whole).rate, rel=0.25)
+
+
+def test_chunks_that_end_in_lost_events_do_not_matter(monkeypatch):
+    recording = without_events(unlabelled(simulate(SCENE, SensorSettings(noise_rate=3.0))), 200_000, 450_000)
+    whole = event_noise(recording)
+    monkeypatch.setattr("kalux.recording.CHUNK_EVENTS", 777)
+    np.testing.assert_array_equal(event_noise(recording).rates, whole.rates)
 
 
 def test_pixels_that_fire_far_more_often_are_not_counted_in_the_rate():

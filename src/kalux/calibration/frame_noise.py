@@ -9,6 +9,7 @@ quarter of a level, of which everything moves, that is a quarter of what the dif
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator
 from typing import Any, Final, NamedTuple
 
 import cv2
@@ -16,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.calibration.intervals import Interval, intervals
+from kalux.calibration.silences import find_silences, overlaps
 from kalux.compiled import empty, event_column, event_row, event_words, loop, smaller, zeros
 from kalux.event_slices import all_between
 from kalux.events import EventArray
@@ -117,7 +119,7 @@ def estimate_frame_noise(
     most_frames = most_frames or _enough_frames(recording.sensor_size)
     # Where noise leaves no pixel without events in 5x5 around it, 3x3 must do, or those beside it; they let more faint
     # motion in.
-    points = _points(recording, camera, most_frames, recording.longest_exposure)
+    points = _points(recording, camera, most_frames)
     chosen = next((k for k, found in enumerate(points) if _is_curve(found)), None)
     if chosen is None:
         return None
@@ -175,10 +177,7 @@ def usual_noise(recording: Recording, camera: CameraSettings) -> UsualNoise:
     usual, cross = camera.usual_frame_noise, _SURROUNDINGS[-1]
     of_silent: list[float] = []
     of_all: list[float] = []
-    margin = recording.longest_exposure
-    for interval in intervals(recording, camera, margin=margin, most_frames=_MIN_FRAMES, apart=0):
-        if not _has_one_exposure(interval):
-            continue
+    for interval in _comparable(recording, camera, _MIN_FRAMES):
         level, difference, usable, dark = _beyond_neighbours(interval.first, interval.second)
         low = usable & ~dark & (level < 2 * _DARKEST)
         busy = _busy(all_between(interval.chunks, interval.first.start, interval.second.end), level.shape)
@@ -214,6 +213,19 @@ def _possible_read(recording: Recording, camera: CameraSettings, dark: float) ->
 def _response(recording: Recording, camera: CameraSettings) -> Response:
     """The camera's, or that of its green pixels."""
     return Camera.named(chosen_response(camera.response, recording.response), camera.clipped_from).response
+
+
+def _comparable(recording: Recording, camera: CameraSettings, most_frames: int) -> Iterator[Interval]:
+    """The intervals whose frames differ by noise alone where there is no event.
+
+    Not those in which events have been lost: there all that moves is without.
+    """
+    silences = find_silences(recording, most_frames=most_frames)
+    margin = recording.longest_exposure
+    for interval in intervals(recording, camera, margin=margin, most_frames=most_frames, apart=0):
+        begin, end = interval.first.start, interval.second.end
+        if _has_one_exposure(interval) and not overlaps(silences, begin, end):
+            yield interval
 
 
 def _has_one_exposure(interval: Interval) -> bool:
@@ -259,17 +271,13 @@ def _is_curve(points: _Points) -> bool:
     return sum(map(bool, points)) >= 2
 
 
-def _points(
-    recording: Recording, camera: CameraSettings, most_frames: int, margin: int
-) -> tuple[_Points, ...]:
+def _points(recording: Recording, camera: CameraSettings, most_frames: int) -> tuple[_Points, ...]:
     """By bins of the level: level, variance and number of pixels of every frame pair; for each of `_SURROUNDINGS`.
 
     Those of the smaller end where the larger are enough.
     """
     found: tuple[_Points, ...] = tuple([[] for _ in range(_BINS)] for _ in _SURROUNDINGS)
-    for interval in intervals(recording, camera, margin=margin, most_frames=most_frames, apart=0):
-        if not _has_one_exposure(interval):
-            continue
+    for interval in _comparable(recording, camera, most_frames):
         level, difference, usable, dark = _beyond_neighbours(interval.first, interval.second)
         busy = _busy(all_between(interval.chunks, interval.first.start, interval.second.end), level.shape)
         near_dark = _near(dark)

@@ -7,6 +7,7 @@ correction. Frame noise is in `kalux.calibration.frame_noise`.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final, NamedTuple
@@ -26,9 +27,10 @@ from kalux.calibration.levels import ClippingLevels, clipping_levels
 from kalux.calibration.refractory import dead_time, shortest_interval
 from kalux.calibration.region import Region, widened
 from kalux.calibration.regression import ratio_error
+from kalux.calibration.silences import Silence, find_silences
 from kalux.calibration.values import Calibration
 from kalux.compiled import inner, larger, loop, smaller
-from kalux.event_slices import first_events
+from kalux.event_slices import events_until, first_events
 from kalux.events import NEVER, EventArray
 from kalux.recording import Recording
 from kalux.settings import CameraSettings, EventSettings
@@ -198,7 +200,8 @@ def event_noise(
 ) -> EventNoise | None:
     """Background rate and dead pixels, from the first ``most_events``, or all; ``known_hot`` ones do not count.
 
-    Nor do pixels beyond a region of interest, which are silent because they are off (`kalux.calibration.region`).
+    Nor do pixels beyond a region of interest, which are silent because they are off (`kalux.calibration.region`), nor
+    times in which events have been lost (`kalux.calibration.silences`).
 
     Returns None without events, or where next to nothing is ever quiet (1 %).
     """
@@ -207,13 +210,14 @@ def event_noise(
     if first is None or last is None or region is None or last <= first:
         return None
     inside = region.mask(recording.sensor_size)
-    of_all = _tallied(_chunks(recording, most_events, known), first, last, known)
+    silences = sorted(find_silences(recording, end=last))
+    of_all = _tallied(_chunks(recording, most_events, known), first, last, known, silences)
     # Where the region is never quiet, the rest may be so because it is still.
     for part in (inside, np.ones_like(inside)):
         tally = of_all
         unusual = _unusual_pixels(tally, part) | known
         if (unusual & ~known).any():  # again without them: their neighbours are quiet after all
-            tally = _tallied(_chunks(recording, most_events, known), first, last, unusual)
+            tally = _tallied(_chunks(recording, most_events, known), first, last, unusual, silences)
         tally = tally._replace(quiet=tally.quiet * part)
         share = float(tally.quiet.sum() / (np.count_nonzero(part) * (last - first)))
         if share >= _LEAST_QUIET or part.all():
@@ -259,8 +263,17 @@ class _Tally(NamedTuple):
 _MOST_WINDOWS: Final = 32
 
 
-def _tallied(chunks: Iterator[EventArray], first: int, last: int, ignored: NDArray[np.bool_]) -> _Tally:
-    """Count events in quiet time; those of ignored pixels do not end their neighbours' quiet."""
+def _tallied(
+    chunks: Iterator[EventArray],
+    first: int,
+    last: int,
+    ignored: NDArray[np.bool_],
+    silences: list[Silence],
+) -> _Tally:
+    """Count events in quiet time; those of ignored pixels do not end their neighbours' quiet.
+
+    What lies in the ``silences``, which follow one another, is no quiet time.
+    """
     height, width = ignored.shape
     windows = int(np.clip((last - first) // _WINDOW, 1, _MOST_WINDOWS))
     length = (last - first) / windows
@@ -270,11 +283,26 @@ def _tallied(chunks: Iterator[EventArray], first: int, last: int, ignored: NDArr
     busy_until = np.full((height, width), first, np.int64)  # silence before the first event is not known
     # An event in quiet time, until its future is quiet, too.
     pending = np.full((height, width), NEVER, np.int64)
+    left = deque(silences)
     for chunk in chunks:
-        t, x, y = (chunk[name] for name in ("t", "x", "y"))
-        _tally(t, x, y, first, length, QUIET, ignored, busy_until, pending, counts, quiet, total)
+        while left and chunk["t"][-1] >= left[0][1]:
+            begin, end = left.popleft()
+            place = events_until(chunk, end - 1)
+            before, chunk = chunk[:place], chunk[place:]
+            _tally(
+                *_columns(before), first, length, QUIET, ignored, busy_until, pending, counts, quiet, total
+            )
+            _close(begin, first, length, QUIET, busy_until, pending, counts, quiet)
+            busy_until.fill(end)  # as before the first event
+            pending.fill(NEVER)
+        _tally(*_columns(chunk), first, length, QUIET, ignored, busy_until, pending, counts, quiet, total)
     _close(last, first, length, QUIET, busy_until, pending, counts, quiet)
     return _Tally(counts, quiet, total)
+
+
+def _columns(events: EventArray) -> tuple[NDArray[np.generic], ...]:
+    """Times, columns and rows."""
+    return tuple(events[name] for name in ("t", "x", "y"))
 
 
 @inner

@@ -7,12 +7,12 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from typing import Final, NamedTuple, TypeVar
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.calibration.region import LEAST_MISSED, Region, widened
-from kalux.event_slices import between, events_until
+from kalux.calibration.region import Region, widened
+from kalux.calibration.silences import EventWaits, FrameChanges
+from kalux.event_slices import events_until
 from kalux.frames import Frame, exposure_doubt
 from kalux.recording import Recording, clock_doubt, no_frames
 from kalux.settings import CameraSettings
@@ -33,18 +33,7 @@ _MANY_INTERVALS: Final = 100
 """As many times longer than usual: pictures of a slow series are not missed."""
 
 
-_SILENCES: Final = 8  # the longest, of each chunk of events, that are looked at
 _LEAST_EVENTS: Final = 1_000  # of one polarity, without the other: fewer may be noise
-_LEAST_INTERVALS: Final = 2  # between frames: in less of them, little is lost
-_ALIKE: Final = 0.25
-"""Share of the usual change from frame to frame from which something moved in a silence, too."""
-
-_BLOCKS: Final = (16, 16)
-"""Means of so many blocks of a frame tell how much it changes: of single pixels, noise would."""
-
-
-_LEAST_BEYOND: Final = 16
-"""Blocks without any event, that frames must have: a row of them."""
 
 
 class Contents(NamedTuple):
@@ -163,20 +152,19 @@ def check_recording(
     InputError
         Whatever is wrong with the recording, or it has no frames.
     """
-    spans, colours = [], "grey"
-    white, changes, exposed = WhiteCheck(), _Changes(), False
+    colours = "grey"
+    white, changes, exposed = WhiteCheck(), FrameChanges(), False
     for frame in white.watched(recording.frames()):
-        spans.append((frame.exposure_start, frame.exposure_end))
         colours = frame.colours
         exposed = exposed or _is_exposed(frame)
         changes.see(frame)
-    if not spans:
+    exposures = changes.exposures
+    if not len(exposures):
         raise no_frames(recording)
-    exposures = np.array(spans, np.int64)
     start, end = (int(t) for t in (exposures[0, 0], exposures[-1, 1]))
-    count = on = events_between = events_from = 0
+    count = on = events_from = 0
     complete = True
-    last_event, silences = start, [(start, start)]
+    waits = EventWaits(exposures)
     region: Region | None = None
     for chunk in recording.events():
         if most is not None and events_from >= most:
@@ -185,26 +173,17 @@ def check_recording(
         count += len(chunk)
         on += int(np.count_nonzero(chunk["p"]))
         region = widened(region, chunk)
-        events_between += len(between(chunk, start - 1, end))
+        waits.see(chunk)
         events_from += len(chunk) - events_until(chunk, start - 1)
-        silences += _longest_silences(between(chunk, start - 1, end)["t"], last_event)
-        last_event = max(last_event, min(int(chunk["t"][-1]), end))
         on_events(len(chunk))
-    if complete:
-        silences.append((last_event, end))
     doubts = tuple(filter(None, (white.doubt(), exposure_doubt(exposures))))
-    seen = (end if complete else last_event) - start
-    lost = [
-        silence
-        for silence in _with_events_missing(silences, seen, events_between)
-        if changes.go_on(exposures, *silence)
-    ]
+    lost = waits.lost(changes, complete=complete)
     return Contents(
         len(exposures),
         count,
         start,
         end,
-        events_between,
+        waits.events,
         colours,
         doubts,
         complete,
@@ -217,78 +196,11 @@ def check_recording(
     )
 
 
-def _longest_silences(times: NDArray[np.int64], before: int) -> list[tuple[int, int]]:
-    """(start, end) us of the longest times without one of the events at ``times``, which follow one at ``before``."""
-    if not len(times):
-        return []
-    waits = np.diff(times, prepend=before)
-    longest = (
-        np.argpartition(waits, -_SILENCES)[-_SILENCES:] if len(waits) > _SILENCES else np.arange(len(waits))
-    )
-    return [(int(times[i] - waits[i]), int(times[i])) for i in longest]
-
-
-def _with_events_missing(
-    silences: list[tuple[int, int]], seen: int, events: int
-) -> Iterator[tuple[int, int]]:
-    """Silences, the longest first, in which events are missing at the usual rate of the rest of the time, ``seen``."""
-    rest = seen
-    for begin, end in sorted(silences, key=lambda silence: silence[0] - silence[1]):
-        rest -= end - begin
-        if events == 0 or end - begin < LEAST_MISSED * rest / events:
-            return
-        yield begin, end
-
-
 def _is_exposed(frame: Frame) -> bool:
     """Whether any pixel lies between black and white."""
     image = frame.image if frame.valid is None else frame.image[frame.valid]
     white = frame.black + CameraSettings.usual_saturation * frame.full_scale
     return bool(((image > frame.black) & (image < white)).any())
-
-
-class _Changes:
-    """How much each frame differs from the one before: root mean square of the means of blocks, white = 1."""
-
-    def __init__(self) -> None:
-        self._blocks: NDArray[np.float32] | None = None
-        self._changes: list[float] = []
-        self._of_blocks: NDArray[np.float32] = np.zeros(_BLOCKS, np.float32)
-
-    def see(self, frame: Frame) -> None:
-        """Look at the next frame."""
-        image = frame.image if frame.image.ndim == 2 else frame.image[..., 1]
-        resized = cv2.resize(image.astype(np.float32), _BLOCKS, interpolation=cv2.INTER_AREA)
-        blocks = np.asarray(resized / frame.white_value, np.float32)
-        if self._blocks is not None:
-            squares = np.square(blocks - self._blocks)
-            self._changes.append(float(np.sqrt(np.mean(squares))))
-            self._of_blocks += squares
-        self._blocks = blocks
-
-    def go_on(self, exposures: NDArray[np.int64], begin: int, end: int) -> bool:
-        """Whether frames from ``begin`` to ``end`` (us) change about as much as the others."""
-        inside = (exposures[:-1, 1] >= begin) & (exposures[1:, 0] <= end)
-        changes = np.array(self._changes)
-        if np.count_nonzero(inside) < _LEAST_INTERVALS or inside.all():
-            return False
-        usual = float(np.median(changes[~inside]))
-        return usual > 0 and bool(np.median(changes[inside]) >= _ALIKE * usual)
-
-    def go_on_beyond(self, region: Region, sensor_size: tuple[int, int]) -> bool:
-        """Whether frames change beyond a region of events about as much as in it."""
-        if not region.is_part_of(sensor_size):
-            return False
-        sides = zip(_BLOCKS, sensor_size, (region[0:2], region[2:4]), strict=True)
-        rows, columns = (
-            (np.arange(blocks) * size < end * blocks) & ((np.arange(blocks) + 1) * size > begin * blocks)
-            for blocks, size, (begin, end) in sides
-        )
-        inside = rows[:, None] & columns
-        if np.count_nonzero(~inside) < _LEAST_BEYOND:
-            return False
-        usual, beyond = (float(np.sqrt(self._of_blocks[each].mean())) for each in (inside, ~inside))
-        return usual > 0 and beyond >= _ALIKE * usual
 
 
 def _gap(exposures: NDArray[np.int64]) -> tuple[int, int] | None:

@@ -1,0 +1,56 @@
+"""Times without an event: those in which events were lost."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from kalux import Recording
+from kalux.calibration.silences import find_silences, overlaps
+
+from builders import moving_blocks, unlabelled, without_events
+
+
+def test_silences_in_which_frames_change_are_found_the_longest_first():
+    whole = unlabelled(moving_blocks(duration=1_000_000))
+    assert find_silences(whole) == []
+    cut = without_events(without_events(whole, 100_000, 350_000), 500_000, 900_000)
+    (first, second) = find_silences(cut)
+    assert first == (pytest.approx(500_000, abs=10_000), pytest.approx(900_000, abs=10_000))
+    assert second == (pytest.approx(100_000, abs=10_000), pytest.approx(350_000, abs=10_000))
+
+
+def test_a_silence_in_which_the_frames_end_is_found_though_events_come_after_them():
+    cut = without_events(unlabelled(moving_blocks(duration=1_000_000)), 500_000, 900_000)
+    frames = [frame for frame in cut.frames() if frame.exposure_end < 850_000]
+    (events,) = cut.events()
+    short = Recording.from_arrays(events, frames, sensor_size=cut.sensor_size)
+    assert find_silences(short) == [(pytest.approx(500_000, abs=10_000), frames[-1].exposure_end)]
+
+
+def test_where_frames_stand_still_silence_is_as_it_should_be():
+    made = moving_blocks(duration=1_000_000)
+    still = [
+        dataclasses.replace(f, image=made.frames[7].image) if 300_000 < f.middle < 700_000 else f
+        for f in made.frames
+    ]
+    whole = Recording.from_arrays(made.events, still, sensor_size=made.scene.sensor_size)
+    assert find_silences(without_events(whole, 300_000, 700_000)) == []
+
+
+def test_only_the_frames_that_are_asked_for_are_looked_at():
+    cut = without_events(unlabelled(moving_blocks(duration=1_000_000)), 500_000, 900_000)
+    assert find_silences(cut, most_frames=10) == []
+    assert find_silences(cut, end=480_000) == []
+    (events,) = cut.events()
+    assert find_silences(Recording.from_arrays(events, [], sensor_size=cut.sensor_size)) == []
+
+
+def test_overlaps():
+    silences = [(10, 20), (40, 50)]
+    assert overlaps(silences, 15, 16)
+    assert overlaps(silences, 0, 11)
+    assert overlaps(silences, 19, 60)
+    assert not overlaps(silences, 20, 40)
+    assert not overlaps([], 0, 100)
