@@ -251,6 +251,17 @@ def test_the_neighbours_are_no_baseline_where_they_are_not_held_out(cli, with_tr
     assert "held out" in cli("evaluate", with_truth, "--methods", "mean").error
 
 
+def test_the_neighbours_are_a_baseline_of_truth_between_frames(cli, recording, tmp_path):
+    """Of artificial HDR with frames held out, those are the truth, and no method is given one of them."""
+    out = tmp_path / "a.h5"
+    for every, compared in ((None, False), (2, True)):
+        held = () if every is None else ("--hold-out-frames", every)
+        assert cli("ahdr", recording, "-o", out, "--cut", 30, "--overwrite", *held).code == 0
+        found = cli("evaluate", out, "--methods", "hold,mean")
+        assert found.code == (0 if compared else 2), found.err
+        assert ("mean of the neighbours" in found.out) == compared
+
+
 @pytest.mark.parametrize("damage", ["event outside the sensor", "no frames", "no exposure times", "NaN"])
 def test_damage_is_found_before_the_table(cli, damaged, damage):
     found = cli("evaluate", damaged(damage))

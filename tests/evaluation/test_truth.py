@@ -11,7 +11,7 @@ import kalux
 from kalux.errors import FormatError, InputError
 from kalux.evaluation.baselines import methods
 from kalux.evaluation.method import Estimated, Method
-from kalux.evaluation.truth import evaluate_truth, load_truth, prepare_reference
+from kalux.evaluation.truth import evaluate_truth, lies_between_frames, load_truth, prepare_reference
 from kalux.frames import GroundTruth
 
 from builders import from_black, lifted, moving_blocks
@@ -88,6 +88,15 @@ def test_images_may_come_in_any_order(simulation, recording):
     shuffled = np.random.default_rng(0).permutation(len(truth.times))
     reference = prepare_reference(recording, GroundTruth(truth.times[shuffled], truth.images[shuffled]))
     assert evaluate_truth(recording, reference, perfect(simulation)).mse == 0
+
+
+def test_truth_lies_between_frames_if_no_frame_sees_the_scene_at_any_of_its_times(recording):
+    frames = list(recording.frames())
+    first, second = frames[:2]
+    between = [first.exposure_end + 1, second.exposure_start - 1, frames[-1].exposure_end + 5]
+    assert lies_between_frames(recording, np.array(between[::-1]))
+    for t in (first.exposure_start, second.middle, frames[-1].exposure_end):
+        assert not lies_between_frames(recording, np.array([*between, t]))
 
 
 def test_images_before_and_after_the_frames_are_left_out_and_told(simulation, recording):

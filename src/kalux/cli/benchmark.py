@@ -26,8 +26,8 @@ Writes results.csv, results.json and report.html to the folder OUT. Run again af
 the same command does only what is missing. Needs the extra kalux[evaluation].
 
 SET is a recording, a folder with recordings, or a TOML file that lists sequences (docs/benchmark.md).
-methods: as of kalux evaluate; without --methods hold, mean (where frames are held out), edi, cf, iccv2021,
-default, smooth. In the name of a file or folder {sequence} stands for the name of the sequence."""
+methods: as of kalux evaluate; without --methods hold, mean (where images lie between frames), edi, cf,
+iccv2021, default, smooth. In the name of a file or folder {sequence} stands for the name of the sequence."""
 
 _EXAMPLES = """\
 examples:

@@ -36,7 +36,7 @@ _DESCRIPTION = """\
 Compare what methods reconstruct from a recording with its ground truth or, where it has none, with frames
 that were held out from them. Needs the extra kalux[evaluation].
 
-methods: hold (the last frame), mean (of the frames around; held-out frames only), edi (nearest frame,
+methods: hold (the last frame), mean (of the frames around; for images between frames only), edi (nearest frame,
 deblurred and moved by events), cf, iccv2021, iccv2021-flir, default, smooth (default, both ways in time),
 davis240c, davis346, prophesee-flir. Without --methods all but iccv2021-flir and the last three, which are for
 one camera each. Networks, with their weights (need the extra kalux[learned]):
@@ -174,7 +174,7 @@ class Protocol:
         recording = compared_recording(recording, self._response, camera.get("black_level"))
         self._recording = recording
         weights = lpips_weights(options)
-        reference = None
+        reference, between = None, True
         if options.hold_out_frames is None:
             reference, origin = _reference(recording, options)
         if reference is None:
@@ -187,6 +187,7 @@ class Protocol:
         else:
             self.described = reference.described(origin) + of_black(recording)
             self._images = len(reference.times)
+            between = truth.lies_between_frames(recording, reference.times)
             self._score = lambda method, count: truth.evaluate_truth(
                 recording, reference, method, hdr_vdp=options.hdrvdp, lpips=weights, on_image=count
             )
@@ -194,7 +195,7 @@ class Protocol:
         self.methods = specs.chosen_methods(
             named_methods(options),
             response=self._response,
-            held_out=reference is None,
+            held_out=between,
             calibration=calibration,
         )
 

@@ -67,7 +67,7 @@ class Method:
     images
         From a recording and ascending times (N,) int64, us, to N images.
     needs_held_out
-        Whether it looks at the frames before and after, which would be unfair where they are not held out.
+        Whether it looks at the frames before and after, which is no comparison where one of them is of the very moment.
     estimates
         As ``images``, with the variance of every image; None: the method has none.
     settings

@@ -57,7 +57,8 @@ def chosen_methods(
     response
         Of the camera, as in `kalux.settings.CameraSettings`.
     held_out
-        Whether frames are held out.
+        Whether all that is compared lies between the frames that methods are given: frames are held out, or ground
+        truth is nowhere else.
     calibration
         What was measured of the sensor, for all filters.
 
@@ -82,7 +83,7 @@ def chosen_methods(
         if method.needs_held_out and not held_out:
             raise InputError(
                 f"method {name!r} looks at the frames around an image, which is a comparison only where frames "
-                "are held out"
+                "are held out, or all ground truth lies between frames"
             )
         chosen.append(method)
     if not chosen:

@@ -139,6 +139,19 @@ def prepare_reference(
     )
 
 
+def lies_between_frames(recording: Recording, times: NDArray[np.int64]) -> bool:
+    """Whether no frame of the recording sees the scene at any of ``times`` (us), as of frames that are held out.
+
+    The frames around an image are then a fair comparison with it.
+    """
+    ordered = np.sort(times)
+    for frame in recording.frames():
+        first, last = np.searchsorted(ordered, (frame.exposure_start, frame.exposure_end + 1))
+        if last > first:
+            return False
+    return True
+
+
 _LARGEST: Final = 1e12
 """Times white, as of frames: squares of such values are still numbers."""
 

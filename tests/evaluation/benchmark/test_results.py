@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import io
 import json
 
 import numpy as np
 import pytest
 
+import kalux
+from kalux.datasets.ahdr import ArtificialCamera, artificial_hdr
 from kalux.errors import InputError
-from kalux.evaluation.benchmark.jobs import run_job
+from kalux.evaluation.benchmark.jobs import Failed, Finished, run_job
 from kalux.evaluation.benchmark.results import PSNR, SHOWN, Results, as_csv, as_json, make_plan
 from kalux.evaluation.benchmark.sequences import Benchmark
+from kalux.writers import hdf5
 
 
 def planned(small_set, methods=None, sequences=None):
@@ -35,6 +39,27 @@ def test_the_neighbours_are_compared_only_where_frames_are_held_out(small_set):
     ]
     assert [job.held_out for job in plan.jobs] == [False] * 6 + [True] * 7
     assert "mean" in [job.method for job in plan.jobs if job.sequence.name == "b"]
+
+
+def test_the_neighbours_are_compared_with_truth_between_frames(small_set):
+    """That of a recording of artificial HDR whose held-out frames are the truth, as a file."""
+    made = artificial_hdr(kalux.open(small_set.without.path), ArtificialCamera.with_cut(30), every=2)
+    hdf5.write(
+        small_set.without.path,
+        sensor_size=made.sensor_size,
+        events=list(made.events()),
+        frames=list(made.frames()),
+        ground_truth=made.ground_truth(),
+        response=made.response,
+    )
+    plan = planned(small_set, ["hold", "mean"])
+    assert [(job.name, job.held_out) for job in plan.jobs] == [
+        ("a/hold", False),
+        ("b/hold", False),
+        ("b/mean", False),
+    ]
+    assert isinstance(run_job(plan.jobs[-1]), Finished)
+    assert isinstance(run_job(dataclasses.replace(plan.jobs[-1], between=False)), Failed)
 
 
 def test_a_sequence_that_cannot_be_opened_fails_alone(small_set):

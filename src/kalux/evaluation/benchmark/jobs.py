@@ -25,7 +25,7 @@ from kalux.evaluation.method import Method
 from kalux.evaluation.pairs import Pair
 from kalux.evaluation.scores import Scores, finite_or_none, score
 from kalux.evaluation.specs import chosen_methods, relocated, spec_path
-from kalux.evaluation.truth import find_truth, prepare_reference, truth_pairs
+from kalux.evaluation.truth import find_truth, lies_between_frames, prepare_reference, truth_pairs
 from kalux.models.camera import Camera, Response
 from kalux.recording import Recording, reference_exposure
 from kalux.settings import chosen_response, to_dict
@@ -64,6 +64,8 @@ class Job:
         That a file or folder in the method's name is relative to; absolute.
     lpips
         Files of weights, as of `kalux.evaluation.lpips.load_lpips`; empty: LPIPS is not computed.
+    between
+        Whether its ground truth lies between the frames that methods are given, as of `truth_lies_between`.
     """
 
     sequence: Sequence
@@ -74,6 +76,7 @@ class Job:
     version: str
     folder: Path
     lpips: tuple[Path, ...] = ()
+    between: bool = False
 
     @property
     def name(self) -> str:
@@ -129,6 +132,21 @@ def uses_held_out(sequence: Sequence) -> bool:
     return sequence.truth_file() is None and sequence.open().source.ground_truth is None
 
 
+def truth_lies_between(sequence: Sequence) -> bool:
+    """Whether all of a sequence's ground truth lies between its frames, as of artificial HDR with frames held out.
+
+    Raises
+    ------
+    KaluxError
+        If recording or truth cannot be read.
+    """
+    if sequence.options.ahdr is not None:  # the truth is of its frames
+        return False
+    recording = sequence.open()
+    truth, _ = find_truth(recording, sequence.truth_file())
+    return truth is not None and lies_between_frames(recording, truth.times)
+
+
 def make_job(
     sequence: Sequence,
     method: str,
@@ -137,6 +155,7 @@ def make_job(
     hdr_vdp: bool,
     folder: Path = Path(),
     lpips: tuple[Path, ...] = (),
+    between: bool = False,
 ) -> Job:
     """A job with its key; the rest is as in `Job`.
 
@@ -151,7 +170,7 @@ def make_job(
     """
     folder = folder.absolute()
     weights = tuple(file.absolute() for file in lpips)
-    chosen = _method(method, sequence, held_out, folder)
+    chosen = _method(method, sequence, held_out or between, folder)
     named = spec_path(method_text(method, sequence.name, folder))
     parts = {
         "layout": LAYOUT,
@@ -168,7 +187,7 @@ def make_job(
         "lpips": [_identity(path) for path in weights],
     }
     digest = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
-    return Job(sequence, method, held_out, hdr_vdp, digest, kalux.__version__, folder, weights)
+    return Job(sequence, method, held_out, hdr_vdp, digest, kalux.__version__, folder, weights, between)
 
 
 def _identity(path: Path) -> tuple[str, int, int]:
@@ -179,10 +198,10 @@ def _identity(path: Path) -> tuple[str, int, int]:
     return str(path.absolute()), status.st_size, status.st_mtime_ns
 
 
-def _method(name: str, sequence: Sequence, held_out: bool, folder: Path) -> Method:
+def _method(name: str, sequence: Sequence, between: bool, folder: Path) -> Method:
     text = method_text(name, sequence.name, folder)
     return chosen_methods(
-        [text], response=sequence.response, held_out=held_out, calibration=sequence.calibration
+        [text], response=sequence.response, held_out=between, calibration=sequence.calibration
     )[0]
 
 
@@ -209,7 +228,7 @@ def run_job(job: Job) -> Outcome:
 def _run(job: Job) -> Finished:
     started = time.perf_counter()
     recording = job.sequence.open()
-    method = _method(job.method, job.sequence, job.held_out, job.folder)
+    method = _method(job.method, job.sequence, job.held_out or job.between, job.folder)
     comparison = _comparison(job, recording)
     pictures = Pictures(moments(comparison.images))
     clock = Clock()

@@ -14,7 +14,14 @@ import numpy as np
 
 import kalux
 from kalux.errors import InputError, KaluxError
-from kalux.evaluation.benchmark.jobs import GROUPS, Failed, Job, make_job, uses_held_out
+from kalux.evaluation.benchmark.jobs import (
+    GROUPS,
+    Failed,
+    Job,
+    make_job,
+    truth_lies_between,
+    uses_held_out,
+)
 from kalux.evaluation.benchmark.sequences import Benchmark, Sequence
 from kalux.evaluation.scores import METRICS, UNCERTAINTY
 from kalux.evaluation.specs import check_distinct, chosen_methods, relocated
@@ -120,7 +127,7 @@ def make_plan(
     folder = (benchmark.folder if methods is None else Path()).absolute()
     names = tuple(dict.fromkeys(DEFAULT_METHODS if chosen is None else chosen))
     check_distinct(names)
-    fair_only_held_out = {
+    fair_only_between = {
         name
         for name in names
         if "{sequence}" not in name
@@ -131,14 +138,23 @@ def make_plan(
     for sequence in benchmark.sequences:
         try:
             held_out = uses_held_out(sequence)
-            wanted = [name for name in names if held_out or name not in fair_only_held_out]
+            between = not held_out and bool(fair_only_between) and truth_lies_between(sequence)
+            wanted = [name for name in names if held_out or between or name not in fair_only_between]
         except KaluxError as error:
             failures.update({(sequence.name, name): _failed(error) for name in names})
             continue
         for name in wanted:
             try:
                 jobs.append(
-                    make_job(sequence, name, held_out=held_out, hdr_vdp=hdr_vdp, folder=folder, lpips=lpips)
+                    make_job(
+                        sequence,
+                        name,
+                        held_out=held_out,
+                        hdr_vdp=hdr_vdp,
+                        folder=folder,
+                        lpips=lpips,
+                        between=between,
+                    )
                 )
             except KaluxError as error:
                 failures[sequence.name, name] = _failed(error)
