@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 
 from kalux.calibration.values import Calibration
+from kalux.evaluation import baselines
 from kalux.evaluation.baselines import OPTIONAL, methods
 from kalux.evaluation.held_out import evaluate_held_out, hold_out_frames
+from kalux.planning import plan
 from kalux.recording import open as open_recording
 from kalux.writers import hdf5
 from kalux.writers.calibration import save_calibration
@@ -245,6 +247,13 @@ def test_errors_are_one_line(cli, recording, tmp_path, monkeypatch, arguments, t
     found = cli("evaluate", recording, *arguments)
     assert found.code == 2
     assert told in found.error
+
+
+def test_a_reconstruction_is_planned_once_for_the_warning_and_all_that_go_by_it(cli, recording, monkeypatch):
+    plans = []
+    monkeypatch.setattr(baselines, "plan", lambda *a, **k: plans.append(k["settings"]) or plan(*a, **k))
+    assert cli("evaluate", recording, "--methods", "edi,cf,default").code == 0
+    assert len(plans) == len(set(plans)) == 2
 
 
 def test_the_neighbours_are_no_baseline_where_they_are_not_held_out(cli, with_truth):

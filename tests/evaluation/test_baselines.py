@@ -9,6 +9,7 @@ from kalux import PRESETS, Frame, Recording, reconstruct
 from kalux.datasets import SensorSettings
 from kalux.evaluation.baselines import (
     EventWindow,
+    Planner,
     edi_video,
     hold_last_frame,
     mean_of_neighbours,
@@ -18,6 +19,20 @@ from kalux.evaluation.baselines import (
 from kalux.settings import altered
 
 from builders import frame, moving_blocks, pixel_events
+
+
+def test_a_plan_is_made_once_for_the_same_recording_times_and_settings():
+    recording, times = moving_blocks().recording(), np.array([80_000, 120_000])
+    planner, settings = Planner(), PRESETS["default"]
+    first = planner.plan(recording, times, settings)
+    others = [
+        planner.plan(moving_blocks().recording(), times, settings),
+        planner.plan(recording, times, altered(settings, "events", threshold_on=0.3)),
+        planner.plan(recording, times, settings, smooth=True),
+    ]
+    assert planner.plan(recording, times.copy(), settings) is first
+    assert all(other is not first for other in others)
+    assert planner.plan(recording, times[:1], settings).times.tolist() == [80_000]
 
 
 def of_frames(*frames, events=(), threshold=0.2):

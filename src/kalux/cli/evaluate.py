@@ -8,6 +8,7 @@ import dataclasses
 import io
 import json
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -159,7 +160,7 @@ class Protocol:
     """
 
     def __init__(self, recording: Recording, options: argparse.Namespace, colours: str) -> None:
-        from kalux.evaluation import held_out, specs, truth
+        from kalux.evaluation import baselines, held_out, specs, truth
         from kalux.evaluation.exposures import compared_recording, of_black
 
         self._options = options
@@ -168,8 +169,7 @@ class Protocol:
         calibration = given_calibration(options)
         if calibration is not None:
             calibration = calibration.merged(said)
-        self._known = said if calibration is None else calibration
-        camera = self._known.settings.get("camera", {})
+        camera = (said if calibration is None else calibration).settings.get("camera", {})
         self._response: str = camera.get("response", AUTO)
         recording = compared_recording(recording, self._response, camera.get("black_level"))
         self._recording = recording
@@ -180,11 +180,13 @@ class Protocol:
         if reference is None:
             every = 2 if options.hold_out_frames is None else options.hold_out_frames
             held = held_out.hold_out_frames(recording, every, response=self._response)
+            self._given, self._times = held.kept, held.times.ravel()
             self.described, self._images = held.described(), len(held.compared)
             self._score = lambda method, count: held_out.evaluate_held_out(
                 held, method, clip=options.clip, hdr_vdp=options.hdrvdp, lpips=weights, on_image=count
             )
         else:
+            self._given, self._times = recording, reference.times
             self.described = reference.described(origin) + of_black(recording)
             self._images = len(reference.times)
             between = truth.lies_between_frames(recording, reference.times)
@@ -192,27 +194,31 @@ class Protocol:
                 recording, reference, method, hdr_vdp=options.hdrvdp, lpips=weights, on_image=count
             )
         self.described += _of_colours(colours)
-        self.methods = specs.chosen_methods(
-            named_methods(options),
+        self._planner = baselines.Planner(calibration)
+        choose = partial(
+            specs.chosen_methods,
             response=self._response,
             held_out=between,
             calibration=calibration,
+            planner=self._planner,
         )
+        self.methods, (self._default,) = choose(named_methods(options)), choose(["default"])
 
     def doubt(self) -> str | None:
-        """That events do not explain the frames, as a reconstruction would warn; None where they do."""
+        """That events do not explain the frames, as a reconstruction would warn; None where they do.
+
+        The plan that tells it is that of the method ``default``, which makes no other.
+        """
         from kalux.cli.plan_warnings import unrelated_warning
         from kalux.cli.progress import Stages
-        from kalux.planning import plan
-        from kalux.settings import preset
 
         stages = Stages(quiet=self._options.quiet)
+        assert self._default.settings is not None
         with stages.stage("estimating"):
-            settings = self._known.apply(preset("default"))
-            made = plan(
-                stages.watched(self._recording), at="frames", settings=settings, calibration=self._known
+            planned = self._planner.plan(
+                self._given, self._times, self._default.settings, watched=stages.watched(self._given)
             )
-        return unrelated_warning(made)
+        return unrelated_warning(planned)
 
     def score(self, method: Method) -> Scores:
         """Score one method, with progress."""

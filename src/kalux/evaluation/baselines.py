@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterable, Iterator
 from functools import partial
 from itertools import chain, pairwise
@@ -18,10 +19,51 @@ from kalux.event_slices import between, count_events
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.frames import Frame
 from kalux.models.camera import log_intensity
-from kalux.pipeline import reconstruct
-from kalux.planning import plan
+from kalux.pipeline import execute
+from kalux.planning import Plan, plan
 from kalux.recording import Recording, less_black, reference_exposure
 from kalux.settings import AUTO, PRESETS, Settings, altered, chosen_response
+
+_PLANS_KEPT: Final = 2
+"""Of each settings: one of the recording without the frames that are held out, one with them for blur consistency."""
+
+
+class Planner:
+    """Plans reconstructions, and keeps the last two plans of each settings, which several methods may need.
+
+    Parameters
+    ----------
+    calibration
+        For all plans, as of `kalux.reconstruct`.
+    """
+
+    def __init__(self, calibration: Calibration | None = None) -> None:
+        self._calibration = calibration
+        self._kept: dict[tuple[Settings, bool], deque[tuple[Recording, Times, Plan]]] = {}
+
+    def plan(
+        self,
+        recording: Recording,
+        times: Times,
+        settings: Settings,
+        *,
+        smooth: bool = False,
+        watched: Recording | None = None,
+    ) -> Plan:
+        """The plan of `kalux.planning.plan`; ``watched`` is the same recording, read in its place for progress."""
+        kept = self._kept.setdefault((settings, smooth), deque(maxlen=_PLANS_KEPT))
+        for of_recording, of_times, made in kept:
+            if of_recording is recording and np.array_equal(of_times, times):
+                return made
+        made = plan(
+            recording if watched is None else watched,
+            times=times,
+            settings=settings,
+            calibration=self._calibration,
+            smooth=smooth,
+        )
+        kept.append((recording, times, made))
+        return made
 
 
 def hold_last_frame(recording: Recording, times: Times, *, response: str = AUTO) -> Iterator[Image]:
@@ -43,13 +85,20 @@ def mean_of_neighbours(recording: Recording, times: Times, *, response: str = AU
         yield np.mean(pair, axis=0).astype(np.float32)
 
 
-def edi_video(recording: Recording, times: Times, *, settings: Settings | None = None) -> Iterator[Image]:
+def edi_video(
+    recording: Recording,
+    times: Times,
+    *,
+    settings: Settings | None = None,
+    planner: Planner | None = None,
+) -> Iterator[Image]:
     """EDI: the nearest frame, deblurred by its events, and moved to the time by the events in between.
 
     The thresholds are nominal, the same for all pixels: those of the settings, the recording, or an estimate; so is the
     events' delay, which is taken off their times. Nothing is known of clipped pixels: they are taken as they are.
     """
-    chosen = plan(recording, times=times, settings=settings or PRESETS["default"]).settings
+    planner = planner or Planner()
+    chosen = planner.plan(recording, times, settings or PRESETS["default"]).settings
     on, off = (np.full(recording.sensor_size, c) for c in chosen.events.thresholds)
     recording = less_black(recording, chosen.camera.black_level)
     camera, reference = chosen.camera, reference_exposure(recording)
@@ -75,13 +124,11 @@ def filtered_estimates(
     times: Times,
     *,
     settings: Settings,
-    calibration: Calibration | None = None,
+    planner: Planner,
     smooth: bool = False,
 ) -> Iterator[Estimated]:
     """`kalux.reconstruct` with given settings, the AKF or the complementary filter: images and their variances."""
-    for image in reconstruct(
-        recording, times=times, settings=settings, calibration=calibration, smooth=smooth
-    ):
+    for image in execute(recording, planner.plan(recording, times, settings, smooth=smooth)):
         yield Estimated(image.intensity, image.variance, image.log_offset, image.fixed_pattern)
 
 
@@ -99,30 +146,32 @@ OPTIONAL: Final = ("iccv2021-flir", "davis240c", "davis346", "prophesee-flir")
 """Not among those that are compared if nothing is said: for one camera only."""
 
 
-def methods(response: str = AUTO, calibration: Calibration | None = None) -> dict[str, Method]:
+def methods(
+    response: str = AUTO, calibration: Calibration | None = None, planner: Planner | None = None
+) -> dict[str, Method]:
     """All methods by name; ``response`` is the camera's, as in `kalux.settings.CameraSettings`.
 
-    A calibration changes the settings of all filters.
+    A calibration changes the settings of all filters. A ``planner`` of the same calibration, if there is one already,
+    makes their plans.
     """
     known = Calibration() if calibration is None else calibration
+    planner = planner or Planner(calibration)
     presets = {name: known.apply(altered(PRESETS[name], "camera", response=response)) for name in _FILTERS}
     return {
         "hold": Method("hold the last frame", partial(hold_last_frame, response=response)),
         "mean": Method("mean of the neighbours", partial(mean_of_neighbours, response=response), True),
-        "edi": Method("EDI video", partial(edi_video, settings=presets["default"])),
-        **{name: filter_method(label, presets[name], calibration) for name, label in _FILTERS.items()},
-        "smooth": filter_method("AKF default, both ways", presets["default"], calibration, smooth=True),
+        "edi": Method("EDI video", partial(edi_video, settings=presets["default"], planner=planner)),
+        **{name: filter_method(label, presets[name], planner) for name, label in _FILTERS.items()},
+        "smooth": filter_method("AKF default, both ways", presets["default"], planner, smooth=True),
     }
 
 
-def filter_method(
-    label: str, settings: Settings, calibration: Calibration | None = None, *, smooth: bool = False
-) -> Method:
-    """`kalux.reconstruct` with these settings as a method; of a calibration the pixels are taken."""
-    with_variance = partial(filtered_estimates, settings=settings, calibration=calibration, smooth=smooth)
+def filter_method(label: str, settings: Settings, planner: Planner, *, smooth: bool = False) -> Method:
+    """`kalux.reconstruct` with these settings as a method; of the planner's calibration the pixels are taken."""
+    with_variance = partial(filtered_estimates, settings=settings, planner=planner, smooth=smooth)
     return Method(
         label,
-        partial(filtered, settings=settings, calibration=calibration, smooth=smooth),
+        partial(filtered, settings=settings, planner=planner, smooth=smooth),
         estimates=None if settings.filter.kind == "cf" else with_variance,
         settings=settings,
     )

@@ -24,7 +24,7 @@ from typing import Any, Final
 from kalux.calibration.values import Calibration
 from kalux.errors import InputError, MissingDependencyError
 from kalux.evaluation import folder_method
-from kalux.evaluation.baselines import OPTIONAL, methods
+from kalux.evaluation.baselines import OPTIONAL, Planner, methods
 from kalux.evaluation.learned.catalogue import NETWORKS, checksums
 from kalux.evaluation.method import Image, Method, Times
 from kalux.recording import Recording
@@ -46,6 +46,7 @@ def chosen_methods(
     response: str = AUTO,
     held_out: bool = False,
     calibration: Calibration | None = None,
+    planner: Planner | None = None,
 ) -> list[Method]:
     """Methods by name, in that order.
 
@@ -61,6 +62,8 @@ def chosen_methods(
         truth is nowhere else.
     calibration
         What was measured of the sensor, for all filters.
+    planner
+        Of the same calibration, to share its plans. Default: a new one.
 
     Raises
     ------
@@ -70,7 +73,7 @@ def chosen_methods(
     MissingDependencyError
         If the method is a network, and PyTorch is not installed.
     """
-    known = methods(response, calibration)
+    known = methods(response, calibration, planner)
     if names is None:
         names = [n for n, m in known.items() if n not in OPTIONAL and (held_out or not m.needs_held_out)]
     names = list(names)
