@@ -67,9 +67,16 @@ def white_of_bits(frames: Iterable[Frame]) -> int | None:
 
 
 class WhiteCheck:
-    """Watches frames go by, and tells whether the white value that they state, or that their type has, can be right."""
+    """Watches frames go by, and tells whether the white value that they state, or that their type has, can be right.
+
+    Attributes
+    ----------
+    white
+        The white value of the last frame; None before the first.
+    """
 
     def __init__(self) -> None:
+        self.white: float | None = None
         self._frame: Frame | None = None
         self._largest = 0.0
         self._stated: float | None = None  # white of frames in floats
@@ -82,6 +89,7 @@ class WhiteCheck:
 
     def see(self, frame: Frame) -> None:
         """Look at the next frame."""
+        self.white = float(frame.white_value)
         floats = frame.image.dtype.kind == "f"
         if floats or (frame.white is None and frame.image.dtype != np.uint8):
             self._frame, self._stated = frame, frame.white

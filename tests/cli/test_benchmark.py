@@ -11,6 +11,7 @@ import time
 
 import pytest
 
+import kalux
 from kalux.evaluation.benchmark import jobs, runners
 
 FILES = ("results.csv", "results.json", "report.html")
@@ -69,6 +70,20 @@ def test_what_has_changed_is_done_again(cli, ran, folder, tmp_path):
     os.utime(folder / "b.h5", ns=(5, 5))
     cli(*arguments)
     assert ran == ["a/hold", "b/hold", "b/hold"]
+
+
+def test_what_another_kalux_has_done_is_done_again_with_a_line(cli, ran, folder, tmp_path, monkeypatch):
+    """Versions in development have one number: the code tells them apart."""
+    out = tmp_path / "out"
+    arguments = ("benchmark", folder, "--methods", "hold,cf", "-o", out)
+    cli(*arguments)
+    monkeypatch.setattr(jobs, "code_digest", lambda: "other")
+    again = cli(*arguments)
+    assert ran == 2 * ["a/hold", "a/cf", "b/hold", "b/cf"]
+    told = f"4 jobs in {out} were done by another version or other code of kalux ({kalux.__version__})"
+    assert f"kalux: {told}, and are done again" in again.err
+    assert "another version" not in cli(*arguments).err
+    assert len(ran) == 8
 
 
 def test_a_failed_job_is_told_and_tried_again_and_the_others_are_done(cli, ran, folder, tmp_path):

@@ -126,6 +126,8 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     missing = [job for job in plan.jobs if job not in records]
     if records and not options.quiet:
         error_line(f"{len(records)} of {len(plan.jobs)} jobs are done already, in {options.out}")
+    if not (options.overwrite or options.quiet):
+        _tell_of_others(store, missing, options.out)
     failed = _work(plan, store, missing, options)
     done = {
         job: record for job in plan.jobs if (record := store.record(job)) is not None and job not in failed
@@ -152,6 +154,19 @@ def _check_apart(out: Path, plan: Plan) -> None:
     for place in (*(sequence.path for sequence in plan.sequences), *methods):
         if place is not None and place.is_dir() and lies_in(out, place):
             raise UsageError(f"{out}: lies in {place}, an input; choose another place for the output")
+
+
+def _tell_of_others(store: Store, missing: list[Job], out: Path) -> None:
+    """Say how many jobs another kalux has done, which are not mixed with those of this one."""
+    from kalux.wording import how_many
+
+    others = [version for job in missing if (version := store.other_kalux(job)) is not None]
+    if others:
+        versions = ", ".join(sorted({*others}))
+        error_line(
+            f"{how_many(len(others), 'job')} in {out} {'was' if len(others) == 1 else 'were'} done by another version "
+            f"or other code of kalux ({versions}), and {'is' if len(others) == 1 else 'are'} done again"
+        )
 
 
 def _work(plan: Plan, store: Store, jobs: list[Job], options: argparse.Namespace) -> dict[Job, Any]:

@@ -80,10 +80,10 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
         found = calibrate_contrast(
             recording, settings.camera, delay=options.delay, refractory=options.refractory
         )
+    assert contents is not None
     if found is None:
-        assert contents is not None
         raise InputError(f"{recording.source.path}: {untold(contents, mends)}")
-    finish(found.calibration(), recording, options, command)
+    finish(found.calibration(), recording, contents.white, options, command)
 
 
 def untold(contents: Contents, mends: Mends) -> str:

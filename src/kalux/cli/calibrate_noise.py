@@ -77,7 +77,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     opened = open_recording(options)
     require_white(known, opened)
     stages = Stages(quiet=options.quiet)
-    (recording, settings, mends), _ = mended_recording(opened, known.apply(preset("default")), stages)
+    (recording, settings, mends), contents = mended_recording(opened, known.apply(preset("default")), stages)
     with stages.stage("measuring noise"):
         found = calibrate_noise(recording, settings.camera, mends.hot).calibration()
     if mends.ceiling is not None:
@@ -97,4 +97,5 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
         if not options.quiet:
             say(fitted.described())
         found = start.merged(fitted.calibration())
-    finish(dataclasses.replace(found, provenance={}), recording, options, command)
+    white = None if contents is None else contents.white
+    finish(dataclasses.replace(found, provenance={}), recording, white, options, command)

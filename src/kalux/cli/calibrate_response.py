@@ -13,6 +13,7 @@ from kalux.cli.terminal import say
 if TYPE_CHECKING:
     from kalux.calibration.response import ResponseCalibration
     from kalux.recording import Recording
+    from kalux.white import WhiteCheck
 
 _DESCRIPTION = """\
 Measure the camera's response function: from images of one still scene at three or more exposure times (from their EXIF,
@@ -69,7 +70,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
         check_picture(options.plot, overwrite=options.overwrite)
     images, times, recording = _inputs(options)
     found = calibrate_response(images, times, per_channel=options.per_channel, method=options.method)
-    finish(found.calibration(), recording, options, command)
+    finish(found.calibration(), recording, _white(recording), options, command)
     if not options.quiet:
         say("\n".join(report(found)))
     if options.plot is not None:
@@ -108,6 +109,16 @@ def _inputs(options: argparse.Namespace) -> tuple[Any, list[float], Recording | 
     else:
         times = exposure_times(options.times)
     return [read_photograph(path) for path in paths], times, None
+
+
+def _white(recording: Recording | None) -> WhiteCheck:
+    """What has watched all frames, of which the measurement has seen the first only; nothing of photographs."""
+    from kalux.white import WhiteCheck
+
+    check = WhiteCheck()
+    for frame in () if recording is None else recording.frames():
+        check.see(frame)
+    return check
 
 
 def _recording(path: Path, options: argparse.Namespace, *, may_be_none: bool) -> Recording | None:

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from kalux.planning.mending import Mended
     from kalux.recording import Recording
     from kalux.settings import Settings
+    from kalux.white import WhiteCheck
 
 
 def add_calibration(group: Any) -> None:
@@ -135,9 +136,13 @@ def check_result(options: argparse.Namespace, inputs: Iterable[Path | str | None
 
 
 def finish(
-    calibration: Calibration, recording: Recording | None, options: argparse.Namespace, command: list[str]
+    calibration: Calibration,
+    recording: Recording | None,
+    white: WhiteCheck | None,
+    options: argparse.Namespace,
+    command: list[str],
 ) -> None:
-    """Print the result and write it."""
+    """Print the result and write it; ``white`` has watched the recording's frames, if there are any."""
     import kalux
     from kalux.writers.calibration import save_calibration
 
@@ -149,7 +154,7 @@ def finish(
             "format": recording.source.format,
             "width": width,
             "height": height,
-            **_white_of(recording),
+            **_of_white(white),
         }
     made = dataclasses.replace(calibration, provenance=provenance)
     if not options.quiet:
@@ -161,11 +166,8 @@ def finish(
             say(f"wrote {files}, for kalux reconstruct REC --calibration {shlex.quote(str(written[-1]))}")
 
 
-def _white_of(recording: Recording) -> dict[str, Any]:
+def _of_white(check: WhiteCheck | None) -> dict[str, Any]:
     """For the provenance: what was taken for white, and whether the frames make that doubtful."""
-    from kalux.white import WhiteCheck
-
-    check, white = WhiteCheck(), None
-    for frame in check.watched(recording.stamped_frames()):
-        white = float(frame.white_value)
-    return {} if white is None else {"white": white, "white_is_doubtful": check.doubt() is not None}
+    if check is None or check.white is None:
+        return {}
+    return {"white": check.white, "white_is_doubtful": check.doubt() is not None}

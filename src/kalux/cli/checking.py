@@ -65,6 +65,8 @@ class Contents(NamedTuple):
         Whether a pixel of any frame lies between black and white.
     region
         Where all events lie, if frames change elsewhere as well.
+    white
+        What has watched the frames.
     """
 
     frames: int
@@ -81,6 +83,7 @@ class Contents(NamedTuple):
     on_share: float | None = None
     exposed: bool = True
     region: Region | None = None
+    white: WhiteCheck | None = None
 
     @property
     def seconds(self) -> float:
@@ -193,6 +196,7 @@ def check_recording(
         on / count if count else None,
         exposed,
         region if region is not None and changes.go_on_beyond(region, recording.sensor_size) else None,
+        white,
     )
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -109,7 +111,27 @@ def test_the_key_is_of_all_that_scores_depend_on(small_set, monkeypatch):
     others.add(small_set.job("hold").key)
     monkeypatch.setattr(kalux, "__version__", "9.9")
     others.add(small_set.job("hold").key)
-    assert len(others - {first}) == 5
+    monkeypatch.setattr(jobs, "code_digest", lambda: "other")
+    others.add(small_set.job("hold").key)
+    assert len(others - {first}) == 6
+
+
+def test_the_code_is_all_but_what_shows_results(tmp_path, monkeypatch):
+    """As scores do not depend on the command line and the report; line ends are the checkout's."""
+    copy = tmp_path / "kalux"
+    shutil.copytree(Path(kalux.__file__).parent, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    monkeypatch.setattr(kalux, "__file__", str(copy / "__init__.py"))
+    whole = jobs.code_digest.__wrapped__
+    assert whole() == jobs.code_digest()
+
+    def after(name):
+        (copy / name).write_bytes((copy / name).read_bytes() + b"# changed\n")
+        return whole()
+
+    assert after("cli/app.py") == after("evaluation/benchmark/report.py") == jobs.code_digest()
+    (copy / "events.py").write_bytes((copy / "events.py").read_bytes().replace(b"\n", b"\r\n"))
+    assert whole() == jobs.code_digest()
+    assert len({jobs.code_digest(), after("filters/akf.py"), after("evaluation/benchmark/jobs.py")}) == 3
 
 
 def test_a_title_is_not_part_of_the_key(small_set):
@@ -135,6 +157,7 @@ def test_whatever_goes_wrong_is_an_outcome_of_one_line(small_set, monkeypatch):
     assert run_job(dataclasses.replace(job, version="0.0")) == Failed(
         f"the job is for kalux 0.0, this is {kalux.__version__}; install the same", is_bug=False
     )
+    assert "the job is for other code of kalux" in run_job(dataclasses.replace(job, code="other")).message
     few = dataclasses.replace(small_set.without, options=Options(hold_out_frames=99))
     assert "too few" in run_job(make_job(few, "hold", held_out=True, hdr_vdp=False)).message
     small_set.without.path.write_bytes(b"x")

@@ -8,6 +8,7 @@ import json
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
@@ -31,13 +32,13 @@ from kalux.recording import Recording, reference_exposure
 from kalux.settings import chosen_response, to_dict
 from kalux.writers.settings_file import versions
 
-LAYOUT: Final = 4
-"""Of the files of jobs; part of every key, so that others are not taken for one's own."""
-
 MOMENTS: Final = 3
 """Times of a sequence at which pictures are kept."""
 
 GROUPS: Final = {False: "Ground truth", True: "Held-out frames"}
+
+_JOBS: Final = ("jobs.py", "sequences.py")
+"""Modules of the benchmark that a job runs; the others plan it or show what it found."""
 
 _LIBRARIES: Final = ("numpy", "scipy", "numba", "scikit-image", "opencv-python-headless")
 
@@ -60,6 +61,8 @@ class Job:
         Digest of all that the scores depend on, from `make_job`.
     version
         Of the kalux that made the job; another one refuses to run it.
+    code
+        `code_digest` of the same.
     folder
         That a file or folder in the method's name is relative to; absolute.
     lpips
@@ -77,6 +80,7 @@ class Job:
     folder: Path
     lpips: tuple[Path, ...] = ()
     between: bool = False
+    code: str = ""
 
     @property
     def name(self) -> str:
@@ -117,6 +121,22 @@ class Failed:
 
 
 Outcome = Finished | Failed
+
+
+@cache
+def code_digest() -> str:
+    """A digest of all modules of kalux that scores can depend on: results of others are not of one table.
+
+    Of versions in development there are many of one number. The command line and the report are left out.
+    """
+    package = Path(kalux.__file__).parent
+    benchmark, digest = package / "evaluation" / "benchmark", hashlib.sha256()
+    for file in sorted(package.rglob("*.py")):
+        shows = file.is_relative_to(package / "cli") or (file.parent == benchmark and file.name not in _JOBS)
+        if not shows:
+            digest.update(f"{file.relative_to(package).as_posix()}\n".encode())
+            digest.update(file.read_bytes().replace(b"\r\n", b"\n"))  # as a checkout may have them
+    return digest.hexdigest()[:16]
 
 
 def uses_held_out(sequence: Sequence) -> bool:
@@ -161,7 +181,7 @@ def make_job(
 
     The key is a digest of: path, size and time of change of every file of the sequence, of the file or folder in a
     method's name, and of the weights of LPIPS; the sequence's options; the method's name and settings; whether Q is
-    computed; the version of kalux.
+    computed; the version of kalux and its code.
 
     Raises
     ------
@@ -173,8 +193,8 @@ def make_job(
     chosen = _method(method, sequence, held_out or between, folder)
     named = spec_path(method_text(method, sequence.name, folder))
     parts = {
-        "layout": LAYOUT,
         "kalux": kalux.__version__,
+        "code": code_digest(),
         "files": [_identity(path) for path in sequence.files()],
         "options": {k: str(v) for k, v in dataclasses.asdict(sequence.options).items()},
         "held_out": held_out,
@@ -187,7 +207,18 @@ def make_job(
         "lpips": [_identity(path) for path in weights],
     }
     digest = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
-    return Job(sequence, method, held_out, hdr_vdp, digest, kalux.__version__, folder, weights, between)
+    return Job(
+        sequence,
+        method,
+        held_out,
+        hdr_vdp,
+        digest,
+        kalux.__version__,
+        folder,
+        weights,
+        between,
+        code_digest(),
+    )
 
 
 def _identity(path: Path) -> tuple[str, int, int]:
@@ -216,6 +247,10 @@ def run_job(job: Job) -> Outcome:
         if job.version != kalux.__version__:
             raise InputError(
                 f"the job is for kalux {job.version}, this is {kalux.__version__}; install the same"
+            )
+        if job.code != code_digest():
+            raise InputError(
+                f"the job is for other code of kalux {job.version} than there is here; install the same"
             )
         return _run(job)
     except KaluxError as error:
@@ -249,8 +284,8 @@ def _run(job: Job) -> Finished:
         lpips=load_lpips(*job.lpips) if job.lpips else None,
     )
     record = {
-        "layout": LAYOUT,
         "key": job.key,
+        "code": job.code,
         "sequence": described(job),
         "method": {
             "name": job.method,

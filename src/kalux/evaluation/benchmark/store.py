@@ -60,13 +60,28 @@ class Store:
 
     def record(self, job: Job) -> dict[str, Any] | None:
         """The record of a job, if it is done with this very key; its title and group may have changed since."""
+        found = self._stored(job)
+        if found is None or found.get("key") != job.key:
+            return None
+        return {**found, "sequence": described(job)}
+
+    def other_kalux(self, job: Job) -> str | None:
+        """The version of kalux that has left a record of a job, if that or its code is another; None: none has."""
+        found = self._stored(job)
+        if found is None or found.get("code") == job.code:
+            return None
+        made_by = found.get("versions")
+        return str(made_by.get("kalux", "?")) if isinstance(made_by, dict) else "?"
+
+    def _stored(self, job: Job) -> dict[str, Any] | None:
+        """What is stored of a job, with whatever key; None if nothing is, or not whole."""
         path = self.path(job)
         if not path.with_suffix(".npz").is_file():
             return None
         with contextlib.suppress(OSError, ValueError):
             found = json.loads(path.read_text(encoding="utf-8"))
-            if isinstance(found, dict) and found.get("key") == job.key:
-                return {**found, "sequence": described(job)}
+            if isinstance(found, dict):
+                return found
         return None
 
     def pictures(self, job: Job) -> dict[str, NDArray[Any]]:
