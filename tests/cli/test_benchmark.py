@@ -14,7 +14,7 @@ import pytest
 import kalux
 from kalux.evaluation.benchmark import jobs, runners
 
-FILES = ("results.csv", "results.json", "report.html")
+FILES = ("results.csv", "results.json", "results.tex", "report.html")
 
 
 @pytest.fixture

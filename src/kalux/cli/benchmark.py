@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
 _DESCRIPTION = """\
 Compare methods on many recordings: each with its ground truth or, where it has none, with frames held out.
-Writes results.csv, results.json and report.html to the folder OUT. Run again after an interrupt or an error,
-the same command does only what is missing. Needs the extra kalux[evaluation].
+Writes results.csv, results.json, results.tex and report.html to the folder OUT. Run again after an interrupt
+or an error, the same command does only what is missing. Needs the extra kalux[evaluation].
 
 SET is a recording, a folder with recordings, or a TOML file that lists sequences (docs/benchmark.md).
 methods: as of kalux evaluate; without --methods hold, mean (where images lie between frames), edi, cf,
@@ -45,7 +45,7 @@ a TOML file:
   path = "pan.mat"
   truth = "pan_hdr.npz"                # or hold_out_frames = 2, or ahdr = {low = 10, high = 90}"""
 
-CSV, JSON, REPORT = "results.csv", "results.json", "report.html"
+CSV, JSON, LATEX, REPORT = "results.csv", "results.json", "results.tex", "report.html"
 _LISTED: Final = 6
 
 
@@ -140,7 +140,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     _write(options.out, results, store)
     for line in table(results):
         say(line)
-    say(f"wrote {options.out / CSV}, {options.out / JSON}, {options.out / REPORT}")
+    say("wrote " + ", ".join(str(options.out / name) for name in (CSV, JSON, LATEX, REPORT)))
     _raise_failures(results, options.out)
 
 
@@ -236,12 +236,14 @@ def _some(names: Iterable[str]) -> str:
 
 def _write(out: Path, results: Results, store: Store) -> None:
     from kalux.evaluation.benchmark.report import make_report
+    from kalux.evaluation.benchmark.report_latex import latex_table
     from kalux.evaluation.benchmark.results import as_csv, as_json
     from kalux.writers.files import save
 
     for name, text in (
         (CSV, as_csv(results)),
         (JSON, as_json(results)),
+        (LATEX, latex_table(results)),
         (REPORT, make_report(results, store)),
     ):
         save(out / name, text)
