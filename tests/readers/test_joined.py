@@ -180,6 +180,24 @@ class TestSize:
         assert (rec.sensor_size, rec.source.missing) == ((60, 80), ())
         assert next(iter(rec.frames())).image.shape == (60, 80)
 
+    def test_rows_that_are_counted_from_below_are_those_of_the_frames(self, tmp_path):
+        """jAER's text does not say how many there are."""
+        path, folder = tmp_path / "events.txt", tmp_path / "images"
+        path.write_text(
+            "# jAER DAVIS/DVS camera text file output\n# t_us x y p\n1 0 0 1\n2 3 19 0\n3 3 10 1\n"
+        )
+        write_images(folder, [Frame(np.zeros((60, 80), np.uint8), 0, 1)])
+        (folder / "frames.csv").write_text("t_us,exposure_us\n0,5\n")
+        alone, joined = kalux.open(path), kalux.open(path, frames=folder)
+        assert np.concatenate([*alone.events()])["y"].tolist() == [19, 0, 9]
+        assert np.concatenate([*joined.events()])["y"].tolist() == [59, 40, 49]
+        (tmp_path / "low").mkdir()
+        cv2.imwrite(str(tmp_path / "low" / "000.png"), np.zeros((19, 80), np.uint8))
+        (tmp_path / "low" / "frames.csv").write_text("t_us\n0\n")
+        path.write_text("# jAER DAVIS/DVS camera text file output\n# t_us x y p\n1 0 15 1\n2 3 19 0\n")
+        with pytest.raises(FrameError, match="is at least 4x20"):
+            kalux.open(path, frames=tmp_path / "low")
+
     def test_but_all_events_must_lie_in_it(self, sizeless, tmp_path):
         folder = tmp_path / "images"
         write_images(folder, [Frame(np.zeros((60, 20), np.uint8), 0, 1)])

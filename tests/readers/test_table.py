@@ -139,7 +139,7 @@ def test_whole_times_with_a_point_are_microseconds_all_the_same(path, header):
 @pytest.mark.parametrize("unit", ["float s", "int32 us"])
 @pytest.mark.parametrize("order", ["txyp", "xypt", "txyps"])
 def test_the_header_that_jaer_writes(path, separator, unit, order):
-    """Save As text: the names stand after "format:", the unit in the comment before; rows are told to be from below."""
+    """Save As text: the names stand after "format:", the unit in the comment before; rows are turned."""
     legend = f"timestamp({unit}) x y polarity(off/on=-1/+1)".replace(" ", separator)
     header = [
         "# jAER DAVIS/DVS camera text file output",
@@ -152,9 +152,40 @@ def test_the_header_that_jaer_writes(path, separator, unit, order):
     lines = [separator.join(str(row[name]) for name in order) for row in rows]
     path.write_text("\n".join([*header, *lines]))
     source = readers.read(path)
-    assert all_events(source).tolist() == [(10, 2, 3, False), (12_300, 4, 5, True)]
+    assert source.sensor_size == (6, 5)
+    assert all_events(source).tolist() == [(10, 2, 6 - 1 - 3, False), (12_300, 4, 6 - 1 - 5, True)]
     assert any("from the bottom" in text for text in source.missing)
     assert not any("unit of time" in text for text in source.missing)
+
+
+@pytest.mark.parametrize(
+    ("legend", "line", "expected"),
+    [
+        ("timestamp(float s) x y polarity(off/on=0/1)", "0.000010 2 3 0", (10, 2, 0, False)),
+        ("timestamp(int32 us) x y polarity(off/on=-1/+1)", "12300 4 5 1", (12_300, 4, 0, True)),
+        ("x,y,polarity(off/on=0/1),(flipped),timestamp(int32,us)", "4,5,1,7", (7, 4, 0, True)),
+        (
+            "timestamp(float s) x y polarity(off/on=0/1) special(1=special,0=normal)",
+            "1.5E-5 2 3 1 0",
+            (15, 2, 0, True),
+        ),
+    ],
+)
+def test_the_legend_of_jaer_alone_names_columns(path, legend, line, expected):
+    """As DavisTextOutputWriter writes them while a recording is played."""
+    path.write_text(
+        f"# jAER DAVIS/DVS camera text file output\n# dvs-events: One event per line:  {legend}\n{line}\n"
+    )
+    source = readers.read(path)
+    assert all_events(source).tolist() == [expected]
+    assert any("from the bottom" in text for text in source.missing)
+
+
+def test_rows_of_files_that_only_lay_in_a_folder_of_jaer_stay(path):
+    assert (
+        parse(path, "# source-file: /home/u/jAER/text file output\n# t_us x y p\n7 2 3 1\n8 0 9 1\n")[0][2]
+        == 3
+    )
 
 
 def test_a_comment_with_fewer_or_more_names_than_there_are_columns_names_none(path):

@@ -103,7 +103,8 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     from kalux.calibration.two_cameras import events_size, open_frames, register
     from kalux.cli.output import check_apart, check_file, check_picture, write_picture
     from kalux.cli.recordings import check_name
-    from kalux.recording import less_black
+    from kalux.readers.source import on_sensor
+    from kalux.recording import Recording, less_black
 
     timing = _timing(options)
     centre, reach = checked_range(options)
@@ -116,6 +117,8 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     rig = None if options.rig is None else load_rig(options.rig)
     events = kalux.open(options.events)
     size = events_size(events, rig)
+    if not events.source.sensor_size_known:
+        events = Recording(on_sensor(events.source, size))
     by_trigger = timing == "triggers"
     other = open_frames(
         options.frames,

@@ -30,7 +30,7 @@ from kalux.readers.image_lists import (
     read_listed,
 )
 from kalux.readers.images import files_in_colour, load_image
-from kalux.readers.source import EXPOSURE_UNKNOWN, SIZE_NOT_STATED, Source, reading, size_needed
+from kalux.readers.source import EXPOSURE_UNKNOWN, SIZE_NOT_STATED, Source, on_sensor, reading, size_needed
 from kalux.readers.videos import opened_video
 from kalux.wording import how_many
 
@@ -92,12 +92,13 @@ def join(source: Source, frames: Path, *, start: int | None, rate_hz: float | No
     size = _joint_size(source, frames, joined)
     kept = (text for text in source.missing if not _ABOUT_FRAMES.search(text))
     adopted = not source.sensor_size_known
+    placed = on_sensor(source, size) if adopted else source
     return dataclasses.replace(
         joined,
         path=source.path,
         format=f"{source.format} + {joined.format}",
         sensor_size=size,
-        events=source.events,
+        events=placed.events,
         count_events=source.count_events,
         contrast_threshold=source.contrast_threshold,
         ground_truth=source.ground_truth,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator
@@ -67,6 +68,9 @@ class Source:
     mosaic
         The Bayer pattern of the sensor, if the recording states one. Frames are given as stored all the same: a mosaic,
         or RGB that was made of it.
+    rows_from_below
+        Whether the file counts rows from the bottom: events of a sensor that turns out to be taller than
+        ``sensor_size`` lie as many rows lower (`on_sensor`).
     """
 
     path: Path
@@ -85,6 +89,7 @@ class Source:
     missing: tuple[str, ...] = field(default=())
     sensor_size_known: bool = True
     mosaic: Mosaic | None = None
+    rows_from_below: bool = False
 
 
 NO_EVENTS: Final = "The file has no events."
@@ -121,6 +126,37 @@ def smallest_size(path: Path, chunks: Iterable[EventArray]) -> tuple[int, int]:
     return height, width
 
 
+def with_rows_turned(source: Source) -> Source:
+    """A recording whose file counts rows from the bottom, with row 0 at the top. An event that lies outside stays."""
+    height = source.sensor_size[0]
+    return dataclasses.replace(
+        source,
+        events=lambda: (_with_rows(chunk, _turned(chunk["y"], height)) for chunk in source.events()),
+        rows_from_below=True,
+    )
+
+
+def on_sensor(source: Source, size: tuple[int, int]) -> Source:
+    """A recording that does not state its sensor size, on a sensor of ``size``, (height, width), that holds it."""
+    lower = size[0] - source.sensor_size[0] if source.rows_from_below else 0
+    moved = dataclasses.replace(source, sensor_size=size)
+    if not lower:
+        return moved
+    return dataclasses.replace(
+        moved, events=lambda: (_with_rows(chunk, chunk["y"] + np.uint16(lower)) for chunk in source.events())
+    )
+
+
+def _turned(rows: NDArray[np.uint16], height: int) -> NDArray[Any]:
+    return np.where(rows < height, height - 1 - rows.astype(np.int32), rows)
+
+
+def _with_rows(chunk: EventArray, rows: NDArray[Any]) -> EventArray:
+    events = chunk.copy()
+    events["y"] = rows
+    return events
+
+
 def size_needed(source: Source, size: tuple[int, int]) -> tuple[int, int] | None:
     """The (height, width) that a recording's events need, where a sensor of ``size`` does not hold them all; else None.
 
@@ -128,6 +164,8 @@ def size_needed(source: Source, size: tuple[int, int]) -> tuple[int, int] | None
     """
     if _holds(size, source.sensor_size):
         return None
+    if source.rows_from_below:  # in the file they go up to this
+        return source.sensor_size
     # What was assumed, as of DSEC's layout, may be more than the events need.
     least = smallest_size(source.path, source.events())
     return None if _holds(size, least) else least

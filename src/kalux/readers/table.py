@@ -43,6 +43,7 @@ from kalux.readers.source import (
     counted,
     reading,
     smallest_size,
+    with_rows_turned,
 )
 
 _MOST_COLUMNS: Final = 64
@@ -74,12 +75,15 @@ _IJRR_ASSUMED: Final = (
 )
 _FORMAT: Final = re.compile(r"^format:\s*", re.IGNORECASE)
 """What jAER writes before the names."""
-_LEGEND: Final = re.compile(r"timestamp\((?:float|int32)[ ,](?P<unit>s|us)\)")
-"""How jAER states the unit of time, in a comment before that of the names."""
-_JAER: Final = "jAER"
-_ROWS_FROM_BELOW: Final = (
-    "jAER counts rows from the bottom, and y is read as it is there: the picture is upside down."
-)
+_UNIT_OF_LEGEND: Final = re.compile(r"timestamp\((?:(?:float|int32)[ ,])?(?P<unit>s|us)\)")
+_LEGEND: Final = re.compile(r"^\W*dvs-events:(?: One event per line:)?\s*(?P<names>.*)$")
+_OF_LEGEND: Final = re.compile(r"[ ,]?\([^)]*\)")
+"""How jAER names the columns, in a comment: `timestamp(float s) x y polarity(off/on=0/1)`, with what is in brackets.
+Some of its versions write the line that begins with format, too."""
+_JAER: Final = re.compile(r"^\W*jAER\b.* text file output")
+"""The first comment of jAER's DavisTextOutputWriter and CsvEventSink (https://github.com/SensorsINI/jaer), of any
+version. They write the rows of its BasicEvent: "by convention starts at bottom"."""
+_ROWS_FROM_BELOW: Final = "jAER counts rows from the bottom; they are turned."
 _SECONDS_ASSUMED: Final = (
     "The unit of time is not stated; lines are like those of events.txt of IJRR, and times taken as seconds."
 )
@@ -90,7 +94,7 @@ _DECIMALS: Final = {"s": 6, "ms": 3, "us": 0, "ns": -3, None: 0}
 class _Header(NamedTuple):
     """Where the data begin (bytes, lines), what separates columns, which column is what, and the sensor's size.
 
-    ``assumed`` says what the file leaves open, for `Source.missing`.
+    ``assumed`` says what the file leaves open, for `Source.missing`, ``from_below`` whether rows count from the bottom.
     """
 
     begin: int
@@ -100,6 +104,7 @@ class _Header(NamedTuple):
     unit: str | None
     assumed: tuple[str, ...]
     size: tuple[int, int] | None
+    from_below: bool = False
 
 
 class _Beginning(NamedTuple):
@@ -151,7 +156,7 @@ def read(path: Path) -> Source:
     """
     with reading(path), path.open("rb") as file:
         header = _read_header(path, file.read(LONGEST_LINE))
-    return Source(
+    source = Source(
         path=path,
         format="table",
         sensor_size=header.size or smallest_size(path, _events(path, header)),
@@ -160,6 +165,7 @@ def read(path: Path) -> Source:
         missing=(NO_FRAMES, *header.assumed, *(() if header.size else (SIZE_UNKNOWN,))),
         sensor_size_known=header.size is not None,
     )
+    return with_rows_turned(source) if header.from_below else source
 
 
 # The line with the names
@@ -213,7 +219,12 @@ def _fields(line: str, separator: str) -> list[str]:
 def _named(beginning: _Beginning) -> Iterator[_Named]:
     """The lines that name columns: the first that is no comment, and comments."""
     others = [(beginning.before, line) for line in beginning.others[:1]]
-    for index, line in (*others, *beginning.comments):
+    legends = []
+    for index, line in beginning.comments:
+        legend = _LEGEND.match(line)
+        if legend is not None:
+            legends.append((index, _OF_LEGEND.sub("", legend["names"])))
+    for index, line in (*others, *beginning.comments, *legends):
         text = _FORMAT.sub("", line.strip().lstrip("#%").strip())
         separator = _separator(text)
         matches = [(name, _SIZED.fullmatch(name)) for name in _fields(text, separator)]
@@ -233,6 +244,13 @@ def _has_numbers(line: str) -> bool:
 
 def _read_header(path: Path, data: bytes) -> _Header:
     beginning = _beginning(data)
+    header = _header_as_stored(path, data, beginning)
+    if not any(_JAER.match(comment) for _, comment in beginning.comments):
+        return header
+    return header._replace(assumed=(*header.assumed, _ROWS_FROM_BELOW), from_below=True)
+
+
+def _header_as_stored(path: Path, data: bytes, beginning: _Beginning) -> _Header:
     all_named = list(_named(beginning))
     named = next((named for named in all_named if _fits(beginning, named)), None)
     if named is not None:
@@ -292,8 +310,6 @@ def _header_of_names(path: Path, data: bytes, beginning: _Beginning, named: _Nam
     assumed: tuple[str, ...] = () if unit else (UNIT_ASSUMED,)
     if unit is None and roles == _TXYP and _are_seconds(lines):
         unit, assumed = "s", (_SECONDS_ASSUMED,)
-    if any(_JAER in comment for _, comment in beginning.comments):
-        assumed += (_ROWS_FROM_BELOW,)
     before = max(beginning.before, named.before + 1)
     return _Header(
         _place(data, before),
@@ -307,7 +323,7 @@ def _header_of_names(path: Path, data: bytes, beginning: _Beginning, named: _Nam
 
 
 def _unit_of_legend(beginning: _Beginning) -> str | None:
-    matches = (_LEGEND.search(comment) for _, comment in beginning.comments)
+    matches = (_UNIT_OF_LEGEND.search(comment) for _, comment in beginning.comments)
     return next((match["unit"] for match in matches if match is not None), None)
 
 
