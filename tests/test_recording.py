@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import gzip
 import os
+import pickle
 
+import cv2
 import numpy as np
 import pytest
 
 from kalux import readers, recording
 from kalux.errors import EventError, ExposureError, FormatError, FrameError, InputError
-from kalux.frames import Frame, GroundTruth
+from kalux.frames import Frame, GroundTruth, with_black_level
 from kalux.recording import (
     FrameCorrections,
     Recording,
+    less_black,
     with_cached_start,
     with_counted_events,
     without_events_of,
@@ -41,12 +45,48 @@ def stamped(tmp_path):
     return path
 
 
+def write_listed(folder):
+    """A folder of one image with its exposure."""
+    cv2.imwrite(str(folder / "000.png"), np.zeros(SIZE, np.uint8))
+    (folder / "frames.csv").write_text("t_us,exposure_us\n0,5\n")
+    return folder
+
+
 def test_streams_can_be_iterated_again():
     rec = in_memory()
     for _ in range(2):
         assert np.array_equal(np.concatenate(list(rec.events())), small_events())
         assert same_frames(rec.frames(), small_frames())
     assert (len(rec.events()), len(rec.frames())) == (500, 4)
+
+
+def test_an_opened_recording_is_opened_again_where_it_is_unpickled(stamped, tmp_path, monkeypatch):
+    """With what was given and what is known of it, wherever the other process runs."""
+    monkeypatch.chdir(stamped.parent)
+    opened = recording.open(stamped.name, exposure=3_000, stamp="middle")
+    frames, sent = list(opened.frames()), pickle.dumps(less_black(opened, 0.1))
+    monkeypatch.chdir("/")
+    rec = pickle.loads(sent)
+    assert rec.black_level == 0.1
+    assert same_frames(rec.frames(), [with_black_level(frame, 0.1) for frame in frames])
+    assert np.array_equal(np.concatenate([*rec.events()]), small_events())
+    assert pickle.loads(pickle.dumps(rec)).black_level == 0.1
+    joined = recording.open(stamped, frames=write_listed(tmp_path), replace_frames=True)
+    assert same_frames(pickle.loads(pickle.dumps(joined)).frames(), joined.frames())
+
+
+def test_a_recording_that_is_not_as_a_file_says_is_not_pickled(stamped):
+    """It would be another one on the other side; copied it can be."""
+    opened = recording.open(stamped, exposure=3_000)
+    for rec in (
+        in_memory(),
+        without_events_of(opened, np.zeros(SIZE, bool)),
+        with_cached_start(opened, 9, 9),
+    ):
+        with pytest.raises(InputError, match="only a recording as kalux"):
+            pickle.dumps(rec)
+        for copied in (copy.copy(rec), copy.deepcopy(rec)):
+            assert same_frames(copied.frames(), rec.frames())
 
 
 def test_chunks_are_bounded(monkeypatch):

@@ -340,8 +340,18 @@ def check_stated(exposure: int | None, stamp: str, white: float | None) -> None:
         raise InputError(f"stamp is {stamp!r}; it must be 'start', 'middle' or 'end'")
 
 
+class _Opening(NamedTuple):
+    """The source that `open` has made, and of what: another process can do the same."""
+
+    source: Source
+    path: Path
+    options: dict[str, Any]
+
+
 class Recording:
     """A hybrid recording, opened with `kalux.open` or made with `Recording.from_arrays`.
+
+    One that was opened can be pickled, as processes need it that share work: its files are opened again there.
 
     Iterating the same recording twice gives the same chunks and frames twice. Every chunk and frame is
     checked on the way (order, sensor bounds, sizes, exposure times); what is wrong is raised with its index.
@@ -386,6 +396,34 @@ class Recording:
         self._stamp: Stamp = stamp
         self._longest: int | None = None
         self._black_level: float | None = None
+        self._opening: _Opening | None = None
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """How to open it again elsewhere.
+
+        Raises
+        ------
+        InputError
+            If it was made in memory, or its events or frames are others than those of the file.
+        """
+        if self._opening is None or self._opening.source is not self.source:
+            raise InputError(
+                f"{self.source.path}: only a recording as kalux.open has given it can be sent to another process; open "
+                "or make it there"
+            )
+        _, path, options = self._opening
+        state = {name: value for name, value in vars(self).items() if name not in ("source", "_opening")}
+        return _opened_again, (path, options, state)
+
+    def __copy__(self) -> Recording:
+        """The same, of the same source."""
+        made = object.__new__(type(self))
+        vars(made).update(vars(self))
+        return made
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Recording:
+        """As a copy: reading changes nothing."""
+        return copy.copy(self)
 
     @classmethod
     def from_arrays(
@@ -663,6 +701,16 @@ def open(
     MissingDependencyError
         If the format needs a library that is not installed.
     """
+    options: dict[str, Any] = {
+        "exposure": exposure,
+        "stamp": stamp,
+        "frames": None if frames is None else Path(frames).absolute(),
+        "frames_start": frames_start,
+        "frames_rate": frames_rate,
+        "replace_frames": replace_frames,
+        "mosaic": mosaic,
+        "white": white,
+    }
     source = readers.read(path)
     if frames is not None:
         source = joined.join(
@@ -672,4 +720,13 @@ def open(
         raise InputError(
             "frames_start, frames_rate and replace_frames say what to do with frames; give frames"
         )
-    return Recording(source, exposure=exposure, stamp=stamp, mosaic=mosaic, white=white)
+    recording = Recording(source, exposure=exposure, stamp=stamp, mosaic=mosaic, white=white)
+    recording._opening = _Opening(source, Path(path).absolute(), options)
+    return recording
+
+
+def _opened_again(path: Path, options: dict[str, Any], state: dict[str, Any]) -> Recording:
+    """A recording that was pickled, with what was known of it."""
+    recording = open(path, **options)
+    vars(recording).update(state)
+    return recording
