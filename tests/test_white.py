@@ -28,6 +28,7 @@ def test_a_white_value_that_can_hardly_be_right_is_doubted(values, dtype, white,
     check = WhiteCheck()
     assert list(check.watched(frames)) == frames
     doubt = check.doubt()
+    assert check.found() == (frames[-1].white_value, told is not None)
     assert doubt is None if told is None else told in doubt
 
 

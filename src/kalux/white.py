@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,17 +66,18 @@ def white_of_bits(frames: Iterable[Frame]) -> int | None:
     return int(end) if end is not None and end + 1 in [1 << bits for bits in _BITS] else None
 
 
-class WhiteCheck:
-    """Watches frames go by, and tells whether the white value that they state, or that their type has, can be right.
+class CheckedWhite(NamedTuple):
+    """The white value of frames, and whether they make it doubtful."""
 
-    Attributes
-    ----------
-    white
-        The white value of the last frame; None before the first.
-    """
+    value: float
+    is_doubtful: bool
+
+
+class WhiteCheck:
+    """Watches frames go by, and tells whether the white value that they state, or that their type has, can be right."""
 
     def __init__(self) -> None:
-        self.white: float | None = None
+        self._white: float | None = None
         self._frame: Frame | None = None
         self._largest = 0.0
         self._stated: float | None = None  # white of frames in floats
@@ -89,11 +90,15 @@ class WhiteCheck:
 
     def see(self, frame: Frame) -> None:
         """Look at the next frame."""
-        self.white = float(frame.white_value)
+        self._white = float(frame.white_value)
         floats = frame.image.dtype.kind == "f"
         if floats or (frame.white is None and frame.image.dtype != np.uint8):
             self._frame, self._stated = frame, frame.white
             self._largest = max(self._largest, float(frame.image.max()))
+
+    def found(self) -> CheckedWhite | None:
+        """The white value of the last frame; None if there was none."""
+        return None if self._white is None else CheckedWhite(self._white, self.doubt() is not None)
 
     def doubt(self) -> str | None:
         """What makes the white value doubtful, in one line; None if nothing does."""

@@ -11,6 +11,7 @@ import pytest
 from kalux import Recording
 from kalux.cli.checking import check_beside, check_recording
 from kalux.errors import EventError, InputError
+from kalux.readers.source import Lost
 
 from builders import events, frame, moving_blocks, random_stream
 
@@ -118,6 +119,17 @@ def test_events_that_are_missing_while_frames_change_are_told():
         for f in made.frames
     ]
     assert silence((t >= 300_000) & (t <= 700_000), still) == (None, [])
+
+
+def test_packets_that_are_missing_are_told_up_to_what_was_checked():
+    made, asked = moving_blocks(), []
+    rec = made.recording()
+    last = int(made.events["t"][-1])
+    rec.source = dataclasses.replace(rec.source, lost=lambda until: asked.append(until) or Lost(3, 250_000))
+    found = check_recording(rec, lambda _: None)
+    assert asked == [min(last, found.end)]
+    told = f"3 packets of events are missing by their numbers, the first before {(250_000 - found.start) * 1e-6:.3f} s"
+    assert [text for text in found.warnings() if text.startswith(told)]
 
 
 def test_every_silence_counts():

@@ -800,6 +800,42 @@ def test_after_lost_packets_row_column_and_time_are_unknown_until_stated(tmp_pat
     assert source.count_events() == 7
 
 
+@pytest.mark.parametrize(
+    ("numbers", "lost"),
+    [
+        ([5, 6, 7, 8, 9], None),
+        ([5, 6, 9, 10, 14, 15, 16], (5, 2)),
+        ([0, 0, 0, 0], None),  # as written by programs that do not count
+        ([1, 9, 2, 10, 3, 11], None),  # of two publishers
+        ([7, 8, 9, 0, 1, 2], None),  # begun anew
+        ([2, 4, 6, 8], None),  # one that counts otherwise
+    ],
+)
+def test_numbers_of_packets_tell_what_is_lost(tmp_path, numbers, lost):
+    """Those of an EventPacket, and those of headers in ROS 1; headers of ROS 2 have none."""
+    contents = [evt3(10 * k, 0x0003, 0x2802) for k in range(len(numbers))]
+    packed = [
+        event_packet("evt3", content, EPOCH + 10_000 * k, 0, False, seq=number)
+        for k, (content, number) in enumerate(zip(contents, numbers, strict=True))
+    ]
+    arrays = []
+    for k, number in enumerate(numbers):
+        data = packed_event_array(small_events()[k : k + 1], epoch=EPOCH + 10_000_000 * k)
+        arrays.append(number.to_bytes(4, "little") + data[4:])
+    start = EPOCH // 1000
+    found = readers.read(packets(tmp_path / "packets.bag", *packed)).lost(start + 1000)
+    assert found == (None if lost is None else (lost[0], start + 10 * lost[1]))
+    path = tmp_path / "arrays.bag"
+    write_bag1(
+        path, [(k + 1, "/dvs/events", "dvs_msgs/msg/EventArray", data) for k, data in enumerate(arrays)]
+    )
+    of_arrays = readers.read(path).lost
+    assert (of_arrays(2**60) or (None,))[0] == (None if lost is None else lost[0])
+    assert of_arrays(0) is None
+    if lost is not None:
+        assert readers.read(tmp_path / "packets.bag").lost(start + 30).packets == 2
+
+
 def test_a_late_packet_that_goes_back_too_far_is_refused(tmp_path):
     parts = [(100_000, evt3(100_000, *EVENT), 8), (0, evt3(0, *EVENT), 7)]
     with pytest.raises(FormatError, match="clock goes back from 100000 to 0 us"):

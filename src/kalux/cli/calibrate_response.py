@@ -13,7 +13,7 @@ from kalux.cli.terminal import say
 if TYPE_CHECKING:
     from kalux.calibration.response import ResponseCalibration
     from kalux.recording import Recording
-    from kalux.white import WhiteCheck
+    from kalux.white import CheckedWhite
 
 _DESCRIPTION = """\
 Measure the camera's response function: from images of one still scene at three or more exposure times (from their EXIF,
@@ -111,14 +111,14 @@ def _inputs(options: argparse.Namespace) -> tuple[Any, list[float], Recording | 
     return [read_photograph(path) for path in paths], times, None
 
 
-def _white(recording: Recording | None) -> WhiteCheck:
-    """What has watched all frames, of which the measurement has seen the first only; nothing of photographs."""
+def _white(recording: Recording | None) -> CheckedWhite | None:
+    """That of all frames, of which the measurement has seen the first only; None of photographs."""
     from kalux.white import WhiteCheck
 
     check = WhiteCheck()
     for frame in () if recording is None else recording.frames():
         check.see(frame)
-    return check
+    return check.found()
 
 
 def _recording(path: Path, options: argparse.Namespace, *, may_be_none: bool) -> Recording | None:

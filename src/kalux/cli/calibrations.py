@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from kalux.planning.mending import Mended
     from kalux.recording import Recording
     from kalux.settings import Settings
-    from kalux.white import WhiteCheck
+    from kalux.white import CheckedWhite
 
 
 def add_calibration(group: Any) -> None:
@@ -138,11 +138,11 @@ def check_result(options: argparse.Namespace, inputs: Iterable[Path | str | None
 def finish(
     calibration: Calibration,
     recording: Recording | None,
-    white: WhiteCheck | None,
+    white: CheckedWhite | None,
     options: argparse.Namespace,
     command: list[str],
 ) -> None:
-    """Print the result and write it; ``white`` has watched the recording's frames, if there are any."""
+    """Print the result and write it; ``white`` is that of the recording's frames, if there are any."""
     import kalux
     from kalux.writers.calibration import save_calibration
 
@@ -154,7 +154,7 @@ def finish(
             "format": recording.source.format,
             "width": width,
             "height": height,
-            **_of_white(white),
+            **({} if white is None else {"white": white.value, "white_is_doubtful": white.is_doubtful}),
         }
     made = dataclasses.replace(calibration, provenance=provenance)
     if not options.quiet:
@@ -164,10 +164,3 @@ def finish(
         if not options.quiet:
             files = " and ".join(str(path) for path in written[::-1])
             say(f"wrote {files}, for kalux reconstruct REC --calibration {shlex.quote(str(written[-1]))}")
-
-
-def _of_white(check: WhiteCheck | None) -> dict[str, Any]:
-    """For the provenance: what was taken for white, and whether the frames make that doubtful."""
-    if check is None or check.white is None:
-        return {}
-    return {"white": check.white, "white_is_doubtful": check.doubt() is not None}

@@ -14,9 +14,10 @@ from kalux.calibration.region import Region, widened
 from kalux.calibration.silences import EventWaits, FrameChanges
 from kalux.event_slices import events_until
 from kalux.frames import Frame, exposure_doubt
+from kalux.readers.source import Lost
 from kalux.recording import Recording, clock_doubt, no_frames
 from kalux.settings import CameraSettings
-from kalux.white import WhiteCheck
+from kalux.white import CheckedWhite, WhiteCheck
 from kalux.wording import how_many
 
 T = TypeVar("T")
@@ -66,7 +67,9 @@ class Contents(NamedTuple):
     region
         Where all events lie, if frames change elsewhere as well.
     white
-        What has watched the frames.
+        What is taken for it; None where nothing was checked.
+    lost
+        Packets of events that are missing, of those that were checked.
     """
 
     frames: int
@@ -83,7 +86,8 @@ class Contents(NamedTuple):
     on_share: float | None = None
     exposed: bool = True
     region: Region | None = None
-    white: WhiteCheck | None = None
+    white: CheckedWhite | None = None
+    lost: Lost | None = None
 
     @property
     def seconds(self) -> float:
@@ -110,7 +114,11 @@ class Contents(NamedTuple):
         doubt = clock_doubt(self.frames, self.events, self.events_between, CHECKED_FIRST)
         if doubt is not None:
             yield doubt
-        elif self.silence is not None:
+        if self.lost is not None:
+            yield self._lost_packets(*self.lost) + (
+                "; what their events told is not in the images" if of_images else ""
+            )
+        if doubt is None and self.silence is not None:
             yield self._silence_doubt(*self.silence) + (
                 "? Images between the frames do not move there" if of_images else "?"
             )
@@ -121,6 +129,12 @@ class Contents(NamedTuple):
                 "frames change there, too: was only a part of the sensor read out"
                 + ("? Images do not move there, and their uncertainty is too small" if of_images else "?")
             )
+
+    def _lost_packets(self, packets: int, first: int) -> str:
+        return (
+            f"{how_many(packets, 'packet')} of events {'is' if packets == 1 else 'are'} missing by their numbers, the "
+            f"first before {(first - self.start) * 1e-6:.3f} s: lost between camera and recorder"
+        )
 
     @property
     def one_sided(self) -> bool:
@@ -166,7 +180,7 @@ def check_recording(
         raise no_frames(recording)
     start, end = (int(t) for t in (exposures[0, 0], exposures[-1, 1]))
     count = on = events_from = 0
-    complete = True
+    complete, last_event = True, start
     waits = EventWaits(exposures)
     region: Region | None = None
     for chunk in recording.events():
@@ -177,10 +191,11 @@ def check_recording(
         on += int(np.count_nonzero(chunk["p"]))
         region = widened(region, chunk)
         waits.see(chunk)
+        last_event = max(last_event, min(int(chunk["t"][-1]), end))
         events_from += len(chunk) - events_until(chunk, start - 1)
         on_events(len(chunk))
     doubts = tuple(filter(None, (white.doubt(), exposure_doubt(exposures))))
-    lost = waits.lost(changes, complete=complete)
+    silent = waits.lost(changes, complete=complete)
     return Contents(
         len(exposures),
         count,
@@ -191,12 +206,13 @@ def check_recording(
         doubts,
         complete,
         _gap(exposures),
-        lost[0] if lost else None,
-        max(len(lost) - 1, 0),
+        silent[0] if silent else None,
+        max(len(silent) - 1, 0),
         on / count if count else None,
         exposed,
         region if region is not None and changes.go_on_beyond(region, recording.sensor_size) else None,
-        white,
+        white.found(),
+        recording.source.lost(last_event) if recording.source.lost is not None else None,
     )
 
 

@@ -6,8 +6,9 @@ those of dv-ros are, too. Nothing is deserialised event by event: each kind has 
 
 from __future__ import annotations
 
+import dataclasses
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, Final
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 from kalux.events import EventArray
 from kalux.readers import evt, evt3_packets
 from kalux.readers.evt import BACKWARDS_US, rows_as_events
-from kalux.readers.source import TriggerArray
+from kalux.readers.source import Lost, TriggerArray
 from kalux.readers.streams import rechunk
 
 EVENT_ARRAYS: Final = (
@@ -92,10 +93,14 @@ class Message:
 
     def stamp(self) -> int:
         """Skip a ``std_msgs/Header``; its time stamp, ns."""
-        # ROS 1 has a running number first.
-        seconds, nanoseconds = self.numbers("iI") if self.cdr else self.numbers("III")[1:]
+        return self.header()[1]
+
+    def header(self) -> tuple[int | None, int]:
+        """Skip a ``std_msgs/Header``; its running number, which ROS 1 alone has, and its time stamp, ns."""
+        number = None if self.cdr else self.number("I")
+        seconds, nanoseconds = self.numbers("iI" if self.cdr else "II")
         self.text()
-        return seconds * 1_000_000_000 + nanoseconds
+        return number, seconds * 1_000_000_000 + nanoseconds
 
 
 @dataclass(frozen=True)
@@ -112,12 +117,15 @@ class EventTopic:
         Number of events; reads through the messages.
     triggers
         Edges on the camera's trigger inputs, where the encoding has them.
+    lost
+        As of `kalux.readers.source.Source`, where messages have numbers.
     """
 
     size: tuple[int, int]
     events: Callable[[], Iterator[EventArray]]
     count: Callable[[], int]
     triggers: Callable[[], Iterator[TriggerArray]] | None = None
+    lost: Callable[[int], Lost | None] | None = None
 
 
 Messages = Callable[[], Iterator[Message]]
@@ -141,6 +149,26 @@ def open_topic(kind: str, messages: Messages) -> EventTopic:
     return _open_arrays(messages) if kind in EVENT_ARRAYS else _open_packets(messages)
 
 
+def lost_packets(numbered: Iterable[tuple[int, int]], until: int) -> Lost | None:
+    """What is missing of packets, of which the number and the stamp, us, are given, up to a time, us.
+
+    None where no number is left out. Where no more packets follow their predecessors than do not, the numbers are none
+    of a publisher: some programs leave them 0, and two publishers have numbers of their own.
+    """
+    packets = gaps = followed = 0
+    first = previous = None
+    for number, stamp in numbered:
+        if stamp > until:
+            break
+        missing = 0 if previous is None else number - previous - 1
+        followed += previous is not None and missing == 0
+        if missing > 0:
+            packets, gaps = packets + missing, gaps + 1
+            first = stamp if first is None else first
+        previous = number
+    return None if first is None or followed <= gaps else Lost(packets, first)
+
+
 # EventArray of dvs_msgs and others, which are the same
 
 
@@ -148,10 +176,16 @@ def _open_arrays(messages: Messages) -> EventTopic:
     first = next(messages())
     first.stamp()
     height, width = first.numbers("II")
+
+    def numbered() -> Iterator[tuple[int, int]]:
+        headers = (message.header() for message in messages())
+        return ((number, stamp // 1000) for number, stamp in headers if number is not None)
+
     return EventTopic(
         (height, width),
         lambda: rechunk(map(_array_events, messages())),
         lambda: sum(_array_length(message)[1] for message in messages()),
+        lost=None if first.cdr else lambda until: lost_packets(numbered(), until),
     )
 
 
@@ -240,9 +274,12 @@ def _open_packets(messages: Messages) -> EventTopic:
                 )
             yield packet
 
+    def lost(until: int) -> Lost | None:
+        return lost_packets(((packet.number, packet.stamp // 1000) for packet in packets()), until)
+
     first = _packet(next(messages()))
     if first.encoding == "evt3":  # the packets are one stream
-        return _open_evt3(first.size, packets)
+        return dataclasses.replace(_open_evt3(first.size, packets), lost=lost)
     if first.encoding not in _ENCODINGS:
         known = ", ".join(("evt3", *_ENCODINGS))
         raise ValueError(f"its encoding {first.encoding[:40]!r} is not one of {known}")
@@ -251,7 +288,7 @@ def _open_packets(messages: Messages) -> EventTopic:
     def events() -> Iterator[EventArray]:
         return rechunk(_decoded(decode, packets(), first))
 
-    return EventTopic(first.size, events, lambda: sum(len(chunk) for chunk in events()))
+    return EventTopic(first.size, events, lambda: sum(len(chunk) for chunk in events()), lost=lost)
 
 
 def _open_evt3(size: tuple[int, int], messages: Callable[[], Iterator[_Packet]]) -> EventTopic:

@@ -103,6 +103,7 @@ def join(source: Source, frames: Path, *, start: int | None, rate_hz: float | No
         contrast_threshold=source.contrast_threshold,
         ground_truth=source.ground_truth,
         triggers=source.triggers,
+        lost=source.lost,
         missing=(
             *(text for text in kept if not (adopted and text.startswith(SIZE_NOT_STATED))),
             *joined.missing,

@@ -27,7 +27,7 @@ from kalux.readers.event_packet import EVENT_ARRAYS, EVENT_PACKETS, EventTopic, 
 from kalux.readers.evt3_packets import RestartError
 from kalux.readers.images import in_colour, read_image
 from kalux.readers.ros_bags import BAG_MAGIC, DAMAGE, Bag, Topic, container, open_bag, parts
-from kalux.readers.source import EXPOSURE_UNKNOWN, Source, TriggerArray, reading
+from kalux.readers.source import EXPOSURE_UNKNOWN, Lost, Source, TriggerArray, reading
 from kalux.readers.streams import in_order
 
 
@@ -382,6 +382,12 @@ def _source(
             with _decoding(path, events.topic):
                 yield from events.content.triggers()
 
+    def lost(until: int) -> Lost | None:
+        if events is None or events.content.lost is None:
+            return None
+        with _decoding(path, events.topic):
+            return events.content.lost(until)
+
     def read_frames() -> Iterator[Frame]:
         return iter(()) if images is None else in_order(_frames(path, bag, images, exposures))
 
@@ -413,6 +419,7 @@ def _source(
         triggers=None if events is None or events.content.triggers is None else read_triggers,
         missing=missing,
         mosaic=None if images is None else images.mosaic,
+        lost=lost,
     )
 
 

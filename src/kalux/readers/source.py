@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,13 @@ TRIGGER_DTYPE: Final = np.dtype([("t", "<i8"), ("id", "u1"), ("rising", "?")], a
 
 TriggerArray = NDArray[np.void]
 """A 1-D array of `TRIGGER_DTYPE`, sorted by ``t``."""
+
+
+class Lost(NamedTuple):
+    """How many ``packets`` of events a recording lacks, and when the first that came after one is stamped, us."""
+
+    packets: int
+    first: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,6 +78,9 @@ class Source:
     rows_from_below
         Whether the file counts rows from the bottom: events of a sensor that turns out to be taller than
         ``sensor_size`` lie as many rows lower (`on_sensor`).
+    lost
+        Called with a time, us: the packets of events up to then that their numbers show to be missing, or None; reads
+        through them. None where the format has no such numbers.
     """
 
     path: Path
@@ -90,6 +100,7 @@ class Source:
     sensor_size_known: bool = True
     mosaic: Mosaic | None = None
     rows_from_below: bool = False
+    lost: Callable[[int], Lost | None] | None = None
 
 
 NO_EVENTS: Final = "The file has no events."
