@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import cv2
 import numpy as np
 import pytest
 
@@ -23,9 +24,10 @@ SIZE = (48, 64)
 SETTINGS = PRESETS["default"]
 
 
-def filmed(motion=None, light=lambda t: 1.0, exposures=None, **sensor):
+def filmed(motion=None, light=lambda t: 1.0, exposures=None, image=None, **sensor):
     """Events, and frames at 24 Hz, of a camera that pans over rectangles in a light that may change."""
-    seen = photograph_scene(blocks(), motion or pan(60.0), sensor_size=SIZE, duration=500_000)
+    image = blocks() if image is None else image
+    seen = photograph_scene(image, motion or pan(60.0), sensor_size=SIZE, duration=500_000)
     lit = Scene(lambda t: seen.at(t) * light(t), SIZE, seen.start, seen.end)
     made = simulate(
         lit,
@@ -133,6 +135,38 @@ def test_a_gain_that_comes_back_is_the_one_that_it_was():
     found = faults(events, [stated(frame, 6_000) for frame in frames])
     assert found.steps == (3, 6, 9)
     assert len({*found.gains.tolist()}) == 2
+
+
+def unstated(exposures, **how):
+    """Events, and frames at 48 Hz of which each says that it was exposed for 6 ms."""
+    events, frames = filmed(exposures=exposures, frame_rate=48.0, **how)
+    return events, [stated(frame, 6_000) for frame in frames]
+
+
+def spread_of(gains, exposures):
+    """Largest log gain less smallest, where exposures are made up for."""
+    return np.ptp(np.log(gains / np.array(exposures)))
+
+
+def test_gains_that_go_up_and_down_do_not_drift():
+    """Though fast light makes some of the steps less certain than others, which once were left out."""
+    exposures = [6_000, 4_000] * 12
+    slow = {"refractory": 1_000, "cutoff": 1_500.0, "threshold_on": 0.3, "threshold_off": 0.35}
+    found = faults(*unstated(exposures, motion=pan(300.0), **slow))
+    assert found.steps == tuple(range(1, 24))
+    assert spread_of(found.gains, exposures) < 0.05
+
+
+def test_events_that_are_lost_of_one_sign_alone_make_gains_hardly_drift():
+    """Frames are then always darker than events say, which adds up to 2.3 in these 24 if it is taken for the gain's."""
+    leaves = np.random.default_rng(0).normal(size=(120, 400))
+    leaves = cv2.GaussianBlur(leaves, (0, 0), 1.0)
+    exposures = [6_000, 3_000] * 12
+    lossy = {"refractory": 1_500, "cutoff": 1_000.0, "threshold_on": 0.2, "threshold_off": 0.35}
+    image = np.exp(0.75 * leaves / leaves.std() - 1.6)
+    found = faults(*unstated(exposures, motion=pan(400.0), image=image, **lossy))
+    assert found.steps == tuple(range(1, 24))
+    assert spread_of(found.gains, exposures) < 0.5
 
 
 @pytest.mark.parametrize("refractory", [0, 2_000])
