@@ -9,7 +9,14 @@ import numpy as np
 import pytest
 
 from kalux import Frame, Recording
-from kalux.calibration.intervals import APART, frames_apart, intervals, spread
+from kalux.calibration.intervals import (
+    APART,
+    APART_IN_TIME,
+    SOON_FOR_THRESHOLDS,
+    frames_apart,
+    intervals,
+    spread,
+)
 from kalux.events import EVENT_DTYPE
 from kalux.settings import CameraSettings
 
@@ -57,6 +64,25 @@ def frames_at(*milliseconds):
 def test_frames_that_follow_too_soon_are_passed_over(recorded, left):
     found = frames_apart(frames_at(*recorded), APART)
     assert [each.middle for each in found] == [1_000 * t for t in left]
+
+
+@pytest.mark.parametrize(
+    ("recorded", "left"),
+    [
+        (range(0, 140, 33), [0, 33, 66, 99, 132]),  # of 30 a second all
+        (range(0, 110, 25), [0, 50, 100]),
+        (range(0, 100, 20), [0, 40, 80]),
+        (range(0, 125, 10), [0, 40, 80, 120]),
+    ],
+)
+def test_frames_for_thresholds_are_farther_apart(recorded, left):
+    found = frames_apart(frames_at(*recorded), APART, SOON_FOR_THRESHOLDS)
+    assert [each.middle for each in found] == [1_000 * t for t in left]
+
+
+def test_delays_are_looked_for_in_short_intervals_whatever_is_soon():
+    found = frames_apart(frames_at(*range(0, 100, 20)), APART_IN_TIME, SOON_FOR_THRESHOLDS)
+    assert len(list(found)) == 5
 
 
 def test_intervals_of_frames_that_follow_soon_are_long_and_have_all_their_events():

@@ -34,6 +34,11 @@ SOON: Final = 18_000
 passed over. In a few ms a pixel has an event or none, which tells little of its step and nothing of when it was. Every
 frame of a camera of 50 frames a second counts."""
 
+SOON_FOR_THRESHOLDS: Final = 28_000
+"""The same where thresholds are looked for: by frames at 40 and 50 Hz those of simulated scenes are 6 and 8 % off, by
+every second one 2 and 4 %. What else is found, as the variance of an event's step, is to hold from frame to frame.
+Every frame of a camera of 35 frames a second counts."""
+
 APART: Final = 38_000
 """us between two of the frames that are left then: what frames at 25 Hz have, and a little less, as clocks are not that
 exact. Thresholds of seven simulated scenes are 3 % off in the root mean square; by frames 20 ms apart 6 %
@@ -137,8 +142,8 @@ class Interval:
         return self.ends[0].usable & self.ends[1].usable
 
 
-def frames_apart(frames: Iterable[Frame], apart: int) -> Iterator[Frame]:
-    """Frames without those that follow another too soon (`SOON`) for events between them to tell anything.
+def frames_apart(frames: Iterable[Frame], apart: int, soon: int = SOON) -> Iterator[Frame]:
+    """Frames without those that follow another in less than ``soon`` us, too soon for events between them to tell much.
 
     Of these the first is left that comes ``apart`` us after the last one that is left, by the middles of the exposures.
     """
@@ -146,19 +151,27 @@ def frames_apart(frames: Iterable[Frame], apart: int) -> Iterator[Frame]:
     latest = 0
     for frame in frames:
         middle = frame.middle
-        if before is None or middle - before >= SOON or middle - latest >= apart:
+        if before is None or middle - before >= soon or middle - latest >= apart:
             latest = middle
             yield frame
         before = middle
 
 
-def compared_frames(frames: Iterable[Frame], most: int, apart: int = APART) -> Iterator[Frame]:
+def compared_frames(
+    frames: Iterable[Frame], most: int, apart: int = APART, soon: int = SOON
+) -> Iterator[Frame]:
     """The first ``most`` of the frames whose changes are compared with events: those that `frames_apart` leaves."""
-    return islice(frames_apart(frames, apart), most)
+    return islice(frames_apart(frames, apart, soon), most)
 
 
 def intervals(
-    recording: Recording, camera: CameraSettings, *, margin: int, most_frames: int, apart: int = APART
+    recording: Recording,
+    camera: CameraSettings,
+    *,
+    margin: int,
+    most_frames: int,
+    apart: int = APART,
+    soon: int = SOON,
 ) -> Iterator[Interval]:
     """The intervals between the first ``most_frames`` frames, with the events up to ``margin`` us around each.
 
@@ -170,7 +183,7 @@ def intervals(
     held: list[EventArray] = []
     previous: End | None = None
     reference = float(camera.reference_exposure or 0)
-    for frame in compared_frames(recording.frames(), most_frames, apart):
+    for frame in compared_frames(recording.frames(), most_frames, apart, soon):
         reference = reference or float(frame.exposure)
         shot = take_shot(frame, model, reference)
         while not held or held[-1]["t"][-1] <= shot.middle + margin:

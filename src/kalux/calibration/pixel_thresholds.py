@@ -32,7 +32,7 @@ from kalux.augmentation.refractory import step_weight
 from kalux.calibration.black_level import with_known_black
 from kalux.calibration.delay import estimate_delay
 from kalux.calibration.global_thresholds import Usual, estimate_thresholds
-from kalux.calibration.intervals import Interval, intervals
+from kalux.calibration.intervals import SOON_FOR_THRESHOLDS, Interval, intervals
 from kalux.calibration.refractory import dead_time, shortest_interval
 from kalux.calibration.region import event_region
 from kalux.calibration.regression import (
@@ -262,7 +262,9 @@ def _samples(
     """The usable pixels of every frame interval, once for every delay."""
     margin = recording.longest_exposure + max(abs(d) for d in delays)
     histories = [_History(recording.sensor_size, sampling) for _ in delays]
-    for interval in intervals(recording, camera, margin=margin, most_frames=most_frames):
+    for interval in intervals(
+        recording, camera, margin=margin, most_frames=most_frames, soon=SOON_FOR_THRESHOLDS
+    ):
         yield tuple(
             _of_interval(interval, history, camera, sampling, d)
             for history, d in zip(histories, delays, strict=True)

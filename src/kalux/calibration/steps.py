@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from kalux.augmentation.refractory import step_weight
 from kalux.calibration.exposures import Exposures
-from kalux.calibration.intervals import APART, Interval, intervals
+from kalux.calibration.intervals import APART, SOON_FOR_THRESHOLDS, Interval, intervals
 from kalux.calibration.neighbours import sum_of_neighbours
 from kalux.compiled import empty, event_column, event_is_on, event_row, event_words, loop, smaller, zeros
 from kalux.event_slices import between, count_chunks
@@ -126,7 +126,7 @@ def steps(
     at_least
         Intervals that they are taken from, if there are as many: these differ more than pixels of one.
     apart
-        us between frames that follow sooner than `kalux.calibration.intervals.SOON`.
+        us between frames that follow sooner than `kalux.calibration.intervals.SOON_FOR_THRESHOLDS`.
 
     Raises
     ------
@@ -143,7 +143,15 @@ def steps(
     ]
     found: list[list[Steps]] = []
     count = 0
-    for interval in intervals(recording, camera, margin=margin, most_frames=_MAX_FRAMES, apart=apart):
+    found_in = intervals(
+        recording,
+        camera,
+        margin=margin,
+        most_frames=_MAX_FRAMES,
+        apart=apart,
+        soon=SOON_FOR_THRESHOLDS,
+    )
+    for interval in found_in:
         found.append([sampler.sample(interval) for sampler in samplers])
         count += len(found[-1][0].change)
         if count >= most:
