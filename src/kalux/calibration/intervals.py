@@ -35,8 +35,8 @@ passed over. In a few ms a pixel has an event or none, which tells little of its
 frame of a camera of 50 frames a second counts."""
 
 SOON_FOR_THRESHOLDS: Final = 28_000
-"""The same where thresholds are looked for: by frames at 40 and 50 Hz those of simulated scenes are 6 and 8 % off, by
-every second one 2 and 4 %. What else is found, as the variance of an event's step, is to hold from frame to frame.
+"""The same where thresholds are looked for: by frames at 40 and 50 Hz those of simulated scenes are 5 and 7 % off, by
+every second one 2 and 3 %. What else is found, as the variance of an event's step, is to hold from frame to frame.
 Every frame of a camera of 35 frames a second counts."""
 
 APART: Final = 38_000
