@@ -76,8 +76,7 @@ def pixels(events, frames, sensor_size, settings, begin):
                 ]
                 same = [q["t"] for q in earlier if (q["y"], q["x"]) == (row, column)]
                 previous = [q for q in events[:i] if (q["y"], q["x"]) == (row, column)]
-                goes_on = bool(previous) and bool(previous[-1]["p"]) == bool(e["p"])
-                weight = event_weight(e["t"] - previous[-1]["t"], settings) if goes_on else 1.0
+                weight = event_weight([*previous, e], settings)
                 own.append(
                     (
                         int(e["t"]),
@@ -110,12 +109,30 @@ def half_rounded(response, level):
     return float(response.inverse(most) - response.inverse(least)) / 2
 
 
-def event_weight(since, settings):
-    """K13: how many thresholds an event tells of that comes ``since`` us after one of its polarity."""
+def event_weight(events, settings):
+    """K13: how many thresholds the last of a pixel's ``events`` tells of."""
     period = settings.events.refractory
-    if period == 0 or since <= 0.95 * period:
+    if period == 0 or len(events) == 1:
         return 1.0
-    weight = since / np.hypot(since - period, 0.2 * period)
+
+    def since(n):
+        """us from the event before the n-th last one that this goes on from; 0 if it does not go on."""
+        if len(events) <= n or bool(events[-n - 1]["p"]) != bool(events[-n]["p"]):
+            return 0.0
+        return float(events[-n]["t"] - events[-n - 1]["t"])
+
+    now, before = since(1), since(2)
+
+    def pace(interval, other):
+        unsteady = min(max((other - period) / 2, 0.1 * period), 0.15 * period)
+        return period / np.hypot(interval - period, unsteady)
+
+    if now <= 0.95 * period:
+        weight = 1.0
+    elif before <= 0.95 * period:
+        weight = 1 + period / np.hypot(now - period, 0.2 * period)
+    else:
+        weight = 1 + (pace(now, before) + pace(before, now)) / 2
     return 1 + round((weight - 1) * 4096) / 4096  # as events carry it
 
 

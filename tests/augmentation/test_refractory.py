@@ -14,7 +14,7 @@ from kalux.event_slices import count_events
 from kalux.events import EVENT_DTYPE, make_events
 
 SIZE = (3, 4)
-MOST = 5.1  # docs/equations.md, K13
+MOST = 1 + 1 / 0.1  # docs/equations.md, K13
 
 
 def stream(count, seed=0, span=20_000):
@@ -28,19 +28,37 @@ def weights(events):
     return 1 + ((event_words(events)[:, 1] >> 40) & 0xFFFF) * WEIGHT_UNIT
 
 
-@given(st.floats(1, 1e6), st.floats(1, 1e5))
-def test_a_weight_lies_between_one_and_the_most(since, period):
-    weight = step_weight(np.float32(since), np.float32(period))
-    assert 1 <= weight <= MOST
+@given(st.floats(1, 1e6), st.floats(0, 1e6), st.floats(1, 1e5))
+def test_a_weight_lies_between_one_and_the_most(since, before, period):
+    weight = step_weight(np.float32(since), np.float32(before), np.float32(period))
+    assert 1 <= weight <= MOST * (1 + 1e-6)
 
 
 @pytest.mark.parametrize(
-    ("since", "weight"),
-    [(200, 1), (940, 1), (960, 4.707), (1_000, 5), (1_250, 3.904), (2_000, 1.961), (11_000, 1.1)],
+    ("since", "before", "weight"),
+    [
+        (200, 0, 1),
+        (940, 0, 1),
+        (940, 1_000, 1),
+        (960, 0, 5.903),
+        (1_000, 0, 6),
+        (1_250, 0, 4.123),
+        (2_000, 0, 1.981),
+        (2_000, 900, 1.981),
+        (2_000, 2_000, 1.989),
+        (2_000, 1_000, 4.831),
+        (2_000, 11_000, 1.544),
+        (1_000, 1_000, 11),
+        (1_250, 1_250, 4.578),
+        (11_000, 11_000, 1.1),
+    ],
 )
-def test_weights_under_a_refractory_period_of_a_millisecond(since, weight):
-    """What comes earlier than the period allows is noise; twice the period after, half of the change was missed."""
-    assert step_weight(np.float32(since), np.float32(1_000)) == pytest.approx(weight, abs=5e-4)
+def test_weights_under_a_refractory_period_of_a_millisecond(since, before, weight):
+    """What comes earlier than the period allows is noise; else the light goes on at the mean of the paces before and
+    after."""
+    assert step_weight(np.float32(since), np.float32(before), np.float32(1_000)) == pytest.approx(
+        weight, abs=5e-4
+    )
 
 
 @given(slope=st.floats(10, 80), period=st.integers(500, 5_000))
@@ -51,7 +69,7 @@ def test_a_pixel_that_is_held_in_reset_is_made_good(slope, period):
     events = make_events(times, *np.zeros((2, 39), int), np.ones(39, bool))
     weighed = EventClock((1, 1), period).weighed(events)
     told = count_events(weighed[1:], (1, 1), weighed=True)[0][0, 0]
-    doubted = (0.2 * period / (gap - period)) ** 2 / 2  # of a pace that is never quite steady
+    doubted = (0.15 * period / (gap - period)) ** 2 / 2  # of a pace that is never quite steady
     assert told == pytest.approx(slope * 1e-6 * (times[-1] - times[0]), rel=2e-3 + doubted)
 
 
@@ -89,10 +107,20 @@ def test_weights_count_only_where_they_are_asked_for():
 
 
 def test_nothing_is_added_where_the_direction_turns():
-    """Up, up, down, down, up: only a second event of the same polarity says at what pace the light went on."""
-    t = 1_500 * np.arange(5)
-    zeros = np.zeros(5, np.int64)
-    events = make_events(t, zeros, zeros, np.array([1, 1, 0, 0, 1], bool))
+    """Up, up, up, down, down, up: only a second event of the same polarity says at what pace the light went on."""
+    t = 1_500 * np.arange(6)
+    zeros = np.zeros(6, np.int64)
+    events = make_events(t, zeros, zeros, np.array([1, 1, 1, 0, 0, 1], bool))
     found = weights(EventClock((1, 1), 1_000).weighed(events))
-    going_on = 1.5 / np.hypot(0.5, 0.2)
-    np.testing.assert_allclose(found, [1, going_on, 1, going_on, 1], rtol=1e-4)
+    once, twice = 1 + 1 / np.hypot(0.5, 0.2), 1 + 1 / np.hypot(0.5, 0.15)
+    np.testing.assert_allclose(found, [1, once, twice, 1, once, 1], rtol=1e-4)
+
+
+def test_an_early_event_says_nothing_of_the_pace():
+    """It is noise: the next one is weighed as if it had been the first."""
+    t = np.array([0, 500, 2_000, 3_500])
+    zeros = np.zeros(4, np.int64)
+    events = make_events(t, zeros, zeros, np.ones(4, bool))
+    found = weights(EventClock((1, 1), 1_000).weighed(events))
+    once, twice = 1 + 1 / np.hypot(0.5, 0.2), 1 + 1 / np.hypot(0.5, 0.15)
+    np.testing.assert_allclose(found, [1, 1, once, twice], rtol=1e-4)

@@ -1,17 +1,17 @@
 """Changes that a pixel cannot report in its refractory period: a weight for every event makes up for them.
 
 After an event a pixel is held in reset for its refractory period, and compares with the light at the end of that, not
-with the light at the event. What changed meanwhile is never reported. If the light goes on at one pace from one event
-to the next, it changes by the threshold in the time in which the pixel looks, so that from event to event it changes by
-about the threshold times
+with the light at the event. What changed meanwhile is never reported. A pixel that looked for the time l before it
+reported a threshold saw light of the pace 1 / l. In the refractory period between two looks the light went on at their
+mean pace, so that from event to event it changes by about the threshold times
 
-    w = Delta / ((Delta - rho)^2 + (rho / 5)^2)^(1/2)                                       (docs/equations.md, K13)
+    w = 1 + rho (1 / l + 1 / l') / 2,      l = Delta - rho,                                   (docs/equations.md, K13)
 
-with rho the refractory period and Delta the time since the pixel's previous event, if that has the same polarity; rho /
-5 is there because the pace is not the same all the time, and what looked for a short time says little of it. Where the
-direction turns, the light may have moved either way meanwhile, and nothing is added: w = 1. Every event is given its
-weight once, when it arrives, in the bytes that `kalux.events.EVENT_DTYPE` leaves unused; all that adds up steps
-multiplies by it.
+with rho the refractory period, Delta the time since the pixel's previous event and l' the look before that, if all
+three events have the same polarity; of the first two l alone tells the pace. Looks are taken to be a little longer than
+they were, since a short one may be chance or noise. Where the direction turns, the light may have moved either way
+meanwhile, and nothing is added: w = 1. Every event is given its weight once, when it arrives, in the bytes that
+`kalux.events.EVENT_DTYPE` leaves unused; all that adds up steps multiplies by it.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from kalux.compiled import (
     event_is_on,
     event_row,
     event_words,
+    larger,
     loop,
     prefetch,
     smaller,
@@ -38,9 +39,14 @@ from kalux.compiled import (
 from kalux.events import EVENT_DTYPE, NEVER, EventArray
 
 _UNSTEADY: Final = np.float32(0.2)
-"""Refractory periods by which the time in which a pixel looked is taken to be longer, as the other side of a right
-triangle: events of light that come 1.2 to 1.3 periods after another stand for 2.9 to 4.0 thresholds on simulated
-scenes, where it would be 4.5 to 4.8 without (docs/equations.md, K13)."""
+"""Refractory periods by which a look is taken to be longer, as the other side of a right triangle, where it alone tells
+the pace: second events of one polarity that come 1.2 to 1.3 periods after the first stand for 3.7 to 4.2 thresholds on
+simulated scenes, where it would be 5 without (docs/equations.md, K13)."""
+
+_MOST_UNSTEADY: Final = np.float32(0.15)
+_LEAST_UNSTEADY: Final = np.float32(0.1)
+"""The same where two looks tell the pace: half of the other one, between these. Noise hardly ever makes two short looks
+in a row. No less, since the period is not known better than to a few percent."""
 
 _EARLY: Final = np.float32(0.95)
 """Shares of the refractory period from which on an event counts as one that came at its end: pixels differ. What comes
@@ -64,6 +70,7 @@ class EventClock:
         self._latest: NDArray[np.int64] | None = (
             None  # twice its time, plus 1 if it was on; once it is needed
         )
+        self._before = np.empty(0, np.float32)  # us, of `step_weight`
 
     @property
     def weighs(self) -> bool:
@@ -78,7 +85,8 @@ class EventClock:
         height, width = self._sensor_size
         if self._latest is None:
             self._latest = np.full(height * width, NEVER, np.int64)
-        _weigh(words, self._latest, np.uint64(width), self._refractory_period)
+            self._before = np.zeros(height * width, np.float32)
+        _weigh(words, self._latest, self._before, np.uint64(width), self._refractory_period)
 
     def weighed(self, events: EventArray) -> EventArray:
         """A copy of the next events, with their weights."""
@@ -88,25 +96,45 @@ class EventClock:
 
 
 @nb.njit(cache=True, inline="always", error_model="numpy")
-def step_weight(since_pixel, refractory_period):  # type: ignore[no-untyped-def]
-    """Thresholds that an event stands for (K13), ``since_pixel`` us after the pixel's previous one; float32."""
-    if since_pixel <= _EARLY * refractory_period:  # also without a period, of events at one time
+def step_weight(since_pixel, before, refractory_period):  # type: ignore[no-untyped-def]
+    """Thresholds that an event stands for that goes on where the pixel's previous one went (K13); float32.
+
+    ``since_pixel`` us after the previous one, which came ``before`` us after one that it went on from, or 0.
+    """
+    earliest = _EARLY * refractory_period
+    if since_pixel <= earliest:  # also without a period, of events at one time
         return ONE
-    looked, unsteady = since_pixel - refractory_period, _UNSTEADY * refractory_period
-    return since_pixel / np.sqrt(looked * looked + unsteady * unsteady)
+    looked = since_pixel - refractory_period
+    if before > earliest:
+        looked_before = before - refractory_period
+        pace = _pace(looked, looked_before, refractory_period)
+        return ONE + np.float32(0.5) * (pace + _pace(looked_before, looked, refractory_period))
+    unsteady = _UNSTEADY * refractory_period
+    return ONE + refractory_period / np.sqrt(looked * looked + unsteady * unsteady)
+
+
+@nb.njit(cache=True, inline="always", error_model="numpy")
+def _pace(looked, other, refractory_period):  # type: ignore[no-untyped-def]
+    """Thresholds in a refractory period by the pace of one of two looks, us."""
+    unsteady = larger(np.float32(0.5) * other, _LEAST_UNSTEADY * refractory_period)
+    unsteady = smaller(unsteady, _MOST_UNSTEADY * refractory_period)
+    return refractory_period / np.sqrt(looked * looked + unsteady * unsteady)
 
 
 @loop
-def _weigh(words, latest, width, refractory_period):  # type: ignore[no-untyped-def]
+def _weigh(words, latest, before, width, refractory_period):  # type: ignore[no-untyped-def]
     last = len(words) - 1
     for i in range(len(words)):
         ahead = words[smaller(i + AHEAD, last), 1]
         prefetch(latest, event_row(ahead) * width + event_column(ahead))
+        prefetch(before, event_row(ahead) * width + event_column(ahead))
         t, word = words[i, 0], words[i, 1]
         at = event_row(word) * width + event_column(word)
         code = t * 2 + np.int64(event_is_on(word))
-        goes_on = (code ^ latest[at]) & 1 == 0
-        weight = step_weight(np.float32(t - (latest[at] >> 1)), refractory_period) if goes_on else ONE
+        goes_on = latest[at] != NEVER and (code ^ latest[at]) & 1 == 0
+        since = np.float32(t - (latest[at] >> 1))
+        weight = step_weight(since, before[at], refractory_period) if goes_on else ONE
+        before[at] = since if goes_on else np.float32(0.0)
         latest[at] = code
         words[i, 1] = weighed(word, np.int32((weight - ONE) / WEIGHT_UNIT + np.float32(0.5)))
 

@@ -577,4 +577,4 @@ def _period_without_excess(sampling: _Sampling) -> int:
         return 0
     # A longer period explains more of the excess; what does not decrease is noise.
     falling = np.minimum.accumulate(excess)
-    return round(float(np.interp(-_USUAL_EXCESS, -falling, periods)))
+    return round(float(np.interp(0.0, -falling, periods)))

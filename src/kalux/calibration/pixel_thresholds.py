@@ -277,6 +277,7 @@ class _History:
     def __init__(self, shape: tuple[int, int], sampling: _Sampling) -> None:
         self._sampling, self._shape = sampling, shape
         self._last = np.full(shape, NEVER, np.int64)
+        self._before = np.zeros(shape, np.float32)  # us, of `step_weight`
         self.sign = np.zeros(shape)
         self.begun = False
 
@@ -286,14 +287,13 @@ class _History:
         crowded = np.zeros(self._shape, np.bool_)
         least = _CROWDED * max(self._sampling.shortest, self._sampling.refractory)
         t, x, y, p = (events[name] for name in ("t", "x", "y", "p"))
-        _count(
-            t, x, y, p, self._last, self.sign, least, np.float32(self._sampling.refractory), on, off, crowded
-        )
+        memory, refractory = (self._last, self._before, self.sign), np.float32(self._sampling.refractory)
+        _count(t, x, y, p, *memory, least, refractory, on, off, crowded)
         return on, off, crowded
 
 
 @loop
-def _count(t, x, y, p, last, sign, least, refractory, on, off, crowded):  # type: ignore[no-untyped-def]
+def _count(t, x, y, p, last, before, sign, least, refractory, on, off, crowded):  # type: ignore[no-untyped-def]
     for i in range(len(t)):
         row, column = y[i], x[i]
         since = t[i] - last[row, column]
@@ -301,11 +301,14 @@ def _count(t, x, y, p, last, sign, least, refractory, on, off, crowded):  # type
             crowded[row, column] = True
         direction = 1.0 if p[i] else -1.0
         goes_on = sign[row, column] == direction
-        weight = step_weight(np.float32(since), refractory) if goes_on else np.float32(1.0)  # K13
+        weight = np.float32(1.0)
+        if goes_on:
+            weight = step_weight(np.float32(since), before[row, column], refractory)  # K13
         if p[i]:
             on[row, column] += weight
         else:
             off[row, column] += weight
+        before[row, column] = since if goes_on else 0
         sign[row, column] = direction
         last[row, column] = t[i]
 

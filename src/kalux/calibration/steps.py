@@ -321,6 +321,7 @@ def _count(words, order, starts, latest, sign, origin, exposures, periods, late,
             continue
         before, sign_before = float(latest[at] - origin), sign[at]
         pace_before = _SLOWEST  # us for a threshold
+        went_on = np.float32(0.0)  # us, of K13
         for j in range(starts[at], starts[at + 1]):
             t, on = float(words[order[j], 0] - origin), event_is_on(words[order[j], 1])
             own_sign = 1 if on else -1
@@ -350,8 +351,11 @@ def _count(words, order, starts, latest, sign, origin, exposures, periods, late,
                         step = 0.5 * _ramp_difference(*exposures, before, before + leave)
                         step += 0.5 * _ramp_difference(*exposures, t - arrive, t)
                     for k in range(len(periods)):
-                        counts[at, k, soon, column] += step * step_weight(np.float32(since), periods[k])
+                        counts[at, k, soon, column] += step * step_weight(
+                            np.float32(since), went_on, periods[k]
+                        )
             pace_before = smaller(_SLOWEST, since) if own_sign == sign_before else _SLOWEST
+            went_on = np.float32(since) if own_sign == sign_before else np.float32(0.0)
             before, sign_before = t, own_sign
         # The next event is too far away to know its sign: on both ways lies half a threshold.
         step = 0.5 * _ramp_difference(*exposures, before, before + 0.5 * pace_before)
