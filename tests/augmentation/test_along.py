@@ -93,6 +93,19 @@ def test_nothing_is_seen_of_what_either_frame_does_not_measure(share):
         np.testing.assert_allclose(left[30:34, columns], 0.01, rtol=1e-4)
 
 
+@pytest.mark.parametrize("path", [0.0, 3e-16, 1e-15, 3e-15, -1e-15, 1e-7])
+def test_a_variance_stays_positive_beside_what_no_frame_measures(path):
+    """A path that ends next to nothing before a pixel takes no negative share of its neighbour."""
+    frames = [frame_of(texture(0)) for _ in range(2)]
+    for frame in frames:
+        frame.variance[:, 1::2] = UNMEASURED
+    motion = dataclasses.replace(moving_right(*frames), path=np.full((2, *SHAPE), path, np.float32))
+    for share in (0.0, 0.3, 0.5, 1.0):
+        joined, left = whole(Along(motion, share), texture(0), np.full(SHAPE, 0.01, np.float32))
+        assert np.isfinite(joined).all()
+        assert left.min() > 0
+
+
 @pytest.mark.parametrize(
     "windows",
     [

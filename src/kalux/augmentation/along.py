@@ -394,7 +394,9 @@ def _place(at: Number, most: Number) -> tuple[Number, Number]:
     at = choose(at < most, at, most)
     at = choose(at > _LEAST, at, at.like(_LEAST))
     below = (at - _LEAST).to(types.int32) + np.int32(_LEAST)
-    return below, at - below.to(types.float32)
+    # A little before a pixel at - _LEAST may be rounded to it. A negative share of a variance of `UNMEASURED` would be
+    # less than all that is known of its neighbour.
+    return below, _larger(at - below.to(types.float32), np.float32(0.0))
 
 
 @row_formula
