@@ -121,18 +121,16 @@ def event_weight(events, settings):
             return 0.0
         return float(events[-n]["t"] - events[-n - 1]["t"])
 
+    def pace(interval, unsteady):
+        return period / np.hypot(interval - period, unsteady * period)
+
     now, before = since(1), since(2)
-
-    def pace(interval, other):
-        unsteady = min(max((other - period) / 2, 0.1 * period), 0.15 * period)
-        return period / np.hypot(interval - period, unsteady)
-
     if now <= 0.95 * period:
         weight = 1.0
     elif before <= 0.95 * period:
-        weight = 1 + period / np.hypot(now - period, 0.2 * period)
+        weight = 1 + pace(now, 0.2)
     else:
-        weight = 1 + (pace(now, before) + pace(before, now)) / 2
+        weight = 1 + (pace(now, 0.15) + pace(before, 0.15)) / 2
     return 1 + round((weight - 1) * 4096) / 4096  # as events carry it
 
 

@@ -114,7 +114,7 @@ def test_where_the_direction_turns_nothing_is_added():
     sampling = pixel_thresholds._Sampling((0.2, 0.2), 1000, 1000, everywhere)
     history = pixel_thresholds._History((1, 1), sampling)
     on, off, _ = history.counts(pixel_events([10_000, 13_500, 17_000], [True, False, False]))
-    going_on = 3.5 / np.hypot(2.5, 0.2)
+    going_on = 1 + 1 / np.hypot(2.5, 0.2)
     assert (on[0, 0], off[0, 0]) == (1.0, pytest.approx(1.0 + going_on))
 
 

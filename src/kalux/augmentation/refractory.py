@@ -30,7 +30,6 @@ from kalux.compiled import (
     event_is_on,
     event_row,
     event_words,
-    larger,
     loop,
     prefetch,
     smaller,
@@ -43,10 +42,9 @@ _UNSTEADY: Final = np.float32(0.2)
 the pace: second events of one polarity that come 1.2 to 1.3 periods after the first stand for 3.7 to 4.2 thresholds on
 simulated scenes, where it would be 5 without (docs/equations.md, K13)."""
 
-_MOST_UNSTEADY: Final = np.float32(0.15)
-_LEAST_UNSTEADY: Final = np.float32(0.1)
-"""The same where two looks tell the pace: half of the other one, between these. Noise hardly ever makes two short looks
-in a row. No less, since the period is not known better than to a few percent."""
+_UNSTEADY_OF_TWO: Final = np.float32(0.15)
+"""The same of either look where two tell the pace. With 0.1 the few pixels that noise gives two short looks in a row
+come out several times too bright."""
 
 _EARLY: Final = np.float32(0.95)
 """Shares of the refractory period from which on an event counts as one that came at its end: pixels differ. What comes
@@ -104,20 +102,16 @@ def step_weight(since_pixel, before, refractory_period):  # type: ignore[no-unty
     earliest = _EARLY * refractory_period
     if since_pixel <= earliest:  # also without a period, of events at one time
         return ONE
-    looked = since_pixel - refractory_period
-    if before > earliest:
-        looked_before = before - refractory_period
-        pace = _pace(looked, looked_before, refractory_period)
-        return ONE + np.float32(0.5) * (pace + _pace(looked_before, looked, refractory_period))
-    unsteady = _UNSTEADY * refractory_period
-    return ONE + refractory_period / np.sqrt(looked * looked + unsteady * unsteady)
+    if before <= earliest:
+        return ONE + _pace(since_pixel, refractory_period, _UNSTEADY)
+    pace = _pace(since_pixel, refractory_period, _UNSTEADY_OF_TWO)
+    return ONE + np.float32(0.5) * (pace + _pace(before, refractory_period, _UNSTEADY_OF_TWO))
 
 
 @nb.njit(cache=True, inline="always", error_model="numpy")
-def _pace(looked, other, refractory_period):  # type: ignore[no-untyped-def]
-    """Thresholds in a refractory period by the pace of one of two looks, us."""
-    unsteady = larger(np.float32(0.5) * other, _LEAST_UNSTEADY * refractory_period)
-    unsteady = smaller(unsteady, _MOST_UNSTEADY * refractory_period)
+def _pace(interval, refractory_period, unsteady):  # type: ignore[no-untyped-def]
+    """Thresholds in a refractory period, by the look that ended an ``interval`` between two events, us."""
+    looked, unsteady = interval - refractory_period, unsteady * refractory_period
     return refractory_period / np.sqrt(looked * looked + unsteady * unsteady)
 
 
