@@ -84,7 +84,8 @@ changes count as lost in the refractory period. Where nothing is lost it is -0.0
 The limit is low because a period that is missed costs more than one that is assumed wrongly: 0.2 ms change the held-out
 errors of the three recordings by 5 % to the better and 2 % to the worse."""
 
-_USUAL_EXCESS: Final = 0.02  # where nothing is lost
+_USUAL_EXCESS: Final = 0.02
+"""Where nothing is lost. Under the true period it is 0.03 +- 0.04 on nine scenes with 1 and 2 ms."""
 
 _THRESHOLD_OF_EXCESS: Final = 0.6
 """Relative error of thresholds over that of the excess: lost changes make the thresholds of seven scenes too large by
