@@ -166,8 +166,11 @@ def methods(
     }
 
 
-def filter_method(label: str, settings: Settings, planner: Planner, *, smooth: bool = False) -> Method:
+def filter_method(
+    label: str, settings: Settings, planner: Planner | None = None, *, smooth: bool = False
+) -> Method:
     """`kalux.reconstruct` with these settings as a method; of the planner's calibration the pixels are taken."""
+    planner = planner or Planner()
     with_variance = partial(filtered_estimates, settings=settings, planner=planner, smooth=smooth)
     return Method(
         label,
