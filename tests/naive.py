@@ -1070,6 +1070,23 @@ def keys(d):
     return a * (d**3 - 5 * d**2 + 8 * d - 4) if d < 2 else 0.0
 
 
+def calmed(image, variance, log_offset, unmeasured):
+    """K17; ``unmeasured`` is a (H, W) mask."""
+    out = image.astype(float)
+    for row in range(1, image.shape[0] - 1):
+        for column in range(1, image.shape[1] - 1):
+            beside = [(row - 1, column), (row, column - 1), (row, column + 1), (row + 1, column)]
+            if not unmeasured[row, column] or not all(unmeasured[at] for at in beside):
+                continue
+            apart = [(row + a, column + b) for a in (-1, 1) for b in (-1, 1)]
+            mean = np.mean([image[at] for at in beside])
+            ground = min(mean, np.mean([image[at] for at in apart]))
+            error = np.sqrt(sum((image[at] + log_offset) ** 2 * variance[at] for at in beside)) / 4
+            most = ground + 8.4 * (mean - ground + error)
+            out[row, column] = min(image[row, column], max(most, *(image[at] for at in beside)))
+    return out
+
+
 def around(values, reach):
     """Mean of the square around every pixel; outside, the image is mirrored at its outermost pixels."""
     wide = np.pad(values, reach, mode="reflect")

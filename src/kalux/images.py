@@ -18,7 +18,7 @@ from kalux.augmentation.bridge import RANDOM
 from kalux.augmentation.highlights import Unshown
 from kalux.augmentation.motion import Paths
 from kalux.augmentation.subthreshold import UNKNOWN_CHANGE
-from kalux.filters.highlights import keep_white, lifted, read_unshown, tempered
+from kalux.filters.highlights import calm_specks, keep_white, lifted, read_unshown, tempered
 from kalux.filters.readout import HighlightPrior, Subthreshold, read_out
 from kalux.filters.uncertainty import (
     Around,
@@ -240,6 +240,8 @@ def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) ->
         read_unshown(intensity, levels, estimate.log_intensity, unshown, view.log_offset, prior)
     if estimate.unmeasured is not None:
         keep_white(intensity, estimate.log_intensity, estimate.unmeasured, view.log_offset, prior)
+        if view.neighbours > 0 and view.mosaic is None:  # a mosaic's neighbours are of other colours
+            calm_specks(intensity, variance, view.log_offset, estimate.unmeasured)
     white = float(np.exp(estimate.white) - view.log_offset)
     pattern = view.fixed_pattern * white
     if not needs_variance:

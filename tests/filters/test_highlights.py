@@ -4,12 +4,24 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 import kalux
 from kalux.augmentation.highlights import Unshown
 from kalux.events import make_events
-from kalux.filters.highlights import keep_white, lifted, obey_bounds, read_unshown, smoothed_unshown, tempered
+from kalux.filters.highlights import (
+    calm_specks,
+    keep_white,
+    lifted,
+    obey_bounds,
+    read_unshown,
+    smoothed_unshown,
+    tempered,
+)
 from kalux.filters.readout import HighlightPrior, Subthreshold, read_out
+
+import naive
 
 OFFSET = 0.03
 WHITE = float(np.log(1 + OFFSET))
@@ -125,6 +137,48 @@ def test_a_clipped_pixel_that_went_dark_between_the_frames_is_dark():
     image = np.full((1, 3), 0.5, np.float32)
     keep_white(image, np.array([[WHITE + 0.2, WHITE - 0.9, WHITE]]), np.array([0, 1]), OFFSET, PRIOR)
     np.testing.assert_allclose(image, [[1.0, 0.5, 0.5]], rtol=1e-6)
+
+
+def everywhere(image):
+    return np.arange(image.size)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_specks_are_calmed_as_by_the_oracle(seed):
+    rng = np.random.default_rng(seed)
+    image = np.exp(rng.normal(0.5, 1.0, (9, 11))).astype(np.float32)
+    variance = rng.uniform(1e-4, 0.3, image.shape).astype(np.float32)
+    unmeasured = rng.random(image.shape) < 0.9
+    expected = naive.calmed(image, variance, OFFSET, unmeasured)
+    assert (expected < image).any()
+    calm_specks(image, variance, OFFSET, np.flatnonzero(unmeasured))
+    np.testing.assert_allclose(image, expected, rtol=1e-5)
+
+
+@given(row=st.floats(2.5, 3.5), column=st.floats(2.5, 3.5), ground=st.floats(1.0, 5.0))
+def test_a_point_of_light_behind_a_lens_is_none(row, column, ground):
+    """A Gaussian of half a pixel, wherever it falls, though all pixels are known exactly."""
+    rows, columns = np.mgrid[:7, :7]
+    point = np.exp(-2 * ((rows - row) ** 2 + (columns - column) ** 2))
+    image = (ground + 100 * point).astype(np.float32)
+    before = image.copy()
+    calm_specks(image, np.zeros_like(image), OFFSET, everywhere(image))
+    np.testing.assert_allclose(image, before, rtol=0.02)
+
+
+def test_a_speck_in_a_white_is_no_brighter_than_its_surroundings_allow():
+    """Neighbours may be too dark by their noise; where a frame measures one of them, it may be a lamp of its own."""
+    image = np.full((5, 5), 1.1, np.float32)
+    image[2, 2] = 30
+    for noise, expected in ((0.0, 1.1), (0.01, 1.1 + 8.4 * 0.5 * 0.1 * (1.1 + OFFSET))):
+        calmed = image.copy()
+        calm_specks(calmed, np.full((5, 5), noise, np.float32), OFFSET, everywhere(image))
+        assert calmed[2, 2] == pytest.approx(expected, rel=1e-5)
+        np.testing.assert_array_equal(np.delete(calmed, 12), np.delete(image, 12))
+    for known in (7, 11, 12, 13, 17):
+        calmed = image.copy()
+        calm_specks(calmed, np.zeros((5, 5), np.float32), OFFSET, np.delete(everywhere(image), known))
+        np.testing.assert_array_equal(calmed, image)
 
 
 def test_neighbours_take_a_bound_of_noisy_events_down_to_two_standard_deviations():

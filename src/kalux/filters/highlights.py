@@ -1,4 +1,4 @@
-"""Read-out of highlights that no frame has shown yet (docs/equations.md, K15)."""
+"""Read-out of highlights that the frames around do not show (docs/equations.md, K15, K17)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.highlights import Unshown
-from kalux.compiled import ONE, exponential, larger, loop
+from kalux.compiled import ONE, exponential, larger, loop, smaller
 from kalux.filters.readout import HighlightPrior, read_levels
 
 Floats = NDArray[np.floating[Any]]
@@ -25,6 +25,11 @@ _LEAST_SPREAD: Final = np.float32(0.3)
 
 _LEAST: Final = np.float32(1e-6)
 """Least expected excess, and least variance of it, since it is divided by these."""
+
+_PEAK: Final = np.float32(8.4)
+"""By how much a point of light is brighter than the mean of the four pixels diagonally beside it, over how much that of
+the four straight beside it is: (1 - e^-4) / (e^-2 - e^-4), of a Gaussian of half a pixel on the middle of one. Lens and
+the pixels' own aperture make no less than that of it (docs/equations.md, K17)."""
 
 
 def tempered(unshown: Unshown, bound: Floats, prior: HighlightPrior) -> Unshown:
@@ -109,6 +114,56 @@ def _keep(log_intensity, unmeasured, white, log_offset, image):  # type: ignore[
             below = larger(white - level, np.float32(0.0))
             least = exponential(white - below - below * below / _ABOUT_WHITE) - log_offset
             image[i] = larger(image[i], least)
+
+
+def calm_specks(
+    image: NDArray[np.float32], variance: Floats, log_offset: float, unmeasured: NDArray[np.int64]
+) -> None:
+    """Keep pixels from shining brighter above those around them than a lens lets a point of light (K17). In place.
+
+    Of the ``unmeasured`` pixels these are those whose four neighbours are such as well: all of them lie within a white
+    of the frames, and each is known by its own events alone. They are never taken below the brightest of the four.
+
+    Parameters
+    ----------
+    image
+        (H, W) I.
+    variance
+        (H, W) P, the variance of log(I + I_0), by which neighbours may be too dark.
+    log_offset
+        I_0.
+    unmeasured
+        (N,) indices in the flattened image of pixels that no frame around measures.
+    """
+    if len(unmeasured) == 0:
+        return
+    inside = np.zeros(image.size, np.bool_)
+    inside[unmeasured] = True
+    before, known = image.copy().reshape(-1), variance.astype(np.float32, copy=False).reshape(-1)
+    _calm(before, known, np.float32(log_offset), unmeasured, inside, image.shape, image.reshape(-1))
+
+
+@loop
+def _calm(before, variance, log_offset, unmeasured, inside, shape, image):  # type: ignore[no-untyped-def]
+    height, width = shape
+    for pixel in unmeasured:
+        row, column = pixel // width, pixel % width
+        if row == 0 or column == 0 or row == height - 1 or column == width - 1:
+            continue
+        if not (inside[pixel - width] and inside[pixel - 1] and inside[pixel + 1] and inside[pixel + width]):
+            continue
+        beside, doubt, brightest = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+        for step in (-width, -1, 1, width):
+            value = before[pixel + step]
+            noise = (value + log_offset) * (value + log_offset) * variance[pixel + step]
+            beside, doubt, brightest = beside + value, doubt + noise, larger(brightest, value)
+        apart = np.float32(0.0)
+        for step in (-width - 1, -width + 1, width - 1, width + 1):
+            apart += before[pixel + step]
+        quarter = np.float32(0.25)
+        beside, ground = quarter * beside, quarter * smaller(apart, beside)
+        most = ground + _PEAK * (beside - ground + quarter * np.sqrt(doubt))
+        image[pixel] = smaller(before[pixel], larger(most, brightest))
 
 
 def smoothed_unshown(
