@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from kalux.calibration.intervals import Interval, intervals
 from kalux.calibration.neighbours import sum_of_neighbours
-from kalux.event_slices import all_between, count_chunks
 from kalux.recording import AS_STORED, EventLayout, Recording
 from kalux.settings import CameraSettings
 
@@ -115,7 +114,7 @@ def find_layout(recording: Recording, camera: CameraSettings) -> LayoutFit | Non
 
 def _change_and_count(interval: Interval, size: tuple[int, int]) -> tuple[Array, Array]:
     """(H, W) change of the log intensity, less its median, and net count of events."""
-    on, off = count_chunks(all_between(interval.chunks, interval.start, interval.end), size, weighed=False)
+    on, off = interval.counts(size)
     usable = interval.usable
     middle = float(np.median(interval.change[usable])) if usable.any() else 0.0
     change = np.clip(interval.change - middle, -_LARGEST_CHANGE, _LARGEST_CHANGE)

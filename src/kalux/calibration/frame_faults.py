@@ -19,7 +19,6 @@ from kalux.calibration.intervals import WELL_EXPOSED, Interval, intervals, sprea
 from kalux.calibration.neighbours import sum_of_neighbours
 from kalux.calibration.regression import two_stage
 from kalux.calibration.stuck_pixels import RangeWatch
-from kalux.event_slices import all_between, count_chunks
 from kalux.frames import Frame
 from kalux.models.camera import Camera
 from kalux.recording import FrameCorrections, Recording
@@ -225,9 +224,7 @@ def find_frame_faults(recording: Recording, camera: CameraSettings, watch: Frame
     compared = dataclasses.replace(camera, log_offset=_SMALL_OFFSET)
     certain_copies, certain_empty, rests = list[int](), list[int](), dict[int, _Rest]()
     for index, interval in _intervals(recording, compared, {*empty}, asked):
-        on, off = count_chunks(
-            all_between(interval.chunks, interval.start, interval.end), recording.sensor_size, weighed=False
-        )
+        on, off = interval.counts(recording.sensor_size)
         if index in copies:
             if _shows_motion(on, off, interval.usable):
                 certain_copies.append(index)
@@ -350,10 +347,7 @@ def _rests(recording: Recording, camera: CameraSettings, asked: set[int]) -> dic
     """
     found: dict[int, _Rest] = {}
     for index, interval in _intervals(recording, camera, set(), asked) if asked else ():
-        counts = count_chunks(
-            all_between(interval.chunks, interval.start, interval.end), recording.sensor_size, weighed=False
-        )
-        rest = _rest(interval, *counts)
+        rest = _rest(interval, *interval.counts(recording.sensor_size))
         if rest is not None:
             found[index] = rest
     return found

@@ -15,7 +15,7 @@ from kalux import memory
 from kalux.augmentation.refractory import EventClock
 from kalux.calibration.exposures import Exposures
 from kalux.compiled import event_words
-from kalux.event_slices import all_between, between, count_events
+from kalux.event_slices import all_between, between, count_chunks, count_events
 from kalux.events import EVENT_DTYPE, EventArray
 from kalux.filters.shots import Shot, take_shot
 from kalux.frames import Frame
@@ -125,6 +125,10 @@ class Interval:
     def events(self) -> EventArray:
         """Those of ``chunks`` in one array."""
         return _joined(self.chunks)
+
+    def counts(self, sensor_size: tuple[int, int]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """(H, W) each, of a sensor of ``sensor_size``: on and off events between the middles, each counted once."""
+        return count_chunks(all_between(self.chunks, self.start, self.end), sensor_size, weighed=False)
 
     @cached_property
     def change(self) -> Array:
