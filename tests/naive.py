@@ -112,7 +112,7 @@ def half_rounded(response, level):
 def event_weight(events, settings):
     """K13: how many thresholds the last of a pixel's ``events`` tells of."""
     period = settings.events.refractory
-    if period == 0 or len(events) == 1:
+    if period == 0:
         return 1.0
 
     def since(n):
@@ -121,16 +121,23 @@ def event_weight(events, settings):
             return 0.0
         return float(events[-n]["t"] - events[-n - 1]["t"])
 
-    def pace(interval, unsteady):
-        return period / np.hypot(interval - period, unsteady * period)
+    def tells(n):
+        """Whether the time since the event before the n-th last one tells a pace."""
+        return since(n) > 0.95 * period
 
-    now, before = since(1), since(2)
-    if now <= 0.95 * period:
-        weight = 1.0
-    elif before <= 0.95 * period:
-        weight = 1 + pace(now, 0.2)
-    else:
-        weight = 1 + (pace(now, 0.15) + pace(before, 0.15)) / 2
+    def pace(n, unsteady):
+        return period / np.hypot(since(n) - period, unsteady * period)
+
+    def to_come(n):
+        """What is counted with the n-th last one of what its own refractory period hides."""
+        if not (tells(n) and tells(n + 1)):
+            return 0.0
+        return max(1 - 500 / period, 0) / 2 * min(pace(n, 0.15), pace(n + 1, 0.15))
+
+    if not tells(1):
+        return 1.0
+    between = (pace(1, 0.15) + pace(2, 0.15)) / 2 if tells(2) else pace(1, 0.2)
+    weight = 1 + between - to_come(2) + to_come(1)
     return 1 + round((weight - 1) * 4096) / 4096  # as events carry it
 
 

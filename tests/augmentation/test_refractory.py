@@ -106,14 +106,55 @@ def test_weights_count_only_where_they_are_asked_for():
     assert integrate_exposure(events, -1, 20_000, steps, steps).events.sum() == 100
 
 
-def test_nothing_is_added_where_the_direction_turns():
-    """Up, up, up, down, down, up: only a second event of the same polarity says at what pace the light went on."""
-    t = 1_500 * np.arange(6)
-    zeros = np.zeros(6, np.int64)
-    events = make_events(t, zeros, zeros, np.array([1, 1, 1, 0, 0, 1], bool))
+def test_of_what_the_next_period_hides_a_part_is_counted_before_where_two_looks_agree():
+    """Up four times, down twice, up. One look alone may be noise; where the direction turns nothing is added, and what
+    has been counted stays: the light went on before it turned."""
+    t = 1_500 * np.arange(7)
+    zeros = np.zeros(7, np.int64)
+    events = make_events(t, zeros, zeros, np.array([1, 1, 1, 1, 0, 0, 1], bool))
     found = weights(EventClock((1, 1), 1_000).weighed(events))
-    once, twice = 1 + 1 / np.hypot(0.5, 0.2), 1 + 1 / np.hypot(0.5, 0.15)
-    np.testing.assert_allclose(found, [1, once, twice, 1, once, 1], rtol=1e-4)
+    once, pace = 1 + 1 / np.hypot(0.5, 0.2), 1 / np.hypot(0.5, 0.15)
+    np.testing.assert_allclose(found, [1, once, 1 + 1.25 * pace, 1 + pace, 1, once, 1], rtol=1e-4)
+
+
+def test_it_is_the_slower_of_both_paces_that_is_counted_before():
+    """A short look after a long one may be noise."""
+    t = np.array([0, 3_000, 4_500, 7_500])
+    zeros = np.zeros(4, np.int64)
+    found = weights(EventClock((1, 1), 1_000).weighed(make_events(t, zeros, zeros, np.ones(4, bool))))
+    alone, slow, fast = 1 / np.hypot(2, 0.2), 1 / np.hypot(2, 0.15), 1 / np.hypot(0.5, 0.15)
+    mean = (slow + fast) / 2
+    np.testing.assert_allclose(found, [1, 1 + alone, 1 + mean + slow / 4, 1 + mean], rtol=1e-4)
+
+
+def test_behind_a_low_pass_nothing_is_counted_before():
+    """A period of half a millisecond is no longer than a photoreceptor lags."""
+    t, zeros = 1_000 * np.arange(6), np.zeros(6, np.int64)
+    found = weights(EventClock((1, 1), 500).weighed(make_events(t, zeros, zeros, np.ones(6, bool))))
+    np.testing.assert_allclose(found[2:], 1 + 1 / np.hypot(1, 0.15), rtol=1e-4)
+
+
+@given(st.integers(0, 1_000), st.integers(100, 3_000))
+def test_nothing_is_counted_twice(seed, period):
+    """The weights of a run add up to what lies between its events and a part of the slower pace at its end."""
+    part = max(1 - 500 / period, 0) / 2
+    events = stream(120, seed)
+    events["x"], events["y"] = 0, 0
+    found = weights(EventClock((1, 1), period).weighed(events)) - 1
+    runs = np.split(np.arange(120), np.flatnonzero(np.diff(events["p"].astype(int))) + 1)
+    for run in runs:
+        since = np.diff(events["t"][run]).astype(np.float32)
+        before = np.concatenate([[np.float32(0)], since[:-1]])[: len(since)]
+        between, counted = 0.0, 0.0
+        for now, last in zip(since, before, strict=True):
+            if now <= np.float32(0.95) * np.float32(period):  # noise, which what was counted is left at
+                between, counted = between + counted, 0.0
+                continue
+            between += step_weight(now, last, np.float32(period)) - 1
+            counted = 0.0
+            if last > np.float32(0.95) * np.float32(period):
+                counted = part * min(period / np.hypot(look - period, 0.15 * period) for look in (now, last))
+        assert found[run].sum() == pytest.approx(between + counted, abs=2e-3 * len(run))
 
 
 def test_an_early_event_says_nothing_of_the_pace():
@@ -123,4 +164,4 @@ def test_an_early_event_says_nothing_of_the_pace():
     events = make_events(t, zeros, zeros, np.ones(4, bool))
     found = weights(EventClock((1, 1), 1_000).weighed(events))
     once, twice = 1 + 1 / np.hypot(0.5, 0.2), 1 + 1 / np.hypot(0.5, 0.15)
-    np.testing.assert_allclose(found, [1, 1, once, twice], rtol=1e-4)
+    np.testing.assert_allclose(found, [1, 1, once, twice + 0.25 / np.hypot(0.5, 0.15)], rtol=1e-4)
