@@ -836,6 +836,22 @@ def test_numbers_of_packets_tell_what_is_lost(tmp_path, numbers, lost):
         assert readers.read(tmp_path / "packets.bag").lost(start + 30).packets == 2
 
 
+def test_arrays_that_are_not_stamped_are_as_late_as_their_events(tmp_path):
+    """Some drivers leave stamps 0: what is lost was before the recording then, and so it was though all was later."""
+    arrays = []
+    for k, number in enumerate([5, 6, 9, 10, 11]):
+        data = packed_event_array(small_events()[k : k + 1], epoch=EPOCH + 10_000_000 * k)
+        arrays.append(number.to_bytes(4, "little") + bytes(8) + data[12:])
+    path = tmp_path / "arrays.bag"
+    write_bag1(
+        path, [(k + 1, "/dvs/events", "dvs_msgs/msg/EventArray", data) for k, data in enumerate(arrays)]
+    )
+    source = readers.read(path)
+    times = [t for t, *_ in all_events(source).tolist()]
+    assert source.lost(times[-1]) == (2, times[2])
+    assert source.lost(times[1]) is None
+
+
 def test_a_late_packet_that_goes_back_too_far_is_refused(tmp_path):
     parts = [(100_000, evt3(100_000, *EVENT), 8), (0, evt3(0, *EVENT), 7)]
     with pytest.raises(FormatError, match="clock goes back from 100000 to 0 us"):

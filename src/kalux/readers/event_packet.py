@@ -150,21 +150,21 @@ def open_topic(kind: str, messages: Messages) -> EventTopic:
 
 
 def lost_packets(numbered: Iterable[tuple[int, int]], until: int) -> Lost | None:
-    """What is missing of packets, of which the number and the stamp, us, are given, up to a time, us.
+    """What is missing of packets, of which the number and the time, us, are given, up to a time, us.
 
     None where no number is left out. Where no more packets follow their predecessors than do not, the numbers are none
     of a publisher: some programs leave them 0, and two publishers have numbers of their own.
     """
     packets = gaps = followed = 0
     first = previous = None
-    for number, stamp in numbered:
-        if stamp > until:
+    for number, t in numbered:
+        if t > until:
             break
         missing = 0 if previous is None else number - previous - 1
         followed += previous is not None and missing == 0
         if missing > 0:
             packets, gaps = packets + missing, gaps + 1
-            first = stamp if first is None else first
+            first = t if first is None else first
         previous = number
     return None if first is None or followed <= gaps else Lost(packets, first)
 
@@ -177,16 +177,33 @@ def _open_arrays(messages: Messages) -> EventTopic:
     first.stamp()
     height, width = first.numbers("II")
 
-    def numbered() -> Iterator[tuple[int, int]]:
-        headers = (message.header() for message in messages())
-        return ((number, stamp // 1000) for number, stamp in headers if number is not None)
-
     return EventTopic(
         (height, width),
         lambda: rechunk(map(_array_events, messages())),
         lambda: sum(_array_length(message)[1] for message in messages()),
-        lost=None if first.cdr else lambda until: lost_packets(numbered(), until),
+        lost=None if first.cdr else lambda until: lost_packets(_numbered_arrays(messages()), until),
     )
+
+
+def _numbered_arrays(messages: Iterable[Message]) -> Iterator[tuple[int, int]]:
+    """Numbers of arrays of ROS 1, and the times of their first events, us.
+
+    Stamps may be 0: the driver of the DVS128, and that of the DAVIS once, set none. An empty array is as late as the
+    last one, or as its stamp.
+    """
+    now = 0
+    for message in messages:
+        number, stamp = message.header()
+        assert number is not None
+        _, _, count = message.numbers("III")
+        now = _array_start(message) if count else max(now, stamp // 1000)
+        yield number, now
+
+
+def _array_start(message: Message) -> int:
+    """The time, us, of the event that follows in a message of ROS 1."""
+    _, _, seconds, nanoseconds = message.numbers("HHII")
+    return seconds * 1_000_000 + nanoseconds // 1000
 
 
 def _array_length(message: Message) -> tuple[int, int]:

@@ -31,7 +31,7 @@ TriggerArray = NDArray[np.void]
 
 
 class Lost(NamedTuple):
-    """How many ``packets`` of events a recording lacks, and when the first that came after one is stamped, us."""
+    """How many ``packets`` of events a recording lacks, and the time of the first that came after one, us."""
 
     packets: int
     first: int
