@@ -157,6 +157,19 @@ def test_gains_that_go_up_and_down_do_not_drift():
     assert spread_of(found.gains, exposures) < 0.05
 
 
+def test_light_that_came_while_a_frame_was_repeated_and_goes_after_it_is_no_gain():
+    """The frame after the copy is as bright as it, though events since say that it should be darker."""
+    exposures = [6_000] * 4 + [3_000] * 16 + [6_000] * 4
+    frame = 1e6 / 48.0  # us
+
+    def light(t):
+        return 1.0 + 0.6 * np.clip(min(t / frame - 13.3, 15.0 - t / frame) / 0.6, 0.0, 1.0)
+
+    events, frames = unstated(exposures, light=light)
+    found = faults(events, repeated(frames, 14))
+    assert (found.copies, found.steps) == ((14,), (4, 20))
+
+
 def test_events_that_are_lost_of_one_sign_alone_make_gains_hardly_drift():
     """Frames are then always darker than events say, which adds up to 2.3 in these 24 if it is taken for the gain's."""
     leaves = np.random.default_rng(0).normal(size=(120, 400))

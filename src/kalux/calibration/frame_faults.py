@@ -235,8 +235,11 @@ def find_frame_faults(recording: Recording, camera: CameraSettings, watch: Frame
             rests[index] = rest
     logs = np.zeros(watch.frames)
     if any(rest.is_certain for rest in rests.values()):
-        no_steps = {*watch.copies, *watch.empty, *(index + 1 for index in watch.empty)}
-        others = set(range(1, max(rests))) - asked - no_steps
+        # Events since a copy do not tell what changed since the frame that it repeats, nor those since an empty frame.
+        untold = {*watch.copies, *watch.empty}
+        untold |= {index + 1 for index in untold}
+        rests = {index: rest for index, rest in rests.items() if rest.is_certain or index not in untold}
+        others = set(range(1, max(rests))) - asked - untold
         logs = _log_gains(watch.frames, _steps(rests | _rests(recording, compared, others)))
     return found._replace(
         copies=tuple(certain_copies),
