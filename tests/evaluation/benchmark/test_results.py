@@ -62,6 +62,19 @@ def test_the_neighbours_are_compared_with_truth_between_frames(small_set):
     assert isinstance(run_job(dataclasses.replace(plan.jobs[-1], between=False)), Failed)
 
 
+def test_truth_that_is_not_compared_may_lie_in_frames(small_set):
+    """Masked altogether, or before the middle of the first exposure, where `kalux evaluate` leaves it out, too."""
+    first, second = list(kalux.open(small_set.with_truth.path).frames())[:2]
+    times = [first.exposure_start + 1, (first.exposure_end + second.exposure_start) // 2, second.middle]
+    images = np.full((3, *first.image.shape), 0.5, np.float32)
+    file, compared = small_set.folder / "a_gt.npz", np.array([True, True, False])
+    mask = np.broadcast_to(compared[:, None, None], images.shape)
+    np.savez(file, times_us=times, gt=images, mask=mask)
+    assert "a/mean" in [job.name for job in planned(small_set).jobs]
+    np.savez(file, times_us=times, gt=images)
+    assert "a/mean" not in [job.name for job in planned(small_set).jobs]
+
+
 def test_a_sequence_that_cannot_be_opened_fails_alone(small_set):
     small_set.without.path.write_bytes(b"no recording")
     plan = planned(small_set, ["hold", "cf"])

@@ -153,18 +153,20 @@ def uses_held_out(sequence: Sequence) -> bool:
 
 
 def truth_lies_between(sequence: Sequence) -> bool:
-    """Whether all of a sequence's ground truth lies between its frames, as of artificial HDR with frames held out.
+    """Whether all ground truth that is compared lies between the frames, as of artificial HDR with frames held out.
 
     Raises
     ------
     KaluxError
-        If recording or truth cannot be read.
+        If recording or truth cannot be read, or do not fit together.
     """
     if sequence.options.ahdr is not None:  # the truth is of its frames
         return False
     recording = sequence.open()
-    truth, _ = find_truth(recording, sequence.truth_file())
-    return truth is not None and lies_between_frames(recording, truth.times)
+    truth, mask = find_truth(recording, sequence.truth_file())
+    if truth is None:
+        return False
+    return lies_between_frames(recording, prepare_reference(recording, truth, mask).times)
 
 
 def make_job(
