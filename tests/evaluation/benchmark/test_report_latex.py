@@ -49,6 +49,14 @@ def test_titles_are_escaped(results):
     assert titles in latex_table(results).splitlines()
 
 
+def test_a_name_at_the_beginning_of_a_row_is_no_argument_of_the_row_before(results):
+    """LaTeX takes ``[new]`` and ``*`` after a line's end for its own; ``<`` it prints as an exclamation mark."""
+    (first, record), *_ = results.records.items()
+    named = {**record, "method": {**record["method"], "label": "[new] < *old*"}}
+    table = latex_table(dataclasses.replace(results, records={first: named}))
+    assert rows(table, "{[}new] \\textless{} {*}old{*}")
+
+
 def test_numbers_are_those_of_the_results_and_the_best_is_bold(results):
     table, (metric, *_) = latex_table(results), results.shown()
     assert "MSE $\\times$ 100 $\\downarrow$" in table

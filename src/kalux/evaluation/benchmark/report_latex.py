@@ -17,6 +17,12 @@ _ESCAPED: Final = str.maketrans(
         "^": r"\textasciicircum{}",
         "×": r"$\times$",
         "–": "--",
+        # Without \usepackage[T1]{fontenc} these would be other characters.
+        "<": r"\textless{}",
+        ">": r"\textgreater{}",
+        "|": r"\textbar{}",
+        "[": "{[}",  # at the beginning of a row, this and the star would belong to the end of the one before
+        "*": "{*}",
     }
 )
 
