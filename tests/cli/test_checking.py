@@ -121,13 +121,13 @@ def test_events_that_are_missing_while_frames_change_are_told():
     assert silence((t >= 300_000) & (t <= 700_000), still) == (None, [])
 
 
-def test_packets_that_are_missing_are_told_up_to_what_was_checked():
+def test_packets_that_are_missing_are_told_from_the_first_frame_up_to_what_was_checked():
     made, asked = moving_blocks(), []
     rec = made.recording()
     last = int(made.events["t"][-1])
-    rec.source = dataclasses.replace(rec.source, lost=lambda until: asked.append(until) or Lost(3, 250_000))
+    rec.source = dataclasses.replace(rec.source, lost=lambda *times: asked.append(times) or Lost(3, 250_000))
     found = check_recording(rec, lambda _: None)
-    assert asked == [min(last, found.end)]
+    assert asked == [(found.start, min(last, found.end))]
     told = f"3 packets of events are missing by their numbers, the first before {(250_000 - found.start) * 1e-6:.3f} s"
     assert [text for text in found.warnings() if text.startswith(told)]
 

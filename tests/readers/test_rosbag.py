@@ -823,17 +823,20 @@ def test_numbers_of_packets_tell_what_is_lost(tmp_path, numbers, lost):
         data = packed_event_array(small_events()[k : k + 1], epoch=EPOCH + 10_000_000 * k)
         arrays.append(number.to_bytes(4, "little") + data[4:])
     start = EPOCH // 1000
-    found = readers.read(packets(tmp_path / "packets.bag", *packed)).lost(start + 1000)
+    found = readers.read(packets(tmp_path / "packets.bag", *packed)).lost(0, start + 1000)
     assert found == (None if lost is None else (lost[0], start + 10 * lost[1]))
     path = tmp_path / "arrays.bag"
     write_bag1(
         path, [(k + 1, "/dvs/events", "dvs_msgs/msg/EventArray", data) for k, data in enumerate(arrays)]
     )
     of_arrays = readers.read(path).lost
-    assert (of_arrays(2**60) or (None,))[0] == (None if lost is None else lost[0])
-    assert of_arrays(0) is None
+    assert (of_arrays(0, 2**60) or (None,))[0] == (None if lost is None else lost[0])
+    assert of_arrays(0, 0) is None
     if lost is not None:
-        assert readers.read(tmp_path / "packets.bag").lost(start + 30).packets == 2
+        assert readers.read(tmp_path / "packets.bag").lost(0, start + 30).packets == 2
+        # Before frames begin, nothing is missing in images.
+        assert readers.read(tmp_path / "packets.bag").lost(start + 30, start + 1000) == (3, start + 40)
+        assert of_arrays(2**59, 2**60) is None
 
 
 def test_arrays_that_are_not_stamped_are_as_late_as_their_events(tmp_path):
@@ -848,8 +851,8 @@ def test_arrays_that_are_not_stamped_are_as_late_as_their_events(tmp_path):
     )
     source = readers.read(path)
     times = [t for t, *_ in all_events(source).tolist()]
-    assert source.lost(times[-1]) == (2, times[2])
-    assert source.lost(times[1]) is None
+    assert source.lost(0, times[-1]) == (2, times[2])
+    assert source.lost(0, times[1]) is None
 
 
 def test_a_late_packet_that_goes_back_too_far_is_refused(tmp_path):

@@ -69,7 +69,7 @@ class Contents(NamedTuple):
     white
         What is taken for it; None where nothing was checked.
     lost
-        Packets of events that are missing, of those that were checked.
+        Packets of events that are missing from the first exposure on, of those that were checked.
     """
 
     frames: int
@@ -212,7 +212,7 @@ def check_recording(
         exposed,
         region if region is not None and changes.go_on_beyond(region, recording.sensor_size) else None,
         white.found(),
-        recording.source.lost(last_event) if recording.source.lost is not None else None,
+        recording.source.lost(start, last_event) if recording.source.lost is not None else None,
     )
 
 

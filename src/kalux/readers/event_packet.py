@@ -125,7 +125,7 @@ class EventTopic:
     events: Callable[[], Iterator[EventArray]]
     count: Callable[[], int]
     triggers: Callable[[], Iterator[TriggerArray]] | None = None
-    lost: Callable[[int], Lost | None] | None = None
+    lost: Callable[[int, int], Lost | None] | None = None
 
 
 Messages = Callable[[], Iterator[Message]]
@@ -149,8 +149,8 @@ def open_topic(kind: str, messages: Messages) -> EventTopic:
     return _open_arrays(messages) if kind in EVENT_ARRAYS else _open_packets(messages)
 
 
-def lost_packets(numbered: Iterable[tuple[int, int]], until: int) -> Lost | None:
-    """What is missing of packets, of which the number and the time, us, are given, up to a time, us.
+def lost_packets(numbered: Iterable[tuple[int, int]], begin: int, until: int) -> Lost | None:
+    """What is missing of packets, of which number and time are given, before those from ``begin`` to ``until``, us.
 
     None where no number is left out. Where no more packets follow their predecessors than do not, the numbers are none
     of a publisher: some programs leave them 0, and two publishers have numbers of their own.
@@ -162,8 +162,9 @@ def lost_packets(numbered: Iterable[tuple[int, int]], until: int) -> Lost | None
             break
         missing = 0 if previous is None else number - previous - 1
         followed += previous is not None and missing == 0
-        if missing > 0:
-            packets, gaps = packets + missing, gaps + 1
+        gaps += missing > 0
+        if missing > 0 and t >= begin:
+            packets += missing
             first = t if first is None else first
         previous = number
     return None if first is None or followed <= gaps else Lost(packets, first)
@@ -181,7 +182,7 @@ def _open_arrays(messages: Messages) -> EventTopic:
         (height, width),
         lambda: rechunk(map(_array_events, messages())),
         lambda: sum(_array_length(message)[1] for message in messages()),
-        lost=None if first.cdr else lambda until: lost_packets(_numbered_arrays(messages()), until),
+        lost=None if first.cdr else lambda *times: lost_packets(_numbered_arrays(messages()), *times),
     )
 
 
@@ -291,8 +292,8 @@ def _open_packets(messages: Messages) -> EventTopic:
                 )
             yield packet
 
-    def lost(until: int) -> Lost | None:
-        return lost_packets(((packet.number, packet.stamp // 1000) for packet in packets()), until)
+    def lost(begin: int, until: int) -> Lost | None:
+        return lost_packets(((packet.number, packet.stamp // 1000) for packet in packets()), begin, until)
 
     first = _packet(next(messages()))
     if first.encoding == "evt3":  # the packets are one stream

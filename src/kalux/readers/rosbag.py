@@ -382,11 +382,11 @@ def _source(
             with _decoding(path, events.topic):
                 yield from events.content.triggers()
 
-    def lost(until: int) -> Lost | None:
+    def lost(begin: int, until: int) -> Lost | None:
         if events is None or events.content.lost is None:
             return None
         with _decoding(path, events.topic):
-            return events.content.lost(until)
+            return events.content.lost(begin, until)
 
     def read_frames() -> Iterator[Frame]:
         return iter(()) if images is None else in_order(_frames(path, bag, images, exposures))

@@ -79,8 +79,8 @@ class Source:
         Whether the file counts rows from the bottom: events of a sensor that turns out to be taller than
         ``sensor_size`` lie as many rows lower (`on_sensor`).
     lost
-        Called with a time, us: the packets of events up to then that their numbers show to be missing, or None; reads
-        through them. None where the format has no such numbers.
+        Called with two times, us: the packets of events that their numbers show to be missing before those from one to
+        the other, or None; reads through them. None where the format has no such numbers.
     """
 
     path: Path
@@ -100,7 +100,7 @@ class Source:
     sensor_size_known: bool = True
     mosaic: Mosaic | None = None
     rows_from_below: bool = False
-    lost: Callable[[int], Lost | None] | None = None
+    lost: Callable[[int, int], Lost | None] | None = None
 
 
 NO_EVENTS: Final = "The file has no events."
