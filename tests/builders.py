@@ -124,7 +124,6 @@ def moving_blocks(
     return simulate(scene, sensor, exposures=exposures)
 
 
-@lru_cache(maxsize=1)
 def without_events(source: Recording, begin: int, end: int) -> Recording:
     """A recording whose sensor has dropped its events from ``begin`` to ``end``, us."""
     events = np.concatenate([*source.events()])
@@ -132,6 +131,7 @@ def without_events(source: Recording, begin: int, end: int) -> Recording:
     return Recording.from_arrays(kept, [*source.frames()], sensor_size=source.sensor_size)
 
 
+@lru_cache(maxsize=1)
 def quick_frames() -> Simulation:
     """The demonstration's scene before a sensor whose frames come every 2 ms, its events 5 ms late."""
     sensor = SensorSettings(
