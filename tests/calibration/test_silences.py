@@ -8,8 +8,11 @@ import pytest
 
 from kalux import Recording
 from kalux.calibration.silences import find_silences, overlaps
+from kalux.datasets import SensorSettings, simulate
+from kalux.datasets.motion import pan
+from kalux.datasets.scenes import Scene, photograph_scene
 
-from builders import moving_blocks, unlabelled, without_events
+from builders import blocks, moving_blocks, unlabelled, without_events
 
 
 def test_silences_in_which_frames_change_are_found_the_longest_first():
@@ -37,6 +40,20 @@ def test_where_frames_stand_still_silence_is_as_it_should_be():
     ]
     whole = Recording.from_arrays(made.events, still, sensor_size=made.scene.sensor_size)
     assert find_silences(without_events(whole, 300_000, 700_000)) == []
+
+
+def test_what_moves_now_and_then_leaves_silences_as_they_should_be():
+    """Most frames are still then, and change by their noise: about as much in a silence as in most others."""
+    passing = photograph_scene(blocks(), pan(60.0), sensor_size=(32, 40), duration=2_000_000)
+
+    def moved(t):
+        return t // 400_000 * 80_000 + min(t % 400_000, 80_000)
+
+    scene = Scene(lambda t: passing.at(int(moved(t))), (32, 40), 0, 2_000_000)
+    made = simulate(scene, SensorSettings(read_noise=0.005), seed=1)
+    whole = unlabelled(made)
+    assert len(made.events) > 5_000
+    assert find_silences(whole) == []
 
 
 def test_only_the_frames_that_are_asked_for_are_looked_at():

@@ -6,7 +6,7 @@ command warns of, and what estimates of noise leave out.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import islice
 from typing import Final
 
@@ -26,7 +26,7 @@ Silence = tuple[int, int]
 
 _LEAST_INTERVALS: Final = 2  # between frames: in less of them, little is lost
 _ALIKE: Final = 0.25
-"""Share of the usual change from frame to frame from which something moved in a silence, too."""
+"""Share of the usual change from frame to frame, where there are events, from which something moved in a silence."""
 
 _BLOCKS: Final = (16, 16)
 """Means of so many blocks of a frame tell how much it changes: of single pixels, noise would."""
@@ -61,15 +61,30 @@ class FrameChanges:
         self._blocks = blocks
         self._spans.append((frame.exposure_start, frame.exposure_end))
 
-    def go_on(self, begin: int, end: int) -> bool:
-        """Whether frames from ``begin`` to ``end`` (us) change about as much as the others."""
-        exposures = self.exposures
-        inside = (exposures[:-1, 1] >= begin) & (exposures[1:, 0] <= end)
-        changes = np.array(self._changes)
-        if np.count_nonzero(inside) < _LEAST_INTERVALS or inside.all():
-            return False
-        usual = float(np.median(changes[~inside]))
-        return usual > 0 and bool(np.median(changes[inside]) >= _ALIKE * usual)
+    def go_on(self, silences: Sequence[Silence]) -> list[Silence]:
+        """Those of times without events in which frames change about as much as where there are events.
+
+        Where something moves now and then, frames are mostly still, and change by their noise alone.
+        """
+        exposures, changes = self.exposures, np.array(self._changes)
+        parts = [
+            slice(
+                int(np.searchsorted(exposures[:-1, 1], begin)),
+                int(np.searchsorted(exposures[1:, 0], end, side="right")),
+            )
+            for begin, end in silences
+        ]
+        moving = np.ones(len(changes), np.bool_)
+        for part in parts:
+            moving[part] = False
+        usual = float(np.median(changes[moving])) if moving.any() else 0.0
+        return [
+            silence
+            for silence, part in zip(silences, parts, strict=True)
+            if usual > 0
+            and part.stop - part.start >= _LEAST_INTERVALS
+            and np.median(changes[part]) >= _ALIKE * usual
+        ]
 
     def go_on_beyond(self, region: Region, sensor_size: tuple[int, int]) -> bool:
         """Whether frames change beyond a region of events about as much as in it."""
@@ -126,7 +141,7 @@ class EventWaits:
         if complete:
             self._see_end()
         seen = self._last - self._start
-        return [silence for silence in _missing(self._found, seen, self.events) if changes.go_on(*silence)]
+        return changes.go_on([*_missing(self._found, seen, self.events)])
 
 
 def find_silences(
@@ -135,7 +150,7 @@ def find_silences(
     """Times without an event in which events are missing though frames change, the longest first.
 
     At the rate of the rest 100 events are missing in each, and frames go on to change by a quarter of what they usually
-    do, over two intervals between them at least.
+    do where there are events, over two intervals between them at least.
 
     Parameters
     ----------
