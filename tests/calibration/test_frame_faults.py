@@ -61,6 +61,11 @@ def repeated(frames, *indices):
     return made
 
 
+def emptied(frames):
+    """The frames, all of which show nothing."""
+    return [with_image(frame, 10) for frame in frames]
+
+
 def stated(frame, exposure):
     """The frame, which says that it was exposed for so long, us."""
     start = frame.middle - exposure // 2
@@ -155,6 +160,19 @@ def test_gains_that_go_up_and_down_do_not_drift():
     found = faults(*unstated(exposures, motion=pan(300.0), **slow))
     assert found.steps == tuple(range(1, 24))
     assert spread_of(found.gains, exposures) < 0.05
+
+
+@pytest.mark.parametrize(
+    "hide", [lambda frames: repeated(frames, 5, 6), lambda f: [*f[:5], *emptied(f[5:7]), *f[7:]]]
+)
+def test_steps_across_frames_that_are_left_out_are_found(hide):
+    """Of a gain that goes up and down, with an odd number of steps hidden: else those after it are half or twice."""
+    exposures = np.array([6_000, 3_000] * 12)
+    events, frames = unstated(exposures.tolist())
+    found = faults(events, hide(frames))
+    shown = [index for index in range(24) if index not in (5, 6)]
+    assert {*found.copies, *found.empty} == {5, 6}
+    assert spread_of(found.gains[shown], exposures[shown]) < 0.05
 
 
 def test_light_that_came_while_a_frame_was_repeated_and_goes_after_it_is_no_gain():

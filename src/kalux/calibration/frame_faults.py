@@ -21,7 +21,7 @@ from kalux.calibration.regression import two_stage
 from kalux.calibration.stuck_pixels import RangeWatch
 from kalux.frames import Frame
 from kalux.models.camera import Camera
-from kalux.recording import FrameCorrections, Recording
+from kalux.recording import FrameCorrections, Recording, with_frames
 from kalux.settings import CameraSettings
 
 Array = NDArray[np.float64]
@@ -217,30 +217,23 @@ def find_frame_faults(recording: Recording, camera: CameraSettings, watch: Frame
     """
     empty = watch.empty if len(watch.empty) <= _MOST_EMPTY * watch.frames else []
     copies = watch.copies if len(watch.copies) <= _MOST_COPIES * watch.frames else []
-    asked = {*empty, *copies, *watch.suspects}
     found = FrameFaults(watch.frames, stuck=watch.ranges.stuck(recording))
-    if not asked:
+    if not (empty or copies or watch.suspects):
         return found
     compared = dataclasses.replace(camera, log_offset=_SMALL_OFFSET)
-    certain_copies, certain_empty, rests = list[int](), list[int](), dict[int, _Rest]()
-    for index, interval in _intervals(recording, compared, {*empty}, asked):
+    certain_copies, certain_empty = list[int](), list[int]()
+    for index, interval in _intervals(recording, compared, {*empty}, {*empty, *copies}):
         on, off = interval.counts(recording.sensor_size)
         if index in copies:
             if _shows_motion(on, off, interval.usable):
                 certain_copies.append(index)
-        elif index in empty:
-            if abs(float(np.median(on - off))) < _LIT:
-                certain_empty.append(index)
-        elif (rest := _rest(interval, on, off)) is not None:
-            rests[index] = rest
+        elif abs(float(np.median(on - off))) < _LIT:
+            certain_empty.append(index)
     logs = np.zeros(watch.frames)
+    rests = _rests(recording, compared, watch, {*watch.suspects})
     if any(rest.is_certain for rest in rests.values()):
-        # Events since a copy do not tell what changed since the frame that it repeats, nor those since an empty frame.
-        untold = {*watch.copies, *watch.empty}
-        untold |= {index + 1 for index in untold}
-        rests = {index: rest for index, rest in rests.items() if rest.is_certain or index not in untold}
-        others = set(range(1, max(rests))) - asked - untold
-        logs = _log_gains(watch.frames, _steps(rests | _rests(recording, compared, others)))
+        others = set(range(1, max(rests))) - {*watch.suspects}
+        logs = _log_gains(watch.frames, _steps(rests | _rests(recording, compared, watch, others)))
     return found._replace(
         copies=tuple(certain_copies),
         empty=tuple(certain_empty),
@@ -256,7 +249,7 @@ def _intervals(
 
     What is beside an empty frame cannot be compared with it.
     """
-    most = max(asked) + 2
+    most = max(asked, default=-2) + 2
     for before, interval in enumerate(intervals(recording, camera, margin=0, most_frames=most, apart=0)):
         if before in empty and all(i in empty for i in range(before)):
             yield before, interval
@@ -343,15 +336,25 @@ def _rest(interval: Interval, on: NDArray[Any], off: NDArray[Any]) -> _Rest | No
     )
 
 
-def _rests(recording: Recording, camera: CameraSettings, asked: set[int]) -> dict[int, _Rest]:
-    """What frames that are asked for show beyond the events since those before them.
+def _rests(
+    recording: Recording, camera: CameraSettings, watch: FrameWatch, asked: set[int]
+) -> dict[int, _Rest]:
+    """What frames that are asked for show beyond the events since those before them that are no copies, nor empty.
 
-    A step of the gain against a change of the scene may leave a frame as bright as the one before.
+    Events since a copy do not tell what changed since the frame that it repeats, and an empty frame shows no step. Over
+    so long a time less is known of light that comes and goes: there only what is certain counts. A step of the gain
+    against a change of the scene may leave a frame as bright as the one before.
     """
+    left_out = {*watch.copies, *watch.empty}
+    kept = [index for index in range(max(asked, default=-1) + 1) if index not in left_out]
+    shown = with_frames(
+        recording, lambda: (f for index, f in enumerate(recording.frames()) if index not in left_out)
+    )
     found: dict[int, _Rest] = {}
-    for index, interval in _intervals(recording, camera, set(), asked) if asked else ():
-        rest = _rest(interval, *interval.counts(recording.sensor_size))
-        if rest is not None:
+    each = intervals(shown, camera, margin=0, most_frames=len(kept), apart=0)
+    for index, interval in zip(kept[1:], each, strict=True) if asked else ():
+        rest = _rest(interval, *interval.counts(recording.sensor_size)) if index in asked else None
+        if rest is not None and (rest.is_certain or index - 1 not in left_out):
             found[index] = rest
     return found
 
