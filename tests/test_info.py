@@ -45,6 +45,21 @@ def test_event_numbers_do_not_depend_on_chunks(times, size):
         assert summarise_events(parts).peak_rate == pytest.approx(bins.max() * 100)
 
 
+@pytest.mark.parametrize(
+    ("times", "said"),
+    [
+        ([0, 2_500, 5_000], "600 events/s on average"),
+        ([0, 2_500, 5_000, 7_500, 10_000, 12_500], "480 events/s on average"),
+        ([0, 2_500, 5_000, 7_500, 20_000], "250 events/s on average, 400 events/s in the busiest 10 ms"),
+    ],
+)
+def test_no_10_ms_are_the_busiest_that_have_less_than_on_average(times, said):
+    """Of a short recording the busiest 10 ms were said to have fewer events a second than the average."""
+    recording = Recording.from_arrays(events_at(times), [], sensor_size=(1, 1))
+    lines = format_description(describe(recording)).splitlines()
+    assert [line.strip() for line in lines if "on average" in line] == [said]
+
+
 def test_frames_by_hand():
     image = np.zeros((10, 10), np.uint8)
     image[0] = 255

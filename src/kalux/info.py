@@ -292,9 +292,10 @@ def _event_rows(events: EventSummary) -> list[tuple[str, str]]:
         ("", _span(events.first, events.last)),
     ]
     if events.mean_rate is not None:
-        rows.append(
-            ("", f"{_rate(events.mean_rate)} on average, {_rate(events.peak_rate)} in the busiest 10 ms")
-        )
+        # The last 10 ms are not whole: a short recording, or an even one, may have less in any than on average.
+        told = (events.peak_rate or 0.0) >= events.mean_rate
+        busiest = f", {_rate(events.peak_rate)} in the busiest 10 ms" if told else ""
+        rows.append(("", f"{_rate(events.mean_rate)} on average{busiest}"))
     if events.largest_gap is not None:
         rows.append(("", f"longest gap {_time(events.largest_gap)}"))
     return rows
