@@ -14,6 +14,7 @@ import sys
 import threading
 import time
 
+import numba
 import pytest
 
 import kalux
@@ -206,6 +207,28 @@ def test_standard_output_that_is_full_is_told(recording):
         )
     assert done.returncode == 2
     assert done.stderr == "kalux: error: standard output: No space left on device\n"
+
+
+@pytest.mark.skipif(
+    not hasattr(numba.config, "CACHE_LOCATOR_CLASSES"), reason="this numba always tries all its folders"
+)
+def test_a_folder_for_compiled_loops_that_cannot_be_written_is_one_line(recording, tmp_path):
+    """It was a traceback, as of a mistake in kalux, where neither that folder nor the one of kalux can be written."""
+    (tmp_path / "file").write_text("not a folder")
+    place = str(tmp_path / "file" / "loops")
+    done = subprocess.run(
+        [sys.executable, "-m", "kalux", "info", str(recording)],
+        # Without numba's other folders, which root can write to whatever their permissions.
+        env=dict(os.environ, NUMBA_CACHE_DIR=place, NUMBA_CACHE_LOCATOR_CLASSES="UserProvidedCacheLocator"),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert done.stderr == (
+        f"kalux: error: {place}: compiled loops cannot be kept: neither this folder nor that of kalux can be written; "
+        "name another one in NUMBA_CACHE_DIR\n"
+    )
 
 
 def test_no_room_for_compiled_loops_is_one_line(recording, tmp_path):

@@ -108,6 +108,12 @@ def _failed(error: Exception) -> int:
             f"{VARIABLE}"
         )
         return BAD_INPUT
+    if _finds_no_folder(error):
+        error_line(
+            f"error: {os.environ.get(VARIABLE)}: compiled loops cannot be kept: neither this folder nor that of kalux "
+            f"can be written; name another one in {VARIABLE}"
+        )
+        return BAD_INPUT
     if isinstance(error, KaluxError):
         error_line(f"error: {error}", *_notes(error))
         return BUG if isinstance(error, InternalError) else BAD_INPUT
@@ -123,6 +129,11 @@ def _keeps_a_loop(error: BaseException | None) -> bool:
         return False
     frames = traceback.walk_tb(error.__traceback__)
     return any(frame.f_globals.get("__name__") == "numba.core.caching" for frame, _ in frames)
+
+
+def _finds_no_folder(error: Exception) -> bool:
+    """Whether numba can write to none of its folders, one of them named by the user: else `check_variables` says so."""
+    return isinstance(error, RuntimeError) and "no locator available" in str(error) and VARIABLE in os.environ
 
 
 def _bug(error: Exception) -> int:
