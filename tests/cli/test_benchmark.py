@@ -104,6 +104,13 @@ def test_a_failed_job_is_told_and_tried_again_and_the_others_are_done(cli, ran, 
     assert json.loads((out / "results.json").read_text())["failures"] == []
 
 
+def test_where_all_jobs_failed_there_are_no_others(cli, ran, tmp_path):
+    """A mistyped name was said to have left results of other jobs in the folder, where there are none."""
+    found = cli("benchmark", tmp_path / "none.h5", "--methods", "hold", "-o", tmp_path / "out", "--quiet")
+    assert found.code == 2
+    assert "1 of 1 jobs failed: none/hold; the same command tries again. none/hold: " in found.error
+
+
 def test_an_error_of_kalux_itself_is_one(cli, ran, folder, tmp_path, monkeypatch):
     def broken(job):
         raise ZeroDivisionError("oh")

@@ -257,9 +257,10 @@ def _raise_failures(results: Results, out: Path) -> None:
         return
     total = len(results.plan.jobs) + len(results.plan.failures)
     first = next(iter(results.failures.items()))
+    others = f"the others are in {out}, " if len(results.failures) < total else ""
     text = (
-        f"{len(results.failures)} of {total} jobs failed: {_some('/'.join(n) for n in results.failures)}; the others "
-        f"are in {out}, the same command tries again. {'/'.join(first[0])}: {first[1].message}"
+        f"{len(results.failures)} of {total} jobs failed: {_some('/'.join(n) for n in results.failures)}; {others}"
+        f"the same command tries again. {'/'.join(first[0])}: {first[1].message}"
     )
     raise (InternalError if any(f.is_bug for f in results.failures.values()) else InputError)(text)
 
