@@ -3,9 +3,9 @@
 After an event a pixel is held in reset for its refractory period, and compares with the light at the end of that, not
 with the light at the event. What changed meanwhile is never reported. A pixel that looked for the time l before it
 reported a threshold saw light of the pace 1 / l. In the refractory period between two looks the light went on at their
-mean pace, so that from event to event it changes by about the threshold times
+mean pace, so that from event to event it changes by about so many thresholds:
 
-    w = 1 + rho (1 / l + 1 / l') / 2,      l = Delta - rho,                                   (docs/equations.md, K13)
+    1 + rho (1 / l + 1 / l') / 2,      l = Delta - rho,                                       (docs/equations.md, K13)
 
 with rho the refractory period, Delta the time since the pixel's previous event and l' the look before that, if all
 three events have the same polarity; of the first two l alone tells the pace. Looks are taken to be a little longer than
