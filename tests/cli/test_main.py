@@ -193,18 +193,18 @@ def test_closed_streams_are_no_error(recording, tmp_path, closed):
     assert "complete = true" in (tmp_path / "out" / "kalux.toml").read_text()
 
 
+def info_apart(recording, variables, **options):
+    """`kalux info` in a process of its own, with some variables of the environment set."""
+    command = [sys.executable, "-m", "kalux", "info", str(recording)]
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **options}
+    return subprocess.run(command, env={**os.environ, **variables}, text=True, check=False, **streams)
+
+
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="this system has no /dev/full")
 def test_standard_output_that_is_full_is_told(recording):
-    env = {**os.environ, "PYTHONPATH": os.path.dirname(os.path.dirname(kalux.__file__))}
+    package = os.path.dirname(os.path.dirname(kalux.__file__))
     with open("/dev/full", "w") as full:
-        done = subprocess.run(
-            [sys.executable, "-m", "kalux", "info", str(recording)],
-            env=env,
-            stdout=full,
-            stderr=subprocess.PIPE,
-            text=True,
-            check=False,
-        )
+        done = info_apart(recording, {"PYTHONPATH": package}, stdout=full)
     assert done.returncode == 2
     assert done.stderr == "kalux: error: standard output: No space left on device\n"
 
@@ -216,14 +216,9 @@ def test_a_folder_for_compiled_loops_that_cannot_be_written_is_one_line(recordin
     """It was a traceback, as of a mistake in kalux, where neither that folder nor the one of kalux can be written."""
     (tmp_path / "file").write_text("not a folder")
     place = str(tmp_path / "file" / "loops")
-    done = subprocess.run(
-        [sys.executable, "-m", "kalux", "info", str(recording)],
-        # Without numba's other folders, which root can write to whatever their permissions.
-        env=dict(os.environ, NUMBA_CACHE_DIR=place, NUMBA_CACHE_LOCATOR_CLASSES="UserProvidedCacheLocator"),
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    # Without numba's other folders, which root can write to whatever their permissions.
+    only = {"NUMBA_CACHE_DIR": place, "NUMBA_CACHE_LOCATOR_CLASSES": "UserProvidedCacheLocator"}
+    done = info_apart(recording, only)
     assert done.returncode == 2
     assert done.stderr == (
         f"kalux: error: {place}: compiled loops cannot be kept: neither this folder nor that of kalux can be written; "
@@ -232,13 +227,10 @@ def test_a_folder_for_compiled_loops_that_cannot_be_written_is_one_line(recordin
 
 
 def test_no_room_for_compiled_loops_is_one_line(recording, tmp_path):
-    done = subprocess.run(
-        [sys.executable, "-m", "kalux", "info", str(recording)],
-        env=dict(os.environ, NUMBA_CACHE_DIR=str(tmp_path / "loops")),
+    done = info_apart(
+        recording,
+        {"NUMBA_CACHE_DIR": str(tmp_path / "loops")},
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000)),
-        capture_output=True,
-        text=True,
-        check=False,
     )
     assert done.returncode == 2
     assert done.stderr == (

@@ -249,7 +249,9 @@ def _intervals(
 
     What is beside an empty frame cannot be compared with it.
     """
-    most = max(asked, default=-2) + 2
+    if not asked:
+        return
+    most = max(asked) + 2
     for before, interval in enumerate(intervals(recording, camera, margin=0, most_frames=most, apart=0)):
         if before in empty and all(i in empty for i in range(before)):
             yield before, interval
@@ -345,14 +347,16 @@ def _rests(
     so long a time less is known of light that comes and goes: there only what is certain counts. A step of the gain
     against a change of the scene may leave a frame as bright as the one before.
     """
+    found: dict[int, _Rest] = {}
+    if not asked:
+        return found
     left_out = {*watch.copies, *watch.empty}
-    kept = [index for index in range(max(asked, default=-1) + 1) if index not in left_out]
+    kept = [index for index in range(max(asked) + 1) if index not in left_out]
     shown = with_frames(
         recording, lambda: (f for index, f in enumerate(recording.frames()) if index not in left_out)
     )
-    found: dict[int, _Rest] = {}
     each = intervals(shown, camera, margin=0, most_frames=len(kept), apart=0)
-    for index, interval in zip(kept[1:], each, strict=True) if asked else ():
+    for index, interval in zip(kept[1:], each, strict=True):
         rest = _rest(interval, *interval.counts(recording.sensor_size)) if index in asked else None
         if rest is not None and (rest.is_certain or index - 1 not in left_out):
             found[index] = rest
