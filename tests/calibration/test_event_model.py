@@ -76,6 +76,27 @@ def test_offsets_of_less_than_a_level_need_certainty(offset, error, allowed):
     assert allowed[0] <= found <= allowed[1]
 
 
+@pytest.mark.parametrize(("of_clear", "allowed"), [(0.02, (0.001, 0.0026)), (0.005, (0.0028, 0.0057))])
+def test_small_offsets_must_be_likelier_where_noise_lifts_no_samples(monkeypatch, of_clear, allowed):
+    """Samples are above 0.01 of white by what frames show: with noise of 0.01 many are that are darker."""
+    model = MODEL._replace(frame_noise=(0.01, 0.0))
+    samples = changes(0.001, 0.05)
+    assert samples.darkest.min() < 0.011
+
+    def gain(samples, limits, model):
+        return of_clear if samples.darkest.min() > 0.04 else 0.02
+
+    monkeypatch.setattr(event_model, "_least_gain", gain)
+    assert allowed[0] <= event_model._log_offset(samples, None, model) <= allowed[1]
+
+
+def test_the_gain_of_small_offsets_is_that_of_an_observation():
+    """However many there are; the prior counts less the more there are."""
+    many, few = (event_model._least_gain(changes(0.001, 0.05, n), None, MODEL) for n in (400_000, 40_000))
+    assert few == pytest.approx(many, abs=0.01)
+    assert few > 0.012 > event_model._least_gain(changes(0.004, 0.05), None, MODEL)
+
+
 @pytest.mark.parametrize("white", [0.25, 4.0])
 def test_the_reference_exposure_is_only_a_unit_of_samples(white):
     """Of the noise in the dark, and of what is likely."""

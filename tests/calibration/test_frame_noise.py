@@ -10,9 +10,11 @@ from scipy.optimize import nnls
 
 from kalux import EVENT_DTYPE, Frame, Recording, reconstruct
 from kalux.calibration.frame_noise import (
+    _comparable,
     _enough_frames,
     _not_negative,
     estimate_frame_noise,
+    flat_noise,
     photon_transfer,
     trimmed_variance,
     usual_noise,
@@ -181,7 +183,7 @@ def test_nothing_to_be_told():
 
 
 def test_dark_pixels_bound_the_noise_that_is_not_known():
-    """Whatever moves elsewhere; at half of white it is the usual."""
+    """Whatever moves elsewhere; at half of white it is the usual, or as much as in the dark where that is more."""
     usual, dark = CAMERA.usual_frame_noise, np.where(np.arange(200) < 100, 0.015, RAMP)
     moving = 0.1 * np.random.default_rng(6).random(RAMP.shape) * (np.arange(200) >= 100)
     read, shot, _ = usual_noise(still(dark, 0.003, 0.0, changes=moving), CAMERA)
@@ -190,8 +192,59 @@ def test_dark_pixels_bound_the_noise_that_is_not_known():
     assert usual_noise(still(dark, 1e-5, 0.0), CAMERA)[0] == pytest.approx(
         LEVEL
     )  # no less than rounding makes
-    assert usual_noise(still(dark, 0.012, 0.0), CAMERA) == (usual, 0.0, True)
-    assert usual_noise(still(RAMP + 0.02, 0.003, 0.0), CAMERA) == (usual, 0.0, False)  # nothing is dark
+    noisy = usual_noise(still(dark + 0.01, 0.009, 0.0), CAMERA)
+    assert noisy.read == pytest.approx(0.009, rel=0.15)
+    assert (noisy.shot, noisy.silent) == (0.0, True)
+    bright = usual_noise(still(RAMP + 0.05, 0.003, 0.0), CAMERA)
+    assert bright == (usual, 0.0, False)  # nothing is dark
+
+
+def all_moves(shape, noise, flat, *, frames=12):
+    """A fine texture that is another one in every frame, but for its columns up to ``flat``; all pixels have events."""
+    rng = np.random.default_rng(3)
+    made = []
+    for k in range(frames):
+        texture = np.where(np.arange(shape[1]) < flat, 0.02, rng.uniform(0.005, 0.045, shape))
+        values = np.rint(255 * (texture + noise * rng.standard_normal(shape)).clip(0, 1)).astype(np.uint8)
+        made.append(Frame(values, 40_000 * k, 40_000 * k + 10_000))
+    y, x = (i.ravel() for i in np.indices(shape))
+    t = np.arange(frames).repeat(len(x)) * 40_000 + 20_000
+    events = make_events(t, np.tile(x, frames), np.tile(y, frames), np.ones(len(t), np.int64))
+    return Recording.from_arrays(events, made, sensor_size=shape)
+
+
+@pytest.mark.parametrize("noise", [0.003, 0.009])
+def test_flat_parts_of_what_moves_tell_the_noise_of_dark_pixels(noise):
+    """A third of the image: more than the usual noise, too, while the texture changes by 0.016.
+
+    They are a tenth too high where a third is flat, since the tenth part of all from below is taken.
+    """
+    found = usual_noise(all_moves((90, 120), noise, 40), CAMERA)
+    assert 0.9 < found.read / np.hypot(noise, LEVEL) < 1.25
+    assert not found.silent
+    texture = usual_noise(all_moves((90, 120), noise, 0), CAMERA)
+    assert texture.read > 0.008  # nothing is flat: it is taken for noise
+
+
+@pytest.mark.parametrize(("flat", "least", "most"), [(0, 0.01, 0.02), (40, 0.0, 0.003)])
+def test_what_moves_unseen_is_no_noise_where_flat_parts_have_less(flat, least, most):
+    """One in four pixels has no event, nor have the four beside it, while the texture changes by 0.016."""
+    recording = all_moves((90, 120), 0.001, flat)
+    events = np.concatenate([*recording.events()])
+    some = events[(events["x"] % 2 == 0) & (events["y"] % 2 == 0)]
+    faint = Recording.from_arrays(some, [*recording.frames()], sensor_size=recording.sensor_size)
+    found = estimate_frame_noise(faint, CAMERA)
+    assert (found is None) == (flat > 0)
+    read = usual_noise(faint, CAMERA).read if found is None else found.read
+    assert least < read < most
+
+
+def test_flat_parts_do_not_tell_the_noise_of_colours():
+    """Neighbours in a mosaic have other colours."""
+    interval = next(_comparable(all_moves((90, 120), 0.004, 40), CAMERA, 2))
+    first, second = interval.first, interval.second
+    assert flat_noise(first, second) == pytest.approx(np.hypot(0.004, LEVEL), rel=0.2)
+    assert flat_noise(first._replace(pitch=2), second._replace(pitch=2)) is None
 
 
 def test_of_dark_pixels_those_without_events_bound_the_noise():

@@ -9,6 +9,7 @@ each other decides (docs/equations.md, K9).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import pairwise
 from typing import Final, NamedTuple
 
@@ -44,6 +45,9 @@ _CERTAIN: Final = (0.93, 0.012)
 with the prior, for each independent observation. Noise makes them likely where I_0 is 0.004: on 88 such scenes the gain
 is up to 0.021, with correlations of 0.86 to 0.92, and up to 0.008 with larger ones. Of six scenes with 0.001 (0.94 to
 0.98) it is 0.014 to 0.07 on four, and 0 and 0.008 on two for which it does not matter."""
+
+_CLEAR: Final = 4.0
+"""Standard deviations of the frames' noise above which they put no sample that is darker."""
 
 STEP_VARIANCES: Final = (0.07, 0.1, 0.2, 0.4)
 """Variances of an event's step that are tried with every I_0, in units of c^2. The likelihood often asks for less than
@@ -313,13 +317,7 @@ def _log_offset(samples: Samples, limits: FrameLimits | None, model: ErrorModel)
     Samples count as far as events explain the changes of frames, since noise has no information of I_0; the less they
     count, the more does the prior around the usual I_0.
     """
-    _, explained = slope_and_share(samples, model, UNKNOWN_LOG_OFFSET)
-    count = len(samples.before) * explained / _CORRELATED
-
-    def loss(log_offset: float) -> float:
-        prior = 0.5 * (np.log(log_offset / UNKNOWN_LOG_OFFSET) / _LOG_OFFSET_SPREAD) ** 2
-        return float(prior) + count * model.best_fit(samples, limits, log_offset)[0]
-
+    loss, explained, _ = _losses(samples, limits, model)
     losses = {offset: loss(offset) for offset in LOG_OFFSETS}
 
     def likeliest() -> float:
@@ -327,15 +325,49 @@ def _log_offset(samples: Samples, limits: FrameLimits | None, model: ErrorModel)
 
     correlation, gain = _CERTAIN
     if explained >= correlation and likeliest() == LOG_OFFSETS[0]:
-        smaller = {offset: loss(offset) for offset in SMALL_LOG_OFFSETS}
-        if min(smaller.values()) <= losses[LOG_OFFSETS[0]] - gain * count:
-            losses |= smaller
+        # Also of those samples that the frames' noise cannot have put above `DARKEST`.
+        clear = samples.darkest > _CLEAR * model.frame_noise[0]
+        if all(
+            _least_gain(*_chosen(samples, limits, which), model) >= gain for which in (slice(None), clear)
+        ):
+            losses |= {offset: loss(offset) for offset in SMALL_LOG_OFFSETS}
     for _ in range(2):
         offsets = sorted(losses)
         index = offsets.index(likeliest())
         between = [float(np.sqrt(a * b)) for a, b in pairwise(offsets[max(index - 1, 0) : index + 2])]
         losses |= {offset: loss(offset) for offset in between}
     return float(f"{likeliest():.2g}")
+
+
+def _losses(
+    samples: Samples, limits: FrameLimits | None, model: ErrorModel
+) -> tuple[Callable[[float], float], float, float]:
+    """The negative log-likelihood of an I_0 with its prior; how much events explain; the independent observations."""
+    _, explained = slope_and_share(samples, model, UNKNOWN_LOG_OFFSET)
+    count = len(samples.before) * explained / _CORRELATED
+
+    def loss(log_offset: float) -> float:
+        prior = 0.5 * (np.log(log_offset / UNKNOWN_LOG_OFFSET) / _LOG_OFFSET_SPREAD) ** 2
+        return float(prior) + count * model.best_fit(samples, limits, log_offset)[0]
+
+    return loss, explained, count
+
+
+def _least_gain(samples: Samples, limits: FrameLimits | None, model: ErrorModel) -> float:
+    """By how much the likeliest of `SMALL_LOG_OFFSETS` is likelier than the least of the others, an observation."""
+    if len(samples.before) < _MIN_SAMPLES:
+        return 0.0
+    loss, _, count = _losses(samples, limits, model)
+    return (loss(LOG_OFFSETS[0]) - min(loss(offset) for offset in SMALL_LOG_OFFSETS)) / max(count, 1.0)
+
+
+def _chosen(
+    samples: Samples, limits: FrameLimits | None, which: slice | NDArray[np.bool_]
+) -> tuple[Samples, FrameLimits | None]:
+    """Some of the samples, and their limits."""
+    return Samples(*(values[which] for values in samples)), (
+        None if limits is None else FrameLimits(*(limit[which] for limit in limits))
+    )
 
 
 def _frame_variance(intensity: Array, white: Array, model: ErrorModel, log_offset: float) -> Array:

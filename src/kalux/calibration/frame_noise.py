@@ -47,6 +47,22 @@ scenes is 5 to 8 % larger."""
 _DARKEST: Final = 0.01  # two to three levels of 8 bits: below, black cuts the noise off
 
 
+_FLAT: Final = 5
+"""Width of the parts of a frame by whose noise those that are flat are told, pixels."""
+
+_FLATTEST: Final = (0.1, 0.6)
+"""Share of these parts that counts as flat, and the mean square in the noisiest of them, of that of all if all are."""
+
+_DARK_PARTS: Final = (_FLAT + 2, 1.5 * _DARKEST, 4 * _DARKEST)
+"""Width of the surroundings by whose mean a part is dark, and the levels from which and up to which it is."""
+
+_LEAST_PARTS: Final = 100
+"""Dark parts of a frame that are enough: each pixel is in the middle of one."""
+
+_CONTRADICTED: Final = 1.5
+"""Noise, in units of that of the flattest parts, which these contradict: they say 0.88 to 1.05 of what there is, or
+more."""
+
 _LEAST_READ: Final = 0.5 / 65535
 """Least read noise of frames in floats, white = 1: the rounding of 16 bits, finer than any camera's."""
 
@@ -100,7 +116,8 @@ def estimate_frame_noise(
     In units of the intensity of a saturated pixel of the frames, by levels; the median over frame pairs, so that pairs
     with faint motion do not count. Read noise is no less than `common_rounding`, or that of 16 bits. None where fewer
     than two levels are seen, each by 200 pixels of a frame pair. Where noise leaves no such pixels, 50 without events
-    of their own and of the four beside are enough, if they have more noise than usual: of less, they say too little.
+    of their own and of the four beside are enough, if they have more noise than usual: of less, they say too little;
+    and if the flattest parts of single dark frames have as much (`flat_noise`).
 
     Parameters
     ----------
@@ -133,8 +150,11 @@ def estimate_frame_noise(
     found = photon_transfer(
         levels, np.maximum(variances, least**2 / 3), weights, motion=_SURROUNDINGS[chosen].moves
     )
-    if _SURROUNDINGS[chosen].moves and found.read <= camera.usual_frame_noise:
-        return None
+    if _SURROUNDINGS[chosen].moves:
+        flat = _median([flat_noise(i.first, i.second) for i in _comparable(recording, camera, _MIN_FRAMES)])
+        most = np.inf if flat is None else _CONTRADICTED * flat
+        if found.read <= camera.usual_frame_noise or found.read > most:
+            return None
     read = max(found.read, rounding, _LEAST_READ)
     return found._replace(read=read, shot=found.shot if found.shot > _LEAST_READ**2 else 0.0)
 
@@ -159,7 +179,8 @@ def usual_noise(recording: Recording, camera: CameraSettings) -> UsualNoise:
     """Read and shot noise where nothing tells them: the usual at half of white, in the dark what its pixels allow.
 
     Whatever moves, pixels change by their noise at least: from 0.01 to 0.02 of white it is no more than those do that
-    see no event, nor the four beside, or than all do where these are too few. Where nothing is still the rounding is
+    see no event, nor the four beside, or than all do where these are too few. And it is no more than in the flattest
+    parts of the dark (`flat_noise`), or than the usual where there are none. Where nothing is still the rounding is
     another one in every frame, so that its standard deviation is the least.
 
     Parameters
@@ -177,6 +198,7 @@ def usual_noise(recording: Recording, camera: CameraSettings) -> UsualNoise:
     usual, cross = camera.usual_frame_noise, _SURROUNDINGS[-1]
     of_silent: list[float] = []
     of_all: list[float] = []
+    of_flat: list[float | None] = []
     for interval in _comparable(recording, camera, _MIN_FRAMES):
         level, difference, usable, dark = _beyond_neighbours(interval.first, interval.second)
         low = usable & ~dark & (level < 2 * _DARKEST)
@@ -188,26 +210,61 @@ def usual_noise(recording: Recording, camera: CameraSettings) -> UsualNoise:
         ):
             if np.count_nonzero(chosen) >= least:
                 into.append(trimmed_variance(difference[chosen]) / 2)
-    found = of_silent or of_all
-    if not found:
-        return UsualNoise(usual, 0.0, silent=False)
-    read = _possible_read(recording, camera, float(np.sqrt(np.median(found))))
-    return UsualNoise(read, (usual**2 - read**2) / 0.5, silent=bool(of_silent))
+        of_flat.append(flat_noise(interval.first, interval.second))
+    flat, changes = _median(of_flat), of_silent or of_all
+    most = usual if flat is None else flat
+    if changes:
+        most = min(most, float(np.sqrt(np.median(changes))))
+    read = _possible_read(recording, camera, most)
+    return UsualNoise(read, _shot(read, usual), silent=bool(of_silent))
+
+
+def flat_noise(first: Shot, second: Shot) -> float | None:
+    """Standard deviation of the noise of two frames in their flattest dark parts, white = 1.
+
+    Whatever moves, pixels change by their noise at least. Of every part of 5x5 pixels, of which the mean of those
+    around is 0.015 to 0.04 of white in both frames, the mean square of what its pixels change beyond the mean of
+    their four neighbours; of these the tenth from below, which is less than the mean where all is noise. None: too
+    little is dark; frames have colours, whose neighbours have others or share their noise.
+    """
+    if first.chroma is not None or first.pitch > 1:
+        return None
+    level, difference, usable, _ = _beyond_neighbours(first, second)
+    squares = cv2.boxFilter(difference * difference, cv2.CV_64F, (_FLAT, _FLAT)) / 2
+    width, darkest, brightest = _DARK_PARTS
+    around = cv2.boxFilter(level, cv2.CV_64F, (width, width))
+    whole = cv2.erode(usable.astype(np.uint8), np.ones((_FLAT, _FLAT), np.uint8)) > 0
+    found = squares[whole & (around > darkest) & (around < brightest)]
+    if len(found) < _LEAST_PARTS:
+        return None
+    share, of_mean = _FLATTEST
+    return float(np.sqrt(np.quantile(found, share) / of_mean))
+
+
+def _median(values: list[float | None]) -> float | None:
+    """Of those that are known; None: none is."""
+    known = [value for value in values if value is not None]
+    return float(np.median(known)) if known else None
 
 
 def quiet_noise(recording: Recording, camera: CameraSettings, dark: float) -> tuple[float, float]:
-    """Read and shot noise of frames that have less than the usual noise in the dark: ``dark``, white = 1.
+    """Read and shot noise of frames that have less than was taken in the dark: ``dark``, white = 1.
 
     At half of white it is taken to be twice that, but no more than the usual: three DAVIS sensors have 1 to 1.85 times.
     """
     read = _possible_read(recording, camera, dark)
-    return read, (min(_AT_HALF * read, camera.usual_frame_noise) ** 2 - read**2) / 0.5
+    return read, _shot(read, min(_AT_HALF * read, camera.usual_frame_noise))
+
+
+def _shot(read: float, at_half: float) -> float:
+    """Shot noise with which the standard deviation at half of white is ``at_half``: none where ``read`` is more."""
+    return max(at_half**2 - read**2, 0.0) / 0.5
 
 
 def _possible_read(recording: Recording, camera: CameraSettings, dark: float) -> float:
-    """Noise in the dark: no more than the usual, and no less than the standard deviation of rounding."""
+    """Noise in the dark: no less than the standard deviation of rounding."""
     rounding = common_rounding(next(iter(recording.frames())), _response(recording, camera)) / 3**0.5
-    return min(max(dark, rounding, _LEAST_READ), camera.usual_frame_noise)
+    return max(dark, rounding, _LEAST_READ)
 
 
 def _response(recording: Recording, camera: CameraSettings) -> Response:
