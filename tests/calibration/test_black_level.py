@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -34,6 +36,34 @@ def test_a_scene_that_has_nothing_dark_has_no_black_level(least):
     assert found is not None
     assert found.floor >= 0.9 * least
     assert found.level == 0
+
+
+def exposed(source, times):
+    """The recording with frames that are exposed for ``times`` as long, one after the other, again and again."""
+    frames = []
+    for k, frame in enumerate(source.frames()):
+        longer = times[k % len(times)]
+        image = np.rint(np.minimum(frame.image * longer, 255)).astype(np.uint8)
+        end = frame.exposure_start + round(longer * (frame.exposure_end - frame.exposure_start))
+        frames.append(dataclasses.replace(frame, image=image, exposure_end=end))
+    return Recording.from_arrays(
+        np.concatenate(list(source.events())), frames, sensor_size=source.sensor_size, name="exposed"
+    )
+
+
+def test_changes_of_the_exposure_are_none_of_the_light():
+    """Those of more than a tenth from frame to frame say nothing of black."""
+    source = passing_by(np.maximum(textured(1.0) - 0.25, 0) / 2 + 0.05)
+    found = find_black_level(exposed(source, [1.0, 0.7]), SETTINGS.camera, SETTINGS.events)
+    assert found is not None
+    assert (found.level, found.samples) == (0.0, 0)
+
+
+def test_smaller_changes_of_the_exposure_are_taken_off():
+    exposures = 1.05 ** -np.arange(40.0)
+    found = find_black_level(lifted(exposed(from_black(), exposures), 16), SETTINGS.camera, SETTINGS.events)
+    assert found is not None
+    assert 255 * found.level == pytest.approx(16, abs=3)
 
 
 def test_frames_that_show_black_or_state_it_are_not_looked_at():

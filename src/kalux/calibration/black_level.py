@@ -101,10 +101,12 @@ class BlackLevel(NamedTuple):
 
 
 class _Samples(NamedTuple):
-    """Pixels that change: (N,) responses before and after, net counts of events, and parts of the image."""
+    """Pixels that change: (N,) responses before and after, log ratios of what they stand for by their exposures, net
+    counts of events, and parts of the image."""
 
     before: Array
     after: Array
+    of_exposures: Array
     net: Array
     part: NDArray[np.int64]
 
@@ -113,11 +115,12 @@ class _Samples(NamedTuple):
         before, after = (
             np.log(response.inverse((values - black) / (1.0 - black))) for values in (self.before, self.after)
         )
-        return np.asarray(after - before)
+        return np.asarray(after - before + self.of_exposures)
 
     def where(self, chosen: NDArray[np.bool_]) -> _Samples:
         """Some of them."""
-        return _Samples(self.before[chosen], self.after[chosen], self.net[chosen], self.part[chosen])
+        before, after, of_exposures, net, part = self
+        return _Samples(before[chosen], after[chosen], of_exposures[chosen], net[chosen], part[chosen])
 
 
 def with_known_black(
@@ -190,13 +193,19 @@ def _floor(recording: Recording) -> float | None:
 
 
 def _samples(recording: Recording, camera: CameraSettings, floor: float, delay: int) -> _Samples:
-    """At most 5000 of every interval between two of the first frames, spread evenly over its pixels that change."""
+    """At most 5000 of every interval between two of the first frames, spread evenly over its pixels that change.
+
+    The frames have the same exposure but for a tenth: of others a difference of responses is no change of the light.
+    """
     height, width = recording.sensor_size
     row, column = (np.arange(n) * _PARTS // n for n in (height, width))
     parts = _PARTS * row[:, None] + column
     margin = recording.longest_exposure + abs(delay)
-    found = [_Samples(np.empty(0), np.empty(0), np.empty(0), np.empty(0, np.int64))]
+    none = np.empty(0)
+    found = [_Samples(none, none, none, none, np.empty(0, np.int64))]
     for interval in intervals(recording, camera, margin=margin, most_frames=_MAX_FRAMES):
+        if not interval.has_one_exposure:
+            continue
         before, after = (end.frame.normalised() for end in interval.ends)
         low, high = np.minimum(before, after), np.maximum(before, after)
         usable = (low >= floor + _ABOVE) & (high < WELL_EXPOSED[1]) & (high - low >= _CHANGE)
@@ -206,10 +215,13 @@ def _samples(recording: Recording, camera: CameraSettings, floor: float, delay: 
         inside = between(interval.events, interval.start + delay, interval.end + delay)
         on, off = count_events(inside, recording.sensor_size)
         net = np.asarray(on, np.float64) - off
-        values = (before.ravel()[chosen], after.ravel()[chosen], net.ravel()[chosen], parts.ravel()[chosen])
-        found.append(_Samples(*values))
-    before, after, net = (np.concatenate([samples[field] for samples in found]) for field in range(3))
-    return _Samples(before, after, net, np.concatenate([samples.part for samples in found]))
+        of_exposures = np.full(len(chosen), np.log(interval.second.white / interval.first.white))
+        values = (before.ravel()[chosen], after.ravel()[chosen], of_exposures, net.ravel()[chosen])
+        found.append(_Samples(*values, parts.ravel()[chosen]))
+    before, after, of_exposures, net = (
+        np.concatenate([samples[field] for samples in found]) for field in range(4)
+    )
+    return _Samples(before, after, of_exposures, net, np.concatenate([samples.part for samples in found]))
 
 
 def _decided(samples: _Samples, response: Response, floor: float) -> BlackLevel:

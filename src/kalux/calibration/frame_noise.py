@@ -281,13 +281,8 @@ def _comparable(recording: Recording, camera: CameraSettings, most_frames: int) 
     margin = recording.longest_exposure
     for interval in intervals(recording, camera, margin=margin, most_frames=most_frames, apart=0):
         begin, end = interval.first.start, interval.second.end
-        if _has_one_exposure(interval) and not overlaps(silences, begin, end):
+        if interval.has_one_exposure and not overlaps(silences, begin, end):
             yield interval
-
-
-def _has_one_exposure(interval: Interval) -> bool:
-    """Whether the exposure times of both frames are the same but for a tenth, so that their noise is, too."""
-    return 0.9 < interval.first.white / interval.second.white < 1.1
 
 
 def _enough_frames(sensor_size: tuple[int, int]) -> int:

@@ -121,6 +121,11 @@ class Interval:
         """The middle of the exposure after, us."""
         return self.second.middle
 
+    @property
+    def has_one_exposure(self) -> bool:
+        """Whether the exposure times of both frames are the same but for a tenth, so that their noise is, too."""
+        return 0.9 < self.first.white / self.second.white < 1.1
+
     @cached_property
     def events(self) -> EventArray:
         """Those of ``chunks`` in one array."""
