@@ -17,6 +17,7 @@ from kalux.calibration.frame_noise import (
     flat_noise,
     photon_transfer,
     trimmed_variance,
+    typical_flat_noise,
     usual_noise,
 )
 from kalux.datasets import SensorSettings, demo_scene, simulate
@@ -243,8 +244,37 @@ def test_flat_parts_do_not_tell_the_noise_of_colours():
     """Neighbours in a mosaic have other colours."""
     interval = next(_comparable(all_moves((90, 120), 0.004, 40), CAMERA, 2))
     first, second = interval.first, interval.second
-    assert flat_noise(first, second) == pytest.approx(np.hypot(0.004, LEVEL), rel=0.2)
-    assert flat_noise(first._replace(pitch=2), second._replace(pitch=2)) is None
+    assert flat_noise(first, second)[0] == pytest.approx(np.hypot(0.004, LEVEL), rel=0.2)
+    assert flat_noise(first._replace(pitch=2), second._replace(pitch=2)) == [None, None, None]
+
+
+def test_flat_parts_that_black_cuts_off_do_not_count():
+    """From two standard deviations of the noise on, unless nothing is less dark."""
+    found = [[0.012, 0.016, 0.02], [0.012, 0.018, 0.022], [0.012, 0.017, 0.024]]
+    assert typical_flat_noise(found) == 0.022
+    assert typical_flat_noise([[0.007, *row[1:]] for row in found]) == 0.007
+    assert typical_flat_noise([[0.012, 0.017, None], [None, None, None]]) == 0.017
+    assert typical_flat_noise([[None, 0.004, 0.004]]) is None
+    assert typical_flat_noise([]) is None
+
+
+def test_levels_that_black_cuts_off_are_no_points_of_the_curve():
+    """Noise of 0.03 is more than the darkest level."""
+    found = estimate_frame_noise(still(RAMP, 0.03, 0.0), CAMERA)
+    assert found.read == pytest.approx(0.03, rel=0.03)
+    assert found.levels.min() > 0.05
+
+
+def test_no_change_at_all_is_no_noise():
+    """The mean squares of parts are sums that go up and down, so that rounding may leave less than nothing."""
+    rng = np.random.default_rng(4)
+    image = np.where(rng.random((60, 80)) < 0.2, 255, 6).astype(np.uint8)
+    changed = image.copy()
+    changed[:, 60:] = np.where(rng.random((60, 20)) < 0.5, 5, 9)
+    frames = [Frame((image, changed)[k % 2], 40_000 * k, 40_000 * k + 10_000) for k in range(6)]
+    recording = Recording.from_arrays(NOTHING, frames, sensor_size=image.shape)
+    interval = next(_comparable(recording, CAMERA, 2))
+    assert all(noise is None or noise >= 0.0 for noise in flat_noise(interval.first, interval.second))
 
 
 def test_of_dark_pixels_those_without_events_bound_the_noise():

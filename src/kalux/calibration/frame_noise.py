@@ -53,8 +53,14 @@ _FLAT: Final = 5
 _FLATTEST: Final = (0.1, 0.6)
 """Share of these parts that counts as flat, and the mean square in the noisiest of them, of that of all if all are."""
 
-_DARK_PARTS: Final = (_FLAT + 2, 1.5 * _DARKEST, 4 * _DARKEST)
-"""Width of the surroundings by whose mean a part is dark, and the levels from which and up to which it is."""
+_AROUND: Final = _FLAT + 2
+"""Width of the surroundings by whose mean a part is dark, pixels."""
+
+_DARK_PARTS: Final = ((0.015, 0.04), (0.03, 0.06), (0.06, 0.12))
+"""Levels from which and up to which it is: the darker, the less is beside noise that changes with the light; but from
+`_CUT` standard deviations of the noise on, or black cuts it off."""
+
+_CUT: Final = 2.0
 
 _LEAST_PARTS: Final = 100
 """Dark parts of a frame that are enough: each pixel is in the middle of one."""
@@ -147,11 +153,14 @@ def estimate_frame_noise(
     rounding = common_rounding(frame, response)
     # Noise of much less than a level shows as none, or as any.
     least = np.maximum(rounding, response.rounding(response(levels), rounding_error(frame)))
-    found = photon_transfer(
-        levels, np.maximum(variances, least**2 / 3), weights, motion=_SURROUNDINGS[chosen].moves
-    )
-    if _SURROUNDINGS[chosen].moves:
-        flat = _median([flat_noise(i.first, i.second) for i in _comparable(recording, camera, _MIN_FRAMES)])
+    moves, points_of = _SURROUNDINGS[chosen].moves, (levels, np.maximum(variances, least**2 / 3), weights)
+    found = photon_transfer(*points_of, motion=moves)
+    whole = levels >= _CUT * found.read  # where black cuts nothing off
+    if 2 <= np.count_nonzero(whole) < len(whole):
+        found = photon_transfer(*(values[whole] for values in points_of), motion=moves)
+    if moves:
+        found_flat = [flat_noise(i.first, i.second) for i in _comparable(recording, camera, _MIN_FRAMES)]
+        flat = typical_flat_noise(found_flat)
         most = np.inf if flat is None else _CONTRADICTED * flat
         if found.read <= camera.usual_frame_noise or found.read > most:
             return None
@@ -198,7 +207,7 @@ def usual_noise(recording: Recording, camera: CameraSettings) -> UsualNoise:
     usual, cross = camera.usual_frame_noise, _SURROUNDINGS[-1]
     of_silent: list[float] = []
     of_all: list[float] = []
-    of_flat: list[float | None] = []
+    of_flat: list[list[float | None]] = []
     for interval in _comparable(recording, camera, _MIN_FRAMES):
         level, difference, usable, dark = _beyond_neighbours(interval.first, interval.second)
         low = usable & ~dark & (level < 2 * _DARKEST)
@@ -211,7 +220,7 @@ def usual_noise(recording: Recording, camera: CameraSettings) -> UsualNoise:
             if np.count_nonzero(chosen) >= least:
                 into.append(trimmed_variance(difference[chosen]) / 2)
         of_flat.append(flat_noise(interval.first, interval.second))
-    flat, changes = _median(of_flat), of_silent or of_all
+    flat, changes = typical_flat_noise(of_flat), of_silent or of_all
     most = usual if flat is None else flat
     if changes:
         most = min(most, float(np.sqrt(np.median(changes))))
@@ -219,32 +228,47 @@ def usual_noise(recording: Recording, camera: CameraSettings) -> UsualNoise:
     return UsualNoise(read, _shot(read, usual), silent=bool(of_silent))
 
 
-def flat_noise(first: Shot, second: Shot) -> float | None:
-    """Standard deviation of the noise of two frames in their flattest dark parts, white = 1.
+def flat_noise(first: Shot, second: Shot) -> list[float | None]:
+    """Standard deviation of the noise of two frames in their flattest dark parts, white = 1, by how dark they are.
 
     Whatever moves, pixels change by their noise at least. Of every part of 5x5 pixels, of which the mean of those
-    around is 0.015 to 0.04 of white in both frames, the mean square of what its pixels change beyond the mean of
-    their four neighbours; of these the tenth from below, which is less than the mean where all is noise. None: too
-    little is dark; frames have colours, whose neighbours have others or share their noise.
+    around is between two levels over both frames (0.015 and 0.04, 0.03 and 0.06, 0.06 and 0.12 of white), the mean
+    square of what its pixels change beyond the mean of their four neighbours; of these the tenth from below, which is
+    less than the mean where all is noise. None: too little is so dark; frames have colours, whose neighbours have
+    others or share their noise.
     """
     if first.chroma is not None or first.pitch > 1:
-        return None
+        return [None] * len(_DARK_PARTS)
     level, difference, usable, _ = _beyond_neighbours(first, second)
     squares = cv2.boxFilter(difference * difference, cv2.CV_64F, (_FLAT, _FLAT)) / 2
-    width, darkest, brightest = _DARK_PARTS
-    around = cv2.boxFilter(level, cv2.CV_64F, (width, width))
+    around = cv2.boxFilter(level, cv2.CV_64F, (_AROUND, _AROUND))
     whole = cv2.erode(usable.astype(np.uint8), np.ones((_FLAT, _FLAT), np.uint8)) > 0
-    found = squares[whole & (around > darkest) & (around < brightest)]
-    if len(found) < _LEAST_PARTS:
-        return None
     share, of_mean = _FLATTEST
-    return float(np.sqrt(np.quantile(found, share) / of_mean))
+
+    def noise(darkest: float, brightest: float) -> float | None:
+        found = squares[whole & (around > darkest) & (around < brightest)]
+        if len(found) < _LEAST_PARTS:
+            return None
+        least = max(float(np.quantile(found, share)), 0.0)  # the filter adds and subtracts, and rounds
+        return float(np.sqrt(least / of_mean))
+
+    return [noise(*limits) for limits in _DARK_PARTS]
 
 
-def _median(values: list[float | None]) -> float | None:
-    """Of those that are known; None: none is."""
-    known = [value for value in values if value is not None]
-    return float(np.median(known)) if known else None
+def typical_flat_noise(found: list[list[float | None]]) -> float | None:
+    """The median of `flat_noise` of several pairs of frames, of the darkest parts from which black cuts nothing off.
+
+    None: no parts are of the darkest kind.
+    """
+    noise = None
+    for (darkest, _), of_parts in zip(_DARK_PARTS, zip(*found, strict=True), strict=False):
+        known = [value for value in of_parts if value is not None]
+        if not known:
+            break
+        noise = float(np.median(known))
+        if darkest >= _CUT * noise:
+            break
+    return noise
 
 
 def quiet_noise(recording: Recording, camera: CameraSettings, dark: float) -> tuple[float, float]:
