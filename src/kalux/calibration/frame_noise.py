@@ -61,6 +61,7 @@ _DARK_PARTS: Final = ((0.015, 0.04), (0.03, 0.06), (0.06, 0.12))
 `_CUT` standard deviations of the noise on, or black cuts it off."""
 
 _CUT: Final = 2.0
+"""Level, in standard deviations of the noise, below which black cuts off a part of it: from here on 2 %."""
 
 _LEAST_PARTS: Final = 100
 """Dark parts of a frame that are enough: each pixel is in the middle of one."""
@@ -123,7 +124,7 @@ def estimate_frame_noise(
     with faint motion do not count. Read noise is no less than `common_rounding`, or that of 16 bits. None where fewer
     than two levels are seen, each by 200 pixels of a frame pair. Where noise leaves no such pixels, 50 without events
     of their own and of the four beside are enough, if they have more noise than usual: of less, they say too little;
-    and if the flattest parts of single dark frames have as much (`flat_noise`).
+    and if the flattest parts of the dark do not say that it is less (`flat_noise`).
 
     Parameters
     ----------
