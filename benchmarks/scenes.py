@@ -60,10 +60,8 @@ def draw(photographs: list[Path], count: int, seed: int) -> list[Scene]:
 
 
 def _flags(rng: random.Random, k: int) -> Iterable[object]:
-    preset, motion = (
-        rng.choice(["ideal", "ideal", "davis240c", "davis346", "prophesee-vga"]),
-        rng.choice(MOTIONS),
-    )
+    preset = rng.choice(["ideal", "ideal", "davis240c", "davis346", "prophesee-vga"])
+    motion = rng.choice(MOTIONS)
     yield from ("--preset", preset, "--motion", motion, "--seed", k, "--size", "160x120", "--duration", 1.2)
     if "pan" in motion:
         yield from ("--speed", rng.choice([20, 60, 120, 250]), "--direction", rng.choice([0, 30, 90, 135]))
@@ -91,6 +89,17 @@ def _flags(rng: random.Random, k: int) -> Iterable[object]:
     ):
         if rng.random() < share:
             yield from (rng.choice(flag) if isinstance(flag, list) else flag for flag in flags)
+
+
+def claim(folder: Path, scenes: list[Scene]) -> None:
+    """Note in a folder which scenes it holds, or end where it holds others: recordings that are there are kept."""
+    listed = folder / "scenes.txt"
+    drawn = [f"{scene.photograph} {' '.join(scene.flags)}" for scene in scenes]
+    before = listed.read_text().splitlines() if listed.exists() else []
+    if before[: len(drawn)] != drawn[: len(before)]:
+        raise SystemExit(f"{folder}: has other scenes; choose another folder")
+    folder.mkdir(parents=True, exist_ok=True)
+    listed.write_text("\n".join(max(before, drawn, key=len)) + "\n")
 
 
 def simulate(scene: Scene, folder: Path) -> None:
@@ -163,19 +172,15 @@ def main() -> None:
     options = parser.parse_args()
     scenes = draw(options.photographs, options.count, options.seed)
     recordings, results = options.out / "recordings", options.out / "results"
-    recordings.mkdir(parents=True, exist_ok=True)
+    claim(options.out, scenes)
+    recordings.mkdir(exist_ok=True)
     with ThreadPoolExecutor(options.processes) as pool:
         for k, _ in enumerate(pool.map(lambda scene: simulate(scene, recordings), scenes), 1):
             print(f"\rsimulated {k}/{len(scenes)}", end="", file=sys.stderr, flush=True)
     print(file=sys.stderr)
-    command = [
-        sys.executable,
-        "-m",
-        "kalux",
-        "benchmark",
-        *(str(recordings / f"{s.name}.h5") for s in scenes),
-    ]
-    command += ["-o", str(results), "--methods", ",".join(METHODS), "--processes", str(options.processes)]
+    made = [str(recordings / f"{scene.name}.h5") for scene in scenes]
+    command = [sys.executable, "-m", "kalux", "benchmark", *made, "-o", str(results)]
+    command += ["--methods", ",".join(METHODS), "--processes", str(options.processes)]
     done = subprocess.run(command, stdout=subprocess.DEVNULL)
     if done.returncode:
         raise SystemExit("kalux benchmark failed; the same command goes on where it was")

@@ -84,6 +84,15 @@ def test_scenes_at_random_are_those_of_the_seed():
     assert [scene.name for scene in drawn[:2]] == ["000_a", "001_b"]
 
 
+def test_a_folder_with_other_scenes_is_refused(tmp_path):
+    """Their recordings would be scored as those of this run; more and fewer of the same are no others."""
+    for count in (3, 5, 2):
+        scenes.claim(tmp_path, scenes.draw([Path("a.hdr")], count, 1))
+    assert len((tmp_path / "scenes.txt").read_text().splitlines()) == 5
+    with pytest.raises(SystemExit, match="has other scenes"):
+        scenes.claim(tmp_path, scenes.draw([Path("a.hdr")], 3, 2))
+
+
 def test_what_stands_out_among_scenes_is_told():
     fine = {"mse": 0.1, "ssim": 0.9, "log_mse": 0.1, "rms_z": 1.0}
     simple = {"mse": 1.0, "ssim": 0.5, "log_mse": 1.0}

@@ -10,6 +10,7 @@ from scipy.optimize import nnls
 
 from kalux import EVENT_DTYPE, Frame, Recording, reconstruct
 from kalux.calibration.frame_noise import (
+    _beyond_neighbours,
     _comparable,
     _enough_frames,
     _not_negative,
@@ -244,8 +245,9 @@ def test_flat_parts_do_not_tell_the_noise_of_colours():
     """Neighbours in a mosaic have other colours."""
     interval = next(_comparable(all_moves((90, 120), 0.004, 40), CAMERA, 2))
     first, second = interval.first, interval.second
-    assert flat_noise(first, second)[0] == pytest.approx(np.hypot(0.004, LEVEL), rel=0.2)
-    assert flat_noise(first._replace(pitch=2), second._replace(pitch=2)) == [None, None, None]
+    assert flat_noise(_beyond_neighbours(first, second))[0] == pytest.approx(np.hypot(0.004, LEVEL), rel=0.2)
+    mosaic = _beyond_neighbours(first._replace(pitch=2), second._replace(pitch=2))
+    assert flat_noise(mosaic) == [None, None, None]
 
 
 def test_flat_parts_that_black_cuts_off_do_not_count():
@@ -274,7 +276,8 @@ def test_no_change_at_all_is_no_noise():
     frames = [Frame((image, changed)[k % 2], 40_000 * k, 40_000 * k + 10_000) for k in range(6)]
     recording = Recording.from_arrays(NOTHING, frames, sensor_size=image.shape)
     interval = next(_comparable(recording, CAMERA, 2))
-    assert all(noise is None or noise >= 0.0 for noise in flat_noise(interval.first, interval.second))
+    change = _beyond_neighbours(interval.first, interval.second)
+    assert all(noise is None or noise >= 0.0 for noise in flat_noise(change))
 
 
 def test_of_dark_pixels_those_without_events_bound_the_noise():

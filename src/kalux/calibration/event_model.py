@@ -182,12 +182,20 @@ class Samples(NamedTuple):
         mean: Array = (self.white_before + self.white_after) / 2
         return mean
 
+    def where(self, chosen: NDArray[np.bool_]) -> Samples:
+        """Some of them."""
+        return Samples(*(values[chosen] for values in self))
+
 
 class FrameLimits(NamedTuple):
     """Least and most I that the frames after can show, (N,) each; the least is 0 where black is not crushed."""
 
     least: Array
     most: Array
+
+    def where(self, chosen: NDArray[np.bool_]) -> FrameLimits:
+        """Those of some of the samples."""
+        return FrameLimits(*(limit[chosen] for limit in self))
 
 
 _LEAST_SHARE: Final = 1e-3
@@ -250,12 +258,12 @@ def estimate_event_model(
     samples, limits = _samples(recording, camera, events)
     net, darkest = np.abs(samples.on - samples.off), samples.darkest
     chosen = (net >= _LEAST_NET) & (darkest > np.maximum(limits.least / samples.white_after, DARKEST))
-    signals = Samples(*(values[chosen] for values in samples))
+    signals = samples.where(chosen)
     if len(signals.before) < _MIN_SAMPLES:
         return None
     # Frames that show the dark range over a hundred to one: what is beyond matters little, and lost events, of
     # which the model knows nothing, would count for more.
-    of_signals = FrameLimits(*(limit[chosen] for limit in limits)) if limits.least.any() else None
+    of_signals = limits.where(chosen) if limits.least.any() else None
 
     def fitted(model: ErrorModel) -> tuple[float, float]:
         log_offset = camera.log_offset or _log_offset(signals, of_signals, model)
@@ -304,7 +312,7 @@ def dark_noise(samples: Samples, model: ErrorModel, log_offset: float, step_vari
     chosen = (of_white > DARKEST) & (of_white < _DARK) & (samples.on + samples.off <= _FEW_EVENTS)
     if np.count_nonzero(chosen) < _MIN_DARK:
         return None
-    dark = Samples(*(values[chosen] for values in samples))
+    dark = samples.where(chosen)
     scale = (level[chosen] + log_offset) / dark.white
     mismatch, of_events = mismatch_of(dark, model._replace(frame_noise=(0.0, 0.0)), log_offset, step_variance)
     unexplained = trimmed_variance(mismatch * scale) - float(np.mean(of_events * scale**2))
@@ -325,11 +333,10 @@ def _log_offset(samples: Samples, limits: FrameLimits | None, model: ErrorModel)
 
     correlation, gain = _CERTAIN
     if explained >= correlation and likeliest() == LOG_OFFSETS[0]:
-        # Also of those samples that the frames' noise cannot have put above `DARKEST`.
+        # Also by those samples alone that the frames' noise cannot have put above `DARKEST`.
         clear = samples.darkest > _CLEAR * model.frame_noise[0]
-        if all(
-            _least_gain(*_chosen(samples, limits, which), model) >= gain for which in (slice(None), clear)
-        ):
+        of_clear = samples.where(clear), None if limits is None else limits.where(clear)
+        if all(_least_gain(*chosen, model) >= gain for chosen in ((samples, limits), of_clear)):
             losses |= {offset: loss(offset) for offset in SMALL_LOG_OFFSETS}
     for _ in range(2):
         offsets = sorted(losses)
@@ -359,15 +366,6 @@ def _least_gain(samples: Samples, limits: FrameLimits | None, model: ErrorModel)
         return 0.0
     loss, _, count = _losses(samples, limits, model)
     return (loss(LOG_OFFSETS[0]) - min(loss(offset) for offset in SMALL_LOG_OFFSETS)) / max(count, 1.0)
-
-
-def _chosen(
-    samples: Samples, limits: FrameLimits | None, which: slice | NDArray[np.bool_]
-) -> tuple[Samples, FrameLimits | None]:
-    """Some of the samples, and their limits."""
-    return Samples(*(values[which] for values in samples)), (
-        None if limits is None else FrameLimits(*(limit[which] for limit in limits))
-    )
 
 
 def _frame_variance(intensity: Array, white: Array, model: ErrorModel, log_offset: float) -> Array:

@@ -159,14 +159,17 @@ def estimate_frame_noise(
     whole = levels >= _CUT * found.read  # where black cuts nothing off
     if 2 <= np.count_nonzero(whole) < len(whole):
         found = photon_transfer(*(values[whole] for values in points_of), motion=moves)
-    if moves:
-        found_flat = [flat_noise(i.first, i.second) for i in _comparable(recording, camera, _MIN_FRAMES)]
-        flat = typical_flat_noise(found_flat)
-        most = np.inf if flat is None else _CONTRADICTED * flat
-        if found.read <= camera.usual_frame_noise or found.read > most:
-            return None
+    if moves and (found.read <= camera.usual_frame_noise or _contradicted(found.read, recording, camera)):
+        return None
     read = max(found.read, rounding, _LEAST_READ)
     return found._replace(read=read, shot=found.shot if found.shot > _LEAST_READ**2 else 0.0)
+
+
+def _contradicted(read: float, recording: Recording, camera: CameraSettings) -> bool:
+    """Whether flat parts of the dark have so much less noise that ``read`` is what moves."""
+    changes = (_beyond_neighbours(i.first, i.second) for i in _comparable(recording, camera, _MIN_FRAMES))
+    flat = typical_flat_noise([flat_noise(change) for change in changes])
+    return flat is not None and read > _CONTRADICTED * flat
 
 
 class UsualNoise(NamedTuple):
@@ -210,7 +213,8 @@ def usual_noise(recording: Recording, camera: CameraSettings) -> UsualNoise:
     of_all: list[float] = []
     of_flat: list[list[float | None]] = []
     for interval in _comparable(recording, camera, _MIN_FRAMES):
-        level, difference, usable, dark = _beyond_neighbours(interval.first, interval.second)
+        change = _beyond_neighbours(interval.first, interval.second)
+        level, difference, usable, dark, _ = change
         low = usable & ~dark & (level < 2 * _DARKEST)
         busy = _busy(all_between(interval.chunks, interval.first.start, interval.second.end), level.shape)
         silent = low & (cv2.dilate(busy, cross.shape) == 0)
@@ -220,7 +224,7 @@ def usual_noise(recording: Recording, camera: CameraSettings) -> UsualNoise:
         ):
             if np.count_nonzero(chosen) >= least:
                 into.append(trimmed_variance(difference[chosen]) / 2)
-        of_flat.append(flat_noise(interval.first, interval.second))
+        of_flat.append(flat_noise(change))
     flat, changes = typical_flat_noise(of_flat), of_silent or of_all
     most = usual if flat is None else flat
     if changes:
@@ -229,7 +233,7 @@ def usual_noise(recording: Recording, camera: CameraSettings) -> UsualNoise:
     return UsualNoise(read, _shot(read, usual), silent=bool(of_silent))
 
 
-def flat_noise(first: Shot, second: Shot) -> list[float | None]:
+def flat_noise(change: FrameChange) -> list[float | None]:
     """Standard deviation of the noise of two frames in their flattest dark parts, white = 1, by how dark they are.
 
     Whatever moves, pixels change by their noise at least. Of every part of 5x5 pixels, of which the mean of those
@@ -238,12 +242,11 @@ def flat_noise(first: Shot, second: Shot) -> list[float | None]:
     less than the mean where all is noise. None: too little is so dark; frames have colours, whose neighbours have
     others or share their noise.
     """
-    if first.chroma is not None or first.pitch > 1:
+    if not change.is_grey:
         return [None] * len(_DARK_PARTS)
-    level, difference, usable, _ = _beyond_neighbours(first, second)
-    squares = cv2.boxFilter(difference * difference, cv2.CV_64F, (_FLAT, _FLAT)) / 2
-    around = cv2.boxFilter(level, cv2.CV_64F, (_AROUND, _AROUND))
-    whole = cv2.erode(usable.astype(np.uint8), np.ones((_FLAT, _FLAT), np.uint8)) > 0
+    squares = cv2.boxFilter(change.beyond * change.beyond, cv2.CV_64F, (_FLAT, _FLAT)) / 2
+    around = cv2.boxFilter(change.level, cv2.CV_64F, (_AROUND, _AROUND))
+    whole = cv2.erode(change.usable.astype(np.uint8), np.ones((_FLAT, _FLAT), np.uint8)) > 0
     share, of_mean = _FLATTEST
 
     def noise(darkest: float, brightest: float) -> float | None:
@@ -355,7 +358,7 @@ def _points(recording: Recording, camera: CameraSettings, most_frames: int) -> t
     """
     found: tuple[_Points, ...] = tuple([[] for _ in range(_BINS)] for _ in _SURROUNDINGS)
     for interval in _comparable(recording, camera, most_frames):
-        level, difference, usable, dark = _beyond_neighbours(interval.first, interval.second)
+        level, difference, usable, dark, _ = _beyond_neighbours(interval.first, interval.second)
         busy = _busy(all_between(interval.chunks, interval.first.start, interval.second.end), level.shape)
         near_dark = _near(dark)
         for points, around in zip(found, _SURROUNDINGS, strict=True):
@@ -386,14 +389,34 @@ def _near(dark: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.asarray(cv2.dilate(dark.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0, np.bool_)
 
 
-def _beyond_neighbours(
-    first: Shot, second: Shot
-) -> tuple[Array, Array, NDArray[np.bool_], NDArray[np.bool_]]:
-    """(H, W): mean intensity, the part of its change that neighbours do not share, where none clips, what is too dark.
+class FrameChange(NamedTuple):
+    """By how much two frames differ, (H, W) each; white = 1.
 
-    The part has the variance of the change where that is white noise. Frames in RGB have been demosaiced, most of them
-    compressed too, so that neighbours share their noise: the whole change is taken.
+    Attributes
+    ----------
+    level
+        Mean intensity.
+    beyond
+        The part of its change that neighbours do not share. It has the variance of the change where that is white
+        noise. Frames in RGB have been demosaiced, most of them compressed too, so that neighbours share their noise:
+        the whole change is taken.
+    usable
+        Pixels in whose surroundings nothing clips, or is masked.
+    dark
+        What is too dark.
+    is_grey
+        Whether neighbours are of one colour and have a noise of their own.
     """
+
+    level: Array
+    beyond: Array
+    usable: NDArray[np.bool_]
+    dark: NDArray[np.bool_]
+    is_grey: bool
+
+
+def _beyond_neighbours(first: Shot, second: Shot) -> FrameChange:
+    """The change from one frame to another."""
     level, change = np.empty((2, *first.levels.shape))
     bad = np.empty(level.shape, np.bool_)
     _compare(*_by_level(first), *_by_level(second), level, change, bad)
@@ -407,7 +430,8 @@ def _beyond_neighbours(
     usable = ~_near(bad)
     usable[[0, -1]] = False  # of pixels at the border a neighbour counts twice
     usable[:, [0, -1]] = False
-    return level, np.asarray(beyond, np.float64), usable, dark
+    is_grey = first.chroma is None and first.pitch == 1
+    return FrameChange(level, np.asarray(beyond, np.float64), usable, dark, is_grey)
 
 
 def _by_level(shot: Shot) -> tuple[NDArray[np.integer[Any]], Array, NDArray[np.bool_]]:
