@@ -694,10 +694,18 @@ def forgotten(pixels, place, c2, q0):
         yield silent_change(pixels, place, k, c2) * missed**2 if measured and silent else 0.0
 
 
-def half_way(pixels, interval, c2, q0):
-    """K11: how far the middle between two frames is off the mean of both, in units of their mean square change."""
+def lately(values):
+    """K11: the mean of up to eight, and of more such that every new one counts an eighth."""
+    mean = 0.0
+    for n, value in enumerate(values, 1):
+        mean = mean + (value - mean) / min(n, 8)
+    return mean
+
+
+def correlated(pixels, interval, c2, q0):
+    """K11: sums of C, M and N over the pixels that are silent in this interval and the one before."""
     both, squares, noise = 0.0, 0.0, 0.0
-    for q in pixels.values() if interval > 0 else ():
+    for q in pixels.values():
         before, now = q.changes[interval - 1], q.changes[interval]
         if all(before[:2]) and all(now[:2]):
             a, b = (np.clip(change[4], -np.sqrt(c2), np.sqrt(c2)) for change in (before, now))
@@ -705,6 +713,12 @@ def half_way(pixels, interval, c2, q0):
             both += weight * (a * b + first)
             squares += weight * ((a**2 + b**2) / 2 - first - second)
             noise += weight * (first + second)
+    return np.array([both, squares, noise])
+
+
+def half_way(pixels, interval, c2, q0):
+    """K11: how far the middle between two frames is off the mean of both, in units of their mean square change."""
+    both, squares, noise = lately(correlated(pixels, k, c2, q0) for k in range(1, interval + 1)) + np.zeros(3)
     told = both * max(squares, 0) / (squares**2 + noise**2 + (25 * 0.1 * c2) ** 2)
     correlation = np.clip(told, -0.5, 1)
     return 1 / (2 * (1 + correlation)) - 1 / 4
@@ -733,7 +747,7 @@ def exposed_around(pixels, pixel, k):
     return exposed_as(pixels, start, end, min(sum(exposures) / 2 / (end - start), 1))
 
 
-def blurred(pixels, place, t, c2, camera):
+def blurred(pixels, place, t, c2, settings):
     """K11: how far the middle of the exposures around is off their mean, as no event tells."""
     pixel = pixels[place]
     middles = pixel.middles
@@ -743,19 +757,25 @@ def blurred(pixels, place, t, c2, camera):
     share = (t - middles[k]) / (middles[k + 1] - middles[k])
     exposed = exposed_around(pixels, pixel, k)
     silent = pixel.changes[k][1]
-    change = shown_change(pixels, place, k, c2, camera) if silent else 0.1 * c2
+    change = shown_change(pixels, place, k, c2, settings) if silent else 0.1 * c2
     return 0.06 * exposed**2 * change * (1 - 4 * share * (1 - share))
 
 
-def shown_change(pixels, place, interval, c2, camera):
-    """K11: the same for images: of a pixel that one of the frames shows black, no frame says that it changes little."""
-    black = any(is_crushed(pixels[place], k, camera) for k in (interval, interval + 1))
-    return 0.4 * c2 if black else silent_change(pixels, place, interval, c2)
+def shown_change(pixels, place, interval, c2, settings):
+    """K11: the same for images: what turns back within intervals changes as lately, not as in this interval.
+
+    Of a pixel that one of the frames shows black, no frame says that it changes little.
+    """
+    if any(is_crushed(pixels[place], k, settings.camera) for k in (interval, interval + 1)):
+        return 0.4 * c2
+    turning = half_way(pixels, interval, c2, settings.events.quantisation_variance * c2)
+    change = [silent_change(pixels, place, k, c2) for k in range(interval + 1)]
+    return change[-1] + min(4 * turning, 1) * (lately(change) - change[-1])
 
 
 def hidden(pixels, place, moving, t, on, off, settings):
     """K11: the variance of what no event has told, before neighbours are heard, and as it is given out."""
-    pixel, c2, camera = pixels[place], on * off, settings.camera
+    pixel, c2 = pixels[place], on * off
     middles = pixel.middles
     k = sum(m < t for m in middles) - 1
     if 0 <= k < len(middles) - 1:
@@ -766,7 +786,7 @@ def hidden(pixels, place, moving, t, on, off, settings):
         between += (1 - between) * 0.2 * exposed**2
         of_moving = 0.09 * c2 * between
         still = half_way(pixels, k, c2, settings.events.quantisation_variance * c2)
-        still *= between * shown_change(pixels, place, k, c2, camera)
+        still *= between * shown_change(pixels, place, k, c2, settings)
         used = of_moving if moving else still
         _, silent, _, frames, _ = pixel.changes[k]
         waits = silent and min(frames) < UNMEASURED and (moving or max(frames) >= UNMEASURED)
@@ -777,7 +797,7 @@ def hidden(pixels, place, moving, t, on, off, settings):
     if moving:
         return 0.09 * c2, 0.09 * c2
     gap = middles[-1] - middles[-2] if k > 0 else USUAL_INTERVAL
-    change = shown_change(pixels, place, k - 1, c2, camera) if k > 0 else 0.1 * c2
+    change = shown_change(pixels, place, k - 1, c2, settings) if k > 0 else 0.1 * c2
     changed = min(abs(t - middles[max(k, 0)]) / gap, 1) * change
     return changed, changed
 

@@ -169,7 +169,7 @@ def assert_agrees(name, events, frames, times):
             given += np.nan_to_num(doubt)
             if name.startswith("default"):
                 for place in pixels:
-                    given[place] += naive.blurred(pixels, place, t, 0.21 * 0.17, chosen.camera)
+                    given[place] += naive.blurred(pixels, place, t, 0.21 * 0.17, chosen)
             if name == "default-quiet":
                 given = naive.with_rounding(given, level, moving[i], white / 255, offset)
             # What float32 leaves of differences of variances: more than 1e-4 in one of some thousand random streams.

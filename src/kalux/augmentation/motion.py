@@ -32,7 +32,7 @@ from kalux.augmentation.along import (
 from kalux.augmentation.bridge import Latent
 from kalux.augmentation.resampling import readable
 from kalux.compiled import FUSED, ONE, empty, loop, smaller
-from kalux.formulas import Pixels, row_formula
+from kalux.formulas import Number, Pixels, row_formula
 
 Floats = NDArray[np.floating[Any]]
 Plane = NDArray[np.float32]
@@ -64,8 +64,9 @@ _STILL: Final = 0.25
 
 # The bend of the paths.
 
-_BENDS: Final = 2
-"""Steps of Gauss and Newton by which the path is bent."""
+_LOOKS: Final = (400.0, 400.0, 16.0, 4.0)
+"""Steps of Gauss and Newton by which the path is bent: the squared error, in units of its variance, at which a pixel
+counts for a quarter. Where a camera shakes all that tells of it is far off at first."""
 
 _MOST_BENT: Final = 4.0
 """Pixels that a path is bent by at most, half-way."""
@@ -77,7 +78,14 @@ _ALIKE: Final = np.float32(1.0 / 20.0)
 """Of the pixels of a tile so many tell something of their own, since errors of neighbours are alike."""
 
 _BEND_INFORMATION: Final = np.float32(1.0)
-"""1 / pixel^2: what is known of a bend beforehand."""
+"""1 / pixel^2: what is known beforehand of the bend of all that moves together."""
+
+_COMMON: Final = np.float32(32.0)
+"""1 / pixel^2: what is known of a tile's bend once that one is, since it is most often the camera that moves."""
+
+_SILENT: Final = 1.0
+"""Variance, in c^2, that the level of a pixel without events has more in the fit: it stays where it is while what it
+shows changes by less than a threshold."""
 
 _ACCELERATION: Final = 500.0
 """pixels/s^2, in either direction: of what moves, by which its path bends, as far as the image does not tell by how
@@ -85,9 +93,6 @@ much (docs/equations.md, K16)."""
 
 _LEAST_TOLD: Final = np.float32(1e-6)
 """1 / pixel^2, added where nothing may be told: a division."""
-
-_OUTLIER: Final = np.float32(4.0)
-"""Squared error, in units of its variance, at which a pixel counts for a quarter."""
 
 _BEHIND: Final = 0.08
 """Time by which an image half-way is behind the light, in units of the s of K14: so much is left of how events trail it
@@ -183,6 +188,8 @@ class HalfWay(NamedTuple):
         c^2.
     interval
         Time from one frame to the other, s.
+    events
+        (H, W) between both frames.
     """
 
     level: Floats
@@ -190,6 +197,7 @@ class HalfWay(NamedTuple):
     behind: float
     threshold2: float
     interval: float
+    events: Floats
 
 
 def behind(scale: float, interval: float) -> float:
@@ -227,7 +235,8 @@ def bent(first: Latent, second: Latent, path: Plane, image: HalfWay) -> Motion |
     """The paths between two frames, bent to the image half-way.
 
     What moves need not go straight on, nor at one pace. The bend of a tile, 4 points of the grid wide, is the one by
-    which the frames explain the image best: two steps of Gauss and Newton, of overlapping tiles.
+    which the frames explain the image best, near that of all that moves: steps of Gauss and Newton, of overlapping
+    tiles.
 
     Parameters
     ----------
@@ -255,13 +264,16 @@ def bent(first: Latent, second: Latent, path: Plane, image: HalfWay) -> Motion |
     rows, columns = (part.stop - part.start for part in window)
     bend = np.zeros((2, -(-rows // cell), -(-columns // cell)), np.float32)
     whole = cell * bend.shape[2], cell * bend.shape[1]
+    of_cells = cv2.resize(moving[window].astype(np.float32), bend.shape[:0:-1], interpolation=cv2.INTER_AREA)
+    common = np.where(of_cells > 0.5, np.float32(1.0), np.float32(0.0))
+    unsignalled = np.where(image.events[window] > 0, np.float32(0.0), np.float32(_SILENT * image.threshold2))
+    known = level[window], variance[window] + unsignalled
 
     def fill(plane: Plane, of_cells: Plane) -> None:
         plane[window] = cv2.resize(of_cells, whole, interpolation=cv2.INTER_LINEAR)[:rows, :columns]
 
-    for _ in range(_BENDS):
-        seen = seen_along(shown, window)
-        bend, told = _bent_further(bend, *seen, level[window], variance[window], cell)
+    for outlier in _LOOKS:
+        bend, told = _bent_further(bend, *seen_along(shown, window), *known, cell, common, outlier)
         for plane, of_cells in zip(bends, bend, strict=True):
             fill(plane, of_cells)
     left = variance.copy()
@@ -317,31 +329,51 @@ def unknown_bend(told: Plane, interval: float) -> Plane:
 
 
 def _bent_further(
-    bend: Plane, seen: Plane, doubt: Plane, level: Plane, variance: Plane, cell: int
+    bend: Plane,
+    seen: Plane,
+    doubt: Plane,
+    level: Plane,
+    variance: Plane,
+    cell: int,
+    common: Plane,
+    outlier: float,
 ) -> tuple[Plane, Plane]:
     """A step of Gauss and Newton: what is seen is shifted, tile by tile, so that its error becomes least.
 
-    ``bend`` is that of every cell of ``cell`` x ``cell`` pixels. Also returned is what the image tells of it, as
-    `unknown_bend` takes it.
+    ``bend`` is that of every cell of ``cell`` x ``cell`` pixels, ``common`` 1 where it is near that of all cells, and 0
+    where near none. Also returned is what the image tells of it, as `unknown_bend` takes it.
     """
     sums = np.zeros((5, *bend.shape[1:]), np.float32)
     _sum_cells(
         *(np.ascontiguousarray(plane).reshape(-1) for plane in (seen, doubt, level, variance)),
         (np.uint64(seen.shape[0]), np.uint64(seen.shape[1])),
         np.uint64(cell),
+        np.float32(outlier),
         sums.reshape(-1),
     )
-    xx, yy, xy, x, y = (np.float32(_CELLS**2) * mean_around(part, (_CELLS, _CELLS)) for part in sums)
-    told = np.stack([xx, yy, xy])
-    xx, yy = xx + _BEND_INFORMATION, yy + _BEND_INFORMATION
-    x, y = x - _BEND_INFORMATION * bend[0], y - _BEND_INFORMATION * bend[1]
-    step = np.stack([yy * x - xy * y, xx * y - xy * x]) / (xx * yy - xy * xy)
-    further: Plane = np.clip(bend + step, -_MOST_BENT, _MOST_BENT)
-    return further, told
+    of_all = _least_squares(*_about_zero(sums, bend).sum(axis=(1, 2)), _BEND_INFORMATION)
+    near = of_all[:, None, None] * common
+    tiles = np.stack([np.float32(_CELLS**2) * mean_around(part, (_CELLS, _CELLS)) for part in sums])
+    xx, yy, xy, x, y = _about_zero(tiles, bend)
+    further = _least_squares(xx, yy, xy, x + _COMMON * near[0], y + _COMMON * near[1], _COMMON)
+    return np.clip(further, -_MOST_BENT, _MOST_BENT), tiles[:3]
+
+
+def _about_zero(sums: Plane, bend: Plane) -> Plane:
+    """Sums of `_sum_cells` of which the last two belong to what is left beyond ``bend``: the same of the whole bend."""
+    xx, yy, xy, x, y = sums
+    across, down = bend
+    return np.stack([xx, yy, xy, x + xx * across + xy * down, y + xy * across + yy * down])
+
+
+def _least_squares(xx: Plane, yy: Plane, xy: Plane, x: Plane, y: Plane, information: np.float32) -> Plane:
+    """(2, ...): the bend by sums of `_about_zero` and ``information`` that is known beforehand, 1 / pixel^2."""
+    xx, yy = xx + information, yy + information
+    return np.stack([yy * x - xy * y, xx * y - xy * x]) / (xx * yy - xy * xy)
 
 
 @loop(fastmath=FUSED)
-def _sum_cells(seen, doubt, level, variance, shape, cell, sums):  # type: ignore[no-untyped-def]
+def _sum_cells(seen, doubt, level, variance, shape, cell, outlier, sums):  # type: ignore[no-untyped-def]
     """Add up, cell by cell, the weighted products of slopes across and down, and of slopes with the error.
 
     ``sums`` are those of all cells, one product after the other.
@@ -365,7 +397,7 @@ def _sum_cells(seen, doubt, level, variance, shape, cell, sums):  # type: ignore
         # fmt: off
         _multiply(
             count, products, xx, products, yy, products, xy, products, x, products, y,
-            smooth, FIRST, steep, FIRST, seen, at, doubt, at, level, at, variance, at,
+            smooth, FIRST, steep, FIRST, seen, at, doubt, at, level, at, variance, at, outlier,
         )
         # fmt: on
         for part in range(np.uint64(5)):
@@ -396,12 +428,13 @@ def _multiply(
     doubt: Pixels,
     level: Pixels,
     variance: Pixels,
+    outlier: Number,
 ) -> None:
     """Of weighted slopes, and with the error, at every pixel of a row."""
     across = (smooth[1] - smooth[-1]) * np.float32(1 / 8)
     down = (steep[-1] + np.float32(2.0) * steep[0] + steep[1]) * np.float32(1 / 8)
     error, doubted = level[0] - seen[0], variance[0] + doubt[0]
-    outlying = ONE + error * error / (_OUTLIER * doubted)
+    outlying = ONE + error * error / (outlier * doubted)
     weight = _ALIKE / (doubted * (outlying * outlying))
     weighted_x, weighted_y = weight * across, weight * down
     xx[0], yy[0], xy[0] = weighted_x * across, weighted_y * down, weighted_x * down

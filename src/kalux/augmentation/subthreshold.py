@@ -5,7 +5,7 @@ For the variance of images (docs/equations.md, K11).
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -26,6 +26,14 @@ frame is then that of a moving pixel, as on the same scenes."""
 
 _LEAST_INFORMATION: Final = 25.0
 """Least information from which the change of the whole image is estimated, in pixels without noise."""
+
+_LATEST: Final = 8
+"""Intervals over which is averaged how silent pixels change: two of them, at 10 or 20 frames/s of a camera that shakes,
+may be unlike the next ones."""
+
+_TURNING: Final = 4.0
+"""Units of `half_way` by which less of this interval's change counts, and more of that of the latest: a random walk, at
+1/4, is the first whose middle does not depend on where it ends."""
 
 _BLOCK: Final = 64
 """Pixels in a block: few enough that intermediate values stay in the first-level cache."""
@@ -90,13 +98,26 @@ def _pairs(on, off):  # type: ignore[no-untyped-def]
     return pairs, active
 
 
-def half_way(
-    before: Array, segment: BridgedSegment, quantisation_variance: float, threshold2: float
-) -> tuple[float, Array]:
-    """Variance of silent pixels half-way between two frames about the mean of both, from this interval and the last.
+class Correlation(NamedTuple):
+    """Sums over pixels that are silent in two successive intervals (docs/equations.md, K11).
 
-    If the changes of successive intervals are correlated, intensities move along straight lines; if they are
-    anti-correlated, they have reversed within the intervals, too. One correlation is taken for the whole image.
+    Attributes
+    ----------
+    products, squares
+        Of their changes by the frames, both less what the frames' noise makes of them.
+    noise
+        What the frames' noise makes of the squares.
+    """
+
+    products: float
+    squares: float
+    noise: float
+
+
+def correlation(
+    before: Array, segment: BridgedSegment, quantisation_variance: float, threshold2: float
+) -> tuple[Correlation, Array]:
+    """How the changes of silent pixels go together in this interval and the last.
 
     Parameters
     ----------
@@ -111,8 +132,7 @@ def half_way(
 
     Returns
     -------
-    The variance in units of the mean square change from one frame to the next, 0 to 3/4; and (H, W) the changes, as
-    ``before`` is for the interval after.
+    The sums; and (H, W) the changes, as ``before`` is for the interval after.
     """
     assert segment.events is not None
     change = np.empty_like(before)
@@ -125,14 +145,74 @@ def half_way(
         segment.events,
         change,
     )
-    both, squares, noise = _correlation_sums(
+    sums = _correlation_sums(
         seconds, q0, np.float32(threshold2**0.5), *(plane.reshape(-1) for plane in planes)
     )
+    return Correlation(*sums), change
+
+
+def half_way(told: Correlation, threshold2: float) -> float:
+    """Variance of silent pixels half-way between two frames about the mean of both, 0 to 3/4.
+
+    It is in units of the mean square change from one frame to the next. If the changes of successive intervals are
+    correlated, intensities move along straight lines; if they are anti-correlated, they have reversed within the
+    intervals, too. One correlation is taken for the whole image.
+
+    Parameters
+    ----------
+    told
+        From `correlation`.
+    threshold2
+        c^2.
+    """
+    both, squares, noise = told
     usual = _LEAST_INFORMATION * UNKNOWN_CHANGE * threshold2
     # Shrunk towards 0 where changes are less than the noise, whose variance is an estimate.
     goes_on = both * max(squares, 0.0) / (squares**2 + noise**2 + usual**2)
-    goes_on = min(max(goes_on, -0.5), 1.0)
-    return 0.5 / (1.0 + goes_on) - 0.25, change
+    return 0.5 / (1.0 + min(max(goes_on, -0.5), 1.0)) - 0.25
+
+
+class Usual(NamedTuple):
+    """What the latest intervals tell of silent pixels: means over up to `_LATEST`, then with as much of each new one.
+
+    Attributes
+    ----------
+    intervals, pairs
+        How many intervals, and pairs of successive ones, are in the means; `_LATEST` at most.
+    change
+        (H, W): `silent_change`.
+    told
+        `correlation`.
+    """
+
+    intervals: int
+    pairs: int
+    change: Array
+    told: Correlation
+
+    def with_interval(self, change: Array, told: Correlation, *, has_pair: bool) -> Usual:
+        """With one more interval; the first has no one before it (``has_pair`` is false)."""
+        intervals = min(self.intervals + 1, _LATEST)
+        pairs = min(self.pairs + has_pair, _LATEST)
+        mean = self.change + (change - self.change) * np.float32(1.0 / intervals)
+        if not has_pair:
+            return Usual(intervals, pairs, mean, self.told)
+        sums = (old + (new - old) / pairs for old, new in zip(self.told, told, strict=True))
+        return Usual(intervals, pairs, mean, Correlation(*sums))
+
+    def mixed(self, change: Array, half_way: float) -> Array:
+        """(H, W) the mean square change that `half_way` is in units of, given that of this interval.
+
+        How far a light that goes straight on is off the middle depends on how far it goes now. How far one is off that
+        turns back does not depend on where the two frames happen to find it.
+        """
+        share = np.float32(min(_TURNING * half_way, 1.0))
+        return change + share * (self.change - change)
+
+
+def nothing_usual(shape: tuple[int, int]) -> Usual:
+    """What is told by no interval."""
+    return Usual(0, 0, np.zeros(shape, np.float32), Correlation(0.0, 0.0, 0.0))
 
 
 @loop

@@ -17,7 +17,7 @@ from kalux.augmentation.background import doubt, signal_shares
 from kalux.augmentation.bridge import BridgeNoise, Latent, bridge, drift, nominal_thresholds
 from kalux.augmentation.highlights import Unshown
 from kalux.augmentation.motion import HalfWay, Paths
-from kalux.augmentation.subthreshold import add_missed_change, half_way, silent_change, turns
+from kalux.augmentation.subthreshold import add_missed_change, correlation, silent_change, turns
 from kalux.augmentation.trail import Trail, nothing_followed, polarity_of, trail_between
 from kalux.cli.loops import prepare_loops
 from kalux.compiled import apart
@@ -78,7 +78,7 @@ def rehearse_images() -> None:
     make_image(estimate, view, with_variance=False)
     even, known = np.zeros(_SIZE, np.float32), np.ones(_SIZE, np.float32)
     frame, aside = Latent(even, known), np.ones((2, *_SIZE), np.float32)
-    paths = Paths(frame, frame, aside, HalfWay(even, known, 0.0, 0.1, 0.04))
+    paths = Paths(frame, frame, aside, HalfWay(even, known, 0.0, 0.1, 0.04, known))
     moving = dataclasses.replace(estimate, log_intensity=even, variance=known, paths=paths, share=0.5)
     make_image(moving, view)
 
@@ -107,7 +107,7 @@ def rehearse_segment() -> None:
     signal = signal_shares(on, off, 0.1)
     joined, _ = bridge(first, second, (on, off), thresholds, noise, 0, _PERIOD, grown=grown, signal=signal)
     of_silent = silent_change(joined, variance, variance)
-    half_way(change, joined, variance, variance)
+    correlation(change, joined, variance, variance)
     drifted, _, _ = drift(first, second, thresholds, noise, (far_on, far_off), (on, off))
     add_missed_change(drifted, joined, second, (on, off), of_silent, variance)
     turns(on, off)

@@ -24,8 +24,11 @@ from kalux.augmentation.motion import HalfWay, Paths, Plane, behind, find_path
 from kalux.augmentation.subthreshold import (
     UNKNOWN_CHANGE,
     UNMEASURED_CHANGE,
+    Usual,
     add_missed_change,
+    correlation,
     half_way,
+    nothing_usual,
     silent_change,
     turns,
 )
@@ -99,7 +102,9 @@ class BridgeMemory(NamedTuple):
     silent_change
         (H, W) mean square change of the silent pixels around each (K11).
     latest_change
-        (H, W) change of silent pixels in the latest interval, NaN of others (`subthreshold.half_way`).
+        (H, W) change of silent pixels in the latest interval, NaN of others (`subthreshold.correlation`).
+    usual
+        What the latest intervals tell of silent pixels.
     """
 
     latent: Latent
@@ -114,6 +119,7 @@ class BridgeMemory(NamedTuple):
     tail: Tail
     silent_change: Floats
     latest_change: Floats
+    usual: Usual
 
 
 class BridgedFrames(Method):
@@ -251,6 +257,7 @@ class BridgedFrames(Method):
             tail=tail,
             silent_change=np.full(self.shape, UNKNOWN_CHANGE * self._threshold2, np.float32),
             latest_change=np.full(self.shape, np.nan, np.float32),
+            usual=nothing_usual(self.shape),
         )
         lead_in, value, variance = None, latent.value, latent.variance
         if not self.lookahead:
@@ -327,11 +334,13 @@ class BridgedFrames(Method):
         if signal is not None:
             joined = joined._replace(doubt=doubt(signal, self.noise.step_variance, self._threshold2))
         change = self._silent_change(joined)
-        share, latest_change = half_way(
+        told, latest_change = correlation(
             memory.latest_change, joined, self.noise.quantisation_variance, self._threshold2
         )
+        usual = memory.usual.with_interval(change, told, has_pair=memory.usual.intervals > 0)
+        share = half_way(usual.told, self._threshold2)
         joined, since_measured = self._with_drift(joined, memory, second, (on, off), change, signal)
-        change = self._with_black_change(change, memory.latent, second)
+        change = self._with_black_change(usual.mixed(change, share), memory.latent, second)
         assert joined.net is not None
         unshown = self._follow_unshown(memory, second, following, joined.net)
         after = memory._replace(
@@ -344,6 +353,7 @@ class BridgedFrames(Method):
             unshown=unshown,
             silent_change=change,
             latest_change=latest_change,
+            usual=usual,
         )
         joined = joined._replace(
             trail=trail,
@@ -567,9 +577,10 @@ class BridgedFrames(Method):
     def paths(self, segment: BridgedSegment, path: Plane, level: Floats, variance: Floats) -> Paths:
         assert segment.latents is not None
         assert segment.trail is not None
+        assert segment.events is not None
         interval = segment.end - segment.start
         late = behind(1e6 * segment.trail.scale, interval)
-        image = HalfWay(level, variance, late, self._threshold2, 1e-6 * interval)
+        image = HalfWay(level, variance, late, self._threshold2, 1e-6 * interval, segment.events)
         return Paths(*segment.latents, path, image)
 
     def turns(self, segment: BridgedSegment) -> float:
