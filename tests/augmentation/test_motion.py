@@ -16,6 +16,7 @@ from kalux.settings import altered
 from textures import SHAPE, frame_of, texture, whole
 
 INSIDE = (slice(16, -16), slice(16, -16))
+EVENTS = np.ones(SHAPE, np.float32)
 
 
 @pytest.mark.parametrize(("x", "y"), [(3.0, 0.0), (-1.5, 4.0), (6.0, -5.0), (0.0, 0.5)])
@@ -49,7 +50,7 @@ def test_the_path_is_bent_to_the_image_half_way(late):
     first, second = frame_of(texture(0)), frame_of(texture(0, 4.0))
     level, variance = texture(0, 2.0 + late), np.full(SHAPE, 1e-3, np.float32)
     motion = bent(
-        first, second, find_path(first, second, -3.5, 1.0), HalfWay(level, variance, 0.0, 0.04, 0.04)
+        first, second, find_path(first, second, -3.5, 1.0), HalfWay(level, variance, 0.0, 0.04, 0.04, EVENTS)
     )
     np.testing.assert_allclose(np.median(motion.bend[0][INSIDE]), -late, atol=0.1)
     np.testing.assert_allclose(np.median(motion.bend[1][INSIDE]), 0.0, atol=0.05)
@@ -65,11 +66,48 @@ def test_an_image_that_is_behind_the_light_bends_no_path():
     first, second = frame_of(texture(0)), frame_of(texture(0, 8.0))
     level, variance = texture(0, 3.6), np.full(SHAPE, 1e-3, np.float32)
     path = find_path(first, second, -3.5, 1.0)
-    motion = bent(first, second, path, HalfWay(level, variance, 0.05, 0.04, 0.04))
+    motion = bent(first, second, path, HalfWay(level, variance, 0.05, 0.04, 0.04, EVENTS))
     np.testing.assert_allclose(np.median(motion.bend[0][INSIDE]), 0.0, atol=0.05)
     noisy = level + np.random.default_rng(1).normal(0, 0.1, SHAPE).astype(np.float32)
     joined, _ = whole(Along(motion, 0.5), noisy, np.full(SHAPE, 0.03, np.float32))
     assert np.sqrt(np.mean(np.square(joined - texture(0, 4.0))[INSIDE])) < 0.06
+
+
+@pytest.mark.parametrize("far", [(2.5, 0.0), (-2.0, 2.5)])
+def test_a_camera_that_shakes_bends_the_path_by_more_than_its_length(far):
+    """Silent pixels say that half-way there is the mean of both frames; those with events know better."""
+    x, y = far
+    first, second = frame_of(texture(0)), frame_of(texture(0, 1.0))
+    level, variance = texture(0, 0.5 + x, y), np.full(SHAPE, 1e-3, np.float32)
+    mean = (first.value + second.value) / 2
+    events = (np.abs(level - mean) > 0.2).astype(np.float32)
+    assert 0.2 < events.mean() < 0.8
+    known = np.where(events > 0, level, mean)
+    path = find_path(first, second, -3.5, 1.0)
+    motion = bent(first, second, path, HalfWay(known, variance, 0.0, 0.04, 0.04, events))
+    np.testing.assert_allclose(np.median(motion.bend[0][INSIDE]), -x, atol=0.25)
+    np.testing.assert_allclose(np.median(motion.bend[1][INSIDE]), -y, atol=0.25)
+
+
+def test_where_no_event_comes_the_path_is_bent_as_elsewhere_and_what_stands_still_is_not():
+    """The image moves, but for its right third, which is faint; only the left third tells by how much half-way."""
+    left, right = np.s_[:, : SHAPE[1] // 3], np.s_[:, -SHAPE[1] // 3 :]
+    still, moved = texture(0), texture(0, 4.0)
+    still[right] *= np.float32(0.02)
+    moved[right] = still[right]
+    first = frame_of(still)
+    second = frame_of(moved)
+    level, variance = (first.value + moved) / 2, np.full(SHAPE, 1e-3, np.float32)
+    level[left] = texture(0, 3.0)[left]
+    events = np.zeros(SHAPE, np.float32)
+    events[left] = 1.0
+    path = find_path(first, second, -3.5, 1.0)
+    motion = bent(first, second, path, HalfWay(level, variance, 0.0, 0.04, 0.04, events))
+    middle = np.s_[16:-16, SHAPE[1] // 2 - 4 : SHAPE[1] // 2 + 4]
+    assert np.median(motion.bend[0][left]) == pytest.approx(-1.0, abs=0.15)
+    assert np.median(motion.bend[0][middle]) < -0.5
+    beside = np.s_[:, 2 * SHAPE[1] // 3 + 4 : 2 * SHAPE[1] // 3 + 12]
+    assert np.abs(motion.bend[0][beside]).max() < 0.25
 
 
 def test_what_is_not_known_of_a_bend():
@@ -93,7 +131,7 @@ def test_a_wrong_path_is_not_believed():
     first, second = frame_of(texture(0)), frame_of(texture(1))
     level, variance = texture(2), np.full(SHAPE, 1e-3, np.float32)
     path = find_path(first, second, -3.5, 1.0)
-    motion = bent(first, second, path, HalfWay(level, variance, 0.0, 0.04, 0.04))
+    motion = bent(first, second, path, HalfWay(level, variance, 0.0, 0.04, 0.04, EVENTS))
     if motion is not None:
         joined, _ = whole(Along(motion, 0.5), level, variance)
         assert np.sqrt(np.mean(np.square(joined - level))) < 0.01

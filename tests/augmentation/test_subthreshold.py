@@ -8,7 +8,16 @@ import numpy as np
 import pytest
 
 from kalux.augmentation.bridge import UNMEASURED, BridgeNoise, Latent, bridge, nominal_thresholds
-from kalux.augmentation.subthreshold import UNKNOWN_CHANGE, add_missed_change, half_way, silent_change, turns
+from kalux.augmentation.subthreshold import (
+    UNKNOWN_CHANGE,
+    Correlation,
+    add_missed_change,
+    correlation,
+    half_way,
+    nothing_usual,
+    silent_change,
+    turns,
+)
 
 SHAPE = (40, 60)
 C2 = 0.04
@@ -43,12 +52,13 @@ def changes(change, **frames):
 
 
 def off_the_mean(*levels, variance=1e-8, on=None):
-    """`half_way` between the last two frames that show these levels."""
-    found, before = None, np.full(SHAPE, np.nan, np.float32)
-    for first, second in itertools.pairwise(levels):
+    """`half_way` between the last two frames that show these levels, by all of them."""
+    usual, before = nothing_usual(SHAPE), np.full(SHAPE, np.nan, np.float32)
+    for number, (first, second) in enumerate(itertools.pairwise(levels)):
         segment = joined(second - first, variance=variance, on=on)
-        found, before = half_way(before, segment, NOISE.quantisation_variance, C2)
-    return found
+        told, before = correlation(before, segment, NOISE.quantisation_variance, C2)
+        usual = usual.with_interval(usual.change, told, has_pair=number > 0)
+    return half_way(usual.told, C2)
 
 
 def forgotten(variance, change, on, after=None):
@@ -157,6 +167,34 @@ def test_what_is_not_known_to_go_on_goes_at_random():
     assert off_the_mean(0 * one, one) == 0.25  # no interval before
     assert off_the_mean(0 * one, one, 2 * one, on=np.ones(SHAPE, np.float32)) == 0.25  # no pixel is silent
     assert off_the_mean(*3 * [two]) == pytest.approx(0.25, abs=1e-3)  # nothing moves
+
+
+def test_one_interval_that_is_unlike_the_others_does_not_tell_the_next():
+    """Light that turns back all the time, but for one pair of intervals in which it went straight on."""
+    rng = np.random.default_rng(6)
+    shaken = list(0.05 * rng.standard_normal((8, *SHAPE)))
+    onward = [*shaken, 2 * shaken[-1] - shaken[-2]]
+    assert off_the_mean(*onward[-3:]) == pytest.approx(0.0, abs=0.02)
+    assert off_the_mean(*shaken) == pytest.approx(0.75, abs=0.05)
+    assert off_the_mean(*onward) > 0.3
+
+
+def test_what_is_usual_is_the_mean_of_eight_intervals_and_then_forgets():
+    usual, nothing = nothing_usual(SHAPE), Correlation(0.0, 0.0, 0.0)
+    for number in range(8):
+        usual = usual.with_interval(np.full(SHAPE, number, np.float32), nothing, has_pair=number > 0)
+    np.testing.assert_allclose(usual.change, 3.5, rtol=1e-6)
+    told = Correlation(8.0, 16.0, 24.0)
+    usual = usual.with_interval(np.full(SHAPE, 11.5, np.float32), told, has_pair=True)
+    np.testing.assert_allclose(usual.change, 4.5, rtol=1e-6)
+    assert usual.told == pytest.approx((1.0, 2.0, 3.0))  # the first interval had no one before it: eight pairs
+
+
+def test_what_goes_straight_on_changes_as_now_and_what_turns_back_as_lately():
+    now, lately = np.full(SHAPE, 0.01, np.float32), np.full(SHAPE, 0.03, np.float32)
+    usual = nothing_usual(SHAPE).with_interval(lately, Correlation(0.0, 0.0, 0.0), has_pair=False)
+    for off, expected in ((0.0, 0.01), (0.125, 0.02), (0.25, 0.03), (0.75, 0.03)):
+        np.testing.assert_allclose(usual.mixed(now, off), expected, rtol=1e-5)
 
 
 def test_light_turns_where_events_of_both_signs_come():
