@@ -68,6 +68,9 @@ _LOOKS: Final = (400.0, 400.0, 16.0, 4.0)
 """Steps of Gauss and Newton by which the path is bent: the squared error, in units of its variance, at which a pixel
 counts for a quarter. Where a camera shakes all that tells of it is far off at first."""
 
+_SETTLED: Final = 0.5
+"""Pixels by which a step changes the bend at most anywhere for the last step to come at once."""
+
 _MOST_BENT: Final = 4.0
 """Pixels that a path is bent by at most, half-way."""
 
@@ -272,8 +275,12 @@ def bent(first: Latent, second: Latent, path: Plane, image: HalfWay) -> Motion |
     def fill(plane: Plane, of_cells: Plane) -> None:
         plane[window] = cv2.resize(of_cells, whole, interpolation=cv2.INTER_LINEAR)[:rows, :columns]
 
+    settled = False
     for outlier in _LOOKS:
-        bend, told = _bent_further(bend, *seen_along(shown, window), *known, cell, common, outlier)
+        if settled and outlier != _LOOKS[-1]:
+            continue
+        further, told = _bent_further(bend, *seen_along(shown, window), *known, cell, common, outlier)
+        settled, bend = float(np.abs(further - bend).max()) < _SETTLED, further
         for plane, of_cells in zip(bends, bend, strict=True):
             fill(plane, of_cells)
     left = variance.copy()
