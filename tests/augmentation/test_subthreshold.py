@@ -187,7 +187,9 @@ def test_what_is_usual_is_the_mean_of_eight_intervals_and_then_forgets():
     told = Correlation(8.0, 16.0, 24.0)
     usual = usual.with_interval(np.full(SHAPE, 11.5, np.float32), told, has_pair=True)
     np.testing.assert_allclose(usual.change, 4.5, rtol=1e-6)
-    assert usual.told == pytest.approx((1.0, 2.0, 3.0))  # the first interval had no one before it: eight pairs
+    assert usual.told == pytest.approx(
+        (1.0, 2.0, 3.0)
+    )  # the first interval had no one before it: eight pairs
 
 
 def test_what_goes_straight_on_changes_as_now_and_what_turns_back_as_lately():

@@ -267,10 +267,9 @@ def bent(first: Latent, second: Latent, path: Plane, image: HalfWay) -> Motion |
     rows, columns = (part.stop - part.start for part in window)
     bend = np.zeros((2, -(-rows // cell), -(-columns // cell)), np.float32)
     whole = cell * bend.shape[2], cell * bend.shape[1]
-    of_cells = cv2.resize(moving[window].astype(np.float32), bend.shape[:0:-1], interpolation=cv2.INTER_AREA)
-    common = np.where(of_cells > 0.5, np.float32(1.0), np.float32(0.0))
-    unsignalled = np.where(image.events[window] > 0, np.float32(0.0), np.float32(_SILENT * image.threshold2))
-    known = level[window], variance[window] + unsignalled
+    common = _mostly(moving[window], bend.shape[1:])
+    silent = np.where(image.events[window] > 0, np.float32(0.0), np.float32(_SILENT * image.threshold2))
+    known = level[window], variance[window] + silent
 
     def fill(plane: Plane, of_cells: Plane) -> None:
         plane[window] = cv2.resize(of_cells, whole, interpolation=cv2.INTER_LINEAR)[:rows, :columns]
@@ -291,6 +290,13 @@ def bent(first: Latent, second: Latent, path: Plane, image: HalfWay) -> Motion |
         return None
     fill(unsure, unknown_bend(told, image.interval))  # only now, as it changes nothing of the image
     return dataclasses.replace(motion, windows=windows)
+
+
+def _mostly(places: NDArray[np.bool_], cells: tuple[int, ...]) -> Plane:
+    """1 in cells of which most are true, and 0 in others; ``cells`` are their rows and columns."""
+    rows, columns = cells
+    share = cv2.resize(places.astype(np.float32), (columns, rows), interpolation=cv2.INTER_AREA)
+    return np.where(share > 0.5, np.float32(1.0), np.float32(0.0))
 
 
 def _around(places: NDArray[np.bool_], margin: int) -> Window:
@@ -358,25 +364,27 @@ def _bent_further(
         np.float32(outlier),
         sums.reshape(-1),
     )
-    of_all = _least_squares(*_about_zero(sums, bend).sum(axis=(1, 2)), _BEND_INFORMATION)
-    near = of_all[:, None, None] * common
+    of_all = _least_squares(_of_whole_bend(sums, bend).sum(axis=(1, 2)), _BEND_INFORMATION)
     tiles = np.stack([np.float32(_CELLS**2) * mean_around(part, (_CELLS, _CELLS)) for part in sums])
-    xx, yy, xy, x, y = _about_zero(tiles, bend)
-    further = _least_squares(xx, yy, xy, x + _COMMON * near[0], y + _COMMON * near[1], _COMMON)
-    return np.clip(further, -_MOST_BENT, _MOST_BENT), tiles[:3]
+    near_that = _of_whole_bend(tiles, bend)
+    near_that[3:] += _COMMON * of_all[:, None, None] * common
+    further: Plane = np.clip(_least_squares(near_that, _COMMON), -_MOST_BENT, _MOST_BENT)
+    return further, tiles[:3]
 
 
-def _about_zero(sums: Plane, bend: Plane) -> Plane:
-    """Sums of `_sum_cells` of which the last two belong to what is left beyond ``bend``: the same of the whole bend."""
+def _of_whole_bend(sums: Plane, bend: Plane) -> Plane:
+    """(5, ...) sums of `_sum_cells`, whose last two are of what is left beyond ``bend``: of all of it instead."""
     xx, yy, xy, x, y = sums
     across, down = bend
     return np.stack([xx, yy, xy, x + xx * across + xy * down, y + xy * across + yy * down])
 
 
-def _least_squares(xx: Plane, yy: Plane, xy: Plane, x: Plane, y: Plane, information: np.float32) -> Plane:
-    """(2, ...): the bend by sums of `_about_zero` and ``information`` that is known beforehand, 1 / pixel^2."""
+def _least_squares(sums: Plane, information: np.float32) -> Plane:
+    """(2, ...): the bend by sums of `_of_whole_bend`, and ``information`` that is known beforehand, 1 / pixel^2."""
+    xx, yy, xy, x, y = sums
     xx, yy = xx + information, yy + information
-    return np.stack([yy * x - xy * y, xx * y - xy * x]) / (xx * yy - xy * xy)
+    solved: Plane = np.stack([yy * x - xy * y, xx * y - xy * x]) / (xx * yy - xy * xy)
+    return solved
 
 
 @loop(fastmath=FUSED)
