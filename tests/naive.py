@@ -1072,7 +1072,7 @@ def joined_along(first, second, path, bend, unsure, share, level, variance, c2):
     rows = wide[:-2] + wide[1:-1] + wide[2:]
     across, down = (rows[:, 2:] - rows[:, :-2]) / 6, (wide[2:, 1:-1] - wide[:-2, 1:-1]) / 2
     strayed = (4 * share * (1 - share)) ** 2 * unsure * (across**2 + down**2)
-    trust = (1.5 - 0.5 * 4 * share * (1 - share)) / ((doubt + strayed) * (1 + 0.7 * contradiction) ** 2)
+    trust = (1.5 - 0.5 * 4 * share * (1 - share)) / ((doubt + strayed) * (1 + 0.4 * contradiction) ** 2)
     return (level / variance + seen * believed) / (1 / variance + believed), 1 / (1 / variance + trust)
 
 

@@ -55,7 +55,7 @@ _CONTRADICTED: Final = np.float32(4.0)
 """How steeply less is believed of what an image contradicts, per mean squared difference, in units of its variance,
 beyond 1."""
 
-_DISTRUST: Final = np.float32(0.7)
+_DISTRUST: Final = np.float32(0.4)
 """How much less the variance falls where the filter contradicts, per such difference: what looks right is not always,
 so that it tells less of its own error than it is worth (docs/equations.md, K16)."""
 
