@@ -54,10 +54,10 @@ def changes(change, **frames):
 def off_the_mean(*levels, variance=1e-8, on=None):
     """`half_way` between the last two frames that show these levels, by all of them."""
     usual, before = nothing_usual(SHAPE), np.full(SHAPE, np.nan, np.float32)
-    for number, (first, second) in enumerate(itertools.pairwise(levels)):
+    for first, second in itertools.pairwise(levels):
         segment = joined(second - first, variance=variance, on=on)
         told, before = correlation(before, segment, NOISE.quantisation_variance, C2)
-        usual = usual.with_interval(usual.change, told, has_pair=number > 0)
+        usual = usual.with_interval(usual.change, told)
     return half_way(usual.told, C2)
 
 
@@ -182,10 +182,10 @@ def test_one_interval_that_is_unlike_the_others_does_not_tell_the_next():
 def test_what_is_usual_is_the_mean_of_eight_intervals_and_then_forgets():
     usual, nothing = nothing_usual(SHAPE), Correlation(0.0, 0.0, 0.0)
     for number in range(8):
-        usual = usual.with_interval(np.full(SHAPE, number, np.float32), nothing, has_pair=number > 0)
+        usual = usual.with_interval(np.full(SHAPE, number, np.float32), nothing)
     np.testing.assert_allclose(usual.change, 3.5, rtol=1e-6)
     told = Correlation(8.0, 16.0, 24.0)
-    usual = usual.with_interval(np.full(SHAPE, 11.5, np.float32), told, has_pair=True)
+    usual = usual.with_interval(np.full(SHAPE, 11.5, np.float32), told)
     np.testing.assert_allclose(usual.change, 4.5, rtol=1e-6)
     assert usual.told == pytest.approx(
         (1.0, 2.0, 3.0)
@@ -194,7 +194,7 @@ def test_what_is_usual_is_the_mean_of_eight_intervals_and_then_forgets():
 
 def test_what_goes_straight_on_changes_as_now_and_what_turns_back_as_lately():
     now, lately = np.full(SHAPE, 0.01, np.float32), np.full(SHAPE, 0.03, np.float32)
-    usual = nothing_usual(SHAPE).with_interval(lately, Correlation(0.0, 0.0, 0.0), has_pair=False)
+    usual = nothing_usual(SHAPE).with_interval(lately, Correlation(0.0, 0.0, 0.0))
     for off, expected in ((0.0, 0.01), (0.125, 0.02), (0.25, 0.03), (0.75, 0.03)):
         np.testing.assert_allclose(usual.mixed(now, off), expected, rtol=1e-5)
 

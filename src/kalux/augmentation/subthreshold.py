@@ -190,13 +190,12 @@ class Usual(NamedTuple):
     change: Array
     told: Correlation
 
-    def with_interval(self, change: Array, told: Correlation, *, has_pair: bool) -> Usual:
-        """With one more interval; the first has no one before it (``has_pair`` is false)."""
-        intervals = min(self.intervals + 1, _LATEST)
-        pairs = min(self.pairs + has_pair, _LATEST)
+    def with_interval(self, change: Array, told: Correlation) -> Usual:
+        """With one more interval. The first is no pair: ``told`` says nothing then."""
+        if self.intervals == 0:
+            return Usual(1, 0, change, self.told)
+        intervals, pairs = (min(number + 1, _LATEST) for number in (self.intervals, self.pairs))
         mean = self.change + (change - self.change) * np.float32(1.0 / intervals)
-        if not has_pair:
-            return Usual(intervals, pairs, mean, self.told)
         sums = (old + (new - old) / pairs for old, new in zip(self.told, told, strict=True))
         return Usual(intervals, pairs, mean, Correlation(*sums))
 

@@ -337,7 +337,7 @@ class BridgedFrames(Method):
         told, latest_change = correlation(
             memory.latest_change, joined, self.noise.quantisation_variance, self._threshold2
         )
-        usual = memory.usual.with_interval(change, told, has_pair=memory.usual.intervals > 0)
+        usual = memory.usual.with_interval(change, told)
         share = half_way(usual.told, self._threshold2)
         joined, since_measured = self._with_drift(joined, memory, second, (on, off), change, signal)
         change = self._with_black_change(usual.mixed(change, share), memory.latent, second)
