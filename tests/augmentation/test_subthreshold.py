@@ -189,7 +189,7 @@ def test_what_is_usual_is_the_mean_of_eight_intervals_and_then_forgets():
     np.testing.assert_allclose(usual.change, 4.5, rtol=1e-6)
     assert usual.told == pytest.approx(
         (1.0, 2.0, 3.0)
-    )  # the first interval had no one before it: eight pairs
+    )  # of eight pairs: the first interval had none before it
 
 
 def test_what_goes_straight_on_changes_as_now_and_what_turns_back_as_lately():

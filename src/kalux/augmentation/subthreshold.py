@@ -177,8 +177,8 @@ class Usual(NamedTuple):
 
     Attributes
     ----------
-    intervals, pairs
-        How many intervals, and pairs of successive ones, are in the means; `_LATEST` at most.
+    intervals
+        How many there were.
     change
         (H, W): `silent_change`.
     told
@@ -186,18 +186,17 @@ class Usual(NamedTuple):
     """
 
     intervals: int
-    pairs: int
     change: Array
     told: Correlation
 
     def with_interval(self, change: Array, told: Correlation) -> Usual:
         """With one more interval. The first is no pair: ``told`` says nothing then."""
         if self.intervals == 0:
-            return Usual(1, 0, change, self.told)
-        intervals, pairs = (min(number + 1, _LATEST) for number in (self.intervals, self.pairs))
-        mean = self.change + (change - self.change) * np.float32(1.0 / intervals)
-        sums = (old + (new - old) / pairs for old, new in zip(self.told, told, strict=True))
-        return Usual(intervals, pairs, mean, Correlation(*sums))
+            return Usual(1, change, self.told)
+        pairs = self.intervals
+        mean = self.change + (change - self.change) * np.float32(1.0 / min(pairs + 1, _LATEST))
+        sums = (old + (new - old) / min(pairs, _LATEST) for old, new in zip(self.told, told, strict=True))
+        return Usual(pairs + 1, mean, Correlation(*sums))
 
     def mixed(self, change: Array, half_way: float) -> Array:
         """(H, W) the mean square change that `half_way` is in units of, given that of this interval.
@@ -211,7 +210,7 @@ class Usual(NamedTuple):
 
 def nothing_usual(shape: tuple[int, int]) -> Usual:
     """What is told by no interval."""
-    return Usual(0, 0, np.zeros(shape, np.float32), Correlation(0.0, 0.0, 0.0))
+    return Usual(0, np.zeros(shape, np.float32), Correlation(0.0, 0.0, 0.0))
 
 
 @loop
