@@ -304,13 +304,17 @@ def trail_scales(every, settings):
 
 
 def trail(pixel, t, scale, height, on, off):
-    """K14: how far the pixel is beyond its newest event."""
+    """K14: how far the pixel is beyond its newest event, as far as that is signal."""
     earlier = [(q, p) for q, p, *_ in pixel.events if q <= t]
     if not earlier:
         return 0.0
     newest, polarity = earlier[-1]
+    signal = 1.0
+    for k, of_interval in enumerate(pixel.signal):
+        if pixel.middles[k] < newest <= pixel.middles[k + 1]:
+            signal = np.floor(127 * of_interval[0 if polarity else 1] + 0.5) / 127
     x = (t - newest) * US / scale
-    return height * (on if polarity else -off) * 2 * x / (1 + x * x)
+    return signal * height * (on if polarity else -off) * 2 * x / (1 + x * x)
 
 
 def hides(camera):
@@ -595,11 +599,20 @@ def signal_shares(every, k, settings):
             ]
             n = sum((3 - distance) * count for distance, count in around)
             near[polarity, (row, column)] = n if n < 4 else int(2 * np.log2(n))
+    unmeasured = {place: pixel.clipped[k] and pixel.clipped[k + 1] for place, pixel in every.items()}
     for (polarity, place), a in own.items():
-        alike = [own[other] for other, n in near.items() if n == near[polarity, place]]
+        alike = [
+            (own[other], unmeasured[other[1]]) for other, n in near.items() if n == near[polarity, place]
+        ]
+        same = [number for number, clipped in alike if clipped == unmeasured[place]]
+        all_of_them = [4 + sum(number == b for number, _ in alike) for b in range(6)]
         noise = 0.0
         for b in range(1, a + 1):
-            fewer, as_many = (4 + alike.count(number) for number in (b - 1, b))
+            fewer, as_many = (
+                same.count(number)
+                + (200 * all_of_them[number] / sum(all_of_them) if unmeasured[place] else 4)
+                for number in (b - 1, min(b, 5))
+            )
             one = min(m / b * (fewer / as_many if b < 6 else 1.0), 1.0)
             noise = one if b == 1 or b >= 6 else min(noise, one)
         shares[polarity, place] = 1 - noise

@@ -124,9 +124,9 @@ def test_the_backward_filter_is_told_what_the_forward_one_knows(tmp_path, delay,
     broken = np.zeros(SIZE, bool)
     broken[2, 3] = hot
     settings = plan(source, rate_hz=10, settings=altered(PRESETS["default"], "events", delay=delay)).settings
-    trails = Trails(Spill(source, tmp_path), settings, broken if hot else None)
-    events = np.concatenate(list(source.events()))
     engine = Reconstructor(SIZE, settings=settings)
+    trails = Trails(Spill(source, tmp_path), settings, broken if hot else None, engine.measures)
+    events = np.concatenate(list(source.events()))
     frames = list(source.frames())
     for frame in frames:
         engine.push_frame(frame)

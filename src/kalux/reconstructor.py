@@ -222,6 +222,11 @@ class Reconstructor:
         self._last_frame = frame
         self._frame_count += 1
 
+    def measures(self, frame: Frame) -> NDArray[np.bool_]:
+        """(H, W): pixels that a frame, pushed or not, measures: neither saturated nor masked."""
+        frame = with_black_level(frame, self.settings.camera.black_level)
+        return take_shot(frame, self._camera, frame.exposure, self._gains_of(frame)).measured
+
     def _gains_of(self, frame: Frame) -> Gains:
         """The white balance, which grey frames do not need."""
         if frame.colours == "grey":

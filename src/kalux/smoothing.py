@@ -25,11 +25,13 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.augmentation.background import signal_shares
 from kalux.augmentation.bridge import REPEATED, UNMEASURED
-from kalux.augmentation.trail import FrameTrail, follow, nothing_followed, trail_at
+from kalux.augmentation.trail import FrameTrail, follow, nothing_followed, trail_at, with_surety
 from kalux.event_slices import counted
 from kalux.filters.highlights import obey_bounds, smoothed_unshown
 from kalux.filters.uncertainty import Around
+from kalux.frames import Frame
 from kalux.images import Estimate
 from kalux.models.pixels import PixelCalibration
 from kalux.reconstructor import Reconstructor
@@ -58,6 +60,9 @@ class Trails:
         Of the forward filter, with its thresholds and its delay.
     hot
         (H, W) bool: pixels whose events are left out; None: none.
+    measures
+        Which pixels, (H, W) bool, a frame measures (`Reconstructor.measures`): the forward filter tells noise from
+        signal by it (K5). None: it does not look ahead, and takes all events for signal here.
     on_events
         Told the number of events of every block that has been followed.
     """
@@ -67,9 +72,12 @@ class Trails:
         spill: Spill,
         settings: Settings,
         hot: NDArray[np.bool_] | None,
+        measures: Callable[[Frame], NDArray[np.bool_]] | None,
         on_events: Callable[[int], None] | None = None,
     ) -> None:
         events = settings.events
+        rate = None if measures is None else events.noise_rate
+        measured = np.zeros(spill.sensor_size, np.bool_)
         on, off = events.thresholds
         self._spill = spill
         self._heights = events.trail * on, events.trail * off
@@ -81,8 +89,16 @@ class Trails:
             chunks = spill.events_between(start + delay, end + delay, hot)
             if on_events is not None:
                 chunks = counted(chunks, on_events)
-            _, _, followed = follow(chunks, followed, start + delay, end + delay)
-            spill.save_newest_events(index, followed.newest - 2 * delay)
+            before = followed
+            on_events_of, off_events_of, followed = follow(chunks, before, start + delay, end + delay)
+            if rate is not None and measures is not None:
+                latest = measures(spill.reversed_frame(len(spill) - 1 - index))
+                if index > 0:
+                    counts = on_events_of, off_events_of
+                    shares = signal_shares(*counts, rate * (end - start) * 1e-6, ~(measured | latest))
+                    followed = with_surety(before, followed, shares)
+                measured = latest
+            spill.save_newest_events(index, followed.newest - 2 * delay, followed.surety)
             self._scales.append(followed.scale)
             start = end
 
@@ -182,7 +198,8 @@ class Backward:
     ) -> None:
         height, width = recording.sensor_size
         self._spill = Spill(recording, folder, engine.settings.events.refractory, on_events)
-        self._trails = None if trail is None else Trails(self._spill, *trail, on_events)
+        measures = engine.measures if engine.lookahead else None
+        self._trails = None if trail is None else Trails(self._spill, *trail, measures, on_events)
         times = times[times <= self._spill.end]
         window = max(1, _WINDOW_BYTES // (16 * height * width))
         self._windows = [times[i : i + window] for i in range(0, len(times), window)]

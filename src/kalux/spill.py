@@ -160,15 +160,21 @@ class Spill:
         return self._frames[index].middle
 
     def events_between(self, start: int, end: int, without: NDArray[np.bool_] | None) -> Iterator[EventArray]:
-        """The events with ``start`` < t <= ``end`` (us), in blocks, without those of some pixels, (H, W) bool."""
+        """The events with ``start`` < t <= ``end`` (us), in blocks, without those of some pixels, (H, W) bool.
+
+        They carry their weights.
+        """
         if self.count == 0:
             return
         inside = between(np.memmap(self._events, EVENT_DTYPE, "r"), start, end)
         for first in range(0, len(inside), _BLOCK_EVENTS):
-            events = np.array(inside[first : first + _BLOCK_EVENTS])
-            yield events if without is None else events[~without[events["y"], events["x"]]]
+            events = inside[first : first + _BLOCK_EVENTS]
+            words = event_words(events).copy()  # NumPy does not copy what lies between the fields
+            if without is not None:
+                words = words[~without[events["y"], events["x"]]]
+            yield words.reshape(-1).view(EVENT_DTYPE)
 
-    def save_newest_events(self, index: int, newest: NDArray[np.int64]) -> None:
+    def save_newest_events(self, index: int, newest: NDArray[np.int64], surety: NDArray[np.int8]) -> None:
         """Keep the pixels' newest events at the middle of a frame, (H, W) as in `kalux.augmentation.trail.Followed`.
 
         Raises
@@ -177,15 +183,15 @@ class Spill:
             The disk is full.
         """
         with spilling(self._folder):
-            np.save(self._newest_path(index), newest)
+            np.savez(self._newest_path(index), newest=newest, surety=surety)
 
-    def newest_events(self, index: int) -> NDArray[np.int64]:
+    def newest_events(self, index: int) -> tuple[NDArray[np.int64], NDArray[np.int8]]:
         """What `save_newest_events` has kept of a frame."""
-        newest: NDArray[np.int64] = np.load(self._newest_path(index))
-        return newest
+        with np.load(self._newest_path(index)) as kept:
+            return kept["newest"], kept["surety"]
 
     def _newest_path(self, index: int) -> Path:
-        return self._folder / f"newest_{index:06d}.npy"
+        return self._folder / f"newest_{index:06d}.npz"
 
     def _frame_path(self, index: int) -> Path:
         return self._folder / f"frame_{index:06d}.npy"

@@ -44,10 +44,25 @@ def test_the_newest_event_and_its_polarity_are_remembered():
     _, _, after = trail.follow([events], before, -100, 0)
     assert after.newest[0, 1] >> 1 == -20
     assert after.newest[2, 2] >> 1 == -10
-    polarity = trail.polarity_of(after.newest)
-    assert polarity[0, 1] == -1
-    assert polarity[2, 2] == 1
-    assert np.count_nonzero(polarity) == 2
+    signed = trail.signed_surety(after.events)
+    assert signed[0, 1] == -trail.SURE
+    assert signed[2, 2] == trail.SURE
+    assert np.count_nonzero(signed) == 2
+
+
+def test_an_event_is_as_sure_as_its_neighbours_say_until_the_next_one():
+    before = trail.nothing_followed(SHAPE)
+    first, then = (np.full(SHAPE, share, np.float32) for share in (0.5, 0.25))
+    events = make_events([10, 20, 30], [1, 1, 2], [0, 0, 2], [1, 0, 1])
+    _, _, after = trail.follow([events], before, 0, 100)
+    known = trail.with_surety(before, after, (first, then))
+    signed = trail.signed_surety(known.events)
+    assert signed[0, 1] == -round(0.25 * trail.SURE)
+    assert signed[2, 2] == round(0.5 * trail.SURE)
+    _, _, later = trail.follow([make_events([110], [2], [2], [0])], known, 100, 200)
+    again = trail.with_surety(known, later, (np.ones_like(first), np.zeros_like(first)))
+    assert again.surety[0, 1] == known.surety[0, 1]  # no newer event
+    assert again.surety[2, 2] == 0
 
 
 def test_the_scale_is_that_of_the_intervals_between_events_of_one_polarity():
@@ -66,13 +81,16 @@ def test_the_scale_is_that_of_the_intervals_between_events_of_one_polarity():
 
 
 def test_a_pixel_goes_on_and_comes_back():
-    newest = np.array([[2 * 1_000 + 1, 2 * 1_000, trail.NO_EVENT]])
+    code = np.array([[2 * 1_000 + 1, 2 * 1_000, trail.NO_EVENT, 2 * 1_000 + 1]])
+    newest = code, np.array([[trail.SURE, trail.SURE, trail.SURE, trail.SURE // 2]], np.int8)
     ages = np.array([0, 3_000, 10_000, 30_000, 1_000_000])
     f = np.array([trail.trail_at(newest, 1_000 + age, (0.01, 0.1, 0.2))[0] for age in ages])
     x = ages / 10_000
     np.testing.assert_allclose(f[:, 0], 0.1 * 2 * x / (1 + x * x), atol=1e-7)
     np.testing.assert_allclose(f[:, 1], -2 * f[:, 0], atol=1e-7)
     np.testing.assert_allclose(f[:, 2], 0, atol=1e-7)
+    # Half as likely, half as far.
+    np.testing.assert_allclose(f[:, 3], 63 / 127 * f[:, 0], atol=1e-7)
 
 
 @pytest.mark.parametrize("lookahead", [True, False])

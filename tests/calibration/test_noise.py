@@ -88,6 +88,21 @@ def test_noise_beside_motion_is_not_much_overestimated():
     assert 2.7 < found.rate < 5.0
 
 
+def test_faint_edges_that_pass_slowly_are_no_noise():
+    """At 25 pixels/s, where neighbours in a row have the same edge 40 ms later, and those in a column 15 ms apart."""
+    rng = np.random.default_rng(3)
+    y, x, edge = (i.ravel() for i in np.indices((*SIZE, 40)))
+    begin = rng.uniform(-4.0, 2.0, 40)
+    t = ((begin[edge] + x / 25.0) * 1e6 + rng.normal(0.0, 15_000.0, len(x))).astype(np.int64)
+    inside = (t > 0) & (t < 2_000_000)
+    edges = make_events(t[inside], x[inside], y[inside], rng.integers(0, 2, int(inside.sum())))
+    both = np.concatenate([edges, noise_events(0.5, seconds=2.0)])
+    recording = Recording.from_arrays(both[np.argsort(both["t"], kind="stable")], [], sensor_size=SIZE)
+    found = event_noise(recording)
+    assert event_noise(recording, enough=np.inf).rate > 1.5 * found.rate  # after the first look
+    assert found.rate == pytest.approx(0.5, rel=0.3)
+
+
 def test_a_time_in_which_events_are_lost_is_not_quiet():
     """It would be the quietest of all, and the rate none."""
     whole = unlabelled(simulate(SCENE, SensorSettings(noise_rate=3.0)))

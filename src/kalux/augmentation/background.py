@@ -7,7 +7,8 @@ its own have, then of a events the share
     (m / a) p(a - 1) / p(a)
 
 is noise, where m is expected of it (Robbins 1956: nothing is assumed of the signal). p is counted in the image itself:
-where neighbours are silent, most pixels with one event have it from noise; where they are not, few have none.
+where neighbours are silent, most pixels with one event have it from noise; where they are not, few have none. Pixels
+that no frame around measures are counted by themselves: nothing else says of a clipped sky that nothing moves there.
 """
 
 from __future__ import annotations
@@ -37,13 +38,19 @@ _CLASSES: Final = 25
 """Of the neighbours' events."""
 
 _CELLS: Final = _CLASSES * (_MOST + 1)
-"""Of pixels with like events of their own and of their neighbours."""
+"""Of pixels with like events of their own and of their neighbours; there are as many of hidden pixels."""
 
 _PRIOR_PIXELS: Final = 4.0
 """Pixels by which every number is as likely as the next, beside those counted: a class with few says little."""
 
+_PRIOR_OF_HIDDEN: Final = 200.0
+"""Pixels as which the distribution of all pixels counts in every class of hidden ones. With 20, noisy skies just above
+white gain a tenth more, but textures in large windows lose up to 4 % (docs/equations.md, K5)."""
 
-def signal_shares(on: Floats, off: Floats, expected: float) -> tuple[Floats, Floats]:
+
+def signal_shares(
+    on: Floats, off: Floats, expected: float, hidden: NDArray[np.bool_]
+) -> tuple[Floats, Floats]:
     """Probability that an event of a pixel is signal, of on and of off events: (H, W) float32 each.
 
     Parameters
@@ -52,17 +59,22 @@ def signal_shares(on: Floats, off: Floats, expected: float) -> tuple[Floats, Flo
         (H, W) events of each polarity in an interval (sums of their weights, K13).
     expected
         Noise events of a pixel in that time, of both polarities.
+    hidden
+        (H, W): pixels that neither frame around measures.
     """
     counts = tuple(np.rint(events).astype(np.float32) for events in (on, off))
-    cells = tuple(np.empty(on.size, np.uint8) for _ in counts)
-    found = np.zeros((2, _CELLS), np.int64)
+    cells = tuple(np.empty(on.size, np.uint16) for _ in counts)
+    found = np.zeros((2, 2 * _CELLS), np.int64)
     for own, cell in zip(counts, cells, strict=True):
-        _classify(own.reshape(-1), _around(own).reshape(-1), cell)
+        _classify(own.reshape(-1), _around(own).reshape(-1), hidden.reshape(-1), cell)
         _count(cell, found)
-    pixels = found.sum(axis=0).reshape(_CLASSES, _MOST + 1)[:, :_MOST] + _PRIOR_PIXELS
+    shown, of_hidden = found.sum(axis=0).reshape(2, _CLASSES, _MOST + 1)[..., :_MOST]
+    of_all = shown + of_hidden + _PRIOR_PIXELS
+    usual = of_all / of_all.sum(axis=1, keepdims=True)
+    pixels = np.concatenate([shown + _PRIOR_PIXELS, of_hidden + _PRIOR_OF_HIDDEN * usual])
     own_events = np.arange(1, _MOST)
     noise = np.minimum(expected / 2.0 / own_events * pixels[:, :-1] / pixels[:, 1:], 1.0)
-    signal = np.ones((_CLASSES, _MOST + 1), np.float32)  # also of no event
+    signal = np.ones((2 * _CLASSES, _MOST + 1), np.float32)  # also of no event
     signal[:, 1:-1] = 1.0 - np.minimum.accumulate(noise, axis=1)  # no less for more events
     shares = apart(2, on.shape)
     for own, cell, share in zip(counts, cells, shares, strict=True):
@@ -90,8 +102,8 @@ def _around(counts: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 @loop
-def _classify(own, near, cells):  # type: ignore[no-untyped-def]
-    """The cell of every pixel: the class of its neighbours' events n, and its own, up to `_MOST`.
+def _classify(own, near, hidden, cells):  # type: ignore[no-untyped-def]
+    """The cell of every pixel: the class of its neighbours' events n, and its own, up to `_MOST`; hidden ones after.
 
     Half octaves are the exponent of n^2, which is exact in float32.
     """
@@ -100,7 +112,8 @@ def _classify(own, near, cells):  # type: ignore[no-untyped-def]
         n = smaller(near[i], largest)
         half_octave = np.int32(_exponent(n * n))
         of_near = np.int32(n) if n < np.float32(_EXACT) else half_octave
-        cells[i] = np.uint8(of_near * np.int32(_MOST + 1) + np.int32(smaller(own[i], most)))
+        shown = of_near * np.int32(_MOST + 1) + np.int32(smaller(own[i], most))
+        cells[i] = np.uint16(shown + np.int32(hidden[i]) * np.int32(_CELLS))
 
 
 @formula(types.int32)

@@ -195,6 +195,8 @@ class BridgedSegment(NamedTuple):
         By how much the variance of an on and of an off event's step is more than a sure event's
         (`kalux.augmentation.background`); the steps are then those that are expected. None: every event is weighed by
         the age of those around it.
+    signal
+        Probability that an on and that an off event is signal, as far as K14 asks for it; None: all are.
     """
 
     start: int
@@ -221,6 +223,7 @@ class BridgedSegment(NamedTuple):
     latents: tuple[Latent, Latent] | None = None
     brightest: float = 1.0
     doubt: tuple[Array, Array] | None = None
+    signal: tuple[Array, Array] | None = None
 
 
 def drift(

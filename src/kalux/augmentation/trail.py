@@ -5,8 +5,9 @@ newest event a pixel is on average
 
     f(a) = h c 2 x / (1 + x^2),   x = a / s,
 
-beyond the level of that event, in its direction (c: on or off threshold; docs/equations.md, K14). The time s follows
-the recording: 1.1 times the mean interval between two events of one polarity at a pixel.
+beyond the level of that event, in its direction (c: on or off threshold; docs/equations.md, K14), times the probability
+that the event is signal. The time s follows the recording: 1.1 times the mean interval between two events of one
+polarity at a pixel.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from kalux.compiled import (
     event_weight,
     event_words,
     flat,
+    inner,
     loop,
     prefetch,
     smaller,
@@ -40,6 +42,9 @@ FloatArray = NDArray[np.float32]
 
 NO_EVENT: Final = -(1 << 62)
 """Code of a pixel that has had no event."""
+
+SURE: Final = 127
+"""Surety of an event that is signal for sure; of others it is as much less as they are less likely."""
 
 FOLLOWED_PIXEL: Final = np.dtype([("newest", "i8"), ("off", "f4"), ("on", "f4")], align=True)
 """What is counted of a pixel, in one line of memory: code of its newest event, weights of off and of on events."""
@@ -54,8 +59,14 @@ LONGEST: Final = 100_000
 USUAL: Final = 10_000
 """us: mean interval that is taken before there are any; the middle of those recordings."""
 
+_OF_SURE: Final = np.float32(1.0 / SURE)
+
 _USUAL_WEIGHT: Final = 100.0  # intervals
 _KEPT: Final = 0.5  # of the intervals, from frame to frame: speeds change within some frames
+
+
+Newest = tuple[NDArray[np.int64], NDArray[np.int8]]
+"""`Followed.newest` and `Followed.surety`."""
 
 
 class Followed(NamedTuple):
@@ -65,13 +76,21 @@ class Followed(NamedTuple):
     ----------
     newest
         (H, W) int64: 2 t + p of the newest event (t in us), `NO_EVENT` before the first.
+    surety
+        (H, W) int8: `SURE` times the probability that it is signal (K5), rounded; `SURE` where nobody has asked.
     span, intervals
         Sum (us) and number of the intervals that count.
     """
 
     newest: NDArray[np.int64]
+    surety: NDArray[np.int8]
     span: float
     intervals: float
+
+    @property
+    def events(self) -> Newest:
+        """The pixels' newest events, as f depends on them."""
+        return self.newest, self.surety
 
     @property
     def scale(self) -> float:
@@ -87,8 +106,8 @@ class Trail(NamedTuple):
     ----------
     start
         (H, W) f at the start of the segment, where L^A is a frame's; in the lead-in to the first frame, at its end.
-    polarity
-        (H, W) int8: that of the newest event there, 1 or -1; 0: none so far.
+    signed
+        (H, W) int8: surety of the newest event there, negative if it is off; 0: none so far.
     scale
         s, seconds.
     on, off
@@ -99,7 +118,7 @@ class Trail(NamedTuple):
     """
 
     start: FloatArray
-    polarity: NDArray[np.int8]
+    signed: NDArray[np.int8]
     scale: float
     on: float
     off: float
@@ -126,7 +145,7 @@ class FrameTrail(NamedTuple):
 
 def nothing_followed(shape: tuple[int, int]) -> Followed:
     """`Followed` before the first event."""
-    return Followed(np.full(shape, NO_EVENT, np.int64), 0.0, 0.0)
+    return Followed(np.full(shape, NO_EVENT, np.int64), np.full(shape, SURE, np.int8), 0.0, 0.0)
 
 
 def follow(
@@ -154,7 +173,31 @@ def follow(
     off, on = apart(2, before.newest.shape)
     newest = memory.empty(before.newest.shape, np.int64)
     _end_following(pixels, newest.reshape(-1), off.reshape(-1), on.reshape(-1))
-    return on, off, Followed(newest, span, intervals)
+    return on, off, Followed(newest, before.surety, span, intervals)
+
+
+def with_surety(before: Followed, after: Followed, shares: tuple[FloatArray, FloatArray]) -> Followed:
+    """``after``, with the surety of the events since ``before``, as `follow` does not know it.
+
+    ``shares`` are the probabilities that an on and that an off event of each pixel is signal, (H, W) each.
+    """
+    surety = memory.empty(after.newest.shape, np.int8)
+    planes = before.newest, after.newest, before.surety, *shares, surety
+    _with_surety(*(plane.reshape(-1) for plane in planes))
+    return after._replace(surety=surety)
+
+
+@inner
+def surety_of(share):  # type: ignore[no-untyped-def]
+    """Of an event that is signal with the probability ``share``, float32."""
+    return np.int32(share * np.float32(SURE) + np.float32(0.5))
+
+
+@loop
+def _with_surety(first, last, before, on, off, surety):  # type: ignore[no-untyped-def]
+    for i in range(np.uint64(len(surety))):
+        of_newest = surety_of(on[i] if last[i] & 1 else off[i])
+        surety[i] = before[i] if last[i] == first[i] else np.int8(of_newest)
 
 
 @loop
@@ -193,16 +236,16 @@ def _follow(words, codes, counts, width, late):  # type: ignore[no-untyped-def]
     return span, count
 
 
-def trail_at(newest: NDArray[np.int64], t: int, trail: tuple[float, float, float]) -> FloatArray:
+def trail_at(newest: Newest, t: int, trail: tuple[float, float, float]) -> FloatArray:
     """f at ``t`` (us), (H, W) log intensity, given the newest events there; ``trail`` is s and h c_on, h c_off."""
-    out = memory.empty(newest.shape)
-    _trail_at(newest.reshape(-1), t, tuple(np.float32(value) for value in trail), out.reshape(-1))
+    out = memory.empty(newest[0].shape)
+    _trail_at(_flat(newest), t, tuple(np.float32(value) for value in trail), out.reshape(-1))
     return out
 
 
 def trail_between(
-    first: NDArray[np.int64],
-    last: NDArray[np.int64],
+    first: Newest,
+    last: Newest,
     span: tuple[int, int],
     trail: tuple[float, float, float],
 ) -> tuple[FloatArray, FloatArray]:
@@ -210,24 +253,30 @@ def trail_between(
 
     ``first`` and ``last`` are the newest events at these times.
     """
-    start, grown = apart(2, first.shape)
+    start, grown = apart(2, first[0].shape)
     scalars = tuple(np.float32(value) for value in trail)
-    _trail_between(first.reshape(-1), last.reshape(-1), *span, scalars, start.reshape(-1), grown.reshape(-1))
+    _trail_between(_flat(first), _flat(last), *span, scalars, start.reshape(-1), grown.reshape(-1))
     return start, grown
 
 
-def polarity_of(newest: NDArray[np.int64]) -> NDArray[np.int8]:
-    """1 and -1 of the newest event; 0 where there was none."""
-    polarity = memory.empty(newest.shape, np.int8)
-    _polarity_of(newest.reshape(-1), polarity.reshape(-1))
-    return polarity
+def _flat(newest: Newest) -> Newest:
+    code, surety = newest
+    return code.reshape(-1), surety.reshape(-1)
+
+
+def signed_surety(newest: Newest) -> NDArray[np.int8]:
+    """`Trail.signed` of the newest events."""
+    signed = memory.empty(newest[0].shape, np.int8)
+    _signed_surety(_flat(newest), signed.reshape(-1))
+    return signed
 
 
 @loop
-def _polarity_of(newest, polarity):  # type: ignore[no-untyped-def]
-    for i in range(len(newest)):
-        sign = np.int8(newest[i] & 1) * np.int8(2) - np.int8(1)
-        polarity[i] = np.int8(0) if newest[i] == NO_EVENT else sign
+def _signed_surety(newest, signed):  # type: ignore[no-untyped-def]
+    code, surety = newest
+    for i in range(len(signed)):
+        sign = np.int8(code[i] & 1) * np.int8(2) - np.int8(1)
+        signed[i] = np.int8(0) if code[i] == NO_EVENT else sign * surety[i]
 
 
 @nb.njit(cache=True, inline="always")
@@ -237,32 +286,32 @@ def beyond(age: Any, scale: Any) -> Any:
 
 
 @nb.njit(cache=True, inline="always")
-def ahead_of_event(sign: Any, age: Any, heights: Any) -> Any:
-    """f of a pixel whose newest event, of polarity ``sign`` (0: not known), is ``age`` seconds old; float32."""
+def ahead_of_event(signed: Any, age: Any, heights: Any) -> Any:
+    """f of a pixel whose newest event, of the surety ``signed`` as in `Trail`, is ``age`` seconds old; float32."""
     scale, on, off = heights
-    high = on if sign > 0 else np.float32(0.0)
-    high = -off if sign < 0 else high
-    return high * beyond(age, scale)
+    return (on if signed > 0 else off) * (np.float32(signed) * _OF_SURE) * beyond(age, scale)
 
 
 @nb.njit(cache=True, inline="always", error_model="numpy")
-def _ahead_of_newest(newest, t, heights):  # type: ignore[no-untyped-def]
+def _ahead_of_newest(newest, surety, t, heights):  # type: ignore[no-untyped-def]
     scale, on, off = heights
     age = np.float32(t - (newest >> 1)) * MICROSECOND32
-    return (on if newest & 1 else -off) * beyond(age, scale)
+    return (on if newest & 1 else -off) * (np.float32(surety) * _OF_SURE) * beyond(age, scale)
 
 
 @loop
 def _trail_at(newest, t, heights, out):  # type: ignore[no-untyped-def]
+    code, surety = newest
     for i in range(len(out)):
-        out[i] = _ahead_of_newest(newest[i], t, heights)
+        out[i] = _ahead_of_newest(code[i], surety[i], t, heights)
 
 
 @loop
 def _trail_between(first, last, begin, end, heights, start, grown):  # type: ignore[no-untyped-def]
+    (first_code, first_surety), (last_code, last_surety) = first, last
     for i in range(len(start)):
-        start[i] = _ahead_of_newest(first[i], begin, heights)
-        grown[i] = _ahead_of_newest(last[i], end, heights) - start[i]
+        start[i] = _ahead_of_newest(first_code[i], first_surety[i], begin, heights)
+        grown[i] = _ahead_of_newest(last_code[i], last_surety[i], end, heights) - start[i]
 
 
 def given_trail(start: FloatArray, end: FloatArray) -> Trail:
@@ -281,23 +330,23 @@ def no_trail(shape: tuple[int, int]) -> Trail:
 
 
 def trail_by_clock(
-    trail: Trail, polarity: NDArray[np.int8], clock: NDArray[np.int32], now: int, beyond: np.float32
+    trail: Trail, signed: NDArray[np.int8], clock: NDArray[np.int32], now: int, beyond: np.float32
 ) -> FloatArray:
     """f at ``beyond`` seconds after ``now`` (us after the clock's origin), (H, W) log intensity.
 
-    ``polarity`` and ``clock`` are those of the newest events, with a frame of one pixel around the sensor.
+    ``signed`` (as in `Trail`) and ``clock`` are of the newest events, with a frame of one pixel around the sensor.
     """
     out = memory.empty(trail.start.shape)
-    _trail_by_clock(polarity, clock, (np.int32(now), beyond), trail.heights, out)
+    _trail_by_clock(signed, clock, (np.int32(now), beyond), trail.heights, out)
     return out
 
 
 @loop
-def _trail_by_clock(polarity, clock, moment, heights, out):  # type: ignore[no-untyped-def]
+def _trail_by_clock(signed, clock, moment, heights, out):  # type: ignore[no-untyped-def]
     height, width = out.shape
     now, beyond = moment
     for row in range(height):
-        signs, times, ahead = polarity[row + 1, 1 : width + 1], clock[row + 1, 1 : width + 1], out[row]
+        signs, times, ahead = signed[row + 1, 1 : width + 1], clock[row + 1, 1 : width + 1], out[row]
         for column in range(width):
             age = np.float32(np.int32(now - times[column])) * MICROSECOND32 + beyond
             ahead[column] = ahead_of_event(signs[column], age, heights)

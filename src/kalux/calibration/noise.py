@@ -38,13 +38,15 @@ from kalux.settings import CameraSettings, EventSettings
 Array = NDArray[np.float64]
 
 QUIET: Final = 10_000
-"""us around a neighbour's event in which a pixel is not quiet: what an edge at 100 pixels/s takes for a pixel."""
+"""us around a neighbour's event in which a pixel is not quiet: what an edge at 100 pixels/s takes for a pixel. Slower
+ones take longer, so that twice the time and more is tried (`event_noise`)."""
 
 MAX_FRAMES: Final = 400
 _WINDOW: Final = 100_000  # us
 _BLOCK: Final = 16  # pixels
 _NEARLY: Final = 0.85
 _LEAST_QUIET: Final = 0.01  # of the sensor's time
+_CLEARLY: Final = 2.0  # standard errors by which a rate is less than another one
 _UNUSUAL_FACTOR: Final = 10.0  # times the typical rate
 _UNUSUAL_SIGNIFICANCE: Final = 8.0  # standard deviations above the typical count
 _UNUSUAL_LEAST: Final = 5  # events
@@ -196,12 +198,20 @@ def calibrate_noise(
 
 
 def event_noise(
-    recording: Recording, most_events: int | None = None, known_hot: NDArray[np.bool_] | None = None
+    recording: Recording,
+    most_events: int | None = None,
+    known_hot: NDArray[np.bool_] | None = None,
+    *,
+    enough: float = 0.0,
 ) -> EventNoise | None:
     """Background rate and dead pixels, from the first ``most_events``, or all; ``known_hot`` ones do not count.
 
-    Nor do pixels beyond a region of interest, which are silent because they are off (`kalux.calibration.region`), nor
-    times in which events have been lost (`kalux.calibration.silences`).
+    Single events of slow or faint edges look like noise. The longer their neighbours must have been quiet and stay so,
+    the fewer of them count, but the less is quiet: the time is doubled as long as the rate falls by more than two of its
+    errors, down to ``enough`` (Hz).
+
+    Pixels beyond a region of interest do not count either, being silent because they are off
+    (`kalux.calibration.region`), nor do times in which events have been lost (`kalux.calibration.silences`).
 
     Returns None without events, or where next to nothing is ever quiet (1 %).
     """
@@ -211,24 +221,54 @@ def event_noise(
         return None
     inside = region.mask(recording.sensor_size)
     silences = sorted(find_silences(recording, end=last))
-    of_all = _tallied(_chunks(recording, most_events, known), first, last, known, silences)
+
+    def tallied(gap: int, ignored: NDArray[np.bool_]) -> _Tally:
+        return _tallied(_chunks(recording, most_events, known), first, last, gap, ignored, silences)
+
+    of_all = tallied(QUIET, known)
     # Where the region is never quiet, the rest may be so because it is still.
     for part in (inside, np.ones_like(inside)):
         tally = of_all
         unusual = _unusual_pixels(tally, part) | known
         if (unusual & ~known).any():  # again without them: their neighbours are quiet after all
-            tally = _tallied(_chunks(recording, most_events, known), first, last, unusual, silences)
-        tally = tally._replace(quiet=tally.quiet * part)
-        share = float(tally.quiet.sum() / (np.count_nonzero(part) * (last - first)))
-        if share >= _LEAST_QUIET or part.all():
+            tally = tallied(QUIET, unusual)
+        quietest = _of_blocks(tally, unusual, part).quietest
+        found = _in_quiet_time(tally, unusual, part, quietest, last - first)
+        if found is not None:
             break
-    if share < _LEAST_QUIET:
+    if found is None:
         return None
-    rate, error = _typical_rate(tally, unusual, part)
+    gap = QUIET
+    while found.rate > enough:
+        gap *= 2
+        # Of the same blocks: chosen by longer times, those would count that have less noise by chance.
+        longer = _in_quiet_time(tallied(gap, unusual), unusual, part, quietest, last - first)
+        if longer is None or longer.rate + _CLEARLY * longer.rate_error >= found.rate:
+            break
+        found = longer
+    return found._replace(dead=found.dead & ~known)
+
+
+def _in_quiet_time(
+    tally: _Tally,
+    unusual: NDArray[np.bool_],
+    part: NDArray[np.bool_],
+    used: NDArray[np.bool_],
+    duration: int,
+) -> EventNoise | None:
+    """What events in quiet time of ``part`` (H, W) say; None where less than 1 % of the ``duration`` (us) is quiet.
+
+    The rate is that of the ``used`` blocks.
+    """
+    tally = tally._replace(quiet=tally.quiet * part)
+    share = float(tally.quiet.sum() / (np.count_nonzero(part) * duration))
+    blocks = _of_blocks(tally, unusual, part)
+    if share < _LEAST_QUIET or not (blocks.quiet * used).any():
+        return None
+    rate, error = _typical_rate(blocks, used)
     counts = tally.counts.sum(axis=0).astype(np.float64)
     quiet = (tally.quiet.sum(axis=0) * 1e-6).astype(np.float64, copy=False)
-    rates = shrunk_rates(counts, quiet, rate, unusual)
-    return EventNoise(rate, error, rates, _dead_pixels(tally.all) & ~known, share)
+    return EventNoise(rate, error, shrunk_rates(counts, quiet, rate, unusual), _dead_pixels(tally.all), share)
 
 
 def _chunks(
@@ -267,6 +307,7 @@ def _tallied(
     chunks: Iterator[EventArray],
     first: int,
     last: int,
+    gap: int,
     ignored: NDArray[np.bool_],
     silences: list[Silence],
 ) -> _Tally:
@@ -289,14 +330,12 @@ def _tallied(
             begin, end = left.popleft()
             place = events_until(chunk, end - 1)
             before, chunk = chunk[:place], chunk[place:]
-            _tally(
-                *_columns(before), first, length, QUIET, ignored, busy_until, pending, counts, quiet, total
-            )
-            _close(begin, first, length, QUIET, busy_until, pending, counts, quiet)
+            _tally(*_columns(before), first, length, gap, ignored, busy_until, pending, counts, quiet, total)
+            _close(begin, first, length, gap, busy_until, pending, counts, quiet)
             busy_until.fill(end)  # as before the first event
             pending.fill(NEVER)
-        _tally(*_columns(chunk), first, length, QUIET, ignored, busy_until, pending, counts, quiet, total)
-    _close(last, first, length, QUIET, busy_until, pending, counts, quiet)
+        _tally(*_columns(chunk), first, length, gap, ignored, busy_until, pending, counts, quiet, total)
+    _close(last, first, length, gap, busy_until, pending, counts, quiet)
     return _Tally(counts, quiet, total)
 
 
@@ -387,14 +426,29 @@ def _unusual_pixels(tally: _Tally, inside: NDArray[np.bool_]) -> NDArray[np.bool
     return unusual
 
 
-def _typical_rate(
-    tally: _Tally, unusual: NDArray[np.bool_], inside: NDArray[np.bool_]
-) -> tuple[float, float]:
-    """Hz per pixel, and its standard error: of those blocks and windows of time that are nearly the quietest (85 %).
+class _Blocks(NamedTuple):
+    """Of every window of time and block of pixels, (N, M) each: events while quiet, quiet time and all time, s."""
 
-    Where something moves, faint edges make single events, too, so that the busier blocks say little. Noise itself
-    makes all of them less quiet alike. Blocks begin where the region does that is ``inside``.
-    """
+    counts: Array
+    quiet: Array
+    possible: Array
+
+    @property
+    def quietest(self) -> NDArray[np.bool_]:
+        """(N, M): those that are nearly (85 %) as quiet as any.
+
+        Where something moves, faint edges make single events, too, so that the busier blocks say little. Noise itself
+        makes all of them less quiet alike.
+        """
+        share = self.quiet / np.maximum(self.possible, 1)
+        there = self.possible > 0
+        if not there.any():
+            return there
+        return there & (self.quiet > 0) & (share >= _NEARLY * np.quantile(share[there], 0.95))
+
+
+def _of_blocks(tally: _Tally, unusual: NDArray[np.bool_], inside: NDArray[np.bool_]) -> _Blocks:
+    """Sums over blocks of usual pixels; they begin where the region does that is ``inside``."""
     height, width = unusual.shape
     rows, columns = -(-height // _BLOCK), -(-width // _BLOCK)
     top, left = (int(np.argmax(inside.any(axis=axis))) for axis in (1, 0))
@@ -402,15 +456,17 @@ def _typical_rate(
     index = row[:, None] * columns + column
     good = ~unusual & inside
     size = rows * columns
-    counts = np.array([np.bincount(index[good], c[good], size) for c in tally.counts]).ravel()
-    quiet = np.array([np.bincount(index[good], q[good], size) for q in tally.quiet]).ravel() * 1e-6
+    counts = np.array([np.bincount(index[good], c[good], size) for c in tally.counts])
+    quiet = np.array([np.bincount(index[good], q[good], size) for q in tally.quiet]) * 1e-6
     full = np.bincount(index[good], minlength=size)
-    possible = np.tile(full, len(tally.counts)).astype(np.float64)
-    share = quiet / np.maximum(possible, 1)
-    used = (possible > 0) & (quiet > 0) & (share >= _NEARLY * np.quantile(share[possible > 0], 0.95))
-    rate = counts[used].sum() / quiet[used].sum()
-    block = np.tile(np.arange(size), len(tally.counts))[used]
-    by_block = np.array([np.bincount(block, values[used], size) for values in (counts, quiet)]).T
+    return _Blocks(counts, quiet, np.tile(full, (len(tally.counts), 1)).astype(np.float64))
+
+
+def _typical_rate(blocks: _Blocks, used: NDArray[np.bool_]) -> tuple[float, float]:
+    """Hz per pixel, and its standard error, of the ``used`` blocks and windows of time, (N, M) bool."""
+    counts, quiet = blocks.counts * used, blocks.quiet * used
+    rate = counts.sum() / quiet.sum()
+    by_block = np.array([counts.sum(axis=0), quiet.sum(axis=0)]).T
     return float(rate), ratio_error(by_block[by_block[:, 1] > 0])
 
 

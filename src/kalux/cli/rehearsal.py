@@ -18,7 +18,7 @@ from kalux.augmentation.bridge import BridgeNoise, Latent, bridge, drift, nomina
 from kalux.augmentation.highlights import Unshown
 from kalux.augmentation.motion import HalfWay, Paths
 from kalux.augmentation.subthreshold import add_missed_change, correlation, silent_change, turns
-from kalux.augmentation.trail import Trail, nothing_followed, polarity_of, trail_between
+from kalux.augmentation.trail import Trail, nothing_followed, signed_surety, trail_between, with_surety
 from kalux.cli.loops import prepare_loops
 from kalux.compiled import apart
 from kalux.display import Auto, DisplaySettings, fill_levels, measure, quantised
@@ -102,17 +102,20 @@ def rehearse_segment() -> None:
     on, off, far_on, far_off = planes[4:]
     thresholds = nominal_thresholds(_SIZE, 0.1, np.float32)
     noise = BridgeNoise(0.2, 0.2, variance, variance, variance)
-    newest = nothing_followed(_SIZE).newest
+    signal = signal_shares(on, off, 0.1, np.zeros(_SIZE, np.bool_))
+    nothing = nothing_followed(_SIZE)
+    newest = with_surety(nothing, nothing, signal).events
     start, grown = trail_between(newest, newest, (0, _PERIOD), (seconds, 0.1, 0.1))
-    signal = signal_shares(on, off, 0.1)
     joined, _ = bridge(first, second, (on, off), thresholds, noise, 0, _PERIOD, grown=grown, signal=signal)
     of_silent = silent_change(joined, variance, variance)
     correlation(change, joined, variance, variance)
     drifted, _, _ = drift(first, second, thresholds, noise, (far_on, far_off), (on, off))
     add_missed_change(drifted, joined, second, (on, off), of_silent, variance)
     turns(on, off)
-    trail = Trail(start, polarity_of(newest), seconds, 0.1, 0.1)
-    segment = joined._replace(trail=trail, drift=drifted, doubt=doubt(signal, variance, variance))
+    trail = Trail(start, signed_surety(newest), seconds, 0.1, 0.1)
+    segment = joined._replace(
+        trail=trail, drift=drifted, doubt=doubt(signal, variance, variance), signal=signal
+    )
     cursor = akf_bridged.begin(segment, State(first.value, first.variance, make_clock(_SIZE, 0)))
     akf_bridged.advance(segment, cursor, np.zeros(1, EVENT_DTYPE), akf_bridged.Noise(0.1, variance, variance))
     akf_bridged.moving_pixels(segment, cursor)

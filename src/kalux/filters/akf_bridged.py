@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from kalux import memory
 from kalux.augmentation.bridge import UNMEASURED, BridgedSegment, lower_to_ceiling, raise_to_bound
-from kalux.augmentation.trail import NO_HEIGHTS, ahead_of_event, no_trail, trail_by_clock
+from kalux.augmentation.trail import NO_HEIGHTS, ahead_of_event, no_trail, surety_of, trail_by_clock
 from kalux.compiled import (
     AHEAD,
     FUSED,
@@ -67,8 +67,9 @@ STEP_PIXEL: Final = np.dtype(
             "doubt_on",  # variance of an on event's step beyond that of a sure one
             "doubt_off",
             "coming",  # sum of their weights; exact, where subtracting their variances would leave rounding errors
+            "surety",  # of an on event and, `_BITS` further up, that of an off event (K14)
         ],
-        "formats": ["f4"] * 7,
+        "formats": ["f4"] * 8,
         "itemsize": 32,
     }
 )
@@ -83,7 +84,9 @@ _BEGIN_BLOCK: Final = 64
 _STATE_FIELDS: Final = STATE_PIXEL.itemsize // 4
 _STEP_FIELDS: Final = STEP_PIXEL.itemsize // 4
 _INFORMATION, _WEIGHTED, _AUGMENTED, _RATE = range(_STATE_FIELDS)
-_STEP_ON, _STEP_OFF, _FORWARD, _BACKWARD, _DOUBT_ON, _DOUBT_OFF, _COMING = range(len(STEP_PIXEL.names or ()))
+_STEP_ON, _STEP_OFF, _FORWARD, _BACKWARD, _DOUBT_ON, _DOUBT_OFF, _COMING, _SURETY = range(_STEP_FIELDS)
+_BITS: Final = np.int32(8)
+_FIRST_BITS: Final = np.int32(255)
 
 
 @dataclass
@@ -97,8 +100,8 @@ class Cursor:
     clock
         Newest event of every pixel, us after ``origin``. The pixel's state holds from there, or from ``origin``
         if that is later.
-    polarity
-        1 or -1, that of the newest event of every pixel, laid out as the clock is; 0: not known.
+    signed
+        Surety of the newest event of every pixel, negative if it is off (`Trail.signed`), laid out as the clock is.
     origin
         us: the segment's start, then a whole number of epochs later.
     moving
@@ -110,7 +113,7 @@ class Cursor:
     pixels: NDArray[np.void]
     steps: NDArray[np.void]
     clock: Clock
-    polarity: NDArray[np.int8]
+    signed: NDArray[np.int8]
     origin: int
     moving: NDArray[np.bool_] | None = None
     unmeasured: NDArray[np.int64] | None = None
@@ -139,20 +142,22 @@ def begin(segment: BridgedSegment, state: State) -> Cursor:
     clock: Clock = memory.empty(state.newest.shape, np.int32)
     clock[:] = state.newest
     pixels, steps = memory.empty(clock.shape, STATE_PIXEL), memory.empty(clock.shape, STEP_PIXEL)
-    polarity = memory.empty(clock.shape, np.int8)
-    polarity[:] = 0
+    signed = memory.empty(clock.shape, np.int8)
+    signed[:] = 0
     floor = state.log_intensity if segment.floor is None else segment.floor
     scalars = np.float32(segment.rate), np.float32(segment.step_variance)
     variances = segment.forward_variance, segment.backward_variance
     coming = np.zeros_like(segment.augmented) if segment.events is None else segment.events
     trail = no_trail(coming.shape) if segment.trail is None else segment.trail
-    none = np.zeros_like(segment.augmented)
+    none, all_of_it = np.zeros_like(segment.augmented), np.ones_like(segment.augmented)
     doubts = (none, none) if segment.doubt is None else segment.doubt
-    given = segment.augmented, segment.step_on, segment.step_off, *variances, coming, trail.start, *doubts
+    signal = (all_of_it, all_of_it) if segment.signal is None else segment.signal
+    steps_given = segment.step_on, segment.step_off, *variances, coming, *doubts, *signal
+    given = segment.augmented, trail.start, steps_given
     before = state.log_intensity, floor, state.variance
     _begin_bridged(given, scalars, before, pixels.reshape(-1), steps.reshape(-1))
-    polarity[1:-1, 1:-1] = trail.polarity
-    return Cursor(pixels, steps, clock, polarity, segment.start)
+    signed[1:-1, 1:-1] = trail.signed
+    return Cursor(pixels, steps, clock, signed, segment.start)
 
 
 def advance(segment: BridgedSegment, cursor: Cursor, events: EventArray, noise: Noise) -> None:
@@ -163,7 +168,7 @@ def advance(segment: BridgedSegment, cursor: Cursor, events: EventArray, noise: 
         if words[-1, 0] > cursor.origin + EPOCH:
             within = words[: words_until(words, cursor.origin + EPOCH)]
         if len(within):
-            arrays = cursor.pixels, cursor.steps, cursor.clock, cursor.polarity
+            arrays = cursor.pixels, cursor.steps, cursor.clock, cursor.signed
             told = noise if segment.doubt is None else noise._replace(noise_rate=0.0)
             _advance_bridged(within, *arrays, cursor.origin, segment.rate, segment.step_variance, told)
         words = words[len(within) :]
@@ -189,7 +194,7 @@ def trail_ahead(segment: BridgedSegment, cursor: Cursor, t: int) -> FloatArray |
     """(H, W) how far the light is ahead of its events at ``t`` (us), K14; None where that is not followed."""
     if segment.trail is None:
         return None
-    return trail_by_clock(segment.trail, cursor.polarity, cursor.clock, *_on_clock(cursor, t))
+    return trail_by_clock(segment.trail, cursor.signed, cursor.clock, *_on_clock(cursor, t))
 
 
 def _on_clock(cursor: Cursor, t: int) -> tuple[int, np.float32]:
@@ -204,7 +209,7 @@ def _read(segment: BridgedSegment, cursor: Cursor, t: int) -> tuple[FloatArray, 
     log_intensity, variance = apart(2, shape)
     within, beyond = _on_clock(cursor, t)
     since_start = np.float32((t - segment.start) * 1e-6)
-    arrays = cursor.pixels, cursor.clock, cursor.polarity, segment.slope
+    arrays = cursor.pixels, cursor.clock, cursor.signed, segment.slope
     heights = NO_HEIGHTS if segment.trail is None else segment.trail.heights
     _read_bridged(*arrays, heights, (within, beyond, since_start), log_intensity, variance)
     if t == segment.end:
@@ -281,7 +286,7 @@ def _since(clock, now):  # type: ignore[no-untyped-def]
 def _begin_bridged(given, scalars, before, pixels, steps):  # type: ignore[no-untyped-def]
     rate, step_variance = scalars
     log_intensity, floor, variance = before
-    augmented, step_on, step_off, forward, backward, events, trail, doubt_on, doubt_off = given
+    augmented, trail, (step_on, step_off, forward, backward, events, doubt_on, doubt_off, on, off) = given
     height, width = log_intensity.shape
     states = empty((_STATE_FIELDS, _BEGIN_BLOCK), np.float32)
     known = zeros((_STEP_FIELDS, _BEGIN_BLOCK), np.float32)
@@ -292,6 +297,7 @@ def _begin_bridged(given, scalars, before, pixels, steps):  # type: ignore[no-un
         states[_RATE],
     )
     first_variance, last_variance, coming = known[_FORWARD], known[_BACKWARD], known[_COMING]
+    surety = known[_SURETY]
     for row in range(np.uint64(height)):
         at = (row + np.uint64(1)) * np.uint64(width + 2) + np.uint64(1)
         for first in range(np.uint64(0), np.uint64(width), np.uint64(_BEGIN_BLOCK)):
@@ -304,6 +310,9 @@ def _begin_bridged(given, scalars, before, pixels, steps):  # type: ignore[no-un
             _copy(doubt_on, row, first, count, known[_DOUBT_ON])
             _copy(doubt_off, row, first, count, known[_DOUBT_OFF])
             _copy(augmented, row, first, count, level)
+            for i in range(count):
+                of_off = surety_of(np.float32(off[row, first + i])) << _BITS
+                surety[i] = np.float32(surety_of(np.float32(on[row, first + i])) + of_off)
             for i in range(count):
                 information[i] = ONE / np.float32(variance[row, first + i])
             for i in range(count):
@@ -329,7 +338,7 @@ def _copy(plane, row, first, count, out):  # type: ignore[no-untyped-def]
 
 
 @loop(fastmath=FUSED)
-def _advance_bridged(words, pixels, steps, clock, polarity, origin, rate, step_variance, noise):  # type: ignore[no-untyped-def]
+def _advance_bridged(words, pixels, steps, clock, signed, origin, rate, step_variance, noise):  # type: ignore[no-untyped-def]
     scalars = _Scalars(
         np.float32(rate),
         np.float32(step_variance),
@@ -338,18 +347,18 @@ def _advance_bridged(words, pixels, steps, clock, polarity, origin, rate, step_v
         np.float32(noise.threshold2),
     )
     stride, one, two = np.uint64(clock.shape[1]), np.uint64(1), np.uint64(2)
-    words, pixels, steps, clock, polarity = (
+    words, pixels, steps, clock, signed = (
         flat(words),
         flat(pixels),
         flat(steps),
         flat(clock),
-        flat(polarity),
+        flat(signed),
     )
     last = np.uint64(len(words)) - two
     # A software pipeline: while an event is filtered, the noise of the next one is computed, and the clock is read for
     # the one after. None of these depends on another, so that the processor executes them at the same time.
-    event = _with_noise(_looked_up(words, np.uint64(0), clock, polarity, stride, origin), scalars)
-    following = _looked_up(words, smaller(two, last), clock, polarity, stride, origin)
+    event = _with_noise(_looked_up(words, np.uint64(0), clock, stride, origin), scalars)
+    following = _looked_up(words, smaller(two, last), clock, stride, origin)
     for i in range(np.uint64(0), last + one, two):
         ahead = words[smaller(i + two * np.uint64(AHEAD), last) + one]
         place = event_row(ahead) * stride + event_column(ahead) + stride + one
@@ -369,19 +378,20 @@ def _advance_bridged(words, pixels, steps, clock, polarity, origin, rate, step_v
         forward, coming = known.forward + weight * scalars.step_variance, known.coming - weight
         pixel.rate = measurement_rate(scalars.rate, forward, known.backward + coming * scalars.step_variance)
         known.forward, known.coming = forward, coming
+        surety = np.int32(known.surety)
+        signed[at] = np.int8(surety & _FIRST_BITS if is_on else -(surety >> _BITS))
         event = _with_noise(following, scalars)
-        following = _looked_up(words, smaller(i + two + two, last), clock, polarity, stride, origin)
+        following = _looked_up(words, smaller(i + two + two, last), clock, stride, origin)
 
 
 @nb.njit(cache=True, inline="always")
-def _looked_up(words, i, clock, polarity, stride, origin):  # type: ignore[no-untyped-def]
+def _looked_up(words, i, clock, stride, origin):  # type: ignore[no-untyped-def]
     """An event, by the index of its first word: its pixel's index, us since the time of the pixel's state, us since the
     newest event around it, and the second word. Sets the clock; a second look-up does not change it."""
     now, word = np.int32(words[i] - origin), words[i + np.uint64(1)]
     at = event_row(word) * stride + event_column(word) + stride + np.uint64(1)
     since, age = _since(clock[at], now), np.int32(now - newest_around_inside(clock, at, stride))
     clock[at] = now
-    polarity[at] = np.int8(2) * np.int8(event_is_on(word)) - np.int8(1)
     return at, since, age, word
 
 
@@ -398,15 +408,15 @@ def _with_noise(event, scalars):  # type: ignore[no-untyped-def]
 
 @loop
 def _read_bridged(  # type: ignore[no-untyped-def]
-    pixels, clock, polarity, slope, heights, moment, log_intensity, variance
+    pixels, clock, signed, slope, heights, moment, log_intensity, variance
 ):
     height, width = variance.shape
-    pixels, clock, polarity = flat(pixels), flat(clock), flat(polarity)
+    pixels, clock, signed = flat(pixels), flat(clock), flat(signed)
     size = smaller(width, _BLOCK)
     planes, ahead = empty((_STATE_FIELDS, size), np.float32), empty(size, np.float32)
     for row in range(height):
         at = (row + 1) * (width + 2) + 1
-        newest = clock[at : at + width], polarity[at : at + width]
+        newest = clock[at : at + width], signed[at : at + width]
         rows = slope[row], log_intensity[row], variance[row]
         for first in range(0, width, size):  # the last block begins where it ends with the row
             first = smaller(first, width - size)

@@ -38,9 +38,10 @@ from kalux.augmentation.trail import (
     follow,
     given_trail,
     nothing_followed,
-    polarity_of,
+    signed_surety,
     trail_at,
     trail_between,
+    with_surety,
 )
 from kalux.compiled import apart, empty, loop, smaller
 from kalux.event_slices import all_between
@@ -318,8 +319,13 @@ class BridgedFrames(Method):
         """The segment from the middle of one exposure to that of the next, and the memory after it."""
         start, end = shot.middle, following.middle
         on, off, at_middle = self.follow(events, start, end, memory.followed)
+        first_hidden, second_hidden = (
+            latent.variance >= bridge.UNMEASURED for latent in (memory.latent, second)
+        )
+        signal = self._signal_shares(on, off, (end - start) * 1e-6, first_hidden & second_hidden)
+        if signal is not None:
+            at_middle = with_surety(memory.followed, at_middle, signal)
         trail, grown = self._trail_between(memory, shot, following, at_middle)
-        signal = self._signal_shares(on, off, (end - start) * 1e-6)
         joined, learned = bridge.bridge(
             memory.latent,
             second,
@@ -332,7 +338,8 @@ class BridgedFrames(Method):
             signal=signal,
         )
         if signal is not None:
-            joined = joined._replace(doubt=doubt(signal, self.noise.step_variance, self._threshold2))
+            of_steps = doubt(signal, self.noise.step_variance, self._threshold2)
+            joined = joined._replace(doubt=of_steps, signal=signal)
         change = self._silent_change(joined)
         told, latest_change = correlation(
             memory.latest_change, joined, self.noise.quantisation_variance, self._threshold2
@@ -426,7 +433,7 @@ class BridgedFrames(Method):
     def _trail(self, followed: Followed, start: int, scale: float) -> Trail:
         """By how much events trail the light in the segment from ``start`` on (K14)."""
         at_start = self._trail_at(followed, start, scale)
-        return Trail(at_start, polarity_of(followed.newest), scale, *self._trail_heights)
+        return Trail(at_start, signed_surety(followed.events), scale, *self._trail_heights)
 
     def _trail_between(
         self, memory: BridgeMemory, shot: Shot, following: Shot, at_end: Followed
@@ -435,25 +442,27 @@ class BridgedFrames(Method):
         if shot.trail is not None and following.trail is not None:
             before, after = shot.trail.before, following.trail.after
             return given_trail(before, after), after - before
-        newest, heights = memory.followed.newest, self._trail_heights
+        newest, heights = memory.followed.events, self._trail_heights
         span = shot.middle, following.middle
-        at_start, grown = trail_between(newest, at_end.newest, span, (at_end.scale, *heights))
-        return Trail(at_start, polarity_of(newest), at_end.scale, *heights), grown
+        at_start, grown = trail_between(newest, at_end.events, span, (at_end.scale, *heights))
+        return Trail(at_start, signed_surety(newest), at_end.scale, *heights), grown
 
     def _lead_in_trail(self, shot: Shot, followed: Followed) -> Trail:
         """The same before the middle of the first exposure, where the frame's level stays as it is."""
         if shot.trail is not None:
             return given_trail(shot.trail.after, shot.trail.after)
         trail = self._trail(followed, shot.middle, followed.scale)
-        return trail._replace(polarity=np.zeros(self.shape, np.int8))
+        return trail._replace(signed=np.zeros(self.shape, np.int8))
 
     def _trail_at(self, followed: Followed, t: int, scale: float) -> NDArray[np.float32]:
-        return trail_at(followed.newest, t, (scale, *self._trail_heights))
+        return trail_at(followed.events, t, (scale, *self._trail_heights))
 
-    def _signal_shares(self, on: Floats, off: Floats, seconds: float) -> tuple[Floats, Floats] | None:
+    def _signal_shares(
+        self, on: Floats, off: Floats, seconds: float, hidden: NDArray[np.bool_]
+    ) -> tuple[Floats, Floats] | None:
         """Which share of the pixels' events is signal (K5); None where the noise of events is not known."""
         rate = self.settings.events.noise_rate
-        return None if rate is None else signal_shares(on, off, rate * seconds)
+        return None if rate is None else signal_shares(on, off, rate * seconds, hidden)
 
     @property
     def _trail_heights(self) -> tuple[float, float]:

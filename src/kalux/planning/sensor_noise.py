@@ -113,8 +113,9 @@ def with_background(
     events = settings.events
     if events.noise_rate is not None or not settings.filter.joins_frames:
         return settings, None
-    found = event_noise(recording, _NOISE_EVENTS, None if pixels is None else pixels.hot)
+    least = min(_LEAST_NOISE, events.usual_noise_rate) if lookahead else events.usual_noise_rate
+    hot = None if pixels is None else pixels.hot
+    found = event_noise(recording, _NOISE_EVENTS, hot, enough=least)
     if found is None:
         return altered(settings, "events", noise_rate=events.background_rate), None
-    least = min(_LEAST_NOISE, events.usual_noise_rate) if lookahead else events.usual_noise_rate
     return altered(settings, "events", noise_rate=max(found.rate, least)), found.rate
