@@ -207,8 +207,8 @@ def event_noise(
     """Background rate and dead pixels, from the first ``most_events``, or all; ``known_hot`` ones do not count.
 
     Single events of slow or faint edges look like noise. The longer their neighbours must have been quiet and stay so,
-    the fewer of them count, but the less is quiet: the time is doubled as long as the rate falls by more than two of its
-    errors, down to ``enough`` (Hz).
+    the fewer of them count, but the less is quiet: the time is doubled as long as the rate falls by more than two of
+    its errors, down to ``enough`` (Hz).
 
     Pixels beyond a region of interest do not count either, being silent because they are off
     (`kalux.calibration.region`), nor do times in which events have been lost (`kalux.calibration.silences`).
