@@ -1,9 +1,11 @@
 """Many scenes at random: where is the default filter worse than something simpler, or its variance wrong?
 
     python benchmarks/scenes.py PHOTOGRAPH ... -o OUT [--count 200] [--seed 1] [--processes N]
+        [--size 160x120] [--duration 1.2]
 
-Simulates recordings of 160x120 pixels over HDR photographs: sensors, thresholds, noise, motions, exposures, responses
-and things that pass are drawn by ``--seed``, so that the same command makes the same recordings (`kalux simulate`).
+Simulates recordings of 160x120 pixels and 1.2 s, or others, over HDR photographs: sensors, thresholds, noise, motions,
+exposures, responses and things that pass are drawn by ``--seed``, so that the same command makes the same recordings
+(`kalux simulate`).
 Then it scores them against their truth (`kalux benchmark`, whose report lies in OUT/results) and prints a summary, and
 what stands out, with the flags that make it again. What is drawn goes farther than most cameras do: settings that are
 estimated from a recording show here where they fail. 200 scenes take an hour or two of one core. An interrupted run
@@ -49,20 +51,22 @@ class Scene(NamedTuple):
     flags: tuple[str, ...]
 
 
-def draw(photographs: list[Path], count: int, seed: int) -> list[Scene]:
+def draw(
+    photographs: list[Path], count: int, seed: int, size: str = "160x120", duration: float = 1.2
+) -> list[Scene]:
     """The scenes, photographs in turns. The first of many are those of few."""
     scenes = []
     for k in range(count):
         photograph = photographs[k % len(photographs)]
-        flags = tuple(map(str, _flags(random.Random(1000 * seed + k), k)))
+        flags = tuple(map(str, _flags(random.Random(1000 * seed + k), k, size, duration)))
         scenes.append(Scene(f"{k:03d}_{photograph.stem}", photograph, flags))
     return scenes
 
 
-def _flags(rng: random.Random, k: int) -> Iterable[object]:
+def _flags(rng: random.Random, k: int, size: str, duration: float) -> Iterable[object]:
     preset = rng.choice(["ideal", "ideal", "davis240c", "davis346", "prophesee-vga"])
     motion = rng.choice(MOTIONS)
-    yield from ("--preset", preset, "--motion", motion, "--seed", k, "--size", "160x120", "--duration", 1.2)
+    yield from ("--preset", preset, "--motion", motion, "--seed", k, "--size", size, "--duration", duration)
     if "pan" in motion:
         yield from ("--speed", rng.choice([20, 60, 120, 250]), "--direction", rng.choice([0, 30, 90, 135]))
     if "rotate" in motion:
@@ -169,8 +173,10 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--size", default="160x120", metavar="WxH", help="pixels of the sensor")
+    parser.add_argument("--duration", type=float, default=1.2, help="s")
     options = parser.parse_args()
-    scenes = draw(options.photographs, options.count, options.seed)
+    scenes = draw(options.photographs, options.count, options.seed, options.size, options.duration)
     recordings, results = options.out / "recordings", options.out / "results"
     claim(options.out, scenes)
     recordings.mkdir(exist_ok=True)

@@ -34,7 +34,7 @@ scenes = benchmark("scenes")
     ("command", "told"),
     [
         (
-            ["speed.py", "--events", "300000", "--rounds", "1"],
+            ["speed.py", "--events", "60000", "--rounds", "1"],
             ["filter, literal in numba", "EDI / literal in numba", "all else"],
         ),
         (["fuzz.py", "--seconds", "0.2", "--readers", "kalux"], ["| kalux | 1 |"]),
@@ -61,9 +61,10 @@ def test_a_small_run(command, told, tmp_path):
 def test_scenes_at_random(tmp_path):
     """They are simulated, scored and summed up; a second run has nothing to do."""
     rng = np.random.default_rng(0)
-    small = np.exp(rng.normal(0.0, 1.0, (30, 40, 3))).astype(np.float32)
-    cv2.imwrite(str(tmp_path / "small.hdr"), cv2.resize(small, (240, 180)))
-    command = [sys.executable, ROOT / "benchmarks" / "scenes.py", "small.hdr", "-o", "out", "--count", "1"]
+    coarse = np.exp(rng.normal(0.0, 1.0, (30, 40, 3))).astype(np.float32)
+    cv2.imwrite(str(tmp_path / "small.hdr"), cv2.resize(coarse, (240, 180)))
+    small = ["--count", "1", "--size", "64x48", "--duration", "0.5", "--processes", "1"]
+    command = [sys.executable, ROOT / "benchmarks" / "scenes.py", "small.hdr", "-o", "out", *small]
     environment = {**os.environ, "PYTHONPATH": str(SOURCE)}
     first, again = (
         subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)

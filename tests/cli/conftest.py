@@ -17,6 +17,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import kalux
 from kalux.cli import main
 from kalux.datasets import SensorSettings, pan, photograph_scene, simulate
+from kalux.evaluation.benchmark import runners
 from kalux.writers import hdf5
 
 SOURCE = Path(kalux.__file__).resolve().parent.parent
@@ -48,6 +49,20 @@ def cli(capsys):
         return Result(code, *capsys.readouterr())
 
     return run
+
+
+@pytest.fixture
+def ran(monkeypatch):
+    """Jobs of a benchmark are run in this process, which starts no others; the names of those that are."""
+    names = []
+
+    def in_this(jobs, processes):
+        for job, outcome in runners.here(jobs):
+            names.append(job.name)
+            yield job, outcome
+
+    monkeypatch.setattr(runners, "in_processes", in_this)
+    return names
 
 
 @pytest.fixture(scope="session")

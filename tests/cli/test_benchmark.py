@@ -18,20 +18,6 @@ FILES = ("results.csv", "results.json", "results.tex", "report.html")
 
 
 @pytest.fixture
-def ran(monkeypatch):
-    """Jobs are run in this process; the names of those that are."""
-    names = []
-
-    def in_this(jobs, processes):
-        for job, outcome in runners.here(jobs):
-            names.append(job.name)
-            yield job, outcome
-
-    monkeypatch.setattr(runners, "in_processes", in_this)
-    return names
-
-
-@pytest.fixture
 def folder(tmp_path, recording):
     """A folder with two recordings."""
     folder = tmp_path / "set"

@@ -87,7 +87,7 @@ def test_truth_beside_the_recording_is_found_and_told(cli, write_recording, simu
     assert "held-out" in cli("evaluate", path, "--hold-out-frames", "3", "--methods", "hold").out
 
 
-def test_a_mask_without_a_window_leaves_ssim_empty_and_says_so(cli, recording, simulation, tmp_path):
+def test_a_mask_without_a_window_leaves_ssim_empty_and_says_so(cli, ran, recording, simulation, tmp_path):
     """In table and files, and in a benchmark."""
     truth = simulation.truth()
     mask = np.zeros(truth.images.shape[1:], bool)
@@ -124,7 +124,9 @@ def ijrr_folder(tmp_path, simulation):
 
 
 @pytest.mark.parametrize(("inside", "name"), [("", "."), ("images", "..")])
-def test_truth_beside_a_folder_is_found_from_within_it(cli, ijrr_folder, tmp_path, monkeypatch, inside, name):
+def test_truth_beside_a_folder_is_found_from_within_it(
+    cli, ran, ijrr_folder, tmp_path, monkeypatch, inside, name
+):
     """By the name of the folder, which . and .. do not tell; in a benchmark it is called by it, too."""
     monkeypatch.chdir(ijrr_folder / inside)
     arguments = ("--exposure", "10000", "--methods", "hold")
@@ -137,7 +139,7 @@ def test_truth_beside_a_folder_is_found_from_within_it(cli, ijrr_folder, tmp_pat
     assert named.out == found.out
 
 
-def test_truth_beside_the_recording_comes_before_its_own(cli, write_recording, simulation, tmp_path):
+def test_truth_beside_the_recording_comes_before_its_own(cli, ran, write_recording, simulation, tmp_path):
     """As in `kalux benchmark`, with the same numbers."""
     truth = simulation.truth()
     path = write_recording(tmp_path / "pan.h5", ground_truth=truth)
