@@ -72,7 +72,7 @@ def test_slow_pixels_of_a_dim_scene_are_followed():
         noise_rate=1.0,
         read_noise=0.005,
     )
-    recording = unlabelled(simulate(demo_scene(sensor_size=(90, 120)), sensor))
+    recording = unlabelled(simulate(demo_scene(sensor_size=(90, 120), duration=700_000), sensor))
     assert estimate_delay(recording, CAMERA).apparent == pytest.approx(17_000, abs=2_000)
     found = calibrate_contrast(recording, CAMERA)
     assert found.delay == pytest.approx(17_000, abs=2_000)

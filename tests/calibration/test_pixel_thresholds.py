@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import lru_cache
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from builders import from_black, lifted, pixel_events, quick_frames, unlabelled
 
 CAMERA = CameraSettings()
 SCENE = demo_scene(sensor_size=(90, 120))
+SMALL = demo_scene(sensor_size=(60, 80))
 
 
 def first_frames(recording, count, start=0):
@@ -37,6 +39,13 @@ SENSOR = SensorSettings(
 def simulation():
     """A window in a dim room, a part of it saturated; 10 % mismatch and noise."""
     return simulate(SCENE, SENSOR)
+
+
+@lru_cache(maxsize=2)
+def noiseless(period):
+    """Of a sensor without noise and with a refractory period."""
+    sensor = SensorSettings(threshold_on=0.3, threshold_off=0.2, refractory=period)
+    return unlabelled(simulate(SMALL, sensor))
 
 
 @pytest.fixture(scope="module")
@@ -67,8 +76,7 @@ def test_within_fifteen_percent_from_five_frames(simulation):
 
 def test_the_refractory_period_is_made_up_for_where_it_is_known():
     """With 500 us lost after every event the plain fit is several percent too large."""
-    sensor = SensorSettings(threshold_on=0.3, threshold_off=0.2, refractory=500.0)
-    recording = unlabelled(simulate(SCENE, sensor))
+    recording = noiseless(500.0)
     known = calibrate_contrast(recording, CAMERA, delay=0, refractory=500)
     plain = calibrate_contrast(recording, CAMERA, delay=0, refractory=0)
     assert known.on == pytest.approx(0.3, rel=0.05)
@@ -81,8 +89,7 @@ def test_the_refractory_period_is_made_up_for_where_it_is_known():
 @pytest.mark.parametrize(("period", "found"), [(500.0, (350, 550)), (0.0, (0, 0))])
 def test_a_refractory_period_that_no_noise_shows_is_found(period, found):
     """By what explains the frames, and its own error is one of the thresholds."""
-    sensor = SensorSettings(threshold_on=0.3, threshold_off=0.2, refractory=period)
-    recording = unlabelled(simulate(SCENE, sensor))
+    recording = noiseless(period)
     told, known = (calibrate_contrast(recording, CAMERA, refractory=us) for us in (None, int(period)))
     assert told.on == pytest.approx(0.3, rel=0.04)
     assert told.off == pytest.approx(0.2, rel=0.04)

@@ -18,7 +18,7 @@ SIZE = (5, 6)
 def test_the_shortest_interval_is_not_that_of_noise():
     """Noise follows an event at any time; with a refractory period of 400 us others do not follow before."""
     sensor = SensorSettings(refractory=400.0, noise_rate=3.0)
-    recording = simulate(demo_scene(sensor_size=(90, 120)), sensor).recording()
+    recording = simulate(demo_scene(sensor_size=(90, 120), duration=600_000), sensor).recording()
     assert 400 <= shortest_interval(recording) < 900
     assert shortest_interval(recording, most_events=20_000) >= 400
 
@@ -74,7 +74,7 @@ def test_no_period_is_longer_than_the_shortest_interval_may_be():
 
 def simulated(**sensor):
     settings = SensorSettings(noise_rate=20.0, noise_resets=True, **sensor)
-    return simulate(demo_scene(sensor_size=(90, 120)), settings).recording()
+    return simulate(demo_scene(sensor_size=(60, 80), duration=600_000), settings).recording()
 
 
 def random_intervals(draw):

@@ -64,7 +64,7 @@ def test_the_fixed_pattern_comes_from_the_frames_and_can_be_given():
 def test_the_refractory_period_comes_from_noise_and_can_be_given():
     """`iccv2021` knows none, and is not given any."""
     sensor = SensorSettings(noise_rate=20.0, noise_resets=True, refractory=600.0)
-    seen = simulate(demo_scene(sensor_size=(90, 120)), sensor).recording()
+    seen = simulate(demo_scene(sensor_size=(60, 80), duration=600_000), sensor).recording()
     found, given = plan(seen, at="frames"), plan(seen, at="frames", settings=refractory(700))
     assert found.dead_time == found.settings.events.refractory_period == pytest.approx(600, rel=0.02)
     assert (given.dead_time, given.settings.events.refractory_period) == (0, 700)
