@@ -25,7 +25,7 @@ from kalux.datasets import (
     simulate_colour,
 )
 from kalux.events import make_events
-from kalux.settings import altered
+from kalux.settings import Settings, altered
 
 
 def own_threads() -> list[str]:
@@ -55,6 +55,17 @@ VARIANTS = {
     "iccv2021-exact": altered(PRESETS["iccv2021"], "filter", solution="exact"),
     "cf": PRESETS["cf"],
 }
+
+
+def all_given() -> Settings:
+    """The default settings, of which all that a plan would estimate is given, but contrast thresholds."""
+    chosen = altered(PRESETS["default"], "events", delay=0, step_variance=0.2, refractory_period=0)
+    chosen = altered(
+        chosen, "events", threshold_spread=0.1, noise_rate=3.0, leave_out_hot=False, mend_layout=False
+    )
+    chosen = altered(chosen, "events", extrapolation_gain=1.0, extrapolation_trust=1.0)
+    chosen = altered(chosen, "camera", log_offset=0.03, frame_noise=0.006, black_level=0.0)
+    return altered(chosen, "camera", even_gain=False, leave_out_faulty=False, mend_stuck=False)
 
 
 class Stream(NamedTuple):

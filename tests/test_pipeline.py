@@ -8,7 +8,7 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from kalux import PRESETS, Frame, Reconstructor, Recording, pipeline, reconstruct
+from kalux import Frame, Reconstructor, Recording, pipeline, reconstruct
 from kalux.datasets import SensorSettings
 from kalux.errors import EventError
 from kalux.events import make_events
@@ -16,7 +16,16 @@ from kalux.pipeline import execute
 from kalux.planning import plan
 from kalux.settings import altered
 
-from builders import VARIANTS, events, moving_blocks, own_threads, random_stream, recording, unlabelled
+from builders import (
+    VARIANTS,
+    all_given,
+    events,
+    moving_blocks,
+    own_threads,
+    random_stream,
+    recording,
+    unlabelled,
+)
 
 every_variant = pytest.mark.parametrize("variant", VARIANTS)
 both_modes = pytest.mark.parametrize("lookahead", [True, False], ids=["lookahead", "causal"])
@@ -186,13 +195,7 @@ def test_images_before_the_damage_are_returned(monkeypatch):
     monkeypatch.setattr("kalux.recording.CHUNK_EVENTS", 10)
     stream = random_stream(6)
     # All is given: to estimate it reads ahead, and would find the damage before the first image.
-    chosen = altered(PRESETS["default"], "events", delay=0, step_variance=0.2, refractory_period=0)
-    chosen = altered(
-        chosen, "events", threshold_spread=0.1, noise_rate=3.0, leave_out_hot=False, mend_layout=False
-    )
-    chosen = altered(chosen, "events", extrapolation_gain=1.0, extrapolation_trust=1.0)
-    chosen = altered(chosen, "camera", log_offset=0.03, frame_noise=0.006, black_level=0.0)
-    chosen = altered(chosen, "camera", even_gain=False, leave_out_faulty=False, mend_stuck=False)
+    chosen = all_given()
     good = list(reconstruct(recording(6), at="frames", settings=chosen))
     place = int(stream.events["t"].searchsorted(stream.frames[2].exposure_end)) + 12
     broken = stream.events.copy()
@@ -271,8 +274,9 @@ def long_recording(frames=200, per_frame=100, first_frame=0, last_frame=10**9):
 
 @both_modes
 def test_memory_is_bounded(lookahead, watched):
-    """A few frames' worth of 20,000 events."""
-    count = sum(1 for _ in reconstruct(long_recording(), rate_hz=50, lookahead=lookahead))
+    """A few frames' worth of 20,000 events; here and below without estimates, which the engine does not make."""
+    images = reconstruct(long_recording(), rate_hz=50, lookahead=lookahead, settings=all_given())
+    count = sum(1 for _ in images)
     assert count == pytest.approx(100, abs=2)
     assert watched.most_events <= 1_000
     assert watched.most_frames <= 5
@@ -283,7 +287,8 @@ def test_memory_is_bounded(lookahead, watched):
 def test_memory_is_bounded_however_few_images_are_wanted(when, lookahead, watched):
     rec = long_recording()
     times = [4_000, 1_990_000] if when == "both ends" else [1_990_000]
-    assert len(list(reconstruct(rec, times=times, lookahead=lookahead))) == len(times)
+    images = list(reconstruct(rec, times=times, lookahead=lookahead, settings=all_given()))
+    assert len(images) == len(times)
     assert watched.most_events <= 1_000
     assert watched.most_frames <= 5
 
@@ -293,7 +298,7 @@ def test_memory_is_bounded_where_events_end_early(watched):
     few = Recording.from_arrays(
         next(iter(rec.events())), rec.frames(), sensor_size=(4, 5), contrast_threshold=0.2
     )
-    assert list(reconstruct(few, rate_hz=50))
+    assert list(reconstruct(few, rate_hz=50, settings=all_given()))
     assert watched.most_frames <= 5
 
 
@@ -301,7 +306,7 @@ def test_memory_is_bounded_where_frames_begin_late(watched):
     """Events before the first exposure say nothing and need not be kept."""
     with pytest.warns(UserWarning, match="of the 20,000 events lie between"):
         rec = long_recording(first_frame=190)
-    assert list(reconstruct(rec, rate_hz=50))
+    assert list(reconstruct(rec, rate_hz=50, settings=all_given()))
     assert watched.most_events <= 1_000
 
 
@@ -309,7 +314,7 @@ def test_memory_is_bounded_where_frames_end_early(watched):
     with pytest.warns(UserWarning, match="of the 20,000 events lie between"):
         rec = long_recording(last_frame=10)
     times = list(range(0, 1_990_000, 10_000))
-    assert len(list(reconstruct(rec, times=times))) == len(times)
+    assert len(list(reconstruct(rec, times=times, settings=all_given()))) == len(times)
     assert watched.most_events <= 1_000
 
 

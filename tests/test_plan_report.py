@@ -10,9 +10,9 @@ import numpy as np
 from kalux import PRESETS, Recording
 from kalux.plan_report import plan_report
 from kalux.planning import plan
-from kalux.settings import from_dict
+from kalux.settings import altered, from_dict
 
-from builders import moving_blocks, passing_by, textured
+from builders import all_given, moving_blocks, passing_by, textured
 
 
 def rows_of(recording, **groups):
@@ -104,7 +104,7 @@ def test_whether_motion_is_followed():
     )
 
     def told(recording, motion="auto", **how):
-        asked = from_dict({"filter": {"motion": motion}}, PRESETS["default"])
+        asked = altered(all_given(), "filter", motion=motion)
         made = plan(recording, at="frames", settings=asked, **how)
         return dict(plan_report(recording, made, asked)).get("motion")
 

@@ -360,7 +360,9 @@ NEED_MORE = {"filter.motion", "camera.weight_floor", "events.extrapolation_sprea
 
 @pytest.fixture(scope="module")
 def clipped():
-    return unlabelled(moving_blocks(0.05, 3.0, sensor=SensorSettings(noise_rate=2.0), size=(24, 32)))
+    return unlabelled(
+        moving_blocks(0.05, 3.0, sensor=SensorSettings(noise_rate=2.0), size=(24, 32), duration=300_000)
+    )
 
 
 @functools.cache
