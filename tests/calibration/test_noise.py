@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 import pytest
 
@@ -24,6 +26,12 @@ CAMERA = CameraSettings()
 SIZE = (64, 96)
 NOTHING = np.empty(0, EVENT_DTYPE)
 SCENE = demo_scene(sensor_size=(90, 120), duration=600_000)
+
+
+@lru_cache(maxsize=1)
+def noisy():
+    """A recording with three events of noise per second and pixel."""
+    return unlabelled(simulate(SCENE, SensorSettings(noise_rate=3.0)))
 
 
 def noise_events(rate, *, hot=(), hot_rate=200.0, seconds=1.0, seed=0):
@@ -84,7 +92,7 @@ def test_times_may_be_of_any_clock(shift):
 
 def test_noise_beside_motion_is_not_much_overestimated():
     """Faint edges that make single events look like noise: an upper bound where everything moves."""
-    found = event_noise(unlabelled(simulate(SCENE, SensorSettings(noise_rate=3.0))))
+    found = event_noise(noisy())
     assert 2.7 < found.rate < 5.0
 
 
@@ -105,13 +113,13 @@ def test_faint_edges_that_pass_slowly_are_no_noise():
 
 def test_a_time_in_which_events_are_lost_is_not_quiet():
     """It would be the quietest of all, and the rate none."""
-    whole = unlabelled(simulate(SCENE, SensorSettings(noise_rate=3.0)))
+    whole = noisy()
     found = event_noise(without_events(whole, 200_000, 450_000))
     assert found.rate == pytest.approx(event_noise(whole).rate, rel=0.25)
 
 
 def test_chunks_that_end_in_lost_events_do_not_matter(monkeypatch):
-    recording = without_events(unlabelled(simulate(SCENE, SensorSettings(noise_rate=3.0))), 200_000, 450_000)
+    recording = without_events(noisy(), 200_000, 450_000)
     whole = event_noise(recording)
     monkeypatch.setattr("kalux.recording.CHUNK_EVENTS", 777)
     np.testing.assert_array_equal(event_noise(recording).rates, whole.rates)

@@ -19,7 +19,6 @@ from builders import from_black, lifted, pixel_events, quick_frames, unlabelled
 
 CAMERA = CameraSettings()
 SCENE = demo_scene(sensor_size=(90, 120))
-SMALL = demo_scene(sensor_size=(60, 80))
 
 
 def first_frames(recording, count, start=0):
@@ -45,7 +44,7 @@ def simulation():
 def noiseless(period):
     """Of a sensor without noise and with a refractory period."""
     sensor = SensorSettings(threshold_on=0.3, threshold_off=0.2, refractory=period)
-    return unlabelled(simulate(SMALL, sensor))
+    return unlabelled(simulate(demo_scene(sensor_size=(60, 80)), sensor))
 
 
 @pytest.fixture(scope="module")
