@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any, Final
 
 import cv2
@@ -71,8 +72,9 @@ def _ball_matrix(t: float) -> NDArray[np.float64]:
     return np.column_stack([rotation, shift])
 
 
+@functools.lru_cache(maxsize=1)
 def _draw_room(seed: int) -> Image:
-    """The room's radiance on the fine canvas."""
+    """The room's radiance on the fine canvas, 4 MB; kept, since drawing it takes a second. Not to be changed."""
     rng = np.random.default_rng(seed)
     shape = (_ROOM[0] * _FINE, _ROOM[1] * _FINE)
     light = _window_light(shape)
@@ -83,7 +85,9 @@ def _draw_room(seed: int) -> Image:
     _draw_shelf(room, light, rng)
     _draw_window(room, rng)
     _draw_plant(room)
-    return np.asarray(room, np.float32)
+    drawn = np.asarray(room, np.float32)
+    drawn.flags.writeable = False
+    return drawn
 
 
 def pink_noise(shape: tuple[int, int], rng: np.random.Generator, *, exponent: float = 1.0) -> Image:
