@@ -312,7 +312,7 @@ def trail(pixel, t, scale, height, on, off):
     signal = 1.0
     for k, of_interval in enumerate(pixel.signal):
         if pixel.middles[k] < newest <= pixel.middles[k + 1]:
-            signal = np.floor(127 * of_interval[0 if polarity else 1] + 0.5) / 127
+            signal = np.floor(127 * np.sqrt(of_interval[0 if polarity else 1]) + 0.5) / 127
     x = (t - newest) * US / scale
     return signal * height * (on if polarity else -off) * 2 * x / (1 + x * x)
 

@@ -57,8 +57,8 @@ def test_an_event_is_as_sure_as_its_neighbours_say_until_the_next_one():
     _, _, after = trail.follow([events], before, 0, 100)
     known = trail.with_surety(before, after, (first, then))
     signed = trail.signed_surety(known.events)
-    assert signed[0, 1] == -round(0.25 * trail.SURE)
-    assert signed[2, 2] == round(0.5 * trail.SURE)
+    assert signed[0, 1] == -round(0.5 * trail.SURE)
+    assert signed[2, 2] == round(0.5**0.5 * trail.SURE)
     _, _, later = trail.follow([make_events([110], [2], [2], [0])], known, 100, 200)
     again = trail.with_surety(known, later, (np.ones_like(first), np.zeros_like(first)))
     assert again.surety[0, 1] == known.surety[0, 1]  # no newer event
@@ -89,7 +89,7 @@ def test_a_pixel_goes_on_and_comes_back():
     np.testing.assert_allclose(f[:, 0], 0.1 * 2 * x / (1 + x * x), atol=1e-7)
     np.testing.assert_allclose(f[:, 1], -2 * f[:, 0], atol=1e-7)
     np.testing.assert_allclose(f[:, 2], 0, atol=1e-7)
-    # Half as likely, half as far.
+    # Half as sure, half as far.
     np.testing.assert_allclose(f[:, 3], 63 / 127 * f[:, 0], atol=1e-7)
 
 

@@ -5,9 +5,9 @@ newest event a pixel is on average
 
     f(a) = h c 2 x / (1 + x^2),   x = a / s,
 
-beyond the level of that event, in its direction (c: on or off threshold; docs/equations.md, K14), times the probability
-that the event is signal. The time s follows the recording: 1.1 times the mean interval between two events of one
-polarity at a pixel.
+beyond the level of that event, in its direction (c: on or off threshold; docs/equations.md, K14), times the square root
+of the probability that the event is signal. The time s follows the recording: 1.1 times the mean interval between two
+events of one polarity at a pixel.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ NO_EVENT: Final = -(1 << 62)
 """Code of a pixel that has had no event."""
 
 SURE: Final = 127
-"""Surety of an event that is signal for sure; of others it is as much less as they are less likely."""
+"""Surety of an event that is signal for sure."""
 
 FOLLOWED_PIXEL: Final = np.dtype([("newest", "i8"), ("off", "f4"), ("on", "f4")], align=True)
 """What is counted of a pixel, in one line of memory: code of its newest event, weights of off and of on events."""
@@ -77,7 +77,8 @@ class Followed(NamedTuple):
     newest
         (H, W) int64: 2 t + p of the newest event (t in us), `NO_EVENT` before the first.
     surety
-        (H, W) int8: `SURE` times the probability that it is signal (K5), rounded; `SURE` where nobody has asked.
+        (H, W) int8: `SURE` times the square root of the probability that it is signal (K5), rounded; `SURE` where it is
+        not asked for. The root, since an event of noise does not end the way that the light was on before it.
     span, intervals
         Sum (us) and number of the intervals that count.
     """
@@ -190,7 +191,7 @@ def with_surety(before: Followed, after: Followed, shares: tuple[FloatArray, Flo
 @inner
 def surety_of(share):  # type: ignore[no-untyped-def]
     """Of an event that is signal with the probability ``share``, float32."""
-    return np.int32(share * np.float32(SURE) + np.float32(0.5))
+    return np.int32(np.sqrt(share) * np.float32(SURE) + np.float32(0.5))
 
 
 @loop
