@@ -90,11 +90,11 @@ class Trails:
             if on_events is not None:
                 chunks = counted(chunks, on_events)
             before = followed
-            on_events_of, off_events_of, followed = follow(chunks, before, start + delay, end + delay)
+            counts_on, counts_off, followed = follow(chunks, before, start + delay, end + delay)
             if rate is not None and measures is not None:
                 latest = measures(spill.reversed_frame(len(spill) - 1 - index))
                 if index > 0:
-                    counts = on_events_of, off_events_of
+                    counts = counts_on, counts_off
                     shares = signal_shares(*counts, rate * (end - start) * 1e-6, ~(measured | latest))
                     followed = with_surety(before, followed, shares)
                 measured = latest

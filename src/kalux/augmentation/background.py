@@ -45,7 +45,7 @@ _PRIOR_PIXELS: Final = 4.0
 
 _PRIOR_OF_HIDDEN: Final = 200.0
 """Pixels as which the distribution of all pixels counts in every class of hidden ones. With 20, noisy skies just above
-white gain a tenth more, but textures in large windows lose up to 4 % (docs/equations.md, K5)."""
+white gain 3 to 5 % more, but others lose up to 4 (docs/equations.md, K5)."""
 
 
 def signal_shares(

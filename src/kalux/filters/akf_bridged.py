@@ -86,6 +86,8 @@ _STEP_FIELDS: Final = STEP_PIXEL.itemsize // 4
 _INFORMATION, _WEIGHTED, _AUGMENTED, _RATE = range(_STATE_FIELDS)
 _STEP_ON, _STEP_OFF, _FORWARD, _BACKWARD, _DOUBT_ON, _DOUBT_OFF, _COMING, _SURETY = range(_STEP_FIELDS)
 _BITS: Final = np.int32(8)
+"""Of a surety. Two are one whole number, which float32 holds exactly."""
+
 _FIRST_BITS: Final = np.int32(255)
 
 
