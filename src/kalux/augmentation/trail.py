@@ -276,8 +276,7 @@ def signed_surety(newest: Newest) -> NDArray[np.int8]:
 def _signed_surety(newest, signed):  # type: ignore[no-untyped-def]
     code, surety = newest
     for i in range(len(signed)):
-        sign = np.int8(code[i] & 1) * np.int8(2) - np.int8(1)
-        signed[i] = np.int8(0) if code[i] == NO_EVENT else sign * surety[i]
+        signed[i] = np.int8(0) if code[i] == NO_EVENT else np.int8(_signed(code[i], surety[i]))
 
 
 @nb.njit(cache=True, inline="always")
@@ -295,9 +294,13 @@ def ahead_of_event(signed: Any, age: Any, heights: Any) -> Any:
 
 @nb.njit(cache=True, inline="always", error_model="numpy")
 def _ahead_of_newest(newest, surety, t, heights):  # type: ignore[no-untyped-def]
-    scale, on, off = heights
     age = np.float32(t - (newest >> 1)) * MICROSECOND32
-    return (on if newest & 1 else -off) * (np.float32(surety) * _OF_SURE) * beyond(age, scale)
+    return ahead_of_event(_signed(newest, surety), age, heights)
+
+
+@nb.njit(cache=True, inline="always")
+def _signed(newest: Any, surety: Any) -> Any:
+    return surety if newest & 1 else -surety
 
 
 @loop

@@ -232,43 +232,38 @@ def event_noise(
         unusual = _unusual_pixels(tally, part) | known
         if (unusual & ~known).any():  # again without them: their neighbours are quiet after all
             tally = tallied(QUIET, unusual)
-        quietest = _of_blocks(tally, unusual, part).quietest
-        found = _in_quiet_time(tally, unusual, part, quietest, last - first)
-        if found is not None:
+        tally = tally._replace(quiet=tally.quiet * part)
+        share = _quiet_share(tally, part, last - first)
+        if share >= _LEAST_QUIET or part.all():
             break
-    if found is None:
+    if share < _LEAST_QUIET:
         return None
-    gap = QUIET
-    while found.rate > enough:
-        gap *= 2
-        # Of the same blocks: chosen by longer times, those would count that have less noise by chance.
-        longer = _in_quiet_time(tallied(gap, unusual), unusual, part, quietest, last - first)
-        if longer is None or longer.rate + _CLEARLY * longer.rate_error >= found.rate:
-            break
-        found = longer
-    return found._replace(dead=found.dead & ~known)
-
-
-def _in_quiet_time(
-    tally: _Tally,
-    unusual: NDArray[np.bool_],
-    part: NDArray[np.bool_],
-    used: NDArray[np.bool_],
-    duration: int,
-) -> EventNoise | None:
-    """What events in quiet time of ``part`` (H, W) say; None where less than 1 % of the ``duration`` (us) is quiet.
-
-    The rate is that of the ``used`` blocks.
-    """
-    tally = tally._replace(quiet=tally.quiet * part)
-    share = float(tally.quiet.sum() / (np.count_nonzero(part) * duration))
     blocks = _of_blocks(tally, unusual, part)
-    if share < _LEAST_QUIET or not (blocks.quiet * used).any():
-        return None
-    rate, error = _typical_rate(blocks, used)
+    quietest = blocks.quietest
+    rate, error = _typical_rate(blocks, quietest)
+    gap = QUIET
+    while rate > enough:
+        gap *= 2
+        longer = tallied(gap, unusual)
+        longer = longer._replace(quiet=longer.quiet * part)
+        longer_share = _quiet_share(longer, part, last - first)
+        # Of the same blocks: chosen by longer times, those would count that have less noise by chance.
+        blocks = _of_blocks(longer, unusual, part)
+        if longer_share < _LEAST_QUIET or not blocks.quiet[quietest].any():
+            break
+        longer_rate, longer_error = _typical_rate(blocks, quietest)
+        if longer_rate + _CLEARLY * longer_error >= rate:
+            break
+        tally, share, rate, error = longer, longer_share, longer_rate, longer_error
     counts = tally.counts.sum(axis=0).astype(np.float64)
     quiet = (tally.quiet.sum(axis=0) * 1e-6).astype(np.float64, copy=False)
-    return EventNoise(rate, error, shrunk_rates(counts, quiet, rate, unusual), _dead_pixels(tally.all), share)
+    rates = shrunk_rates(counts, quiet, rate, unusual)
+    return EventNoise(rate, error, rates, _dead_pixels(tally.all) & ~known, share)
+
+
+def _quiet_share(tally: _Tally, part: NDArray[np.bool_], duration: int) -> float:
+    """Of the time of ``part`` (H, W), ``duration`` us, beyond which nothing is quiet."""
+    return float(tally.quiet.sum() / (np.count_nonzero(part) * duration))
 
 
 def _chunks(
@@ -442,8 +437,6 @@ class _Blocks(NamedTuple):
         """
         share = self.quiet / np.maximum(self.possible, 1)
         there = self.possible > 0
-        if not there.any():
-            return there
         return there & (self.quiet > 0) & (share >= _NEARLY * np.quantile(share[there], 0.95))
 
 

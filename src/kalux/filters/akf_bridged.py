@@ -151,11 +151,10 @@ def begin(segment: BridgedSegment, state: State) -> Cursor:
     variances = segment.forward_variance, segment.backward_variance
     coming = np.zeros_like(segment.augmented) if segment.events is None else segment.events
     trail = no_trail(coming.shape) if segment.trail is None else segment.trail
-    none, all_of_it = np.zeros_like(segment.augmented), np.ones_like(segment.augmented)
-    doubts = (none, none) if segment.doubt is None else segment.doubt
-    signal = (all_of_it, all_of_it) if segment.signal is None else segment.signal
-    steps_given = segment.step_on, segment.step_off, *variances, coming, *doubts, *signal
-    given = segment.augmented, trail.start, steps_given
+    doubts = (np.zeros_like(segment.augmented),) * 2 if segment.doubt is None else segment.doubt
+    signal = (np.ones_like(segment.augmented),) * 2 if segment.signal is None else segment.signal
+    of_steps = segment.step_on, segment.step_off, *variances, coming, *doubts, *signal
+    given = segment.augmented, trail.start, of_steps
     before = state.log_intensity, floor, state.variance
     _begin_bridged(given, scalars, before, pixels.reshape(-1), steps.reshape(-1))
     signed[1:-1, 1:-1] = trail.signed

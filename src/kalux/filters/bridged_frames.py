@@ -319,10 +319,7 @@ class BridgedFrames(Method):
         """The segment from the middle of one exposure to that of the next, and the memory after it."""
         start, end = shot.middle, following.middle
         on, off, at_middle = self.follow(events, start, end, memory.followed)
-        first_hidden, second_hidden = (
-            latent.variance >= bridge.UNMEASURED for latent in (memory.latent, second)
-        )
-        signal = self._signal_shares(on, off, (end - start) * 1e-6, first_hidden & second_hidden)
+        signal = self._signal_shares((on, off), (end - start) * 1e-6, (memory.latent, second))
         if signal is not None:
             at_middle = with_surety(memory.followed, at_middle, signal)
         trail, grown = self._trail_between(memory, shot, following, at_middle)
@@ -458,11 +455,14 @@ class BridgedFrames(Method):
         return trail_at(followed.events, t, (scale, *self._trail_heights))
 
     def _signal_shares(
-        self, on: Floats, off: Floats, seconds: float, hidden: NDArray[np.bool_]
+        self, counts: tuple[Floats, Floats], seconds: float, frames: tuple[Latent, Latent]
     ) -> tuple[Floats, Floats] | None:
-        """Which share of the pixels' events is signal (K5); None where the noise of events is not known."""
+        """Which share of the pixels' on and off events is signal (K5); None where their noise is not known."""
         rate = self.settings.events.noise_rate
-        return None if rate is None else signal_shares(on, off, rate * seconds, hidden)
+        if rate is None:
+            return None
+        first, second = (frame.variance >= bridge.UNMEASURED for frame in frames)
+        return signal_shares(*counts, rate * seconds, first & second)
 
     @property
     def _trail_heights(self) -> tuple[float, float]:
