@@ -924,6 +924,66 @@ def steps(rows, columns):
     return 2.1969 * (more - less) + 1.4 * (2 * less - more)
 
 
+def below_white(split, settings, k):
+    """Pixels that frame ``k`` clips, and how far the others are below white, log intensity."""
+    camera = Camera.named(chosen_response(settings.camera.response, None), settings.camera.clipped_from)
+    first = np.ceil(settings.camera.clipped_from * 255) / 255
+    found = {place for place, pixel in split.items() if pixel.clipped[k]}
+    top = next(iter(split.values())).white[k]
+    if found:
+        top *= camera.response.inverse(np.array(first))
+    darker = {q: np.log(top) - np.log(max(p.intensity[k], 1e-30)) for q, p in split.items() if q not in found}
+    return found, {q: min(max(value, 0.0), 10.0) for q, value in darker.items()}
+
+
+def mean_hardness(found, darker):
+    """K15: of the pixels beside clipped ones; 1 where there are none."""
+    hard = []
+    for row, column in darker:
+        around = {(row + i, column + j) for i in (-1, 0, 1) for j in (-1, 0, 1)}
+        if around & found:
+            darkest = max(darker.get(q, 0.0) for q in around)
+            hard.append(darkest / (darkest + 0.05))
+    return np.mean(hard) if hard else 1.0
+
+
+def told_by_events(split, settings, k):
+    """K15: E, U, E_r and S_r of the interval that ends at frame ``k``. Of a sensor of one part."""
+    found, darker = below_white(split, settings, k)
+    height, width = (1 + max(places) for places in zip(*split, strict=True))
+
+    def signal_events(pixel):
+        shares = pixel.signal[k - 1] if pixel.signal else (1.0, 1.0)
+        inside = (e for e in pixel.events if pixel.middles[k - 1] < e[0] <= pixel.middles[k])
+        return sum(e[-1] * shares[not e[1]] for e in inside)
+
+    def slope(row, column):
+        step = [0.0, 0.0]
+        if 0 < row < height - 1:
+            step[0] = (darker.get((row + 1, column), 0.0) - darker.get((row - 1, column), 0.0)) / 2
+        if 0 < column < width - 1:
+            step[1] = (darker.get((row, column + 1), 0.0) - darker.get((row, column - 1), 0.0)) / 2
+        return np.hypot(*step)
+
+    unknown = [pixel for pixel in split.values() if pixel.shown > k]
+    rim = [
+        place
+        for place, value in darker.items()
+        if value < 0.7 and any(max(abs(place[0] - r), abs(place[1] - c)) <= 2 for r, c in found)
+    ]
+    events, rim_events = (sum(map(signal_events, some)) for some in (unknown, [split[q] for q in rim]))
+    return np.array([events, len(unknown), rim_events, sum(slope(*place) for place in rim)])
+
+
+def limited(excess, told, hard):
+    """K15: what frames make expect, limited by what events tell; ``told``: from `told_by_events`, of all intervals."""
+    events, count, rim_events, rim_slope = 1.3 * told
+    if rim_events == 0 or rim_slope == 0 or hard == 1:
+        return excess
+    slope = (events + 3) / (count * rim_events / rim_slope)
+    return excess / np.sqrt(1 + (excess / (10 * slope + 2 * 0.05 * hard / (1 - hard))) ** 2)
+
+
 def beyond_rims(split, settings, frames, k):
     """K15: how far above white pixels are that frame ``k`` clips, from those around. Of a sensor of one part."""
     camera = Camera.named(chosen_response(settings.camera.response, None), settings.camera.clipped_from)
@@ -933,29 +993,13 @@ def beyond_rims(split, settings, frames, k):
     most = min(min(max(np.log(2) / max(fall, 1e-3), 0.3), 2.0) - 0.275, 0.5)
     near = clipped = 0
     for j in range(k + 1):
-        first = np.ceil(settings.camera.clipped_from * 255) / 255
-        found = {place for place, pixel in split.items() if pixel.clipped[j]}
-        top = next(iter(split.values())).white[j]
-        if found:
-            top *= camera.response.inverse(np.array(first))
-        darker = {
-            q: np.log(top) - np.log(max(p.intensity[j], 1e-30)) for q, p in split.items() if q not in found
-        }
-        darker = {q: min(max(value, 0.0), 10.0) for q, value in darker.items()}
+        found, darker = below_white(split, settings, j)
         below = sum(value < 0.2 for value in darker.values())
         near, clipped = near + below, clipped + len(found)
     area = len(split)
     share = 0.1 * near / max(clipped, 1) + 1e-4
     scale = 0.2 * (len(found) + 0.1 * area) / (below + share * area)
-    hard = []
-    for row, column in darker:
-        around = {(row + i, column + j) for i in (-1, 0, 1) for j in (-1, 0, 1)}
-        if around & found:
-            darkest = max(darker.get(q, 0.0) for q in around)
-            hard.append(darkest / (darkest + 0.05))
-    level = (
-        most * (1 - np.exp(-settings.filter.unshown_tail * scale / most)) * (np.mean(hard) if hard else 1.0)
-    )
+    level = most * (1 - np.exp(-settings.filter.unshown_tail * scale / most)) * mean_hardness(found, darker)
     size = sum(frames[k].image.shape)  # where all is clipped
     far = {p: min((steps(p[0] - q[0], p[1] - q[1]) for q in darker), default=size) for p in found}
     return {p: level * (1 - np.exp(-distance)) for p, distance in far.items()}
@@ -967,12 +1011,18 @@ def unshown(split, settings, frames, t):
     nan where a frame has. Of a sensor no larger than one part.
     """
     looked = min(sum(f.middle < t for f in frames), len(frames) - 1)  # the newest frame that is used
-    excess = {}
+    excess, likely, by_events = {}, {}, np.zeros(4)
     for k in range(looked + 1):
         for place, level in beyond_rims(split, settings, frames, k).items():
             if split[place].shown > k and (k == 0 or split[place].raised[k - 1]):
                 excess[place] = min(excess.get(place, np.inf), level)
-    told = [(p, excess[place]) for place, p in split.items() if 0 < p.shown <= looked]
+        if k > 0:
+            by_events += told_by_events(split, settings, k)
+        hard = mean_hardness(*below_white(split, settings, k))
+        for place, level in excess.items():
+            if split[place].shown > k:
+                likely[place] = limited(level, by_events, hard) if k else level
+    told = [(p, likely[place]) for place, p in split.items() if 0 < p.shown <= looked]
     gone, gone_foretold = (
         sum(of) for of in ([p.excess for p, _ in told if p.gone], [e for p, e in told if p.gone])
     )
@@ -982,7 +1032,7 @@ def unshown(split, settings, frames, t):
     out = np.full((2, *frames[0].image.shape), np.nan)
     for place, pixel in split.items():
         if pixel.shown > looked:
-            usual = of_all * excess[place]
+            usual = of_all * likely[place]
             scaled = usual * (total + 5) / (foretold + 5)
             out[0][place] = min(scaled, usual + max(total - foretold, 0.0) / (len(left) + 10))
             out[1][place] = (3 * usual) ** 2 * 5 / (foretold + 5)

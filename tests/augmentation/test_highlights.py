@@ -41,11 +41,11 @@ def begun(clipped, darker=1.0):
     return begin_unshown(latent(clipped), frame_highlights(clipped, darker), TAIL)
 
 
-def followed(memory, clipped, value, net):
+def followed(memory, clipped, value, net, events=(STILL, STILL)):
     """The next frame, which is ``value`` where it is not ``clipped``."""
     noise = np.full(len(memory.pixels), NOISE, np.float32)
     return follow_unshown(
-        memory, latent(clipped, value), frame_highlights(clipped, -value), noise, net, MOVED, TAIL
+        memory, latent(clipped, value), frame_highlights(clipped, -value), noise, net, events, MOVED, TAIL
     )
 
 
@@ -69,6 +69,18 @@ def window(shape=SIZE, sides=np.s_[12:28, 14:34]):
     clipped = np.zeros(shape, bool)
     clipped[sides] = True
     return clipped
+
+
+def striped():
+    """Half of every part is clipped, half just below white; the clipped ones are expected to lie by 0.5 above it."""
+    clipped = np.broadcast_to(np.arange(48) % 8 >= 4, SIZE)
+    memory = begun(clipped, 0.1)
+    high = np.full(len(memory.pixels), 0.5, np.float32)
+    return clipped, memory._replace(excess=high, limited=high, expected=high)
+
+
+def uniform(events):
+    return np.full(SIZE, events / 2, np.float32), np.full(SIZE, events / 2, np.float32)
 
 
 def test_where_nothing_is_clipped_nothing_is_expected():
@@ -219,7 +231,8 @@ def test_what_deblurring_adds_to_the_variance_silences_nobody():
     frame = latent(~told, -0.08)
     moving = frame._replace(variance=np.where(told, np.float32(0.01), frame.variance))
     noise = np.full(len(memory.pixels), NOISE, np.float32)
-    memory = follow_unshown(memory, moving, frame_highlights(~told, 0.08), noise, net, MOVED, TAIL)
+    events = STILL, STILL
+    memory = follow_unshown(memory, moving, frame_highlights(~told, 0.08), noise, net, events, MOVED, TAIL)
     assert memory.revealed.pixels.sum() == told.sum()
 
 
@@ -229,6 +242,57 @@ def test_silent_pixels_that_leave_saturation_tell_those_near():
     found = excess_at(followed(begun(EVERYWHERE), ~left, -0.08, STILL))
     assert found[4, 8] < 0.1
     assert found[-1, -1] == pytest.approx(0.5, abs=1e-3)
+
+
+def test_silent_pixels_beside_moving_borders_lie_no_farther_above_white_than_these_are_steep():
+    """Two of four pixels of the borders have a slope of 0.05, all have half an event: 20 events a slope of one."""
+    clipped, memory = striped()
+    at_rims = tuple(np.where(clipped, np.float32(0.0), plane) for plane in uniform(0.5))
+    found = excess_at(followed(memory, clipped, -0.1, STILL, at_rims))[2 * 8 + 3, 3 * 8 + 6]
+    around = 1.3 * alternating()[1]  # 0.3 of the whole image's counts besides
+    most = 10 * 3 / (around * 20) + 2 * 0.1
+    assert found == pytest.approx(0.5 / np.sqrt(1 + (0.5 / most) ** 2), rel=2e-3)
+
+
+def test_events_beyond_white_tell_that_the_light_changes_there():
+    """As many events as at the borders: slopes of 0.025 on average, for 10 pixels."""
+    clipped, memory = striped()
+    found = excess_at(followed(memory, clipped, -0.1, STILL, uniform(0.5)))[2 * 8 + 3, 3 * 8 + 6]
+    around = 1.3 * alternating()[1]
+    most = 10 * (0.5 * around + 3) / (around * 20) + 2 * 0.1
+    assert found == pytest.approx(0.5 / np.sqrt(1 + (0.5 / most) ** 2), rel=2e-3)
+
+
+def test_where_nothing_moves_silence_tells_nothing():
+    clipped, memory = striped()
+    np.testing.assert_array_equal(excess_at(followed(memory, clipped, -0.1, STILL)), excess_at(memory))
+
+
+def test_what_is_limited_is_what_revealed_pixels_are_compared_with():
+    clipped, memory = striped()
+    at_rims = tuple(np.where(clipped, np.float32(0.0), plane) for plane in uniform(2.0))
+    second = followed(memory, clipped, -0.1, STILL, at_rims)
+    left = clipped & (np.arange(40)[:, None] < 8)
+    third = followed(second, clipped & ~left, -0.1, np.where(left, np.float32(-1.0), np.float32(0.0)))
+    gone = left.reshape(-1)[second.pixels]
+    assert third.revealed.expected.sum() == pytest.approx(second.limited[gone].sum(), rel=1e-6)
+    assert second.limited[gone].sum() < 0.9 * memory.excess[gone].sum()
+
+
+@pytest.mark.parametrize("pitch", [1, 2])
+def test_slopes_are_per_pixel_in_a_mosaic_too(pitch):
+    """Down from a clipped half by 0.1 a pixel. In a mosaic four pixels belong to the rim, not two, and one of them is
+    compared with one that lies 0.1 above white and is shown as white."""
+    darker = np.broadcast_to(np.maximum(24 - np.arange(48), 0) * np.float32(0.1), SIZE)
+    clipped = darker == 0.0
+    memory = begun(clipped)
+    seen, noise = FrameHighlights(clipped, darker, ~clipped, pitch), np.zeros(len(memory.pixels), np.float32)
+    after = follow_unshown(memory, latent(clipped, -1.0), seen, noise, STILL, uniform(1.0), MOVED, TAIL)
+    rim = 2 * pitch * SIZE[0]
+    assert after.texture.rim_events.sum() == pytest.approx(rim)
+    lost = 0.1 / 4 * SIZE[0] if pitch == 2 else 0.0
+    assert after.texture.rim_slope.sum() == pytest.approx(0.1 * rim - lost, rel=1e-5)
+    assert after.texture.pixels.sum() == clipped.sum()
 
 
 def test_a_clipped_frame_that_raises_the_bound_tells_of_its_surroundings():

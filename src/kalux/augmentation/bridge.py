@@ -89,6 +89,25 @@ class Revealed(NamedTuple):
     moved_expected: float
 
 
+class Texture(NamedTuple):
+    """What events tell of how fast the light changes beyond white: sums over all intervals until now (K15).
+
+    Attributes
+    ----------
+    events, pixels
+        Of every part of the image: sum of the events of pixels that no frame has measured, as far as they are signal,
+        and the number of these pixels. E and U of docs/equations.md.
+    rim_events, rim_slope
+        The same of measured pixels beside clipped ones, and the sum of the slopes that frames show there, log intensity
+        per pixel. E_r and S_r.
+    """
+
+    events: Array
+    pixels: Array
+    rim_events: Array
+    rim_slope: Array
+
+
 class UnshownMemory(NamedTuple):
     """At a node: pixels that no frame has measured yet, and what is expected of them (K15).
 
@@ -100,13 +119,15 @@ class UnshownMemory(NamedTuple):
         (N,) float32, lower bound of L.
     shape
         (H, W).
-    excess, expected
-        (N,) float32: how far above it L is expected to be by what frames show around the pixels; and the same,
-        corrected by pixels that have left saturation.
+    excess, limited, expected
+        (N,) float32: how far above it L is expected to be by what frames show around the pixels; the same, limited by
+        what events tell; and that, corrected by pixels that have left saturation.
     doubt
         (N,) float32: variance of ``expected``.
     revealed
         Statistics of the pixels that have left saturation.
+    texture
+        Of those that have not.
     near, clipped
         Numbers of pixels just below white and of clipped ones, in all frames until now.
     """
@@ -115,9 +136,11 @@ class UnshownMemory(NamedTuple):
     bound: NDArray[np.float32]
     shape: tuple[int, ...]
     excess: NDArray[np.float32]
+    limited: NDArray[np.float32]
     expected: NDArray[np.float32]
     doubt: NDArray[np.float32]
     revealed: Revealed
+    texture: Texture
     near: int
     clipped: int
 

@@ -4,7 +4,9 @@ The frames and the events of such a pixel give a lower bound of its intensity. H
 estimated twice. First from the pixels around it: intensities are continuous, so that where many pixels lie just below
 white, few lie far above it. Then from pixels that were clipped, too, and have left saturation: when a frame measures
 one for the first time, its distance from its bound is known. These distances are collected as the recording goes on,
-for every part of the image, since a window is brighter than the floor that it lights.
+for every part of the image, since a window is brighter than the floor that it lights. Events limit the first: where the
+image moves and clipped pixels stay silent, the light hardly changes among them, and lies no farther above white than
+their borders are steep.
 """
 
 from __future__ import annotations
@@ -15,7 +17,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.bridge import MASKED, UNMEASURED, BridgedSegment, Latent, Revealed, UnshownMemory
+from kalux.augmentation.bridge import (
+    MASKED,
+    UNMEASURED,
+    BridgedSegment,
+    Latent,
+    Revealed,
+    Texture,
+    UnshownMemory,
+)
 from kalux.augmentation.parts import (
     interpolated,
     part_grid,
@@ -59,6 +69,25 @@ _NOISE: Final = 3.0
 
 _RAISED: Final = np.float32(1e-4)
 """Log intensity by which a frame must raise a bound to count: less may be rounding."""
+
+_RIM: Final = 2
+"""Pixels from a clipped one up to which a measured one is at its rim: an edge that passes by moves both."""
+
+_RIM_DARKEST: Final = 0.7
+"""Log intensity below white down to which it is, half of white: what is darker may be something else that moves."""
+
+_TEXTURE_WHOLE: Final = 0.3
+"""Share of the whole image's events that counts around every part; 0.1 to 5 do alike (docs/equations.md, K15)."""
+
+_UNSEEN_EVENTS: Final = 3.0
+"""Events that count besides those that were seen: where none was, as many are expected at most, with a probability of
+95 %."""
+
+_SLOPE_REACH: Final = np.float32(10.0)
+"""Pixels over which the light rises with the slope that events tell. 5 to 20 do alike."""
+
+_STEP_REACH: Final = np.float32(2.0)
+"""Excess beyond a border that is steep, in units of what it rises by up to white."""
 
 _NEIGHBOURHOOD: Final = np.ones((3, 3), np.uint8)
 
@@ -127,7 +156,9 @@ def begin_unshown(first: Latent, highlights: FrameHighlights, tail: Tail) -> Uns
     near, clipped = _counts(highlights)
     excess = excess_from_surroundings(highlights, pixels, near / max(clipped, 1), tail)
     doubt = (np.float32(_UNKNOWN_SCALE) * excess) ** 2
-    return UnshownMemory(pixels, bound, first.value.shape, excess, excess, doubt, revealed, near, clipped)
+    texture = Texture(*(np.zeros(parts) for _ in Texture._fields))
+    expected = excess, excess, excess
+    return UnshownMemory(pixels, bound, first.value.shape, *expected, doubt, revealed, texture, near, clipped)
 
 
 def follow_unshown(
@@ -136,6 +167,7 @@ def follow_unshown(
     highlights: FrameHighlights,
     noise: Floats,
     net: Floats,
+    events: tuple[Floats, Floats],
     moved: float,
     tail: Tail,
 ) -> UnshownMemory:
@@ -152,6 +184,8 @@ def follow_unshown(
         saturation. Deblurring adds variance to moving pixels only.
     net
         (H, W) what events add to L between the two frames.
+    events
+        (H, W) each: on and off events between them, as far as they are signal.
     moved
         Log intensity by which events must take a pixel down for it to have moved: more than one wrong event.
     """
@@ -172,14 +206,18 @@ def follow_unshown(
     if raised.any():
         around = excess_from_surroundings(highlights, unknown[raised], near / max(clipped, 1), tail)
         excess[raised] = np.minimum(excess[raised], around)
-    expected, doubt = _corrected(excess, unknown, memory.shape[1], revealed)
+    texture = _with_texture(memory.texture, unknown, highlights, events)
+    limited = _limited(excess, unknown, texture, highlights)
+    expected, doubt = _corrected(limited, unknown, memory.shape[1], revealed)
     return memory._replace(
         pixels=unknown,
         bound=bounded[~measured],
         excess=excess,
+        limited=limited,
         expected=expected,
         doubt=doubt,
         revealed=revealed,
+        texture=texture,
         near=near,
         clipped=clipped,
     )
@@ -202,17 +240,13 @@ def excess_from_surroundings(
     near
         Number of pixels just below white over that of clipped ones, of all frames until now.
     """
-    distance, rim, hardness = _borders(highlights)
-    of_parts = (
-        weighted_sums(part_sums(plane))
-        for plane in (highlights.clipped, highlights.just_below, rim, hardness)
+    clipped, below = (
+        weighted_sums(part_sums(plane)) for plane in (highlights.clipped, highlights.just_below)
     )
-    clipped, below, rims, hard = of_parts
     area = weighted_area(highlights.darker.shape)
     scale = _NEAR * (clipped + _WHOLE * area) / (below + (_WHOLE * near + _LEAST) * area)
-    hard = np.where(rims > 0.0, hard / np.maximum(rims, 1e-300), 1.0)
-    level = tail.most * -np.expm1(-tail.share * scale / tail.most) * hard
-    inside = -np.expm1(-distance.reshape(-1)[pixels])
+    level = tail.most * -np.expm1(-tail.share * scale / tail.most) * _hardness(highlights)
+    inside = -np.expm1(-_distance(highlights).reshape(-1)[pixels])
     excess: NDArray[np.float32] = (
         interpolated(level.astype(np.float32), pixels, highlights.darker.shape[1]) * inside
     )
@@ -224,27 +258,101 @@ def _counts(highlights: FrameHighlights) -> tuple[int, int]:
     return int(np.count_nonzero(highlights.just_below)), int(np.count_nonzero(highlights.clipped))
 
 
-def _borders(
-    highlights: FrameHighlights,
-) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.float32]]:
-    """(H, W) each: distance to the nearest pixel not clipped, pixels that border on clipped ones, and their hardness.
-
-    Distances, in pixels, are right to 2 %. Hardness is 0 to 1, 0 away from borders.
-    """
-    shape, pitch = highlights.clipped.shape, highlights.pitch
-    distance, hardness = np.empty(shape, np.float32), np.zeros(shape, np.float32)
-    rim = np.zeros(shape, np.bool_)
-    for row, column in np.ndindex(pitch, pitch):
-        of_colour = np.s_[row::pitch, column::pitch]
+def _distance(highlights: FrameHighlights) -> NDArray[np.float32]:
+    """(H, W) distance to the nearest pixel of the same colour that is not clipped, pixels, right to 2 %."""
+    distance = np.empty(highlights.clipped.shape, np.float32)
+    for of_colour in _colours(highlights):
         clipped = np.ascontiguousarray(highlights.clipped[of_colour], np.uint8)
         steps = cv2.distanceTransform(clipped, cv2.DIST_L2, cv2.DIST_MASK_5)
         # Where all pixels are clipped, OpenCV's distances have no meaning.
-        distance[of_colour] = pitch * np.minimum(steps, np.float32(sum(shape)))
+        distance[of_colour] = highlights.pitch * np.minimum(steps, np.float32(sum(distance.shape)))
+    return distance
+
+
+def _hardness(highlights: FrameHighlights) -> Floats:
+    """Mean hardness, 0 to 1, of the borders of clipped pixels around every part; 1 where there are none."""
+    shape = highlights.clipped.shape
+    rim, hardness = np.zeros(shape, np.bool_), np.zeros(shape, np.float32)
+    for of_colour in _colours(highlights):
+        clipped = np.ascontiguousarray(highlights.clipped[of_colour], np.uint8)
         beside = cv2.dilate(clipped, _NEIGHBOURHOOD).view(np.bool_) & highlights.measured[of_colour]
         darkest = cv2.dilate(np.ascontiguousarray(highlights.darker[of_colour]), _NEIGHBOURHOOD)[beside]
         rim[of_colour] = beside
         hardness[of_colour][beside] = darkest / (darkest + np.float32(_SOFT))
-    return distance, rim, hardness
+    rims, hard = (weighted_sums(part_sums(plane)) for plane in (rim, hardness))
+    return np.where(rims > 0.0, hard / np.maximum(rims, 1e-300), 1.0)
+
+
+def _colours(highlights: FrameHighlights) -> list[tuple[slice, slice]]:
+    """The pixels of each colour."""
+    pitch = highlights.pitch
+    return [np.s_[row::pitch, column::pitch] for row, column in np.ndindex(pitch, pitch)]
+
+
+def _with_texture(
+    before: Texture, unknown: NDArray[np.int64], highlights: FrameHighlights, events: tuple[Floats, Floats]
+) -> Texture:
+    """The sums with those of an interval, after which ``unknown`` pixels are not measured and others are as given."""
+    shape, parts = highlights.darker.shape, before.pixels.shape
+    reach = 2 * _RIM * highlights.pitch + 1
+    near_clipped = cv2.dilate(highlights.clipped.view(np.uint8), np.ones((reach, reach), np.uint8))
+    rim = np.flatnonzero(
+        near_clipped.view(np.bool_) & highlights.measured & (highlights.darker < _RIM_DARKEST)
+    )
+
+    def more(pixels: NDArray[np.int64], weights: Floats | None) -> Floats:
+        sums = np.bincount(parts_of(pixels, shape), weights, parts[0] * parts[1])
+        return np.asarray(sums, np.float64).reshape(parts)
+
+    on, off = (plane.reshape(-1) for plane in events)
+    sums = (
+        more(unknown, on[unknown] + off[unknown]),
+        more(unknown, None),
+        more(rim, on[rim] + off[rim]),
+        more(rim, _slope(highlights, rim)),
+    )
+    return Texture(*(old + new for old, new in zip(before, sums, strict=True)))
+
+
+def _slope(highlights: FrameHighlights, pixels: NDArray[np.int64]) -> Floats:
+    """(N,) slope of the log intensity, at most white, that a frame shows at ``pixels``, per pixel.
+
+    Across the border of the image it counts as 0.
+    """
+    height, width = highlights.darker.shape
+    pitch, flat = highlights.pitch, highlights.darker.reshape(-1)
+    row, column = np.divmod(pixels, width)
+
+    def along(place: NDArray[np.int64], size: int, step: int) -> Floats:
+        inside = (place >= pitch) & (place < size - pitch)
+        reach = np.where(inside, step * pitch, 0)
+        return (flat[pixels + reach] - flat[pixels - reach]) / (2.0 * pitch)
+
+    slope: Floats = np.hypot(along(row, height, width), along(column, width, 1))
+    return slope
+
+
+def _limited(
+    excess: NDArray[np.float32], pixels: NDArray[np.int64], texture: Texture, highlights: FrameHighlights
+) -> NDArray[np.float32]:
+    """The expected ``excess``, (N,), limited by the slope that events tell and by how steep the borders are.
+
+    As many events come per slope at the rim as beyond white, where they tell it alone. Where nothing moves, or there is
+    no rim, nothing is limited.
+    """
+    shape = highlights.darker.shape
+    whole = _TEXTURE_WHOLE * weighted_area(shape) / (shape[0] * shape[1])
+    events, count, rim_events, rim_slope = (weighted_sums(part) + whole * part.sum() for part in texture)
+    hard = _hardness(highlights)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        slope = (events + _UNSEEN_EVENTS) / count * (rim_slope / rim_events)
+        step = _SOFT * hard / (1.0 - hard)
+        # Inverse, so that what is not limited is finite.
+        inverse = 1.0 / (_SLOPE_REACH * slope + _STEP_REACH * step)
+    known = np.where(rim_slope > 0.0, inverse, 0.0).astype(np.float32)
+    relative = excess * interpolated(known, pixels, shape[1])
+    limited: NDArray[np.float32] = excess / np.sqrt(np.float32(1.0) + np.square(relative))
+    return limited
 
 
 def _with_revealed(
@@ -263,10 +371,10 @@ def _with_revealed(
 
     return Revealed(
         known.excess + more(distance[left]),
-        known.expected + more(memory.excess[left]),
+        known.expected + more(memory.limited[left]),
         known.pixels + more(None),
         known.moved_excess + float(distance[moved_out].sum(dtype=np.float64)),
-        known.moved_expected + float(memory.excess[moved_out].sum(dtype=np.float64)),
+        known.moved_expected + float(memory.limited[moved_out].sum(dtype=np.float64)),
     )
 
 

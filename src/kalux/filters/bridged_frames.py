@@ -286,7 +286,7 @@ class BridgedFrames(Method):
         return join(memory, shot, following, second, events)
 
     def _follow_unshown(
-        self, memory: BridgeMemory, second: Latent, following: Shot, net: Floats
+        self, memory: BridgeMemory, second: Latent, following: Shot, net: Floats, steps: Counts
     ) -> UnshownMemory:
         if len(memory.unshown.pixels) == 0:
             return memory.unshown
@@ -294,7 +294,7 @@ class BridgedFrames(Method):
         noise = self.level_variance(following)[levels]
         moved = self.off / 2
         return follow_unshown(
-            memory.unshown, second, frame_highlights(following), noise, net, moved, memory.tail
+            memory.unshown, second, frame_highlights(following), noise, net, steps, moved, memory.tail
         )
 
     def _open_segment(self, memory: BridgeMemory, shot: Shot) -> BridgedSegment:
@@ -343,10 +343,11 @@ class BridgedFrames(Method):
         )
         usual = memory.usual.with_interval(change, told)
         share = half_way(usual.told, self._threshold2)
-        joined, since_measured = self._with_drift(joined, memory, second, (on, off), change, signal)
+        steps = (on, off) if signal is None else (on * signal[0], off * signal[1])
+        joined, since_measured = self._with_drift(joined, memory, second, (on, off), change, steps)
         change = self._with_black_change(usual.mixed(change, share), memory.latent, second)
         assert joined.net is not None
-        unshown = self._follow_unshown(memory, second, following, joined.net)
+        unshown = self._follow_unshown(memory, second, following, joined.net, steps)
         after = memory._replace(
             latent=second,
             thresholds=learned,
@@ -384,10 +385,11 @@ class BridgedFrames(Method):
         since_on, since_off = memory.since_middle
         grown = self._trail_at(at_middle, following.middle, scale)
         grown -= self._trail_at(memory.at_middle, shot.middle, scale)
+        between = on + since_on, off + since_off
         behind, learned = bridge.bridge(
             memory.latent,
             second,
-            (on + since_on, off + since_off),
+            between,
             memory.thresholds,
             self.noise,
             shot.middle,
@@ -403,7 +405,7 @@ class BridgedFrames(Method):
             since_middle=(tail_on, tail_off),
             followed=followed,
             at_middle=at_middle,
-            unshown=self._follow_unshown(memory, second, following, behind.net),
+            unshown=self._follow_unshown(memory, second, following, behind.net, between),
             silent_change=self._silent_change(behind),
         )
         forward = bridge.extend(
@@ -416,7 +418,7 @@ class BridgedFrames(Method):
             self._latent_at_end(after, following),
         )
         counts, change = (on + tail_on, off + tail_off), memory.silent_change
-        forward, since_measured = self._with_drift(forward, memory, second, counts, change)
+        forward, since_measured = self._with_drift(forward, memory, second, counts, change, counts)
         trail = self._trail(memory.followed, start, scale)
         forward = forward._replace(trail=trail, unshown=memory.unshown, silent_change=change)
         return forward, after._replace(since_measured=since_measured)
@@ -487,15 +489,14 @@ class BridgedFrames(Method):
         second: Latent,
         counts: tuple[Floats, Floats],
         change: Floats,
-        signal: tuple[Floats, Floats] | None = None,
+        steps: Counts,
     ) -> tuple[BridgedSegment, Counts]:
         """The segment with the drift of its pixels (K10), and the events since they were last measured, at its end.
 
-        ``counts`` are its on and off events, of which ``signal`` is the share that is signal (None: all), ``change`` is
-        the mean square change of silent pixels around each (K11).
+        ``counts`` are its on and off events, ``steps`` those as far as they are signal, ``change`` is the mean square
+        change of silent pixels around each (K11).
         """
-        since_measured, (on, off) = self._events_since_measured(memory, segment), counts
-        steps = counts if signal is None else (on * signal[0], off * signal[1])
+        since_measured = self._events_since_measured(memory, segment)
         grown, far_on, far_off = bridge.drift(
             memory.latent, second, memory.thresholds, self.noise, since_measured, steps
         )
