@@ -27,6 +27,7 @@ from kalux.augmentation.bridge import (
     UnshownMemory,
 )
 from kalux.augmentation.parts import (
+    PART,
     interpolated,
     part_grid,
     part_sums,
@@ -293,43 +294,39 @@ def _with_texture(
     before: Texture, unknown: NDArray[np.int64], highlights: FrameHighlights, events: tuple[Floats, Floats]
 ) -> Texture:
     """The sums with those of an interval, after which ``unknown`` pixels are not measured and others are as given."""
-    shape, parts = highlights.darker.shape, before.pixels.shape
     reach = 2 * _RIM * highlights.pitch + 1
     near_clipped = cv2.dilate(highlights.clipped.view(np.uint8), np.ones((reach, reach), np.uint8))
     rim = np.flatnonzero(
         near_clipped.view(np.bool_) & highlights.measured & (highlights.darker < _RIM_DARKEST)
     )
-
-    def more(pixels: NDArray[np.int64], weights: Floats | None) -> Floats:
-        sums = np.bincount(parts_of(pixels, shape), weights, parts[0] * parts[1])
-        return np.asarray(sums, np.float64).reshape(parts)
-
-    on, off = (plane.reshape(-1) for plane in events)
-    sums = (
-        more(unknown, on[unknown] + off[unknown]),
-        more(unknown, None),
-        more(rim, on[rim] + off[rim]),
-        more(rim, _slope(highlights, rim)),
-    )
+    on, off = (np.ascontiguousarray(plane, np.float32).reshape(-1) for plane in events)
+    sums = np.zeros((4, *before.pixels.shape))
+    darker = np.ascontiguousarray(highlights.darker)
+    _sum_texture(unknown, rim, on, off, darker, highlights.pitch, sums)
     return Texture(*(old + new for old, new in zip(before, sums, strict=True)))
 
 
-def _slope(highlights: FrameHighlights, pixels: NDArray[np.int64]) -> Floats:
-    """(N,) slope of the log intensity, at most white, that a frame shows at ``pixels``, per pixel.
+@loop
+def _sum_texture(unknown, rim, on, off, darker, pitch, sums):  # type: ignore[no-untyped-def]
+    """The four sums of `Texture`, of one interval, are added to ``sums``.
 
-    Across the border of the image it counts as 0.
+    The slope is that of the log intensity, at most white; across the border of the image it counts as 0.
     """
-    height, width = highlights.darker.shape
-    pitch, flat = highlights.pitch, highlights.darker.reshape(-1)
-    row, column = np.divmod(pixels, width)
-
-    def along(place: NDArray[np.int64], size: int, step: int) -> Floats:
-        inside = (place >= pitch) & (place < size - pitch)
-        reach = np.where(inside, step * pitch, 0)
-        return (flat[pixels + reach] - flat[pixels - reach]) / (2.0 * pitch)
-
-    slope: Floats = np.hypot(along(row, height, width), along(column, width, 1))
-    return slope
+    (height, width), part = darker.shape, np.int64(PART)
+    for pixel in unknown:
+        row, column = pixel // width // part, pixel % width // part
+        sums[0, row, column] += on[pixel] + off[pixel]
+        sums[1, row, column] += 1.0
+    for pixel in rim:
+        y, x = pixel // width, pixel % width
+        down, right = np.float32(0.0), np.float32(0.0)
+        if pitch <= y < height - pitch:
+            down = darker[y + pitch, x] - darker[y - pitch, x]
+        if pitch <= x < width - pitch:
+            right = darker[y, x + pitch] - darker[y, x - pitch]
+        row, column = y // part, x // part
+        sums[2, row, column] += on[pixel] + off[pixel]
+        sums[3, row, column] += np.sqrt(down * down + right * right) / np.float32(2 * pitch)
 
 
 def _limited(
