@@ -295,6 +295,19 @@ def test_slopes_are_per_pixel_in_a_mosaic_too(pitch):
     assert after.texture.pixels.sum() == clipped.sum()
 
 
+def test_across_masked_pixels_there_is_no_slope():
+    """A flat wall beside a window, masked two pixels beside it: only the row of pixels at the window has one."""
+    clipped = np.zeros(SIZE, bool)
+    clipped[:, 24:] = True
+    darker = np.where(clipped, np.float32(0.0), np.float32(0.1))
+    masked = np.zeros(SIZE, bool)
+    masked[:, 21] = True
+    memory, noise = begun(clipped), np.zeros(clipped.sum(), np.float32)
+    seen = FrameHighlights(clipped, np.where(masked, np.float32(0.0), darker), ~clipped & ~masked)
+    after = follow_unshown(memory, latent(clipped, -1.0), seen, noise, STILL, uniform(1.0), MOVED, TAIL)
+    assert after.texture.rim_slope.sum() == pytest.approx(0.05 * SIZE[0], rel=1e-5)
+
+
 def test_a_clipped_frame_that_raises_the_bound_tells_of_its_surroundings():
     """The window comes to lie beside pixels just below white. Where it raises no bound that tells nothing."""
     down = np.where(np.arange(48) < 24, np.float32(-0.3), np.float32(0.0)) * np.ones(SIZE, np.float32)

@@ -301,16 +301,17 @@ def _with_texture(
     )
     on, off = (np.ascontiguousarray(plane, np.float32).reshape(-1) for plane in events)
     sums = np.zeros((4, *before.pixels.shape))
-    darker = np.ascontiguousarray(highlights.darker)
-    _sum_texture(unknown, rim, on, off, darker, highlights.pitch, sums)
+    seen = highlights.clipped | highlights.measured
+    _sum_texture(unknown, rim, on, off, np.ascontiguousarray(highlights.darker), seen, highlights.pitch, sums)
     return Texture(*(old + new for old, new in zip(before, sums, strict=True)))
 
 
 @loop
-def _sum_texture(unknown, rim, on, off, darker, pitch, sums):  # type: ignore[no-untyped-def]
+def _sum_texture(unknown, rim, on, off, darker, seen, pitch, sums):  # type: ignore[no-untyped-def]
     """The four sums of `Texture`, of one interval, are added to ``sums``.
 
-    The slope is that of the log intensity, at most white; across the border of the image it counts as 0.
+    The slope is that of the log intensity, at most white; across what is masked, and the border of the image, it counts
+    as 0.
     """
     (height, width), part = darker.shape, np.int64(PART)
     for pixel in unknown:
@@ -320,9 +321,9 @@ def _sum_texture(unknown, rim, on, off, darker, pitch, sums):  # type: ignore[no
     for pixel in rim:
         y, x = pixel // width, pixel % width
         down, right = np.float32(0.0), np.float32(0.0)
-        if pitch <= y < height - pitch:
+        if pitch <= y < height - pitch and seen[y - pitch, x] and seen[y + pitch, x]:
             down = darker[y + pitch, x] - darker[y - pitch, x]
-        if pitch <= x < width - pitch:
+        if pitch <= x < width - pitch and seen[y, x - pitch] and seen[y, x + pitch]:
             right = darker[y, x + pitch] - darker[y, x - pitch]
         row, column = y // part, x // part
         sums[2, row, column] += on[pixel] + off[pixel]
