@@ -824,7 +824,7 @@ def known(pixel, variance, t, settings, c2, left):
     a, b = middles[k], middles[k + 1]
     share, (first, second) = (t - a) / (b - a), pixel.changes[k][3]
     if min(first, second) >= UNMEASURED:
-        variance *= 1 - 0.9 * (1 - left) / 0.3
+        variance *= 0.65 * (1 - 0.9 * (1 - left) / 0.3)
     events = sum(w for q, *_, w in pixel.events if a < q <= b)
     between = 4 * share * (1 - share)
     wrong = 0.1 * ev.believed_mismatch**2 * c2 * between * events**2

@@ -166,7 +166,7 @@ def assert_agrees(name, events, frames, times):
         if name != "cf":
             if name.startswith("default") and chosen.camera.response in ("auto", "linear"):
                 given = naive.with_pattern(given, level, white, offset)
-            given += np.nan_to_num(doubt)
+            given += 4 / 9 * np.nan_to_num(doubt)
             if name.startswith("default"):
                 for place in pixels:
                     given[place] += naive.blurred(pixels, place, t, 0.21 * 0.17, chosen)

@@ -21,6 +21,7 @@ from kalux.augmentation.subthreshold import UNKNOWN_CHANGE
 from kalux.filters.highlights import calm_specks, keep_white, lifted, read_unshown, tempered
 from kalux.filters.readout import HighlightPrior, Subthreshold, read_out
 from kalux.filters.uncertainty import (
+    UNSHOWN_SHARE,
     Around,
     add_blurred,
     add_pattern,
@@ -253,7 +254,7 @@ def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) ->
         if pattern > 0:
             add_pattern(total, intensity, view.log_offset, pattern)
     if needs_variance and unshown is not None:
-        total.reshape(-1)[unshown.pixels] += unshown.doubt
+        total.reshape(-1)[unshown.pixels] += np.float32(UNSHOWN_SHARE) * unshown.doubt
     if along is not None:
         _look_along(intensity, total, along, view.log_offset)
         if not with_variance:

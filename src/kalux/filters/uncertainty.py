@@ -52,6 +52,14 @@ CORRELATED_UNMEASURED: Final = 0.1
 """Part of P that spatial averaging does not reduce, of a pixel that neither frame around measures, by the errors of 91
 scenes (docs/equations.md, K11). `kalux.filters.readout.CORRELATED`, by which highlights are doubted, is more."""
 
+UNMEASURED_SHARE: Final = 0.65
+"""Part of P that is given out of such a pixel: P allows for more than thresholds turn out to be wrong by. The errors of
+83 scenes say 0.6, whatever their noise and motion (docs/equations.md, K11)."""
+
+UNSHOWN_SHARE: Final = 4.0 / 9.0
+"""The same of the variance of what an unshown pixel is expected to exceed its bound by (K15): 2 in place of 3 for how
+little is known of it, by the errors of 83 scenes. Both ways in time the 3 weighs."""
+
 _BLOCK: Final = 4096
 """Pixels that all steps to the variance are taken of at a time."""
 
@@ -245,17 +253,18 @@ def _inform(variance, first, second, events, around, known):  # type: ignore[no-
 
 @loop(fastmath=FUSED)
 def _average_unmeasured(variance, left, first, second, untied, averaged):  # type: ignore[no-untyped-def]
-    """P after spatial averaging (K12) where neither frame measures the pixel; as it is elsewhere.
+    """P where a frame measures the pixel; else `UNMEASURED_SHARE` of what spatial averaging (K12) leaves of it.
 
     ``untied`` are the variance of its subthreshold change before averaging, and by how much that is above other moving
     pixels' after it. ``left`` is what averaging makes of P and the former under the correlation `CORRELATED`. That
     relative reduction times `_REDUCTION` is the one under `CORRELATED_UNMEASURED`.
     """
     one, unmeasured, (before, above_moving) = np.float32(1.0), np.float32(UNMEASURED), untied
+    share = np.float32(UNMEASURED_SHARE)
     for i in range(np.uint64(len(averaged))):
         reduction = one - np.float32(left[i]) / (variance[i] + before)
         neither = smaller(first[i], second[i]) >= unmeasured
-        reduced = variance[i] * (one - _REDUCTION * larger(reduction, np.float32(0.0))) + above_moving
+        reduced = share * variance[i] * (one - _REDUCTION * larger(reduction, np.float32(0.0))) + above_moving
         averaged[i] = reduced if neither else variance[i]
 
 
