@@ -10,11 +10,13 @@ from __future__ import annotations
 import argparse
 import dataclasses
 from collections.abc import Callable
+from unittest import mock
 
 import cv2
 import numpy as np
 
 import kalux
+import kalux.images
 from kalux.datasets import SensorSettings, colour_photograph, combine, handheld, pan, simulate_colour
 from kalux.models import colour
 from kalux.models.colour import calm_highlights, channels, demosaic, luminance, sample_mosaic
@@ -120,19 +122,22 @@ def compare_images(picture) -> None:
             images = list(kalux.reconstruct(made.recording(), times=times, smooth=smooth))
             print(f"  {name:22} {errors(np.stack([image.colour for image in images]), truth)}")
             if mosaic is not None:
-                compare_doubt(images, truth)
+                compare_doubt(made.recording(), times, smooth, truth)
         if mosaic is not None:
             compare_rgb_of_a_mosaic(made, times, truth)
 
 
-def compare_doubt(images, truth) -> None:
+def compare_doubt(recording, times, smooth, truth) -> None:
     """Highlights with more and less of their colour."""
-    raw = [demosaic(image.intensity, "RGGB", OFFSET) for image in images]
-    chosen = colour.DOUBT
     for doubt in (0.0, 1.0, 3.0, 10.0):
-        scale = np.float32(doubt / chosen)
-        calmed = [calm_highlights(c, scale * image.variance) for c, image in zip(raw, images, strict=True)]
-        print(f"    {f'DOUBT {doubt:g}':20} {errors(np.stack(calmed), truth)}")
+        scale = np.float32(doubt / colour.DOUBT)
+
+        def calmed(picture, variance, *white, scale=scale):
+            return calm_highlights(picture, scale * variance, *white)
+
+        with mock.patch.object(kalux.images, "calm_highlights", calmed):
+            images = list(kalux.reconstruct(recording, times=times, smooth=smooth))
+        print(f"    {f'DOUBT {doubt:g}':20} {errors(np.stack([image.colour for image in images]), truth)}")
 
 
 def compare_rgb_of_a_mosaic(made, times, truth) -> None:
