@@ -128,8 +128,8 @@ def compare_images(picture) -> None:
 
 
 def compare_doubt(recording, times, smooth, truth) -> None:
-    """Highlights with more and less of their colour."""
-    for doubt in (0.0, 1.0, 3.0, 10.0):
+    """Highlights with more and less of their colour than with `colour.DOUBT`, which the images before have."""
+    for doubt in (0.0, 1.0, 10.0):
         scale = np.float32(doubt / colour.DOUBT)
 
         def calmed(picture, variance, *white, scale=scale):

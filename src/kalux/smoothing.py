@@ -94,8 +94,8 @@ class Trails:
             if rate is not None and measures is not None:
                 latest = measures(spill.reversed_frame(len(spill) - 1 - index))
                 if index > 0:
-                    counts = counts_on, counts_off
-                    shares = signal_shares(*counts, rate * (end - start) * 1e-6, ~(measured | latest))
+                    seconds = (end - start) * 1e-6
+                    shares = signal_shares(counts_on, counts_off, rate * seconds, ~(measured | latest))
                     followed = with_surety(before, followed, shares)
                 measured = latest
             spill.save_newest_events(index, followed.newest - 2 * delay, followed.surety)

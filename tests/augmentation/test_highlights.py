@@ -11,6 +11,7 @@ from kalux.augmentation.highlights import (
     Tail,
     above_frames,
     begin_unshown,
+    border_hardness,
     excess_from_surroundings,
     expected_excess,
     follow_unshown,
@@ -61,7 +62,7 @@ def around(seen, tail=TAIL):
     pixels = np.flatnonzero(seen.clipped)
     out = np.full(seen.clipped.shape, np.nan)
     near = (seen.measured & (seen.darker < 0.2)).sum() / max(len(pixels), 1)
-    out.reshape(-1)[pixels] = excess_from_surroundings(seen, pixels, near, tail)
+    out.reshape(-1)[pixels] = excess_from_surroundings(seen, border_hardness(seen), pixels, near, tail)
     return out
 
 

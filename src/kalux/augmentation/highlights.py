@@ -155,11 +155,23 @@ def begin_unshown(first: Latent, highlights: FrameHighlights, tail: Tail) -> Uns
     parts = part_grid(first.value.shape)
     revealed = Revealed(np.zeros(parts), np.zeros(parts), np.zeros(parts), 0.0, 0.0)
     near, clipped = _counts(highlights)
-    excess = excess_from_surroundings(highlights, pixels, near / max(clipped, 1), tail)
+    hardness = border_hardness(highlights)
+    excess = excess_from_surroundings(highlights, hardness, pixels, near / max(clipped, 1), tail)
     doubt = (np.float32(_UNKNOWN_SCALE) * excess) ** 2
     texture = Texture(*(np.zeros(parts) for _ in Texture._fields))
-    expected = excess, excess, excess
-    return UnshownMemory(pixels, bound, first.value.shape, *expected, doubt, revealed, texture, near, clipped)
+    return UnshownMemory(
+        pixels=pixels,
+        bound=bound,
+        shape=first.value.shape,
+        excess=excess,
+        limited=excess,
+        expected=excess,
+        doubt=doubt,
+        revealed=revealed,
+        texture=texture,
+        near=near,
+        clipped=clipped,
+    )
 
 
 def follow_unshown(
@@ -204,11 +216,12 @@ def follow_unshown(
     )
     unknown, excess = pixels[~measured], memory.excess[~measured]
     raised = (bounded > predicted + _RAISED)[~measured]
+    hardness = border_hardness(highlights)
     if raised.any():
-        around = excess_from_surroundings(highlights, unknown[raised], near / max(clipped, 1), tail)
+        around = excess_from_surroundings(highlights, hardness, unknown[raised], near / max(clipped, 1), tail)
         excess[raised] = np.minimum(excess[raised], around)
     texture = _with_texture(memory.texture, unknown, highlights, events)
-    limited = _limited(excess, unknown, texture, highlights)
+    limited = _limited(excess, unknown, texture, hardness, memory.shape)
     expected, doubt = _corrected(limited, unknown, memory.shape[1], revealed)
     return memory._replace(
         pixels=unknown,
@@ -225,7 +238,7 @@ def follow_unshown(
 
 
 def excess_from_surroundings(
-    highlights: FrameHighlights, pixels: NDArray[np.int64], near: float, tail: Tail
+    highlights: FrameHighlights, hardness: Floats, pixels: NDArray[np.int64], near: float, tail: Tail
 ) -> NDArray[np.float32]:
     """How far above white clipped pixels are expected, from the pixels around them.
 
@@ -236,6 +249,8 @@ def excess_from_surroundings(
 
     Parameters
     ----------
+    hardness
+        `border_hardness`.
     pixels
         (N,) which pixels, in the flattened image, ascending.
     near
@@ -246,7 +261,7 @@ def excess_from_surroundings(
     )
     area = weighted_area(highlights.darker.shape)
     scale = _NEAR * (clipped + _WHOLE * area) / (below + (_WHOLE * near + _LEAST) * area)
-    level = tail.most * -np.expm1(-tail.share * scale / tail.most) * _hardness(highlights)
+    level = tail.most * -np.expm1(-tail.share * scale / tail.most) * hardness
     inside = -np.expm1(-_distance(highlights).reshape(-1)[pixels])
     excess: NDArray[np.float32] = (
         interpolated(level.astype(np.float32), pixels, highlights.darker.shape[1]) * inside
@@ -270,7 +285,7 @@ def _distance(highlights: FrameHighlights) -> NDArray[np.float32]:
     return distance
 
 
-def _hardness(highlights: FrameHighlights) -> Floats:
+def border_hardness(highlights: FrameHighlights) -> Floats:
     """Mean hardness, 0 to 1, of the borders of clipped pixels around every part; 1 where there are none."""
     shape = highlights.clipped.shape
     rim, hardness = np.zeros(shape, np.bool_), np.zeros(shape, np.float32)
@@ -331,24 +346,27 @@ def _sum_texture(unknown, rim, on, off, darker, seen, pitch, sums):  # type: ign
 
 
 def _limited(
-    excess: NDArray[np.float32], pixels: NDArray[np.int64], texture: Texture, highlights: FrameHighlights
+    excess: NDArray[np.float32],
+    pixels: NDArray[np.int64],
+    texture: Texture,
+    hardness: Floats,
+    shape: tuple[int, ...],
 ) -> NDArray[np.float32]:
     """The expected ``excess``, (N,), limited by the slope that events tell and by how steep the borders are.
 
     As many events come per slope at the rim as beyond white, where they tell it alone. Where nothing moves, or there is
     no rim, nothing is limited.
     """
-    shape = highlights.darker.shape
-    whole = _TEXTURE_WHOLE * weighted_area(shape) / (shape[0] * shape[1])
+    height, width = shape
+    whole = _TEXTURE_WHOLE * weighted_area((height, width)) / (height * width)
     events, count, rim_events, rim_slope = (weighted_sums(part) + whole * part.sum() for part in texture)
-    hard = _hardness(highlights)
     with np.errstate(divide="ignore", invalid="ignore"):
         slope = (events + _UNSEEN_EVENTS) / count * (rim_slope / rim_events)
-        step = _SOFT * hard / (1.0 - hard)
+        step = _SOFT * hardness / (1.0 - hardness)
         # Inverse, so that what is not limited is finite.
         inverse = 1.0 / (_SLOPE_REACH * slope + _STEP_REACH * step)
     known = np.where(rim_slope > 0.0, inverse, 0.0).astype(np.float32)
-    relative = excess * interpolated(known, pixels, shape[1])
+    relative = excess * interpolated(known, pixels, width)
     limited: NDArray[np.float32] = excess / np.sqrt(np.float32(1.0) + np.square(relative))
     return limited
 
