@@ -836,9 +836,20 @@ def known(pixel, variance, t, settings, c2, left):
     return max(1 / (1 / variance + 1 / following), common) + wrong
 
 
-def with_pattern(variance, intensity, white, offset):
-    """K11: the offsets that pixels keep in all frames, half a percent of ``white`` where nothing tells them."""
-    return variance + (0.005 * white / (intensity + offset)) ** 2
+def with_pattern(variance, intensity, white, camera):
+    """K11: the offsets of stored values that pixels keep in all frames, half a percent where nothing tells them."""
+    response = Camera.named(chosen_response(camera.response, None), camera.clipped_from).response
+    if response.is_linear:
+        return variance + (0.005 * white / (intensity + camera.offset)) ** 2
+    slopes = []  # at the levels of the curve
+    for stored in response.response:
+        least, most = max(stored - 0.005, 0.0), min(stored + 0.005, 1.0)
+        slopes.append((response.inverse(most) - response.inverse(least)) / (most - least))
+    given = variance.copy()
+    for place in np.ndindex(variance.shape):
+        slope = np.interp(intensity[place] / white, response.irradiance, slopes)
+        given[place] += np.arcsinh(0.005 * slope * white / (intensity[place] + camera.offset)) ** 2
+    return given
 
 
 def with_rounding(variance, intensity, moving, level, offset):

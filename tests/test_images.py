@@ -8,6 +8,7 @@ import pytest
 from kalux.augmentation.highlights import Unshown
 from kalux.filters.uncertainty import Around
 from kalux.images import Estimate, View, make_image
+from kalux.models.camera import Response
 
 GREY = View(
     log_offset=0.05,
@@ -19,6 +20,7 @@ GREY = View(
     highlight_growth=1.0,
     unknown_variance=9.0,
     fixed_pattern=0.0,
+    response=None,
     rounding=0.0,
     mosaic=None,
     gains=(1.0, 1.0, 1.0),
@@ -51,6 +53,29 @@ def test_the_variance_counts_the_fixed_pattern_of_the_frames():
     np.testing.assert_array_equal(image.intensity, make_image(known, GREY).intensity)
     longer = dataclasses.replace(known, white=float(np.log(2.05)))
     assert make_image(longer, view).fixed_pattern == pytest.approx(0.02)
+
+
+def test_offsets_of_stored_values_are_as_much_light_as_the_curve_is_steep():
+    """0.01 of what is stored, v = sqrt(I / white): 2 v 0.01 of white."""
+    view = dataclasses.replace(GREY, fixed_pattern=0.01, response=Response.gamma(2.0))
+    still = np.zeros((1, 2), bool)
+    known = estimate([[0.04, 0.64]], moving=still, silent_change=np.zeros((1, 2), np.float32))
+    image = make_image(known, view)
+    np.testing.assert_allclose(image.fixed_pattern, [[0.004, 0.016]], rtol=2e-3)
+    np.testing.assert_allclose(
+        image.variance, 1e-4 + np.array([[0.004 / 0.09, 0.016 / 0.69]]) ** 2, rtol=3e-3
+    )
+    longer = dataclasses.replace(known, white=float(np.log(4.05)))  # I / 4 is stored
+    np.testing.assert_allclose(make_image(longer, view).fixed_pattern, [[0.008, 0.032]], rtol=3e-3)
+    crushed = dataclasses.replace(view, response=Response.s_curve(0.4))
+    dark = make_image(
+        estimate([[0.0, 0.0]], moving=still, silent_change=np.zeros((1, 2), np.float32)), crushed
+    )
+    # Darker than 0.4, which is 8 times I + I_0: its square would say less than that nothing is known.
+    assert (dark.variance > 1).all()
+    assert (dark.variance < GREY.unknown_variance).all()
+    unwanted = make_image(known, view, with_variance=False)
+    assert (np.isinf(unwanted.variance).all(), unwanted.fixed_pattern) == (True, 0.0)
 
 
 def test_what_exposures_take_off_a_frame_is_not_known_there():

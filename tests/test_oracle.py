@@ -164,8 +164,9 @@ def assert_agrees(name, events, frames, times):
         off = np.abs(np.log(image.intensity + offset) - np.log(level + offset))
         assert (off <= 1e-4 + slack).all(), (off, slack)
         if name != "cf":
-            if name.startswith("default") and chosen.camera.response in ("auto", "linear"):
-                given = naive.with_pattern(given, level, white, offset)
+            if name.startswith("default"):
+                # At its own levels: near black the slope of a curve changes by more than they do.
+                given = naive.with_pattern(given, image.intensity, white, chosen.camera)
             given += 4 / 9 * np.nan_to_num(doubt)
             if name.startswith("default"):
                 for place in pixels:

@@ -1025,7 +1025,7 @@ def test_a_calibration_of_the_sensor_is_used():
 
 
 def test_the_fixed_pattern_of_a_live_stream_is_the_usual_one():
-    """Of raw frames: it is in every image, whatever is averaged."""
+    """Of grey frames: it is in every image, whatever is averaged."""
     grey, colour = (np.full(shape, 9, np.uint8) for shape in ((4, 6), (4, 6, 3)))
     for image, variant, expected in (
         (grey, "default", 0.005),
@@ -1038,6 +1038,10 @@ def test_the_fixed_pattern_of_a_live_stream_is_the_usual_one():
     stated = Reconstructor((4, 6), settings=altered(PRESETS["default"], "camera", fixed_pattern=0.002))
     stated.push_frame(Frame(grey, 0, 10_000))
     assert stated.read(10_000).fixed_pattern == 0.002
+    curved = Reconstructor((4, 6), settings=altered(PRESETS["default"], "camera", response="gamma:2"))
+    curved.push_frame(Frame(np.full((4, 6), 51, np.uint8), 0, 10_000))
+    # A stored value of 0.2 is 0.2^2 of the light, and 0.005 of it 2 * 0.2 * 0.005.
+    np.testing.assert_allclose(curved.read(10_000).fixed_pattern, 0.002, rtol=0.02)
 
 
 @pytest.mark.parametrize(

@@ -31,6 +31,7 @@ from kalux.filters.uncertainty import (
     subthreshold_variance,
 )
 from kalux.frames import Mosaic
+from kalux.models.camera import Response
 from kalux.models.colour import Gains, calm_highlights, demosaic, luminance
 
 _INFINITE: Final = np.full(1, np.inf, np.float32)
@@ -59,7 +60,8 @@ class Image:
         float32 (H, W, 3), linear red, green, blue with the scale of ``intensity``, which of a Bayer sensor holds each
         pixel's own channel before white balance, and of frames in RGB the luminance. None: the frames are grey.
     fixed_pattern
-        Standard deviation, in units of the intensity, of the offsets of the sensor's pixels that ``variance`` counts.
+        Standard deviation, in units of the intensity, of the offsets of the sensor's pixels that ``variance`` counts:
+        a number, or (H, W) behind a response that bends.
     """
 
     t: int
@@ -68,7 +70,7 @@ class Image:
     log_offset: float
     final: bool
     colour: NDArray[np.float32] | None = None
-    fixed_pattern: float = 0.0
+    fixed_pattern: float | NDArray[np.float32] = 0.0
 
     def __repr__(self) -> str:
         height, width = self.intensity.shape
@@ -169,7 +171,9 @@ class View:
     unknown_variance
         P of a pixel that has not been measured.
     fixed_pattern
-        Standard deviation of the pixels' offsets in the frames (K11), white = 1.
+        Standard deviation of the pixels' offsets in the frames (K11), of stored values, white = 1.
+    response
+        Of grey frames whose response bends; None: stored values are light.
     rounding
         Standard deviation of the rounding that all frames of a still pixel share (K11), white = 1; 0: none.
     mosaic, gains
@@ -185,6 +189,7 @@ class View:
     highlight_growth: float
     unknown_variance: float
     fixed_pattern: float
+    response: Response | None
     rounding: float
     mosaic: Mosaic | None
     gains: Gains
@@ -244,14 +249,14 @@ def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) ->
         if view.neighbours > 0 and view.mosaic is None:  # a mosaic's neighbours are of other colours
             calm_specks(intensity, variance, view.log_offset, estimate.unmeasured)
     white = float(np.exp(estimate.white) - view.log_offset)
-    pattern = view.fixed_pattern * white
+    pattern = _pattern(intensity, view, white) if needs_variance else 0.0
     if not needs_variance:
         total = _infinite(intensity.shape)
     elif moving is not None and change is not None:
         total = given_variance(
             signalled, moving, change, subthreshold, estimate.around, total if needs_averaged else None
         )
-        if pattern > 0:
+        if np.any(pattern):
             add_pattern(total, intensity, view.log_offset, pattern)
     if needs_variance and unshown is not None:
         total.reshape(-1)[unshown.pixels] += np.float32(UNSHOWN_SHARE) * unshown.doubt
@@ -277,6 +282,18 @@ def _untied(
     untied = variance.copy()
     untied.reshape(-1)[unmeasured] += np.float32(subthreshold.above_moving)
     return untied
+
+
+def _pattern(intensity: NDArray[Any], view: View, white: float) -> float | NDArray[np.float32]:
+    """Standard deviation of the pixels' offsets in units of I: one, or (H, W) behind a response that bends.
+
+    Where a curve makes more than I + I_0 of them, as one that crushes the dark, the light is that much brighter only.
+    """
+    if view.response is None or view.fixed_pattern == 0:
+        return view.fixed_pattern * white
+    offsets = view.response.irradiance_error(intensity / white, view.fixed_pattern) * white
+    level = intensity + view.log_offset
+    return np.asarray(level * np.arcsinh(offsets / level), np.float32)
 
 
 def _misses_some(estimate: Estimate) -> bool:

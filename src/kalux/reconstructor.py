@@ -515,17 +515,18 @@ class Reconstructor:
             highlight_growth=growth,
             unknown_variance=filtered.initial_variance,
             fixed_pattern=self._pattern_of(frame),
+            response=None if self._camera.response.is_linear else self._camera.response,
             rounding=repeated_rounding(frame, self.settings.camera),
             mosaic=frame.mosaic,
             gains=(1.0, 1.0, 1.0) if frame.mosaic is None else self._gains_of(frame),
         )
 
     def _pattern_of(self, frame: Frame) -> float:
-        """The fixed pattern that the variance counts: the usual one where no plan has looked for it in raw frames."""
+        """The fixed pattern that the variance counts: the usual one where no plan has looked for it in grey frames."""
         camera = self.settings.camera
         if camera.fixed_pattern is not None:
             return camera.fixed_pattern
-        raw = camera.is_linear and frame.image.ndim == 2
+        raw = self._camera.colours is None and frame.image.ndim == 2
         return USUAL_PATTERN if raw and self.settings.filter.joins_frames else 0.0
 
     def _unshown(self, progress: _Progress, variance: NDArray[np.floating[Any]]) -> Unshown | None:

@@ -8,6 +8,7 @@ import pytest
 
 from kalux import EVENT_DTYPE, Frame, Recording
 from kalux.calibration.fixed_pattern import FixedPattern, estimate_fixed_pattern
+from kalux.models.camera import Response
 from kalux.settings import CameraSettings
 
 CAMERA = CameraSettings(frame_noise=0.003)
@@ -90,10 +91,24 @@ def test_colours_of_a_mosaic_are_no_pattern():
     assert found.deviation == pytest.approx(0.004, rel=0.1)
 
 
-def test_cameras_that_process_what_they_see_are_left_alone():
+@pytest.mark.parametrize("name", ["srgb", "gamma:2.2"])
+def test_behind_a_curve_offsets_are_those_of_stored_values(name):
+    """Dark or bright, as much of what is stored; in light a tenth as much in the dark."""
+    response = Response.named(name)
+    stored = response(scene(180, 300))
+    camera = CameraSettings(response=name, frame_noise=0.003)
+    found = estimate_fixed_pattern(recorded(pattern(0.005), image=stored), camera)
+    assert found.deviation == pytest.approx(0.005, rel=0.1)
+    none = estimate_fixed_pattern(recorded(0.0, image=stored, noise=0.01), camera)
+    assert none.deviation == 0
+    assert none.is_measured
+
+
+def test_colours_have_been_demosaiced():
     source = recorded(pattern(0.01))
-    assert estimate_fixed_pattern(source, CameraSettings(response="srgb")) is None
     rgb = [
         Frame(np.repeat(f.image[..., None], 3, 2), f.exposure_start, f.exposure_end) for f in source.frames()
     ]
     assert estimate_fixed_pattern(Recording.from_arrays(NOTHING, rgb, sensor_size=SIZE), CAMERA) is None
+    three = CameraSettings(response="linear;gamma:2;linear")
+    assert estimate_fixed_pattern(source, three) is None

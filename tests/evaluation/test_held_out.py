@@ -237,6 +237,9 @@ def test_a_pattern_that_the_held_out_frames_share_is_no_error_between_them():
     intensity, own = np.array([[0.1, 0.4]]), np.array([[0.01, 0.02]])
     made = Estimated(intensity, own + (0.05 / (intensity + 0.1)) ** 2, 0.1, 0.05)
     np.testing.assert_allclose(made.variance_of_frames, own)
+    of_pixels = np.array([[0.05, 0.0]])
+    first = Estimated(intensity, made.variance, 0.1, of_pixels).variance_of_frames
+    np.testing.assert_allclose(first, [[own[0, 0], made.variance[0, 1]]])
     assert Estimated(intensity, own, 0.1).variance_of_frames is own
     assert Estimated(intensity, None, 0.1, 0.05).variance_of_frames is None
 

@@ -270,6 +270,16 @@ def test_noise_of_a_frame_is_no_less_than_the_rounding_of_its_levels():
     np.testing.assert_allclose(found, [1e-4 / 0.13**2, 4e-4 / 0.53**2], rtol=1e-12)
 
 
+def test_errors_of_a_response_are_as_much_light_as_its_inverse_is_steep():
+    """Of v^2 the slope within v -+ e is 2 v; at black and white only the side that there is counts."""
+    response, light = Response.gamma(2.0), np.array([0.01, 0.25, 0.81])
+    np.testing.assert_allclose(response.irradiance_error(light, 0.005), 2 * np.sqrt(light) * 0.005, rtol=1e-3)
+    assert response.irradiance_error(np.array([0.0]), 0.004) == pytest.approx(0.004**2, rel=0.1)
+    white, beyond = response.irradiance_error(np.array([1.0, 3.0]), 0.004)
+    assert white == beyond == pytest.approx(2 * 0.998 * 0.004, rel=1e-3)
+    np.testing.assert_allclose(Response.linear().irradiance_error(light, 0.005), 0.005)
+
+
 def test_rounding_follows_the_slope_of_the_inverse_response():
     """Of gamma 2.2 half a level is 2.2 v^1.2 halves of a level at v: nearly nothing in the dark, double near white."""
     level, half = np.array([0.0, 0.1, 0.5, 0.9]), 0.5 / 255

@@ -4,6 +4,8 @@ Differences of frames do not contain it, and no number of frames averages it out
 scene moves. Let r be how much brighter a pixel is than the mean of its neighbours. In two frames that show different
 parts of the scene there, r has the texture of either part and the same offset: the mean product of both is the variance
 of the offset. Textures are far stronger than the pattern, so that smooth surroundings have most of the information.
+
+Offsets are those of stored values: of a response that bends, each is as much light as the curve is steep there.
 """
 
 from __future__ import annotations
@@ -18,11 +20,12 @@ from kalux.calibration.frame_noise import MAX_FRAMES
 from kalux.calibration.regression import parts, ratio_error
 from kalux.compiled import larger, loop, smaller
 from kalux.filters.shots import Shot, take_shot
-from kalux.models.camera import Camera
+from kalux.models.camera import Camera, Response
 from kalux.recording import Recording
 from kalux.settings import USUAL_PATTERN, CameraSettings, chosen_response
 
 Array = NDArray[np.float64]
+Planes = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
 
 _MOST_PIXELS: Final = 20_000
 """On a grid over the sensor. Of all 90,000 of a DAVIS346 the pattern is the same within 3 %."""
@@ -47,7 +50,7 @@ class FixedPattern(NamedTuple):
     Attributes
     ----------
     deviation
-        Standard deviation of the pixels' offsets, white = 1; 0 where there is none to be measured.
+        Standard deviation of the pixels' offsets of stored values, white = 1; 0 where there is none to be measured.
     variance, error
         Its square as measured, which chance may make negative, and the standard error of that, infinite where too few
         pixels change.
@@ -78,7 +81,7 @@ def estimate_fixed_pattern(recording: Recording, camera: CameraSettings) -> Fixe
     camera
         Response, saturation and frame noise.
 
-    Returns None of cameras that have a curve or demosaic: these have processed what the sensor gave.
+    Returns None of frames in colour, which have been demosaiced, and of colours that have responses of their own.
 
     Raises
     ------
@@ -86,16 +89,17 @@ def estimate_fixed_pattern(recording: Recording, camera: CameraSettings) -> Fixe
         If the frames' exposures are not known.
     """
     response = chosen_response(camera.response, recording.response)
-    if response != "linear":
+    model = Camera.named(response, camera.clipped_from)
+    if model.colours is not None:
         return None
     height, width = recording.sensor_size
     step = int(np.ceil(np.sqrt(height * width / _MOST_PIXELS)))
-    model = Camera.named(response, camera.clipped_from)
     seen = []
     for frame in islice(recording.frames(), MAX_FRAMES):
         if frame.image.ndim == 3:
             return None
-        seen.append(_around(take_shot(frame, model, float(frame.exposure)), camera.noise, step))
+        around = _around(take_shot(frame, model, float(frame.exposure)), camera.noise, step)
+        seen.append(around if model.response.is_linear else _stored(around, model.response))
     if not seen:
         return None
     every = -(-len(seen) // _MOST_FRAMES)
@@ -106,9 +110,14 @@ def estimate_fixed_pattern(recording: Recording, camera: CameraSettings) -> Fixe
     return _solved(sums)
 
 
-def _around(
-    shot: Shot, noise: tuple[float, float], step: int
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+def _stored(around: Planes, response: Response) -> Planes:
+    """What `_around` gives, with what pixels have beyond their neighbours, and its variance, of stored values."""
+    beyond, light, weight = around
+    slope = response.irradiance_error(light, USUAL_PATTERN) / USUAL_PATTERN
+    return (beyond / slope).astype(np.float32), light, (weight * slope**2).astype(np.float32)
+
+
+def _around(shot: Shot, noise: tuple[float, float], step: int) -> Planes:
     """(N,) of every ``step``-th pixel: what it has beyond its neighbours, their mean, and 1 / s^2 (0: not usable)."""
     bad = shot.level_clipped
     intensity = np.where(bad, np.inf, shot.level_intensity / shot.white).astype(np.float32)

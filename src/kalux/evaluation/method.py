@@ -35,18 +35,19 @@ class Estimated(NamedTuple):
     log_offset
         I_0.
     fixed_pattern
-        Standard deviation of the sensor's fixed pattern that the variance counts, in units of the intensity.
+        Standard deviation of the sensor's fixed pattern that the variance counts, in units of the intensity: a number,
+        or (H, W).
     """
 
     intensity: Image
     variance: Image | None
     log_offset: float = 0.0
-    fixed_pattern: float = 0.0
+    fixed_pattern: float | Image = 0.0
 
     @property
     def variance_of_frames(self) -> Image | None:
         """The variance of what separates the image from frames of the same sensor: they share its fixed pattern."""
-        if self.variance is None or self.fixed_pattern == 0:
+        if self.variance is None or not np.any(self.fixed_pattern):
             return self.variance
         shared = np.square(self.fixed_pattern / (self.intensity + self.log_offset))
         return np.asarray(np.maximum(self.variance - shared, 0.0), self.variance.dtype)

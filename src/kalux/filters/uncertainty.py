@@ -292,7 +292,9 @@ def _add_subthreshold(known, moving, intermittent, change, subthreshold, given):
         given[i] = known[i] + (active if moving[i] | intermittent[i] else silent)
 
 
-def add_pattern(variance: NDArray[np.float32], intensity: Array, log_offset: float, deviation: float) -> None:
+def add_pattern(
+    variance: NDArray[np.float32], intensity: Array, log_offset: float, deviation: float | NDArray[np.float32]
+) -> None:
     """Add the variance of log(I + I_0) by offsets of the pixels that all frames share. In place.
 
     Images have them as the frames do: events tell changes of the light only, and no number of frames averages them.
@@ -306,10 +308,10 @@ def add_pattern(variance: NDArray[np.float32], intensity: Array, log_offset: flo
     log_offset
         I_0.
     deviation
-        Standard deviation of the offsets, in units of I.
+        Standard deviation of the offsets, in units of I: a number, or (H, W).
     """
-    scalars = np.float32(log_offset), np.float32(deviation)
-    _add_pattern(variance.reshape(-1), np.ascontiguousarray(intensity).reshape(-1), *scalars)
+    planes = np.ascontiguousarray(intensity).reshape(-1), np.asarray(deviation, np.float32).reshape(-1)
+    _add_pattern(variance.reshape(-1), *planes, np.float32(log_offset))
 
 
 @nb.njit(cache=True, inline="always", error_model="numpy")
@@ -320,9 +322,10 @@ def _of_logarithm(deviation, intensity, log_offset):  # type: ignore[no-untyped-
 
 
 @loop(fastmath=FUSED)
-def _add_pattern(variance, intensity, log_offset, deviation):  # type: ignore[no-untyped-def]
+def _add_pattern(variance, intensity, deviation, log_offset):  # type: ignore[no-untyped-def]
+    every = len(deviation) > 1
     for i in range(np.uint64(len(variance))):
-        variance[i] += _of_logarithm(deviation, intensity[i], log_offset)
+        variance[i] += _of_logarithm(deviation[i] if every else deviation[0], intensity[i], log_offset)
 
 
 def add_blurred(

@@ -206,6 +206,16 @@ class Response:
         """f^w of equation (5): the certainty as a function of the response."""
         return self.certainty(self.inverse(response))
 
+    def irradiance_error(self, irradiance: NDArray[np.floating[Any]], error: float) -> Array:
+        """What an error of the response is in irradiance: ``error`` times the mean slope of CRF^-1 within it.
+
+        Beyond white it is that of white.
+        """
+        low, high = (np.clip(self.response + side, 0.0, 1.0) for side in (-error, error))
+        slope = (self.inverse(high) - self.inverse(low)) / (high - low)
+        found: Array = np.interp(irradiance, self.irradiance, error * slope)
+        return found
+
     def rounding(self, response: Array, half_level: float) -> Array:
         """What ``half_level`` of the response is in irradiance there: half of what is rounded to this response.
 

@@ -58,7 +58,7 @@ def with_frame_noise(recording: Recording, settings: Settings) -> FilledFrameNoi
 def with_fixed_pattern(recording: Recording, settings: Settings) -> tuple[Settings, FixedPattern | None]:
     """Fill in the frames' fixed pattern, where the variance counts it: from the settings, else an estimate.
 
-    Where the recording cannot tell, because nothing moves, the usual one; 0 of frames that have been processed.
+    Where the recording cannot tell, because nothing moves, the usual one; 0 of frames in colour.
     """
     if settings.camera.fixed_pattern is not None or not settings.filter.joins_frames:
         return settings, None
