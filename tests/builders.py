@@ -1,4 +1,4 @@
-"""Small recordings for tests: by hand, at random, and simulated."""
+"""Small recordings for tests, by hand, at random, and simulated; and pixels that no frame has shown."""
 
 from __future__ import annotations
 
@@ -13,6 +13,9 @@ from typing import NamedTuple
 import numpy as np
 
 from kalux import EVENT_DTYPE, PRESETS, Frame, Recording
+from kalux.augmentation.bridge import Revealed, Texture, UnshownMemory
+from kalux.augmentation.highlights import Unshown
+from kalux.augmentation.parts import part_grid
 from kalux.datasets import (
     ColourScene,
     SensorSettings,
@@ -258,3 +261,26 @@ def printed_on_threads(code: str, *arguments: object) -> set[str]:
         subprocess.check_output(command, env={**os.environ, "OPENBLAS_NUM_THREADS": threads}, text=True)
         for threads in ("1", "2")
     }
+
+
+def unshown(pixels, excess, noise=0.0, doubt=0.0, shape=(1, 10)):
+    """Pixels that no frame has shown, of which their surroundings alone make ``excess`` expected (K15)."""
+    parts = part_grid(shape)
+    nothing = [np.zeros(parts) for _ in range(4)]
+    expected = np.full(len(pixels), excess, np.float32)
+    memory = UnshownMemory(
+        pixels=np.array(pixels),
+        bound=np.zeros(len(pixels), np.float32),
+        shape=shape,
+        excess=expected,
+        limited=expected,
+        expected=expected,
+        doubt=9 * expected**2,
+        revealed=Revealed(*nothing[:3], 0.0, 0.0),
+        texture=Texture(*nothing),
+        hardness=np.ones(parts),
+        near=0,
+        clipped=len(pixels),
+    )
+    planes = (np.full(len(pixels), value, np.float32) for value in (noise, doubt))
+    return Unshown(memory.pixels, expected, *planes, memory)

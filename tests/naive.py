@@ -843,12 +843,12 @@ def with_pattern(variance, intensity, white, camera):
         return variance + (0.005 * white / (intensity + camera.offset)) ** 2
     slopes = []  # at the levels of the curve
     for stored in response.response:
-        least, most = max(stored - 0.005, 0.0), min(stored + 0.005, 1.0)
+        least, most = max(stored - 0.005, 0.5 / 255), min(stored + 0.005, 1.0)
         slopes.append((response.inverse(most) - response.inverse(least)) / (most - least))
     given = variance.copy()
     for place in np.ndindex(variance.shape):
         slope = np.interp(intensity[place] / white, response.irradiance, slopes)
-        given[place] += np.arcsinh(0.005 * slope * white / (intensity[place] + camera.offset)) ** 2
+        given[place] += (0.005 * slope * white / (intensity[place] + camera.offset)) ** 2
     return given
 
 

@@ -285,15 +285,11 @@ def _untied(
 
 
 def _pattern(intensity: NDArray[Any], view: View, white: float) -> float | NDArray[np.float32]:
-    """Standard deviation of the pixels' offsets in units of I: one, or (H, W) behind a response that bends.
-
-    Where a curve makes more than I + I_0 of them, as one that crushes the dark, the light is that much brighter only.
-    """
+    """Standard deviation of the pixels' offsets in units of I: one, or (H, W) behind a response that bends."""
     if view.response is None or view.fixed_pattern == 0:
         return view.fixed_pattern * white
-    offsets = view.response.irradiance_error(intensity / white, view.fixed_pattern) * white
-    level = intensity + view.log_offset
-    return np.asarray(level * np.arcsinh(offsets / level), np.float32)
+    offsets = view.response.irradiance_error(intensity / white, view.fixed_pattern)
+    return np.asarray(offsets * white, np.float32)
 
 
 def _misses_some(estimate: Estimate) -> bool:

@@ -15,6 +15,7 @@ from kalux.augmentation.highlights import (
     excess_from_surroundings,
     expected_excess,
     follow_unshown,
+    of_both,
 )
 
 from builders import printed_on_threads
@@ -278,6 +279,43 @@ def test_what_is_limited_is_what_revealed_pixels_are_compared_with():
     gone = left.reshape(-1)[second.pixels]
     assert third.revealed.expected.sum() == pytest.approx(second.limited[gone].sum(), rel=1e-6)
     assert second.limited[gone].sum() < 0.9 * memory.excess[gone].sum()
+
+
+def test_silence_in_one_direction_limits_what_events_in_the_other_leave_open():
+    """As many pixels and slopes are beyond white in both: half of the events per pixel are left."""
+    clipped, memory = striped()
+    below, rims = np.full(SIZE, -0.1, np.float32), np.where(clipped, np.float32(0.0), np.float32(1.0))
+    quiet, loud = (followed(memory, clipped, below, STILL, events) for events in ((rims, rims), uniform(2.0)))
+    found = of_both(quiet, loud)
+    assert (quiet.limited < found.limited).all()
+    assert (found.limited < loud.limited).all()
+
+
+def test_pixels_that_leave_saturation_in_either_direction_tell():
+    clipped, memory = striped()
+    fall = np.full(SIZE, -1.0, np.float32)
+    columns = np.arange(48)
+    first, second = (
+        followed(memory, clipped & ~gone, np.where(gone, value, -0.5).astype(np.float32), fall)
+        for gone, value in ((clipped & (columns < 16), -0.1), (clipped & (columns >= 32), -0.3))
+    )
+    found = of_both(first, second)
+    np.testing.assert_array_equal(found.pixels, np.flatnonzero(clipped & (columns >= 16) & (columns < 32)))
+    for name, of_one, of_other in zip(found.revealed._fields, first.revealed, second.revealed, strict=True):
+        np.testing.assert_array_equal(getattr(found.revealed, name), of_one + of_other)
+    assert found.revealed.moved_excess == pytest.approx(0.9 * 40 * 8 + 0.7 * 40 * 8)
+
+
+def test_of_two_expectations_of_the_same_pixels_the_mean_is_that_of_logarithms():
+    _, memory = striped()
+    twice = memory._replace(excess=2 * memory.excess, bound=memory.bound + 1)
+    found = of_both(memory, twice)
+    np.testing.assert_allclose(found.expected, 2**0.5 * memory.excess, rtol=1e-6)
+    np.testing.assert_allclose(found.doubt, 9 * 2 * memory.excess**2, rtol=1e-6)
+    np.testing.assert_array_equal(found.bound, memory.bound + 1)
+    again = of_both(twice, memory)
+    for one, other in zip(found, again, strict=True):
+        np.testing.assert_equal(one, other)
 
 
 @pytest.mark.parametrize("pitch", [1, 2])

@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import kalux
-from kalux.augmentation.highlights import Unshown
 from kalux.events import make_events
 from kalux.filters.highlights import (
     calm_specks,
@@ -22,6 +21,7 @@ from kalux.filters.highlights import (
 from kalux.filters.readout import HighlightPrior, Subthreshold, read_out
 
 import naive
+from builders import unshown
 
 OFFSET = 0.03
 WHITE = float(np.log(1 + OFFSET))
@@ -40,12 +40,6 @@ def regularised(value, variance, moving, difference, pitch):
         value, variance, OFFSET, OFF, moving=moving, subthreshold=nothing, difference=difference, pitch=pitch
     )[0]
     return np.log(image + OFFSET)
-
-
-def unshown(pixels, excess, noise=0.0, doubt=0.0):
-    return Unshown(
-        np.array(pixels), *(np.full(len(pixels), value, np.float32) for value in (excess, noise, doubt))
-    )
 
 
 def read(level, where, difference=0.0, moving=None, pitch=1, prior=PRIOR):
@@ -206,14 +200,12 @@ def both(smoothed, first, second):
 
 def test_of_both_directions_only_what_neither_has_seen_is_left():
     alike = np.full(10, 1.0)
-    first, second = unshown([1, 4, 7], 0.2, 0.3, 0.5), unshown([4, 7, 9], 0.4, 0.1, 0.8)
+    first, second = unshown([1, 4, 7], 0.2, 0.3), unshown([4, 7, 9], 0.8, 0.1)
     found, level = both(alike, (alike, first), (alike, second))
     np.testing.assert_array_equal(found.pixels, [4, 7])
-    np.testing.assert_allclose(
-        found.excess, (5 * 0.2 + 12.5 * 0.4) / 17.5, rtol=1e-6
-    )  # 0.5 / 0.2^2 and 0.8 / 0.4^2
+    np.testing.assert_allclose(found.excess, 0.4, rtol=1e-6)
     np.testing.assert_allclose(found.noise, 0.1, rtol=1e-6)
-    np.testing.assert_allclose(found.doubt, 0.5, rtol=1e-6)
+    np.testing.assert_allclose(found.doubt, (3 * 0.4) ** 2, rtol=1e-6)
     np.testing.assert_array_equal(level, alike)
     assert both(alike, (alike, found), (alike, None))[0] is None
 
@@ -224,13 +216,14 @@ def test_of_both_directions_only_what_neither_has_seen_is_left():
     ids=["exact", "known", "as much as both differ", "anything"],
 )
 def test_the_higher_of_two_bounds_holds_as_far_as_its_events_are_exact(noise, rise):
-    """What is expected above it, 0.3, and not known of that, 0.4, are a scale of 0.5: noise v takes off v / 0.5."""
-    low = np.array([1.0]), unshown([0], 0.2, 0.01, 0.16)
-    high = np.array([2.2]), unshown([0], 0.4, noise, 0.64)
+    """What is expected above it, e, and not known of that, 3 e, are a scale of 0.5: noise v takes off v / 0.5."""
+    expected = 0.5 / 10**0.5
+    low = np.array([1.0]), unshown([0], 0.5 * expected, 0.01)
+    high = np.array([2.2]), unshown([0], 2 * expected, noise)
     for first, second in ((low, high), (high, low)):
         found, level = both(np.array([1.6]), first, second)
         assert level[0] == pytest.approx(1.6 + rise, abs=1e-6)
-        assert found.excess[0] == pytest.approx(0.3 / (1 + rise / 0.5), rel=1e-5)
+        assert found.excess[0] == pytest.approx(expected / (1 + rise / 0.5), rel=1e-5)
         assert found.noise[0] == pytest.approx(noise if rise else min(noise, 0.01))
 
 

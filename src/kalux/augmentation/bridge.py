@@ -128,6 +128,8 @@ class UnshownMemory(NamedTuple):
         Statistics of the pixels that have left saturation.
     texture
         Of those that have not.
+    hardness
+        Of every part of the image: that of the borders of clipped pixels around, in the latest frame, 0 to 1.
     near, clipped
         Numbers of pixels just below white and of clipped ones, in all frames until now.
     """
@@ -141,6 +143,7 @@ class UnshownMemory(NamedTuple):
     doubt: NDArray[np.float32]
     revealed: Revealed
     texture: Texture
+    hardness: Array
     near: int
     clipped: int
 

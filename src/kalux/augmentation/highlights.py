@@ -11,6 +11,7 @@ their borders are steep.
 
 from __future__ import annotations
 
+import operator
 from typing import Any, Final, NamedTuple
 
 import cv2
@@ -140,12 +141,15 @@ class Unshown(NamedTuple):
         (N,) float32: variance of the bounds, that of the events.
     doubt
         (N,) float32: variance of that mean, which is an expectation itself.
+    memory
+        What both are expected by.
     """
 
     pixels: NDArray[np.int64]
     excess: NDArray[np.float32]
     noise: NDArray[np.float32]
     doubt: NDArray[np.float32]
+    memory: UnshownMemory
 
 
 def begin_unshown(first: Latent, highlights: FrameHighlights, tail: Tail) -> UnshownMemory:
@@ -169,6 +173,7 @@ def begin_unshown(first: Latent, highlights: FrameHighlights, tail: Tail) -> Uns
         doubt=doubt,
         revealed=revealed,
         texture=texture,
+        hardness=hardness,
         near=near,
         clipped=clipped,
     )
@@ -220,21 +225,48 @@ def follow_unshown(
     if raised.any():
         around = excess_from_surroundings(highlights, hardness, unknown[raised], near / max(clipped, 1), tail)
         excess[raised] = np.minimum(excess[raised], around)
-    texture = _with_texture(memory.texture, unknown, highlights, events)
-    limited = _limited(excess, unknown, texture, hardness, memory.shape)
-    expected, doubt = _corrected(limited, unknown, memory.shape[1], revealed)
-    return memory._replace(
-        pixels=unknown,
-        bound=bounded[~measured],
-        excess=excess,
-        limited=limited,
-        expected=expected,
-        doubt=doubt,
-        revealed=revealed,
-        texture=texture,
-        near=near,
-        clipped=clipped,
+    return _with_expectation(
+        memory._replace(
+            pixels=unknown,
+            bound=bounded[~measured],
+            excess=excess,
+            revealed=revealed,
+            texture=_with_texture(memory.texture, unknown, highlights, events),
+            hardness=hardness,
+            near=near,
+            clipped=clipped,
+        )
     )
+
+
+def of_both(first: UnshownMemory, second: UnshownMemory) -> UnshownMemory:
+    """What two directions of time know together, of pixels that neither has seen measured.
+
+    Each has seen frames, events and revealed pixels of its own: sums add up. Of what frames show around the pixels the
+    mean counts, of logarithms, since it is their scale that is not known.
+    """
+    pixels, of_first, of_second = np.intersect1d(
+        first.pixels, second.pixels, assume_unique=True, return_indices=True
+    )
+    return _with_expectation(
+        first._replace(
+            pixels=pixels,
+            bound=np.maximum(first.bound[of_first], second.bound[of_second]),
+            excess=np.sqrt(first.excess[of_first] * second.excess[of_second]),
+            revealed=Revealed(*map(operator.add, first.revealed, second.revealed)),
+            texture=Texture(*map(operator.add, first.texture, second.texture)),
+            hardness=(first.hardness + second.hardness) / 2.0,
+            near=first.near + second.near,
+            clipped=first.clipped + second.clipped,
+        )
+    )
+
+
+def _with_expectation(memory: UnshownMemory) -> UnshownMemory:
+    """``memory`` with what is expected of its pixels by all else in it."""
+    limited = _limited(memory)
+    expected, doubt = _corrected(limited, memory.pixels, memory.shape[1], memory.revealed)
+    return memory._replace(limited=limited, expected=expected, doubt=doubt)
 
 
 def excess_from_surroundings(
@@ -345,29 +377,25 @@ def _sum_texture(unknown, rim, on, off, darker, seen, pitch, sums):  # type: ign
         sums[3, row, column] += np.sqrt(down * down + right * right) / np.float32(2 * pitch)
 
 
-def _limited(
-    excess: NDArray[np.float32],
-    pixels: NDArray[np.int64],
-    texture: Texture,
-    hardness: Floats,
-    shape: tuple[int, ...],
-) -> NDArray[np.float32]:
-    """The expected ``excess``, (N,), limited by the slope that events tell and by how steep the borders are.
+def _limited(memory: UnshownMemory) -> NDArray[np.float32]:
+    """(N,) the expected excess, limited by the slope that events tell and by how steep the borders are.
 
     As many events come per slope at the rim as beyond white, where they tell it alone. Where nothing moves, or there is
     no rim, nothing is limited.
     """
-    height, width = shape
+    height, width = memory.shape
     whole = _TEXTURE_WHOLE * weighted_area((height, width)) / (height * width)
-    events, count, rim_events, rim_slope = (weighted_sums(part) + whole * part.sum() for part in texture)
+    events, count, rim_events, rim_slope = (
+        weighted_sums(part) + whole * part.sum() for part in memory.texture
+    )
     with np.errstate(divide="ignore", invalid="ignore"):
         slope = (events + _UNSEEN_EVENTS) / count * (rim_slope / rim_events)
-        step = _SOFT * hardness / (1.0 - hardness)
+        step = _SOFT * memory.hardness / (1.0 - memory.hardness)
         # Inverse, so that what is not limited is finite.
         inverse = 1.0 / (_SLOPE_REACH * slope + _STEP_REACH * step)
     known = np.where(rim_slope > 0.0, inverse, 0.0).astype(np.float32)
-    relative = excess * interpolated(known, pixels, width)
-    limited: NDArray[np.float32] = excess / np.sqrt(np.float32(1.0) + np.square(relative))
+    relative = memory.excess * interpolated(known, memory.pixels, width)
+    limited: NDArray[np.float32] = memory.excess / np.sqrt(np.float32(1.0) + np.square(relative))
     return limited
 
 
@@ -428,7 +456,7 @@ def expected_excess(memory: UnshownMemory, variance: Floats, initial_variance: f
         return None
     noise = np.empty(len(memory.pixels), np.float32)
     _bound_noise(memory.pixels, variance.reshape(-1), np.float32(initial_variance), noise)
-    return Unshown(memory.pixels, memory.expected, noise, memory.doubt)
+    return Unshown(memory.pixels, memory.expected, noise, memory.doubt, memory)
 
 
 @loop

@@ -14,8 +14,8 @@ from typing import Final
 import numpy as np
 
 from kalux.augmentation.background import doubt, signal_shares
-from kalux.augmentation.bridge import BridgeNoise, Latent, bridge, drift, nominal_thresholds
-from kalux.augmentation.highlights import Unshown
+from kalux.augmentation.bridge import UNMEASURED, BridgeNoise, Latent, bridge, drift, nominal_thresholds
+from kalux.augmentation.highlights import FrameHighlights, Tail, begin_unshown, expected_excess
 from kalux.augmentation.motion import HalfWay, Paths
 from kalux.augmentation.subthreshold import add_missed_change, correlation, silent_change, turns
 from kalux.augmentation.trail import Trail, nothing_followed, signed_surety, trail_between, with_surety
@@ -62,16 +62,19 @@ def rehearse_filter() -> None:
 def rehearse_images() -> None:
     """From an estimate to an image, without and with its variance."""
     level = np.random.default_rng(0).normal(-1.0, 1.0, _SIZE).astype(np.float32)
-    some, ones = np.arange(100), np.ones(100, np.float32)
+    clipped = level > 0.0
+    seen = FrameHighlights(clipped, np.maximum(-level, np.float32(0.0)), ~clipped)
+    bounds = Latent(level, np.where(clipped, np.float32(UNMEASURED), np.float32(0.01)))
+    unshown = expected_excess(begin_unshown(bounds, seen, Tail(0.5, 0.5)), bounds.variance, UNMEASURED)
     estimate = Estimate(
         0,
         level,
         np.abs(level),
         white=0.0,
         final=True,
-        moving=level > 0.0,
+        moving=clipped,
         silent_change=np.abs(level),
-        unshown=Unshown(some, ones, ones, ones),
+        unshown=unshown,
         unmeasured=np.arange(5000),
     )
     view = View(0.02, 0.04, 0.1, 1.0, 0.3, 1.0, 1.0, 1.0, 0.005, None, 0.001, None, (1.0, 1.0, 1.0))

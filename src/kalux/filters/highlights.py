@@ -7,7 +7,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.highlights import Unshown
+from kalux.augmentation.highlights import Unshown, of_both
 from kalux.compiled import ONE, exponential, larger, loop, smaller
 from kalux.filters.readout import HighlightPrior, read_levels
 
@@ -24,7 +24,7 @@ _LEAST_SPREAD: Final = np.float32(0.3)
 """Least standard deviation of the excess, where hardly any is expected."""
 
 _LEAST: Final = np.float32(1e-6)
-"""Least expected excess, and least variance of it, since it is divided by these."""
+"""Least scale of the excess, since it is divided by."""
 
 _PEAK: Final = np.float32(8.4)
 """By how much a point of light is brighter than the mean of the four pixels diagonally beside it, over how much that of
@@ -174,34 +174,27 @@ def smoothed_unshown(
     """Pixels that no frame of the recording measures: both bounds hold. Raises ``smoothed``, (H, W) L, in place.
 
     ``forward`` and ``backward`` are L, P and the pixels that no frame has measured in that direction. The expected
-    excess is the mean of both, weighted by the inverse relative variance. The level is the mean of both, but no less
-    than either bound, lowered by its noise over the scale of the excess: that is the mean of a normal variable times
-    an exponential density. By what the level rises, less is expected above it.
+    excess is by what both know (`of_both`). The level is the mean of both, but no less than either bound, lowered by
+    its noise over the scale of the excess: that is the mean of a normal variable times an exponential density. By what
+    the level rises, less is expected above it.
     """
     if forward[2] is None or backward[2] is None:
         return None
-    pixels, *places = np.intersect1d(
-        forward[2].pixels, backward[2].pixels, assume_unique=True, return_indices=True
-    )
-    first, second = (
-        Unshown(pixels, *(values[place] for values in unshown[1:]))
-        for unshown, place in zip((forward[2], backward[2]), places, strict=True)
-    )
-    # The variances of the logarithms of both means: the less is known of one, the more the other counts.
-    of_first, of_second = (u.doubt / np.maximum(u.excess, _LEAST) ** 2 + _LEAST for u in (first, second))
-    excess = (of_second * first.excess + of_first * second.excess) / (of_first + of_second)
-    doubt = np.minimum(first.doubt, second.doubt)
+    memory = of_both(forward[2].memory, backward[2].memory)
+    excess, doubt = memory.expected, memory.doubt
     scale = np.maximum(np.sqrt(excess**2 + doubt), _LEAST)
-    bounds = tuple(
-        level.reshape(-1)[pixels] - unshown.noise / scale
-        for (level, *_), unshown in ((forward, first), (backward, second))
-    )
-    mean = smoothed.reshape(-1)[pixels]
+    noises = [
+        unshown.noise[np.searchsorted(unshown.pixels, memory.pixels)] for unshown in (forward[2], backward[2])
+    ]
+    bounds = [
+        level.reshape(-1)[memory.pixels] - noise / scale
+        for (level, *_), noise in zip((forward, backward), noises, strict=True)
+    ]
+    mean = smoothed.reshape(-1)[memory.pixels]
     rise = np.maximum(np.maximum(*bounds) - mean, np.float32(0.0)).astype(np.float32)
-    smoothed.reshape(-1)[pixels] = mean + rise
-    noises = first.noise, second.noise
+    smoothed.reshape(-1)[memory.pixels] = mean + rise
     noise = np.where(rise > 0, np.where(bounds[0] > bounds[1], *noises), np.minimum(*noises))
-    return Unshown(pixels, excess / (np.float32(1.0) + rise / scale), noise, doubt)
+    return Unshown(memory.pixels, excess / (np.float32(1.0) + rise / scale), noise, doubt, memory)
 
 
 def obey_bounds(

@@ -19,6 +19,9 @@ Array = NDArray[np.float64]
 _LEVELS: Final = 256
 """Samples of a curve: the levels of an 8-bit camera, below which a slope cannot be told from quantisation."""
 
+_BLACK: Final = 0.5 / 255
+"""Response up to which an 8-bit camera stores black."""
+
 
 @dataclass(frozen=True, eq=False)
 class Response:
@@ -209,9 +212,9 @@ class Response:
     def irradiance_error(self, irradiance: NDArray[np.floating[Any]], error: float) -> Array:
         """What an error of the response is in irradiance: ``error`` times the mean slope of CRF^-1 within it.
 
-        Beyond white it is that of white.
+        Beyond white it is that of white; what is stored as black is all alike, so that no slope there counts.
         """
-        low, high = (np.clip(self.response + side, 0.0, 1.0) for side in (-error, error))
+        low, high = np.maximum(self.response - error, _BLACK), np.minimum(self.response + error, 1.0)
         slope = (self.inverse(high) - self.inverse(low)) / (high - low)
         found: Array = np.interp(irradiance, self.irradiance, error * slope)
         return found
