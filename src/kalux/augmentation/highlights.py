@@ -245,12 +245,11 @@ def of_both(first: UnshownMemory, second: UnshownMemory) -> UnshownMemory:
     Each has seen frames, events and revealed pixels of its own: sums add up. Of what frames show around the pixels the
     mean counts, of logarithms, since it is their scale that is not known.
     """
-    pixels, of_first, of_second = np.intersect1d(
-        first.pixels, second.pixels, assume_unique=True, return_indices=True
-    )
+    of_first = np.isin(first.pixels, second.pixels, kind="table")
+    of_second = np.isin(second.pixels, first.pixels, kind="table")
     return _with_expectation(
         first._replace(
-            pixels=pixels,
+            pixels=first.pixels[of_first],
             bound=np.maximum(first.bound[of_first], second.bound[of_second]),
             excess=np.sqrt(first.excess[of_first] * second.excess[of_second]),
             revealed=Revealed(*map(operator.add, first.revealed, second.revealed)),
