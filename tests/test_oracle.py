@@ -132,9 +132,9 @@ def assert_agrees(name, events, frames, times):
         top = np.log(white + chosen.camera.offset)
         if unshown.any():
             value, total, beyond, noise = naive.lifted(value, total, excess, chosen, top)
-        given = total
+        given = sure = np.where(unshown, np.maximum(beyond, 0.05) ** 2 + noise, total)
         if chosen.filter.neighbours > 0:
-            known, told = total + 1.6 * hidden[0, i], total  # before neighbours are heard
+            known = total + 1.6 * hidden[0, i]  # before neighbours are heard
             raised = value
             value, total = naive.regularised(raised, known, moving[i], chosen.filter.neighbours)
             surface = np.zeros(unshown.shape, bool)
@@ -148,7 +148,7 @@ def assert_agrees(name, events, frames, times):
             total = np.where(unshown, known, total)
             given, left = hidden[1, i].copy(), total / known
             for place, pixel in pixels.items():
-                given[place] += naive.known(pixel, told[place], t, chosen, 0.21 * 0.17, left[place])
+                given[place] += naive.known(pixel, sure[place], t, chosen, 0.21 * 0.17, left[place])
         least = np.minimum(bound, np.maximum(bound - 2 * np.sqrt(noise), top))
         value = np.where(unshown, np.maximum(value, least) + np.minimum(beyond**2, beyond) / 2, value)
         level = np.vectorize(lambda v, p: naive.intensity(v, p, chosen, white, stretch))(  # noqa: B023

@@ -18,7 +18,7 @@ from kalux.augmentation.bridge import RANDOM
 from kalux.augmentation.highlights import Unshown
 from kalux.augmentation.motion import Paths
 from kalux.augmentation.subthreshold import UNKNOWN_CHANGE
-from kalux.filters.highlights import calm_specks, keep_white, lifted, read_unshown, tempered
+from kalux.filters.highlights import calm_specks, given_spread, keep_white, lifted, read_unshown, tempered
 from kalux.filters.readout import HighlightPrior, Subthreshold, read_out
 from kalux.filters.uncertainty import (
     UNSHOWN_SHARE,
@@ -343,9 +343,8 @@ def _above_bounds(
         return estimate.log_intensity, variance, variance if signalled is None else signalled, None
     unshown = tempered(estimate.unshown, estimate.log_intensity, prior)
     level, variance = lifted(estimate.log_intensity, estimate.variance, unshown)
-    if signalled is None:
-        return level, variance, variance, unshown
-    return level, variance, lifted(estimate.log_intensity, signalled, unshown)[1], unshown
+    given = given_spread(estimate.variance if signalled is None else signalled, unshown)
+    return level, variance, given, unshown
 
 
 def _coloured(image: Image, estimate: Estimate, view: View, white: float) -> NDArray[np.float32] | None:
