@@ -799,7 +799,7 @@ def hidden(pixels, place, moving, t, on, off, settings):
         between += (1 - between) * 0.2 * exposed**2
         of_moving = 0.09 * c2 * between
         still = half_way(pixels, k, c2, settings.events.quantisation_variance * c2)
-        still *= 0.8 * between * shown_change(pixels, place, k, c2, settings)
+        still *= between * shown_change(pixels, place, k, c2, settings)
         used = of_moving if moving else still
         _, silent, _, frames, _ = pixel.changes[k]
         waits = silent and min(frames) < UNMEASURED and (moving or max(frames) >= UNMEASURED)

@@ -26,11 +26,6 @@ SUBTHRESHOLD_MOVING: Final = 0.09
 errors of images, forward and both ways in time, of thirty simulated scenes and of the held-out frames of three real
 recordings."""
 
-SUBTHRESHOLD_SILENT: Final = 0.8
-"""Variance half-way between two frames of a pixel without recent events, in units of that of silent pixels about the
-mean of both frames (`kalux.augmentation.subthreshold.half_way`): what is seen along the paths (K16) is nearer. The
-likeliest of 1, 0.8 and 0.65, forward and both ways, by the errors of 57 scenes (docs/equations.md, K11)."""
-
 SUBTHRESHOLD_EXPOSED: Final = 0.2
 """Share of these variances, of moving and of silent pixels, that is left at a frame that is exposed all the time, the
 mean of which is not the middle: fifty simulated scenes, exposed for a twentieth to three quarters of the time."""
@@ -141,7 +136,7 @@ def subthreshold_variance(
         That of `Around`.
     """
     unsignalled = between + (1.0 - between) * SUBTHRESHOLD_EXPOSED * exposed**2
-    silent = SUBTHRESHOLD_SILENT * unsignalled * half_way if since is None else min(since, 1.0)
+    silent = unsignalled * half_way if since is None else min(since, 1.0)
     moving = threshold2 * SUBTHRESHOLD_MOVING
     return Subthreshold(silent, moving * unsignalled, moving)
 
