@@ -522,12 +522,18 @@ def bridged(pixel, settings, times, on, off, scales):
         deviation = (value - augmented(interval, at, at)) / variance / information  # (17)
         return augmented(interval, t, at) + deviation, 1 / information
 
+    def come(t):  # K10: the share of the interval's events, of a pixel that no frame measures at its end
+        a, b, left, right, *_ = intervals[index]
+        if left is None or right is None or right[1] < UNMEASURED or not pixel.events:
+            return 0.0
+        return sum(counts(a, t)) / max(sum(counts(a, b)), 1e-9)
+
     def bounded(t):  # K7 and K10
         value, variance = predict(t)
         value += grown(index, t)
         _, b, _, right, *_ = intervals[index]
         if t != b:
-            return value, variance
+            return value, variance + drifts[index] * come(t) if index < len(drifts) else variance
         value = max(value, right[0]) if right[1] >= UNMEASURED else value
         most = np.inf if index + 1 == len(intervals) else ceiling(index, right[0])
         return min(value, most), variance + drifts[index]

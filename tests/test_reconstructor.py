@@ -1024,6 +1024,24 @@ def test_a_calibration_of_the_sensor_is_used():
     assert Reconstructor((4, 6), settings=given, calibration=known).thresholds == (0.2, 0.2)
 
 
+@pytest.mark.parametrize("clips", [True, False])
+def test_an_edge_into_a_highlight_is_no_surer_before_the_next_frame_than_after_it(clips):
+    """Ten events of 0.2 with thresholds 10 or 30 % off: P knows as they come, if no frame is to tie them (K10)."""
+    levels = {}
+    for spread in (0.1, 0.3):
+        known = {"threshold_on": 0.2, "threshold_off": 0.2, "threshold_spread": spread}
+        engine = Reconstructor((1, 2), settings=altered(PRESETS["default"], "events", **known))
+        for t, level in ((0, 50), (100_000, 255 if clips else 200)):
+            engine.push_frame(Frame(np.array([[50, level]], np.uint8), t, t + 10_000))
+        engine.push_events(pixel_events(range(50_000, 60_000, 1_000), [1] * 10, x=1))
+        engine.finish()
+        times = (49_000, 54_500, 70_000, 105_000)
+        levels[spread] = np.array([engine.estimate(t).variance[0, 1] for t in times])
+    drift = (0.3**2 - 0.1**2) * (10 * 0.2) ** 2
+    found = (levels[0.3] - levels[0.1]) / drift
+    np.testing.assert_allclose(found, [0, 0.5, 1, 1] if clips else 0, atol=0.03)
+
+
 def test_the_fixed_pattern_of_a_live_stream_is_the_usual_one():
     """Of grey frames: it is in every image, whatever is averaged."""
     grey, colour = (np.full(shape, 9, np.uint8) for shape in ((4, 6), (4, 6, 3)))

@@ -194,7 +194,7 @@ class BridgedSegment(NamedTuple):
     bound
         The frame at the end, whose clipped pixels are bounds of the state there (`raise_to_bound`).
     drift
-        Growth of P at the end by errors of the thresholds (`drift`); None: none.
+        Growth of P until the end by errors of the thresholds (`drift`), with the pixel's events; None: none.
     still_since
         us: pixels without an event after it are still.
     floor

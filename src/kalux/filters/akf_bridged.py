@@ -7,7 +7,7 @@ constant in between (`akf`).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numba as nb
 import numpy as np
@@ -110,6 +110,8 @@ class Cursor:
         `moving_pixels`, once it has been asked for, where it is the same throughout the segment.
     unmeasured
         `unmeasured_pixels`, once it has been asked for.
+    drifting
+        (N,) pixels in the flattened image with events and no frame at the end that measures them, once asked for.
     """
 
     pixels: NDArray[np.void]
@@ -119,6 +121,7 @@ class Cursor:
     origin: int
     moving: NDArray[np.bool_] | None = None
     unmeasured: NDArray[np.int64] | None = None
+    drifting: NDArray[np.int64] | None = None
 
 
 class Noise(NamedTuple):
@@ -205,7 +208,7 @@ def _on_clock(cursor: Cursor, t: int) -> tuple[int, np.float32]:
 
 
 def _read(segment: BridgedSegment, cursor: Cursor, t: int) -> tuple[FloatArray, FloatArray]:
-    """The same, at the end of the segment with the trail, bounds (K7) and drift (K10) there."""
+    """The same, with the drift of K10, and at the end of the segment with the trail and bounds (K7) there."""
     shape = segment.augmented.shape
     log_intensity, variance = apart(2, shape)
     within, beyond = _on_clock(cursor, t)
@@ -221,7 +224,25 @@ def _read(segment: BridgedSegment, cursor: Cursor, t: int) -> tuple[FloatArray, 
             lower_to_ceiling(log_intensity, segment.bound)
         if segment.drift is not None:
             variance += segment.drift  # K10
+    elif segment.drift is not None and segment.events is not None:
+        _add_drift(segment, cursor, segment.drift, segment.events, variance)
     return log_intensity, variance
+
+
+def _add_drift(
+    segment: BridgedSegment,
+    cursor: Cursor,
+    drift: NDArray[np.floating[Any]],
+    events: NDArray[np.floating[Any]],
+    variance: FloatArray,
+) -> None:
+    """Add as much of ``drift`` to P as ``events`` have come, of pixels that no frame measures at the end. In place."""
+    if cursor.drifting is None:
+        cursor.drifting = np.flatnonzero((segment.backward_variance >= UNMEASURED) & (events > 0))
+    pixels = cursor.drifting
+    row, column = np.divmod(pixels, events.shape[1])
+    coming = cursor.steps["coming"][row + 1, column + 1] / events.reshape(-1)[pixels]
+    variance.reshape(-1)[pixels] += drift.reshape(-1)[pixels] * (np.float32(1.0) - coming)
 
 
 def moving_pixels(segment: BridgedSegment, cursor: Cursor) -> NDArray[np.bool_]:
