@@ -328,6 +328,7 @@ def test_where_one_filter_knows_only_a_bound_it_is_one():
     np.testing.assert_allclose(found.variance[0, :2], [1e-3, 0.1])
     assert found.unshown.pixels.tolist() == [2]
     assert found.unshown.excess[0] == pytest.approx(0.2)  # the mean of the logarithms
+    assert found.unshown.doubt[0] == pytest.approx((3 * 0.2) ** 2)
 
 
 @pytest.mark.parametrize(

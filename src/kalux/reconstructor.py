@@ -526,8 +526,8 @@ class Reconstructor:
         camera = self.settings.camera
         if camera.fixed_pattern is not None:
             return camera.fixed_pattern
-        raw = self._camera.colours is None and frame.image.ndim == 2
-        return USUAL_PATTERN if raw and self.settings.filter.joins_frames else 0.0
+        grey = self._camera.colours is None and frame.image.ndim == 2
+        return USUAL_PATTERN if grey and self.settings.filter.joins_frames else 0.0
 
     def _unshown(self, progress: _Progress, variance: NDArray[np.floating[Any]]) -> Unshown | None:
         """Pixels that no frame has measured yet (K15), where highlights are looked at."""

@@ -275,6 +275,7 @@ def test_errors_of_a_response_are_as_much_light_as_its_inverse_is_steep():
     response, light = Response.gamma(2.0), np.array([0.01, 0.25, 0.81])
     np.testing.assert_allclose(response.irradiance_error(light, 0.005), 2 * np.sqrt(light) * 0.005, rtol=1e-3)
     assert 0 < response.irradiance_error(np.array([0.0]), 0.004)[0] < 3e-5
+    assert response.irradiance_error(np.array([0.0]), 0.5 / 255)[0] > 0  # from half a level to a whole one
     crushed = Response.s_curve(0.2)
     assert crushed.irradiance_error(np.array([0.1]), 0.004)[0] < 0.03  # not what may be hidden, 0.2
     white, beyond = response.irradiance_error(np.array([1.0, 3.0]), 0.004)

@@ -214,7 +214,8 @@ class Response:
 
         Beyond white it is that of white; what is stored as black is all alike, so that no slope there counts.
         """
-        low, high = np.maximum(self.response - error, _BLACK), np.minimum(self.response + error, 1.0)
+        low = np.maximum(self.response - error, _BLACK)
+        high = np.clip(self.response + error, 2.0 * _BLACK, 1.0)
         slope = (self.inverse(high) - self.inverse(low)) / (high - low)
         found: Array = np.interp(irradiance, self.irradiance, error * slope)
         return found
