@@ -213,7 +213,7 @@ def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) ->
     Where the variance is not wanted it is infinite: computing it (K11) takes a seventh of the time.
     """
     prior = view.prior(estimate.white)
-    log_intensity, variance, signalled, unshown = _above_bounds(estimate, prior)
+    log_intensity, variance, unshown = _above_bounds(estimate, prior)
     moving, change = estimate.moving, estimate.silent_change
     if change is None and moving is not None:  # K11 needs it only there
         change = np.full(log_intensity.shape, UNKNOWN_CHANGE * view.threshold2, np.float32)
@@ -253,8 +253,10 @@ def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) ->
     if not needs_variance:
         total = _infinite(intensity.shape)
     elif moving is not None and change is not None:
+        signalled = estimate.variance if estimate.signalled_variance is None else estimate.signalled_variance
+        given = signalled if unshown is None else given_spread(signalled, unshown)
         total = given_variance(
-            signalled, moving, change, subthreshold, estimate.around, total if needs_averaged else None
+            given, moving, change, subthreshold, estimate.around, total if needs_averaged else None
         )
         if np.any(pattern):
             add_pattern(total, intensity, view.log_offset, pattern)
@@ -335,16 +337,13 @@ def _look_along(
 
 def _above_bounds(
     estimate: Estimate, prior: HighlightPrior
-) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], Unshown | None]:
-    """L, P, the signalled variance, and the unshown pixels, raised from bounds to where they are expected (K15)."""
-    signalled = estimate.signalled_variance
+) -> tuple[NDArray[Any], NDArray[Any], Unshown | None]:
+    """L, P, and the unshown pixels, raised from bounds to where they are expected (K15)."""
     if estimate.unshown is None:
-        variance = estimate.variance
-        return estimate.log_intensity, variance, variance if signalled is None else signalled, None
+        return estimate.log_intensity, estimate.variance, None
     unshown = tempered(estimate.unshown, estimate.log_intensity, prior)
     level, variance = lifted(estimate.log_intensity, estimate.variance, unshown)
-    given = given_spread(estimate.variance if signalled is None else signalled, unshown)
-    return level, variance, given, unshown
+    return level, variance, unshown
 
 
 def _coloured(image: Image, estimate: Estimate, view: View, white: float) -> NDArray[np.float32] | None:

@@ -91,6 +91,15 @@ _BITS: Final = np.int32(8)
 _FIRST_BITS: Final = np.int32(255)
 
 
+class _Drifting(NamedTuple):
+    """(N,) each: places in the flattened image and in the flattened `Cursor.steps`, drift (K10), and events."""
+
+    pixels: NDArray[np.int64]
+    steps: NDArray[np.int64]
+    growth: NDArray[np.floating[Any]]
+    events: NDArray[np.floating[Any]]
+
+
 @dataclass
 class Cursor:
     """Working arrays of the bridged form; changed in place by `advance`.
@@ -111,7 +120,7 @@ class Cursor:
     unmeasured
         `unmeasured_pixels`, once it has been asked for.
     drifting
-        (N,) pixels in the flattened image with events and no frame at the end that measures them, once asked for.
+        Pixels with events and no frame at the end that measures them, once they have been asked for.
     """
 
     pixels: NDArray[np.void]
@@ -121,7 +130,7 @@ class Cursor:
     origin: int
     moving: NDArray[np.bool_] | None = None
     unmeasured: NDArray[np.int64] | None = None
-    drifting: NDArray[np.int64] | None = None
+    drifting: _Drifting | None = None
 
 
 class Noise(NamedTuple):
@@ -238,11 +247,13 @@ def _add_drift(
 ) -> None:
     """Add as much of ``drift`` to P as ``events`` have come, of pixels that no frame measures at the end. In place."""
     if cursor.drifting is None:
-        cursor.drifting = np.flatnonzero((segment.backward_variance >= UNMEASURED) & (events > 0))
-    pixels = cursor.drifting
-    row, column = np.divmod(pixels, events.shape[1])
-    coming = cursor.steps["coming"][row + 1, column + 1] / events.reshape(-1)[pixels]
-    variance.reshape(-1)[pixels] += drift.reshape(-1)[pixels] * (np.float32(1.0) - coming)
+        pixels = np.flatnonzero((segment.backward_variance >= UNMEASURED) & (events > 0))
+        row, column = np.divmod(pixels, events.shape[1])
+        steps = (row + 1) * cursor.steps.shape[1] + column + 1
+        cursor.drifting = _Drifting(pixels, steps, drift.reshape(-1)[pixels], events.reshape(-1)[pixels])
+    pixels, steps, growth, count = cursor.drifting
+    coming = cursor.steps.reshape(-1)["coming"][steps] / count
+    variance.reshape(-1)[pixels] += growth * (np.float32(1.0) - coming)
 
 
 def moving_pixels(segment: BridgedSegment, cursor: Cursor) -> NDArray[np.bool_]:
