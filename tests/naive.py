@@ -506,7 +506,12 @@ def bridged(pixel, settings, times, on, off, scales):
             ) / spread
         forward = UNMEASURED if left is None else left[1]
         forward += ev.step_noise * c2 * sum(counts(a, known_until))
-        backward = right[1] + ev.step_noise * c2 * sum(counts(known_until, b))
+        coming = sum(counts(known_until, b))
+        backward = right[1] + ev.step_noise * c2 * coming
+        if left is not None and left[1] >= UNMEASURED > right[1] and coming > 0:  # nothing ties the other end
+            v_on, v_off, (f_on, f_off), (n_on, n_off) = *interval[6:8], interval[-1], counts(a, b)
+            wrong = v_on * (on * f_on * n_on) ** 2 + v_off * (off * f_off * n_off) ** 2
+            backward += 0.1 * wrong * (coming / (n_on + n_off)) ** 2
         return 0.5 / ((b - a) * US) * (1 / forward + 1 / backward)
 
     value = augmented(intervals[0], begin, begin)
@@ -837,6 +842,8 @@ def known(pixel, variance, t, settings, c2, left):
     if is_crushed(pixel, k + 1, settings.camera):  # says what others have said
         return variance + wrong
     following = second + (1 - share) * events * ev.step_noise * c2
+    if first >= UNMEASURED:  # K4
+        following += 0.1 * ev.believed_mismatch**2 * c2 * ((1 - share) * events) ** 2
     q0 = ev.quantisation_variance * c2
     common = (q0 / (first + second + q0)) ** 2 * min(first, second) * (1 - between / 2)
     return max(1 / (1 / variance + 1 / following), common) + wrong

@@ -75,7 +75,7 @@ def test_offsets_of_stored_values_are_as_much_light_as_the_curve_is_steep():
 def test_what_exposures_take_off_a_frame_is_not_known_there():
     """The image is the same, and a variance that is not wanted stays infinite."""
     plane = np.full((1, 2), 0.02, np.float32)
-    told = Around(plane, plane, 0 * plane, 0.0, 0.0, 0.01, 1.0, 0.0, share=1.0)
+    told = Around(plane, plane, 0 * plane, 0.0, 0.0, 0.01, 1.0, 0.0, 0.0, share=1.0)
     seen = estimate([[0.2, 0.4]], moving=np.array([[False, True]]), silent_change=plane, around=told)
     blurred = dataclasses.replace(seen, exposed=0.8)
     image, before = make_image(blurred, GREY), make_image(seen, GREY)
@@ -163,7 +163,7 @@ def test_a_mosaics_colours_are_the_same_where_no_variance_is_wanted():
     """Beyond white they depend on the variance, with what exposures hide and the rounding that frames share."""
     view = dataclasses.replace(GREY, mosaic="RGGB", gains=(2.0, 1.0, 1.5), rounding=0.3, fixed_pattern=0.2)
     plane = np.full((4, 4), 0.5, np.float32)
-    told = Around(plane, plane, 0 * plane, 0.0, 0.0, 0.01, 1.0, 0.0, share=0.0)
+    told = Around(plane, plane, 0 * plane, 0.0, 0.0, 0.01, 1.0, 0.0, 0.0, share=0.0)
     seen = estimate(
         1.3 * np.ones((4, 4)), 0.2, moving=plane > 1, silent_change=plane, around=told, exposed=0.9
     )

@@ -1042,6 +1042,24 @@ def test_an_edge_into_a_highlight_is_no_surer_before_the_next_frame_than_after_i
     np.testing.assert_allclose(found, [0, 0.5, 1, 1] if clips else 0, atol=0.03)
 
 
+def test_events_alone_lead_back_into_a_highlight_as_far_as_thresholds_are_known():
+    """Twenty events of 0.2 lead back from the next frame to 27 times white: half of that way if thresholds are known,
+    less if these may be 50 % off (K4). At the next frame nothing of that is left."""
+    levels = {}
+    for spread in (0.01, 0.5):
+        known = {"threshold_on": 0.2, "threshold_off": 0.2, "threshold_spread": spread}
+        engine = Reconstructor((1, 2), settings=altered(PRESETS["default"], "events", **known))
+        for t, level in ((0, 255), (100_000, 128)):
+            engine.push_frame(Frame(np.array([[50, level]], np.uint8), t, t + 10_000))
+        engine.push_events(pixel_events(range(60_000, 100_000, 2_000), [0] * 20, x=1))
+        engine.finish()
+        found = [engine.estimate(t) for t in (55_000, 105_000)]
+        levels[spread] = np.array([np.exp(each.log_intensity[0, 1]) for each in found])
+    assert levels[0.01][0] > 8
+    assert 2 < levels[0.5][0] < 3.5
+    np.testing.assert_allclose(levels[0.5][1], levels[0.01][1], rtol=0.01)
+
+
 def test_the_fixed_pattern_of_a_live_stream_is_the_usual_one():
     """Of grey frames: it is in every image, whatever is averaged."""
     grey, colour = (np.full(shape, 9, np.uint8) for shape in ((4, 6), (4, 6, 3)))

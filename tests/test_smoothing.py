@@ -255,7 +255,9 @@ def estimates_around(first, second, share=0.5, ends=None, hidden=0.2 * 0.1 * 0.2
     first, second, ends = (np.reshape(v, shape) for v in (first, second, second if ends is None else ends))
     ones, level = np.ones(shape), np.zeros(shape)
     return tuple(
-        Estimate(t, level, p * ones, 0.0, True, around=Around(*frames, ones, 0.0, 0.0, hidden, 1.0, 0.0, way))
+        Estimate(
+            t, level, p * ones, 0.0, True, around=Around(*frames, ones, 0.0, 0.0, hidden, 1.0, 0.0, 0.0, way)
+        )
         for t, p, frames, way in ((5, 0.01, (first, ends), share), (-5, 0.04, (second, first), 1 - share))
     )
 

@@ -117,6 +117,25 @@ def test_variances_to_come_are_counted_not_subtracted():
     assert 1 / after - 1 / before == pytest.approx(rate * 1e-3, rel=1e-5)
 
 
+def test_steps_that_are_all_wrong_alike_count_until_they_have_come():
+    """Where the frame before does not measure a pixel, 1/R is that of the way back from the next one (K4)."""
+    q, frame, wrong = 0.008, 3.4e-5, 0.002
+    segment = drifting_segment(10**6)._replace(
+        backward_variance=ONE * frame, events=ONE * 3, step_variance=q, wrong=ONE * wrong
+    )
+    cursor = akf_bridged.begin(segment, bridged_state(0.0, 0.1))
+    for come in range(4):
+        start = 200_000 * come
+        if come:
+            akf_bridged.advance(
+                segment, cursor, events_at([start], [True]), akf_bridged.Noise(3.0, 0.2, 0.04)
+            )
+        before, after = (akf_bridged.read(segment, cursor, start + wait)[1][0, 0] for wait in (0, 100))
+        left = 3 - come
+        expected = 1e-4 / (frame + q * left + wrong * left**2)
+        assert 1 / after - 1 / before == pytest.approx(expected, rel=1e-2)
+
+
 DAYS = 3 * 24 * 3600 * 10**6
 
 

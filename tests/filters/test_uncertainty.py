@@ -36,8 +36,8 @@ def plane(value):
 
 
 def around(first=UNMEASURED, second=UNMEASURED, events=0.0, **changes):
-    scalars = {"coming": 0.0, "counted": 0.0, "quantisation_variance": C2 / 6, "repeated": 1.0, "wrong": 0.0}
-    scalars["share"] = 0.5
+    scalars = {"coming": 0.0, "counted": 0.0, "quantisation_variance": C2 / 6, "repeated": 1.0}
+    scalars |= {"wrong": 0.0, "wrong_back": 0.0, "share": 0.5}
     return Around(plane(first), plane(second), plane(events), **{**scalars, **changes})
 
 
@@ -92,15 +92,17 @@ def test_rounding_that_frames_share_bounds_the_variance_of_still_pixels():
     np.testing.assert_allclose(variance, [[0.2**2 / 2, 0.05**2 / 2, 1e-4, 0.5]], rtol=1e-5)
 
 
-@given(variances, variances, st.floats(0.0, 30.0), st.floats(0.0, 0.1))
-def test_the_next_frame_tells_of_the_image_before_it(p, second, events, coming):
-    """As much as it knows, and as the events between are sure; not where it is counted already."""
-    found = known_variance(*np.float32([p, UNMEASURED, second, events]), (coming, 0.0, C2 / 6, 1.0, 0.0))
-    assert 1 / found == pytest.approx(1 / p + 1 / (second + coming * events), rel=1e-4)
-    counted = known_variance(
-        *np.float32([p, UNMEASURED, second, events]), (coming, UNMEASURED, C2 / 6, 1.0, 0.0)
-    )
-    assert counted == pytest.approx(p, rel=1e-6)
+@given(variances, variances, st.floats(0.0, 30.0), st.floats(0.0, 0.1), st.floats(0.0, 0.1))
+def test_the_next_frame_tells_of_the_image_before_it(p, second, events, coming, wrong):
+    """As much as it knows, and as the events between are sure, all together where no frame ties them before (K4); not
+    where it is counted already."""
+    for first, all_wrong in ((UNMEASURED, wrong), (1e9, 0.0)):
+        pixel = np.float32([p, first, second, events])
+        found = known_variance(*pixel, (coming, 0.0, C2 / 6, 1.0, 0.0, wrong))
+        behind = second + coming * events + all_wrong * events**2
+        assert 1 / found == pytest.approx(1 / p + 1 / behind, rel=1e-4)
+        counted = known_variance(*pixel, (coming, UNMEASURED, C2 / 6, 1.0, 0.0, wrong))
+        assert counted == pytest.approx(p, rel=1e-6)
 
 
 def test_noise_that_the_slope_follows_is_in_every_image():

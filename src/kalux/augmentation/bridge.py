@@ -37,6 +37,11 @@ REPEATED: Final = 2.0**39
 RANDOM: Final = 0.25
 """Of a random walk: variance of its middle about the mean of its ends, over the variance of its change."""
 
+WRONG_STEPS: Final = 0.1
+"""Variance of steps that are all wrong alike, in units of what the thresholds' spread makes of as many events (K10):
+half-way between two frames that both measure the pixel, by the errors of 30 scenes and three recordings, and on the way
+back from a frame where the one before does not (docs/equations.md, K11 and K4)."""
+
 _LEAST_SQUARE: Final = 1e-12  # log intensity^2: where events tell of no change, a division
 
 _BLOCK: Final = 64
@@ -223,6 +228,9 @@ class BridgedSegment(NamedTuple):
         the age of those around it.
     signal
         Probability that an on and that an off event is signal, as far as K14 asks for it; None: all are.
+    wrong
+        Variance of the way that events lead back from the second frame, by errors of the thresholds, per squared number
+        of these events, of pixels that the first frame does not measure; 0 of others (`wrong_way_back`, K4). None: 0.
     """
 
     start: int
@@ -250,6 +258,48 @@ class BridgedSegment(NamedTuple):
     brightest: float = 1.0
     doubt: tuple[Array, Array] | None = None
     signal: tuple[Array, Array] | None = None
+    wrong: Array | None = None
+
+
+def wrong_way_back(
+    first: Latent,
+    second: Latent,
+    thresholds: Thresholds,
+    noise: BridgeNoise,
+    counts: tuple[Array, Array],
+    events: Array,
+) -> Array | None:
+    """Variance of the way back from the second frame, per squared event, by errors of the thresholds (K4).
+
+    A wrong threshold is wrong for all events alike. Where the first frame does not measure a pixel, it does not tie the
+    other end of the way that they lead back from the second.
+
+    Parameters
+    ----------
+    first, second
+        The frames before and after.
+    thresholds, noise
+        As in `bridge`.
+    counts
+        (H, W) on and off events between them, as far as they are signal.
+    events
+        (H, W) the sum of both, with what is noise.
+
+    Returns
+    -------
+    (H, W), 0 of pixels that the first frame measures and of those that the second does not; None: 0 of all.
+    """
+    pixels = np.flatnonzero((first.variance >= UNMEASURED) & (second.variance < UNMEASURED) & (events > 0))
+    if len(pixels) == 0:
+        return None
+    on, off, all_events, on_variance, off_variance = (
+        plane.reshape(-1)[pixels] for plane in (*counts, events, *thresholds[2:])
+    )
+    of_on, of_off = noise.threshold_on * on, noise.threshold_off * off
+    found = np.zeros(first.variance.shape, first.variance.dtype)
+    of_both = on_variance * of_on**2 + off_variance * of_off**2
+    found.reshape(-1)[pixels] = WRONG_STEPS * of_both / all_events**2
+    return found
 
 
 def drift(

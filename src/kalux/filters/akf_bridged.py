@@ -62,7 +62,7 @@ STEP_PIXEL: Final = np.dtype(
         "names": [
             "step_on",
             "step_off",
-            "forward",  # variance of L^A from the frame before
+            "forward",  # variance of L^A from the frame before; or, if that is not known, less `BridgedSegment.wrong`
             "backward",  # the same from the frame after, without the events still to come
             "doubt_on",  # variance of an on event's step beyond that of a sure one
             "doubt_off",
@@ -74,6 +74,8 @@ STEP_PIXEL: Final = np.dtype(
     }
 )
 """What events need in addition: 32 bytes, so that no pixel lies in two lines of the cache."""
+
+_ZERO: Final = np.float32(0.0)
 
 _BLOCK: Final = 128
 """Pixels that are read together: few enough that their fields stay in the first-level cache."""
@@ -166,7 +168,8 @@ def begin(segment: BridgedSegment, state: State) -> Cursor:
     doubts = (np.zeros_like(segment.augmented),) * 2 if segment.doubt is None else segment.doubt
     signal = (np.ones_like(segment.augmented),) * 2 if segment.signal is None else segment.signal
     of_steps = segment.step_on, segment.step_off, *variances, coming, *doubts, *signal
-    given = segment.augmented, trail.start, of_steps
+    wrong = np.zeros_like(segment.augmented) if segment.wrong is None else segment.wrong
+    given = segment.augmented, trail.start, of_steps, wrong
     before = state.log_intensity, floor, state.variance
     _begin_bridged(given, scalars, before, pixels.reshape(-1), steps.reshape(-1))
     signed[1:-1, 1:-1] = trail.signed
@@ -319,7 +322,8 @@ def _since(clock, now):  # type: ignore[no-untyped-def]
 def _begin_bridged(given, scalars, before, pixels, steps):  # type: ignore[no-untyped-def]
     rate, step_variance = scalars
     log_intensity, floor, variance = before
-    augmented, trail, (step_on, step_off, forward, backward, events, doubt_on, doubt_off, on, off) = given
+    augmented, trail, of_steps, wrong = given
+    step_on, step_off, forward, backward, events, doubt_on, doubt_off, on, off = of_steps
     height, width = log_intensity.shape
     states = empty((_STATE_FIELDS, _BEGIN_BLOCK), np.float32)
     known = zeros((_STEP_FIELDS, _BEGIN_BLOCK), np.float32)
@@ -354,13 +358,22 @@ def _begin_bridged(given, scalars, before, pixels, steps):  # type: ignore[no-un
                 )  # K7
                 weighted[i] = information[i] * (known_before - level[i])
             for i in range(count):
-                rates[i] = measurement_rate(
-                    rate, first_variance[i], last_variance[i] + coming[i] * step_variance
-                )
+                way_back = np.float32(wrong[row, first + i])
+                first_variance[i] = -way_back if way_back > 0 else first_variance[i]
+            for i in range(count):
+                rates[i] = _rate(rate, first_variance[i], last_variance[i], coming[i], step_variance)
             for i in range(count):
                 level[i] -= np.float32(trail[row, first + i])
             pack(states, pixels, np.int64(at + first), np.int64(count))
             pack(known, steps, np.int64(at + first), np.int64(count))
+
+
+@nb.njit(cache=True, inline="always")
+def _rate(rate, forward, backward, coming, step_variance):  # type: ignore[no-untyped-def]
+    """1/R (K4) by the fields of `STEP_PIXEL`."""
+    wrong, measured = larger(-forward, _ZERO), forward >= _ZERO
+    backward += coming * (step_variance + wrong * coming)
+    return measurement_rate(rate, forward if measured else np.float32(UNMEASURED), backward)
 
 
 @nb.njit(cache=True, inline="always")
@@ -408,8 +421,9 @@ def _advance_bridged(words, pixels, steps, clock, signed, origin, rate, step_var
         pixel.weighted = (pixel.weighted - information * p_noise * step) * kept
         pixel.information = information * kept
         pixel.augmented += step
-        forward, coming = known.forward + weight * scalars.step_variance, known.coming - weight
-        pixel.rate = measurement_rate(scalars.rate, forward, known.backward + coming * scalars.step_variance)
+        forward, coming = known.forward, known.coming - weight
+        forward += weight * scalars.step_variance if forward >= _ZERO else _ZERO
+        pixel.rate = _rate(scalars.rate, forward, known.backward, coming, scalars.step_variance)
         known.forward, known.coming = forward, coming
         surety = np.int32(known.surety)
         signed[at] = np.int8(surety & _FIRST_BITS if is_on else -(surety >> _BITS))

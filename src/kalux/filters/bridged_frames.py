@@ -51,7 +51,7 @@ from kalux.filters.akf import State
 from kalux.filters.common import make_clock
 from kalux.filters.method import FAR_FUTURE, USUAL_INTERVAL, Chunks, Method, Segment
 from kalux.filters.shots import Shot, level_variance
-from kalux.filters.uncertainty import WRONG_STEPS, Around
+from kalux.filters.uncertainty import Around
 from kalux.models.camera import CRUSHED, beyond_white, dark_scale, log_intensity
 from kalux.models.dark_levels import dark_correction
 from kalux.models.pixels import PixelCalibration
@@ -360,7 +360,11 @@ class BridgedFrames(Method):
             latest_change=latest_change,
             usual=usual,
         )
+        assert joined.events is not None
         joined = joined._replace(
+            wrong=bridge.wrong_way_back(
+                memory.latent, second, memory.thresholds, self.noise, steps, joined.events
+            ),
             trail=trail,
             unshown=unshown,
             silent_change=change,
@@ -603,6 +607,7 @@ class BridgedFrames(Method):
         second = segment.backward_variance
         if segment.bound is not None and segment.bound.ceiling is not None:
             second = np.where(np.isfinite(segment.bound.ceiling), np.float32(bridge.REPEATED), second)
+        wrong = bridge.WRONG_STEPS * self._spread2 * self._threshold2
         return Around(
             segment.forward_variance,
             second,
@@ -611,7 +616,8 @@ class BridgedFrames(Method):
             counted=0.0,
             quantisation_variance=self.noise.quantisation_variance,
             repeated=1.0 - between / 2.0,
-            wrong=WRONG_STEPS * self._spread2 * between * self._threshold2,
+            wrong=wrong * between,
+            wrong_back=wrong * (1.0 - share) ** 2,
             share=share,
             half_way=segment.half_way,
         )

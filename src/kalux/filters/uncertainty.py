@@ -38,9 +38,7 @@ SUBTHRESHOLD_INTERMITTENT: Final = (0.5, 0.25)
 """Variance of an intermittent pixel's subthreshold change (`_mark_intermittent`), in units of that of a silent pixel
 and of that of one with an event in this frame interval, which are added: the same scenes, and the held-out frames."""
 
-WRONG_STEPS: Final = 0.1
-"""Variance half-way between two frames of steps that are all wrong alike, in units of what the thresholds' spread makes
-of as many events where no frame ties them (K10): the same scenes."""
+_NOTHING: Final = np.float32(0.0)
 
 _FEW_TURNS: Final = 1e-2  # in an exposure: what they change is less than the digits of their exponentials
 
@@ -90,6 +88,8 @@ class Around(NamedTuple):
         What share of the variance of the frames' noise is in the image: 1 at a frame, 1/2 half-way between two.
     wrong
         Variance of steps that are all wrong alike, per squared number of events.
+    wrong_back
+        The same of the way back from the second frame, where the first does not measure the pixel (K4).
     share
         Of the way from the frame before to the one after.
     half_way
@@ -104,6 +104,7 @@ class Around(NamedTuple):
     quantisation_variance: float
     repeated: float
     wrong: float
+    wrong_back: float
     share: float
     half_way: float = RANDOM
 
@@ -170,8 +171,9 @@ def known_variance(variance, first, second, events, around):  # type: ignore[no-
     follows the frames, the share q_0 / V of their mismatch (K1), their noise is in every image, however many have been
     seen.
     """
-    coming, counted, q0, repeated, wrong = around
+    coming, counted, q0, repeated, wrong, wrong_back = around
     following = counted + second + coming * events
+    following += wrong_back * events * events if first >= UNMEASURED else _NOTHING  # K4
     slope = q0 / (first + second + q0)
     known = larger(
         variance * following / (variance + following), repeated * slope * slope * smaller(first, second)
@@ -211,7 +213,7 @@ def given_variance(
     planes = variance, silent_change, *((nothing,) * 3 if around is None else around[:3])
     _give(
         *(np.ascontiguousarray(plane, np.float32).reshape(-1) for plane in planes),
-        tuple(np.float32(value) for value in ((0.0,) * 5 if around is None else around[3:-2])),
+        tuple(np.float32(value) for value in ((0.0,) * 6 if around is None else around[3:-2])),
         nothing if left is None else left.reshape(-1),
         moving.reshape(-1),
         (np.float32(subthreshold.silent), np.float32(subthreshold.moving)),
