@@ -62,7 +62,7 @@ STEP_PIXEL: Final = np.dtype(
         "names": [
             "step_on",
             "step_off",
-            "forward",  # variance of L^A from the frame before; or, if that is not known, less `BridgedSegment.wrong`
+            "forward",  # variance of L^A from the frame before; where that measures nothing, -`BridgedSegment.wrong`
             "backward",  # the same from the frame after, without the events still to come
             "doubt_on",  # variance of an on event's step beyond that of a sure one
             "doubt_off",
@@ -370,7 +370,7 @@ def _begin_bridged(given, scalars, before, pixels, steps):  # type: ignore[no-un
 
 @nb.njit(cache=True, inline="always")
 def _rate(rate, forward, backward, coming, step_variance):  # type: ignore[no-untyped-def]
-    """1/R (K4) by the fields of `STEP_PIXEL`."""
+    """1/R (K4) by the fields of `STEP_PIXEL`; without a branch, as the loop over events must be."""
     wrong, measured = larger(-forward, _ZERO), forward >= _ZERO
     backward += coming * (step_variance + wrong * coming)
     return measurement_rate(rate, forward if measured else np.float32(UNMEASURED), backward)
