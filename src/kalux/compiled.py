@@ -33,6 +33,7 @@ MICROSECOND32: Final = np.float32(1e-6)
 """Seconds."""
 
 ONE: Final = np.float32(1.0)
+ZERO: Final = np.float32(0.0)
 
 AHEAD: Final = 48
 """Events ahead whose pixels are prefetched: enough to cover the latency of memory, few enough to stay in the cache."""

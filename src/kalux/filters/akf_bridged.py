@@ -22,6 +22,7 @@ from kalux.compiled import (
     MICROSECOND32,
     ONE,
     WEIGHT_UNIT,
+    ZERO,
     apart,
     empty,
     event_column,
@@ -74,8 +75,6 @@ STEP_PIXEL: Final = np.dtype(
     }
 )
 """What events need in addition: 32 bytes, so that no pixel lies in two lines of the cache."""
-
-_ZERO: Final = np.float32(0.0)
 
 _BLOCK: Final = 128
 """Pixels that are read together: few enough that their fields stay in the first-level cache."""
@@ -371,7 +370,7 @@ def _begin_bridged(given, scalars, before, pixels, steps):  # type: ignore[no-un
 @nb.njit(cache=True, inline="always")
 def _rate(rate, forward, backward, coming, step_variance):  # type: ignore[no-untyped-def]
     """1/R (K4) by the fields of `STEP_PIXEL`; without a branch, as the loop over events must be."""
-    wrong, measured = larger(-forward, _ZERO), forward >= _ZERO
+    wrong, measured = larger(-forward, ZERO), forward >= ZERO
     backward += coming * (step_variance + wrong * coming)
     return measurement_rate(rate, forward if measured else np.float32(UNMEASURED), backward)
 
@@ -422,7 +421,7 @@ def _advance_bridged(words, pixels, steps, clock, signed, origin, rate, step_var
         pixel.information = information * kept
         pixel.augmented += step
         forward, coming = known.forward, known.coming - weight
-        forward += weight * scalars.step_variance if forward >= _ZERO else _ZERO
+        forward += weight * scalars.step_variance if forward >= ZERO else ZERO
         pixel.rate = _rate(scalars.rate, forward, known.backward, coming, scalars.step_variance)
         known.forward, known.coming = forward, coming
         surety = np.int32(known.surety)

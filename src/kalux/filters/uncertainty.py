@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from kalux.augmentation.bridge import RANDOM, UNMEASURED, bridge_variance
 from kalux.augmentation.subthreshold import UNKNOWN_CHANGE
-from kalux.compiled import FUSED, empty, larger, loop, smaller, zeros
+from kalux.compiled import FUSED, ZERO, empty, larger, loop, smaller, zeros
 from kalux.filters.readout import CORRELATED, Subthreshold
 
 Array = NDArray[np.floating[Any]]
@@ -37,8 +37,6 @@ frame, if frames are exposed all the time: by the errors at frames of silent and
 SUBTHRESHOLD_INTERMITTENT: Final = (0.5, 0.25)
 """Variance of an intermittent pixel's subthreshold change (`_mark_intermittent`), in units of that of a silent pixel
 and of that of one with an event in this frame interval, which are added: the same scenes, and the held-out frames."""
-
-_NOTHING: Final = np.float32(0.0)
 
 _FEW_TURNS: Final = 1e-2  # in an exposure: what they change is less than the digits of their exponentials
 
@@ -173,7 +171,7 @@ def known_variance(variance, first, second, events, around):  # type: ignore[no-
     """
     coming, counted, q0, repeated, wrong, wrong_back = around
     following = counted + second + coming * events
-    following += wrong_back * events * events if first >= UNMEASURED else _NOTHING  # K4
+    following += wrong_back * events * events if first >= UNMEASURED else ZERO  # K4
     slope = q0 / (first + second + q0)
     known = larger(
         variance * following / (variance + following), repeated * slope * slope * smaller(first, second)
