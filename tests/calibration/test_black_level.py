@@ -11,6 +11,9 @@ import kalux
 from kalux import Frame, Recording
 from kalux.calibration.black_level import find_black_level, with_known_black
 from kalux.calibration.delay import estimate_delay
+from kalux.datasets import SensorSettings, simulate
+from kalux.datasets.motion import pan
+from kalux.datasets.scenes import photograph_scene
 from kalux.planning import plan
 from kalux.recording import less_black
 from kalux.settings import PRESETS, altered
@@ -36,6 +39,30 @@ def test_a_scene_that_has_nothing_dark_has_no_black_level(least):
     assert found is not None
     assert found.floor >= 0.9 * least
     assert found.level == 0
+
+
+def of_v2e(picture):
+    """The picture, recorded with the events of v2e's pixels: linear below 20 of 255, where the logarithm begins."""
+    scene = photograph_scene(picture, pan(60.0), sensor_size=(48, 64), duration=500_000)
+
+    def as_seen(t):
+        level = 255 * scene.radiance(t)
+        return np.where(level > 20, level, np.exp(level * np.log(20) / 20)) / 255
+
+    sensor = SensorSettings(threshold_on=0.2, threshold_off=0.2, log_offset=1e-9, exposure=2_000)
+    events = simulate(dataclasses.replace(scene, radiance=as_seen), sensor, seed=1).recording().events()
+    return Recording.from_arrays(
+        np.concatenate(list(events)), list(passing_by(picture).frames()), sensor_size=(48, 64), name="v2e"
+    )
+
+
+@pytest.mark.parametrize("least", [0.02, 0.03])
+def test_pixels_that_are_linear_in_the_dark_have_no_black_level(least):
+    """Their events are more in the dark than those of the logarithm, as if the frames were lifted."""
+    found = find_black_level(of_v2e(least * 20 * textured(1.0)), SETTINGS.camera, SETTINGS.events)
+    assert found is not None
+    assert found.floor >= 0.8 * least
+    assert (found.level, found.samples > 10_000) == (0.0, True)
 
 
 def exposed(source, times):

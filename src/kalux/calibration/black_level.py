@@ -63,13 +63,18 @@ _LEAST_GAIN: Final = 0.05
 nothing dark have up to 0.013; with one, scenes with something dark mostly have 0.05 to 0.9 (docs/calibration.md)."""
 
 _LEAST_GAIN_AT_FLOOR: Final = 0.02
-"""The same where the floor agrees with the best level: two that say so."""
+"""The same where the floor agrees with the best level: two that say so. Where v2e's pixels explain some of it, too,
+they are not two."""
 
 _SURE: Final = 3.0
 """Standard deviations, between parts of the image, by which that gain is more than nothing."""
 
 _PARTS: Final = 6  # of the image along each side
 _LEAST_PARTS: Final = 4
+
+_KNEE: Final = 20 / 255
+"""Of white, below which the pixels of v2e are linear (its `lin_log`), three times as steep at the knee as above it: in
+the dark they have more events than log(I) has, as the light of a camera with a black level seems to have."""
 
 _AT_FLOOR: Final = 4 * _LEVEL
 """How far below the floor of the frames the best level lies at most where that floor is black: the best level is too
@@ -114,6 +119,16 @@ class _Samples(NamedTuple):
         """(N,) log changes of frames less ``black``."""
         before, after = (
             np.log(response.inverse((values - black) / (1.0 - black))) for values in (self.before, self.after)
+        )
+        return np.asarray(after - before + self.of_exposures)
+
+    def linear_below_knee(self) -> Array:
+        """(N,) changes of what v2e's pixels make of frames."""
+        before, after = (
+            np.where(
+                values > _KNEE, np.log(np.maximum(values, _KNEE) / _KNEE), (values / _KNEE - 1) * np.log(20)
+            )
+            for values in (self.before, self.after)
         )
         return np.asarray(after - before + self.of_exposures)
 
@@ -236,17 +251,18 @@ def _decided(samples: _Samples, response: Response, floor: float) -> BlackLevel:
     # The same weights under every level, so that their misfits can be compared.
     weight = 1 / (1 + _MISMATCH * np.square(expected))
 
-    def misfit(black: float) -> Array:
-        return _misfit(samples.change(response, black), samples.net, weight)
+    def misfit(change: Array) -> Array:
+        return _misfit(change, samples.net, weight)
 
     tried = np.arange(0.0, floor, _STEP)
-    best = float(tried[np.argmin([misfit(level).mean() for level in tried])])
-    without, least = misfit(0.0), misfit(best)
+    best = float(tried[np.argmin([misfit(samples.change(response, level)).mean() for level in tried])])
+    without, least = misfit(samples.change(response, 0.0)), misfit(samples.change(response, best))
+    of_v2e = float((without - misfit(samples.linear_below_knee())).mean())
     gain = float((without - least).mean())
     share = gain / max(float(without.mean()), 1e-12)
     at_floor = floor - best <= _AT_FLOOR
-    least_gain = _LEAST_GAIN_AT_FLOOR if at_floor else _LEAST_GAIN
-    if share < least_gain or not _is_sure(without - least, samples.part):
+    least_gain = _LEAST_GAIN_AT_FLOOR if at_floor and of_v2e <= 0 else _LEAST_GAIN
+    if gain < of_v2e or share < least_gain or not _is_sure(without - least, samples.part):
         return BlackLevel(floor, samples=len(samples.net))
     return BlackLevel(floor, floor if at_floor else best, share, len(samples.net))
 
