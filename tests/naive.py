@@ -1050,7 +1050,9 @@ def unshown(split, settings, frames, t):
     gone, gone_foretold = (
         sum(of) for of in ([p.excess for p, _ in told if p.gone], [e for p, e in told if p.gone])
     )
-    of_all = ((5 + gone) / (5 + gone_foretold)) ** (gone_foretold / (gone_foretold + 100))
+    told_of_all = gone_foretold / (gone_foretold + 100)
+    of_all = ((5 + gone) / (5 + gone_foretold)) ** told_of_all
+    of_all *= settings.filter.believed_unshown_scale ** (1 - told_of_all)
     left = [(p.excess, e) for p, e in told if p.left]
     total, foretold = sum(p for p, _ in left), of_all * sum(e for _, e in left)
     out = np.full((2, *frames[0].image.shape), np.nan)

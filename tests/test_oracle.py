@@ -43,7 +43,9 @@ VARIANTS = {
         camera=dataclasses.replace(PRESETS["default"].camera, response="gamma:2.2", frame_noise=0.002),
     ),
     "default-trusted": dataclasses.replace(
-        PRESETS["default"], events=dataclasses.replace(PRESETS["default"].events, extrapolation_trust=0.7)
+        PRESETS["default"],
+        events=dataclasses.replace(PRESETS["default"].events, extrapolation_trust=0.7),
+        filter=dataclasses.replace(PRESETS["default"].filter, unshown_scale=0.4),
     ),
     "iccv2021": PRESETS["iccv2021"],
     "iccv2021-exact": dataclasses.replace(

@@ -333,6 +333,7 @@ OTHER_VALUES = {
     "filter.highlight_scale": 0.5,
     "filter.highlight_tail": 1.0,
     "filter.unshown_tail": 0.1,
+    "filter.unshown_scale": 3.0,
     "filter.bright_tail": 0.1,
     "filter.neighbours": 0.05,
     "filter.motion": "off",

@@ -106,6 +106,7 @@ def _of_frames(recording: Recording, plan: Plan, asked: Settings) -> Iterator[tu
     if plan.settings.filter.bright_tail is not None and plan.settings.filter.highlight_scale > 0:
         how = "measured" if asked.filter.bright_tail is None else _GIVEN
         yield "bright tail", f"{plan.settings.filter.bright_tail:.2f} log intensity ({how})"
+    yield from _unshown(asked, plan)
     stated = "usual, the recording does not state it" if recording.response is None else "as recorded"
     how = stated if asked.camera.response == AUTO else _GIVEN
     yield "response", f"{response_text(camera.response)} ({how})"
@@ -125,6 +126,16 @@ def _of_frames(recording: Recording, plan: Plan, asked: Settings) -> Iterator[tu
         yield "saturation", f"from {camera.clipped_from:.2g} of white ({ceiling_text(plan.mends.ceiling)})"
     if camera.white_balance != asked.camera.white_balance:
         yield "white balance", f"{camera.white_balance} for red, green, blue (measured)"
+
+
+def _unshown(asked: Settings, plan: Plan) -> Iterator[tuple[str, str]]:
+    """How far pixels that no frame has measured lie beyond white, where that is told."""
+    scale, found = asked.filter.unshown_scale, plan.unshown_scale
+    if scale is not None:
+        yield "unshown", f"{scale:.2g} times as far beyond white as frames make expect ({_GIVEN})"
+    elif found is not None:
+        told = f"told by pixels that leave saturation: {found.excess:.0f} for {found.expected:.0f} log intensity in all"
+        yield "unshown", f"{found.scale:.2g} times as far beyond white as frames make expect ({told})"
 
 
 def _of_motion(recording: Recording, plan: Plan, asked: Settings) -> Iterator[tuple[str, str]]:

@@ -346,6 +346,9 @@ class FilterSettings:
         How far pixels that every frame so far has clipped are expected to lie above their lower bounds, as a share of
         the scale of the pixels just below white around them (docs/equations.md, K15). 0 leaves them at their bounds.
         0.5 (docs/tuning.md).
+    unshown_scale
+        How many times as far above their lower bounds such pixels lie as frames make expect (R_0 of K15); None: as
+        pixels that leave saturation in the first frames of a recording tell, 1 in a live stream.
     bright_tail
         Scale of the frames' bright tail; None: from the recording's frames, in a live stream from the first.
     neighbours
@@ -369,6 +372,7 @@ class FilterSettings:
     highlight_scale: float = 2.0
     highlight_tail: float = 6.0
     unshown_tail: float = 0.5
+    unshown_scale: float | None = None
     bright_tail: float | None = None
     neighbours: float = 0.2
     motion: MotionName = "auto"
@@ -378,6 +382,11 @@ class FilterSettings:
     def joins_frames(self) -> bool:
         """Whether the filter follows frames that are joined by events (docs/equations.md, K1): the default's way."""
         return self.kind == "akf" and self.augmentation == "bridge"
+
+    @property
+    def believed_unshown_scale(self) -> float:
+        """The scale of what is expected of pixels that no frame has measured; 1 where nothing is known."""
+        return 1.0 if self.unshown_scale is None else self.unshown_scale
 
     def follows_motion(self, sensor_size: tuple[int, int]) -> bool:
         """Whether frames of a sensor are read along the paths of what moves."""
@@ -447,6 +456,7 @@ _USED_BY: Final[Mapping[str, tuple[str, ...]]] = {
         (
             "filter.highlight_tail",
             "filter.unshown_tail",
+            "filter.unshown_scale",
             "filter.bright_tail",
             "filter.neighbours",
             "filter.motion",
@@ -592,6 +602,7 @@ _POSITIVE: Final = {
     "usual_threshold_on",
     "usual_threshold_off",
     "bright_tail",
+    "unshown_scale",
     "initial_variance",
     "cutoff",
 }
@@ -620,7 +631,9 @@ _LARGEST_OF: Final[Mapping[str, float]] = {
     **dict.fromkeys(
         ("step_variance", "usual_step_variance", "quantisation_variance", "deblur_variance"), 100.0
     ),  # c^2
-    **dict.fromkeys(("highlight_tail", "unshown_tail"), 100.0),  # multiples of a log intensity
+    **dict.fromkeys(
+        ("highlight_tail", "unshown_tail", "unshown_scale"), 100.0
+    ),  # multiples of a log intensity
     # us: pixels in the dark are late by tens of milliseconds, guessed stamps by an exposure, at most seconds.
     **dict.fromkeys(("delay", "usual_delay", "refractory_period"), 10_000_000),
 }

@@ -5,7 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kalux.augmentation.bridge import MASKED, UNMEASURED, BridgeNoise, Latent, bridge, nominal_thresholds
+from kalux.augmentation.bridge import (
+    MASKED,
+    UNMEASURED,
+    BridgeNoise,
+    Latent,
+    Revealed,
+    bridge,
+    nominal_thresholds,
+)
 from kalux.augmentation.highlights import (
     FrameHighlights,
     Tail,
@@ -16,6 +24,7 @@ from kalux.augmentation.highlights import (
     expected_excess,
     follow_unshown,
     of_both,
+    scale_of_all,
 )
 
 from builders import printed_on_threads
@@ -404,3 +413,27 @@ print(weighted_sums(np.random.default_rng(0).random((90, 160))).tobytes().hex())
 def test_sums_of_parts_do_not_depend_on_the_number_of_threads():
     """Of 1280 x 720 pixels OpenBLAS's do. What is made of them in float32 hides it nearly always, not always."""
     assert len(printed_on_threads(_SUMS)) == 1
+
+
+def test_what_was_known_of_the_scale_counts_until_pixels_tell():
+    """Of the logarithm as much as pixels that have left saturation do not say."""
+    clipped, none = window(), np.zeros((1, 1))
+    as_expected, thrice = (
+        begin_unshown(latent(clipped), frame_highlights(clipped), TAIL._replace(times=times))
+        for times in (1.0, 3.0)
+    )
+    np.testing.assert_allclose(excess_at(thrice), 3 * excess_at(as_expected), rtol=1e-6)
+    np.testing.assert_allclose(thrice.doubt, 9 * as_expected.doubt, rtol=1e-6)
+    assert scale_of_all(Revealed(none, none, none, 0.0, 0.0), 3.0) == 3.0
+    assert scale_of_all(Revealed(none, none, none, 295.0, 95.0), 3.0) == pytest.approx(3.0)
+    half_told = scale_of_all(Revealed(none, none, none, 100.0, 100.0), 3.0)
+    assert half_told == pytest.approx(np.sqrt(3.0))
+
+
+def test_what_was_known_of_the_scale_counts_after_the_next_frame():
+    clipped = window()
+    seen = [
+        followed(begin_unshown(latent(clipped), frame_highlights(clipped), tail), clipped, -1.0, STILL)
+        for tail in (TAIL, TAIL._replace(times=0.5))
+    ]
+    np.testing.assert_allclose(excess_at(seen[1]), excess_at(seen[0]) / 2, rtol=1e-6)

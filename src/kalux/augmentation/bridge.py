@@ -137,6 +137,8 @@ class UnshownMemory(NamedTuple):
         Of every part of the image: that of the borders of clipped pixels around, in the latest frame, 0 to 1.
     near, clipped
         Numbers of pixels just below white and of clipped ones, in all frames until now.
+    times
+        How many times as far beyond white pixels lie as frames make expect, by what was known of it before (R_0).
     """
 
     pixels: NDArray[np.int64]
@@ -151,6 +153,7 @@ class UnshownMemory(NamedTuple):
     hardness: Array
     near: int
     clipped: int
+    times: float = 1.0
 
 
 class Thresholds(NamedTuple):

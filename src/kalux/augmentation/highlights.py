@@ -121,10 +121,14 @@ class FrameHighlights(NamedTuple):
 
 
 class Tail(NamedTuple):
-    """How far highlights go beyond white: ``share`` of the scale of pixels just below it, at most ``most`` (K15)."""
+    """How far highlights go beyond white (K15): ``share`` of the scale of pixels just below it, at most ``most``.
+
+    ``times`` as far, where the recording has been looked at before.
+    """
 
     share: float
     most: float
+    times: float = 1.0
 
 
 class Unshown(NamedTuple):
@@ -161,7 +165,8 @@ def begin_unshown(first: Latent, highlights: FrameHighlights, tail: Tail) -> Uns
     near, clipped = _counts(highlights)
     hardness = border_hardness(highlights)
     excess = excess_from_surroundings(highlights, hardness, pixels, near / max(clipped, 1), tail)
-    doubt = (np.float32(_UNKNOWN_SCALE) * excess) ** 2
+    expected = np.float32(tail.times) * excess
+    doubt = (np.float32(_UNKNOWN_SCALE) * expected) ** 2
     texture = Texture(*(np.zeros(parts) for _ in Texture._fields))
     return UnshownMemory(
         pixels=pixels,
@@ -169,13 +174,14 @@ def begin_unshown(first: Latent, highlights: FrameHighlights, tail: Tail) -> Uns
         shape=first.value.shape,
         excess=excess,
         limited=excess,
-        expected=excess,
+        expected=expected,
         doubt=doubt,
         revealed=revealed,
         texture=texture,
         hardness=hardness,
         near=near,
         clipped=clipped,
+        times=tail.times,
     )
 
 
@@ -264,7 +270,8 @@ def of_both(first: UnshownMemory, second: UnshownMemory) -> UnshownMemory:
 def _with_expectation(memory: UnshownMemory) -> UnshownMemory:
     """``memory`` with what is expected of its pixels by all else in it."""
     limited = _limited(memory)
-    expected, doubt = _corrected(limited, memory.pixels, memory.shape[1], memory.revealed)
+    scale = np.float32(scale_of_all(memory.revealed, memory.times))
+    expected, doubt = _corrected(scale, limited, memory.pixels, memory.shape[1], memory.revealed)
     return memory._replace(limited=limited, expected=expected, doubt=doubt)
 
 
@@ -421,16 +428,25 @@ def _with_revealed(
     )
 
 
+def scale_of_all(revealed: Revealed, known: float = 1.0) -> float:
+    """R of docs/equations.md: by what the whole image has revealed, and what was ``known`` before."""
+    certainty = revealed.moved_expected / (revealed.moved_expected + _PRIOR_OF_ALL)
+    told = (revealed.moved_excess + _PRIOR_EXCESS) / (revealed.moved_expected + _PRIOR_EXCESS)
+    return float(told**certainty * known ** (1.0 - certainty))
+
+
 def _corrected(
-    excess: NDArray[np.float32], pixels: NDArray[np.int64], width: int, revealed: Revealed
+    scale: np.float32,
+    excess: NDArray[np.float32],
+    pixels: NDArray[np.int64],
+    width: int,
+    revealed: Revealed,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """The expected ``excess``, (N,), corrected by the pixels that have left saturation, and the variance of its mean.
 
-    It is scaled by what the whole image has revealed, R of docs/equations.md, and then by what the pixels around have,
-    in comparison with what is expected of them after the first step.
+    It is scaled by what the whole image has revealed, ``scale``, and then by what the pixels around have, in comparison
+    with what is expected of them after the first step.
     """
-    certainty = revealed.moved_expected / (revealed.moved_expected + _PRIOR_OF_ALL)
-    scale = ((revealed.moved_excess + _PRIOR_EXCESS) / (revealed.moved_expected + _PRIOR_EXCESS)) ** certainty
     found, expected, count = (weighted_sums(values) for values in revealed[:3])
     expected *= scale
     factor = (found + _PRIOR_EXCESS) / (expected + _PRIOR_EXCESS)
@@ -439,7 +455,7 @@ def _corrected(
     times, plus, left = (
         interpolated(values.astype(np.float32), pixels, width) for values in (factor, surplus, unknown)
     )
-    scaled = np.float32(scale) * excess
+    scaled = scale * excess
     return np.minimum(times * scaled, scaled + plus), left * scaled**2
 
 

@@ -239,7 +239,8 @@ class BridgedFrames(Method):
         latent = self.latent(shot, events, thresholds)
         begin = self.begin_time(shot)
         nothing, none = nothing_followed(self.shape), np.zeros(self.shape, np.float32)
-        tail = Tail(self.settings.filter.unshown_tail, beyond_white(shot.bright_tail))
+        filtered = self.settings.filter
+        tail = Tail(filtered.unshown_tail, beyond_white(shot.bright_tail), filtered.believed_unshown_scale)
         if self.lookahead:
             on, off, followed = self.follow(events, begin, shot.middle, nothing)
         else:

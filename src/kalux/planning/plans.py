@@ -25,6 +25,7 @@ from kalux.planning.event_steps import (
     ThresholdOrigin,
     with_event_steps,
 )
+from kalux.planning.highlights import UnshownScale, with_unshown_scale
 from kalux.planning.mending import Mends, mend_events_and_levels
 from kalux.planning.sensor_noise import (
     with_background,
@@ -78,6 +79,8 @@ class Plan:
         The measured noise of events, Hz per pixel, where it was.
     dead_time
         The refractory period that noise shows, us; 0 where it does not.
+    unshown_scale
+        How far the scene goes beyond white, where the beginning of the recording tells.
     """
 
     settings: Settings
@@ -93,6 +96,7 @@ class Plan:
     mismatch: Mismatch | None
     background_rate: float | None
     dead_time: int
+    unshown_scale: UnshownScale | None
 
 
 def plan(
@@ -150,13 +154,21 @@ def plan(
     if origin == "settings" and _are_calibrated(chosen, known):
         origin = "calibration"
     hot = mended.mends.hot
+    pixels = pixels if hot is None else with_hot(pixels, hot, chosen.events.mismatch)
+    chosen, unshown = with_unshown_scale(
+        recording,
+        _with_bright_tail(chosen, seen.tail, origin),
+        pixels,
+        threshold_is_estimate=origin in UNCERTAIN_ORIGINS,
+        lookahead=lookahead,
+    )
     return Plan(
-        settings=_with_bright_tail(chosen, seen.tail, origin),
+        settings=chosen,
         threshold_origin=origin,
         times=wanted,
         lookahead=lookahead,
         smooth=smooth,
-        pixels=pixels if hot is None else with_hot(pixels, hot, chosen.events.mismatch),
+        pixels=pixels,
         mends=mended.mends,
         steps=steps.estimates,
         frame_noise=of_frames.estimate,
@@ -164,6 +176,7 @@ def plan(
         mismatch=mismatch,
         background_rate=background,
         dead_time=dead_time,
+        unshown_scale=unshown,
     )
 
 
