@@ -58,6 +58,7 @@ GIVEN = (
     ),
     *("--events.threshold-on", "0.2", "--events.threshold-off", "0.2"),
     *("--events.refractory-period", "0", "--events.threshold-spread", "0.1", "--events.noise-rate", "0.1"),
+    *("--filter.unshown-scale", "1"),
 )
 
 
