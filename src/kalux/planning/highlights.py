@@ -76,6 +76,7 @@ def with_unshown_scale(
     if revealed is None or revealed.moved_expected == 0:
         return altered(settings, "filter", unshown_scale=1.0), None
     told = scale_of_all(revealed)
+    # Too bright costs more than too dark, and those that leave later are not always like the first (docs/equations.md).
     scale = min(told, math.sqrt(told))
     found = UnshownScale(scale, revealed.moved_excess, revealed.moved_expected)
     return altered(settings, "filter", unshown_scale=scale), found
