@@ -25,6 +25,7 @@ from kalux.augmentation.highlights import (
     follow_unshown,
     of_both,
     scale_of_all,
+    weights_of_both,
 )
 
 from builders import printed_on_threads
@@ -325,6 +326,29 @@ def test_of_two_expectations_of_the_same_pixels_the_mean_is_that_of_logarithms()
     again = of_both(twice, memory)
     for one, other in zip(found, again, strict=True):
         np.testing.assert_equal(one, other)
+
+
+def test_a_direction_whose_bounds_are_lower_tells_less_of_what_lies_above_both():
+    """As before a longer exposure: white is lower, and what leaves saturation lay above less."""
+    bound, excess = np.linspace(0, 1, 7, dtype=np.float32), np.full(7, 0.5, np.float32)
+    assert weights_of_both((bound, bound), (excess, excess)) == (1.0, 1.0)
+    assert weights_of_both((bound, bound - 0.5), (excess, excess)) == pytest.approx((1.0, 2.0**-8))
+    assert weights_of_both((bound - 0.5, bound), (excess, excess)) == pytest.approx((2.0**-8, 1.0))
+    none = np.zeros(0, np.float32)
+    assert weights_of_both((none, none), (none, none)) == (1.0, 1.0)
+
+
+def test_what_leaves_saturation_counts_as_far_as_bounds_are_those_of_both():
+    clipped, memory = striped()
+    columns, fall = np.arange(48), np.full(SIZE, -1.0, np.float32)
+    first, second = (
+        followed(memory, clipped & ~gone, np.where(gone, np.float32(-0.2), np.float32(-0.5)), fall)
+        for gone in (clipped & (columns < 16), clipped & (columns >= 32))
+    )
+    found = of_both(first, second._replace(bound=second.bound - second.excess))
+    expected = second.revealed.excess / 2**8 + first.revealed.excess
+    np.testing.assert_allclose(found.revealed.excess, expected, rtol=1e-3)
+    assert 0 < (second.revealed.excess / 2**8).sum() < first.revealed.excess.sum() / 100
 
 
 @pytest.mark.parametrize("pitch", [1, 2])

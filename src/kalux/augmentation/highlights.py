@@ -91,6 +91,13 @@ _SLOPE_REACH: Final = np.float32(10.0)
 _STEP_REACH: Final = np.float32(2.0)
 """Excess beyond a border that is steep, in units of what it rises by up to white."""
 
+_LEAST_EXCESS: Final = np.float32(1e-4)
+"""Log intensity, since it is divided by."""
+
+_LOWER_BOUNDS: Final = 8.0
+"""How fast a direction of time counts less the lower its bounds are (docs/equations.md, K15): with 8 none counts whose
+bounds lie an excess lower, and noise of bounds, which both have, changes little."""
+
 _NEIGHBOURHOOD: Final = np.ones((3, 3), np.uint8)
 
 
@@ -248,23 +255,52 @@ def follow_unshown(
 def of_both(first: UnshownMemory, second: UnshownMemory) -> UnshownMemory:
     """What two directions of time know together, of pixels that neither has seen measured.
 
-    Each has seen frames, events and revealed pixels of its own: sums add up. Of what frames show around the pixels the
-    mean counts, of logarithms, since it is their scale that is not known.
+    Each has seen frames, events and revealed pixels of its own: sums add up, of revealed pixels as far as a direction's
+    bounds are those of both. Of what frames show around the pixels the mean counts, of logarithms, since it is their
+    scale that is not known.
     """
     of_first = np.isin(first.pixels, second.pixels, kind="table")
     of_second = np.isin(second.pixels, first.pixels, kind="table")
+    bounds = first.bound[of_first], second.bound[of_second]
+    excesses = first.excess[of_first], second.excess[of_second]
+    first_counts, second_counts = weights_of_both(bounds, excesses)
+
+    def weighed(one: Any, other: Any) -> Any:
+        return first_counts * one + second_counts * other
+
     return _with_expectation(
         first._replace(
             pixels=first.pixels[of_first],
-            bound=np.maximum(first.bound[of_first], second.bound[of_second]),
-            excess=np.sqrt(first.excess[of_first] * second.excess[of_second]),
-            revealed=Revealed(*map(operator.add, first.revealed, second.revealed)),
+            bound=np.maximum(*bounds),
+            excess=np.sqrt(np.multiply(*excesses)),
+            revealed=Revealed(*map(weighed, first.revealed, second.revealed)),
             texture=Texture(*map(operator.add, first.texture, second.texture)),
             hardness=(first.hardness + second.hardness) / 2.0,
             near=first.near + second.near,
             clipped=first.clipped + second.clipped,
         )
     )
+
+
+def weights_of_both(
+    bounds: tuple[NDArray[np.float32], NDArray[np.float32]],
+    excesses: tuple[NDArray[np.float32], NDArray[np.float32]],
+) -> tuple[float, float]:
+    """How much what has left saturation counts of either direction of time, by the ``bounds`` that it has, (N,) each.
+
+    Where an exposure was longer, white was lower, and pixels have left saturation that lay above less: they tell too
+    much of those above both bounds. The direction with the higher bounds counts 1.
+    """
+    if len(bounds[0]) == 0:
+        return 1.0, 1.0
+
+    def nearness(bound: NDArray[np.float32], excess: NDArray[np.float32]) -> float:
+        scale = np.maximum(excess, _LEAST_EXCESS)
+        return float((scale / (scale + np.maximum(*bounds) - bound)).mean(dtype=np.float64))
+
+    first, second = map(nearness, bounds, excesses)
+    highest = max(first, second)
+    return (first / highest) ** _LOWER_BOUNDS, (second / highest) ** _LOWER_BOUNDS
 
 
 def _with_expectation(memory: UnshownMemory) -> UnshownMemory:
