@@ -92,6 +92,16 @@ def test_says_how_far_events_are_believed_beyond_white():
     )
 
 
+def test_says_what_is_known_of_pixels_that_no_frame_has_shown():
+    """And by what, if it is not given; nothing where no frame clips any."""
+    beyond = passing_by(textured(6.0))
+    told = r"[12].* times as far beyond white as frames make expect \(told by pixels that leave .*: \d+ for \d+ .*\)"
+    assert re.fullmatch(told, rows_of(beyond)["unshown"])
+    given = rows_of(beyond, filter={"unshown_scale": 0.25})["unshown"]
+    assert given == "0.25 times as far beyond white as frames make expect (given)"
+    assert "unshown" not in rows_of(passing_by(textured(0.9)))
+
+
 def test_whether_motion_is_followed():
     """By the sensor's size, as asked for, and both ways in time always; where it could be, as not in causal mode."""
     small = moving_blocks().recording()

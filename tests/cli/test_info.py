@@ -39,6 +39,7 @@ def test_says_all_that_reconstruct_would_settle(cli, write_recording, tmp_path):
         "noise",
         "pattern",
         "bright tail",
+        "unshown",
         "response",
         "black",  # the blocks have nothing dark
         "motion",

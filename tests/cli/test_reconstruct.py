@@ -310,6 +310,7 @@ class TestWhatIsSaid:
             "noise",
             "pattern",
             "bright",
+            "unshown",
             "response",
             "black",
             "motion",
