@@ -282,6 +282,7 @@ def unshown(pixels, excess, noise=0.0, doubt=0.0, shape=(1, 10)):
         hardness=np.ones(parts),
         near=0,
         clipped=len(pixels),
+        times=1.0,
     )
     planes = (np.full(len(pixels), value, np.float32) for value in (noise, doubt))
     return Unshown(memory.pixels, expected, *planes, memory)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from kalux import memory
 from kalux.calibration.values import Calibration
+from kalux.driver import EventFeed, engine_of
 from kalux.events import EventArray
 from kalux.images import Estimate, Image
 from kalux.planning import UNCERTAIN_ORIGINS, Plan, plan
@@ -185,14 +186,9 @@ def _trail(plan: Plan) -> tuple[Settings, NDArray[np.bool_] | None] | None:
 
 
 def _engine(recording: Recording, plan: Plan) -> Reconstructor:
-    return Reconstructor(
-        recording.sensor_size,
-        settings=plan.settings,
-        lookahead=plan.lookahead,
-        threshold_is_estimate=plan.threshold_origin in UNCERTAIN_ORIGINS,
-        inverse_covariance=recording.source.inverse_covariance,
-        pixels=plan.pixels,
-        tells_doubts=False,
+    estimated = plan.threshold_origin in UNCERTAIN_ORIGINS
+    return engine_of(
+        recording, plan.settings, plan.pixels, threshold_is_estimate=estimated, lookahead=plan.lookahead
     )
 
 
@@ -204,23 +200,21 @@ def _forward_estimates(
     read_ahead: bool,
 ) -> Generator[Estimate, None, None]:
     """Drive the engine over the recording, reading each time of the plan as soon as it is final."""
-    events, times, ended = recording.events(), deque(plan.times.tolist()), False
+    events, times = recording.events(), deque(plan.times.tolist())
     reading: AbstractContextManager[Iterator[EventArray]] = (
         contextlib.closing(ahead(events, 1, "read")) if read_ahead else contextlib.nullcontext(iter(events))
     )
     with reading as chunks:
+        feed = EventFeed(engine, chunks, on_events)
         for frame in recording.frames():
             engine.push_frame(frame)
-            while not ended and not engine.covers(frame.exposure_end):
-                ended = not _push_next(engine, chunks, on_events)
-            if ended:
-                engine.advance(frame.exposure_end + plan.settings.events.lateness)
+            feed.cover(frame.exposure_end)
             yield from _final_estimates(engine, times)
             if not times:
                 return
         engine.end_frames()
-        while not ended and times:
-            ended = not _push_next(engine, chunks, on_events)
+        while not feed.ended and times:
+            feed.push_next()
             yield from _final_estimates(engine, times)
         engine.finish()
         yield from _final_estimates(engine, times)
@@ -233,16 +227,3 @@ def _final_estimates(engine: Reconstructor, times: deque[int]) -> Iterator[Estim
         yield engine.estimate(times.popleft())
     if times:
         engine.forget(times[0])
-
-
-def _push_next(
-    engine: Reconstructor, chunks: Iterator[EventArray], on_events: Callable[[int], None] | None
-) -> bool:
-    """Push the next chunk of events; False if there is none."""
-    chunk = next(chunks, None)
-    if chunk is None:
-        return False
-    engine.push_events(chunk)
-    if on_events is not None:
-        on_events(len(chunk))
-    return True

@@ -130,12 +130,12 @@ def _of_frames(recording: Recording, plan: Plan, asked: Settings) -> Iterator[tu
 
 def _unshown(asked: Settings, plan: Plan) -> Iterator[tuple[str, str]]:
     """How far pixels that no frame has measured lie beyond white, where that is told."""
-    scale, found = asked.filter.unshown_scale, plan.unshown_scale
-    if scale is not None:
-        yield "unshown", f"{scale:.2g} times as far beyond white as frames make expect ({_GIVEN})"
-    elif found is not None:
-        told = f"told by pixels that leave saturation: {found.excess:.0f} for {found.expected:.0f} log intensity in all"
-        yield "unshown", f"{found.scale:.2g} times as far beyond white as frames make expect ({told})"
+    scale, found, how = plan.settings.filter.unshown_scale, plan.unshown_scale, _GIVEN
+    if found is not None:
+        how = f"told by pixels that leave saturation: {found.excess:.0f} for {found.expected:.0f} log intensity in all"
+    elif asked.filter.unshown_scale is None:
+        return
+    yield "unshown", f"{scale:.2g} times as far beyond white as frames make expect ({how})"
 
 
 def _of_motion(recording: Recording, plan: Plan, asked: Settings) -> Iterator[tuple[str, str]]:

@@ -153,7 +153,7 @@ class UnshownMemory(NamedTuple):
     hardness: Array
     near: int
     clipped: int
-    times: float = 1.0
+    times: float
 
 
 class Thresholds(NamedTuple):

@@ -294,9 +294,11 @@ def weights_of_both(
     if len(bounds[0]) == 0:
         return 1.0, 1.0
 
+    higher = np.maximum(*bounds)
+
     def nearness(bound: NDArray[np.float32], excess: NDArray[np.float32]) -> float:
         scale = np.maximum(excess, _LEAST_EXCESS)
-        return float((scale / (scale + np.maximum(*bounds) - bound)).mean(dtype=np.float64))
+        return float((scale / (scale + higher - bound)).mean(dtype=np.float64))
 
     first, second = map(nearness, bounds, excesses)
     highest = max(first, second)

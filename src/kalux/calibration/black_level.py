@@ -8,6 +8,7 @@ agree best leaves log(I + I_0): it is less than the camera's by I_0, never more.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -115,22 +116,9 @@ class _Samples(NamedTuple):
     net: Array
     part: NDArray[np.int64]
 
-    def change(self, response: Response, black: float) -> Array:
-        """(N,) log changes of frames less ``black``."""
-        before, after = (
-            np.log(response.inverse((values - black) / (1.0 - black))) for values in (self.before, self.after)
-        )
-        return np.asarray(after - before + self.of_exposures)
-
-    def linear_below_knee(self) -> Array:
-        """(N,) changes of what v2e's pixels make of frames."""
-        before, after = (
-            np.where(
-                values > _KNEE, np.log(np.maximum(values, _KNEE) / _KNEE), (values / _KNEE - 1) * np.log(20)
-            )
-            for values in (self.before, self.after)
-        )
-        return np.asarray(after - before + self.of_exposures)
+    def change(self, seen: Callable[[Array], Array]) -> Array:
+        """(N,) log changes of the light that frames show, where ``seen`` makes its logarithm of responses."""
+        return np.asarray(seen(self.after) - seen(self.before) + self.of_exposures)
 
     def where(self, chosen: NDArray[np.bool_]) -> _Samples:
         """Some of them."""
@@ -241,7 +229,11 @@ def _samples(recording: Recording, camera: CameraSettings, floor: float, delay: 
 
 def _decided(samples: _Samples, response: Response, floor: float) -> BlackLevel:
     """The black level that the samples say is there: the best one, or the floor where that is near."""
-    change = samples.change(response, 0.0)
+
+    def above(level: float) -> Callable[[Array], Array]:
+        return lambda values: np.log(response.inverse((values - level) / (1.0 - level)))
+
+    change = samples.change(above(0.0))
     extent = float(np.abs(change).sum())
     rate = float((np.sign(change) * samples.net).sum()) / extent if extent > 0 else 0.0
     enough = rate * np.abs(change) >= _LEAST_EVENTS
@@ -251,13 +243,13 @@ def _decided(samples: _Samples, response: Response, floor: float) -> BlackLevel:
     # The same weights under every level, so that their misfits can be compared.
     weight = 1 / (1 + _MISMATCH * np.square(expected))
 
-    def misfit(change: Array) -> Array:
-        return _misfit(change, samples.net, weight)
+    def misfit(seen: Callable[[Array], Array]) -> Array:
+        return _misfit(samples.change(seen), samples.net, weight)
 
     tried = np.arange(0.0, floor, _STEP)
-    best = float(tried[np.argmin([misfit(samples.change(response, level)).mean() for level in tried])])
-    without, least = misfit(samples.change(response, 0.0)), misfit(samples.change(response, best))
-    of_v2e = float((without - misfit(samples.linear_below_knee())).mean())
+    best = float(tried[np.argmin([misfit(above(level)).mean() for level in tried])])
+    without, least = misfit(above(0.0)), misfit(above(best))
+    of_v2e = float((without - misfit(_seen_by_v2e)).mean())
     gain = float((without - least).mean())
     share = gain / max(float(without.mean()), 1e-12)
     at_floor = floor - best <= _AT_FLOOR
@@ -265,6 +257,12 @@ def _decided(samples: _Samples, response: Response, floor: float) -> BlackLevel:
     if gain < of_v2e or share < least_gain or not _is_sure(without - least, samples.part):
         return BlackLevel(floor, samples=len(samples.net))
     return BlackLevel(floor, floor if at_floor else best, share, len(samples.net))
+
+
+def _seen_by_v2e(values: Array) -> Array:
+    """(N,) what v2e's pixels make of responses, log intensity from the knee."""
+    linear, logarithm = (values / _KNEE - 1) * np.log(20), np.log(np.maximum(values, _KNEE) / _KNEE)
+    return np.where(values > _KNEE, logarithm, linear)
 
 
 def _misfit(change: Array, net: Array, weight: Array) -> Array:

@@ -6,10 +6,9 @@ import itertools
 import math
 from typing import Final, NamedTuple
 
-import numpy as np
-
 from kalux.augmentation.bridge import Revealed
 from kalux.augmentation.highlights import scale_of_all
+from kalux.driver import EventFeed, engine_of
 from kalux.models.pixels import PixelCalibration
 from kalux.reconstructor import Reconstructor
 from kalux.recording import Recording
@@ -64,15 +63,9 @@ def with_unshown_scale(
     if not (uses_it and lookahead) or filtered.unshown_scale is not None:
         return settings, None
     # Paths are followed in images alone, and take longer than all else.
-    engine = Reconstructor(
-        recording.sensor_size,
-        settings=altered(settings, "filter", motion="off"),
-        threshold_is_estimate=threshold_is_estimate,
-        inverse_covariance=recording.source.inverse_covariance,
-        pixels=pixels,
-        tells_doubts=False,
-    )
-    revealed = _revealed(recording, engine, settings.events.lateness)
+    without_paths = altered(settings, "filter", motion="off")
+    engine = engine_of(recording, without_paths, pixels, threshold_is_estimate=threshold_is_estimate)
+    revealed = _revealed(recording, engine)
     if revealed is None or revealed.moved_expected == 0:
         return altered(settings, "filter", unshown_scale=1.0), None
     told = scale_of_all(revealed)
@@ -82,19 +75,12 @@ def with_unshown_scale(
     return altered(settings, "filter", unshown_scale=scale), found
 
 
-def _revealed(recording: Recording, engine: Reconstructor, lateness: int) -> Revealed | None:
+def _revealed(recording: Recording, engine: Reconstructor) -> Revealed | None:
     """What the first frames reveal; None where the first one clips nothing, or there is one alone."""
-    chunks, chunk, pushed, revealed = iter(recording.events()), None, 0, None
+    feed, revealed = EventFeed(engine, iter(recording.events())), None
     for frame in itertools.islice(recording.frames(), _MOST_FRAMES):
         engine.push_frame(frame)
-        last = frame.exposure_end + lateness
-        while not engine.covers(frame.exposure_end):
-            pushed += 0 if chunk is None else len(chunk)
-            chunk = next(chunks, None)
-            if chunk is None:
-                engine.advance(last)
-                break
-            engine.push_events(chunk)
+        feed.cover(frame.exposure_end)
         until = engine.final_until
         if until is None:
             continue
@@ -102,7 +88,6 @@ def _revealed(recording: Recording, engine: Reconstructor, lateness: int) -> Rev
         if unshown is None:
             break
         revealed = unshown.memory.revealed
-        # However the events come in chunks.
-        if pushed + (0 if chunk is None else np.searchsorted(chunk["t"], last, "right")) >= _MOST_EVENTS:
+        if feed.count(frame.exposure_end) >= _MOST_EVENTS:
             break
     return revealed
