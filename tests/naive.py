@@ -835,7 +835,7 @@ def known(pixel, variance, t, settings, c2, left):
     a, b = middles[k], middles[k + 1]
     share, (first, second) = (t - a) / (b - a), pixel.changes[k][3]
     if min(first, second) >= UNMEASURED:
-        variance *= 0.65 * (1 - 0.9 * (1 - left) / 0.3)
+        variance *= 0.52 * (1 - 0.9 * (1 - left) / 0.3)
     events = sum(w for q, *_, w in pixel.events if a < q <= b)
     between = 4 * share * (1 - share)
     wrong = 0.1 * ev.believed_mismatch**2 * c2 * between * events**2
@@ -1149,19 +1149,19 @@ def joined_along(first, second, path, bend, unsure, share, level, variance, c2):
         a = resampled(*first, x - share * step_x, y - share * step_y)
         b = resampled(*second, x + (1 - share) * step_x, y + (1 - share) * step_y)
         seen[row, column] = (1 - of_second) * a[0] + of_second * b[0]
-        doubt[row, column] = (1 - of_second) ** 2 * a[1] + of_second**2 * b[1]
+        doubt[row, column] = (1 - of_second) ** 2 * a[1] / 2 + of_second**2 * b[1] / 2
         apart[row, column] = (a[0] - b[0]) ** 2
     fine = (seen - around(seen, 1)) ** 2
-    doubt += 0.15 * around(apart, 1) + 0.1 * around(fine, 1)
+    doubt += ((1 - of_second) ** 2 + of_second**2) / 4 * around(apart, 1) + 0.05 * around(fine, 1)
     unexplained = around(apart, 2) / np.maximum(around((first[0] - second[0]) ** 2, 2), 5e-4)
     doubt /= np.maximum(1 - unexplained, 1e-6)
     contradiction = around((level - seen) ** 2 / (variance + doubt + c2 / 4), 2)
-    believed = 1.5 / (doubt * (1 + 4 * np.maximum(contradiction - 1, 0)) ** 2)
+    believed = 1 / (doubt * (1 + 4 * np.maximum(contradiction - 1, 0)) ** 2)
     wide = np.pad(seen, 1, mode="reflect")
     rows = wide[:-2] + wide[1:-1] + wide[2:]
     across, down = (rows[:, 2:] - rows[:, :-2]) / 6, (wide[2:, 1:-1] - wide[:-2, 1:-1]) / 2
     strayed = (4 * share * (1 - share)) ** 2 * unsure * (across**2 + down**2)
-    trust = (1.5 - 0.5 * 4 * share * (1 - share)) / ((doubt + strayed) * (1 + 0.4 * contradiction) ** 2)
+    trust = 1 / ((doubt + strayed) * (1 + 0.4 * contradiction) ** 2)
     return (level / variance + seen * believed) / (1 / variance + believed), 1 / (1 / variance + trust)
 
 

@@ -127,7 +127,7 @@ def test_a_pixel_that_no_frame_has_shown_is_above_its_bound_and_doubtful():
     plain, lifted = (make_image(estimate([[0.5, 1.0]], unshown=u), GREY) for u in (None, bounded))
     assert lifted.intensity[0, 0] == plain.intensity[0, 0]
     assert lifted.intensity[0, 1] > 1.2
-    assert lifted.variance[0, 1] == pytest.approx(0.7**2 + 0.01 + 4 / 9 * 2.0)
+    assert lifted.variance[0, 1] == pytest.approx(0.7**2 + 0.01 + 0.25 * 2.0)
 
 
 @pytest.mark.parametrize(("between", "alike"), [(0.0, False), (1.0, True)])

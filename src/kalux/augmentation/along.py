@@ -27,14 +27,14 @@ from kalux.formulas import Number, Pixels, Row, choose, formula, row_formula, sq
 Floats = NDArray[np.floating[Any]]
 Plane = NDArray[np.float32]
 
-_FINE_RESAMPLING: Final = np.float32(0.1)
+_FINE_RESAMPLING: Final = np.float32(0.05)
 """Variance of a frame that is read between its pixels, in units of the mean square of what 3x3 pixels do not have in
 common."""
 
-_DISAGREEMENT: Final = np.float32(0.15)
-"""Variance of the mean of both frames, in units of their mean squared difference. With independent errors it is a
-quarter; errors of the path, by which one frame is read too far on and the other not far enough, cancel in the mean.
-Measured: 0.09 to 0.12 (docs/equations.md, K16)."""
+_STATED: Final = 0.5
+"""Weight of a frame's own variance where it is read; the rest has half of the squared difference of both frames, which
+is what either errs by if both err alike. Own variances are too large between pixels, where noise is averaged, and too
+small where the path is wrong: 0.3 to 0.6 is the likeliest for the errors of 87 scenes (docs/equations.md, K16)."""
 
 _LEAST_WEIGHT: Final = 1e-3
 """Of a frame in the mean of both, so that nothing is seen of what it does not measure (K7): behind a white the other
@@ -46,10 +46,6 @@ _LEAST_UNMOVED: Final = np.float32(5e-4)
 _UNSIGNALLED: Final = 0.25
 """Mean squared difference, in c^2, of an image from what is seen that says nothing against it: events tell no less, and
 what they miss is alike among neighbours (docs/equations.md, K16)."""
-
-_CAREFUL: Final = 1.5
-"""Weight of what is seen, in units of one over its variance. Half-way the variance that is given out counts it once:
-simulated and real errors differ by that much there (docs/equations.md, K16)."""
 
 _CONTRADICTED: Final = np.float32(4.0)
 """How steeply less is believed of what an image contradicts, per mean squared difference, in units of its variance,
@@ -165,9 +161,10 @@ class Along(NamedTuple):
         return min(max(weight, _LEAST_WEIGHT), 1.0 - _LEAST_WEIGHT)
 
     @property
-    def trust(self) -> float:
-        """What is seen counts so many times for the variance that is given out: at a frame as many as it weighs."""
-        return _CAREFUL + (1.0 - _CAREFUL) * self.bent
+    def disagreement(self) -> float:
+        """Part of the variance of the mean of both that they differ by, in units of their mean squared difference."""
+        weight = self.weight
+        return (1.0 - _STATED) * ((1.0 - weight) ** 2 + weight**2) / 2.0
 
 
 def as_seen(frame: Latent) -> Latent:
@@ -250,7 +247,7 @@ def _look(
         np.float32(along.share),
         np.float32(along.bent),
         np.float32(along.weight),
-        np.float32(along.trust),
+        np.float32(along.disagreement),
         np.float32(_UNSIGNALLED * motion.threshold2),
         np.arange(width, dtype=np.float32),
         seen,
@@ -288,7 +285,7 @@ def _look_along(  # type: ignore[no-untyped-def]
     share,
     bent,
     weight,
-    trust,
+    disagreement,
     unsignalled,
     numbers,
     seen,
@@ -334,7 +331,9 @@ def _look_along(  # type: ignore[no-untyped-def]
                 row = step - _ONE
                 at = row % _RING * count
                 _add_three(seen, begin, row, rows, rows, count, sums)
-                _roughen(count, local, at, seen, begin + row * count, difference, at, sums, FIRST)
+                _roughen(
+                    count, local, at, seen, begin + row * count, difference, at, sums, FIRST, disagreement
+                )
                 if joins:
                     above = begin + mirrored(row - _ONE, rows) * count
                     below, place = begin + mirrored(row + _ONE, rows) * count, (top + row) * width + left
@@ -358,11 +357,7 @@ def _look_along(  # type: ignore[no-untyped-def]
                 row = step - _FOUR
                 here, at = begin + row * count, row % _RING * count
                 _add_five(contradiction, row, rows, count, sums)
-                # fmt: off
-                _join(
-                    count, seen, here, doubt, here, sums, FIRST, strayed, at, level, here, variance, here, trust,
-                )
-                # fmt: on
+                _join(count, seen, here, doubt, here, sums, FIRST, strayed, at, level, here, variance, here)
         begin += rows * count
 
 
@@ -410,19 +405,22 @@ def _compare(
     second_variance: Pixels,
     weight: Number,
 ) -> None:
-    """The mean of both frames, their squared difference, and the variance of the mean by the frames' own."""
+    """The mean of both frames, their squared difference, and the part of the mean's variance by the frames' own."""
     rest = np.float32(1.0) - weight
     error = first[0] - second[0]
     seen[0] = rest * first[0] + weight * second[0]
     difference[0] = error * error
-    doubt[0] = rest * rest * first_variance[0] + weight * weight * second_variance[0]
+    of_both = rest * rest * first_variance[0] + weight * weight * second_variance[0]
+    doubt[0] = np.float32(_STATED) * of_both
 
 
 @row_formula
-def _roughen(local: Pixels, seen: Pixels, difference: Pixels, seen_around: Pixels) -> None:
+def _roughen(
+    local: Pixels, seen: Pixels, difference: Pixels, seen_around: Pixels, disagreement: Number
+) -> None:
     """What the frames disagree by, and what texture loses between its pixels."""
     fine = seen[0] - _mean_of_three(seen_around)
-    local[0] = _DISAGREEMENT * difference[0] + _FINE_RESAMPLING * (fine * fine)
+    local[0] = disagreement * difference[0] + _FINE_RESAMPLING * (fine * fine)
 
 
 @row_formula
@@ -440,7 +438,7 @@ def _stray(
 
 @row_formula
 def _doubt(doubt: Pixels, local_around: Pixels, difference_around: Pixels, unmoved: Pixels) -> None:
-    """The variance of what is seen, in place of that by the frames' own: the larger the less the motion explains."""
+    """The variance of what is seen, in place of that part of it: the larger the less the motion explains."""
     explained = ONE - _mean_of_five(difference_around) / _larger(unmoved[0], _LEAST_UNMOVED)
     doubt[0] = (doubt[0] + _mean_of_three(local_around)) / _larger(explained, _LEAST_MOVING)
 
@@ -467,15 +465,14 @@ def _join(
     strayed: Pixels,
     level: Pixels,
     variance: Pixels,
-    trust: Number,
 ) -> None:
     """The image joined with what is seen, and its variance, in place of this."""
     contradicted = _mean_of_five(contradiction_around)
     believed = doubt[0] * squared(ONE + _CONTRADICTED * _larger(contradicted - ONE, np.float32(0.0)))
-    kept = believed / (np.float32(_CAREFUL) * variance[0] + believed)
+    kept = believed / (variance[0] + believed)
     seen[0] = seen[0] + kept * (level[0] - seen[0])
     doubted = (doubt[0] + strayed[0]) * squared(ONE + _DISTRUST * contradicted)
-    doubt[0] = doubted / (trust * variance[0] + doubted) * variance[0]
+    doubt[0] = doubted / (variance[0] + doubted) * variance[0]
 
 
 def _larger(one: Number, other: np.float32) -> Number:

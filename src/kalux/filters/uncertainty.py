@@ -48,13 +48,13 @@ CORRELATED_UNMEASURED: Final = 0.1
 """Part of P that spatial averaging does not reduce, of a pixel that neither frame around measures, by the errors of 91
 scenes (docs/equations.md, K11). `kalux.filters.readout.CORRELATED`, by which highlights are doubted, is more."""
 
-UNMEASURED_SHARE: Final = 0.65
-"""Part of P that is given out of such a pixel: P allows for more than thresholds turn out to be wrong by. The errors of
-83 scenes say 0.6, whatever their noise and motion (docs/equations.md, K11)."""
+UNMEASURED_SHARE: Final = 0.52
+"""Part of P that is given out of such a pixel: P allows for more than thresholds turn out to be wrong by, as the errors
+of 294 scenes say, whatever their noise and motion (docs/equations.md, K11)."""
 
-UNSHOWN_SHARE: Final = 4.0 / 9.0
-"""The same of the variance of what an unshown pixel is expected to exceed its bound by (K15): 2 in place of 3 for how
-little is known of it, by the errors of 83 scenes. Both ways in time the 3 weighs."""
+UNSHOWN_SHARE: Final = 0.25
+"""The same of the variance of what an unshown pixel is expected to exceed its bound by (K15): 1.5 in place of 3 for how
+little is known of it, by the errors of 294 scenes. Both ways in time the 3 weighs."""
 
 _BLOCK: Final = 4096
 """Pixels that all steps to the variance are taken of at a time."""
