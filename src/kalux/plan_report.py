@@ -296,9 +296,9 @@ def _noise_origin(plan: Plan, asked: Settings) -> str:
     if plan.frame_noise is not None:
         return "estimated"
     by_events = plan.steps.model is not None and plan.steps.model.frame_noise is not None
-    return (
-        "in the dark as much as events do not explain, at half of white twice that" if by_events else _USUAL
-    )
+    if by_events:
+        return "in the dark as much as events do not explain, at half of white twice that"
+    return "the usual, or what parts allow that are dark, or change smoothly"
 
 
 def _delay_origin(plan: Plan, asked: Settings) -> str:

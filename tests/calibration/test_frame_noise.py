@@ -17,6 +17,7 @@ from kalux.calibration.frame_noise import (
     estimate_frame_noise,
     flat_noise,
     photon_transfer,
+    smooth_noise,
     trimmed_variance,
     typical_flat_noise,
     usual_noise,
@@ -187,7 +188,8 @@ def test_nothing_to_be_told():
 def test_dark_pixels_bound_the_noise_that_is_not_known():
     """Whatever moves elsewhere; at half of white it is the usual, or as much as in the dark where that is more."""
     usual, dark = CAMERA.usual_frame_noise, np.where(np.arange(200) < 100, 0.015, RAMP)
-    moving = 0.1 * np.random.default_rng(6).random(RAMP.shape) * (np.arange(200) >= 100)
+    contrast = np.where(np.arange(200) < 100, 0.0, np.geomspace(0.005, 0.5, 200))
+    moving = contrast * np.random.default_rng(6).random(RAMP.shape)
     read, shot, _ = usual_noise(still(dark, 0.003, 0.0, changes=moving), CAMERA)
     assert read == pytest.approx(np.hypot(0.003, LEVEL), rel=0.1)
     assert read**2 + shot / 2 == pytest.approx(usual**2)
@@ -197,8 +199,58 @@ def test_dark_pixels_bound_the_noise_that_is_not_known():
     noisy = usual_noise(still(dark + 0.01, 0.009, 0.0), CAMERA)
     assert noisy.read == pytest.approx(0.009, rel=0.15)
     assert (noisy.shot, noisy.silent) == (0.0, True)
-    bright = usual_noise(still(RAMP + 0.05, 0.003, 0.0), CAMERA)
-    assert bright == (usual, 0.0, False)  # nothing is dark
+    bright = usual_noise(still(RAMP[:20, 20:] + 0.05, 0.003, 0.0), CAMERA)
+    assert bright == (usual, 0.0, False)  # nothing is dark, and too little is bright
+
+
+@pytest.mark.parametrize("noise", [0.002, 0.01])
+def test_parts_that_change_smoothly_tell_the_noise_where_nothing_is_dark(noise):
+    """Light that comes and goes, in slopes, and what pixels always have, are no noise; it may be more than the usual.
+
+    The tenth of these parts from below have 0.83 of it. At half of white it is 1.4 times that in the dark.
+    """
+    rng = np.random.default_rng(4)
+    bright = np.linspace(0.2, 0.7, 200) + rng.normal(0, 0.02, RAMP.shape)  # a fixed pattern
+    changes = np.broadcast_to(np.linspace(0.2, -0.1, 200), RAMP.shape)
+    read, shot, silent = usual_noise(still(bright, noise, 0.0, changes=changes), CAMERA)
+    assert not silent
+    assert read**2 + 0.5 * shot == pytest.approx((0.83 * np.hypot(noise, LEVEL)) ** 2, rel=0.15)
+    assert read**2 + shot / 2 == pytest.approx(2 * read**2, rel=1e-6)
+
+
+def test_smooth_parts_say_no_more_than_the_usual_where_texture_moves():
+    """Texture is not alike everywhere, as noise is. Where it is the least of both is told."""
+    usual, rng = CAMERA.usual_frame_noise, np.random.default_rng(5)
+    bright = np.full(RAMP.shape, 0.4)
+    texture = rng.normal(0, 1, RAMP.shape) * np.linspace(0.01, 0.1, 200)
+    assert usual_noise(still(bright, 0.002, 0.0, changes=texture), CAMERA) == (usual, 0.0, False)
+    fine = rng.normal(0, 0.03, RAMP.shape)
+    assert usual_noise(still(bright, 0.002, 0.0, changes=fine), CAMERA) == (usual, 0.0, False)
+    least = usual_noise(still(bright, 0.002, 0.0, changes=texture / 8), CAMERA)
+    assert np.hypot(0.002, LEVEL) < np.sqrt(least.read**2 + 0.4 * least.shot) < usual
+
+
+def test_smooth_parts_are_bright_but_not_clipped_and_of_one_colour():
+    """Parts of 10x10 pixels from 0.12 of white on, twenty at least; what clips or is masked is in none."""
+
+    def told(level, **parts):
+        interval = next(_comparable(still(level, 0.004, 0.0), CAMERA, 2))
+        pair = (shot._replace(**parts) for shot in (interval.first, interval.second))
+        return smooth_noise(_beyond_neighbours(*pair))
+
+    bright = np.full((80, 100), 0.4)
+    found = told(bright)
+    assert found.level == pytest.approx(0.4, abs=0.002)
+    assert found.deviation == pytest.approx(0.83 * np.hypot(0.004, LEVEL), rel=0.1)
+    assert found.is_noise
+    assert told(bright, pitch=2) is None
+    assert told(bright / 4) is None
+    assert told(bright * 2.5) is None
+    masked = np.ones(bright.shape, np.bool_)
+    masked[:, 55:] = False
+    assert told(bright, valid=masked) is not None  # 4 by 6 parts away from the border
+    masked[:, 45:] = False
+    assert told(bright, valid=masked) is None
 
 
 def all_moves(shape, noise, flat, *, frames=12):
