@@ -34,7 +34,8 @@ common."""
 _STATED: Final = 0.5
 """Weight of a frame's own variance where it is read; the rest has half of the squared difference of both frames, which
 is what either errs by if both err alike. Own variances are too large between pixels, where noise is averaged, and too
-small where the path is wrong: 0.3 to 0.6 is the likeliest for the errors of 87 scenes (docs/equations.md, K16)."""
+small where the path is wrong: half-way between frames 0.5 is the likeliest for the errors of 87 scenes, at frames less
+(docs/equations.md, K16)."""
 
 _LEAST_WEIGHT: Final = 1e-3
 """Of a frame in the mean of both, so that nothing is seen of what it does not measure (K7): behind a white the other
@@ -438,7 +439,7 @@ def _stray(
 
 @row_formula
 def _doubt(doubt: Pixels, local_around: Pixels, difference_around: Pixels, unmoved: Pixels) -> None:
-    """The variance of what is seen, in place of that part of it: the larger the less the motion explains."""
+    """The variance of what is seen, in place of the frames' own part: the larger the less the motion explains."""
     explained = ONE - _mean_of_five(difference_around) / _larger(unmoved[0], _LEAST_UNMOVED)
     doubt[0] = (doubt[0] + _mean_of_three(local_around)) / _larger(explained, _LEAST_MOVING)
 

@@ -242,7 +242,7 @@ def usual_noise(recording: Recording, camera: CameraSettings) -> UsualNoise:
     of_smooth: list[SmoothNoise] = []
     for interval in _comparable(recording, camera, _MIN_FRAMES):
         change = _beyond_neighbours(interval.first, interval.second)
-        level, difference, usable, dark = change.level, change.beyond, change.usable, change.dark
+        level, difference, usable, dark, *_ = change
         low = usable & ~dark & (level < 2 * _DARKEST)
         busy = _busy(all_between(interval.chunks, interval.first.start, interval.second.end), level.shape)
         silent = low & (cv2.dilate(busy, cross.shape) == 0)
@@ -257,10 +257,11 @@ def usual_noise(recording: Recording, camera: CameraSettings) -> UsualNoise:
         if smooth is not None:
             of_smooth.append(smooth)
     flat, changes = typical_flat_noise(of_flat), of_silent or of_all
-    if flat is None and not changes:
-        bright = _typical_smooth_noise(of_smooth, usual)
-        read = _possible_read(recording, camera, bright.in_the_dark)
-        return UsualNoise(read, bright.shot(read), silent=False)
+    if flat is None and not changes and of_smooth:
+        smooth = SmoothNoise(*np.median(np.array(of_smooth), axis=0).tolist())
+        if smooth.is_told(usual):
+            read = _possible_read(recording, camera, smooth.in_the_dark)
+            return UsualNoise(read, smooth.shot(read), silent=False)
     most = usual if flat is None else flat
     if changes:
         most = min(most, float(np.sqrt(np.median(changes))))
@@ -279,24 +280,28 @@ class SmoothNoise(NamedTuple):
         Their mean intensity.
     next_deviation
         The same of those that come next.
-    growth
-        Of the variance from black to white, in units of that at black.
     """
 
     deviation: float
     level: float
     next_deviation: float
-    growth: float = _BRIGHTER
 
     @property
     def is_noise(self) -> bool:
         """Whether both are so much alike that texture has no part in them."""
         return self.next_deviation <= _ALIKE * self.deviation
 
+    def is_told(self, usual: float) -> bool:
+        """Whether it counts in place of the usual noise.
+
+        Where it is no less, parts must be alike, and texture as fine as noise may be all over the frame.
+        """
+        return self.deviation < usual or (self.is_noise and self.deviation < _MOST_USUAL * usual)
+
     @property
     def in_the_dark(self) -> float:
         """Standard deviation at black."""
-        return self.deviation / float(np.sqrt(1.0 + self.growth * self.level))
+        return self.deviation / float(np.sqrt(1.0 + _BRIGHTER * self.level))
 
     def shot(self, read: float) -> float:
         """Shot noise with which the noise at the level is this, with ``read`` in the dark; none if that is more."""
@@ -327,18 +332,6 @@ def _parts(plane: NDArray[Any]) -> NDArray[Any]:
     rows, columns = (length // _SMOOTH for length in plane.shape)
     cut = plane[: rows * _SMOOTH, : columns * _SMOOTH].reshape(rows, _SMOOTH, columns, _SMOOTH)
     return np.asarray(cut.swapaxes(1, 2).reshape(rows * columns, _SMOOTH**2))
-
-
-def _typical_smooth_noise(found: list[SmoothNoise], usual: float) -> SmoothNoise:
-    """The median of several; the usual where there is none, or it may be texture.
-
-    Where it is no less than the usual, parts must be alike, and texture as fine as noise may be all over the frame.
-    """
-    if found:
-        typical = SmoothNoise(*np.median(np.array(found), axis=0).tolist())
-        if typical.deviation < usual or (typical.is_noise and typical.deviation < _MOST_USUAL * usual):
-            return typical
-    return SmoothNoise(usual, 0.5, usual, growth=0.0)
 
 
 def flat_noise(change: FrameChange) -> list[float | None]:
@@ -466,8 +459,7 @@ def _points(recording: Recording, camera: CameraSettings, most_frames: int) -> t
     """
     found: tuple[_Points, ...] = tuple([[] for _ in range(_BINS)] for _ in _SURROUNDINGS)
     for interval in _comparable(recording, camera, most_frames):
-        compared = _beyond_neighbours(interval.first, interval.second)
-        level, difference, usable, dark = compared.level, compared.beyond, compared.usable, compared.dark
+        level, difference, usable, dark, *_ = _beyond_neighbours(interval.first, interval.second)
         busy = _busy(all_between(interval.chunks, interval.first.start, interval.second.end), level.shape)
         near_dark = _near(dark)
         for points, around in zip(found, _SURROUNDINGS, strict=True):
@@ -505,8 +497,6 @@ class FrameChange(NamedTuple):
     ----------
     level
         Mean intensity.
-    change
-        Of the intensity.
     beyond
         The part of its change that neighbours do not share. It has the variance of the change where that is white
         noise. Frames in RGB have been demosaiced, most of them compressed too, so that neighbours share their noise:
@@ -517,14 +507,16 @@ class FrameChange(NamedTuple):
         What is too dark.
     is_grey
         Whether neighbours are of one colour and have a noise of their own.
+    change
+        The whole change.
     """
 
     level: Array
-    change: Array
     beyond: Array
     usable: NDArray[np.bool_]
     dark: NDArray[np.bool_]
     is_grey: bool
+    change: Array
 
 
 def _beyond_neighbours(first: Shot, second: Shot) -> FrameChange:
@@ -543,7 +535,7 @@ def _beyond_neighbours(first: Shot, second: Shot) -> FrameChange:
     usable[[0, -1]] = False  # of pixels at the border a neighbour counts twice
     usable[:, [0, -1]] = False
     is_grey = first.chroma is None and first.pitch == 1
-    return FrameChange(level, change, np.asarray(beyond, np.float64), usable, dark, is_grey)
+    return FrameChange(level, np.asarray(beyond, np.float64), usable, dark, is_grey, change)
 
 
 def _by_level(shot: Shot) -> tuple[NDArray[np.integer[Any]], Array, NDArray[np.bool_]]:
