@@ -141,6 +141,15 @@ def event_weight(events, settings):
     return 1 + round((weight - 1) * 4096) / 4096  # as events carry it
 
 
+def growth_with_period(weight):
+    """K10: derivative of an event's weight by the logarithm of the refractory period, by its mean pace."""
+    pace = weight - 1
+    if pace <= 0:
+        return 0.0
+    looked = np.sqrt(max(pace**-2 - 0.15**2, 0.0))
+    return pace + max(pace**3 * (looked - 0.15**2), 0.0)
+
+
 def event_sum(pixel, a, b, on, off):
     """int_a^b e(gamma) d gamma: the steps of the events with a < t <= b."""
     return sum(w * (on if p else -off) for t, p, _, _, w in pixel.events if a < t <= b)
@@ -462,7 +471,7 @@ def bridged(pixel, settings, times, on, off, scales):
     intervals.append(last)
 
     def drift():  # K10: what the thresholds add to the variance at the end of every interval
-        far_on = far_off = 0
+        far_on = far_off = far = 0
         yield 0.0
         for k, (a, b, left, right, _, _, v_on, v_off, _, signal) in enumerate(intervals[1:-1], 1):
             n_on, n_off = (f * n for f, n in zip(signal, counts(a, b), strict=True))
@@ -470,15 +479,21 @@ def bridged(pixel, settings, times, on, off, scales):
                 above = max(bounds[k - 1] - said(intervals[k], k), 0.0)
                 far_on = min(far_on, above / on / np.sqrt(v_on))
                 far_off = min(far_off, above / off / np.sqrt(v_off))
+                far = np.clip(far, -above, above)
             if right[1] < UNMEASURED:
-                far_on = far_off = 0
+                far_on = far_off = far = 0
                 unseen = pixel.forgotten[k - 1] if pixel.forgotten else 0.0
                 yield right[1] / 12 if crushed(k) else unseen  # K7
                 continue
             unseen = ev.quantisation_variance * c2 / 2 if left[1] < UNMEASURED else 0.0
-            before = v_on * (on * far_on) ** 2 + v_off * (off * far_off) ** 2
+            before = v_on * (on * far_on) ** 2 + v_off * (off * far_off) ** 2 + far**2
             far_on, far_off = far_on + n_on, far_off + n_off
-            yield v_on * (on * far_on) ** 2 + v_off * (off * far_off) ** 2 - before + unseen
+            for t, p, *_, w in pixel.events:
+                if a < t <= b:
+                    step = on * signal[0] if p else -off * signal[1]
+                    far += ev.refractory_doubt * step * growth_with_period(w)
+            after = v_on * (on * far_on) ** 2 + v_off * (off * far_off) ** 2 + far**2
+            yield max(after - before + unseen, 0.0)
 
     drifts = list(drift())
 

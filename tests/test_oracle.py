@@ -28,6 +28,10 @@ VARIANTS = {
     "default-refractory": dataclasses.replace(
         PRESETS["default"], events=dataclasses.replace(PRESETS["default"].events, refractory_period=2_000)
     ),
+    "default-refractory-doubted": dataclasses.replace(
+        PRESETS["default"],
+        events=dataclasses.replace(PRESETS["default"].events, refractory_period=2_000, refractory_spread=0.3),
+    ),
     "default-background": dataclasses.replace(
         PRESETS["default"], events=dataclasses.replace(PRESETS["default"].events, noise_rate=5.0)
     ),

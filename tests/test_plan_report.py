@@ -8,11 +8,12 @@ import re
 import numpy as np
 
 from kalux import PRESETS, Recording
+from kalux.datasets import SensorSettings, simulate
 from kalux.plan_report import plan_report
 from kalux.planning import plan
 from kalux.settings import altered, from_dict
 
-from builders import all_given, moving_blocks, passing_by, textured
+from builders import all_given, dark_scene, moving_blocks, passing_by, textured
 
 
 def rows_of(recording, **groups):
@@ -124,3 +125,15 @@ def test_whether_motion_is_followed():
     assert told(large, "on") == "followed between frames (given)"
     assert told(large, smooth=True) == "followed between frames (as both ways in time always)"
     assert told(small, lookahead=False) is None
+
+
+def test_says_how_far_a_refractory_period_that_frames_tell_may_be_wrong():
+    """And nothing of one that is given."""
+    sensor = SensorSettings(exposure=2_000, log_offset=0.004, refractory=2_000.0)
+    lossy = simulate(dark_scene(), sensor, seed=1).recording()
+    told = re.fullmatch(
+        r"(\d\.\d+) ms \+- (\d+) % \(estimated from [\d,]+ samples\)", rows_of(lossy)["refractory"]
+    )
+    assert told is not None
+    assert abs(float(told[1]) / 2 - 1) < 2 * float(told[2]) / 100 < 0.5
+    assert rows_of(lossy, events={"refractory_period": 2_000})["refractory"] == "2 ms (given)"

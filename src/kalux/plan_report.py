@@ -14,7 +14,7 @@ from kalux.calibration.event_model import Agreement
 from kalux.calibration.frame_faults import FrameFaults
 from kalux.calibration.levels import Ceiling, find_ceiling
 from kalux.recording import Recording, less_black
-from kalux.settings import AUTO, Settings
+from kalux.settings import AUTO, EventSettings, Settings
 from kalux.wording import how_many
 
 if TYPE_CHECKING:
@@ -69,10 +69,7 @@ def _of_events(plan: Plan, asked: Settings) -> Iterator[tuple[str, str]]:
         how = _step_origin(plan, asked.events.step_variance)
         yield "step", f"variance of one event {events.step_variance:g} c^2, c its threshold ({how})"
     if events.refractory_period is not None:
-        what = (
-            f"{events.refractory_period * 1e-3:g} ms" if events.refractory_period else "nothing is lost in it"
-        )
-        yield "refractory", f"{what} ({_refractory_origin(plan, asked)})"
+        yield "refractory", f"{_refractory_text(events)} ({_refractory_origin(plan, asked)})"
     if events.threshold_spread is not None:
         how = _estimated(asked.events.threshold_spread, plan.mismatch is not None)
         yield "spread", f"{100 * events.threshold_spread:.1f} % between the pixels' thresholds ({how})"
@@ -278,6 +275,13 @@ def _threshold_origin(plan: Plan) -> str:
     if found.usual_share > _NOTABLE_SHARE:
         text += f"; {100 * found.usual_share:.0f} % is the usual of the preset, as frames show little change"
     return text
+
+
+def _refractory_text(events: EventSettings) -> str:
+    if events.refractory == 0:
+        return "nothing is lost in it"
+    doubt = f" +- {100 * events.refractory_doubt:.0f} %" if events.refractory_doubt else ""
+    return f"{events.refractory * 1e-3:g} ms{doubt}"
 
 
 def _refractory_origin(plan: Plan, asked: Settings) -> str:

@@ -154,6 +154,10 @@ class EventSettings:
         Time after an event in which a pixel produces no other, us: the change meanwhile is added to its next event
         (docs/equations.md, K13). None: an estimate from the recording, 0 where its frames show that no change is lost
         and in a live stream. For augmentation "bridge" only.
+    refractory_spread
+        Relative standard deviation of ``refractory_period``: how wrong events that follow soon are, all alike, where no
+        frame measures (docs/equations.md, K10). None: that of the estimate; 0 of a period that is given, or that noise
+        shows, and in a live stream. For augmentation "bridge" only.
     quantisation_variance
         Variance, in c^2, of the changes below the threshold at both ends of a frame interval, which have produced no
         event yet: two uniform distributions one threshold wide, 2/12.
@@ -213,6 +217,7 @@ class EventSettings:
     threshold_spread: float | None = None
     step_variance: float | None = None
     refractory_period: int | None = None
+    refractory_spread: float | None = None
     quantisation_variance: float = 1 / 6
     deblur_variance: float = 0.05
     noise_rate: float | None = None
@@ -311,6 +316,11 @@ class EventSettings:
     def refractory(self) -> int:
         """``refractory_period``, us, or 0 while that is None."""
         return 0 if self.refractory_period is None else self.refractory_period
+
+    @property
+    def refractory_doubt(self) -> float:
+        """``refractory_spread``, or 0 while that is None."""
+        return 0.0 if self.refractory_spread is None else self.refractory_spread
 
 
 _FOLLOWED_PIXELS: Final = 120_000
@@ -463,6 +473,7 @@ _USED_BY: Final[Mapping[str, tuple[str, ...]]] = {
             "camera.fixed_pattern",
             "events.step_variance",
             "events.refractory_period",
+            "events.refractory_spread",
             "events.deblur_variance",
             "events.noise_rate",
             "events.extrapolation_spread",
@@ -625,7 +636,14 @@ _LARGEST_OF: Final[Mapping[str, float]] = {
     "initial_variance": 1e4,  # the square of that
     # Shares: at ten times a value nothing is known of it.
     **dict.fromkeys(
-        ("threshold_spread", "usual_spread", "usual_threshold_spread", "extrapolation_spread"), 10.0
+        (
+            "threshold_spread",
+            "usual_spread",
+            "usual_threshold_spread",
+            "extrapolation_spread",
+            "refractory_spread",
+        ),
+        10.0,
     ),
     "trail": 10.0,  # c: a pixel one threshold beyond its newest event has another
     **dict.fromkeys(

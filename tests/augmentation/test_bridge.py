@@ -17,6 +17,7 @@ from kalux.augmentation.bridge import (
     extend,
     extend_backward,
     nominal_thresholds,
+    period_drift,
     raise_to_bound,
     wrong_way_back,
 )
@@ -205,6 +206,18 @@ def test_wrong_thresholds_count_on_the_way_back_that_no_frame_ties():
     of_both = 0.1 * 0.1**2 * ((0.3 * 1.5) ** 2 + 0.2**2) / 4**2
     np.testing.assert_allclose(found, [[of_both, 0, 0, 0, 0.1 * 0.1**2 * 0.2**2]], rtol=1e-12)
     assert wrong_way_back(second, second, thresholds, NOISE, (on, off), on + off) is None
+
+
+def test_what_a_wrong_refractory_period_adds_on_the_way_up_it_takes_off_on_the_way_down():
+    """Of pixels that no frame measures; others begin anew."""
+    frames = [latent([[0.0, 0.0, 0.0]], [[UNMEASURED, MASKED, 0.01]]) for _ in range(3)]
+    far, variance = np.zeros((1, 3), np.float32), np.zeros((1, 3), np.float32)
+    seen = []
+    for frame, step in zip(frames, (0.5, 0.25, -0.75), strict=True):
+        grown, far = period_drift(frame, far, np.full((1, 3), step, np.float32))
+        variance += grown
+        seen.append(variance.copy())
+    np.testing.assert_allclose(np.concatenate(seen), [[0.25, 0.25, 0], [0.5625, 0.5625, 0], [0, 0, 0]])
 
 
 def test_extend_holds_one_frame():

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kalux.augmentation.deblur import integrate_exposure
-from kalux.augmentation.refractory import EventClock, step_weight
+from kalux.augmentation.refractory import EventClock, growth_with_period, step_weight
 from kalux.compiled import WEIGHT_UNIT, event_words
 from kalux.event_slices import count_events
 from kalux.events import EVENT_DTYPE, make_events
@@ -71,6 +71,28 @@ def test_a_pixel_that_is_held_in_reset_is_made_good(slope, period):
     told = count_events(weighed[1:], (1, 1), weighed=True)[0][0, 0]
     doubted = (0.15 * period / (gap - period)) ** 2 / 2  # of a pace that is never quite steady
     assert told == pytest.approx(slope * 1e-6 * (times[-1] - times[0]), rel=2e-3 + doubted)
+
+
+@pytest.mark.parametrize("polarity", [0, 1])
+@pytest.mark.parametrize("pace", [0.1, 0.3, 1.0, 2.5, 4.0])
+def test_what_weights_grow_by_with_the_period_is_what_longer_periods_make_of_them(pace, polarity):
+    """Events of one pace, against their weights under periods that are 2 % longer and shorter.
+
+    The first two of them tell it less.
+    """
+    period = 400
+    times = round(period * (1 + 1 / pace)) * np.arange(1, 12)
+    events = make_events(times, np.full(11, 2), np.ones(11, int), np.full(11, polarity))
+
+    def told(length):
+        return weights(EventClock(SIZE, length).weighed(events))[2:].sum()
+
+    expected = (told(1.02 * period) - told(0.98 * period)) / 0.04
+    weighed = EventClock(SIZE, period).weighed(events)
+    grown = growth_with_period([weighed[2:5], weighed[5:]], SIZE)
+    assert grown[1 - polarity][1, 2] == pytest.approx(expected, rel=0.06)
+    for plane, expected_sum in zip(grown, (polarity, 1 - polarity), strict=True):
+        assert (plane.sum() > 0) == expected_sum
 
 
 def test_no_period_makes_all_weights_one_whatever_the_padding_held():

@@ -255,8 +255,10 @@ def test_a_refractory_period_is_found(period, known):
     found = estimate_thresholds(lossy, camera, usual, delay=1_500, refractory_period=None)
     assert found.refractory_period == pytest.approx(period, rel=0.3)
     np.testing.assert_allclose([found.on, found.off], 0.2, rtol=1e-3 if known else 0.25)
+    assert abs(found.refractory_period / period - 1) < 2 * found.refractory_spread < 0.6
     ignored = estimate_thresholds(lossy, camera, USUAL, delay=1_500)
     assert ignored.on > 1.15 * 0.2
+    assert ignored.refractory_spread == 0
 
 
 @pytest.mark.parametrize("delay", [1_500, 3_000])
@@ -354,6 +356,7 @@ def test_of_a_rough_estimate_delay_and_period_are_kept(monkeypatch):
     assert refined.delay == rough.delay
     np.testing.assert_allclose([refined.on, refined.off], [whole.on, whole.off], rtol=0.02)
     assert refined.refractory_period == pytest.approx(whole.refractory_period, rel=0.1)
+    assert refined.refractory_spread == pytest.approx(whole.refractory_spread, rel=0.2)
 
 
 # --- lamps ----------------------------------------------------------------------------------------------

@@ -82,6 +82,7 @@ def test_the_refractory_period_is_made_up_for_where_it_is_known():
     assert known.off == pytest.approx(0.2, rel=0.05)
     assert plain.off > 1.04 * known.off
     assert known.calibration().settings["events"]["refractory_period"] == 500
+    assert "refractory_spread" not in known.calibration().settings["events"]
     assert "refractory_period" not in plain.calibration().settings["events"]
 
 
@@ -94,6 +95,7 @@ def test_a_refractory_period_that_no_noise_shows_is_found(period, found):
     assert told.off == pytest.approx(0.2, rel=0.04)
     assert found[0] <= told.refractory <= found[1]
     assert (told.on_error > 1.5 * known.on_error) == (period > 0)
+    assert (told.calibration().settings["events"].get("refractory_spread", 0) > 0.01) == (period > 0)
 
 
 def test_a_region_of_interest_is_measured_as_a_sensor_of_its_size(simulation):
@@ -117,7 +119,7 @@ def test_a_region_of_interest_is_measured_as_a_sensor_of_its_size(simulation):
 def test_where_the_direction_turns_nothing_is_added():
     """K13: meanwhile the light may have moved either way."""
     everywhere = np.ones((1, 1), np.bool_)
-    sampling = pixel_thresholds._Sampling((0.2, 0.2), 1000, 1000, everywhere)
+    sampling = pixel_thresholds._Sampling((0.2, 0.2), 1000, pixel_thresholds._Period(1000), everywhere)
     history = pixel_thresholds._History((1, 1), sampling)
     on, off, _ = history.counts(pixel_events([10_000, 13_500, 17_000], [True, False, False]))
     going_on = 1 + 1 / np.hypot(2.5, 0.2)

@@ -379,6 +379,29 @@ def _drift(  # type: ignore[no-untyped-def]
             new_off[i] = far_off[i] + off[i] if after[i] >= unmeasured else zero
 
 
+def period_drift(second: Latent, far: Array, now: Array) -> tuple[Array, Array]:
+    """Growth of P by the error of the refractory period, of pixels that no frame measures (docs/equations.md, K10).
+
+    The period is wrong for on and for off events alike, so that what it adds on the way up it takes off on the way
+    down.
+
+    Parameters
+    ----------
+    second
+        The frame after.
+    far, now
+        (H, W) log intensity: what the standard error of the period adds to a pixel's level by the events since a frame
+        last measured it, up to the frame before, and by those that come then.
+
+    Returns
+    -------
+    (H, W) growth of the variance, negative on the way back, and ``far`` up to ``second``.
+    """
+    unmeasured = second.variance >= UNMEASURED
+    then = np.where(unmeasured, far + now, np.float32(0.0))
+    return np.where(unmeasured, then**2 - far**2, np.float32(0.0)), then
+
+
 def raise_to_bound(log_intensity: Array, frame: Latent) -> None:
     """Raise L to the lower bounds that clipped pixels of a frame give (docs/equations.md, K7). In place.
 

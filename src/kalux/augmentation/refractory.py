@@ -19,6 +19,7 @@ event, if that goes on. Every event is given its weight once, when it arrives, i
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Final
 
 import numba as nb
@@ -32,7 +33,9 @@ from kalux.compiled import (
     event_column,
     event_is_on,
     event_row,
+    event_weight,
     event_words,
+    larger,
     loop,
     prefetch,
     smaller,
@@ -134,6 +137,47 @@ def _pace(interval, refractory_period, unsteady):  # type: ignore[no-untyped-def
     """Thresholds in a refractory period, by the look that ended an ``interval`` between two events, us."""
     looked, unsteady = interval - refractory_period, unsteady * refractory_period
     return refractory_period / np.sqrt(looked * looked + unsteady * unsteady)
+
+
+def growth_with_period(
+    chunks: Iterable[EventArray], shape: tuple[int, int]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """By how much the weights of on and of off events of every pixel would grow with the refractory period (K10).
+
+    Parameters
+    ----------
+    chunks
+        Events with their weights.
+    shape
+        (H, W).
+
+    Returns
+    -------
+    (H, W) each, thresholds: sums of the derivatives of weights by the logarithm of the refractory period.
+    """
+    height, width = shape
+    grown = np.zeros((2, height * width), np.float32)
+    for chunk in chunks:
+        _growth_with_period(event_words(chunk), grown, np.uint64(width))
+    return grown[1].reshape(shape), grown[0].reshape(shape)
+
+
+@loop
+def _growth_with_period(words, grown, width):  # type: ignore[no-untyped-def]
+    for i in range(len(words)):
+        word = words[i, 1]
+        hidden = event_weight(word, WEIGHT_UNIT) - ONE
+        if hidden > np.float32(0.0):
+            at = event_row(word) * width + event_column(word)
+            grown[np.uint64(event_is_on(word)), at] += _growth_of_pace(hidden)
+
+
+@nb.njit(cache=True, inline="always", error_model="numpy")
+def _growth_of_pace(pace):  # type: ignore[no-untyped-def]
+    """Derivative of a `_pace` by the logarithm of the refractory period; at least the pace itself; float32."""
+    unsteady = _UNSTEADY_OF_TWO * _UNSTEADY_OF_TWO
+    looked = np.sqrt(larger(ONE / (pace * pace) - unsteady, np.float32(0.0)))  # in refractory periods
+    return pace + larger(pace * pace * pace * (looked - unsteady), np.float32(0.0))
 
 
 @loop

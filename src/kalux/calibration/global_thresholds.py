@@ -100,6 +100,13 @@ _THRESHOLD_OF_EXCESS: Final = 0.6
 _LEAST_DOUBT: Final = 0.02
 """Least relative error of thresholds, by changes that may be lost, that matters: that of the least excess."""
 
+_PERIOD_ERRORS: Final = 3.0
+"""Standard errors of the excess, as its regression tells them, that the refractory period is taken to be off by. Pixels
+beside one another err alike: on 41 simulated scenes it is 4 to 5 of them, and 5 % of the period. More than 3 takes from
+highlights of those whose period is right as much as it mends of the others (docs/equations.md, K10)."""
+
+_LARGEST_SPREAD: Final = 1.0  # relative: nothing is known of the refractory period
+
 _LARGEST_SHORTEST: Final = 5_000
 """us: where events of a pixel are never closer, little is lost in the refractory period of any sensor, at most 2 ms."""
 
@@ -121,6 +128,8 @@ class ThresholdEstimate(NamedTuple):
         Share of the information that is not the recording's, but that of the usual thresholds; 0 to 1.
     refractory_period
         us; 0 where nothing is lost in it, or too little to tell.
+    refractory_spread
+        Its relative standard deviation, as far as it matters; 0 where it is given, or 0.
     delay
         How much later than the frames' clock events were taken to be stamped, us.
     delay_found
@@ -139,6 +148,7 @@ class ThresholdEstimate(NamedTuple):
     spread: float
     usual_share: float
     refractory_period: int
+    refractory_spread: float
     delay: int
     delay_found: bool
     doubt: float
@@ -215,7 +225,7 @@ def estimate_thresholds(
     if usual.spread == 0:
         sampling = sampling._replace(thresholds=(usual.on, usual.off))
     else:  # what the light does within exposures needs thresholds
-        rough = _combined(sampling.samples(period, most=ROUGH_SAMPLES), usual, period, sampling, 0.0)
+        rough = _combined(sampling.samples(period, most=ROUGH_SAMPLES), usual, _Period(period), sampling, 0.0)
         sampling = sampling if rough is None else sampling._replace(thresholds=(rough.on, rough.off))
     sampling = sampling.without_trailing(delay, period)
     return _estimate(sampling, usual, refractory_period, most, delay)
@@ -271,13 +281,11 @@ def refine_thresholds(
     sampling = _Sampling(
         recording, camera, of_log_offset, rough.delay, rough.delay_found, rough.shortest_interval, thresholds
     )
-    period = rough.refractory_period
-    if refractory_period is not None or period == 0:
+    if refractory_period is not None or rough.refractory_period == 0:
         return _estimate(sampling, usual, refractory_period, MAX_SAMPLES, None) or rough
-    period = _period_without_excess(sampling) or period
-    return (
-        _combined(sampling.samples(period, most=MAX_SAMPLES), usual, period, sampling, rough.doubt) or rough
-    )
+    period = _period_without_excess(sampling) or _Period(rough.refractory_period, rough.refractory_spread)
+    samples = sampling.samples(period.length, most=MAX_SAMPLES)
+    return _combined(samples, usual, period, sampling, rough.doubt) or rough
 
 
 def _estimate(
@@ -288,25 +296,27 @@ def _estimate(
     ``delay`` is the apparent one, us: what is lost in the refractory period makes events seem late, too, so that the
     delay is found again with the period. None: that of the sampling is right.
     """
-    period = refractory_period or 0
-    samples = sampling.samples(period, most=most)
+    given = _Period(refractory_period or 0)
+    samples = sampling.samples(given.length, most=most)
     if len(samples.steps.change) < _MIN_SAMPLES:
         return None
     if not 0 < sampling.shortest <= _LARGEST_SHORTEST:
-        return _combined(samples, usual, period, sampling, 0.0)
+        return _combined(samples, usual, given, sampling, 0.0)
     excess = _measured_excess(samples)
     # Thresholds may be too large by this even where the excess is too uncertain to be corrected.
     doubt = _THRESHOLD_OF_EXCESS * max(excess.value - _USUAL_EXCESS, 0.0)
-    estimate = _combined(samples, usual, period, sampling, doubt)
+    estimate = _combined(samples, usual, given, sampling, doubt)
     if estimate is None or not excess.value - 2 * excess.error > _LEAST_EXCESS:
         return estimate
+    period = None
     for _ in range(2 if delay is not None else 1):
         period = _period_without_excess(sampling)
-        if period == 0:
+        if period is None:
             return estimate
-        sampling = sampling if delay is None else sampling.without_trailing(delay, period)
+        sampling = sampling if delay is None else sampling.without_trailing(delay, period.length)
+    assert period is not None
     doubt = _THRESHOLD_OF_EXCESS * float(np.hypot(excess.error, _USUAL_EXCESS))
-    return _combined(sampling.samples(period, most=most), usual, period, sampling, doubt) or estimate
+    return _combined(sampling.samples(period.length, most=most), usual, period, sampling, doubt) or estimate
 
 
 class _Sampling(NamedTuple):
@@ -417,6 +427,13 @@ class _Samples(NamedTuple):
         return halves(self.steps.change_around)
 
 
+class _Period(NamedTuple):
+    """A refractory period, us, and its relative standard deviation."""
+
+    length: int
+    spread: float = 0.0
+
+
 class _LogThresholds(NamedTuple):
     """Logs of the thresholds on and off, and their variances, (2,) each; inf where nothing is known."""
 
@@ -425,7 +442,7 @@ class _LogThresholds(NamedTuple):
 
 
 def _combined(
-    samples: _Samples, usual: Usual, period: int, sampling: _Sampling, doubt: float
+    samples: _Samples, usual: Usual, period: _Period, sampling: _Sampling, doubt: float
 ) -> ThresholdEstimate | None:
     """Thresholds from either kind of instruments and the usual ones, combined by Bayes' rule (`_posterior`).
 
@@ -451,7 +468,8 @@ def _combined(
         samples=len(change),
         spread=float(np.sqrt(np.mean(known.variances))),
         usual_share=float(np.mean(np.minimum(known.variances / max(usual.spread**2, 1e-12), 1.0))),
-        refractory_period=period,
+        refractory_period=period.length,
+        refractory_spread=period.spread,
         delay=sampling.delay,
         delay_found=sampling.delay_found,
         doubt=doubt,
@@ -544,17 +562,16 @@ class _Excess(NamedTuple):
 def _measured_excess(samples: _Samples) -> _Excess:
     """The excess under the first refractory period."""
     found = _fit_late_and_soon(samples, 0)
-    if found is None:
-        return _Excess(0.0, np.inf)
+    return _Excess(0.0, np.inf) if found is None else _excess(samples, found)
+
+
+def _excess(samples: _Samples, found: _LateAndSoon) -> _Excess:
+    """That of a regression, with its standard error."""
+    known, fit = samples.steps, found.fit
     late, soon = standard_errors(
-        samples.steps.change,
-        found.explained,
-        found.instruments,
-        found.fit.weights,
-        samples.steps.pixel,
-        samples.sensor_size,
+        known.change, found.explained, found.instruments, fit.weights, known.pixel, samples.sensor_size
     )
-    return _Excess(found.excess, float(np.hypot(late, soon) / found.fit.solution[0]))
+    return _Excess(found.excess, float(np.hypot(late, soon) / fit.solution[0]))
 
 
 def _fit_late_and_soon(samples: _Samples, index: int, *, by_changes: bool = False) -> _LateAndSoon | None:
@@ -581,14 +598,23 @@ def _fit_late_and_soon(samples: _Samples, index: int, *, by_changes: bool = Fals
     return None if again is None or not again.solution[0] > 0 else _LateAndSoon(explained, instruments, again)
 
 
-def _period_without_excess(sampling: _Sampling) -> int:
-    """The refractory period, us, under which events that follow soon have the steps of late ones; 0 if unknown."""
+def _period_without_excess(sampling: _Sampling) -> _Period | None:
+    """The refractory period under which events that follow soon have the steps of late ones; None if unknown, or 0."""
     periods = possible_periods(sampling.shortest)
     samples = sampling.samples(*periods, most=_PERIOD_SAMPLES)
     fits = [_fit_late_and_soon(samples, index, by_changes=True) for index in range(len(periods))]
-    excess = np.array([np.nan if fit is None else fit.excess for fit in fits])
-    if not np.isfinite(excess).all():
-        return 0
+    found = [_excess(samples, fit) for fit in fits if fit is not None]
+    if len(found) < len(periods) or not np.isfinite(found).all():
+        return None
     # A longer period explains more of the excess; what does not decrease is noise.
-    falling = np.minimum.accumulate(excess)
-    return round(_HIDDEN * float(np.interp(0.0, -falling, periods)))
+    falling = np.minimum.accumulate([excess.value for excess in found])
+    even = float(np.interp(0.0, -falling, periods))
+    length = round(_HIDDEN * even)
+    if length == 0:
+        return None
+    after = int(np.clip(np.searchsorted(periods, even), 1, len(periods) - 1))
+    slope = (falling[after - 1] - falling[after]) / (periods[after] - periods[after - 1])
+    error = float(np.interp(even, periods, [excess.error for excess in found]))
+    # The share of the period in which the excess falls by its error.
+    spread = _PERIOD_ERRORS * error / max(slope * even, _PERIOD_ERRORS * error / _LARGEST_SPREAD)
+    return _Period(length, float(spread))

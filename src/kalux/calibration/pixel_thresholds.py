@@ -102,6 +102,8 @@ class ContrastCalibration:
         Shortest time between two events of a pixel that is not chance, us.
     refractory
         Refractory period, us, that the thresholds take account of; 0: none.
+    refractory_spread
+        Its relative standard deviation; 0 where it is given, or shown by noise.
     black_level
         What was taken off the frames, a share of white, given or found; None: nothing, or what they state themselves.
     samples, intervals
@@ -124,6 +126,7 @@ class ContrastCalibration:
     step_variance: float
     shortest_interval: int
     refractory: int
+    refractory_spread: float
     black_level: float | None
     samples: int
     intervals: int
@@ -149,6 +152,8 @@ class ContrastCalibration:
         }
         if self.refractory > 0:
             settings["refractory_period"] = self.refractory
+        if self.refractory_spread > 0:
+            settings["refractory_spread"] = self.refractory_spread
         errors = {"threshold_on": self.on_error, "threshold_off": self.off_error}
         names = ("spread_on", "spread_off", "correlation", "trailing", "residual", "shortest_interval")
         measured = {name: getattr(self, name) for name in (*names, "samples", "intervals")}
@@ -196,7 +201,7 @@ def calibrate_contrast(
     first = estimate_thresholds(recording, camera, Usual.of(EventSettings()), delay=delay or 0)
     if first is None or first.usual_share > _MOST_USUAL:
         return None
-    period, doubt = (refractory, 0.0) if refractory is not None else _lost_period(recording, camera, delay)
+    period = _Period(refractory) if refractory is not None else _lost_period(recording, camera, delay)
     sampling = _Sampling((first.on, first.off), shortest_interval(recording), period, event_region(recording))
     if delay is None:
         delay = _delay_of_trailing(recording, camera, sampling)
@@ -209,37 +214,47 @@ def calibrate_contrast(
         sampling = sampling._replace(thresholds=(fit.on, fit.off))
     assert fit is not None
     assert data is not None
-    return _per_pixel(recording, camera, sampling, fit, data[0], delay).doubted(doubt)
+    return _per_pixel(recording, camera, sampling, fit, data[0], delay).doubted(period.doubt)
 
 
-def _lost_period(recording: Recording, camera: CameraSettings, delay: int | None) -> tuple[int, float]:
-    """The refractory period, us, and the relative error of thresholds that comes from its own.
+class _Period(NamedTuple):
+    """A refractory period, us, its relative standard deviation, and the relative error of thresholds by that."""
+
+    length: int
+    spread: float = 0.0
+    doubt: float = 0.0
+
+
+def _lost_period(recording: Recording, camera: CameraSettings, delay: int | None) -> _Period:
+    """The refractory period of a recording.
 
     Noise shows it where there is enough of it: a part of a sensor, or of the time, may have too little.
     """
     shown = dead_time(recording)
     if shown:
-        return shown, 0.0
+        return _Period(shown)
     if delay is None:
         apparent = estimate_delay(recording, camera)
         delay = 0 if apparent is None else apparent.apparent
     usual = Usual.of(EventSettings())
     found = estimate_thresholds(recording, camera, usual, delay=delay, refractory_period=None)
-    return (0, 0.0) if found is None else (found.refractory_period, found.doubt)
+    if found is None:
+        return _Period(0)
+    return _Period(found.refractory_period, found.refractory_spread, found.doubt)
 
 
 # --- samples --------------------------------------------------------------------------------------------------
 
 
 class _Sampling(NamedTuple):
-    """How pixels are sampled: thresholds to deblur with, shortest inter-event interval and refractory period, us.
+    """How pixels are sampled: thresholds to deblur with, shortest inter-event interval, us, and refractory period.
 
     And ``inside``, (H, W) bool: which pixels may have events.
     """
 
     thresholds: tuple[float, float]
     shortest: int
-    refractory: int
+    refractory: _Period
     inside: NDArray[np.bool_]
 
 
@@ -285,9 +300,12 @@ class _History:
         """On and off counts of events, and which pixels had some that follow too fast."""
         on, off = np.zeros(self._shape), np.zeros(self._shape)
         crowded = np.zeros(self._shape, np.bool_)
-        least = _CROWDED * max(self._sampling.shortest, self._sampling.refractory)
+        least = _CROWDED * max(self._sampling.shortest, self._sampling.refractory.length)
         t, x, y, p = (events[name] for name in ("t", "x", "y", "p"))
-        memory, refractory = (self._last, self._before, self.sign), np.float32(self._sampling.refractory)
+        memory, refractory = (
+            (self._last, self._before, self.sign),
+            np.float32(self._sampling.refractory.length),
+        )
         _count(t, x, y, p, *memory, least, refractory, on, off, crowded)
         return on, off, crowded
 
@@ -492,7 +510,8 @@ def _per_pixel(
         residual=fit.residual,
         step_variance=variance.per_event / (fit.on * fit.off),
         shortest_interval=sampling.shortest,
-        refractory=sampling.refractory,
+        refractory=sampling.refractory.length,
+        refractory_spread=sampling.refractory.spread,
         black_level=recording.black_level or camera.black_level,
         samples=len(data.change),
         intervals=count,

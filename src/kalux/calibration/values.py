@@ -55,6 +55,7 @@ UNITS: Final[Mapping[str, str]] = {
     "residual": "log intensity, of frames' changes that events do not explain",
     "shortest_interval": "us, between two events of a pixel",
     "refractory_period": "us",
+    "refractory_spread": "relative, of the refractory period",
     "refractory_at_most": "us",
     "residual_full_scale": "root mean square of images predicted from the merged radiance, share of full scale",
     "left_out_full_scale": "root mean square of images predicted from the others, share of full scale",

@@ -215,6 +215,8 @@ def _fitted_values(settings: Settings) -> dict[str, dict[str, float | int]]:
     names = ("threshold_on", "threshold_off", "delay", "step_variance", "threshold_spread", "noise_rate")
     for name in (*names, "refractory_period"):
         values["events"][name] = getattr(settings.events, name)
+    if settings.events.refractory_doubt:
+        values["events"]["refractory_spread"] = settings.events.refractory_doubt
     for name in ("frame_noise", "shot_noise", "log_offset"):
         values["camera"][name] = getattr(settings.camera, name)
     return values

@@ -21,6 +21,7 @@ from kalux.augmentation.highlights import (
     follow_unshown,
 )
 from kalux.augmentation.motion import HalfWay, Paths, Plane, behind, find_path
+from kalux.augmentation.refractory import growth_with_period
 from kalux.augmentation.subthreshold import (
     UNKNOWN_CHANGE,
     UNMEASURED_CHANGE,
@@ -80,6 +81,23 @@ _LEAST_ERROR: Final = 1e-9
 """Least standard deviation of a threshold, log intensity, since it is divided by."""
 
 
+class SinceMeasured(NamedTuple):
+    """What events have told since a frame last measured each pixel; 0 where the latest frame does (K10).
+
+    Attributes
+    ----------
+    on, off
+        (H, W) number of events.
+    by_period
+        (H, W) log intensity: what the standard error of the refractory period adds to their change; None: the period is
+        known.
+    """
+
+    on: Floats
+    off: Floats
+    by_period: Floats | None
+
+
 class BridgeMemory(NamedTuple):
     """What later segments need of the frames until now.
 
@@ -92,7 +110,7 @@ class BridgeMemory(NamedTuple):
     since_middle
         Events from the middle of the latest exposure to its end; in causal mode only.
     since_measured
-        Events since a frame last measured a pixel, to the latest node; 0 where the latest frame does.
+        Events since a frame last measured a pixel, to the latest node.
     first_start
         Start of the first exposure, us.
     followed, at_middle
@@ -112,7 +130,7 @@ class BridgeMemory(NamedTuple):
     thresholds: Thresholds
     interval: float
     since_middle: Counts
-    since_measured: Counts
+    since_measured: SinceMeasured
     first_start: int
     followed: Followed
     at_middle: Followed
@@ -147,6 +165,7 @@ class BridgedFrames(Method):
             scale2 if scale2 > 0 else bridge.UNMEASURED,
         )
         self._spread2 = events.believed_mismatch**2  # K11
+        self._period_spread = events.refractory_doubt if events.refractory > 0 else 0.0
         self._follows_motion = settings.filter.follows_motion(shape)
         self._event_noise = akf_bridged.Noise(events.background_rate, events.step_noise, self._threshold2)
         self._prior = (
@@ -251,7 +270,7 @@ class BridgedFrames(Method):
             thresholds=thresholds,
             interval=USUAL_INTERVAL * 1e-6,
             since_middle=(on, off),
-            since_measured=(none, none),
+            since_measured=SinceMeasured(none, none, none if self._period_spread > 0 else None),
             first_start=shot.start,
             followed=followed,
             at_middle=followed,
@@ -345,7 +364,8 @@ class BridgedFrames(Method):
         usual = memory.usual.with_interval(change, told)
         share = half_way(usual.told, self._threshold2)
         steps = (on, off) if signal is None else (on * signal[0], off * signal[1])
-        joined, since_measured = self._with_drift(joined, memory, second, (on, off), change, steps)
+        by_period = self._by_period(events, start, end, signal)
+        joined, since_measured = self._with_drift(joined, memory, second, (on, off), change, steps, by_period)
         change = self._with_black_change(usual.mixed(change, share), memory.latent, second)
         assert joined.net is not None
         unshown = self._follow_unshown(memory, second, following, joined.net, steps)
@@ -423,7 +443,8 @@ class BridgedFrames(Method):
             self._latent_at_end(after, following),
         )
         counts, change = (on + tail_on, off + tail_off), memory.silent_change
-        forward, since_measured = self._with_drift(forward, memory, second, counts, change, counts)
+        by_period = self._by_period(events, start, following.end, None)
+        forward, since_measured = self._with_drift(forward, memory, second, counts, change, counts, by_period)
         trail = self._trail(memory.followed, start, scale)
         forward = forward._replace(trail=trail, unshown=memory.unshown, silent_change=change)
         return forward, after._replace(since_measured=since_measured)
@@ -495,38 +516,65 @@ class BridgedFrames(Method):
         counts: tuple[Floats, Floats],
         change: Floats,
         steps: Counts,
-    ) -> tuple[BridgedSegment, Counts]:
+        by_period: Floats | None,
+    ) -> tuple[BridgedSegment, SinceMeasured]:
         """The segment with the drift of its pixels (K10), and the events since they were last measured, at its end.
 
-        ``counts`` are its on and off events, ``steps`` those as far as they are signal, ``change`` is the mean square
-        change of silent pixels around each (K11).
+        ``counts`` are its on and off events, ``steps`` those as far as they are signal, ``by_period`` is what the
+        error of the refractory period adds to these, ``change`` the mean square change of silent pixels around each
+        (K11).
         """
-        since_measured = self._events_since_measured(memory, segment)
+        far_on, far_off, far = self._since_measured(memory, segment)
         grown, far_on, far_off = bridge.drift(
-            memory.latent, second, memory.thresholds, self.noise, since_measured, steps
+            memory.latent, second, memory.thresholds, self.noise, (far_on, far_off), steps
         )
+        if far is not None and by_period is not None:
+            more, far = bridge.period_drift(second, far, by_period)
+            np.maximum(grown + more, np.float32(0.0), out=grown)
         add_missed_change(grown, segment, second, counts, change, self.noise.quantisation_variance)
         if second.ceiling is not None:
             black = np.isfinite(second.ceiling)
             grown[black] = second.variance[black] / (_BLACK_FRAMES * (_BLACK_FRAMES + 1))
         segment = segment._replace(drift=grown, still_since=_still_since(memory, segment.start))
-        return segment, (far_on, far_off)
+        return segment, SinceMeasured(far_on, far_off, far)
 
-    def _events_since_measured(self, memory: BridgeMemory, segment: BridgedSegment) -> Counts:
-        """On and off events since a frame measured each pixel.
+    def _by_period(
+        self, events: Chunks, start: int, end: int, signal: tuple[Floats, Floats] | None
+    ) -> Floats | None:
+        """(H, W) log intensity: what the refractory period's standard error adds by the events of an interval (K10).
 
-        Of a pixel that no frame has measured, at most as many as raise its bound above those by the frames (K15).
+        As far as they are ``signal``, if that is known. None: the period is known.
+        """
+        if self._period_spread == 0:
+            return None
+        up: Floats
+        down: Floats
+        up, down = growth_with_period(all_between(events, start, end), self.shape)
+        if signal is not None:
+            up, down = up * signal[0], down * signal[1]
+        return (
+            np.float32(self._period_spread * self.on) * up - np.float32(self._period_spread * self.off) * down
+        )
+
+    def _since_measured(self, memory: BridgeMemory, segment: BridgedSegment) -> SinceMeasured:
+        """What events have told since a frame measured each pixel.
+
+        Of a pixel that no frame has measured, at most as much as raises its bound above those by the frames (K15).
         """
         pixels, known = memory.unshown.pixels, memory.thresholds
         if len(pixels) == 0:
             return memory.since_measured
         above = above_frames(segment, pixels, memory.unshown.bound)
-        on, off = (counts.copy() for counts in memory.since_measured)
+        on, off = memory.since_measured.on.copy(), memory.since_measured.off.copy()
         steps = (self.on, known.on_variance), (self.off, known.off_variance)
         for counts, (threshold, variance) in zip((on, off), steps, strict=True):
             each = np.maximum(threshold * np.sqrt(variance.reshape(-1)[pixels]), _LEAST_ERROR)
             counts.reshape(-1)[pixels] = np.minimum(counts.reshape(-1)[pixels], above / each)
-        return on, off
+        by_period = memory.since_measured.by_period
+        if by_period is not None:
+            by_period = by_period.copy()
+            by_period.reshape(-1)[pixels] = np.clip(by_period.reshape(-1)[pixels], -above, above)
+        return SinceMeasured(on, off, by_period)
 
     def _latent_at_end(self, memory: BridgeMemory, shot: Shot) -> Latent:
         """The latest frame, ``shot``, at the end of its exposure: moved there from its middle by events (10)."""

@@ -241,7 +241,12 @@ def _with_thresholds(
         )
     if finds_period:
         period = 0 if estimate is None else estimate.refractory_period
-        known = dataclasses.replace(known, refractory_period=period)
+        spread = 0.0 if estimate is None else round(estimate.refractory_spread, 3)
+        known = dataclasses.replace(
+            known,
+            refractory_period=period,
+            refractory_spread=spread if known.refractory_spread is None else known.refractory_spread,
+        )
     if not known.has_thresholds:
         origin = "assumed" if estimate is None or estimate.usual_share > 0.5 else "estimate"
         known = known.assuming() if estimate is None else known.with_thresholds(estimate.on, estimate.off)
