@@ -175,6 +175,53 @@ def test_levels_that_are_alike_do_not_tell_read_from_shot_noise():
     assert found.shot == 0.0
 
 
+def busy_on_the_right(shape, frames=12):
+    """Events of all pixels of the right half, between any two frames."""
+    y, x = (i.ravel() for i in np.indices((shape[0], shape[1] // 2)))
+    t = np.arange(frames).repeat(len(x)) * 40_000 + 20_000
+    return make_events(t, np.tile(x + shape[1] // 2, frames), np.tile(y, frames), np.ones(len(t), np.int64))
+
+
+@pytest.mark.parametrize("electrons", [5_000, 20_000, np.inf])
+def test_brighter_parts_that_change_smoothly_tell_how_the_noise_of_dark_still_pixels_grows(electrons):
+    """These have 0.83 of it. No more than the usual at half of white is believed, or twice that in the dark."""
+    x = np.arange(200)
+    light = np.broadcast_to(
+        np.where(x < 100, np.linspace(0.03, 0.09, 200), np.linspace(0.2, 0.9, 200)), (150, 200)
+    )
+    waves = np.broadcast_to(np.where(x < 100, 0.0, 0.1 * np.sin(x / 15)), light.shape)
+    events = busy_on_the_right(light.shape)
+    found = estimate_frame_noise(still(light, 0.002, 1 / electrons, changes=waves, events=events), CAMERA)
+    assert found.at(0.045) == pytest.approx(np.sqrt(0.002**2 + LEVEL**2 + 0.045 / electrons), rel=0.1)
+    told = 0.83 * np.sqrt(0.002**2 + LEVEL**2 + 0.5 / electrons)
+    assert found.at_half == pytest.approx(
+        min(max(told, found.at(0.045)), 2 * found.at(0.045), 0.006), rel=0.12
+    )
+
+
+def test_flat_parts_of_the_dark_tell_how_the_noise_of_bright_still_pixels_grows():
+    """The dark is never still, and noise in it a third of that in the light."""
+    light = np.broadcast_to(np.where(np.arange(200) < 100, np.linspace(0.4, 0.9, 200), 0.03), (150, 200))
+    found = estimate_frame_noise(still(light, 0.002, 1e-4, events=busy_on_the_right(light.shape)), CAMERA)
+    assert found.read == pytest.approx(np.hypot(0.002, LEVEL), rel=0.25)
+    assert found.at(0.5) == pytest.approx(np.sqrt(0.002**2 + LEVEL**2 + 0.5e-4), rel=0.1)
+    flickering = still(
+        light, 0.002, 1e-4, events=busy_on_the_right(light.shape), changes=0.03 * (light < 0.1) * RAMP
+    )
+    assert estimate_frame_noise(flickering, CAMERA).at(0.5) == pytest.approx(found.at(0.5), rel=0.1)
+
+
+@pytest.mark.parametrize("texture", [0.0, 0.02])
+def test_texture_that_changes_without_events_is_no_noise_where_smooth_parts_have_less(texture):
+    """On the left; on the right light comes and goes in slopes, and has 0.83 of the noise."""
+    fine = np.random.default_rng(8).normal(0, texture, RAMP.shape)
+    changes = np.where(np.arange(200) < 100, fine, 0.1 * np.sin(np.arange(200) / 15))
+    light = np.broadcast_to(np.linspace(0.4, 0.8, 200), RAMP.shape)
+    recording = still(light, 0.004, 0.0, changes=changes, events=busy_on_the_right(light.shape))
+    true = np.hypot(0.004, LEVEL)
+    assert 0.8 * true < estimate_frame_noise(recording, CAMERA).at(0.5) < 1.1 * true
+
+
 def test_nothing_to_be_told():
     y, x = (i.ravel() for i in np.indices((60, 80)))
     t = np.arange(12).repeat(len(x)) * 40_000

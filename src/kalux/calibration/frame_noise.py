@@ -20,8 +20,8 @@ from kalux.calibration.intervals import Interval, intervals
 from kalux.calibration.silences import find_silences, overlaps
 from kalux.compiled import empty, event_column, event_row, event_words, loop, smaller, zeros
 from kalux.event_slices import all_between
-from kalux.events import EventArray
 from kalux.filters.shots import Shot
+from kalux.frames import Frame
 from kalux.models.camera import Camera, Response, common_rounding, rounding_error
 from kalux.recording import Recording
 from kalux.settings import CameraSettings, chosen_response
@@ -96,6 +96,13 @@ _BRIGHTER: Final = 2.0
 """Growth of the variance from black to white, in units of that at black, where its level alone is told: at half of
 white the noise is 1.4 times that in the dark. Of three DAVIS sensors it is 1 to 1.85 times."""
 
+_BRIGHTER_PARTS: Final = 2.0
+"""Least level of parts that change smoothly, in units of that of still pixels, from which they tell how noise grows."""
+
+_BEYOND_SMOOTH: Final = 1.4
+"""Noise of still pixels, in units of that of parts that change smoothly, from which it is not noise alone. It is 1.2
+where there is nothing else, 1.05 to 1.22 on four recordings."""
+
 _LEAST_READ: Final = 0.5 / 65535
 """Least read noise of frames in floats, white = 1: the rounding of 16 bits, finer than any camera's."""
 
@@ -135,7 +142,11 @@ class FrameNoise(NamedTuple):
     @property
     def at_half(self) -> float:
         """Standard deviation at half of white."""
-        return float(np.sqrt(self.read**2 + self.shot / 2))
+        return self.at(0.5)
+
+    def at(self, level: float) -> float:
+        """Standard deviation at a level of intensity, white = 1."""
+        return float(np.sqrt(self.read**2 + self.shot * level))
 
 
 def estimate_frame_noise(
@@ -143,6 +154,7 @@ def estimate_frame_noise(
     camera: CameraSettings,
     *,
     most_frames: int | None = None,
+    delay: int = 0,
 ) -> FrameNoise | None:
     """Photon transfer curve of pixels without events nearby from one exposure's start to the next one's end.
 
@@ -150,7 +162,9 @@ def estimate_frame_noise(
     with faint motion do not count. Read noise is no less than `common_rounding`, or that of 16 bits. None where fewer
     than two levels are seen, each by 200 pixels of a frame pair. Where noise leaves no such pixels, 50 without events
     of their own and of the four beside are enough, if they have more noise than usual: of less, they say too little;
-    and if the flattest parts of the dark do not say that it is less (`flat_noise`).
+    and if the flattest parts of the dark do not say that it is less (`flat_noise`). In any case
+    parts that change smoothly may say that it is less (`smooth_noise`), and where all pixels are about as bright, these
+    or flat parts how it grows.
 
     Parameters
     ----------
@@ -160,6 +174,8 @@ def estimate_frame_noise(
         Response and saturation.
     most_frames
         Only so many frames from the start are looked at. Default: as many as it takes, at most 80.
+    delay
+        How late the events are known to be, us.
 
     Raises
     ------
@@ -169,7 +185,7 @@ def estimate_frame_noise(
     most_frames = most_frames or _enough_frames(recording.sensor_size)
     # Where noise leaves no pixel without events in 5x5 around it, 3x3 must do, or those beside it; they let more faint
     # motion in.
-    points = _points(recording, camera, most_frames)
+    points = _points(recording, camera, most_frames, delay)
     chosen = next((k for k, found in enumerate(points) if _is_curve(found)), None)
     if chosen is None:
         return None
@@ -179,16 +195,71 @@ def estimate_frame_noise(
     frame, response = next(iter(recording.frames())), _response(recording, camera)
     rounding = common_rounding(frame, response)
     # Noise of much less than a level shows as none, or as any.
-    least = np.maximum(rounding, response.rounding(response(levels), rounding_error(frame)))
-    moves, points_of = _SURROUNDINGS[chosen].moves, (levels, np.maximum(variances, least**2 / 3), weights)
+    least = _rounding(levels, frame, response)
+    moves, points_of = _SURROUNDINGS[chosen].moves, (levels, np.maximum(variances, least**2), weights)
     found = photon_transfer(*points_of, motion=moves)
     whole = levels >= _CUT * found.read  # where black cuts nothing off
     if 2 <= np.count_nonzero(whole) < len(whole):
         found = photon_transfer(*(values[whole] for values in points_of), motion=moves)
     if moves and (found.read <= camera.usual_frame_noise or _contradicted(found.read, recording, camera)):
         return None
+    found = _checked(found, recording, camera, response)
     read = max(found.read, rounding, _LEAST_READ)
     return found._replace(read=read, shot=found.shot if found.shot > _LEAST_READ**2 else 0.0)
+
+
+def _rounding(levels: Array, frame: Frame, response: Response) -> Array:
+    """Standard deviation of rounding at levels of the intensity."""
+    half = np.maximum(
+        common_rounding(frame, response), response.rounding(response(levels), rounding_error(frame))
+    )
+    return np.asarray(half / 3**0.5, np.float64)
+
+
+def _checked(
+    found: FrameNoise, recording: Recording, camera: CameraSettings, response: Response
+) -> FrameNoise:
+    """The noise of still pixels, by what flat and smooth parts say of it.
+
+    These tell how it grows with the light where the levels of still pixels do not (`_with_growth`), and that it is less
+    where what seems still changes all the same, as fine texture that moves below the threshold does.
+    """
+    changes = (_beyond_neighbours(i.first, i.second) for i in _comparable(recording, camera, _MIN_FRAMES))
+    seen = [(flat_noise(change), smooth_noise(change)) for change in changes]
+    flat, smooth = (
+        typical_flat_noise([one for one, _ in seen]),
+        typical_smooth_noise([one for _, one in seen]),
+    )
+    if smooth is not None and not smooth.is_noise:
+        smooth = None
+    if _are_alike(found.levels):
+        found = _with_growth(found, flat, smooth, camera)
+    if smooth is None:
+        return found
+    rounding = float(_rounding(np.array([smooth.level]), next(iter(recording.frames())), response)[0])
+    beyond = found.at(smooth.level) / max(smooth.deviation, rounding, _LEAST_READ)
+    if beyond <= _BEYOND_SMOOTH:
+        return found
+    return found._replace(read=found.read / beyond, shot=found.shot / beyond**2)
+
+
+def _with_growth(
+    found: FrameNoise, flat: float | None, smooth: SmoothNoise | None, camera: CameraSettings
+) -> FrameNoise:
+    """How the noise grows with the light, where still pixels, whose levels are alike, do not tell it.
+
+    Of bright ones by the flattest parts of the dark, if these have less noise. Of dark ones by brighter parts that
+    change smoothly, at most as the noise of other cameras grows.
+    """
+    level, variance = float(np.mean(found.levels)), found.read**2
+    darkest, brightest = _DARK_PARTS[0][0], _DARK_PARTS[-1][-1]
+    if level > brightest:
+        shot = 0.0 if flat is None else max(variance - flat**2, 0.0) / (level - (darkest + brightest) / 2)
+    else:
+        shot = max(_most_at_half(found.read, camera) ** 2 - variance, 0.0) / (0.5 - level)
+        if smooth is not None and smooth.level > _BRIGHTER_PARTS * level:
+            shot = min(shot, max(smooth.deviation**2 - variance, 0.0) / (smooth.level - level))
+    return found._replace(read=float(np.sqrt(max(variance - shot * level, 0.0))), shot=shot)
 
 
 def _contradicted(read: float, recording: Recording, camera: CameraSettings) -> bool:
@@ -214,7 +285,7 @@ class UsualNoise(NamedTuple):
     silent: bool
 
 
-def usual_noise(recording: Recording, camera: CameraSettings) -> UsualNoise:
+def usual_noise(recording: Recording, camera: CameraSettings, *, delay: int = 0) -> UsualNoise:
     """Read and shot noise where no photon transfer tells them: the usual at half of white, in the dark what it allows.
 
     Whatever moves, pixels change by their noise at least: from 0.01 to 0.02 of white it is no more than those do that
@@ -229,6 +300,8 @@ def usual_noise(recording: Recording, camera: CameraSettings) -> UsualNoise:
         With known exposures.
     camera
         Response, saturation, and ``usual_frame_noise``.
+    delay
+        How late the events are known to be, us.
 
     Raises
     ------
@@ -239,12 +312,12 @@ def usual_noise(recording: Recording, camera: CameraSettings) -> UsualNoise:
     of_silent: list[float] = []
     of_all: list[float] = []
     of_flat: list[list[float | None]] = []
-    of_smooth: list[SmoothNoise] = []
-    for interval in _comparable(recording, camera, _MIN_FRAMES):
+    of_smooth: list[SmoothNoise | None] = []
+    for interval in _comparable(recording, camera, _MIN_FRAMES, delay):
         change = _beyond_neighbours(interval.first, interval.second)
         level, difference, usable, dark, *_ = change
         low = usable & ~dark & (level < 2 * _DARKEST)
-        busy = _busy(all_between(interval.chunks, interval.first.start, interval.second.end), level.shape)
+        busy = _busy(interval, delay)
         silent = low & (cv2.dilate(busy, cross.shape) == 0)
         for chosen, least, into in (
             (low & ~_near(dark), _LEAST, of_all),
@@ -253,15 +326,12 @@ def usual_noise(recording: Recording, camera: CameraSettings) -> UsualNoise:
             if np.count_nonzero(chosen) >= least:
                 into.append(trimmed_variance(difference[chosen]) / 2)
         of_flat.append(flat_noise(change))
-        smooth = smooth_noise(change) if of_flat[-1][0] is None else None
-        if smooth is not None:
-            of_smooth.append(smooth)
+        of_smooth.append(smooth_noise(change) if of_flat[-1][0] is None else None)
     flat, changes = typical_flat_noise(of_flat), of_silent or of_all
-    if flat is None and not changes and of_smooth:
-        smooth = SmoothNoise(*np.median(np.array(of_smooth), axis=0).tolist())
-        if smooth.is_told(usual):
-            read = _possible_read(recording, camera, smooth.in_the_dark)
-            return UsualNoise(read, smooth.shot(read), silent=False)
+    smooth = typical_smooth_noise(of_smooth)
+    if flat is None and not changes and smooth is not None and smooth.is_told(usual):
+        read = _possible_read(recording, camera, smooth.in_the_dark)
+        return UsualNoise(read, smooth.shot(read), silent=False)
     most = usual if flat is None else flat
     if changes:
         most = min(most, float(np.sqrt(np.median(changes))))
@@ -327,6 +397,12 @@ def smooth_noise(change: FrameChange) -> SmoothNoise | None:
     return SmoothNoise(float(first), float(levels[whole][found <= first].mean()), float(after))
 
 
+def typical_smooth_noise(found: list[SmoothNoise | None]) -> SmoothNoise | None:
+    """The median of `smooth_noise` of several pairs of frames; None: none has such parts."""
+    known = [one for one in found if one is not None]
+    return SmoothNoise(*np.median(np.array(known), axis=0).tolist()) if known else None
+
+
 def _parts(plane: NDArray[Any]) -> NDArray[Any]:
     """(N, 100) the pixels of every part; what is left over on the right and below is in none."""
     rows, columns = (length // _SMOOTH for length in plane.shape)
@@ -382,7 +458,12 @@ def quiet_noise(recording: Recording, camera: CameraSettings, dark: float) -> tu
     At half of white it is taken to be twice that, but no more than the usual: three DAVIS sensors have 1 to 1.85 times.
     """
     read = _possible_read(recording, camera, dark)
-    return read, _shot(read, min(_AT_HALF * read, camera.usual_frame_noise))
+    return read, _shot(read, _most_at_half(read, camera))
+
+
+def _most_at_half(dark: float, camera: CameraSettings) -> float:
+    """Standard deviation at half of white, where only that in the dark is told."""
+    return min(_AT_HALF * dark, camera.usual_frame_noise)
 
 
 def _shot(read: float, at_half: float) -> float:
@@ -401,16 +482,18 @@ def _response(recording: Recording, camera: CameraSettings) -> Response:
     return Camera.named(chosen_response(camera.response, recording.response), camera.clipped_from).response
 
 
-def _comparable(recording: Recording, camera: CameraSettings, most_frames: int) -> Iterator[Interval]:
+def _comparable(
+    recording: Recording, camera: CameraSettings, most_frames: int, delay: int = 0
+) -> Iterator[Interval]:
     """The intervals whose frames differ by noise alone where there is no event.
 
     Not those in which events have been lost: there all that moves is without.
     """
     silences = find_silences(recording, most_frames=most_frames)
-    margin = recording.longest_exposure
+    margin = recording.longest_exposure + abs(delay)
     for interval in intervals(recording, camera, margin=margin, most_frames=most_frames, apart=0):
         begin, end = interval.first.start, interval.second.end
-        if interval.has_one_exposure and not overlaps(silences, begin, end):
+        if interval.has_one_exposure and not overlaps(silences, begin + delay, end + delay):
             yield interval
 
 
@@ -452,15 +535,17 @@ def _is_curve(points: _Points) -> bool:
     return sum(map(bool, points)) >= 2
 
 
-def _points(recording: Recording, camera: CameraSettings, most_frames: int) -> tuple[_Points, ...]:
+def _points(
+    recording: Recording, camera: CameraSettings, most_frames: int, delay: int
+) -> tuple[_Points, ...]:
     """By bins of the level: level, variance and number of pixels of every frame pair; for each of `_SURROUNDINGS`.
 
     Those of the smaller end where the larger are enough.
     """
     found: tuple[_Points, ...] = tuple([[] for _ in range(_BINS)] for _ in _SURROUNDINGS)
-    for interval in _comparable(recording, camera, most_frames):
+    for interval in _comparable(recording, camera, most_frames, delay):
         level, difference, usable, dark, *_ = _beyond_neighbours(interval.first, interval.second)
-        busy = _busy(all_between(interval.chunks, interval.first.start, interval.second.end), level.shape)
+        busy = _busy(interval, delay)
         near_dark = _near(dark)
         for points, around in zip(found, _SURROUNDINGS, strict=True):
             still = cv2.dilate(busy, around.shape) == 0
@@ -471,10 +556,11 @@ def _points(recording: Recording, camera: CameraSettings, most_frames: int) -> t
     return found
 
 
-def _busy(chunks: list[EventArray], shape: tuple[int, ...]) -> NDArray[np.uint8]:
-    """(H, W): 1 where there is an event."""
-    busy = np.zeros(shape, np.uint8)
-    for events in chunks:
+def _busy(interval: Interval, delay: int) -> NDArray[np.uint8]:
+    """(H, W): 1 where there is an event from the start of one exposure to the end of the next; ``delay`` us late."""
+    first, second = interval.first, interval.second
+    busy = np.zeros(first.levels.shape, np.uint8)
+    for events in all_between(interval.chunks, first.start + delay, second.end + delay):
         _mark(event_words(events), busy)
     return busy
 
@@ -622,7 +708,7 @@ def photon_transfer(levels: Array, variances: Array, weights: Array, *, motion: 
     what is found: what moves unseen changes the light by a share of it.
     """
     relative = weights / np.maximum(variances, 1e-10)
-    alike = levels.max() < _SPAN * levels.min()
+    alike = _are_alike(levels)
     powers = 1 if alike else 3 if motion else 2
     design = levels[:, None] ** np.arange(powers)
     found = _not_negative(design * relative[:, None], variances * relative)
@@ -632,6 +718,11 @@ def photon_transfer(levels: Array, variances: Array, weights: Array, *, motion: 
     )
     read2, shot = float(found[0]), 0.0 if alike else float(found[1])
     return FrameNoise(float(np.sqrt(read2)), shot, scatter / 2, levels, variances)
+
+
+def _are_alike(levels: Array) -> bool:
+    """Whether levels are too near to one another to tell read and shot noise apart."""
+    return bool(levels.max() < _SPAN * levels.min())
 
 
 def _not_negative(design: Array, values: Array) -> Array:

@@ -46,10 +46,11 @@ def with_frame_noise(recording: Recording, settings: Settings) -> FilledFrameNoi
     camera = settings.camera
     if camera.frame_noise is not None or not settings.filter.joins_frames:
         return FilledFrameNoise(settings)
-    found = estimate_frame_noise(recording, camera)
+    delay = settings.events.lateness
+    found = estimate_frame_noise(recording, camera, delay=delay)
     if found is not None and not found.is_reliable:
         found = None
-    noise = usual_noise(recording, camera) if found is None else found
+    noise = usual_noise(recording, camera, delay=delay) if found is None else found
     doubted = isinstance(noise, UsualNoise) and not noise.silent and camera.shot_noise is None
     filled = completed(settings, "camera", frame_noise=noise.read, shot_noise=noise.shot)
     return FilledFrameNoise(filled, found, doubted)
