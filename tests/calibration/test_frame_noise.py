@@ -276,7 +276,7 @@ def test_smooth_parts_say_no_more_than_the_usual_where_texture_moves():
     assert np.hypot(0.002, LEVEL) < np.sqrt(least.read**2 + 0.4 * least.shot) < usual
 
 
-def test_smooth_parts_are_bright_but_not_clipped_and_of_one_colour():
+def test_smooth_parts_are_bright_but_not_clipped_and_not_in_rgb():
     """Parts of 10x10 pixels from 0.12 of white on, twenty at least; what clips or is masked is in none."""
 
     def told(level, **parts):
@@ -289,7 +289,8 @@ def test_smooth_parts_are_bright_but_not_clipped_and_of_one_colour():
     assert found.level == pytest.approx(0.4, abs=0.002)
     assert found.deviation == pytest.approx(0.83 * np.hypot(0.004, LEVEL), rel=0.1)
     assert found.is_noise
-    assert told(bright, pitch=2) is None
+    assert told(bright, pitch=2).deviation == pytest.approx(found.deviation, rel=0.1)
+    assert told(bright, chroma=np.ones((*bright.shape, 3))) is None
     assert told(bright / 4) is None
     assert told(bright * 2.5) is None
     masked = np.ones(bright.shape, np.bool_)
@@ -339,13 +340,28 @@ def test_what_moves_unseen_is_no_noise_where_flat_parts_have_less(flat, least, m
     assert least < read < most
 
 
-def test_flat_parts_do_not_tell_the_noise_of_colours():
-    """Neighbours in a mosaic have other colours."""
+def test_flat_parts_do_not_tell_the_noise_of_rgb():
+    """Its neighbours share it. Those of a mosaic do not."""
     interval = next(_comparable(all_moves((90, 120), 0.004, 40), CAMERA, 2))
     first, second = interval.first, interval.second
-    assert flat_noise(_beyond_neighbours(first, second))[0] == pytest.approx(np.hypot(0.004, LEVEL), rel=0.2)
+    true, rgb = np.hypot(0.004, LEVEL), np.ones((90, 120, 3))
+    assert flat_noise(_beyond_neighbours(first, second))[0] == pytest.approx(true, rel=0.2)
     mosaic = _beyond_neighbours(first._replace(pitch=2), second._replace(pitch=2))
-    assert flat_noise(mosaic) == [None, None, None]
+    assert flat_noise(mosaic)[0] == pytest.approx(true, rel=0.2)
+    demosaiced = _beyond_neighbours(first._replace(chroma=rgb), second._replace(chroma=rgb))
+    assert flat_noise(demosaiced) == [None, None, None]
+
+
+@pytest.mark.parametrize(("level", "told"), [(0.03, flat_noise), (0.4, smooth_noise)])
+def test_pixels_of_a_mosaic_are_compared_with_those_of_their_own_colour(level, told):
+    """Every second column becomes brighter by a third, as where a red thing comes; noise is what it was."""
+    columns = np.where(np.arange(120) % 2, level / 3, 0.0)
+    recording = still(np.full((90, 120), level), 0.004, 0.0, changes=np.broadcast_to(columns, (90, 120)))
+    interval = next(_comparable(recording, CAMERA, 2))
+    first, second = (shot._replace(pitch=2) for shot in (interval.first, interval.second))
+    found = told(_beyond_neighbours(first, second))
+    noise = found[0] if told is flat_noise else found.deviation / 0.83
+    assert noise == pytest.approx(np.hypot(0.004, LEVEL), rel=0.15)
 
 
 def test_flat_parts_that_black_cuts_off_do_not_count():

@@ -383,11 +383,11 @@ def smooth_noise(change: FrameChange) -> SmoothNoise | None:
 
     Of every part of 10x10 pixels, the root mean square of what its pixels' changes have beyond rows and columns:
     neither slopes nor what the sensor's pixels always have count. The tenth of these from below is noise, or more.
-    None: fewer than 20 parts are from 0.12 of white on and not clipped; frames have colours, as in `flat_noise`.
+    None: fewer than 20 parts are from 0.12 of white on and not clipped; frames are in RGB, as in `flat_noise`.
     """
-    if not change.is_grey:
+    if not change.is_own:
         return None
-    beyond = cv2.filter2D(change.change, cv2.CV_64F, _WITHOUT_SLOPES)
+    beyond = cv2.filter2D(change.change, cv2.CV_64F, _of_one_colour(_WITHOUT_SLOPES, change.pitch))
     squares, levels = _parts(beyond * beyond).mean(1) / 2, _parts(change.level).mean(1)
     whole = _parts(change.usable).all(1) & (levels > _DARK_PARTS[-1][-1])
     if np.count_nonzero(whole) < _LEAST_SMOOTH:
@@ -416,12 +416,13 @@ def flat_noise(change: FrameChange) -> list[float | None]:
     Whatever moves, pixels change by their noise at least. Of every part of 5x5 pixels, of which the mean of those
     around is between two levels over both frames (0.015 and 0.04, 0.03 and 0.06, 0.06 and 0.12 of white), the mean
     square of what its pixels change beyond the mean of their four neighbours; of these the tenth from below, which is
-    less than the mean where all is noise. None: too little is so dark; frames have colours, whose neighbours have
-    others or share their noise.
+    less than the mean where all is noise. Neighbours are those of a pixel's own colour. None: too little is so dark;
+    frames are in RGB, whose neighbours share their noise.
     """
-    if not change.is_grey:
+    if not change.is_own:
         return [None] * len(_DARK_PARTS)
-    squares = cv2.boxFilter(change.beyond * change.beyond, cv2.CV_64F, (_FLAT, _FLAT)) / 2
+    beyond = change.beyond if change.pitch == 1 else _beyond_four(change.change, change.pitch)
+    squares = cv2.boxFilter(beyond * beyond, cv2.CV_64F, (_FLAT, _FLAT)) / 2
     around = cv2.boxFilter(change.level, cv2.CV_64F, (_AROUND, _AROUND))
     whole = cv2.erode(change.usable.astype(np.uint8), np.ones((_FLAT, _FLAT), np.uint8)) > 0
     share, of_mean = _FLATTEST
@@ -591,8 +592,10 @@ class FrameChange(NamedTuple):
         Pixels in whose surroundings nothing clips, or is masked.
     dark
         What is too dark.
-    is_grey
-        Whether neighbours are of one colour and have a noise of their own.
+    pitch
+        How far apart pixels of one colour are: 2 in a Bayer mosaic.
+    is_own
+        Whether every pixel has a noise of its own: not of frames in RGB.
     change
         The whole change.
     """
@@ -601,7 +604,8 @@ class FrameChange(NamedTuple):
     beyond: Array
     usable: NDArray[np.bool_]
     dark: NDArray[np.bool_]
-    is_grey: bool
+    pitch: int
+    is_own: bool
     change: Array
 
 
@@ -611,17 +615,28 @@ def _beyond_neighbours(first: Shot, second: Shot) -> FrameChange:
     bad = np.empty(level.shape, np.bool_)
     _compare(*_by_level(first), *_by_level(second), level, change, bad)
     dark = level <= _DARKEST
-    beyond = change
-    if first.chroma is None:
-        beyond = cv2.filter2D(change, cv2.CV_64F, _BEYOND_NEIGHBOURS) / np.linalg.norm(_BEYOND_NEIGHBOURS)
+    is_own = first.chroma is None
+    beyond = _beyond_four(change, 1) if is_own else change
     for shot in (first, second):
         if shot.valid is not None:
             bad |= ~shot.valid
     usable = ~_near(bad)
     usable[[0, -1]] = False  # of pixels at the border a neighbour counts twice
     usable[:, [0, -1]] = False
-    is_grey = first.chroma is None and first.pitch == 1
-    return FrameChange(level, np.asarray(beyond, np.float64), usable, dark, is_grey, change)
+    return FrameChange(level, beyond, usable, dark, first.pitch, is_own, change)
+
+
+def _beyond_four(change: Array, pitch: int) -> Array:
+    """What a pixel's change has beyond the mean of four, ``pitch`` from it; with the variance of white noise."""
+    kernel = _of_one_colour(_BEYOND_NEIGHBOURS, pitch)
+    return np.asarray(cv2.filter2D(change, cv2.CV_64F, kernel) / np.linalg.norm(kernel), np.float64)
+
+
+def _of_one_colour(kernel: Array, pitch: int) -> Array:
+    """A filter's ``kernel`` that reaches for the pixels of its own colour, which are ``pitch`` apart."""
+    spread = np.zeros((pitch * (len(kernel) - 1) + 1,) * 2)
+    spread[::pitch, ::pitch] = kernel
+    return spread
 
 
 def _by_level(shot: Shot) -> tuple[NDArray[np.integer[Any]], Array, NDArray[np.bool_]]:
