@@ -162,9 +162,9 @@ def estimate_frame_noise(
     with faint motion do not count. Read noise is no less than `common_rounding`, or that of 16 bits. None where fewer
     than two levels are seen, each by 200 pixels of a frame pair. Where noise leaves no such pixels, 50 without events
     of their own and of the four beside are enough, if they have more noise than usual: of less, they say too little;
-    and if the flattest parts of the dark do not say that it is less (`flat_noise`). In any case
-    parts that change smoothly may say that it is less (`smooth_noise`), and where all pixels are about as bright, these
-    or flat parts how it grows.
+    and if the flattest parts of the dark do not say that it is less (`flat_noise`). In any case parts that change
+    smoothly may say that it is less (`smooth_noise`), and where all pixels are about as bright, these or flat parts
+    how it grows.
 
     Parameters
     ----------
@@ -226,10 +226,8 @@ def _checked(
     """
     changes = (_beyond_neighbours(i.first, i.second) for i in _comparable(recording, camera, _MIN_FRAMES))
     seen = [(flat_noise(change), smooth_noise(change)) for change in changes]
-    flat, smooth = (
-        typical_flat_noise([one for one, _ in seen]),
-        typical_smooth_noise([one for _, one in seen]),
-    )
+    flat = typical_flat_noise([one for one, _ in seen])
+    smooth = typical_smooth_noise([one for _, one in seen])
     if smooth is not None and not smooth.is_noise:
         smooth = None
     if _are_alike(found.levels):
@@ -252,9 +250,10 @@ def _with_growth(
     change smoothly, at most as the noise of other cameras grows.
     """
     level, variance = float(np.mean(found.levels)), found.read**2
-    darkest, brightest = _DARK_PARTS[0][0], _DARK_PARTS[-1][-1]
-    if level > brightest:
-        shot = 0.0 if flat is None else max(variance - flat**2, 0.0) / (level - (darkest + brightest) / 2)
+    if level > _DARK_PARTS[-1][-1]:
+        shot = (
+            0.0 if flat is None else max(variance - flat**2, 0.0) / (level - float(np.mean(_DARK_PARTS[0])))
+        )
     else:
         shot = max(_most_at_half(found.read, camera) ** 2 - variance, 0.0) / (0.5 - level)
         if smooth is not None and smooth.level > _BRIGHTER_PARTS * level:

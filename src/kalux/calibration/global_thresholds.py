@@ -604,10 +604,11 @@ def _period_without_excess(sampling: _Sampling) -> _Period | None:
     samples = sampling.samples(*periods, most=_PERIOD_SAMPLES)
     fits = [_fit_late_and_soon(samples, index, by_changes=True) for index in range(len(periods))]
     found = [_excess(samples, fit) for fit in fits if fit is not None]
-    if len(found) < len(periods) or not np.isfinite(found).all():
+    values = np.array([excess.value for excess in found])
+    if len(found) < len(periods) or not np.isfinite(values).all():
         return None
     # A longer period explains more of the excess; what does not decrease is noise.
-    falling = np.minimum.accumulate([excess.value for excess in found])
+    falling = np.minimum.accumulate(values)
     even = float(np.interp(0.0, -falling, periods))
     length = round(_HIDDEN * even)
     if length == 0:
@@ -615,6 +616,6 @@ def _period_without_excess(sampling: _Sampling) -> _Period | None:
     after = int(np.clip(np.searchsorted(periods, even), 1, len(periods) - 1))
     slope = (falling[after - 1] - falling[after]) / (periods[after] - periods[after - 1])
     error = float(np.interp(even, periods, [excess.error for excess in found]))
-    # The share of the period in which the excess falls by its error.
-    spread = _PERIOD_ERRORS * error / max(slope * even, _PERIOD_ERRORS * error / _LARGEST_SPREAD)
-    return _Period(length, float(spread))
+    known = slope > 0 and np.isfinite(error)
+    spread = _PERIOD_ERRORS * error / (slope * even) if known else _LARGEST_SPREAD
+    return _Period(length, float(min(spread, _LARGEST_SPREAD)))
