@@ -97,9 +97,9 @@ _BRIGHTER: Final = 2.0
 white the noise is 1.4 times that in the dark. Of three DAVIS sensors it is 1 to 1.85 times."""
 
 _FLAT_LEVEL: Final = 0.0675
-"""Level at which flat parts of the dark are taken to tell the noise: the middle of all that count. Most are from 0.015 to
-0.04, but some texture is left in them: with 0.0275, the middle of these, noise in the dark comes out 1.1 to 1.9 times
-as large, and log-MSE of one scene is 1.38 times what it is so, of others 0.99 to 1.01 times."""
+"""Level at which flat parts of the dark are taken to tell the noise: the middle of all that count. Most are from 0.015
+to 0.04, but some texture is left in them: with 0.0275, the middle of these, noise in the dark comes out 1.1 to 1.9
+times as large, and log-MSE of one scene is 1.38 times what it is so, of others 0.99 to 1.01 times."""
 
 _BRIGHTER_PARTS: Final = 2.0
 """Least level of parts that change smoothly, in units of that of still pixels, from which they tell how noise grows."""
