@@ -1042,7 +1042,8 @@ def test_an_edge_into_a_highlight_is_no_surer_before_the_next_frame_than_after_i
     np.testing.assert_allclose(found, [0, 0.5, 1, 1] if clips else 0, atol=0.03)
 
 
-def test_an_edge_into_a_highlight_is_as_doubtful_as_the_refractory_period_makes_it():
+@pytest.mark.parametrize("lookahead", [True, False])
+def test_an_edge_into_a_highlight_is_as_doubtful_as_the_refractory_period_makes_it(lookahead):
     """Ten events of which each hides one threshold, and two as much: 10 % of the period is then two thresholds (K10).
 
     As many of the other polarity take it off again, but for what thresholds may be off by.
@@ -1055,13 +1056,15 @@ def test_an_edge_into_a_highlight_is_as_doubtful_as_the_refractory_period_makes_
             "refractory_period": 400,
             "refractory_spread": spread,
         }
-        engine = Reconstructor((1, 2), settings=altered(PRESETS["default"], "events", **known))
+        engine = Reconstructor(
+            (1, 2), settings=altered(PRESETS["default"], "events", **known), lookahead=lookahead
+        )
         for t, level in ((0, 50), (100_000, 255), (200_000, 255), (300_000, 255)):
             engine.push_frame(Frame(np.array([[50, level]], np.uint8), t, t + 10_000))
         up, down = 50_000 + 800 * np.arange(12), 150_000 + 800 * np.arange(12)
         engine.push_events(pixel_events([*up, *down], [1] * 12 + [0] * 12, x=1))
         engine.finish()
-        variances[spread] = np.array([engine.estimate(t).variance[0, 1] for t in (49_000, 105_000, 205_000)])
+        variances[spread] = np.array([engine.estimate(t).variance[0, 1] for t in (49_000, 115_000, 215_000)])
     more = variances[0.1] - variances[None]
     growth = 10 * (1 + 1) + 2 * 1  # thresholds: the paces, of each event but the first, and their own growth
     assert more[0] == 0
