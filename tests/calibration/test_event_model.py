@@ -215,8 +215,8 @@ def test_dark_pixels_tell_noise_by_what_events_leave(read):
 def test_a_plan_takes_it_where_nothing_else_tells_noise(monkeypatch, recordings, silent):
     """Stated noise stays, and so does what pixels without events tell."""
     usual = UsualNoise(0.006, 0.0, silent=silent)
-    monkeypatch.setattr("kalux.planning.sensor_noise.estimate_frame_noise", lambda *_: None)
-    monkeypatch.setattr("kalux.planning.sensor_noise.usual_noise", lambda *_: usual)
+    monkeypatch.setattr("kalux.planning.sensor_noise.estimate_frame_noise", lambda *_, **__: None)
+    monkeypatch.setattr("kalux.planning.sensor_noise.usual_noise", lambda *_, **__: usual)
     made = plan(recordings[0.03], at="frames", settings=PRESETS["default"])
     assert made.frame_noise is None
     if silent:
