@@ -12,6 +12,7 @@ import kalux
 from kalux import Recording
 from kalux.calibration import pixel_thresholds
 from kalux.calibration.pixel_thresholds import calibrate_contrast, shrunk
+from kalux.calibration.refractory import Period
 from kalux.datasets import SensorSettings, demo_scene, simulate, static
 from kalux.settings import CameraSettings
 
@@ -119,7 +120,7 @@ def test_a_region_of_interest_is_measured_as_a_sensor_of_its_size(simulation):
 def test_where_the_direction_turns_nothing_is_added():
     """K13: meanwhile the light may have moved either way."""
     everywhere = np.ones((1, 1), np.bool_)
-    sampling = pixel_thresholds._Sampling((0.2, 0.2), 1000, pixel_thresholds._Period(1000), everywhere)
+    sampling = pixel_thresholds._Sampling((0.2, 0.2), 1000, Period(1000), everywhere)
     history = pixel_thresholds._History((1, 1), sampling)
     on, off, _ = history.counts(pixel_events([10_000, 13_500, 17_000], [True, False, False]))
     going_on = 1 + 1 / np.hypot(2.5, 0.2)

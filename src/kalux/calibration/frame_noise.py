@@ -96,7 +96,7 @@ _BRIGHTER: Final = 2.0
 """Growth of the variance from black to white, in units of that at black, where its level alone is told: at half of
 white the noise is 1.4 times that in the dark. Of three DAVIS sensors it is 1 to 1.85 times."""
 
-_FLAT_LEVEL: Final = 0.0675
+_FLAT_LEVEL: Final = (_DARK_PARTS[0][0] + _DARK_PARTS[-1][-1]) / 2
 """Level at which flat parts of the dark are taken to tell the noise: the middle of all that count. Most are from 0.015
 to 0.04, but some texture is left in them: with 0.0275, the middle of these, noise in the dark comes out 1.1 to 1.9
 times as large, and log-MSE of one scene is 1.38 times what it is so, of others 0.99 to 1.01 times."""
@@ -206,9 +206,15 @@ def estimate_frame_noise(
     whole = levels >= _CUT * found.read  # where black cuts nothing off
     if 2 <= np.count_nonzero(whole) < len(whole):
         found = photon_transfer(*(values[whole] for values in points_of), motion=moves)
-    if moves and (found.read <= camera.usual_frame_noise or _contradicted(found.read, recording, camera)):
+    if moves and found.read <= camera.usual_frame_noise:
         return None
-    found = _checked(found, recording, camera, response)
+    flat, smooth = _noise_of_parts(recording, camera)
+    if moves and flat is not None and found.read > _CONTRADICTED * flat:  # what moves, and not noise
+        return None
+    if _are_alike(found.levels):
+        found = _with_growth(found, flat, smooth, camera)
+    if smooth is not None:
+        found = _bounded(found, smooth, float(_rounding(np.array([smooth.level]), frame, response)[0]))
     read = max(found.read, rounding, _LEAST_READ)
     return found._replace(read=read, shot=found.shot if found.shot > _LEAST_READ**2 else 0.0)
 
@@ -221,25 +227,20 @@ def _rounding(levels: Array, frame: Frame, response: Response) -> Array:
     return np.asarray(half / 3**0.5, np.float64)
 
 
-def _checked(
-    found: FrameNoise, recording: Recording, camera: CameraSettings, response: Response
-) -> FrameNoise:
-    """The noise of still pixels, by what flat and smooth parts say of it.
-
-    These tell how it grows with the light where the levels of still pixels do not (`_with_growth`), and that it is less
-    where what seems still changes all the same, as fine texture that moves below the threshold does.
-    """
+def _noise_of_parts(recording: Recording, camera: CameraSettings) -> tuple[float | None, SmoothNoise | None]:
+    """That of flat parts of the dark, and that of parts that change smoothly where it is noise; None: nothing tells."""
     changes = (_beyond_neighbours(i.first, i.second) for i in _comparable(recording, camera, _MIN_FRAMES))
     seen = [(flat_noise(change), smooth_noise(change)) for change in changes]
     flat = typical_flat_noise([one for one, _ in seen])
     smooth = typical_smooth_noise([one for _, one in seen])
-    if smooth is not None and not smooth.is_noise:
-        smooth = None
-    if _are_alike(found.levels):
-        found = _with_growth(found, flat, smooth, camera)
-    if smooth is None:
-        return found
-    rounding = float(_rounding(np.array([smooth.level]), next(iter(recording.frames())), response)[0])
+    return flat, smooth if smooth is not None and smooth.is_noise else None
+
+
+def _bounded(found: FrameNoise, smooth: SmoothNoise, rounding: float) -> FrameNoise:
+    """The noise scaled to that of ``smooth`` parts, or to ``rounding`` at their level, if it is far more.
+
+    What seems still changes all the same then, as fine texture does that moves below the threshold.
+    """
     beyond = found.at(smooth.level) / max(smooth.deviation, rounding, _LEAST_READ)
     if beyond <= _BEYOND_SMOOTH:
         return found
@@ -262,13 +263,6 @@ def _with_growth(
         if smooth is not None and smooth.level > _BRIGHTER_PARTS * level:
             shot = min(shot, max(smooth.deviation**2 - variance, 0.0) / (smooth.level - level))
     return found._replace(read=float(np.sqrt(max(variance - shot * level, 0.0))), shot=shot)
-
-
-def _contradicted(read: float, recording: Recording, camera: CameraSettings) -> bool:
-    """Whether flat parts of the dark have so much less noise that ``read`` is what moves."""
-    changes = (_beyond_neighbours(i.first, i.second) for i in _comparable(recording, camera, _MIN_FRAMES))
-    flat = typical_flat_noise([flat_noise(change) for change in changes])
-    return flat is not None and read > _CONTRADICTED * flat
 
 
 class UsualNoise(NamedTuple):

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from kalux.calibration.delay import DelayEstimate, in_thresholds, vertex
 from kalux.calibration.intervals import APART, APART_IN_TIME
-from kalux.calibration.refractory import LATE, intervals, possible_periods
+from kalux.calibration.refractory import LATE, Period, intervals, possible_periods
 from kalux.calibration.regression import Fit, halves, products, standard_errors, two_stage
 from kalux.calibration.steps import MAX_SAMPLES, Steps, steps
 from kalux.recording import Recording
@@ -225,7 +225,7 @@ def estimate_thresholds(
     if usual.spread == 0:
         sampling = sampling._replace(thresholds=(usual.on, usual.off))
     else:  # what the light does within exposures needs thresholds
-        rough = _combined(sampling.samples(period, most=ROUGH_SAMPLES), usual, _Period(period), sampling, 0.0)
+        rough = _combined(sampling.samples(period, most=ROUGH_SAMPLES), usual, Period(period), sampling, 0.0)
         sampling = sampling if rough is None else sampling._replace(thresholds=(rough.on, rough.off))
     sampling = sampling.without_trailing(delay, period)
     return _estimate(sampling, usual, refractory_period, most, delay)
@@ -283,7 +283,7 @@ def refine_thresholds(
     )
     if refractory_period is not None or rough.refractory_period == 0:
         return _estimate(sampling, usual, refractory_period, MAX_SAMPLES, None) or rough
-    period = _period_without_excess(sampling) or _Period(rough.refractory_period, rough.refractory_spread)
+    period = _period_without_excess(sampling) or Period(rough.refractory_period, rough.refractory_spread)
     samples = sampling.samples(period.length, most=MAX_SAMPLES)
     return _combined(samples, usual, period, sampling, rough.doubt) or rough
 
@@ -296,13 +296,13 @@ def _estimate(
     ``delay`` is the apparent one, us: what is lost in the refractory period makes events seem late, too, so that the
     delay is found again with the period. None: that of the sampling is right.
     """
-    given = _Period(refractory_period or 0)
+    given = Period(refractory_period or 0)
     samples = sampling.samples(given.length, most=most)
     if len(samples.steps.change) < _MIN_SAMPLES:
         return None
     if not 0 < sampling.shortest <= _LARGEST_SHORTEST:
         return _combined(samples, usual, given, sampling, 0.0)
-    excess = _measured_excess(samples)
+    excess = _measured_excess(samples, _fit_late_and_soon(samples, 0))
     # Thresholds may be too large by this even where the excess is too uncertain to be corrected.
     doubt = _THRESHOLD_OF_EXCESS * max(excess.value - _USUAL_EXCESS, 0.0)
     estimate = _combined(samples, usual, given, sampling, doubt)
@@ -427,13 +427,6 @@ class _Samples(NamedTuple):
         return halves(self.steps.change_around)
 
 
-class _Period(NamedTuple):
-    """A refractory period, us, and its relative standard deviation."""
-
-    length: int
-    spread: float = 0.0
-
-
 class _LogThresholds(NamedTuple):
     """Logs of the thresholds on and off, and their variances, (2,) each; inf where nothing is known."""
 
@@ -442,7 +435,7 @@ class _LogThresholds(NamedTuple):
 
 
 def _combined(
-    samples: _Samples, usual: Usual, period: _Period, sampling: _Sampling, doubt: float
+    samples: _Samples, usual: Usual, period: Period, sampling: _Sampling, doubt: float
 ) -> ThresholdEstimate | None:
     """Thresholds from either kind of instruments and the usual ones, combined by Bayes' rule (`_posterior`).
 
@@ -559,14 +552,10 @@ class _Excess(NamedTuple):
     error: float
 
 
-def _measured_excess(samples: _Samples) -> _Excess:
-    """The excess under the first refractory period."""
-    found = _fit_late_and_soon(samples, 0)
-    return _Excess(0.0, np.inf) if found is None else _excess(samples, found)
-
-
-def _excess(samples: _Samples, found: _LateAndSoon) -> _Excess:
-    """That of a regression, with its standard error."""
+def _measured_excess(samples: _Samples, found: _LateAndSoon | None) -> _Excess:
+    """The excess of a regression on the samples, with its standard error."""
+    if found is None:
+        return _Excess(0.0, np.inf)
     known, fit = samples.steps, found.fit
     late, soon = standard_errors(
         known.change, found.explained, found.instruments, fit.weights, known.pixel, samples.sensor_size
@@ -598,24 +587,26 @@ def _fit_late_and_soon(samples: _Samples, index: int, *, by_changes: bool = Fals
     return None if again is None or not again.solution[0] > 0 else _LateAndSoon(explained, instruments, again)
 
 
-def _period_without_excess(sampling: _Sampling) -> _Period | None:
+def _period_without_excess(sampling: _Sampling) -> Period | None:
     """The refractory period under which events that follow soon have the steps of late ones; None if unknown, or 0."""
     periods = possible_periods(sampling.shortest)
     samples = sampling.samples(*periods, most=_PERIOD_SAMPLES)
     fits = [_fit_late_and_soon(samples, index, by_changes=True) for index in range(len(periods))]
-    found = [_excess(samples, fit) for fit in fits if fit is not None]
-    values = np.array([excess.value for excess in found])
-    if len(found) < len(periods) or not np.isfinite(values).all():
+    known = [fit for fit in fits if fit is not None]
+    excess = np.array([fit.excess for fit in known])
+    if len(known) < len(periods) or not np.isfinite(excess).all():
         return None
     # A longer period explains more of the excess; what does not decrease is noise.
-    falling = np.minimum.accumulate(values)
+    falling = np.minimum.accumulate(excess)
     even = float(np.interp(0.0, -falling, periods))
     length = round(_HIDDEN * even)
     if length == 0:
         return None
     after = int(np.clip(np.searchsorted(periods, even), 1, len(periods) - 1))
-    slope = (falling[after - 1] - falling[after]) / (periods[after] - periods[after - 1])
-    error = float(np.interp(even, periods, [excess.error for excess in found]))
-    known = slope > 0 and np.isfinite(error)
-    spread = _PERIOD_ERRORS * error / (slope * even) if known else _LARGEST_SPREAD
-    return _Period(length, float(min(spread, _LARGEST_SPREAD)))
+    around = slice(after - 1, after + 1)
+    slope = -np.diff(falling[around]).item() / np.diff(periods[around]).item()
+    errors = [_measured_excess(samples, fit).error for fit in known[around]]
+    error = float(np.interp(even, periods[around], errors))
+    told = slope > 0 and np.isfinite(error)
+    spread = _PERIOD_ERRORS * error / (slope * even) if told else _LARGEST_SPREAD
+    return Period(length, min(spread, _LARGEST_SPREAD))

@@ -33,7 +33,7 @@ from kalux.calibration.black_level import with_known_black
 from kalux.calibration.delay import estimate_delay
 from kalux.calibration.global_thresholds import Usual, estimate_thresholds
 from kalux.calibration.intervals import SOON_FOR_THRESHOLDS, Interval, intervals
-from kalux.calibration.refractory import dead_time, shortest_interval
+from kalux.calibration.refractory import Period, dead_time, shortest_interval
 from kalux.calibration.region import event_region
 from kalux.calibration.regression import (
     HUBER,
@@ -201,7 +201,8 @@ def calibrate_contrast(
     first = estimate_thresholds(recording, camera, Usual.of(EventSettings()), delay=delay or 0)
     if first is None or first.usual_share > _MOST_USUAL:
         return None
-    period = _Period(refractory) if refractory is not None else _lost_period(recording, camera, delay)
+    given = None if refractory is None else (Period(refractory), 0.0)
+    period, doubt = given or _lost_period(recording, camera, delay)
     sampling = _Sampling((first.on, first.off), shortest_interval(recording), period, event_region(recording))
     if delay is None:
         delay = _delay_of_trailing(recording, camera, sampling)
@@ -214,33 +215,25 @@ def calibrate_contrast(
         sampling = sampling._replace(thresholds=(fit.on, fit.off))
     assert fit is not None
     assert data is not None
-    return _per_pixel(recording, camera, sampling, fit, data[0], delay).doubted(period.doubt)
+    return _per_pixel(recording, camera, sampling, fit, data[0], delay).doubted(doubt)
 
 
-class _Period(NamedTuple):
-    """A refractory period, us, its relative standard deviation, and the relative error of thresholds by that."""
-
-    length: int
-    spread: float = 0.0
-    doubt: float = 0.0
-
-
-def _lost_period(recording: Recording, camera: CameraSettings, delay: int | None) -> _Period:
-    """The refractory period of a recording.
+def _lost_period(recording: Recording, camera: CameraSettings, delay: int | None) -> tuple[Period, float]:
+    """The refractory period, and the relative error of thresholds that comes from its own.
 
     Noise shows it where there is enough of it: a part of a sensor, or of the time, may have too little.
     """
     shown = dead_time(recording)
     if shown:
-        return _Period(shown)
+        return Period(shown), 0.0
     if delay is None:
         apparent = estimate_delay(recording, camera)
         delay = 0 if apparent is None else apparent.apparent
     usual = Usual.of(EventSettings())
     found = estimate_thresholds(recording, camera, usual, delay=delay, refractory_period=None)
     if found is None:
-        return _Period(0)
-    return _Period(found.refractory_period, found.refractory_spread, found.doubt)
+        return Period(0), 0.0
+    return Period(found.refractory_period, found.refractory_spread), found.doubt
 
 
 # --- samples --------------------------------------------------------------------------------------------------
@@ -254,7 +247,7 @@ class _Sampling(NamedTuple):
 
     thresholds: tuple[float, float]
     shortest: int
-    refractory: _Period
+    refractory: Period
     inside: NDArray[np.bool_]
 
 

@@ -60,6 +60,13 @@ _LEAST_TURNING: Final = 0.2
 to 0.57 on thirteen simulated scenes, and 0 where edges of one speed and contrast make equal intervals."""
 
 
+class Period(NamedTuple):
+    """A refractory period, us, and its relative standard deviation: 0 where it is known."""
+
+    length: int
+    spread: float = 0.0
+
+
 class Intervals(NamedTuple):
     """Times between two events of a pixel.
 
