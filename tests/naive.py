@@ -470,6 +470,18 @@ def bridged(pixel, settings, times, on, off, scales):
     last = (pixel.middles[-1], None, first, None, scale_on, scale_off, var_on, var_off, 0.0, SURE)
     intervals.append(last)
 
+    def period_error(k):  # K10: what that of the refractory period adds to the level in an interval
+        a, b, *_, signal = intervals[k]
+        error = 0.0
+        for t, p, *_, w in pixel.events:
+            if a < t <= b:
+                step = on * signal[0] if p else -off * signal[1]
+                error += ev.refractory_doubt * step * growth_with_period(w)
+        return error
+
+    # K10: what every on and off event of an interval adds to the variance besides
+    untied = [(0.0, 0.0)] * len(intervals)
+
     def drift():  # K10: what the thresholds add to the variance at the end of every interval
         far_on = far_off = far = 0
         yield 0.0
@@ -481,6 +493,12 @@ def bridged(pixel, settings, times, on, off, scales):
                 far_off = min(far_off, above / off / np.sqrt(v_off))
                 far = np.clip(far, -above, above)
             if right[1] < UNMEASURED:
+                if left[1] >= UNMEASURED and sum(counts(a, b)) > 0:
+                    (f_on, f_off), now = signal, period_error(k)
+                    more = ((far + now) ** 2 - far**2) / sum(counts(a, b))
+                    of_on = f_on * v_on * on**2 * (2 * far_on + n_on)
+                    of_off = f_off * v_off * off**2 * (2 * far_off + n_off)
+                    untied[k] = max(of_on + more, 0.0), max(of_off + more, 0.0)
                 far_on = far_off = far = 0
                 unseen = pixel.forgotten[k - 1] if pixel.forgotten else 0.0
                 yield right[1] / 12 if crushed(k) else unseen  # K7
@@ -488,10 +506,7 @@ def bridged(pixel, settings, times, on, off, scales):
             unseen = ev.quantisation_variance * c2 / 2 if left[1] < UNMEASURED else 0.0
             before = v_on * (on * far_on) ** 2 + v_off * (off * far_off) ** 2 + far**2
             far_on, far_off = far_on + n_on, far_off + n_off
-            for t, p, *_, w in pixel.events:
-                if a < t <= b:
-                    step = on * signal[0] if p else -off * signal[1]
-                    far += ev.refractory_doubt * step * growth_with_period(w)
+            far += period_error(k)
             after = v_on * (on * far_on) ** 2 + v_off * (off * far_off) ** 2 + far**2
             yield max(after - before + unseen, 0.0)
 
@@ -587,7 +602,7 @@ def bridged(pixel, settings, times, on, off, scales):
                 noise = ev.step_noise + signal * (1 - signal)
             # Several events may share a time: this one alone moves L^A by its own step.
             step = weight * own_step(intervals[index], polarity, on, off, ev, c2, counts)
-            q = weight * c2 * noise
+            q = weight * (c2 * noise + untied[index][0 if polarity else 1])
             state = (value + signal * step, variance + q)
             at = t
 

@@ -178,6 +178,22 @@ class BridgeNoise(NamedTuple):
     saturated_variance: float = UNMEASURED
 
 
+class UntiedSteps(NamedTuple):
+    """What errors of the thresholds add to the variance of each event's step, where only the next frame ties it (K10).
+
+    Attributes
+    ----------
+    pixels
+        (N,) int64 places in the flattened image, ascending.
+    on, off
+        (N,) float32, log intensity^2: of an on and of an off event.
+    """
+
+    pixels: NDArray[np.int64]
+    on: NDArray[np.float32]
+    off: NDArray[np.float32]
+
+
 class BridgedSegment(NamedTuple):
     """L^A and its uncertainty from one moment to the next; arrays are (H, W) in the type of the frames.
 
@@ -234,6 +250,8 @@ class BridgedSegment(NamedTuple):
     wrong
         Variance of the way that events lead back from the second frame, by errors of the thresholds, per squared number
         of these events, of pixels that the first frame does not measure; 0 of others (`wrong_way_back`, K4). None: 0.
+    untied
+        What P grows by with each event of these pixels besides (`untied_steps`, K10). None: nothing.
     """
 
     start: int
@@ -262,6 +280,7 @@ class BridgedSegment(NamedTuple):
     doubt: tuple[Array, Array] | None = None
     signal: tuple[Array, Array] | None = None
     wrong: Array | None = None
+    untied: UntiedSteps | None = None
 
 
 def wrong_way_back(
@@ -292,7 +311,7 @@ def wrong_way_back(
     -------
     (H, W), 0 of pixels that the first frame measures and of those that the second does not; None: 0 of all.
     """
-    pixels = np.flatnonzero((first.variance >= UNMEASURED) & (second.variance < UNMEASURED) & (events > 0))
+    pixels = _become_measured(first, second, events)
     if len(pixels) == 0:
         return None
     on, off, all_events, on_variance, off_variance = (
@@ -303,6 +322,67 @@ def wrong_way_back(
     of_both = on_variance * of_on**2 + off_variance * of_off**2
     found.reshape(-1)[pixels] = WRONG_STEPS * of_both / all_events**2
     return found
+
+
+def _become_measured(first: Latent, second: Latent, events: Array) -> NDArray[np.int64]:
+    """Pixels with ``events`` that the second frame measures and the first does not: places in the flattened image."""
+    return np.flatnonzero((first.variance >= UNMEASURED) & (second.variance < UNMEASURED) & (events > 0))
+
+
+def untied_steps(
+    first: Latent,
+    second: Latent,
+    thresholds: Thresholds,
+    noise: BridgeNoise,
+    far: tuple[Array, Array, Array | None],
+    counts: tuple[Array, Array],
+    signal: tuple[Array, Array] | None,
+    by_period: Array | None,
+) -> UntiedSteps | None:
+    """What P grows by with each event of pixels that the second frame measures and the first does not (K10).
+
+    Their events move L as they do where no frame measures (`drift`), until the second frame has told the level.
+
+    Parameters
+    ----------
+    first, second
+        The frames before and after.
+    thresholds, noise
+        As in `bridge`.
+    far
+        (H, W) on and off events since a frame last measured the pixel, up to ``first``, and what the standard error of
+        the refractory period adds to its level by these, log intensity; None: the period is known.
+    counts
+        (H, W) on and off events between the frames.
+    signal
+        (H, W) shares of these that are signal (K5); None: all.
+    by_period
+        (H, W) what the period's error adds by the events between the frames, as far as they are signal.
+
+    Returns
+    -------
+    None where there is no such pixel.
+    """
+    pixels = _become_measured(first, second, counts[0] + counts[1])
+    if len(pixels) == 0:
+        return None
+
+    def of(*planes: Array) -> list[Array]:
+        return [plane.reshape(-1)[pixels] for plane in planes]
+
+    numbers, before = of(*counts), of(*far[:2])
+    shares = (np.ones(1, np.float32),) * 2 if signal is None else of(*signal)
+    variances = of(thresholds.on_variance, thresholds.off_variance)
+    on, off = (
+        share * variance * np.float32(step**2) * (2 * since + share * now)
+        for step, share, variance, since, now in zip(
+            (noise.threshold_on, noise.threshold_off), shares, variances, before, numbers, strict=True
+        )
+    )
+    if far[2] is not None and by_period is not None:
+        grown = _growth(*of(far[2], by_period)) / (numbers[0] + numbers[1])
+        on, off = (np.maximum(each + grown, np.float32(0.0)) for each in (on, off))
+    return UntiedSteps(pixels, on.astype(np.float32), off.astype(np.float32))
 
 
 def drift(
@@ -399,7 +479,12 @@ def period_drift(second: Latent, far: Array, now: Array) -> tuple[Array, Array]:
     """
     unmeasured = second.variance >= UNMEASURED
     then = np.where(unmeasured, far + now, np.float32(0.0))
-    return np.where(unmeasured, then**2 - far**2, np.float32(0.0)), then
+    return np.where(unmeasured, _growth(far, now), np.float32(0.0)), then
+
+
+def _growth(far: Array, now: Array) -> Array:
+    """By how much the square of an error grows that was ``far`` and becomes more by ``now``."""
+    return np.asarray((far + now) ** 2 - far**2)
 
 
 def raise_to_bound(log_intensity: Array, frame: Latent) -> None:

@@ -171,6 +171,10 @@ def begin(segment: BridgedSegment, state: State) -> Cursor:
     given = segment.augmented, trail.start, of_steps, wrong
     before = state.log_intensity, floor, state.variance
     _begin_bridged(given, scalars, before, pixels.reshape(-1), steps.reshape(-1))
+    if segment.untied is not None:  # K10
+        places = _places(segment.untied.pixels, clock.shape)
+        for doubt, more in (("doubt_on", segment.untied.on), ("doubt_off", segment.untied.off)):
+            steps.reshape(-1)[doubt][places] += more
     signed[1:-1, 1:-1] = trail.signed
     return Cursor(pixels, steps, clock, signed, segment.start)
 
@@ -250,12 +254,17 @@ def _add_drift(
     """Add as much of ``drift`` to P as ``events`` have come, of pixels that no frame measures at the end. In place."""
     if cursor.drifting is None:
         pixels = np.flatnonzero((segment.backward_variance >= UNMEASURED) & (events > 0))
-        row, column = np.divmod(pixels, events.shape[1])
-        steps = (row + 1) * cursor.steps.shape[1] + column + 1
+        steps = _places(pixels, cursor.steps.shape)
         cursor.drifting = _Drifting(pixels, steps, drift.reshape(-1)[pixels], events.reshape(-1)[pixels])
     pixels, steps, growth, count = cursor.drifting
     coming = cursor.steps.reshape(-1)["coming"][steps] / count
     variance.reshape(-1)[pixels] += growth * (np.float32(1.0) - coming)
+
+
+def _places(pixels: NDArray[np.int64], padded: tuple[int, ...]) -> NDArray[np.int64]:
+    """Where pixels of the flattened image lie in a flattened plane with a border, of the shape ``padded``."""
+    row, column = np.divmod(pixels, padded[1] - 2)
+    return (row + 1) * padded[1] + column + 1
 
 
 def moving_pixels(segment: BridgedSegment, cursor: Cursor) -> NDArray[np.bool_]:

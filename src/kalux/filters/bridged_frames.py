@@ -365,7 +365,14 @@ class BridgedFrames(Method):
         share = half_way(usual.told, self._threshold2)
         steps = (on, off) if signal is None else (on * signal[0], off * signal[1])
         by_period = self._by_period(events, start, end, signal)
-        joined, since_measured = self._with_drift(joined, memory, second, (on, off), change, steps, by_period)
+        # Where the second frame measures a pixel L^A is led back from it, also at the first frame, which bounds it.
+        far = self._since_measured(memory, joined._replace(augmented=memory.latent.value))
+        untied = bridge.untied_steps(
+            memory.latent, second, memory.thresholds, self.noise, far, (on, off), signal, by_period
+        )
+        joined, since_measured = self._with_drift(
+            joined._replace(untied=untied), memory, second, (on, off), change, steps, far, by_period
+        )
         change = self._with_black_change(usual.mixed(change, share), memory.latent, second)
         assert joined.net is not None
         unshown = self._follow_unshown(memory, second, following, joined.net, steps)
@@ -444,7 +451,10 @@ class BridgedFrames(Method):
         )
         counts, change = (on + tail_on, off + tail_off), memory.silent_change
         by_period = self._by_period(events, start, following.end, None)
-        forward, since_measured = self._with_drift(forward, memory, second, counts, change, counts, by_period)
+        far = self._since_measured(memory, forward)
+        forward, since_measured = self._with_drift(
+            forward, memory, second, counts, change, counts, far, by_period
+        )
         trail = self._trail(memory.followed, start, scale)
         forward = forward._replace(trail=trail, unshown=memory.unshown, silent_change=change)
         return forward, after._replace(since_measured=since_measured)
@@ -516,27 +526,28 @@ class BridgedFrames(Method):
         counts: tuple[Floats, Floats],
         change: Floats,
         steps: Counts,
+        far: SinceMeasured,
         by_period: Floats | None,
     ) -> tuple[BridgedSegment, SinceMeasured]:
         """The segment with the drift of its pixels (K10), and the events since they were last measured, at its end.
 
-        ``counts`` are its on and off events, ``steps`` those as far as they are signal, ``by_period`` is what the
-        error of the refractory period adds to these, ``change`` the mean square change of silent pixels around each
-        (K11).
+        ``counts`` are its on and off events, ``steps`` those as far as they are signal, ``far`` those since a frame
+        last measured each pixel, ``by_period`` is what the error of the refractory period adds to ``steps``, ``change``
+        the mean square change of silent pixels around each (K11).
         """
-        far_on, far_off, far = self._since_measured(memory, segment)
         grown, far_on, far_off = bridge.drift(
-            memory.latent, second, memory.thresholds, self.noise, (far_on, far_off), steps
+            memory.latent, second, memory.thresholds, self.noise, (far.on, far.off), steps
         )
-        if far is not None and by_period is not None:
-            more, far = bridge.period_drift(second, far, by_period)
+        far_period = far.by_period
+        if far_period is not None and by_period is not None:
+            more, far_period = bridge.period_drift(second, far_period, by_period)
             np.maximum(grown + more, np.float32(0.0), out=grown)
         add_missed_change(grown, segment, second, counts, change, self.noise.quantisation_variance)
         if second.ceiling is not None:
             black = np.isfinite(second.ceiling)
             grown[black] = second.variance[black] / (_BLACK_FRAMES * (_BLACK_FRAMES + 1))
         segment = segment._replace(drift=grown, still_since=_still_since(memory, segment.start))
-        return segment, SinceMeasured(far_on, far_off, far)
+        return segment, SinceMeasured(far_on, far_off, far_period)
 
     def _by_period(
         self, events: Chunks, start: int, end: int, signal: tuple[Floats, Floats] | None
