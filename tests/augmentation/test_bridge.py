@@ -19,6 +19,7 @@ from kalux.augmentation.bridge import (
     nominal_thresholds,
     period_drift,
     raise_to_bound,
+    untied_steps,
     wrong_way_back,
 )
 
@@ -206,6 +207,38 @@ def test_wrong_thresholds_count_on_the_way_back_that_no_frame_ties():
     of_both = 0.1 * 0.1**2 * ((0.3 * 1.5) ** 2 + 0.2**2) / 4**2
     np.testing.assert_allclose(found, [[of_both, 0, 0, 0, 0.1 * 0.1**2 * 0.2**2]], rtol=1e-12)
     assert wrong_way_back(second, second, thresholds, NOISE, (on, off), on + off) is None
+
+
+def test_every_event_adds_its_share_of_what_wrong_thresholds_add_until_a_frame_measures_the_pixel():
+    """v c^2 ((N + n)^2 - N^2) over the n events that come, as far as they are signal; the same of the period."""
+    first = latent([0.0, 0.0, 0.0, 0.0, 0.0], [UNMEASURED, UNMEASURED, 0.01, UNMEASURED, MASKED])
+    second = latent(np.ones(5), [0.02, UNMEASURED, 0.02, 0.02, 0.02])
+    on, off = counts(4, 3, 3, 0, 0), counts(1, 1, 1, 0, 2)
+    far_on, far_off = counts(3, 3, 0, 3, 0), counts(2, 2, 0, 2, 0)
+    thresholds = nominal_thresholds((1, 5), 0.1)
+
+    def untied(by_period=(None, None), signal=None):
+        far = far_on, far_off, by_period[0]
+        return untied_steps(first, second, thresholds, NOISE, far, (on, off), signal, by_period[1])
+
+    found = untied()
+    np.testing.assert_array_equal(found.pixels, [0, 4])
+    per_on, per_off = (0.1 * 0.3) ** 2, (0.1 * 0.2) ** 2
+    assert found.on[0] * 4 == pytest.approx(per_on * (7**2 - 3**2))
+    assert found.off[0] * 1 == pytest.approx(per_off * (3**2 - 2**2))
+    assert found.off[1] * 2 == pytest.approx(per_off * 2**2)
+    half = untied(signal=(np.full((1, 5), 0.5), np.ones((1, 5))))
+    assert half.on[0] * 4 == pytest.approx(per_on * (5**2 - 3**2))
+    np.testing.assert_array_equal(half.off, found.off)
+    doubted = untied(by_period=(np.full((1, 5), 0.1), np.full((1, 5), 0.2)))
+    np.testing.assert_allclose(doubted.on[0] - found.on[0], (0.3**2 - 0.1**2) / 5, rtol=1e-5)
+    np.testing.assert_allclose(doubted.off[1] - found.off[1], (0.3**2 - 0.1**2) / 2, rtol=1e-5)
+    back = untied(by_period=(np.full((1, 5), 0.5), np.full((1, 5), -0.5)))
+    assert back.on[0] == 0, "what it takes off leaves at least nothing"
+    assert (
+        untied_steps(second, second, thresholds, NOISE, (far_on, far_off, None), (on, off), None, None)
+        is None
+    )
 
 
 def test_what_a_wrong_refractory_period_adds_on_the_way_up_it_takes_off_on_the_way_down():

@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kalux import memory
-from kalux.augmentation.bridge import UNMEASURED, BridgedSegment, Latent
+from kalux.augmentation.bridge import UNMEASURED, BridgedSegment, Latent, UntiedSteps
+from kalux.augmentation.refractory import EventClock
 from kalux.events import make_events
 from kalux.filters import akf_bridged
 from kalux.filters.akf import State
@@ -134,6 +135,21 @@ def test_steps_that_are_all_wrong_alike_count_until_they_have_come():
         left = 3 - come
         expected = 1e-4 / (frame + q * left + wrong * left**2)
         assert 1 / after - 1 / before == pytest.approx(expected, rel=1e-2)
+
+
+def test_events_add_what_wrong_thresholds_add_to_those_pixels_that_they_are_wrong_for():
+    """K10: of the second of two pixels, an on event 0.05 and an off event 0.03, times their weights."""
+    segment = drifting_segment(10**6, shape=(1, 2))
+    untied = UntiedSteps(np.array([1]), np.array([0.05], np.float32), np.array([0.03], np.float32))
+    events = make_events(np.array([100, 200, 300]), np.ones(3, int), np.zeros(3, int), np.array([1, 0, 0]))
+    weighed = EventClock((1, 2), 0).weighed(events)
+    variances = []
+    for of_steps in (None, untied):
+        state = State(np.zeros((1, 2)), np.full((1, 2), 0.1), make_clock((1, 2), 0))
+        cursor = akf_bridged.begin(segment._replace(untied=of_steps), state)
+        akf_bridged.advance(segment, cursor, weighed, akf_bridged.Noise(3.0, 0.2, 0.04))
+        variances.append(akf_bridged.read(segment, cursor, 400)[1])
+    np.testing.assert_allclose(variances[1] - variances[0], [[0, 0.05 + 2 * 0.03]], rtol=1e-3, atol=1e-6)
 
 
 DAYS = 3 * 24 * 3600 * 10**6
