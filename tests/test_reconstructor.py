@@ -1093,8 +1093,8 @@ def test_events_alone_lead_back_into_a_highlight_as_far_as_thresholds_are_known(
 def test_events_out_of_a_highlight_are_doubted_as_they_come_where_the_next_frame_measures_the_pixel():
     """Ten events down, then twenty-eight up, though the next frame shows less than the one before, which clips.
 
-    Wrong thresholds explain that. The more they may be off, the less P trusts these events, and the sooner L is where the
-    frame to come has it (K10)."""
+    Wrong thresholds explain that. The more they may be off, the less P trusts these events, and the sooner L is where
+    the frame to come has it (K10)."""
     levels, variances = {}, {}
     for spread in (0.01, 0.3):
         known = {"threshold_on": 0.2, "threshold_off": 0.2, "threshold_spread": spread}
