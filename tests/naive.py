@@ -31,7 +31,8 @@ class Pixel:
     (K13).
 
     Changes, of frame intervals, K11: whether both frames measure it, whether it is silent, how much its L changed,
-    squared, without what noise makes of that, and the variances of both frames. Forgotten: what comes to P after each.
+    squared, as far as frames tell (told), without what noise makes of that, and the variances of both frames; and how
+    likely it has an event that is signal (active). Forgotten: what comes to P after each.
     Signal: probability that its on and its off events of every frame interval are no noise (K5); none: by their age.
     """
 
@@ -51,6 +52,8 @@ class Pixel:
     left: bool = False
     gone: bool = False
     changes: list[tuple[bool, bool, float, tuple[float, float], float]] = field(default_factory=list)
+    told: list[float] = field(default_factory=list)
+    active: list[float] = field(default_factory=list)
     forgotten: list[float] = field(default_factory=list)
     measured: list[bool] = field(default_factory=list)
     signal: list[tuple[float, float]] = field(default_factory=list)
@@ -357,6 +360,8 @@ def bridged(pixel, settings, times, on, off, scales):
     var_on = var_off = ev.mismatch**2
     learned = []
     pixel.changes.clear()
+    pixel.active.clear()
+    pixel.told.clear()
     pixel.measured.clear()
 
     hidden_by_black = hides(c)
@@ -430,10 +435,12 @@ def bridged(pixel, settings, times, on, off, scales):
         )
         q0, noise = ev.quantisation_variance * c2, first[1] + second[1]
         told = (q0 / (noise + q0)) ** 2
-        squared = min((q0 * mismatch / total) ** 2, c2) - noise * told + (1 - told) * 0.1 * c2
+        squared = min((q0 * mismatch / total) ** 2, c2) - noise * told
         pixel.changes.append(
             (noise < UNMEASURED, n_on + n_off == 0, squared, (first[1], second[1]), mismatch)
         )
+        pixel.active.append(min(told_on + told_off, 1.0))
+        pixel.told.append(told)
         gain_on, gain_off = var_on * on * told_on / total, -var_off * off * told_off / total  # K2
         hidden = 2.4 * q0
         excess = mismatch + (change * hidden / (change**2 + hidden) if change else 0.0)
@@ -731,14 +738,25 @@ def kept_white(value, pixel, t, white, offset):
 def silent_change(pixels, place, interval, c2):
     """K11: the mean square change of the silent pixels around from one frame to the next."""
     row, column = place
-    if not pixels[place].changes[interval][0]:
-        return 0.4 * c2
+
+    whole = sum(q.active[interval] for q in pixels.values()) / len(pixels)
+
+    def usual(place):  # by the share of the pixels around that have events
+        near = [
+            q.active[interval]
+            for p, q in pixels.items()
+            if max(abs(p[0] - place[0]), abs(p[1] - place[1])) <= 4
+        ]
+        return c2 * (0.62 * sum(near) / len(near) + 0.03 * min(max(whole / 0.25, 0.1), 1))
+
     near = [
-        q.changes[interval][2]
+        q.changes[interval][2] + (1 - q.told[interval]) * usual((i, j))
         for (i, j), q in pixels.items()
         if abs(i - row) <= 2 and abs(j - column) <= 2 and all(q.changes[interval][:2])
     ]
-    return max(sum(near) / len(near), 0.0) if near else 0.1 * c2
+    if not pixels[place].changes[interval][0] or not near:
+        return usual(place)
+    return max(sum(near) / len(near), 0.0)
 
 
 def forgotten(pixels, place, c2, q0):

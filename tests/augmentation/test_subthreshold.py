@@ -9,7 +9,6 @@ import pytest
 
 from kalux.augmentation.bridge import UNMEASURED, BridgeNoise, Latent, bridge, nominal_thresholds
 from kalux.augmentation.subthreshold import (
-    UNKNOWN_CHANGE,
     Correlation,
     add_missed_change,
     correlation,
@@ -48,7 +47,14 @@ def joined(change, *, on=None, variance=1e-4, clipped=None):
 
 def changes(change, **frames):
     """`silent_change` of the same."""
-    return silent_change(joined(change, **frames), NOISE.quantisation_variance, C2)
+    segment = joined(change, **frames)
+    active = np.minimum(segment.events, 1)
+    return silent_change(segment, active, NOISE.quantisation_variance, C2)
+
+
+def scattered(share):
+    """(40, 60) events: a ``share`` of the pixels has one."""
+    return (np.random.default_rng(0).random(SHAPE) < share).astype(np.float32)
 
 
 def off_the_mean(*levels, variance=1e-8, on=None):
@@ -79,22 +85,35 @@ def test_a_change_that_all_pixels_share():
 
 
 def test_noise_is_no_change():
+    """What it hides of one is as usual where nothing moves."""
     rng = np.random.default_rng(0)
     sigma = 0.02
     noise = sigma * np.sqrt(2) * rng.standard_normal(SHAPE)
     assert changes(noise, variance=sigma**2).mean() < 0.2 * 2 * sigma**2
+    told = (1 + 2 * sigma**2 / NOISE.quantisation_variance) ** -2
     moved = changes(noise + 0.08, variance=sigma**2)
-    assert moved.mean() == pytest.approx(0.08**2, rel=0.05)
+    assert moved.mean() == pytest.approx(told * 0.08**2 + (1 - told) * 0.003 * C2, rel=0.05)
 
 
-def test_pixels_too_noisy_to_tell_are_told_of_the_whole_image():
-    change = np.full(SHAPE, 0.08)
-    noisy = np.full(SHAPE, 1e-8)
-    noisy[:, 40:] = 1.0
-    found = changes(change, variance=noisy)
-    np.testing.assert_allclose(found, 0.08**2, rtol=0.05)
-    alone = changes(0.0, variance=1.0)  # and where nothing tells, as usual
-    np.testing.assert_allclose(alone, UNKNOWN_CHANGE * C2, rtol=0.01)
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.2, 0.5, 0.8])
+def test_the_more_pixels_have_events_the_more_the_others_change_that_noise_hides(share):
+    """Next to nothing where nothing moves, and the more the more pixels around have events where the image moves."""
+    found = changes(0.0, on=scattered(share), variance=1.0)
+    moving = min(max(share / 0.25, 0.1), 1)
+    assert found.mean() == pytest.approx(
+        (0.03 * moving + 0.62 * share) * C2, rel=0.25 if share < 0.1 else 0.05
+    )
+
+
+def test_what_noise_hides_is_told_by_the_events_around():
+    """Of an image of which the lower half moves; the right is dark."""
+    on, change, variance = scattered(0.5), np.zeros(SHAPE), np.full(SHAPE, 1e-8)
+    on[:20], change[20:], variance[:, 30:] = 0, 0.1, 100.0
+    found = changes(change, on=on, variance=variance)
+    np.testing.assert_allclose(found[28:, :25], 0.1**2, rtol=1e-4)
+    np.testing.assert_allclose(found[:12, :25], 0.0, atol=1e-7)
+    assert found[28:, 35:].mean() == pytest.approx(0.34 * C2, rel=0.1)
+    np.testing.assert_allclose(found[:12, 35:], 0.03 * C2, rtol=0.03)
 
 
 def test_it_belongs_to_the_place_where_it_is_seen():
@@ -118,15 +137,17 @@ def test_no_more_than_a_threshold_can_be_hidden():
     np.testing.assert_allclose(changes(3.0, variance=1e-8), C2, rtol=1e-4)
 
 
-def test_where_nothing_is_known():
-    on = np.zeros(SHAPE, np.float32)
-    on[:, :20] = 1
-    np.testing.assert_allclose(changes(0.0, on=on)[:, :18], UNKNOWN_CHANGE * C2)
+def test_where_no_silent_pixel_is_near_or_a_frame_does_not_measure_it_it_is_as_usual():
+    on = np.ones(SHAPE, np.float32)
+    np.testing.assert_allclose(changes(0.0, on=on), 0.65 * C2, rtol=1e-5)
+    on[10, 10] = 0
     clipped = np.zeros(SHAPE, bool)
     clipped[10, 10] = True
-    found = changes(0.0, clipped=clipped)
-    assert found[10, 10] == pytest.approx(0.4 * C2)
-    assert np.delete(found.ravel(), 10 * SHAPE[1] + 10).max() == 0.0
+    found = changes(0.0, on=on, clipped=clipped)
+    assert found[10, 10] == pytest.approx((0.03 + 0.62 * 80 / 81) * C2, rel=1e-5)
+    assert found[0, 0] == pytest.approx(0.65 * C2, rel=1e-5), "at the border those count that there are"
+    still = changes(0.0, clipped=clipped)
+    assert np.delete(still.ravel(), 10 * SHAPE[1] + 10).max() == 0.0
 
 
 def test_a_silent_pixel_forgets_what_the_slope_does_not_take():

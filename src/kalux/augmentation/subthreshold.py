@@ -13,19 +13,37 @@ from numpy.typing import NDArray
 
 from kalux import memory
 from kalux.augmentation.bridge import UNMEASURED, BridgedSegment, Latent
-from kalux.compiled import apart, empty, larger, loop, smaller, zeros
+from kalux.compiled import empty, larger, loop, smaller
 
 Array = NDArray[np.floating[Any]]
 
 UNKNOWN_CHANGE: Final = 0.1
-"""Mean square change, in c^2, where it cannot be estimated: that of eleven simulated scenes under a moving camera."""
+"""Mean square change of a silent pixel, in c^2, where it is not estimated: that of eleven simulated scenes under a
+moving camera."""
 
-UNMEASURED_CHANGE: Final = 0.4
-"""The same where a frame does not measure the pixel, so that the change may be large: the variance half-way to such a
-frame is then that of a moving pixel, as on the same scenes."""
+BLACK_CHANGE: Final = 0.4
+"""The same where a frame is black and does not measure the pixel, so that the change may be large: the variance
+half-way to such a frame is then that of a moving pixel, as on the same scenes."""
+
+_ACTIVE: Final = 0.62
+"""Mean square change of a silent pixel, in c^2, where all pixels around have events: by the share that has, those of 87
+simulated scenes lie on a straight line (docs/equations.md, K11)."""
+
+_STILL: Final = 0.03
+"""In addition, also where none has, if `_MOVING` of the whole image has; of smooth surfaces that move."""
+
+_MOVING: Final = 0.25
+"""Share of the pixels of an image of which more have events in most of these scenes. Where fewer have, `_STILL` counts
+as much less."""
+
+_LEAST_MOVING: Final = 0.1
+"""The least that counts of `_STILL`: light may change slowly where nothing moves."""
+
+_AROUND: Final = 9
+"""Side of the window in which pixels with events are counted, pixels."""
 
 _LEAST_INFORMATION: Final = 25.0
-"""Least information from which the change of the whole image is estimated, in pixels without noise."""
+"""Information from which a correlation is estimated, in pixels without noise."""
 
 _LATEST: Final = 8
 """Intervals over which is averaged how silent pixels change: two of them, at 10 or 20 frames/s of a camera that shakes,
@@ -42,17 +60,40 @@ _WINDOW: Final = 5
 """Side of the window of the mean, pixels. 3 to 9 predict the errors of these scenes about equally well."""
 
 
-def silent_change(segment: BridgedSegment, quantisation_variance: float, threshold2: float) -> Array:
+def usual_change(active: Array, threshold2: float) -> Array:
+    """Mean square change of silent pixels by how many around them have events: (H, W) float32, log intensity^2.
+
+    Parameters
+    ----------
+    active
+        (H, W) probability that a pixel has an event that is signal.
+    threshold2
+        c^2.
+    """
+    active = np.asarray(active, np.float32)
+    moving = min(max(float(active.mean(dtype=np.float64)) / _MOVING, _LEAST_MOVING), 1.0)
+    share = _mean_around(active)
+    share *= np.float32(_ACTIVE * threshold2)
+    share += np.float32(moving * _STILL * threshold2)
+    return share
+
+
+def silent_change(
+    segment: BridgedSegment, active: Array, quantisation_variance: float, threshold2: float
+) -> Array:
     """Mean square change of silent pixels from one frame to the next, around every pixel: (H, W), log intensity^2.
 
     The mean is over the pixels of 5 x 5 that have no event in the segment and are measured by both frames, of their
     squared changes by the frames (``segment.slope``), at most c^2, since larger changes cause events, less the variance
-    of the frames' noise. As far as noise hides a pixel's change, that of the whole image takes its place.
+    of the frames' noise. As far as noise hides a pixel's change, and where no such pixel is near or a frame does not
+    measure the pixel itself, what is usual among so many events takes its place.
 
     Parameters
     ----------
     segment
         From `bridge`.
+    active
+        As of `usual_change`.
     quantisation_variance
         As in `BridgeNoise`.
     threshold2
@@ -60,20 +101,15 @@ def silent_change(segment: BridgedSegment, quantisation_variance: float, thresho
     """
     assert segment.events is not None
     shape = segment.slope.shape
-    change, hidden = apart(2, shape)
+    change = memory.empty(shape)
     mean, silent = memory.empty(shape), memory.empty(shape, np.uint8)
     seconds = np.float32((segment.end - segment.start) * 1e-6)
     q0, most = np.float32(quantisation_variance), np.float32(threshold2)
     variances = segment.forward_variance, segment.backward_variance
-    given = tuple(plane.reshape(-1) for plane in (segment.slope, *variances, segment.events))
-    filled = tuple(plane.reshape(-1) for plane in (change, hidden, silent))
-    of_all, information = _squared_changes(given, seconds, q0, most, filled)
-    whole = (
-        max(of_all, 0.0) / information if information > _LEAST_INFORMATION else UNKNOWN_CHANGE * threshold2
-    )
-    _add_share(change.reshape(-1), hidden.reshape(-1), np.float32(whole))
-    unknown, unmeasured = (np.float32(u * threshold2) for u in (UNKNOWN_CHANGE, UNMEASURED_CHANGE))
-    _mean(_sum_around(change), _sum_around(silent), *variances, unknown, unmeasured, mean)
+    usual = usual_change(active, threshold2)
+    given = tuple(plane.reshape(-1) for plane in (segment.slope, *variances, segment.events, usual))
+    _squared_changes(given, seconds, q0, most, change.reshape(-1), silent.reshape(-1))
+    _mean(_sum_around(change), _sum_around(silent), *variances, usual, mean)
     return mean
 
 
@@ -271,20 +307,18 @@ def _add_missed_change(q0, forward, backward, after, on, off, change, grown):  #
 
 
 @loop
-def _squared_changes(given, seconds, q0, most, filled):  # type: ignore[no-untyped-def]
-    """Of silent pixels (0 of others): squared change less noise, and the share that noise hides. Returns both sums.
+def _squared_changes(given, seconds, q0, most, change, silent):  # type: ignore[no-untyped-def]
+    """Of silent pixels (0 of others): squared change less noise, and what is usual of the share that noise hides.
 
-    Blocks of flat planes and few arrays in a loop: vector code, with sums that do not depend on it.
+    Blocks of flat planes and few arrays in a loop: vector code.
     """
-    slope, forward, backward, events = given
-    change, hidden, silent = filled
+    slope, forward, backward, events, usual = given
     zero, one, unmeasured = np.float32(0.0), np.float32(1.0), np.float32(UNMEASURED)
     noise, share, is_silent = (
         empty(_BLOCK, np.float32),
         empty(_BLOCK, np.float32),
         empty(_BLOCK, np.float32),
     )
-    sum_change, sum_share = zeros(_BLOCK, np.float64), zeros(_BLOCK, np.float64)
     for first in range(np.uint64(0), np.uint64(len(slope)), np.uint64(_BLOCK)):
         pixels = range(smaller(np.uint64(len(slope)) - first, np.uint64(_BLOCK)))
         for k in pixels:
@@ -300,36 +334,37 @@ def _squared_changes(given, seconds, q0, most, filled):  # type: ignore[no-untyp
             of_noise = smaller(noise[k], unmeasured) * share[k]
             change[first + k] = is_silent[k] * (smaller(moved * moved, most) - of_noise)
         for k in pixels:
-            hidden[first + k] = is_silent[k] * (one - share[k])
+            change[first + k] += is_silent[k] * (one - share[k]) * usual[first + k]
         for k in pixels:
             silent[first + k] = np.uint8(is_silent[k])
-        for k in pixels:
-            sum_change[k] += change[first + k]
-        for k in pixels:
-            sum_share[k] += is_silent[k] * share[k]
-    of_change, of_share = 0.0, 0.0
-    for k in range(_BLOCK):
-        of_change += sum_change[k]
-        of_share += sum_share[k]
-    return of_change, of_share
 
 
 @loop
-def _add_share(change, hidden, whole):  # type: ignore[no-untyped-def]
-    for i in range(np.uint64(len(change))):
-        change[i] += hidden[i] * whole
-
-
-@loop
-def _mean(total, count, forward, backward, unknown, unmeasured_change, mean):  # type: ignore[no-untyped-def]
+def _mean(total, count, forward, backward, usual, mean):  # type: ignore[no-untyped-def]
     zero, one = np.float32(0.0), np.float32(1.0)
     unmeasured = np.float32(UNMEASURED)
     for row in range(total.shape[0]):
         for column in range(total.shape[1]):
             i = row, column
-            near = larger(total[i], zero) / larger(np.float32(count[i]), one) if count[i] > 0 else unknown
             measured = np.float32(forward[i]) + np.float32(backward[i]) < unmeasured
-            mean[i] = near if measured else unmeasured_change
+            told = larger(total[i], zero) / larger(np.float32(count[i]), one)
+            mean[i] = told if measured and count[i] > 0 else usual[i]
+
+
+def _mean_around(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Means over 9 x 9 pixels, of those that there are."""
+    size = (_AROUND, _AROUND)
+    sums = memory.empty(values.shape)
+    cv2.boxFilter(values, -1, size, sums, normalize=False, borderType=cv2.BORDER_CONSTANT)
+    height, width = (_within(length) for length in values.shape)
+    sums /= height[:, np.newaxis] * width
+    return np.asarray(sums)
+
+
+def _within(length: int) -> NDArray[np.float32]:
+    """Of every pixel of a row, how many of those around it lie within the image."""
+    place, reach = np.arange(length), _AROUND // 2
+    return (np.minimum(place, reach) + np.minimum(length - 1 - place, reach) + 1).astype(np.float32)
 
 
 def _sum_around(values: NDArray[Any]) -> NDArray[Any]:

@@ -110,7 +110,7 @@ def rehearse_segment() -> None:
     newest = with_surety(nothing, nothing, signal).events
     start, grown = trail_between(newest, newest, (0, _PERIOD), (seconds, 0.1, 0.1))
     joined, _ = bridge(first, second, (on, off), thresholds, noise, 0, _PERIOD, grown=grown, signal=signal)
-    of_silent = silent_change(joined, variance, variance)
+    of_silent = silent_change(joined, on, variance, variance)
     correlation(change, joined, variance, variance)
     drifted, _, _ = drift(first, second, thresholds, noise, (far_on, far_off), (on, off))
     add_missed_change(drifted, joined, second, (on, off), of_silent, variance)

@@ -23,8 +23,8 @@ from kalux.augmentation.highlights import (
 from kalux.augmentation.motion import HalfWay, Paths, Plane, behind, find_path
 from kalux.augmentation.refractory import growth_with_period
 from kalux.augmentation.subthreshold import (
+    BLACK_CHANGE,
     UNKNOWN_CHANGE,
-    UNMEASURED_CHANGE,
     Usual,
     add_missed_change,
     correlation,
@@ -357,13 +357,13 @@ class BridgedFrames(Method):
         if signal is not None:
             of_steps = doubt(signal, self.noise.step_variance, self._threshold2)
             joined = joined._replace(doubt=of_steps, signal=signal)
-        change = self._silent_change(joined)
+        steps = (on, off) if signal is None else (on * signal[0], off * signal[1])
+        change = self._silent_change(joined, steps)
         told, latest_change = correlation(
             memory.latest_change, joined, self.noise.quantisation_variance, self._threshold2
         )
         usual = memory.usual.with_interval(change, told)
         share = half_way(usual.told, self._threshold2)
-        steps = (on, off) if signal is None else (on * signal[0], off * signal[1])
         by_period = self._by_period(events, start, end, signal)
         # Where the second frame measures a pixel L^A is led back from it, also at the first frame, which bounds it.
         far = self._since_measured(memory, joined._replace(augmented=memory.latent.value))
@@ -438,7 +438,7 @@ class BridgedFrames(Method):
             followed=followed,
             at_middle=at_middle,
             unshown=self._follow_unshown(memory, second, following, behind.net, between),
-            silent_change=self._silent_change(behind),
+            silent_change=self._silent_change(behind, between),
         )
         forward = bridge.extend(
             self._latent_at_end(memory, shot),
@@ -507,15 +507,17 @@ class BridgedFrames(Method):
         height = self.settings.events.trail
         return height * self.on, height * self.off
 
-    def _silent_change(self, segment: BridgedSegment) -> Floats:
-        return silent_change(segment, self.noise.quantisation_variance, self._threshold2)
+    def _silent_change(self, segment: BridgedSegment, steps: Counts) -> Floats:
+        """K11, given the on and the off events as far as they are signal."""
+        active = np.minimum(steps[0] + steps[1], np.float32(1.0))
+        return silent_change(segment, active, self.noise.quantisation_variance, self._threshold2)
 
     def _with_black_change(self, change: Floats, *frames: Latent) -> Floats:
         """The ``change`` of silent pixels, larger where a frame is black and cannot show that it is small (K11)."""
         for frame in frames:
             if frame.ceiling is not None:
-                unmeasured = np.float32(UNMEASURED_CHANGE * self._threshold2)
-                change = np.where(np.isfinite(frame.ceiling), unmeasured, change)
+                unknown = np.float32(BLACK_CHANGE * self._threshold2)
+                change = np.where(np.isfinite(frame.ceiling), unknown, change)
         return change
 
     def _with_drift(
