@@ -99,9 +99,9 @@ def test_noise_is_no_change():
 def test_the_more_pixels_have_events_the_more_the_others_change_that_noise_hides(share):
     """Next to nothing where nothing moves, and the more the more pixels around have events where the image moves."""
     on = scattered(share)
-    found = changes(0.0, on=on, variance=1.0)
+    found = changes(0.0, on=on, variance=100.0)
     moving = min(max(on.mean() / 0.25, 0.1), 1)
-    assert found.mean() == pytest.approx((0.03 * moving + 0.62 * on.mean()) * C2, rel=0.05)
+    assert found.mean() == pytest.approx((0.03 * moving + 0.62 * on.mean()) * C2, rel=0.06)
 
 
 def test_what_noise_hides_is_told_by_the_events_around():
