@@ -32,7 +32,8 @@ class Pixel:
 
     Changes, of frame intervals, K11: whether both frames measure it, whether it is silent, how much its L changed,
     squared, as far as frames tell (told), without what noise makes of that, and the variances of both frames; and how
-    likely it has an event that is signal (active). Forgotten: what comes to P after each.
+    likely it has an event that is signal (active). Untold: variance of what no event tells of it (K1). Forgotten: what
+    comes to P after each.
     Signal: probability that its on and its off events of every frame interval are no noise (K5); none: by their age.
     """
 
@@ -54,6 +55,7 @@ class Pixel:
     changes: list[tuple[bool, bool, float, tuple[float, float], float]] = field(default_factory=list)
     told: list[float] = field(default_factory=list)
     active: list[float] = field(default_factory=list)
+    untold: list[float] = field(default_factory=list)
     forgotten: list[float] = field(default_factory=list)
     measured: list[bool] = field(default_factory=list)
     signal: list[tuple[float, float]] = field(default_factory=list)
@@ -415,6 +417,7 @@ def bridged(pixel, settings, times, on, off, scales):
     first = latent(0)
     pixel.measured.append(first[1] < UNMEASURED)
     intervals = [(begin, pixel.middles[0], None, first, scale_on, scale_off, var_on, var_off, 0.0, SURE)]
+    untold_from = {}  # K1: variance of what no event tells, of the interval that begins there
     for k in range(count - 1):
         second = latent(k + 1)
         pixel.measured.append(second[1] < UNMEASURED)
@@ -430,10 +433,11 @@ def bridged(pixel, settings, times, on, off, scales):
         total = 4 * settings.filter.highlight_scale**2 if saturated else first[1] + second[1]
         total += var_on * (on * told_on) ** 2 + var_off * (off * told_off) ** 2
         total += q_on * n_on + q_off * n_off + ev.quantisation_variance * c2
-        intervals.append(
-            (a, b, first, second, scale_on, scale_off, var_on, var_off, mismatch / total, signal)
-        )
         q0, noise = ev.quantisation_variance * c2, first[1] + second[1]
+        untold = pixel.untold[k] if pixel.untold else q0
+        untold_from[a] = untold
+        gain = mismatch / (total - q0 + untold)
+        intervals.append((a, b, first, second, scale_on, scale_off, var_on, var_off, gain, signal))
         told = (q0 / (noise + q0)) ** 2
         squared = min((q0 * mismatch / total) ** 2, c2) - noise * told
         pixel.changes.append(
@@ -530,7 +534,7 @@ def bridged(pixel, settings, times, on, off, scales):
         shared = left[1] if min(left[1], right[1]) < UNMEASURED else 0.0  # two bounds measure nothing
         shared += v_on * (f_on * on) ** 2 * t_on * n_on + v_off * (f_off * off) ** 2 * t_off * n_off
         shared += c2 * (step_noise(f_on, ev) * t_on + step_noise(f_off, ev) * t_off)
-        shared += ev.quantisation_variance * c2 * (t - a) / (b - a)
+        shared += untold_from[a] * (t - a) / (b - a)
         return prior + shared * gain
 
     def rate(interval, known_until):  # K4
@@ -759,10 +763,16 @@ def silent_change(pixels, place, interval, c2):
     return max(sum(near) / len(near), 0.0)
 
 
-def forgotten(pixels, place, c2, q0):
+def untold(pixels, place, c2, q0):
+    """K1: variance of what no event has told of a pixel's change in every frame interval."""
+    for k, (measured, silent, *_) in enumerate(pixels[place].changes):
+        yield max(silent_change(pixels, place, k, c2), 0.003 * c2) if measured and silent else q0
+
+
+def forgotten(pixels, place, c2):
     """K11: what the state of a pixel loses in every frame interval."""
     for k, (measured, silent, _, noise, _) in enumerate(pixels[place].changes):
-        missed = sum(noise) / (sum(noise) + q0)
+        missed = sum(noise) / (sum(noise) + pixels[place].untold[k])
         yield silent_change(pixels, place, k, c2) * missed**2 if measured and silent else 0.0
 
 
@@ -892,8 +902,8 @@ def known(pixel, variance, t, settings, c2, left):
     following = second + (1 - share) * events * ev.step_noise * c2
     if first >= UNMEASURED:  # K4
         following += 0.1 * ev.believed_mismatch**2 * c2 * ((1 - share) * events) ** 2
-    q0 = ev.quantisation_variance * c2
-    common = (q0 / (first + second + q0)) ** 2 * min(first, second) * (1 - between / 2)
+    common = (pixel.untold[k] / (first + second + pixel.untold[k])) ** 2
+    common *= min(first, second) * (1 - between / 2)
     return max(1 / (1 / variance + 1 / following), common) + wrong
 
 
@@ -1169,9 +1179,8 @@ def reconstruct(events, frames, sensor_size, settings, times):
             np.full((len(times), 2, *sensor_size), np.nan),
         )
     for place, pixel in every.items():  # of which nothing depends on it but P and L
-        pixel.forgotten = list(
-            forgotten(every, place, on * off, settings.events.quantisation_variance * on * off)
-        )
+        pixel.untold = list(untold(every, place, on * off, settings.events.quantisation_variance * on * off))
+        pixel.forgotten = list(forgotten(every, place, on * off))
     for (row, column), pixel in every.items():
         out[:2, :, row, column] = method(pixel, settings, times, on, off, *more).T
     for (row, column), pixel in every.items():

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kalux import PRESETS, Calibration, Frame, Reconstructor
+from kalux import PRESETS, Calibration, Frame, Reconstructor, Recording, reconstruct
 from kalux.errors import EventError, ExposureError, FrameError, InputError, KaluxError, SettingsError
 from kalux.filters import bridged_frames
 from kalux.models.camera import Camera, count_bright
@@ -1088,6 +1088,24 @@ def test_events_alone_lead_back_into_a_highlight_as_far_as_thresholds_are_known(
     assert levels[0.01][0] > 8
     assert 2 < levels[0.5][0] < 3.5
     np.testing.assert_allclose(levels[0.5][1], levels[0.01][1], rtol=0.01)
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+def test_the_noise_of_frames_averages_out_where_nothing_moves(smooth):
+    """Twenty frames of a grey with a noise of 0.02: an image has less than half of it, at a frame and between two."""
+    rng = np.random.default_rng(0)
+    frames = [
+        Frame(
+            np.clip(np.rint(128 + 5.1 * rng.standard_normal((24, 32))), 0, 255).astype(np.uint8), t, t + 5_000
+        )
+        for t in range(0, 600_000, 30_000)
+    ]
+    recording = Recording.from_arrays(events(), frames, sensor_size=(24, 32))
+    chosen = altered(PRESETS["default"], "events", threshold_on=0.2, threshold_off=0.2)
+    chosen = altered(chosen, "filter", neighbours=0.0)
+    for image in reconstruct(recording, times=[302_500, 317_500], settings=chosen, smooth=smooth):
+        assert np.std(image.intensity) < 0.5 * 0.02
+        assert np.sqrt(image.variance.mean()) * 0.5 < 0.5 * 0.02
 
 
 def test_events_out_of_a_highlight_are_doubted_as_they_come_where_the_next_frame_measures_the_pixel():

@@ -12,6 +12,7 @@ from kalux.augmentation.subthreshold import (
     Correlation,
     add_missed_change,
     correlation,
+    follow_silent,
     half_way,
     nothing_usual,
     silent_change,
@@ -147,6 +148,29 @@ def test_where_no_silent_pixel_is_near_or_a_frame_does_not_measure_it_it_is_as_u
     assert found[0, 0] == pytest.approx(0.65 * C2, rel=1e-5), "at the border those count that there are"
     still = changes(0.0, clipped=clipped)
     assert np.delete(still.ravel(), 10 * SHAPE[1] + 10).max() == 0.0
+
+
+def test_silent_pixels_follow_the_frames_by_as_much_as_they_change():
+    """Of those with events, and where a frame does not measure the pixel, the bridge stays as it is."""
+    on = np.zeros(SHAPE, np.float32)
+    on[0, 0] = 1
+    clipped = np.zeros(SHAPE, bool)
+    clipped[0, 1] = True
+    segment = joined(0.1, on=on, variance=0.01, clipped=clipped)
+    first = Latent(np.zeros(SHAPE, np.float32), np.full(SHAPE, 0.01, np.float32))
+    scalars = NOISE.quantisation_variance, C2
+    for change in (0.0, 0.002, 0.05):
+        followed = follow_silent(segment, first, np.full(SHAPE, change, np.float32), *scalars)
+        variance = max(change, 0.003 * C2)
+        mismatch = 0.1 / (0.02 + variance)
+        np.testing.assert_allclose(followed.slope[1:], variance * mismatch, rtol=1e-4)
+        np.testing.assert_allclose(followed.augmented[1:], 0.01 * mismatch, rtol=1e-4)
+        np.testing.assert_allclose(followed.untold[1:], variance, rtol=1e-6)
+        for plane, before in ((followed.slope, segment.slope), (followed.augmented, segment.augmented)):
+            np.testing.assert_array_equal(plane[0, :2], before[0, :2])
+        np.testing.assert_allclose(followed.untold[0, :2], NOISE.quantisation_variance, rtol=1e-6)
+    as_before = follow_silent(segment, first, np.full(SHAPE, scalars[0], np.float32), *scalars)
+    np.testing.assert_allclose(as_before.slope, segment.slope, rtol=1e-5)
 
 
 def test_a_silent_pixel_forgets_what_the_slope_does_not_take():

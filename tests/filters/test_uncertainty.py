@@ -98,10 +98,10 @@ def test_the_next_frame_tells_of_the_image_before_it(p, second, events, coming, 
     where it is counted already."""
     for first, all_wrong in ((UNMEASURED, wrong), (1e9, 0.0)):
         pixel = np.float32([p, first, second, events])
-        found = known_variance(*pixel, (coming, 0.0, C2 / 6, 1.0, 0.0, wrong))
+        found = known_variance(*pixel, C2 / 6, (coming, 0.0, 1.0, 0.0, wrong))
         behind = second + coming * events + all_wrong * events**2
         assert 1 / found == pytest.approx(1 / p + 1 / behind, rel=1e-4)
-        counted = known_variance(*pixel, (coming, UNMEASURED, C2 / 6, 1.0, 0.0, wrong))
+        counted = known_variance(*pixel, C2 / 6, (coming, UNMEASURED, 1.0, 0.0, wrong))
         assert counted == pytest.approx(p, rel=1e-6)
 
 
@@ -114,6 +114,11 @@ def test_noise_that_the_slope_follows_is_in_every_image():
     )
     assert precise == pytest.approx(1e-5, rel=0.02)
     assert noisy < 1e-4
+    still = around(1e-3, 1e-3, counted=UNMEASURED)._replace(
+        untold=plane(1e-5)
+    )  # changes little: follows little
+    followed = given_variance(p, STILL, NO_CHANGE, NOTHING, still)[0, 0]
+    assert followed == pytest.approx(1e-3 * (1e-5 / (2e-3 + 1e-5)) ** 2, rel=0.02)
     half = given_variance(p, STILL, NO_CHANGE, NOTHING, around(1e-5, 1e-5, counted=UNMEASURED, repeated=0.5))
     assert half[0, 0] == pytest.approx(precise / 2, rel=1e-5)
 

@@ -250,6 +250,9 @@ class BridgedSegment(NamedTuple):
     wrong
         Variance of the way that events lead back from the second frame, by errors of the thresholds, per squared number
         of these events, of pixels that the first frame does not measure; 0 of others (`wrong_way_back`, K4). None: 0.
+    untold
+        Variance of what no event has told of the change from start to end (`subthreshold.follow_silent`); None: q_0 of
+        all pixels.
     untied
         What P grows by with each event of these pixels besides (`untied_steps`, K10). None: nothing.
     """
@@ -280,6 +283,7 @@ class BridgedSegment(NamedTuple):
     doubt: tuple[Array, Array] | None = None
     signal: tuple[Array, Array] | None = None
     wrong: Array | None = None
+    untold: Array | None = None
     untied: UntiedSteps | None = None
 
 

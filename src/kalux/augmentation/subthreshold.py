@@ -113,6 +113,52 @@ def silent_change(
     return mean
 
 
+def follow_silent(
+    segment: BridgedSegment, first: Latent, change: Array, quantisation_variance: float, threshold2: float
+) -> BridgedSegment:
+    """The segment in which silent pixels follow the frames by as much as they change, where `bridge` takes q_0 (K1).
+
+    Parameters
+    ----------
+    segment, quantisation_variance
+        As of `silent_change`.
+    first
+        The frame at the segment's start.
+    change
+        From `silent_change`.
+    threshold2
+        c^2.
+
+    Returns
+    -------
+    It has ``untold``, q_0 of pixels with events and of those that a frame does not measure.
+    """
+    assert segment.events is not None
+    shape = segment.slope.shape
+    untold, slope, augmented = memory.empty(shape), memory.empty(shape), memory.empty(shape)
+    least = np.float32(_LEAST_MOVING * _STILL * threshold2)
+    scalars = np.float32(quantisation_variance), least, np.float32((segment.end - segment.start) * 1e-6)
+    planes = segment.slope, segment.augmented, first.value, first.variance, segment.backward_variance
+    given = tuple(plane.reshape(-1) for plane in (*planes, segment.events, change))
+    _follow_silent(given, *scalars, untold.reshape(-1), slope.reshape(-1), augmented.reshape(-1))
+    return segment._replace(slope=slope, augmented=augmented, untold=untold)
+
+
+@loop
+def _follow_silent(given, q0, least, seconds, untold, new_slope, new_augmented):  # type: ignore[no-untyped-def]
+    slope, augmented, value, forward, backward, events, change = given
+    zero, unmeasured = np.float32(0.0), np.float32(UNMEASURED)
+    for i in range(np.uint64(len(untold))):
+        first = np.float32(forward[i])
+        noise = first + np.float32(backward[i])
+        silent = (events[i] == zero) & (noise < unmeasured)
+        variance = larger(change[i], least) if silent else q0
+        gain = np.float32(slope[i]) * seconds / q0 * ((noise + q0) / (noise + variance))
+        untold[i] = variance
+        new_slope[i] = gain * variance / seconds if silent else np.float32(slope[i])
+        new_augmented[i] = np.float32(value[i]) + first * gain if silent else np.float32(augmented[i])
+
+
 def turns(on: Array, off: Array) -> float:
     """How often the intensity of a pixel with events reverses between two frames: twice for every pair of on and off.
 
@@ -277,8 +323,8 @@ def add_missed_change(
 ) -> None:
     """Add to ``grown``, (H, W), the part of silent pixels' changes that the bridge does not follow. In place.
 
-    Its slope follows the share q0 / V of the mismatch (K1). P grows by the mean square change times the square of the
-    other share (docs/equations.md, K11).
+    Its slope follows the share m / V of the mismatch (`follow_silent`). P grows by the mean square change times the
+    square of the other share (docs/equations.md, K11).
 
     Parameters
     ----------
@@ -289,18 +335,29 @@ def add_missed_change(
     change
         From `silent_change`.
     quantisation_variance
-        As in `BridgeNoise`.
+        As in `BridgeNoise`; counts where the segment has no ``untold``.
     """
-    planes = segment.forward_variance, segment.backward_variance, second.variance, *counts, change, grown
-    _add_missed_change(np.float32(quantisation_variance), *(plane.reshape(-1) for plane in planes))
+    untold = segment.untold
+    if untold is None:
+        untold = np.full(grown.shape, quantisation_variance, np.float32)
+    planes = (
+        segment.forward_variance,
+        segment.backward_variance,
+        second.variance,
+        *counts,
+        change,
+        untold,
+        grown,
+    )
+    _add_missed_change(*(plane.reshape(-1) for plane in planes))
 
 
 @loop
-def _add_missed_change(q0, forward, backward, after, on, off, change, grown):  # type: ignore[no-untyped-def]
+def _add_missed_change(forward, backward, after, on, off, change, untold, grown):  # type: ignore[no-untyped-def]
     zero, unmeasured = np.float32(0.0), np.float32(UNMEASURED)
     for i in range(np.uint64(len(grown))):
         noise = np.float32(forward[i]) + np.float32(backward[i])
-        missed = noise / (noise + q0)
+        missed = noise / (noise + untold[i])
         measured = larger(np.float32(forward[i]), np.float32(after[i])) < unmeasured
         lost = np.float32(change[i]) * missed * missed
         grown[i] += lost if measured and on[i] + off[i] == zero else zero

@@ -17,7 +17,13 @@ from kalux.augmentation.background import doubt, signal_shares
 from kalux.augmentation.bridge import UNMEASURED, BridgeNoise, Latent, bridge, drift, nominal_thresholds
 from kalux.augmentation.highlights import FrameHighlights, Tail, begin_unshown, expected_excess
 from kalux.augmentation.motion import HalfWay, Paths
-from kalux.augmentation.subthreshold import add_missed_change, correlation, silent_change, turns
+from kalux.augmentation.subthreshold import (
+    add_missed_change,
+    correlation,
+    follow_silent,
+    silent_change,
+    turns,
+)
 from kalux.augmentation.trail import Trail, nothing_followed, signed_surety, trail_between, with_surety
 from kalux.cli.loops import prepare_loops
 from kalux.compiled import apart
@@ -112,6 +118,7 @@ def rehearse_segment() -> None:
     joined, _ = bridge(first, second, (on, off), thresholds, noise, 0, _PERIOD, grown=grown, signal=signal)
     of_silent = silent_change(joined, on, variance, variance)
     correlation(change, joined, variance, variance)
+    joined = follow_silent(joined, first, of_silent, variance, variance)
     drifted, _, _ = drift(first, second, thresholds, noise, (far_on, far_off), (on, off))
     add_missed_change(drifted, joined, second, (on, off), of_silent, variance)
     turns(on, off)

@@ -28,6 +28,7 @@ from kalux.augmentation.subthreshold import (
     Usual,
     add_missed_change,
     correlation,
+    follow_silent,
     half_way,
     nothing_usual,
     silent_change,
@@ -362,6 +363,9 @@ class BridgedFrames(Method):
         told, latest_change = correlation(
             memory.latest_change, joined, self.noise.quantisation_variance, self._threshold2
         )
+        joined = follow_silent(
+            joined, memory.latent, change, self.noise.quantisation_variance, self._threshold2
+        )
         usual = memory.usual.with_interval(change, told)
         share = half_way(usual.told, self._threshold2)
         by_period = self._by_period(events, start, end, signal)
@@ -676,6 +680,7 @@ class BridgedFrames(Method):
             segment.events,
             coming=(1.0 - share) * self.noise.step_variance,
             counted=0.0,
+            untold=segment.untold,
             quantisation_variance=self.noise.quantisation_variance,
             repeated=1.0 - between / 2.0,
             wrong=wrong * between,

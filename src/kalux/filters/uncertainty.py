@@ -92,6 +92,8 @@ class Around(NamedTuple):
         Of the way from the frame before to the one after.
     half_way
         How far silent pixels are off the mean of both frames there (`kalux.augmentation.subthreshold.half_way`).
+    untold
+        (H, W) variance of what no event has told of the change between them; None: q_0.
     """
 
     first: Array
@@ -105,6 +107,17 @@ class Around(NamedTuple):
     wrong_back: float
     share: float
     half_way: float = RANDOM
+    untold: Array | None = None
+
+    def followed(self) -> Array:
+        """(H, W) ``untold``, or q_0 where it is not known."""
+        if self.untold is not None:
+            return self.untold
+        return np.full(self.first.shape, self.quantisation_variance, np.float32)
+
+    def scalars(self) -> tuple[float, ...]:
+        """Those that `known_variance` takes."""
+        return self.coming, self.counted, self.repeated, self.wrong, self.wrong_back
 
     def misses_some(self, unmeasured: NDArray[np.int64]) -> bool:
         """Whether of pixels without a measurement some are not known to be black either (K7)."""
@@ -162,17 +175,17 @@ def before_averaging(subthreshold: Subthreshold) -> Subthreshold:
 
 
 @nb.njit(cache=True, inline="always", error_model="numpy")
-def known_variance(variance, first, second, events, around):  # type: ignore[no-untyped-def]
+def known_variance(variance, first, second, events, untold, around):  # type: ignore[no-untyped-def]
     """Variance of L given all frames and events around, from P and the variances of the frames around.
 
     The next frame, seen through the events that are to come, is information about L besides P. As far as the slope
-    follows the frames, the share q_0 / V of their mismatch (K1), their noise is in every image, however many have been
-    seen.
+    follows the frames, the share ``untold`` / V of their mismatch (K1), their noise is in every image, however many
+    have been seen.
     """
-    coming, counted, q0, repeated, wrong, wrong_back = around
+    coming, counted, repeated, wrong, wrong_back = around
     following = counted + second + coming * events
     following += wrong_back * events * events if first >= UNMEASURED else ZERO  # K4
-    slope = q0 / (first + second + q0)
+    slope = untold / (first + second + untold)
     known = larger(
         variance * following / (variance + following), repeated * slope * slope * smaller(first, second)
     )
@@ -208,10 +221,14 @@ def given_variance(
     before, above_moving = before_averaging(subthreshold), subthreshold.above_moving
     given = np.empty(variance.shape, np.float32)
     nothing = np.empty(0, np.float32)
-    planes = variance, silent_change, *((nothing,) * 3 if around is None else around[:3])
+    planes = (
+        variance,
+        silent_change,
+        *((nothing,) * 4 if around is None else (*around[:3], around.followed())),
+    )
     _give(
         *(np.ascontiguousarray(plane, np.float32).reshape(-1) for plane in planes),
-        tuple(np.float32(value) for value in ((0.0,) * 6 if around is None else around[3:-2])),
+        tuple(np.float32(value) for value in ((0.0,) * 5 if around is None else around.scalars())),
         nothing if left is None else left.reshape(-1),
         moving.reshape(-1),
         (np.float32(subthreshold.silent), np.float32(subthreshold.moving)),
@@ -223,7 +240,7 @@ def given_variance(
 
 @loop
 def _give(  # type: ignore[no-untyped-def]
-    variance, change, first, second, events, around, left, moving, subthreshold, untied, given
+    variance, change, first, second, events, untold, around, left, moving, subthreshold, untied, given
 ):
     """`given_variance`, a few pixels at a time: what one step leaves is in the nearer caches for the next.
 
@@ -238,17 +255,17 @@ def _give(  # type: ignore[no-untyped-def]
             if len(left):
                 _average_unmeasured(known, left[here], first[here], second[here], untied, averaged[:count])
                 known = averaged[:count]
-            _inform(known, first[here], second[here], events[here], around, informed[:count])
+            _inform(known, first[here], second[here], events[here], untold[here], around, informed[:count])
             _mark_intermittent(moving[here], first[here], second[here], events[here], intermittent[:count])
             known = informed[:count]
         _add_subthreshold(known, moving[here], intermittent, change[here], subthreshold, given[here])
 
 
 @loop(fastmath=FUSED)
-def _inform(variance, first, second, events, around, known):  # type: ignore[no-untyped-def]
+def _inform(variance, first, second, events, untold, around, known):  # type: ignore[no-untyped-def]
     """`known_variance` of every pixel."""
     for i in range(np.uint64(len(known))):
-        known[i] = known_variance(variance[i], first[i], second[i], events[i], around)
+        known[i] = known_variance(variance[i], first[i], second[i], events[i], untold[i], around)
 
 
 @loop(fastmath=FUSED)
