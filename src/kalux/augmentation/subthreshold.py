@@ -146,17 +146,29 @@ def follow_silent(
 
 @loop
 def _follow_silent(given, q0, least, seconds, untold, new_slope, new_augmented):  # type: ignore[no-untyped-def]
+    """`follow_silent` in blocks and with few arrays in a loop: vector code."""
     slope, augmented, value, forward, backward, events, change = given
     zero, unmeasured = np.float32(0.0), np.float32(UNMEASURED)
-    for i in range(np.uint64(len(untold))):
-        first = np.float32(forward[i])
-        noise = first + np.float32(backward[i])
-        silent = (events[i] == zero) & (noise < unmeasured)
-        variance = larger(change[i], least) if silent else q0
-        gain = np.float32(slope[i]) * seconds / q0 * ((noise + q0) / (noise + variance))
-        untold[i] = variance
-        new_slope[i] = gain * variance / seconds if silent else np.float32(slope[i])
-        new_augmented[i] = np.float32(value[i]) + first * gain if silent else np.float32(augmented[i])
+    noise, gain, silent = empty(_BLOCK, np.float32), empty(_BLOCK, np.float32), empty(_BLOCK, np.bool_)
+    for first in range(np.uint64(0), np.uint64(len(untold)), np.uint64(_BLOCK)):
+        pixels = range(smaller(np.uint64(len(untold)) - first, np.uint64(_BLOCK)))
+        for k in pixels:
+            noise[k] = np.float32(forward[first + k]) + np.float32(backward[first + k])
+        for k in pixels:
+            silent[k] = (events[first + k] == zero) & (noise[k] < unmeasured)
+        for k in pixels:
+            untold[first + k] = larger(change[first + k], least) if silent[k] else q0
+        for k in pixels:
+            mismatch = np.float32(slope[first + k]) * seconds / q0
+            gain[k] = mismatch * ((noise[k] + q0) / (noise[k] + untold[first + k]))
+        for k in pixels:
+            followed = gain[k] * untold[first + k] / seconds
+            new_slope[first + k] = followed if silent[k] else np.float32(slope[first + k])
+        for k in pixels:
+            gain[k] *= np.float32(forward[first + k])
+        for k in pixels:
+            level = np.float32(value[first + k]) + gain[k]
+            new_augmented[first + k] = level if silent[k] else np.float32(augmented[first + k])
 
 
 def turns(on: Array, off: Array) -> float:
