@@ -766,7 +766,8 @@ def silent_change(pixels, place, interval, c2):
 def untold(pixels, place, c2, q0):
     """K1: variance of what no event has told of a pixel's change in every frame interval."""
     for k, (measured, silent, *_) in enumerate(pixels[place].changes):
-        yield max(silent_change(pixels, place, k, c2), 0.003 * c2) if measured and silent else q0
+        changes = measured and silent and q0 > 0
+        yield max(silent_change(pixels, place, k, c2), 0.003 * c2) if changes else q0
 
 
 def forgotten(pixels, place, c2):

@@ -38,6 +38,9 @@ VARIANTS = {
     "default-quiet": dataclasses.replace(
         PRESETS["default"], camera=dataclasses.replace(PRESETS["default"].camera, frame_noise=0.0019)
     ),
+    "default-no-slope": dataclasses.replace(
+        PRESETS["default"], events=dataclasses.replace(PRESETS["default"].events, quantisation_variance=0.0)
+    ),
     "default-noisy": dataclasses.replace(
         PRESETS["default"],
         camera=dataclasses.replace(PRESETS["default"].camera, frame_noise=0.01, shot_noise=5e-4),

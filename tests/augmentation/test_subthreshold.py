@@ -169,6 +169,7 @@ def test_silent_pixels_follow_the_frames_by_as_much_as_they_change():
         for plane, before in ((followed.slope, segment.slope), (followed.augmented, segment.augmented)):
             np.testing.assert_array_equal(plane[0, :2], before[0, :2])
         np.testing.assert_allclose(followed.untold[0, :2], NOISE.quantisation_variance, rtol=1e-6)
+    assert follow_silent(segment, first, on, 0.0, C2) is segment
     as_before = follow_silent(segment, first, np.full(SHAPE, scalars[0], np.float32), *scalars)
     np.testing.assert_allclose(as_before.slope, segment.slope, rtol=1e-5)
 

@@ -131,9 +131,12 @@ def follow_silent(
 
     Returns
     -------
-    It has ``untold``, q_0 of pixels with events and of those that a frame does not measure.
+    It has ``untold``, q_0 of pixels with events and of those that a frame does not measure. The segment itself where
+    q_0 is 0, so that nothing follows the frames.
     """
     assert segment.events is not None
+    if quantisation_variance == 0:
+        return segment
     shape = segment.slope.shape
     untold, slope, augmented = memory.empty(shape), memory.empty(shape), memory.empty(shape)
     least = np.float32(_LEAST_MOVING * _STILL * threshold2)
