@@ -13,6 +13,7 @@ from kalux.augmentation.bridge import (
     BridgeNoise,
     Latent,
     Thresholds,
+    become_measured,
     bridge,
     extend,
     extend_backward,
@@ -203,10 +204,14 @@ def test_wrong_thresholds_count_on_the_way_back_that_no_frame_ties():
     second = latent(np.ones(5), [0.02, UNMEASURED, 0.02, 0.02, 0.02])
     on, off = counts(3, 3, 3, 0, 0), counts(1, 1, 1, 0, 2)
     thresholds = nominal_thresholds((1, 5), 0.1)
-    found = wrong_way_back(first, second, thresholds, NOISE, (0.5 * on, off), on + off)
+    pixels = become_measured(first, second, on + off)
+    found = wrong_way_back(pixels, thresholds, NOISE, (0.5 * on, off), on + off)
     of_both = 0.1 * 0.1**2 * ((0.3 * 1.5) ** 2 + 0.2**2) / 4**2
     np.testing.assert_allclose(found, [[of_both, 0, 0, 0, 0.1 * 0.1**2 * 0.2**2]], rtol=1e-12)
-    assert wrong_way_back(second, second, thresholds, NOISE, (on, off), on + off) is None
+    assert (
+        wrong_way_back(become_measured(second, second, on + off), thresholds, NOISE, (on, off), on + off)
+        is None
+    )
 
 
 def test_every_event_adds_its_share_of_what_wrong_thresholds_add_until_a_frame_measures_the_pixel():
@@ -217,9 +222,11 @@ def test_every_event_adds_its_share_of_what_wrong_thresholds_add_until_a_frame_m
     far_on, far_off = counts(3, 3, 0, 3, 0), counts(2, 2, 0, 2, 0)
     thresholds = nominal_thresholds((1, 5), 0.1)
 
+    pixels = become_measured(first, second, on + off)
+
     def untied(by_period=(None, None), signal=None):
         far = far_on, far_off, by_period[0]
-        return untied_steps(first, second, thresholds, NOISE, far, (on, off), signal, by_period[1])
+        return untied_steps(pixels, thresholds, NOISE, far, (on, off), signal, by_period[1])
 
     found = untied()
     np.testing.assert_array_equal(found.pixels, [0, 4])
@@ -235,10 +242,8 @@ def test_every_event_adds_its_share_of_what_wrong_thresholds_add_until_a_frame_m
     np.testing.assert_allclose(doubted.off[1] - found.off[1], (0.3**2 - 0.1**2) / 2, rtol=1e-5)
     back = untied(by_period=(np.full((1, 5), 0.5), np.full((1, 5), -0.5)))
     assert back.on[0] == 0, "what it takes off leaves at least nothing"
-    assert (
-        untied_steps(second, second, thresholds, NOISE, (far_on, far_off, None), (on, off), None, None)
-        is None
-    )
+    pixels = become_measured(second, second, on + off)
+    assert untied() is None
 
 
 def test_what_a_wrong_refractory_period_adds_on_the_way_up_it_takes_off_on_the_way_down():

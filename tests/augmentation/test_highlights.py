@@ -422,9 +422,11 @@ def test_a_bound_is_too_high_by_what_it_is_above_the_frames_at_most():
     noise = BridgeNoise(0.5, 0.5, 0.0, 0.0)
     on, off = np.array([[2.0, 0, 0, 0]]), np.array([[0, 2.0, 0, 0]])
     segment, _ = bridge(first, second, (on, off), nominal_thresholds((1, 4), 0.0), noise, 0, 40_000)
-    found = above_frames(segment, np.arange(4), np.array([1.5, 1.5, 1.5, 1.5]))
+    found = above_frames(segment, segment.augmented, np.arange(4), np.array([1.5, 1.5, 1.5, 1.5]))
     np.testing.assert_allclose(found, [1.5, 0.5, np.inf, np.inf])
-    np.testing.assert_array_equal(above_frames(segment, np.arange(2), np.array([0.0, 0.5])), [0.0, 0.0])
+    np.testing.assert_array_equal(
+        above_frames(segment, segment.augmented, np.arange(2), np.array([0.0, 0.5])), [0.0, 0.0]
+    )
 
 
 _SUMS = """

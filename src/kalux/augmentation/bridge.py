@@ -287,9 +287,25 @@ class BridgedSegment(NamedTuple):
     untied: UntiedSteps | None = None
 
 
+def become_measured(first: Latent, second: Latent, events: Array) -> NDArray[np.int64]:
+    """Pixels with ``events`` that the second frame measures and the first does not.
+
+    Parameters
+    ----------
+    first, second
+        The frames before and after.
+    events
+        (H, W) number of events between them.
+
+    Returns
+    -------
+    (N,) places in the flattened image.
+    """
+    return np.flatnonzero((first.variance >= UNMEASURED) & (second.variance < UNMEASURED) & (events > 0))
+
+
 def wrong_way_back(
-    first: Latent,
-    second: Latent,
+    pixels: NDArray[np.int64],
     thresholds: Thresholds,
     noise: BridgeNoise,
     counts: tuple[Array, Array],
@@ -302,40 +318,33 @@ def wrong_way_back(
 
     Parameters
     ----------
-    first, second
-        The frames before and after.
+    pixels
+        Those that `become_measured`.
     thresholds, noise
         As in `bridge`.
     counts
-        (H, W) on and off events between them, as far as they are signal.
+        (H, W) on and off events between the frames, as far as they are signal.
     events
         (H, W) the sum of both, with what is noise.
 
     Returns
     -------
-    (H, W), 0 of pixels that the first frame measures and of those that the second does not; None: 0 of all.
+    (H, W), 0 of other pixels; None: 0 of all.
     """
-    pixels = _become_measured(first, second, events)
     if len(pixels) == 0:
         return None
     on, off, all_events, on_variance, off_variance = (
         plane.reshape(-1)[pixels] for plane in (*counts, events, *thresholds[2:])
     )
     of_on, of_off = noise.threshold_on * on, noise.threshold_off * off
-    found = np.zeros(first.variance.shape, first.variance.dtype)
     of_both = on_variance * of_on**2 + off_variance * of_off**2
+    found = np.zeros(events.shape, of_both.dtype)
     found.reshape(-1)[pixels] = WRONG_STEPS * of_both / all_events**2
     return found
 
 
-def _become_measured(first: Latent, second: Latent, events: Array) -> NDArray[np.int64]:
-    """Pixels with ``events`` that the second frame measures and the first does not: places in the flattened image."""
-    return np.flatnonzero((first.variance >= UNMEASURED) & (second.variance < UNMEASURED) & (events > 0))
-
-
 def untied_steps(
-    first: Latent,
-    second: Latent,
+    pixels: NDArray[np.int64],
     thresholds: Thresholds,
     noise: BridgeNoise,
     far: tuple[Array, Array, Array | None],
@@ -349,13 +358,13 @@ def untied_steps(
 
     Parameters
     ----------
-    first, second
-        The frames before and after.
+    pixels
+        Those that `become_measured`.
     thresholds, noise
         As in `bridge`.
     far
-        (H, W) on and off events since a frame last measured the pixel, up to ``first``, and what the standard error of
-        the refractory period adds to its level by these, log intensity; None: the period is known.
+        (H, W) on and off events since a frame last measured the pixel, up to the first of both, and what the standard
+        error of the refractory period adds to its level by these, log intensity; None: the period is known.
     counts
         (H, W) on and off events between the frames.
     signal
@@ -367,7 +376,6 @@ def untied_steps(
     -------
     None where there is no such pixel.
     """
-    pixels = _become_measured(first, second, counts[0] + counts[1])
     if len(pixels) == 0:
         return None
 

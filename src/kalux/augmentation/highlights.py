@@ -519,15 +519,16 @@ def _bound_noise(pixels, variance, initial_variance, noise):  # type: ignore[no-
         noise[i] = larger(np.float32(variance[pixels[i]]) - initial_variance, np.float32(0.0))
 
 
-def above_frames(segment: BridgedSegment, pixels: NDArray[np.int64], bound: Floats) -> Floats:
+def above_frames(segment: BridgedSegment, level: Floats, pixels: NDArray[np.int64], bound: Floats) -> Floats:
     """(N,) by how much the ``bound`` of ``pixels`` at the segment's start exceeds the bounds by the frames around.
 
-    The bound is too high by that at most. The frame at the start bounds the pixel without events, the one at the end
-    (`BridgedSegment.floor`) without those from before the segment. Infinite where one of them is masked.
+    The bound is too high by that at most. The frame at the start, of log intensity ``level`` (H, W), bounds the pixel
+    without events, the one at the end (`BridgedSegment.floor`) without those from before the segment. Infinite where
+    one of them is masked.
     """
     variances = segment.forward_variance, segment.backward_variance
     seen = np.maximum(*(plane.reshape(-1)[pixels] for plane in variances)) < MASKED
-    least = np.where(seen, segment.augmented.reshape(-1)[pixels], -np.inf)
+    least = np.where(seen, level.reshape(-1)[pixels], -np.inf)
     if segment.floor is not None:
         least = np.maximum(least, segment.floor.reshape(-1)[pixels])
     return np.maximum(bound - least, 0.0)

@@ -370,10 +370,11 @@ class BridgedFrames(Method):
         share = half_way(usual.told, self._threshold2)
         by_period = self._by_period(events, start, end, signal)
         # Where the second frame measures a pixel L^A is led back from it, also at the first frame, which bounds it.
-        far = self._since_measured(memory, joined._replace(augmented=memory.latent.value))
-        untied = bridge.untied_steps(
-            memory.latent, second, memory.thresholds, self.noise, far, (on, off), signal, by_period
-        )
+        far = self._since_measured(memory, joined, memory.latent.value)
+        assert joined.events is not None
+        now_measured = bridge.become_measured(memory.latent, second, joined.events)
+        known = memory.thresholds
+        untied = bridge.untied_steps(now_measured, known, self.noise, far, (on, off), signal, by_period)
         joined, since_measured = self._with_drift(
             joined._replace(untied=untied), memory, second, (on, off), change, steps, far, by_period
         )
@@ -394,9 +395,7 @@ class BridgedFrames(Method):
         )
         assert joined.events is not None
         joined = joined._replace(
-            wrong=bridge.wrong_way_back(
-                memory.latent, second, memory.thresholds, self.noise, steps, joined.events
-            ),
+            wrong=bridge.wrong_way_back(now_measured, known, self.noise, steps, joined.events),
             trail=trail,
             unshown=unshown,
             silent_change=change,
@@ -455,7 +454,7 @@ class BridgedFrames(Method):
         )
         counts, change = (on + tail_on, off + tail_off), memory.silent_change
         by_period = self._by_period(events, start, following.end, None)
-        far = self._since_measured(memory, forward)
+        far = self._since_measured(memory, forward, forward.augmented)
         forward, since_measured = self._with_drift(
             forward, memory, second, counts, change, counts, far, by_period
         )
@@ -573,15 +572,15 @@ class BridgedFrames(Method):
             np.float32(self._period_spread * self.on) * up - np.float32(self._period_spread * self.off) * down
         )
 
-    def _since_measured(self, memory: BridgeMemory, segment: BridgedSegment) -> SinceMeasured:
-        """What events have told since a frame measured each pixel.
+    def _since_measured(self, memory: BridgeMemory, segment: BridgedSegment, level: Floats) -> SinceMeasured:
+        """What events have told since a frame measured each pixel, whose ``level`` the frame at the start bounds.
 
         Of a pixel that no frame has measured, at most as much as raises its bound above those by the frames (K15).
         """
         pixels, known = memory.unshown.pixels, memory.thresholds
         if len(pixels) == 0:
             return memory.since_measured
-        above = above_frames(segment, pixels, memory.unshown.bound)
+        above = above_frames(segment, level, pixels, memory.unshown.bound)
         on, off = memory.since_measured.on.copy(), memory.since_measured.off.copy()
         steps = (self.on, known.on_variance), (self.off, known.off_variance)
         for counts, (threshold, variance) in zip((on, off), steps, strict=True):
@@ -617,7 +616,7 @@ class BridgedFrames(Method):
         if segment.unshown is None or len(segment.unshown.pixels) == 0:
             return state
         pixels, variance = segment.unshown.pixels, state.variance.copy()
-        above = above_frames(segment, pixels, state.log_intensity.reshape(-1)[pixels])
+        above = above_frames(segment, segment.augmented, pixels, state.log_intensity.reshape(-1)[pixels])
         most = self.settings.filter.initial_variance + above**2
         variance.reshape(-1)[pixels] = np.minimum(variance.reshape(-1)[pixels], most)
         return state._replace(variance=variance)
