@@ -200,6 +200,18 @@ def test_events_that_are_lost_of_one_sign_alone_make_gains_hardly_drift():
     assert spread_of(found.gains, exposures) < 0.5
 
 
+@pytest.mark.parametrize(
+    ("seed", "sigma", "ramp"), [(0, 1.0, 0.0), (0, 1.0, 3.0), (1, 1.0, 3.0), (1, 2.0, 0.0)]
+)
+def test_fast_light_most_of_whose_events_are_lost_is_no_gain(seed, sigma, ramp):
+    """Long exposures of what passes in a third of a second: frames show in all parts what events do not say."""
+    leaves = cv2.GaussianBlur(np.random.default_rng(seed).normal(size=(120, 700)), (0, 0), sigma)
+    image = np.exp(1.5 * leaves / leaves.std() - 2.5 + ramp * np.linspace(-0.5, 0.5, 700))
+    lossy = {"refractory": 1_500, "cutoff": 1_000.0, "threshold_on": 0.15, "threshold_off": 0.15}
+    found = faults(*filmed(motion=pan(500.0), image=image, frame_rate=20.0, exposure=40_000, **lossy))
+    assert found.steps == ()
+
+
 @pytest.mark.parametrize("refractory", [0, 2_000])
 def test_light_that_is_switched_on_is_no_gain(refractory):
     """Though pixels lose most of so fast a change in their refractory period."""
