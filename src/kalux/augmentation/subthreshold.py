@@ -147,6 +147,11 @@ def follow_silent(
     return segment._replace(slope=slope, augmented=augmented, untold=untold)
 
 
+def told_by_none(untold: Array | None, quantisation_variance: float, shape: tuple[int, ...]) -> Array:
+    """Variance of what no event has told of the change between two frames: ``untold`` if it is known, else q_0 (K1)."""
+    return np.full(shape, quantisation_variance, np.float32) if untold is None else untold
+
+
 @loop
 def _follow_silent(given, q0, least, seconds, untold, new_slope, new_augmented):  # type: ignore[no-untyped-def]
     """`follow_silent` in blocks and with few arrays in a loop: vector code."""
@@ -352,9 +357,7 @@ def add_missed_change(
     quantisation_variance
         As in `BridgeNoise`; counts where the segment has no ``untold``.
     """
-    untold = segment.untold
-    if untold is None:
-        untold = np.full(grown.shape, quantisation_variance, np.float32)
+    untold = told_by_none(segment.untold, quantisation_variance, grown.shape)
     planes = (
         segment.forward_variance,
         segment.backward_variance,

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -405,15 +405,24 @@ def _steps(rests: dict[int, _Rest]) -> dict[int, float]:
     To begin with, all that frames show is a step. Where none is certain without what is unexplained then, there are
     none: events that are lost in all of the image look like steps, too.
     """
-    steps = {index: rests[index].step for index in sorted(rests)}
-    unexplained = _unexplained([rests[index] for index in steps])
-    if not any(rest.is_certain(rest.step - unexplained * rest.events) for rest in rests.values()):
+    beyond = _beyond(rests, rests)
+    if not any(rests[index].is_certain(step) for index, step in beyond.items()):
         return {}
-    for _ in range(_ROUNDS):
-        unexplained = _unexplained([rests[index] for index in steps])
-        beyond = {index: rests[index].step - unexplained * rests[index].events for index in sorted(rests)}
-        steps = {index: step for index, step in beyond.items() if rests[index].is_gain(step, _MORE_FLICKER)}
+    steps = _gains(rests, beyond)
+    for _ in range(_ROUNDS - 1):
+        steps = _gains(rests, _beyond(rests, steps))
     return steps
+
+
+def _beyond(rests: dict[int, _Rest], steps: Iterable[int]) -> dict[int, float]:
+    """What frames show beyond their events, in order, without what these leave unexplained of frames that step."""
+    unexplained = _unexplained([rests[index] for index in sorted(steps)])
+    return {index: rests[index].step - unexplained * rests[index].events for index in sorted(rests)}
+
+
+def _gains(rests: dict[int, _Rest], beyond: dict[int, float]) -> dict[int, float]:
+    """Those that are steps of the gain, given that one is."""
+    return {index: step for index, step in beyond.items() if rests[index].is_gain(step, _MORE_FLICKER)}
 
 
 def _unexplained(rests: list[_Rest]) -> float:

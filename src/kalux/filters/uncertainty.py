@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.bridge import RANDOM, UNMEASURED, bridge_variance
-from kalux.augmentation.subthreshold import UNKNOWN_CHANGE
+from kalux.augmentation.subthreshold import UNKNOWN_CHANGE, told_by_none
 from kalux.compiled import FUSED, ZERO, empty, larger, loop, smaller, zeros
 from kalux.filters.readout import CORRELATED, Subthreshold
 
@@ -108,12 +108,6 @@ class Around(NamedTuple):
     share: float
     half_way: float = RANDOM
     untold: Array | None = None
-
-    def followed(self) -> Array:
-        """(H, W) ``untold``, or q_0 where it is not known."""
-        if self.untold is not None:
-            return self.untold
-        return np.full(self.first.shape, self.quantisation_variance, np.float32)
 
     def scalars(self) -> tuple[float, ...]:
         """Those that `known_variance` takes."""
@@ -221,11 +215,11 @@ def given_variance(
     before, above_moving = before_averaging(subthreshold), subthreshold.above_moving
     given = np.empty(variance.shape, np.float32)
     nothing = np.empty(0, np.float32)
-    planes = (
-        variance,
-        silent_change,
-        *((nothing,) * 4 if around is None else (*around[:3], around.followed())),
-    )
+    frames: tuple[Array, ...] = (nothing,) * 4
+    if around is not None:
+        untold = told_by_none(around.untold, around.quantisation_variance, variance.shape)
+        frames = around.first, around.second, around.events, untold
+    planes = variance, silent_change, *frames
     _give(
         *(np.ascontiguousarray(plane, np.float32).reshape(-1) for plane in planes),
         tuple(np.float32(value) for value in ((0.0,) * 5 if around is None else around.scalars())),
