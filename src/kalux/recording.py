@@ -204,6 +204,36 @@ def with_frames(recording: Recording, frames: Callable[[], Iterator[Frame]]) -> 
     return less_black(chosen, recording.black_level)
 
 
+def without_repeats(recording: Recording) -> Recording:
+    """The same recording, without frames whose image is that of the frame before, to the bit.
+
+    If something moved between the two, events since the second do not tell what changed since the first, which both
+    show.
+    """
+    whole, made = recording.source.frames, copy.copy(recording)
+
+    def distinct() -> Iterator[Frame]:
+        before: Frame | None = None
+        for frame in whole():
+            if before is None or not np.array_equal(frame.image, before.image):
+                yield frame
+            before = frame
+
+    made.source = dataclasses.replace(
+        recording.source, frames=distinct, count_frames=lambda: sum(1 for _ in distinct())
+    )
+    return made
+
+
+def with_frames_of(recording: Recording, other: Recording) -> Recording:
+    """The recording with all frames of another, of which it is a part."""
+    made = copy.copy(recording)
+    made.source = dataclasses.replace(
+        recording.source, frames=other.source.frames, count_frames=other.source.count_frames
+    )
+    return made
+
+
 class FrameCorrections(NamedTuple):
     """What is to be done with the frames of a recording before they are used (`kalux.calibration.frame_faults`).
 

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from kalux import PRESETS, Recording, reconstruct
-from kalux.datasets import SensorSettings, demo_scene, simulate
+from kalux.datasets import SensorSettings, demo_scene, photograph_scene, simulate
+from kalux.datasets.motion import Pose
 from kalux.plan_report import plan_report
 from kalux.planning import plan
 from kalux.planning.mending import mend
-from kalux.recording import EventLayout, with_event_layout
+from kalux.recording import AS_STORED, EventLayout, with_event_layout
 from kalux.settings import altered
 
 from builders import damaged, lifted, moving_blocks, passing_by, textured
@@ -80,6 +83,28 @@ def test_all_that_is_wrong_is_mended_at_once():
     assert (planned.layout, planned.faults.copies) == (mends.layout, mends.faults.copies)
     paper = mend(source, PRESETS["iccv2021"]).mends
     assert not paper.changes
+
+
+def test_copies_do_not_turn_events_round():
+    """Every frame twice, before a camera that goes on and back again: events since a copy say the contrary of
+    what changed since the frame that it repeats."""
+
+    sensor = SensorSettings(threshold_on=0.1, threshold_off=0.1, frame_rate=20.0, exposure=1_000)
+
+    def to_and_fro(t):
+        frames = t * 1e-6 * sensor.frame_rate - 0.5
+        return Pose(0.5 * frames + 2.0 * (1 - np.cos(np.pi * frames)))
+
+    waves = 0.3 + 0.25 * np.sin(np.add.outer(0.2 * np.arange(60), 0.25 * np.arange(90)))
+    scene = photograph_scene(waves, to_and_fro, sensor_size=(32, 40), duration=800_000)
+    source = simulate(scene, sensor).recording()
+    frames = [*source.frames()]
+    twice = [replace(frame, image=frames[i - i % 2].image) for i, frame in enumerate(frames)]
+    events = np.concatenate([*source.events()])
+    made = mend(Recording.from_arrays(events, twice, sensor_size=source.sensor_size), PRESETS["default"])
+    assert made.mends.layout.found == AS_STORED
+    assert made.mends.faults.copies == (*range(1, len(frames), 2),)
+    assert len(made.recording.frames()) == len(frames[::2])
 
 
 def test_black_and_saturation_are_settings_of_what_is_mended():

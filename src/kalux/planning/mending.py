@@ -26,7 +26,9 @@ from kalux.recording import (
     Recording,
     with_corrected_frames,
     with_event_layout,
+    with_frames_of,
     without_events_of,
+    without_repeats,
 )
 from kalux.settings import Settings
 
@@ -95,11 +97,15 @@ class Mended(NamedTuple):
 def mend_events_and_levels(recording: Recording, settings: Settings) -> Mended:
     """Put events right, take the black level off, and find out where frames are clipped, as far as the settings ask.
 
+    Copies are still among the frames, since only events that are put right tell them from a scene that stands still:
+    they are passed over.
+
     Raises
     ------
     ExposureError
         If the frames' exposures are not known.
     """
+    whole, recording = recording, without_repeats(recording)
     events, joins_frames = settings.events, settings.filter.joins_frames
     layout = find_layout(recording, settings.camera) if joins_frames and events.mend_layout else None
     if layout is not None:
@@ -109,7 +115,7 @@ def mend_events_and_levels(recording: Recording, settings: Settings) -> Mended:
         recording = without_events_of(recording, hot)
     recording, settings, black = without_black(recording, settings)
     settings, ceiling = with_saturation(recording, settings)
-    return Mended(recording, settings, Mends(layout, hot, black, ceiling))
+    return Mended(with_frames_of(recording, whole), settings, Mends(layout, hot, black, ceiling))
 
 
 def mend(recording: Recording, settings: Settings) -> Mended:
