@@ -33,7 +33,7 @@ class Pixel:
     Changes, of frame intervals, K11: whether both frames measure it, whether it is silent, how much its L changed,
     squared, as far as frames tell (told), without what noise makes of that, and the variances of both frames; and how
     likely it has an event that is signal (active). Untold: variance of what no event tells of it (K1). Forgotten: what
-    comes to P after each.
+    comes to P after each. Lost: variance of what events would have told that are missing (K18); None: none are.
     Signal: probability that its on and its off events of every frame interval are no noise (K5); none: by their age.
     """
 
@@ -56,6 +56,7 @@ class Pixel:
     told: list[float] = field(default_factory=list)
     active: list[float] = field(default_factory=list)
     untold: list[float] = field(default_factory=list)
+    lost: list[float | None] = field(default_factory=list)
     forgotten: list[float] = field(default_factory=list)
     measured: list[bool] = field(default_factory=list)
     signal: list[tuple[float, float]] = field(default_factory=list)
@@ -432,8 +433,9 @@ def bridged(pixel, settings, times, on, off, scales):
         mismatch -= change + grown(k + 1, b)
         total = 4 * settings.filter.highlight_scale**2 if saturated else first[1] + second[1]
         total += var_on * (on * told_on) ** 2 + var_off * (off * told_off) ** 2
-        total += q_on * n_on + q_off * n_off + ev.quantisation_variance * c2
         q0, noise = ev.quantisation_variance * c2, first[1] + second[1]
+        q0 += pixel.lost[k] or 0.0
+        total += q_on * n_on + q_off * n_off + q0
         untold = pixel.untold[k] if pixel.untold else q0
         untold_from[a] = untold
         gain = mismatch / (total - q0 + untold)
@@ -446,7 +448,7 @@ def bridged(pixel, settings, times, on, off, scales):
         pixel.active.append(min(told_on + told_off, 1.0))
         pixel.told.append(told)
         gain_on, gain_off = var_on * on * told_on / total, -var_off * off * told_off / total  # K2
-        hidden = 2.4 * q0
+        hidden = 2.4 * ev.quantisation_variance * c2
         excess = mismatch + (change * hidden / (change**2 + hidden) if change else 0.0)
         scale_on = min(max(scale_on + gain_on * excess, 0.3), 3.0)
         scale_off = min(max(scale_off + gain_off * excess, 0.3), 3.0)
@@ -503,6 +505,7 @@ def bridged(pixel, settings, times, on, off, scales):
                 far_on = min(far_on, above / on / np.sqrt(v_on))
                 far_off = min(far_off, above / off / np.sqrt(v_off))
                 far = np.clip(far, -above, above)
+            unseen = pixel.forgotten[k - 1] if pixel.forgotten else 0.0
             if right[1] < UNMEASURED:
                 if left[1] >= UNMEASURED and sum(counts(a, b)) > 0:
                     (f_on, f_off), now = signal, period_error(k)
@@ -511,10 +514,9 @@ def bridged(pixel, settings, times, on, off, scales):
                     of_off = f_off * v_off * off**2 * (2 * far_off + n_off)
                     untied[k] = max(of_on + more, 0.0), max(of_off + more, 0.0)
                 far_on = far_off = far = 0
-                unseen = pixel.forgotten[k - 1] if pixel.forgotten else 0.0
                 yield right[1] / 12 if crushed(k) else unseen  # K7
                 continue
-            unseen = ev.quantisation_variance * c2 / 2 if left[1] < UNMEASURED else 0.0
+            unseen += ev.quantisation_variance * c2 / 2 if left[1] < UNMEASURED else 0.0
             before = v_on * (on * far_on) ** 2 + v_off * (off * far_off) ** 2 + far**2
             far_on, far_off = far_on + n_on, far_off + n_off
             far += period_error(k)
@@ -766,15 +768,62 @@ def silent_change(pixels, place, interval, c2):
 def untold(pixels, place, c2, q0):
     """K1: variance of what no event has told of a pixel's change in every frame interval."""
     for k, (measured, silent, *_) in enumerate(pixels[place].changes):
-        changes = measured and silent and q0 > 0
-        yield max(silent_change(pixels, place, k, c2), 0.003 * c2) if changes else q0
+        lost = pixels[place].lost[k]
+        if lost is not None:  # K18
+            yield q0 + lost
+        elif measured and silent and q0 > 0:
+            yield max(silent_change(pixels, place, k, c2), 0.003 * c2)
+        else:
+            yield q0
 
 
 def forgotten(pixels, place, c2):
     """K11: what the state of a pixel loses in every frame interval."""
     for k, (measured, silent, _, noise, _) in enumerate(pixels[place].changes):
-        missed = sum(noise) / (sum(noise) + pixels[place].untold[k])
+        untold, lost = pixels[place].untold[k], pixels[place].lost[k]
+        missed = sum(noise) / (sum(noise) + untold)
+        if lost is not None:  # K18
+            yield untold * missed**2 if measured else lost
+            continue
         yield silent_change(pixels, place, k, c2) * missed**2 if measured and silent else 0.0
+
+
+def seen(pixels, interval):
+    """K18: the intervals up to one that tell of silent pixels: no events are missing in them."""
+    lost = next(iter(pixels.values())).lost
+    return [k for k in range(interval + 1) if lost[k] is None]
+
+
+def lost_time(pixels, start, end):
+    """K18: the time between two frames in which events are missing, us."""
+    times = sorted(t for pixel in pixels.values() for t, *_ in pixel.events if start < t <= end)
+    waits = np.diff([start, *times, end])
+    long = waits[waits >= max(round((end - start) / 20), 1)]
+    rest = end - start - long.sum()
+    if not len(long) or not times or rest < (end - start) / 4:
+        return 0
+    digits = sorted(len(f"{wait:b}") for wait in waits[:-1] if wait > 0)
+    usual = 2 ** next(d for n, d in enumerate(digits, 1) if sum(e <= d for e in digits) >= 0.9 * len(digits))
+    return sum(wait for wait in long if wait * len(times) / rest >= 100 and wait >= 4 * usual)
+
+
+def lost_changes(pixels, k, on, off, q0):
+    """K18: of every pixel, the variance of what events would have told that are missing between two frames."""
+    a, b = next(iter(pixels.values())).middles[k : k + 2]
+    lost = lost_time(pixels, a, b)
+    if lost == 0:
+        return dict.fromkeys(pixels)
+    told = {}
+    for place, pixel in pixels.items():
+        f_on, f_off = pixel.signal[k] if pixel.signal else SURE
+        told[place] = sum(
+            on * f_on * w if p else -off * f_off * w for t, p, *_, w in pixel.events if a < t <= b
+        )
+    found = {}
+    for row, column in pixels:
+        near = [told[i, j] ** 2 for i, j in pixels if max(abs(i - row), abs(j - column)) <= 4]
+        found[row, column] = sum(near) / len(near) * lost / (b - a - lost)
+    return found if max(found.values()) > q0 else dict.fromkeys(pixels)
 
 
 def lately(values):
@@ -790,7 +839,8 @@ def correlated(pixels, interval, c2, q0):
     both, squares, noise = 0.0, 0.0, 0.0
     for q in pixels.values():
         before, now = q.changes[interval - 1], q.changes[interval]
-        if all(before[:2]) and all(now[:2]):
+        seen = q.lost[interval - 1] is None and q.lost[interval] is None
+        if seen and all(before[:2]) and all(now[:2]):
             a, b = (np.clip(change[4], -np.sqrt(c2), np.sqrt(c2)) for change in (before, now))
             (first, second), weight = now[3], (q0 / (sum(now[3]) + q0)) ** 2
             both += weight * (a * b + first)
@@ -801,7 +851,8 @@ def correlated(pixels, interval, c2, q0):
 
 def half_way(pixels, interval, c2, q0):
     """K11: how far the middle between two frames is off the mean of both, in units of their mean square change."""
-    both, squares, noise = lately(correlated(pixels, k, c2, q0) for k in range(1, interval + 1)) + np.zeros(3)
+    pairs = (correlated(pixels, k, c2, q0) for k in seen(pixels, interval)[1:])
+    both, squares, noise = lately(pairs) + np.zeros(3)
     told = both * max(squares, 0) / (squares**2 + noise**2 + (25 * 0.1 * c2) ** 2)
     correlation = np.clip(told, -0.5, 1)
     return 1 / (2 * (1 + correlation)) - 1 / 4
@@ -849,10 +900,12 @@ def shown_change(pixels, place, interval, c2, settings):
 
     Of a pixel that one of the frames shows black, no frame says that it changes little.
     """
+    if pixels[place].lost[interval] is not None:  # K18
+        return shown_change(pixels, place, interval - 1, c2, settings) if interval > 0 else 0.1 * c2
     if any(is_crushed(pixels[place], k, settings.camera) for k in (interval, interval + 1)):
         return 0.4 * c2
     turning = half_way(pixels, interval, c2, settings.events.quantisation_variance * c2)
-    change = [silent_change(pixels, place, k, c2) for k in range(interval + 1)]
+    change = [silent_change(pixels, place, k, c2) for k in seen(pixels, interval)]
     return change[-1] + min(4 * turning, 1) * (lately(change) - change[-1])
 
 
@@ -898,9 +951,11 @@ def known(pixel, variance, t, settings, c2, left):
     events = sum(w for q, *_, w in pixel.events if a < q <= b)
     between = 4 * share * (1 - share)
     wrong = 0.1 * ev.believed_mismatch**2 * c2 * between * events**2
+    lost = pixel.lost[k] or 0.0  # K18
+    wrong += between / 4 * lost
     if is_crushed(pixel, k + 1, settings.camera):  # says what others have said
         return variance + wrong
-    following = second + (1 - share) * events * ev.step_noise * c2
+    following = second + (1 - share) * (events * ev.step_noise * c2 + lost)
     if first >= UNMEASURED:  # K4
         following += 0.1 * ev.believed_mismatch**2 * c2 * ((1 - share) * events) ** 2
     common = (pixel.untold[k] / (first + second + pixel.untold[k])) ** 2
@@ -1168,6 +1223,10 @@ def reconstruct(events, frames, sensor_size, settings, times):
             shares = signal_shares(every, k, settings)
             for place, pixel in every.items():
                 pixel.signal.append((shares[True, place], shares[False, place]))
+    for k in range(len(frames) - 1):
+        found = lost_changes(every, k, on, off, settings.events.quantisation_variance * on * off)
+        for place, pixel in every.items():
+            pixel.lost.append(found[place])
     for (row, column), pixel in every.items():
         out[:2, :, row, column] = method(pixel, settings, times, on, off, *more).T
     if method is not bridged:

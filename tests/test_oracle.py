@@ -103,6 +103,41 @@ def test_engine_agrees_with_the_oracle(name, data):
     assert_agrees(name, *data.draw(streams()))
 
 
+@st.composite
+def streams_with_losses(draw):
+    """Three or four frames, and many events, of which those of about half of a frame interval are missing."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    begin, every = draw(st.integers(0, 10**6)), draw(st.integers(12_000, 40_000))
+    count = draw(st.integers(3, 4))
+    frames = [
+        Frame(
+            rng.integers(0, 256, (HEIGHT, WIDTH)).astype(np.uint8),
+            start,
+            start + draw(st.integers(1000, 9000)),
+        )
+        for start in range(begin, begin + count * every, every)
+    ]
+    t = np.sort(rng.integers(begin - 500, begin + count * every, 350 * count))
+    lost = frames[draw(st.integers(0, count - 2))].middle + round(draw(st.floats(0.0, 0.3)) * every)
+    t = t[(t < lost) | (t > lost + draw(st.floats(0.4, 0.65)) * every)]
+    events = make_events(
+        t, rng.integers(0, WIDTH, len(t)), rng.integers(0, HEIGHT, len(t)), rng.integers(0, 2, len(t)) > 0
+    )
+    moments = st.integers(frames[0].middle, frames[-1].exposure_end)
+    around_the_loss = st.integers(lost, lost + every)
+    times = sorted(draw(st.lists(st.one_of(moments, around_the_loss), min_size=2, max_size=6)))
+    return events, frames, times
+
+
+@pytest.mark.parametrize(
+    "name", ["default", "default-background", "default-black", "default-refractory-doubted"]
+)
+@given(data=st.data())
+@settings(max_examples=8, deadline=None)
+def test_they_agree_where_events_are_missing(name, data):
+    assert_agrees(name, *data.draw(streams_with_losses()))
+
+
 def test_they_agree_where_frames_are_exposed_for_longer_than_between_their_middles():
     """Of a pixel that both frames clip, whose b' of K11 is then more than 1."""
     places = [(1, 0, 0), (1, 0, 1), (1, 1, 0), (1, 1, 1), (2, 0, 0), (2, 0, 0), (2, 0, 1), (2, 0, 1)]

@@ -98,11 +98,22 @@ def test_the_next_frame_tells_of_the_image_before_it(p, second, events, coming, 
     where it is counted already."""
     for first, all_wrong in ((UNMEASURED, wrong), (1e9, 0.0)):
         pixel = np.float32([p, first, second, events])
-        found = known_variance(*pixel, C2 / 6, (coming, 0.0, 1.0, 0.0, wrong))
+        found = known_variance(*pixel, C2 / 6, 0.0, (coming, 0.0, 1.0, 0.0, wrong, 0.0, 0.0))
         behind = second + coming * events + all_wrong * events**2
         assert 1 / found == pytest.approx(1 / p + 1 / behind, rel=1e-4)
-        counted = known_variance(*pixel, C2 / 6, (coming, UNMEASURED, 1.0, 0.0, wrong))
+        counted = known_variance(*pixel, C2 / 6, 0.0, (coming, UNMEASURED, 1.0, 0.0, wrong, 0.0, 0.0))
         assert counted == pytest.approx(p, rel=1e-6)
+
+
+@given(variances, variances, st.floats(0.01, 1.0), st.floats(0.0, 1.0))
+def test_what_is_lost_is_told_by_the_next_frame_alone(p, second, lost, share):
+    """That knows less of what came before it, and half-way a quarter of the lost change is not known (K18)."""
+    frames = around(0.1, second, coming=0.0)._replace(share=share, untold=plane(lost), lost=plane(lost))
+    found = given_variance(plane(p), STILL, NO_CHANGE, NOTHING, frames)[0, 0]
+    behind = second + (1 - share) * lost
+    common = (lost / (0.1 + second + lost)) ** 2 * min(0.1, second)
+    known = max(p * behind / (p + behind), common)
+    assert found == pytest.approx(known + share * (1 - share) * lost, rel=1e-4)
 
 
 def test_noise_that_the_slope_follows_is_in_every_image():

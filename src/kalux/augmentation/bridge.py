@@ -251,8 +251,10 @@ class BridgedSegment(NamedTuple):
         Variance of the way that events lead back from the second frame, by errors of the thresholds, per squared number
         of these events, of pixels that the first frame does not measure; 0 of others (`wrong_way_back`, K4). None: 0.
     untold
-        Variance of what no event has told of the change from start to end (`subthreshold.follow_silent`); None: q_0 of
-        all pixels.
+        Variance of what no event has told of the change from start to end (`subthreshold.follow_silent`, K18); None:
+        q_0 of all pixels.
+    lost
+        The part of it that events would have told which have been lost (K18); None: none.
     untied
         What P grows by with each event of these pixels besides (`untied_steps`, K10). None: nothing.
     """
@@ -284,6 +286,7 @@ class BridgedSegment(NamedTuple):
     signal: tuple[Array, Array] | None = None
     wrong: Array | None = None
     untold: Array | None = None
+    lost: Array | None = None
     untied: UntiedSteps | None = None
 
 
@@ -537,6 +540,7 @@ def bridge(
     *,
     grown: Array | None = None,
     signal: tuple[Array, Array] | None = None,
+    untold: Array | None = None,
 ) -> tuple[BridgedSegment, Thresholds]:
     """Join two latent frames (docs/equations.md, K1), and learn the pixels' thresholds from them (K2).
 
@@ -554,6 +558,8 @@ def bridge(
         (H, W) change of L between the frames in addition to the events' steps (K14); None: none.
     signal
         (H, W) shares of the on and of the off events that are signal (K5); None: all.
+    untold
+        (H, W) float32 variance of the change that no event has told, log intensity^2 (K18); None: q_0 of all pixels.
 
     Returns
     -------
@@ -579,12 +585,19 @@ def bridge(
         bound=second,
         floor=floor,
         net=net,
+        untold=untold,
     )
     more = np.zeros(shape, first.value.dtype) if grown is None else grown
     shares = (np.ones(shape, first.value.dtype),) * 2 if signal is None else signal
+    by_none = np.full(shape, noise.quantisation_variance, np.float32) if untold is None else untold
     given, known, filled, learned = (
         tuple(plane.reshape(-1) for plane in several)
-        for several in ((*first[:2], *second[:2], *counts, more, *shares), thresholds, planes, factors)
+        for several in (
+            (*first[:2], *second[:2], *counts, more, *shares, by_none),
+            thresholds,
+            planes,
+            factors,
+        )
     )
     _bridge(given, known, noise, seconds, filled, learned)
     return segment, Thresholds(*factors)
@@ -606,13 +619,12 @@ def _bridge(given, thresholds, noise, seconds, planes, factors):  # type: ignore
     piece of scratch memory is one array.
     """
     low, high = _SCALE_BOUNDS
-    value, variance, next_value, next_variance, on, off, grown, signal_on, signal_off = given
+    value, variance, next_value, next_variance, on, off, grown, signal_on, signal_off, untold = given
     augmented, slope, step_on, step_off, events, net, floor = planes
     new_on, new_off, new_on_variance, new_off_variance = factors
     scale_on, scale_off, variance_on, variance_off = thresholds
     c_on, c_off, of_step = noise.threshold_on, noise.threshold_off, noise.step_variance
-    unsignalled, of_saturated = noise.quantisation_variance, noise.saturated_variance
-    not_shown = _NOT_SHOWN * unsignalled
+    of_saturated, not_shown = noise.saturated_variance, _NOT_SHOWN * noise.quantisation_variance
     s = empty(_SCRATCH * _BLOCK, np.float64)
     size = np.uint64(len(value))
     for first in range(np.uint64(0), size, np.uint64(_BLOCK)):
@@ -645,12 +657,12 @@ def _bridge(given, thresholds, noise, seconds, planes, factors):  # type: ignore
                 - off_covariance * c_off * n_off
                 + of_step * (n_on + n_off)
                 + (in_doubt_on * n_on + in_doubt_off * n_off)
-                + unsignalled
+                + np.float64(untold[i])
             )
             inverse = 1.0 / total
             gain = mismatch * inverse
             s[_LEVEL + k] += gain * s[_MOVES + k]
-            s[_SLOPE + k] = gain * unsignalled / seconds
+            s[_SLOPE + k] = gain * np.float64(untold[i]) / seconds
             s[_STEP_ON + k] = f_on * (nominal_on + gain * (c_on * on_covariance + (of_step + in_doubt_on)))
             s[_STEP_OFF + k] = f_off * (
                 nominal_off + gain * (c_off * off_covariance - (of_step + in_doubt_off))

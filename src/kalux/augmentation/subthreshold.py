@@ -72,7 +72,7 @@ def usual_change(active: Array, threshold2: float) -> Array:
     """
     active = np.asarray(active, np.float32)
     moving = min(max(float(active.mean(dtype=np.float64)) / _MOVING, _LEAST_MOVING), 1.0)
-    share = _mean_around(active)
+    share = mean_around(active)
     share *= np.float32(_ACTIVE * threshold2)
     share += np.float32(moving * _STILL * threshold2)
     return share
@@ -426,7 +426,7 @@ def _mean(total, count, forward, backward, usual, mean):  # type: ignore[no-unty
             mean[i] = told if measured and count[i] > 0 else usual[i]
 
 
-def _mean_around(values: NDArray[np.float32]) -> NDArray[np.float32]:
+def mean_around(values: NDArray[np.float32]) -> NDArray[np.float32]:
     """Means over 9 x 9 pixels, of those that there are."""
     size = (_AROUND, _AROUND)
     sums = memory.empty(values.shape)

@@ -20,6 +20,7 @@ from kalux.augmentation.highlights import (
     expected_excess,
     follow_unshown,
 )
+from kalux.augmentation.lost import add_lost_change, lost_change, lost_time
 from kalux.augmentation.motion import HalfWay, Paths, Plane, behind, find_path
 from kalux.augmentation.refractory import growth_with_period
 from kalux.augmentation.subthreshold import (
@@ -344,6 +345,8 @@ class BridgedFrames(Method):
         if signal is not None:
             at_middle = with_surety(memory.followed, at_middle, signal)
         trail, grown = self._trail_between(memory, shot, following, at_middle)
+        steps = (on, off) if signal is None else (on * signal[0], off * signal[1])
+        lost = self._lost_change(events, start, end, steps)
         joined, learned = bridge.bridge(
             memory.latent,
             second,
@@ -354,20 +357,12 @@ class BridgedFrames(Method):
             end,
             grown=grown,
             signal=signal,
+            untold=self._with_untold(lost),
         )
         if signal is not None:
             of_steps = doubt(signal, self.noise.step_variance, self._threshold2)
             joined = joined._replace(doubt=of_steps, signal=signal)
-        steps = (on, off) if signal is None else (on * signal[0], off * signal[1])
-        change = self._silent_change(joined, steps)
-        told, latest_change = correlation(
-            memory.latest_change, joined, self.noise.quantisation_variance, self._threshold2
-        )
-        joined = follow_silent(
-            joined, memory.latent, change, self.noise.quantisation_variance, self._threshold2
-        )
-        usual = memory.usual.with_interval(change, told)
-        share = half_way(usual.told, self._threshold2)
+        joined, change, told = self._with_silent(joined._replace(lost=lost), memory, second, steps)
         by_period = self._by_period(events, start, end, signal)
         # Where the second frame measures a pixel L^A is led back from it, also at the first frame, which bounds it.
         far = self._since_measured(memory, joined, memory.latent.value)
@@ -378,10 +373,9 @@ class BridgedFrames(Method):
         joined, since_measured = self._with_drift(
             joined._replace(untied=untied), memory, second, (on, off), change, steps, far, by_period
         )
-        change = self._with_black_change(usual.mixed(change, share), memory.latent, second)
         assert joined.net is not None
         unshown = self._follow_unshown(memory, second, following, joined.net, steps)
-        after = memory._replace(
+        after = told._replace(
             latent=second,
             thresholds=learned,
             interval=(end - start) * 1e-6,
@@ -389,18 +383,15 @@ class BridgedFrames(Method):
             followed=at_middle,
             at_middle=at_middle,
             unshown=unshown,
-            silent_change=change,
-            latest_change=latest_change,
-            usual=usual,
         )
         assert joined.events is not None
         joined = joined._replace(
             wrong=bridge.wrong_way_back(now_measured, known, self.noise, steps, joined.events),
             trail=trail,
             unshown=unshown,
-            silent_change=change,
+            silent_change=told.silent_change,
             turns=turns(on, off),
-            half_way=share,
+            half_way=half_way(told.usual.told, self._threshold2),
             latents=(memory.latent, second) if self._follows_motion and shot.pitch == 1 else None,
             brightest=max(shot.white, following.white),
         )
@@ -421,6 +412,8 @@ class BridgedFrames(Method):
         grown = self._trail_at(at_middle, following.middle, scale)
         grown -= self._trail_at(memory.at_middle, shot.middle, scale)
         between = on + since_on, off + since_off
+        lost = self._lost_change(events, start, following.end, between)
+        untold = self._with_untold(lost)
         behind, learned = bridge.bridge(
             memory.latent,
             second,
@@ -430,6 +423,7 @@ class BridgedFrames(Method):
             shot.middle,
             following.middle,
             grown=grown,
+            untold=untold,
         )
         assert behind.net is not None
         tail_on, tail_off, followed = self.follow(events, following.middle, following.end, at_middle)
@@ -441,7 +435,7 @@ class BridgedFrames(Method):
             followed=followed,
             at_middle=at_middle,
             unshown=self._follow_unshown(memory, second, following, behind.net, between),
-            silent_change=self._silent_change(behind, between),
+            silent_change=memory.silent_change if lost is not None else self._silent_change(behind, between),
         )
         forward = bridge.extend(
             self._latent_at_end(memory, shot),
@@ -451,7 +445,7 @@ class BridgedFrames(Method):
             following.end,
             memory.interval,
             self._latent_at_end(after, following),
-        )
+        )._replace(untold=untold, lost=lost)
         counts, change = (on + tail_on, off + tail_off), memory.silent_change
         by_period = self._by_period(events, start, following.end, None)
         far = self._since_measured(memory, forward, forward.augmented)
@@ -510,6 +504,43 @@ class BridgedFrames(Method):
         height = self.settings.events.trail
         return height * self.on, height * self.off
 
+    def _lost_change(self, events: Chunks, start: int, end: int, steps: Counts) -> Floats | None:
+        """(H, W) variance of the change by events that are missing in an interval, given those that are there (K18).
+
+        None where it is nowhere more than q_0.
+        """
+        lost = lost_time(all_between(events, start, end), start, end)
+        if lost == 0:
+            return None
+        told = np.float32(self.on) * steps[0] - np.float32(self.off) * steps[1]
+        variance = lost_change(told, lost, end - start)
+        return variance if float(variance.max()) > self.noise.quantisation_variance else None
+
+    def _with_untold(self, lost: Floats | None) -> Floats | None:
+        """(H, W) variance of all that no event has told: what is lost, and q_0. None: nothing is lost."""
+        return None if lost is None else lost + np.float32(self.noise.quantisation_variance)
+
+    def _with_silent(
+        self, segment: BridgedSegment, memory: BridgeMemory, second: Latent, steps: Counts
+    ) -> tuple[BridgedSegment, Floats, BridgeMemory]:
+        """The segment in which silent pixels follow the frames (K1), their change in it, and the memory with both.
+
+        Where events are missing, a pixel without one is not known to be silent: those that are change as before (K18).
+        """
+        if segment.lost is not None:
+            unknown = np.full(self.shape, np.nan, np.float32)
+            return segment, memory.silent_change, memory._replace(latest_change=unknown)
+        quantisation, threshold2 = self.noise.quantisation_variance, self._threshold2
+        change = self._silent_change(segment, steps)
+        told, latest_change = correlation(memory.latest_change, segment, quantisation, threshold2)
+        usual = memory.usual.with_interval(change, told)
+        shown = self._with_black_change(
+            usual.mixed(change, half_way(usual.told, threshold2)), memory.latent, second
+        )
+        followed = follow_silent(segment, memory.latent, change, quantisation, threshold2)
+        remembered = memory._replace(silent_change=shown, latest_change=latest_change, usual=usual)
+        return followed, change, remembered
+
     def _silent_change(self, segment: BridgedSegment, steps: Counts) -> Floats:
         """K11, given the on and the off events as far as they are signal."""
         active = np.minimum(steps[0] + steps[1], np.float32(1.0))
@@ -547,7 +578,11 @@ class BridgedFrames(Method):
         if far_period is not None and by_period is not None:
             more, far_period = bridge.period_drift(second, far_period, by_period)
             np.maximum(grown + more, np.float32(0.0), out=grown)
-        add_missed_change(grown, segment, second, counts, change, self.noise.quantisation_variance)
+        if segment.lost is not None:
+            assert segment.untold is not None
+            add_lost_change(grown, memory.latent, second, segment.untold, segment.lost)
+        else:
+            add_missed_change(grown, segment, second, counts, change, self.noise.quantisation_variance)
         if second.ceiling is not None:
             black = np.isfinite(second.ceiling)
             grown[black] = second.variance[black] / (_BLACK_FRAMES * (_BLACK_FRAMES + 1))
@@ -680,6 +715,7 @@ class BridgedFrames(Method):
             coming=(1.0 - share) * self.noise.step_variance,
             counted=0.0,
             untold=segment.untold,
+            lost=segment.lost,
             quantisation_variance=self.noise.quantisation_variance,
             repeated=1.0 - between / 2.0,
             wrong=wrong * between,

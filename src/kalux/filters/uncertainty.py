@@ -94,6 +94,8 @@ class Around(NamedTuple):
         How far silent pixels are off the mean of both frames there (`kalux.augmentation.subthreshold.half_way`).
     untold
         (H, W) variance of what no event has told of the change between them; None: q_0.
+    lost
+        (H, W) the part of it that is of events that have been lost (K18); None: none.
     """
 
     first: Array
@@ -108,10 +110,12 @@ class Around(NamedTuple):
     share: float
     half_way: float = RANDOM
     untold: Array | None = None
+    lost: Array | None = None
 
     def scalars(self) -> tuple[float, ...]:
         """Those that `known_variance` takes."""
-        return self.coming, self.counted, self.repeated, self.wrong, self.wrong_back
+        of_lost = RANDOM * bridge_variance(self.share), 1.0 - self.share
+        return self.coming, self.counted, self.repeated, self.wrong, self.wrong_back, *of_lost
 
     def misses_some(self, unmeasured: NDArray[np.int64]) -> bool:
         """Whether of pixels without a measurement some are not known to be black either (K7)."""
@@ -169,21 +173,21 @@ def before_averaging(subthreshold: Subthreshold) -> Subthreshold:
 
 
 @nb.njit(cache=True, inline="always", error_model="numpy")
-def known_variance(variance, first, second, events, untold, around):  # type: ignore[no-untyped-def]
+def known_variance(variance, first, second, events, untold, lost, around):  # type: ignore[no-untyped-def]
     """Variance of L given all frames and events around, from P and the variances of the frames around.
 
     The next frame, seen through the events that are to come, is information about L besides P. As far as the slope
     follows the frames, the share ``untold`` / V of their mismatch (K1), their noise is in every image, however many
-    have been seen.
+    have been seen. What is ``lost`` came at any time between the frames.
     """
-    coming, counted, repeated, wrong, wrong_back = around
-    following = counted + second + coming * events
+    coming, counted, repeated, wrong, wrong_back, lost_between, lost_after = around
+    following = counted + second + coming * events + lost_after * lost
     following += wrong_back * events * events if first >= UNMEASURED else ZERO  # K4
     slope = untold / (first + second + untold)
     known = larger(
         variance * following / (variance + following), repeated * slope * slope * smaller(first, second)
     )
-    return known + wrong * events * events
+    return known + wrong * events * events + lost_between * lost
 
 
 def given_variance(
@@ -215,14 +219,15 @@ def given_variance(
     before, above_moving = before_averaging(subthreshold), subthreshold.above_moving
     given = np.empty(variance.shape, np.float32)
     nothing = np.empty(0, np.float32)
-    frames: tuple[Array, ...] = (nothing,) * 4
+    frames: tuple[Array, ...] = (nothing,) * 5
     if around is not None:
         untold = told_by_none(around.untold, around.quantisation_variance, variance.shape)
-        frames = around.first, around.second, around.events, untold
+        lost = nothing if around.lost is None else around.lost
+        frames = around.first, around.second, around.events, untold, lost
     planes = variance, silent_change, *frames
     _give(
         *(np.ascontiguousarray(plane, np.float32).reshape(-1) for plane in planes),
-        tuple(np.float32(value) for value in ((0.0,) * 5 if around is None else around.scalars())),
+        tuple(np.float32(value) for value in ((0.0,) * 7 if around is None else around.scalars())),
         nothing if left is None else left.reshape(-1),
         moving.reshape(-1),
         (np.float32(subthreshold.silent), np.float32(subthreshold.moving)),
@@ -234,7 +239,7 @@ def given_variance(
 
 @loop
 def _give(  # type: ignore[no-untyped-def]
-    variance, change, first, second, events, untold, around, left, moving, subthreshold, untied, given
+    variance, change, first, second, events, untold, lost, around, left, moving, subthreshold, untied, given
 ):
     """`given_variance`, a few pixels at a time: what one step leaves is in the nearer caches for the next.
 
@@ -249,17 +254,21 @@ def _give(  # type: ignore[no-untyped-def]
             if len(left):
                 _average_unmeasured(known, left[here], first[here], second[here], untied, averaged[:count])
                 known = averaged[:count]
-            _inform(known, first[here], second[here], events[here], untold[here], around, informed[:count])
+            some = lost[here] if len(lost) else lost
+            _inform(
+                known, first[here], second[here], events[here], untold[here], some, around, informed[:count]
+            )
             _mark_intermittent(moving[here], first[here], second[here], events[here], intermittent[:count])
             known = informed[:count]
         _add_subthreshold(known, moving[here], intermittent, change[here], subthreshold, given[here])
 
 
 @loop(fastmath=FUSED)
-def _inform(variance, first, second, events, untold, around, known):  # type: ignore[no-untyped-def]
+def _inform(variance, first, second, events, untold, lost, around, known):  # type: ignore[no-untyped-def]
     """`known_variance` of every pixel."""
     for i in range(np.uint64(len(known))):
-        known[i] = known_variance(variance[i], first[i], second[i], events[i], untold[i], around)
+        gone = lost[i] if len(lost) else ZERO
+        known[i] = known_variance(variance[i], first[i], second[i], events[i], untold[i], gone, around)
 
 
 @loop(fastmath=FUSED)

@@ -1,0 +1,151 @@
+"""Times between two frames in which events are missing, and what the light may have done meanwhile (K18).
+
+A sensor whose events come faster than they can be read, or a computer that is late to fetch them, loses all of some
+milliseconds. To the filter that is a scene that stands still, and the frame after it blames thresholds and single
+events for what it shows. What is lost is known by the time for which nothing comes though events are many before and
+after; how much, by what the events around tell.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux.augmentation.bridge import UNMEASURED, Latent
+from kalux.augmentation.subthreshold import mean_around
+from kalux.compiled import event_words, loop
+from kalux.events import EventArray
+
+Array = NDArray[np.floating[Any]]
+
+_LEAST_SHARE: Final = 1 / 20
+"""Of the time between two frames: with less missing, events still tell nearly all of the change."""
+
+_LEAST_REST: Final = 1 / 4
+"""Of that time that must be left: the events of a flash come within a moment, and none are missing before and after."""
+
+_MISSING: Final = 100.0
+"""Events that a wait must be short of, at the rate of the rest of the time between the frames: at random, as many come
+once in exp(100) times."""
+
+_BUNCHES: Final = 4.0
+"""Times as long as most other waits (`_MOST`) that one must be: events of some simulators and readers are stamped in
+bunches, some milliseconds apart."""
+
+_MOST: Final = 0.9
+
+
+def lost_time(chunks: Sequence[EventArray], start: int, end: int) -> int:
+    """us from ``start`` to ``end`` in which events are missing; 0 where none are, or too few come to tell.
+
+    Parameters
+    ----------
+    chunks
+        The events with start < t <= end, in one array or several.
+
+    A wait from one event of the sensor to the next counts if a hundred events are missing in it at the rate of the rest
+    of the time, a quarter at least, if it takes a twentieth of the time, and if it is four times as long as nine of ten
+    others: stamps that come in bunches are no loss.
+    """
+    waits = np.zeros(_WAITS, np.int64)
+    least = max(round(_LEAST_SHARE * (end - start)), 1)
+    before, found, events = start, 0, 0
+    for chunk in chunks:
+        before, found = _find_waits(event_words(chunk), before, least, waits, found)
+        events += len(chunk)
+    if end - before >= least:
+        waits[found], found = end - before, found + 1
+    longest = waits[:found]
+    rest = end - start - int(longest.sum())
+    if found == 0 or events == 0 or rest < _LEAST_REST * (end - start):
+        return 0
+    lost = longest[longest * (events / rest) >= _MISSING]
+    if len(lost) == 0:
+        return 0
+    return int(lost[lost >= _BUNCHES * _usual_wait(chunks, start)].sum())
+
+
+def lost_change(told: Array, lost: int, duration: int) -> Array:
+    """What events that are missing between two frames would have told (docs/equations.md, K18).
+
+    Parameters
+    ----------
+    told
+        (H, W) float32 change of log intensity by those that are there.
+    lost
+        us without events, of `lost_time`.
+    duration
+        us from one frame to the next; longer than ``lost``.
+
+    Returns
+    -------
+    (H, W) float32 variance of the change of log intensity that is not told.
+    """
+    variance = mean_around(np.square(told))
+    variance *= np.float32(lost / (duration - lost))
+    return variance
+
+
+def add_lost_change(grown: Array, first: Latent, second: Latent, untold: Array, lost: Array) -> None:
+    """Add to ``grown``, (H, W), the part of changes in a time without events that the bridge does not follow. In place.
+
+    As of silent pixels (K11): its slope follows the share untold / V of the mismatch where both frames measure the
+    pixel. Where one does not, nothing follows what is lost.
+
+    Parameters
+    ----------
+    first, second
+        The frames before and after.
+    untold
+        (H, W) variance of what no event has told.
+    lost
+        (H, W) that of what lost ones would have.
+    """
+    noise = first.variance + second.variance
+    missed = noise / (noise + untold)
+    measured = np.maximum(first.variance, second.variance) < UNMEASURED
+    grown += np.where(measured, untold * missed * missed, lost)
+
+
+_WAITS: Final = round(1 / _LEAST_SHARE) + 1
+"""More of them do not fit between the frames."""
+
+_POWERS: Final = 64
+
+
+@loop
+def _find_waits(words, before, least, waits, found):  # type: ignore[no-untyped-def]
+    """Write down waits of ``least`` us and more; the time of the last event, and how many there are now."""
+    for i in range(len(words)):
+        if words[i, 0] - before >= least:
+            waits[found] = words[i, 0] - before
+            found += 1
+        before = words[i, 0]
+    return before, found
+
+
+def _usual_wait(chunks: Sequence[EventArray], start: int) -> int:
+    """us, a power of two: that which `_MOST` of the waits between events of different times do not reach."""
+    numbers = np.zeros(_POWERS, np.int64)
+    before = start
+    for chunk in chunks:
+        before = _count_waits(event_words(chunk), before, numbers)
+    below = np.cumsum(numbers)
+    return 1 << int(np.searchsorted(below, _MOST * below[-1]))
+
+
+@loop
+def _count_waits(words, before, numbers):  # type: ignore[no-untyped-def]
+    """Count waits by how many binary digits they have; the time of the last event."""
+    for i in range(len(words)):
+        wait, digits = words[i, 0] - before, 0
+        before = words[i, 0]
+        while wait > 0:
+            wait >>= 1
+            digits += 1
+        if digits > 0:
+            numbers[digits] += 1
+    return before

@@ -1,0 +1,93 @@
+"""Times in which events are missing are found, and no others; what they hide is told by the events around."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kalux.augmentation.bridge import MASKED, UNMEASURED, Latent
+from kalux.augmentation.lost import add_lost_change, lost_change, lost_time
+from kalux.events import make_events
+
+START, END = 1_000_000, 1_040_000
+
+
+def events_at(t):
+    t = np.sort(np.asarray(t, np.int64))
+    return make_events(t, np.zeros_like(t), np.zeros_like(t), np.zeros_like(t))
+
+
+def any_time(number, seed=0):
+    return np.random.default_rng(seed).integers(START + 1, END + 1, number)
+
+
+def without(t, begin, end):
+    return t[(t <= begin) | (t > end)]
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(0, 5_000))
+def test_nothing_is_missing_of_events_at_random(seed, number):
+    assert lost_time([events_at(any_time(number, seed))], START, END) == 0
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(START, END - 6_000), st.integers(6_000, 25_000))
+def test_what_is_missing_is_found_wherever_it_begins(seed, begin, time):
+    """Also before the first event, and after the last; to a few of the mean waits of 13 us."""
+    end = min(begin + time, END)
+    found = lost_time([events_at(without(any_time(3_000, seed), begin, end))], START, END)
+    assert found == pytest.approx(end - begin, abs=200)
+
+
+def test_two_losses_add_up():
+    t = without(without(any_time(5_000), START + 3_000, START + 8_000), START + 20_000, START + 30_000)
+    assert lost_time([events_at(t)], START, END) == pytest.approx(15_000, abs=100)
+
+
+@given(st.lists(st.integers(0, 2_000), max_size=4))
+def test_it_does_not_matter_how_events_are_cut_into_chunks(cuts):
+    events = events_at(without(any_time(2_000), START + 9_000, START + 17_000))
+    chunks = [part for part in np.split(events, sorted(min(cut, len(events)) for cut in cuts)) if len(part)]
+    assert lost_time(chunks, START, END) == lost_time([events], START, END) > 0
+
+
+def test_stamps_that_come_in_bunches_are_no_loss():
+    """As of simulators that make all events of a frame at once; a bunch that is left out is."""
+    bunches = np.arange(START, END, 2_500)
+    assert lost_time([events_at(np.repeat(bunches, 500))], START, END) == 0
+    left = without(np.arange(START, END, 500), START + 10_000, START + 20_000)
+    assert lost_time([events_at(np.repeat(left, 100))], START, END) == 10_500
+
+
+def test_a_flash_is_no_loss():
+    """All events of 2 ms, and nothing before and after."""
+    flash = np.random.default_rng(1).integers(START + 19_000, START + 21_000, 5_000)
+    assert lost_time([events_at(flash)], START, END) == 0
+
+
+def test_few_events_tell_nothing():
+    assert lost_time([], START, END) == 0
+    assert lost_time([events_at(without(any_time(100), START, START + 20_000))], START, END) == 0
+
+
+def test_what_is_lost_goes_with_the_time_and_with_what_events_around_tell():
+    told = np.zeros((30, 40), np.float32)
+    told[10, 10] = 0.9
+    variance = lost_change(told, 10_000, 40_000)
+    assert variance[10, 10] == pytest.approx(0.9**2 / 81 / 3, rel=1e-5)
+    assert variance[14, 14] == pytest.approx(variance[10, 10], rel=1e-4)
+    assert variance[20, 20] == pytest.approx(0, abs=1e-7)
+    np.testing.assert_allclose(lost_change(told, 20_000, 40_000), 3 * variance, rtol=1e-5)
+
+
+def test_p_grows_by_what_frames_do_not_tell_of_the_loss():
+    """Of pixels that both measure little, of those that one clips or masks by all of it."""
+    grown = np.full((1, 4), 0.001)
+    first = Latent(np.zeros((1, 4)), np.array([[1e-4, 1.0, UNMEASURED, 1e-4]]))
+    second = Latent(np.zeros((1, 4)), np.array([[1e-4, 1.0, 1e-4, MASKED]]))
+    add_lost_change(grown, first, second, np.full((1, 4), 0.3), np.full((1, 4), 0.25))
+    part = 2e-4 / 0.3002, 2.0 / 2.3
+    np.testing.assert_allclose(
+        grown[0] - 0.001, [0.3 * part[0] ** 2, 0.3 * part[1] ** 2, 0.25, 0.25], rtol=1e-6
+    )
