@@ -589,7 +589,9 @@ def bridge(
     )
     more = np.zeros(shape, first.value.dtype) if grown is None else grown
     shares = (np.ones(shape, first.value.dtype),) * 2 if signal is None else signal
-    by_none = np.full(shape, noise.quantisation_variance, np.float32) if untold is None else untold
+    by_none = np.full(shape, noise.quantisation_variance)
+    if untold is not None:
+        by_none[...] = untold
     given, known, filled, learned = (
         tuple(plane.reshape(-1) for plane in several)
         for several in (
@@ -657,12 +659,12 @@ def _bridge(given, thresholds, noise, seconds, planes, factors):  # type: ignore
                 - off_covariance * c_off * n_off
                 + of_step * (n_on + n_off)
                 + (in_doubt_on * n_on + in_doubt_off * n_off)
-                + np.float64(untold[i])
+                + untold[i]
             )
             inverse = 1.0 / total
             gain = mismatch * inverse
             s[_LEVEL + k] += gain * s[_MOVES + k]
-            s[_SLOPE + k] = gain * np.float64(untold[i]) / seconds
+            s[_SLOPE + k] = gain * untold[i] / seconds
             s[_STEP_ON + k] = f_on * (nominal_on + gain * (c_on * on_covariance + (of_step + in_doubt_on)))
             s[_STEP_OFF + k] = f_off * (
                 nominal_off + gain * (c_off * off_covariance - (of_step + in_doubt_off))

@@ -24,7 +24,7 @@ Array = NDArray[np.floating[Any]]
 _LEAST_SHARE: Final = 1 / 20
 """Of the time between two frames: with less missing, events still tell nearly all of the change."""
 
-_LEAST_REST: Final = 1 / 4
+_LEAST_REST: Final = 1 / 10
 """Of that time that must be left: the events of a flash come within a moment, and none are missing before and after."""
 
 _MISSING: Final = 100.0

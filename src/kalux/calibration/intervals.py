@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux import memory
+from kalux.augmentation.lost import lost_time
 from kalux.augmentation.refractory import EventClock
 from kalux.calibration.exposures import Exposures
 from kalux.compiled import event_words
@@ -230,7 +231,7 @@ class Counted(NamedTuple):
 def counted_intervals(
     recording: Recording, camera: CameraSettings, events: EventSettings, *, most_frames: int
 ) -> Iterator[Counted]:
-    """As `intervals`, with the events of every pixel counted.
+    """As `intervals`, with the events of every pixel counted, without those in which events are missing (K18).
 
     Of ``events``, thresholds, delay and refractory period are used.
     """
@@ -239,7 +240,10 @@ def counted_intervals(
     exposures = Exposures(recording.sensor_size, delay, events.thresholds)
     margin = recording.longest_exposure + abs(delay)
     for interval in intervals(recording, camera, margin=margin, most_frames=most_frames):
-        inside = clock.weighed(between(interval.events, interval.start + delay, interval.end + delay))
+        start, end = interval.start + delay, interval.end + delay
+        inside = clock.weighed(between(interval.events, start, end))
+        if lost_time([inside], start, end):
+            continue
         on, off = count_events(inside, recording.sensor_size, weighed=True)
         before, after = exposures.of(interval.first, interval.second, interval.events)
         yield Counted(interval, on, off, after.over_middle - before.over_middle)
