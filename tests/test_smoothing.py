@@ -358,3 +358,21 @@ def test_black_hides_as_much_of_two_filters_as_of_one():
         (image,) = kalux.reconstruct(source, times=[222_500], settings=black, smooth=smooth)
         # P falls from V/3 to V/4 within an interval, and grows by V/12 at the frame.
         assert 0.75 * hidden < image.variance[3, 4] < 1.05 * hidden
+
+
+def test_what_is_lost_is_unknown_to_both_directions():
+    """Where one frame measures a pixel, their errors are the same by half, half-way, and the more the less events told
+    (K1, K18)."""
+    shape = (1, 2)
+    plane = np.full(shape, 0.01, np.float32)
+    unmeasured = np.full(shape, UNMEASURED, np.float32)
+    lost = np.array([[0.0, 0.3]], np.float32)
+    scalars = {"coming": 0.0, "counted": 0.0, "quantisation_variance": 0.007, "repeated": 1.0}
+    scalars |= {"wrong": 0.0, "wrong_back": 0.0, "share": 0.5}
+    around = Around(plane, unmeasured, plane, **scalars)
+    information = np.full(shape, 2.0, np.float32)
+    same = smoothing.shared_errors(around, around, information)
+    np.testing.assert_allclose(same, 0.014 + (1 - 0.014) / 2, rtol=1e-5)
+    known = around._replace(untold=lost + np.float32(0.007), lost=lost)
+    same = smoothing.shared_errors(known, known, information)
+    np.testing.assert_allclose(same, [[0.014 + (1 - 0.014) / 2, 0.614 + (1 - 0.614) / 2]], rtol=1e-5)

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from kalux.augmentation.background import signal_shares
 from kalux.augmentation.bridge import REPEATED, UNMEASURED
+from kalux.augmentation.subthreshold import told_by_none
 from kalux.augmentation.trail import FrameTrail, follow, nothing_followed, trail_at, with_surety
 from kalux.event_slices import counted
 from kalux.filters.highlights import obey_bounds, smoothed_unshown
@@ -317,14 +318,13 @@ def shared_errors(
     this bridge as well as the other knows it from behind. With s the share of the way to the second frame, their
     errors are the same by 1 - s where the first frame measures the pixel, and by s where the second does: all where
     both do, and none where neither does and each direction comes from a frame of its own. What else they know, neither
-    is told where the light is between its latest event and its next: a variance of q_0 (K1), out of one over
-    ``information``, (H, W), the geometric mean of both. None: not told.
+    is told where the light is between its latest event and its next: the variance that no event tells (K1, K18), out of
+    one over ``information``, (H, W), the geometric mean of both. None: not told.
     """
     if forward is None or backward is None:
         return None
-    unsignalled: NDArray[Any] = np.minimum(
-        np.float32(forward.quantisation_variance) * information, np.float32(1.0)
-    )
+    untold = told_by_none(forward.untold, forward.quantisation_variance, information.shape)
+    unsignalled: NDArray[Any] = np.minimum(untold * information, np.float32(1.0))
     share = np.float32(forward.share)
     first, second = forward.first < UNMEASURED, forward.second < UNMEASURED
     same = (np.float32(1.0) - share) * first + share * second

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from kalux import Recording
-from kalux.calibration.silences import find_silences, overlaps
+from kalux.augmentation.lost import lost_time
+from kalux.calibration.silences import MissingWatch, find_silences, overlaps
 from kalux.datasets import SensorSettings, simulate
 from kalux.datasets.motion import pan
 from kalux.datasets.scenes import Scene, photograph_scene
@@ -22,6 +27,29 @@ def test_silences_in_which_frames_change_are_found_the_longest_first():
     (first, second) = find_silences(cut)
     assert first == (pytest.approx(500_000, abs=10_000), pytest.approx(900_000, abs=10_000))
     assert second == (pytest.approx(100_000, abs=10_000), pytest.approx(350_000, abs=10_000))
+
+
+LOSSY = without_events(without_events(moving_blocks().recording(), 110_000, 130_000), 300_000, 312_000)
+
+
+@given(st.lists(st.integers(1, 20_000), max_size=6))
+def test_events_are_missing_in_the_same_intervals_however_they_are_cut(cuts):
+    events = np.concatenate([*LOSSY.events()])
+    frames = [*LOSSY.frames()]
+    watch = MissingWatch(np.array([(frame.exposure_start, frame.exposure_end) for frame in frames]))
+    for chunk in np.split(events, sorted(min(cut, len(events)) for cut in cuts)):
+        if len(chunk):
+            watch.see(chunk)
+    watch.finish()
+    middles = [frame.middle for frame in frames]
+    between = [
+        events[(events["t"] > start) & (events["t"] <= end)] for start, end in itertools.pairwise(middles)
+    ]
+    lost = [lost_time([some], int(some["t"][0]), int(some["t"][-1])) for some in between]
+    found = watch.found
+    assert (found.intervals, found.lossy, found.time) == (len(lost), np.count_nonzero(lost), sum(lost))
+    assert found.lossy >= 2
+    assert found.first == middles[next(k for k, time in enumerate(lost) if time)]
 
 
 def test_a_silence_in_which_the_frames_end_is_found_though_events_come_after_them():

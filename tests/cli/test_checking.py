@@ -121,6 +121,27 @@ def test_events_that_are_missing_while_frames_change_are_told():
     assert silence((t >= 300_000) & (t <= 700_000), still) == (None, [])
 
 
+def test_moments_without_events_between_frames_are_told_where_there_are_many():
+    made = moving_blocks(duration=1_000_000)
+    t = made.events["t"]
+
+    def told(length, *moments):
+        missing = np.any([(t > moment) & (t < moment + length) for moment in moments], axis=0)
+        source = Recording.from_arrays(made.events[~missing], made.frames, sensor_size=made.scene.sensor_size)
+        found = check_recording(source, lambda _: None)
+        return found, list(found.warnings())
+
+    middles = [frame.middle for frame in made.frames]
+    found, (warning,) = told(15_000, *(middle + 8_000 for middle in middles[3:15:2]))
+    assert (found.missing.intervals, found.missing.lossy) == (len(made.frames) - 1, 6)
+    assert found.missing.time == pytest.approx(6 * 15_000, rel=0.05)
+    assert found.missing.first == middles[3]
+    assert "in 6 of 23 intervals between frames, the first after" in warning
+    assert "what changed then is told by the frames alone" in warning
+    once, nothing = told(5_000, middles[3] + 8_000)
+    assert (once.missing.lossy, once.missing.time < 5_500, nothing) == (1, True, [])
+
+
 def test_packets_that_are_missing_are_told_from_the_first_frame_up_to_what_was_checked():
     made, asked = moving_blocks(), []
     rec = made.recording()

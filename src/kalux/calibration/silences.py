@@ -1,4 +1,4 @@
-"""Times without an event though frames go on to change: a sensor, or what read it, has dropped events.
+"""Times without an event in which there should be some: a sensor, or what read it, has dropped events.
 
 Silence of a sensor says that the light stays and that there is no noise; this silence says neither. It is what a
 command warns of, and what estimates of noise leave out.
@@ -8,15 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import islice
-from typing import Final
+from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.augmentation.lost import lost_time
 from kalux.calibration.region import LEAST_MISSED, Region
 from kalux.compiled import event_words, loop
-from kalux.event_slices import between
+from kalux.event_slices import all_between, between
 from kalux.events import EventArray
 from kalux.frames import Frame
 from kalux.recording import Recording
@@ -142,6 +143,68 @@ class EventWaits:
             self._see_end()
         seen = self._last - self._start
         return changes.go_on([*_missing(self._found, seen, self.events)])
+
+
+class Missing(NamedTuple):
+    """Events that are missing between frames (docs/equations.md, K18), after some and before others.
+
+    What has none until the next frame, or since the one before, may have come to stand still.
+
+    Attributes
+    ----------
+    intervals
+        From frame to frame, that were looked at, and
+    lossy
+        those in which some are.
+    time
+        us without them, of all these together.
+    first
+        us: the frame from which on the first ones are.
+    """
+
+    intervals: int = 0
+    lossy: int = 0
+    time: int = 0
+    first: int = 0
+
+
+class MissingWatch:
+    """Sees the events go by, and tells between which of the frames some are missing.
+
+    Parameters
+    ----------
+    exposures
+        (K, 2) us: start and end of those of the frames, in order.
+    """
+
+    def __init__(self, exposures: NDArray[np.int64]) -> None:
+        self._middles: list[int] = (exposures[:, 0] + (exposures[:, 1] - exposures[:, 0]) // 2).tolist()
+        self._held: list[EventArray] = []
+        self.found = Missing()
+
+    def see(self, chunk: EventArray) -> None:
+        """Look at the next events, of which there is one at least."""
+        self._held.append(chunk)
+        self._look(int(chunk["t"][-1]))
+
+    def finish(self) -> None:
+        """No event is to come."""
+        if self._held:
+            self._look(self._middles[-1] + 1)
+
+    def _look(self, until: int) -> None:
+        """At the intervals that have ended before ``until``, us."""
+        while (done := self.found.intervals) + 1 < len(self._middles) and self._middles[done + 1] < until:
+            start, end = self._middles[done : done + 2]
+            events = all_between(self._held, start, end)
+            lost = lost_time(events, int(events[0]["t"][0]), int(events[-1]["t"][-1])) if events else 0
+            self.found = Missing(
+                done + 1,
+                self.found.lossy + (lost > 0),
+                self.found.time + lost,
+                start if lost and not self.found.lossy else self.found.first,
+            )
+            self._held = [chunk for chunk in self._held if chunk["t"][-1] > end]
 
 
 def find_silences(

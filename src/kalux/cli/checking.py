@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.calibration.region import Region, widened
-from kalux.calibration.silences import EventWaits, FrameChanges
+from kalux.calibration.silences import EventWaits, FrameChanges, Missing, MissingWatch
 from kalux.event_slices import events_until
 from kalux.frames import Frame, exposure_doubt
 from kalux.readers.source import Lost
@@ -33,6 +33,10 @@ _LONG_GAP: Final = 10_000_000
 _MANY_INTERVALS: Final = 100
 """As many times longer than usual: pictures of a slow series are not missed."""
 
+
+_MUCH_MISSING: Final = 0.01
+"""Share of the time from the first frame to the last: a moment between two frames is no matter, the images say how
+uncertain they are there."""
 
 _LEAST_EVENTS: Final = 1_000  # of one polarity, without the other: fewer may be noise
 
@@ -70,6 +74,8 @@ class Contents(NamedTuple):
         What is taken for it; None where nothing was checked.
     lost
         Packets of events that are missing from the first exposure on, of those that were checked.
+    missing
+        Events that are, by the times between them.
     """
 
     frames: int
@@ -88,6 +94,7 @@ class Contents(NamedTuple):
     region: Region | None = None
     white: CheckedWhite | None = None
     lost: Lost | None = None
+    missing: Missing = Missing()
 
     @property
     def seconds(self) -> float:
@@ -122,6 +129,10 @@ class Contents(NamedTuple):
             yield self._silence_doubt(*self.silence) + (
                 "? Images between the frames do not move there" if of_images else "?"
             )
+        elif doubt is None and self.lost is None and self.missing.time > _MUCH_MISSING * 1e6 * self.seconds:
+            yield self._missing_events(self.missing) + (
+                "; what changed then is told by the frames alone" if of_images else ""
+            )
         if self.region is not None:
             top, bottom, left, right, _ = self.region
             yield (
@@ -134,6 +145,13 @@ class Contents(NamedTuple):
         return (
             f"{how_many(packets, 'packet')} of events {'is' if packets == 1 else 'are'} missing by their numbers, the "
             f"first before {(first - self.start) * 1e-6:.3f} s: lost between camera and recorder"
+        )
+
+    def _missing_events(self, missing: Missing) -> str:
+        return (
+            f"events are missing for {missing.time * 1e-6:.3f} s in all, in {missing.lossy} of "
+            f"{how_many(missing.intervals, 'interval')} between frames, the first after "
+            f"{(missing.first - self.start) * 1e-6:.3f} s: were they lost between camera and recorder"
         )
 
     @property
@@ -181,7 +199,7 @@ def check_recording(
     start, end = (int(t) for t in (exposures[0, 0], exposures[-1, 1]))
     count = on = events_from = 0
     complete, last_event = True, start
-    waits = EventWaits(exposures)
+    waits, missing = EventWaits(exposures), MissingWatch(exposures)
     region: Region | None = None
     for chunk in recording.events():
         if most is not None and events_from >= most:
@@ -191,9 +209,12 @@ def check_recording(
         on += int(np.count_nonzero(chunk["p"]))
         region = widened(region, chunk)
         waits.see(chunk)
+        missing.see(chunk)
         last_event = max(last_event, min(int(chunk["t"][-1]), end))
         events_from += len(chunk) - events_until(chunk, start - 1)
         on_events(len(chunk))
+    if complete:
+        missing.finish()
     doubts = tuple(filter(None, (white.doubt(), exposure_doubt(exposures))))
     silent = waits.lost(changes, complete=complete)
     return Contents(
@@ -213,6 +234,7 @@ def check_recording(
         region if region is not None and changes.go_on_beyond(region, recording.sensor_size) else None,
         white.found(),
         recording.source.lost(start, last_event) if recording.source.lost is not None else None,
+        missing.found,
     )
 
 
