@@ -8,7 +8,7 @@ filter has a linear response only; I and f^w of others are `kalux.models.camera`
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from math import erf
 
@@ -34,6 +34,8 @@ class Pixel:
     squared, as far as frames tell (told), without what noise makes of that, and the variances of both frames; and how
     likely it has an event that is signal (active). Untold: variance of what no event tells of it (K1). Forgotten: what
     comes to P after each. Lost: variance of what events would have told that are missing (K18); None: none are.
+    Before: events before the first exposure, of which frames alone know (K19). Late: how much later than a frame's
+    middle its row is exposed; reach: the same of the row that is exposed last.
     Signal: probability that its on and its off events of every frame interval are no noise (K5); none: by their age.
     """
 
@@ -47,6 +49,9 @@ class Pixel:
     black: list[bool]
     dark: list[float]
     events: list[tuple[int, bool, int, int, float]]
+    before: list[tuple[int, bool, int, int, float]]
+    late: int = 0
+    reach: int = 0
     shown: int = 0
     excess: float = 0.0
     raised: list[bool] = field(default_factory=list)
@@ -72,9 +77,14 @@ def pixels(events, frames, sensor_size, settings, begin):
         for column in range(width):
             ratio = [reference / (f.exposure_end - f.exposure_start) for f in frames]
             response = [float(f.image[row, column]) / 255 for f in frames]
-            own = []
+            own, early = [], []
             for i, e in enumerate(events):
-                if (e["y"], e["x"]) != (row, column) or e["t"] <= begin:
+                if (e["y"], e["x"]) != (row, column):
+                    continue
+                if e["t"] <= begin:
+                    previous = [q for q in events[:i] if (q["y"], q["x"]) == (row, column)]
+                    weight = event_weight([*previous, e], settings)
+                    early.append((int(e["t"]), bool(e["p"]), begin, begin, weight))
                     continue
                 earlier = [q for q in events[:i] if q["t"] > begin]
                 near = [
@@ -103,6 +113,7 @@ def pixels(events, frames, sensor_size, settings, begin):
                 [r == 0 for r in response],
                 [dark_scale(f, settings.camera) for f in frames],
                 own,
+                early,
             )
     return out
 
@@ -193,7 +204,7 @@ def dark_correction(intensity, read, shot, i0):
 
 def edi(pixel, k, log_frame, on, off):
     """EDI: L^D(start), straight from B + I_0 = 1/T int exp(L(t)) dt."""
-    s, e = pixel.starts[k], pixel.ends[k]
+    s, e = pixel.starts[k] + pixel.late, pixel.ends[k] + pixel.late
     inside = [(t, w * (on if p else -off)) for t, p, _, _, w in pixel.events if s < t <= e]
     edges = [s, *[t for t, _ in inside], e]
     levels = [0.0, *np.cumsum([step for _, step in inside])]  # after each event, also of several at one time
@@ -393,16 +404,25 @@ def bridged(pixel, settings, times, on, off, scales):
             most = hidden_by_black * pixel.white[k]
             log_frame = black = np.log(most * np.exp(-pixel.dark[k]) + i0)
         a, b = on * scale_on, off * scale_off
-        middle = edi(pixel, k, log_frame, a, b) if settings.filter.deblur else log_frame
+        whole = replace(pixel, events=[*pixel.before, *pixel.events])
+        own_middle, late = pixel.middles[k] + pixel.late, pixel.late
+        middle = edi(whole, k, log_frame, a, b) if settings.filter.deblur else log_frame
         inside = 0
         if settings.filter.deblur:
-            middle += event_sum(pixel, pixel.starts[k], pixel.middles[k], a, b)
-            inside = sum(w for t, *_, w in pixel.events if pixel.starts[k] < t <= pixel.ends[k])
+            middle += event_sum(whole, pixel.starts[k] + late, own_middle, a, b)
+            inside = sum(w for t, *_, w in whole.events if pixel.starts[k] < t - late <= pixel.ends[k])
         variance = frame_variance(k)
         if crushed(k):
             shares = (np.arange(64) + 0.5) / 64
             variance = 3 * np.mean((np.log(most * shares ** pixel.dark[k] + i0) - black) ** 2)
         variance += ev.deblur_variance * c2 * inside
+        if late != 0:  # K19
+            first, last = sorted((own_middle, pixel.middles[k]))
+            middle -= np.sign(late) * event_sum(whole, first, last, a, b)
+            told = sum(w for t, *_, w in whole.events if first < t <= last)
+            around = sum(w for t, *_, w in whole.events if abs(t - pixel.middles[k] - 0.5) < pixel.reach)
+            untold = c2 * (around * abs(late) / (2 * pixel.reach)) ** 2
+            variance += ev.step_noise * c2 * told + min(untold, ev.quantisation_variance * c2)
         return middle, UNMEASURED if pixel.clipped[k] else variance
 
     def counts(a, b):
@@ -1217,6 +1237,10 @@ def reconstruct(events, frames, sensor_size, settings, times):
     on, off = settings.events.threshold_on, settings.events.threshold_off
     out = np.zeros((5, len(times), *sensor_size))  # outside the bridge nothing is hidden and nobody moves
     every = pixels(events, frames, sensor_size, settings, begin)
+    height = sensor_size[0]
+    for (row, _), pixel in every.items():
+        pixel.late = round((row - (height - 1) / 2) * settings.camera.row_time)
+        pixel.reach = round((height - 1) / 2 * abs(settings.camera.row_time))
     more = (trail_scales(every, settings),) if method is bridged else ()
     if method is bridged and settings.events.noise_rate is not None:
         for k in range(len(frames) - 1):

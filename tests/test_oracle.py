@@ -49,6 +49,14 @@ VARIANTS = {
         PRESETS["default"],
         camera=dataclasses.replace(PRESETS["default"].camera, response="gamma:2.2", frame_noise=0.002),
     ),
+    "default-rolling": dataclasses.replace(
+        PRESETS["default"], camera=dataclasses.replace(PRESETS["default"].camera, row_time=810.0)
+    ),
+    "default-rolling-up": dataclasses.replace(
+        PRESETS["default"],
+        camera=dataclasses.replace(PRESETS["default"].camera, row_time=-810.0),
+        events=dataclasses.replace(PRESETS["default"].events, refractory_period=2_000),
+    ),
     "default-trusted": dataclasses.replace(
         PRESETS["default"],
         events=dataclasses.replace(PRESETS["default"].events, extrapolation_trust=0.7),

@@ -1,4 +1,4 @@
-"""Parts of an event stream: slices by time, and the numbers of events of every pixel."""
+"""Parts of an event stream: slices by time, also by that of rows, and the numbers of events of every pixel."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.compiled import event_column, event_is_on, event_row, event_weight, event_words, loop, weight_unit
-from kalux.events import EventArray
+from kalux.events import EVENT_DTYPE, EventArray
 
 Array = NDArray[np.float64]
 FloatArray = NDArray[np.float32]
@@ -62,6 +62,26 @@ def words_until(words, t):  # type: ignore[no-untyped-def]
         else:
             last = middle
     return first
+
+
+def row_delays(height: int, row_time: float) -> NDArray[np.int64]:
+    """(H,) us: how much later than the middle of the frame each row is exposed, given the time from row to row."""
+    delays: NDArray[np.int64] = np.rint((np.arange(height) - (height - 1) / 2) * row_time).astype(np.int64)
+    return delays
+
+
+def with_delay_of_rows(events: EventArray, delays: NDArray[np.int64]) -> EventArray:
+    """The events, earlier by the delay of their row: no longer in time order."""
+    words = event_words(events).copy()
+    words[:, 0] -= delays[events["y"]]
+    return words.reshape(-1).view(EVENT_DTYPE)
+
+
+def in_order(events: EventArray) -> EventArray:
+    """The events in time order; those of one time as they were."""
+    words = event_words(events)
+    sorted_words = words[np.argsort(words[:, 0], kind="stable")]
+    return sorted_words.reshape(-1).view(EVENT_DTYPE)
 
 
 def count_events(events: EventArray, shape: tuple[int, int], *, weighed: bool = False) -> tuple[Array, Array]:

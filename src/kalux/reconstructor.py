@@ -577,7 +577,7 @@ class Reconstructor:
         """No event up to this time is needed any more."""
         start = self._start_time()
         if start is None:
-            return self._shots[0].start if self._shots else None
+            return self._method.needed_from(self._shots[0]) if self._shots else None
         return start if self._freed is None else max(start, self._freed)
 
     def _require_open(self) -> None:

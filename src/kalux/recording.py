@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from kalux import readers
 from kalux.compiled import event_column, event_row, event_words, loop
 from kalux.errors import ExposureError, FormatError, FrameError, InputError, require_type
-from kalux.event_slices import counted
+from kalux.event_slices import counted, events_until, in_order, row_delays, with_delay_of_rows
 from kalux.events import (
+    EVENT_DTYPE,
     LARGEST_SIDE,
     LATEST,
     EventArray,
@@ -176,6 +177,32 @@ def with_event_layout(recording: Recording, layout: EventLayout) -> Recording:
         return events
 
     made.source = dataclasses.replace(recording.source, events=lambda: map(turned, whole()))
+    return made
+
+
+def with_rows_at_once(recording: Recording, row_time: float) -> Recording:
+    """The same recording, the events of each row earlier by as much as its exposure is late (K19).
+
+    To its frames, of a rolling shutter with ``row_time`` us from row to row, events are then as if all rows were
+    exposed at once.
+    """
+    delays = row_delays(recording.sensor_size[0], row_time)
+    reach = int(np.abs(delays).max())
+    whole, made = recording.source.events, copy.copy(recording)
+
+    def moved() -> Iterator[EventArray]:
+        waiting = np.empty(0, EVENT_DTYPE)
+        for chunk in whole():
+            check_events(chunk, recording.sensor_size, where=str(recording.source.path))
+            waiting = in_order(np.concatenate([waiting, with_delay_of_rows(chunk, delays)]))
+            ready = events_until(waiting, int(chunk["t"][-1]) - reach - 1)
+            if ready:
+                yield waiting[:ready]
+            waiting = waiting[ready:]
+        if len(waiting):
+            yield waiting
+
+    made.source = dataclasses.replace(recording.source, events=moved)
     return made
 
 

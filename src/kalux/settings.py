@@ -79,6 +79,10 @@ class CameraSettings:
         levels below 255, for sensors with fixed pattern noise at the top.
     reference_exposure
         Exposure time, us, at which a saturated pixel has intensity 1; None: the recording's median.
+    row_time
+        Rolling shutter: how much later than the row above each row of a frame is exposed, us; negative from the lowest
+        row up. A frame's exposure is that of its middle (docs/equations.md, K19). 0: all rows at once. For augmentation
+        "bridge" only.
     even_gain
         Whether the brightness of frames is evened out where it steps though events say that the light does not
         (`kalux.calibration.frame_faults`): exposure or amplification that nobody states. Not in a live stream.
@@ -106,6 +110,7 @@ class CameraSettings:
     saturation: float | None = None
     usual_saturation: float = 0.98
     reference_exposure: int | None = None
+    row_time: float = 0.0
     even_gain: bool = True
     leave_out_faulty: bool = True
     mend_stuck: bool = True
@@ -471,6 +476,7 @@ _USED_BY: Final[Mapping[str, tuple[str, ...]]] = {
             "filter.neighbours",
             "filter.motion",
             "camera.fixed_pattern",
+            "camera.row_time",
             "events.step_variance",
             "events.refractory_period",
             "events.refractory_spread",
@@ -654,12 +660,13 @@ _LARGEST_OF: Final[Mapping[str, float]] = {
     ),  # multiples of a log intensity
     # us: pixels in the dark are late by tens of milliseconds, guessed stamps by an exposure, at most seconds.
     **dict.fromkeys(("delay", "usual_delay", "refractory_period"), 10_000_000),
+    "row_time": 1e6,  # us, as in simulations
 }
 _LEAST_OF: Final[Mapping[str, float]] = {
     # The square of a frame's weight, 1 / noise^2, is still a number in single precision.
     **dict.fromkeys(("frame_noise", "usual_frame_noise"), 1e-9),
 }
-_SIGNED: Final = {"delay", "usual_delay"}
+_SIGNED: Final = {"delay", "usual_delay", "row_time"}
 _CHOICES: Final = {
     "kind": ("akf", "cf"),
     "augmentation": ("bridge", "paper"),

@@ -383,8 +383,9 @@ def reversed_settings(settings: Settings) -> Settings:
         delay=-settings.events.lateness,
         trail=0.0,
     )
+    camera = dataclasses.replace(settings.camera, row_time=-settings.camera.row_time)
     filtered = dataclasses.replace(settings.filter, motion="off")  # the forward filter's images have it
-    return dataclasses.replace(settings, events=events, filter=filtered)
+    return dataclasses.replace(settings, camera=camera, events=events, filter=filtered)
 
 
 def reversed_pixels(pixels: PixelCalibration | None) -> PixelCalibration | None:

@@ -23,6 +23,7 @@ from kalux.augmentation.highlights import (
 from kalux.augmentation.lost import add_lost_change, lost_change, lost_time
 from kalux.augmentation.motion import HalfWay, Paths, Plane, behind, find_path
 from kalux.augmentation.refractory import growth_with_period
+from kalux.augmentation.rolling import carried, in_time_of_rows
 from kalux.augmentation.subthreshold import (
     BLACK_CHANGE,
     UNKNOWN_CHANGE,
@@ -47,7 +48,7 @@ from kalux.augmentation.trail import (
     with_surety,
 )
 from kalux.compiled import apart, empty, loop, smaller
-from kalux.event_slices import all_between
+from kalux.event_slices import all_between, row_delays
 from kalux.events import EventArray
 from kalux.filters import akf_bridged
 from kalux.filters.akf import State
@@ -168,6 +169,8 @@ class BridgedFrames(Method):
         )
         self._spread2 = events.believed_mismatch**2  # K11
         self._period_spread = events.refractory_doubt if events.refractory > 0 else 0.0
+        rolls = settings.camera.row_time != 0
+        self._row_delays = row_delays(shape[0], settings.camera.row_time) if rolls else None
         self._follows_motion = settings.filter.follows_motion(shape)
         self._event_noise = akf_bridged.Noise(events.background_rate, events.step_noise, self._threshold2)
         self._prior = (
@@ -187,13 +190,27 @@ class BridgedFrames(Method):
     def begin_time(self, shot: Shot) -> int:
         return shot.start if self.lookahead else shot.end
 
+    def needed_from(self, shot: Shot) -> int:
+        return shot.start - self._reach
+
     def needed_until(self, shot: Shot) -> int:
-        return shot.end
+        return shot.end + self._reach
+
+    @property
+    def _reach(self) -> int:
+        """us from the middle of a frame to that of the row that is exposed first, or last."""
+        return 0 if self._row_delays is None else int(np.abs(self._row_delays).max())
 
     def latent(self, shot: Shot, events: Chunks, thresholds: Thresholds) -> Latent:
-        """The frame without blur at the middle of its exposure, and its variance (K3)."""
+        """The frame without blur at the middle of its exposure, and its variance (K3).
+
+        Rows of a rolling shutter are brought there from the middle of their own exposures by events (K19).
+        """
+        inside = events
+        if self._row_delays is not None:
+            inside = in_time_of_rows(events, self._row_delays, shot.start, shot.end)
         exposure = deblur.expose(
-            events if self.settings.filter.deblur else (),
+            inside if self.settings.filter.deblur else (),
             shot.start,
             shot.end,
             (thresholds.on, thresholds.off),
@@ -214,12 +231,28 @@ class BridgedFrames(Method):
             duration=shot.end - shot.start,
             event_variance=self.settings.events.deblur_variance * self._threshold2,
         )
+        if self._row_delays is not None:
+            self._carry_rows(latent, shot, events, thresholds)
         if shot.valid is not None:
             latent.variance[~shot.valid] = bridge.MASKED
         if crushed is None:
             return latent
         room = np.where(crushed, np.log(shot.level_ceiling + self.offset) - level_log, np.inf)
         return latent._replace(ceiling=latent.value + room.astype(np.float32)[shot.levels])
+
+    def _carry_rows(self, latent: Latent, shot: Shot, events: Chunks, thresholds: Thresholds) -> None:
+        """Bring all rows to the middle of the frame, at the price of what events tell and do not (K19). In place."""
+        assert self._row_delays is not None
+        on, off, around = carried(events, self._row_delays, shot.middle, self.shape[1], weighed=True)
+        latent.value[...] += np.float32(self.on) * thresholds.on * on
+        latent.value[...] -= np.float32(self.off) * thresholds.off * off
+        expected = around * (np.abs(self._row_delays) / (2 * self._reach))[:, np.newaxis].astype(np.float32)
+        untold = np.minimum(
+            np.float32(self._threshold2) * expected**2, np.float32(self.noise.quantisation_variance)
+        )
+        told = np.float32(self.noise.step_variance) * (np.abs(on) + np.abs(off))
+        measured = latent.variance < bridge.UNMEASURED
+        latent.variance[measured] += (told + untold)[measured]
 
     def level_log(self, shot: Shot) -> Array:
         """(N,) log(I + I_0) of each level, of dark ones such that the mean of noisy frames is right (K3).

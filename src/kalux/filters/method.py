@@ -65,6 +65,10 @@ class Method(ABC):
     def begin_time(self, shot: Shot) -> int:
         """The first moment, us, that can be read when ``shot`` is the first frame."""
 
+    def needed_from(self, shot: Shot) -> int:
+        """Events after this time, us, are needed when ``shot`` is the first frame."""
+        return shot.start
+
     @abstractmethod
     def needed_until(self, shot: Shot) -> int:
         """Events up to this time, us, are needed before the segment that ends at the frame is final."""

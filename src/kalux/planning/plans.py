@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
@@ -35,7 +36,7 @@ from kalux.planning.sensor_noise import (
     with_step_errors,
 )
 from kalux.planning.survey import survey
-from kalux.recording import RECORDING_NEEDED, Recording, with_cached_start
+from kalux.recording import RECORDING_NEEDED, Recording, with_cached_start, with_rows_at_once
 from kalux.schedule import begin_time, image_times
 from kalux.settings import SETTINGS_NEEDED, Settings, altered, chosen_response, completed
 from kalux.settings import preset as named_preset
@@ -122,6 +123,21 @@ def plan(
     if known.pixels is not None:
         require_size(known.pixels, recording.sensor_size)
     require_white(known, recording)
+    row_time = chosen.camera.row_time
+    if row_time:
+        # Beside events in the time of its rows a frame is one whose rows are exposed at once: so all is estimated.
+        at_once = altered(chosen, "camera", row_time=0.0)
+        planned = plan(
+            with_rows_at_once(recording, row_time),
+            rate_hz=rate_hz,
+            times=times,
+            at=at,
+            settings=at_once,
+            calibration=calibration,
+            lookahead=lookahead,
+            smooth=smooth,
+        )
+        return dataclasses.replace(planned, settings=altered(planned.settings, "camera", row_time=row_time))
     chosen = _with_causal_trust(chosen, lookahead)
     recording = with_cached_start(recording, _CACHED_EVENTS, _CACHED_FRAME_BYTES)
 
