@@ -820,7 +820,7 @@ def lost_time(pixels, start, end):
     waits = np.diff([start, *times, end])
     long = waits[waits >= max(round((end - start) / 20), 1)]
     rest = end - start - long.sum()
-    if not len(long) or not times or rest < (end - start) / 4:
+    if not len(long) or not times or rest < (end - start) / 10:
         return 0
     digits = sorted(len(f"{wait:b}") for wait in waits[:-1] if wait > 0)
     usual = 2 ** next(d for n, d in enumerate(digits, 1) if sum(e <= d for e in digits) >= 0.9 * len(digits))

@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kalux.augmentation.refractory import EventClock
+from kalux.compiled import event_words
 from kalux.event_slices import (
     all_between,
     between,
@@ -14,7 +15,11 @@ from kalux.event_slices import (
     count_events,
     events_until,
     first_events,
+    in_order,
+    row_delays,
+    with_delay_of_rows,
 )
+from kalux.events import make_events
 
 from builders import events, pixel_events, random_stream
 
@@ -71,3 +76,24 @@ def test_chunks_count_together_and_weights_only_where_they_are_asked_for():
     for counted, expected in zip(sums, count_chunks(whole, stream.sensor_size, weighed=True), strict=True):
         np.testing.assert_allclose(counted, expected, rtol=1e-6)
     assert sum(map(np.sum, sums)) > 1.1 * sum(map(np.sum, ones))
+
+
+def test_rows_are_late_by_their_distance_from_the_middle():
+    np.testing.assert_array_equal(row_delays(4, 10.0), [-15, -5, 5, 15])
+    np.testing.assert_array_equal(row_delays(3, -7.0), [7, 0, -7])
+
+
+@given(st.lists(st.tuples(st.integers(0, 50), st.integers(0, 2), st.booleans()), min_size=1, max_size=20))
+def test_events_in_the_time_of_their_rows(stream):
+    """Sorted, those of one time stay as they were; what else an event carries stays with it."""
+    t, y, p = zip(*sorted(stream, key=lambda event: event[0]), strict=True)
+    events = make_events(t, np.zeros(len(t), np.int64), y, p)
+    words = event_words(events)
+    words[:, 1] = (words[:, 1] & ((1 << 40) - 1)) | np.arange(len(t)) << 40  # where weights are
+    delays = row_delays(3, 20.0)
+    found = in_order(with_delay_of_rows(events, delays))
+    order = np.argsort(np.array(t) - delays[list(y)], kind="stable")
+    np.testing.assert_array_equal(found["t"], (np.array(t) - delays[list(y)])[order])
+    np.testing.assert_array_equal(found["y"], np.array(y)[order])
+    np.testing.assert_array_equal(event_words(found)[:, 1] >> 40, order)
+    assert events["t"].tolist() == list(t)

@@ -11,9 +11,13 @@ import pickle
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from kalux import readers, recording
 from kalux.errors import EventError, ExposureError, FormatError, FrameError, InputError
+from kalux.event_slices import in_order, row_delays, with_delay_of_rows
+from kalux.events import make_events
 from kalux.frames import Frame, GroundTruth, with_black_level
 from kalux.recording import (
     FrameCorrections,
@@ -21,6 +25,7 @@ from kalux.recording import (
     less_black,
     with_cached_start,
     with_counted_events,
+    with_rows_at_once,
     without_events_of,
 )
 from kalux.writers import hdf5
@@ -436,3 +441,18 @@ def test_events_are_counted_as_often_as_they_are_read():
         for chunk, expected in zip(watched.events(), rec.events(), strict=True):
             assert np.array_equal(chunk, expected)
         assert sum(told) == times * len(small_events())
+
+
+@given(st.lists(st.integers(0, 400), max_size=5))
+def test_events_in_the_time_of_rows_are_in_order_however_they_are_cut(cuts):
+    rng = np.random.default_rng(2)
+    t = np.sort(rng.integers(0, 5_000, 400))
+    events = make_events(t, rng.integers(0, 4, 400), rng.integers(0, 8, 400), rng.integers(0, 2, 400) > 0)
+    whole = Recording.from_arrays(events, [], sensor_size=(8, 4))
+    parts = Recording.from_arrays(events, [], sensor_size=(8, 4))
+    parts.source = dataclasses.replace(
+        parts.source, events=lambda: (part for part in np.split(events, sorted(cuts)) if len(part))
+    )
+    found, same = (np.concatenate([*with_rows_at_once(r, 300.0).events()]) for r in (whole, parts))
+    np.testing.assert_array_equal(found, same)
+    np.testing.assert_array_equal(found, in_order(with_delay_of_rows(events, row_delays(8, 300.0))))

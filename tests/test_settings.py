@@ -252,6 +252,10 @@ def test_none_is_auto_in_files():
         (f"[camera]\nreference_exposure = {2**63}", "finite number is needed, at most 1e[+]18"),
         ("[events]\ndelay = -100000000", "at most 1e[+]07 us; kalux register brings clocks together"),
         ("[events]\nrefractory_period = 10000001", "at most 1e[+]07"),
+        (
+            "[camera]\nrow_time = -1000001",
+            "row_time is -1000001; a finite number is needed, at most 1e[+]06$",
+        ),
         ("[camera]\nlog_offset = 0", "camera.log_offset is 0; it must be positive"),
         ("[camera]\nlog_offset = -1", "camera.log_offset is -1; it must be positive"),
         ("[camera]\nresponse = 2.2", "camera.response is 2.2; str is needed"),
@@ -285,6 +289,9 @@ def test_a_missing_file(tmp_path):
 @pytest.mark.parametrize(("group", "name"), NUMBERS)
 @pytest.mark.parametrize("value", [-1.0, float("nan"), float("inf"), "0.1", True])
 def test_every_number_is_checked(group, name, value):
+    if (name, value) == ("row_time", -1.0):  # of a shutter that begins at the lowest row
+        assert altered(DEFAULT, group, row_time=value).camera.row_time == value
+        return
     with pytest.raises(SettingsError, match=f"{group}.{name}"):
         altered(DEFAULT, group, **{name: value})
 
@@ -338,6 +345,7 @@ OTHER_VALUES = {
     "filter.neighbours": 0.05,
     "filter.motion": "off",
     "camera.fixed_pattern": 0.03,
+    "camera.row_time": 150.0,
     "camera.confidence": 1e5,
     "camera.weight_floor": 0.9,
     "events.step_variance": 0.4,

@@ -699,7 +699,7 @@ def _check_value(label: str, name: str, value: Any, default: Any) -> None:
     elif name in _WHOLE and not (isinstance(value, int) and not isinstance(value, bool)):
         raise SettingsError(f"settings: {label} is {value!r}; whole microseconds are needed")
     elif isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= most:
-        hint = " us; kalux register brings clocks together that differ by more" if name in _SIGNED else ""
+        hint = " us; kalux register brings clocks together that differ by more" if "delay" in name else ""
         raise SettingsError(
             f"settings: {label} is {value!r}; a finite number is needed, at most {most:g}{hint}"
         )

@@ -24,7 +24,7 @@ Array = NDArray[np.floating[Any]]
 _LEAST_SHARE: Final = 1 / 20
 """Of the time between two frames: with less missing, events still tell nearly all of the change."""
 
-_LEAST_REST: Final = 1 / 10
+_LEAST_REST: Final = 0.1
 """Of that time that must be left: the events of a flash come within a moment, and none are missing before and after."""
 
 _MISSING: Final = 100.0
@@ -47,7 +47,7 @@ def lost_time(chunks: Sequence[EventArray], start: int, end: int) -> int:
         The events with start < t <= end, in one array or several.
 
     A wait from one event of the sensor to the next counts if a hundred events are missing in it at the rate of the rest
-    of the time, a quarter at least, if it takes a twentieth of the time, and if it is four times as long as nine of ten
+    of the time, a tenth at least, if it takes a twentieth of the time, and if it is four times as long as nine of ten
     others: stamps that come in bunches are no loss.
     """
     waits = np.zeros(_WAITS, np.int64)

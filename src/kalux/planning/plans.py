@@ -123,7 +123,7 @@ def plan(
     if known.pixels is not None:
         require_size(known.pixels, recording.sensor_size)
     require_white(known, recording)
-    row_time = chosen.camera.row_time
+    row_time = chosen.camera.row_time if chosen.filter.joins_frames else 0.0
     if row_time:
         # Beside events in the time of its rows a frame is one whose rows are exposed at once: so all is estimated.
         at_once = altered(chosen, "camera", row_time=0.0)
