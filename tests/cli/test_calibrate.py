@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from kalux import load_calibration
-from kalux.datasets import SensorSettings
+from kalux.datasets import SensorSettings, photograph_scene, simulate
+from kalux.datasets.motion import pan
 from kalux.models.camera import Response
 from kalux.recording import EventLayout, with_event_layout
 from kalux.settings import read_toml
@@ -276,3 +277,26 @@ def test_mistakes_are_one_line(cli, unlabelled_file, arguments, message):
     done = cli(*[unlabelled_file if word == "REC" else word for word in arguments])
     assert done.code == 2
     assert message in done.error
+
+
+def test_a_rolling_shutter_is_measured_written_and_used(cli, tmp_path):
+    sensor = SensorSettings(threshold_on=0.15, threshold_off=0.15, row_time=150.0, exposure=2_000)
+    scene = photograph_scene(blocks(0.05, 0.6), pan(60.0, 25.0), sensor_size=(64, 48), duration=600_000)
+    made = simulate(scene, sensor).recording()
+    path, out = tmp_path / "rec.h5", tmp_path / "shutter.toml"
+    hdf5.write(path, sensor_size=made.sensor_size, events=made.events(), frames=made.frames())
+    done = cli("calibrate", "shutter", path, "-o", out)
+    assert done.code == 0, done.err
+    assert "us" in next(line for line in done.out.splitlines() if "row_time" in line)
+    row_time = load_calibration(out).settings["camera"]["row_time"]
+    assert row_time == pytest.approx(150, rel=0.1)
+    used = cli("reconstruct", path, "-o", tmp_path / "images", "--calibration", out, "--at", "frames")
+    assert used.code == 0, used.err
+    assert read_toml(tmp_path / "images" / "kalux.toml")["settings"]["camera"]["row_time"] == row_time
+
+
+def test_a_global_shutter_is_said_to_be_none_that_rolls(cli, unlabelled_file, tmp_path):
+    done = cli("calibrate", "shutter", unlabelled_file, "-o", tmp_path / "shutter.toml")
+    assert done.code == 2
+    assert "no rolling shutter is seen" in done.err
+    assert not (tmp_path / "shutter.toml").exists()

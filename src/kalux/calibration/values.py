@@ -31,6 +31,7 @@ _FACTORS: Final = {"threshold_on": 1.0, "threshold_off": 1.0}
 UNITS: Final[Mapping[str, str]] = {
     "threshold_on": "log intensity",
     "threshold_off": "log intensity",
+    "row_time": "us",
     "threshold_spread": "relative standard deviation between pixels",
     "spread_on": "relative standard deviation between pixels",
     "spread_off": "relative standard deviation between pixels",

@@ -5,7 +5,14 @@ from __future__ import annotations
 import argparse
 from typing import Any, Final
 
-from kalux.cli import calibrate_contrast, calibrate_noise, calibrate_offset, calibrate_response, calibrate_rig
+from kalux.cli import (
+    calibrate_contrast,
+    calibrate_noise,
+    calibrate_offset,
+    calibrate_response,
+    calibrate_rig,
+    calibrate_shutter,
+)
 from kalux.cli.parser import Parser, UsageError
 
 SUBCOMMANDS: Final = (
@@ -14,11 +21,12 @@ SUBCOMMANDS: Final = (
     calibrate_response,
     calibrate_rig,
     calibrate_offset,
+    calibrate_shutter,
 )
 
 _DESCRIPTION = """\
-Measure cameras, from their own recordings. The results are small TOML files; those of contrast, noise and response
-are for --calibration of other commands, those of rig and offset for kalux register.
+Measure cameras, from their own recordings. The results are small TOML files; those of contrast, noise, response
+and shutter are for --calibration of other commands, those of rig and offset for kalux register.
 
 commands:
   contrast     the events' thresholds, global and of every pixel
@@ -26,6 +34,7 @@ commands:
   response     the frame camera's response, from images at several exposures
   rig          lenses and pose of an event camera and a frame camera, from a blinking board
   offset       the offset between the clocks of frames and events
+  shutter      how much later than the one above each row of frames is exposed
 
 kalux calibrate COMMAND --help says more."""
 
@@ -51,5 +60,5 @@ def add_command(commands: Any) -> None:
 def run(options: argparse.Namespace, command: list[str]) -> None:
     """No command of the group was given."""
     raise UsageError(
-        "calibrate what? contrast, noise, response, rig or offset; kalux calibrate --help says more"
+        "calibrate what? contrast, noise, response, rig, offset or shutter; kalux calibrate --help says more"
     )
