@@ -818,7 +818,7 @@ def lost_time(pixels, start, end):
     """K18: the time between two frames in which events are missing, us."""
     times = sorted(t for pixel in pixels.values() for t, *_ in pixel.events if start < t <= end)
     waits = np.diff([start, *times, end])
-    long = waits[waits >= max(round((end - start) / 20), 1)]
+    long = waits[waits >= max(np.ceil((end - start) / 20), 1)]
     rest = end - start - long.sum()
     if not len(long) or not times or rest < (end - start) / 10:
         return 0

@@ -60,6 +60,13 @@ def test_stamps_that_come_in_bunches_are_no_loss():
     assert lost_time([events_at(np.repeat(left, 100))], START, END) == 10_500
 
 
+@given(st.integers(1, 60), st.integers(1, 5))
+def test_there_is_room_for_all_waits_of_any_time(duration, every):
+    """However short it is: an event of every microsecond or so waits for a twentieth of 20 us."""
+    t = np.arange(START + 1, START + duration + 1, every)
+    assert lost_time([events_at(t)], START, START + duration) == 0
+
+
 def test_a_flash_is_no_loss():
     """All events of 2 ms, and nothing before and after."""
     flash = np.random.default_rng(1).integers(START + 19_000, START + 21_000, 5_000)

@@ -21,8 +21,9 @@ from kalux.events import EventArray
 
 Array = NDArray[np.floating[Any]]
 
-_LEAST_SHARE: Final = 1 / 20
-"""Of the time between two frames: with less missing, events still tell nearly all of the change."""
+_MOST_WAITS: Final = 20
+"""Waits that count take a twentieth of the time between two frames or more: with less missing, events still tell nearly
+all of the change."""
 
 _LEAST_REST: Final = 0.1
 """Of that time that must be left: the events of a flash come within a moment, and none are missing before and after."""
@@ -50,8 +51,8 @@ def lost_time(chunks: Sequence[EventArray], start: int, end: int) -> int:
     of the time, a tenth at least, if it takes a twentieth of the time, and if it is four times as long as nine of ten
     others: stamps that come in bunches are no loss.
     """
-    waits = np.zeros(_WAITS, np.int64)
-    least = max(round(_LEAST_SHARE * (end - start)), 1)
+    waits = np.zeros(_MOST_WAITS, np.int64)
+    least = max(-(-(end - start) // _MOST_WAITS), 1)  # rounded up, so that no more of them fit
     before, found, events = start, 0, 0
     for chunk in chunks:
         before, found = _find_waits(event_words(chunk), before, least, waits, found)
@@ -109,9 +110,6 @@ def add_lost_change(grown: Array, first: Latent, second: Latent, untold: Array, 
     measured = np.maximum(first.variance, second.variance) < UNMEASURED
     grown += np.where(measured, untold * missed * missed, lost)
 
-
-_WAITS: Final = round(1 / _LEAST_SHARE) + 1
-"""More of them do not fit between the frames."""
 
 _POWERS: Final = 64
 

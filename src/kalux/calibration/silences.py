@@ -22,6 +22,9 @@ from kalux.events import EventArray
 from kalux.frames import Frame
 from kalux.recording import Recording
 
+_MOST_HELD: Final = 4_000_000
+"""Events between two frames that are kept to look at: 64 MB."""
+
 Silence = tuple[int, int]
 """(start, end) us."""
 
@@ -184,6 +187,8 @@ class MissingWatch:
 
     def see(self, chunk: EventArray) -> None:
         """Look at the next events, of which there is one at least."""
+        if sum(map(len, self._held)) > _MOST_HELD:
+            self._held.clear()  # frames that are far apart: the rest of the interval is looked at
         self._held.append(chunk)
         self._look(int(chunk["t"][-1]))
 

@@ -169,8 +169,8 @@ class BridgedFrames(Method):
         )
         self._spread2 = events.believed_mismatch**2  # K11
         self._period_spread = events.refractory_doubt if events.refractory > 0 else 0.0
-        rolls = settings.camera.row_time != 0
-        self._row_delays = row_delays(shape[0], settings.camera.row_time) if rolls else None
+        delays = row_delays(shape[0], settings.camera.row_time)
+        self._row_delays = delays if delays.any() else None
         self._follows_motion = settings.filter.follows_motion(shape)
         self._event_noise = akf_bridged.Noise(events.background_rate, events.step_noise, self._threshold2)
         self._prior = (
@@ -390,7 +390,7 @@ class BridgedFrames(Method):
             end,
             grown=grown,
             signal=signal,
-            untold=self._with_untold(lost),
+            untold=self._untold(lost),
         )
         if signal is not None:
             of_steps = doubt(signal, self.noise.step_variance, self._threshold2)
@@ -446,7 +446,7 @@ class BridgedFrames(Method):
         grown -= self._trail_at(memory.at_middle, shot.middle, scale)
         between = on + since_on, off + since_off
         lost = self._lost_change(events, start, following.end, between)
-        untold = self._with_untold(lost)
+        untold = self._untold(lost)
         behind, learned = bridge.bridge(
             memory.latent,
             second,
@@ -549,7 +549,7 @@ class BridgedFrames(Method):
         variance = lost_change(told, lost, end - start)
         return variance if float(variance.max()) > self.noise.quantisation_variance else None
 
-    def _with_untold(self, lost: Floats | None) -> Floats | None:
+    def _untold(self, lost: Floats | None) -> Floats | None:
         """(H, W) variance of all that no event has told: what is lost, and q_0. None: nothing is lost."""
         return None if lost is None else lost + np.float32(self.noise.quantisation_variance)
 
