@@ -400,8 +400,10 @@ class Reconstructor:
             return self._complete_until
         if not self.lookahead:
             # A frame that is still to come ends after the last one, and changes images from there on.
+            # So does one whose rows are not all exposed.
             until = self._complete_until
-            return None if until is None else min(until, self._shots[-1].end)
+            waiting = (shot.end - 1 for shot in self._shots if not self._is_complete(shot))
+            return None if until is None else min(until, self._shots[-1].end, *waiting)
         for shot in reversed(self._shots):
             if self._is_complete(shot):
                 node = self._method.node(shot)

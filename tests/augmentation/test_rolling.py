@@ -105,3 +105,20 @@ def test_all_is_estimated_as_if_rows_were_exposed_at_once():
     assert rolling.settings.camera.row_time == 1_000.0
     assert ignored.settings.camera.row_time == 0.0
     assert rolling.settings.events.step_variance < 0.5 * ignored.settings.events.step_variance
+
+
+@pytest.mark.parametrize("lookahead", [True, False])
+def test_images_do_not_depend_on_how_events_come(lookahead):
+    """Nor without lookahead, where the lower rows of a frame are exposed while images after its end are asked for."""
+    recording = recorded(300.0)
+    settings = altered(PRESETS["default"], "camera", row_time=300.0)
+    events = np.concatenate([*recording.events()])
+    found = []
+    for length in (len(events), 37):
+        recording.source = replace(
+            recording.source,
+            events=lambda n=length: (events[i : i + n] for i in range(0, len(events), n)),
+        )
+        images = reconstruct(recording, rate_hz=211, settings=settings, lookahead=lookahead)
+        found.append([(image.intensity, image.variance) for image in images])
+    np.testing.assert_array_equal(*found)
