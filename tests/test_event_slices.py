@@ -16,7 +16,7 @@ from kalux.event_slices import (
     events_until,
     first_events,
     in_order,
-    row_delays,
+    whole_row_delays,
     with_delay_of_rows,
 )
 from kalux.events import make_events
@@ -79,8 +79,8 @@ def test_chunks_count_together_and_weights_only_where_they_are_asked_for():
 
 
 def test_rows_are_late_by_their_distance_from_the_middle():
-    np.testing.assert_array_equal(row_delays(4, 10.0), [-15, -5, 5, 15])
-    np.testing.assert_array_equal(row_delays(3, -7.0), [7, 0, -7])
+    np.testing.assert_array_equal(whole_row_delays(4, 10.0), [-15, -5, 5, 15])
+    np.testing.assert_array_equal(whole_row_delays(3, -7.0), [7, 0, -7])
 
 
 @given(st.lists(st.tuples(st.integers(0, 50), st.integers(0, 2), st.booleans()), min_size=1, max_size=20))
@@ -90,7 +90,7 @@ def test_events_in_the_time_of_their_rows(stream):
     events = make_events(t, np.zeros(len(t), np.int64), y, p)
     words = event_words(events)
     words[:, 1] = (words[:, 1] & ((1 << 40) - 1)) | np.arange(len(t)) << 40  # where weights are
-    delays = row_delays(3, 20.0)
+    delays = whole_row_delays(3, 20.0)
     found = in_order(with_delay_of_rows(events, delays))
     order = np.argsort(np.array(t) - delays[list(y)], kind="stable")
     np.testing.assert_array_equal(found["t"], (np.array(t) - delays[list(y)])[order])

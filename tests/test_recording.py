@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from kalux import readers, recording
 from kalux.errors import EventError, ExposureError, FormatError, FrameError, InputError
-from kalux.event_slices import in_order, row_delays, with_delay_of_rows
+from kalux.event_slices import in_order, whole_row_delays, with_delay_of_rows
 from kalux.events import make_events
 from kalux.frames import Frame, GroundTruth, with_black_level
 from kalux.recording import (
@@ -455,4 +455,4 @@ def test_events_in_the_time_of_rows_are_in_order_however_they_are_cut(cuts):
     )
     found, same = (np.concatenate([*with_rows_at_once(r, 300.0).events()]) for r in (whole, parts))
     np.testing.assert_array_equal(found, same)
-    np.testing.assert_array_equal(found, in_order(with_delay_of_rows(events, row_delays(8, 300.0))))
+    np.testing.assert_array_equal(found, in_order(with_delay_of_rows(events, whole_row_delays(8, 300.0))))

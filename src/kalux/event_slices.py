@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux import memory
 from kalux.compiled import event_column, event_is_on, event_row, event_weight, event_words, loop, weight_unit
 from kalux.events import EVENT_DTYPE, EventArray
 
@@ -64,9 +65,36 @@ def words_until(words, t):  # type: ignore[no-untyped-def]
     return first
 
 
-def row_delays(height: int, row_time: float) -> NDArray[np.int64]:
+def long_waits(events: EventArray, before: int, least: int) -> Iterator[tuple[int, int]]:
+    """Times of ``least`` us and more up to each event, (start, end) us, in which none comes; one came at ``before``."""
+    words = event_words(events)
+    place = _next_wait(words, 0, before, least)
+    while place < len(words):
+        yield int(words[place - 1, 0]) if place else before, int(words[place, 0])
+        place = _next_wait(words, place + 1, words[place, 0], least)
+
+
+@loop
+def _next_wait(words, start, before, least):  # type: ignore[no-untyped-def]
+    """Place of the first event from ``start`` on that comes ``least`` us after the one before it; none: their number.
+
+    ``before`` is the time of the event before ``start``.
+    """
+    for i in range(start, len(words)):
+        if words[i, 0] - before >= least:
+            return i
+        before = words[i, 0]
+    return len(words)
+
+
+def row_delays(height: int, row_time: float) -> Array:
     """(H,) us: how much later than the middle of the frame each row is exposed, given the time from row to row."""
-    delays: NDArray[np.int64] = np.rint((np.arange(height) - (height - 1) / 2) * row_time).astype(np.int64)
+    return (np.arange(height, dtype=np.float64) - (height - 1) / 2) * row_time
+
+
+def whole_row_delays(height: int, row_time: float) -> NDArray[np.int64]:
+    """The same in whole us, as events are stamped."""
+    delays: NDArray[np.int64] = np.rint(row_delays(height, row_time)).astype(np.int64)
     return delays
 
 
@@ -75,6 +103,16 @@ def with_delay_of_rows(events: EventArray, delays: NDArray[np.int64]) -> EventAr
     words = event_words(events).copy()
     words[:, 0] -= delays[events["y"]]
     return words.reshape(-1).view(EVENT_DTYPE)
+
+
+def joined_events(chunks: list[EventArray]) -> EventArray:
+    """Events one after the other. NumPy would copy them field by field, in ten times the time."""
+    if len(chunks) == 1:
+        return chunks[0]
+    words = [np.empty((0, 2), np.int64), *map(event_words, chunks)]
+    joined: EventArray = memory.empty((sum(map(len, words)),), EVENT_DTYPE)
+    np.concatenate(words, out=event_words(joined))
+    return joined
 
 
 def in_order(events: EventArray) -> EventArray:

@@ -219,6 +219,11 @@ def place_exposure(frame: Frame, exposure: int, stamp: Stamp) -> Frame:
     return dataclasses.replace(frame, exposure_start=start, exposure_end=start + exposure)
 
 
+def repeats(frame: Frame, before: Frame | None) -> bool:
+    """Whether the image is that of the frame before, to the bit."""
+    return before is not None and np.array_equal(frame.image, before.image)
+
+
 def require_frame(frame: Any, *, where: str = "frames", index: int = 0) -> None:
     """Require a `Frame` with an array.
 

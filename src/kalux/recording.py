@@ -18,7 +18,14 @@ from numpy.typing import NDArray
 from kalux import readers
 from kalux.compiled import event_column, event_row, event_words, loop
 from kalux.errors import ExposureError, FormatError, FrameError, InputError, require_type
-from kalux.event_slices import counted, events_until, in_order, row_delays, with_delay_of_rows
+from kalux.event_slices import (
+    counted,
+    events_until,
+    in_order,
+    joined_events,
+    whole_row_delays,
+    with_delay_of_rows,
+)
 from kalux.events import (
     EVENT_DTYPE,
     LARGEST_SIDE,
@@ -42,6 +49,7 @@ from kalux.frames import (
     is_white,
     median_exposure,
     place_exposure,
+    repeats,
     require_frame,
     with_black_level,
 )
@@ -186,7 +194,7 @@ def with_rows_at_once(recording: Recording, row_time: float) -> Recording:
     To its frames, of a rolling shutter with ``row_time`` us from row to row, events are then as if all rows were
     exposed at once.
     """
-    delays = row_delays(recording.sensor_size[0], row_time)
+    delays = whole_row_delays(recording.sensor_size[0], row_time)
     reach = int(np.abs(delays).max())
     whole, made = recording.source.events, copy.copy(recording)
 
@@ -194,7 +202,7 @@ def with_rows_at_once(recording: Recording, row_time: float) -> Recording:
         waiting = np.empty(0, EVENT_DTYPE)
         for chunk in whole():
             check_events(chunk, recording.sensor_size, where=str(recording.source.path))
-            waiting = in_order(np.concatenate([waiting, with_delay_of_rows(chunk, delays)]))
+            waiting = in_order(joined_events([waiting, with_delay_of_rows(chunk, delays)]))
             ready = events_until(waiting, int(chunk["t"][-1]) - reach - 1)
             if ready:
                 yield waiting[:ready]
@@ -242,7 +250,7 @@ def without_repeats(recording: Recording) -> Recording:
     def distinct() -> Iterator[Frame]:
         before: Frame | None = None
         for frame in whole():
-            if before is None or not np.array_equal(frame.image, before.image):
+            if not repeats(frame, before):
                 yield frame
             before = frame
 

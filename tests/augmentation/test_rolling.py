@@ -13,7 +13,7 @@ from kalux import PRESETS, Recording, reconstruct
 from kalux.augmentation.rolling import carried, in_time_of_rows
 from kalux.datasets import SensorSettings, photograph_scene, simulate
 from kalux.datasets.motion import pan
-from kalux.event_slices import row_delays
+from kalux.event_slices import whole_row_delays
 from kalux.events import make_events
 from kalux.frames import GroundTruth
 from kalux.planning import plan
@@ -21,7 +21,7 @@ from kalux.settings import altered
 
 from builders import blocks
 
-DELAYS = row_delays(3, 1000.0)
+DELAYS = whole_row_delays(3, 1000.0)
 streams = st.lists(
     st.tuples(st.integers(0, 20_000), st.integers(0, 1), st.integers(0, 2), st.booleans()), max_size=30
 )

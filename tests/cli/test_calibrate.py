@@ -300,3 +300,10 @@ def test_a_global_shutter_is_said_to_be_none_that_rolls(cli, unlabelled_file, tm
     assert done.code == 2
     assert "no rolling shutter is seen" in done.err
     assert not (tmp_path / "shutter.toml").exists()
+
+
+def test_without_frames_there_is_no_shutter(cli, tmp_path):
+    hdf5.write(tmp_path / "events.h5", sensor_size=SIZE, events=[small_events()], frames=[])
+    done = cli("calibrate", "shutter", tmp_path / "events.h5")
+    assert done.code == 2
+    assert "no frames; kalux needs frames as well as events" in done.err

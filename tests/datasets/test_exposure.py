@@ -10,9 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kalux.datasets import Scene, SensorSettings, linear_ramp, log_ramp, moving_edge, simulate, static
-from kalux.datasets.exposure import mean_radiance, plan_exposures, rolling_radiance, row_delays
+from kalux.datasets.exposure import mean_radiance, plan_exposures, rolling_radiance
 from kalux.datasets.scenes import LOG_OFFSET
 from kalux.errors import ExposureError
+from kalux.event_slices import row_delays
 
 SIZE = (8, 10)
 

@@ -17,12 +17,13 @@ from numpy.typing import NDArray
 from kalux.augmentation.bridge import UNMEASURED, Latent
 from kalux.augmentation.subthreshold import mean_around
 from kalux.compiled import event_words, loop
+from kalux.event_slices import long_waits
 from kalux.events import EventArray
 
 Array = NDArray[np.floating[Any]]
 
 _MOST_WAITS: Final = 20
-"""Waits that count take a twentieth of the time between two frames or more: with less missing, events still tell nearly
+"""How many of the least waits that count are the time between two frames: with less missing, events still tell nearly
 all of the change."""
 
 _LEAST_REST: Final = 0.1
@@ -51,17 +52,16 @@ def lost_time(chunks: Sequence[EventArray], start: int, end: int) -> int:
     of the time, a tenth at least, if it takes a twentieth of the time, and if it is four times as long as nine of ten
     others: stamps that come in bunches are no loss.
     """
-    waits = np.zeros(_MOST_WAITS, np.int64)
-    least = max(-(-(end - start) // _MOST_WAITS), 1)  # rounded up, so that no more of them fit
-    before, found, events = start, 0, 0
-    for chunk in chunks:
-        before, found = _find_waits(event_words(chunk), before, least, waits, found)
-        events += len(chunk)
+    least = max(-(-(end - start) // _MOST_WAITS), 1)
+    before, events, waits = start, 0, list[tuple[int, int]]()
+    for chunk in filter(len, chunks):
+        waits += long_waits(chunk, before, least)
+        before, events = int(chunk["t"][-1]), events + len(chunk)
     if end - before >= least:
-        waits[found], found = end - before, found + 1
-    longest = waits[:found]
+        waits.append((before, end))
+    longest = np.diff(np.array(waits, np.int64).reshape(-1, 2)).ravel()
     rest = end - start - int(longest.sum())
-    if found == 0 or events == 0 or rest < _LEAST_REST * (end - start):
+    if not waits or events == 0 or rest < _LEAST_REST * (end - start):
         return 0
     lost = longest[longest * (events / rest) >= _MISSING]
     if len(lost) == 0:
@@ -112,17 +112,6 @@ def add_lost_change(grown: Array, first: Latent, second: Latent, untold: Array, 
 
 
 _POWERS: Final = 64
-
-
-@loop
-def _find_waits(words, before, least, waits, found):  # type: ignore[no-untyped-def]
-    """Write down waits of ``least`` us and more; the time of the last event, and how many there are now."""
-    for i in range(len(words)):
-        if words[i, 0] - before >= least:
-            waits[found] = words[i, 0] - before
-            found += 1
-        before = words[i, 0]
-    return before, found
 
 
 def _usual_wait(chunks: Sequence[EventArray], start: int) -> int:

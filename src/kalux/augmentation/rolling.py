@@ -29,7 +29,7 @@ def in_time_of_rows(
     chunks
         In time order.
     delays
-        From `kalux.event_slices.row_delays`.
+        From `kalux.event_slices.whole_row_delays`.
     start, end
         Exposure of the middle of the frame, us. Events are those with start < t <= end after that.
     """

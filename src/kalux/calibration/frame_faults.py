@@ -20,7 +20,7 @@ from kalux.calibration.intervals import WELL_EXPOSED, Interval, intervals, sprea
 from kalux.calibration.neighbours import sum_of_neighbours
 from kalux.calibration.regression import two_stage
 from kalux.calibration.stuck_pixels import RangeWatch
-from kalux.frames import Frame
+from kalux.frames import Frame, repeats
 from kalux.models.camera import Camera
 from kalux.recording import FrameCorrections, Recording, with_frames
 from kalux.settings import CameraSettings
@@ -160,7 +160,7 @@ class FrameWatch:
         self._gain, self._faulty, self._stuck = gain, faulty, stuck
         self._response = camera.of_channel(1).response
         self._previous: tuple[Array, Array] | None = None
-        self._last_image: NDArray[Any] | None = None
+        self._last: Frame | None = None
         self.frames = 0
         self.copies: list[int] = []
         self.empty: list[int] = []
@@ -175,8 +175,8 @@ class FrameWatch:
         image = np.ascontiguousarray(image if image.ndim == 2 else image[..., 1])
         response = dataclasses.replace(frame, image=image, valid=None).normalised()
         low, high = np.quantile(response, (0.01, 0.99))
-        is_copy = self._last_image is not None and np.array_equal(frame.image, self._last_image)
-        self._last_image = frame.image
+        is_copy = repeats(frame, self._last)
+        self._last = frame
         if high - low < _CONTRAST:
             if self._faulty:
                 self.empty.append(index)

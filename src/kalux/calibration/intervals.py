@@ -11,13 +11,11 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux import memory
 from kalux.augmentation.lost import lost_time
 from kalux.augmentation.refractory import EventClock
 from kalux.calibration.exposures import Exposures
-from kalux.compiled import event_words
-from kalux.event_slices import all_between, between, count_chunks, count_events
-from kalux.events import EVENT_DTYPE, EventArray
+from kalux.event_slices import all_between, between, count_chunks, count_events, joined_events
+from kalux.events import EventArray
 from kalux.filters.shots import Shot, take_shot
 from kalux.frames import Frame
 from kalux.models.camera import Camera, log_intensity
@@ -130,7 +128,7 @@ class Interval:
     @cached_property
     def events(self) -> EventArray:
         """Those of ``chunks`` in one array."""
-        return _joined(self.chunks)
+        return joined_events(self.chunks)
 
     def counts(self, sensor_size: tuple[int, int]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """(H, W) each, of a sensor of ``sensor_size``: on and off events between the middles, each counted once."""
@@ -252,16 +250,6 @@ def counted_intervals(
 def _later(chunks: list[EventArray], t: int) -> list[EventArray]:
     """Those that have events after ``t`` (us)."""
     return [chunk for chunk in chunks if chunk["t"][-1] > t]
-
-
-def _joined(chunks: list[EventArray]) -> EventArray:
-    """Events one after the other. NumPy would copy them field by field, in ten times the time."""
-    if len(chunks) == 1:
-        return chunks[0]
-    words = [np.empty((0, 2), np.int64), *map(event_words, chunks)]
-    joined: EventArray = memory.empty((sum(map(len, words)),), EVENT_DTYPE)
-    np.concatenate(words, out=event_words(joined))
-    return joined
 
 
 def spread(chosen: NDArray[np.bool_], most: int) -> NDArray[np.int64]:

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from kalux.augmentation.lost import lost_time
 from kalux.calibration.region import LEAST_MISSED, Region
-from kalux.compiled import event_words, loop
-from kalux.event_slices import all_between, between
+from kalux.event_slices import all_between, between, long_waits
 from kalux.events import EventArray
 from kalux.frames import Frame
 from kalux.recording import Recording
@@ -120,15 +119,10 @@ class EventWaits:
     def see(self, chunk: EventArray) -> None:
         """Look at the next events, of which there is one at least."""
         inside = between(chunk, self._start - 1, self._end)
-        words, before = event_words(inside), self._last
-        place = _next_wait(words, 0, before, self._least)
-        while place < len(words):
-            before = int(words[place - 1, 0]) if place else before
-            self._found.append((before, int(words[place, 0])))
-            place = _next_wait(words, place + 1, words[place, 0], self._least)
+        self._found += long_waits(inside, self._last, self._least)
         self.events += len(inside)
-        if len(words):
-            self._last = int(words[-1, 0])
+        if len(inside):
+            self._last = int(inside["t"][-1])
         if self._last < self._end < chunk["t"][-1]:
             self._see_end()
 
@@ -246,19 +240,6 @@ def find_silences(
 def overlaps(silences: Iterable[Silence], begin: int, end: int) -> bool:
     """Whether some time from ``begin`` to ``end``, us, lies in one of the silences."""
     return any(begin < silent_until and end > silent_from for silent_from, silent_until in silences)
-
-
-@loop
-def _next_wait(words, start, before, least):  # type: ignore[no-untyped-def]
-    """Place of the first event from ``start`` on that comes ``least`` us after the one before it; none: their number.
-
-    ``before`` is the time of the event before ``start``.
-    """
-    for i in range(start, len(words)):
-        if words[i, 0] - before >= least:
-            return i
-        before = words[i, 0]
-    return len(words)
 
 
 def _missing(silences: list[Silence], seen: int, events: int) -> Iterator[Silence]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import Any
 
 from kalux.cli.calibrations import (
@@ -49,18 +48,21 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     from kalux.calibration.rolling import estimate_row_time
     from kalux.calibration.values import Calibration
     from kalux.cli.progress import Stages
+    from kalux.recording import no_frames
     from kalux.settings import preset
 
     check_result(options, [options.recording, options.frames])
     known = camera_calibration(options.black_level)
     opened = open_recording(options)
+    if not len(opened.frames()):
+        raise no_frames(opened)
     stages = Stages(quiet=options.quiet)
     (recording, settings, _), contents = mended_recording(opened, known.apply(preset("default")), stages)
     with stages.stage("comparing rows"):
         found = estimate_row_time(recording, settings.camera)
     if found is None:
         raise InputError(
-            f"{Path(options.recording)}: no rolling shutter is seen: the delay of the events does not grow from row to "
+            f"{recording.source.path}: no rolling shutter is seen: the delay of the events does not grow from row to "
             "row by 4 ms or more in all, or too little moves to tell"
         )
     row_time = float(f"{found:.3g}")

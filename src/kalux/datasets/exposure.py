@@ -12,6 +12,7 @@ from kalux.datasets.event_stream import CAMERA, FIXED
 from kalux.datasets.scenes import Scene
 from kalux.datasets.sensors import FloatArray, Sampling, SensorSettings
 from kalux.errors import ExposureError
+from kalux.event_slices import row_delays
 from kalux.frames import Frame
 
 _LEAST_SAMPLES: Final = 8
@@ -120,11 +121,6 @@ def auto_exposures(
         seen = float(respond_to(np.minimum(irradiance, 1.0)).mean())
         exposure *= (settings.auto_exposure / max(seen, 1e-6)) ** _SPEED
     return np.array(found, np.int64)
-
-
-def row_delays(height: int, row_time: float) -> FloatArray:
-    """(height,) us by which each row's exposure is later than the frame's, which is that of its middle."""
-    return (np.arange(height, dtype=np.float64) - (height - 1) / 2) * row_time
 
 
 def frame_stream(

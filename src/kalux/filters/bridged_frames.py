@@ -48,7 +48,7 @@ from kalux.augmentation.trail import (
     with_surety,
 )
 from kalux.compiled import apart, empty, loop, smaller
-from kalux.event_slices import all_between, row_delays
+from kalux.event_slices import all_between, whole_row_delays
 from kalux.events import EventArray
 from kalux.filters import akf_bridged
 from kalux.filters.akf import State
@@ -169,7 +169,7 @@ class BridgedFrames(Method):
         )
         self._spread2 = events.believed_mismatch**2  # K11
         self._period_spread = events.refractory_doubt if events.refractory > 0 else 0.0
-        delays = row_delays(shape[0], settings.camera.row_time)
+        delays = whole_row_delays(shape[0], settings.camera.row_time)
         self._row_delays = delays if delays.any() else None
         self._follows_motion = settings.filter.follows_motion(shape)
         self._event_noise = akf_bridged.Noise(events.background_rate, events.step_noise, self._threshold2)
@@ -395,7 +395,7 @@ class BridgedFrames(Method):
         if signal is not None:
             of_steps = doubt(signal, self.noise.step_variance, self._threshold2)
             joined = joined._replace(doubt=of_steps, signal=signal)
-        joined, change, told = self._with_silent(joined._replace(lost=lost), memory, second, steps)
+        joined, change, remembered = self._with_silent(joined._replace(lost=lost), memory, second, steps)
         by_period = self._by_period(events, start, end, signal)
         # Where the second frame measures a pixel L^A is led back from it, also at the first frame, which bounds it.
         far = self._since_measured(memory, joined, memory.latent.value)
@@ -408,7 +408,7 @@ class BridgedFrames(Method):
         )
         assert joined.net is not None
         unshown = self._follow_unshown(memory, second, following, joined.net, steps)
-        after = told._replace(
+        after = remembered._replace(
             latent=second,
             thresholds=learned,
             interval=(end - start) * 1e-6,
@@ -422,9 +422,9 @@ class BridgedFrames(Method):
             wrong=bridge.wrong_way_back(now_measured, known, self.noise, steps, joined.events),
             trail=trail,
             unshown=unshown,
-            silent_change=told.silent_change,
+            silent_change=remembered.silent_change,
             turns=turns(on, off),
-            half_way=half_way(told.usual.told, self._threshold2),
+            half_way=half_way(remembered.usual.told, self._threshold2),
             latents=(memory.latent, second) if self._follows_motion and shot.pitch == 1 else None,
             brightest=max(shot.white, following.white),
         )
