@@ -209,8 +209,10 @@ def layout_text(fit: LayoutFit) -> str:
 
 
 def gain_text(faults: FrameFaults) -> str:
-    """By how much the frames' brightness steps, and where first."""
+    """By how much the frames' brightness steps, and where first; or by how much it goes up and down."""
     spans = float(faults.gains.max() / faults.gains.min())
+    if faults.unsteady:
+        return f"the brightness of the frames goes up and down by a factor of {spans:.2g}, and events show no such change"
     return (
         f"the brightness of the frames steps at {how_many(len(faults.steps), 'frame')}, first at frame "
         f"{faults.steps[0]}, by up to a factor of {spans:.2g} in all, and events show no such change"

@@ -162,6 +162,18 @@ def test_gains_that_go_up_and_down_do_not_drift():
     assert spread_of(found.gains, exposures) < 0.05
 
 
+def test_a_gain_that_is_never_steady_is_evened_out():
+    """As automatic exposure has it that follows the scene, by less than what is taken for a step."""
+    exposures = np.round(6_000 * np.exp(0.12 * np.sin(0.5 * np.arange(24)))).astype(int).tolist()
+    events, frames = filmed(exposures=exposures, frame_rate=48.0)
+    assert np.abs(np.diff(np.log(exposures))).max() < 0.1
+    found = faults(events, [stated(frame, 6_000) for frame in frames])
+    assert found.unsteady
+    left = np.log(found.gains / np.array(exposures))
+    assert np.std(left) < 0.25 * np.std(np.log(exposures))
+    assert not faults(events, frames).unsteady
+
+
 @pytest.mark.parametrize(
     "hide", [lambda frames: repeated(frames, 5, 6), lambda f: [*f[:5], *emptied(f[5:7]), *f[7:]]]
 )

@@ -20,6 +20,7 @@ from kalux.calibration.intervals import WELL_EXPOSED, Interval, intervals, sprea
 from kalux.calibration.neighbours import sum_of_neighbours
 from kalux.calibration.regression import two_stage
 from kalux.calibration.stuck_pixels import RangeWatch
+from kalux.calibration.unsteady_gain import likely_log_gains
 from kalux.frames import Frame, repeats
 from kalux.models.camera import Camera
 from kalux.recording import FrameCorrections, Recording, with_frames
@@ -84,6 +85,26 @@ _TREND: Final = 1.5
 _ROUNDS: Final = 3
 """How often steps are told from what is none, each time without what the steps before leave unexplained."""
 
+_LEAST_UNSTEADY: Final = 0.03
+"""Least step of a gain that is never steady, as of a camera whose automatic exposure follows the scene, which nobody
+states. At least `_LEAST_OFTEN` are asked for, where more of the image is quiet than `_MUCH_QUIET`, and agrees twice as
+well as for larger steps (`_QUIET_ALIKE`). Of 404 simulated recordings of steady gains one seems to have one such step; of
+28 whose gain goes up and down by 13 or 25 % eleven have two to 34."""
+
+_LEAST_OFTEN: Final = 2
+_MUCH_QUIET: Final = 0.3
+_QUIET_ALIKE: Final = 0.25
+
+_SLIGHT: Final = 0.02
+_MOST_SLIGHT: Final = 30
+"""So many frames whose median log intensity changes by so much, the first ones, tell whether the gain is unsteady."""
+
+_PART_ERROR: Final = 0.4
+"""Standard error of what frames show beyond their events, as a share of how far most parts of the image are from it
+(`_Rest.apart`): it is 0.1 to 0.5 of it in those."""
+
+_LEAST_ERROR: Final = 0.002  # log intensity
+
 _SMALL_OFFSET: Final = 1e-3
 """I_0 for comparing frames: with a larger one, steps of dark pixels would come out too small."""
 
@@ -118,6 +139,8 @@ class FrameFaults(NamedTuple):
         Indices of the frames from which on another gain holds, and
     gains
         (K,) the gain of every frame, 1 that of the median frame.
+    unsteady
+        Whether the gain is another in every frame, so that all of them are ``steps``.
     stuck
         (H, W) pixels that always show the same; None: none.
     """
@@ -127,6 +150,7 @@ class FrameFaults(NamedTuple):
     empty: tuple[int, ...] = ()
     steps: tuple[int, ...] = ()
     gains: Array = np.ones(0)
+    unsteady: bool = False
     stuck: NDArray[np.bool_] | None = None
 
     @property
@@ -165,6 +189,7 @@ class FrameWatch:
         self.copies: list[int] = []
         self.empty: list[int] = []
         self.suspects: list[int] = []
+        self.slight: list[int] = []
         self.ranges = RangeWatch()
 
     def see(self, frame: Frame) -> None:
@@ -198,6 +223,8 @@ class FrameWatch:
                 change = np.median(np.log(intensity[both] / earlier[both]))
                 if abs(change) >= _SUSPECT:
                     self.suspects.append(index)
+                if abs(change) >= _SLIGHT and len(self.slight) < _MOST_SLIGHT:
+                    self.slight.append(index)
         self._previous = response, intensity
 
 
@@ -226,7 +253,7 @@ def find_frame_faults(recording: Recording, camera: CameraSettings, watch: Frame
     empty = watch.empty if len(watch.empty) <= _MOST_EMPTY * watch.frames else []
     copies = watch.copies if len(watch.copies) <= _MOST_COPIES * watch.frames else []
     found = FrameFaults(watch.frames, stuck=watch.ranges.stuck(recording))
-    if not (empty or copies or watch.suspects):
+    if not (empty or copies or watch.suspects or watch.slight):
         return found
     compared = dataclasses.replace(camera, log_offset=_SMALL_OFFSET)
     certain_copies, certain_empty = list[int](), list[int]()
@@ -238,15 +265,21 @@ def find_frame_faults(recording: Recording, camera: CameraSettings, watch: Frame
         elif abs(float(np.median(on - off))) < _LIT:
             certain_empty.append(index)
     logs = np.zeros(watch.frames)
-    rests = _rests(recording, compared, watch, {*watch.suspects})
-    if any(rest.is_certain(rest.step) for rest in rests.values()):
-        others = set(range(1, max(rests))) - {*watch.suspects}
-        logs = _log_gains(watch.frames, _steps(rests | _rests(recording, compared, watch, others)))
+    rests = _rests(recording, compared, watch, {*watch.suspects, *watch.slight})
+    unsteady = sum(rest.is_unsteady for rest in rests.values()) >= _LEAST_OFTEN
+    suspects = {index: rest for index, rest in rests.items() if index in {*watch.suspects}}
+    if unsteady:
+        others = set(range(1, watch.frames)) - {*rests}
+        logs = _unsteady_log_gains(watch.frames, rests | _rests(recording, compared, watch, others))
+    elif any(rest.is_certain(rest.step) for rest in suspects.values()):
+        others = set(range(1, max(suspects))) - {*suspects}
+        logs = _log_gains(watch.frames, _steps(suspects | _rests(recording, compared, watch, others)))
     return found._replace(
         copies=tuple(certain_copies),
         empty=tuple(certain_empty),
         steps=tuple((1 + np.flatnonzero(np.diff(logs))).tolist()),
         gains=np.asarray(np.exp(logs - np.sort(logs)[watch.frames // 2]), np.float64),
+        unsteady=unsteady,
     )
 
 
@@ -320,10 +353,19 @@ class _Rest(NamedTuple):
     back_and_forth: float
     quiet: _Quiet
 
-    def is_gain(self, step: float, flicker: float) -> bool:
+    def is_gain(self, step: float, flicker: float, at_least: float = _LEAST_STEP) -> bool:
         """Whether a step is the gain's and not the light's, which flickers by less than a share of the step."""
         lit = max(light * np.sign(step) for light in (self.light, self.quiet.light)) >= _SEEN * abs(step)
-        return bool(abs(step) >= _LEAST_STEP and not lit and self.back_and_forth < flicker * abs(step))
+        return bool(abs(step) >= at_least and not lit and self.back_and_forth < flicker * abs(step))
+
+    @property
+    def is_unsteady(self) -> bool:
+        """Whether this is a small step that can only be the gain's (`_LEAST_UNSTEADY`)."""
+        step, quiet = self.step, self.quiet
+        if abs(step) >= _LEAST_STEP:
+            return False
+        alike = self.apart < _ALIKE * abs(step) and abs(quiet.beyond - step) < _QUIET_ALIKE * abs(step)
+        return alike and quiet.share >= _MUCH_QUIET and self.is_gain(step, _FLICKER, _LEAST_UNSTEADY)
 
     def is_certain(self, step: float) -> bool:
         """Whether a step is the gain's whatever other frames show: most of the image, and quiet pixels, have it."""
@@ -454,3 +496,12 @@ def _log_gains(frames: int, steps: dict[int, float]) -> Array:
             nearest = reached
         logs[index:] = nearest
     return logs
+
+
+def _unsteady_log_gains(frames: int, rests: dict[int, _Rest]) -> Array:
+    """(K,) log gains where every frame has its own. Quiet pixels tell most where there are many."""
+    steps, errors = np.zeros(frames - 1), np.full(frames - 1, np.inf)
+    for index, rest in rests.items():
+        steps[index - 1] = rest.quiet.beyond if rest.quiet.share >= _MUCH_QUIET else rest.step
+        errors[index - 1] = max(_PART_ERROR * rest.apart, _LEAST_ERROR)
+    return likely_log_gains(steps, errors)
