@@ -212,7 +212,8 @@ def gain_text(faults: FrameFaults) -> str:
     """By how much the frames' brightness steps, and where first; or by how much it goes up and down."""
     spans = float(faults.gains.max() / faults.gains.min())
     if faults.unsteady:
-        return f"the brightness of the frames goes up and down by a factor of {spans:.2g}, and events show no such change"
+        moved = f"goes up and down by a factor of {spans:.2g}"
+        return f"the brightness of the frames {moved}, and events show no such change"
     return (
         f"the brightness of the frames steps at {how_many(len(faults.steps), 'frame')}, first at frame "
         f"{faults.steps[0]}, by up to a factor of {spans:.2g} in all, and events show no such change"

@@ -88,8 +88,8 @@ _ROUNDS: Final = 3
 _LEAST_UNSTEADY: Final = 0.03
 """Least step of a gain that is never steady, as of a camera whose automatic exposure follows the scene, which nobody
 states. At least `_LEAST_OFTEN` are asked for, where more of the image is quiet than `_MUCH_QUIET`, and agrees twice as
-well as for larger steps (`_QUIET_ALIKE`). Of 404 simulated recordings of steady gains one seems to have one such step; of
-28 whose gain goes up and down by 13 or 25 % eleven have two to 34."""
+well as for larger steps (`_QUIET_ALIKE`). Of 404 simulated recordings of steady gains one seems to have one such step;
+of 28 whose gain goes up and down by 13 or 25 % eleven have two to 34."""
 
 _LEAST_OFTEN: Final = 2
 _MUCH_QUIET: Final = 0.3

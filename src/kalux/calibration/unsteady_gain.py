@@ -35,8 +35,8 @@ def likely_log_gains(steps: Array, errors: Array) -> Array:
     Returns
     -------
     Array
-        (K,): the solution of (1 / S^2 + D' W D) g = D' W d with the steps d, the differences D between frames, weights W
-        of one over the squared errors, and S, the gains' standard deviation.
+        (K,): the solution of (1 / S^2 + D' W D) g = D' W d with the steps d, the differences D between frames,
+        weights W of one over the squared errors, and S, the gains' standard deviation.
     """
     weights = 1.0 / np.square(errors)
     matrix = np.zeros((2, len(steps) + 1))  # the diagonal, and the one beside it
