@@ -62,6 +62,7 @@ class Pixel:
     active: list[float] = field(default_factory=list)
     untold: list[float] = field(default_factory=list)
     lost: list[float | None] = field(default_factory=list)
+    latents: list[tuple[float, float]] = field(default_factory=list)
     forgotten: list[float] = field(default_factory=list)
     measured: list[bool] = field(default_factory=list)
     signal: list[tuple[float, float]] = field(default_factory=list)
@@ -377,6 +378,7 @@ def bridged(pixel, settings, times, on, off, scales):
     pixel.active.clear()
     pixel.told.clear()
     pixel.measured.clear()
+    pixel.latents.clear()
 
     hidden_by_black = hides(c)
 
@@ -437,11 +439,13 @@ def bridged(pixel, settings, times, on, off, scales):
     begin = pixel.starts[0]
     first = latent(0)
     pixel.measured.append(first[1] < UNMEASURED)
+    pixel.latents.append(first)
     intervals = [(begin, pixel.middles[0], None, first, scale_on, scale_off, var_on, var_off, 0.0, SURE)]
     untold_from = {}  # K1: variance of what no event tells, of the interval that begins there
     for k in range(count - 1):
         second = latent(k + 1)
         pixel.measured.append(second[1] < UNMEASURED)
+        pixel.latents.append(second)
         a, b = pixel.middles[k], pixel.middles[k + 1]
         n_on, n_off = counts(a, b)
         signal = pixel.signal[k] if pixel.signal else SURE
@@ -814,21 +818,31 @@ def seen(pixels, interval):
     return [k for k in range(interval + 1) if lost[k] is None]
 
 
-def lost_time(pixels, start, end):
-    """K18: the time between two frames in which events are missing, us."""
+def waits_for_events(pixels, start, end):
+    """K18: times of the sensor's events between two frames, all waits for them, those that are long, and the rest."""
     times = sorted(t for pixel in pixels.values() for t, *_ in pixel.events if start < t <= end)
     waits = np.diff([start, *times, end])
     long = waits[waits >= max(np.ceil((end - start) / 20), 1)]
-    rest = end - start - long.sum()
-    if not len(long) or not times or rest < (end - start) / 10:
+    return times, waits, long, end - start - long.sum()
+
+
+def lost_time(pixels, start, end):
+    """K18: the time between two frames in which events are missing, us; None: frames have to tell."""
+    times, waits, long, rest = waits_for_events(pixels, start, end)
+    if not len(long):
         return 0
+    if rest < (end - start) / 10:
+        return None
     digits = sorted(len(f"{wait:b}") for wait in waits[:-1] if wait > 0)
     usual = 2 ** next(d for n, d in enumerate(digits, 1) if sum(e <= d for e in digits) >= 0.9 * len(digits))
     return sum(wait for wait in long if wait * len(times) / rest >= 100 and wait >= 4 * usual)
 
 
-def lost_changes(pixels, k, on, off, q0):
-    """K18: of every pixel, the variance of what events would have told that are missing between two frames."""
+def lost_changes(pixels, k, on, off, q0, latents):
+    """K18: of every pixel, the variance of what events would have told that are missing between two frames.
+
+    ``latents`` makes those of all pixels by what was lost before.
+    """
     a, b = next(iter(pixels.values())).middles[k : k + 2]
     lost = lost_time(pixels, a, b)
     if lost == 0:
@@ -839,11 +853,35 @@ def lost_changes(pixels, k, on, off, q0):
         told[place] = sum(
             on * f_on * w if p else -off * f_off * w for t, p, *_, w in pixel.events if a < t <= b
         )
+    if lost is None:
+        return shown_by_frames(pixels, k, told, on * off, latents)
     found = {}
     for row, column in pixels:
         near = [told[i, j] ** 2 for i, j in pixels if max(abs(i - row), abs(j - column)) <= 4]
         found[row, column] = sum(near) / len(near) * lost / (b - a - lost)
     return found if max(found.values()) > q0 else dict.fromkeys(pixels)
+
+
+def shown_by_frames(pixels, k, told, c2, latents):
+    """K18: the same where hardly an event comes, by the frames; None of all pixels where nothing moved."""
+    if len(pixels) < 20:
+        return dict.fromkeys(pixels)
+    latents()
+    beyond, far = {}, 0
+    for place, pixel in pixels.items():
+        (before, *v_before), (after, *v_after) = pixel.latents[k : k + 2]
+        noise = v_before[0] + v_after[0]
+        if noise < UNMEASURED:
+            square = (after - before - told[place]) ** 2
+            far += square > max(16 * noise, 4 * c2)
+            beyond[place] = square - noise
+    if far < max(0.005 * len(beyond), 20):
+        return dict.fromkeys(pixels)
+    found = {}
+    for row, column in pixels:
+        near = [v for (i, j), v in beyond.items() if max(abs(i - row), abs(j - column)) <= 4]
+        found[row, column] = max(np.mean(near or [*beyond.values()]), 0.0)
+    return found
 
 
 def lately(values):
@@ -1247,10 +1285,17 @@ def reconstruct(events, frames, sensor_size, settings, times):
             shares = signal_shares(every, k, settings)
             for place, pixel in every.items():
                 pixel.signal.append((shares[True, place], shares[False, place]))
-    for k in range(len(frames) - 1):
-        found = lost_changes(every, k, on, off, settings.events.quantisation_variance * on * off)
-        for place, pixel in every.items():
-            pixel.lost.append(found[place])
+    for pixel in every.values():
+        pixel.lost = [None] * (len(frames) - 1)
+
+    def latents():
+        for pixel in every.values():
+            bridged(pixel, settings, [], on, off, *more)
+
+    for k in range(len(frames) - 1 if method is bridged else 0):
+        q0 = settings.events.quantisation_variance * on * off
+        for place, lost in lost_changes(every, k, on, off, q0, latents).items():
+            every[place].lost[k] = lost
     for (row, column), pixel in every.items():
         out[:2, :, row, column] = method(pixel, settings, times, on, off, *more).T
     if method is not bridged:

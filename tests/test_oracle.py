@@ -146,6 +146,37 @@ def test_they_agree_where_events_are_missing(name, data):
     assert_agrees(name, *data.draw(streams_with_losses()))
 
 
+@st.composite
+def streams_unheard(draw):
+    """Three or four frames of 6 x 6 pixels, between two of which hardly an event comes though all of them change."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    begin, every = draw(st.integers(0, 10**6)), draw(st.integers(12_000, 40_000))
+    count = draw(st.integers(3, 4))
+    least = draw(st.sampled_from([0, 60]))  # of frames that clip hardly a pixel, and others
+    frames = [
+        Frame(rng.integers(least, 256, (6, 6)).astype(np.uint8), start, start + draw(st.integers(1000, 9000)))
+        for start in range(begin, begin + count * every, every)
+    ]
+    silent = draw(st.integers(0, count - 2))
+    start, end = frames[silent].middle, frames[silent + 1].middle
+    t = np.sort(rng.integers(begin - 500, begin + count * every, 150 * count))
+    heard = (t <= start) | (t > end - draw(st.sampled_from([0, every // 30])))
+    t = t[heard]
+    events = make_events(
+        t, rng.integers(0, 6, len(t)), rng.integers(0, 6, len(t)), rng.integers(0, 2, len(t)) > 0
+    )
+    moments = st.integers(frames[0].middle, frames[-1].exposure_end)
+    times = sorted(draw(st.lists(st.one_of(moments, st.integers(start, end)), min_size=2, max_size=4)))
+    return events, frames, times
+
+
+@pytest.mark.parametrize("name", ["default", "default-background"])
+@given(data=st.data())
+@settings(max_examples=8, deadline=None)
+def test_they_agree_where_no_event_is_heard(name, data):
+    assert_agrees(name, *data.draw(streams_unheard()))
+
+
 def test_they_agree_where_frames_are_exposed_for_longer_than_between_their_middles():
     """Of a pixel that both frames clip, whose b' of K11 is then more than 1."""
     places = [(1, 0, 0), (1, 0, 1), (1, 1, 0), (1, 1, 1), (2, 0, 0), (2, 0, 0), (2, 0, 1), (2, 0, 1)]
@@ -164,10 +195,11 @@ def assert_agrees(name, events, frames, times):
         events=dataclasses.replace(chosen.events, threshold_on=0.21, threshold_off=0.17),
         camera=dataclasses.replace(chosen.camera, reference_exposure=10_000),
     )
+    size = frames[0].image.shape
     pixels, expected, variance, hidden, moving, unshowns = naive.reconstruct(
-        events, frames, (HEIGHT, WIDTH), chosen, times
+        events, frames, size, chosen, times
     )
-    engine = Reconstructor((HEIGHT, WIDTH), settings=chosen)
+    engine = Reconstructor(size, settings=chosen)
     for frame in frames:
         engine.push_frame(frame)
     engine.push_events(events)

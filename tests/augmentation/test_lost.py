@@ -8,7 +8,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kalux.augmentation.bridge import MASKED, UNMEASURED, Latent
-from kalux.augmentation.lost import add_lost_change, lost_change, lost_time
+from kalux.augmentation.lost import (
+    Loss,
+    add_lost_change,
+    loss_between,
+    lost_change,
+    lost_time,
+    unheard_change,
+)
 from kalux.events import make_events
 
 START, END = 1_000_000, 1_040_000
@@ -76,6 +83,56 @@ def test_a_flash_is_no_loss():
 def test_few_events_tell_nothing():
     assert lost_time([], START, END) == 0
     assert lost_time([events_at(without(any_time(100), START, START + 20_000))], START, END) == 0
+
+
+def test_frames_have_to_tell_where_hardly_an_event_comes():
+    few = events_at(any_time(100)[:3])
+    flash = events_at(np.random.default_rng(1).integers(START + 19_000, START + 21_000, 5_000))
+    for events in ([], [few], [flash]):
+        assert loss_between(events, START, END) == Loss(0, unheard=True)
+    assert not loss_between([events_at(any_time(3_000))], START, END).unheard
+    assert not loss_between([events_at(without(any_time(3_000), START, START + 30_000))], START, END).unheard
+
+
+def shown(value, variance=1e-4):
+    return Latent(np.asarray(value, np.float32), np.full_like(value, variance, np.float32))
+
+
+def test_what_frames_show_without_events_is_what_is_missing():
+    """Less their noise, around each pixel, and less what the events that come tell."""
+    rng = np.random.default_rng(2)
+    first = np.zeros((40, 60), np.float32)
+    change = np.where(np.arange(60) < 30, 0.5, 0.05) * rng.choice([-1, 1], (40, 60))
+    noise = rng.normal(0.0, 0.1, (40, 60))
+    told = np.zeros((40, 60), np.float32)
+    variance = unheard_change(shown(first, 0.005), shown(first + change + noise, 0.005), told, 0.04)
+    assert variance is not None
+    np.testing.assert_allclose(variance[:, :20], 0.25, rtol=0.25)
+    assert variance[:, 40:].mean() == pytest.approx(0.0025, abs=0.001)
+    assert variance.min() >= 0
+    told = change.astype(np.float32)
+    assert unheard_change(shown(first, 0.005), shown(first + change, 0.005), told, 0.04) is None
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from([1e-6, 1e-4, 0.01, 1.0]))
+def test_nothing_is_missing_where_frames_differ_by_noise(seed, variance):
+    """Nor where they change by less than two thresholds, or where a few pixels are broken."""
+    rng = np.random.default_rng(seed)
+    noise = rng.normal(0.0, np.sqrt(2 * variance), (40, 60))
+    noise.ravel()[:10] = 3.0
+    told = np.zeros((40, 60), np.float32)
+    assert unheard_change(shown(np.zeros((40, 60)), variance), shown(noise, variance), told, 0.04) is None
+    slow = rng.uniform(-0.39, 0.39, (40, 60))
+    assert unheard_change(shown(np.zeros((40, 60)), 1e-6), shown(slow, 1e-6), told, 0.04) is None
+
+
+def test_where_no_frame_measures_the_rest_of_the_image_tells():
+    change = np.full((40, 60), 0.8, np.float32)
+    clipped = np.full((40, 60), 1e-4, np.float32)
+    clipped[:, 30:] = UNMEASURED
+    first, second = Latent(0 * change, np.full_like(clipped, 1e-4)), Latent(change, clipped)
+    variance = unheard_change(first, second, 0 * change, 0.04)
+    np.testing.assert_allclose(variance, 0.64 - 2e-4, rtol=1e-5)
 
 
 def test_what_is_lost_goes_with_the_time_and_with_what_events_around_tell():

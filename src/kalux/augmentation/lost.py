@@ -9,7 +9,7 @@ after; how much, by what the events around tell.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,16 @@ _MOST_WAITS: Final = 20
 all of the change."""
 
 _LEAST_REST: Final = 0.1
-"""Of that time that must be left: the events of a flash come within a moment, and none are missing before and after."""
+"""Of that time that must be left for events to tell what is missing: the events of a flash come within a moment, and
+none are missing before and after."""
+
+_FAR: Final = 4.0, 2.0
+"""Standard deviations of the frames' noise, and thresholds, beyond which a pixel has changed without events that would
+have come from a sensor that is heard."""
+
+_LEAST_FAR: Final = 0.005
+_LEAST_FAR_PIXELS: Final = 20
+"""Share of the measured pixels, and number, that must have: fewer may be broken ones."""
 
 _MISSING: Final = 100.0
 """Events that a wait must be short of, at the rate of the rest of the time between the frames: at random, as many come
@@ -39,9 +48,34 @@ bunches, some milliseconds apart."""
 
 _MOST: Final = 0.9
 
+_NONE_AROUND: Final = 0.5 / 81  # of the pixels around, 9 x 9
+
+
+class Loss(NamedTuple):
+    """Whether events are missing between two frames, as far as these events alone tell.
+
+    Attributes
+    ----------
+    time
+        us in which they are missing; 0 where none are, or too few come to tell.
+    unheard
+        Whether none come, or all within a tenth of the time, so that frames have to tell (`unheard_change`).
+    """
+
+    time: int
+    unheard: bool
+
+
+_NONE: Final = Loss(0, False)
+
 
 def lost_time(chunks: Sequence[EventArray], start: int, end: int) -> int:
-    """us from ``start`` to ``end`` in which events are missing; 0 where none are, or too few come to tell.
+    """us from ``start`` to ``end`` in which events are missing (`loss_between`)."""
+    return loss_between(chunks, start, end).time
+
+
+def loss_between(chunks: Sequence[EventArray], start: int, end: int) -> Loss:
+    """Whether events are missing from ``start`` to ``end``, us.
 
     Parameters
     ----------
@@ -59,14 +93,16 @@ def lost_time(chunks: Sequence[EventArray], start: int, end: int) -> int:
         before, events = int(chunk["t"][-1]), events + len(chunk)
     if end - before >= least:
         waits.append((before, end))
+    if not waits:
+        return _NONE
     longest = np.diff(np.array(waits, np.int64).reshape(-1, 2)).ravel()
     rest = end - start - int(longest.sum())
-    if not waits or events == 0 or rest < _LEAST_REST * (end - start):
-        return 0
+    if events == 0 or rest < _LEAST_REST * (end - start):
+        return Loss(0, unheard=True)
     lost = longest[longest * (events / rest) >= _MISSING]
     if len(lost) == 0:
-        return 0
-    return int(lost[lost >= _BUNCHES * _usual_wait(chunks, start)].sum())
+        return _NONE
+    return Loss(int(lost[lost >= _BUNCHES * _usual_wait(chunks, start)].sum()), unheard=False)
 
 
 def lost_change(told: Array, lost: int, duration: int) -> Array:
@@ -88,6 +124,37 @@ def lost_change(told: Array, lost: int, duration: int) -> Array:
     variance = mean_around(np.square(told))
     variance *= np.float32(lost / (duration - lost))
     return variance
+
+
+def unheard_change(first: Latent, second: Latent, told: Array, threshold2: float) -> Array | None:
+    """The same where hardly an event comes, by what the frames show (docs/equations.md, K18).
+
+    Parameters
+    ----------
+    first, second
+        The frames before and after.
+    told
+        (H, W) float32 change of log intensity by the events that come.
+    threshold2
+        c^2.
+
+    Returns
+    -------
+    (H, W) float32 variance of the change that is not told: the mean of its squares around each pixel, less the noise
+    of the frames; of all of the image where no pixel around is measured. None where nothing moved.
+    """
+    noise = first.variance + second.variance
+    measured = np.maximum(first.variance, second.variance) < UNMEASURED
+    beyond = np.where(measured, np.square(second.value - first.value - told), 0)
+    far = measured & (beyond > np.maximum(_FAR[0] ** 2 * noise, _FAR[1] ** 2 * threshold2))
+    seen = np.count_nonzero(measured)
+    if np.count_nonzero(far) < max(_LEAST_FAR * seen, _LEAST_FAR_PIXELS):
+        return None
+    beyond = np.where(measured, beyond - noise, 0).astype(np.float32)
+    share = mean_around(measured.astype(np.float32))
+    whole = float(beyond.sum(dtype=np.float64)) / seen
+    around = np.where(share > _NONE_AROUND, mean_around(beyond) / np.maximum(share, _NONE_AROUND), whole)
+    return np.maximum(around, 0).astype(np.float32)
 
 
 def add_lost_change(grown: Array, first: Latent, second: Latent, untold: Array, lost: Array) -> None:

@@ -20,7 +20,7 @@ from kalux.augmentation.highlights import (
     expected_excess,
     follow_unshown,
 )
-from kalux.augmentation.lost import add_lost_change, lost_change, lost_time
+from kalux.augmentation.lost import add_lost_change, loss_between, lost_change, unheard_change
 from kalux.augmentation.motion import HalfWay, Paths, Plane, behind, find_path
 from kalux.augmentation.refractory import growth_with_period
 from kalux.augmentation.rolling import carried, in_time_of_rows
@@ -379,7 +379,7 @@ class BridgedFrames(Method):
             at_middle = with_surety(memory.followed, at_middle, signal)
         trail, grown = self._trail_between(memory, shot, following, at_middle)
         steps = (on, off) if signal is None else (on * signal[0], off * signal[1])
-        lost = self._lost_change(events, start, end, steps)
+        lost = self._lost_change(events, start, end, steps, memory.latent, second)
         joined, learned = bridge.bridge(
             memory.latent,
             second,
@@ -445,7 +445,7 @@ class BridgedFrames(Method):
         grown = self._trail_at(at_middle, following.middle, scale)
         grown -= self._trail_at(memory.at_middle, shot.middle, scale)
         between = on + since_on, off + since_off
-        lost = self._lost_change(events, start, following.end, between)
+        lost = self._lost_change(events, start, following.end, between, memory.latent, second)
         untold = self._untold(lost)
         behind, learned = bridge.bridge(
             memory.latent,
@@ -537,16 +537,20 @@ class BridgedFrames(Method):
         height = self.settings.events.trail
         return height * self.on, height * self.off
 
-    def _lost_change(self, events: Chunks, start: int, end: int, steps: Counts) -> Floats | None:
+    def _lost_change(
+        self, events: Chunks, start: int, end: int, steps: Counts, first: Latent, second: Latent
+    ) -> Floats | None:
         """(H, W) variance of the change by events that are missing in an interval, given those that are there (K18).
 
         None where it is nowhere more than q_0.
         """
-        lost = lost_time(all_between(events, start, end), start, end)
-        if lost == 0:
+        loss = loss_between(all_between(events, start, end), start, end)
+        if loss.time == 0 and not loss.unheard:
             return None
         told = np.float32(self.on) * steps[0] - np.float32(self.off) * steps[1]
-        variance = lost_change(told, lost, end - start)
+        if loss.unheard:
+            return unheard_change(first, second, told, self._threshold2)
+        variance = lost_change(told, loss.time, end - start)
         return variance if float(variance.max()) > self.noise.quantisation_variance else None
 
     def _untold(self, lost: Floats | None) -> Floats | None:
