@@ -56,6 +56,50 @@ def test_a_stuck_pixel_is_found(value, channels):
     ]
 
 
+def dimmed(frames, share, least=0):
+    """The frames with so much of their light, on top of a least level."""
+    return [
+        dataclasses.replace(frame, image=(least + share * frame.image).astype(frame.image.dtype))
+        for frame in frames
+    ]
+
+
+def few(events, share):
+    """Evenly spread events of every pixel, so that each has a share of its own."""
+    order = np.lexsort((events["t"], events["x"], events["y"]))
+    return events[np.sort(order[:: round(1 / share)])]
+
+
+@pytest.mark.parametrize("mosaic", [None, "RGGB"])
+@pytest.mark.parametrize("value", [0, 255])
+def test_it_is_found_among_neighbours_that_change_little(value, mosaic):
+    """Darker, or brighter, than each of them in every frame, by a twentieth of white."""
+    events, frames = moving()
+    dim = [dataclasses.replace(frame, mosaic=mosaic) for frame in dimmed(frames, 0.3, 20)]
+    assert found(events, with_pixels(dim, value, (20, 16))) == [(20, 16)]
+    assert found(events, with_pixels(dim, int(dim[0].image.min()) + 5, (20, 16))) == []
+
+
+def test_few_events_are_enough_where_no_neighbour_is_like_it():
+    events, frames = moving()
+    median = np.median(np.bincount(events["y"].astype(int) * 40 + events["x"], minlength=32 * 40))
+    dim = with_pixels(dimmed(frames, 0.3, 20), 255, (20, 16))
+    assert found(few(events, 5 / median), dim) == [(20, 16)]
+    assert found(few(events, 2 / median), dim) == []
+
+
+def test_a_black_hole_is_stuck_without_any_event_and_a_dark_spot_is_not():
+    """No lens draws a single pixel that is black while all around it are bright, in every frame."""
+    events, frames = moving()
+    still = [
+        dataclasses.replace(frame, image=np.full_like(frame.image, 60 + i % 9))
+        for i, frame in enumerate(frames)
+    ]
+    assert found(events[:0], with_pixels(still, 0, (20, 16))) == [(20, 16)]
+    for level in (20, 255):
+        assert found(events[:0], with_pixels(still, level, (20, 16))) == []
+
+
 def test_two_side_by_side_are_found():
     events, frames = moving()
     assert found(events, with_pixels(frames, 0, (20, 16), (21, 16))) == [(20, 16), (21, 16)]
