@@ -114,10 +114,9 @@ class RangeWatch:
 
 
 def _beyond_neighbours(image: NDArray[Any], pitch: int) -> tuple[NDArray[Any], NDArray[Any]]:
-    """(H, W) by how much every pixel is darker, and brighter, than all its neighbours; below 0 where it is not."""
+    """(H, W) by how much every pixel is darker, and brighter, than all its neighbours; not above 0 where it is not."""
     beside = np.zeros((2 * pitch + 1, 2 * pitch + 1), np.uint8)
     beside[::pitch, ::pitch] = 1
     beside[pitch, pitch] = 0
-    signed = np.float32 if image.dtype.kind == "f" else np.int32
-    darkest, brightest = (np.asarray(found(image, beside), signed) for found in (cv2.erode, cv2.dilate))
-    return darkest - image, image.astype(signed) - brightest
+    darker = cv2.subtract(cv2.erode(image, beside), image)
+    return np.asarray(darker), np.asarray(cv2.subtract(image, cv2.dilate(image, beside)))
