@@ -20,7 +20,7 @@ from kalux.events import EventArray
 from kalux.images import Estimate, Image
 from kalux.planning import UNCERTAIN_ORIGINS, Plan, plan
 from kalux.reconstructor import Reconstructor
-from kalux.recording import Recording, with_corrected_frames, with_event_layout
+from kalux.recording import Recording, with_corrected_frames, with_event_layout, with_shifted_frames
 from kalux.settings import Settings
 from kalux.smoothing import Backward, combine, reversed_pixels, reversed_settings
 from kalux.spill import temporary_folder
@@ -129,6 +129,8 @@ def execute(
         Without, grey images have an infinite variance and are made faster.
     """
     memory.give_back()  # that planning and checking have used
+    if plan.mends.times is not None:
+        recording = with_shifted_frames(recording, plan.mends.times.shifts)
     recording = with_corrected_frames(recording, plan.mends.corrections)
     if plan.mends.layout is not None:
         recording = with_event_layout(recording, plan.mends.layout.found)

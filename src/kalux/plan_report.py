@@ -12,6 +12,7 @@ from kalux.calibration.delay import SHARE
 from kalux.calibration.event_layout import LayoutFit
 from kalux.calibration.event_model import Agreement
 from kalux.calibration.frame_faults import FrameFaults
+from kalux.calibration.frame_times import FrameTimes
 from kalux.calibration.levels import Ceiling, find_ceiling
 from kalux.recording import Recording, less_black
 from kalux.settings import AUTO, EventSettings, Settings
@@ -113,6 +114,8 @@ def _of_frames(recording: Recording, plan: Plan, asked: Settings) -> Iterator[tu
         yield "left out", left_out_text(plan.mends.faults)
     if plan.mends.faults is not None and plan.mends.faults.stuck is not None:
         yield "stuck", f"{stuck_text(plan.mends.faults.stuck)}: the median of their neighbours is taken"
+    if plan.mends.times is not None:
+        yield "times", f"{times_text(plan.mends.times)}: corrected"
     if recording.found_white is not None:
         yield "white", f"{recording.found_white}, where the 16-bit frames end"
     if plan.mends.black is not None or camera.black_level is not None:
@@ -223,6 +226,14 @@ def gain_text(faults: FrameFaults) -> str:
 def stuck_text(stuck: NDArray[np.bool_]) -> str:
     """How many pixels of frames are stuck."""
     return f"{how_many(int(np.count_nonzero(stuck)), 'pixel')} always the same though the light changes"
+
+
+def times_text(times: FrameTimes) -> str:
+    """By how much the times of frames are off."""
+    return (
+        f"those of the frames are off one by one, by {times.spread / 1000:.1f} ms (standard deviation): events explain "
+        f"{100 * (1 - times.left):.0f} % more of what frames show"
+    )
 
 
 def left_out_text(faults: FrameFaults) -> str:

@@ -337,6 +337,19 @@ def _corrected(frames: Iterator[Frame], corrections: FrameCorrections, pitch: in
         yield frame
 
 
+def with_shifted_frames(recording: Recording, shifts: NDArray[np.int64]) -> Recording:
+    """The same recording, each of whose frames is of another time: (K,) us are added to their exposures."""
+
+    def shifted() -> Iterator[Frame]:
+        for frame, shift in zip(whole(), shifts.tolist(), strict=True):
+            start, end = frame.exposure_start + shift, frame.exposure_end + shift
+            yield dataclasses.replace(frame, exposure_start=start, exposure_end=end)
+
+    whole, made = recording.source.frames, copy.copy(recording)
+    made.source = dataclasses.replace(recording.source, frames=shifted)
+    return made
+
+
 def no_frames(recording: Recording) -> FrameError:
     """What to raise where a recording without frames cannot be used."""
     return FrameError(

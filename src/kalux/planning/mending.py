@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from kalux.calibration.black_level import BlackLevel
 from kalux.calibration.event_layout import LayoutFit, find_layout
 from kalux.calibration.frame_faults import FrameFaults
+from kalux.calibration.frame_times import FrameTimes
 from kalux.calibration.hot_pixels import find_hot_pixels
 from kalux.calibration.levels import Ceiling
 from kalux.planning.levels import with_saturation, without_black
@@ -50,6 +51,8 @@ class Mends(NamedTuple):
         Frames that are left out, or whose gain is not that of others, and stuck pixels; None: none.
     corrections
         What is done about these.
+    times
+        Of single frames, where their stamps are off; None: they are right, or not looked for.
     """
 
     layout: LayoutFit | None = None
@@ -58,6 +61,7 @@ class Mends(NamedTuple):
     ceiling: Ceiling | None = None
     faults: FrameFaults | None = None
     corrections: FrameCorrections = UNCHANGED
+    times: FrameTimes | None = None
 
     @property
     def moves_events(self) -> bool:
@@ -68,7 +72,8 @@ class Mends(NamedTuple):
     def changes(self) -> bool:
         """Whether frames or events are others than as recorded."""
         less_black = self.black is not None and self.black.level > 0
-        return self.moves_events or self.hot_pixels > 0 or less_black or bool(self.corrections)
+        frames = bool(self.corrections) or self.times is not None
+        return self.moves_events or self.hot_pixels > 0 or less_black or frames
 
     @property
     def hot_pixels(self) -> int:

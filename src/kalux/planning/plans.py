@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from kalux.calibration.delay import DelayEstimate
 from kalux.calibration.fixed_pattern import FixedPattern
 from kalux.calibration.frame_noise import FrameNoise
+from kalux.calibration.frame_times import FrameTimes, find_frame_times
 from kalux.calibration.mismatch import Mismatch
 from kalux.calibration.values import Calibration, require_white
 from kalux.calibration.white_balance import grey_world
@@ -36,7 +37,13 @@ from kalux.planning.sensor_noise import (
     with_step_errors,
 )
 from kalux.planning.survey import survey
-from kalux.recording import RECORDING_NEEDED, Recording, with_cached_start, with_rows_at_once
+from kalux.recording import (
+    RECORDING_NEEDED,
+    Recording,
+    with_cached_start,
+    with_rows_at_once,
+    with_shifted_frames,
+)
 from kalux.schedule import begin_time, image_times
 from kalux.settings import SETTINGS_NEEDED, Settings, altered, chosen_response, completed
 from kalux.settings import preset as named_preset
@@ -123,21 +130,38 @@ def plan(
     if known.pixels is not None:
         require_size(known.pixels, recording.sensor_size)
     require_white(known, recording)
+    asked = _Asked(rate_hz, times, at, lookahead, smooth)
     row_time = chosen.camera.row_time if chosen.filter.joins_frames else 0.0
-    if row_time:
-        # Beside events in the time of its rows a frame is one whose rows are exposed at once: so all is estimated.
-        at_once = altered(chosen, "camera", row_time=0.0)
-        planned = plan(
-            with_rows_at_once(recording, row_time),
-            rate_hz=rate_hz,
-            times=times,
-            at=at,
-            settings=at_once,
-            calibration=calibration,
-            lookahead=lookahead,
-            smooth=smooth,
-        )
-        return dataclasses.replace(planned, settings=altered(planned.settings, "camera", row_time=row_time))
+    if not row_time:
+        return _planned(recording, chosen, known, asked)
+    # Beside events in the time of its rows a frame is one whose rows are exposed at once: so all is estimated.
+    at_once = altered(chosen, "camera", row_time=0.0)
+    planned = _planned(with_rows_at_once(recording, row_time), at_once, known, asked)
+    return dataclasses.replace(planned, settings=altered(planned.settings, "camera", row_time=row_time))
+
+
+class _Asked(NamedTuple):
+    """What is asked for, as of `plan`."""
+
+    rate_hz: float | None
+    times: Any
+    at: Literal["frames"] | None
+    lookahead: bool
+    smooth: bool
+
+
+def _planned(
+    recording: Recording,
+    chosen: Settings,
+    known: Calibration,
+    asked: _Asked,
+    moved: FrameTimes | None = None,
+) -> Plan:
+    """The plan for frames whose rows are exposed at once, and whose times have been ``moved``, if they were off."""
+    rate_hz, times, at, lookahead, smooth = asked
+    as_stored, as_chosen = recording, chosen
+    if moved is not None:
+        recording = with_shifted_frames(recording, moved.shifts)
     chosen = _with_causal_trust(chosen, lookahead)
     recording = with_cached_start(recording, _CACHED_EVENTS, _CACHED_FRAME_BYTES)
 
@@ -163,6 +187,11 @@ def plan(
     chosen, dead_time = with_dead_time(recording, chosen)
     apparent_delay = _delay_of_black(mended.mends, chosen, seen.exposures)
     steps = with_event_steps(recording, chosen, apparent_delay, doubt_noise=of_frames.doubted)
+    if moved is None and _looks_for_times(chosen):
+        moved = find_frame_times(recording, steps.settings.camera, steps.settings.events)
+        if moved is not None:
+            moved = moved.of_all(mended.mends.corrections.left_out)
+            return _planned(as_stored, as_chosen, known, asked, moved)
     chosen, mismatch = with_step_errors(recording, steps.settings, steps.threshold_error, known=chosen.events)
     chosen, background = with_background(recording, chosen, known.pixels, lookahead=lookahead)
     pixels = known.pixels_of(chosen.events.mismatch)
@@ -185,7 +214,7 @@ def plan(
         lookahead=lookahead,
         smooth=smooth,
         pixels=pixels,
-        mends=mended.mends,
+        mends=mended.mends._replace(times=moved),
         steps=steps.estimates,
         frame_noise=of_frames.estimate,
         fixed_pattern=pattern,
@@ -216,6 +245,11 @@ def _check_smooth(settings: Settings, lookahead: bool) -> None:
         raise InputError(
             "reconstruct: the complementary filter has no variance, so that it cannot be smoothed"
         )
+
+
+def _looks_for_times(settings: Settings) -> bool:
+    """Whether times of frames that are off are to be corrected."""
+    return settings.camera.mend_times and settings.filter.joins_frames
 
 
 def _are_calibrated(settings: Settings, calibration: Calibration) -> bool:

@@ -1,0 +1,239 @@
+"""Times of frames that are off one by one, as stamps of a computer are that fetches frames when it can.
+
+Events between two frames tell what changes from the first to the second. If a frame is of another moment than its stamp
+says, the events around it explain what is left, with one sign and one time everywhere:
+
+    log I_{k+1} - log I_k = C(t_k, t_{k+1}) + R(t_{k+1}) d_{k+1} - R(t_k) d_k,
+
+with C the change by the events between the stamps t, R its rate, and d the errors of the stamps. Least squares with
+Huber's weights, in all errors at once, by Gauss and Newton's iteration; a normal prior holds frames that tell nothing.
+A step is spread over the time in which it gathered (`kalux.calibration.alignment.levels`), so that light that changes
+slowly does not seem late. What all frames have in common is no error of single ones, but the delay of the events.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solveh_banded
+
+from kalux.calibration.alignment import levels
+from kalux.calibration.intervals import Interval, intervals
+from kalux.calibration.regression import huber_weights, robust_deviation
+from kalux.recording import Recording
+from kalux.settings import CameraSettings, EventSettings
+
+Array = NDArray[np.float64]
+Times = NDArray[np.int64]
+
+_MOST_FRAMES: Final = 40
+"""The first ones, which tell whether times are off: then those of all frames are corrected."""
+
+_SPREAD: Final = 5_000.0
+"""us, standard deviation of the errors before the frames are asked."""
+
+_FAREST: Final = 15_000.0  # us, of a stamp from its frame
+_LARGEST_STEP: Final = 4_000.0  # us, of an iteration: further away the rate is another
+_COMMON_ROUNDS: Final = 2
+_ROUNDS: Final = 3
+
+_MARGIN: Final = 80_000
+"""us around an interval in which events are looked at: `_FAREST`, and some more for the steps before."""
+
+_HALF_STEP: Final = 1_000  # us, of the rate
+_LEAST_PIXELS: Final = 200
+_ALIKE: Final = 9.0  # neighbouring pixels that say the same
+_LEAST_ERROR: Final = 0.02  # log intensity
+
+_SUSPECT: Final = 0.97
+_LEFT: Final = 0.94
+"""Share of the misfit that errors of single frames leave, beside one that all have: by a straight line from the stamps
+as they are, from which on nothing more is looked at; and in the end, from which on nothing is corrected."""
+
+
+class FrameTimes(NamedTuple):
+    """Errors of the times of frames.
+
+    Attributes
+    ----------
+    shifts
+        (K,) us, what is to be added to the times of each frame.
+    left
+        Share of what events did not explain of the frames that is left with them.
+    """
+
+    shifts: Times
+    left: float
+
+    @property
+    def spread(self) -> float:
+        """Standard deviation of the errors, us."""
+        return float(np.std(self.shifts))
+
+    def of_all(self, left_out: Sequence[int]) -> FrameTimes:
+        """With times of frames that were ``left_out``, by their indices: those of frames between are between."""
+        if not left_out:
+            return self
+        kept = np.setdiff1d(np.arange(len(self.shifts) + len(left_out)), left_out)
+        shifts = np.interp(np.arange(len(self.shifts) + len(left_out)), kept, self.shifts)
+        return self._replace(shifts=np.round(shifts).astype(np.int64))
+
+
+class _Normal(NamedTuple):
+    """Normal equations for K errors: (K,) diagonal and (K - 1,) beside it, (K,) right side; the misfit without them."""
+
+    diagonal: Array
+    beside: Array
+    right: Array
+    misfit: float
+
+
+def find_frame_times(
+    recording: Recording, camera: CameraSettings, events: EventSettings
+) -> FrameTimes | None:
+    """Errors of the times of single frames, where they explain much of what events do not; else None.
+
+    The first frame is not moved to later times, nor the last one to earlier ones, so that there are images at all times
+    of the recording as it is stored.
+
+    Parameters
+    ----------
+    recording
+        With frames and exposures.
+    camera
+        Response and I_0.
+    events
+        Both thresholds, and the delay.
+
+    Raises
+    ------
+    ExposureError
+        If the frames' exposures are not known.
+    """
+    found = _errors(recording, camera, events, _MOST_FRAMES)
+    if found is None or found[1] > _LEFT:
+        return None
+    exposures = [(frame.exposure_start, frame.exposure_end) for frame in recording.frames()]
+    if len(exposures) > _MOST_FRAMES:
+        found = _errors(recording, camera, events, len(exposures)) or found
+    shifts = np.zeros(len(exposures), np.int64)
+    shifts[: len(found[0])] = np.round(found[0])
+    return FrameTimes(_in_order(np.array(exposures, np.int64), shifts), found[1])
+
+
+def _errors(
+    recording: Recording, camera: CameraSettings, events: EventSettings, most_frames: int
+) -> tuple[Array, float] | None:
+    """(K,) errors of the first frames, us, beside what they have in common; the share of the misfit that is left."""
+    scales: list[float] = []
+
+    def normal(errors: Array | None) -> _Normal:
+        seen = intervals(recording, camera, margin=_MARGIN, most_frames=most_frames, apart=0)
+        sums: list[tuple[Array, Array, float]] = []
+        for index, interval in enumerate(seen):
+            ends = (0.0, 0.0) if errors is None else (float(errors[index]), float(errors[index + 1]))
+            sums.append(_of_interval(interval, recording.sensor_size, events, ends, scales, index))
+        return _joined(sums)
+
+    first = normal(None)
+    if len(first.right) < 3 or not _is_suspect(first):
+        return None
+    equations, errors = first, np.zeros(len(first.right))
+    for _ in range(_COMMON_ROUNDS):
+        errors += np.clip(_common(equations), -_LARGEST_STEP, _LARGEST_STEP)
+        equations = normal(errors)
+    common, without = errors.copy(), equations.misfit
+    for _ in range(_ROUNDS):
+        step = _solved(equations, errors - common)
+        moved = errors + np.clip(step, -_LARGEST_STEP, _LARGEST_STEP)
+        errors = common + np.clip(moved - common, -_FAREST, _FAREST)
+        equations = normal(errors)
+    return errors - common, equations.misfit / without if without > 0 else 1.0
+
+
+def _of_interval(
+    interval: Interval,
+    sensor_size: tuple[int, int],
+    events: EventSettings,
+    errors: tuple[float, float],
+    scales: list[float],
+    index: int,
+) -> tuple[Array, Array, float]:
+    """(2, 2) matrix and (2,) right side for what is added to the ``errors`` of both frames, and the misfit with them.
+
+    ``scales`` holds the error of the pixels, log intensity, of every interval, or none yet: misfits are compared.
+    """
+    nothing = np.zeros((2, 2)), np.zeros(2), 0.0
+    delay = events.delay or 0
+    middles = [
+        round(end + delay + error) for end, error in zip((interval.start, interval.end), errors, strict=True)
+    ]
+    times = np.array([t + step for t in middles for step in (-_HALF_STEP, 0, _HALF_STEP)], np.int64)
+    if index == len(scales):
+        scales.append(0.0)
+    if (np.diff(times) < 0).any() or len(interval.events) == 0:
+        return nothing
+    on, off = levels(interval.events, sensor_size, times)
+    threshold_on, threshold_off = events.thresholds
+    usable = interval.usable
+    level = threshold_on * on[:, usable].astype(np.float64) - threshold_off * off[:, usable]
+    left = interval.change[usable] - (level[4] - level[1])
+    rates = np.stack([level[0] - level[2], level[5] - level[3]]) / (2 * _HALF_STEP)
+    moving = (rates != 0).any(axis=0)
+    if np.count_nonzero(moving) < _LEAST_PIXELS:
+        return nothing
+    left, rates = left[moving] - np.median(left), rates[:, moving]
+    if scales[index] == 0.0:
+        scales[index] = max(robust_deviation(left), _LEAST_ERROR)
+    weights = huber_weights(left)[0] / (_ALIKE * scales[index] ** 2)
+    weighed = rates * weights
+    return weighed @ rates.T, weighed @ left, float(weights @ np.square(left))
+
+
+def _joined(sums: Sequence[tuple[Array, Array, float]]) -> _Normal:
+    """The equations of all intervals, each of which has an error at both ends."""
+    diagonal, right = np.zeros(len(sums) + 1), np.zeros(len(sums) + 1)
+    beside = np.zeros(len(sums))
+    for index, (matrix, vector, _) in enumerate(sums):
+        diagonal[index : index + 2] += np.diag(matrix)
+        beside[index] = matrix[0, 1]
+        right[index : index + 2] += vector
+    return _Normal(diagonal, beside, right, sum(misfit for *_, misfit in sums))
+
+
+def _common(normal: _Normal) -> float:
+    """The step of an error that all frames have, us."""
+    whole = float(normal.diagonal.sum() + 2 * normal.beside.sum())
+    return float(normal.right.sum()) / whole if whole > 0 else 0.0
+
+
+def _solved(normal: _Normal, errors: Array) -> Array:
+    """(K,) the most probable step of each error, us, by the prior of what they are."""
+    precision = 1.0 / _SPREAD**2
+    matrix = np.zeros((2, len(normal.right)))
+    matrix[0] = normal.diagonal + precision
+    matrix[1, :-1] = normal.beside
+    return np.asarray(solveh_banded(matrix, normal.right - precision * errors, lower=True), np.float64)
+
+
+def _is_suspect(normal: _Normal) -> bool:
+    """Whether errors of single frames may explain much more than one of all, by a straight line."""
+    with_common = normal.misfit - _common(normal) * float(normal.right.sum())
+    with_each = normal.misfit - float(_solved(normal, np.zeros(len(normal.right))) @ normal.right)
+    return with_common > 0 and with_each < _SUSPECT * with_common
+
+
+def _in_order(exposures: Times, shifts: Times) -> Times:
+    """(K,) the shifts, so that no frame begins before the one before it ends, and the recording is not shorter.
+
+    ``exposures`` are (K, 2) starts and ends, us.
+    """
+    made = shifts.copy()
+    made[0], made[-1] = min(made[0], 0), max(made[-1], 0)
+    for index in range(1, len(made)):
+        ended = int(exposures[index - 1, 1] + made[index - 1])
+        made[index] = max(made[index], ended - int(exposures[index, 0]))
+    return made
