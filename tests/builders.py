@@ -69,7 +69,8 @@ def all_given() -> Settings:
     chosen = altered(chosen, "events", extrapolation_gain=1.0, extrapolation_trust=1.0)
     chosen = altered(chosen, "filter", unshown_scale=1.0)
     chosen = altered(chosen, "camera", log_offset=0.03, frame_noise=0.006, black_level=0.0)
-    return altered(chosen, "camera", even_gain=False, leave_out_faulty=False, mend_stuck=False)
+    chosen = altered(chosen, "camera", even_gain=False, leave_out_faulty=False)
+    return altered(chosen, "camera", mend_stuck=False, mend_times=False)
 
 
 class Stream(NamedTuple):

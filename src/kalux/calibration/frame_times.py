@@ -29,8 +29,9 @@ from kalux.settings import CameraSettings, EventSettings
 Array = NDArray[np.float64]
 Times = NDArray[np.int64]
 
+_ASKED: Final = 16
 _MOST_FRAMES: Final = 40
-"""The first ones, which tell whether times are off: then those of all frames are corrected."""
+"""The first ones, which tell whether times may be off, and if so whether they are: then all frames are corrected."""
 
 _SPREAD: Final = 5_000.0
 """us, standard deviation of the errors before the frames are asked."""
@@ -49,9 +50,24 @@ _ALIKE: Final = 9.0  # neighbouring pixels that say the same
 _LEAST_ERROR: Final = 0.02  # log intensity
 
 _SUSPECT: Final = 0.97
-_LEFT: Final = 0.94
+_LEFT: Final = 0.92
 """Share of the misfit that errors of single frames leave, beside one that all have: by a straight line from the stamps
 as they are, from which on nothing more is looked at; and in the end, from which on nothing is corrected."""
+
+
+_LEAST_SPREAD: Final = 1_000.0
+"""us, standard deviation of errors below which they are left: the light that changes between two events is not known
+that well either. Of 180 recordings whose stamps are right none has more together with `_LEFT`."""
+
+_KNOWN: Final = 6.0
+"""Least spread of the errors, in standard errors of the median one: where few edges of an image of 48 x 64 pixels move
+by 20 pixels a second, errors seem to be five of these, 2.3 ms."""
+
+
+_UNRELATED: Final = 0.5
+"""Least mean square of the difference of one error to the next, of that of unrelated ones: what a sensor's delay, and
+lost events, make of a scene that moves is alike from frame to frame (0.2 and 0.5 of two fast pans that seem to be 3.3 and
+2.4 ms off, 0.6 to 1.3 of stamps that are, 0.02 to 0.4 of a clock that is fast)."""
 
 
 class FrameTimes(NamedTuple):
@@ -73,13 +89,22 @@ class FrameTimes(NamedTuple):
         """Standard deviation of the errors, us."""
         return float(np.std(self.shifts))
 
-    def of_all(self, left_out: Sequence[int]) -> FrameTimes:
-        """With times of frames that were ``left_out``, by their indices: those of frames between are between."""
-        if not left_out:
-            return self
-        kept = np.setdiff1d(np.arange(len(self.shifts) + len(left_out)), left_out)
-        shifts = np.interp(np.arange(len(self.shifts) + len(left_out)), kept, self.shifts)
-        return self._replace(shifts=np.round(shifts).astype(np.int64))
+    def of_all(self, exposures: Times, left_out: Sequence[int]) -> FrameTimes:
+        """With times of frames that were ``left_out``, too, so that all can be moved.
+
+        Those are moved as the frames around. No frame begins before the one before it ends, the first is not moved to
+        later times, nor the last to earlier ones: there are images at all times of the recording as it is stored.
+
+        Parameters
+        ----------
+        exposures
+            (K, 2) starts and ends of all frames, us.
+        left_out
+            Indices of those that were not there when the errors were found.
+        """
+        kept = np.setdiff1d(np.arange(len(exposures)), left_out)
+        shifts = np.round(np.interp(np.arange(len(exposures)), kept, self.shifts)).astype(np.int64)
+        return self._replace(shifts=_in_order(exposures, shifts))
 
 
 class _Normal(NamedTuple):
@@ -96,9 +121,6 @@ def find_frame_times(
 ) -> FrameTimes | None:
     """Errors of the times of single frames, where they explain much of what events do not; else None.
 
-    The first frame is not moved to later times, nor the last one to earlier ones, so that there are images at all times
-    of the recording as it is stored.
-
     Parameters
     ----------
     recording
@@ -114,34 +136,52 @@ def find_frame_times(
         If the frames' exposures are not known.
     """
     found = _errors(recording, camera, events, _MOST_FRAMES)
-    if found is None or found[1] > _LEFT:
+    if found is None or not found.are_certain:
         return None
-    exposures = [(frame.exposure_start, frame.exposure_end) for frame in recording.frames()]
-    if len(exposures) > _MOST_FRAMES:
-        found = _errors(recording, camera, events, len(exposures)) or found
-    shifts = np.zeros(len(exposures), np.int64)
-    shifts[: len(found[0])] = np.round(found[0])
-    return FrameTimes(_in_order(np.array(exposures, np.int64), shifts), found[1])
+    frames = recording.source.count_frames()
+    if frames > _MOST_FRAMES:
+        found = _errors(recording, camera, events, frames) or found
+    shifts = np.zeros(frames, np.int64)
+    shifts[: len(found.errors)] = np.round(found.errors)
+    return FrameTimes(shifts, found.left)
+
+
+class _Errors(NamedTuple):
+    """(K,) errors of frames, us, beside what they have in common; the share of the misfit that is left; and how well
+    the median one is known, us."""
+
+    errors: Array
+    left: float
+    standard_error: float
+
+    @property
+    def are_certain(self) -> bool:
+        """Whether they are large, explain much, and have nothing to do with one another."""
+        spread = float(np.std(self.errors))
+        if self.left > _LEFT or spread < max(_LEAST_SPREAD, _KNOWN * self.standard_error):
+            return False
+        return float(np.mean(np.square(np.diff(self.errors)))) >= _UNRELATED * 2 * spread**2
 
 
 def _errors(
     recording: Recording, camera: CameraSettings, events: EventSettings, most_frames: int
-) -> tuple[Array, float] | None:
-    """(K,) errors of the first frames, us, beside what they have in common; the share of the misfit that is left."""
+) -> _Errors | None:
+    """Those of the first frames; None where they can hardly explain anything."""
     scales: list[float] = []
 
-    def normal(errors: Array | None) -> _Normal:
-        seen = intervals(recording, camera, margin=_MARGIN, most_frames=most_frames, apart=0)
+    def normal(errors: Array | None, most: int = most_frames) -> _Normal:
+        seen = intervals(recording, camera, margin=_MARGIN, most_frames=most, apart=0)
         sums: list[tuple[Array, Array, float]] = []
         for index, interval in enumerate(seen):
             ends = (0.0, 0.0) if errors is None else (float(errors[index]), float(errors[index + 1]))
             sums.append(_of_interval(interval, recording.sensor_size, events, ends, scales, index))
         return _joined(sums)
 
-    first = normal(None)
-    if len(first.right) < 3 or not _is_suspect(first):
+    asked = normal(None, _ASKED)
+    if len(asked.right) < 3 or not _is_suspect(asked):
         return None
-    equations, errors = first, np.zeros(len(first.right))
+    equations = normal(None)
+    errors = np.zeros(len(equations.right))
     for _ in range(_COMMON_ROUNDS):
         errors += np.clip(_common(equations), -_LARGEST_STEP, _LARGEST_STEP)
         equations = normal(errors)
@@ -151,7 +191,12 @@ def _errors(
         moved = errors + np.clip(step, -_LARGEST_STEP, _LARGEST_STEP)
         errors = common + np.clip(moved - common, -_FAREST, _FAREST)
         equations = normal(errors)
-    return errors - common, equations.misfit / without if without > 0 else 1.0
+    information = float(np.median(equations.diagonal))
+    return _Errors(
+        errors - common,
+        equations.misfit / without if without > 0 else 1.0,
+        1.0 / np.sqrt(information) if information > 0 else np.inf,
+    )
 
 
 def _of_interval(
@@ -232,7 +277,10 @@ def _in_order(exposures: Times, shifts: Times) -> Times:
     ``exposures`` are (K, 2) starts and ends, us.
     """
     made = shifts.copy()
-    made[0], made[-1] = min(made[0], 0), max(made[-1], 0)
+    made[0] = min(made[0], 0)
+    made[-1] = max(made[-1], 0)
+    if len(made) == 1:
+        return np.zeros_like(made)
     for index in range(1, len(made)):
         ended = int(exposures[index - 1, 1] + made[index - 1])
         made[index] = max(made[index], ended - int(exposures[index, 0]))

@@ -190,7 +190,7 @@ def _planned(
     if moved is None and _looks_for_times(chosen):
         moved = find_frame_times(recording, steps.settings.camera, steps.settings.events)
         if moved is not None:
-            moved = moved.of_all(mended.mends.corrections.left_out)
+            moved = moved.of_all(seen.exposures, mended.mends.corrections.left_out)
             return _planned(as_stored, as_chosen, known, asked, moved)
     chosen, mismatch = with_step_errors(recording, steps.settings, steps.threshold_error, known=chosen.events)
     chosen, background = with_background(recording, chosen, known.pixels, lookahead=lookahead)
