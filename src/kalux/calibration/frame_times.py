@@ -66,8 +66,8 @@ by 20 pixels a second, errors seem to be five of these, 2.3 ms."""
 
 _UNRELATED: Final = 0.5
 """Least mean square of the difference of one error to the next, of that of unrelated ones: what a sensor's delay, and
-lost events, make of a scene that moves is alike from frame to frame (0.2 and 0.5 of two fast pans that seem to be 3.3 and
-2.4 ms off, 0.6 to 1.3 of stamps that are, 0.02 to 0.4 of a clock that is fast)."""
+lost events, make of a scene that moves is alike from frame to frame (0.2 and 0.5 of two fast pans that seem to be 3.3
+and 2.4 ms off, 0.6 to 1.3 of stamps that are, 0.02 to 0.4 of a clock that is fast)."""
 
 
 class FrameTimes(NamedTuple):
