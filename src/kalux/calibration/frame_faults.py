@@ -97,7 +97,10 @@ _QUIET_ALIKE: Final = 0.25
 
 _SLIGHT: Final = 0.02
 _MOST_SLIGHT: Final = 30
-"""So many frames whose median log intensity changes by so much, the first ones, tell whether the gain is unsteady."""
+_EVERYWHERE: Final = 0.5
+"""So many frames whose median log intensity changes by so much, and so does that of so many parts of the image, to a
+factor of two, tell whether the gain is unsteady: the first ones. Of recordings of steady gains these are a quarter of
+those whose median changes, of others three quarters."""
 
 _PART_ERROR: Final = 0.4
 """Standard error of what frames show beyond their events, as a share of how far most parts of the image are from it
@@ -220,11 +223,14 @@ class FrameWatch:
             before, earlier = self._previous
             both = _inside(response) & _inside(before)
             if np.count_nonzero(both):
-                change = np.median(np.log(intensity[both] / earlier[both]))
+                changes = np.log(intensity[both] / earlier[both])
+                change = float(np.median(changes))
                 if abs(change) >= _SUSPECT:
                     self.suspects.append(index)
                 if abs(change) >= _SLIGHT and len(self.slight) < _MOST_SLIGHT:
-                    self.slight.append(index)
+                    parts = _middles(changes, _part(np.flatnonzero(both), *both.shape))
+                    if np.count_nonzero(np.abs(parts - change) < abs(change)) >= _EVERYWHERE * _PARTS**2:
+                        self.slight.append(index)
         self._previous = response, intensity
 
 
@@ -388,15 +394,7 @@ def _rest(interval: Interval, on: NDArray[Any], off: NDArray[Any]) -> _Rest | No
         return None
     thresholds = fit.solution[:-1].tolist()
     rest = change - sum(c * column for c, column in zip(thresholds, columns, strict=True))
-    height, width = interval.change.shape
-    rows, across = np.divmod(chosen, width)
-    part = (rows * _PARTS // height) * _PARTS + across * _PARTS // width
-    middles = np.array(
-        [
-            np.median(rest[part == i])
-            for i in np.flatnonzero(np.bincount(part, minlength=_PARTS**2) >= _LEAST_IN_PART)
-        ]
-    )
+    middles = _middles(rest, _part(chosen, *interval.change.shape))
     if len(middles) < _LEAST_PARTS:
         return None
     step = float(np.median(middles))
@@ -414,6 +412,18 @@ def _rest(interval: Interval, on: NDArray[Any], off: NDArray[Any]) -> _Rest | No
         back_and_forth=float(np.median(np.minimum(ups, downs))) * largest,
         quiet=quiet,
     )
+
+
+def _part(pixels: NDArray[np.int64], height: int, width: int) -> NDArray[np.int64]:
+    """(N,) in which of the parts of an image each of its pixels lies, by their indices."""
+    rows, across = np.divmod(pixels, width)
+    return np.asarray((rows * _PARTS // height) * _PARTS + across * _PARTS // width, np.int64)
+
+
+def _middles(values: Array, part: NDArray[np.int64]) -> Array:
+    """The median of the values in each part that has enough of them."""
+    many = np.flatnonzero(np.bincount(part, minlength=_PARTS**2) >= _LEAST_IN_PART)
+    return np.array([np.median(values[part == i]) for i in many])
 
 
 def _rests(
