@@ -43,12 +43,12 @@ def found(source):
 
 
 def test_stamps_that_are_off_are_found():
-    events, frames = filmed(noise_rate=2.0, read_noise=0.005)
+    events, frames = filmed(pan(120.0), noise_rate=2.0, read_noise=0.005)
     times = found(recorded(events, frames, OFF))
     assert times is not None
     assert times.left < 0.7
     wrong = times.shifts - OFF[: len(frames)]
-    assert np.std(wrong[1:-1]) < 0.35 * np.std(OFF)
+    assert np.std(wrong[1:-1]) < 0.15 * np.std(OFF)
     assert times.spread == pytest.approx(np.std(OFF), rel=0.25)
 
 

@@ -147,20 +147,29 @@ def find_frame_times(
 
 
 class _Errors(NamedTuple):
-    """(K,) errors of frames, us, beside what they have in common; the share of the misfit that is left; and how well
-    the median one is known, us."""
+    """Errors of frames.
+
+    Attributes
+    ----------
+    errors
+        (K,) us, beside what they have in common.
+    left
+        Share of the misfit that is left with them.
+    spread, standard_error
+        Their standard deviation, those that are known well counting most, and how well the median one is known, us.
+    """
 
     errors: Array
     left: float
+    spread: float
     standard_error: float
 
     @property
     def are_certain(self) -> bool:
         """Whether they are large, explain much, and have nothing to do with one another."""
-        spread = float(np.std(self.errors))
-        if self.left > _LEFT or spread < max(_LEAST_SPREAD, _KNOWN * self.standard_error):
+        if self.left > _LEFT or self.spread < max(_LEAST_SPREAD, _KNOWN * self.standard_error):
             return False
-        return float(np.mean(np.square(np.diff(self.errors)))) >= _UNRELATED * 2 * spread**2
+        return float(np.mean(np.square(np.diff(self.errors)))) >= _UNRELATED * 2 * float(np.var(self.errors))
 
 
 def _errors(
@@ -191,12 +200,13 @@ def _errors(
         moved = errors + np.clip(step, -_LARGEST_STEP, _LARGEST_STEP)
         errors = common + np.clip(moved - common, -_FAREST, _FAREST)
         equations = normal(errors)
-    information = float(np.median(equations.diagonal))
-    return _Errors(
-        errors - common,
-        equations.misfit / without if without > 0 else 1.0,
-        1.0 / np.sqrt(information) if information > 0 else np.inf,
-    )
+    found, known = errors - common, equations.diagonal
+    median = float(np.median(known))
+    if median == 0 or without == 0:
+        return None
+    about = found - np.average(found, weights=known)
+    spread = float(np.sqrt(np.average(np.square(about), weights=known)))
+    return _Errors(found, equations.misfit / without, spread, 1.0 / np.sqrt(median))
 
 
 def _of_interval(
