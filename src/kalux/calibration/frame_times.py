@@ -135,15 +135,17 @@ def find_frame_times(
     ExposureError
         If the frames' exposures are not known.
     """
-    found = _errors(recording, camera, events, _MOST_FRAMES)
+    normal = _Normals(recording, camera, events, [])
+    found = _first_errors(normal)
     if found is None or not found.are_certain:
         return None
     frames = recording.source.count_frames()
-    if frames > _MOST_FRAMES:
-        found = _errors(recording, camera, events, frames) or found
-    shifts = np.zeros(frames, np.int64)
-    shifts[: len(found.errors)] = np.round(found.errors)
-    return FrameTimes(shifts, found.left)
+    errors = (
+        found.errors
+        if frames <= _MOST_FRAMES
+        else _each(normal, np.full(frames, found.common)) - found.common
+    )
+    return FrameTimes(np.round(errors).astype(np.int64), found.left)
 
 
 class _Errors(NamedTuple):
@@ -152,7 +154,9 @@ class _Errors(NamedTuple):
     Attributes
     ----------
     errors
-        (K,) us, beside what they have in common.
+        (K,) us, beside what they have in common:
+    common
+        us.
     left
         Share of the misfit that is left with them.
     spread, standard_error
@@ -160,6 +164,7 @@ class _Errors(NamedTuple):
     """
 
     errors: Array
+    common: float
     left: float
     spread: float
     standard_error: float
@@ -172,41 +177,61 @@ class _Errors(NamedTuple):
         return float(np.mean(np.square(np.diff(self.errors)))) >= _UNRELATED * 2 * float(np.var(self.errors))
 
 
-def _errors(
-    recording: Recording, camera: CameraSettings, events: EventSettings, most_frames: int
-) -> _Errors | None:
-    """Those of the first frames; None where they can hardly explain anything."""
-    scales: list[float] = []
+class _Normals(NamedTuple):
+    """Makes the normal equations for what is added to errors of the first frames.
 
-    def normal(errors: Array | None, most: int = most_frames) -> _Normal:
-        seen = intervals(recording, camera, margin=_MARGIN, most_frames=most, apart=0)
-        sums: list[tuple[Array, Array, float]] = []
+    ``scales`` holds the error of the pixels, log intensity, of every interval that has been looked at: misfits are
+    compared.
+    """
+
+    recording: Recording
+    camera: CameraSettings
+    events: EventSettings
+    scales: list[float]
+
+    def at(self, errors: Array) -> _Normal:
+        """Of as many frames as there are ``errors``, us."""
+        recording, most = self.recording, len(errors)
+        seen = intervals(recording, self.camera, margin=_MARGIN, most_frames=most, apart=0)
+        sums = list[tuple[Array, Array, float]]()
         for index, interval in enumerate(seen):
-            ends = (0.0, 0.0) if errors is None else (float(errors[index]), float(errors[index + 1]))
-            sums.append(_of_interval(interval, recording.sensor_size, events, ends, scales, index))
+            ends = float(errors[index]), float(errors[index + 1])
+            if index == len(self.scales):
+                self.scales.append(0.0)
+            sums.append(_of_interval(interval, recording.sensor_size, self.events, ends, self.scales, index))
         return _joined(sums)
 
-    asked = normal(None, _ASKED)
+
+def _first_errors(normal: _Normals) -> _Errors | None:
+    """Those of the first frames; None where they can hardly explain anything."""
+    frames = normal.recording.source.count_frames()
+    asked = normal.at(np.zeros(min(frames, _ASKED)))
     if len(asked.right) < 3 or not _is_suspect(asked):
         return None
-    equations = normal(None)
-    errors = np.zeros(len(equations.right))
+    common = np.zeros(min(frames, _MOST_FRAMES))
+    equations = normal.at(common)
     for _ in range(_COMMON_ROUNDS):
-        errors += np.clip(_common(equations), -_LARGEST_STEP, _LARGEST_STEP)
-        equations = normal(errors)
-    common, without = errors.copy(), equations.misfit
-    for _ in range(_ROUNDS):
-        step = _solved(equations, errors - common)
-        moved = errors + np.clip(step, -_LARGEST_STEP, _LARGEST_STEP)
-        errors = common + np.clip(moved - common, -_FAREST, _FAREST)
-        equations = normal(errors)
+        common += np.clip(_common(equations), -_LARGEST_STEP, _LARGEST_STEP)
+        equations = normal.at(common)
+    without = equations.misfit
+    errors = _each(normal, common)
+    equations = normal.at(errors)
     found, known = errors - common, equations.diagonal
     median = float(np.median(known))
     if median == 0 or without == 0:
         return None
     about = found - np.average(found, weights=known)
     spread = float(np.sqrt(np.average(np.square(about), weights=known)))
-    return _Errors(found, equations.misfit / without, spread, 1.0 / np.sqrt(median))
+    return _Errors(found, float(common[0]), equations.misfit / without, spread, 1.0 / np.sqrt(median))
+
+
+def _each(normal: _Normals, common: Array) -> Array:
+    """(K,) errors of the frames, us, from the ``common`` one of all, (K,), on."""
+    errors = common
+    for _ in range(_ROUNDS):
+        moved = errors + np.clip(_solved(normal.at(errors), errors - common), -_LARGEST_STEP, _LARGEST_STEP)
+        errors = common + np.clip(moved - common, -_FAREST, _FAREST)
+    return errors
 
 
 def _of_interval(
@@ -219,7 +244,7 @@ def _of_interval(
 ) -> tuple[Array, Array, float]:
     """(2, 2) matrix and (2,) right side for what is added to the ``errors`` of both frames, and the misfit with them.
 
-    ``scales`` holds the error of the pixels, log intensity, of every interval, or none yet: misfits are compared.
+    Its place in ``scales`` is filled in where it is 0.
     """
     nothing = np.zeros((2, 2)), np.zeros(2), 0.0
     delay = events.delay or 0
@@ -227,8 +252,6 @@ def _of_interval(
         round(end + delay + error) for end, error in zip((interval.start, interval.end), errors, strict=True)
     ]
     times = np.array([t + step for t in middles for step in (-_HALF_STEP, 0, _HALF_STEP)], np.int64)
-    if index == len(scales):
-        scales.append(0.0)
     if (np.diff(times) < 0).any() or len(interval.events) == 0:
         return nothing
     on, off = levels(interval.events, sensor_size, times)
