@@ -273,7 +273,7 @@ def find_frame_faults(recording: Recording, camera: CameraSettings, watch: Frame
     logs = np.zeros(watch.frames)
     rests = _rests(recording, compared, watch, {*watch.suspects, *watch.slight})
     unsteady = sum(rest.is_unsteady for rest in rests.values()) >= _LEAST_OFTEN
-    suspects = {index: rest for index, rest in rests.items() if index in {*watch.suspects}}
+    suspects = {index: rests[index] for index in watch.suspects if index in rests}
     if unsteady:
         others = set(range(1, watch.frames)) - {*rests}
         logs = _unsteady_log_gains(watch.frames, rests | _rests(recording, compared, watch, others))

@@ -54,7 +54,6 @@ _LEFT: Final = 0.92
 """Share of the misfit that errors of single frames leave, beside one that all have: by a straight line from the stamps
 as they are, from which on nothing more is looked at; and in the end, from which on nothing is corrected."""
 
-
 _LEAST_SPREAD: Final = 1_000.0
 """us, standard deviation of errors below which they are left: the light that changes between two events is not known
 that well either. Of 180 recordings whose stamps are right none has more together with `_LEFT`."""
@@ -62,7 +61,6 @@ that well either. Of 180 recordings whose stamps are right none has more togethe
 _KNOWN: Final = 6.0
 """Least spread of the errors, in standard errors of the median one: where few edges of an image of 48 x 64 pixels move
 by 20 pixels a second, errors seem to be five of these, 2.3 ms."""
-
 
 _UNRELATED: Final = 0.5
 """Least mean square of the difference of one error to the next, of that of unrelated ones: what a sensor's delay, and
@@ -140,11 +138,12 @@ def find_frame_times(
     if found is None or not found.are_certain:
         return None
     frames = recording.source.count_frames()
-    errors = (
-        found.errors
-        if frames <= _MOST_FRAMES
-        else _each(normal, np.full(frames, found.common)) - found.common
-    )
+    errors = found.errors
+    if frames > _MOST_FRAMES:
+        common = all_errors = np.full(frames, found.common)
+        for _ in range(_ROUNDS):
+            all_errors = _moved(normal.at(all_errors), all_errors, common)
+        errors = all_errors - common
     return FrameTimes(np.round(errors).astype(np.int64), found.left)
 
 
@@ -213,9 +212,10 @@ def _first_errors(normal: _Normals) -> _Errors | None:
     for _ in range(_COMMON_ROUNDS):
         common += np.clip(_common(equations), -_LARGEST_STEP, _LARGEST_STEP)
         equations = normal.at(common)
-    without = equations.misfit
-    errors = _each(normal, common)
-    equations = normal.at(errors)
+    errors, without = common, equations.misfit
+    for _ in range(_ROUNDS):
+        errors = _moved(equations, errors, common)
+        equations = normal.at(errors)
     found, known = errors - common, equations.diagonal
     median = float(np.median(known))
     if median == 0 or without == 0:
@@ -225,13 +225,10 @@ def _first_errors(normal: _Normals) -> _Errors | None:
     return _Errors(found, float(common[0]), equations.misfit / without, spread, 1.0 / np.sqrt(median))
 
 
-def _each(normal: _Normals, common: Array) -> Array:
-    """(K,) errors of the frames, us, from the ``common`` one of all, (K,), on."""
-    errors = common
-    for _ in range(_ROUNDS):
-        moved = errors + np.clip(_solved(normal.at(errors), errors - common), -_LARGEST_STEP, _LARGEST_STEP)
-        errors = common + np.clip(moved - common, -_FAREST, _FAREST)
-    return errors
+def _moved(equations: _Normal, errors: Array, common: Array) -> Array:
+    """(K,) the ``errors`` of the frames, us, after one more iteration; not far from the ``common`` one of all, (K,)."""
+    moved = errors + np.clip(_solved(equations, errors - common), -_LARGEST_STEP, _LARGEST_STEP)
+    return np.asarray(common + np.clip(moved - common, -_FAREST, _FAREST), np.float64)
 
 
 def _of_interval(

@@ -542,7 +542,7 @@ class BridgedFrames(Method):
     ) -> Floats | None:
         """(H, W) variance of the change by events that are missing in an interval, given those that are there (K18).
 
-        None where it is nowhere more than q_0.
+        None where it is nowhere more than q_0, or nothing moved unheard.
         """
         loss = loss_between(all_between(events, start, end), start, end)
         if loss.time == 0 and not loss.unheard:
