@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.calibration.clock_rate import ClockRate
 from kalux.calibration.delay import SHARE
 from kalux.calibration.event_layout import LayoutFit
 from kalux.calibration.event_model import Agreement
@@ -114,8 +115,11 @@ def _of_frames(recording: Recording, plan: Plan, asked: Settings) -> Iterator[tu
         yield "left out", left_out_text(plan.mends.faults)
     if plan.mends.faults is not None and plan.mends.faults.stuck is not None:
         yield "stuck", f"{stuck_text(plan.mends.faults.stuck)}: the median of their neighbours is taken"
-    if plan.mends.times is not None:
-        yield "times", f"{times_text(plan.mends.times)}: corrected"
+    moved = plan.mends.moved
+    if moved.clock is not None:
+        yield "clock", f"{clock_text(moved.clock)}: corrected"
+    if moved.times is not None:
+        yield "times", f"{times_text(moved.times)}: corrected"
     if recording.found_white is not None:
         yield "white", f"{recording.found_white}, where the 16-bit frames end"
     if plan.mends.black is not None or camera.black_level is not None:
@@ -226,6 +230,14 @@ def gain_text(faults: FrameFaults) -> str:
 def stuck_text(stuck: NDArray[np.bool_]) -> str:
     """How many pixels of frames are stuck."""
     return f"{how_many(int(np.count_nonzero(stuck)), 'pixel')} always the same though the light changes"
+
+
+def clock_text(clock: ClockRate) -> str:
+    """How fast or slow the clock of the frames is."""
+    return (
+        f"that of the frames is {'slow' if clock.rate > 0 else 'fast'} by {1e6 * abs(clock.rate):.0f} us in a second "
+        f"(+- {1e6 * clock.standard_error:.0f}), {1e-3 * np.abs(clock.shifts).max():.0f} ms in all"
+    )
 
 
 def times_text(times: FrameTimes) -> str:

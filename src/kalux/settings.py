@@ -93,8 +93,9 @@ class CameraSettings:
         Whether pixels of frames that always show the same, though their events and their neighbours say that their
         light changes, are taken for the median of these (`kalux.calibration.stuck_pixels`). Not in a live stream.
     mend_times
-        Whether times of frames that are off one by one are corrected by what events tell
-        (`kalux.calibration.frame_times`). Not in a live stream.
+        Whether times of frames are corrected by what events tell, where they are off one by one
+        (`kalux.calibration.frame_times`), or their clock is fast or slow (`kalux.calibration.clock_rate`). Not in a
+        live stream.
     white_balance
         Of recordings in colour: ``"as-recorded"``, ``"grey-world"`` (gains that make the mean of well exposed pixels
         grey; one set for a recording), or gains of red, green and blue, ``"1.8;1;1.4"``. As recorded: what is grey is

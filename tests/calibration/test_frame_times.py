@@ -75,7 +75,7 @@ def test_a_plan_corrects_them_unless_told_not_to():
     right, wrong = recorded(events, frames), recorded(events, frames, OFF)
     times = [*range(100_000, 400_000, 10_000)]
     made = plan(wrong, times=times)
-    assert made.mends.times is not None
+    assert made.mends.moved.times is not None
     assert made.mends.changes
     images = [
         np.log(
@@ -90,8 +90,8 @@ def test_a_plan_corrects_them_unless_told_not_to():
     ]
     corrected, kept = (float(np.mean(np.square(each - images[0]))) for each in images[1:])
     assert corrected < 0.5 * kept
-    assert plan(right, times=times).mends.times is None
-    assert plan(wrong, times=times, preset="iccv2021").mends.times is None
+    assert plan(right, times=times).mends.moved.times is None
+    assert plan(wrong, times=times, preset="iccv2021").mends.moved.times is None
 
 
 def test_frames_that_are_left_out_keep_their_place():
@@ -113,10 +113,10 @@ def test_frames_that_are_left_out_keep_their_place():
     assert made.mends.corrections.left_out == tuple(
         i for i, f in enumerate(copied) if not any(f is w for w in wrong)
     )
-    assert made.mends.times is not None
-    assert len(made.mends.times.shifts) == len(copied)
+    assert made.mends.moved.times is not None
+    assert len(made.mends.moved.times.shifts) == len(copied)
     kept = [i for i, f in enumerate(copied) if any(f is w for w in wrong)]
-    wrong_by = made.mends.times.shifts[kept] - OFF[: len(frames)]
+    wrong_by = made.mends.moved.times.shifts[kept] - OFF[: len(frames)]
     assert np.std(wrong_by[1:-1]) < 0.4 * np.std(OFF)
 
 

@@ -39,7 +39,9 @@ SURE: Final = 1.15
 _BIN: Final = 1_000  # us
 _CELLS: Final = (12, 16)
 _COARSE_FRAMES: Final = 400
-_LEAST_FRAMES: Final = 6
+LEAST_FRAMES: Final = 6
+"""So many are compared at least."""
+
 _LARGEST: Final = 30_000_000  # pixels of all frames that are aligned together: some 700 MB
 _LEAST_CORRELATION: Final = 0.25
 
@@ -144,9 +146,9 @@ def frame_changes(
                 rows.append(np.asarray(small, np.float64).ravel())
         before = now
         middles.append(frame.middle)
-    if len(middles) < _LEAST_FRAMES:
+    if len(middles) < LEAST_FRAMES:
         raise InputError(
-            f"offset: {how_many(len(middles), 'frame')}, too few; {_LEAST_FRAMES} at least, fifty are good"
+            f"offset: {how_many(len(middles), 'frame')}, too few; {LEAST_FRAMES} at least, fifty are good"
         )
     return Changes(np.array(middles, np.int64), np.array(rows), registration is not None)
 

@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from kalux.calibration.levels import find_ceiling
-from kalux.plan_report import ceiling_text, gain_text, layout_text, left_out_text, saturation_hint, times_text
+from kalux.plan_report import (
+    ceiling_text,
+    clock_text,
+    gain_text,
+    layout_text,
+    left_out_text,
+    saturation_hint,
+    times_text,
+)
 from kalux.planning import ESTIMATED_ORIGINS, Plan
 from kalux.planning.mending import Mends
 from kalux.recording import Recording, less_black
@@ -151,9 +159,11 @@ def mend_warnings(mends: Mends, *, with_flags: bool = True) -> Iterator[str]:
     if faults is not None and (faults.copies or faults.empty):
         flag = " (--camera.leave-out-faulty false keeps them)" if with_flags else ""
         yield f"left out: {left_out_text(faults)}{flag}"
-    if mends.times is not None:
-        flag = " (--camera.mend-times false does not)" if with_flags else ""
-        yield f"times: {times_text(mends.times)}: corrected{flag}"
+    flag = " (--camera.mend-times false does not)" if with_flags else ""
+    if mends.moved.clock is not None:
+        yield f"clock: {clock_text(mends.moved.clock)}: corrected{flag}"
+    if mends.moved.times is not None:
+        yield f"times: {times_text(mends.moved.times)}: corrected{flag}"
     if layout is not None and mends.moves_events:
         flag = " (--events.mend-layout false leaves them as they are)" if with_flags else ""
         yield f"{layout_text(layout)}: put right{flag}"

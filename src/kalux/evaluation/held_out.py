@@ -16,6 +16,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.calibration.clock_rate import ClockRate, find_clock_rate
 from kalux.calibration.frame_noise import estimate_frame_noise
 from kalux.errors import FrameError, InputError, require_type
 from kalux.evaluation.exposures import (
@@ -34,7 +35,13 @@ from kalux.evaluation.scores import Scores, score
 from kalux.filters.shots import level_variance, take_shot
 from kalux.frames import Frame
 from kalux.models.camera import Camera
-from kalux.recording import RECORDING_NEEDED, Recording, reference_exposure, with_frames
+from kalux.recording import (
+    RECORDING_NEEDED,
+    Recording,
+    reference_exposure,
+    with_frames,
+    with_shifted_frames,
+)
 from kalux.settings import AUTO, CameraSettings, chosen_response
 from kalux.wording import how_many, ordinal
 
@@ -55,7 +62,8 @@ class HeldOut:
     Attributes
     ----------
     whole, kept
-        The recording with all frames, and without every n-th; less the black level, if it has one.
+        The recording with all frames, and without every n-th; less the black level, if it has one, and in the clock of
+        the events, if the frames' is another.
     every
         n.
     compared
@@ -70,6 +78,8 @@ class HeldOut:
         Of the camera, as in `kalux.settings.CameraSettings`.
     end
         Where the frames end.
+    clock
+        The rate of the frames' clock, where it was another.
     """
 
     whole: Recording
@@ -81,6 +91,7 @@ class HeldOut:
     scale: float
     response: str
     end: End
+    clock: ClockRate | None = None
 
     @cached_property
     def noise(self) -> tuple[float, float]:
@@ -94,6 +105,11 @@ class HeldOut:
         chosen = {*self.compared.tolist()}
         return (frame for i, frame in enumerate(self.whole.frames()) if i in chosen)
 
+    def _of_clock(self) -> str:
+        if self.clock is None:
+            return ""
+        return f"; times of frames stretched by {1e6 * self.clock.rate:.0f} us a second, to the events' clock"
+
     def described(self) -> str:
         """The protocol in words."""
         first, last = self.compared[0], self.compared[-1]
@@ -101,7 +117,7 @@ class HeldOut:
         return (
             f"held-out frames: every {ordinal(self.every)} dropped, {len(self.compared)} of them compared "
             f"({which}, from 0), mean of {self.times.shape[1]} reads "
-            f"across each exposure{of_black(self.whole)}"
+            f"across each exposure{of_black(self.whole)}{self._of_clock()}"
         )
 
 
@@ -151,6 +167,12 @@ def hold_out_frames(
         )
     response = chosen_response(response, recording.response)
     recording = compared_recording(recording, response, black_level)
+    exposures = np.array(
+        [(frame.exposure_start, frame.exposure_end) for frame in recording.frames()], np.int64
+    )
+    clock = find_clock_rate(recording, CameraSettings(response=response), exposures)
+    if clock is not None:
+        recording = with_shifted_frames(recording, clock.shifts)
     kept = without_frames(recording, every)
     reference = reference_exposure(kept)
     chosen = {*compared.tolist()}
@@ -159,7 +181,7 @@ def hold_out_frames(
     if scale <= 0:
         raise FrameError(f"{recording.source.path}: the frames are black; there is nothing to compare")
     end = end_of_frames(recording, response)
-    return HeldOut(recording, kept, every, compared, np.stack(times), reference, scale, response, end)
+    return HeldOut(recording, kept, every, compared, np.stack(times), reference, scale, response, end, clock)
 
 
 def without_frames(recording: Recording, every: int) -> Recording:

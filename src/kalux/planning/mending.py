@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.calibration.black_level import BlackLevel
+from kalux.calibration.clock_rate import ClockRate
 from kalux.calibration.event_layout import LayoutFit, find_layout
 from kalux.calibration.frame_faults import FrameFaults
 from kalux.calibration.frame_times import FrameTimes
@@ -34,6 +35,27 @@ from kalux.recording import (
 from kalux.settings import Settings
 
 
+class Moved(NamedTuple):
+    """By what the times of frames are corrected.
+
+    Attributes
+    ----------
+    clock
+        That of the frames, where it is fast or slow; None: it is not, or not looked for.
+    times
+        Of single frames, where their stamps are off; None: they are right, or not looked for.
+    """
+
+    clock: ClockRate | None = None
+    times: FrameTimes | None = None
+
+    @property
+    def shifts(self) -> NDArray[np.int64] | None:
+        """(K,) us, what is added to the times of each frame; None: they stay."""
+        found = [part.shifts for part in self if part is not None]
+        return np.sum(found, axis=0) if found else None
+
+
 class Mends(NamedTuple):
     """What was found to be wrong with a recording, and what is done about it.
 
@@ -51,8 +73,8 @@ class Mends(NamedTuple):
         Frames that are left out, or whose gain is not that of others, and stuck pixels; None: none.
     corrections
         What is done about these.
-    times
-        Of single frames, where their stamps are off; None: they are right, or not looked for.
+    moved
+        By what the times of frames are corrected.
     """
 
     layout: LayoutFit | None = None
@@ -61,7 +83,7 @@ class Mends(NamedTuple):
     ceiling: Ceiling | None = None
     faults: FrameFaults | None = None
     corrections: FrameCorrections = UNCHANGED
-    times: FrameTimes | None = None
+    moved: Moved = Moved()
 
     @property
     def moves_events(self) -> bool:
@@ -72,7 +94,7 @@ class Mends(NamedTuple):
     def changes(self) -> bool:
         """Whether frames or events are others than as recorded."""
         less_black = self.black is not None and self.black.level > 0
-        frames = bool(self.corrections) or self.times is not None
+        frames = bool(self.corrections) or self.moved.shifts is not None
         return self.moves_events or self.hot_pixels > 0 or less_black or frames
 
     @property

@@ -9,10 +9,11 @@ from typing import Any, Final, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.calibration.clock_rate import find_clock_rate
 from kalux.calibration.delay import DelayEstimate
 from kalux.calibration.fixed_pattern import FixedPattern
 from kalux.calibration.frame_noise import FrameNoise
-from kalux.calibration.frame_times import FrameTimes, find_frame_times
+from kalux.calibration.frame_times import find_frame_times
 from kalux.calibration.mismatch import Mismatch
 from kalux.calibration.values import Calibration, require_white
 from kalux.calibration.white_balance import grey_world
@@ -28,7 +29,7 @@ from kalux.planning.event_steps import (
     with_event_steps,
 )
 from kalux.planning.highlights import UnshownScale, with_unshown_scale
-from kalux.planning.mending import Mends, mend_events_and_levels
+from kalux.planning.mending import Mends, Moved, mend_events_and_levels
 from kalux.planning.sensor_noise import (
     with_background,
     with_dead_time,
@@ -155,13 +156,17 @@ def _planned(
     chosen: Settings,
     known: Calibration,
     asked: _Asked,
-    moved: FrameTimes | None = None,
+    moved: Moved | None = None,
 ) -> Plan:
-    """The plan for frames whose rows are exposed at once, and whose times have been ``moved``, if they were off."""
+    """The plan for frames whose rows are exposed at once, and whose times have been ``moved``, if they were off.
+
+    None: nothing is known of that yet.
+    """
     rate_hz, times, at, lookahead, smooth = asked
     as_stored, as_chosen = recording, chosen
-    if moved is not None:
-        recording = with_shifted_frames(recording, moved.shifts)
+    shifts = None if moved is None else moved.shifts
+    if shifts is not None:
+        recording = with_shifted_frames(recording, shifts)
     chosen = _with_causal_trust(chosen, lookahead)
     recording = with_cached_start(recording, _CACHED_EVENTS, _CACHED_FRAME_BYTES)
 
@@ -179,6 +184,14 @@ def _planned(
     )
     mended = mended.with_frames(seen.faults, with_first=bool(len(wanted)) and int(wanted[0]) < begin)
 
+    left_out = mended.mends.corrections.left_out
+    if moved is None and _looks_for_times(chosen):
+        kept = np.delete(seen.exposures, left_out, axis=0)
+        clock = find_clock_rate(mended.recording, mended.settings.camera, kept)
+        if clock is not None:
+            return _planned(as_stored, as_chosen, known, asked, Moved(clock.of_all(seen.exposures)))
+    moved = Moved() if moved is None else moved
+
     recording, chosen = mended.recording, _with_motion(mended.settings, recording.sensor_size, smooth)
     chosen = _with_exposure_and_response(recording, chosen, seen.exposures)
     chosen = _with_white_balance(recording, chosen)
@@ -187,10 +200,10 @@ def _planned(
     chosen, dead_time = with_dead_time(recording, chosen)
     apparent_delay = _delay_of_black(mended.mends, chosen, seen.exposures)
     steps = with_event_steps(recording, chosen, apparent_delay, doubt_noise=of_frames.doubted)
-    if moved is None and _looks_for_times(chosen):
-        moved = find_frame_times(recording, steps.settings.camera, steps.settings.events)
-        if moved is not None:
-            moved = moved.of_all(seen.exposures, mended.mends.corrections.left_out)
+    if moved.times is None and _looks_for_times(chosen):
+        times_found = find_frame_times(recording, steps.settings.camera, steps.settings.events)
+        if times_found is not None:
+            moved = moved._replace(times=times_found.of_all(seen.exposures, left_out))
             return _planned(as_stored, as_chosen, known, asked, moved)
     chosen, mismatch = with_step_errors(recording, steps.settings, steps.threshold_error, known=chosen.events)
     chosen, background = with_background(recording, chosen, known.pixels, lookahead=lookahead)
@@ -214,7 +227,7 @@ def _planned(
         lookahead=lookahead,
         smooth=smooth,
         pixels=pixels,
-        mends=mended.mends._replace(times=moved),
+        mends=mended.mends._replace(moved=moved),
         steps=steps.estimates,
         frame_noise=of_frames.estimate,
         fixed_pattern=pattern,
