@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.calibration.clock_rate import ClockRate
+from kalux.calibration.compression import Compression
 from kalux.calibration.delay import SHARE
 from kalux.calibration.event_layout import LayoutFit
 from kalux.calibration.event_model import Agreement
@@ -115,6 +116,8 @@ def _of_frames(recording: Recording, plan: Plan, asked: Settings) -> Iterator[tu
         yield "left out", left_out_text(plan.mends.faults)
     if plan.mends.faults is not None and plan.mends.faults.stuck is not None:
         yield "stuck", f"{stuck_text(plan.mends.faults.stuck)}: the median of their neighbours is taken"
+    if plan.mends.compression is not None:
+        yield "compression", f"{compression_text(plan.mends.compression)}: allowed for"
     moved = plan.mends.moved
     if moved.clock is not None:
         yield "clock", f"{clock_text(moved.clock)}: corrected"
@@ -168,7 +171,8 @@ def saturation_text(recording: Recording, plan: Plan, asked: Settings) -> str:
     frames once more (`kalux.calibration.levels`).
     """
     used = plan.settings.camera.clipped_from
-    how = "the usual" if asked.camera.saturation is None else _GIVEN
+    how = "the usual" if plan.mends.compression is None else "the usual, less what JPEG may be off by"
+    how = how if asked.camera.saturation is None else _GIVEN
     text = f"from {used:.2g} of white ({how}); "
     source = less_black(recording, plan.settings.camera.black_level)
     ceiling = find_ceiling(source, plan.settings.camera, plan.settings.events)
@@ -230,6 +234,14 @@ def gain_text(faults: FrameFaults) -> str:
 def stuck_text(stuck: NDArray[np.bool_]) -> str:
     """How many pixels of frames are stuck."""
     return f"{how_many(int(np.count_nonzero(stuck)), 'pixel')} always the same though the light changes"
+
+
+def compression_text(compression: Compression) -> str:
+    """That frames were JPEG, and what it did to them."""
+    return (
+        f"frames were stored as JPEG once, which leaves pixels off by up to some {100 * compression.error:.1f} % of "
+        "white (standard deviation)"
+    )
 
 
 def clock_text(clock: ClockRate) -> str:

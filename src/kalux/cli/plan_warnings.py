@@ -11,6 +11,7 @@ from kalux.calibration.levels import find_ceiling
 from kalux.plan_report import (
     ceiling_text,
     clock_text,
+    compression_text,
     gain_text,
     layout_text,
     left_out_text,
@@ -159,6 +160,8 @@ def mend_warnings(mends: Mends, *, with_flags: bool = True) -> Iterator[str]:
     if faults is not None and (faults.copies or faults.empty):
         flag = " (--camera.leave-out-faulty false keeps them)" if with_flags else ""
         yield f"left out: {left_out_text(faults)}{flag}"
+    if mends.compression is not None:
+        yield f"compression: {compression_text(mends.compression)}: allowed for; raw frames would be better"
     flag = " (--camera.mend-times false does not)" if with_flags else ""
     if mends.moved.clock is not None:
         yield f"clock: {clock_text(mends.moved.clock)}: corrected{flag}"

@@ -66,7 +66,7 @@ class End(NamedTuple):
 
 def end_of_frames(recording: Recording, response: str) -> End:
     """Where a recording's frames end, as `kalux.reconstruct` takes it by default; ``response`` as of `linear_frame`."""
-    settings, ceiling = with_saturation(recording, altered(preset("default"), "camera", response=response))
+    settings, ceiling, _ = with_saturation(recording, altered(preset("default"), "camera", response=response))
     curve = Camera.named(response, settings.camera.clipped_from).response
     return End(
         settings.camera.clipped_from,

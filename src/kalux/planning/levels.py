@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Final, NamedTuple
+
 from kalux.calibration.black_level import BlackLevel, with_known_black
+from kalux.calibration.compression import Compression, find_compression
 from kalux.calibration.levels import Ceiling, exact_end, find_ceiling
 from kalux.planning.event_steps import with_event_steps
 from kalux.recording import Recording, less_black
 from kalux.settings import Settings, altered
+
+_DEVIATIONS: Final = 4
+"""Of what JPEG is off by beside clipped pixels, below the usual saturation: from there on pixels count as clipped."""
 
 
 def without_black(recording: Recording, settings: Settings) -> tuple[Recording, Settings, BlackLevel | None]:
@@ -26,24 +32,42 @@ def without_black(recording: Recording, settings: Settings) -> tuple[Recording, 
     return recording, settings, found
 
 
-def with_saturation(recording: Recording, settings: Settings) -> tuple[Settings, Ceiling | None]:
+class Saturation(NamedTuple):
+    """Settings with the saturation, and what it goes by.
+
+    Attributes
+    ----------
+    settings
+        With the saturation filled in.
+    ceiling
+        The level at which frames are clipped below the usual saturation, if that was found.
+    compression
+        What JPEG did to the frames, if they show it, and that was asked for.
+    """
+
+    settings: Settings
+    ceiling: Ceiling | None = None
+    compression: Compression | None = None
+
+
+def with_saturation(recording: Recording, settings: Settings) -> Saturation:
     """Fill in the saturation: from the settings, else the level at which all frames end while events go on, else usual.
 
     Frames also end where the scene has nothing brighter. Events tell which it is: pixels at that level are clipped if
-    events go on there, by thresholds that are estimated as if it were the saturation.
-
-    Returns
-    -------
-    The settings, and the level at which frames are clipped, if that was found.
+    events go on there, by thresholds that are estimated as if it were the saturation. JPEG leaves pixels below it which
+    were clipped; so of frames that it has compressed some more count as clipped.
     """
     camera = settings.camera
-    usual = altered(settings, "camera", saturation=camera.clipped_from)
     if camera.saturation is not None or not settings.filter.joins_frames:
-        return usual, None
+        return Saturation(altered(settings, "camera", saturation=camera.clipped_from))
+    compression = find_compression(recording)
+    error = 0.0 if compression is None else compression.error
+    level = camera.usual_saturation - _DEVIATIONS * error
+    usual = Saturation(altered(settings, "camera", saturation=level), None, compression)
     end = exact_end(recording, camera.usual_saturation)
     if end is None:
-        return usual, None
-    clipped = altered(settings, "camera", saturation=camera.usual_saturation * end)
+        return usual
+    clipped = altered(settings, "camera", saturation=level * end)
     known = with_event_steps(recording, clipped).settings
     found = find_ceiling(recording, known.camera, known.events)
-    return (clipped, found) if found is not None and found.is_at(end) else (usual, None)
+    return Saturation(clipped, found, compression) if found is not None and found.is_at(end) else usual

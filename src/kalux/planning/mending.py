@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from kalux.calibration.black_level import BlackLevel
 from kalux.calibration.clock_rate import ClockRate
+from kalux.calibration.compression import Compression
 from kalux.calibration.event_layout import LayoutFit, find_layout
 from kalux.calibration.frame_faults import FrameFaults
 from kalux.calibration.frame_times import FrameTimes
@@ -69,6 +70,8 @@ class Mends(NamedTuple):
         What was looked for where the frames begin above 0: whether that is black.
     ceiling
         Where the frames end at one level below the usual saturation while events go on.
+    compression
+        What JPEG did to the frames, if they show it.
     faults
         Frames that are left out, or whose gain is not that of others, and stuck pixels; None: none.
     corrections
@@ -81,6 +84,7 @@ class Mends(NamedTuple):
     hot: NDArray[np.bool_] | None = None
     black: BlackLevel | None = None
     ceiling: Ceiling | None = None
+    compression: Compression | None = None
     faults: FrameFaults | None = None
     corrections: FrameCorrections = UNCHANGED
     moved: Moved = Moved()
@@ -141,8 +145,9 @@ def mend_events_and_levels(recording: Recording, settings: Settings) -> Mended:
     if hot is not None and hot.any():
         recording = without_events_of(recording, hot)
     recording, settings, black = without_black(recording, settings)
-    settings, ceiling = with_saturation(recording, settings)
-    return Mended(with_frames_of(recording, whole), settings, Mends(layout, hot, black, ceiling))
+    levels = with_saturation(recording, settings)
+    found = Mends(layout, hot, black, levels.ceiling, compression=levels.compression)
+    return Mended(with_frames_of(recording, whole), levels.settings, found)
 
 
 def mend(recording: Recording, settings: Settings) -> Mended:

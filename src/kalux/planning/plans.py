@@ -195,7 +195,7 @@ def _planned(
     recording, chosen = mended.recording, _with_motion(mended.settings, recording.sensor_size, smooth)
     chosen = _with_exposure_and_response(recording, chosen, seen.exposures)
     chosen = _with_white_balance(recording, chosen)
-    of_frames = with_frame_noise(recording, chosen)
+    of_frames = with_frame_noise(recording, chosen, mended.mends.compression)
     chosen, pattern = with_fixed_pattern(recording, of_frames.settings)
     chosen, dead_time = with_dead_time(recording, chosen)
     apparent_delay = _delay_of_black(mended.mends, chosen, seen.exposures)

@@ -6,6 +6,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from kalux.calibration.compression import Compression
 from kalux.calibration.fixed_pattern import FixedPattern, estimate_fixed_pattern
 from kalux.calibration.frame_noise import FrameNoise, UsualNoise, estimate_frame_noise, usual_noise
 from kalux.calibration.mismatch import Mismatch, estimate_mismatch
@@ -41,8 +42,18 @@ class FilledFrameNoise(NamedTuple):
     doubted: bool = False
 
 
-def with_frame_noise(recording: Recording, settings: Settings) -> FilledFrameNoise:
-    """Fill in the frames' noise, where the filter uses it: from the settings, else an estimate, else the usual."""
+_TYPICAL: Final = 0.65
+"""Errors of pixels by JPEG in terms of `Compression.error`, root mean square: 0.5 to 0.8 on 17 scenes, qualities of 97
+to 75."""
+
+
+def with_frame_noise(
+    recording: Recording, settings: Settings, compression: Compression | None
+) -> FilledFrameNoise:
+    """Fill in the frames' noise, where the filter uses it: from the settings, else an estimate, else the usual.
+
+    Estimates are of what stands still, where a ``compression`` is the same in every frame: what it does is added.
+    """
     camera = settings.camera
     if camera.frame_noise is not None or not settings.filter.joins_frames:
         return FilledFrameNoise(settings)
@@ -52,7 +63,9 @@ def with_frame_noise(recording: Recording, settings: Settings) -> FilledFrameNoi
         found = None
     noise = usual_noise(recording, camera, delay=delay) if found is None else found
     doubted = isinstance(noise, UsualNoise) and not noise.silent and camera.shot_noise is None
-    filled = completed(settings, "camera", frame_noise=noise.read, shot_noise=noise.shot)
+    of_blocks = 0.0 if compression is None else _TYPICAL * compression.error
+    read = float(np.hypot(noise.read, of_blocks)) if of_blocks else noise.read
+    filled = completed(settings, "camera", frame_noise=read, shot_noise=noise.shot)
     return FilledFrameNoise(filled, found, doubted)
 
 
