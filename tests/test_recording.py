@@ -26,6 +26,7 @@ from kalux.recording import (
     with_cached_start,
     with_counted_events,
     with_rows_at_once,
+    with_white_from,
     without_events_of,
 )
 from kalux.writers import hdf5
@@ -456,3 +457,18 @@ def test_events_in_the_time_of_rows_are_in_order_however_they_are_cut(cuts):
     found, same = (np.concatenate([*with_rows_at_once(r, 300.0).events()]) for r in (whole, parts))
     np.testing.assert_array_equal(found, same)
     np.testing.assert_array_equal(found, in_order(with_delay_of_rows(events, whole_row_delays(8, 300.0))))
+
+
+@pytest.mark.parametrize(
+    ("black", "dtype", "white"), [(None, np.uint8, 255), (0.2, np.uint8, 255), (None, np.uint16, 65535)]
+)
+def test_pixels_are_white_from_a_level_on(black, dtype, white):
+    levels = np.array([[0.5, 0.85, 0.89], [0.91, 0.95, 1.0]])
+    stored = np.rint(((black or 0.0) + levels * (1.0 - (black or 0.0))) * white).astype(dtype)
+    source = less_black(
+        Recording.from_arrays(small_events()[:0], [Frame(stored, 0, 10)], sensor_size=(2, 3)), black
+    )
+    (frame,) = with_white_from(source, 0.9).frames()
+    assert frame.image.dtype == dtype
+    assert frame.image[0].tolist() == stored[0].tolist()
+    assert frame.image[1].tolist() == [white] * 3

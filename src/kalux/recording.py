@@ -223,6 +223,23 @@ def less_black(recording: Recording, level: float | None) -> Recording:
     return made
 
 
+def with_white_from(recording: Recording, level: float) -> Recording:
+    """The same recording, each pixel of whose frames is white from a ``level`` of the response on."""
+    black = recording.black_level or 0.0
+    stored = black + level * (1.0 - black)
+    whole, made = recording.source.frames, copy.copy(recording)
+
+    def whitened() -> Iterator[Frame]:
+        for frame in whole():
+            image = np.where(frame.normalised() < stored, frame.image, frame.white_value).astype(
+                frame.image.dtype
+            )
+            yield dataclasses.replace(frame, image=image)
+
+    made.source = dataclasses.replace(recording.source, frames=whitened)
+    return made
+
+
 def with_frames(recording: Recording, frames: Callable[[], Iterator[Frame]]) -> Recording:
     """The recording with some of its own frames, or with others; their exposures are known, it has no ground truth."""
     chosen = Recording(

@@ -113,6 +113,30 @@ def test_a_black_level_that_is_told_is_taken_off(cli, files, tmp_path):
     assert "black_level" in wrong.error
 
 
+def test_what_jpeg_leaves_clipped_pixels_at_is_white(cli, files, tmp_path):
+    """Where frames are clipped in the camera they are in the recording, though their JPEG says less there."""
+    whole, jpeg = [], []
+    for frame in distant_recording().frames:
+        image = np.minimum(frame.image.astype(np.uint16) * 2, 255).astype(np.uint8)
+        coded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 60])[1]
+        whole.append(dataclasses.replace(frame, image=image))
+        jpeg.append(dataclasses.replace(frame, image=cv2.imdecode(coded, cv2.IMREAD_UNCHANGED)))
+    shares = []
+    for name, frames in (("whole", whole), ("jpeg", jpeg)):
+        hdf5.write(tmp_path / f"{name}.h5", sensor_size=(240, 320), events=[], frames=frames)
+        out = tmp_path / f"both_{name}.h5"
+        done = cli(
+            "register", files / "scene.h5", "--frames", tmp_path / f"{name}.h5", "--rig", files / "true.toml",
+            "--homography", "rig", "--distance", DISTANCE, "--offset", OFFSET, "-o", out,
+        )  # fmt: skip
+        assert done.code == 0, done.err
+        assert ("stored as JPEG once" in done.err) == (name == "jpeg")
+        shares.append([f.normalised() >= 0.98 for f in kalux.open(out).frames()])
+    clipped, found = (np.array(each) for each in shares)
+    assert clipped.mean() > 0.02
+    assert found[clipped].mean() > 0.9
+
+
 def test_the_response_that_the_frames_state_is_kept(cli, files, tmp_path):
     source = kalux.open(files / "scene_frames.h5")
     stated = tmp_path / "stated.h5"

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from kalux.calibration.two_cameras import Registered
     from kalux.frames import Frame
     from kalux.recording import Recording
+    from kalux.settings import CameraSettings
 
 _DESCRIPTION = """\
 Make one recording of an event camera's events and another camera's frames: the frames are undistorted, warped
@@ -127,7 +128,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
         exposure=None if by_trigger else options.exposure,
         stamp=options.stamp or "start",
     )
-    other = less_black(other, camera.black_level)
+    other = _with_clipped_white(less_black(other, camera.black_level), camera)
     response = chosen_response(options.response, other.response)
     frames, exposure_known = _timed_frames(options, events, other, by_trigger)
     found = register(
@@ -156,6 +157,21 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
         )
     if options.overlay is not None:
         write_picture(options.overlay, _overlay(found, frames, events))
+
+
+def _with_clipped_white(frames: Recording, camera: CameraSettings) -> Recording:
+    """Frames whose clipped pixels are white again where JPEG left them below: once warped, it does not show any more."""
+    from kalux.calibration.compression import find_compression
+    from kalux.plan_report import compression_text
+    from kalux.planning.levels import usual_saturation
+    from kalux.recording import with_white_from
+
+    compression = find_compression(frames)
+    if compression is None:
+        return frames
+    level = usual_saturation(camera, compression)
+    warn(f"compression: {compression_text(compression)}: what is above {level:.2g} of white becomes white")
+    return with_white_from(frames, level)
 
 
 def _known_offset(options: argparse.Namespace, timing: str) -> float | None:

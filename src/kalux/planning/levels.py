@@ -9,7 +9,7 @@ from kalux.calibration.compression import Compression, find_compression
 from kalux.calibration.levels import Ceiling, exact_end, find_ceiling
 from kalux.planning.event_steps import with_event_steps
 from kalux.recording import Recording, less_black
-from kalux.settings import Settings, altered
+from kalux.settings import CameraSettings, Settings, altered
 
 _DEVIATIONS: Final = 4
 """Of what JPEG is off by beside clipped pixels, below the usual saturation: from there on pixels count as clipped."""
@@ -30,6 +30,11 @@ def without_black(recording: Recording, settings: Settings) -> tuple[Recording, 
     if found is not None and found.level:
         settings = altered(settings, "camera", black_level=found.level)
     return recording, settings, found
+
+
+def usual_saturation(camera: CameraSettings, compression: Compression | None) -> float:
+    """The response from which on pixels count as clipped where the recording does not tell it."""
+    return camera.usual_saturation - (0.0 if compression is None else _DEVIATIONS * compression.error)
 
 
 class Saturation(NamedTuple):
@@ -61,8 +66,7 @@ def with_saturation(recording: Recording, settings: Settings) -> Saturation:
     if camera.saturation is not None or not settings.filter.joins_frames:
         return Saturation(altered(settings, "camera", saturation=camera.clipped_from))
     compression = find_compression(recording)
-    error = 0.0 if compression is None else compression.error
-    level = camera.usual_saturation - _DEVIATIONS * error
+    level = usual_saturation(camera, compression)
     usual = Saturation(altered(settings, "camera", saturation=level), None, compression)
     end = exact_end(recording, camera.usual_saturation)
     if end is None:
