@@ -171,7 +171,7 @@ def saturation_text(recording: Recording, plan: Plan, asked: Settings) -> str:
     frames once more (`kalux.calibration.levels`).
     """
     used = plan.settings.camera.clipped_from
-    how = "the usual" if plan.mends.compression is None else "the usual, less what JPEG may be off by"
+    how = "the usual" if plan.mends.compression is None else "the usual, less what their compression does"
     how = how if asked.camera.saturation is None else _GIVEN
     text = f"from {used:.2g} of white ({how}); "
     source = less_black(recording, plan.settings.camera.black_level)
@@ -237,10 +237,11 @@ def stuck_text(stuck: NDArray[np.bool_]) -> str:
 
 
 def compression_text(compression: Compression) -> str:
-    """That frames were JPEG, and what it did to them."""
+    """That frames were JPEG or a video, and what it did to them."""
+    what = "are of a lossy video" if compression.of_video else "were stored as JPEG once"
     return (
-        f"frames were stored as JPEG once, which leaves pixels off by up to some {100 * compression.error:.1f} % of "
-        "white (standard deviation)"
+        f"frames {what}, which leaves pixels off by up to some {100 * compression.error:.1f} % of white (standard "
+        "deviation)"
     )
 
 

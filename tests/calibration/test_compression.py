@@ -11,12 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kalux import Recording
-from kalux.calibration.compression import find_compression
+from kalux.calibration.compression import OF_VIDEO, find_compression
 from kalux.datasets import SensorSettings, simulate
 from kalux.datasets.motion import pan
 from kalux.datasets.scenes import photograph_scene
 from kalux.frames import Frame
-from kalux.plan_report import plan_report
+from kalux.plan_report import compression_text, plan_report
 from kalux.planning import plan
 from kalux.planning.levels import with_saturation
 from kalux.settings import PRESETS, altered
@@ -64,6 +64,21 @@ def test_jpeg_is_found_and_its_error_about_known(quality):
 @given(st.integers(0, 1_000_000), st.floats(0, 8))
 def test_frames_that_were_never_compressed_are_left(seed, noise):
     assert find_compression(recorded([scene(seed + i, noise) for i in range(4)])) is None
+
+
+def test_frames_of_a_lossy_video_are_what_their_reader_says():
+    raw = recorded([scene(seed) for seed in range(4)])
+    video = Recording(dataclasses.replace(raw.source, of_lossy_video=True))
+    found = find_compression(video)
+    assert found is not None
+    assert found.of_video
+    assert found.error == OF_VIDEO
+    jpeg = recorded([compressed(scene(seed), 90) for seed in range(4)])
+    shown = find_compression(Recording(dataclasses.replace(jpeg.source, of_lossy_video=True)))
+    assert shown is not None
+    assert not shown.of_video
+    assert "lossy video" in compression_text(found)
+    assert "JPEG" in compression_text(shown)
 
 
 def test_blocks_are_found_wherever_they_begin():

@@ -331,6 +331,16 @@ def write_h264(path, images, reordered, **options):
 class TestVideo:
     images = tuple(frame.image for frame in small_frames(6))
 
+    @pytest.mark.parametrize(
+        ("codec", "pixels", "lossy"),
+        [("ffv1", "gray", False), ("h264", "yuv420p", True), ("mjpeg", "yuvj420p", True)],
+    )
+    def test_says_whether_its_codec_changes_pictures(self, events_only, tmp_path, codec, pixels, lossy):
+        video = write_video(tmp_path / "v.mkv", self.images, codec=codec, pixels=pixels)
+        joined = kalux.open(events_only, frames=video, frames_start=0, frames_rate=30, exposure=2_000)
+        assert joined.source.of_lossy_video == lossy
+        assert not kalux.open(events_only).source.of_lossy_video
+
     def test_lossless(self, events_only, tmp_path):
         video = write_video(tmp_path / "v.mkv", self.images)
         rec = kalux.open(events_only, frames=video, frames_start=1_000, frames_rate=30, exposure=2_000)

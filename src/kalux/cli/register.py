@@ -160,7 +160,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
 
 
 def _with_clipped_white(frames: Recording, camera: CameraSettings) -> Recording:
-    """Frames whose clipped pixels are white again where JPEG left them below: once warped, it does not show any more."""
+    """Frames whose clipped pixels are white again where a codec left them below: once warped, that does not show."""
     from kalux.calibration.compression import find_compression
     from kalux.plan_report import compression_text
     from kalux.planning.levels import usual_saturation

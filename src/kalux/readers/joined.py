@@ -220,7 +220,7 @@ def _video(path: Path, start: int | None, rate_hz: float | None) -> Source:
     first = next(iter(beginning), None)
     if first is None:
         raise FormatError(f"{path}: has no picture that can be decoded; copy or download it again")
-    transfer = _transfer(path)
+    transfer, lossy = _transfer(path), _is_lossy(path)
 
     @cache
     def count_frames() -> int:
@@ -244,6 +244,7 @@ def _video(path: Path, start: int | None, rate_hz: float | None) -> Source:
             f"The frames are the {'colours' if colour else 'luma'} of a video, with whatever its encoder did to them.",
             *(() if transfer in _TRANSFERS else (_no_response(transfer),)),
         ),
+        of_lossy_video=lossy,
     )
 
 
@@ -251,6 +252,12 @@ def _transfer(path: Path) -> int:
     """How the pictures of a video follow the light, as a number of ITU-T H.273."""
     with opened_video(path) as container:
         return int(container.streams.video[0].codec_context.color_trc)
+
+
+def _is_lossy(path: Path) -> bool:
+    """Whether a video's codec does not keep pictures as they were; of one that can do both, that it did not."""
+    with opened_video(path) as container:
+        return bool(container.streams.video[0].codec_context.codec.lossy)
 
 
 def _no_response(transfer: int) -> str:

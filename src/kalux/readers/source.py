@@ -81,6 +81,8 @@ class Source:
     lost
         Called with two times, us: the packets of events that their numbers show to be missing before those from one to
         the other, or None; reads through them. None where the format has no such numbers.
+    of_lossy_video
+        Whether the frames are pictures of a video whose codec does not keep them as they were.
     """
 
     path: Path
@@ -101,6 +103,7 @@ class Source:
     mosaic: Mosaic | None = None
     rows_from_below: bool = False
     lost: Callable[[int, int], Lost | None] | None = None
+    of_lossy_video: bool = False
 
 
 NO_EVENTS: Final = "The file has no events."
