@@ -94,6 +94,8 @@ def _of_frames(recording: Recording, plan: Plan, asked: Settings) -> Iterator[tu
     if camera.frame_noise is not None:
         read, shot = camera.noise
         how = _noise_origin(plan, asked)
+        if plan.mends.compression is not None and asked.camera.frame_noise is None:
+            how += ", and what their compression adds"
         half = np.sqrt(read**2 + shot / 2)
         yield "noise", f"of frames {read:.2g} of white in the dark, {half:.2g} at half of it ({how})"
     if camera.fixed_pattern is not None:
