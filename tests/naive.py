@@ -689,7 +689,7 @@ def signal_shares(every, k, settings):
             fewer, as_many = (
                 same.count(number)
                 + (200 * all_of_them[number] / sum(all_of_them) if unmeasured[place] else 4)
-                for number in (b - 1, min(b, 5))
+                for number in (min(b, 6) - 1, min(b, 5))
             )
             one = min(m / b * (fewer / as_many if b < 6 else 1.0), 1.0)
             noise = one if b == 1 or b >= 6 else min(noise, one)
