@@ -129,9 +129,7 @@ def execute(
         Without, grey images have an infinite variance and are made faster.
     """
     memory.give_back()  # that planning and checking have used
-    shifts = plan.mends.moved.shifts
-    if shifts is not None:
-        recording = with_shifted_frames(recording, shifts)
+    recording = with_shifted_frames(recording, plan.mends.moved.shifts)
     recording = with_corrected_frames(recording, plan.mends.corrections)
     if plan.mends.layout is not None:
         recording = with_event_layout(recording, plan.mends.layout.found)

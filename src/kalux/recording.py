@@ -354,8 +354,10 @@ def _corrected(frames: Iterator[Frame], corrections: FrameCorrections, pitch: in
         yield frame
 
 
-def with_shifted_frames(recording: Recording, shifts: NDArray[np.int64]) -> Recording:
-    """The same recording, each of whose frames is of another time: (K,) us are added to their exposures."""
+def with_shifted_frames(recording: Recording, shifts: NDArray[np.int64] | None) -> Recording:
+    """The same recording with (K,) us added to the exposures of its frames; None: as before."""
+    if shifts is None:
+        return recording
 
     def shifted() -> Iterator[Frame]:
         for frame, shift in zip(whole(), shifts.tolist(), strict=True):

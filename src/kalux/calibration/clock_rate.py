@@ -17,10 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.calibration.intervals import APART_IN_TIME, frames_apart
-from kalux.calibration.offset import LEAST_FRAMES, Changes, Correlation, correlate, frame_changes
+from kalux.calibration.offset import LEAST_FRAMES, Changes, correlate, frame_changes
 from kalux.calibration.registration import Registration
 from kalux.calibration.regression import huber_weights
-from kalux.calibration.rig import Lens
 from kalux.errors import EventError, InputError
 from kalux.events import EventArray
 from kalux.recording import Recording
@@ -125,8 +124,8 @@ def find_clock_rate(recording: Recording, camera: CameraSettings, exposures: Tim
 def offsets(recording: Recording, camera: CameraSettings, exposures: Times) -> Offsets:
     """Offsets of the frames' clock all over a recording, as far as they can be told; see `find_clock_rate`."""
     seen = _changes(recording, camera, _stretches(exposures))
-    sure = [(time, found.offset) for time, found in _correlations(recording, seen) if _is_clear(found)]
-    return Offsets(*np.array(sure, np.float64).reshape(-1, 2).T)
+    clear = [*_clear_offsets(recording, seen)]
+    return Offsets(*np.array(clear, np.float64).reshape(-1, 2).T)
 
 
 def _stretches(exposures: Times) -> list[slice]:
@@ -145,8 +144,7 @@ def _stretches(exposures: Times) -> list[slice]:
 
 def _changes(recording: Recording, camera: CameraSettings, stretches: Sequence[slice]) -> list[Changes]:
     """What changes between the frames of each stretch."""
-    lens = Lens.pinhole(recording.sensor_size)
-    same = Registration(lens, lens, np.eye(3))
+    same = Registration.same_pixels(recording.sensor_size)
     response = chosen_response(camera.response, recording.response)
     camera = dataclasses.replace(camera, response=response)
     found, passed = list[Changes](), 0
@@ -160,8 +158,8 @@ def _changes(recording: Recording, camera: CameraSettings, stretches: Sequence[s
     return found
 
 
-def _correlations(recording: Recording, seen: Sequence[Changes]) -> Iterator[tuple[float, Correlation]]:
-    """The time of each stretch, us, and its correlation around the offset of the last one that is clear."""
+def _clear_offsets(recording: Recording, seen: Sequence[Changes]) -> Iterator[tuple[float, float]]:
+    """Time and offset, us, of each stretch whose offset is clear, looked for around that of the last such one."""
     chunks, kept = iter(recording.events()), list[EventArray]()
     centre, before = 0.0, 0.0
     for changes in seen:
@@ -174,14 +172,9 @@ def _correlations(recording: Recording, seen: Sequence[Changes]) -> Iterator[tup
             raise
         except InputError:  # nothing changes there, or there are no events
             continue
-        if _is_clear(found):
+        if found.sure and found.standard_error <= _CLEAR:
             centre, before = found.offset, time
-        yield time, found
-
-
-def _is_clear(found: Correlation) -> bool:
-    """Whether an offset is known, and to a few ms."""
-    return found.sure and found.standard_error <= _CLEAR
+            yield time, found.offset
 
 
 def _ahead(chunks: Iterator[EventArray], kept: list[EventArray]) -> Iterator[EventArray]:

@@ -60,6 +60,12 @@ class Registration:
     homography: Array
 
     @classmethod
+    def same_pixels(cls, sensor_size: tuple[int, int]) -> Registration:
+        """That of frames which have the events' pixels; (height, width)."""
+        lens = Lens.pinhole(sensor_size)
+        return cls(lens, lens, np.eye(3))
+
+    @classmethod
     def of_rig(cls, rig: Rig, distance: float | None = None) -> Registration:
         """The registration of a rig, for a scene at a distance (m), or infinitely far."""
         return cls(rig.events, rig.frames, rig.homography(distance))

@@ -157,7 +157,8 @@ def hold_out_frames(
         raise InputError(
             f"held-out frames: every is {every!r}, reads are {reads!r}; whole numbers, at least 2, are needed"
         )
-    count = sum(1 for _ in recording.frames())
+    spans = [(frame.exposure_start, frame.exposure_end) for frame in recording.frames()]
+    count = len(spans)
     compared = np.arange(MARGIN, count - MARGIN)
     compared = compared[compared % every == every - 1]
     if len(compared) == 0:
@@ -167,12 +168,8 @@ def hold_out_frames(
         )
     response = chosen_response(response, recording.response)
     recording = compared_recording(recording, response, black_level)
-    exposures = np.array(
-        [(frame.exposure_start, frame.exposure_end) for frame in recording.frames()], np.int64
-    )
-    clock = find_clock_rate(recording, CameraSettings(response=response), exposures)
-    if clock is not None:
-        recording = with_shifted_frames(recording, clock.shifts)
+    clock = find_clock_rate(recording, CameraSettings(response=response), np.array(spans, np.int64))
+    recording = with_shifted_frames(recording, None if clock is None else clock.shifts)
     kept = without_frames(recording, every)
     reference = reference_exposure(kept)
     chosen = {*compared.tolist()}

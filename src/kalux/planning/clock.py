@@ -11,8 +11,6 @@ from collections.abc import Callable, Iterable, Iterator
 from itertools import product
 from typing import Final
 
-import numpy as np
-
 from kalux.calibration.event_layout import LayoutFit
 from kalux.calibration.offset import (
     RANGE,
@@ -23,7 +21,6 @@ from kalux.calibration.offset import (
     frame_changes,
 )
 from kalux.calibration.registration import Registration
-from kalux.calibration.rig import Lens
 from kalux.errors import InputError
 from kalux.events import EventArray
 from kalux.frames import Frame
@@ -79,8 +76,7 @@ def offset_of_recording(
     InputError
         If frames or events are too few, or do not go together.
     """
-    lens = Lens.pinhole(recording.sensor_size)
-    same = Registration(lens, lens, np.eye(3))
+    same = Registration.same_pixels(recording.sensor_size)
     settings = altered(
         settings, "camera", response=chosen_response(settings.camera.response, recording.response)
     )

@@ -12,7 +12,7 @@ from kalux.recording import Recording, less_black
 from kalux.settings import CameraSettings, Settings, altered
 
 _DEVIATIONS: Final = 4
-"""Of what JPEG is off by beside clipped pixels, below the usual saturation: from there on pixels count as clipped."""
+"""Of what a codec is off by beside clipped pixels: so far below the usual saturation pixels count as clipped."""
 
 
 def without_black(recording: Recording, settings: Settings) -> tuple[Recording, Settings, BlackLevel | None]:
@@ -47,7 +47,7 @@ class Saturation(NamedTuple):
     ceiling
         The level at which frames are clipped below the usual saturation, if that was found.
     compression
-        What JPEG did to the frames, if they show it, and that was asked for.
+        What JPEG or a video did to the frames, if that is known, and was asked for.
     """
 
     settings: Settings

@@ -71,7 +71,7 @@ class Mends(NamedTuple):
     ceiling
         Where the frames end at one level below the usual saturation while events go on.
     compression
-        What JPEG did to the frames, if they show it.
+        What JPEG or a video did to the frames, if that is known.
     faults
         Frames that are left out, or whose gain is not that of others, and stuck pixels; None: none.
     corrections

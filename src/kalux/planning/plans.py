@@ -164,9 +164,7 @@ def _planned(
     """
     rate_hz, times, at, lookahead, smooth = asked
     as_stored, as_chosen = recording, chosen
-    shifts = None if moved is None else moved.shifts
-    if shifts is not None:
-        recording = with_shifted_frames(recording, shifts)
+    recording = with_shifted_frames(recording, None if moved is None else moved.shifts)
     chosen = _with_causal_trust(chosen, lookahead)
     recording = with_cached_start(recording, _CACHED_EVENTS, _CACHED_FRAME_BYTES)
 

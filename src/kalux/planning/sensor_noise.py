@@ -64,7 +64,7 @@ def with_frame_noise(
     noise = usual_noise(recording, camera, delay=delay) if found is None else found
     doubted = isinstance(noise, UsualNoise) and not noise.silent and camera.shot_noise is None
     of_blocks = 0.0 if compression is None else _TYPICAL * compression.error
-    read = float(np.hypot(noise.read, of_blocks)) if of_blocks else noise.read
+    read = float(np.hypot(noise.read, of_blocks))
     filled = completed(settings, "camera", frame_noise=read, shot_noise=noise.shot)
     return FilledFrameNoise(filled, found, doubted)
 

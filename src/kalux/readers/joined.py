@@ -220,7 +220,7 @@ def _video(path: Path, start: int | None, rate_hz: float | None) -> Source:
     first = next(iter(beginning), None)
     if first is None:
         raise FormatError(f"{path}: has no picture that can be decoded; copy or download it again")
-    transfer, lossy = _transfer(path), _is_lossy(path)
+    transfer, lossy = _coding(path)
 
     @cache
     def count_frames() -> int:
@@ -248,16 +248,14 @@ def _video(path: Path, start: int | None, rate_hz: float | None) -> Source:
     )
 
 
-def _transfer(path: Path) -> int:
-    """How the pictures of a video follow the light, as a number of ITU-T H.273."""
-    with opened_video(path) as container:
-        return int(container.streams.video[0].codec_context.color_trc)
+def _coding(path: Path) -> tuple[int, bool]:
+    """How a video's pictures follow the light, as a number of ITU-T H.273, and whether its codec changes them.
 
-
-def _is_lossy(path: Path) -> bool:
-    """Whether a video's codec does not keep pictures as they were; of one that can do both, that it did not."""
+    A codec that can do without, too, is taken to have changed them.
+    """
     with opened_video(path) as container:
-        return bool(container.streams.video[0].codec_context.codec.lossy)
+        context = container.streams.video[0].codec_context
+        return int(context.color_trc), bool(context.codec.lossy)
 
 
 def _no_response(transfer: int) -> str:
