@@ -139,6 +139,25 @@ def count_chunks(
     return counts[1].reshape(shape), counts[0].reshape(shape)
 
 
+def thinned(events: EventArray, step: int) -> EventArray:
+    """Events of every ``step``-th column of every ``step``-th row, as of a sensor that has these pixels alone."""
+    left: EventArray = memory.empty((len(events),), EVENT_DTYPE)
+    return left[: _thinned(event_words(events), np.uint64(step), event_words(left))]
+
+
+@loop
+def _thinned(words, step, left):  # type: ignore[no-untyped-def]
+    count = 0
+    for i in range(len(words)):
+        word = words[i, 1]
+        row, column = event_row(word), event_column(word)
+        if row % step == 0 and column % step == 0:
+            left[count, 0] = words[i, 0]
+            left[count, 1] = (word >> 32) << 32 | np.int64(row // step) << 16 | np.int64(column // step)
+            count += 1
+    return count
+
+
 @loop
 def _count(words, counts, width, unit):  # type: ignore[no-untyped-def]
     for i in range(len(words)):

@@ -13,6 +13,7 @@ slowly does not seem late. What all frames have in common is no error of single 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
@@ -23,6 +24,7 @@ from scipy.linalg import solveh_banded
 from kalux.calibration.alignment import levels
 from kalux.calibration.intervals import Interval, intervals
 from kalux.calibration.regression import huber_weights, robust_deviation
+from kalux.event_slices import joined_events, thinned
 from kalux.recording import Recording
 from kalux.settings import CameraSettings, EventSettings
 
@@ -45,6 +47,9 @@ _MARGIN: Final = 80_000
 """us around an interval in which events are looked at: `_FAREST`, and some more for the steps before."""
 
 _HALF_STEP: Final = 1_000  # us, of the rate
+_MOST_PIXELS: Final = 90_000
+"""Of larger sensors every second row and column is looked at, or fewer: those of a DAVIS346 tell a time to some tens of
+us."""
 _LEAST_PIXELS: Final = 200
 _ALIKE: Final = 9.0  # neighbouring pixels that say the same
 _LEAST_ERROR: Final = 0.02  # log intensity
@@ -249,13 +254,15 @@ def _of_interval(
         round(end + delay + error) for end, error in zip((interval.start, interval.end), errors, strict=True)
     ]
     times = np.array([t + step for t in middles for step in (-_HALF_STEP, 0, _HALF_STEP)], np.int64)
-    if (np.diff(times) < 0).any() or len(interval.events) == 0:
+    if (np.diff(times) < 0).any() or not interval.chunks:
         return nothing
-    on, off = levels(interval.events, sensor_size, times)
+    step = _step(sensor_size)
+    usable, change = interval.usable[::step, ::step], interval.change[::step, ::step]
+    seen = interval.chunks if step == 1 else [thinned(chunk, step) for chunk in interval.chunks]
+    on, off = levels(joined_events(seen), usable.shape, times)
     threshold_on, threshold_off = events.thresholds
-    usable = interval.usable
     level = threshold_on * on[:, usable].astype(np.float64) - threshold_off * off[:, usable]
-    left = interval.change[usable] - (level[4] - level[1])
+    left = change[usable] - (level[4] - level[1])
     rates = np.stack([level[0] - level[2], level[5] - level[3]]) / (2 * _HALF_STEP)
     moving = (rates != 0).any(axis=0)
     if np.count_nonzero(moving) < _LEAST_PIXELS:
@@ -266,6 +273,11 @@ def _of_interval(
     weights = huber_weights(left)[0] / (_ALIKE * scales[index] ** 2)
     weighed = rates * weights
     return weighed @ rates.T, weighed @ left, float(weights @ np.square(left))
+
+
+def _step(sensor_size: tuple[int, int]) -> int:
+    """From one row, or column, that is looked at to the next."""
+    return math.ceil(math.sqrt(sensor_size[0] * sensor_size[1] / _MOST_PIXELS))
 
 
 def _joined(sums: Sequence[tuple[Array, Array, float]]) -> _Normal:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from kalux.calibration.alignment import MOST_FRAMES, Shots, align, intensities, take_shots
 from kalux.calibration.intervals import APART_IN_TIME, compared_frames, frames_apart
 from kalux.calibration.registration import Registration
+from kalux.compiled import event_column, event_is_on, event_row, event_words, loop
 from kalux.errors import InputError
 from kalux.event_slices import between
 from kalux.events import EVENT_DTYPE, EventArray, check_events
@@ -215,23 +216,33 @@ def _levels(
 ) -> Array | None:
     """Sums of the events of every cell, or of the whole image without a sign, up to every ms; None without events."""
     cells = _CELLS if signed else (1, 1)
+    rows, columns = (
+        np.arange(size) * count // size for size, count in zip(sensor_size, cells, strict=True)
+    )  # of cells, that pixels lie in
     counts = np.zeros(((last - first) // _BIN + 2, cells[0] * cells[1]))
     total = 0
     for chunk in chunks:
         inside = between(chunk, first, last)
         check_events(inside, sensor_size)
-        if len(inside):
-            row = inside["y"].astype(np.int64) * cells[0] // sensor_size[0]
-            column = inside["x"].astype(np.int64) * cells[1] // sensor_size[1]
-            place = (inside["t"] - first) // _BIN * counts.shape[1] + row * cells[1] + column
-            weight = np.where(inside["p"], 1.0, -1.0) if signed else None
-            counts += np.bincount(place, weight, counts.size).reshape(counts.shape)
-            total += len(inside)
+        off = -1.0 if signed else 1.0
+        _add_events(event_words(inside), first, rows * cells[1], columns, off, counts)
+        total += len(inside)
         if len(chunk) and chunk["t"][-1] > last:
             break
     if total == 0:
         return None
     return np.concatenate([np.zeros((1, counts.shape[1])), np.cumsum(counts, axis=0)])
+
+
+@loop
+def _add_events(words, first, rows, columns, off, counts):  # type: ignore[no-untyped-def]
+    """Add 1 for every on event and ``off`` for every other one to the ``counts`` of its bin and cell."""
+    for i in range(len(words)):
+        word = words[i, 1]
+        place = np.uint64(words[i, 0] - first) // np.uint64(_BIN)
+        counts[place, rows[event_row(word)] + columns[event_column(word)]] += (
+            1.0 if event_is_on(word) else off
+        )
 
 
 def _jackknifed(grid: NDArray[np.int64], found: Array, interval: float) -> float:

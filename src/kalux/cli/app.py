@@ -78,6 +78,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # of a damaged image kalux says it, in its line
+    os.environ.setdefault(
+        "OPENBLAS_NUM_THREADS", "1"
+    )  # more only wait, busily, for products that are all small
     hold_closed_streams()
     try:
         with termination_as_interrupt() as was_interrupted:
