@@ -256,9 +256,14 @@ def _add_drift(
         pixels = np.flatnonzero((segment.backward_variance >= UNMEASURED) & (events > 0))
         steps = _places(pixels, cursor.steps.shape)
         cursor.drifting = _Drifting(pixels, steps, drift.reshape(-1)[pixels], events.reshape(-1)[pixels])
-    pixels, steps, growth, count = cursor.drifting
-    coming = cursor.steps.reshape(-1)["coming"][steps] / count
-    variance.reshape(-1)[pixels] += growth * (np.float32(1.0) - coming)
+    _add_drift_so_far(*cursor.drifting, cursor.steps.reshape(-1), variance.reshape(-1))
+
+
+@loop
+def _add_drift_so_far(pixels, places, growth, events, steps, variance):  # type: ignore[no-untyped-def]
+    for i in range(len(pixels)):
+        coming = steps[places[i]].coming / events[i]
+        variance[pixels[i]] += growth[i] * (ONE - coming)
 
 
 def _places(pixels: NDArray[np.int64], padded: tuple[int, ...]) -> NDArray[np.int64]:

@@ -153,14 +153,18 @@ def calm_specks(
         return
     inside = np.zeros(image.size, np.bool_)
     inside[unmeasured] = True
-    before, known = image.copy().reshape(-1), variance.astype(np.float32, copy=False).reshape(-1)
-    _calm(before, known, np.float32(log_offset), unmeasured, inside, image.shape, image.reshape(-1))
+    known = variance.astype(np.float32, copy=False).reshape(-1)
+    calmed = image.reshape(-1)[unmeasured]
+    _calm(image.reshape(-1), known, np.float32(log_offset), unmeasured, inside, image.shape, calmed)
+    image.reshape(-1)[unmeasured] = calmed
 
 
 @loop
-def _calm(before, variance, log_offset, unmeasured, inside, shape, image):  # type: ignore[no-untyped-def]
+def _calm(before, variance, log_offset, unmeasured, inside, shape, calmed):  # type: ignore[no-untyped-def]
+    """Take those of the ``unmeasured`` pixels down in ``calmed``, their values ``before``."""
     height, width = shape
-    for pixel in unmeasured:
+    for k in range(len(unmeasured)):
+        pixel = unmeasured[k]
         row, column = pixel // width, pixel % width
         if row == 0 or column == 0 or row == height - 1 or column == width - 1:
             continue
@@ -177,7 +181,7 @@ def _calm(before, variance, log_offset, unmeasured, inside, shape, image):  # ty
         quarter = np.float32(0.25)
         beside, ground = quarter * beside, quarter * smaller(apart, beside)
         most = ground + _PEAK * (beside - ground + quarter * np.sqrt(doubt))
-        image[pixel] = smaller(before[pixel], larger(most, brightest))
+        calmed[k] = smaller(before[pixel], larger(most, brightest))
 
 
 def smoothed_unshown(
