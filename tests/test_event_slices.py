@@ -16,6 +16,7 @@ from kalux.event_slices import (
     events_until,
     first_events,
     in_order,
+    thinned,
     whole_row_delays,
     with_delay_of_rows,
 )
@@ -76,6 +77,17 @@ def test_chunks_count_together_and_weights_only_where_they_are_asked_for():
     for counted, expected in zip(sums, count_chunks(whole, stream.sensor_size, weighed=True), strict=True):
         np.testing.assert_allclose(counted, expected, rtol=1e-6)
     assert sum(map(np.sum, sums)) > 1.1 * sum(map(np.sum, ones))
+
+
+@given(st.integers(0, 1000), st.integers(1, 5))
+def test_thinned_events_are_those_of_every_nth_pixel(seed, step):
+    stream = random_stream(seed).events
+    kept = stream[(stream["y"] % step == 0) & (stream["x"] % step == 0)]
+    found = thinned(stream, step)
+    for name in ("t", "p"):
+        np.testing.assert_array_equal(found[name], kept[name])
+    for name in ("x", "y"):
+        np.testing.assert_array_equal(found[name], kept[name] // step)
 
 
 def test_rows_are_late_by_their_distance_from_the_middle():

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kalux import Recording
+from kalux.calibration import frame_times
 from kalux.calibration.frame_times import FrameTimes, _in_order, find_frame_times
 from kalux.datasets import SensorSettings, simulate
 from kalux.datasets.motion import pan, still
@@ -26,15 +27,15 @@ KNOWN = altered(PRESETS["default"], "events", threshold_on=0.2, threshold_off=0.
 OFF = np.array([0, 3_500, -4_000, 2_000, -1_500, 4_000, -3_000, 500, 3_000, -4_500, 1_000, 0])
 
 
-def filmed(motion=None, **sensor):
-    seen = photograph_scene(blocks(), motion or pan(80.0), sensor_size=SIZE, duration=500_000)
+def filmed(motion=None, size=SIZE, **sensor):
+    seen = photograph_scene(blocks(), motion or pan(80.0), sensor_size=size, duration=500_000)
     made = simulate(seen, SensorSettings(**{"threshold_on": 0.2, "threshold_off": 0.2, **sensor}), seed=1)
     return made.events, made.frames
 
 
 def recorded(events, frames, off=None):
     """A recording whose stamps are ``off`` by so much, us."""
-    source = Recording.from_arrays(events, frames, sensor_size=SIZE)
+    source = Recording.from_arrays(events, frames, sensor_size=frames[0].image.shape)
     return source if off is None else with_shifted_frames(source, -off[: len(frames)])
 
 
@@ -50,6 +51,15 @@ def test_stamps_that_are_off_are_found():
     wrong = times.shifts - OFF[: len(frames)]
     assert np.std(wrong[1:-1]) < 0.15 * np.std(OFF)
     assert times.spread == pytest.approx(np.std(OFF), rel=0.25)
+
+
+def test_of_many_pixels_some_tell_enough(monkeypatch):
+    events, frames = filmed(pan(120.0), (96, 128), noise_rate=2.0, read_noise=0.005)
+    monkeypatch.setattr(frame_times, "_MOST_PIXELS", 4_000)  # every second row and column
+    times = found(recorded(events, frames, OFF))
+    assert times is not None
+    wrong = times.shifts - OFF[: len(frames)]
+    assert np.std(wrong[1:-1]) < 0.15 * np.std(OFF)
 
 
 @pytest.mark.parametrize("motion", [pan(80.0), pan(20.0), still()])
