@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -270,10 +271,32 @@ def test_smooth_parts_say_no_more_than_the_usual_where_texture_moves():
     bright = np.full(RAMP.shape, 0.4)
     texture = rng.normal(0, 1, RAMP.shape) * np.linspace(0.01, 0.1, 200)
     assert usual_noise(still(bright, 0.002, 0.0, changes=texture), CAMERA) == (usual, 0.0, False)
-    fine = rng.normal(0, 0.03, RAMP.shape)
+    fine = cv2.GaussianBlur(rng.normal(0, 0.12, RAMP.shape), (0, 0), 0.6)  # as lenses make it
     assert usual_noise(still(bright, 0.002, 0.0, changes=fine), CAMERA) == (usual, 0.0, False)
     least = usual_noise(still(bright, 0.002, 0.0, changes=texture / 8), CAMERA)
     assert np.hypot(0.002, LEVEL) < np.sqrt(least.read**2 + 0.4 * least.shot) < usual
+
+
+@pytest.mark.parametrize("deviation", [0.025, 0.06])
+@pytest.mark.parametrize("electrons", [np.inf, 400.0])
+def test_what_is_as_fine_as_noise_is_noise_however_much(deviation, electrons):
+    """Light that comes and goes in slopes leaves it; it grows from darker parts to brighter ones."""
+    changes = np.broadcast_to(0.1 * np.sin(np.arange(200) / 15), RAMP.shape)
+    light = np.broadcast_to(np.linspace(0.25, 0.7, 200), RAMP.shape)
+    found = usual_noise(still(light, deviation, 1 / electrons, changes=changes), CAMERA)
+    for level in (0.3, 0.6):
+        true = np.sqrt(deviation**2 + LEVEL**2 + level / electrons)
+        assert np.sqrt(found.read**2 + level * found.shot) == pytest.approx(true, rel=0.1)
+    assert not found.is_doubtful  # by pixels that black cuts off
+
+
+def test_dark_pixels_do_not_bound_noise_that_black_cuts_off():
+    """Flat parts beside them, which are brighter, say more."""
+    dark = np.where(np.arange(200) < 100, 0.015, np.linspace(0.13, 0.2, 200))
+    changes = np.where(np.arange(200) < 100, 0.0, 0.05 * np.sin(np.arange(200) / 15))
+    light = np.broadcast_to(np.where(np.arange(200) < 40, 0.09, dark), RAMP.shape)
+    found = usual_noise(still(light, 0.04, 0.0, changes=changes), CAMERA)
+    assert found.read == pytest.approx(0.04, rel=0.15)
 
 
 def test_smooth_parts_are_bright_but_not_clipped_and_not_in_rgb():

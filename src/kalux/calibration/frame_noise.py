@@ -87,7 +87,18 @@ _ALIKE: Final = 1.25
 is texture, they differ."""
 
 _MOST_USUAL: Final = 2.0
-"""Noise, in units of the usual, beyond which it is not believed, however alike these parts are."""
+"""Noise, in units of the usual, beyond which it is not believed, however alike these parts are, if it is not white."""
+
+_WHITE: Final = 2.0
+"""Largest ratio of what these parts have at twice the distance between pixels to what they have, for it to be white:
+1.2 to 2.0 with noise of 0.03 and 0.06 over 19 photographs, which all move; of their textures, where these are as much,
+2.5 to 3.5."""
+
+_LEAST_IN_THE_DARK: Final = 0.1
+"""Least variance at black, in units of that at their level."""
+
+_OF_WHITE: Final = 0.84
+"""What `_SMOOTHEST` of the parts have of white noise."""
 
 _LEAST_SMOOTH: Final = 20
 """Parts of a frame that are enough."""
@@ -280,6 +291,11 @@ class UsualNoise(NamedTuple):
     shot: float
     silent: bool
 
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether events may contradict, by pixels of up to 0.03 of white: not where black cuts these off."""
+        return not self.silent and self.read <= 2 * _DARKEST
+
 
 def usual_noise(recording: Recording, camera: CameraSettings, *, delay: int = 0) -> UsualNoise:
     """Read and shot noise where no photon transfer tells them: the usual at half of white, in the dark what it allows.
@@ -322,17 +338,27 @@ def usual_noise(recording: Recording, camera: CameraSettings, *, delay: int = 0)
             if np.count_nonzero(chosen) >= least:
                 into.append(trimmed_variance(difference[chosen]) / 2)
         of_flat.append(flat_noise(change))
-        of_smooth.append(smooth_noise(change) if of_flat[-1][0] is None else None)
+        darkest = of_flat[-1][0]
+        told = darkest is not None and darkest < _MOST_USUAL * usual
+        of_smooth.append(None if told else smooth_noise(change))
     flat, changes = typical_flat_noise(of_flat), of_silent or of_all
     smooth = typical_smooth_noise(of_smooth)
+    if flat is not None and flat > 2 * _DARKEST:  # black cuts off half of what pixels have that are so dark
+        changes = []
+    if smooth is not None and smooth.is_all_noise(usual):
+        black = smooth.in_the_dark(usual)
+        if flat is not None:
+            black = flat if _CUT * flat <= _DARK_PARTS[-1][0] else max(flat, black)
+        read = _possible_read(recording, camera, black)
+        return UsualNoise(read, smooth.shot(read, usual), silent=False)
     if flat is None and not changes and smooth is not None and smooth.is_told(usual):
-        read = _possible_read(recording, camera, smooth.in_the_dark)
-        return UsualNoise(read, smooth.shot(read), silent=False)
+        read = _possible_read(recording, camera, smooth.in_the_dark(usual))
+        return UsualNoise(read, smooth.shot(read, usual), silent=False)
     most = usual if flat is None else flat
     if changes:
         most = min(most, float(np.sqrt(np.median(changes))))
     read = _possible_read(recording, camera, most)
-    return UsualNoise(read, _shot(read, usual), silent=bool(of_silent))
+    return UsualNoise(read, _shot(read, usual), silent=bool(of_silent and changes))
 
 
 class SmoothNoise(NamedTuple):
@@ -346,11 +372,19 @@ class SmoothNoise(NamedTuple):
         Their mean intensity.
     next_deviation
         The same of those that come next.
+    coarser
+        What the smoothest parts have if pixels twice as far apart are compared, in units of ``deviation``: 1 of white
+        noise, more of texture.
+    growth
+        By how much the variance of the smoothest of the brighter half of all parts is more than that of the darker
+        half's, over the difference of their levels, in units of ``deviation``^2.
     """
 
     deviation: float
     level: float
     next_deviation: float
+    coarser: float
+    growth: float
 
     @property
     def is_noise(self) -> bool:
@@ -365,13 +399,28 @@ class SmoothNoise(NamedTuple):
         return self.deviation < usual or (self.is_noise and self.deviation < _MOST_USUAL * usual)
 
     @property
-    def in_the_dark(self) -> float:
-        """Standard deviation at black."""
-        return self.deviation / float(np.sqrt(1.0 + _BRIGHTER * self.level))
+    def is_white(self) -> bool:
+        """Whether it is as fine as noise, and no texture."""
+        return self.coarser <= _WHITE
 
-    def shot(self, read: float) -> float:
+    def is_all_noise(self, usual: float) -> bool:
+        """Whether it is far more than the ``usual``, and noise all the same."""
+        return self.is_noise and self.is_white and self.deviation >= _MOST_USUAL * usual
+
+    def of_level(self, usual: float) -> float:
+        """Standard deviation of all pixels at the level: where it is all noise, these parts have the least of it."""
+        return self.deviation / (_OF_WHITE if self.is_all_noise(usual) else 1.0)
+
+    def in_the_dark(self, usual: float) -> float:
+        """Standard deviation at black; where it is all noise, by how it grows from darker parts to brighter ones."""
+        if not self.is_all_noise(usual):
+            return self.deviation / float(np.sqrt(1.0 + _BRIGHTER * self.level))
+        most = (1.0 - _LEAST_IN_THE_DARK) / self.level
+        return self.of_level(usual) * float(np.sqrt(1.0 - min(max(self.growth, 0.0), most) * self.level))
+
+    def shot(self, read: float, usual: float) -> float:
         """Shot noise with which the noise at the level is this, with ``read`` in the dark; none if that is more."""
-        return max(self.deviation**2 - read**2, 0.0) / self.level
+        return max(self.of_level(usual) ** 2 - read**2, 0.0) / self.level
 
 
 def smooth_noise(change: FrameChange) -> SmoothNoise | None:
@@ -383,14 +432,34 @@ def smooth_noise(change: FrameChange) -> SmoothNoise | None:
     """
     if not change.is_own:
         return None
-    beyond = cv2.filter2D(change.change, cv2.CV_64F, _of_one_colour(_WITHOUT_SLOPES, change.pitch))
-    squares, levels = _parts(beyond * beyond).mean(1) / 2, _parts(change.level).mean(1)
+    squares, coarse = (
+        _parts(beyond * beyond).mean(1) / 2
+        for beyond in (
+            cv2.filter2D(change.change, cv2.CV_64F, _of_one_colour(_WITHOUT_SLOPES, apart * change.pitch))
+            for apart in (1, 2)
+        )
+    )
+    levels = _parts(change.level).mean(1)
     whole = _parts(change.usable).all(1) & (levels > _DARK_PARTS[-1][-1])
     if np.count_nonzero(whole) < _LEAST_SMOOTH:
         return None
     found = np.sqrt(squares[whole])
     first, after = np.quantile(found, (_SMOOTHEST, _NEXT_SMOOTHEST))
-    return SmoothNoise(float(first), float(levels[whole][found <= first].mean()), float(after))
+    level, fine, coarser = (float(of[whole][found <= first].mean()) for of in (levels, squares, coarse))
+    coarser = float(np.sqrt(coarser / max(fine, _LEAST_READ**2)))
+    growth = _growth(levels[whole], squares[whole]) / max(float(first), _LEAST_READ) ** 2
+    return SmoothNoise(float(first), level, float(after), coarser, growth)
+
+
+def _growth(levels: Array, squares: Array) -> float:
+    """By how much the smoothest brighter parts have more than the smoothest darker ones, over their difference."""
+    brighter = levels > np.median(levels)
+    if brighter.all() or not brighter.any():
+        return 0.0
+    (dark, less), (bright, more) = (
+        (levels[half].mean(), np.quantile(squares[half], _SMOOTHEST)) for half in (~brighter, brighter)
+    )
+    return float((more - less) / (bright - dark))
 
 
 def typical_smooth_noise(found: list[SmoothNoise | None]) -> SmoothNoise | None:

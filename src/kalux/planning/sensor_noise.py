@@ -62,7 +62,7 @@ def with_frame_noise(
     if found is not None and not found.is_reliable:
         found = None
     noise = usual_noise(recording, camera, delay=delay) if found is None else found
-    doubted = isinstance(noise, UsualNoise) and not noise.silent and camera.shot_noise is None
+    doubted = isinstance(noise, UsualNoise) and noise.is_doubtful and camera.shot_noise is None
     of_blocks = 0.0 if compression is None else _TYPICAL * compression.error
     read = float(np.hypot(noise.read, of_blocks))
     filled = completed(settings, "camera", frame_noise=read, shot_noise=noise.shot)
