@@ -181,12 +181,9 @@ def dark_levels(read, shot, i0):
         return [0.0], [0.0]
     step = max(1, int(clean * 255 / 4)) / 255
     levels = [k * step for k in range(int(12 * clean / step) + 1)]
-    weights = [(max(b, 1.5 * read) + i0) ** 2 / (read**2 + shot * b) for b in levels]
     rows, wanted = [], []
     for i in np.linspace(0, 8 * clean, 200):
-        deviation = np.sqrt(clean**2 + shot * i) * np.sqrt(2)
-        below = [0.0] + [(1 + erf((b + step / 2 - i) / deviation)) / 2 for b in levels[:-1]] + [1.0]
-        share = np.diff(below) * weights
+        share = weights_of(levels, i, read, shot, i0)
         share /= share.sum()
         rows.append(share[None])
         wanted.append([np.log(i + i0)])
@@ -197,6 +194,41 @@ def dark_levels(read, shot, i0):
     value = np.linalg.lstsq(np.concatenate(rows), np.concatenate(wanted), rcond=None)[0]
     added = value - np.log(np.array(levels) + i0)
     return levels, added * np.clip((8 * clean - np.array(levels)) / (2 * clean), 0, 1)
+
+
+def weights_of(levels, i, read, shot, i0):
+    """K3: probabilities that an intensity i reads levels, times how much these count."""
+    clean, step = np.sqrt(read**2 - (1 / 255) ** 2 / 12), levels[1] - levels[0]
+    deviation = np.sqrt(clean**2 + shot * i) * np.sqrt(2)
+    below = [0.0] + [(1 + erf((b + step / 2 - i) / deviation)) / 2 for b in levels[:-1]] + [1.0]
+    return np.diff(below) * [(max(b, 1.5 * read) + i0) ** 2 / (read**2 + shot * b) for b in levels]
+
+
+@lru_cache
+def dark_doubts(read, shot, i0):
+    """K11: by intensities shown, what the mean of frames is wrong by where noise hides the light below black."""
+    levels, added = dark_levels(read, shot, i0)
+    clean = np.sqrt(max(read**2 - (1 / 255) ** 2 / 12, 0))
+    if len(levels) == 1 or clean < 4 * i0:
+        return [0.0, 1.0], [0.0, 0.0]
+    shown = np.linspace(0, 4 * clean, 65)
+    found = []
+    for i in np.geomspace(i0, 4 * clean + i0, 200) - i0:
+        weights = weights_of(levels, i, read, shot, i0)
+        mean = np.sum(weights * (np.log(np.array(levels) + i0) + added)) / np.sum(weights)
+        found.append((mean, (mean - np.log(i + i0)) ** 2, 1 / np.sum(weights) / 4))  # of a mean of four
+    doubts = []
+    for one in shown[:-1]:
+        chances = [
+            -((np.log(one + i0) - mean) ** 2) / (2 * noise) - np.log(noise) / 2 for mean, _, noise in found
+        ]
+        chances = np.exp(np.array(chances) - max(chances))
+        doubts.append(np.sum(chances * [wrong for _, wrong, _ in found]) / np.sum(chances))
+    return shown, [*doubts, 0.0]
+
+
+def with_dark_doubt(variance, intensity, camera):
+    return variance + np.interp(intensity, *dark_doubts(*camera.noise, camera.offset))
 
 
 def dark_correction(intensity, read, shot, i0):

@@ -8,6 +8,7 @@ import pytest
 from kalux.filters.uncertainty import Around
 from kalux.images import Estimate, View, make_image
 from kalux.models.camera import Response
+from kalux.models.dark_levels import DarkDoubt
 
 from builders import unshown
 
@@ -23,6 +24,7 @@ GREY = View(
     fixed_pattern=0.0,
     response=None,
     rounding=0.0,
+    dark=None,
     mosaic=None,
     gains=(1.0, 1.0, 1.0),
 )
@@ -92,6 +94,17 @@ def test_still_pixels_are_no_surer_than_the_rounding_that_their_frames_share():
     image, before = make_image(known, view), make_image(known, GREY)
     np.testing.assert_allclose(image.variance[0, 0], 0.1**2 / 2, rtol=1e-4)
     np.testing.assert_array_equal(image.variance[0, 1:], before.variance[0, 1:])
+    np.testing.assert_array_equal(image.intensity, before.intensity)
+    assert np.isinf(make_image(known, view, with_variance=False).variance).all()
+
+
+def test_what_noise_hides_below_black_is_doubted_and_shown_as_before():
+    view = dataclasses.replace(GREY, dark=DarkDoubt(0.1, np.array([0.5, 0.0], np.float32)))
+    known = estimate(
+        [[0.05, 0.95]], moving=np.zeros((1, 2), bool), silent_change=np.zeros((1, 2), np.float32)
+    )
+    image, before = make_image(known, view), make_image(known, GREY)
+    np.testing.assert_allclose(image.variance - before.variance, [[0.25, 0.0]], rtol=1e-3, atol=1e-7)
     np.testing.assert_array_equal(image.intensity, before.intensity)
     assert np.isinf(make_image(known, view, with_variance=False).variance).all()
 

@@ -24,6 +24,7 @@ from kalux.filters.uncertainty import (
     UNSHOWN_SHARE,
     Around,
     add_blurred,
+    add_dark_doubt,
     add_pattern,
     before_averaging,
     given_variance,
@@ -33,6 +34,7 @@ from kalux.filters.uncertainty import (
 from kalux.frames import Mosaic
 from kalux.models.camera import Response
 from kalux.models.colour import Gains, calm_highlights, demosaic, luminance
+from kalux.models.dark_levels import DarkDoubt
 
 _INFINITE: Final = np.full(1, np.inf, np.float32)
 """The variance of all pixels where it is not wanted."""
@@ -176,6 +178,8 @@ class View:
         Of grey frames whose response bends; None: stored values are light.
     rounding
         Standard deviation of the rounding that all frames of a still pixel share (K11), white = 1; 0: none.
+    dark
+        What frames of the usual exposure may be wrong by in the dark (K11); None: hardly anything.
     mosaic, gains
         Pattern of a Bayer sensor, None of others, and its white balance.
     """
@@ -191,6 +195,7 @@ class View:
     fixed_pattern: float
     response: Response | None
     rounding: float
+    dark: DarkDoubt | None
     mosaic: Mosaic | None
     gains: Gains
 
@@ -270,6 +275,8 @@ def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) ->
         add_blurred(total, change, estimate.around, estimate.exposed, view.threshold2)
     if with_variance and moving is not None and view.rounding > 0:
         keep_rounding(total, intensity, moving, view.log_offset, view.rounding * white)
+    if with_variance and moving is not None and view.dark is not None:
+        add_dark_doubt(total, intensity, view.dark)
     image = Image(estimate.t, intensity, total, view.log_offset, estimate.final, fixed_pattern=pattern)
     colour = _coloured(image, estimate, view, white)
     return image if colour is None else dataclasses.replace(image, colour=colour)

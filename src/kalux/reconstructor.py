@@ -39,8 +39,9 @@ from kalux.filters.shots import Shot, take_shot
 from kalux.filters.uncertainty import changed_within, subthreshold_variance
 from kalux.frames import Frame, check_frame, with_black_level
 from kalux.images import Estimate, Image, View, make_image
-from kalux.models.camera import Camera, beyond_white, count_bright, repeated_rounding
+from kalux.models.camera import Camera, beyond_white, count_bright, repeated_rounding, rounding_error
 from kalux.models.colour import Gains, white_balance
+from kalux.models.dark_levels import DarkDoubt, dark_doubt
 from kalux.models.pixels import CALIBRATION_NEEDED, Measured, PixelCalibration, require_size
 from kalux.moments import Moment
 from kalux.settings import SETTINGS_NEEDED, USUAL_PATTERN, Settings
@@ -519,9 +520,17 @@ class Reconstructor:
             fixed_pattern=self._pattern_of(frame),
             response=None if self._camera.response.is_linear else self._camera.response,
             rounding=repeated_rounding(frame, self.settings.camera),
+            dark=self._dark_doubt(frame),
             mosaic=frame.mosaic,
             gains=(1.0, 1.0, 1.0) if frame.mosaic is None else self._gains_of(frame),
         )
+
+    def _dark_doubt(self, frame: Frame) -> DarkDoubt | None:
+        """What noise hides below black; None where it is not known, or not that of the levels (K3)."""
+        camera = self.settings.camera
+        if camera.frame_noise is None or not camera.is_linear or frame.image.ndim == 3:
+            return None
+        return dark_doubt(camera.noise, camera.offset, 2.0 * rounding_error(frame))
 
     def _pattern_of(self, frame: Frame) -> float:
         """The fixed pattern that the variance counts: the usual one where no plan has looked for it in grey frames."""

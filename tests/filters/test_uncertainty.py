@@ -15,6 +15,7 @@ from kalux.filters.uncertainty import (
     UNMEASURED_SHARE,
     Around,
     add_blurred,
+    add_dark_doubt,
     add_pattern,
     before_averaging,
     changed_within,
@@ -23,6 +24,7 @@ from kalux.filters.uncertainty import (
     known_variance,
     subthreshold_variance,
 )
+from kalux.models.dark_levels import DarkDoubt
 
 C2 = 0.04
 STILL = np.zeros((1, 2), bool)
@@ -90,6 +92,14 @@ def test_rounding_that_frames_share_bounds_the_variance_of_still_pixels():
     intensity = np.array([[0.0, 0.3, 0.0, 0.0]], np.float32)
     keep_rounding(variance, intensity, np.array([[False, False, True, False]]), 0.1, 0.02)
     np.testing.assert_allclose(variance, [[0.2**2 / 2, 0.05**2 / 2, 1e-4, 0.5]], rtol=1e-5)
+
+
+def test_what_noise_hides_below_black_is_doubted_by_the_intensity():
+    """Between those at which it is told it is interpolated, and none beyond the last."""
+    variance = np.full((1, 5), 0.5, np.float32)
+    intensity = np.array([[0.0, 0.005, 0.01, 0.02, 3.0]], np.float32)
+    add_dark_doubt(variance, intensity, DarkDoubt(0.01, np.array([0.4, 0.2, 0.0], np.float32)))
+    np.testing.assert_allclose(variance, [[0.9, 0.8, 0.7, 0.5, 0.5]], rtol=1e-6)
 
 
 @given(variances, variances, st.floats(0.0, 30.0), st.floats(0.0, 0.1), st.floats(0.0, 0.1))

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kalux.models.camera import frame_log_covariance, log_intensity
-from kalux.models.dark_levels import dark_correction
+from kalux.models.dark_levels import dark_correction, dark_doubt
 
 GAP = 1 / 255
 LEVELS = np.arange(256) * GAP
@@ -72,3 +72,26 @@ def test_brightness_has_no_unit(noise, shot, offset, gap, white):
     scaled = dark_correction(white * intensity, (noise, shot), white, white * offset, white * gap)
     assert np.isfinite(added).all()
     np.testing.assert_allclose(scaled, added, atol=1e-6)
+
+
+@pytest.mark.parametrize("noise", [0.03, 0.06])
+def test_what_is_hidden_below_black_is_doubted_by_as_much_as_means_are_wrong(noise):
+    """By how much those of a hundred intensities are, all as likely in log(I + I_0), that show about the same."""
+    both = (float(np.hypot(noise, GAP / 12**0.5)), 0.0)
+    added = dark_correction(LEVELS, both, 1.0, OFFSET, GAP)
+    light = np.geomspace(OFFSET, noise + OFFSET, 40) - OFFSET
+    wrong = np.array([error_of_mean(i, noise, added) for i in light])
+    shown = np.exp(wrong + np.log(light + OFFSET)) - OFFSET
+    doubt = dark_doubt(both, OFFSET, GAP)
+    told = np.interp(shown, np.arange(len(doubt.variances)) * doubt.spacing, doubt.variances)
+    assert 0.8 < np.sqrt(np.mean(wrong**2) / np.mean(told)) < 1.25
+    assert told[0] > 0.25
+
+
+def test_nothing_is_doubted_that_noise_does_not_hide():
+    assert dark_doubt((0.008, 0.0), OFFSET, GAP) is None
+    assert dark_doubt((0.001, 0.0), 1e-5, GAP) is None  # frames are only rounded
+    doubt = dark_doubt((0.03, 0.001), OFFSET, GAP)
+    assert doubt.variances[-1] == 0
+    assert doubt.spacing * (len(doubt.variances) - 1) == pytest.approx(4 * np.sqrt(0.03**2 - GAP**2 / 12))
+    assert (doubt.variances[doubt.spacing * np.arange(len(doubt.variances)) > 0.06] < 1e-3).all()

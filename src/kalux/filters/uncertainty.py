@@ -18,6 +18,7 @@ from kalux.augmentation.bridge import RANDOM, UNMEASURED, bridge_variance
 from kalux.augmentation.subthreshold import UNKNOWN_CHANGE, told_by_none
 from kalux.compiled import FUSED, ZERO, empty, larger, loop, smaller, zeros
 from kalux.filters.readout import CORRELATED, Subthreshold
+from kalux.models.dark_levels import DarkDoubt
 
 Array = NDArray[np.floating[Any]]
 
@@ -419,3 +420,31 @@ def _keep_rounding(variance, intensity, moving, log_offset, deviation):  # type:
     for i in range(np.uint64(len(variance))):
         least = larger(variance[i], _of_logarithm(deviation, intensity[i], log_offset))
         variance[i] = variance[i] if moving[i] else least
+
+
+def add_dark_doubt(variance: NDArray[np.float32], intensity: Array, doubt: DarkDoubt) -> None:
+    """Add what the mean of frames may be wrong by where noise hides the light below black (K11). In place.
+
+    Parameters
+    ----------
+    variance
+        (H, W), contiguous.
+    intensity
+        (H, W) I.
+    doubt
+        By I.
+    """
+    planes = variance, np.ascontiguousarray(intensity)
+    _add_dark_doubt(
+        *(plane.reshape(-1) for plane in planes), np.float32(1.0 / doubt.spacing), doubt.variances
+    )
+
+
+@loop(fastmath=FUSED)
+def _add_dark_doubt(variance, intensity, per_step, table):  # type: ignore[no-untyped-def]
+    last = np.float32(len(table) - 1)
+    for i in range(np.uint64(len(variance))):
+        place = smaller(larger(np.float32(intensity[i]) * per_step, ZERO), last)
+        step = smaller(np.int64(place), len(table) - 2)
+        share = place - np.float32(step)
+        variance[i] += table[step] + share * (table[step + 1] - table[step])
