@@ -48,8 +48,7 @@ _MARGIN: Final = 80_000
 
 _HALF_STEP: Final = 1_000  # us, of the rate
 _MOST_PIXELS: Final = 90_000
-"""Of larger sensors every second row and column is looked at, or fewer: those of a DAVIS346 tell a time to some tens of
-us."""
+"""About those of a DAVIS346, which all count: of larger sensors every second row and column is looked at, or fewer."""
 _LEAST_PIXELS: Final = 200
 _ALIKE: Final = 9.0  # neighbouring pixels that say the same
 _LEAST_ERROR: Final = 0.02  # log intensity

@@ -216,9 +216,8 @@ def _levels(
 ) -> Array | None:
     """Sums of the events of every cell, or of the whole image without a sign, up to every ms; None without events."""
     cells = _CELLS if signed else (1, 1)
-    rows, columns = (
-        np.arange(size) * count // size for size, count in zip(sensor_size, cells, strict=True)
-    )  # of cells, that pixels lie in
+    # Of the cells that pixels lie in.
+    rows, columns = (np.arange(size) * count // size for size, count in zip(sensor_size, cells, strict=True))
     counts = np.zeros(((last - first) // _BIN + 2, cells[0] * cells[1]))
     total = 0
     for chunk in chunks:

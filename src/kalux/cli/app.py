@@ -80,7 +80,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # of a damaged image kalux says it, in its line
     os.environ.setdefault(
         "OPENBLAS_NUM_THREADS", "1"
-    )  # more only wait, busily, for products that are all small
+    )  # products are small: a second one would only wait, busily
     hold_closed_streams()
     try:
         with termination_as_interrupt() as was_interrupted:
