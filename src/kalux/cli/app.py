@@ -78,9 +78,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # of a damaged image kalux says it, in its line
-    os.environ.setdefault(
-        "OPENBLAS_NUM_THREADS", "1"
-    )  # products are small: a second one would only wait, busily
+    # Its products are small: a second thread would only wait, busily.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     hold_closed_streams()
     try:
         with termination_as_interrupt() as was_interrupted:
