@@ -345,14 +345,12 @@ def usual_noise(recording: Recording, camera: CameraSettings, *, delay: int = 0)
     smooth = typical_smooth_noise(of_smooth)
     if flat is not None and flat > 2 * _DARKEST:  # black cuts off half of what pixels have that are so dark
         changes = []
-    if smooth is not None and smooth.is_all_noise(usual):
+    alone = flat is None and not changes
+    if smooth is not None and (smooth.is_all_noise(usual) or (alone and smooth.is_told(usual))):
         black = smooth.in_the_dark(usual)
         if flat is not None:
             black = flat if _CUT * flat <= _DARK_PARTS[-1][0] else max(flat, black)
         read = _possible_read(recording, camera, black)
-        return UsualNoise(read, smooth.shot(read, usual), silent=False)
-    if flat is None and not changes and smooth is not None and smooth.is_told(usual):
-        read = _possible_read(recording, camera, smooth.in_the_dark(usual))
         return UsualNoise(read, smooth.shot(read, usual), silent=False)
     most = usual if flat is None else flat
     if changes:
@@ -432,23 +430,24 @@ def smooth_noise(change: FrameChange) -> SmoothNoise | None:
     """
     if not change.is_own:
         return None
-    squares, coarse = (
-        _parts(beyond * beyond).mean(1) / 2
-        for beyond in (
-            cv2.filter2D(change.change, cv2.CV_64F, _of_one_colour(_WITHOUT_SLOPES, apart * change.pitch))
-            for apart in (1, 2)
-        )
-    )
     levels = _parts(change.level).mean(1)
     whole = _parts(change.usable).all(1) & (levels > _DARK_PARTS[-1][-1])
     if np.count_nonzero(whole) < _LEAST_SMOOTH:
         return None
-    found = np.sqrt(squares[whole])
-    first, after = np.quantile(found, (_SMOOTHEST, _NEXT_SMOOTHEST))
-    level, fine, coarser = (float(of[whole][found <= first].mean()) for of in (levels, squares, coarse))
-    coarser = float(np.sqrt(coarser / max(fine, _LEAST_READ**2)))
-    growth = _growth(levels[whole], squares[whole]) / max(float(first), _LEAST_READ) ** 2
-    return SmoothNoise(float(first), level, float(after), coarser, growth)
+    levels, fine, coarse = levels[whole], _beyond_slopes(change, 1)[whole], _beyond_slopes(change, 2)[whole]
+    found = np.sqrt(fine)
+    first, after = (float(value) for value in np.quantile(found, (_SMOOTHEST, _NEXT_SMOOTHEST)))
+    smoothest = found <= first
+    ratio = coarse[smoothest].mean() / max(fine[smoothest].mean(), _LEAST_READ**2)
+    growth = _growth(levels, fine) / max(first, _LEAST_READ) ** 2
+    return SmoothNoise(first, float(levels[smoothest].mean()), after, float(np.sqrt(ratio)), growth)
+
+
+def _beyond_slopes(change: FrameChange, apart: int) -> NDArray[Any]:
+    """(N,) noise of every part, a variance, by `_WITHOUT_SLOPES` over pixels of one colour, ``apart`` of its pitch."""
+    kernel = _of_one_colour(_WITHOUT_SLOPES, apart * change.pitch)
+    beyond = cv2.filter2D(change.change, cv2.CV_64F, kernel)
+    return np.asarray(_parts(beyond * beyond).mean(1) / 2)
 
 
 def _growth(levels: Array, squares: Array) -> float:

@@ -201,7 +201,7 @@ class _Normals(NamedTuple):
             ends = float(errors[index]), float(errors[index + 1])
             if index == len(self.scales):
                 self.scales.append(0.0)
-            sums.append(_of_interval(interval, recording.sensor_size, self.events, ends, self.scales, index))
+            sums.append(_of_interval(interval, self.events, ends, self.scales, index))
         return _joined(sums)
 
 
@@ -237,7 +237,6 @@ def _moved(equations: _Normal, errors: Array, common: Array) -> Array:
 
 def _of_interval(
     interval: Interval,
-    sensor_size: tuple[int, int],
     events: EventSettings,
     errors: tuple[float, float],
     scales: list[float],
@@ -255,7 +254,7 @@ def _of_interval(
     times = np.array([t + step for t in middles for step in (-_HALF_STEP, 0, _HALF_STEP)], np.int64)
     if (np.diff(times) < 0).any() or not interval.chunks:
         return nothing
-    step = _step(sensor_size)
+    step = _step(interval.usable.size)
     usable, change = interval.usable[::step, ::step], interval.change[::step, ::step]
     seen = interval.chunks if step == 1 else [thinned(chunk, step) for chunk in interval.chunks]
     on, off = levels(joined_events(seen), usable.shape, times)
@@ -274,9 +273,9 @@ def _of_interval(
     return weighed @ rates.T, weighed @ left, float(weights @ np.square(left))
 
 
-def _step(sensor_size: tuple[int, int]) -> int:
-    """From one row, or column, that is looked at to the next."""
-    return math.ceil(math.sqrt(sensor_size[0] * sensor_size[1] / _MOST_PIXELS))
+def _step(pixels: int) -> int:
+    """From one row, or column, that is looked at to the next, of a sensor with so many ``pixels``."""
+    return math.ceil(math.sqrt(pixels / _MOST_PIXELS))
 
 
 def _joined(sums: Sequence[tuple[Array, Array, float]]) -> _Normal:

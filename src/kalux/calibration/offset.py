@@ -218,12 +218,11 @@ def _levels(
     cells = _CELLS if signed else (1, 1)
     # Of the cells that pixels lie in.
     rows, columns = (np.arange(size) * count // size for size, count in zip(sensor_size, cells, strict=True))
-    counts = np.zeros(((last - first) // _BIN + 2, cells[0] * cells[1]))
+    counts, off = np.zeros(((last - first) // _BIN + 2, cells[0] * cells[1])), -1.0 if signed else 1.0
     total = 0
     for chunk in chunks:
         inside = between(chunk, first, last)
         check_events(inside, sensor_size)
-        off = -1.0 if signed else 1.0
         _add_events(event_words(inside), first, rows * cells[1], columns, off, counts)
         total += len(inside)
         if len(chunk) and chunk["t"][-1] > last:

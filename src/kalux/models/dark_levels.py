@@ -110,8 +110,7 @@ def dark_doubt(noise: tuple[float, float], log_offset: float, gap: float) -> Dar
     if len(levels) == 1 or read < _HIDDEN * log_offset:
         return None
     intensity = np.geomspace(log_offset, _HIDES * read + log_offset, _INTENSITIES) - log_offset
-    weights = _shares(intensity, levels, np.sqrt(noise_variance(intensity, (read, noise[1]), 1.0)))
-    weights /= frame_log_covariance(levels, np.ones(len(levels)), noise, 1.0, log_offset)
+    weights = _weights(intensity, levels, noise, log_offset, gap)
     total = weights.sum(axis=1)
     mean = weights @ (log_intensity(levels, log_offset) + added) / total
     wrong = np.square(mean - log_intensity(intensity, log_offset))
@@ -138,14 +137,23 @@ def _correction(noise: tuple[float, float], log_offset: float, gap: float) -> tu
     levels = np.asarray(np.arange(int((_REACH + _BEYOND) * read / step) + 1) * step, np.float64)
     intensity = np.linspace(0.0, _REACH * read, _INTENSITIES, dtype=np.float64)
     told, wanted = log_intensity(levels, log_offset), log_intensity(intensity, log_offset)
-    share = _shares(intensity, levels, np.sqrt(noise_variance(intensity, (read, noise[1]), 1.0)))
-    share /= frame_log_covariance(levels, np.ones(len(levels)), noise, 1.0, log_offset)
+    share = _weights(intensity, levels, noise, log_offset, gap)
     share /= share.sum(axis=1, keepdims=True)
     # The sum over intensities of the squared error of the mean and of its variance is least.
     mean = share.T @ share
     normal = mean + (np.diag(share.sum(axis=0)) - mean) / _FRAMES
     added = np.linalg.solve(normal, share.T @ wanted - normal @ told)
     return levels, np.asarray(added * np.clip((_REACH * read - levels) / (_TAPER * read), 0.0, 1.0))
+
+
+def _weights(
+    intensity: Array, levels: Array, noise: tuple[float, float], log_offset: float, gap: float
+) -> Array:
+    """(M, N) probabilities that an intensity of M reads each level of N, times how much that counts; white = 1."""
+    own = _without_rounding(noise[0], gap), noise[1]
+    share = _shares(intensity, levels, np.sqrt(noise_variance(intensity, own, 1.0)))
+    share /= frame_log_covariance(levels, np.ones(len(levels)), noise, 1.0, log_offset)
+    return share
 
 
 def _shares(intensity: Array, levels: Array, deviation: Array) -> Array:
