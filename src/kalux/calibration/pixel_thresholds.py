@@ -33,7 +33,7 @@ from kalux.calibration.black_level import with_known_black
 from kalux.calibration.delay import estimate_delay
 from kalux.calibration.global_thresholds import Usual, estimate_thresholds
 from kalux.calibration.intervals import SOON_FOR_THRESHOLDS, Interval, intervals
-from kalux.calibration.refractory import Period, dead_time, shortest_interval
+from kalux.calibration.refractory import Period, counted_period, dead_time, shortest_interval
 from kalux.calibration.region import event_region
 from kalux.calibration.regression import (
     HUBER,
@@ -225,7 +225,7 @@ def _lost_period(recording: Recording, camera: CameraSettings, delay: int | None
     """
     shown = dead_time(recording)
     if shown:
-        return Period(shown), 0.0
+        return Period(counted_period(shown)), 0.0
     if delay is None:
         apparent = estimate_delay(recording, camera)
         delay = 0 if apparent is None else apparent.apparent

@@ -11,7 +11,7 @@ from kalux.calibration.fixed_pattern import FixedPattern, estimate_fixed_pattern
 from kalux.calibration.frame_noise import FrameNoise, UsualNoise, estimate_frame_noise, usual_noise
 from kalux.calibration.mismatch import Mismatch, estimate_mismatch
 from kalux.calibration.noise import event_noise
-from kalux.calibration.refractory import dead_time
+from kalux.calibration.refractory import counted_period, dead_time
 from kalux.models.pixels import PixelCalibration
 from kalux.recording import Recording
 from kalux.settings import USUAL_PATTERN, EventSettings, Settings, altered, completed
@@ -83,11 +83,11 @@ def with_fixed_pattern(recording: Recording, settings: Settings) -> tuple[Settin
 
 
 def with_dead_time(recording: Recording, settings: Settings) -> tuple[Settings, int]:
-    """Fill in the refractory period where noise events show it. Returned as well, us; 0 where they do not."""
+    """Fill in the refractory period where noise events show a dead time, which is returned, us; 0: they do not."""
     if settings.events.refractory_period is not None or not settings.filter.joins_frames:
         return settings, 0
     period = dead_time(recording)
-    return altered(settings, "events", refractory_period=period or None), period
+    return altered(settings, "events", refractory_period=counted_period(period) or None), period
 
 
 def with_step_errors(
