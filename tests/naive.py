@@ -474,6 +474,7 @@ def bridged(pixel, settings, times, on, off, scales):
     pixel.latents.append(first)
     intervals = [(begin, pixel.middles[0], None, first, scale_on, scale_off, var_on, var_off, 0.0, SURE)]
     untold_from = {}  # K1: variance of what no event tells, of the interval that begins there
+    moved_from = {}  # K1: by which its first frame is moved, of the mismatch
     for k in range(count - 1):
         second = latent(k + 1)
         pixel.measured.append(second[1] < UNMEASURED)
@@ -492,9 +493,14 @@ def bridged(pixel, settings, times, on, off, scales):
         q0, noise = ev.quantisation_variance * c2, first[1] + second[1]
         q0 += pixel.lost[k] or 0.0
         total += q_on * n_on + q_off * n_off + q0
+        no_error = 0.0  # K7: a bound that events lead below is reached from the other frame, or left to it
+        if min(first[1], second[1]) < UNMEASURED <= max(first[1], second[1]):
+            below = mismatch > 0 if second[1] >= UNMEASURED else mismatch < 0
+            no_error = max(first[1], second[1]) if below else 0.0
         untold = pixel.untold[k] if pixel.untold else q0
         untold_from[a] = untold
-        gain = mismatch / (total - q0 + untold)
+        gain = mismatch / (total - no_error - q0 + untold)
+        moved_from[a] = 0.0 if no_error == first[1] else first[1]
         intervals.append((a, b, first, second, scale_on, scale_off, var_on, var_off, gain, signal))
         told = (q0 / (noise + q0)) ** 2
         squared = min((q0 * mismatch / total) ** 2, c2) - noise * told
@@ -589,7 +595,7 @@ def bridged(pixel, settings, times, on, off, scales):
         if right is None:
             return prior
         (t_on, t_off), (n_on, n_off) = counts(a, known_until), counts(a, b)
-        shared = left[1] if min(left[1], right[1]) < UNMEASURED else 0.0  # two bounds measure nothing
+        shared = moved_from[a] if min(left[1], right[1]) < UNMEASURED else 0.0  # two bounds measure nothing
         shared += v_on * (f_on * on) ** 2 * t_on * n_on + v_off * (f_off * off) ** 2 * t_off * n_off
         shared += c2 * (step_noise(f_on, ev) * t_on + step_noise(f_off, ev) * t_off)
         shared += untold_from[a] * (t - a) / (b - a)
@@ -1017,6 +1023,11 @@ def hidden(pixels, place, moving, t, on, off, settings):
         _, silent, _, frames, _ = pixel.changes[k]
         waits = silent and min(frames) < UNMEASURED and (moving or max(frames) >= UNMEASURED)
         given = still / 2 + of_moving / 4 if waits else used
+        if silent and min(frames) < UNMEASURED <= max(frames):  # nothing ties it at the other frame
+            away = share if frames[0] < UNMEASURED else 1 - share
+            change = shown_change(pixels, place, k, c2, settings)
+            half = half_way(pixels, k, c2, settings.events.quantisation_variance * c2)
+            given = (half * change / 2 + 0.09 * c2 / 4) * (between / 2 + (away if away < 1 else 0))
         untied = max(0.09 * c2, of_moving)  # no frame ties what neither measures
         heard = untied if is_unmeasured(pixel, t) else used
         return heard, untied if min(frames) >= UNMEASURED else given

@@ -66,7 +66,8 @@ def test_smoothing_is_two_filters_combined_by_information():
             unsignalled = np.minimum(0.2 * 0.25 / 6 / np.sqrt(a.variance * b.variance), 1)  # c^2 / 6
             correlation = unsignalled + (1 - unsignalled) * same
             half_way = (a.around.half_way + b.around.half_way) / 2
-            around = a.around._replace(counted=UNMEASURED, half_way=half_way)
+            at_frame = t in middles  # which neither direction counts yet
+            around = a.around._replace(counted=0.0 if at_frame else UNMEASURED, half_way=half_way)
         either = dataclasses.replace(
             a,
             log_intensity=level,
@@ -271,6 +272,23 @@ def test_what_two_filters_know_adds_up():
     assert found.around.counted == UNMEASURED
     assert found.since is None
     assert combine(dataclasses.replace(forward, since=0.2), late).since == 0.2
+
+
+def test_a_frame_is_counted_at_its_middle():
+    """Both directions come to it there, and neither has it yet."""
+    here, beside = (
+        combine(
+            *(
+                dataclasses.replace(e, around=e.around._replace(share=s))
+                for e, s in zip(ways, shares, strict=True)
+            )
+        )
+        for ways, shares in (
+            (estimates_around([0.01], [0.02]), (1.0, 1.0)),
+            (estimates_around([0.01], [0.02]), (1.0, 0.0)),
+        )
+    )
+    assert (here.around.counted, beside.around.counted) == (0.0, UNMEASURED)
 
 
 @pytest.mark.parametrize("share", [0.25, 0.5, 1.0])

@@ -302,11 +302,17 @@ def combine(
 
 
 def _around(forward: Around | None, backward: Around | None) -> Around | None:
-    """The forward one, with the next frame counted already, and what both directions say of half-way."""
+    """The forward one, with the next frame counted already, and what both directions say of half-way.
+
+    At the middle of a frame both are about to count that.
+    """
     if forward is None:
         return None
-    half_way = forward.half_way if backward is None else (forward.half_way + backward.half_way) / 2.0
-    return forward._replace(counted=UNMEASURED, half_way=half_way)
+    if backward is None:
+        return forward._replace(counted=UNMEASURED)
+    half_way = (forward.half_way + backward.half_way) / 2.0
+    by_none = forward.share == backward.share == 1.0
+    return forward._replace(counted=0.0 if by_none else UNMEASURED, half_way=half_way)
 
 
 def shared_errors(

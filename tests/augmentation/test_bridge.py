@@ -173,8 +173,9 @@ def test_a_silent_pixel_is_a_straight_line():
 
 @pytest.mark.parametrize("clipped", ["first", "second", "both"])
 def test_a_clipped_end_leaves_the_steps_alone(clipped):
+    """Where events lead above its bound."""
     on, off = counts(5), counts(2)
-    first = latent(0.5, UNMEASURED if clipped != "second" else 1e-4)
+    first = latent(-3.0 if clipped == "first" else 0.5, UNMEASURED if clipped != "second" else 1e-4)
     second = latent(-1.0, UNMEASURED if clipped != "first" else 1e-4)
     segment, learned = join(first, second, on, off)
     np.testing.assert_allclose(segment.step_on, 0.3, rtol=1e-9)
@@ -185,6 +186,40 @@ def test_a_clipped_end_leaves_the_steps_alone(clipped):
         np.testing.assert_allclose(segment.augmented, -2.1, rtol=1e-3)
     elif clipped == "second":
         np.testing.assert_allclose(segment.augmented, 0.5, rtol=1e-9)
+
+
+@pytest.mark.parametrize("on", [0, 3])
+def test_a_bound_that_events_lead_below_is_reached(on):
+    """From the frame that measures the pixel, and back from it: by the slope, and by the events, which are too small.
+
+    But thresholds are not learned of a bound.
+    """
+    rising, falling = counts(on), counts(0)
+    segment, learned = join(latent(-1.5, 1e-9), latent(0.0, UNMEASURED), rising, falling)
+    np.testing.assert_allclose(segment.augmented, -1.5, atol=1e-6)
+    np.testing.assert_allclose(reached(segment, rising, falling), 0.0, atol=1e-6)
+    np.testing.assert_allclose([learned.on, learned.off], 1.0, rtol=1e-12)
+    assert (segment.slope > 0).all()
+    assert on == 0 or (segment.step_on > NOISE.threshold_on).all()
+    back, learned = join(latent(0.0, UNMEASURED), latent(-1.5, 1e-9), falling, rising)
+    np.testing.assert_allclose(back.augmented, 0.0, atol=1e-6)
+    np.testing.assert_allclose(reached(back, falling, rising), -1.5, atol=1e-6)
+    np.testing.assert_allclose([learned.on, learned.off], 1.0, rtol=1e-12)
+
+
+def test_a_masked_pixel_is_no_bound():
+    segment, _ = join(latent(-1.0, 1e-9), latent(0.0, MASKED), counts(0), counts(0))
+    np.testing.assert_allclose(reached(segment, 0.0, 0.0), -1.0, atol=1e-6)
+
+
+@given(value=st.floats(-3.0, 3.0), on=st.integers(0, 20), off=st.integers(0, 20), is_first=st.booleans())
+def test_a_bridge_keeps_to_the_bound_of_a_clipped_end(value, on, off, is_first):
+    ends = latent(0.0, UNMEASURED), latent(value, 1e-6)
+    first, second = ends if is_first else ends[::-1]
+    rising, falling = counts(on), counts(off)
+    segment, _ = join(first, second, rising, falling)
+    clipped = segment.augmented if is_first else reached(segment, rising, falling)
+    assert (clipped >= -1e-5).all()
 
 
 def test_information_goes_from_one_end_to_the_other():

@@ -7,11 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kalux.augmentation.bridge import REPEATED, UNMEASURED
+from kalux.augmentation.bridge import REPEATED, UNMEASURED, bridge_variance
 from kalux.filters.readout import CORRELATED, Subthreshold
 from kalux.filters.uncertainty import (
     BEFORE_AVERAGING,
     CORRELATED_UNMEASURED,
+    SUBTHRESHOLD_MOVING,
     UNMEASURED_SHARE,
     Around,
     add_blurred,
@@ -180,10 +181,10 @@ def test_still_pixels_hide_what_silent_ones_around_them_show():
 def test_a_pixel_that_waits_for_its_next_event_lies_between_still_and_moving_ones():
     """One with an event of late, none in this interval; or silent, and measured by one of the frames alone."""
     moving, change, p = np.array([[True, False]]), plane(0.02), plane(0.01)
-    subthreshold = Subthreshold(0.5, 0.004)
+    subthreshold = Subthreshold(0.5, 0.004, 0.004)
 
     def found(first, second, events):
-        told = around(first, second, events, counted=UNMEASURED, quantisation_variance=0.0)
+        told = around(first, second, events, counted=UNMEASURED, quantisation_variance=0.0, half_way=0.5)
         return given_variance(p, moving, change, subthreshold, told) - p
 
     waits = 0.5 * 0.5 * 0.02 + 0.25 * 0.004
@@ -191,6 +192,24 @@ def test_a_pixel_that_waits_for_its_next_event_lies_between_still_and_moving_one
     np.testing.assert_allclose(found(1e-6, 1e-6, 1.0), [[0.004, 0.01]], rtol=1e-4)
     np.testing.assert_allclose(found(UNMEASURED, 1e-6, 0.0), [[waits, waits]], rtol=1e-4)
     np.testing.assert_allclose(found(UNMEASURED, UNMEASURED, 0.0), [[0.004, 0.01]], rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("share", "of_first"), [(1e-6, 0.0), (0.25, 0.625), (0.75, 1.125), (1 - 1e-6, 1.0), (1.0, 0.0)]
+)
+def test_nothing_ties_a_pixel_at_a_frame_that_does_not_measure_it(share, of_first):
+    """Its variance grows from the other frame on, until P itself does at the end of the interval."""
+    change, p = plane(0.02), plane(0.01)
+    subthreshold = subthreshold_variance(bridge_variance(share), C2, half_way=0.5)
+    waits = 0.5 * 0.5 * 0.02 + 0.25 * SUBTHRESHOLD_MOVING * C2
+
+    def found(first, second, share):
+        told = around(first, second, 0.0, counted=UNMEASURED, share=share, half_way=0.5)
+        return given_variance(p, STILL, change, subthreshold, told) - p
+
+    np.testing.assert_allclose(found(1e-6, UNMEASURED, share), of_first * waits, rtol=1e-3, atol=1e-7)
+    if share < 1:
+        np.testing.assert_allclose(found(UNMEASURED, 1e-6, 1 - share), of_first * waits, rtol=1e-3, atol=1e-7)
 
 
 def test_without_a_next_frame_nothing_holds_the_other_end():

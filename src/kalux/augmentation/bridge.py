@@ -605,8 +605,8 @@ def bridge(
     return segment, Thresholds(*factors)
 
 
-_SCRATCH: Final = 13
-_COUNT_ON, _COUNT_OFF, _CHANGE, _BOTH, _MOVES, _LEVEL, _SLOPE, *_LEARNED = (
+_SCRATCH: Final = 15
+_COUNT_ON, _COUNT_OFF, _CHANGE, _BOTH, _MOVES, _BOUND, _MEASURED, _LEVEL, _SLOPE, *_LEARNED = (
     np.uint64(k * _BLOCK) for k in range(_SCRATCH)
 )
 _STEP_ON, _STEP_OFF, _NEW_ON, _NEW_OFF, _LEFT_ON, _LEFT_OFF = _LEARNED
@@ -641,6 +641,10 @@ def _bridge(given, thresholds, noise, seconds, planes, factors):  # type: ignore
             s[_CHANGE + k] = -more if saturated else np.float64(next_value[i]) - more - here
             s[_BOTH + k] = of_saturated if saturated else before + after
             s[_LEVEL + k], s[_MOVES + k] = here, 0.0 if saturated else before
+            one = (smaller(before, after) < UNMEASURED) & (larger(before, after) >= UNMEASURED)
+            bounded = one & (larger(before, after) < MASKED)
+            s[_BOUND + k] = (1.0 if after > before else -1.0) if bounded else 0.0
+            s[_MEASURED + k] = smaller(before, after)
         for k in pixels:
             i = first + k
             f_on, f_off = np.float64(signal_on[i]), np.float64(signal_off[i])
@@ -653,8 +657,13 @@ def _bridge(given, thresholds, noise, seconds, planes, factors):  # type: ignore
             on_variance, off_variance = np.float64(variance_on[i]), np.float64(variance_off[i])
             on_covariance = on_variance * c_on * n_on
             off_covariance = -off_variance * c_off * n_off
+            # A bound that events lead below is as good as a measurement (K7): light comes from there, or gets there.
+            bound, measured = s[_BOUND + k], s[_MEASURED + k]
+            below = bound * mismatch > 0.0
+            both = measured if below else s[_BOTH + k]
+            moves = (measured if bound > 0.0 else 0.0) if below else s[_MOVES + k]
             total = (
-                s[_BOTH + k]
+                both
                 + on_covariance * c_on * n_on
                 - off_covariance * c_off * n_off
                 + of_step * (n_on + n_off)
@@ -663,13 +672,15 @@ def _bridge(given, thresholds, noise, seconds, planes, factors):  # type: ignore
             )
             inverse = 1.0 / total
             gain = mismatch * inverse
-            s[_LEVEL + k] += gain * s[_MOVES + k]
+            s[_LEVEL + k] += gain * moves
             s[_SLOPE + k] = gain * untold[i] / seconds
             s[_STEP_ON + k] = f_on * (nominal_on + gain * (c_on * on_covariance + (of_step + in_doubt_on)))
             s[_STEP_OFF + k] = f_off * (
                 nominal_off + gain * (c_off * off_covariance - (of_step + in_doubt_off))
             )
             learned = gain + inverse * told * not_shown / larger(told * told + not_shown, _LEAST_SQUARE)
+            told_of = 0.0 if below else 1.0  # a bound says of a threshold no more than that it is too small
+            learned, inverse = told_of * learned, told_of * inverse
             s[_NEW_ON + k] = smaller(larger(of_on + learned * on_covariance, low), high)
             s[_NEW_OFF + k] = smaller(larger(of_off + learned * off_covariance, low), high)
             s[_LEFT_ON + k] = on_variance - on_covariance * on_covariance * inverse + _SCALE_DRIFT

@@ -36,8 +36,8 @@ BLURRED: Final = 0.06
 frame, if frames are exposed all the time: by the errors at frames of silent and of moving pixels of 152 scenes."""
 
 SUBTHRESHOLD_INTERMITTENT: Final = (0.5, 0.25)
-"""Variance of an intermittent pixel's subthreshold change (`_mark_intermittent`), in units of that of a silent pixel
-and of that of one with an event in this frame interval, which are added: the same scenes, and the held-out frames."""
+"""Variance of an intermittent pixel's subthreshold change (`_mark_intermittent`) half-way, in units of that of a silent
+pixel and of that of one with an event in this frame interval, which are added: the same scenes, and held-out frames."""
 
 _FEW_TURNS: Final = 1e-2  # in an exposure: what they change is less than the digits of their exponentials
 
@@ -232,22 +232,51 @@ def given_variance(
         nothing if left is None else left.reshape(-1),
         moving.reshape(-1),
         (np.float32(subthreshold.silent), np.float32(subthreshold.moving)),
+        tuple(np.float32(value) for value in _of_intermittent(subthreshold, around)),
         (np.float32(before.moving + before.above_moving), np.float32(above_moving)),
         given.reshape(-1),
     )
     return given
 
 
+def _of_intermittent(subthreshold: Subthreshold, around: Around | None) -> tuple[float, ...]:
+    """Variance of an intermittent pixel half-way, of each unit of its surroundings' change and in any case, and what
+    of it there is of one that both frames measure, that the first does alone, and that the second does.
+
+    Nothing ties a pixel at the frame that does not measure it, but that P grows there (at that frame itself it has).
+    """
+    if around is None:
+        return (0.0,) * 5
+    of_silent, of_moving = SUBTHRESHOLD_INTERMITTENT
+    between = subthreshold.moving / subthreshold.untied if subthreshold.untied else 0.0
+    away = around.share if around.share < 1.0 else 0.0
+    shares = between, between / 2.0 + away, between / 2.0 + 1.0 - around.share
+    return of_silent * around.half_way, of_moving * subthreshold.untied, *shares
+
+
 @loop
 def _give(  # type: ignore[no-untyped-def]
-    variance, change, first, second, events, untold, lost, around, left, moving, subthreshold, untied, given
+    variance,
+    change,
+    first,
+    second,
+    events,
+    untold,
+    lost,
+    around,
+    left,
+    moving,
+    subthreshold,
+    intermittent,
+    untied,
+    given,
 ):
     """`given_variance`, a few pixels at a time: what one step leaves is in the nearer caches for the next.
 
     No step writes over what it reads, or it would be no vector code.
     """
     averaged, informed = empty(_BLOCK, np.float32), empty(_BLOCK, np.float32)
-    intermittent = zeros(_BLOCK, np.bool_)
+    waits = zeros(_BLOCK, np.float32)
     for start in range(0, len(given), _BLOCK):
         here = slice(start, min(start + _BLOCK, len(given)))
         known, count = variance[here], len(given[here])
@@ -259,9 +288,11 @@ def _give(  # type: ignore[no-untyped-def]
             _inform(
                 known, first[here], second[here], events[here], untold[here], some, around, informed[:count]
             )
-            _mark_intermittent(moving[here], first[here], second[here], events[here], intermittent[:count])
+            _mark_intermittent(
+                moving[here], first[here], second[here], events[here], intermittent, waits[:count]
+            )
             known = informed[:count]
-        _add_subthreshold(known, moving[here], intermittent, change[here], subthreshold, given[here])
+        _add_subthreshold(known, moving[here], waits, change[here], subthreshold, intermittent, given[here])
 
 
 @loop(fastmath=FUSED)
@@ -290,27 +321,27 @@ def _average_unmeasured(variance, left, first, second, untied, averaged):  # typ
 
 
 @loop
-def _mark_intermittent(moving, first, second, events, intermittent):  # type: ignore[no-untyped-def]
-    """Pixels without an event between the frames, but with one just before, or measured by one of the frames alone."""
+def _mark_intermittent(moving, first, second, events, intermittent, waits):  # type: ignore[no-untyped-def]
+    """What there is (`_of_intermittent`) of pixels without an event between the frames, but with one just before, or
+    measured by one of the frames alone; 0 of others."""
     unmeasured = np.float32(UNMEASURED)
-    for i in range(np.uint64(len(intermittent))):
-        doubtful = moving[i] | (larger(first[i], second[i]) >= unmeasured)
-        measured = smaller(first[i], second[i]) < unmeasured
-        intermittent[i] = doubtful & (events[i] == np.float32(0.0)) & measured
+    _, _, of_both, of_first, of_second = intermittent
+    for i in range(np.uint64(len(waits))):
+        by_first, by_second = first[i] < unmeasured, second[i] < unmeasured
+        share = of_both if moving[i] else ZERO
+        share = share if by_first & by_second else (of_first if by_first else of_second)
+        waits[i] = share if (events[i] == ZERO) & (by_first | by_second) else ZERO
 
 
 @loop(fastmath=FUSED)
-def _add_subthreshold(known, moving, intermittent, change, subthreshold, given):  # type: ignore[no-untyped-def]
+def _add_subthreshold(known, moving, waits, change, subthreshold, intermittent, given):  # type: ignore[no-untyped-def]
     """The known variance and that of the subthreshold change: of a silent, an intermittent or a moving pixel."""
     share, of_moving = subthreshold
-    part, of_intermittent = (
-        np.float32(SUBTHRESHOLD_INTERMITTENT[0]),
-        np.float32(SUBTHRESHOLD_INTERMITTENT[1]) * of_moving,
-    )
+    per_change, always = intermittent[:2]
     for i in range(np.uint64(len(given))):
         silent = share * change[i]
-        active = of_intermittent + part * silent if intermittent[i] else of_moving
-        given[i] = known[i] + (active if moving[i] | intermittent[i] else silent)
+        active = waits[i] * (per_change * change[i] + always) if waits[i] > ZERO else of_moving
+        given[i] = known[i] + (active if moving[i] | (waits[i] > ZERO) else silent)
 
 
 def add_pattern(
