@@ -488,19 +488,20 @@ def bridged(pixel, settings, times, on, off, scales):
         mismatch = 0.0 if saturated else second[0] - first[0]
         change = on * scale_on * told_on - off * scale_off * told_off
         mismatch -= change + grown(k + 1, b)
-        total = 4 * settings.filter.highlight_scale**2 if saturated else first[1] + second[1]
-        total += var_on * (on * told_on) ** 2 + var_off * (off * told_off) ** 2
+        of_frames = 4 * settings.filter.highlight_scale**2 if saturated else first[1] + second[1]
+        of_events = var_on * (on * told_on) ** 2 + var_off * (off * told_off) ** 2
+        of_events += q_on * n_on + q_off * n_off
         q0, noise = ev.quantisation_variance * c2, first[1] + second[1]
         q0 += pixel.lost[k] or 0.0
-        total += q_on * n_on + q_off * n_off + q0
-        no_error = 0.0  # K7: a bound that events lead below is reached from the other frame, or left to it
-        if min(first[1], second[1]) < UNMEASURED <= max(first[1], second[1]):
-            below = mismatch > 0 if second[1] >= UNMEASURED else mismatch < 0
-            no_error = max(first[1], second[1]) if below else 0.0
+        total = of_frames + of_events + q0
         untold = pixel.untold[k] if pixel.untold else q0
         untold_from[a] = untold
-        gain = mismatch / (total - no_error - q0 + untold)
-        moved_from[a] = 0.0 if no_error == first[1] else first[1]
+        reached = 0  # K7: the bound that events lead below, to which the other frame is joined as if it had no error
+        if min(first[1], second[1]) < UNMEASURED <= max(first[1], second[1]):
+            which = 1 if first[1] >= UNMEASURED else 2
+            reached = which if (mismatch < 0 if which == 1 else mismatch > 0) else 0
+        gain = mismatch / ((min(first[1], second[1]) if reached else of_frames) + of_events + untold)
+        moved_from[a] = 0.0 if reached == 1 else first[1]
         intervals.append((a, b, first, second, scale_on, scale_off, var_on, var_off, gain, signal))
         told = (q0 / (noise + q0)) ** 2
         squared = min((q0 * mismatch / total) ** 2, c2) - noise * told
