@@ -679,8 +679,8 @@ def _bridge(given, thresholds, noise, seconds, planes, factors):  # type: ignore
                 nominal_off + gain * (c_off * off_covariance - (of_step + in_doubt_off))
             )
             learned = gain + inverse * told * not_shown / larger(told * told + not_shown, _LEAST_SQUARE)
-            told_of = 0.0 if below else 1.0  # a bound says of a threshold no more than that it is too small
-            learned, inverse = told_of * learned, told_of * inverse
+            tells = 0.0 if below else 1.0  # a bound says of thresholds no more than that they are too small
+            learned, inverse = tells * learned, tells * inverse
             s[_NEW_ON + k] = smaller(larger(of_on + learned * on_covariance, low), high)
             s[_NEW_OFF + k] = smaller(larger(of_off + learned * off_covariance, low), high)
             s[_LEFT_ON + k] = on_variance - on_covariance * on_covariance * inverse + _SCALE_DRIFT

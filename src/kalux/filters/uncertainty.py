@@ -240,10 +240,10 @@ def given_variance(
 
 
 def _of_intermittent(subthreshold: Subthreshold, around: Around | None) -> tuple[float, ...]:
-    """Variance of an intermittent pixel half-way, of each unit of its surroundings' change and in any case, and what
-    of it there is of one that both frames measure, that the first does alone, and that the second does.
+    """Variance of an intermittent pixel half-way, per unit of its surroundings' change and besides, and how much of
+    both there is of one that both frames measure, that the first alone does, and that the second alone does.
 
-    Nothing ties a pixel at the frame that does not measure it, but that P grows there (at that frame itself it has).
+    Nothing ties a pixel at the frame that does not measure it. At the second frame itself P has grown by that.
     """
     if around is None:
         return (0.0,) * 5
@@ -322,8 +322,8 @@ def _average_unmeasured(variance, left, first, second, untied, averaged):  # typ
 
 @loop
 def _mark_intermittent(moving, first, second, events, intermittent, waits):  # type: ignore[no-untyped-def]
-    """What there is (`_of_intermittent`) of pixels without an event between the frames, but with one just before, or
-    measured by one of the frames alone; 0 of others."""
+    """How much of `_of_intermittent` a pixel has: without an event between the frames, but with one just before, or
+    measured by one of the frames alone. 0: it is another."""
     unmeasured = np.float32(UNMEASURED)
     _, _, of_both, of_first, of_second = intermittent
     for i in range(np.uint64(len(waits))):
