@@ -1,7 +1,7 @@
 """Many scenes at random: where is the default filter worse than something simpler, or its variance wrong?
 
     python benchmarks/scenes.py PHOTOGRAPH ... -o OUT [--count 200] [--seed 1] [--processes N]
-        [--size 160x120] [--duration 1.2]
+        [--size 160x120] [--duration 1.2] [--truth-rate HZ]
 
 Simulates recordings of 160x120 pixels and 1.2 s, or others, over HDR photographs: sensors, thresholds, noise, motions,
 exposures, responses and things that pass are drawn by ``--seed``, so that the same command makes the same recordings
@@ -52,14 +52,20 @@ class Scene(NamedTuple):
 
 
 def draw(
-    photographs: list[Path], count: int, seed: int, size: str = "160x120", duration: float = 1.2
+    photographs: list[Path],
+    count: int,
+    seed: int,
+    size: str = "160x120",
+    duration: float = 1.2,
+    truth_rate: float | None = None,
 ) -> list[Scene]:
     """The scenes, photographs in turns. The first of many are those of few."""
+    truth = () if truth_rate is None else ("--truth-rate", str(truth_rate))
     scenes = []
     for k in range(count):
         photograph = photographs[k % len(photographs)]
         flags = tuple(map(str, _flags(random.Random(1000 * seed + k), k, size, duration)))
-        scenes.append(Scene(f"{k:03d}_{photograph.stem}", photograph, flags))
+        scenes.append(Scene(f"{k:03d}_{photograph.stem}", photograph, flags + truth))
     return scenes
 
 
@@ -175,8 +181,15 @@ def main() -> None:
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--size", default="160x120", metavar="WxH", help="pixels of the sensor")
     parser.add_argument("--duration", type=float, default=1.2, help="s")
+    parser.add_argument(
+        "--truth-rate",
+        type=float,
+        metavar="HZ",
+        help="true images at this rate, at any time between frames, instead of at frames and half-way",
+    )
     options = parser.parse_args()
-    scenes = draw(options.photographs, options.count, options.seed, options.size, options.duration)
+    drawn = options.count, options.seed, options.size, options.duration, options.truth_rate
+    scenes = draw(options.photographs, *drawn)
     recordings, results = options.out / "recordings", options.out / "results"
     claim(options.out, scenes)
     recordings.mkdir(exist_ok=True)

@@ -83,6 +83,10 @@ def test_scenes_at_random_are_those_of_the_seed():
     assert drawn != scenes.draw([Path("a.hdr"), Path("b.exr")], 40, 4)
     assert len({scene.flags for scene in drawn}) == 40
     assert [scene.name for scene in drawn[:2]] == ["000_a", "001_b"]
+    often = scenes.draw([Path("a.hdr"), Path("b.exr")], 2, 3, truth_rate=197.0)
+    assert [scene.flags for scene in often] == [
+        (*scene.flags, "--truth-rate", "197.0") for scene in drawn[:2]
+    ]
 
 
 def test_a_folder_with_other_scenes_is_refused(tmp_path):
