@@ -1110,25 +1110,40 @@ def test_the_noise_of_frames_averages_out_where_nothing_moves(smooth):
 
 
 def test_events_out_of_a_highlight_are_doubted_as_they_come_where_the_next_frame_measures_the_pixel():
-    """Ten events down, then twenty-eight up, though the next frame shows less than the one before, which clips.
+    """Eight events up, then twenty-eight down, though the next frame shows hardly less than the one before, clipped.
 
-    Wrong thresholds explain that. The more they may be off, the less P trusts these events, and the sooner L is where
-    the frame to come has it (K10)."""
+    Wrong thresholds explain that, or a highlight far above white. The more they may be off, the less P trusts these
+    events, and the sooner L is where the frame to come has it (K10)."""
     levels, variances = {}, {}
     for spread in (0.01, 0.3):
         known = {"threshold_on": 0.2, "threshold_off": 0.2, "threshold_spread": spread}
         engine = Reconstructor((1, 2), settings=altered(PRESETS["default"], "events", **known))
         for t, level in ((0, 255), (100_000, 230)):
             engine.push_frame(Frame(np.array([[50, level]], np.uint8), t, t + 8_000))
-        times = [*range(50_000, 60_000, 1_000), *range(76_600, 99_000, 800)]
-        engine.push_events(pixel_events(times, [0] * 10 + [1] * 28, x=1))
+        times = [*range(50_000, 58_000, 1_000), *range(76_600, 99_000, 800)]
+        engine.push_events(pixel_events(times, [1] * 8 + [0] * 28, x=1))
         engine.finish()
         found = engine.estimate(98_000)
         levels[spread], variances[spread] = found.log_intensity[0, 1], found.variance[0, 1]
     frame = np.log(230 / 255)
-    assert levels[0.01] - frame > 0.4
+    assert frame - levels[0.01] > 0.4
     assert abs(levels[0.3] - frame) < 0.1
     assert variances[0.3] > 2 * variances[0.01]
+
+
+def test_light_that_was_white_comes_from_there_though_events_lead_from_less():
+    """Ten events down, then twenty-eight up, to less than white: where a frame clips, the pixel is no darker (K7)."""
+    engine = Reconstructor(
+        (1, 2), settings=altered(PRESETS["default"], "events", threshold_on=0.2, threshold_off=0.2)
+    )
+    for t, level in ((0, 255), (100_000, 230)):
+        engine.push_frame(Frame(np.array([[50, level]], np.uint8), t, t + 8_000))
+    times = [*range(50_000, 60_000, 1_000), *range(76_600, 99_000, 800)]
+    engine.push_events(pixel_events(times, [0] * 10 + [1] * 28, x=1))
+    engine.finish()
+    before, after = (engine.estimate(t).log_intensity[0, 1] for t in (49_000, 98_000))
+    assert abs(before) < 0.1
+    assert abs(after - np.log(230 / 255)) < 0.2
 
 
 def test_the_fixed_pattern_of_a_live_stream_is_the_usual_one():
