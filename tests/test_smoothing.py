@@ -276,19 +276,10 @@ def test_what_two_filters_know_adds_up():
 
 def test_a_frame_is_counted_at_its_middle():
     """Both directions come to it there, and neither has it yet."""
-    here, beside = (
-        combine(
-            *(
-                dataclasses.replace(e, around=e.around._replace(share=s))
-                for e, s in zip(ways, shares, strict=True)
-            )
-        )
-        for ways, shares in (
-            (estimates_around([0.01], [0.02]), (1.0, 1.0)),
-            (estimates_around([0.01], [0.02]), (1.0, 0.0)),
-        )
-    )
-    assert (here.around.counted, beside.around.counted) == (0.0, UNMEASURED)
+    forward, beside = estimates_around([0.01], [0.02], share=1.0)
+    here = dataclasses.replace(beside, around=beside.around._replace(share=1.0))
+    assert combine(forward, here).around.counted == 0.0
+    assert combine(forward, beside).around.counted == UNMEASURED
 
 
 @pytest.mark.parametrize("share", [0.25, 0.5, 1.0])

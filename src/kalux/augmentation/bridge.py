@@ -658,10 +658,10 @@ def _bridge(given, thresholds, noise, seconds, planes, factors):  # type: ignore
             on_covariance = on_variance * c_on * n_on
             off_covariance = -off_variance * c_off * n_off
             # A bound that events lead below is as good as a measurement (K7): light comes from there, or gets there.
-            bound, measured = s[_BOUND + k], s[_MEASURED + k]
+            bound = s[_BOUND + k]
             below = bound * mismatch > 0.0
-            both = measured if below else s[_BOTH + k]
-            moves = (measured if bound > 0.0 else 0.0) if below else s[_MOVES + k]
+            both = s[_MEASURED + k] if below else s[_BOTH + k]
+            moves = 0.0 if below & (bound < 0.0) else s[_MOVES + k]
             total = (
                 both
                 + on_covariance * c_on * n_on

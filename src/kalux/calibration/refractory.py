@@ -143,7 +143,8 @@ def _onset(count: NDArray[np.int64], turned: NDArray[np.int64]) -> int:
     """
     begin, end = _DEAD_TIMES, 2 * _DEAD_TIMES
     shorter, any_shorter = (np.concatenate([[0], np.cumsum(each)]) for each in (turned, count))
-    before, after = shorter[begin], shorter[end] - shorter[begin]
+    before, within = shorter[begin], shorter[end]
+    after = within - before
     density = after / begin
     gain = _log_likelihood(before, begin) + _log_likelihood(after, begin)
     sudden = (
@@ -151,7 +152,7 @@ def _onset(count: NDArray[np.int64], turned: NDArray[np.int64]) -> int:
         & (after >= _LEAST_AFTER)
         & (before / begin <= _MOST_BEFORE * density)
         & (any_shorter[begin] / begin <= _MOST_BEFORE * 2 * density)  # half of those of noise turn
-        & (gain - _of_power(turned, end) >= _LEAST_SUDDEN)
+        & (gain - _of_power(turned, within, end) >= _LEAST_SUDDEN)
     )
     for unit in (begin // 10, begin // 2):
         ratio, chance = _growth(shorter, begin, unit)
@@ -161,7 +162,7 @@ def _onset(count: NDArray[np.int64], turned: NDArray[np.int64]) -> int:
         sudden &= ratio >= _LEAST_BEYOND - chance
     if not sudden.any():
         return 0
-    best = int(np.argmax(np.where(sudden, gain - _log_likelihood(before + after, end), -np.inf)))
+    best = int(np.argmax(np.where(sudden, gain - _log_likelihood(within, end), -np.inf)))
     apart = 1 / float(2 * density[best])  # mean time between two, of any polarity
     latest = int(begin[best])
     earliest = max(latest - round(_LATE_BY * apart), 0)
@@ -174,11 +175,12 @@ def _log_likelihood(number: NDArray[np.int64], time: NDArray[np.int64]) -> NDArr
     return np.asarray(number * np.log(np.maximum(number, 1) / time))
 
 
-def _of_power(turned: NDArray[np.int64], end: NDArray[np.int64]) -> NDArray[np.float64]:
-    """The same of the intervals shorter than ``end`` whose density grows by the best power, not less than 0, of their
-    length, as that of light does."""
-    of_log = turned * np.log(np.maximum(np.arange(len(turned)), 0.5))
-    number, logs = (np.concatenate([[0], np.cumsum(each)])[end] for each in (turned, of_log))
+def _of_power(
+    turned: NDArray[np.int64], number: NDArray[np.int64], end: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """The same of the ``number`` of intervals shorter than ``end`` whose density grows by the best power, not less than
+    0, of their length, as that of light does."""
+    logs = np.cumsum(turned * np.log(np.maximum(np.arange(len(turned)), 0.5)))[end - 1]
     short_of = np.maximum(number * np.log(end) - logs, 1e-9)  # sum of log(end / length)
     power = np.maximum(number / short_of - 1, 0.0)
     return np.asarray(_log_likelihood(number, end) + number * np.log(power + 1) - power * short_of)
