@@ -76,18 +76,35 @@ def test_offsets_of_less_than_a_level_need_certainty(offset, error, allowed):
     assert allowed[0] <= found <= allowed[1]
 
 
-@pytest.mark.parametrize(("of_clear", "allowed"), [(0.02, (0.001, 0.0026)), (0.005, (0.0028, 0.0057))])
-def test_small_offsets_must_be_likelier_where_noise_lifts_no_samples(monkeypatch, of_clear, allowed):
-    """Samples are above 0.01 of white by what frames show: with noise of 0.01 many are that are darker."""
-    model = MODEL._replace(frame_noise=(0.01, 0.0))
-    samples = changes(0.001, 0.05)
-    assert samples.darkest.min() < 0.011
+def noisy_changes(offset, noise=0.004, count=80_000):
+    """As `changes`, also of darker pixels; chosen by what frames with that noise show."""
+    rng = np.random.default_rng(4)
+    steps = rng.integers(-8, 9, count)
+    before = np.exp(rng.uniform(np.log(0.004), np.log(0.9), count))
+    wrong = 0.05 * np.sqrt(np.abs(steps)) * rng.standard_normal(count)
+    after = (before + offset) * np.exp(0.2 * steps + wrong) - offset
+    shown = np.array([before, after]) + noise * rng.standard_normal((2, count))
+    kept = (shown.min(axis=0) > event_model.DARKEST) & (shown.max(axis=0) < 0.95) & (np.abs(steps) >= 2)
+    told = np.array([np.maximum(steps, 0), np.maximum(-steps, 0), np.zeros(count)])
+    return Samples(*shown[:, kept], *told[:, kept], *np.ones((2, int(kept.sum()))))
 
-    def gain(samples, limits, model):
-        return of_clear if samples.darkest.min() > 0.04 else 0.02
 
-    monkeypatch.setattr(event_model, "_least_gain", gain)
-    assert allowed[0] <= event_model._log_offset(samples, None, model) <= allowed[1]
+@pytest.mark.parametrize("offset", [0.001, 0.004])
+def test_samples_that_noise_lifts_do_not_make_the_offset_small(offset):
+    """Of pixels darker than the darkest that is chosen only those count whose noise is bright."""
+    samples = noisy_changes(offset)
+    model = MODEL._replace(frame_noise=(0.004, 0.0))
+    whole, chosen = (
+        event_model._least_gain(samples, limits, model)
+        for limits in (None, event_model._chosen_limits(samples))
+    )
+    assert whole > event_model._CERTAIN[1]
+    assert (chosen > event_model._CERTAIN[1]) == (offset == 0.001)
+
+
+def test_an_offset_of_a_level_is_found_though_noise_lifts_samples():
+    found = event_model._log_offset(noisy_changes(0.004), None, MODEL._replace(frame_noise=(0.004, 0.0)))
+    assert 0.004 <= found <= 0.0057
 
 
 def test_the_gain_of_small_offsets_is_that_of_an_observation():
