@@ -330,8 +330,8 @@ def _log_offset(samples: Samples, limits: FrameLimits | None, model: ErrorModel)
         return min(losses, key=lambda offset: losses[offset])
 
     correlation, gain = _CERTAIN
-    least = explained >= correlation and likeliest() == LOG_OFFSETS[0]
-    if least and _least_gain(samples, limits or _chosen_limits(samples), model) >= gain:
+    reaches_least = explained >= correlation and likeliest() == LOG_OFFSETS[0]
+    if reaches_least and _least_gain(samples, limits or _chosen_limits(samples), model) >= gain:
         losses |= {offset: loss(offset) for offset in SMALL_LOG_OFFSETS}
     for _ in range(2):
         offsets = sorted(losses)
