@@ -50,14 +50,16 @@ def test_the_offset_of_the_events_logarithm_is_found(recordings, offset, allowed
     assert found.samples > 5_000
 
 
-def changes(offset, error, count=40_000):
-    """Of pixels between 0.01 and 0.9 whose events are steps of 0.2 of log(I + offset), wrong by ``error`` each."""
+def changes(offset, error, count=40_000, *, noise=0.0, darkest=0.01):
+    """Of pixels from 0.01 to 0.95 in frames with this noise, whose events are steps of 0.2 of log(I + offset), wrong by
+    ``error`` each; from ``darkest`` on before."""
     rng = np.random.default_rng(2)
     steps = rng.integers(-12, 13, count)
-    before = np.exp(rng.uniform(np.log(0.01), np.log(0.9), count))
+    before = np.exp(rng.uniform(np.log(darkest), np.log(0.9), count))
     wrong = error * np.sqrt(np.abs(steps)) * rng.standard_normal(count)
     after = (before + offset) * np.exp(0.2 * steps + wrong) - offset
-    kept = (after > 0.01) & (after < 0.95) & (np.abs(steps) >= 2)
+    before, after = np.array([before, after]) + noise * rng.standard_normal((2, count))
+    kept = (np.minimum(before, after) > 0.01) & (after < 0.95) & (np.abs(steps) >= 2)
     told = (np.maximum(steps, 0), np.maximum(-steps, 0), np.zeros(count))
     ones = np.ones(int(kept.sum()))
     return Samples(before[kept], after[kept], *(values[kept] * 1.0 for values in told), ones, ones)
@@ -76,24 +78,19 @@ def test_offsets_of_less_than_a_level_need_certainty(offset, error, allowed):
     assert allowed[0] <= found <= allowed[1]
 
 
-def noisy_changes(offset, noise=0.004, count=80_000):
-    """As `changes`, also of darker pixels; chosen by what frames with that noise show."""
-    rng = np.random.default_rng(4)
-    steps = rng.integers(-8, 9, count)
-    before = np.exp(rng.uniform(np.log(0.004), np.log(0.9), count))
-    wrong = 0.05 * np.sqrt(np.abs(steps)) * rng.standard_normal(count)
-    after = (before + offset) * np.exp(0.2 * steps + wrong) - offset
-    shown = np.array([before, after]) + noise * rng.standard_normal((2, count))
-    kept = (shown.min(axis=0) > event_model.DARKEST) & (shown.max(axis=0) < 0.95) & (np.abs(steps) >= 2)
-    told = np.array([np.maximum(steps, 0), np.maximum(-steps, 0), np.zeros(count)])
-    return Samples(*shown[:, kept], *told[:, kept], *np.ones((2, int(kept.sum()))))
+NOISE = 0.004
+
+
+def noisy_changes(offset):
+    """Some of pixels that are darker than 0.01, whose noise is bright."""
+    return changes(offset, 0.05, 80_000, noise=NOISE, darkest=0.004)
 
 
 @pytest.mark.parametrize("offset", [0.001, 0.004])
 def test_samples_that_noise_lifts_do_not_make_the_offset_small(offset):
     """Of pixels darker than the darkest that is chosen only those count whose noise is bright."""
     samples = noisy_changes(offset)
-    model = MODEL._replace(frame_noise=(0.004, 0.0))
+    model = MODEL._replace(frame_noise=(NOISE, 0.0))
     whole, chosen = (
         event_model._least_gain(samples, limits, model)
         for limits in (None, event_model._chosen_limits(samples))
@@ -102,9 +99,10 @@ def test_samples_that_noise_lifts_do_not_make_the_offset_small(offset):
     assert (chosen > event_model._CERTAIN[1]) == (offset == 0.001)
 
 
-def test_an_offset_of_a_level_is_found_though_noise_lifts_samples():
-    found = event_model._log_offset(noisy_changes(0.004), None, MODEL._replace(frame_noise=(0.004, 0.0)))
-    assert 0.004 <= found <= 0.0057
+@pytest.mark.parametrize(("offset", "allowed"), [(0.001, (0.001, 0.0014)), (0.004, (0.004, 0.0057))])
+def test_small_offsets_are_found_though_noise_lifts_samples(offset, allowed):
+    found = event_model._log_offset(noisy_changes(offset), None, MODEL._replace(frame_noise=(NOISE, 0.0)))
+    assert allowed[0] <= found <= allowed[1]
 
 
 def test_the_gain_of_small_offsets_is_that_of_an_observation():
