@@ -208,14 +208,14 @@ class _StepSampler:
         self._seen_until = begin
         chosen, usable, lost = self._chosen(interval)
         words = event_words(between(interval.events, begin, end))
-        order, starts = _by_pixel(words, np.uint64(width), _with_neighbours(chosen, height, width))
+        codes, starts = _by_pixel(words, np.uint64(width), _with_neighbours(chosen, height, width))
         exposures = tuple(
             float(t + self._delay - begin)
             for shot in (first, second)
             for t in (shot.start, max(shot.end, shot.start + 1))
         )
         counts = np.zeros((height * width, len(self._periods), 2, 2), np.float32)
-        events = words, order, starts, self._latest, self._sign, begin
+        events = codes, starts, self._latest, self._sign, begin
         _count(*events, exposures, self._periods, self._late, counts)
         shape = len(chosen), len(self._periods), 2, 2
         share = interval.level / np.maximum(interval.level + self._log_offset, 1e-9)
@@ -271,7 +271,7 @@ def _remember_newest(words, width, latest, sign):  # type: ignore[no-untyped-def
 
 @loop
 def _by_pixel(words, width, wanted):  # type: ignore[no-untyped-def]
-    """Indices of the wanted pixels' events, one pixel after the other and in order, and where those of each start."""
+    """2 t + p of the wanted pixels' events, one pixel after the other and in order, and where those of each start."""
     starts = zeros(len(wanted) + 1, np.int64)
     for i in range(len(words)):
         word = words[i, 1]
@@ -280,14 +280,14 @@ def _by_pixel(words, width, wanted):  # type: ignore[no-untyped-def]
     for at in range(len(wanted)):
         starts[at + 1] += starts[at]
     place = starts[:-1].copy()
-    order = empty(starts[-1], np.int32)
+    codes = empty(starts[-1], np.int64)
     for i in range(len(words)):
         word = words[i, 1]
         at = event_row(word) * width + event_column(word)
         if wanted[at]:
-            order[place[at]] = i
+            codes[place[at]] = 2 * words[i, 0] + np.int64(event_is_on(word))
             place[at] += 1
-    return order, starts
+    return codes, starts
 
 
 def _ramp_sum(t: Number, start: Number, end: Number) -> Number:
@@ -311,7 +311,7 @@ def _ramp_difference(
 
 
 @loop
-def _count(words, order, starts, latest, sign, origin, exposures, periods, late, counts):  # type: ignore[no-untyped-def]
+def _count(codes, starts, latest, sign, origin, exposures, periods, late, counts):  # type: ignore[no-untyped-def]
     """Add to ``counts`` the part of every event's step that lies between the two exposures.
 
     Times are taken from the ``origin`` on, us: those since 1970 are no whole number of us in float64.
@@ -323,13 +323,13 @@ def _count(words, order, starts, latest, sign, origin, exposures, periods, late,
         pace_before = _SLOWEST  # us for a threshold
         went_on = np.float32(0.0)  # us, of K13
         for j in range(starts[at], starts[at + 1]):
-            t, on = float(words[order[j], 0] - origin), event_is_on(words[order[j], 1])
+            t, on = float((codes[j] >> 1) - origin), codes[j] & 1 == 1
             own_sign = 1 if on else -1
             since = t - before
             if t > exposures[0] and before < exposures[3]:
                 pace_after = _SLOWEST
-                if j + 1 < starts[at + 1] and event_is_on(words[order[j + 1], 1]) == on:
-                    pace_after = smaller(_SLOWEST, float(words[order[j + 1], 0] - origin) - t)
+                if j + 1 < starts[at + 1] and (codes[j + 1] ^ codes[j]) & 1 == 0:
+                    pace_after = smaller(_SLOWEST, float((codes[j + 1] >> 1) - origin) - t)
                 soon, column = np.uint64(since < late), np.uint64(not on)
                 if own_sign == -sign_before:
                     # At one pace, the way out takes a quarter of the time and the way back the rest.
