@@ -198,7 +198,8 @@ _TOLD_PIXEL: Final = np.dtype(
     ],
     align=True,
 )
-"""What `levels` counts of a pixel, in one line of memory: a loop over planes takes three to four times as long."""
+"""What `levels` counts of a pixel, in one line of memory that is used again: over planes of fresh memory it takes 1.5
+to 3 times as long (sensors of 160x120 to 640x480)."""
 
 
 @loop
