@@ -13,6 +13,7 @@ from kalux import readers
 from kalux.errors import KaluxError
 from kalux.events import EVENT_DTYPE, make_events
 from kalux.frames import Frame, GroundTruth
+from kalux.readers.source import SeekableEvents
 from kalux.recording import Recording
 from kalux.writers import hdf5
 
@@ -83,6 +84,8 @@ def complaint(path: Path) -> str:
         recording = Recording(readers.read(path))
         for _ in recording.events():
             pass
+        for _ in recording.events_since(50_000):
+            pass
         for _ in recording.stamped_frames():
             pass
         recording.ground_truth()
@@ -126,3 +129,16 @@ def read_by_dv_processing(path):
         images.append(image)
     found = np.concatenate(batches)
     return make_events(*(found[name] for name in ("timestamp", "x", "y", "polarity"))), images
+
+
+def check_seeking(source: readers.Source, times) -> None:
+    """Require what is read since each of the times to be the events from then on, and not all that are before."""
+    whole = all_events(source)
+    assert isinstance(source.events, SeekableEvents)
+    shortest = len(whole)
+    for t in times:
+        since = np.concatenate([whole[:0], *source.events.since(t)])
+        assert np.array_equal(since, whole[len(whole) - len(since) :])
+        assert (whole["t"][: len(whole) - len(since)] < t).all()
+        shortest = min(shortest, len(since))
+    assert shortest < len(whole) / 2

@@ -19,12 +19,16 @@ from kalux.errors import EventError, ExposureError, FormatError, FrameError, Inp
 from kalux.event_slices import in_order, whole_row_delays, with_delay_of_rows
 from kalux.events import make_events
 from kalux.frames import Frame, GroundTruth, with_black_level
+from kalux.readers.source import SeekableEvents
 from kalux.recording import (
+    EventLayout,
     FrameCorrections,
     Recording,
     less_black,
     with_cached_start,
     with_counted_events,
+    with_event_layout,
+    with_frames,
     with_rows_at_once,
     with_white_from,
     without_events_of,
@@ -431,6 +435,43 @@ def test_events_of_single_pixels_can_be_left_out():
     assert 0 < len(rest) < len(first)
     assert not left_out[rest["y"], rest["x"]].any()
     assert len(np.concatenate(list(whole.events()))) == len(first)
+
+
+def test_a_recording_whose_events_are_seekable_stays_so():
+    """Whatever is left out, cached, counted or put right: only events in the time of rows are read from the first."""
+    rec = in_memory()
+    none = np.zeros(SIZE, np.bool_)
+    told: list[int] = []
+    made = [
+        rec,
+        with_cached_start(rec, 10, 10),
+        without_events_of(rec, none),
+        with_counted_events(rec, told.append),
+        with_event_layout(rec, EventLayout(mirrored_x=True)),
+        with_frames(rec, rec.frames),
+        less_black(rec, 0.1),
+    ]
+    whole = small_events()
+    for each in made:
+        assert each.is_seekable
+        since = np.concatenate([*each.events_since(70_000)])
+        assert np.array_equal(since["t"], whole["t"][whole["t"] >= 70_000])
+    assert sum(told) == len(since)
+    late = with_rows_at_once(rec, 10.0)
+    assert not late.is_seekable
+    assert [*late.events_since(70_000)][-1]["t"][-1] == [*late.events()][-1]["t"][-1]
+
+
+def test_a_wrong_event_that_is_read_later_is_told_by_its_index():
+    events = small_events()
+    events["x"][400] = SIZE[1]
+    source = in_memory().source
+    chunks = np.array_split(events, 10)
+    later = SeekableEvents(lambda: iter(chunks), lambda t: (chunk for chunk in chunks if chunk["t"][-1] >= t))
+    rec = Recording(dataclasses.replace(source, events=later))
+    assert len(next(rec.events_since(0))) == 50
+    with pytest.raises(EventError, match="event 400 "):
+        list(rec.events_since(int(events["t"][300])))
 
 
 def test_events_are_counted_as_often_as_they_are_read():

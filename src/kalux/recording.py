@@ -56,6 +56,7 @@ from kalux.frames import (
 from kalux.models.colour import sample_mosaic
 from kalux.models.frame_pixels import without_stuck
 from kalux.readers import CHUNK_EVENTS, Source, joined
+from kalux.readers.source import SeekableEvents, changed, events_since
 from kalux.settings import CameraSettings
 from kalux.white import WhiteCheck, white_of_bits
 
@@ -122,10 +123,11 @@ def with_cached_start(recording: Recording, events: int, frame_bytes: int) -> Re
     Chunks of the first ``events`` events, and the first ``frame_bytes`` bytes of frames, stay in memory as long as the
     returned recording does. They must not be changed.
     """
-    cached = copy.copy(recording)
+    cached, whole = copy.copy(recording), recording.source.events
+    start = _CachedStart(whole, len, events)
     cached.source = dataclasses.replace(
         recording.source,
-        events=_CachedStart(recording.source.events, len, events),
+        events=SeekableEvents(start, whole.since) if isinstance(whole, SeekableEvents) else start,
         frames=_CachedStart(recording.source.frames, lambda frame: frame.image.nbytes, frame_bytes),
     )
     return cached
@@ -133,17 +135,20 @@ def with_cached_start(recording: Recording, events: int, frame_bytes: int) -> Re
 
 def without_events_of(recording: Recording, pixels: NDArray[np.bool_]) -> Recording:
     """The same recording without the events of ``pixels``, (H, W); how many events there are is not counted again."""
-    whole, made = recording.source.events, copy.copy(recording)
-    made.source = dataclasses.replace(
-        recording.source, events=lambda: (chunk[~pixels[chunk["y"], chunk["x"]]] for chunk in whole())
-    )
+
+    def without(chunks: Iterator[EventArray]) -> Iterator[EventArray]:
+        return (chunk[~pixels[chunk["y"], chunk["x"]]] for chunk in chunks)
+
+    made = copy.copy(recording)
+    made.source = dataclasses.replace(recording.source, events=changed(recording.source.events, without))
     return made
 
 
 def with_counted_events(recording: Recording, on_events: Callable[[int], None]) -> Recording:
     """The same recording; ``on_events`` is told the number of events of every chunk that is read, however often."""
-    whole, made = recording.source.events, copy.copy(recording)
-    made.source = dataclasses.replace(recording.source, events=lambda: counted(whole(), on_events))
+    watched = changed(recording.source.events, lambda chunks: counted(chunks, on_events))
+    made = copy.copy(recording)
+    made.source = dataclasses.replace(recording.source, events=watched)
     return made
 
 
@@ -170,7 +175,7 @@ def with_event_layout(recording: Recording, layout: EventLayout) -> Recording:
     """The same recording, whose events are put as the frames are, from a ``layout`` in which they are not."""
     if layout == AS_STORED:
         return recording
-    whole, made = recording.source.events, copy.copy(recording)
+    made = copy.copy(recording)
     height, width = recording.sensor_size
 
     def turned(chunk: EventArray) -> EventArray:
@@ -184,7 +189,8 @@ def with_event_layout(recording: Recording, layout: EventLayout) -> Recording:
             events["p"] = ~chunk["p"]
         return events
 
-    made.source = dataclasses.replace(recording.source, events=lambda: map(turned, whole()))
+    events = changed(recording.source.events, lambda chunks: map(turned, chunks))
+    made.source = dataclasses.replace(recording.source, events=events)
     return made
 
 
@@ -242,10 +248,14 @@ def with_white_from(recording: Recording, level: float) -> Recording:
 
 def with_frames(recording: Recording, frames: Callable[[], Iterator[Frame]]) -> Recording:
     """The recording with some of its own frames, or with others; their exposures are known, it has no ground truth."""
+
+    def whole() -> Iterator[EventArray]:
+        return iter(recording.events())
+
     chosen = Recording(
         dataclasses.replace(
             recording.source,
-            events=lambda: iter(recording.events()),
+            events=SeekableEvents(whole, recording.events_since) if recording.is_seekable else whole,
             frames=frames,
             count_frames=lambda: sum(1 for _ in frames()),
             exposure_known=True,
@@ -581,16 +591,19 @@ class Recording:
         for index, frame in enumerate(frame_list):
             require_frame(frame, where=name, index=index)
 
-        def chunks() -> Iterator[EventArray]:
-            for start in range(0, len(array), CHUNK_EVENTS):
+        def chunks(first: int = 0) -> Iterator[EventArray]:
+            for start in range(first, len(array), CHUNK_EVENTS):
                 yield array[start : start + CHUNK_EVENTS]
+
+        def since(t: int) -> Iterator[EventArray]:
+            return chunks(int(np.searchsorted(array["t"], t)))
 
         recording = cls(
             Source(
                 path=Path(name),
                 format="arrays",
                 sensor_size=size,
-                events=chunks,
+                events=SeekableEvents(chunks, since),
                 frames=lambda: iter(frame_list),
                 count_events=lambda: len(array),
                 count_frames=lambda: len(frame_list),
@@ -662,6 +675,15 @@ class Recording:
         """The events, as checked, time-ordered chunks of bounded size."""
         return Stream(self._checked_events, self.source.count_events)
 
+    @property
+    def is_seekable(self) -> bool:
+        """Whether later events can be read without those before them."""
+        return isinstance(self.source.events, SeekableEvents)
+
+    def events_since(self, t: int) -> Iterator[EventArray]:
+        """As `events`, but of all events not before ``t``, us; some before it may come first."""
+        return self._checked(events_since(self.source.events, t), of_all=False)
+
     def frames(self) -> Stream[Frame]:
         """The frames, checked, in time order, with their exposures.
 
@@ -687,15 +709,22 @@ class Recording:
         return Stream(lambda: self._checked_frames(as_stored=True), self.source.count_frames)
 
     def _checked_events(self) -> Iterator[EventArray]:
+        return self._checked(self.source.events(), of_all=True)
+
+    def _checked(self, chunks: Iterator[EventArray], *, of_all: bool) -> Iterator[EventArray]:
+        """The chunks, checked; without those before the first one where they are not ``of_all`` events."""
         count, previous_t = 0, None
         height, width = self.sensor_size
-        for chunk in self.source.events():
+        for chunk in chunks:
             if len(chunk) == 0:
                 continue
             earliest, latest = -LATEST if previous_t is None else previous_t, int(chunk["t"][-1])
             valid = _are_valid(event_words(chunk), earliest, np.uint64(height), np.uint64(width))
             if not valid or latest > LATEST:  # `check_events` is slower, and says what is wrong
                 where = str(self.source.path)
+                if not of_all:
+                    for _ in self.events():  # tells the index of the event, too
+                        pass
                 check_events(chunk, self.sensor_size, where=where, first_index=count, previous_t=previous_t)
             count += len(chunk)
             previous_t = latest

@@ -75,6 +75,49 @@ def test_events_that_are_late_throughout_are_not_a_rate():
     assert found(with_shifted_frames(source, np.full(count, -20_000))) is None
 
 
+@pytest.mark.parametrize(("rate", "enough"), [(0.0, True), (2e-3, False), (-5e-4, False)])
+def test_of_a_right_clock_the_ends_of_the_recording_are_read_alone(rate, enough, monkeypatch):
+    """Whether or not later events can be read without those before them."""
+    asked = []
+    seen = clock_rate._offsets
+    monkeypatch.setattr(
+        clock_rate,
+        "_offsets",
+        lambda *given, **named: (asked.append(len(given[2])), seen(*given, **named))[1],
+    )
+    source = recorded(rate)
+    rewound = Recording(dataclasses.replace(source.source, events=source.source.events.whole))
+    assert source.is_seekable
+    assert not rewound.is_seekable
+    stretches = len(_stretches(exposures_of(source)))
+    assert stretches > 6
+    told = [found(either) for either in (source, rewound)]
+    assert asked == 2 * ([6] if enough else [6, stretches])
+    assert (told[0] is None) == (told[1] is None)
+    if told[0] is not None:
+        assert told[0].rate == told[1].rate
+
+
+def test_where_the_ends_do_not_tell_all_is_read_unless_too_little_is_left(monkeypatch):
+    source, asked = recorded(2e-3), []
+    seen = clock_rate._offsets
+
+    def without_ends(recording, camera, stretches, **named):
+        asked.append(len(stretches))
+        if len(stretches) == 6:
+            return Offsets(np.empty(0), np.empty(0))
+        return seen(recording, camera, stretches, **named)
+
+    monkeypatch.setattr(clock_rate, "_offsets", without_ends)
+    many = [slice(24 * k, 24 * k + 24) for k in range(14)]
+    for count, read in ((13, [6]), (14, [6, 14])):
+        monkeypatch.setattr(clock_rate, "_stretches", lambda _, count=count: many[:count])
+        asked.clear()
+        clock = found(source)
+        assert asked == read
+        assert (clock is not None) == (len(read) == 2)
+
+
 def test_nothing_is_read_of_a_recording_that_is_too_short():
     source = recorded(2e-3)
     short = with_frames(source, lambda: pytest.fail("read"))
@@ -154,11 +197,12 @@ def test_a_line_is_found_in_spite_of_one_stretch(rate, offset, count, wrong, by)
 def test_offsets_that_wander_are_no_rate(monkeypatch):
     """An even pan has offsets anywhere; some seem to follow each other."""
     source = recorded()
+    monkeypatch.setattr(clock_rate, "_ends_suffice", lambda *_: False)
     times = np.linspace(0, 14e6, 8)
     wandering = np.array([0, 9, 12, 30, 26, 45, 61, 62]) * 1e3
     for factor, is_one in ((2.0, False), (0.5, True)):
         seen = Offsets(times, factor * wandering)
-        monkeypatch.setattr(clock_rate, "offsets", lambda *_, seen=seen: seen)
+        monkeypatch.setattr(clock_rate, "_offsets", lambda *_, seen=seen: seen)
         assert (found(source) is not None) == is_one
 
 

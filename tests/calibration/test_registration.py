@@ -34,6 +34,19 @@ def test_the_identity_leaves_frames_as_they_are():
     assert (frame.exposure_start, frame.exposure_end, frame.white_value) == (5, 9, 65535)
 
 
+@pytest.mark.parametrize("dtype", [np.uint8, np.float32])
+def test_where_both_cameras_are_one_nothing_is_resampled(dtype):
+    """As resampling with a shift of nothing would have it, to the bit."""
+    image = noise(dtype)
+    same, resampled = Registration.same_pixels(SIZE), Registration(LENS, Lens.pinhole(SIZE), np.eye(3))
+    assert same.is_identity
+    assert not resampled.is_identity
+    np.testing.assert_array_equal(same.resampled(image), resampled.resampled(image))
+    for found, expected in zip(same.maps, resampled.maps, strict=True):
+        np.testing.assert_allclose(found, expected, atol=1e-5)
+        assert found.dtype == expected.dtype
+
+
 def test_a_shift_takes_the_mask_along():
     image = noise()
     frame = shifted(3, -2).frame(Frame(image, 0, 1))

@@ -21,6 +21,7 @@ from recordings import (
     SIZE,
     all_events,
     assert_only_clear_errors,
+    check_seeking,
     colour_frames,
     damaged,
     read_by_dv_processing,
@@ -145,6 +146,18 @@ def test_large_packets_are_split_and_small_ones_joined(path):
     assert [len(chunk) for chunk in readers.read(path).events()] == [CHUNK_EVENTS, 13]
     path.write_bytes(aedat4_file([(0, event_packet(many[:5]))] * 10))
     assert [len(chunk) for chunk in readers.read(path).events()] == [50]
+
+
+@pytest.mark.parametrize("module", ["capture", "jAER"])
+def test_later_events_are_read_without_those_before(path, module):
+    """Packets may be empty, or begin and end at the same time."""
+    times = [[], [1, 1, 5], [5, 5], [5, 8], [], [9, 20], [20, 31], [40], []]
+    packets = [
+        event_packet(make_events(t, t, np.zeros_like(t), np.ones_like(t)))
+        for t in (np.array(packet, np.int64) for packet in times)
+    ]
+    path.write_bytes(aedat4_file([(0, packet) for packet in packets], module=module))
+    check_seeking(readers.read(path), [*range(-1, 42), 1 << 40])
 
 
 def test_late_frames_are_put_in_order(path):

@@ -18,6 +18,7 @@ from recordings import (
     SIZE,
     all_events,
     assert_only_clear_errors,
+    check_seeking,
     colour_frames,
     damaged,
     same_frames,
@@ -25,6 +26,8 @@ from recordings import (
     small_frames,
     write_kalux,
 )
+
+EVENTS_PER_CHUNK = 1 << 17
 
 MASK = np.random.default_rng(1).random(SIZE) < 0.5
 
@@ -48,6 +51,22 @@ def test_round_trip(path):
     for _ in range(2):
         assert np.array_equal(all_events(source), small_events())
         assert same_frames(source.frames(), small_frames())
+
+
+@pytest.mark.parametrize("distinct", [1, 40, 1 << 20])
+def test_later_events_are_read_without_those_before(path, distinct):
+    """Also where chunks of the file begin and end with events of the same time."""
+    events = np.tile(small_events(1), 5 * EVENTS_PER_CHUNK + 7)
+    events["t"] = np.linspace(0, distinct, len(events)).astype(np.int64)
+    write_kalux(path, events=[events])
+    check_seeking(
+        readers.read(path), [-5, 0, distinct // 3, distinct // 2, distinct - 1, distinct, distinct + 1]
+    )
+
+
+def test_a_file_without_events_has_none_later_either(path):
+    write_kalux(path, events=[])
+    assert [*readers.read(path).events.since(5)] == []
 
 
 def test_a_copy_of_a_copy_is_the_same(path, tmp_path):

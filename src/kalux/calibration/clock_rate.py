@@ -9,7 +9,7 @@ of the one before, and a line is laid through them.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import islice
 from typing import Final, NamedTuple
 
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.calibration.intervals import APART_IN_TIME, frames_apart
-from kalux.calibration.offset import LEAST_FRAMES, Changes, correlate, frame_changes
+from kalux.calibration.offset import LEAST_FRAMES, MARGIN, Changes, correlate, frame_changes
 from kalux.calibration.registration import Registration
 from kalux.calibration.regression import huber_weights
 from kalux.errors import EventError, InputError
@@ -48,6 +48,11 @@ _REACH: Final = 50_000
 _CLEAR: Final = 4_000
 """us, standard error up to which the offset of a stretch is told: 0.3 to 2 ms where a camera is in the hand, or shakes.
 In an even pan a change of offset is one of nothing but place, and errors are tens of ms."""
+
+_END: Final = 3
+_AGREE: Final = 2_000
+"""Stretches at the beginning, and at the end, and us by which the medians of two or more of either's offsets may differ
+where there is no rate. `_LEAST_GAIN` over the recording is 4 ms or more between them."""
 
 _LEAST_GAIN: Final = 6_000
 """us from the first to the last stretch below which a rate is left: events trail the light by 1 to 7 ms, the slower it
@@ -95,7 +100,8 @@ def find_clock_rate(recording: Recording, camera: CameraSettings, exposures: Tim
     """The rate of the frames' clock, where it comes to 6 ms or more over the recording, and is certain; else None.
 
     Recordings of less than eight stretches of 24 frames or 1 s, and half of that between them, are too short to tell:
-    12 s at 25 Hz. All frames and events are read once.
+    12 s at 25 Hz. Where the first and the last stretches have the same offset there is no rate; else all are looked at.
+    All frames are read once, or twice; events as often, where later ones cannot be read without those before them.
 
     Parameters
     ----------
@@ -111,7 +117,10 @@ def find_clock_rate(recording: Recording, camera: CameraSettings, exposures: Tim
     ExposureError
         If the frames' exposures are not known.
     """
-    found = offsets(recording, camera, exposures)
+    stretches = _stretches(exposures)
+    if not stretches or _ends_suffice(recording, camera, stretches):
+        return None
+    found = _offsets(recording, camera, stretches)
     if len(found.times) < _LEAST:
         return None
     line = _line(found)
@@ -123,8 +132,34 @@ def find_clock_rate(recording: Recording, camera: CameraSettings, exposures: Tim
 
 def offsets(recording: Recording, camera: CameraSettings, exposures: Times) -> Offsets:
     """Offsets of the frames' clock all over a recording, as far as they can be told; see `find_clock_rate`."""
-    seen = _changes(recording, camera, _stretches(exposures))
-    clear = [*_clear_offsets(recording, seen)]
+    return _offsets(recording, camera, _stretches(exposures))
+
+
+def _ends_suffice(recording: Recording, camera: CameraSettings, stretches: Sequence[slice]) -> bool:
+    """Whether the first and last stretches say that there is no rate to be found.
+
+    They do if their offsets are the same, or if so few of them are clear that too few of all would be.
+    """
+    ends = [*stretches[:_END], *stretches[-_END:]]
+    times, found = _offsets(recording, camera, ends, farthest=2 * _REACH)
+    if len(stretches) - (len(ends) - len(times)) < _LEAST:
+        return True
+    late = times > times.mean() if len(times) else np.zeros(0, np.bool_)
+    if min(np.count_nonzero(late), np.count_nonzero(~late)) < 2:
+        return False
+    return bool(abs(np.median(found[late]) - np.median(found[~late])) <= _AGREE)
+
+
+def _offsets(
+    recording: Recording,
+    camera: CameraSettings,
+    stretches: Sequence[slice],
+    *,
+    farthest: int | None = None,
+) -> Offsets:
+    """Offsets of stretches, as far as they can be told ``farthest`` us around those before them; None: anywhere."""
+    seen = _changes(recording, camera, stretches)
+    clear = [*_clear_offsets(recording, seen, farthest)]
     return Offsets(*np.array(clear, np.float64).reshape(-1, 2).T)
 
 
@@ -158,16 +193,19 @@ def _changes(recording: Recording, camera: CameraSettings, stretches: Sequence[s
     return found
 
 
-def _clear_offsets(recording: Recording, seen: Sequence[Changes]) -> Iterator[tuple[float, float]]:
+def _clear_offsets(
+    recording: Recording, seen: Sequence[Changes], farthest: int | None
+) -> Iterator[tuple[float, float]]:
     """Time and offset, us, of each stretch whose offset is clear, looked for around that of the last such one."""
-    chunks, kept = iter(recording.events()), list[EventArray]()
+    events_since = _events_since(recording)
     centre, before = 0.0, 0.0
     for changes in seen:
         time = float(changes.middles.mean())
         reach = round(_REACH + _FASTEST * (time - before)) if before else _REACH
-        ahead = _ahead(chunks, kept)
+        reach = reach if farthest is None else min(reach, farthest)
+        around = events_since(int(changes.middles[0]) + round(centre) - reach - MARGIN)
         try:
-            found = correlate(changes, ahead, recording.sensor_size, centre=centre, reach=reach)
+            found = correlate(changes, around, recording.sensor_size, centre=centre, reach=reach)
         except EventError:
             raise
         except InputError:  # nothing changes there, or there are no events
@@ -175,6 +213,14 @@ def _clear_offsets(recording: Recording, seen: Sequence[Changes]) -> Iterator[tu
         if found.sure and found.standard_error <= _CLEAR:
             centre, before = found.offset, time
             yield time, found.offset
+
+
+def _events_since(recording: Recording) -> Callable[[int], Iterator[EventArray]]:
+    """Makes of each of some times, us, in order, an iterator over the events since then, and maybe some before it."""
+    if recording.is_seekable:
+        return recording.events_since
+    chunks, kept = iter(recording.events()), list[EventArray]()
+    return lambda _: _ahead(chunks, kept)
 
 
 def _ahead(chunks: Iterator[EventArray], kept: list[EventArray]) -> Iterator[EventArray]:

@@ -71,17 +71,25 @@ class Registration:
         return cls(rig.events, rig.frames, rig.homography(distance))
 
     @cached_property
+    def is_identity(self) -> bool:
+        """Whether both cameras are one, so that there is nothing to resample."""
+        return self.events is self.frames and np.array_equal(self.homography, np.eye(3))
+
+    @cached_property
     def maps(self) -> Maps:
         """Where each pixel of the event camera lies in the frame."""
         height, width = self.events.sensor_size
+        if self.is_identity:
+            rows, columns = np.arange(height, dtype=np.float32), np.arange(width, dtype=np.float32)
+            return Maps(*np.meshgrid(columns, rows), np.ones((height, width), np.bool_))
         x, y = self.places(self.undistorted).T.reshape(2, height, width)
-        rows, columns = self.frames.sensor_size
+        bottom, right = self.frames.sensor_size[0] - 1, self.frames.sensor_size[1] - 1
         with np.errstate(invalid="ignore"):
-            inside = (x >= -_EDGE) & (x <= columns - 1 + _EDGE) & (y >= -_EDGE) & (y <= rows - 1 + _EDGE)
+            inside = (x >= -_EDGE) & (x <= right + _EDGE) & (y >= -_EDGE) & (y <= bottom + _EDGE)
         # A pixel outside shows the nearest that is inside: a guess, for the filter to start with.
         return Maps(
-            np.clip(np.nan_to_num(x), 0, columns - 1).astype(np.float32),
-            np.clip(np.nan_to_num(y), 0, rows - 1).astype(np.float32),
+            np.clip(np.nan_to_num(x), 0, right).astype(np.float32),
+            np.clip(np.nan_to_num(y), 0, bottom).astype(np.float32),
             inside,
         )
 
@@ -115,6 +123,8 @@ class Registration:
 
     def filtered(self, image: NDArray[Any]) -> NDArray[np.float32]:
         """An image of the frame camera, blurred to the event camera's pixels where these are larger; float32."""
+        if self.is_identity:
+            return np.asarray(image, np.float32)
         sigma = _APERTURE * np.sqrt(max(self.scale**2 - 1.0, 0.0))
         source = np.asarray(image, np.float32)
         if sigma < 0.1:
@@ -125,6 +135,8 @@ class Registration:
 
     def sampled(self, filtered: NDArray[np.float32]) -> NDArray[np.float32]:
         """A filtered image at the event camera's pixels, (H, W) or (H, W, channels) float32."""
+        if self.is_identity:
+            return filtered
         x, y, _ = self.maps
         return np.asarray(
             cv2.remap(filtered, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32

@@ -13,6 +13,7 @@ import re
 import struct
 import xml.etree.ElementTree as ElementTree
 from array import array
+from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -26,7 +27,7 @@ import zstandard
 from numpy.typing import NDArray
 
 from kalux.errors import FormatError
-from kalux.events import EVENT_DTYPE, EventArray
+from kalux.events import EVENT_DTYPE, LATEST, EventArray
 from kalux.frames import Frame, Mosaic
 from kalux.layouts import AEDAT4_MAGIC, AEDAT4_PACKET, AEDAT4_PIXELS
 from kalux.readers import aedat2
@@ -35,6 +36,7 @@ from kalux.readers.source import (
     EXPOSURE_UNKNOWN,
     NO_FRAMES,
     TRIGGER_DTYPE,
+    SeekableEvents,
     Source,
     TriggerArray,
     begins_with,
@@ -92,9 +94,9 @@ class _Container:
     streams: tuple[_Stream, ...]
     packets: dict[int, array[int]]  # stream -> offset, size, offset, size, ...
 
-    def read(self, stream: _Stream, decode: Callable[[_Table], T]) -> Iterator[T]:
-        """The contents of one stream, packet by packet."""
-        places = self.packets.get(stream.number, array("q"))
+    def read(self, stream: _Stream, decode: Callable[[_Table], T], first: int = 0) -> Iterator[T]:
+        """The contents of one stream, packet by packet, from the ``first`` on."""
+        places = self.packets.get(stream.number, array("q"))[2 * first :]
         identifier = stream.kind.encode()
         with reading(self.path), self.path.open("rb", buffering=0) as file:
             for offset, size in zip(places[::2], places[1::2], strict=True):
@@ -192,10 +194,11 @@ def read(path: Path) -> Source:
         if mosaic is None and any(stream.filters for stream in container.streams):
             missing += (_JAER_COLOURS,)
 
-    def read_events() -> Iterator[EventArray]:
+    def read_events(since: int | None = None) -> Iterator[EventArray]:
         if events is None:
             return iter(())
-        chunks = _joined(container.read(events, _events))
+        first = 0 if since is None else _packet_of(container, events, since)
+        chunks = _joined(container.read(events, _events, first))
         return (_upright(chunk, events.size[0]) for chunk in chunks) if events.by_jaer else chunks
 
     def read_frames() -> Iterator[Frame]:
@@ -217,7 +220,7 @@ def read(path: Path) -> Source:
         path=path,
         format="aedat4",
         sensor_size=(events or frames).size,  # type: ignore[union-attr]
-        events=read_events,
+        events=SeekableEvents(read_events, read_events),
         frames=read_frames,
         count_events=count_events,
         count_frames=lambda: 0 if frames is None else len(container.packets[frames.number]) // 2,
@@ -315,6 +318,18 @@ def _events(table: _Table) -> memoryview:
     if table.data[start + _POLARITY : end : EVENT_DTYPE.itemsize].translate(None, b"\0\1"):
         raise ValueError("polarity is neither 0 nor 1")
     return memoryview(table.data)[start:end]
+
+
+def _packet_of(container: _Container, stream: _Stream, t: int) -> int:
+    """The packet after which the events not before ``t``, us, begin, or that holds the first of them."""
+
+    def begin(packet: int) -> int:
+        filled = (content for content in container.read(stream, _events, packet) if len(content))
+        content = next(filled, None)
+        return LATEST if content is None else int(np.frombuffer(content, EVENT_DTYPE, 1)["t"][0])
+
+    packets = range(len(container.packets.get(stream.number, ())) // 2)
+    return max(bisect_left(packets, t, key=begin) - 1, 0)
 
 
 def _joined(packets: Iterator[memoryview]) -> Iterator[EventArray]:

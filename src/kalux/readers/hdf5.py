@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
@@ -21,6 +22,7 @@ from kalux.readers.source import (
     EXPOSURE_UNKNOWN,
     NO_EVENTS,
     NO_FRAMES,
+    SeekableEvents,
     Source,
     begins_with,
     checked_inverse_covariance,
@@ -83,7 +85,7 @@ def read(path: Path) -> Source:
         path=path,
         format="kalux",
         sensor_size=sensor_size,
-        events=lambda: _events(path),
+        events=SeekableEvents(lambda: _events(path), lambda t: _events(path, t)),
         frames=lambda: _frames(path),
         count_events=lambda: event_count,
         count_frames=lambda: frame_count,
@@ -175,7 +177,8 @@ def _check_version(path: Path, version: str) -> None:
         )
 
 
-def _events(path: Path) -> Iterator[EventArray]:
+def _events(path: Path, since: int | None = None) -> Iterator[EventArray]:
+    """All events, or those of the file's chunks that hold all ``since`` a time, us."""
     with opened(path) as file:
         columns = [file["events"][name] for name in HDF5_COLUMNS]
         # Whole chunks of the file: reading across their borders decompresses each twice.
@@ -184,14 +187,15 @@ def _events(path: Path) -> Iterator[EventArray]:
         buffers = [np.empty(min(stored, len(column)), column.dtype) for column in columns]
         spaces = [column.id.get_space() for column in columns]
         kinds = [column.id.get_type() for column in columns]
-        for start in range(0, len(columns[0]), step):
+        first = 0 if since is None else _chunk_of(columns[0], stored, since) * stored
+        for start in range(first, len(columns[0]), step):
             events: EventArray = memory.empty((min(step, len(columns[0]) - start),), EVENT_DTYPE)
             # One by one: other threads that read HDF5 wait meanwhile.
-            for first in range(0, len(events), stored):
-                part = events[first : first + stored]
+            for place in range(0, len(events), stored):
+                part = events[place : place + stored]
                 here = library().h5s.create_simple((len(part),))
                 for column, space, kind, buffer in zip(columns, spaces, kinds, buffers, strict=True):
-                    space.select_hyperslab((start + first,), (len(part),))
+                    space.select_hyperslab((start + place,), (len(part),))
                     column.id.read(here, space, buffer, kind)
                 t, x, y, p = (
                     _as_stated(path, name, buffer[: len(part)])
@@ -199,6 +203,12 @@ def _events(path: Path) -> Iterator[EventArray]:
                 )
                 _join(t, x, y, p, event_words(part))
             yield events
+
+
+def _chunk_of(times: Any, stored: int, t: int) -> int:
+    """The chunk of the file, of ``stored`` events each, that holds the first one not before ``t``."""
+    chunks = range(-(-len(times) // stored))
+    return max(bisect_left(chunks, t, key=lambda chunk: int(times[chunk * stored])) - 1, 0)
 
 
 @loop

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache
+from itertools import dropwhile
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -37,6 +38,42 @@ class Lost(NamedTuple):
     first: int
 
 
+@dataclass(frozen=True)
+class SeekableEvents:
+    """For `Source.events`: events that need not be read from the first one on.
+
+    Attributes
+    ----------
+    whole
+        Called for all of them, as `Source.events`.
+    since
+        Called with a time, us: chunks with all events that are not before it, in order; some before it may come first.
+    """
+
+    whole: Callable[[], Iterator[EventArray]]
+    since: Callable[[int], Iterator[EventArray]]
+
+    def __call__(self) -> Iterator[EventArray]:
+        return self.whole()
+
+
+def events_since(events: Callable[[], Iterator[EventArray]], t: int) -> Iterator[EventArray]:
+    """As `SeekableEvents.since`, of any `Source.events`: what is not seekable is read from its beginning."""
+    if isinstance(events, SeekableEvents):
+        return events.since(t)
+    return dropwhile(lambda chunk: not len(chunk) or chunk["t"][-1] < t, events())
+
+
+def changed(
+    events: Callable[[], Iterator[EventArray]],
+    change: Callable[[Iterator[EventArray]], Iterator[EventArray]],
+) -> Callable[[], Iterator[EventArray]]:
+    """The events with a ``change`` to their chunks that leaves times and order; seekable if they were."""
+    if isinstance(events, SeekableEvents):
+        return SeekableEvents(lambda: change(events.whole()), lambda t: change(events.since(t)))
+    return lambda: change(events())
+
+
 @dataclass(frozen=True, kw_only=True)
 class Source:
     """A recording as a reader found it, before any check of its contents.
@@ -50,7 +87,8 @@ class Source:
     sensor_size
         (height, width), pixels.
     events
-        Called for a fresh iterator over time-ordered, bounded chunks of `EVENT_DTYPE`.
+        Called for a fresh iterator over time-ordered, bounded chunks of `EVENT_DTYPE`; `SeekableEvents` where a later
+        part can be read without what is before it.
     count_events, count_frames
         Number of events and frames; may read through the file.
     frames
@@ -145,7 +183,9 @@ def with_rows_turned(source: Source) -> Source:
     height = source.sensor_size[0]
     return dataclasses.replace(
         source,
-        events=lambda: (_with_rows(chunk, _turned(chunk["y"], height)) for chunk in source.events()),
+        events=changed(
+            source.events, lambda chunks: (_with_rows(chunk, _turned(chunk["y"], height)) for chunk in chunks)
+        ),
         rows_from_below=True,
     )
 
@@ -157,7 +197,11 @@ def on_sensor(source: Source, size: tuple[int, int]) -> Source:
     if not lower:
         return moved
     return dataclasses.replace(
-        moved, events=lambda: (_with_rows(chunk, chunk["y"] + np.uint16(lower)) for chunk in source.events())
+        moved,
+        events=changed(
+            source.events,
+            lambda chunks: (_with_rows(chunk, chunk["y"] + np.uint16(lower)) for chunk in chunks),
+        ),
     )
 
 
