@@ -1090,11 +1090,13 @@ def with_rounding(variance, intensity, moving, level, offset):
     return given
 
 
-def averaged(level, variance, hears, rough, apart=1):
+def averaged(level, variance, hears, rough, apart=1, more=None):
     """K12, of whole images: L, and its variance if errors were independent, of the pixels that hear neighbours.
 
-    ``rough`` is the variance by which pixels one apart differ on one surface; neighbours are ``apart``.
+    ``rough`` is the variance by which pixels one apart differ on one surface, ``more`` how many times that they differ
+    from a pixel; neighbours are ``apart``.
     """
+    more = np.ones(level.shape) if more is None else more
     out, left = level.copy(), variance.copy()
     around = [(down, right) for down in (-1, 0, 1) for right in (-1, 0, 1)]
     inside = set(np.ndindex(level.shape))
@@ -1110,7 +1112,9 @@ def averaged(level, variance, hears, rough, apart=1):
                 if one in inside and two in inside:
                     noise = variance[one] + variance[two] + rough[min(one, two)] * distance2 / 8
                     unlike += (level[two] - level[one]) ** 2 / noise
-            weight = (1 + unlike / 18) ** -2 / (variance[other] + rough[other] * distance2)
+            weight = (1 + unlike / 18) ** -2 / (
+                variance[other] + more[row, column] * rough[other] * distance2
+            )
             information, total = information + weight, total + weight * level[other]
         out[row, column], left[row, column] = total / information, 1 / information
     return out, left
@@ -1125,6 +1129,14 @@ def regularised(level, variance, moving, difference):
 def is_surface(pixels):
     """K12: whether pixels that no frame around measures make up a surface. Of a sensor of one part."""
     return np.count_nonzero(pixels) >= 16
+
+
+def median_around(values, place):
+    """Of a pixel and its eight neighbours; beyond the border the nearest pixels count."""
+    rows, columns = (
+        np.clip([at - 1, at, at + 1], 0, size - 1) for at, size in zip(place, values.shape, strict=True)
+    )
+    return np.median(values[np.ix_(rows, columns)])
 
 
 def roughness(level, variance, surface, usual):
@@ -1148,11 +1160,13 @@ def roughness(level, variance, surface, usual):
     return rough
 
 
-def smoothed_surfaces(level, variance, surface, difference):
+def smoothed_surfaces(level, variance, surface, difference, white):
     """K12, of whole images: L and its variance on surfaces that no frame around measures."""
-    rough = roughness(level, variance, surface, difference**2)
-    near, left = averaged(level, variance, surface, rough)
-    far, independent = averaged(near, left, surface, 20 * rough, apart=2)
+    rough, more = roughness(level, variance, surface, difference**2), np.ones(level.shape)
+    for place in np.ndindex(level.shape):
+        more[place] = (1 + 0.4 * max(median_around(level, place) - white - 2, 0)) ** 2
+    near, left = averaged(level, variance, surface, rough, more=more)
+    far, independent = averaged(near, left, surface, 20 * rough, apart=2, more=more)
     return far, 0.7 * variance + 0.3 * independent
 
 

@@ -231,7 +231,7 @@ def assert_agrees(name, events, frames, times):
             for place, pixel in pixels.items():
                 surface[place] = naive.is_unmeasured(pixel, t) and not unshown[place]
             if naive.is_surface(surface):
-                smooth = naive.smoothed_surfaces(raised, known, surface, chosen.filter.neighbours)
+                smooth = naive.smoothed_surfaces(raised, known, surface, chosen.filter.neighbours, top)
                 value, total = (
                     np.where(surface, *planes) for planes in zip(smooth, (value, total), strict=True)
                 )

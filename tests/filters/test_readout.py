@@ -292,18 +292,42 @@ def test_surfaces_that_no_frame_measures_are_smooth_and_their_edges_stay(step, s
 
 
 @pytest.mark.parametrize("shape", [(8, 8), (7, 8)])
-def test_surfaces_are_the_oracles(shape):
-    """K12 of surfaces, pixel by pixel, among moving and still pixels that frames measure."""
+@pytest.mark.parametrize("white", [np.inf, -4.5])
+def test_surfaces_are_the_oracles(shape, white):
+    """K12 of surfaces, pixel by pixel, among moving and still pixels that frames measure; far beyond white, too."""
     rng = np.random.default_rng(4)
-    level, variance = rng.normal(-1.0, 0.3, shape), np.exp(rng.normal(-3.0, 1.0, shape))
+    level, variance = rng.normal(-1.0, 0.7, shape), np.exp(rng.normal(-3.0, 1.0, shape))
     moving, surface = rng.random((2, *shape)) < 0.5
     read = {"moving": moving | surface, "difference": 0.2}
-    image, left, _ = read_out(level, variance, 0.0, OFF, **read, unmeasured=np.flatnonzero(surface))
-    expected, doubt = naive.smoothed_surfaces(level, variance, surface, 0.2)
+    prior = OFF._replace(white=white)
+    image, left, _ = read_out(level, variance, 0.0, prior, **read, unmeasured=np.flatnonzero(surface))
+    expected, doubt = naive.smoothed_surfaces(level, variance, surface, 0.2, white)
     np.testing.assert_allclose(np.log(image)[surface], expected[surface], atol=1e-5)
     np.testing.assert_allclose(left[surface], doubt[surface], rtol=1e-4)
+    usual = naive.smoothed_surfaces(level, variance, surface, 0.2, np.inf)[0]
+    assert (np.abs(usual - expected)[surface].max() > 0.05) == np.isfinite(white)
     others = read_out(level, variance, 0.0, OFF, **read)[0]
     np.testing.assert_array_equal(image[~surface], others[~surface])
+
+
+@pytest.mark.parametrize("pitch", [1, 2])
+def test_a_lamp_is_less_like_what_is_around_it_than_a_sky(pitch):
+    """K12: what is far beyond white is rougher; a single bright pixel is not taken for a lamp."""
+    rng = np.random.default_rng(6)
+    shape = (24, 24)
+    lamp, single = np.zeros((2, *shape), bool)
+    lamp[8 : 8 + 3 * pitch, 8 : 8 + 3 * pitch] = True
+    single[16, 16] = True
+    variance, everywhere = np.full(shape, 0.3), np.arange(24 * 24)
+    read = {"moving": np.ones(shape, bool), "difference": 0.2, "pitch": pitch, "unmeasured": everywhere}
+
+    def kept(beyond, bright):
+        level = beyond + 1.5 * bright + rng.normal(0.0, 0.01, shape)
+        found = np.log(read_out(level, variance, 0.0, OFF._replace(white=0.0), **read)[0])
+        return (found - beyond)[bright].mean() / 1.5
+
+    assert kept(4.0, lamp) > kept(0.0, lamp) + 0.05
+    assert kept(0.0, single) == pytest.approx(kept(-4.0, single), abs=0.05)
 
 
 @pytest.mark.parametrize("pitch", [1, 2])
@@ -316,7 +340,8 @@ def test_surfaces_depend_on_nothing_beyond_what_their_means_look_at(pitch, monke
 
     def found():
         options = {"moving": surface, "difference": 0.2, "pitch": pitch}
-        return read_out(level, variance, 0.0, OFF, **options, unmeasured=np.flatnonzero(surface))[:2]
+        prior = OFF._replace(white=-4.0)
+        return read_out(level, variance, 0.0, prior, **options, unmeasured=np.flatnonzero(surface))[:2]
 
     of_window = found()
     monkeypatch.setattr(readout, "_window_around", lambda places, shape: tuple(slice(0, n) for n in shape))

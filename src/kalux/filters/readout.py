@@ -6,6 +6,7 @@ With the prior on highlights (docs/equations.md, K6) and the weighted mean over 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from typing import Any, Final, NamedTuple
 
 import numba as nb
@@ -28,7 +29,7 @@ from kalux.compiled import (
     word_at,
     zeros,
 )
-from kalux.filters.surfaces import surface_pixels, surface_variance
+from kalux.filters.surfaces import rougher_where_bright, surface_pixels, surface_variance
 from kalux.formulas import Number, Row, choose, formula, squared
 
 Array = NDArray[np.floating[Any]]
@@ -319,7 +320,8 @@ def read_out(
         surface = surface_pixels(unmeasured, out.shape)
         if len(surface):
             state = level, known, moving, change
-            smooth, left = _smooth_surfaces(state, (of_silent, of_moving), surface, difference2, pitch)
+            usual = difference2, np.float32(prior.white)
+            smooth, left = _smooth_surfaces(state, (of_silent, of_moving), surface, usual, pitch)
             read_levels(smooth, left, *scalars)
             out.reshape(-1)[surface] = smooth
             if total.size:
@@ -331,13 +333,13 @@ def _smooth_surfaces(
     state: tuple[NDArray[Any], ...],
     subthreshold: tuple[np.float32, np.float32],
     pixels: NDArray[np.int64],
-    usual: np.float32,
+    usual: tuple[np.float32, np.float32],
     pitch: int,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """(N,) L of ``pixels`` and its variance, averaged by how rough the surface around them is.
 
     They are averaged with their eight neighbours, and then with those twice as far away. ``state`` holds L, P, what
-    moves, and the change of silent pixels.
+    moves, and the change of silent pixels; ``usual`` are the variance by which neighbours differ, and L of white.
     """
     width = state[0].shape[1]
     row, column = np.divmod(pixels, width)
@@ -356,11 +358,15 @@ def _smooth_surfaces(
     inside = (row - rows.start) * shape[1] + column - columns.start
     surface = np.zeros(shape, np.bool_)
     surface.reshape(-1)[inside] = True
-    rough = surface_variance(level, variance, surface, usual, pitch)
+    difference2, white = usual
+    rough, more = (
+        surface_variance(level, variance, surface, difference2, pitch),
+        rougher_where_bright(level, white, pitch),
+    )
     near, left = level.copy(), variance.copy()
-    _average_surface(level, variance, rough, surface, pitch, pitch, near, left)
+    _average_surface(level, variance, (rough, more), surface, pitch, pitch, near, left)
     far, independent = memory.empty((2, *shape))  # filled where they are looked at
-    _average_surface(near, left, _FARTHER * rough, surface, 2 * pitch, pitch, far, independent)
+    _average_surface(near, left, (_FARTHER * rough, more), surface, 2 * pitch, pitch, far, independent)
     averaged, alone, together = (plane.reshape(-1)[inside] for plane in (far, variance, independent))
     return averaged, CORRELATED * alone + (ONE - CORRELATED) * together
 
@@ -380,7 +386,7 @@ def _window_around(places: tuple[NDArray[np.int64], ...], shape: tuple[int, ...]
 def _average_surface(
     level: NDArray[np.float32],
     variance: NDArray[np.float32],
-    allowed: NDArray[np.float32],
+    allowed: tuple[NDArray[np.float32], NDArray[np.float32]],
     surface: NDArray[np.bool_],
     pitch: int,
     patch: int,
@@ -389,10 +395,11 @@ def _average_surface(
 ) -> None:
     """Fill L and its variance, if errors were independent, after averaging, at the pixels of the surface.
 
-    Neighbours are ``pitch`` apart, the pixels of the patches around them ``patch``.
+    Neighbours are ``pitch`` apart, the pixels of the patches around them ``patch``. ``allowed`` are the variance by
+    which those one apart differ, of the neighbour, and how many times that, of the pixel itself.
     """
     for begin in range(0, level.shape[1], _STRIP):
-        _average_planes(level, variance, allowed, surface, pitch, patch, begin, _ring(pitch, ONE), out, left)
+        _average_planes(level, variance, *allowed, surface, pitch, patch, begin, _ring(pitch, ONE), out, left)
 
 
 def _ring(pitch: int, difference2: np.float32) -> _Ring:
@@ -485,8 +492,9 @@ def _read_out(  # type: ignore[no-untyped-def]
                 first, last = smaller(first, spans[place, 0]), larger(last, spans[place, 1])
         if first < last and row + pitch >= 0:
             _compare_row(
-                row, first, last, pitch, pitch, states, allowed, weights, distances, similarities, differences
+                row, first, last, pitch, pitch, states, allowed, distances, similarities, differences
             )
+            _weigh_row(row + pitch, first, last, pitch, states, allowed, weights)
         if row < 0:
             continue
         # L, and I.
@@ -527,36 +535,46 @@ def _read_out(  # type: ignore[no-untyped-def]
 
 
 @loop(fastmath=FUSED)
-def _average_planes(level, variance, allowed, hears, pitch, patch, begin, ring, out, left):  # type: ignore[no-untyped-def]
+def _average_planes(  # type: ignore[no-untyped-def]
+    level, variance, allowed, more, hears, pitch, patch, begin, ring, out, left
+):
     """K12 of the pixels of ``hears`` in the columns of the strip that begins with ``begin``: `_average_surface`."""
-    states, weights, distances, similarities = ring.states, ring.weights, ring.distances, ring.similarities
+    states, rough, distances, similarities = ring.states, ring.allowed, ring.distances, ring.similarities
     differences, averaged, marked, spans = ring.differences, ring.averaged, ring.moving, ring.spans
     height, count = level.shape[0], len(spans)
-    heard = zeros(_STRIP, np.float32)
+    times = zeros(_STRIP, np.float32)
     for row in range(-3 * pitch, height):
-        _load_surface(level, variance, allowed, row + 2 * pitch, begin, pitch, count, states, ring.allowed)
+        _load_surface(level, variance, allowed, row + 2 * pitch, begin, pitch, count, states, rough)
         _mark_moving(hears, row + 3 * pitch, begin, marked, spans)
         first, last = np.int64(_STRIP), np.int64(0)
         for place in range(count):
             first, last = smaller(first, spans[place, 0]), larger(last, spans[place, 1])
         if first >= last or row + pitch < 0:
             continue
-        _compare_row(
-            row,
-            first,
-            last,
-            pitch,
-            patch,
-            states,
-            ring.allowed,
-            weights,
-            distances,
-            similarities,
-            differences,
-        )
+        _compare_row(row, first, last, pitch, patch, states, rough, distances, similarities, differences)
         if row < 0:
             continue
-        _average_row(row, first, last, pitch, states, weights, similarities, marked, averaged, heard)
+        at, start = np.uint64(row), np.uint64(begin)
+        for i in range(np.uint64(smaller(begin + _STRIP, level.shape[1]) - begin)):
+            times[i] = more[at, start + i]
+        up, own, down, of_up, of_own, into = _around(row, first, pitch, count)
+        into_times = np.uint64(first)
+        for i in range(np.uint64(last - first)):
+            _average_rough(
+                states,
+                rough,
+                times,
+                into_times + i,
+                similarities,
+                up + i,
+                own + i,
+                down + i,
+                of_up + i,
+                of_own + i,
+                np.uint64(pitch),
+                averaged,
+                into + i,
+            )
         for column in range(first, smaller(last, level.shape[1] - begin)):
             if marked[row % count, column]:
                 out[row, begin + column] = averaged[_MARGIN + column]
@@ -724,7 +742,7 @@ def _compare_patches(distances: Row, before: Number, own: Number, after: Number,
 
 @nb.njit(cache=True, inline="always")
 def _compare_row(  # type: ignore[no-untyped-def]
-    row, first, last, pitch, patch, states, allowed, weights, distances, similarities, differences
+    row, first, last, pitch, patch, states, allowed, distances, similarities, differences
 ):
     """Similarities of a row's pixels to their four neighbours in `_Ring`, for columns ``first`` to ``last``.
 
@@ -740,11 +758,8 @@ def _compare_row(  # type: ignore[no-untyped-def]
     size, step, aside = np.uint64(last - first + 2 * _ASIDE), np.uint64(pitch), np.uint64(patch)
     begin = np.uint64(_MARGIN - _ASIDE + first)
     own, other = below * _TWO + begin, under * _TWO + begin
-    ahead = np.uint64((row + pitch) % count) * _TWO + begin
     for i in range(size):
         _compare_pixels(states, allowed, own + i, other + i, step, differences, begin + i)
-    for i in range(size):
-        _weigh_pixel(states, allowed, ahead + i, weights)
     into = below * _FOUR + begin
     for k in range(np.uint64(4)):
         start = begin + k * _ONE
@@ -755,6 +770,14 @@ def _compare_row(  # type: ignore[no-untyped-def]
     before, own = above * _FOUR + begin, here * _FOUR + begin
     for i in range(size):
         _compare_patches(distances, before + i, own + i, into + i, similarities)
+
+
+@nb.njit(cache=True, inline="always")
+def _weigh_row(row, first, last, pitch, states, allowed, weights):  # type: ignore[no-untyped-def]
+    """Weights of a row's pixels in the means of their neighbours."""
+    place = np.uint64(row % (4 * pitch + 1)) * _TWO + np.uint64(_MARGIN - _ASIDE + first)
+    for i in range(np.uint64(last - first + 2 * _ASIDE)):
+        _weigh_pixel(states, allowed, place + i, weights)
 
 
 @formula()
@@ -771,7 +794,61 @@ def _average(
     averaged: Row,
     into: Number,
 ) -> None:
-    """K12 of a pixel: the weighted mean of it and its eight neighbours, and its variance if errors were independent."""
+    """K12 of a pixel, where all neighbours differ alike: their weights are known."""
+    _mean(
+        states,
+        lambda place, distance: weights[place + distance],
+        similarities,
+        (up, own, down, of_up, of_own),
+        step,
+        averaged,
+        into,
+    )
+
+
+@formula()
+def _average_rough(
+    states: Row,
+    rough: Row,
+    times: Row,
+    column: Number,
+    similarities: Row,
+    up: Number,
+    own: Number,
+    down: Number,
+    of_up: Number,
+    of_own: Number,
+    step: Number,
+    averaged: Row,
+    into: Number,
+) -> None:
+    """K12 of a pixel from which neighbours differ by so many ``times`` what they do on the surface around them."""
+    more = times[column]
+    _mean(
+        states,
+        lambda place, distance: ONE / (states[place + _VARIANCE] + more * rough[place + distance]),
+        similarities,
+        (up, own, down, of_up, of_own),
+        step,
+        averaged,
+        into,
+    )
+
+
+def _mean(
+    states: Row,
+    weight: Callable[[Number, Any], Number],
+    similarities: Row,
+    places: tuple[Number, ...],
+    step: Number,
+    averaged: Row,
+    into: Number,
+) -> None:
+    """The weighted mean of a pixel and its eight neighbours, and its variance if errors were independent.
+
+    ``weight`` is that of a neighbour at a place, which lies straight or diagonally, where there is no edge.
+    """
+    up, own, down, of_up, of_own = places
     value, variance = states[own + _LEVEL], states[own + _VARIANCE]
     information, deviation = None, None
     for onward, back, ahead, behind, distance in (
@@ -780,8 +857,8 @@ def _average(
         (of_own + _TWO, of_up + _TWO, down, up, _STRAIGHT),
         (of_own + _THREE, of_up + _THREE - step, down + step, up - step, _DIAGONAL),
     ):
-        there = similarities[onward] * weights[ahead + distance]
-        back_there = similarities[back] * weights[behind + distance]
+        there = similarities[onward] * weight(ahead, distance)
+        back_there = similarities[back] * weight(behind, distance)
         more = there * (states[ahead + _LEVEL] - value) + back_there * (states[behind + _LEVEL] - value)
         deviation = more if deviation is None else deviation + more
         information = there + back_there if information is None else information + (there + back_there)
@@ -791,20 +868,31 @@ def _average(
 
 
 @nb.njit(cache=True, inline="always")
-def _average_row(  # type: ignore[no-untyped-def]
-    row, first, last, pitch, states, weights, similarities, marked, averaged, level
-):
-    """K12 of a row: ``averaged`` of all pixels from ``first`` to ``last``; ``level`` of the moving ones."""
-    count = 4 * pitch + 1
+def _around(row, first, pitch, count):  # type: ignore[no-untyped-def]
+    """Places of a row's ``first`` pixel: in states above, here and below, similarities above and here, and results."""
     above, here, below = (
         np.uint64((row - pitch) % count),
         np.uint64(row % count),
         np.uint64((row + pitch) % count),
     )
-    size, step = np.uint64(last - first), np.uint64(pitch)
-    begin, column = np.uint64(_MARGIN + first), np.uint64(first)
+    begin = np.uint64(_MARGIN + first)
     up, own, down = above * _TWO + begin, here * _TWO + begin, below * _TWO + begin
-    of_up, of_own = above * _FOUR + begin, here * _FOUR + begin
+    return up, own, down, above * _FOUR + begin, here * _FOUR + begin, begin
+
+
+@nb.njit(cache=True, inline="always")
+def _average_row(  # type: ignore[no-untyped-def]
+    row, first, last, pitch, states, weights, similarities, marked, averaged, level
+):
+    """K12 of a row: ``averaged`` of all pixels from ``first`` to ``last``; ``level`` of the moving ones."""
+    count = 4 * pitch + 1
+    here, size, step, column = (
+        np.uint64(row % count),
+        np.uint64(last - first),
+        np.uint64(pitch),
+        np.uint64(first),
+    )
+    up, own, down, of_up, of_own, begin = _around(row, first, pitch, count)
     for i in range(size):
         _average(
             states,
