@@ -29,8 +29,8 @@ that it is even, and what differs by more is seldom texture."""
 _BRIGHT: Final = 2.0
 _ROUGHER: Final = 0.4
 """Log intensity over white from which surfaces are rougher the brighter they are, and by which part of what it is for
-each unit farther: lamps are small. In the truth of 19 pans neighbours of pixels 2 to 3 beyond white differ from these by
-0.15 (median), of those 3 to 4 beyond by 0.19, 4 to 5 by 0.59, 5 to 7 by 0.83 (docs/equations.md, K12)."""
+each unit farther: lamps are small. In the truth of 19 pans neighbours of pixels 2 to 3 beyond white differ from these
+by 0.15 (median), of those 3 to 4 beyond by 0.19, 4 to 5 by 0.59, 5 to 7 by 0.83 (docs/equations.md, K12)."""
 
 _FARTHEST: Final = 6
 """Parts on one side, with the one itself, that count for each other: farther ones have less than 1e-7 of its weight."""
