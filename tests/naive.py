@@ -1164,7 +1164,7 @@ def smoothed_surfaces(level, variance, surface, difference, white):
     """K12, of whole images: L and its variance on surfaces that no frame around measures."""
     rough, more = roughness(level, variance, surface, difference**2), np.ones(level.shape)
     for place in np.ndindex(level.shape):
-        more[place] = (1 + 0.4 * max(median_around(level, place) - white - 2, 0)) ** 2
+        more[place] = (1 + 0.4 * np.clip(median_around(level, place) - white - 2, 0, 2)) ** 2
     near, left = averaged(level, variance, surface, rough, more=more)
     far, independent = averaged(near, left, surface, 20 * rough, apart=2, more=more)
     return far, 0.7 * variance + 0.3 * independent
