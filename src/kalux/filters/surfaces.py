@@ -26,11 +26,12 @@ _MOST: Final = 1.25
 """Least and most standard deviation of neighbours' differences, in units of the usual one: of no surface is it known
 that it is even, and what differs by more is seldom texture."""
 
-_BRIGHT: Final = 2.0, 4.0
+_BRIGHT: Final = 2.0
+_BRIGHTEST: Final = 4.0
 _ROUGHER: Final = 0.4
-"""Log intensity over white from which, and up to which, surfaces are rougher the brighter they are, and by which part of
-what it is for each unit: lamps are small. In the truth of 19 pans neighbours of pixels 2 to 3 beyond white differ from these
-by 0.15 (median), of those 3 to 4 beyond by 0.19, 4 to 5 by 0.59, 5 to 7 by 0.83 (docs/equations.md, K12)."""
+"""Log intensity over white from which, and up to which, surfaces are rougher the brighter they are, and by which part
+of what it is for each unit: lamps are small. In the truth of 19 pans neighbours of pixels 2 to 3 beyond white differ
+from these by 0.15 (median), of those 3 to 4 beyond by 0.19, 4 to 5 by 0.59, 5 to 7 by 0.83 (docs/equations.md, K12)."""
 
 _FARTHEST: Final = 6
 """Parts on one side, with the one itself, that count for each other: farther ones have less than 1e-7 of its weight."""
@@ -101,10 +102,11 @@ def rougher_where_bright(level: NDArray[np.float32], white: np.float32, pitch: i
     By the median of L, whose white is ``white``, of it and its neighbours, so that not where it alone is bright: 1 up
     to 2 beyond white, 3.2 from 4 on.
     """
-    beyond = np.clip(_medians(level, pitch) - np.float32(white), *np.float32(_BRIGHT)) - np.float32(
-        _BRIGHT[0]
+    beyond = np.clip(_medians(level, pitch) - white, np.float32(_BRIGHT), np.float32(_BRIGHTEST))
+    more: NDArray[np.float32] = np.square(
+        np.float32(1.0) + np.float32(_ROUGHER) * (beyond - np.float32(_BRIGHT))
     )
-    return np.asarray(np.square(np.float32(1.0) + np.float32(_ROUGHER) * beyond))
+    return more
 
 
 def _medians(level: NDArray[np.float32], pitch: int) -> NDArray[np.float32]:
