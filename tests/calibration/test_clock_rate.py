@@ -79,10 +79,10 @@ def test_events_that_are_late_throughout_are_not_a_rate():
 def test_of_a_right_clock_the_ends_of_the_recording_are_read_alone(rate, enough, monkeypatch):
     """Whether or not later events can be read without those before them."""
     asked = []
-    seen = clock_rate._offsets
+    seen = clock_rate.offsets
     monkeypatch.setattr(
         clock_rate,
-        "_offsets",
+        "offsets",
         lambda *given, **named: (asked.append(len(given[2])), seen(*given, **named))[1],
     )
     source = recorded(rate)
@@ -100,7 +100,7 @@ def test_of_a_right_clock_the_ends_of_the_recording_are_read_alone(rate, enough,
 
 def test_where_the_ends_do_not_tell_all_is_read_unless_too_little_is_left(monkeypatch):
     source, asked = recorded(2e-3), []
-    seen = clock_rate._offsets
+    seen = clock_rate.offsets
 
     def without_ends(recording, camera, stretches, **named):
         asked.append(len(stretches))
@@ -108,7 +108,7 @@ def test_where_the_ends_do_not_tell_all_is_read_unless_too_little_is_left(monkey
             return Offsets(np.empty(0), np.empty(0))
         return seen(recording, camera, stretches, **named)
 
-    monkeypatch.setattr(clock_rate, "_offsets", without_ends)
+    monkeypatch.setattr(clock_rate, "offsets", without_ends)
     many = [slice(24 * k, 24 * k + 24) for k in range(14)]
     for count, read in ((13, [6]), (14, [6, 14])):
         monkeypatch.setattr(clock_rate, "_stretches", lambda _, count=count: many[:count])
@@ -135,7 +135,7 @@ def test_stretches_in_which_nothing_can_be_told_are_passed_over():
     ]
     without = (events["t"] > 5_000_000) & (events["t"] < 8_000_000)
     part = Recording.from_arrays(events[~without], hasty + frames[25:], sensor_size=SIZE)
-    told = offsets(part, CAMERA, exposures_of(part))
+    told = offsets(part, CAMERA, _stretches(exposures_of(part)))
     assert len(told.times) >= 3
     assert told.times[0] > 1_000_000
     assert not ((told.times > 5_500_000) & (told.times < 7_500_000)).any()
@@ -202,7 +202,7 @@ def test_offsets_that_wander_are_no_rate(monkeypatch):
     wandering = np.array([0, 9, 12, 30, 26, 45, 61, 62]) * 1e3
     for factor, is_one in ((2.0, False), (0.5, True)):
         seen = Offsets(times, factor * wandering)
-        monkeypatch.setattr(clock_rate, "_offsets", lambda *_, seen=seen: seen)
+        monkeypatch.setattr(clock_rate, "offsets", lambda *_, seen=seen: seen)
         assert (found(source) is not None) == is_one
 
 

@@ -27,8 +27,6 @@ from recordings import (
     write_kalux,
 )
 
-EVENTS_PER_CHUNK = 1 << 17
-
 MASK = np.random.default_rng(1).random(SIZE) < 0.5
 
 
@@ -56,7 +54,7 @@ def test_round_trip(path):
 @pytest.mark.parametrize("distinct", [1, 40, 1 << 20])
 def test_later_events_are_read_without_those_before(path, distinct):
     """Also where chunks of the file begin and end with events of the same time."""
-    events = np.tile(small_events(1), 5 * EVENTS_PER_CHUNK + 7)
+    events = np.tile(small_events(1), 5 * writer._EVENTS_PER_CHUNK + 7)
     events["t"] = np.linspace(0, distinct, len(events)).astype(np.int64)
     write_kalux(path, events=[events])
     check_seeking(

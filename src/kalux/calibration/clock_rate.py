@@ -21,7 +21,7 @@ from kalux.calibration.offset import LEAST_FRAMES, MARGIN, Changes, correlate, f
 from kalux.calibration.registration import Registration
 from kalux.calibration.regression import huber_weights
 from kalux.errors import EventError, InputError
-from kalux.events import EventArray
+from kalux.events import LATEST, EventArray
 from kalux.recording import Recording
 from kalux.settings import CameraSettings, chosen_response
 
@@ -120,7 +120,7 @@ def find_clock_rate(recording: Recording, camera: CameraSettings, exposures: Tim
     stretches = _stretches(exposures)
     if not stretches or _ends_suffice(recording, camera, stretches):
         return None
-    found = _offsets(recording, camera, stretches)
+    found = offsets(recording, camera, stretches)
     if len(found.times) < _LEAST:
         return None
     line = _line(found)
@@ -130,9 +130,13 @@ def find_clock_rate(recording: Recording, camera: CameraSettings, exposures: Tim
     return ClockRate(line.slope, line.standard_error, _shifts(line.slope, exposures))
 
 
-def offsets(recording: Recording, camera: CameraSettings, exposures: Times) -> Offsets:
-    """Offsets of the frames' clock all over a recording, as far as they can be told; see `find_clock_rate`."""
-    return _offsets(recording, camera, _stretches(exposures))
+def offsets(
+    recording: Recording, camera: CameraSettings, stretches: Sequence[slice], *, farthest: int = LATEST
+) -> Offsets:
+    """Offsets of stretches of the frames, as far as they can be told within ``farthest`` us of those before them."""
+    seen = _changes(recording, camera, stretches)
+    clear = [*_clear_offsets(recording, seen, farthest)]
+    return Offsets(*np.array(clear, np.float64).reshape(-1, 2).T)
 
 
 def _ends_suffice(recording: Recording, camera: CameraSettings, stretches: Sequence[slice]) -> bool:
@@ -141,26 +145,15 @@ def _ends_suffice(recording: Recording, camera: CameraSettings, stretches: Seque
     They do if their offsets are the same, or if so few of them are clear that too few of all would be.
     """
     ends = [*stretches[:_END], *stretches[-_END:]]
-    times, found = _offsets(recording, camera, ends, farthest=2 * _REACH)
+    times, found = offsets(recording, camera, ends, farthest=2 * _REACH)
     if len(stretches) - (len(ends) - len(times)) < _LEAST:
         return True
-    late = times > times.mean() if len(times) else np.zeros(0, np.bool_)
+    if len(times) < 4:
+        return False
+    late = times > times.mean()
     if min(np.count_nonzero(late), np.count_nonzero(~late)) < 2:
         return False
     return bool(abs(np.median(found[late]) - np.median(found[~late])) <= _AGREE)
-
-
-def _offsets(
-    recording: Recording,
-    camera: CameraSettings,
-    stretches: Sequence[slice],
-    *,
-    farthest: int | None = None,
-) -> Offsets:
-    """Offsets of stretches, as far as they can be told ``farthest`` us around those before them; None: anywhere."""
-    seen = _changes(recording, camera, stretches)
-    clear = [*_clear_offsets(recording, seen, farthest)]
-    return Offsets(*np.array(clear, np.float64).reshape(-1, 2).T)
 
 
 def _stretches(exposures: Times) -> list[slice]:
@@ -194,15 +187,14 @@ def _changes(recording: Recording, camera: CameraSettings, stretches: Sequence[s
 
 
 def _clear_offsets(
-    recording: Recording, seen: Sequence[Changes], farthest: int | None
+    recording: Recording, seen: Sequence[Changes], farthest: int
 ) -> Iterator[tuple[float, float]]:
     """Time and offset, us, of each stretch whose offset is clear, looked for around that of the last such one."""
     events_since = _events_since(recording)
     centre, before = 0.0, 0.0
     for changes in seen:
         time = float(changes.middles.mean())
-        reach = round(_REACH + _FASTEST * (time - before)) if before else _REACH
-        reach = reach if farthest is None else min(reach, farthest)
+        reach = min(round(_REACH + _FASTEST * (time - before)), farthest) if before else _REACH
         around = events_since(int(changes.middles[0]) + round(centre) - reach - MARGIN)
         try:
             found = correlate(changes, around, recording.sensor_size, centre=centre, reach=reach)

@@ -80,16 +80,16 @@ class Registration:
         """Where each pixel of the event camera lies in the frame."""
         height, width = self.events.sensor_size
         if self.is_identity:
-            rows, columns = np.arange(height, dtype=np.float32), np.arange(width, dtype=np.float32)
-            return Maps(*np.meshgrid(columns, rows), np.ones((height, width), np.bool_))
+            own = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+            return Maps(*own, np.ones((height, width), np.bool_))
         x, y = self.places(self.undistorted).T.reshape(2, height, width)
-        bottom, right = self.frames.sensor_size[0] - 1, self.frames.sensor_size[1] - 1
+        rows, columns = self.frames.sensor_size
         with np.errstate(invalid="ignore"):
-            inside = (x >= -_EDGE) & (x <= right + _EDGE) & (y >= -_EDGE) & (y <= bottom + _EDGE)
+            inside = (x >= -_EDGE) & (x <= columns - 1 + _EDGE) & (y >= -_EDGE) & (y <= rows - 1 + _EDGE)
         # A pixel outside shows the nearest that is inside: a guess, for the filter to start with.
         return Maps(
-            np.clip(np.nan_to_num(x), 0, right).astype(np.float32),
-            np.clip(np.nan_to_num(y), 0, bottom).astype(np.float32),
+            np.clip(np.nan_to_num(x), 0, columns - 1).astype(np.float32),
+            np.clip(np.nan_to_num(y), 0, rows - 1).astype(np.float32),
             inside,
         )
 
@@ -123,8 +123,6 @@ class Registration:
 
     def filtered(self, image: NDArray[Any]) -> NDArray[np.float32]:
         """An image of the frame camera, blurred to the event camera's pixels where these are larger; float32."""
-        if self.is_identity:
-            return np.asarray(image, np.float32)
         sigma = _APERTURE * np.sqrt(max(self.scale**2 - 1.0, 0.0))
         source = np.asarray(image, np.float32)
         if sigma < 0.1:

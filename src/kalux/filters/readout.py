@@ -320,8 +320,8 @@ def read_out(
         surface = surface_pixels(unmeasured, out.shape)
         if len(surface):
             state = level, known, moving, change
-            usual = difference2, np.float32(prior.white)
-            smooth, left = _smooth_surfaces(state, (of_silent, of_moving), surface, usual, pitch)
+            white = np.float32(prior.white)
+            smooth, left = _smooth_surfaces(state, (of_silent, of_moving), surface, difference2, white, pitch)
             read_levels(smooth, left, *scalars)
             out.reshape(-1)[surface] = smooth
             if total.size:
@@ -333,13 +333,14 @@ def _smooth_surfaces(
     state: tuple[NDArray[Any], ...],
     subthreshold: tuple[np.float32, np.float32],
     pixels: NDArray[np.int64],
-    usual: tuple[np.float32, np.float32],
+    usual: np.float32,
+    white: np.float32,
     pitch: int,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """(N,) L of ``pixels`` and its variance, averaged by how rough the surface around them is.
 
     They are averaged with their eight neighbours, and then with those twice as far away. ``state`` holds L, P, what
-    moves, and the change of silent pixels; ``usual`` are the variance by which neighbours differ, and L of white.
+    moves, and the change of silent pixels; ``usual`` is the variance by which neighbours differ, ``white`` L of white.
     """
     width = state[0].shape[1]
     row, column = np.divmod(pixels, width)
@@ -358,15 +359,12 @@ def _smooth_surfaces(
     inside = (row - rows.start) * shape[1] + column - columns.start
     surface = np.zeros(shape, np.bool_)
     surface.reshape(-1)[inside] = True
-    difference2, white = usual
-    rough, more = (
-        surface_variance(level, variance, surface, difference2, pitch),
-        rougher_where_bright(level, white, pitch),
-    )
+    rough = surface_variance(level, variance, surface, usual, pitch)
+    more = rougher_where_bright(level, white, pitch)
     near, left = level.copy(), variance.copy()
-    _average_surface(level, variance, (rough, more), surface, pitch, pitch, near, left)
+    _average_surface(level, variance, rough, more, surface, pitch, pitch, near, left)
     far, independent = memory.empty((2, *shape))  # filled where they are looked at
-    _average_surface(near, left, (_FARTHER * rough, more), surface, 2 * pitch, pitch, far, independent)
+    _average_surface(near, left, _FARTHER * rough, more, surface, 2 * pitch, pitch, far, independent)
     averaged, alone, together = (plane.reshape(-1)[inside] for plane in (far, variance, independent))
     return averaged, CORRELATED * alone + (ONE - CORRELATED) * together
 
@@ -386,7 +384,8 @@ def _window_around(places: tuple[NDArray[np.int64], ...], shape: tuple[int, ...]
 def _average_surface(
     level: NDArray[np.float32],
     variance: NDArray[np.float32],
-    allowed: tuple[NDArray[np.float32], NDArray[np.float32]],
+    allowed: NDArray[np.float32],
+    more: NDArray[np.float32],
     surface: NDArray[np.bool_],
     pitch: int,
     patch: int,
@@ -395,11 +394,12 @@ def _average_surface(
 ) -> None:
     """Fill L and its variance, if errors were independent, after averaging, at the pixels of the surface.
 
-    Neighbours are ``pitch`` apart, the pixels of the patches around them ``patch``. ``allowed`` are the variance by
-    which those one apart differ, of the neighbour, and how many times that, of the pixel itself.
+    Neighbours are ``pitch`` apart, the pixels of the patches around them ``patch``. From a pixel those one apart differ
+    by ``more``, its own, times the variance that is ``allowed``, that of the neighbour.
     """
     for begin in range(0, level.shape[1], _STRIP):
-        _average_planes(level, variance, *allowed, surface, pitch, patch, begin, _ring(pitch, ONE), out, left)
+        ring = _ring(pitch, ONE)
+        _average_planes(level, variance, allowed, more, surface, pitch, patch, begin, ring, out, left)
 
 
 def _ring(pitch: int, difference2: np.float32) -> _Ring:
@@ -542,7 +542,7 @@ def _average_planes(  # type: ignore[no-untyped-def]
     states, rough, distances, similarities = ring.states, ring.allowed, ring.distances, ring.similarities
     differences, averaged, marked, spans = ring.differences, ring.averaged, ring.moving, ring.spans
     height, count = level.shape[0], len(spans)
-    times = zeros(_STRIP, np.float32)
+    times = zeros(_ROW, np.float32)
     for row in range(-3 * pitch, height):
         _load_surface(level, variance, allowed, row + 2 * pitch, begin, pitch, count, states, rough)
         _mark_moving(hears, row + 3 * pitch, begin, marked, spans)
@@ -556,15 +556,13 @@ def _average_planes(  # type: ignore[no-untyped-def]
             continue
         at, start = np.uint64(row), np.uint64(begin)
         for i in range(np.uint64(smaller(begin + _STRIP, level.shape[1]) - begin)):
-            times[i] = more[at, start + i]
+            times[np.uint64(_MARGIN) + i] = more[at, start + i]
         up, own, down, of_up, of_own, into = _around(row, first, pitch, count)
-        into_times = np.uint64(first)
         for i in range(np.uint64(last - first)):
             _average_rough(
                 states,
                 rough,
                 times,
-                into_times + i,
                 similarities,
                 up + i,
                 own + i,
@@ -811,7 +809,6 @@ def _average_rough(
     states: Row,
     rough: Row,
     times: Row,
-    column: Number,
     similarities: Row,
     up: Number,
     own: Number,
@@ -823,7 +820,7 @@ def _average_rough(
     into: Number,
 ) -> None:
     """K12 of a pixel from which neighbours differ by so many ``times`` what they do on the surface around them."""
-    more = times[column]
+    more = times[into]
     _mean(
         states,
         lambda place, distance: ONE / (states[place + _VARIANCE] + more * rough[place + distance]),
