@@ -1305,7 +1305,7 @@ def lifted(level, variance, excess, settings, top):
     return np.where(where, level + excess, level), spread, np.where(where, excess, 0.0), noise
 
 
-def intensity(log_intensity, variance, settings, white, stretch):
+def intensity(log_intensity, variance, settings, white, unknown_scale):
     """Read-out, K6."""
     i0, scale2 = settings.camera.offset, settings.filter.highlight_scale**2
     top = np.log(white + i0)
@@ -1315,7 +1315,8 @@ def intensity(log_intensity, variance, settings, white, stretch):
         trust = spread / (spread + variance)
         believed = excess * trust
         left = variance * trust
-        if stretch > 0:
+        if unknown_scale > 0:
+            stretch = unknown_scale / np.sqrt(spread)
             w = lambertw(stretch * believed).real
             believed, left = w / stretch, left * (np.exp(-w) / (1 + w)) ** 2
         log_intensity = top + believed + scale2 / spread * min(left, believed * np.sqrt(left)) / 2

@@ -214,8 +214,8 @@ def assert_agrees(name, events, frames, times):
         image = engine.read(t)
         k = max([j for j, f in enumerate(frames) if engine_node(f, name) < t], default=-1)
         white = white_at(t, k, frames, name, chosen.camera.offset)
-        scale, value, total = chosen.filter.highlight_scale, expected[i], np.nan_to_num(variance[i])
-        stretch = chosen.events.mismatch**2 / scale if scale > 0 else 0.0
+        value, total = expected[i], np.nan_to_num(variance[i])
+        unknown_scale = chosen.events.mismatch**2
         bound, noise, beyond = value, total, np.zeros(total.shape)
         excess, doubt = unshowns[i]
         unshown = ~np.isnan(excess)
@@ -241,7 +241,7 @@ def assert_agrees(name, events, frames, times):
                 given[place] += naive.known(pixel, sure[place], t, chosen, 0.21 * 0.17, left[place])
         least = np.minimum(bound, np.maximum(bound - 2 * np.sqrt(noise), top))
         value = np.where(unshown, np.maximum(value, least) + np.minimum(beyond**2, beyond) / 2, value)
-        level = np.vectorize(lambda v, p: naive.intensity(v, p, chosen, white, stretch))(  # noqa: B023
+        level = np.vectorize(lambda v, p: naive.intensity(v, p, chosen, white, unknown_scale))(  # noqa: B023
             value, np.where(unshown, noise, total)
         )
         offset = chosen.camera.offset

@@ -201,12 +201,10 @@ class View:
 
     def prior(self, white: float) -> HighlightPrior:
         """The prior on highlights (K6) beyond ``white``, a log intensity."""
-        scale = self.highlight_scale
-        stretch = self.highlight_spread**2 / scale if scale > 0 else 0.0
         return HighlightPrior(
             white=white,
-            scale2=scale**2,
-            stretch=stretch,
+            scale2=self.highlight_scale**2,
+            unknown_scale=self.highlight_spread**2,
             gain=self.highlight_gain,
             growth=self.highlight_growth,
         )

@@ -20,10 +20,10 @@ from kalux.settings import altered, preset
 
 import naive
 
-OFF = HighlightPrior(white=np.inf, scale2=0.0, stretch=0.0, gain=1.0, growth=0.0)
+OFF = HighlightPrior(white=np.inf, scale2=0.0, unknown_scale=0.0, gain=1.0, growth=0.0)
 NO_SUBTHRESHOLD = Subthreshold(0.0, 0.0)
 excesses = st.floats(0.0, 12.0)
-stretches = st.floats(1e-4, 2.0)
+unknown_scales = st.floats(1e-4, 2.0)
 growths = st.floats(0.0, 1.0)
 
 
@@ -36,35 +36,36 @@ def regularised(value, variance, moving, difference):
     return np.log(read_out(value, variance, 0.0, OFF, moving=moving, difference=difference)[0])
 
 
-def lambert(excess, variance, scale2, stretch, growth):
+def lambert(excess, variance, scale2, unknown_scale, growth):
     """Mode, variance that is left, and share of the normal prior in that of a highlight."""
     spread = scale2 + growth * max(excess**2 - variance, 0.0)
-    trust = spread / (spread + variance)
+    trust, stretch = spread / (spread + variance), unknown_scale / np.sqrt(spread)
     w = lambertw(stretch * excess * trust).real
     return w / stretch, variance * trust * (np.exp(-w) / (1 + w)) ** 2, scale2 / spread
 
 
-@given(excesses, st.floats(0.0, 3.0), st.floats(0.01, 9.0), stretches, growths)
+@given(excesses, st.floats(0.0, 3.0), st.floats(0.01, 9.0), unknown_scales, growths)
 def test_highlights_are_lamberts_w_and_half_the_variance_that_is_left(
-    excess, variance, scale2, stretch, growth
+    excess, variance, scale2, unknown_scale, growth
 ):
-    mode, left, normal = lambert(excess, variance, scale2, stretch, growth)
+    mode, left, normal = lambert(excess, variance, scale2, unknown_scale, growth)
     expected = mode + normal * min(left, mode * np.sqrt(left)) / 2
-    found = believed_highlight(excess, variance, scale2, stretch, 1.0, growth)
+    found = believed_highlight(excess, variance, scale2, unknown_scale, 1.0, growth)
     assert found == pytest.approx(expected, rel=2e-6, abs=1e-12)
 
 
-@given(excesses, st.floats(0.01, 9.0), stretches)
-def test_the_mode_solves_its_equation(excess, scale2, stretch):
-    """K6: without noise, d exp(stretch d) is the excess."""
-    d = believed_highlight(excess, 0.0, scale2, stretch, 1.0, 1.0)
+@given(excesses, st.floats(0.01, 9.0), unknown_scales, growths)
+def test_the_mode_solves_its_equation(excess, scale2, unknown_scale, growth):
+    """K6: without noise, d exp(s^2 d / S^(1/2)) is the excess."""
+    d = believed_highlight(excess, 0.0, scale2, unknown_scale, 1.0, growth)
+    stretch = unknown_scale / np.sqrt(scale2 + growth * excess**2)
     assert d * np.exp(stretch * d) == pytest.approx(excess, rel=1e-4, abs=1e-9)
 
 
-@given(st.floats(1e-6, 12.0), st.floats(1e-3, 2.0), st.floats(0.0, 3.0), stretches, growths)
-def test_more_excess_is_more_highlight(excess, more, variance, stretch, growth):
-    low = believed_highlight(excess, variance, 1.0, stretch, 1.0, growth)
-    assert 0.0 <= low < believed_highlight(excess + more, variance, 1.0, stretch, 1.0, growth)
+@given(st.floats(1e-6, 12.0), st.floats(1e-3, 2.0), st.floats(0.0, 3.0), unknown_scales, growths)
+def test_more_excess_is_more_highlight(excess, more, variance, unknown_scale, growth):
+    low = believed_highlight(excess, variance, 1.0, unknown_scale, 1.0, growth)
+    assert 0.0 <= low < believed_highlight(excess + more, variance, 1.0, unknown_scale, 1.0, growth)
 
 
 @given(st.floats(0.0, 3.0), st.floats(0.01, 9.0), growths)
@@ -103,15 +104,17 @@ def test_a_sure_estimate_is_believed():
     assert believed_highlight(0.0, 1.0, 1.0, 1.7, 1.0, 1.0) == pytest.approx(0.0, abs=1e-20)
 
 
-@given(st.floats(0.0, 1.0), excesses, st.floats(0.0, 3.0), st.floats(0.01, 9.0), stretches, growths)
-def test_of_events_that_explain_frames_half_half_is_believed(gain, excess, variance, scale2, stretch, growth):
-    found = believed_highlight(excess, variance, scale2, stretch, gain, growth)
+@given(st.floats(0.0, 1.0), excesses, st.floats(0.0, 3.0), st.floats(0.01, 9.0), unknown_scales, growths)
+def test_of_events_that_explain_frames_half_half_is_believed(
+    gain, excess, variance, scale2, unknown_scale, growth
+):
+    found = believed_highlight(excess, variance, scale2, unknown_scale, gain, growth)
     assert found == pytest.approx(
-        believed_highlight(gain * excess, variance, scale2, stretch, 1.0, growth), rel=1e-5, abs=1e-9
+        believed_highlight(gain * excess, variance, scale2, unknown_scale, 1.0, growth), rel=1e-5, abs=1e-9
     )
 
 
-def test_the_short_cut_for_a_small_stretch_is_seamless():
+def test_the_short_cut_for_a_small_unknown_scale_is_seamless():
     below, above = (believed_highlight(1.0, 0.0, 1.0, s, 1.0, 0.0) for s in (0.99e-6, 1.01e-6))
     assert below == pytest.approx(above, rel=3e-6)
 
@@ -132,7 +135,7 @@ def test_intensity_is_never_negative_and_inverts_the_logarithm(value, variance, 
 
 
 def test_the_prior_only_concerns_highlights():
-    prior = HighlightPrior(white=np.log(1.03), scale2=1.0, stretch=1.0, gain=1.0, growth=0.0)
+    prior = HighlightPrior(white=np.log(1.03), scale2=1.0, unknown_scale=1.0, gain=1.0, growth=0.0)
     value, variance = np.log(np.array([[0.5, 1.03, 3.0]])), np.full((1, 3), 0.2)
     with_prior, without = intensity(value, variance, 0.03, prior), intensity(value, variance, 0.03, OFF)
     np.testing.assert_array_equal(with_prior[0, :2], without[0, :2])
@@ -143,7 +146,7 @@ def test_the_prior_only_concerns_highlights():
 
 def test_white_is_that_of_the_shortest_exposure():
     """A short exposure measures more than 1: what it can show is no highlight."""
-    prior = HighlightPrior(white=np.log(4.03), scale2=1.0, stretch=1.0, gain=1.0, growth=0.0)
+    prior = HighlightPrior(white=np.log(4.03), scale2=1.0, unknown_scale=1.0, gain=1.0, growth=0.0)
     value, variance = np.log(np.array([[1.03, 2.0, 4.02]])), np.full((1, 3), 0.5)
     np.testing.assert_array_equal(
         intensity(value, variance, 0.03, prior), intensity(value, variance, 0.03, OFF)
@@ -151,7 +154,7 @@ def test_white_is_that_of_the_shortest_exposure():
 
 
 def test_the_white_level_is_continuous():
-    prior = HighlightPrior(white=0.0, scale2=1.0, stretch=1.7, gain=1.0, growth=0.0)
+    prior = HighlightPrior(white=0.0, scale2=1.0, unknown_scale=1.7, gain=1.0, growth=0.0)
     low, high = intensity(np.array([[-1e-7, 1e-7]]), np.ones((1, 2)), 0.03, prior)[0]
     assert high == pytest.approx(low, abs=1e-6)
 
@@ -250,8 +253,8 @@ def test_images_are_the_oracles(shape, moves, pitch, gain):
         altered(preset("default"), "events", extrapolation_gain=gain, extrapolation_trust=0.8),
     )
     change = rng.uniform(0, 0.05, shape).astype(np.float32)
-    white, stretch, offset = 0.8, 0.7, chosen.camera.offset
-    prior = HighlightPrior(np.log(white + offset), chosen.filter.highlight_scale**2, stretch, gain, 0.8)
+    white, unknown_scale, offset = 0.8, 1.4, chosen.camera.offset
+    prior = HighlightPrior(np.log(white + offset), chosen.filter.highlight_scale**2, unknown_scale, gain, 0.8)
     given = value.astype(np.float32), variance.astype(np.float32)
     found = read_out(
         *given,
@@ -268,7 +271,7 @@ def test_images_are_the_oracles(shape, moves, pitch, gain):
     for part in np.ndindex(pitch, pitch):  # a mosaic's colours know nothing of each other
         own = np.s_[part[0] :: pitch, part[1] :: pitch]
         level[own], total[own] = naive.regularised(value[own], total[own], moving[own], 0.3 * pitch)
-    expected = np.vectorize(lambda v, p: naive.intensity(v, p, chosen, white, stretch))(level, total)
+    expected = np.vectorize(lambda v, p: naive.intensity(v, p, chosen, white, unknown_scale))(level, total)
     np.testing.assert_allclose(found[1], total, rtol=1e-5)
     np.testing.assert_allclose(found[0], expected, rtol=1e-5, atol=1e-6)
     assert (value > prior.white).sum() > 2

@@ -132,8 +132,8 @@ class HighlightPrior(NamedTuple):
         log(1 + I_0) of the brightest level that a frame can show.
     scale2
         Variance of the log of highlights over white; 0 turns the prior off.
-    stretch
-        Variance of the log of the events' unknown scale there, divided by the standard deviation of highlights.
+    unknown_scale
+        Variance of the log of the events' scale there, as far as that is not known.
     gain
         Share of the change by events that is believed there.
     growth
@@ -143,30 +143,32 @@ class HighlightPrior(NamedTuple):
 
     white: float
     scale2: float
-    stretch: float
+    unknown_scale: float
     gain: float
     growth: float
 
 
 @nb.njit(cache=True, inline="always", error_model="numpy")
-def believed_highlight(excess, variance, scale2, stretch, gain, growth):  # type: ignore[no-untyped-def]
+def believed_highlight(excess, variance, scale2, unknown_scale, gain, growth):  # type: ignore[no-untyped-def]
     """Posterior of L - white > 0, given its estimate ``excess`` and the filter's ``variance``; float32.
 
     Of the excess the share ``gain`` is taken. Additive noise: a normal prior shrinks it, of variance ``scale2`` and
     ``growth`` times by how much the square of what is taken exceeds its noise. Unknown scale of the events: with a
-    log-normal scale and an exponential prior the mode solves d exp(stretch d) = excess, i.e. d = W(stretch excess) /
-    stretch with Lambert's W. Returned is the log of the posterior mean intensity, half the posterior variance above the
-    mean of the log; that half is bounded by a part of d, so that it is 0 at white, and it counts as far as the prior is
-    the normal one: of a highlight that makes its own, the median is returned.
+    log-normal scale and an exponential prior as wide as that one the mode solves d exp(k d) = excess, i.e. d = W(k
+    excess) / k with Lambert's W, k being ``unknown_scale`` over that width. Returned is the log of the posterior mean
+    intensity, half the posterior variance above the mean of the log; that half is bounded by a part of d, so that it is
+    0 at white, and it counts as far as the prior is the normal one: of a highlight that makes its own, the median is
+    returned.
     """
-    stretch, noise = np.float32(stretch), np.float32(variance)
+    noise = np.float32(variance)
     believed = np.float32(gain) * np.float32(excess)
     square = larger(believed * believed - noise, np.float32(0.0))
     spread = np.float32(scale2) + np.float32(growth) * square
     trust = spread / (spread + noise)
     believed *= trust
     left = noise * trust
-    if stretch != np.float32(0.0):
+    if unknown_scale != np.float32(0.0):
+        stretch = np.float32(unknown_scale) / np.sqrt(spread)
         w = lambert_w(stretch * believed)
         believed = w / stretch
         slope = exponential(-w) / (ONE + w)  # of d in the shrunk excess
@@ -601,11 +603,11 @@ def read_levels(level, doubt, prior, log_offset):  # type: ignore[no-untyped-def
     Without branches, so that it becomes vector code.
     """
     zero = np.float32(0.0)
-    white, scale2, stretch, gain, growth = prior
+    white, scale2, unknown_scale, gain, growth = prior
     doubted = scale2 > zero
     for i in range(len(level)):
         beyond = larger(level[i] - white, zero)
-        believed = white + believed_highlight(beyond, doubt[i], scale2, stretch, gain, growth)
+        believed = white + believed_highlight(beyond, doubt[i], scale2, unknown_scale, gain, growth)
         level[i] = larger(
             exponential(believed if doubted and level[i] > white else level[i]) - log_offset, zero
         )
@@ -924,7 +926,7 @@ def _shrink_highlights(  # type: ignore[no-untyped-def]
     level, variance, row, start, bright, prior, log_offset, places, excess, doubt, out
 ):
     """K6 of the bright pixels of a row, gathered so that they go through vector code and others cost nothing."""
-    white, scale2, stretch, gain, growth = prior
+    white, scale2, unknown_scale, gain, growth = prior
     count = np.uint64(0)
     for first in range(0, len(level), _BLOCK):
         if _any(bright, first, _BLOCK):
@@ -935,7 +937,7 @@ def _shrink_highlights(  # type: ignore[no-untyped-def]
         excess[k] = level[places[k]] - white
         doubt[k] = variance[places[k]]
     for k in range(count):
-        believed = believed_highlight(excess[k], doubt[k], scale2, stretch, gain, growth)
+        believed = believed_highlight(excess[k], doubt[k], scale2, unknown_scale, gain, growth)
         excess[k] = larger(exponential(white + believed) - log_offset, np.float32(0.0))
     for k in range(count):
         out[row, start + places[k]] = excess[k]
