@@ -4,14 +4,15 @@
     python benchmarks/pipeline.py --seconds 10 60 --rounds 1 --threads 2     # does memory grow with the length?
     python benchmarks/pipeline.py --stages --threads 2                       # where the processor time goes
     python benchmarks/pipeline.py --only 346x260 mp4 -- --filter.motion off  # with further flags of kalux reconstruct
+    python benchmarks/pipeline.py --recording pan.h5 --only mp4 --threads 2  # one of your own instead
 
 Writes synthetic recordings (the stream of benchmarks/speed.py) as kalux HDF5 or AEDAT4, and runs ``kalux reconstruct``
 on them in a process of its own, as a user would: start-up, checking, choosing settings and all. The settings that it
-would otherwise estimate are given, ``--estimate`` leaves them to it. Shown are seconds on the clock and of all
-processor cores per second of recording (below 1 on the clock is faster than real time), those on the clock of the part
-that makes and writes images, and the largest memory held. Where other work runs, the processor time tells more: two
-cores cannot need less of the clock than half of it. ``--stages`` shows the processor time of each thread and step
-instead.
+would otherwise estimate are given, ``--estimate`` leaves them to it; of a recording of your own all are estimated.
+Shown are seconds on the clock and of all processor cores per second of recording (below 1 on the clock is faster than
+real time), those on the clock of the part that makes and writes images, and the largest memory held. Where other work
+runs, the processor time tells more: two cores cannot need less of the clock than half of it. ``--stages`` shows the
+processor time of each thread and step instead.
 """
 
 from __future__ import annotations
@@ -171,11 +172,12 @@ def encoder_seconds(size, count):
     return (time.process_time() - start) / 10 * count
 
 
-def command_for(recording, kind, options, threads):
+def command_for(recording, folder, kind, options, threads):
     """The arguments of ``kalux``, and what they make."""
     out, *flags = OUTPUTS[kind]
-    made = recording.with_name(out)
-    given = (*(() if options.estimate else GIVEN), *options.flags)
+    made = Path(folder) / out
+    estimate = options.estimate or options.recording
+    given = (*(() if estimate else GIVEN), *options.flags)
     arguments = ["reconstruct", recording, "-o", made, "--rate", options.rate, "--threads", threads]
     return [*arguments, *flags, *given], made
 
@@ -187,26 +189,54 @@ def remove(made):
     Path(f"{made}.kalux.toml").unlink(missing_ok=True)
 
 
-def measure(recording, kind, options, threads):
+def measure(recording, folder, kind, options, threads):
     """The fastest of several runs."""
     least = None
     for _ in range(options.rounds):
-        arguments, made = command_for(recording, kind, options, threads)
+        arguments, made = command_for(recording, folder, kind, options, threads)
         found = run(arguments)
         remove(made)
         least = found if least is None or found < least else least
     return least
 
 
-def measure_stages(recording, kind, options, threads):
+def measure_stages(recording, folder, kind, options, threads):
     """Of every step and thread, the least of several runs."""
     least = {}
     for _ in range(options.rounds):
-        arguments, made = command_for(recording, kind, options, threads)
+        arguments, made = command_for(recording, folder, kind, options, threads)
         for name, seconds in apart(stages, arguments).items():
             least[name] = min(seconds, least.get(name, seconds))
         remove(made)
     return least
+
+
+def recordings_for(options, folder):
+    """What is reconstructed: sensor, format, events per second, seconds, and file of each, one after the other."""
+    if options.recording:
+        yield from map(described, options.recording)
+        return
+    sensors = [name for name in SENSORS if name in options.only] or list(SENSORS)
+    inputs = [name for name in INPUTS if name in options.only] or ["h5"]
+    for name, kind, seconds in itertools.product(sensors, inputs, options.seconds):
+        size, rate = SENSORS[name]
+        path = Path(folder) / f"{name}.{kind}"
+        apart(write_recording, path, size, rate, seconds)
+        yield name, kind, rate, seconds, path
+        path.unlink()
+
+
+def described(path):
+    """The same of a recording that is there."""
+    recording = kalux.open(path)
+    height, width = recording.sensor_size
+    count, first, last = 0, None, 0
+    for events in recording.events():
+        if len(events):
+            first = int(events["t"][0]) if first is None else first
+            count, last = count + len(events), int(events["t"][-1])
+    seconds = (last - (first or 0)) / 1e6
+    return f"{width}x{height}", path.suffix[1:], count / seconds, seconds, path
 
 
 def main():
@@ -218,37 +248,36 @@ def main():
     parser.add_argument("--estimate", action="store_true", help="let kalux estimate thresholds, delay, noise")
     parser.add_argument("--stages", action="store_true", help="processor time of each step and thread")
     parser.add_argument("--only", nargs="+", choices=[*SENSORS, *OUTPUTS, *INPUTS], default=[])
+    parser.add_argument(
+        "--recording", type=Path, nargs="+", default=[], help="your own, instead of synthetic ones"
+    )
     parser.add_argument("flags", nargs="*", help="after --: further ones of kalux reconstruct")
     options = parser.parse_args()
-    sensors = [name for name in SENSORS if name in options.only] or list(SENSORS)
     outputs = [name for name in OUTPUTS if name in options.only] or ["mp4", "png", "exr"]
-    inputs = [name for name in INPUTS if name in options.only] or ["h5"]
     print(f"Per second of recording, {options.rate} images/s, {os.cpu_count()} cores")
     titles = f"{'clock':>8}{'CPU':>8}{'images':>8}{'MB':>7}"
     print(
         f"{'sensor':9}{'M ev/s':>7} {'input':8}{'seconds':>8} {'output':8}{'threads':>7}"
         f"{'' if options.stages else titles}"
     )
+    sizes = {}
     with tempfile.TemporaryDirectory(prefix="kalux-speed-") as folder:
-        for name, kind_in, seconds in itertools.product(sensors, inputs, options.seconds):
-            size, rate = SENSORS[name]
-            recording = Path(folder) / f"{name}.{kind_in}"
-            apart(write_recording, recording, size, rate, seconds)
+        for name, kind_in, rate, seconds, recording in recordings_for(options, folder):
+            sizes[name] = kalux.open(recording).sensor_size
             for kind, threads in itertools.product(outputs, options.threads):
-                row = f"{name:9}{rate / 1e6:7.0f} {kind_in:8}{seconds:8g} {kind:8}{threads:7}"
+                row = f"{name:9}{rate / 1e6:7.3g} {kind_in:8}{seconds:8.3g} {kind:8}{threads:7}"
                 if options.stages:
                     print(row)
-                    for step, used in measure_stages(recording, kind, options, threads).items():
+                    for step, used in measure_stages(recording, folder, kind, options, threads).items():
                         print(f"{'':9}{step:34}{used / seconds:8.2f}", flush=True)
                     continue
-                wall, cpu, written, memory = measure(recording, kind, options, threads)
+                wall, cpu, written, memory = measure(recording, folder, kind, options, threads)
                 times = "".join(f"{value / seconds:8.2f}" for value in (wall, cpu, written))
                 print(f"{row}{times}{memory:7.0f}", flush=True)
-            recording.unlink()
-        if "exr" in outputs and not options.stages:
-            for name in sensors:
-                alone = apart(encoder_seconds, SENSORS[name][0], options.rate)
-                print(f"{name:9} OpenEXR's own library, which kalux does not write with: CPU {alone:.2f}")
+    if "exr" in outputs and not options.stages:
+        for name, size in sizes.items():
+            alone = apart(encoder_seconds, size, options.rate)
+            print(f"{name:9} OpenEXR's own library, which kalux does not write with: CPU {alone:.2f}")
 
 
 if __name__ == "__main__":
