@@ -211,8 +211,13 @@ def measure_stages(recording, folder, kind, options, threads):
     return least
 
 
+def named(size):
+    """A sensor, by its height and width."""
+    return f"{size[1]}x{size[0]}"
+
+
 def recordings_for(options, folder):
-    """What is reconstructed: sensor, format, events per second, seconds, and file of each, one after the other."""
+    """What is reconstructed: height and width, format, events per second, seconds, and file, one after the other."""
     if options.recording:
         yield from map(described, options.recording)
         return
@@ -222,21 +227,19 @@ def recordings_for(options, folder):
         size, rate = SENSORS[name]
         path = Path(folder) / f"{name}.{kind}"
         apart(write_recording, path, size, rate, seconds)
-        yield name, kind, rate, seconds, path
+        yield size, kind, rate, seconds, path
         path.unlink()
 
 
 def described(path):
     """The same of a recording that is there."""
+    from kalux.info import summarise_events
+
     recording = kalux.open(path)
-    height, width = recording.sensor_size
-    count, first, last = 0, None, 0
-    for events in recording.events():
-        if len(events):
-            first = int(events["t"][0]) if first is None else first
-            count, last = count + len(events), int(events["t"][-1])
-    seconds = (last - (first or 0)) / 1e6
-    return f"{width}x{height}", path.suffix[1:], count / seconds, seconds, path
+    events = summarise_events(recording.events())
+    if events.mean_rate is None:
+        sys.exit(f"{path}: fewer than two events, whose time could be compared")
+    return recording.sensor_size, path.suffix[1:], events.mean_rate, (events.last - events.first) / 1e6, path
 
 
 def main():
@@ -260,10 +263,11 @@ def main():
         f"{'sensor':9}{'M ev/s':>7} {'input':8}{'seconds':>8} {'output':8}{'threads':>7}"
         f"{'' if options.stages else titles}"
     )
-    sizes = {}
+    sizes = []
     with tempfile.TemporaryDirectory(prefix="kalux-speed-") as folder:
-        for name, kind_in, rate, seconds, recording in recordings_for(options, folder):
-            sizes[name] = kalux.open(recording).sensor_size
+        for size, kind_in, rate, seconds, recording in recordings_for(options, folder):
+            name = named(size)
+            sizes.append(size)
             for kind, threads in itertools.product(outputs, options.threads):
                 row = f"{name:9}{rate / 1e6:7.3g} {kind_in:8}{seconds:8.3g} {kind:8}{threads:7}"
                 if options.stages:
@@ -275,9 +279,9 @@ def main():
                 times = "".join(f"{value / seconds:8.2f}" for value in (wall, cpu, written))
                 print(f"{row}{times}{memory:7.0f}", flush=True)
     if "exr" in outputs and not options.stages:
-        for name, size in sizes.items():
+        for size in dict.fromkeys(sizes):
             alone = apart(encoder_seconds, size, options.rate)
-            print(f"{name:9} OpenEXR's own library, which kalux does not write with: CPU {alone:.2f}")
+            print(f"{named(size):9} OpenEXR's own library, which kalux does not write with: CPU {alone:.2f}")
 
 
 if __name__ == "__main__":
