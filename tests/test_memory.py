@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import os
 import pickle
+import subprocess
 import sys
 import threading
 from pathlib import Path
@@ -91,9 +92,12 @@ def resident_bytes():
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
-@pytest.mark.skipif(
+of_glibc = pytest.mark.skipif(
     sys.platform != "linux" or "CS_GNU_LIBC_VERSION" not in os.confstr_names, reason="of glibc's allocator"
 )
+
+
+@of_glibc
 def test_what_lies_below_something_in_use_is_given_back():
     pieces = [np.ones(1 << 16, np.uint8) for _ in range(1000)]
     last, held = pieces[-1], resident_bytes()
@@ -101,3 +105,37 @@ def test_what_lies_below_something_in_use_is_given_back():
     memory.give_back()
     assert resident_bytes() < held - 40e6
     assert last.sum() == 1 << 16
+
+
+IN_THREADS = """
+import ctypes, sys, threading
+from pathlib import Path
+from kalux import memory
+
+if "shared" in sys.argv:
+    memory.share_arena()
+malloc = ctypes.CDLL(None).malloc
+malloc.restype = ctypes.c_void_p
+places = []
+threads = [threading.Thread(target=lambda: places.append(malloc(1000))) for _ in range(3)]
+for thread in threads:
+    thread.start()
+for thread in threads:
+    thread.join()
+heap = next(line for line in Path("/proc/self/maps").read_text().splitlines() if line.endswith("[heap]"))
+first, last = (int(end, 16) for end in heap.split()[0].split("-"))
+print(sum(first <= place < last for place in places))
+"""
+
+
+@of_glibc
+@pytest.mark.parametrize(
+    ("arguments", "chosen", "inside"),
+    [((), {}, "0"), (("shared",), {}, "3"), (("shared",), {"MALLOC_ARENA_MAX": "4"}, "0")],
+)
+def test_threads_share_an_arena_when_asked_to_and_the_user_has_not_chosen(arguments, chosen, inside):
+    """What threads allocate lies in the process's heap, which is the first arena, or outside of it, in their own."""
+    others = {name: value for name, value in os.environ.items() if name != "MALLOC_ARENA_MAX"}
+    command = [sys.executable, "-c", IN_THREADS, *arguments]
+    told = subprocess.run(command, env={**others, **chosen}, capture_output=True, text=True, check=True)
+    assert told.stdout.strip() == inside

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.compiled import larger, loop, smaller
+from kalux.compiled import inner, larger, loop, smaller
 
 Floats = NDArray[np.floating[Any]]
 
@@ -46,18 +46,24 @@ def interpolated(parts: NDArray[np.float32], pixels: NDArray[np.int64], width: i
 
 @loop
 def _at_pixels(pixels, width, parts, values):  # type: ignore[no-untyped-def]
-    one, zero = np.float32(1.0), np.float32(0.0)
-    last_row, last_column = parts.shape[0] - 1, parts.shape[1] - 1
     for i in range(len(pixels)):
         row, column = divmod(pixels[i], width)
-        y = larger((np.float32(row) + np.float32(0.5)) / np.float32(PART) - np.float32(0.5), zero)
-        x = larger((np.float32(column) + np.float32(0.5)) / np.float32(PART) - np.float32(0.5), zero)
-        top, left = smaller(np.int64(y), last_row), smaller(np.int64(x), last_column)
-        below, beside = smaller(top + 1, last_row), smaller(left + 1, last_column)
-        down, right = y - np.float32(top), x - np.float32(left)
-        upper = parts[top, left] * (one - right) + parts[top, beside] * right
-        lower = parts[below, left] * (one - right) + parts[below, beside] * right
-        values[i] = upper * (one - down) + lower * down
+        values[i] = between_parts(parts, row, column)
+
+
+@inner
+def between_parts(parts, row, column):  # type: ignore[no-untyped-def]
+    """Value of the float32 ``parts`` at a pixel: `interpolated`."""
+    one, zero = np.float32(1.0), np.float32(0.0)
+    last_row, last_column = parts.shape[0] - 1, parts.shape[1] - 1
+    y = larger((np.float32(row) + np.float32(0.5)) / np.float32(PART) - np.float32(0.5), zero)
+    x = larger((np.float32(column) + np.float32(0.5)) / np.float32(PART) - np.float32(0.5), zero)
+    top, left = smaller(np.int64(y), last_row), smaller(np.int64(x), last_column)
+    below, beside = smaller(top + 1, last_row), smaller(left + 1, last_column)
+    down, right = y - np.float32(top), x - np.float32(left)
+    upper = parts[top, left] * (one - right) + parts[top, beside] * right
+    lower = parts[below, left] * (one - right) + parts[below, beside] * right
+    return upper * (one - down) + lower * down
 
 
 def part_sums(values: NDArray[Any]) -> Floats:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import cv2
 import numpy as np
 
+from kalux import memory
 from kalux.cli.calibrations import add_calibration, given_calibration
 from kalux.cli.checking import Contents, check_beside
 from kalux.cli.flags import HelpSettings, add_display, add_settings, given_settings
@@ -169,6 +170,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
         raise UsageError(
             f"{options.times}: a time comes twice; a video has one image of each, a folder may have more"
         )
+    memory.share_arena()  # before there are threads
     prepare_loops()
     tell_of_compiling(quiet=options.quiet)
     threads = options.threads or default_threads()

@@ -348,7 +348,10 @@ def _smooth_surfaces(
     row, column = np.divmod(pixels, width)
     rows, columns = _window_around((row, column), state[0].shape)
     shape = rows.stop - rows.start, columns.stop - columns.start
-    level, variance = memory.empty((2, *shape))
+    # One piece of memory for windows of any size, which the next image uses again.
+    level, variance, rough, more, near, left, far, independent = (
+        plane[: shape[0] * shape[1]].reshape(shape) for plane in memory.empty((8, state[0].size))
+    )
     _cut_out(
         *(plane.reshape(-1) for plane in state),
         *subthreshold,
@@ -361,12 +364,13 @@ def _smooth_surfaces(
     inside = (row - rows.start) * shape[1] + column - columns.start
     surface = np.zeros(shape, np.bool_)
     surface.reshape(-1)[inside] = True
-    rough = surface_variance(level, variance, surface, usual, pitch)
-    more = rougher_where_bright(level, white, pitch)
-    near, left = level.copy(), variance.copy()
+    surface_variance(level, variance, surface, usual, pitch, rough)
+    rougher_where_bright(level, white, pitch, more)
+    near[:], left[:] = level, variance
     _average_surface(level, variance, rough, more, surface, pitch, pitch, near, left)
-    far, independent = memory.empty((2, *shape))  # filled where they are looked at
-    _average_surface(near, left, _FARTHER * rough, more, surface, 2 * pitch, pitch, far, independent)
+    rough *= _FARTHER
+    # These two are filled where they are looked at.
+    _average_surface(near, left, rough, more, surface, 2 * pitch, pitch, far, independent)
     averaged, alone, together = (plane.reshape(-1)[inside] for plane in (far, variance, independent))
     return averaged, CORRELATED * alone + (ONE - CORRELATED) * together
 

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.parts import PART, interpolated, part_grid, parts_of, weighted_sums
-from kalux.compiled import loop, smaller
+from kalux.augmentation.parts import PART, between_parts, part_grid, parts_of, weighted_sums
+from kalux.compiled import larger, loop, smaller
 
 _INDEPENDENT: Final = np.float32(0.7)
 """Part of the variances of two neighbours that is in their difference: their errors have correlations of 0.1 to 0.5."""
@@ -57,7 +57,8 @@ def surface_variance(
     surface: NDArray[np.bool_],
     usual: np.float32,
     pitch: int,
-) -> NDArray[np.float32]:
+    out: NDArray[np.float32],
+) -> None:
     """Variance by which neighbours one apart differ on the surface around each pixel.
 
     It is what the squared differences of neighbours, of which at least one is on the surface, are more than the
@@ -73,58 +74,71 @@ def surface_variance(
         What it is where nothing else is known, log intensity^2.
     pitch
         Distance of the neighbours, pixels.
-
-    Returns
-    -------
-    (H, W) float32, log intensity^2. Of pixels beside the surface it is half-way to what it is usually, which it is
-    elsewhere.
+    out
+        (H, W), filled with it, log intensity^2: of pixels beside the surface half-way to what it is usually, which it
+        is elsewhere.
     """
     excess, certainty = np.zeros((2, *part_grid(level.shape)))
-    pixels = np.flatnonzero(surface)
-    _compare_neighbours(level, variance, surface, pixels, usual, pitch, excess, certainty)
+    _compare_neighbours(level, variance, surface, usual, pitch, excess, certainty)
     prior = _PRIOR_PAIRS / float(usual) ** 2
     found = (weighted_sums(excess, _FARTHEST) + prior * float(usual)) / (
         weighted_sums(certainty, _FARTHEST) + prior
     )
     limited = np.clip(found, _LEAST**2 * usual, _MOST**2 * usual).astype(np.float32)
     near = cv2.dilate(surface.view(np.uint8), np.ones((4 * pitch + 1, 4 * pitch + 1), np.uint8))
-    around = np.flatnonzero(near.view(np.bool_))
-    of_surface = surface.reshape(-1)[around]
-    local = interpolated(limited, around, level.shape[1])
-    variances = np.full(level.shape, usual, np.float32)
-    variances.reshape(-1)[around] = np.where(of_surface, local, (local + usual) / np.float32(2.0))
-    return variances
+    _spread(limited, surface, near, usual, out)
 
 
-def rougher_where_bright(level: NDArray[np.float32], white: np.float32, pitch: int) -> NDArray[np.float32]:
-    """(H, W): by how many times that variance the neighbours of a pixel differ from it, where it may be of a lamp.
+def rougher_where_bright(
+    level: NDArray[np.float32], white: np.float32, pitch: int, out: NDArray[np.float32]
+) -> None:
+    """Fill (H, W): by how many times that variance the neighbours of a pixel differ from it, where it may be of a lamp.
 
     By the median of L, whose white is ``white``, of it and its neighbours, so that not where it alone is bright: 1 up
     to 2 beyond white, 3.2 from 4 on.
     """
-    beyond = np.clip(_medians(level, pitch) - white, np.float32(_BRIGHT), np.float32(_BRIGHTEST))
-    more: NDArray[np.float32] = np.square(
-        np.float32(1.0) + np.float32(_ROUGHER) * (beyond - np.float32(_BRIGHT))
-    )
-    return more
+    _take_medians(level, pitch, out)
+    _make_rougher(out, white)
 
 
-def _medians(level: NDArray[np.float32], pitch: int) -> NDArray[np.float32]:
+def _take_medians(level: NDArray[np.float32], pitch: int, out: NDArray[np.float32]) -> None:
     """Of every pixel and its eight neighbours, ``pitch`` apart: that of a single bright one is as those around it."""
-    medians = np.empty_like(level)
     for row, column in itertools.product(range(pitch), repeat=2):
-        medians[row::pitch, column::pitch] = cv2.medianBlur(
+        out[row::pitch, column::pitch] = cv2.medianBlur(
             np.ascontiguousarray(level[row::pitch, column::pitch]), 3
         )
-    return medians
 
 
 @loop
-def _compare_neighbours(level, variance, surface, pixels, usual, pitch, excess, certainty):  # type: ignore[no-untyped-def]
+def _spread(limited, surface, near, usual, variances):  # type: ignore[no-untyped-def]
+    """Fill the variances from those of parts: all of it on the surface, half of it near to it, elsewhere the usual."""
+    for row in range(surface.shape[0]):
+        for column in range(surface.shape[1]):
+            variance = usual
+            if near[row, column]:
+                variance = between_parts(limited, row, column)
+                if not surface[row, column]:
+                    variance = (variance + usual) / np.float32(2.0)
+            variances[row, column] = variance
+
+
+@loop
+def _make_rougher(level, white):  # type: ignore[no-untyped-def]
+    """From L to how many times the variance is, in place."""
+    for row in range(level.shape[0]):
+        for column in range(level.shape[1]):
+            beyond = smaller(larger(level[row, column] - white, np.float32(_BRIGHT)), np.float32(_BRIGHTEST))
+            more = np.float32(1.0) + np.float32(_ROUGHER) * (beyond - np.float32(_BRIGHT))
+            level[row, column] = more * more
+
+
+@loop
+def _compare_neighbours(level, variance, surface, usual, pitch, excess, certainty):  # type: ignore[no-untyped-def]
     """Sums over pairs, in every part: by how much squares exceed the noise, and what they would for a variance of 1."""
     height, width = level.shape
-    for pixel in pixels:
-        row, column = divmod(pixel, width)
+    for row, column in np.ndindex(height, width):
+        if not surface[row, column]:
+            continue
         one, noise = level[row, column], variance[row, column]
         more, sure = 0.0, 0.0
         for k in range(9):
