@@ -1319,7 +1319,8 @@ def intensity(log_intensity, variance, settings, white, unknown_scale):
             stretch = unknown_scale / np.sqrt(spread)
             w = lambertw(stretch * believed).real
             believed, left = w / stretch, left * (np.exp(-w) / (1 + w)) ** 2
-        log_intensity = top + believed + scale2 / spread * min(left, believed * np.sqrt(left)) / 2
+        believed += scale2 / spread * min(left, believed * np.sqrt(left)) / 2
+        log_intensity = top + min(believed, np.log(1e5))
     return max(np.exp(log_intensity) - i0, 0.0)
 
 

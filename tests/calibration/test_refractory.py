@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from types import SimpleNamespace
 
 import numpy as np
@@ -139,17 +140,62 @@ def test_a_dozen_intervals_of_noise_are_enough():
     assert dead_time(few) == pytest.approx(800, rel=0.05)
 
 
-def test_light_that_sets_in_soon_after_hides_no_noise():
-    """Edges that are fast: of twenty intervals one is of noise, the others begin by degrees behind the same time."""
-    rng = np.random.default_rng(2)
+def noise_beside_light(rng, noise, light, share):
+    """Of 100 pixels 2000 intervals each: a ``share`` is of ``noise``, of either polarity, others of ``light``."""
     shape = 100, 2_000
-    of_noise = rng.random(shape) < 0.05
-    gaps = 600 + np.where(of_noise, rng.exponential(5_000, shape), 1_000 * rng.beta(3, 2, shape))
+    of_noise = rng.random(shape) < share
+    gaps = np.where(of_noise, noise(shape), light(shape))
     on = np.cumsum(of_noise & (rng.random(shape) < 0.5), axis=1) % 2 == 0
     t = np.cumsum(gaps, axis=1).astype(np.int64).ravel()
     pixel, order = np.repeat(np.arange(100), 2_000), np.argsort(t, kind="stable")
     events = make_events(t[order], pixel[order] % 10, pixel[order] // 10, on.ravel()[order])
-    assert dead_time(Recording.from_arrays(events, [], sensor_size=(10, 10))) == pytest.approx(600, rel=0.03)
+    return Recording.from_arrays(events, [], sensor_size=(10, 10))
+
+
+def test_light_that_sets_in_soon_after_hides_no_noise():
+    """Edges that are fast: of twenty intervals one is of noise, the others begin by degrees behind the same time."""
+    rng = np.random.default_rng(2)
+    recording = noise_beside_light(
+        rng,
+        lambda shape: 600 + rng.exponential(5_000, shape),
+        lambda shape: 600 + 1_000 * rng.beta(3, 2, shape),
+        share=0.05,
+    )
+    assert dead_time(recording) == pytest.approx(600, rel=0.03)
+
+
+def test_light_that_turns_within_a_dead_time_hides_no_noise():
+    """Texture that passes fast: from a quarter of the dead time behind it on, most that turns is the light's."""
+    rng = np.random.default_rng(4)
+    recording = noise_beside_light(
+        rng,
+        lambda shape: np.where(
+            rng.random(shape) < 0.5, 600 + rng.exponential(20_000, shape), 760 + rng.gamma(4, 200, shape)
+        ),
+        lambda shape: 800 + 1_000 * rng.beta(3, 2, shape),
+        share=0.5,
+    )
+    assert dead_time(recording) == pytest.approx(600, rel=0.03)
+
+
+def test_little_noise_is_looked_at_farther_behind():
+    """Some fifteen intervals that turn up to twice the dead time, and as many up to three times."""
+    recording = random_intervals(lambda rng, shape: 500 + rng.exponential(40_000, shape))
+    events = np.concatenate(list(recording.events()))
+    few = Recording.from_arrays(events[: len(events) // 90], [], sensor_size=(10, 10))
+    assert dead_time(few) == pytest.approx(500, rel=0.1)
+
+
+def test_the_first_intervals_of_noise_may_happen_not_to_turn():
+    recording = random_intervals(lambda rng, shape: 500 + rng.exponential(20_000, shape))
+    events = np.concatenate(list(recording.events()))
+    pixel = events["y"].astype(np.int64) * 10 + events["x"]
+    for one in range(100):
+        own = np.flatnonzero(pixel == one)
+        for before, after in itertools.pairwise(own):
+            if events["t"][after] - events["t"][before] < 516:
+                events["p"][after] = events["p"][before]
+    assert dead_time(Recording.from_arrays(events, [], sensor_size=(10, 10))) == pytest.approx(500, rel=0.02)
 
 
 def test_lamps_are_no_noise():

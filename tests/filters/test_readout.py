@@ -10,6 +10,7 @@ from scipy.special import lambertw
 
 from kalux.filters import readout
 from kalux.filters.readout import (
+    BRIGHTEST,
     HighlightPrior,
     Subthreshold,
     believed_highlight,
@@ -49,12 +50,12 @@ def test_highlights_are_lamberts_w_and_half_the_variance_that_is_left(
     excess, variance, scale2, unknown_scale, growth
 ):
     mode, left, normal = lambert(excess, variance, scale2, unknown_scale, growth)
-    expected = mode + normal * min(left, mode * np.sqrt(left)) / 2
+    expected = min(mode + normal * min(left, mode * np.sqrt(left)) / 2, BRIGHTEST)
     found = believed_highlight(excess, variance, scale2, unknown_scale, 1.0, growth)
     assert found == pytest.approx(expected, rel=2e-6, abs=1e-12)
 
 
-@given(excesses, st.floats(0.01, 9.0), unknown_scales, growths)
+@given(st.floats(0.0, 11.0), st.floats(0.01, 9.0), unknown_scales, growths)
 def test_the_mode_solves_its_equation(excess, scale2, unknown_scale, growth):
     """K6: without noise, d exp(s^2 d / S^(1/2)) is the excess."""
     d = believed_highlight(excess, 0.0, scale2, unknown_scale, 1.0, growth)
@@ -65,7 +66,16 @@ def test_the_mode_solves_its_equation(excess, scale2, unknown_scale, growth):
 @given(st.floats(1e-6, 12.0), st.floats(1e-3, 2.0), st.floats(0.0, 3.0), unknown_scales, growths)
 def test_more_excess_is_more_highlight(excess, more, variance, unknown_scale, growth):
     low = believed_highlight(excess, variance, 1.0, unknown_scale, 1.0, growth)
-    assert 0.0 <= low < believed_highlight(excess + more, variance, 1.0, unknown_scale, 1.0, growth)
+    high = believed_highlight(excess + more, variance, 1.0, unknown_scale, 1.0, growth)
+    assert 0.0 <= low < high or low == high == BRIGHTEST
+
+
+@given(st.floats(0.0, 60.0), st.floats(0.0, 9.0), unknown_scales, growths)
+def test_no_light_is_a_hundred_thousand_times_white(excess, variance, unknown_scale, growth):
+    """K6: what events say has no bound, but light has."""
+    found = believed_highlight(excess, variance, 4.0, unknown_scale, 1.0, growth)
+    assert np.exp(found) <= 1.00001e5
+    assert believed_highlight(60.0, 0.0, 4.0, 0.0, 1.0, 1.0) == BRIGHTEST
 
 
 @given(st.floats(0.0, 3.0), st.floats(0.01, 9.0), growths)
@@ -82,7 +92,7 @@ def test_far_highlights_are_hardly_shrunk(excess, variance):
     spread = 4.0 + excess**2 - variance
     shrunk = excess * variance / (spread + variance)
     found = believed_highlight(excess, variance, 4.0, 0.0, 1.0, 1.0)
-    assert excess - shrunk <= found + 1e-5
+    assert min(excess - shrunk, BRIGHTEST) <= found + 1e-5
     assert found <= excess - shrunk + 2.0 * variance / spread + 1e-5
 
 

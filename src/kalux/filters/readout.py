@@ -76,6 +76,10 @@ _SURROUNDINGS: Final = 8
 """Pixels around a surface that its means look at, at most: neighbours twice as far away, and the patches around them,
 in a Bayer mosaic."""
 
+BRIGHTEST: Final = np.float32(np.log(1e5))
+"""Log of the brightest light over white that is believed. The sun, 1.6e9 cd/m^2, is 5e4 times as bright as white in its
+light (100,000 lx over pi); the flame of a candle in the dark, the brightest of 465 simulated scenes, has 1.5e5."""
+
 _HALF_OF_PATCH: Final = np.float32(1 / 18)
 """Factor from the sum over a patch of nine pixels to half its mean."""
 
@@ -158,7 +162,7 @@ def believed_highlight(excess, variance, scale2, unknown_scale, gain, growth):  
     excess) / k with Lambert's W, k being ``unknown_scale`` over that width. Returned is the log of the posterior mean
     intensity, half the posterior variance above the mean of the log; that half is bounded by a part of d, so that it is
     0 at white, and it counts as far as the prior is the normal one: of a highlight that makes its own, the median is
-    returned.
+    returned. No more than `BRIGHTEST` is.
     """
     noise = np.float32(variance)
     believed = np.float32(gain) * np.float32(excess)
@@ -174,7 +178,7 @@ def believed_highlight(excess, variance, scale2, unknown_scale, gain, growth):  
         slope = exponential(-w) / (ONE + w)  # of d in the shrunk excess
         left *= slope * slope
     normal = np.float32(scale2) / spread
-    return believed + np.float32(0.5) * normal * smaller(left, believed * np.sqrt(left))
+    return smaller(believed + np.float32(0.5) * normal * smaller(left, believed * np.sqrt(left)), BRIGHTEST)
 
 
 @formula(types.float32)
