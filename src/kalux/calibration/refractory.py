@@ -40,7 +40,7 @@ _WINDOWS: Final = (1.0, 2.0, 0.5, 0.25)
 """How far behind a dead time intervals are looked at, in units of it, in the order in which they are: farther where
 there is little noise, less far where light soon makes most of them. Of 204 simulated recordings the dead time is found
 in 192, 180, 172 and 133 by one of these, in 202 by any, and in none of 147 others that have none that noise shows, nor
-in any of seven real ones of DAVIS sensors. (With an eighth of it, 261 us are found on one of these.)"""
+in any of five real ones of DAVIS sensors. (With an eighth of it, 261 us are found on one of these.)"""
 
 _LEAST_AFTER: Final = 15
 """Least number of intervals in such a window. Of the 204 recordings, with 15 to thousands, all are found within 3 %
