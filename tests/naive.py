@@ -992,6 +992,17 @@ def blurred(pixels, place, t, c2, settings):
     return 0.06 * exposed**2 * change * (1 - 4 * share * (1 - share))
 
 
+def lagging(pixel, intensity, t, c2, settings):
+    """K11: how far a slow pixel with events is off the light between two frames."""
+    middles = pixel.middles
+    k = sum(m < t for m in middles) - 1
+    if not 0 <= k < len(middles) - 1 or min(pixel.changes[k][3]) >= UNMEASURED or pixel.changes[k][1]:
+        return 0.0
+    share = (t - middles[k]) / (middles[k + 1] - middles[k])
+    growth = (0.02 / max(intensity, 0.005)) ** 1.5
+    return 1.5 * 4 * share * (1 - share) * settings.events.lag_variance * c2 * growth
+
+
 def shown_change(pixels, place, interval, c2, settings):
     """K11: the same for images: what turns back within intervals changes as lately, not as in this interval.
 

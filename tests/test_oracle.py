@@ -63,6 +63,9 @@ VARIANTS = {
         camera=dataclasses.replace(PRESETS["default"].camera, row_time=-810.0),
         events=dataclasses.replace(PRESETS["default"].events, refractory_period=2_000),
     ),
+    "default-slow": dataclasses.replace(
+        PRESETS["default"], events=dataclasses.replace(PRESETS["default"].events, lag_variance=2.5)
+    ),
     "default-trusted": dataclasses.replace(
         PRESETS["default"],
         events=dataclasses.replace(PRESETS["default"].events, extrapolation_trust=0.7),
@@ -257,6 +260,9 @@ def assert_agrees(name, events, frames, times):
             if name.startswith("default"):
                 # At its own levels: near black the slope of a curve changes by more than they do.
                 given = naive.with_pattern(given, image.intensity, white, chosen.camera)
+            if name == "default-slow":
+                for place, pixel in pixels.items():
+                    given[place] += naive.lagging(pixel, image.intensity[place], t, 0.21 * 0.17, chosen)
             given += 0.25 * np.nan_to_num(doubt)
             if name.startswith("default"):
                 for place in pixels:

@@ -129,7 +129,7 @@ def test_whether_motion_is_followed():
 
 def test_says_how_far_a_refractory_period_that_frames_tell_may_be_wrong():
     """And nothing of one that is given."""
-    sensor = SensorSettings(exposure=2_000, log_offset=0.004, refractory=2_000.0)
+    sensor = SensorSettings(exposure=2_000, log_offset=0.004, refractory=2_000.0, noise_rate=0.0)
     lossy = simulate(dark_scene(), sensor, seed=1).recording()
     told = re.fullmatch(
         r"(\d\.\d+) ms \+- (\d+) % \(estimated from [\d,]+ samples\)", rows_of(lossy)["refractory"]

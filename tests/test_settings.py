@@ -349,6 +349,7 @@ OTHER_VALUES = {
     "camera.confidence": 1e5,
     "camera.weight_floor": 0.9,
     "events.step_variance": 0.4,
+    "events.lag_variance": 2.0,
     "events.refractory_period": 900,
     "events.refractory_spread": 0.5,
     "events.deblur_variance": 3.0,

@@ -25,6 +25,7 @@ from kalux.filters.uncertainty import (
     Around,
     add_blurred,
     add_dark_doubt,
+    add_lag,
     add_pattern,
     before_averaging,
     given_variance,
@@ -172,6 +173,8 @@ class View:
         Share of what events say there that is believed, and how far highlights beyond that scale are (K6).
     unknown_variance
         P of a pixel that has not been measured.
+    lag_variance
+        Variance by which slow pixels are off the light at a moment, at 0.02 of white (K11); 0: none.
     fixed_pattern
         Standard deviation of the pixels' offsets in the frames (K11), of stored values, white = 1.
     response
@@ -192,6 +195,7 @@ class View:
     highlight_gain: float
     highlight_growth: float
     unknown_variance: float
+    lag_variance: float
     fixed_pattern: float
     response: Response | None
     rounding: float
@@ -263,6 +267,8 @@ def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) ->
         )
         if np.any(pattern):
             add_pattern(total, intensity, view.log_offset, pattern)
+    if needs_variance and view.lag_variance > 0 and estimate.around is not None:
+        add_lag(total, intensity, estimate.around, view.lag_variance)
     if needs_variance and unshown is not None:
         total.reshape(-1)[unshown.pixels] += np.float32(UNSHOWN_SHARE) * unshown.doubt
     if along is not None:

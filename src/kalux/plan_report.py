@@ -71,6 +71,9 @@ def _of_events(plan: Plan, asked: Settings) -> Iterator[tuple[str, str]]:
     if events.step_variance is not None:
         how = _step_origin(plan, asked.events.step_variance)
         yield "step", f"variance of one event {events.step_variance:g} c^2, c its threshold ({how})"
+    if events.lag_variance:
+        how = _estimated(asked.events.lag_variance, True)
+        yield "lag", f"of slow pixels at a moment {events.lag_variance:g} c^2 at 0.02 of white ({how})"
     if events.refractory_period is not None:
         yield "refractory", f"{_refractory_text(events)} ({_refractory_origin(plan, asked)})"
     if events.threshold_spread is not None:

@@ -517,6 +517,7 @@ class Reconstructor:
             highlight_gain=events.believed_gain,
             highlight_growth=growth,
             unknown_variance=filtered.initial_variance,
+            lag_variance=on * off * (events.lag_variance or 0.0),
             fixed_pattern=self._pattern_of(frame),
             response=None if self._camera.response.is_linear else self._camera.response,
             rounding=repeated_rounding(frame, self.settings.camera),

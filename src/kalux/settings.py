@@ -160,6 +160,11 @@ class EventSettings:
     step_variance
         Variance of one event's step in units of c^2. None: an estimate from the recording
         (`kalux.calibration.mismatch`).
+    lag_variance
+        Variance, c^2, by which pixels with events are off the light at a moment because they are slow, at 0.02 of
+        white: more in the dark, less in the light (docs/equations.md, K11). It is in the variance of images between
+        frames. None: an estimate from the recording (`kalux.calibration.lag`); 0 in a live stream. For augmentation
+        "bridge" only.
     refractory_period
         Time after an event in which a pixel produces no other, us: the change meanwhile is added to its next event
         (docs/equations.md, K13). None: an estimate from the recording, 0 where its frames show that no change is lost
@@ -226,6 +231,7 @@ class EventSettings:
     delay: int | None = None
     threshold_spread: float | None = None
     step_variance: float | None = None
+    lag_variance: float | None = None
     refractory_period: int | None = None
     refractory_spread: float | None = None
     quantisation_variance: float = 1 / 6
@@ -483,6 +489,7 @@ _USED_BY: Final[Mapping[str, tuple[str, ...]]] = {
             "camera.fixed_pattern",
             "camera.row_time",
             "events.step_variance",
+            "events.lag_variance",
             "events.refractory_period",
             "events.refractory_spread",
             "events.deblur_variance",
@@ -658,7 +665,8 @@ _LARGEST_OF: Final[Mapping[str, float]] = {
     ),
     "trail": 10.0,  # c: a pixel one threshold beyond its newest event has another
     **dict.fromkeys(
-        ("step_variance", "usual_step_variance", "quantisation_variance", "deblur_variance"), 100.0
+        ("step_variance", "usual_step_variance", "lag_variance", "quantisation_variance", "deblur_variance"),
+        100.0,
     ),  # c^2
     **dict.fromkeys(
         ("highlight_tail", "unshown_tail", "unshown_scale"), 100.0

@@ -19,6 +19,8 @@ from kalux.datasets import SensorSettings, demo_scene, simulate
 from kalux.events import make_events
 from kalux.recording import Recording
 
+from builders import dark_scene
+
 SIZE = (5, 6)
 
 
@@ -176,6 +178,12 @@ def test_light_that_turns_within_a_dead_time_hides_no_noise():
         share=0.5,
     )
     assert dead_time(recording) == pytest.approx(600, rel=0.03)
+
+
+def test_light_without_noise_is_none():
+    """Its intervals set in by degrees, and those few that turn may do so at once, later than any refractory period."""
+    sensor = SensorSettings(exposure=2_000, log_offset=0.004, refractory=2_000.0, noise_rate=0.0)
+    assert dead_time(simulate(dark_scene(), sensor, seed=1).recording()) == 0
 
 
 def test_little_noise_is_looked_at_farther_behind():

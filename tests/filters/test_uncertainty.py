@@ -17,6 +17,7 @@ from kalux.filters.uncertainty import (
     Around,
     add_blurred,
     add_dark_doubt,
+    add_lag,
     add_pattern,
     before_averaging,
     changed_within,
@@ -101,6 +102,28 @@ def test_what_noise_hides_below_black_is_doubted_by_the_intensity():
     intensity = np.array([[0.0, 0.005, 0.01, 0.02, 3.0]], np.float32)
     add_dark_doubt(variance, intensity, DarkDoubt(0.01, np.array([0.4, 0.2, 0.0], np.float32)))
     np.testing.assert_allclose(variance, [[0.9, 0.8, 0.7, 0.5, 0.5]], rtol=1e-6)
+
+
+def test_slow_pixels_are_off_between_frames_and_more_so_in_the_dark():
+    """Half-way by 1.5 times the variance at 0.02 of white, an eighth of that at four times it, 8 times in black."""
+    variance, intensity = np.zeros((1, 3), np.float32), np.float32([[0.02, 0.08, 0.0]])
+
+    def added(share, **frames):
+        given = np.zeros_like(variance)
+        planes = {name: np.full_like(variance, value) for name, value in frames.items()}
+        add_lag(given, intensity, around()._replace(share=share, **planes), 0.1)
+        return given
+
+    known = {"first": 0.1, "second": UNMEASURED, "events": 2.0}
+    np.testing.assert_allclose(added(0.5, **known), [[0.15, 0.15 / 8, 1.2]], rtol=1e-6)
+    np.testing.assert_allclose(added(0.25, **known), 0.75 * added(0.5, **known), rtol=1e-6)
+    for share, frames in (
+        (0.0, known),
+        (1.0, known),
+        (0.5, {**known, "events": 0.0}),
+        (0.5, {**known, "first": UNMEASURED}),
+    ):
+        assert (added(share, **frames) == 0).all()
 
 
 @given(variances, variances, st.floats(0.0, 30.0), st.floats(0.0, 0.1), st.floats(0.0, 0.1))

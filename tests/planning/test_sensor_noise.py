@@ -91,3 +91,25 @@ def test_the_background_is_measured_and_at_least_the_least():
 
 def refractory(period):
     return altered(PRESETS["default"], "events", refractory_period=period)
+
+
+def test_how_slow_pixels_are_comes_from_frames_and_can_be_given():
+    """None in causal mode, and of a filter that has no use for it."""
+    sensor = SensorSettings(
+        threshold_on=0.15, threshold_off=0.15, log_offset=0.004, cutoff=200.0, frame_rate=25.0
+    )
+    slow = simulate(demo_scene(sensor_size=(90, 120), duration=1_000_000), sensor, seed=1).recording()
+    found = plan(slow, at="frames")
+    assert found.settings.events.lag_variance == pytest.approx(found.lag.variance, abs=1e-3)
+    assert found.lag.variance > 0.5
+    told = dict(plan_report(slow, found, PRESETS["default"]))["lag"]
+    assert (
+        told
+        == f"of slow pixels at a moment {found.settings.events.lag_variance:g} c^2 at 0.02 of white (measured)"
+    )
+    assert plan(slow, at="frames", lookahead=False).settings.events.lag_variance == 0.0
+    assert plan(slow, at="frames", preset="iccv2021").settings.events.lag_variance is None
+    given = altered(PRESETS["default"], "events", lag_variance=0.7)
+    kept = plan(slow, at="frames", settings=given)
+    assert (kept.settings.events.lag_variance, kept.lag) == (0.7, None)
+    assert dict(plan_report(slow, kept, given))["lag"].endswith("0.7 c^2 at 0.02 of white (given)")

@@ -169,9 +169,11 @@ def _onset_before(share: float, count: NDArray[np.int64], turned: NDArray[np.int
         & (any_shorter[begin] / begin <= _MOST_BEFORE * 2 * density)  # half of those of noise turn
         & (gain - _of_power(turned, within, end) >= _LEAST_SUDDEN)
     )
-    for unit in (window // 10, window // 2):
+    for unit in (window // 10, window // 4, window // 2):
         ratio, chance = _growth(shorter, begin, unit)
         sudden &= ratio <= _MOST_BEYOND + chance
+    if share < 1.0:
+        sudden &= _are_of_noise(shorter, any_shorter, begin, window // 10)
     lasting = np.maximum(window, begin)
     for lengths, unit in ((shorter, lasting // 2), (shorter, lasting), (any_shorter, window // 10)):
         ratio, chance = _growth(lengths, begin, unit)
@@ -184,6 +186,21 @@ def _onset_before(share: float, count: NDArray[np.int64], turned: NDArray[np.int
     earliest = max(latest - round(_LATE_BY * apart), 0)
     first_of_any = earliest + int(np.argmax(count[earliest : latest + 1] > 0))
     return first_of_any - round(apart)  # by which the first comes late
+
+
+def _are_of_noise(
+    shorter: NDArray[np.int64],
+    any_shorter: NDArray[np.int64],
+    begin: NDArray[np.int64],
+    unit: NDArray[np.int64],
+) -> NDArray[np.bool_]:
+    """Whether of the intervals of up to ``begin + unit`` about half turn, as those of noise do, and not fewer.
+
+    Light that begins to make intervals makes few that turn, which may come at once as well.
+    """
+    turned, of_any = (each[begin + unit] - each[begin] for each in (shorter, any_shorter))
+    most = 2 * (_MOST_BEYOND * turned + 2 * np.sqrt(np.maximum(turned, 1)))
+    return np.asarray(of_any <= most, np.bool_)
 
 
 def _log_likelihood(number: NDArray[np.int64], time: NDArray[np.int64]) -> NDArray[np.float64]:

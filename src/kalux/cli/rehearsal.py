@@ -83,7 +83,9 @@ def rehearse_images() -> None:
         unshown=unshown,
         unmeasured=np.arange(5000),
     )
-    view = View(0.02, 0.04, 0.1, 1.0, 0.3, 1.0, 1.0, 1.0, 0.005, None, 0.001, None, None, (1.0, 1.0, 1.0))
+    view = View(
+        0.02, 0.04, 0.1, 1.0, 0.3, 1.0, 1.0, 1.0, 0.0, 0.005, None, 0.001, None, None, (1.0, 1.0, 1.0)
+    )
     make_image(estimate, view, with_variance=False)
     even, known = np.zeros(_SIZE, np.float32), np.ones(_SIZE, np.float32)
     frame, aside = Latent(even, known), np.ones((2, *_SIZE), np.float32)

@@ -14,6 +14,7 @@ from kalux.calibration.delay import DelayEstimate
 from kalux.calibration.fixed_pattern import FixedPattern
 from kalux.calibration.frame_noise import FrameNoise
 from kalux.calibration.frame_times import find_frame_times
+from kalux.calibration.lag import Lag
 from kalux.calibration.mismatch import Mismatch
 from kalux.calibration.values import Calibration, require_white
 from kalux.calibration.white_balance import grey_world
@@ -35,6 +36,7 @@ from kalux.planning.sensor_noise import (
     with_dead_time,
     with_fixed_pattern,
     with_frame_noise,
+    with_lag,
     with_step_errors,
 )
 from kalux.planning.survey import survey
@@ -62,8 +64,8 @@ class Plan:
     Attributes
     ----------
     settings
-        With thresholds, refractory period, delay, frame noise, fixed pattern, I_0, step variance, black level,
-        saturation, reference exposure and white balance filled in.
+        With thresholds, refractory period, delay, frame noise, fixed pattern, I_0, step and lag variance, black
+        level, saturation, reference exposure and white balance filled in.
     threshold_origin
         Whether the thresholds come from the settings, the recording, a calibration, an estimate, or are assumed.
     times
@@ -84,6 +86,8 @@ class Plan:
         The fit of the frames' fixed pattern, where there was one.
     mismatch
         The fit of the thresholds' spread between pixels, where there was one.
+    lag
+        How far slow pixels are off the light at a moment, where pixels with events told it.
     background_rate
         The measured noise of events, Hz per pixel, where it was.
     dead_time
@@ -103,6 +107,7 @@ class Plan:
     frame_noise: FrameNoise | None
     fixed_pattern: FixedPattern | None
     mismatch: Mismatch | None
+    lag: Lag | None
     background_rate: float | None
     dead_time: int
     unshown_scale: UnshownScale | None
@@ -204,6 +209,7 @@ def _planned(
             moved = moved._replace(times=times_found.of_all(seen.exposures, left_out))
             return _planned(as_stored, as_chosen, known, asked, moved)
     chosen, mismatch = with_step_errors(recording, steps.settings, steps.threshold_error, known=chosen.events)
+    chosen, lag = with_lag(recording, chosen, lookahead=lookahead)
     chosen, background = with_background(recording, chosen, known.pixels, lookahead=lookahead)
     pixels = known.pixels_of(chosen.events.mismatch)
     origin = steps.origin
@@ -230,6 +236,7 @@ def _planned(
         frame_noise=of_frames.estimate,
         fixed_pattern=pattern,
         mismatch=mismatch,
+        lag=lag,
         background_rate=background,
         dead_time=dead_time,
         unshown_scale=unshown,

@@ -9,6 +9,7 @@ import numpy as np
 from kalux.calibration.compression import Compression
 from kalux.calibration.fixed_pattern import FixedPattern, estimate_fixed_pattern
 from kalux.calibration.frame_noise import FrameNoise, UsualNoise, estimate_frame_noise, usual_noise
+from kalux.calibration.lag import Lag, estimate_lag
 from kalux.calibration.mismatch import Mismatch, estimate_mismatch
 from kalux.calibration.noise import event_noise
 from kalux.calibration.refractory import counted_period, dead_time
@@ -114,6 +115,18 @@ def with_step_errors(
         measured = found.step_variance(spread)
         step_variance = step_variance if measured is None else round(measured, 3)
     return altered(settings, "events", threshold_spread=spread, step_variance=step_variance), found
+
+
+def with_lag(recording: Recording, settings: Settings, *, lookahead: bool) -> tuple[Settings, Lag | None]:
+    """Fill in the variance of errors of the moment, where the variance counts it: from the settings, else an estimate.
+
+    Nothing is between two frames in causal mode.
+    """
+    if settings.events.lag_variance is not None or not settings.filter.joins_frames:
+        return settings, None
+    found = estimate_lag(recording, settings.camera, settings.events) if lookahead else None
+    variance = 0.0 if found is None else round(found.believed, 3)
+    return altered(settings, "events", lag_variance=variance), found
 
 
 def with_background(

@@ -1,0 +1,139 @@
+"""How far pixels are, at a moment, from the light, beyond what their steps add up to: slow ones lag in the dark.
+
+Errors of steps stay: from frame to frame they add up, and those of two successive intervals have nothing to do with one
+another. A pixel's lag behind the light is of the moment: what makes it darker at one frame, beside its events, makes an
+interval's mismatch too small and the next one's too large. So the mean product of the mismatches of two successive
+intervals is, but for the sign, the variance of such errors at the frame between them, and that of the frame's noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kalux.calibration.intervals import Counted, counted_intervals
+from kalux.calibration.regression import parts, ratio_error
+from kalux.models.lag import lag_growth
+from kalux.recording import Recording
+from kalux.settings import CameraSettings, EventSettings
+
+Array = NDArray[np.float64]
+
+_MAX_FRAMES: Final = 40
+_ENOUGH: Final = 300_000  # pixels and frames: the standard error is a few percent of a slow sensor's
+
+_BELOW_THRESHOLD: Final = 0.12
+"""Variance, c^2, of what is below the threshold at a frame, by which all pixels are off their events: 0.10 to 0.15
+where nothing lags, in a scene without noise."""
+
+_CLIP: Final = 9.0  # thresholds: flicker and occlusions, or a pixel that lost many events
+
+_DARKEST: Final = (0.01, 2.0)
+"""Level, and standard deviations of the frames' noise, from which pixels count: black cuts the noise of darker ones."""
+
+_CERTAIN: Final = 2.0  # standard errors by which it must be more than none
+
+
+class Lag(NamedTuple):
+    """What a recording says of errors of the moment.
+
+    Attributes
+    ----------
+    variance, error
+        At `kalux.models.lag.LEVEL`, in units of c^2, and its standard error.
+    samples
+        Pixels and frames used.
+    """
+
+    variance: float
+    error: float
+    samples: int
+
+    @property
+    def believed(self) -> float:
+        """The variance, c^2: 0 where it may be none."""
+        return self.variance if self.variance > _CERTAIN * self.error else 0.0
+
+
+def estimate_lag(recording: Recording, camera: CameraSettings, events: EventSettings) -> Lag | None:
+    """The variance of errors of the moment, from the first 40 frames, or as many as have 300,000 pixels that tell.
+
+    With m and m' a pixel's mismatches (docs/equations.md, K1) of two successive intervals, both with events, N the
+    variance of the noise of the frame between and g how the variance grows in the dark (`lag_growth`), it is the sum of
+    g (-m m' - N - 0.12 c^2) over that of g^2 c^2 (docs/equations.md, K11).
+
+    Parameters
+    ----------
+    recording
+        With frames and exposures.
+    camera
+        Response, saturation, I_0 and frame noise.
+    events
+        With both thresholds.
+
+    Returns None where no pixel has events in two successive intervals whose frames measure it.
+
+    Raises
+    ------
+    ExposureError
+        If the frames' exposures are not known.
+    """
+    part = parts(recording.sensor_size)
+    sums: Array = np.zeros((int(part.max()) + 1, 2))
+    samples = 0
+    before: _Mismatches | None = None
+    for here in _mismatches(recording, camera, events):
+        if before is not None and before.end == here.start:
+            shared = before.told & here.told
+            told = before.second[shared]
+            threshold2 = float(np.prod(events.thresholds))
+            growth = lag_growth(told)
+            product = -before.change[shared] * here.change[shared]
+            excess = product - before.noise[shared] - _BELOW_THRESHOLD * threshold2
+            for column, values in enumerate((growth * excess, growth**2 * threshold2)):
+                sums[:, column] += np.bincount(part[shared], values, len(sums))
+            samples += len(told)
+        if samples >= _ENOUGH:
+            break
+        before = here
+    if not samples:
+        return None
+    over, under = sums.sum(axis=0)
+    return Lag(float(over / under), ratio_error(sums), samples)
+
+
+class _Mismatches(NamedTuple):
+    """An interval's: where it begins and ends, us; (H, W): the mismatch, clipped, and whether it counts; I at its end,
+    and the variance of its logarithm by the frame's noise."""
+
+    start: int
+    end: int
+    change: Array
+    told: NDArray[np.bool_]
+    second: Array
+    noise: Array
+
+
+def _mismatches(recording: Recording, camera: CameraSettings, events: EventSettings) -> Iterator[_Mismatches]:
+    most = _CLIP * max(events.thresholds)
+    for counted in counted_intervals(recording, camera, events, most_frames=_MAX_FRAMES):
+        interval = counted.interval
+        mismatch = np.clip(_mismatch(counted, events), -most, most)
+        told = (counted.on + counted.off > 0) & interval.first.measured & interval.second.measured
+        read, shot = camera.noise
+        for end in interval.ends:
+            told &= end.intensity > max(_DARKEST[0], _DARKEST[1] * read) * end.shot.white
+        end, white = interval.ends[1], float(interval.second.white)
+        variance = (read * white) ** 2 + shot * white * end.intensity
+        noise = variance / (end.intensity + end.log_offset) ** 2
+        yield _Mismatches(interval.start, interval.end, mismatch, told, end.intensity, noise)
+
+
+def _mismatch(counted: Counted, events: EventSettings) -> Array:
+    """By how much the frames' logs differ from what the events between say."""
+    on, off = events.thresholds
+    told: Array = counted.interval.change - counted.bend - (on * counted.on - off * counted.off)
+    return told

@@ -1,0 +1,26 @@
+"""How the variance of errors of the moment grows in the dark, where pixels are slow (docs/equations.md, K11)."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+LEVEL: Final = 0.02
+"""Intensity, white = 1, at which it is stated: darker than most of a scene, and not yet the noise of frames."""
+
+DARKEST: Final = 0.005
+"""Below this intensity it grows no more: nothing tells it there."""
+
+
+def lag_growth(intensity: NDArray[Any]) -> NDArray[np.float64]:
+    """The variance at an intensity, in units of that at `LEVEL`: (0.02 / I)^1.5, at most 8.
+
+    A photoreceptor's time constant goes by 1 / I, so that what a pixel lags behind light that changes steadily has a
+    variance that goes by 1 / I^2, and less where the light turns before it has caught up. On four simulated scenes of a
+    slow sensor it grows by 1.7 to 3.5 for each halving of the light.
+    """
+    share = LEVEL / np.maximum(np.asarray(intensity, np.float64), DARKEST)
+    growth: NDArray[np.float64] = share * np.sqrt(share)
+    return growth
