@@ -36,7 +36,7 @@ def test_slow_pixels_are_told_from_fast_ones():
     """Those of 200 Hz at white are of 4 Hz at 0.02 of it."""
     fast, slow = (estimate_lag(made(cutoff), CAMERA, EVENTS) for cutoff in (0.0, 200.0))
     assert fast.believed < 0.1
-    assert slow.believed > 1.0
+    assert slow.believed == min(slow.variance, 4.0) > 1.0
     assert slow.error < 0.3 * slow.variance
 
 
@@ -50,6 +50,10 @@ def test_what_may_be_none_is_not_believed():
     assert Lag(0.5, 0.3, 1000).believed == 0.0
     assert Lag(0.5, 0.2, 1000).believed == 0.5
     assert Lag(-0.5, 0.1, 1000).believed == 0.0
+
+
+def test_more_than_pixels_lag_is_not_believed():
+    assert Lag(17.0, 7.0, 1000).believed == 4.0
 
 
 def test_noise_of_frames_is_no_lag():

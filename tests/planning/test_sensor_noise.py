@@ -100,8 +100,8 @@ def test_how_slow_pixels_are_comes_from_frames_and_can_be_given():
     )
     slow = simulate(demo_scene(sensor_size=(90, 120), duration=1_000_000), sensor, seed=1).recording()
     found = plan(slow, at="frames")
-    assert found.settings.events.lag_variance == pytest.approx(found.lag.variance, abs=1e-3)
-    assert found.lag.variance > 0.5
+    assert found.settings.events.lag_variance == pytest.approx(found.lag.believed, abs=1e-3)
+    assert found.lag.believed > 0.5
     told = dict(plan_report(slow, found, PRESETS["default"]))["lag"]
     assert (
         told

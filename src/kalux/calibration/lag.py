@@ -35,6 +35,8 @@ _DARKEST: Final = (0.01, 2.0)
 """Level, and standard deviations of the frames' noise, from which pixels count: black cuts the noise of darker ones."""
 
 _CERTAIN: Final = 2.0  # standard errors by which it must be more than none
+_MOST: Final = 4.0
+"""What is believed at most, c^2: on 465 simulated scenes it is up to 3.4, but for one of a fine texture, of 17 +- 7."""
 
 
 class Lag(NamedTuple):
@@ -54,8 +56,8 @@ class Lag(NamedTuple):
 
     @property
     def believed(self) -> float:
-        """The variance, c^2: 0 where it may be none."""
-        return self.variance if self.variance > _CERTAIN * self.error else 0.0
+        """The variance, c^2, up to 4: 0 where it may be none."""
+        return min(self.variance, _MOST) if self.variance > _CERTAIN * self.error else 0.0
 
 
 def estimate_lag(recording: Recording, camera: CameraSettings, events: EventSettings) -> Lag | None:
