@@ -92,7 +92,7 @@ def estimate_lag(recording: Recording, camera: CameraSettings, events: EventSett
             shared = before.told & here.told
             told = before.second[shared]
             threshold2 = float(np.prod(events.thresholds))
-            growth = lag_growth(told)
+            growth = lag_growth(told).astype(np.float64)
             product = -before.change[shared] * here.change[shared]
             excess = product - before.noise[shared] - _BELOW_THRESHOLD * threshold2
             for column, values in enumerate((growth * excess, growth**2 * threshold2)):

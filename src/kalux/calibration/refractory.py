@@ -54,15 +54,14 @@ _MOST_BEFORE: Final = 0.02
 """Largest density of intervals below a dead time, over that beyond; not 0, since pixels differ."""
 
 _MOST_BEYOND: Final = 1.6
-"""Largest density of intervals beyond a tenth of the window behind the dead time, and beyond a half, over that before,
-beside chance: on 63 simulated recordings 0.6 to 1.75 of half a dead time. It is more where the light turns sooner or
-later: 4 behind 0.28 ms on a DAVIS346 before a bench."""
+"""Largest density of intervals beyond a tenth of the window behind the dead time, a quarter and a half, over that
+before, beside chance: on 63 simulated recordings 0.6 to 1.75 of half a dead time. It is more where the light turns
+sooner or later: 4 behind 0.28 ms on a DAVIS346 before a bench."""
 
 _LEAST_BEYOND: Final = 1 / 3
-"""The least of these ratios, of all intervals within a tenth, and of that from 2 to 3 dead times, or of the next
-window if that is longer: it is less where events
-wait for the end of the dead time, so that nothing is lost (`Intervals.pile_up`), and under a lamp, whose light
-turns after half a period, and again after another."""
+"""The least of these ratios, of all intervals within a tenth, and of that from 2 to 3 dead times, or of the next window
+if that is longer: it is less where events wait for the end of the dead time, so that nothing is lost
+(`Intervals.pile_up`), and under a lamp, whose light turns after half a period, and again after another."""
 
 _LATE_BY: Final = 6.0
 """Mean times between two intervals by which the first one between events of unlike polarity is late, at most: by more
@@ -148,12 +147,12 @@ def _onset(count: NDArray[np.int64], turned: NDArray[np.int64]) -> int:
 
     ``count`` says how many intervals are of each length, us, and ``turned`` of how many both events differ in polarity.
     """
-    found = (_onset_before(share, count, turned) for share in _WINDOWS)
+    found = (_onset_of(share, count, turned) for share in _WINDOWS)
     return next(filter(None, found), 0)
 
 
-def _onset_before(share: float, count: NDArray[np.int64], turned: NDArray[np.int64]) -> int:
-    """The same by the intervals in a window behind it, whose length is a ``share`` of it."""
+def _onset_of(share: float, count: NDArray[np.int64], turned: NDArray[np.int64]) -> int:
+    """The same, by the intervals in a window behind it that is as long as a ``share`` of it."""
     begin = _DEAD_TIMES
     window = (share * begin).astype(np.int64)
     end = begin + window
