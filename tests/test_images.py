@@ -21,6 +21,7 @@ GREY = View(
     highlight_gain=1.0,
     highlight_growth=1.0,
     unknown_variance=9.0,
+    lag_variance=0.0,
     fixed_pattern=0.0,
     response=None,
     rounding=0.0,

@@ -40,6 +40,7 @@ UNITS: Final[Mapping[str, str]] = {
     "apparent_delay": "us",
     "trailing_delay": "us, how late events were taken to be",
     "step_variance": "threshold^2 per event",
+    "lag_variance": "threshold^2 at 0.02 of white",
     "noise_rate": "Hz per pixel",
     "frame_noise": "standard deviation in the dark, white = 1",
     "noise_at_half": "standard deviation at half of white, white = 1",
