@@ -27,8 +27,7 @@ _SMALL: Final = 1 << 16
 
 MOST_FREE: Final = 64 << 20
 """Most bytes of free memory that are kept: at 640x480 a segment ends with 50 MB. With 128 MB a run is not faster, but
-its memory grows by the difference."""
-
+its memory grows by the difference; with 96 MB a photograph panned before it holds 12 MB more."""
 
 _ARENA_MAX: Final = -8
 """M_ARENA_MAX of glibc's malloc.h."""

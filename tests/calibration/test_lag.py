@@ -9,6 +9,7 @@ import pytest
 
 from kalux.calibration.lag import Lag, estimate_lag
 from kalux.datasets import SensorSettings, demo_scene, simulate
+from kalux.events import EVENT_DTYPE
 from kalux.recording import Recording
 from kalux.settings import CameraSettings, EventSettings
 
@@ -74,10 +75,9 @@ def test_noise_of_frames_is_no_lag():
 
 
 def test_nothing_that_moves_tells_nothing():
+    moving = moving_blocks().recording()
     still = Recording.from_arrays(
-        np.concatenate(list(moving_blocks().recording().events()))[:0],
-        list(moving_blocks().recording().frames()),
-        sensor_size=moving_blocks().recording().sensor_size,
+        np.empty(0, EVENT_DTYPE), list(moving.frames()), sensor_size=moving.sensor_size
     )
     assert estimate_lag(still, CAMERA, EVENTS) is None
 

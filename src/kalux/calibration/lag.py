@@ -14,8 +14,10 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from kalux.calibration.event_model import DARKEST
 from kalux.calibration.intervals import Counted, counted_intervals
 from kalux.calibration.regression import parts, ratio_error
+from kalux.models.camera import noise_variance
 from kalux.models.lag import lag_growth
 from kalux.recording import Recording
 from kalux.settings import CameraSettings, EventSettings
@@ -31,8 +33,8 @@ where nothing lags, in a scene without noise."""
 
 _CLIP: Final = 9.0  # thresholds: flicker and occlusions, or a pixel that lost many events
 
-_DARKEST: Final = (0.01, 2.0)
-"""Level, and standard deviations of the frames' noise, from which pixels count: black cuts the noise of darker ones."""
+_CUT: Final = 2.0
+"""Standard deviations of the frames' noise from which pixels count: black cuts the noise of darker ones."""
 
 _CERTAIN: Final = 2.0  # standard errors by which it must be more than none
 _MOST: Final = 4.0
@@ -86,12 +88,12 @@ def estimate_lag(recording: Recording, camera: CameraSettings, events: EventSett
     part = parts(recording.sensor_size)
     sums: Array = np.zeros((int(part.max()) + 1, 2))
     samples = 0
+    threshold2 = float(np.prod(events.thresholds))
     before: _Mismatches | None = None
     for here in _mismatches(recording, camera, events):
         if before is not None and before.end == here.start:
             shared = before.told & here.told
             told = before.second[shared]
-            threshold2 = float(np.prod(events.thresholds))
             growth = lag_growth(told).astype(np.float64)
             product = -before.change[shared] * here.change[shared]
             excess = product - before.noise[shared] - _BELOW_THRESHOLD * threshold2
@@ -125,12 +127,13 @@ def _mismatches(recording: Recording, camera: CameraSettings, events: EventSetti
         interval = counted.interval
         mismatch = np.clip(_mismatch(counted, events), -most, most)
         told = (counted.on + counted.off > 0) & interval.first.measured & interval.second.measured
-        read, shot = camera.noise
         for end in interval.ends:
-            told &= end.intensity > max(_DARKEST[0], _DARKEST[1] * read) * end.shot.white
-        end, white = interval.ends[1], float(interval.second.white)
-        variance = (read * white) ** 2 + shot * white * end.intensity
-        noise = variance / (end.intensity + end.log_offset) ** 2
+            told &= end.intensity > max(DARKEST, _CUT * camera.noise[0]) * end.shot.white
+        end = interval.ends[1]
+        noise = (
+            noise_variance(end.intensity, camera.noise, end.shot.white)
+            / (end.intensity + end.log_offset) ** 2
+        )
         yield _Mismatches(interval.start, interval.end, mismatch, told, end.intensity, noise)
 
 

@@ -212,9 +212,8 @@ def _changed(settings: Settings, factors: Mapping[str, float], rounding: float) 
 
 def _fitted_values(settings: Settings) -> dict[str, dict[str, float | int]]:
     values: dict[str, dict[str, float | int]] = {"camera": {}, "events": {}}
-    steps = ("step_variance", "lag_variance")
-    names = ("threshold_on", "threshold_off", "delay", *steps, "threshold_spread", "noise_rate")
-    for name in (*names, "refractory_period"):
+    names = ("threshold_on", "threshold_off", "delay", "step_variance", "threshold_spread", "noise_rate")
+    for name in (*names, "lag_variance", "refractory_period"):
         values["events"][name] = getattr(settings.events, name)
     if settings.events.refractory_doubt:
         values["events"]["refractory_spread"] = settings.events.refractory_doubt
