@@ -68,7 +68,7 @@ def all_given() -> Settings:
         chosen, "events", threshold_spread=0.1, noise_rate=3.0, leave_out_hot=False, mend_layout=False
     )
     chosen = altered(chosen, "events", extrapolation_gain=1.0, extrapolation_trust=1.0)
-    chosen = altered(chosen, "filter", unshown_scale=1.0)
+    chosen = altered(chosen, "filter", unshown_scale=1.0, dark_shares="even")
     chosen = altered(chosen, "camera", log_offset=0.03, frame_noise=0.006, black_level=0.0)
     chosen = altered(chosen, "camera", even_gain=False, leave_out_faulty=False)
     return altered(chosen, "camera", mend_stuck=False, mend_times=False)

@@ -173,8 +173,23 @@ def event_sum(pixel, a, b, on, off):
     return sum(w * (on if p else -off) for t, p, _, _, w in pixel.events if a < t <= b)
 
 
+def dark_light(clean, shares, even):
+    """K3: intensities, white = 1, and how often frames show them; the even ones where that is not known."""
+    if shares in ("auto", "even"):
+        return even, np.ones(200) / 200
+    edges = [0, 0.125, 0.375, 0.75, 1.25, 1.75, 2.5, 4, 6.5, 10, 14]
+    light, often = [], []
+    for k, share in enumerate(shares.split()):
+        wide = edges[k + 1] - edges[k]
+        part = 0.8 * float(share) / sum(float(s) for s in shares.split()) + 0.2 * wide / 14
+        for j in range(8):
+            light.append(edges[k] + wide * (j / 7 if k == 0 else (j + 0.5) / 8))
+            often.append(part / 8)
+    return np.array(light) * clean, np.array(often)
+
+
 @lru_cache
-def dark_levels(read, shot, i0):
+def dark_levels(read, shot, i0, shares):
     """K3: what is added to log(I + I_0) of the 8-bit levels of dark pixels, white = 1."""
     clean = np.sqrt(max(read**2 - (1 / 255) ** 2 / 12, 0))
     if clean < 0.5 / 255:
@@ -182,13 +197,13 @@ def dark_levels(read, shot, i0):
     step = max(1, int(clean * 255 / 4)) / 255
     levels = [k * step for k in range(int(12 * clean / step) + 1)]
     rows, wanted = [], []
-    for i in np.linspace(0, 8 * clean, 200):
+    for i, often in zip(*dark_light(clean, shares, np.linspace(0, 8 * clean, 200)), strict=True):
         share = weights_of(levels, i, read, shot, i0)
         share /= share.sum()
-        rows.append(share[None])
-        wanted.append([np.log(i + i0)])
+        rows.append(np.sqrt(often) * share[None])
+        wanted.append([np.sqrt(often) * np.log(i + i0)])
         rows.append(
-            np.sqrt(share / 10)[:, None] * (np.eye(len(levels)) - share)
+            np.sqrt(often * share / 10)[:, None] * (np.eye(len(levels)) - share)
         )  # the noise of a mean of ten
         wanted.append(np.zeros(len(levels)))
     value = np.linalg.lstsq(np.concatenate(rows), np.concatenate(wanted), rcond=None)[0]
@@ -201,19 +216,20 @@ def weights_of(levels, i, read, shot, i0):
     clean, step = np.sqrt(read**2 - (1 / 255) ** 2 / 12), levels[1] - levels[0]
     deviation = np.sqrt(clean**2 + shot * i) * np.sqrt(2)
     below = [0.0] + [(1 + erf((b + step / 2 - i) / deviation)) / 2 for b in levels[:-1]] + [1.0]
-    return np.diff(below) * [(max(b, 1.5 * read) + i0) ** 2 / (read**2 + shot * b) for b in levels]
+    return np.diff(below) / [0.03 + (read**2 + shot * b) / (max(b, 1.5 * read) + i0) ** 2 for b in levels]
 
 
 @lru_cache
-def dark_doubts(read, shot, i0):
+def dark_doubts(read, shot, i0, shares):
     """K11: by intensities shown, what the mean of frames is wrong by where noise hides the light below black."""
-    levels, added = dark_levels(read, shot, i0)
+    levels, added = dark_levels(read, shot, i0, shares)
     clean = np.sqrt(max(read**2 - (1 / 255) ** 2 / 12, 0))
     if len(levels) == 1 or clean < 4 * i0:
         return [0.0, 1.0], [0.0, 0.0]
     shown = np.linspace(0, 4 * clean, 65)
     found = []
-    for i in np.geomspace(i0, 4 * clean + i0, 200) - i0:
+    light, often = dark_light(clean, shares, np.geomspace(i0, 4 * clean + i0, 200) - i0)
+    for i in light:
         weights = weights_of(levels, i, read, shot, i0)
         mean = np.sum(weights * (np.log(np.array(levels) + i0) + added)) / np.sum(weights)
         found.append((mean, (mean - np.log(i + i0)) ** 2, 1 / np.sum(weights) / 4))  # of a mean of four
@@ -222,17 +238,19 @@ def dark_doubts(read, shot, i0):
         chances = [
             -((np.log(one + i0) - mean) ** 2) / (2 * noise) - np.log(noise) / 2 for mean, _, noise in found
         ]
-        chances = np.exp(np.array(chances) - max(chances))
+        chances = often * np.exp(np.array(chances) - max(chances))
         doubts.append(np.sum(chances * [wrong for _, wrong, _ in found]) / np.sum(chances))
     return shown, [*doubts, 0.0]
 
 
-def with_dark_doubt(variance, intensity, camera):
-    return variance + np.interp(intensity, *dark_doubts(*camera.noise, camera.offset))
+def with_dark_doubt(variance, intensity, settings):
+    camera = settings.camera
+    doubts = dark_doubts(*camera.noise, camera.offset, settings.filter.dark_shares)
+    return variance + np.interp(intensity, *doubts)
 
 
-def dark_correction(intensity, read, shot, i0):
-    return np.interp(intensity, *dark_levels(read, shot, i0))
+def dark_correction(intensity, read, shot, i0, shares):
+    return np.interp(intensity, *dark_levels(read, shot, i0, shares))
 
 
 def edi(pixel, k, log_frame, on, off):
@@ -433,7 +451,12 @@ def bridged(pixel, settings, times, on, off, scales):
     def latent(k):  # K3
         log_frame = np.log(pixel.intensity[k] + i0)
         if c.frame_noise is not None and chosen_response(c.response, None) == "linear":
-            log_frame += dark_correction(pixel.intensity[k] / pixel.white[k], *c.noise, i0 / pixel.white[k])
+            log_frame += dark_correction(
+                pixel.intensity[k] / pixel.white[k],
+                *c.noise,
+                i0 / pixel.white[k],
+                settings.filter.dark_shares,
+            )
         if crushed(k):
             most = hidden_by_black * pixel.white[k]
             log_frame = black = np.log(most * np.exp(-pixel.dark[k]) + i0)

@@ -51,6 +51,15 @@ VARIANTS = {
             PRESETS["default"].camera, frame_noise=0.03, shot_noise=1e-3, log_offset=0.003
         ),
     ),
+    "default-dark": dataclasses.replace(
+        PRESETS["default"],
+        camera=dataclasses.replace(
+            PRESETS["default"].camera, frame_noise=0.02, shot_noise=5e-4, log_offset=0.004
+        ),
+        filter=dataclasses.replace(
+            PRESETS["default"].filter, dark_shares="0.3 0.05 0 0.01 0.1 0.1 0 0.2 0.3 0.1"
+        ),
+    ),
     "default-gamma": dataclasses.replace(
         PRESETS["default"],
         camera=dataclasses.replace(PRESETS["default"].camera, response="gamma:2.2", frame_noise=0.002),
@@ -269,8 +278,8 @@ def assert_agrees(name, events, frames, times):
                     given[place] += naive.blurred(pixels, place, t, 0.21 * 0.17, chosen)
             if name == "default-quiet":
                 given = naive.with_rounding(given, level, moving[i], white / 255, offset)
-            if name in ("default-noisy", "default-night"):
-                given = naive.with_dark_doubt(given, image.intensity, chosen.camera)
+            if name in ("default-noisy", "default-night", "default-dark"):
+                given = naive.with_dark_doubt(given, image.intensity, chosen)
             # What float32 leaves of differences of variances: more than 1e-4 in one of some thousand random streams.
             np.testing.assert_allclose(image.variance, given, rtol=2e-4)
 

@@ -341,6 +341,7 @@ OTHER_VALUES = {
     "filter.highlight_tail": 1.0,
     "filter.unshown_tail": 0.1,
     "filter.unshown_scale": 3.0,
+    "filter.dark_shares": "1 0 0 0 0 0 0 0 0 0",
     "filter.bright_tail": 0.1,
     "filter.neighbours": 0.05,
     "filter.motion": "off",

@@ -16,6 +16,7 @@ from kalux.calibration.event_model import Agreement
 from kalux.calibration.frame_faults import FrameFaults
 from kalux.calibration.frame_times import FrameTimes
 from kalux.calibration.levels import Ceiling, find_ceiling
+from kalux.models.dark_levels import LIGHT_EDGES, dark_shares
 from kalux.recording import Recording, less_black
 from kalux.settings import AUTO, EventSettings, Settings
 from kalux.wording import how_many
@@ -108,6 +109,14 @@ def _of_frames(recording: Recording, plan: Plan, asked: Settings) -> Iterator[tu
         else:
             processed = "in colour, or not linear: processed"
             yield "pattern", f"none that is fixed ({processed if how == _USUAL else how})"
+    shares = dark_shares(plan.settings.filter.dark_shares)
+    if shares is not None:
+        hidden = sum(shares[: LIGHT_EDGES.index(0.75)]) / sum(shares)
+        how = "measured" if asked.filter.dark_shares == AUTO else _GIVEN
+        yield (
+            "dark",
+            f"{100 * hidden:.0f} % of light up to 14 times the noise is less than three quarters of it ({how})",
+        )
     if plan.settings.filter.bright_tail is not None and plan.settings.filter.highlight_scale > 0:
         how = "measured" if asked.filter.bright_tail is None else _GIVEN
         yield "bright tail", f"{plan.settings.filter.bright_tail:.2f} log intensity ({how})"

@@ -41,7 +41,7 @@ from kalux.frames import Frame, check_frame, with_black_level
 from kalux.images import Estimate, Image, View, make_image
 from kalux.models.camera import Camera, beyond_white, count_bright, repeated_rounding, rounding_error
 from kalux.models.colour import Gains, white_balance
-from kalux.models.dark_levels import DarkDoubt, dark_doubt
+from kalux.models.dark_levels import DarkDoubt, dark_doubt, dark_shares
 from kalux.models.pixels import CALIBRATION_NEEDED, Measured, PixelCalibration, require_size
 from kalux.moments import Moment
 from kalux.settings import SETTINGS_NEEDED, USUAL_PATTERN, Settings
@@ -531,7 +531,8 @@ class Reconstructor:
         camera = self.settings.camera
         if camera.frame_noise is None or not camera.is_linear or frame.image.ndim == 3:
             return None
-        return dark_doubt(camera.noise, camera.offset, 2.0 * rounding_error(frame))
+        shares = dark_shares(self.settings.filter.dark_shares)
+        return dark_doubt(camera.noise, camera.offset, 2.0 * rounding_error(frame), shares)
 
     def _pattern_of(self, frame: Frame) -> float:
         """The fixed pattern that the variance counts: the usual one where no plan has looked for it in grey frames."""

@@ -16,6 +16,9 @@ AugmentationName = Literal["bridge", "paper"]
 AUTO: Final = "auto"
 """In files and flags, stands for None: estimated from the recording."""
 
+EVEN: Final = "even"
+"""Of `FilterSettings.dark_shares`: nothing is known of how often frames show which dark light."""
+
 SolutionName = Literal["exact", "printed"]
 MotionName = Literal["auto", "on", "off"]
 
@@ -377,6 +380,10 @@ class FilterSettings:
         pixels that leave saturation in the first frames of a recording tell, 1 in a live stream.
     bright_tail
         Scale of the frames' bright tail; None: from the recording's frames, in a live stream from the first.
+    dark_shares
+        How often frames show light that their noise hides, by which dark means are put right (docs/equations.md, K3):
+        10 numbers with spaces between, for the parts of `kalux.models.dark_levels.LIGHT_EDGES`, or ``"even"``.
+        ``"auto"``: an estimate from the recording (`kalux.calibration.dark_shares`); even in a live stream.
     neighbours
         Standard deviation, in log intensity, by which neighbouring pixels of a surface differ: moving pixels become
         weighted means of themselves and their eight neighbours (docs/equations.md, K12). 0 turns it off. 0.2
@@ -400,6 +407,7 @@ class FilterSettings:
     unshown_tail: float = 0.5
     unshown_scale: float | None = None
     bright_tail: float | None = None
+    dark_shares: str = AUTO
     neighbours: float = 0.2
     motion: MotionName = "auto"
     cutoff: float = 1.0
@@ -484,6 +492,7 @@ _USED_BY: Final[Mapping[str, tuple[str, ...]]] = {
             "filter.unshown_tail",
             "filter.unshown_scale",
             "filter.bright_tail",
+            "filter.dark_shares",
             "filter.neighbours",
             "filter.motion",
             "camera.fixed_pattern",

@@ -7,8 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from kalux.errors import SettingsError
 from kalux.models.camera import frame_log_covariance, log_intensity
-from kalux.models.dark_levels import dark_correction, dark_doubt
+from kalux.models.dark_levels import LIGHT_EDGES, dark_correction, dark_doubt, dark_shares
 
 GAP = 1 / 255
 LEVELS = np.arange(256) * GAP
@@ -16,31 +17,32 @@ OFFSET = 0.004
 
 
 def error_of_mean(intensity: float, noise: float, added: np.ndarray) -> float:
-    """Of log(I + I_0), as the mean of 100,000 frames of 8 bits in which each counts by its 1 / R tells it."""
+    """Of log(I + I_0), as the mean of 100,000 frames of 8 bits in which each counts by its 1 / (R + 0.03) tells it."""
     rng = np.random.default_rng(5)
     read = np.rint(np.maximum(rng.normal(intensity, noise, 100_000), 0.0) / GAP).astype(int)
     told = log_intensity(LEVELS, OFFSET) + added
-    counted = 1.0 / frame_log_covariance(LEVELS, np.ones(256), (noise, 0.0), 1.0, OFFSET)
+    counted = 1.0 / (0.03 + frame_log_covariance(LEVELS, np.ones(256), (noise, 0.0), 1.0, OFFSET))
     return float(np.average(told[read], weights=counted[read]) - np.log(intensity + OFFSET))
 
 
 @pytest.mark.parametrize("noise", [0.004, 0.008, 0.015])
 def test_the_mean_of_noisy_frames_is_right(noise):
-    """From twice the noise on as good as gone, of less light within a tenth; what is black stays too bright."""
+    """From twice the noise on gone, of less light within a tenth; what is black stays too bright."""
     added = dark_correction(LEVELS, (float(np.hypot(noise, GAP / 12**0.5)), 0.0), 1.0, OFFSET, GAP)
     for share in (0.0, 0.25, 0.5, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0):
         before, after = (error_of_mean(share * noise, noise, d) for d in (np.zeros(256), added))
-        assert before > 0.02
         if share < 0.5:
-            assert 0 < after < 0.95 * before
+            assert 0 < after < before
         else:
-            assert abs(after) < (0.1 if share < 2 else 0.02)
+            assert abs(after) < (0.1 if share < 2 else 0.0125)
+        if share in (2.0, 3.0):
+            assert before > 0.045
 
 
 def test_what_is_not_dark_stays():
     added = dark_correction(LEVELS, (0.008, 0.0), 1.0, OFFSET, GAP)
     assert (added[LEVELS >= 8 * 0.008] == 0).all()
-    assert (added[(LEVELS > 0) & (LEVELS < 6 * 0.008)] < -0.01).all()
+    assert (added[(LEVELS > 0) & (LEVELS < 5 * 0.008)] < -0.01).all()
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.2 * GAP, GAP / 12**0.5])
@@ -95,3 +97,42 @@ def test_nothing_is_doubted_that_noise_does_not_hide():
     assert doubt.variances[-1] == 0
     assert doubt.spacing * (len(doubt.variances) - 1) == pytest.approx(4 * np.sqrt(0.03**2 - GAP**2 / 12))
     assert (doubt.variances[doubt.spacing * np.arange(len(doubt.variances)) > 0.06] < 1e-3).all()
+
+
+def test_black_is_right_where_frames_show_black_and_other_light_where_they_show_that():
+    """Which light noise hides below black no frame says: the light that is there counts."""
+    noise = float(np.hypot(0.01, GAP / 12**0.5)), 0.0
+    black, grey = (
+        tuple(float(edge in shown) for edge in LIGHT_EDGES[:-1])
+        for shown in ((0.0, 6.5), (0.375, 0.75, 1.25, 6.5))
+    )
+    of_black, of_grey = (dark_correction(LEVELS, noise, 1.0, OFFSET, GAP, one) for one in (black, grey))
+    assert abs(error_of_mean(0.0, 0.01, of_black)) < 0.2 < 0.4 < error_of_mean(0.0, 0.01, of_grey)
+    assert abs(error_of_mean(0.01, 0.01, of_grey)) < 0.05 < 0.3 < -error_of_mean(0.01, 0.01, of_black)
+
+
+def test_dark_means_are_doubted_less_where_frames_show_nothing_darker():
+    """Black is the doubt of a mean of the noise, and not where hardly anything is darker than that."""
+    noise = 0.03, 0.0
+    deep, shallow = (tuple(float(low <= edge < 2.0) for edge in LIGHT_EDGES[:-1]) for low in (0.0, 0.75))
+    shown = slice(16, 24)  # from the noise to one and a half of it
+    of_deep, of_shallow = (dark_doubt(noise, OFFSET, GAP, one).variances[shown] for one in (deep, shallow))
+    assert (of_shallow < 0.6 * of_deep).all()
+
+
+def test_shares_have_no_unit():
+    noise, shares = (0.01, 0.0), (3.0, *np.arange(1.0, 10.0))
+    thousandth = tuple(share / 1000 for share in shares)
+    one, other = (dark_correction(LEVELS, noise, 1.0, OFFSET, GAP, given) for given in (shares, thousandth))
+    np.testing.assert_allclose(one, other, atol=1e-12)
+
+
+def test_shares_are_read_from_a_setting():
+    assert dark_shares("auto") is dark_shares("even") is None
+    assert dark_shares(" ".join(["0.5", *["0"] * 8, "1e-3"])) == (0.5, *[0.0] * 8, 0.001)
+
+
+@pytest.mark.parametrize("text", ["", "black", "1 2 3", " ".join(["0"] * 10), " ".join(["1"] * 9 + ["-1"])])
+def test_shares_that_are_none_are_an_error(text):
+    with pytest.raises(SettingsError, match="10 numbers from 0"):
+        dark_shares(text)

@@ -9,6 +9,7 @@ from kalux import PRESETS, Frame, Recording
 from kalux.calibration.refractory import counted_period
 from kalux.datasets import SensorSettings, demo_scene, simulate
 from kalux.events import EVENT_DTYPE
+from kalux.models.dark_levels import dark_shares
 from kalux.plan_report import plan_report
 from kalux.planning import plan
 from kalux.settings import altered
@@ -60,6 +61,30 @@ def test_the_fixed_pattern_comes_from_the_frames_and_can_be_given():
     few = plan(recording(), at="frames")  # its pixels are too few to tell: the usual one
     assert (few.settings.camera.fixed_pattern, few.fixed_pattern) == (0.005, None)
     assert plan(source, at="frames", preset="iccv2021").settings.camera.fixed_pattern is None
+
+
+def test_shares_of_dark_light_come_from_the_frames_and_can_be_given():
+    rng = np.random.default_rng(0)
+    light = np.broadcast_to(np.where(np.arange(80) < 40, 0.0, 60.0), (60, 80))
+    frames = [
+        Frame(np.clip(light + rng.normal(0, 5, light.shape), 0, 255).round().astype(np.uint8), t, t + 1000)
+        for t in range(0, 400_000, 50_000)
+    ]
+    source = Recording.from_arrays(np.empty(0, EVENT_DTYPE), frames, sensor_size=light.shape)
+    noisy = altered(PRESETS["default"], "camera", frame_noise=0.02)
+    made = plan(source, at="frames", settings=noisy)
+    shares = dark_shares(made.settings.filter.dark_shares)
+    assert sum(shares[:2]) > 0.3
+    told = dict(plan_report(source, made, noisy))["dark"]
+    assert told.endswith("of light up to 14 times the noise is less than three quarters of it (measured)")
+    for given in ("even", made.settings.filter.dark_shares):
+        stated = altered(noisy, "filter", dark_shares=given)
+        planned = plan(source, at="frames", settings=stated)
+        assert planned.settings.filter.dark_shares == given
+        assert ("dark" in dict(plan_report(source, planned, stated))) == (given != "even")
+    assert plan(source, at="frames", preset="iccv2021").settings.filter.dark_shares == "auto"
+    quiet = altered(PRESETS["default"], "camera", frame_noise=0.001)
+    assert plan(source, at="frames", settings=quiet).settings.filter.dark_shares == "even"
 
 
 def test_the_refractory_period_comes_from_noise_and_can_be_given():

@@ -57,7 +57,7 @@ from kalux.filters.method import FAR_FUTURE, USUAL_INTERVAL, Chunks, Method, Seg
 from kalux.filters.shots import Shot, level_variance
 from kalux.filters.uncertainty import Around
 from kalux.models.camera import CRUSHED, beyond_white, dark_scale, log_intensity
-from kalux.models.dark_levels import dark_correction
+from kalux.models.dark_levels import dark_correction, dark_shares
 from kalux.models.pixels import PixelCalibration
 from kalux.settings import Settings
 
@@ -170,6 +170,7 @@ class BridgedFrames(Method):
         self._spread2 = events.believed_mismatch**2  # K11
         self._period_spread = events.refractory_doubt if events.refractory > 0 else 0.0
         delays = whole_row_delays(shape[0], settings.camera.row_time)
+        self._dark_shares = dark_shares(settings.filter.dark_shares)
         self._row_delays = delays if delays.any() else None
         self._follows_motion = settings.filter.follows_motion(shape)
         self._event_noise = akf_bridged.Noise(events.background_rate, events.step_noise, self._threshold2)
@@ -263,7 +264,8 @@ class BridgedFrames(Method):
         camera = self.settings.camera
         if camera.frame_noise is None or not camera.is_linear or shot.chroma is not None:
             return told
-        return told + dark_correction(shot.level_intensity, camera.noise, shot.white, self.offset, shot.gap)
+        levels, shares = shot.level_intensity, self._dark_shares
+        return told + dark_correction(levels, camera.noise, shot.white, self.offset, shot.gap, shares)
 
     def level_variance(self, shot: Shot) -> Array:
         """(N,) variance of log(I + I_0) of each level, by the noise of the frame alone."""

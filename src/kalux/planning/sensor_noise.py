@@ -7,6 +7,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from kalux.calibration.compression import Compression
+from kalux.calibration.dark_shares import estimate_dark_shares
 from kalux.calibration.fixed_pattern import FixedPattern, estimate_fixed_pattern
 from kalux.calibration.frame_noise import FrameNoise, UsualNoise, estimate_frame_noise, usual_noise
 from kalux.calibration.lag import Lag, estimate_lag
@@ -15,7 +16,7 @@ from kalux.calibration.noise import event_noise
 from kalux.calibration.refractory import counted_period, dead_time
 from kalux.models.pixels import PixelCalibration
 from kalux.recording import Recording
-from kalux.settings import USUAL_PATTERN, EventSettings, Settings, altered, completed
+from kalux.settings import AUTO, EVEN, USUAL_PATTERN, EventSettings, Settings, altered, completed
 
 _NOISE_EVENTS: Final = 1_000_000
 """Number of events from which the background noise is estimated: at 15 million events/s, those of 70 ms."""
@@ -127,6 +128,15 @@ def with_lag(recording: Recording, settings: Settings, *, lookahead: bool) -> tu
     found = estimate_lag(recording, settings.camera, settings.events) if lookahead else None
     variance = 0.0 if found is None else round(found.believed, 3)
     return altered(settings, "events", lag_variance=variance), found
+
+
+def with_dark_shares(recording: Recording, settings: Settings) -> Settings:
+    """Fill in how often frames show light that their noise hides: from the settings, else an estimate, else even."""
+    if settings.filter.dark_shares != AUTO or not settings.filter.joins_frames:
+        return settings
+    found = estimate_dark_shares(recording, settings.camera)
+    shares = EVEN if found is None else " ".join(f"{share:.3g}" for share in found)
+    return altered(settings, "filter", dark_shares=shares)
 
 
 def with_background(
