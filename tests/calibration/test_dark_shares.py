@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -99,3 +101,14 @@ def test_nothing_is_said_of_colours_and_of_scenes_without_dark_pixels():
     ]
     assert shares_of(colours) is None
     assert shares_of(frames_of(half_black() + 0.5)) is None
+
+
+def test_what_a_sensor_has_in_all_frames_is_not_light():
+    """Offsets of pixels as large as the noise: half of the light seems darker, and none of it is black."""
+    pattern = np.random.default_rng(1).normal(0, 2 * NOISE, (60, 80))
+    frames = frames_of(np.full((60, 80), 2 * NOISE) + pattern)
+    unknown, known = (
+        shares_of(frames, dataclasses.replace(CAMERA, fixed_pattern=one)) for one in (0.0, 2 * NOISE)
+    )
+    assert between(unknown, 0.0, 0.375) > 0.15
+    assert between(known, 0.0, 0.375) < 0.06

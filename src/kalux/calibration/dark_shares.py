@@ -7,7 +7,7 @@ K3): in a scene with black in it a frame's 0 is black, in others hardly ever.
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,8 +40,8 @@ _BEYOND: Final = LIGHT_EDGES[-1] - 3.0
 
 _STEPS: Final = 30
 """Of the search for the likeliest shares. It is not to converge: the last bit of likelihood is noise's, and that of a
-noise that is not quite right. With 10, 30 and 100, what 18 noisy and 16 night scenes show would make the cost of d
-0.906, 0.888 and 0.880 of that with even light, and 1.5, 2.1 and 3.3 on one whose noise is taken for a third of it."""
+noise that is not quite right. With 10, 30 and 100, the cost of d on 18 noisy and 16 night scenes is 0.906, 0.888 and
+0.880 of that with even light, and 1.5, 2.1 and 3.3 on one whose noise is taken for less than half of it."""
 
 
 def estimate_dark_shares(recording: Recording, camera: CameraSettings) -> Shares | None:
@@ -55,7 +55,7 @@ def estimate_dark_shares(recording: Recording, camera: CameraSettings) -> Shares
     recording
         With frames and exposures, less its black level.
     camera
-        Response, saturation and frame noise.
+        Response, saturation, frame noise and fixed pattern.
 
     Returns None where dark means need no correction: of frames whose noise is not known or less than half a level, that
     are in colour or whose response is not linear; and where fewer than 1000 pixels are dark.
@@ -68,30 +68,47 @@ def estimate_dark_shares(recording: Recording, camera: CameraSettings) -> Shares
     response = chosen_response(camera.response, recording.response)
     if camera.frame_noise is None or response != "linear":
         return None
-    model = Camera.named(response, camera.clipped_from)
+    counted = _dark_levels(recording, Camera.named(response, camera.clipped_from), camera.noise[0])
+    if counted is None or counted.counts.sum() < _LEAST:
+        return None
+    light, levels = light_of_parts(counted.read), counted.levels
+    own = noise_variance(light.ravel(), (counted.read, camera.noise[1]), 1.0)
+    deviation = np.sqrt(own + (camera.fixed_pattern or 0.0) ** 2)  # pixels differ by either
+    chances = level_shares(light.ravel(), np.append(levels, levels[-1] + levels[1]), deviation)[:, :-1]
+    return _likely(counted.counts, chances.reshape(*light.shape, -1).mean(axis=1))
+
+
+_NEVER: Final = 1e-12  # a chance of 0, as of levels that no part is read as
+
+
+class _Levels(NamedTuple):
+    """Noise in the dark, white = 1; levels of a frame, (N,); and how many pixels read each."""
+
+    read: float
+    levels: Array
+    counts: NDArray[np.int64]
+
+
+def _dark_levels(recording: Recording, model: Camera, noise: float) -> _Levels | None:
+    """What pixels on a grid read in the dark; None: frames are in colour, or hardly have more noise than levels."""
     height, width = recording.sensor_size
     step = int(np.ceil(np.sqrt(height * width / _MOST_PIXELS)))
-    counts, levels, gap = np.zeros(0, np.int64), np.zeros(0), None
+    found: _Levels | None = None
+    first = 0.0
     for frame in compared_frames(recording.frames(), MAX_FRAMES):
         if frame.image.ndim == 3:
             return None
         shot = take_shot(frame, model, float(frame.exposure))
-        own = shot.gap / shot.white
-        if gap is None:
-            gap = own
-            levels = noisy_levels(without_rounding(camera.noise[0], gap), gap, _BEYOND)
-            counts = np.zeros(len(levels), np.int64)
-            if len(levels) == 0:
-                return None
-        if own == gap:  # of frames of several depths those like the first
-            counts += _counted(shot, levels, step)
-    if gap is None or counts.sum() < _LEAST:
-        return None
-    read = without_rounding(camera.noise[0], gap)
-    light = light_of_parts(read)
-    deviation = np.sqrt(noise_variance(light.ravel(), (read, camera.noise[1]), 1.0))
-    chances = level_shares(light.ravel(), np.append(levels, levels[-1] + levels[1]), deviation)[:, :-1]
-    return _likely(counts, chances.reshape(*light.shape, -1).mean(axis=1))
+        gap = shot.gap / shot.white
+        if found is None:
+            first, read = gap, without_rounding(noise, gap)
+            levels = noisy_levels(read, gap, _BEYOND)
+            found = _Levels(read, levels, np.zeros(len(levels), np.int64))
+        if len(found.levels) == 0:
+            return None
+        if gap == first:  # of frames of several depths those like the first
+            found = found._replace(counts=found.counts + _counted(shot, found.levels, step))
+    return found
 
 
 def _counted(shot: Shot, levels: Array, step: int) -> NDArray[np.int64]:
@@ -112,6 +129,3 @@ def _likely(counts: NDArray[np.int64], chances: Array) -> Shares:
         shares = shares * (chances @ (counts / np.maximum(shares @ chances, _NEVER)))
         shares = shares / shares.sum()
     return tuple(shares.tolist())
-
-
-_NEVER: Final = 1e-12
