@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kalux import PRESETS, Frame, Recording
+from kalux import PRESETS, Frame, Recording, reconstruct
 from kalux.calibration.refractory import counted_period
 from kalux.datasets import SensorSettings, demo_scene, simulate
 from kalux.events import EVENT_DTYPE
@@ -83,6 +83,11 @@ def test_shares_of_dark_light_come_from_the_frames_and_can_be_given():
         assert planned.settings.filter.dark_shares == given
         assert ("dark" in dict(plan_report(source, planned, stated))) == (given != "even")
     assert plan(source, at="frames", preset="iccv2021").settings.filter.dark_shares == "auto"
+    black, even = (
+        next(iter(reconstruct(source, at="frames", settings=one))).intensity[:, :30].mean()
+        for one in (noisy, altered(noisy, "filter", dark_shares="even"))
+    )
+    assert black < 0.8 * even  # half of the scene is
     quiet = altered(PRESETS["default"], "camera", frame_noise=0.001)
     assert plan(source, at="frames", settings=quiet).settings.filter.dark_shares == "even"
 

@@ -106,7 +106,7 @@ def _dark_levels(recording: Recording, model: Camera, noise: float) -> _Levels |
             found = _Levels(read, levels, np.zeros(len(levels), np.int64))
         if len(found.levels) == 0:
             return None
-        if gap == first:  # of frames of several depths those like the first
+        if np.isclose(gap, first, rtol=1e-6):  # of frames of several depths those like the first
             found = found._replace(counts=found.counts + _counted(shot, found.levels, step))
     return found
 
