@@ -73,6 +73,16 @@ def test_bright_pixels_do_not_count():
     assert next(ratios) == pytest.approx(next(ratios) / 2, rel=0.2)
 
 
+def test_all_colours_of_a_mosaic_count():
+    """On a sensor so large that only some of its pixels are looked at: those of one colour are black."""
+    light = np.full((260, 346), 0.06)
+    light[::2, ::2] = 0.0
+    shares = shares_of(frames_of(light, count=4))
+    assert between(shares, 0.0, 0.375) == pytest.approx(0.25, abs=0.05)
+    large = np.tile(light, (2, 2))
+    assert between(shares_of(frames_of(large, count=4)), 0.0, 0.375) == pytest.approx(0.25, abs=0.05)
+
+
 def test_pixels_that_say_nothing_do_not_count():
     """Of a frame that is put together from others, say."""
     valid = half_black() > 0
@@ -104,7 +114,7 @@ def test_nothing_is_said_of_colours_and_of_scenes_without_dark_pixels():
 
 
 def test_what_a_sensor_has_in_all_frames_is_not_light():
-    """Offsets of pixels as large as the noise: half of the light seems darker, and none of it is black."""
+    """Offsets of pixels twice as large as the noise, which spread the light: some of it seems black, and none is."""
     pattern = np.random.default_rng(1).normal(0, 2 * NOISE, (60, 80))
     frames = frames_of(np.full((60, 80), 2 * NOISE) + pattern)
     unknown, known = (

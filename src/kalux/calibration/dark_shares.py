@@ -43,6 +43,8 @@ _STEPS: Final = 30
 noise that is not quite right. With 10, 30 and 100, the cost of d on 18 noisy and 16 night scenes is 0.906, 0.888 and
 0.880 of that with even light, and 1.5, 2.1 and 3.3 on one whose noise is taken for less than half of it."""
 
+_NEVER: Final = 1e-12  # a chance of 0, as of levels that no part is read as
+
 
 def estimate_dark_shares(recording: Recording, camera: CameraSettings) -> Shares | None:
     """How often the first 80 frames that are compared with events show each part of `LIGHT_EDGES`, in sum 1.
@@ -78,9 +80,6 @@ def estimate_dark_shares(recording: Recording, camera: CameraSettings) -> Shares
     return _likely(counted.counts, chances.reshape(*light.shape, -1).mean(axis=1))
 
 
-_NEVER: Final = 1e-12  # a chance of 0, as of levels that no part is read as
-
-
 class _Levels(NamedTuple):
     """Noise in the dark, white = 1; levels of a frame, (N,); and how many pixels read each."""
 
@@ -92,7 +91,7 @@ class _Levels(NamedTuple):
 def _dark_levels(recording: Recording, model: Camera, noise: float) -> _Levels | None:
     """What pixels on a grid read in the dark; None: frames are in colour, or hardly have more noise than levels."""
     height, width = recording.sensor_size
-    step = int(np.ceil(np.sqrt(height * width / _MOST_PIXELS)))
+    step = int(np.ceil(np.sqrt(height * width / _MOST_PIXELS))) | 1  # odd: of a mosaic all colours
     found: _Levels | None = None
     first = 0.0
     for frame in compared_frames(recording.frames(), MAX_FRAMES):
