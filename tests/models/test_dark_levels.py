@@ -32,16 +32,17 @@ def test_the_mean_of_noisy_frames_is_right(noise):
     for share in (0.0, 0.25, 0.5, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0):
         before, after = (error_of_mean(share * noise, noise, d) for d in (np.zeros(256), added))
         if share < 0.5:
-            assert 0 < after < before
+            assert 0 < after < (0.95 if share else 0.98) * before
         else:
             assert abs(after) < (0.1 if share < 2 else 0.0125)
-        if share in (2.0, 3.0):
-            assert before > 0.045
+        if share not in (1.0, 5.0, 6.0):  # there the weights make up for the bend
+            assert before > (0.045 if share in (2.0, 3.0) else 0.02)
 
 
 def test_what_is_not_dark_stays():
     added = dark_correction(LEVELS, (0.008, 0.0), 1.0, OFFSET, GAP)
     assert (added[LEVELS >= 8 * 0.008] == 0).all()
+    assert (added[(LEVELS > 0) & (LEVELS < 6 * 0.008)] < -0.008).all()
     assert (added[(LEVELS > 0) & (LEVELS < 5 * 0.008)] < -0.01).all()
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from kalux.calibration.frame_noise import MAX_FRAMES
 from kalux.calibration.intervals import compared_frames
+from kalux.calibration.regression import grid_step
 from kalux.filters.shots import Shot, take_shot
 from kalux.models.camera import Camera, noise_variance
 from kalux.models.dark_levels import (
@@ -90,8 +91,7 @@ class _Levels(NamedTuple):
 
 def _dark_levels(recording: Recording, model: Camera, noise: float) -> _Levels | None:
     """What pixels on a grid read in the dark; None: frames are in colour, or hardly have more noise than levels."""
-    height, width = recording.sensor_size
-    step = int(np.ceil(np.sqrt(height * width / _MOST_PIXELS))) | 1  # odd: of a mosaic all colours
+    step = grid_step(recording.sensor_size, _MOST_PIXELS) | 1  # odd: of a mosaic all colours
     found: _Levels | None = None
     first = 0.0
     for frame in compared_frames(recording.frames(), MAX_FRAMES):

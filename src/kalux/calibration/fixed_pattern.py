@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.calibration.frame_noise import MAX_FRAMES
-from kalux.calibration.regression import parts, ratio_error
+from kalux.calibration.regression import grid_step, parts, ratio_error
 from kalux.compiled import larger, loop, smaller
 from kalux.filters.shots import Shot, take_shot
 from kalux.models.camera import Camera, Response
@@ -93,7 +93,7 @@ def estimate_fixed_pattern(recording: Recording, camera: CameraSettings) -> Fixe
     if model.colours is not None:
         return None
     height, width = recording.sensor_size
-    step = int(np.ceil(np.sqrt(height * width / _MOST_PIXELS)))
+    step = grid_step(recording.sensor_size, _MOST_PIXELS)
     seen = []
     for frame in islice(recording.frames(), MAX_FRAMES):
         if frame.image.ndim == 3:

@@ -13,7 +13,6 @@ slowly does not seem late. What all frames have in common is no error of single 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
@@ -23,7 +22,7 @@ from scipy.linalg import solveh_banded
 
 from kalux.calibration.alignment import levels
 from kalux.calibration.intervals import Interval, intervals
-from kalux.calibration.regression import huber_weights, robust_deviation
+from kalux.calibration.regression import grid_step, huber_weights, robust_deviation
 from kalux.event_slices import joined_events, thinned
 from kalux.recording import Recording
 from kalux.settings import CameraSettings, EventSettings
@@ -254,7 +253,7 @@ def _of_interval(
     times = np.array([t + step for t in middles for step in (-_HALF_STEP, 0, _HALF_STEP)], np.int64)
     if (np.diff(times) < 0).any() or not interval.chunks:
         return nothing
-    step = _step(interval.usable.size)
+    step = grid_step(interval.usable.shape, _MOST_PIXELS)
     usable, change = interval.usable[::step, ::step], interval.change[::step, ::step]
     seen = interval.chunks if step == 1 else [thinned(chunk, step) for chunk in interval.chunks]
     on, off = levels(joined_events(seen), usable.shape, times)
@@ -271,11 +270,6 @@ def _of_interval(
     weights = huber_weights(left)[0] / (_ALIKE * scales[index] ** 2)
     weighed = rates * weights
     return weighed @ rates.T, weighed @ left, float(weights @ np.square(left))
-
-
-def _step(pixels: int) -> int:
-    """From one row, or column, that is looked at to the next, of a sensor with so many ``pixels``."""
-    return math.ceil(math.sqrt(pixels / _MOST_PIXELS))
 
 
 def _joined(sums: Sequence[tuple[Array, Array, float]]) -> _Normal:

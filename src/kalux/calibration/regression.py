@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -113,6 +114,12 @@ def parts(shape: tuple[int, int]) -> NDArray[np.int64]:
     """(H, W) which of 8 x 8 parts of the sensor a pixel lies in, for a jackknife."""
     height, width = shape
     return (np.arange(height)[:, None] * _TILES // height) * _TILES + np.arange(width) * _TILES // width
+
+
+def grid_step(shape: tuple[int, int], most: int) -> int:
+    """From one row, or column, to the next of a grid over the sensor that has about ``most`` pixels, or fewer."""
+    height, width = shape
+    return math.ceil(math.sqrt(height * width / most))
 
 
 def ratio_error(sums: Array) -> float:

@@ -69,8 +69,8 @@ the true light, as finely as it can be told, 0.762."""
 _MOST: Final = 1e6  # a share, in any unit: their sum is a number
 
 _HIDDEN: Final = 4.0
-"""Noise in units of I_0 from which that is told: up to here the mean of black is wrong by 0.7 at most, and rms z of 57
-scenes, whose noise is less, is no nearer to 1 with it (docs/equations.md, K11)."""
+"""Noise in units of I_0 from which it is told what d leaves wrong: up to here the mean of black is wrong by 0.7 at
+most, and rms z of 57 scenes, whose noise is less, is no nearer to 1 with it (docs/equations.md, K11)."""
 
 _HIDES: Final = 4.0
 """Standard deviations of the noise from black up to which means are wrong."""
@@ -79,7 +79,7 @@ _SEEN: Final = 4.0
 """Frames of which the mean is compared: the filter soon forgets those before."""
 
 _SHOWN: Final = 65
-"""Intensities at which that is told."""
+"""Intensities at which it is told."""
 
 Shares = tuple[float, ...]
 """How often frames show each part of `LIGHT_EDGES`, in any unit."""

@@ -65,8 +65,8 @@ class Plan:
     Attributes
     ----------
     settings
-        With thresholds, refractory period, delay, frame noise, fixed pattern, I_0, step and lag variance, black
-        level, saturation, reference exposure and white balance filled in.
+        With thresholds, refractory period, delay, frame noise, fixed pattern, shares of dark light, I_0, step and lag
+        variance, black level, saturation, reference exposure and white balance filled in.
     threshold_origin
         Whether the thresholds come from the settings, the recording, a calibration, an estimate, or are assumed.
     times
