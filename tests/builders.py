@@ -28,6 +28,7 @@ from kalux.datasets import (
     simulate_colour,
 )
 from kalux.events import make_events
+from kalux.filters.surfaces import Unmeasured
 from kalux.settings import Settings, altered
 
 
@@ -264,6 +265,10 @@ def printed_on_threads(code: str, *arguments: object) -> set[str]:
         subprocess.check_output(command, env={**os.environ, "OPENBLAS_NUM_THREADS": threads}, text=True)
         for threads in ("1", "2")
     }
+
+
+def unmeasured(mask) -> Unmeasured:
+    return Unmeasured(np.flatnonzero(mask), mask.shape)
 
 
 def unshown(pixels, excess, noise=0.0, doubt=0.0, shape=(1, 10)):

@@ -10,7 +10,7 @@ from kalux.images import Estimate, View, make_image
 from kalux.models.camera import Response
 from kalux.models.dark_levels import DarkDoubt
 
-from builders import unshown
+from builders import unmeasured, unshown
 
 GREY = View(
     log_offset=0.05,
@@ -151,8 +151,10 @@ def test_neighbours_tell_more_of_a_pixel_that_no_frame_ties(between, alike):
     levels = [[0.5, 0.5, 0.5], [0.5, 0.51, 0.5], [0.5, 0.5, 0.5]]
     told = estimate(levels, moving=np.ones((3, 3), np.bool_), between=between)
     tied, untied = (
-        make_image(dataclasses.replace(told, unmeasured=np.array(of, np.int64)), view).intensity[1, 1]
-        for of in ([], [4])
+        make_image(
+            dataclasses.replace(told, unmeasured=unmeasured(np.arange(9).reshape(3, 3) == of)), view
+        ).intensity[1, 1]
+        for of in (None, 4)
     )
     assert (untied == tied) if alike else (0.5 < untied < tied - 1e-3)
 

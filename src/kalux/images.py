@@ -18,8 +18,10 @@ from kalux.augmentation.bridge import RANDOM
 from kalux.augmentation.highlights import Unshown
 from kalux.augmentation.motion import Paths
 from kalux.augmentation.subthreshold import UNKNOWN_CHANGE
+from kalux.compiled import loop
 from kalux.filters.highlights import calm_specks, given_spread, keep_white, lifted, read_unshown, tempered
 from kalux.filters.readout import HighlightPrior, Subthreshold, read_out
+from kalux.filters.surfaces import Unmeasured
 from kalux.filters.uncertainty import (
     UNSHOWN_SHARE,
     Around,
@@ -119,8 +121,7 @@ class Estimate:
     around
         The variances and event counts between the two frames around (K11); None: not known, or there is only one frame.
     unmeasured
-        (N,) indices in the flattened image of pixels that neither of the frames around measures, nor the only one
-        known; None: not known.
+        Pixels that neither of the frames around measures, nor the only one known; None: not known.
     exposed
         Exposure over frame interval, where the next frame is known; more where the intensity reverses more often
         (`kalux.filters.uncertainty.changed_within`).
@@ -146,7 +147,7 @@ class Estimate:
     unshown: Unshown | None = None
     silent_change: NDArray[np.floating[Any]] | None = None
     around: Around | None = None
-    unmeasured: NDArray[np.int64] | None = None
+    unmeasured: Unmeasured | None = None
     exposed: float = 0.0
     since: float | None = None
     signalled_variance: NDArray[np.floating[Any]] | None = None
@@ -246,13 +247,13 @@ def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) ->
         difference=view.neighbours,
         pitch=1 if view.mosaic is None else 2,  # to neighbours of the same colour
         unshown=None if unshown is None else unshown.pixels,
-        unmeasured=_shown_before(estimate),
+        unmeasured=estimate.unmeasured,
         with_variance=needs_averaged,
     )
     if unshown is not None:
         read_unshown(intensity, levels, estimate.log_intensity, unshown, view.log_offset, prior)
     if estimate.unmeasured is not None:
-        keep_white(intensity, estimate.log_intensity, estimate.unmeasured, view.log_offset, prior)
+        keep_white(intensity, estimate.log_intensity, estimate.unmeasured.pixels, view.log_offset, prior)
         if view.neighbours > 0 and view.mosaic is None:  # a mosaic's neighbours are of other colours
             calm_specks(intensity, variance, view.log_offset, estimate.unmeasured)
     white = float(np.exp(estimate.white) - view.log_offset)
@@ -287,14 +288,20 @@ def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) ->
 
 
 def _untied(
-    variance: NDArray[Any], unmeasured: NDArray[np.int64] | None, subthreshold: Subthreshold
+    variance: NDArray[Any], unmeasured: Unmeasured | None, subthreshold: Subthreshold
 ) -> NDArray[Any]:
     """(H, W) P, and what pixels that neither frame around measures have above others, which a frame ties (K11)."""
-    if unmeasured is None or len(unmeasured) == 0 or subthreshold.above_moving == 0:
+    if unmeasured is None or len(unmeasured.pixels) == 0 or subthreshold.above_moving == 0:
         return variance
     untied = variance.copy()
-    untied.reshape(-1)[unmeasured] += np.float32(subthreshold.above_moving)
+    _add(np.float32(subthreshold.above_moving), unmeasured.pixels, untied.reshape(-1))
     return untied
+
+
+@loop
+def _add(more, pixels, plane):  # type: ignore[no-untyped-def]
+    for i in range(len(pixels)):
+        plane[np.uint64(pixels[i])] += more
 
 
 def _pattern(intensity: NDArray[Any], view: View, white: float) -> float | NDArray[np.float32]:
@@ -308,16 +315,7 @@ def _pattern(intensity: NDArray[Any], view: View, white: float) -> float | NDArr
 def _misses_some(estimate: Estimate) -> bool:
     """Whether there are pixels that neither frame around is known to measure."""
     around, unmeasured = estimate.around, estimate.unmeasured
-    return around is not None and unmeasured is not None and around.misses_some(unmeasured)
-
-
-def _shown_before(estimate: Estimate) -> NDArray[np.int64] | None:
-    """(N,) pixels that neither frame around measures, but another one has shown; None: not known."""
-    if estimate.unmeasured is None or estimate.unshown is None:
-        return estimate.unmeasured
-    bounded = np.zeros(estimate.log_intensity.size, np.bool_)
-    bounded[estimate.unshown.pixels] = True
-    return estimate.unmeasured[~bounded[estimate.unmeasured]]
+    return around is not None and unmeasured is not None and around.misses_some(unmeasured.pixels)
 
 
 def _infinite(shape: tuple[int, ...]) -> NDArray[np.float32]:

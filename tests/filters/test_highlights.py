@@ -21,7 +21,7 @@ from kalux.filters.highlights import (
 from kalux.filters.readout import HighlightPrior, Subthreshold, read_out
 
 import naive
-from builders import unshown
+from builders import unmeasured, unshown
 
 OFFSET = 0.03
 WHITE = float(np.log(1 + OFFSET))
@@ -134,7 +134,7 @@ def test_a_clipped_pixel_that_went_dark_between_the_frames_is_dark():
 
 
 def everywhere(image):
-    return np.arange(image.size)
+    return unmeasured(np.ones(image.shape, bool))
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -142,10 +142,10 @@ def test_specks_are_calmed_as_by_the_oracle(seed):
     rng = np.random.default_rng(seed)
     image = np.exp(rng.normal(0.5, 1.0, (9, 11))).astype(np.float32)
     variance = rng.uniform(1e-4, 0.3, image.shape).astype(np.float32)
-    unmeasured = rng.random(image.shape) < 0.9
-    expected = naive.calmed(image, variance, OFFSET, unmeasured)
+    among = rng.random(image.shape) < 0.9
+    expected = naive.calmed(image, variance, OFFSET, among)
     assert (expected < image).any()
-    calm_specks(image, variance, OFFSET, np.flatnonzero(unmeasured))
+    calm_specks(image, variance, OFFSET, unmeasured(among))
     np.testing.assert_allclose(image, expected, rtol=1e-5)
 
 
@@ -171,7 +171,9 @@ def test_a_speck_in_a_white_is_no_brighter_than_its_surroundings_allow():
         np.testing.assert_array_equal(np.delete(calmed, 12), np.delete(image, 12))
     for known in (7, 11, 12, 13, 17):
         calmed = image.copy()
-        calm_specks(calmed, np.zeros((5, 5), np.float32), OFFSET, np.delete(everywhere(image), known))
+        calm_specks(
+            calmed, np.zeros((5, 5), np.float32), OFFSET, unmeasured(np.arange(25).reshape(5, 5) != known)
+        )
         np.testing.assert_array_equal(calmed, image)
 
 
@@ -257,5 +259,5 @@ def test_an_estimate_tells_which_pixels_neither_frame_around_measures():
         picture.flat[clipped] = 255
         engine.push_frame(kalux.Frame(picture, k * 40_000, k * 40_000 + 10_000))
     engine.finish()
-    assert engine.estimate(20_000).unmeasured.tolist() == [4]
-    assert engine.estimate(60_000).unmeasured.tolist() == []
+    assert engine.estimate(20_000).unmeasured.pixels.tolist() == [4]
+    assert engine.estimate(60_000).unmeasured.pixels.tolist() == []

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import lambertw
 
-from kalux.filters import readout
+from kalux.filters import surfaces
 from kalux.filters.readout import (
     BRIGHTEST,
     HighlightPrior,
@@ -20,6 +20,7 @@ from kalux.filters.readout import (
 from kalux.settings import altered, preset
 
 import naive
+from builders import unmeasured
 
 OFF = HighlightPrior(white=np.inf, scale2=0.0, unknown_scale=0.0, gain=1.0, growth=0.0)
 NO_SUBTHRESHOLD = Subthreshold(0.0, 0.0)
@@ -293,12 +294,10 @@ def test_surfaces_that_no_frame_measures_are_smooth_and_their_edges_stay(step, s
     rng = np.random.default_rng(3)
     truth = 0.5 + step * (np.arange(40) >= 20) * np.ones((30, 1))
     noisy, variance = truth + rng.normal(0.0, 0.2, truth.shape), np.full(truth.shape, 0.04)
-    everywhere, pixels = np.ones(truth.shape, bool), np.arange(truth.size)
+    everywhere = np.ones(truth.shape, bool)
     usual, even = (
-        np.log(
-            read_out(noisy, variance, 0.0, OFF, moving=everywhere, difference=0.2, unmeasured=unmeasured)[0]
-        )
-        for unmeasured in (None, pixels)
+        np.log(read_out(noisy, variance, 0.0, OFF, moving=everywhere, difference=0.2, unmeasured=of)[0])
+        for of in (None, unmeasured(everywhere))
     )
     assert (even - truth).std() < share * (usual - truth).std()
     np.testing.assert_allclose(np.diff(even, axis=1)[:, 19].mean(), step, atol=0.2)
@@ -313,7 +312,7 @@ def test_surfaces_are_the_oracles(shape, white):
     moving, surface = rng.random((2, *shape)) < 0.5
     read = {"moving": moving | surface, "difference": 0.2}
     prior = OFF._replace(white=white)
-    image, left, _ = read_out(level, variance, 0.0, prior, **read, unmeasured=np.flatnonzero(surface))
+    image, left, _ = read_out(level, variance, 0.0, prior, **read, unmeasured=unmeasured(surface))
     expected, doubt = naive.smoothed_surfaces(level, variance, surface, 0.2, white)
     np.testing.assert_allclose(np.log(image)[surface], expected[surface], atol=1e-5)
     np.testing.assert_allclose(left[surface], doubt[surface], rtol=1e-4)
@@ -331,7 +330,7 @@ def test_a_lamp_is_less_like_what_is_around_it_than_a_sky(pitch):
     lamp, single = np.zeros((2, *shape), bool)
     lamp[8 : 8 + 3 * pitch, 8 : 8 + 3 * pitch] = True
     single[16, 16] = True
-    variance, everywhere = np.full(shape, 0.3), np.arange(24 * 24)
+    variance, everywhere = np.full(shape, 0.3), unmeasured(np.ones(shape, bool))
     read = {"moving": np.ones(shape, bool), "difference": 0.2, "pitch": pitch, "unmeasured": everywhere}
 
     def kept(beyond, bright):
@@ -345,7 +344,7 @@ def test_a_lamp_is_less_like_what_is_around_it_than_a_sky(pitch):
 
 @pytest.mark.parametrize("pitch", [1, 2])
 def test_surfaces_depend_on_nothing_beyond_what_their_means_look_at(pitch, monkeypatch):
-    """They are averaged in a window around them: in the whole image they are the same to the last bit."""
+    """Blocks that no mean looks at are left out: with all of them the surfaces are the same to the last bit."""
     rng = np.random.default_rng(5)
     level, variance = rng.normal(-1.0, 0.3, (62, 75)), np.exp(rng.normal(-3.0, 1.0, (62, 75)))
     surface = np.zeros(level.shape, bool)
@@ -354,9 +353,9 @@ def test_surfaces_depend_on_nothing_beyond_what_their_means_look_at(pitch, monke
     def found():
         options = {"moving": surface, "difference": 0.2, "pitch": pitch}
         prior = OFF._replace(white=-4.0)
-        return read_out(level, variance, 0.0, prior, **options, unmeasured=np.flatnonzero(surface))[:2]
+        return read_out(level, variance, 0.0, prior, **options, unmeasured=unmeasured(surface))[:2]
 
-    of_window = found()
-    monkeypatch.setattr(readout, "_window_around", lambda places, shape: tuple(slice(0, n) for n in shape))
-    for plane, expected in zip(of_window, found(), strict=True):
+    of_blocks = found()
+    monkeypatch.setattr(surfaces, "_blocks", lambda mask: np.ones((len(mask), -(-mask.shape[1] // 32)), bool))
+    for plane, expected in zip(of_blocks, found(), strict=True):
         np.testing.assert_array_equal(plane, expected)

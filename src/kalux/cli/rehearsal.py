@@ -32,6 +32,7 @@ from kalux.events import EVENT_DTYPE
 from kalux.filters import akf_bridged
 from kalux.filters.akf import State
 from kalux.filters.common import make_clock
+from kalux.filters.surfaces import Unmeasured
 from kalux.frames import Frame
 from kalux.images import Estimate, View, make_image
 from kalux.reconstructor import Reconstructor
@@ -81,7 +82,7 @@ def rehearse_images() -> None:
         moving=clipped,
         silent_change=np.abs(level),
         unshown=unshown,
-        unmeasured=np.arange(5000),
+        unmeasured=Unmeasured(np.arange(5000), _SIZE),
     )
     view = View(
         0.02, 0.04, 0.1, 1.0, 0.3, 1.0, 1.0, 1.0, 0.0, 0.005, None, 0.001, None, None, (1.0, 1.0, 1.0)

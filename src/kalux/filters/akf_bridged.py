@@ -43,6 +43,7 @@ from kalux.event_slices import words_until
 from kalux.events import EventArray
 from kalux.filters.akf import State, information_kept, measurement_rate, predicted_information
 from kalux.filters.common import EPOCH, Clock, moved_clock, newest_around_inside
+from kalux.filters.surfaces import Unmeasured
 from kalux.models.events import signal_probability, threshold_noise
 
 FloatArray = NDArray[np.float32]
@@ -130,7 +131,7 @@ class Cursor:
     signed: NDArray[np.int8]
     origin: int
     moving: NDArray[np.bool_] | None = None
-    unmeasured: NDArray[np.int64] | None = None
+    unmeasured: Unmeasured | None = None
     drifting: _Drifting | None = None
 
 
@@ -290,11 +291,12 @@ def moving_pixels(segment: BridgedSegment, cursor: Cursor) -> NDArray[np.bool_]:
     return moving
 
 
-def unmeasured_pixels(segment: BridgedSegment, cursor: Cursor) -> NDArray[np.int64]:
-    """(N,) pixels in the flattened image that neither frame around measures. Not to be changed."""
+def unmeasured_pixels(segment: BridgedSegment, cursor: Cursor) -> Unmeasured:
+    """Pixels that neither frame around measures."""
     if cursor.unmeasured is None:
         first, second = segment.forward_variance, segment.backward_variance
-        cursor.unmeasured = np.flatnonzero((first >= UNMEASURED) & (second >= UNMEASURED))
+        pixels = np.flatnonzero((first >= UNMEASURED) & (second >= UNMEASURED))
+        cursor.unmeasured = Unmeasured(pixels, first.shape)
     return cursor.unmeasured
 
 

@@ -55,6 +55,7 @@ from kalux.filters.akf import State
 from kalux.filters.common import make_clock
 from kalux.filters.method import FAR_FUTURE, USUAL_INTERVAL, Chunks, Method, Segment
 from kalux.filters.shots import Shot, level_variance
+from kalux.filters.surfaces import Unmeasured
 from kalux.filters.uncertainty import Around
 from kalux.models.camera import CRUSHED, beyond_white, dark_scale, log_intensity
 from kalux.models.dark_levels import dark_correction, dark_shares
@@ -718,7 +719,7 @@ class BridgedFrames(Method):
     def silent_change(self, segment: BridgedSegment) -> Floats | None:
         return segment.silent_change
 
-    def unmeasured(self, segment: Any, cursor: akf_bridged.Cursor) -> NDArray[np.int64]:
+    def unmeasured(self, segment: Any, cursor: akf_bridged.Cursor) -> Unmeasured:
         return akf_bridged.unmeasured_pixels(segment, cursor)
 
     def path(self, segment: BridgedSegment) -> Plane | None:

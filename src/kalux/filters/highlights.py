@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from kalux.augmentation.highlights import Unshown, of_both
 from kalux.compiled import ONE, exponential, larger, loop, smaller
 from kalux.filters.readout import HighlightPrior, read_levels
+from kalux.filters.surfaces import Unmeasured
 
 Floats = NDArray[np.floating[Any]]
 
@@ -121,17 +122,20 @@ def keep_white(
 
 @loop
 def _keep(log_intensity, unmeasured, white, log_offset, image):  # type: ignore[no-untyped-def]
+    of_white = exponential(white) - log_offset
     for pixel in unmeasured:
         i = np.uint64(pixel)
         level = np.float32(log_intensity[i])
-        if level > white - ONE:
-            below = larger(white - level, np.float32(0.0))
+        if level >= white:  # most of them
+            image[i] = larger(image[i], of_white)
+        elif level > white - ONE:
+            below = white - level
             least = exponential(white - below - below * below / _ABOUT_WHITE) - log_offset
             image[i] = larger(image[i], least)
 
 
 def calm_specks(
-    image: NDArray[np.float32], variance: Floats, log_offset: float, unmeasured: NDArray[np.int64]
+    image: NDArray[np.float32], variance: Floats, log_offset: float, unmeasured: Unmeasured
 ) -> None:
     """Keep pixels from shining brighter above those around them than a lens lets a point of light (K17). In place.
 
@@ -147,41 +151,56 @@ def calm_specks(
     log_offset
         I_0.
     unmeasured
-        (N,) indices in the flattened image of pixels that no frame around measures.
+        Pixels that no frame around measures.
     """
-    if len(unmeasured) == 0:
+    if len(unmeasured.pixels) == 0:
         return
-    inside = np.zeros(image.size, np.bool_)
-    inside[unmeasured] = True
-    known = variance.astype(np.float32, copy=False).reshape(-1)
-    calmed = image.reshape(-1)[unmeasured]
-    _calm(image.reshape(-1), known, np.float32(log_offset), unmeasured, inside, image.shape, calmed)
-    image.reshape(-1)[unmeasured] = calmed
+    known = variance.astype(np.float32, copy=False)
+    inside = unmeasured.mask.reshape(-1)
+    calmed = np.empty(len(unmeasured.pixels), np.float32)
+    _calm(
+        image.reshape(-1),
+        known.reshape(-1),
+        np.float32(log_offset),
+        unmeasured.pixels,
+        inside,
+        image.shape,
+        calmed,
+    )
 
 
 @loop
-def _calm(before, variance, log_offset, unmeasured, inside, shape, calmed):  # type: ignore[no-untyped-def]
-    """Take those of the ``unmeasured`` pixels down in ``calmed``, their values ``before``."""
+def _calm(image, variance, log_offset, unmeasured, inside, shape, calmed):  # type: ignore[no-untyped-def]
+    """Take those of the ``unmeasured`` pixels of ``image`` down that are too bright. ``calmed`` is scratch memory."""
     height, width = shape
     for k in range(len(unmeasured)):
         pixel = unmeasured[k]
-        row, column = pixel // width, pixel % width
-        if row == 0 or column == 0 or row == height - 1 or column == width - 1:
+        calmed[k] = image[pixel]
+        if pixel < width or pixel >= (height - 1) * width:
             continue
-        if not (inside[pixel - width] and inside[pixel - 1] and inside[pixel + 1] and inside[pixel + width]):
+        brightest = larger(
+            larger(image[pixel - width], image[pixel - 1]), larger(image[pixel + 1], image[pixel + width])
+        )
+        if image[pixel] <= brightest or not (
+            inside[pixel - width] and inside[pixel - 1] and inside[pixel + 1] and inside[pixel + width]
+        ):
             continue
-        beside, doubt, brightest = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+        if pixel % width == 0 or pixel % width == width - 1:
+            continue
+        beside, doubt = np.float32(0.0), np.float32(0.0)
         for step in (-width, -1, 1, width):
-            value = before[pixel + step]
+            value = image[pixel + step]
             noise = (value + log_offset) * (value + log_offset) * variance[pixel + step]
-            beside, doubt, brightest = beside + value, doubt + noise, larger(brightest, value)
+            beside, doubt = beside + value, doubt + noise
         apart = np.float32(0.0)
         for step in (-width - 1, -width + 1, width - 1, width + 1):
-            apart += before[pixel + step]
+            apart += image[pixel + step]
         quarter = np.float32(0.25)
         beside, ground = quarter * beside, quarter * smaller(apart, beside)
         most = ground + _PEAK * (beside - ground + quarter * np.sqrt(doubt))
-        calmed[k] = smaller(before[pixel], larger(most, brightest))
+        calmed[k] = smaller(image[pixel], larger(most, brightest))
+    for k in range(len(unmeasured)):
+        image[unmeasured[k]] = calmed[k]
 
 
 def smoothed_unshown(

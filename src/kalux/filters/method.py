@@ -20,6 +20,7 @@ from kalux.event_slices import all_between, count_chunks
 from kalux.events import EventArray
 from kalux.filters.akf import State
 from kalux.filters.shots import Shot
+from kalux.filters.surfaces import Unmeasured
 from kalux.filters.uncertainty import Around
 from kalux.models.camera import log_intensity
 from kalux.settings import Settings
@@ -124,8 +125,8 @@ class Method(ABC):
         """The same bent to L and P half-way; None: not told."""
         return None
 
-    def unmeasured(self, segment: Any, cursor: Any) -> NDArray[np.int64] | None:
-        """(N,) indices in the flattened image of pixels that neither frame of a segment measures."""
+    def unmeasured(self, segment: Any, cursor: Any) -> Unmeasured | None:
+        """Pixels that neither frame of a segment measures."""
         return None
 
     def trail(self, segment: Any, cursor: Any, t: int) -> Floats | None:

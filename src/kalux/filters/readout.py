@@ -6,7 +6,7 @@ With the prior on highlights (docs/equations.md, K6) and the weighted mean over 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Sequence
 from typing import Any, Final, NamedTuple
 
 import numba as nb
@@ -15,7 +15,6 @@ from numba.core import types
 from numpy.typing import NDArray
 
 from kalux import memory
-from kalux.augmentation.parts import PART
 from kalux.compiled import (
     FUSED,
     ONE,
@@ -29,7 +28,14 @@ from kalux.compiled import (
     word_at,
     zeros,
 )
-from kalux.filters.surfaces import rougher_where_bright, surface_pixels, surface_variance
+from kalux.filters.surfaces import (
+    BLOCK,
+    Surface,
+    Unmeasured,
+    next_run,
+    rougher_where_bright,
+    surface_variance,
+)
 from kalux.formulas import Number, Row, choose, formula, squared
 
 Array = NDArray[np.floating[Any]]
@@ -40,11 +46,8 @@ _UNKNOWN: Final = np.float32(1e9)
 _LEAST_ALLOWED: Final = np.float32(8e-9)
 """Least variance by which neighbours differ, so that the inverse of such a product is finite as well."""
 
-_BLOCK: Final = 32
-"""Pixels of a row in a block: blocks without highlights, or without moving pixels, are skipped."""
-
 _STRIP: Final = 640
-"""Columns that are read out together, a multiple of `_BLOCK`; many sensors have no more. Since the compiler knows the
+"""Columns that are read out together, a multiple of `BLOCK`; many sensors have no more. Since the compiler knows the
 number, loops over several rows become vector code; the buffers of these rows fit the second-level cache."""
 
 _MARGIN: Final = 32
@@ -71,10 +74,6 @@ _SLACK: Final = np.float32(1 / 8)
 _FARTHER: Final = np.float32(20.0)
 """By how much more neighbours on one surface differ twice as far away than in proportion to their squared distance: it
 bends. 10 is better for skies and worse for textures (docs/equations.md, K12)."""
-
-_SURROUNDINGS: Final = 8
-"""Pixels around a surface that its means look at, at most: neighbours twice as far away, and the patches around them,
-in a Bayer mosaic."""
 
 BRIGHTEST: Final = np.float32(np.log(1e5))
 """Log of the brightest light over white that is believed. The sun, 1.6e9 cd/m^2, is 5e4 times as bright as white in its
@@ -247,7 +246,7 @@ def read_out(
     difference: float = 0.0,
     pitch: int = 1,
     unshown: NDArray[np.int64] | None = None,
-    unmeasured: NDArray[np.int64] | None = None,
+    unmeasured: Unmeasured | None = None,
     with_variance: bool = True,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """I of a state, and the variance of its logarithm, in one pass over the rows.
@@ -281,8 +280,8 @@ def read_out(
         (N,) indices in the flattened image, ascending, of pixels that no frame has measured: their L is returned as
         well, and averaging does not reduce their variance, since their errors (K15) are the same.
     unmeasured
-        (N,) such indices of pixels that no frame around measures, but one has shown: those that make up a surface are
-        averaged by how rough it is (`_smooth_surfaces`), whether they move or not.
+        Pixels that no frame around measures: those that another one has shown, and that make up a surface, are averaged
+        by how rough it is (`_smooth_surfaces`), whether they move or not.
     with_variance
         Whether to compute the variance; else it is empty.
 
@@ -296,12 +295,12 @@ def read_out(
         (N,) float32: L of the ``unshown`` pixels, after averaging.
     """
     height, width = log_intensity.shape
-    unshown = np.empty(0, np.int64) if unshown is None else unshown
-    levels = np.empty(len(unshown), np.float32)
+    raised = np.empty(0, np.int64) if unshown is None else unshown
+    levels = np.empty(len(raised), np.float32)
     known, level = (plane.astype(np.float32, copy=False) for plane in (variance, log_intensity))
     out = np.empty(log_intensity.shape, np.float32)
     total = np.empty(out.shape if with_variance and moving is not None else (0, 0), np.float32)
-    ends = np.searchsorted(unshown, np.arange(height + 1) * width)
+    ends = np.searchsorted(raised, np.arange(height + 1) * width)
     next_unshown = ends[:-1].copy()  # of every row, in strips from left to right
     difference2 = np.float32(difference * difference)
     of_silent, of_moving = np.float32(subthreshold.silent), np.float32(subthreshold.moving)
@@ -316,87 +315,55 @@ def read_out(
         difference > 0,
         pitch,
         *scalars,
-        unshown,
+        raised,
         ends,
     )
     for begin in range(0, width, _STRIP):
         ring = _ring(0 if moving is None else pitch, difference2)
         _read_out(*given, next_unshown, begin, ring, out, total, levels)
     if moving is not None and difference > 0 and unmeasured is not None:
-        surface = surface_pixels(unmeasured, out.shape)
-        if len(surface):
+        surface = unmeasured.surface(unshown, pitch)
+        if len(surface.pixels):
             state = level, known, moving, change
             white = np.float32(prior.white)
             smooth, left = _smooth_surfaces(state, (of_silent, of_moving), surface, difference2, white, pitch)
             read_levels(smooth, left, *scalars)
-            out.reshape(-1)[surface] = smooth
+            _put(smooth, surface.pixels, out.reshape(-1))
             if total.size:
-                total.reshape(-1)[surface] = left
+                _put(left, surface.pixels, total.reshape(-1))
     return out, known if with_variance and moving is None else total, levels
 
 
 def _smooth_surfaces(
     state: tuple[NDArray[Any], ...],
     subthreshold: tuple[np.float32, np.float32],
-    pixels: NDArray[np.int64],
+    surface: Surface,
     usual: np.float32,
     white: np.float32,
     pitch: int,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """(N,) L of ``pixels`` and its variance, averaged by how rough the surface around them is.
+    """(N,) L of the pixels of a surface and its variance, averaged by how rough the surface around them is.
 
     They are averaged with their eight neighbours, and then with those twice as far away. ``state`` holds L, P, what
     moves, and the change of silent pixels; ``usual`` is the variance by which neighbours differ, ``white`` L of white.
     """
-    width = state[0].shape[1]
-    row, column = np.divmod(pixels, width)
-    rows, columns = _window_around((row, column), state[0].shape)
-    shape = rows.stop - rows.start, columns.stop - columns.start
-    # One piece of memory for windows of any size, which the next image uses again.
-    level, variance, rough, more, near, left, far, independent = (
-        plane[: shape[0] * shape[1]].reshape(shape) for plane in memory.empty((8, state[0].size))
-    )
-    _cut_out(
-        *(plane.reshape(-1) for plane in state),
-        *subthreshold,
-        width,
-        rows.start,
-        columns.start,
-        level,
-        variance,
-    )
-    inside = (row - rows.start) * shape[1] + column - columns.start
-    surface = np.zeros(shape, np.bool_)
-    surface.reshape(-1)[inside] = True
+    level = state[0]
+    # Filled in the blocks that are seen, or, the last three, at the pixels of the surface.
+    variance, rough, near, left, more, far, independent = memory.empty((7, *level.shape))
+    _hear(*state, *subthreshold, surface.seen, variance, near, left)
     surface_variance(level, variance, surface, usual, pitch, rough)
-    rougher_where_bright(level, white, pitch, more)
-    near[:], left[:] = level, variance
-    _average_surface(level, variance, rough, more, surface, pitch, pitch, near, left)
-    rough *= _FARTHER
-    # These two are filled where they are looked at.
-    _average_surface(near, left, rough, more, surface, 2 * pitch, pitch, far, independent)
-    averaged, alone, together = (plane.reshape(-1)[inside] for plane in (far, variance, independent))
-    return averaged, CORRELATED * alone + (ONE - CORRELATED) * together
-
-
-def _window_around(places: tuple[NDArray[np.int64], ...], shape: tuple[int, ...]) -> tuple[slice, slice]:
-    """Rows and columns of whole parts of the image that hold all places, and all that their means look at."""
-    rows, columns = (
-        slice(
-            max((int(at.min()) - _SURROUNDINGS) // PART * PART, 0),
-            min(-(-(int(at.max()) + 1 + _SURROUNDINGS) // PART) * PART, side),
-        )
-        for at, side in zip(places, shape, strict=True)
-    )
-    return rows, columns
+    rougher_where_bright(level, surface.own, white, pitch, more)
+    _average_surface((level, variance, rough, ONE, more), surface, pitch, pitch, near, left)
+    _average_surface((near, left, rough, _FARTHER, more), surface, 2 * pitch, pitch, far, independent)
+    averaged, remaining = np.empty((2, len(surface.pixels)), np.float32)
+    flat = (plane.reshape(-1) for plane in (far, variance, independent))
+    _take_averaged(surface.pixels, *flat, averaged, remaining)
+    return averaged, remaining
 
 
 def _average_surface(
-    level: NDArray[np.float32],
-    variance: NDArray[np.float32],
-    allowed: NDArray[np.float32],
-    more: NDArray[np.float32],
-    surface: NDArray[np.bool_],
+    planes: tuple[Any, ...],
+    surface: Surface,
     pitch: int,
     patch: int,
     out: NDArray[np.float32],
@@ -404,12 +371,14 @@ def _average_surface(
 ) -> None:
     """Fill L and its variance, if errors were independent, after averaging, at the pixels of the surface.
 
-    Neighbours are ``pitch`` apart, the pixels of the patches around them ``patch``. From a pixel those one apart differ
-    by ``more``, its own, times the variance that is ``allowed``, that of the neighbour.
+    ``planes`` are L, its variance, by which variance pixels one apart differ on a surface around each, a factor of
+    these, and by how many times that a pixel's neighbours differ from itself. Neighbours are ``pitch`` apart, the
+    pixels of the patches around them ``patch``.
     """
-    for begin in range(0, level.shape[1], _STRIP):
+    blocks = surface.own, surface.compared, surface.seen
+    for begin in range(0, out.shape[1], _STRIP):
         ring = _ring(pitch, ONE)
-        _average_planes(level, variance, allowed, more, surface, pitch, patch, begin, ring, out, left)
+        _average_planes(*planes, surface.mask, *blocks, pitch, patch, begin, ring, out, left)
 
 
 def _ring(pitch: int, difference2: np.float32) -> _Ring:
@@ -546,62 +515,113 @@ def _read_out(  # type: ignore[no-untyped-def]
 
 @loop(fastmath=FUSED)
 def _average_planes(  # type: ignore[no-untyped-def]
-    level, variance, allowed, more, hears, pitch, patch, begin, ring, out, left
+    level,
+    variance,
+    allowed,
+    factor,
+    more,
+    averages,
+    own,
+    compared,
+    seen,
+    pitch,
+    patch,
+    begin,
+    ring,
+    out,
+    left,
 ):
-    """K12 of the pixels of ``hears`` in the columns of the strip that begins with ``begin``: `_average_surface`."""
+    """K12 of the pixels of ``averages`` in the columns of the strip that begins with ``begin``: `_average_surface`."""
     states, rough, distances, similarities = ring.states, ring.allowed, ring.distances, ring.similarities
-    differences, averaged, marked, spans = ring.differences, ring.averaged, ring.moving, ring.spans
-    height, count = level.shape[0], len(spans)
+    differences, averaged = ring.differences, ring.averaged
+    (height, width), count = level.shape, len(ring.spans)
+    end = smaller(begin + _STRIP, width)
     times = zeros(_ROW, np.float32)
-    for row in range(-3 * pitch, height):
-        _load_surface(level, variance, allowed, row + 2 * pitch, begin, pitch, count, states, rough)
-        _mark_moving(hears, row + 3 * pitch, begin, marked, spans)
-        first, last = np.int64(_STRIP), np.int64(0)
-        for place in range(count):
-            first, last = smaller(first, spans[place, 0]), larger(last, spans[place, 1])
-        if first >= last or row + pitch < 0:
+    for row in range(-2 * pitch, height):
+        _load_surface(
+            level, variance, allowed, factor, seen, row + 2 * pitch, begin, pitch, count, states, rough
+        )
+        if row + pitch < 0:
             continue
-        _compare_row(row, first, last, pitch, patch, states, rough, distances, similarities, differences)
-        if row < 0:
-            continue
-        at, start = np.uint64(row), np.uint64(begin)
-        for i in range(np.uint64(smaller(begin + _STRIP, level.shape[1]) - begin)):
-            times[np.uint64(_MARGIN) + i] = more[at, start + i]
-        up, own, down, of_up, of_own, into = _around(row, first, pitch, count)
-        for i in range(np.uint64(last - first)):
-            _average_rough(
+        first, last = next_run(compared, larger(row, 0), begin, end)
+        while first < last:
+            _compare_row(
+                row,
+                first - begin,
+                last - begin,
+                pitch,
+                patch,
                 states,
                 rough,
-                times,
+                distances,
                 similarities,
-                up + i,
-                own + i,
-                down + i,
-                of_up + i,
-                of_own + i,
-                np.uint64(pitch),
-                averaged,
-                into + i,
+                differences,
             )
-        for column in range(first, smaller(last, level.shape[1] - begin)):
-            if marked[row % count, column]:
-                out[row, begin + column] = averaged[_MARGIN + column]
-                left[row, begin + column] = averaged[_ROW + _MARGIN + column]
+            first, last = next_run(compared, larger(row, 0), last, end)
+        if row < 0:
+            continue
+        first, last = next_run(own, row, begin, end)
+        while first < last:
+            at, column = np.uint64(row), np.uint64(first)
+            up, here, down, of_up, of_own, into = _around(row, first - begin, pitch, count)
+            inside = np.uint64(smaller(last, width) - first)
+            for i in range(inside):
+                times[into + i] = more[at, column + i]
+            for i in range(np.uint64(last - first)):
+                _average_rough(
+                    states,
+                    rough,
+                    times,
+                    similarities,
+                    up + i,
+                    here + i,
+                    down + i,
+                    of_up + i,
+                    of_own + i,
+                    np.uint64(pitch),
+                    averaged,
+                    into + i,
+                )
+            for i in range(inside):
+                alone, together = out[at, column + i], averaged[into + i]
+                out[at, column + i] = together if averages[at, column + i] else alone
+            for i in range(inside):
+                alone, together = left[at, column + i], averaged[into + _ONE + i]
+                left[at, column + i] = together if averages[at, column + i] else alone
+            first, last = next_run(own, row, last, end)
 
 
 @loop
-def _cut_out(  # type: ignore[no-untyped-def]
-    level, known, moving, change, of_silent, of_moving, width, top, left, cut_level, cut_variance
+def _hear(  # type: ignore[no-untyped-def]
+    level, known, moving, change, of_silent, of_moving, seen, variance, near, left
 ):
-    """Fill a window of L, and of P with the variance of subthreshold changes."""
-    rows, columns = cut_level.shape
+    """Fill blocks that are seen: P with the variance of subthreshold changes, and both it and L once more."""
+    rows, blocks = seen.shape
     for row in range(rows):
-        place = (top + row) * width + left
-        for i in range(columns):
-            at = np.uint64(place + i)
-            doubt = known[at] + (of_moving if moving[at] else of_silent * change[at])
-            cut_level[row, i] = level[at]
-            cut_variance[row, i] = smaller(doubt, _UNKNOWN)
+        for block in range(blocks):
+            if seen[row, block]:
+                for i in range(
+                    np.uint64(BLOCK * block), np.uint64(smaller(BLOCK * (block + 1), level.shape[1]))
+                ):
+                    doubt = known[row, i] + (of_moving if moving[row, i] else of_silent * change[row, i])
+                    variance[row, i] = left[row, i] = smaller(doubt, _UNKNOWN)
+                    near[row, i] = level[row, i]
+
+
+@loop
+def _take_averaged(pixels, level, alone, together, averaged, left):  # type: ignore[no-untyped-def]
+    """Take L and its variance at some pixels: errors of neighbours are correlated."""
+    for i in range(len(pixels)):
+        at = np.uint64(pixels[i])
+        averaged[i] = level[at]
+        left[i] = CORRELATED * alone[at] + (ONE - CORRELATED) * together[at]
+
+
+@loop
+def _put(values, pixels, plane):  # type: ignore[no-untyped-def]
+    """Write values at some pixels of a flattened plane."""
+    for i in range(len(pixels)):
+        plane[np.uint64(pixels[i])] = values[i]
 
 
 @loop
@@ -638,16 +658,28 @@ def _part_of_row(plane, row, begin, count, states):  # type: ignore[no-untyped-d
 
 
 @nb.njit(cache=True, inline="always")
-def _load_surface(level, variance, allowed, row, begin, pitch, count, states, rough):  # type: ignore[no-untyped-def]
-    """Load L of a row, its variance, and by how much its pixels differ from neighbours on one surface."""
-    at, start, into, size = _part_of_row(level, row, begin, count, states)
-    for i in range(size):
-        states[into + _LEVEL + i] = level[at, start + i]
-        states[into + _VARIANCE + i] = variance[at, start + i]
-    for i in range(size):
-        near = larger(allowed[at, start + i] * np.float32(pitch * pitch), _LEAST_ALLOWED)
-        rough[into + _STRAIGHT + i] = near
-        rough[into + _DIAGONAL + i] = near + near
+def _load_surface(  # type: ignore[no-untyped-def]
+    level, variance, allowed, factor, seen, row, begin, pitch, count, states, rough
+):
+    """Load L, its variance, and by how much pixels differ from neighbours on one surface, of a row's blocks.
+
+    Of the blocks that are ``seen``, also of those beside the strip, since a margin is as wide as one.
+    """
+    _, _, place, size = _part_of_row(level, row, begin, count, states)
+    if size:
+        place = np.uint64(row % count) * _TWO + np.uint64(_MARGIN)
+        start = begin // BLOCK
+        for block in range(larger(start - 1, 0), smaller(start + _STRIP // BLOCK + 1, seen.shape[1])):
+            if seen[row, block]:
+                at = np.uint64(BLOCK * block)
+                into = place + np.uint64(BLOCK * block - begin)
+                for i in range(np.uint64(smaller(BLOCK, level.shape[1] - BLOCK * block))):
+                    states[into + _LEVEL + i] = level[row, at + i]
+                    states[into + _VARIANCE + i] = variance[row, at + i]
+                for i in range(np.uint64(smaller(BLOCK, level.shape[1] - BLOCK * block))):
+                    near = larger(allowed[row, at + i] * factor * np.float32(pitch * pitch), _LEAST_ALLOWED)
+                    rough[into + _STRAIGHT + i] = near
+                    rough[into + _DIAGONAL + i] = near + near
 
 
 @nb.njit(cache=True, inline="always")
@@ -684,13 +716,18 @@ def _mark_moving(moving, row, begin, marked, spans):  # type: ignore[no-untyped-
         for i in range(np.uint64(smaller(moving.shape[1] - begin, _STRIP))):
             marked[place, i] = moving[at, start + i]
         own = marked[place]
-        for block in range(0, _STRIP, _BLOCK):
-            if _any(own, block, _BLOCK):
-                first, last = smaller(first, block), block + _BLOCK
+        for block in range(0, _STRIP, BLOCK):
+            if _any(own, block, BLOCK):
+                first, last = smaller(first, block), block + BLOCK
     spans[place, 0], spans[place, 1] = first, last
 
 
-# Quotients by four numbers a to d share one division: 1/a = b c d / (a b c d), and so on.
+def _inverses(a: Number, b: Number, c: Number, d: Number) -> tuple[Number, ...]:
+    """One over each of four numbers, with one division: 1 / a = b (c d) / ((a b) (c d)), and so on."""
+    ab, cd = a * b, c * d
+    inverse = ONE / (ab * cd)
+    of_ab, of_cd = inverse * cd, inverse * ab
+    return of_ab * b, of_ab * a, of_cd * d, of_cd * c
 
 
 @formula()
@@ -714,13 +751,11 @@ def _compare_pixels(
     b = variance + states[other + _VARIANCE - step] + far_slack
     c = variance + states[other + _VARIANCE] + near_slack
     d = variance + states[other + _VARIANCE + step] + far_slack
-    ab, cd = a * b, c * d
-    inverse = ONE / (ab * cd)
-    of_ab, of_cd = inverse * cd, inverse * ab
-    differences[into] = right * right * (of_ab * b)
-    differences[into + _ONE] = left_under * left_under * (of_ab * a)
-    differences[into + _TWO] = straight_under * straight_under * (of_cd * d)
-    differences[into + _THREE] = right_under * right_under * (of_cd * c)
+    a, b, c, d = _inverses(a, b, c, d)
+    differences[into] = right * right * a
+    differences[into + _ONE] = left_under * left_under * b
+    differences[into + _TWO] = straight_under * straight_under * c
+    differences[into + _THREE] = right_under * right_under * d
 
 
 @formula()
@@ -735,17 +770,10 @@ def _weigh_pixel(states: Row, allowed: Row, own: Number, weights: Row) -> None:
 @formula()
 def _compare_patches(distances: Row, before: Number, own: Number, after: Number, similarities: Row) -> None:
     """Factors of the weights of a pixel's four neighbours, from three rows around both."""
-    a, b, c, d = (
-        edge(distances[before + k] + distances[own + k] + distances[after + k])
-        for k in (_ZERO, _ONE, _TWO, _THREE)
-    )
-    ab, cd = a * b, c * d
-    inverse = ONE / (ab * cd)
-    of_ab, of_cd = inverse * cd, inverse * ab
-    similarities[own] = squared(of_ab * b)
-    similarities[own + _ONE] = squared(of_ab * a)
-    similarities[own + _TWO] = squared(of_cd * d)
-    similarities[own + _THREE] = squared(of_cd * c)
+    places = _ZERO, _ONE, _TWO, _THREE
+    edges = (edge(distances[before + k] + distances[own + k] + distances[after + k]) for k in places)
+    for k, inverse in zip(places, _inverses(*edges), strict=True):
+        similarities[own + k] = squared(inverse)
 
 
 @nb.njit(cache=True, inline="always")
@@ -803,15 +831,9 @@ def _average(
     into: Number,
 ) -> None:
     """K12 of a pixel, where all neighbours differ alike: their weights are known."""
-    _mean(
-        states,
-        lambda place, distance: weights[place + distance],
-        similarities,
-        (up, own, down, of_up, of_own),
-        step,
-        averaged,
-        into,
-    )
+    beside = _beside(up, own, down, step)
+    heard = [(weights[ahead + lies], weights[behind + lies]) for ahead, behind, lies in beside]
+    _mean(states, beside, heard, similarities, (own, of_up, of_own), step, averaged, into)
 
 
 @formula()
@@ -830,21 +852,29 @@ def _average_rough(
     into: Number,
 ) -> None:
     """K12 of a pixel from which neighbours differ by so many ``times`` what they do on the surface around them."""
-    more = times[into]
-    _mean(
-        states,
-        lambda place, distance: ONE / (states[place + _VARIANCE] + more * rough[place + distance]),
-        similarities,
-        (up, own, down, of_up, of_own),
-        step,
-        averaged,
-        into,
+    more, beside = times[into], _beside(up, own, down, step)
+    doubts = [
+        states[place + _VARIANCE] + more * rough[place + lies] for *pair, lies in beside for place in pair
+    ]
+    first, second = _inverses(*doubts[:4]), _inverses(*doubts[4:])
+    heard = [first[:2], first[2:], second[:2], second[2:]]
+    _mean(states, beside, heard, similarities, (own, of_up, of_own), step, averaged, into)
+
+
+def _beside(up: Number, own: Number, down: Number, step: Number) -> tuple[tuple[Any, ...], ...]:
+    """Places of a pixel's neighbours, one ahead and the one opposite to it, and whether they lie straight beside it."""
+    return (
+        (own + step, own - step, _STRAIGHT),
+        (down - step, up + step, _DIAGONAL),
+        (down, up, _STRAIGHT),
+        (down + step, up - step, _DIAGONAL),
     )
 
 
 def _mean(
     states: Row,
-    weight: Callable[[Number, Any], Number],
+    beside: tuple[tuple[Any, ...], ...],
+    heard: Sequence[Sequence[Number]],
     similarities: Row,
     places: tuple[Number, ...],
     step: Number,
@@ -853,19 +883,19 @@ def _mean(
 ) -> None:
     """The weighted mean of a pixel and its eight neighbours, and its variance if errors were independent.
 
-    ``weight`` is that of a neighbour at a place, which lies straight or diagonally, where there is no edge.
+    ``heard`` are the weights of the neighbours ``beside`` it where there is no edge.
     """
-    up, own, down, of_up, of_own = places
+    own, of_up, of_own = places
     value, variance = states[own + _LEVEL], states[own + _VARIANCE]
+    likeness = (
+        (of_own, of_own - step),
+        (of_own + _ONE, of_up + _ONE + step),
+        (of_own + _TWO, of_up + _TWO),
+        (of_own + _THREE, of_up + _THREE - step),
+    )
     information, deviation = None, None
-    for onward, back, ahead, behind, distance in (
-        (of_own, of_own - step, own + step, own - step, _STRAIGHT),
-        (of_own + _ONE, of_up + _ONE + step, down - step, up + step, _DIAGONAL),
-        (of_own + _TWO, of_up + _TWO, down, up, _STRAIGHT),
-        (of_own + _THREE, of_up + _THREE - step, down + step, up - step, _DIAGONAL),
-    ):
-        there = similarities[onward] * weight(ahead, distance)
-        back_there = similarities[back] * weight(behind, distance)
+    for (ahead, behind, _), weights, (onward, back) in zip(beside, heard, likeness, strict=True):
+        there, back_there = similarities[onward] * weights[0], similarities[back] * weights[1]
         more = there * (states[ahead + _LEVEL] - value) + back_there * (states[behind + _LEVEL] - value)
         deviation = more if deviation is None else deviation + more
         information = there + back_there if information is None else information + (there + back_there)
@@ -936,9 +966,9 @@ def _shrink_highlights(  # type: ignore[no-untyped-def]
     """K6 of the bright pixels of a row, gathered so that they go through vector code and others cost nothing."""
     white, scale2, unknown_scale, gain, growth = prior
     count = np.uint64(0)
-    for first in range(0, len(level), _BLOCK):
-        if _any(bright, first, _BLOCK):
-            for column in range(np.uint64(first), np.uint64(first + _BLOCK)):
+    for first in range(0, len(level), BLOCK):
+        if _any(bright, first, BLOCK):
+            for column in range(np.uint64(first), np.uint64(first + BLOCK)):
                 places[count] = column
                 count += np.uint64(bright[column])
     for k in range(count):

@@ -1,16 +1,20 @@
-"""How rough surfaces are that no frame around an image measures (docs/equations.md, K12)."""
+"""Pixels that no frame around an image measures: which make up surfaces, and how rough these are (K12).
+
+What follows from the pixels alone is found once for all images between two frames.
+"""
 
 from __future__ import annotations
 
-import itertools
-from typing import Final
+import functools
+from typing import Final, NamedTuple
 
 import cv2
+import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.parts import PART, between_parts, part_grid, parts_of, weighted_sums
-from kalux.compiled import larger, loop, smaller
+from kalux.compiled import empty, inner, larger, loop, smaller
 
 _INDEPENDENT: Final = np.float32(0.7)
 """Part of the variances of two neighbours that is in their difference: their errors have correlations of 0.1 to 0.5."""
@@ -40,21 +44,123 @@ _LEAST_PIXELS: Final = 16
 """Of a part that belongs to a surface: a quarter. Single pixels have no neighbours on it to be averaged with."""
 
 
-def surface_pixels(unmeasured: NDArray[np.int64], shape: tuple[int, ...]) -> NDArray[np.int64]:
+BLOCK: Final = 32
+"""Pixels of a row in a block: blocks without any that is averaged are skipped."""
+
+_REACH: Final = 4
+"""Pixels around a surface that its means look at, at most, times the pitch of its pixels: neighbours twice as far away,
+and the patches around them. As many rows before a pixel's own are compared."""
+
+
+class Surface(NamedTuple):
+    """Pixels that make up surfaces, and the blocks of `BLOCK` pixels of a row in which there is something to do.
+
+    Attributes
+    ----------
+    pixels
+        (N,) indices in the flattened image, ascending.
+    mask
+        (H, W) bool: the same.
+    near
+        (H, W) bool: up to two neighbours away from them.
+    own
+        (H, B) bool: blocks with such pixels.
+    compared
+        (H, B) bool: blocks that are compared with those below before such a pixel is averaged.
+    seen
+        (H, B) bool: blocks that means look at.
+    """
+
+    pixels: NDArray[np.int64]
+    mask: NDArray[np.bool_]
+    near: NDArray[np.bool_]
+    own: NDArray[np.bool_]
+    compared: NDArray[np.bool_]
+    seen: NDArray[np.bool_]
+
+
+class Unmeasured:
+    """Pixels that neither of the frames around an image measures, nor the only one known.
+
+    Parameters
+    ----------
+    pixels
+        (N,) their indices in the flattened image, ascending.
+    shape
+        Of the image, (H, W).
+    """
+
+    def __init__(self, pixels: NDArray[np.int64], shape: tuple[int, ...]) -> None:
+        self.pixels = pixels
+        self.shape = shape
+        self._surface: tuple[NDArray[np.int64] | None, int, Surface] | None = None
+
+    @functools.cached_property
+    def mask(self) -> NDArray[np.bool_]:
+        """(H, W): the same. Not to be changed."""
+        return _marked(self.pixels, self.shape)
+
+    def surface(self, unshown: NDArray[np.int64] | None, pitch: int) -> Surface:
+        """Those that make up a surface, without the ``unshown``, which no other frame has shown either.
+
+        ``pitch`` is the distance of neighbours. Not to be changed, since it is kept for other images.
+        """
+        kept = self._surface  # another thread may replace it
+        if kept is None or kept[1] != pitch or not _same(kept[0], unshown):
+            kept = unshown, pitch, surface_of(self._without(unshown), self.shape, pitch)
+            self._surface = kept
+        return kept[2]
+
+    def _without(self, unshown: NDArray[np.int64] | None) -> NDArray[np.int64]:
+        if unshown is None:
+            return self.pixels
+        return self.pixels[~_marked(unshown, self.shape).reshape(-1)[self.pixels]]
+
+
+def _same(one: NDArray[np.int64] | None, other: NDArray[np.int64] | None) -> bool:
+    if one is None or other is None:
+        return one is other
+    return one is other or np.array_equal(one, other)
+
+
+def surface_of(unmeasured: NDArray[np.int64], shape: tuple[int, ...], pitch: int) -> Surface:
     """Those of the pixels that make up a surface: many in their part of the image, or in one beside it.
 
-    Both are indices in the flattened image, ascending.
+    ``unmeasured`` are indices in the flattened image, ascending, ``pitch`` the distance of neighbours.
     """
     part, (rows, columns) = parts_of(unmeasured, shape), part_grid(shape)
     many = np.bincount(part, minlength=rows * columns).reshape(rows, columns) >= _LEAST_PIXELS
-    near = cv2.dilate(many.view(np.uint8), np.ones((3, 3), np.uint8)).view(np.bool_)
-    return unmeasured[near.reshape(-1)[part]]
+    pixels = unmeasured[_widened(many, 1, 1).reshape(-1)[part]]
+    mask, reach = _marked(pixels, shape), _REACH * pitch
+    around = _widened(mask, reach, reach)
+    own = _blocks(mask)
+    return Surface(
+        pixels, mask, _widened(mask, 2 * pitch, 2 * pitch), own, _widened(own, reach, 0), _blocks(around)
+    )
+
+
+def _marked(pixels: NDArray[np.int64], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    mask = np.zeros(shape, np.bool_)
+    mask.reshape(-1)[pixels] = True
+    return mask
+
+
+def _widened(mask: NDArray[np.bool_], rows: int, columns: int) -> NDArray[np.bool_]:
+    """``mask``, and what is up to so many rows and columns beside it."""
+    near = cv2.dilate(mask.view(np.uint8), np.ones((2 * rows + 1, 2 * columns + 1), np.uint8))
+    return np.asarray(near).view(np.bool_)
+
+
+def _blocks(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(H, B): blocks of a row with any."""
+    whole = np.pad(mask, ((0, 0), (0, -mask.shape[1] % BLOCK)))
+    return np.asarray(whole.reshape(len(mask), -1, BLOCK).any(axis=2))
 
 
 def surface_variance(
     level: NDArray[np.float32],
     variance: NDArray[np.float32],
-    surface: NDArray[np.bool_],
+    surface: Surface,
     usual: np.float32,
     pitch: int,
     out: NDArray[np.float32],
@@ -67,53 +173,37 @@ def surface_variance(
     Parameters
     ----------
     level, variance
-        (H, W) L and its variance.
+        (H, W) L and its variance, in the blocks that are seen.
     surface
-        (H, W): its pixels.
+        Its pixels.
     usual
         What it is where nothing else is known, log intensity^2.
     pitch
         Distance of the neighbours, pixels.
     out
-        (H, W), filled with it, log intensity^2: of pixels beside the surface half-way to what it is usually, which it
-        is elsewhere.
+        (H, W), filled with it in the blocks that are seen, log intensity^2: of pixels beside the surface half-way to
+        what it is usually, which it is elsewhere.
     """
     excess, certainty = np.zeros((2, *part_grid(level.shape)))
-    _compare_neighbours(level, variance, surface, usual, pitch, excess, certainty)
+    _compare_neighbours(
+        level, variance, surface.mask.view(np.uint8), surface.own, usual, pitch, excess, certainty
+    )
     prior = _PRIOR_PAIRS / float(usual) ** 2
     found = (weighted_sums(excess, _FARTHEST) + prior * float(usual)) / (
         weighted_sums(certainty, _FARTHEST) + prior
     )
     limited = np.clip(found, _LEAST**2 * usual, _MOST**2 * usual).astype(np.float32)
-    near = cv2.dilate(surface.view(np.uint8), np.ones((4 * pitch + 1, 4 * pitch + 1), np.uint8))
-    _spread(limited, surface, near, usual, out)
-
-
-def rougher_where_bright(
-    level: NDArray[np.float32], white: np.float32, pitch: int, out: NDArray[np.float32]
-) -> None:
-    """Fill (H, W): by how many times that variance the neighbours of a pixel differ from it, where it may be of a lamp.
-
-    By the median of L, whose white is ``white``, of it and its neighbours, so that not where it alone is bright: 1 up
-    to 2 beyond white, 3.2 from 4 on.
-    """
-    _take_medians(level, pitch, out)
-    _make_rougher(out, white)
-
-
-def _take_medians(level: NDArray[np.float32], pitch: int, out: NDArray[np.float32]) -> None:
-    """Of every pixel and its eight neighbours, ``pitch`` apart: that of a single bright one is as those around it."""
-    for row, column in itertools.product(range(pitch), repeat=2):
-        out[row::pitch, column::pitch] = cv2.medianBlur(
-            np.ascontiguousarray(level[row::pitch, column::pitch]), 3
-        )
+    _spread(limited, surface.mask, surface.near, surface.seen, usual, out)
 
 
 @loop
-def _spread(limited, surface, near, usual, variances):  # type: ignore[no-untyped-def]
+def _spread(limited, surface, near, seen, usual, variances):  # type: ignore[no-untyped-def]
     """Fill the variances from those of parts: all of it on the surface, half of it near to it, elsewhere the usual."""
-    for row in range(surface.shape[0]):
-        for column in range(surface.shape[1]):
+    width = surface.shape[1]
+    for row, block in np.ndindex(seen.shape):
+        if not seen[row, block]:
+            continue
+        for column in range(BLOCK * block, smaller(BLOCK * (block + 1), width)):
             variance = usual
             if near[row, column]:
                 variance = between_parts(limited, row, column)
@@ -123,38 +213,153 @@ def _spread(limited, surface, near, usual, variances):  # type: ignore[no-untype
 
 
 @loop
-def _make_rougher(level, white):  # type: ignore[no-untyped-def]
-    """From L to how many times the variance is, in place."""
-    for row in range(level.shape[0]):
-        for column in range(level.shape[1]):
-            beyond = smaller(larger(level[row, column] - white, np.float32(_BRIGHT)), np.float32(_BRIGHTEST))
-            more = np.float32(1.0) + np.float32(_ROUGHER) * (beyond - np.float32(_BRIGHT))
-            level[row, column] = more * more
+def rougher_where_bright(level, own, white, pitch, out):  # type: ignore[no-untyped-def]
+    """Fill in by how many times that variance neighbours of a pixel differ from it, where it may be of a lamp.
+
+    By the median of L, whose white is ``white``, of it and its eight neighbours, ``pitch`` apart, so that not where it
+    alone is bright: 1 up to 2 beyond white, 3.2 from 4 on. Beyond the image neighbours are as the last ones within.
+
+    Parameters
+    ----------
+    level, out
+        (H, W) float32: L, around the blocks, and what is filled in.
+    own
+        (H, B): the blocks that are filled.
+    """
+    height, width = level.shape
+    least, length = np.float32(_BRIGHT), width + 2 * pitch
+    near = empty(3 * length, np.float32)  # three rows, with margins
+    for row in range(height):
+        begin, behind = next_run(own, row, 0, width)
+        while begin < behind:
+            end = smaller(behind, width)
+            brightest = least
+            for k in range(3):
+                beside = row + (k - 1) * pitch
+                at = np.uint64(row if beside < 0 or beside >= height else beside)
+                into = np.uint64(k * length + begin + pitch)
+                for i in range(np.uint64(end - begin)):
+                    near[into + i] = level[at, np.uint64(begin) + i] - white
+                for i in range(pitch):
+                    left = begin - pitch + i
+                    near[into - np.uint64(pitch - i)] = level[at, left if left >= 0 else left + pitch] - white
+                    right = end + i
+                    near[into + np.uint64(right - begin)] = (
+                        level[at, right if right < width else right - pitch] - white
+                    )
+                for i in range(np.uint64(end - begin + 2 * pitch)):
+                    brightest = larger(brightest, near[into - np.uint64(pitch) + i])
+            at, start = np.uint64(row), np.uint64(begin)
+            if brightest == least:
+                for i in range(np.uint64(end - begin)):
+                    out[at, start + i] = np.float32(1.0)
+            else:
+                for i in range(np.uint64(end - begin)):
+                    beyond = _median(near, start + i, np.uint64(length), np.uint64(pitch))
+                    beyond = smaller(larger(beyond, least), np.float32(_BRIGHTEST))
+                    more = np.float32(1.0) + np.float32(_ROUGHER) * (beyond - least)
+                    out[at, start + i] = more * more
+            begin, behind = next_run(own, row, behind, width)
+
+
+@inner
+def next_run(blocks, row, column, end):  # type: ignore[no-untyped-def]
+    """Where the next marked ``blocks`` of a row begin, from ``column`` on, and end; the same if there are none.
+
+    ``column`` begins a block, and all begin before ``end``; the last may reach beyond it.
+    """
+    block, behind = column // BLOCK, -(-end // BLOCK)
+    while block < behind and not blocks[row, block]:
+        block += 1
+    first = block
+    while block < behind and blocks[row, block]:
+        block += 1
+    return first * BLOCK, block * BLOCK
+
+
+@nb.njit(cache=True, inline="always")
+def _median(values, at, row, step):  # type: ignore[no-untyped-def]
+    """Of three times three values, ``row`` and ``step`` apart, the first of which is ``at``."""
+    lowest, middle, highest = _sorted(values[at], values[at + row], values[at + row + row])
+    at += step
+    low, mid, high = _sorted(values[at], values[at + row], values[at + row + row])
+    at += step
+    lower, between, higher = _sorted(values[at], values[at + row], values[at + row + row])
+    # The largest of the lowest, the middle one of the middle ones, the smallest of the highest.
+    lowest = larger(larger(lowest, low), lower)
+    middle = _sorted(middle, mid, between)[1]
+    highest = smaller(smaller(highest, high), higher)
+    return _sorted(lowest, middle, highest)[1]
+
+
+@nb.njit(cache=True, inline="always")
+def _sorted(one, two, three):  # type: ignore[no-untyped-def]
+    """Three numbers, from the least on."""
+    low, high = smaller(one, two), larger(one, two)
+    rest = smaller(high, three)
+    return smaller(low, three), larger(low, rest), larger(high, three)
 
 
 @loop
-def _compare_neighbours(level, variance, surface, usual, pitch, excess, certainty):  # type: ignore[no-untyped-def]
-    """Sums over pairs, in every part: by how much squares exceed the noise, and what they would for a variance of 1."""
+def _compare_neighbours(  # type: ignore[no-untyped-def]
+    level, variance, surface, own, usual, pitch, excess, certainty
+):
+    """Sums over pairs, in every part: by how much squares exceed the noise, and what they would for a variance of 1.
+
+    A pair of which both are on the surface counts for the first of them, else for the one that is.
+    """
     height, width = level.shape
-    for row, column in np.ndindex(height, width):
-        if not surface[row, column]:
-            continue
-        one, noise = level[row, column], variance[row, column]
-        more, sure = 0.0, 0.0
-        for k in range(9):
-            down, right = k // 3 - 1, k % 3 - 1
-            other, beside = row + down * pitch, column + right * pitch
-            if k == 4 or other < 0 or beside < 0 or other >= height or beside >= width:
-                continue
-            if k < 4 and surface[other, beside]:  # this pair has been counted
-                continue
-            distance2 = np.float32((down * down + right * right) * pitch * pitch)
-            explained = noise + variance[other, beside]
-            expected = explained + usual * distance2
-            difference = level[other, beside] - one
-            square = smaller(difference * difference, _EDGE * expected)
-            weight = distance2 / (expected * expected)
-            more += np.float64(weight * (square - _INDEPENDENT * explained))
-            sure += np.float64(weight * distance2)
-        excess[row // PART, column // PART] += more
-        certainty[row // PART, column // PART] += sure
+    more, sure = empty(width, np.float64), empty(width, np.float64)
+    surplus, certain = empty(width, np.float32), empty(width, np.float32)
+    rim = empty(width, np.uint8)  # pixels of which the one before is not on the surface
+    for row in range(height):
+        begin, behind = next_run(own, row, 0, width)
+        while begin < behind:
+            end = smaller(behind, width)
+            for i in range(np.uint64(begin), np.uint64(end)):
+                more[i], sure[i] = 0.0, 0.0
+            for k in range(9):
+                down, right = (k // 3 - 1) * pitch, (k % 3 - 1) * pitch
+                if k == 4 or row + down < 0 or row + down >= height:
+                    continue
+                here, there, aside = np.uint64(row), np.uint64(row + down), np.uint64(right)
+                first, last = np.uint64(larger(begin, -right)), np.uint64(smaller(end, width - right))
+                distance2 = np.float32(down * down + right * right)
+                if k < 4:
+                    some = np.uint8(0)
+                    for i in range(first, last):
+                        rim[i] = surface[here, i] > surface[there, i + aside]
+                        some |= rim[i]
+                    if some:
+                        for i in range(first, last):
+                            if rim[i]:
+                                one, doubt = level[here, i], variance[here, i]
+                                other, noise = level[there, i + aside], variance[there, i + aside]
+                                pair = _excess_of_pair(one, other, doubt, noise, usual, distance2)
+                                more[i] += np.float64(pair[0])
+                                sure[i] += np.float64(pair[1])
+                    continue
+                for i in range(first, last):
+                    one, doubt = level[here, i], variance[here, i]
+                    other, noise = level[there, i + aside], variance[there, i + aside]
+                    pair = _excess_of_pair(one, other, doubt, noise, usual, distance2)
+                    surplus[i], certain[i] = pair
+                for i in range(first, last):
+                    more[i] += np.float64(surplus[i])
+                    sure[i] += np.float64(certain[i])
+            for i in range(begin, end):
+                if surface[row, i]:
+                    excess[row // PART, i // PART] += more[i]
+                    certainty[row // PART, i // PART] += sure[i]
+            begin, behind = next_run(own, row, behind, width)
+
+
+@nb.njit(cache=True, inline="always")
+def _excess_of_pair(one, other, doubt, noise, usual, distance2):  # type: ignore[no-untyped-def]
+    """The terms of both sums of a pair of pixels, of levels ``one`` and ``other`` with variances, and how certain."""
+    explained = doubt + noise
+    expected = explained + usual * distance2
+    difference = other - one
+    square = smaller(difference * difference, _EDGE * expected)
+    weight = distance2 / (expected * expected)
+    return weight * (square - _INDEPENDENT * explained), weight * distance2
