@@ -853,11 +853,10 @@ def _average_rough(
 ) -> None:
     """K12 of a pixel from which neighbours differ by so many ``times`` what they do on the surface around them."""
     more, beside = times[into], _beside(up, own, down, step)
-    doubts = [
-        states[place + _VARIANCE] + more * rough[place + lies] for *pair, lies in beside for place in pair
+    heard = [
+        [ONE / (states[place + _VARIANCE] + more * rough[place + lies]) for place in pair]
+        for *pair, lies in beside
     ]
-    first, second = _inverses(*doubts[:4]), _inverses(*doubts[4:])
-    heard = [first[:2], first[2:], second[:2], second[2:]]
     _mean(states, beside, heard, similarities, (own, of_up, of_own), step, averaged, into)
 
 
