@@ -43,7 +43,6 @@ _FARTHEST: Final = 6
 _LEAST_PIXELS: Final = 16
 """Of a part that belongs to a surface: a quarter. Single pixels have no neighbours on it to be averaged with."""
 
-
 BLOCK: Final = 32
 """Pixels of a row in a block: blocks without any that is averaged are skipped."""
 
