@@ -350,7 +350,8 @@ def _smooth_surfaces(
     level = state[0]
     # Filled in the blocks that are seen, or, the last three, at the pixels of the surface.
     variance, rough, near, left, more, far, independent = memory.empty((7, *level.shape))
-    _hear(*state, *subthreshold, surface.seen, variance, near, left)
+    filled = (plane.reshape(-1) for plane in (variance, near, left))
+    _hear(*(plane.reshape(-1) for plane in state), *subthreshold, level.shape[1], surface.seen, *filled)
     surface_variance(level, variance, surface, usual, pitch, rough)
     rougher_where_bright(level, surface.own, white, pitch, more)
     _average_surface((level, variance, rough, ONE, more), surface, pitch, pitch, near, left)
@@ -593,19 +594,19 @@ def _average_planes(  # type: ignore[no-untyped-def]
 
 @loop
 def _hear(  # type: ignore[no-untyped-def]
-    level, known, moving, change, of_silent, of_moving, seen, variance, near, left
+    level, known, moving, change, of_silent, of_moving, width, seen, variance, near, left
 ):
-    """Fill blocks that are seen: P with the variance of subthreshold changes, and both it and L once more."""
+    """Fill blocks that are seen, of flat planes: P with the variance of subthreshold changes; it and L once more."""
     rows, blocks = seen.shape
     for row in range(rows):
         for block in range(blocks):
             if seen[row, block]:
-                for i in range(
-                    np.uint64(BLOCK * block), np.uint64(smaller(BLOCK * (block + 1), level.shape[1]))
-                ):
-                    doubt = known[row, i] + (of_moving if moving[row, i] else of_silent * change[row, i])
-                    variance[row, i] = left[row, i] = smaller(doubt, _UNKNOWN)
-                    near[row, i] = level[row, i]
+                at = np.uint64(row * width + BLOCK * block)
+                for i in range(np.uint64(smaller(BLOCK, width - BLOCK * block))):
+                    unsignalled = of_moving if moving[at + i] else of_silent * change[at + i]
+                    variance[at + i] = smaller(known[at + i] + unsignalled, _UNKNOWN)
+                for i in range(np.uint64(smaller(BLOCK, width - BLOCK * block))):
+                    near[at + i], left[at + i] = level[at + i], variance[at + i]
 
 
 @loop

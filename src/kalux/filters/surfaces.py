@@ -9,12 +9,12 @@ import functools
 from typing import Final, NamedTuple
 
 import cv2
-import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.parts import PART, between_parts, part_grid, parts_of, weighted_sums
-from kalux.compiled import empty, inner, larger, loop, smaller
+from kalux.compiled import ONE, empty, inner, larger, loop, smaller
+from kalux.formulas import Number, Pixels, choose, row_formula, squared
 
 _INDEPENDENT: Final = np.float32(0.7)
 """Part of the variances of two neighbours that is in their difference: their errors have correlations of 0.1 to 0.5."""
@@ -49,6 +49,9 @@ BLOCK: Final = 32
 _REACH: Final = 4
 """Pixels around a surface that its means look at, at most, times the pitch of its pixels: neighbours twice as far away,
 and the patches around them. As many rows before a pixel's own are compared."""
+
+
+_FIRST: Final = np.uint64(0)
 
 
 class Surface(NamedTuple):
@@ -184,9 +187,8 @@ def surface_variance(
         what it is usually, which it is elsewhere.
     """
     excess, certainty = np.zeros((2, *part_grid(level.shape)))
-    _compare_neighbours(
-        level, variance, surface.mask.view(np.uint8), surface.own, usual, pitch, excess, certainty
-    )
+    flat = (plane.reshape(-1) for plane in (level, variance, surface.mask.view(np.uint8)))
+    _compare_neighbours(*flat, level.shape, surface.own, usual, pitch, excess, certainty)
     prior = _PRIOR_PAIRS / float(usual) ** 2
     found = (weighted_sums(excess, _FARTHEST) + prior * float(usual)) / (
         weighted_sums(certainty, _FARTHEST) + prior
@@ -211,8 +213,13 @@ def _spread(limited, surface, near, seen, usual, variances):  # type: ignore[no-
             variances[row, column] = variance
 
 
-@loop
-def rougher_where_bright(level, own, white, pitch, out):  # type: ignore[no-untyped-def]
+def rougher_where_bright(
+    level: NDArray[np.float32],
+    own: NDArray[np.bool_],
+    white: np.float32,
+    pitch: int,
+    out: NDArray[np.float32],
+) -> None:
     """Fill in by how many times that variance neighbours of a pixel differ from it, where it may be of a lamp.
 
     By the median of L, whose white is ``white``, of it and its eight neighbours, ``pitch`` apart, so that not where it
@@ -221,44 +228,88 @@ def rougher_where_bright(level, own, white, pitch, out):  # type: ignore[no-unty
     Parameters
     ----------
     level, out
-        (H, W) float32: L, around the blocks, and what is filled in.
+        (H, W): L, around the blocks, and what is filled in.
     own
         (H, B): the blocks that are filled.
     """
+    _fill_rougher(level, own, white, pitch, out.reshape(-1))
+
+
+@loop
+def _fill_rougher(level, own, white, pitch, out):  # type: ignore[no-untyped-def]
     height, width = level.shape
-    least, length = np.float32(_BRIGHT), width + 2 * pitch
+    length = width + 2 * pitch
     near = empty(3 * length, np.float32)  # three rows, with margins
+    step, row_step = np.uint64(pitch), np.uint64(length)
     for row in range(height):
-        begin, behind = next_run(own, row, 0, width)
+        begin, behind = next_run(own, row, np.int64(0), width)
         while begin < behind:
             end = smaller(behind, width)
-            brightest = least
             for k in range(3):
                 beside = row + (k - 1) * pitch
                 at = np.uint64(row if beside < 0 or beside >= height else beside)
-                into = np.uint64(k * length + begin + pitch)
+                into = np.uint64(k * length + pitch)
+                start = np.uint64(begin)
                 for i in range(np.uint64(end - begin)):
-                    near[into + i] = level[at, np.uint64(begin) + i] - white
+                    near[into + start + i] = level[at, start + i]
                 for i in range(pitch):
-                    left = begin - pitch + i
-                    near[into - np.uint64(pitch - i)] = level[at, left if left >= 0 else left + pitch] - white
-                    right = end + i
-                    near[into + np.uint64(right - begin)] = (
-                        level[at, right if right < width else right - pitch] - white
+                    left, right = begin - pitch + i, end + i
+                    before = np.uint64(left if left >= 0 else left + pitch)
+                    after = np.uint64(right if right < width else right - pitch)
+                    near[into + np.uint64(left)], near[into + np.uint64(right)] = (
+                        level[at, before],
+                        level[at, after],
                     )
-                for i in range(np.uint64(end - begin + 2 * pitch)):
-                    brightest = larger(brightest, near[into - np.uint64(pitch) + i])
-            at, start = np.uint64(row), np.uint64(begin)
-            if brightest == least:
-                for i in range(np.uint64(end - begin)):
-                    out[at, start + i] = np.float32(1.0)
-            else:
-                for i in range(np.uint64(end - begin)):
-                    beyond = _median(near, start + i, np.uint64(length), np.uint64(pitch))
-                    beyond = smaller(larger(beyond, least), np.float32(_BRIGHTEST))
-                    more = np.float32(1.0) + np.float32(_ROUGHER) * (beyond - least)
-                    out[at, start + i] = more * more
+            a = np.uint64(begin)
+            b, c = a + row_step, a + row_step + row_step
+            # fmt: off
+            _make_rougher(
+                np.uint64(end - begin), out, np.uint64(row * width + begin),
+                near, a, near, a + step, near, a + step + step,
+                near, b, near, b + step, near, b + step + step,
+                near, c, near, c + step, near, c + step + step, white,
+            )
+            # fmt: on
             begin, behind = next_run(own, row, behind, width)
+
+
+@row_formula
+def _make_rougher(
+    more: Pixels,
+    a: Pixels,
+    b: Pixels,
+    c: Pixels,
+    d: Pixels,
+    e: Pixels,
+    f: Pixels,
+    g: Pixels,
+    h: Pixels,
+    i: Pixels,
+    white: Number,
+) -> None:
+    """`rougher_where_bright` of a row, by L of three times three pixels."""
+    rows = (_sorted(*(row[0] for row in rows)) for rows in ((a, b, c), (d, e, f), (g, h, i)))
+    lowest, middle, highest = zip(*rows, strict=True)
+    # The median is that of the largest of the lowest, the middle one of the middle ones, the smallest of the highest.
+    median = _sorted(_sorted(*lowest)[2], _sorted(*middle)[1], _sorted(*highest)[0])[1]
+    beyond = _larger(median - white, median.like(np.float32(_BRIGHT)))
+    beyond = _smaller(beyond, beyond.like(np.float32(_BRIGHTEST))) - np.float32(_BRIGHT)
+    more[0] = squared(ONE + np.float32(_ROUGHER) * beyond)
+
+
+def _sorted(one: Number, two: Number, three: Number) -> tuple[Number, Number, Number]:
+    """From the least on."""
+    low, high = _smaller(one, two), _larger(one, two)
+    rest = _smaller(high, three)
+    return _smaller(low, three), _larger(low, rest), _larger(high, three)
+
+
+def _smaller(one: Number, other: Number) -> Number:
+    return choose(other < one, other, one)
+
+
+def _larger(one: Number, other: Number) -> Number:
+    return choose(other > one, other, one)
 
 
 @inner
@@ -276,89 +327,72 @@ def next_run(blocks, row, column, end):  # type: ignore[no-untyped-def]
     return first * BLOCK, block * BLOCK
 
 
-@nb.njit(cache=True, inline="always")
-def _median(values, at, row, step):  # type: ignore[no-untyped-def]
-    """Of three times three values, ``row`` and ``step`` apart, the first of which is ``at``."""
-    lowest, middle, highest = _sorted(values[at], values[at + row], values[at + row + row])
-    at += step
-    low, mid, high = _sorted(values[at], values[at + row], values[at + row + row])
-    at += step
-    lower, between, higher = _sorted(values[at], values[at + row], values[at + row + row])
-    # The largest of the lowest, the middle one of the middle ones, the smallest of the highest.
-    lowest = larger(larger(lowest, low), lower)
-    middle = _sorted(middle, mid, between)[1]
-    highest = smaller(smaller(highest, high), higher)
-    return _sorted(lowest, middle, highest)[1]
-
-
-@nb.njit(cache=True, inline="always")
-def _sorted(one, two, three):  # type: ignore[no-untyped-def]
-    """Three numbers, from the least on."""
-    low, high = smaller(one, two), larger(one, two)
-    rest = smaller(high, three)
-    return smaller(low, three), larger(low, rest), larger(high, three)
-
-
 @loop
 def _compare_neighbours(  # type: ignore[no-untyped-def]
-    level, variance, surface, own, usual, pitch, excess, certainty
+    level, variance, surface, shape, own, usual, pitch, excess, certainty
 ):
     """Sums over pairs, in every part: by how much squares exceed the noise, and what they would for a variance of 1.
 
-    A pair of which both are on the surface counts for the first of them, else for the one that is.
+    A pair of which both are on the surface counts for the first of them, else for the one that is. The first three
+    planes, of ``shape``, are flattened.
     """
-    height, width = level.shape
+    height, width = shape
     more, sure = empty(width, np.float64), empty(width, np.float64)
     surplus, certain = empty(width, np.float32), empty(width, np.float32)
-    rim = empty(width, np.uint8)  # pixels of which the one before is not on the surface
+    counts = empty(width, np.uint8)
     for row in range(height):
-        begin, behind = next_run(own, row, 0, width)
+        begin, behind = next_run(own, row, np.int64(0), width)
         while begin < behind:
             end = smaller(behind, width)
             for i in range(np.uint64(begin), np.uint64(end)):
                 more[i], sure[i] = 0.0, 0.0
             for k in range(9):
                 down, right = (k // 3 - 1) * pitch, (k % 3 - 1) * pitch
-                if k == 4 or row + down < 0 or row + down >= height:
+                first, last = larger(begin, -right), smaller(end, width - right)
+                if k == 4 or row + down < 0 or row + down >= height or first >= last:
                     continue
-                here, there, aside = np.uint64(row), np.uint64(row + down), np.uint64(right)
-                first, last = np.uint64(larger(begin, -right)), np.uint64(smaller(end, width - right))
-                distance2 = np.float32(down * down + right * right)
-                if k < 4:
-                    some = np.uint8(0)
-                    for i in range(first, last):
-                        rim[i] = surface[here, i] > surface[there, i + aside]
-                        some |= rim[i]
-                    if some:
-                        for i in range(first, last):
-                            if rim[i]:
-                                one, doubt = level[here, i], variance[here, i]
-                                other, noise = level[there, i + aside], variance[there, i + aside]
-                                pair = _excess_of_pair(one, other, doubt, noise, usual, distance2)
-                                more[i] += np.float64(pair[0])
-                                sure[i] += np.float64(pair[1])
+                at, size = np.uint64(first), np.uint64(last - first)
+                here, there = np.uint64(row * width + first), np.uint64((row + down) * width + first + right)
+                is_before, some = np.uint8(k < 4), np.uint8(0)
+                for i in range(size):
+                    counts[i] = surface[here + i] > (surface[there + i] & is_before)
+                for i in range(size):
+                    some |= counts[i]
+                if some == np.uint8(0):
                     continue
-                for i in range(first, last):
-                    one, doubt = level[here, i], variance[here, i]
-                    other, noise = level[there, i + aside], variance[there, i + aside]
-                    pair = _excess_of_pair(one, other, doubt, noise, usual, distance2)
-                    surplus[i], certain[i] = pair
-                for i in range(first, last):
-                    more[i] += np.float64(surplus[i])
-                    sure[i] += np.float64(certain[i])
+                # fmt: off
+                _excess_of_pairs(
+                    size, surplus, _FIRST, certain, _FIRST, level, here, level, there, variance, here, variance, there,
+                    usual, np.float32(down * down + right * right),
+                )
+                # fmt: on
+                for i in range(size):
+                    more[at + i] += np.float64(surplus[i]) if counts[i] else 0.0
+                for i in range(size):
+                    sure[at + i] += np.float64(certain[i]) if counts[i] else 0.0
             for i in range(begin, end):
-                if surface[row, i]:
+                if surface[row * width + i]:
                     excess[row // PART, i // PART] += more[i]
                     certainty[row // PART, i // PART] += sure[i]
             begin, behind = next_run(own, row, behind, width)
 
 
-@nb.njit(cache=True, inline="always")
-def _excess_of_pair(one, other, doubt, noise, usual, distance2):  # type: ignore[no-untyped-def]
-    """The terms of both sums of a pair of pixels, of levels ``one`` and ``other`` with variances, and how certain."""
-    explained = doubt + noise
+@row_formula
+def _excess_of_pairs(
+    surplus: Pixels,
+    certain: Pixels,
+    one: Pixels,
+    other: Pixels,
+    doubt: Pixels,
+    noise: Pixels,
+    usual: Number,
+    distance2: Number,
+) -> None:
+    """The terms of both sums, of pairs of L, their variances, and the square of their distance."""
+    explained = doubt[0] + noise[0]
     expected = explained + usual * distance2
-    difference = other - one
-    square = smaller(difference * difference, _EDGE * expected)
+    difference = other[0] - one[0]
+    square = _smaller(difference * difference, _EDGE * expected)
     weight = distance2 / (expected * expected)
-    return weight * (square - _INDEPENDENT * explained), weight * distance2
+    surplus[0] = weight * (square - _INDEPENDENT * explained)
+    certain[0] = weight * distance2
