@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.parts import PART, between_parts, part_grid, parts_of, weighted_sums
-from kalux.compiled import ONE, empty, inner, larger, loop, smaller
+from kalux.compiled import ONE, empty, inner, loop, smaller
 from kalux.formulas import Number, Pixels, choose, row_formula, squared
 
 _INDEPENDENT: Final = np.float32(0.7)
@@ -49,9 +49,6 @@ BLOCK: Final = 32
 _REACH: Final = 4
 """Pixels around a surface that its means look at, at most, times the pitch of its pixels: neighbours twice as far away,
 and the patches around them. As many rows before a pixel's own are compared."""
-
-
-_FIRST: Final = np.uint64(0)
 
 
 class Surface(NamedTuple):
@@ -187,8 +184,7 @@ def surface_variance(
         what it is usually, which it is elsewhere.
     """
     excess, certainty = np.zeros((2, *part_grid(level.shape)))
-    flat = (plane.reshape(-1) for plane in (level, variance, surface.mask.view(np.uint8)))
-    _compare_neighbours(*flat, level.shape, surface.own, usual, pitch, excess, certainty)
+    _compare_neighbours(level, variance, surface.pixels, surface.mask, usual, pitch, excess, certainty)
     prior = _PRIOR_PAIRS / float(usual) ** 2
     found = (weighted_sums(excess, _FARTHEST) + prior * float(usual)) / (
         weighted_sums(certainty, _FARTHEST) + prior
@@ -329,70 +325,31 @@ def next_run(blocks, row, column, end):  # type: ignore[no-untyped-def]
 
 @loop
 def _compare_neighbours(  # type: ignore[no-untyped-def]
-    level, variance, surface, shape, own, usual, pitch, excess, certainty
+    level, variance, pixels, surface, usual, pitch, excess, certainty
 ):
     """Sums over pairs, in every part: by how much squares exceed the noise, and what they would for a variance of 1.
 
-    A pair of which both are on the surface counts for the first of them, else for the one that is. The first three
-    planes, of ``shape``, are flattened.
+    A pair of which both are on the surface counts for the first of them, else for the one that is.
     """
-    height, width = shape
-    more, sure = empty(width, np.float64), empty(width, np.float64)
-    surplus, certain = empty(width, np.float32), empty(width, np.float32)
-    counts = empty(width, np.uint8)
-    for row in range(height):
-        begin, behind = next_run(own, row, np.int64(0), width)
-        while begin < behind:
-            end = smaller(behind, width)
-            for i in range(np.uint64(begin), np.uint64(end)):
-                more[i], sure[i] = 0.0, 0.0
-            for k in range(9):
-                down, right = (k // 3 - 1) * pitch, (k % 3 - 1) * pitch
-                first, last = larger(begin, -right), smaller(end, width - right)
-                if k == 4 or row + down < 0 or row + down >= height or first >= last:
-                    continue
-                at, size = np.uint64(first), np.uint64(last - first)
-                here, there = np.uint64(row * width + first), np.uint64((row + down) * width + first + right)
-                is_before, some = np.uint8(k < 4), np.uint8(0)
-                for i in range(size):
-                    counts[i] = surface[here + i] > (surface[there + i] & is_before)
-                for i in range(size):
-                    some |= counts[i]
-                if some == np.uint8(0):
-                    continue
-                # fmt: off
-                _excess_of_pairs(
-                    size, surplus, _FIRST, certain, _FIRST, level, here, level, there, variance, here, variance, there,
-                    usual, np.float32(down * down + right * right),
-                )
-                # fmt: on
-                for i in range(size):
-                    more[at + i] += np.float64(surplus[i]) if counts[i] else 0.0
-                for i in range(size):
-                    sure[at + i] += np.float64(certain[i]) if counts[i] else 0.0
-            for i in range(begin, end):
-                if surface[row * width + i]:
-                    excess[row // PART, i // PART] += more[i]
-                    certainty[row // PART, i // PART] += sure[i]
-            begin, behind = next_run(own, row, behind, width)
-
-
-@row_formula
-def _excess_of_pairs(
-    surplus: Pixels,
-    certain: Pixels,
-    one: Pixels,
-    other: Pixels,
-    doubt: Pixels,
-    noise: Pixels,
-    usual: Number,
-    distance2: Number,
-) -> None:
-    """The terms of both sums, of pairs of L, their variances, and the square of their distance."""
-    explained = doubt[0] + noise[0]
-    expected = explained + usual * distance2
-    difference = other[0] - one[0]
-    square = _smaller(difference * difference, _EDGE * expected)
-    weight = distance2 / (expected * expected)
-    surplus[0] = weight * (square - _INDEPENDENT * explained)
-    certain[0] = weight * distance2
+    height, width = level.shape
+    for pixel in pixels:
+        row, column = pixel // width, pixel % width
+        one, noise = level[row, column], variance[row, column]
+        more, sure = 0.0, 0.0
+        for k in range(9):
+            down, right = k // 3 - 1, k % 3 - 1
+            other, beside = row + down * pitch, column + right * pitch
+            if k == 4 or other < 0 or beside < 0 or other >= height or beside >= width:
+                continue
+            if k < 4 and surface[other, beside]:  # this pair has been counted
+                continue
+            distance2 = np.float32((down * down + right * right) * pitch * pitch)
+            explained = noise + variance[other, beside]
+            expected = explained + usual * distance2
+            difference = level[other, beside] - one
+            square = smaller(difference * difference, _EDGE * expected)
+            weight = distance2 / (expected * expected)
+            more += np.float64(weight * (square - _INDEPENDENT * explained))
+            sure += np.float64(weight * distance2)
+        excess[row // PART, column // PART] += more
+        certainty[row // PART, column // PART] += sure
