@@ -359,3 +359,22 @@ def test_surfaces_depend_on_nothing_beyond_what_their_means_look_at(pitch, monke
     monkeypatch.setattr(surfaces, "_blocks", lambda mask: np.ones((len(mask), -(-mask.shape[1] // 32)), bool))
     for plane, expected in zip(of_blocks, found(), strict=True):
         np.testing.assert_array_equal(plane, expected)
+
+
+@pytest.mark.parametrize("pitch", [1, 2])
+def test_surfaces_are_the_same_where_strips_meet(pitch):
+    """Wide images are averaged 640 columns at a time: what lies across is as it is elsewhere."""
+    rng = np.random.default_rng(7)
+    level, variance = rng.normal(-1.0, 0.3, (24, 720)), np.exp(rng.normal(-3.0, 1.0, (24, 720)))
+    surface = np.zeros(level.shape, bool)
+    surface[3:20, 600:690] = rng.random((17, 90)) < 0.8
+
+    def found(aside):
+        """With all moved to the left."""
+        told, doubt, mask = (np.roll(plane, -aside, axis=1) for plane in (level, variance, surface))
+        options = {"moving": mask, "difference": 0.2, "pitch": pitch, "unmeasured": unmeasured(mask)}
+        planes = read_out(told, doubt, 0.0, OFF._replace(white=-4.0), **options)[:2]
+        return [np.roll(plane, aside, axis=1)[surface] for plane in planes]
+
+    for plane, elsewhere in zip(found(0), found(80), strict=True):
+        np.testing.assert_allclose(plane, elsewhere, rtol=1e-5)
