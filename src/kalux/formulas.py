@@ -167,6 +167,16 @@ def choose(condition: Number, one: Number, other: Number) -> Number:
     return Number(one.builder, one.kind, value)
 
 
+def smaller_of(one: Number, other: Number | np.float32) -> Number:
+    """The smaller of two, in a formula; the ``other`` may be a constant."""
+    return choose(one < other, one, one.like(other))
+
+
+def larger_of(one: Number, other: Number | np.float32) -> Number:
+    """The larger of two, likewise."""
+    return choose(one > other, one, one.like(other))
+
+
 def squared(value: Number) -> Number:
     """The value times itself, computed once where it is an expression."""
     return value * value

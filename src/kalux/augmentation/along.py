@@ -22,7 +22,7 @@ from kalux import memory
 from kalux.augmentation.bridge import UNMEASURED, Latent, bridge_variance
 from kalux.augmentation.resampling import BORDER, read_row
 from kalux.compiled import FUSED, ONE, empty, loop
-from kalux.formulas import Number, Pixels, Row, choose, formula, row_formula, squared
+from kalux.formulas import Number, Pixels, Row, choose, formula, larger_of, row_formula, squared
 
 Floats = NDArray[np.floating[Any]]
 Plane = NDArray[np.float32]
@@ -392,7 +392,7 @@ def _place(at: Number, most: Number) -> tuple[Number, Number]:
     below = (at - _LEAST).to(types.int32) + np.int32(_LEAST)
     # A little before a pixel at - _LEAST may be rounded to it. A negative share of a variance of `UNMEASURED` would be
     # less than all that is known of its neighbour.
-    return below, _larger(at - below.to(types.float32), np.float32(0.0))
+    return below, larger_of(at - below.to(types.float32), np.float32(0.0))
 
 
 @row_formula
@@ -440,8 +440,8 @@ def _stray(
 @row_formula
 def _doubt(doubt: Pixels, local_around: Pixels, difference_around: Pixels, unmoved: Pixels) -> None:
     """The variance of what is seen, in place of the frames' own part: the larger the less the motion explains."""
-    explained = ONE - _mean_of_five(difference_around) / _larger(unmoved[0], _LEAST_UNMOVED)
-    doubt[0] = (doubt[0] + _mean_of_three(local_around)) / _larger(explained, _LEAST_MOVING)
+    explained = ONE - _mean_of_five(difference_around) / larger_of(unmoved[0], _LEAST_UNMOVED)
+    doubt[0] = (doubt[0] + _mean_of_three(local_around)) / larger_of(explained, _LEAST_MOVING)
 
 
 @row_formula
@@ -469,15 +469,11 @@ def _join(
 ) -> None:
     """The image joined with what is seen, and its variance, in place of this."""
     contradicted = _mean_of_five(contradiction_around)
-    believed = doubt[0] * squared(ONE + _CONTRADICTED * _larger(contradicted - ONE, np.float32(0.0)))
+    believed = doubt[0] * squared(ONE + _CONTRADICTED * larger_of(contradicted - ONE, np.float32(0.0)))
     kept = believed / (variance[0] + believed)
     seen[0] = seen[0] + kept * (level[0] - seen[0])
     doubted = (doubt[0] + strayed[0]) * squared(ONE + _DISTRUST * contradicted)
     doubt[0] = doubted / (variance[0] + doubted) * variance[0]
-
-
-def _larger(one: Number, other: np.float32) -> Number:
-    return choose(one > other, one, one.like(other))
 
 
 def _mean_of_three(sums: Pixels) -> Number:

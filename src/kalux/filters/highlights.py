@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.highlights import Unshown, of_both
-from kalux.compiled import ONE, exponential, larger, loop, smaller
+from kalux.compiled import ONE, empty, exponential, larger, loop, smaller
 from kalux.filters.readout import HighlightPrior, read_levels
 from kalux.filters.surfaces import Unmeasured
 
@@ -155,24 +155,17 @@ def calm_specks(
     """
     if len(unmeasured.pixels) == 0:
         return
-    known = variance.astype(np.float32, copy=False)
-    inside = unmeasured.mask.reshape(-1)
-    calmed = np.empty(len(unmeasured.pixels), np.float32)
-    _calm(
-        image.reshape(-1),
-        known.reshape(-1),
-        np.float32(log_offset),
-        unmeasured.pixels,
-        inside,
-        image.shape,
-        calmed,
+    planes = (
+        plane.reshape(-1) for plane in (image, variance.astype(np.float32, copy=False), unmeasured.mask)
     )
+    _calm(*planes, np.float32(log_offset), unmeasured.pixels, image.shape)
 
 
 @loop
-def _calm(image, variance, log_offset, unmeasured, inside, shape, calmed):  # type: ignore[no-untyped-def]
-    """Take those of the ``unmeasured`` pixels of ``image`` down that are too bright. ``calmed`` is scratch memory."""
+def _calm(image, variance, inside, log_offset, unmeasured, shape):  # type: ignore[no-untyped-def]
+    """Take those of the ``unmeasured`` pixels of ``image`` down that are too bright."""
     height, width = shape
+    calmed = empty(len(unmeasured), np.float32)
     for k in range(len(unmeasured)):
         pixel = unmeasured[k]
         calmed[k] = image[pixel]

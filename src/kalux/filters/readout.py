@@ -666,21 +666,17 @@ def _load_surface(  # type: ignore[no-untyped-def]
 
     Of the blocks that are ``seen``, also of those beside the strip, since a margin is as wide as one.
     """
-    _, _, place, size = _part_of_row(level, row, begin, count, states)
-    if size:
-        place = np.uint64(row % count) * _TWO + np.uint64(_MARGIN)
-        start = begin // BLOCK
-        for block in range(larger(start - 1, 0), smaller(start + _STRIP // BLOCK + 1, seen.shape[1])):
-            if seen[row, block]:
-                at = np.uint64(BLOCK * block)
-                into = place + np.uint64(BLOCK * block - begin)
-                for i in range(np.uint64(smaller(BLOCK, level.shape[1] - BLOCK * block))):
-                    states[into + _LEVEL + i] = level[row, at + i]
-                    states[into + _VARIANCE + i] = variance[row, at + i]
-                for i in range(np.uint64(smaller(BLOCK, level.shape[1] - BLOCK * block))):
-                    near = larger(allowed[row, at + i] * factor * np.float32(pitch * pitch), _LEAST_ALLOWED)
-                    rough[into + _STRAIGHT + i] = near
-                    rough[into + _DIAGONAL + i] = near + near
+    at, start, into, size = _part_of_row(level, row, begin, count, states)
+    for first in range(np.uint64(0), size, np.uint64(BLOCK)):
+        column, place = start + first, into + first
+        if seen[at, column // np.uint64(BLOCK)]:
+            for i in range(smaller(size - first, np.uint64(BLOCK))):
+                states[place + _LEVEL + i] = level[at, column + i]
+                states[place + _VARIANCE + i] = variance[at, column + i]
+            for i in range(smaller(size - first, np.uint64(BLOCK))):
+                near = larger(allowed[at, column + i] * factor * np.float32(pitch * pitch), _LEAST_ALLOWED)
+                rough[place + _STRAIGHT + i] = near
+                rough[place + _DIAGONAL + i] = near + near
 
 
 @nb.njit(cache=True, inline="always")

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from kalux.augmentation.parts import PART, between_parts, part_grid, parts_of, weighted_sums
 from kalux.compiled import ONE, empty, inner, loop, smaller
-from kalux.formulas import Number, Pixels, choose, row_formula, squared
+from kalux.formulas import Number, Pixels, larger_of, row_formula, smaller_of, squared
 
 _INDEPENDENT: Final = np.float32(0.7)
 """Part of the variances of two neighbours that is in their difference: their errors have correlations of 0.1 to 0.5."""
@@ -44,7 +44,7 @@ _LEAST_PIXELS: Final = 16
 """Of a part that belongs to a surface: a quarter. Single pixels have no neighbours on it to be averaged with."""
 
 BLOCK: Final = 32
-"""Pixels of a row in a block: blocks without any that is averaged are skipped."""
+"""Pixels of a row in a block: blocks without any that is averaged, or without highlights, are skipped."""
 
 _REACH: Final = 4
 """Pixels around a surface that its means look at, at most, times the pitch of its pixels: neighbours twice as far away,
@@ -240,12 +240,11 @@ def _fill_rougher(level, own, white, pitch, out):  # type: ignore[no-untyped-def
     for row in range(height):
         begin, behind = next_run(own, row, np.int64(0), width)
         while begin < behind:
-            end = smaller(behind, width)
+            end, start = smaller(behind, width), np.uint64(begin)
             for k in range(3):
                 beside = row + (k - 1) * pitch
                 at = np.uint64(row if beside < 0 or beside >= height else beside)
                 into = np.uint64(k * length + pitch)
-                start = np.uint64(begin)
                 for i in range(np.uint64(end - begin)):
                     near[into + start + i] = level[at, start + i]
                 for i in range(pitch):
@@ -256,14 +255,13 @@ def _fill_rougher(level, own, white, pitch, out):  # type: ignore[no-untyped-def
                         level[at, before],
                         level[at, after],
                     )
-            a = np.uint64(begin)
-            b, c = a + row_step, a + row_step + row_step
+            above, here, below = start, start + row_step, start + row_step + row_step
             # fmt: off
             _make_rougher(
                 np.uint64(end - begin), out, np.uint64(row * width + begin),
-                near, a, near, a + step, near, a + step + step,
-                near, b, near, b + step, near, b + step + step,
-                near, c, near, c + step, near, c + step + step, white,
+                near, above, near, above + step, near, above + step + step,
+                near, here, near, here + step, near, here + step + step,
+                near, below, near, below + step, near, below + step + step, white,
             )
             # fmt: on
             begin, behind = next_run(own, row, behind, width)
@@ -288,24 +286,15 @@ def _make_rougher(
     lowest, middle, highest = zip(*rows, strict=True)
     # The median is that of the largest of the lowest, the middle one of the middle ones, the smallest of the highest.
     median = _sorted(_sorted(*lowest)[2], _sorted(*middle)[1], _sorted(*highest)[0])[1]
-    beyond = _larger(median - white, median.like(np.float32(_BRIGHT)))
-    beyond = _smaller(beyond, beyond.like(np.float32(_BRIGHTEST))) - np.float32(_BRIGHT)
-    more[0] = squared(ONE + np.float32(_ROUGHER) * beyond)
+    beyond = smaller_of(larger_of(median - white, np.float32(_BRIGHT)), np.float32(_BRIGHTEST))
+    more[0] = squared(ONE + np.float32(_ROUGHER) * (beyond - np.float32(_BRIGHT)))
 
 
 def _sorted(one: Number, two: Number, three: Number) -> tuple[Number, Number, Number]:
     """From the least on."""
-    low, high = _smaller(one, two), _larger(one, two)
-    rest = _smaller(high, three)
-    return _smaller(low, three), _larger(low, rest), _larger(high, three)
-
-
-def _smaller(one: Number, other: Number) -> Number:
-    return choose(other < one, other, one)
-
-
-def _larger(one: Number, other: Number) -> Number:
-    return choose(other > one, other, one)
+    low, high = smaller_of(one, two), larger_of(one, two)
+    rest = smaller_of(high, three)
+    return smaller_of(low, three), larger_of(low, rest), larger_of(high, three)
 
 
 @inner
