@@ -16,7 +16,7 @@ from kalux.calibration.global_thresholds import (
     refine_thresholds,
     with_true_delay,
 )
-from kalux.datasets import SensorSettings, demo_scene, simulate, static
+from kalux.datasets import SensorSettings, demo_scene, pan, photograph_scene, simulate, static
 from kalux.datasets.ahdr import ArtificialCamera, artificial_hdr
 from kalux.datasets.scenes import Scene
 from kalux.errors import ExposureError
@@ -24,6 +24,7 @@ from kalux.events import make_events
 from kalux.settings import CameraSettings
 
 from builders import dark_scene, events, moving_blocks, quick_frames, unlabelled
+from builders import textured as textured_picture
 
 CAMERA = CameraSettings()
 USUAL = Usual(0.25, 0.25, 0.5)
@@ -276,6 +277,34 @@ def test_no_refractory_period_is_found_where_nothing_is_lost():
     """Nor on edges of surfaces without texture, where the first event of each tells less than the others."""
     for recording in (textured(), unlabelled(moving_blocks(0.08, 0.9, size=SIZE))):
         assert estimate_thresholds(recording, CAMERA, USUAL, refractory_period=None).refractory_period == 0
+
+
+def textured_and_fast(**sensor):
+    """Surfaces of four pixels that pass at 500 pixels/s."""
+    scene = photograph_scene(textured_picture(0.8), pan(500.0), sensor_size=(48, 64), duration=400_000)
+    settings = SensorSettings(threshold_on=0.15, threshold_off=0.15, exposure=2_000, frame_rate=30, **sensor)
+    return unlabelled(simulate(scene, settings, seed=1))
+
+
+def test_known_thresholds_tell_the_period_where_no_event_is_late():
+    """Late events have lost nearly as much as others here: by these alone 0.88 ms are found."""
+    lossy, camera = textured_and_fast(refractory=1_000.0), CameraSettings(log_offset=0.004)
+    known = Usual(0.15, 0.15, 0.0)
+    found = estimate_thresholds(lossy, camera, known, refractory_period=None)
+    assert found.refractory_period == pytest.approx(1_030, rel=0.04)
+    assert 0 < found.refractory_spread < 0.05
+    refined = refine_thresholds(lossy, camera, known, found, refractory_period=None)
+    assert refined.refractory_period == pytest.approx(found.refractory_period, rel=0.03)
+    unknown = estimate_thresholds(lossy, camera, USUAL, refractory_period=None)
+    assert unknown.refractory_period < 950
+
+
+@pytest.mark.parametrize("share", [0.5, 0.8])
+def test_thresholds_that_are_known_wrongly_are_not_taken_for_a_period(share):
+    """Events seem to tell too little then, too, but no period explains what the frames show."""
+    recording, camera = textured_and_fast(), CameraSettings(log_offset=0.004)
+    known = Usual(share * 0.15, share * 0.15, 0.0)
+    assert estimate_thresholds(recording, camera, known, refractory_period=None).refractory_period == 0
 
 
 def test_hot_pixels_hide_no_refractory_period():
