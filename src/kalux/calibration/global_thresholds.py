@@ -109,27 +109,25 @@ _LARGEST_SPREAD: Final = 1.0  # relative: nothing is known of the refractory per
 
 _LEAST_MISSING: Final = 0.1
 """Logarithm of the factor by which known thresholds seem too large, from which a period is found by what events are
-worth in sum. Of seven simulated scenes with less it is found 13 to 92 % too short, of 59 others up to 22 % too short and
-14 % too long, 7 % in the root mean square."""
+worth in sum. Of seven simulated scenes with less it is found 13 to 92 % too short, of 59 others up to 22 % too short
+and 14 % too long, 7 % in the root mean square."""
 
 _EVEN: Final = -0.01
 """The same under the true period. On three scenes in which nothing is lost events seem to be worth 3 to 6 % too much;
 with 0, periods that hide little (up to 0.2 of the logarithm) are found 5 % too short in the median of 16 scenes."""
 
-_OF_EVEN: Final = 0.985
-"""Period by which what is hidden is counted, over that. Where much is hidden this is 1.04 of the true one in the median,
-and 1.02 to 1.04 of that is to be counted (docs/equations.md, K13)."""
-
 _SUMS_ERROR: Final = 0.03
 _WORTH_ERROR: Final = 0.025
-"""Relative errors, of the period found in this way and of the thresholds that it is found by: together 0.05 where these
-seem half too large, as on 33 scenes, and more the less is hidden."""
+"""Relative errors, of the period found in this way and of the thresholds that it is found by: together 0.06 where these
+seem half too large, as large as on 33 scenes, and more the less is hidden."""
 
 _ROUGH: Final = 0.09
+"""Relative error from which this period counts only if the other one's is larger: thresholds seem less than a third too
+large. In a dark scene with 1 ms (1.25 times too large) it is 1.24 ms, and 1.05 ms by late events and others."""
 
 _EXCESS_ERROR: Final = 0.06
-"""Relative error of the period by late events and others, beside that which their regression tells: 5 % in the root mean
-square on 64 simulated scenes, more on six others."""
+"""Relative error of the period by late events and others, beside that which their regression tells: 7 % in the root
+mean square on 82 simulated scenes, more on six others."""
 
 _BETTER: Final = 0.95
 """Share of the residual by larger thresholds that a period may leave to be believed; either has one number to explain
@@ -698,7 +696,7 @@ def _period_of_sums(sampling: _Sampling) -> Period | None:
     missing = np.minimum.accumulate([np.log(fit.solution / known).mean() for fit in found])
     if not missing[-1] < _EVEN < _LEAST_MISSING < missing[0]:
         return None
-    length = round(_OF_EVEN * float(np.interp(-_EVEN, -missing, periods)))
+    length = round(float(np.interp(-_EVEN, -missing, periods)))
     told = sampling.samples(length, most=_PERIOD_SAMPLES)
     unexplained = robust_deviation(told.steps.change - told.explained(0) @ known)
     if not unexplained < _BETTER * found[0].residual:
