@@ -349,23 +349,34 @@ def _with_period(
 ) -> tuple[_Sampling, Period] | None:
     """The refractory period, and the sampling with the true delay under it; None where nothing speaks for one.
 
-    By late events and those that follow soon, if they differ, ``by_excess``, and by what all events are worth where
-    thresholds are known; by both in proportion to what they tell. ``delay`` is that of `_estimate`.
+    Parameters are those of `_period`; ``delay`` is that of `_estimate`.
     """
+    period = None
+    for _ in range(2 if delay is not None else 1):
+        period = _period(sampling, usual, by_excess=by_excess)
+        if period is None:
+            return None
+        sampling = sampling if delay is None else sampling.without_trailing(delay, period.length)
+    assert period is not None
+    return sampling, period
 
-    def find() -> Period | None:
-        of_excess = _period_without_excess(sampling) if by_excess else None
-        of_sums = _period_of_sums(sampling) if usual.spread == 0 else None
-        if of_excess is None or of_sums is None:
-            return of_excess or of_sums
-        return _joined(of_excess, of_sums)
 
-    period = find()
-    if period is None or delay is None:
-        return None if period is None else (sampling, period)
-    sampling = sampling.without_trailing(delay, period.length)
-    period = find()
-    return None if period is None else (sampling.without_trailing(delay, period.length), period)
+def _period(sampling: _Sampling, usual: Usual, *, by_excess: bool) -> Period | None:
+    """The refractory period; None where nothing speaks for one.
+
+    By late events and those that follow soon, if they differ, ``by_excess``, and by what all events are worth where
+    thresholds are known; by both in proportion to what they tell.
+    """
+    known = usual.spread == 0
+    if not (by_excess or known):
+        return None
+    periods = possible_periods(sampling.shortest)
+    samples = sampling.samples(*periods, most=_PERIOD_SAMPLES)
+    of_excess = _period_without_excess(samples, periods) if by_excess else None
+    of_sums = _period_of_sums(sampling, samples, periods) if known else None
+    if of_excess is None or of_sums is None:
+        return of_excess or of_sums
+    return _joined(of_excess, of_sums)
 
 
 def _joined(of_excess: Period, of_sums: Period) -> Period:
@@ -483,6 +494,10 @@ class _Samples(NamedTuple):
     def counts_around(self, index: int) -> Array:
         """(N, 2) the same of their neighbours."""
         return self.columns(self.steps.events_around, index)
+
+    def fit_by_counts(self, index: int) -> Fit | None:
+        """The regression of the pixels' changes on their events, by their neighbours', under a refractory period."""
+        return two_stage(self.steps.change, self.explained(index), self.counts_around(index))
 
     def changes_around(self) -> Array:
         """(N, 2) the neighbours' changes, upwards and downwards."""
@@ -631,7 +646,7 @@ def _fit_late_and_soon(samples: _Samples, index: int, *, by_changes: bool = Fals
     The neighbours tell by their events, or ``by_changes``: by their changes in frames, split as their steps are.
     """
     known = samples.steps
-    fit = two_stage(known.change, samples.explained(index), samples.counts_around(index))
+    fit = samples.fit_by_counts(index)
     if fit is None:
         return None
     on, off = fit.solution
@@ -649,10 +664,11 @@ def _fit_late_and_soon(samples: _Samples, index: int, *, by_changes: bool = Fals
     return None if again is None or not again.solution[0] > 0 else _LateAndSoon(explained, instruments, again)
 
 
-def _period_without_excess(sampling: _Sampling) -> Period | None:
-    """The refractory period under which events that follow soon have the steps of late ones; None if unknown, or 0."""
-    periods = possible_periods(sampling.shortest)
-    samples = sampling.samples(*periods, most=_PERIOD_SAMPLES)
+def _period_without_excess(samples: _Samples, periods: tuple[int, ...]) -> Period | None:
+    """The refractory period under which events that follow soon have the steps of late ones; None if unknown, or 0.
+
+    Of the ``samples`` under several ``periods``, us.
+    """
     fits = [_fit_late_and_soon(samples, index, by_changes=True) for index in range(len(periods))]
     known = [fit for fit in fits if fit is not None]
     excess = np.array([fit.excess for fit in known])
@@ -674,21 +690,19 @@ def _period_without_excess(sampling: _Sampling) -> Period | None:
     return Period(length, min(spread, _LARGEST_SPREAD))
 
 
-def _period_of_sums(sampling: _Sampling) -> Period | None:
+def _period_of_sums(sampling: _Sampling, samples: _Samples, periods: tuple[int, ...]) -> Period | None:
     """The refractory period under which all events are worth the thresholds, which are known; None if there is none.
 
     Where light is fast, few events are late, and these have lost something, too, so that those that follow soon are
     worth no more (`_period_without_excess`). In sum events then tell too little, and thresholds seem larger than they
     are known to be. A period is believed if it explains the frames better than larger thresholds do.
+
+    Of the ``samples`` of a ``sampling`` under several ``periods``, us.
     """
-    periods, known = possible_periods(sampling.shortest), np.array(sampling.thresholds)
-    samples = sampling.samples(*periods, most=_PERIOD_SAMPLES)
+    known = np.array(sampling.thresholds)
     if len(samples.steps.change) < _MIN_SAMPLES:
         return None
-    fits = [
-        two_stage(samples.steps.change, samples.explained(index), samples.counts_around(index))
-        for index in range(len(periods))
-    ]
+    fits = [samples.fit_by_counts(index) for index in range(len(periods))]
     found = [fit for fit in fits if fit is not None and (fit.solution > 0).all()]
     if len(found) < len(periods):
         return None
