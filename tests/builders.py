@@ -64,7 +64,7 @@ VARIANTS = {
 def all_given() -> Settings:
     """The default settings, of which all that a plan would estimate is given, but contrast thresholds."""
     chosen = altered(PRESETS["default"], "events", delay=0, step_variance=0.2, refractory_period=0)
-    chosen = altered(chosen, "events", lag_variance=0.0)
+    chosen = altered(chosen, "events", lag_variance=0.0, dark_steps="none")
     chosen = altered(
         chosen, "events", threshold_spread=0.1, noise_rate=3.0, leave_out_hot=False, mend_layout=False
     )

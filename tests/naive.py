@@ -497,6 +497,7 @@ def bridged(pixel, settings, times, on, off, scales):
     pixel.latents.append(first)
     intervals = [(begin, pixel.middles[0], None, first, scale_on, scale_off, var_on, var_off, 0.0, SURE)]
     untold_from = {}  # K1: variance of what no event tells, of the interval that begins there
+    slow_from = {}  # K20: settings of events, with the variance of a step there
     moved_from = {}  # K1: by which its first frame is moved, of the mismatch
     for k in range(count - 1):
         second = latent(k + 1)
@@ -505,7 +506,8 @@ def bridged(pixel, settings, times, on, off, scales):
         a, b = pixel.middles[k], pixel.middles[k + 1]
         n_on, n_off = counts(a, b)
         signal = pixel.signal[k] if pixel.signal else SURE
-        q_on, q_off = (step_noise(f, ev) * c2 for f in signal)
+        slow_from[a] = in_the_dark(ev, first[0], second[0], i0) if pixel.signal else ev
+        q_on, q_off = (step_noise(f, slow_from[a]) * c2 for f in signal)
         told_on, told_off = signal[0] * n_on, signal[1] * n_off
         saturated = first[1] >= UNMEASURED and second[1] >= UNMEASURED and settings.filter.highlight_scale > 0
         mismatch = 0.0 if saturated else second[0] - first[0]
@@ -545,7 +547,9 @@ def bridged(pixel, settings, times, on, off, scales):
 
     def added(interval, k):  # what events and K14 add to the level in all of an interval
         n_on, n_off = counts(*interval[:2])
-        up, down = (own_step(interval, p, on, off, ev, c2, counts) for p in (True, False))
+        up, down = (
+            own_step(interval, p, on, off, slow_from.get(interval[0], ev), c2, counts) for p in (True, False)
+        )
         return n_on * up + n_off * down + grown(k, interval[1])
 
     def said(interval, k):  # K15: what the frames around say themselves of a clipped pixel, at the first
@@ -621,7 +625,7 @@ def bridged(pixel, settings, times, on, off, scales):
         (t_on, t_off), (n_on, n_off) = counts(a, known_until), counts(a, b)
         shared = moved_from[a] if min(left[1], right[1]) < UNMEASURED else 0.0  # two bounds measure nothing
         shared += v_on * (f_on * on) ** 2 * t_on * n_on + v_off * (f_off * off) ** 2 * t_off * n_off
-        shared += c2 * (step_noise(f_on, ev) * t_on + step_noise(f_off, ev) * t_off)
+        shared += c2 * (step_noise(f_on, slow_from[a]) * t_on + step_noise(f_off, slow_from[a]) * t_off)
         shared += untold_from[a] * (t - a) / (b - a)
         return prior + shared * gain
 
@@ -695,12 +699,14 @@ def bridged(pixel, settings, times, on, off, scales):
             joined = intervals[index][2] is not None and intervals[index][3] is not None
             signal = 1.0
             if pixel.signal and joined:  # K5; the steps of L^A are those that are expected
-                noise = step_noise(intervals[index][-1][0 if polarity else 1], ev)
+                told, f = slow_from[intervals[index][0]], intervals[index][-1][0 if polarity else 1]
+                noise = step_noise(f, told)
             else:
                 signal = 1 / (1 + (9 * ev.background_rate * (t - near) * US) ** 2)
                 noise = ev.step_noise + signal * (1 - signal)
             # Several events may share a time: this one alone moves L^A by its own step.
-            step = weight * own_step(intervals[index], polarity, on, off, ev, c2, counts)
+            slow = slow_from.get(intervals[index][0], ev)
+            step = weight * own_step(intervals[index], polarity, on, off, slow, c2, counts)
             q = weight * (c2 * noise + untied[index][0 if polarity else 1])
             state = (value + signal * step, variance + q)
             at = t
@@ -719,6 +725,16 @@ def bridged(pixel, settings, times, on, off, scales):
 def step_noise(signal, ev):
     """K5: variance of an event's step, in c^2, that is signal with a probability."""
     return signal * (ev.step_noise + 1 - signal)
+
+
+def in_the_dark(ev, first, second, i0):
+    """K20: settings of events with the variance that a step has by the mean of both frames' I."""
+    if ev.dark_steps in ("auto", "none"):
+        return ev
+    middles = np.log([0.32 / 2 ** (k + 0.5) for k in range(-1, 6)])
+    more = [0.0, *(float(part) for part in ev.dark_steps.split())]
+    level = max((np.exp(first) + np.exp(second)) / 2 - i0, 1e-9)
+    return replace(ev, step_variance=ev.step_noise + np.interp(-np.log(level), -middles, more))
 
 
 def signal_shares(every, k, settings):

@@ -75,6 +75,12 @@ VARIANTS = {
     "default-slow": dataclasses.replace(
         PRESETS["default"], events=dataclasses.replace(PRESETS["default"].events, lag_variance=2.5)
     ),
+    "default-slow-steps": dataclasses.replace(
+        PRESETS["default"],
+        events=dataclasses.replace(
+            PRESETS["default"].events, noise_rate=2.0, dark_steps="0.1 0.3 1.5 1.2 2 2.5"
+        ),
+    ),
     "default-trusted": dataclasses.replace(
         PRESETS["default"],
         events=dataclasses.replace(PRESETS["default"].events, extrapolation_trust=0.7),

@@ -350,6 +350,7 @@ OTHER_VALUES = {
     "camera.confidence": 1e5,
     "camera.weight_floor": 0.9,
     "events.step_variance": 0.4,
+    "events.dark_steps": "3 3 3 3 3 3",
     "events.lag_variance": 2.0,
     "events.refractory_period": 900,
     "events.refractory_spread": 0.5,

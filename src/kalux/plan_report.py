@@ -17,6 +17,7 @@ from kalux.calibration.frame_faults import FrameFaults
 from kalux.calibration.frame_times import FrameTimes
 from kalux.calibration.levels import Ceiling, find_ceiling
 from kalux.models.dark_levels import LIGHT_EDGES, dark_shares
+from kalux.models.dark_steps import BRIGHT, dark_steps
 from kalux.recording import Recording, less_black
 from kalux.settings import AUTO, EventSettings, Settings
 from kalux.wording import how_many
@@ -72,6 +73,13 @@ def _of_events(plan: Plan, asked: Settings) -> Iterator[tuple[str, str]]:
     if events.step_variance is not None:
         how = _step_origin(plan, asked.events.step_variance)
         yield "step", f"variance of one event {events.step_variance:g} c^2, c its threshold ({how})"
+    more = dark_steps(events.dark_steps)
+    if more is not None:
+        how = "measured" if asked.events.dark_steps == AUTO else _GIVEN
+        yield (
+            "dark steps",
+            f"variance of one event up to {max(more):g} c^2 more below {BRIGHT:g} of white ({how})",
+        )
     if events.lag_variance:
         how = _estimated(asked.events.lag_variance, True)
         yield "lag", f"of slow pixels at a moment {events.lag_variance:g} c^2 at 0.02 of white ({how})"

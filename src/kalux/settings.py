@@ -19,6 +19,9 @@ AUTO: Final = "auto"
 EVEN: Final = "even"
 """Of `FilterSettings.dark_shares`: nothing is known of how often frames show which dark light."""
 
+NO_DARK_STEPS: Final = "none"
+"""Of `EventSettings.dark_steps`: events of dark pixels are as good as others."""
+
 SolutionName = Literal["exact", "printed"]
 MotionName = Literal["auto", "on", "off"]
 
@@ -163,6 +166,11 @@ class EventSettings:
     step_variance
         Variance of one event's step in units of c^2. None: an estimate from the recording
         (`kalux.calibration.mismatch`).
+    dark_steps
+        By how much more the steps of dark pixels vary, c^2, where these are slow (docs/equations.md, K20): 6 numbers
+        with spaces between, for the octaves below 0.32 of white, the brightest first (`kalux.models.dark_steps`), or
+        ``"none"``. ``"auto"``: an estimate from the recording (`kalux.calibration.dark_steps`); none in causal mode
+        and in a live stream. For augmentation "bridge" and lookahead only.
     lag_variance
         Variance, c^2, by which pixels with events are off the light at a moment because they are slow, at 0.02 of
         white: more in the dark, less in the light (docs/equations.md, K11). It is in the variance of images between
@@ -234,6 +242,7 @@ class EventSettings:
     delay: int | None = None
     threshold_spread: float | None = None
     step_variance: float | None = None
+    dark_steps: str = AUTO
     lag_variance: float | None = None
     refractory_period: int | None = None
     refractory_spread: float | None = None
@@ -498,6 +507,7 @@ _USED_BY: Final[Mapping[str, tuple[str, ...]]] = {
             "camera.fixed_pattern",
             "camera.row_time",
             "events.step_variance",
+            "events.dark_steps",
             "events.lag_variance",
             "events.refractory_period",
             "events.refractory_spread",

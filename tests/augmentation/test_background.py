@@ -120,3 +120,11 @@ def test_doubt_by_hand():
     assert threshold_noise(0.2, 0.04, 1.0) + off[0, 0] == pytest.approx(0.5 * 0.2 * 0.04 + 0.25 * 0.04)
     none, _ = doubt((np.zeros((1, 1), np.float32),) * 2, 0.2 * 0.04, 0.04)
     assert threshold_noise(0.2, 0.04, 1.0) + none[0, 0] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_what_steps_vary_more_in_the_dark_counts_as_far_as_they_are_signal():
+    shares = tuple(np.full((1, 2), f, np.float32) for f in (1.0, 0.5))
+    dark = np.array([[0.0, 0.06]], np.float32)
+    plain, more = doubt(shares, 0.2 * 0.04, 0.04), doubt(shares, 0.2 * 0.04, 0.04, dark)
+    for without, with_dark, share in zip(plain, more, (1.0, 0.5), strict=True):
+        np.testing.assert_allclose(with_dark - without, [[0.0, share * 0.06]], atol=1e-8)

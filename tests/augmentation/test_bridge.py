@@ -143,6 +143,22 @@ def test_posterior_by_hand():
     np.testing.assert_allclose(reached(segment, 0, 0), 0.3, rtol=1e-12)
 
 
+def test_steps_of_dark_pixels_take_the_mismatch_as_if_all_varied_by_so_much():
+    first, second = latent([0.0, 0.0], 0.02), latent([0.9, 0.9], 0.03)
+    events, known = (counts(2, 2), counts(1, 1)), nominal_thresholds((1, 2), 0.1)
+    dark = np.array([[0.0, 0.05]], np.float32)
+    found, learned = bridge(first, second, events, known, NOISE, START, END, dark=dark)
+    for pixel, more in enumerate(dark[0]):
+        noise = NOISE._replace(step_variance=NOISE.step_variance + float(more))
+        expected, expected_thresholds = join(first, second, *events, known, noise)
+        for name in ("augmented", "slope", "step_on", "step_off"):
+            one, other = getattr(found, name)[0, pixel], getattr(expected, name)[0, pixel]
+            assert one == pytest.approx(other, rel=1e-12), name
+        for one, other in zip(learned, expected_thresholds, strict=True):
+            assert one[0, pixel] == pytest.approx(other[0, pixel], rel=1e-12)
+    assert found.augmented[0, 1] < found.augmented[0, 0]
+
+
 def test_the_threshold_takes_the_mismatch_where_it_is_what_is_unknown():
     """Then it is equation (12): four events of 0.3 nominal span 1.6, so each is a step of 0.4."""
     thresholds = nominal_thresholds((1, 1), 10.0)

@@ -10,6 +10,7 @@ from kalux.calibration.refractory import counted_period
 from kalux.datasets import SensorSettings, demo_scene, simulate
 from kalux.events import EVENT_DTYPE
 from kalux.models.dark_levels import dark_shares
+from kalux.models.dark_steps import dark_steps
 from kalux.plan_report import plan_report
 from kalux.planning import plan
 from kalux.settings import altered
@@ -143,3 +144,26 @@ def test_how_slow_pixels_are_comes_from_frames_and_can_be_given():
     kept = plan(slow, at="frames", settings=given)
     assert (kept.settings.events.lag_variance, kept.lag) == (0.7, None)
     assert dict(plan_report(slow, kept, given))["lag"].endswith("0.7 c^2 at 0.02 of white (given)")
+
+
+def test_how_steps_vary_in_the_dark_comes_from_frames_and_can_be_given():
+    """None in causal mode, and of a filter that has no use for it."""
+    sensor = SensorSettings(
+        threshold_on=0.15, threshold_off=0.15, log_offset=0.004, cutoff=200.0, frame_rate=25.0
+    )
+    slow = simulate(demo_scene(sensor_size=(90, 120), duration=1_000_000), sensor, seed=1).recording()
+    found = plan(slow, at="frames")
+    steps = dark_steps(found.settings.events.dark_steps)
+    assert max(steps) > 0.3
+    told = dict(plan_report(slow, found, PRESETS["default"]))["dark steps"]
+    assert told == f"variance of one event up to {max(steps):g} c^2 more below 0.32 of white (measured)"
+    assert plan(slow, at="frames", lookahead=False).settings.events.dark_steps == "none"
+    assert plan(slow, at="frames", preset="iccv2021").settings.events.dark_steps == "auto"
+    given = altered(PRESETS["default"], "events", dark_steps="0 0 0 0 1 2")
+    kept = plan(slow, at="frames", settings=given)
+    assert kept.settings.events.dark_steps == "0 0 0 0 1 2"
+    assert dict(plan_report(slow, kept, given))["dark steps"].endswith(
+        "2 c^2 more below 0.32 of white (given)"
+    )
+    without = altered(PRESETS["default"], "events", dark_steps="none")
+    assert "dark steps" not in dict(plan_report(slow, plan(slow, at="frames", settings=without), without))

@@ -82,14 +82,19 @@ def signal_shares(
     return shares[0], shares[1]
 
 
-def doubt(shares: tuple[Floats, Floats], step_variance: float, threshold2: float) -> tuple[Floats, Floats]:
+def doubt(
+    shares: tuple[Floats, Floats], step_variance: float, threshold2: float, dark: Floats | None = None
+) -> tuple[Floats, Floats]:
     """Of on and of off events, by how much the variance of a step is more than a sure event's, q c^2 (K5): (H, W) each.
 
-    An event that is signal with probability f has f (q + 1 - f) c^2. ``step_variance`` is q c^2, ``threshold2`` c^2.
+    An event that is signal with probability f has f (q + 1 - f) c^2. ``step_variance`` is q c^2, ``threshold2`` c^2,
+    and ``dark`` (H, W) what the step of a dark pixel has in addition (K20).
     """
     c2, q = np.float32(threshold2), np.float32(step_variance / threshold2)
     on, off = (c2 * (np.float32(1.0) - f) * (f - q) for f in shares)
-    return on, off
+    if dark is None:
+        return on, off
+    return on + shares[0] * dark, off + shares[1] * dark
 
 
 def _around(counts: NDArray[np.float32]) -> NDArray[np.float32]:

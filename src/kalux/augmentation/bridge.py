@@ -541,6 +541,7 @@ def bridge(
     grown: Array | None = None,
     signal: tuple[Array, Array] | None = None,
     untold: Array | None = None,
+    dark: NDArray[np.float32] | None = None,
 ) -> tuple[BridgedSegment, Thresholds]:
     """Join two latent frames (docs/equations.md, K1), and learn the pixels' thresholds from them (K2).
 
@@ -560,6 +561,8 @@ def bridge(
         (H, W) shares of the on and of the off events that are signal (K5); None: all.
     untold
         (H, W) float32 variance of the change that no event has told, log intensity^2 (K18); None: q_0 of all pixels.
+    dark
+        (H, W) what the variance of a step of dark pixels is more (K20); None: nothing.
 
     Returns
     -------
@@ -601,12 +604,13 @@ def bridge(
             factors,
         )
     )
-    _bridge(given, known, noise, seconds, filled, learned)
+    more_of_steps = np.empty(0, np.float32) if dark is None else dark.reshape(-1)
+    _bridge(given, known, noise, more_of_steps, seconds, filled, learned)
     return segment, Thresholds(*factors)
 
 
-_SCRATCH: Final = 15
-_COUNT_ON, _COUNT_OFF, _CHANGE, _BOTH, _MOVES, _BOUND, _MEASURED, _LEVEL, _SLOPE, *_LEARNED = (
+_SCRATCH: Final = 16
+_COUNT_ON, _COUNT_OFF, _CHANGE, _BOTH, _MOVES, _BOUND, _MEASURED, _LEVEL, _SLOPE, _OF_STEP, *_LEARNED = (
     np.uint64(k * _BLOCK) for k in range(_SCRATCH)
 )
 _STEP_ON, _STEP_OFF, _NEW_ON, _NEW_OFF, _LEFT_ON, _LEFT_OFF = _LEARNED
@@ -614,7 +618,7 @@ _STEP_ON, _STEP_OFF, _NEW_ON, _NEW_OFF, _LEFT_ON, _LEFT_OFF = _LEARNED
 
 
 @loop
-def _bridge(given, thresholds, noise, seconds, planes, factors):  # type: ignore[no-untyped-def]
+def _bridge(given, thresholds, noise, dark, seconds, planes, factors):  # type: ignore[no-untyped-def]
     """Fill ``planes`` and ``factors``; in float64, whatever the arrays' type.
 
     Vector code: a block of pixels at a time, and in no loop more arrays than the compiler compares the places of. One
@@ -625,7 +629,7 @@ def _bridge(given, thresholds, noise, seconds, planes, factors):  # type: ignore
     augmented, slope, step_on, step_off, events, net, floor = planes
     new_on, new_off, new_on_variance, new_off_variance = factors
     scale_on, scale_off, variance_on, variance_off = thresholds
-    c_on, c_off, of_step = noise.threshold_on, noise.threshold_off, noise.step_variance
+    c_on, c_off, of_steps = noise.threshold_on, noise.threshold_off, noise.step_variance
     of_saturated, not_shown = noise.saturated_variance, _NOT_SHOWN * noise.quantisation_variance
     s = empty(_SCRATCH * _BLOCK, np.float64)
     size = np.uint64(len(value))
@@ -646,8 +650,13 @@ def _bridge(given, thresholds, noise, seconds, planes, factors):  # type: ignore
             s[_BOUND + k] = (1.0 if after > before else -1.0) if bounded else 0.0
             s[_MEASURED + k] = smaller(before, after)
         for k in pixels:
+            s[_OF_STEP + k] = of_steps
+        if len(dark):
+            for k in pixels:
+                s[_OF_STEP + k] += np.float64(dark[first + k])
+        for k in pixels:
             i = first + k
-            f_on, f_off = np.float64(signal_on[i]), np.float64(signal_off[i])
+            f_on, f_off, of_step = np.float64(signal_on[i]), np.float64(signal_off[i]), s[_OF_STEP + k]
             n_on, n_off = f_on * s[_COUNT_ON + k], f_off * s[_COUNT_OFF + k]
             in_doubt_on, in_doubt_off = (1.0 - f_on) * c_on * c_off, (1.0 - f_off) * c_on * c_off
             of_on, of_off = np.float64(scale_on[i]), np.float64(scale_off[i])

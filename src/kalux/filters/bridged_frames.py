@@ -59,6 +59,7 @@ from kalux.filters.surfaces import Unmeasured
 from kalux.filters.uncertainty import Around
 from kalux.models.camera import CRUSHED, beyond_white, dark_scale, log_intensity
 from kalux.models.dark_levels import dark_correction, dark_shares
+from kalux.models.dark_steps import dark_step_variance, dark_steps
 from kalux.models.pixels import PixelCalibration
 from kalux.settings import Settings
 
@@ -172,6 +173,7 @@ class BridgedFrames(Method):
         self._period_spread = events.refractory_doubt if events.refractory > 0 else 0.0
         delays = whole_row_delays(shape[0], settings.camera.row_time)
         self._dark_shares = dark_shares(settings.filter.dark_shares)
+        self._dark_steps = dark_steps(settings.events.dark_steps)
         self._row_delays = delays if delays.any() else None
         self._follows_motion = settings.filter.follows_motion(shape)
         self._event_noise = akf_bridged.Noise(events.background_rate, events.step_noise, self._threshold2)
@@ -383,6 +385,7 @@ class BridgedFrames(Method):
         trail, grown = self._trail_between(memory, shot, following, at_middle)
         steps = (on, off) if signal is None else (on * signal[0], off * signal[1])
         lost = self._lost_change(events, start, end, steps, memory.latent, second)
+        dark = None if signal is None else self._of_dark_steps(memory.latent, second)
         joined, learned = bridge.bridge(
             memory.latent,
             second,
@@ -394,9 +397,10 @@ class BridgedFrames(Method):
             grown=grown,
             signal=signal,
             untold=self._untold(lost),
+            dark=dark,
         )
         if signal is not None:
-            of_steps = doubt(signal, self.noise.step_variance, self._threshold2)
+            of_steps = doubt(signal, self.noise.step_variance, self._threshold2, dark)
             joined = joined._replace(doubt=of_steps, signal=signal)
         joined, change, remembered = self._with_silent(joined._replace(lost=lost), memory, second, steps)
         by_period = self._by_period(events, start, end, signal)
@@ -534,6 +538,12 @@ class BridgedFrames(Method):
             return None
         first, second = (frame.variance >= bridge.UNMEASURED for frame in frames)
         return signal_shares(*counts, rate * seconds, first & second)
+
+    def _of_dark_steps(self, first: Latent, second: Latent) -> NDArray[np.float32] | None:
+        """(H, W) what the variance of a step of dark pixels is more (K20); None: nothing."""
+        if self._dark_steps is None:
+            return None
+        return dark_step_variance(first.value, second.value, self._dark_steps, self.offset, self._threshold2)
 
     @property
     def _trail_heights(self) -> tuple[float, float]:

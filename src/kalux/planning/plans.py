@@ -34,6 +34,7 @@ from kalux.planning.mending import Mends, Moved, mend_events_and_levels
 from kalux.planning.sensor_noise import (
     with_background,
     with_dark_shares,
+    with_dark_steps,
     with_dead_time,
     with_fixed_pattern,
     with_frame_noise,
@@ -65,8 +66,8 @@ class Plan:
     Attributes
     ----------
     settings
-        With thresholds, refractory period, delay, frame noise, fixed pattern, shares of dark light, I_0, step and lag
-        variance, black level, saturation, reference exposure and white balance filled in.
+        With thresholds, refractory period, delay, frame noise, fixed pattern, shares of dark light, I_0, variances of
+        steps, of those in the dark and of lag, black level, saturation, reference exposure and white balance filled in.
     threshold_origin
         Whether the thresholds come from the settings, the recording, a calibration, an estimate, or are assumed.
     times
@@ -210,6 +211,7 @@ def _planned(
             moved = moved._replace(times=times_found.of_all(seen.exposures, left_out))
             return _planned(as_stored, as_chosen, known, asked, moved)
     chosen, mismatch = with_step_errors(recording, steps.settings, steps.threshold_error, known=chosen.events)
+    chosen = with_dark_steps(recording, chosen, lookahead=lookahead)
     chosen = with_dark_shares(recording, chosen)
     chosen, lag = with_lag(recording, chosen, lookahead=lookahead)
     chosen, background = with_background(recording, chosen, known.pixels, lookahead=lookahead)

@@ -8,6 +8,7 @@ import numpy as np
 
 from kalux.calibration.compression import Compression
 from kalux.calibration.dark_shares import estimate_dark_shares
+from kalux.calibration.dark_steps import estimate_dark_steps
 from kalux.calibration.fixed_pattern import FixedPattern, estimate_fixed_pattern
 from kalux.calibration.frame_noise import FrameNoise, UsualNoise, estimate_frame_noise, usual_noise
 from kalux.calibration.lag import Lag, estimate_lag
@@ -16,7 +17,16 @@ from kalux.calibration.noise import event_noise
 from kalux.calibration.refractory import counted_period, dead_time
 from kalux.models.pixels import PixelCalibration
 from kalux.recording import Recording
-from kalux.settings import AUTO, EVEN, USUAL_PATTERN, EventSettings, Settings, altered, completed
+from kalux.settings import (
+    AUTO,
+    EVEN,
+    NO_DARK_STEPS,
+    USUAL_PATTERN,
+    EventSettings,
+    Settings,
+    altered,
+    completed,
+)
 
 _NOISE_EVENTS: Final = 1_000_000
 """Number of events from which the background noise is estimated: at 15 million events/s, those of 70 ms."""
@@ -128,6 +138,15 @@ def with_lag(recording: Recording, settings: Settings, *, lookahead: bool) -> tu
     found = estimate_lag(recording, settings.camera, settings.events) if lookahead else None
     variance = 0.0 if found is None else round(found.believed, 3)
     return altered(settings, "events", lag_variance=variance), found
+
+
+def with_dark_steps(recording: Recording, settings: Settings, *, lookahead: bool) -> Settings:
+    """Fill in by how much more steps vary in the dark, where frames are joined: from the settings, else an estimate."""
+    if settings.events.dark_steps != AUTO or not settings.filter.joins_frames:
+        return settings
+    found = estimate_dark_steps(recording, settings.camera, settings.events) if lookahead else None
+    steps = NO_DARK_STEPS if found is None else " ".join(f"{step:.3g}" for step in found)
+    return altered(settings, "events", dark_steps=steps)
 
 
 def with_dark_shares(recording: Recording, settings: Settings) -> Settings:

@@ -1,0 +1,101 @@
+"""By how much more events of dark pixels vary: where these are slow, and not where other things are wrong."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from kalux.calibration.dark_steps import estimate_dark_steps
+from kalux.datasets import SensorSettings, demo_scene, simulate
+from kalux.events import EVENT_DTYPE
+from kalux.recording import Recording
+from kalux.settings import CameraSettings, EventSettings
+
+from builders import moving_blocks
+
+THRESHOLD = 0.15
+CAMERA = CameraSettings(log_offset=0.004, frame_noise=0.002)
+EVENTS = EventSettings(
+    threshold_on=THRESHOLD,
+    threshold_off=THRESHOLD,
+    delay=0,
+    refractory_period=0,
+    threshold_spread=0.02,
+    step_variance=0.05,
+)
+
+
+def made(cutoff=0.0, **sensor):
+    """A scene of a second whose pixels are as fast as light, or slower the darker they are."""
+    settings = SensorSettings(
+        threshold_on=THRESHOLD,
+        threshold_off=THRESHOLD,
+        log_offset=0.004,
+        cutoff=cutoff,
+        frame_rate=25.0,
+        **sensor,
+    )
+    return simulate(demo_scene(sensor_size=(90, 120), duration=1_000_000), settings, seed=1).recording()
+
+
+@pytest.fixture(scope="module")
+def slow():
+    """200 Hz at white is 4 Hz at 0.02 of it."""
+    return made(200.0)
+
+
+def test_slow_pixels_are_told_from_fast_ones(slow):
+    """The darker, and the slower, the more; none where pixels follow the light."""
+    found, faster = (np.array(estimate_dark_steps(one, CAMERA, EVENTS)) for one in (slow, made(400.0)))
+    assert (np.diff(found) >= 0).all()
+    assert found[3] > 1.0
+    assert found[0] < 0.4 * found[3]
+    assert (faster < 0.7 * found).all()
+    assert estimate_dark_steps(made(), CAMERA, EVENTS) is None
+
+
+def test_what_is_more_than_all_steps_have_counts(slow):
+    """Where the variance of all is as large already, less is left, and nothing is negative."""
+    few, most = (
+        estimate_dark_steps(slow, CAMERA, dataclasses.replace(EVENTS, step_variance=step))
+        for step in (0.05, 0.4)
+    )
+    left = np.array(few) - 0.35
+    np.testing.assert_allclose(np.array(most), np.where(left < 0.05, 0.0, left), atol=0.06)
+
+
+def test_no_more_is_believed_than_four_squared_thresholds():
+    """An octave has at most that, and what all steps have is taken off."""
+    broken = made()
+    events = np.concatenate(list(broken.events()))
+    events["p"] = np.random.default_rng(0).random(len(events)) < 0.5
+    wrong = Recording.from_arrays(events, list(broken.frames()), sensor_size=broken.sensor_size)
+    found = estimate_dark_steps(wrong, CAMERA, EVENTS)
+    assert max(found) <= 4.0 - EVENTS.step_noise
+
+
+def test_noise_of_frames_is_not_the_events(slow):
+    """It is taken off as far as it is known."""
+    rng = np.random.default_rng(0)
+    still = made()
+    frames = [
+        dataclasses.replace(
+            frame, image=np.clip(frame.image + rng.normal(0, 3, frame.image.shape), 0, 255).astype(np.uint8)
+        )
+        for frame in still.frames()
+    ]
+    noisy = Recording.from_arrays(np.concatenate(list(still.events())), frames, sensor_size=still.sensor_size)
+    untold = estimate_dark_steps(noisy, CAMERA, EVENTS)
+    told = estimate_dark_steps(noisy, dataclasses.replace(CAMERA, frame_noise=3 / 255), EVENTS)
+    assert max(untold) > 0.3
+    assert told is None or max(told) < 0.3 * max(untold)
+
+
+def test_nothing_that_moves_tells_nothing():
+    moving = moving_blocks().recording()
+    still = Recording.from_arrays(
+        np.empty(0, EVENT_DTYPE), list(moving.frames()), sensor_size=moving.sensor_size
+    )
+    assert estimate_dark_steps(still, CAMERA, EVENTS) is None
