@@ -28,9 +28,11 @@ _FEWEST_EVENTS: Final = 2.0
 """Of a pixel in an interval, as for the steps of all (`kalux.calibration.mismatch`)."""
 
 _LEAST_LIGHT: Final = DARKEST / 2
-"""Of a pixel in either frame, of white; but for its noise, of which black cuts a part."""
+"""Of a pixel in either frame, of white, unless the frame's noise asks for more."""
 
-_CUT: Final = 2.0  # standard deviations of the frames' noise from which pixels count
+_CUT: Final = 4.0
+"""Standard deviations of the frames' noise from which pixels count: the logarithm of darker ones is skewed, and black
+cuts a part of it. From 2 on, d is up to 0.7 where nothing lags (c = 0.1, noise of 0.01 of white)."""
 
 _MIN_SAMPLES: Final = 500
 """Of an octave: as pixels along an edge err alike, these tell a variance within a third."""
