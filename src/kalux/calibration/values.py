@@ -40,6 +40,7 @@ UNITS: Final[Mapping[str, str]] = {
     "apparent_delay": "us",
     "trailing_delay": "us, how late events were taken to be",
     "step_variance": "threshold^2 per event",
+    "dark_steps": "threshold^2 more per event, in six octaves below 0.32 of white",
     "lag_variance": "threshold^2 at 0.02 of white",
     "noise_rate": "Hz per pixel",
     "frame_noise": "standard deviation in the dark, white = 1",

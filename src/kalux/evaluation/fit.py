@@ -84,7 +84,7 @@ class Fit:
         By how much every fitted value was changed.
     """
 
-    settings: Mapping[str, Mapping[str, float | int]]
+    settings: Mapping[str, Mapping[str, float | int | str]]
     start: Score
     best: Score
     evaluations: int
@@ -210,10 +210,10 @@ def _changed(settings: Settings, factors: Mapping[str, float], rounding: float) 
     return from_dict(values, settings)
 
 
-def _fitted_values(settings: Settings) -> dict[str, dict[str, float | int]]:
-    values: dict[str, dict[str, float | int]] = {"camera": {}, "events": {}}
+def _fitted_values(settings: Settings) -> dict[str, dict[str, float | int | str]]:
+    values: dict[str, dict[str, float | int | str]] = {"camera": {}, "events": {}}
     names = ("threshold_on", "threshold_off", "delay", "step_variance", "threshold_spread", "noise_rate")
-    for name in (*names, "lag_variance", "refractory_period"):
+    for name in (*names, "dark_steps", "lag_variance", "refractory_period"):
         values["events"][name] = getattr(settings.events, name)
     if settings.events.refractory_doubt:
         values["events"]["refractory_spread"] = settings.events.refractory_doubt
