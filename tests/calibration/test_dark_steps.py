@@ -46,14 +46,19 @@ def slow():
     return made(200.0)
 
 
-def test_slow_pixels_are_told_from_fast_ones(slow):
+@pytest.fixture(scope="module")
+def fast():
+    return made()
+
+
+def test_slow_pixels_are_told_from_fast_ones(slow, fast):
     """The darker, and the slower, the more; none where pixels follow the light."""
     found, faster = (np.array(estimate_dark_steps(one, CAMERA, EVENTS)) for one in (slow, made(400.0)))
     assert (np.diff(found) >= 0).all()
     assert found[3] > 1.0
     assert found[0] < 0.4 * found[3]
     assert (faster < 0.7 * found).all()
-    assert estimate_dark_steps(made(), CAMERA, EVENTS) is None
+    assert estimate_dark_steps(fast, CAMERA, EVENTS) is None
 
 
 def test_what_is_more_than_all_steps_have_counts(slow):
@@ -66,27 +71,25 @@ def test_what_is_more_than_all_steps_have_counts(slow):
     np.testing.assert_allclose(np.array(most), np.where(left < 0.05, 0.0, left), atol=0.06)
 
 
-def test_no_more_is_believed_than_four_squared_thresholds():
+def test_no_more_is_believed_than_four_squared_thresholds(fast):
     """An octave has at most that, and what all steps have is taken off."""
-    broken = made()
-    events = np.concatenate(list(broken.events()))
+    events = np.concatenate(list(fast.events()))
     events["p"] = np.random.default_rng(0).random(len(events)) < 0.5
-    wrong = Recording.from_arrays(events, list(broken.frames()), sensor_size=broken.sensor_size)
+    wrong = Recording.from_arrays(events, list(fast.frames()), sensor_size=fast.sensor_size)
     found = estimate_dark_steps(wrong, CAMERA, EVENTS)
     assert max(found) <= 4.0 - EVENTS.step_noise
 
 
-def test_noise_of_frames_is_not_the_events(slow):
+def test_noise_of_frames_is_not_the_events(fast):
     """It is taken off as far as it is known."""
     rng = np.random.default_rng(0)
-    still = made()
     frames = [
         dataclasses.replace(
             frame, image=np.clip(frame.image + rng.normal(0, 3, frame.image.shape), 0, 255).astype(np.uint8)
         )
-        for frame in still.frames()
+        for frame in fast.frames()
     ]
-    noisy = Recording.from_arrays(np.concatenate(list(still.events())), frames, sensor_size=still.sensor_size)
+    noisy = Recording.from_arrays(np.concatenate(list(fast.events())), frames, sensor_size=fast.sensor_size)
     untold = estimate_dark_steps(noisy, CAMERA, EVENTS)
     told = estimate_dark_steps(noisy, dataclasses.replace(CAMERA, frame_noise=3 / 255), EVENTS)
     assert max(untold) > 0.3
