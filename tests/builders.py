@@ -165,6 +165,38 @@ def quick_frames() -> Simulation:
     return simulate(demo_scene(sensor_size=(60, 80), duration=500_000), sensor)
 
 
+@lru_cache(maxsize=4)
+def slow_scene(cutoff: float, mismatch: float = 0.0) -> Recording:
+    """A second with thresholds of 0.15; pixels are as fast as light (0), or slower by ``cutoff``, Hz at white."""
+    sensor = SensorSettings(
+        threshold_on=0.15,
+        threshold_off=0.15,
+        threshold_mismatch=mismatch,
+        log_offset=0.004,
+        cutoff=cutoff,
+        frame_rate=25.0,
+    )
+    return simulate(demo_scene(sensor_size=(90, 120), duration=1_000_000), sensor, seed=1).recording()
+
+
+def with_frame_noise(source: Recording, deviation: float) -> Recording:
+    """A recording with noise in its frames, of so many of 255 levels."""
+    rng = np.random.default_rng(0)
+    frames = [
+        dataclasses.replace(
+            frame,
+            image=np.clip(frame.image + rng.normal(0, deviation, frame.image.shape), 0, 255).astype(np.uint8),
+        )
+        for frame in source.frames()
+    ]
+    return Recording.from_arrays(np.concatenate([*source.events()]), frames, sensor_size=source.sensor_size)
+
+
+def without_any_events(source: Recording) -> Recording:
+    """Its frames alone, before a sensor that has no events."""
+    return Recording.from_arrays(events(), [*source.frames()], sensor_size=source.sensor_size)
+
+
 def dark_scene(seed=0):
     """A pan over texture from 0.005 to 1 of white."""
     noise = np.random.default_rng(seed).standard_normal((40, 90))

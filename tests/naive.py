@@ -545,11 +545,12 @@ def bridged(pixel, settings, times, on, off, scales):
         learned.append((scale_on, scale_off))
         first = second
 
+    def events_of(interval):  # K20
+        return slow_from.get(interval[0], ev)
+
     def added(interval, k):  # what events and K14 add to the level in all of an interval
         n_on, n_off = counts(*interval[:2])
-        up, down = (
-            own_step(interval, p, on, off, slow_from.get(interval[0], ev), c2, counts) for p in (True, False)
-        )
+        up, down = (own_step(interval, p, on, off, events_of(interval), c2, counts) for p in (True, False))
         return n_on * up + n_off * down + grown(k, interval[1])
 
     def said(interval, k):  # K15: what the frames around say themselves of a clipped pixel, at the first
@@ -697,16 +698,14 @@ def bridged(pixel, settings, times, on, off, scales):
             t, polarity, near, _, weight = pending.pop(0)
             value, variance = predict(t)
             joined = intervals[index][2] is not None and intervals[index][3] is not None
-            signal = 1.0
+            signal, told = 1.0, events_of(intervals[index])
             if pixel.signal and joined:  # K5; the steps of L^A are those that are expected
-                told, f = slow_from[intervals[index][0]], intervals[index][-1][0 if polarity else 1]
-                noise = step_noise(f, told)
+                noise = step_noise(intervals[index][-1][0 if polarity else 1], told)
             else:
                 signal = 1 / (1 + (9 * ev.background_rate * (t - near) * US) ** 2)
                 noise = ev.step_noise + signal * (1 - signal)
             # Several events may share a time: this one alone moves L^A by its own step.
-            slow = slow_from.get(intervals[index][0], ev)
-            step = weight * own_step(intervals[index], polarity, on, off, slow, c2, counts)
+            step = weight * own_step(intervals[index], polarity, on, off, told, c2, counts)
             q = weight * (c2 * noise + untied[index][0 if polarity else 1])
             state = (value + signal * step, variance + q)
             at = t

@@ -8,12 +8,10 @@ import numpy as np
 import pytest
 
 from kalux.calibration.dark_steps import estimate_dark_steps
-from kalux.datasets import SensorSettings, demo_scene, simulate
-from kalux.events import EVENT_DTYPE
 from kalux.recording import Recording
 from kalux.settings import CameraSettings, EventSettings
 
-from builders import moving_blocks
+from builders import moving_blocks, slow_scene, with_frame_noise, without_any_events
 
 THRESHOLD = 0.15
 CAMERA = CameraSettings(log_offset=0.004, frame_noise=0.002)
@@ -27,33 +25,20 @@ EVENTS = EventSettings(
 )
 
 
-def made(cutoff=0.0, **sensor):
-    """A scene of a second whose pixels are as fast as light, or slower the darker they are."""
-    settings = SensorSettings(
-        threshold_on=THRESHOLD,
-        threshold_off=THRESHOLD,
-        log_offset=0.004,
-        cutoff=cutoff,
-        frame_rate=25.0,
-        **sensor,
-    )
-    return simulate(demo_scene(sensor_size=(90, 120), duration=1_000_000), settings, seed=1).recording()
-
-
 @pytest.fixture(scope="module")
 def slow():
     """200 Hz at white is 4 Hz at 0.02 of it."""
-    return made(200.0)
+    return slow_scene(200.0)
 
 
 @pytest.fixture(scope="module")
 def fast():
-    return made()
+    return slow_scene(0.0)
 
 
 def test_slow_pixels_are_told_from_fast_ones(slow, fast):
     """The darker, and the slower, the more; none where pixels follow the light."""
-    found, faster = (np.array(estimate_dark_steps(one, CAMERA, EVENTS)) for one in (slow, made(400.0)))
+    found, faster = (np.array(estimate_dark_steps(one, CAMERA, EVENTS)) for one in (slow, slow_scene(400.0)))
     assert (np.diff(found) >= 0).all()
     assert found[3] > 1.0
     assert found[0] < 0.4 * found[3]
@@ -82,14 +67,7 @@ def test_no_more_is_believed_than_four_squared_thresholds(fast):
 
 def test_noise_of_frames_is_not_the_events(fast):
     """It is taken off as far as it is known."""
-    rng = np.random.default_rng(0)
-    frames = [
-        dataclasses.replace(
-            frame, image=np.clip(frame.image + rng.normal(0, 3, frame.image.shape), 0, 255).astype(np.uint8)
-        )
-        for frame in fast.frames()
-    ]
-    noisy = Recording.from_arrays(np.concatenate(list(fast.events())), frames, sensor_size=fast.sensor_size)
+    noisy = with_frame_noise(fast, 3.0)
     untold = estimate_dark_steps(noisy, CAMERA, EVENTS)
     told = estimate_dark_steps(noisy, dataclasses.replace(CAMERA, frame_noise=3 / 255), EVENTS)
     assert max(untold) > 0.3
@@ -97,8 +75,5 @@ def test_noise_of_frames_is_not_the_events(fast):
 
 
 def test_nothing_that_moves_tells_nothing():
-    moving = moving_blocks().recording()
-    still = Recording.from_arrays(
-        np.empty(0, EVENT_DTYPE), list(moving.frames()), sensor_size=moving.sensor_size
-    )
+    still = without_any_events(moving_blocks().recording())
     assert estimate_dark_steps(still, CAMERA, EVENTS) is None

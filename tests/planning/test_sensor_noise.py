@@ -15,7 +15,7 @@ from kalux.plan_report import plan_report
 from kalux.planning import plan
 from kalux.settings import altered
 
-from builders import passing_by, recording, textured
+from builders import passing_by, recording, slow_scene, textured
 
 
 def test_the_frame_noise_comes_from_the_frames_and_can_be_given():
@@ -126,10 +126,7 @@ def refractory(period):
 
 def test_how_slow_pixels_are_comes_from_frames_and_can_be_given():
     """None in causal mode, and of a filter that has no use for it."""
-    sensor = SensorSettings(
-        threshold_on=0.15, threshold_off=0.15, log_offset=0.004, cutoff=200.0, frame_rate=25.0
-    )
-    slow = simulate(demo_scene(sensor_size=(90, 120), duration=1_000_000), sensor, seed=1).recording()
+    slow = slow_scene(200.0)
     found = plan(slow, at="frames")
     assert found.settings.events.lag_variance == pytest.approx(found.lag.believed, abs=1e-3)
     assert found.lag.believed > 0.5
@@ -148,10 +145,7 @@ def test_how_slow_pixels_are_comes_from_frames_and_can_be_given():
 
 def test_how_steps_vary_in_the_dark_comes_from_frames_and_can_be_given():
     """None in causal mode, and of a filter that has no use for it."""
-    sensor = SensorSettings(
-        threshold_on=0.15, threshold_off=0.15, log_offset=0.004, cutoff=200.0, frame_rate=25.0
-    )
-    slow = simulate(demo_scene(sensor_size=(90, 120), duration=1_000_000), sensor, seed=1).recording()
+    slow = slow_scene(200.0)
     found = plan(slow, at="frames")
     steps = dark_steps(found.settings.events.dark_steps)
     assert max(steps) > 0.3

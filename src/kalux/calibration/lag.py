@@ -8,15 +8,15 @@ intervals is, but for the sign, the variance of such errors at the frame between
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kalux.calibration.event_model import DARKEST
-from kalux.calibration.intervals import Counted, counted_intervals
+from kalux.calibration.intervals import Counted
 from kalux.calibration.regression import parts, ratio_error
+from kalux.calibration.slow_pixels import observe
 from kalux.models.camera import noise_variance
 from kalux.models.lag import lag_growth
 from kalux.recording import Recording
@@ -24,7 +24,6 @@ from kalux.settings import CameraSettings, EventSettings
 
 Array = NDArray[np.float64]
 
-_MAX_FRAMES: Final = 40
 _ENOUGH: Final = 300_000  # pixels and frames: the standard error is a few percent of a slow sensor's
 
 _BELOW_THRESHOLD: Final = 0.12
@@ -85,28 +84,57 @@ def estimate_lag(recording: Recording, camera: CameraSettings, events: EventSett
     ExposureError
         If the frames' exposures are not known.
     """
-    part = parts(recording.sensor_size)
-    sums: Array = np.zeros((int(part.max()) + 1, 2))
-    samples = 0
-    threshold2 = float(np.prod(events.thresholds))
-    before: _Mismatches | None = None
-    for here in _mismatches(recording, camera, events):
-        if before is not None and before.end == here.start:
-            shared = before.told & here.told
-            told = before.second[shared]
-            growth = lag_growth(told).astype(np.float64)
-            product = -before.change[shared] * here.change[shared]
-            excess = product - before.noise[shared] - _BELOW_THRESHOLD * threshold2
-            for column, values in enumerate((growth * excess, growth**2 * threshold2)):
-                sums[:, column] += np.bincount(part[shared], values, len(sums))
-            samples += len(told)
-        if samples >= _ENOUGH:
-            break
-        before = here
-    if not samples:
-        return None
-    over, under = sums.sum(axis=0)
-    return Lag(float(over / under), ratio_error(sums), samples)
+    seen = LagSums(recording.sensor_size, camera, events)
+    observe(recording, camera, events, seen)
+    return seen.found
+
+
+class LagSums:
+    """What `estimate_lag` sums up, interval by interval: an observer of `kalux.calibration.slow_pixels`.
+
+    Parameters
+    ----------
+    sensor_size
+        (H, W).
+    camera, events
+        As of `estimate_lag`.
+    """
+
+    def __init__(self, sensor_size: tuple[int, int], camera: CameraSettings, events: EventSettings) -> None:
+        self._camera, self._events = camera, events
+        self._part = parts(sensor_size)
+        self._sums: Array = np.zeros((int(self._part.max()) + 1, 2))
+        self._samples = 0
+        self._before: _Mismatches | None = None
+
+    @property
+    def enough(self) -> bool:
+        """Whether 300,000 pixels have told."""
+        return self._samples >= _ENOUGH
+
+    @property
+    def found(self) -> Lag | None:
+        """By what was seen until now; None: nothing told."""
+        if not self._samples:
+            return None
+        over, under = self._sums.sum(axis=0)
+        return Lag(float(over / under), ratio_error(self._sums), self._samples)
+
+    def add(self, counted: Counted) -> None:
+        """Take the next interval in."""
+        before, here = self._before, _mismatches(counted, self._camera, self._events)
+        self._before = here
+        if before is None or before.end != here.start:
+            return
+        threshold2 = float(np.prod(self._events.thresholds))
+        shared = before.told & here.told
+        told = before.second[shared]
+        growth = lag_growth(told).astype(np.float64)
+        product = -before.change[shared] * here.change[shared]
+        excess = product - before.noise[shared] - _BELOW_THRESHOLD * threshold2
+        for column, values in enumerate((growth * excess, growth**2 * threshold2)):
+            self._sums[:, column] += np.bincount(self._part[shared], values, len(self._sums))
+        self._samples += len(told)
 
 
 class _Mismatches(NamedTuple):
@@ -121,20 +149,18 @@ class _Mismatches(NamedTuple):
     noise: Array
 
 
-def _mismatches(recording: Recording, camera: CameraSettings, events: EventSettings) -> Iterator[_Mismatches]:
+def _mismatches(counted: Counted, camera: CameraSettings, events: EventSettings) -> _Mismatches:
     most = _CLIP * max(events.thresholds)
-    for counted in counted_intervals(recording, camera, events, most_frames=_MAX_FRAMES):
-        interval = counted.interval
-        mismatch = np.clip(_mismatch(counted, events), -most, most)
-        told = (counted.on + counted.off > 0) & interval.first.measured & interval.second.measured
-        for end in interval.ends:
-            told &= end.intensity > max(DARKEST, _CUT * camera.noise[0]) * end.shot.white
-        end = interval.ends[1]
-        noise = (
-            noise_variance(end.intensity, camera.noise, end.shot.white)
-            / (end.intensity + end.log_offset) ** 2
-        )
-        yield _Mismatches(interval.start, interval.end, mismatch, told, end.intensity, noise)
+    interval = counted.interval
+    mismatch = np.clip(_mismatch(counted, events), -most, most)
+    told = (counted.on + counted.off > 0) & interval.first.measured & interval.second.measured
+    for end in interval.ends:
+        told &= end.intensity > max(DARKEST, _CUT * camera.noise[0]) * end.shot.white
+    end = interval.ends[1]
+    noise = (
+        noise_variance(end.intensity, camera.noise, end.shot.white) / (end.intensity + end.log_offset) ** 2
+    )
+    return _Mismatches(interval.start, interval.end, mismatch, told, end.intensity, noise)
 
 
 def _mismatch(counted: Counted, events: EventSettings) -> Array:

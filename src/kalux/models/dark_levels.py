@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from kalux.errors import SettingsError
 from kalux.models.camera import frame_log_covariance, log_intensity, noise_variance
+from kalux.models.stated import stated_numbers
 from kalux.settings import AUTO, EVEN
 
 Array = NDArray[np.float64]
@@ -95,11 +96,8 @@ def dark_shares(text: str) -> Shares | None:
     """
     if text in (AUTO, EVEN):
         return None
-    try:
-        shares = tuple(float(part) for part in text.split())
-    except ValueError:
-        shares = ()
-    if len(shares) != _PARTS or not all(0 <= share <= _MOST for share in shares) or not sum(shares) > 0:
+    shares = stated_numbers(text, _PARTS, _MOST)
+    if shares is None or not sum(shares) > 0:
         raise SettingsError(
             f"dark_shares: {text!r} is neither {AUTO}, {EVEN} nor {_PARTS} numbers from 0 to {_MOST:g}, not all of "
             "them 0"

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from kalux.compiled import ONE, ZERO, exponential, larger, logarithm, loop, smaller
 from kalux.errors import SettingsError
+from kalux.models.stated import stated_numbers
 from kalux.settings import AUTO, NO_DARK_STEPS
 
 BRIGHT: Final = 0.32
@@ -40,11 +41,8 @@ def dark_steps(text: str) -> DarkSteps | None:
     """
     if text in (AUTO, NO_DARK_STEPS):
         return None
-    try:
-        steps = tuple(float(part) for part in text.split())
-    except ValueError:
-        steps = ()
-    if len(steps) != PARTS or not all(0 <= step <= _MOST for step in steps):
+    steps = stated_numbers(text, PARTS, _MOST)
+    if steps is None:
         raise SettingsError(
             f"dark_steps: {text!r} is neither {AUTO}, {NO_DARK_STEPS} nor {PARTS} numbers from 0 to {_MOST:g}"
         )

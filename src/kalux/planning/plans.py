@@ -34,11 +34,10 @@ from kalux.planning.mending import Mends, Moved, mend_events_and_levels
 from kalux.planning.sensor_noise import (
     with_background,
     with_dark_shares,
-    with_dark_steps,
     with_dead_time,
     with_fixed_pattern,
     with_frame_noise,
-    with_lag,
+    with_slow_pixels,
     with_step_errors,
 )
 from kalux.planning.survey import survey
@@ -211,9 +210,8 @@ def _planned(
             moved = moved._replace(times=times_found.of_all(seen.exposures, left_out))
             return _planned(as_stored, as_chosen, known, asked, moved)
     chosen, mismatch = with_step_errors(recording, steps.settings, steps.threshold_error, known=chosen.events)
-    chosen = with_dark_steps(recording, chosen, lookahead=lookahead)
     chosen = with_dark_shares(recording, chosen)
-    chosen, lag = with_lag(recording, chosen, lookahead=lookahead)
+    chosen, lag = with_slow_pixels(recording, chosen, lookahead=lookahead)
     chosen, background = with_background(recording, chosen, known.pixels, lookahead=lookahead)
     pixels = known.pixels_of(chosen.events.mismatch)
     origin = steps.origin

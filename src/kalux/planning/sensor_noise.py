@@ -8,13 +8,14 @@ import numpy as np
 
 from kalux.calibration.compression import Compression
 from kalux.calibration.dark_shares import estimate_dark_shares
-from kalux.calibration.dark_steps import estimate_dark_steps
+from kalux.calibration.dark_steps import DarkSamples
 from kalux.calibration.fixed_pattern import FixedPattern, estimate_fixed_pattern
 from kalux.calibration.frame_noise import FrameNoise, UsualNoise, estimate_frame_noise, usual_noise
-from kalux.calibration.lag import Lag, estimate_lag
+from kalux.calibration.lag import Lag, LagSums
 from kalux.calibration.mismatch import Mismatch, estimate_mismatch
 from kalux.calibration.noise import event_noise
 from kalux.calibration.refractory import counted_period, dead_time
+from kalux.calibration.slow_pixels import Observer, observe
 from kalux.models.pixels import PixelCalibration
 from kalux.recording import Recording
 from kalux.settings import (
@@ -128,25 +129,31 @@ def with_step_errors(
     return altered(settings, "events", threshold_spread=spread, step_variance=step_variance), found
 
 
-def with_lag(recording: Recording, settings: Settings, *, lookahead: bool) -> tuple[Settings, Lag | None]:
-    """Fill in the variance of errors of the moment, where the variance counts it: from the settings, else an estimate.
+def with_slow_pixels(
+    recording: Recording, settings: Settings, *, lookahead: bool
+) -> tuple[Settings, Lag | None]:
+    """Fill in what slow pixels do: by how much more steps vary in the dark, and the variance of errors of the moment.
 
-    Nothing is between two frames in causal mode.
+    Where frames are joined: from the settings, else an estimate. In causal mode there is none of either: nothing is
+    between two frames there.
     """
-    if settings.events.lag_variance is not None or not settings.filter.joins_frames:
+    camera, events = settings.camera, settings.events
+    if not settings.filter.joins_frames:
         return settings, None
-    found = estimate_lag(recording, settings.camera, settings.events) if lookahead else None
+    dark = DarkSamples(camera, events) if events.dark_steps == AUTO else None
+    lag = LagSums(recording.sensor_size, camera, events) if events.lag_variance is None else None
+    wanted: list[Observer] = [one for one in (dark, lag) if one is not None]
+    if lookahead and wanted:
+        observe(recording, camera, events, *wanted)
+    if dark is not None:
+        steps = dark.found
+        told = NO_DARK_STEPS if steps is None else " ".join(f"{step:.3g}" for step in steps)
+        settings = altered(settings, "events", dark_steps=told)
+    if lag is None:
+        return settings, None
+    found = lag.found
     variance = 0.0 if found is None else round(found.believed, 3)
     return altered(settings, "events", lag_variance=variance), found
-
-
-def with_dark_steps(recording: Recording, settings: Settings, *, lookahead: bool) -> Settings:
-    """Fill in by how much more steps vary in the dark, where frames are joined: from the settings, else an estimate."""
-    if settings.events.dark_steps != AUTO or not settings.filter.joins_frames:
-        return settings
-    found = estimate_dark_steps(recording, settings.camera, settings.events) if lookahead else None
-    steps = NO_DARK_STEPS if found is None else " ".join(f"{step:.3g}" for step in found)
-    return altered(settings, "events", dark_steps=steps)
 
 
 def with_dark_shares(recording: Recording, settings: Settings) -> Settings:
