@@ -73,49 +73,38 @@ def pixels(events, frames, sensor_size, settings, begin):
     height, width = sensor_size
     camera = Camera.named(chosen_response(settings.camera.response, None), settings.camera.clipped_from)
     reference = settings.camera.reference_exposure
+    places = [(row, column) for row in range(height) for column in range(width)]
+    own, early = ({place: [] for place in places} for _ in range(2))
+    heard = {place: [] for place in places}  # all events of a pixel until now
+    newest = {}  # its latest one after the beginning
+    for e in events:
+        row, column = place = int(e["y"]), int(e["x"])
+        heard[place].append(e)
+        weight = event_weight(heard[place], settings)
+        if e["t"] <= begin:
+            early[place].append((int(e["t"]), bool(e["p"]), begin, begin, weight))
+            continue
+        around = [(row + i, column + j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
+        near = max(newest.get(q, begin) for q in around)
+        own[place].append((int(e["t"]), bool(e["p"]), near, newest.get(place, begin), weight))
+        newest[place] = int(e["t"])
     out = {}
-    for row in range(height):
-        for column in range(width):
-            ratio = [reference / (f.exposure_end - f.exposure_start) for f in frames]
-            response = [float(f.image[row, column]) / 255 for f in frames]
-            own, early = [], []
-            for i, e in enumerate(events):
-                if (e["y"], e["x"]) != (row, column):
-                    continue
-                if e["t"] <= begin:
-                    previous = [q for q in events[:i] if (q["y"], q["x"]) == (row, column)]
-                    weight = event_weight([*previous, e], settings)
-                    early.append((int(e["t"]), bool(e["p"]), begin, begin, weight))
-                    continue
-                earlier = [q for q in events[:i] if q["t"] > begin]
-                near = [
-                    q["t"] for q in earlier if abs(int(q["y"]) - row) <= 1 and abs(int(q["x"]) - column) <= 1
-                ]
-                same = [q["t"] for q in earlier if (q["y"], q["x"]) == (row, column)]
-                previous = [q for q in events[:i] if (q["y"], q["x"]) == (row, column)]
-                weight = event_weight([*previous, e], settings)
-                own.append(
-                    (
-                        int(e["t"]),
-                        bool(e["p"]),
-                        int(max(near, default=begin)),
-                        int(max(same, default=begin)),
-                        weight,
-                    )
-                )
-            out[row, column] = Pixel(
-                [f.exposure_start for f in frames],
-                [(f.exposure_start + f.exposure_end) // 2 for f in frames],
-                [f.exposure_end for f in frames],
-                [r * float(camera.response.inverse(q)) for r, q in zip(ratio, response, strict=True)],
-                ratio,
-                [r >= settings.camera.clipped_from for r in response],
-                [r * half_rounded(camera.response, q) for r, q in zip(ratio, response, strict=True)],
-                [r == 0 for r in response],
-                [dark_scale(f, settings.camera) for f in frames],
-                own,
-                early,
-            )
+    for row, column in places:
+        ratio = [reference / (f.exposure_end - f.exposure_start) for f in frames]
+        response = [float(f.image[row, column]) / 255 for f in frames]
+        out[row, column] = Pixel(
+            [f.exposure_start for f in frames],
+            [(f.exposure_start + f.exposure_end) // 2 for f in frames],
+            [f.exposure_end for f in frames],
+            [r * float(camera.response.inverse(q)) for r, q in zip(ratio, response, strict=True)],
+            ratio,
+            [r >= settings.camera.clipped_from for r in response],
+            [r * half_rounded(camera.response, q) for r, q in zip(ratio, response, strict=True)],
+            [r == 0 for r in response],
+            [dark_scale(f, settings.camera) for f in frames],
+            own[row, column],
+            early[row, column],
+        )
     return out
 
 
