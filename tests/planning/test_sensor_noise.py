@@ -124,40 +124,31 @@ def refractory(period):
     return altered(PRESETS["default"], "events", refractory_period=period)
 
 
-def test_how_slow_pixels_are_comes_from_frames_and_can_be_given():
-    """None in causal mode, and of a filter that has no use for it."""
+def test_what_slow_pixels_do_comes_from_frames_and_can_be_given():
+    """How far they are behind, and how steps vary in the dark: none in causal mode, and of a filter that has no use for
+    either."""
     slow = slow_scene(200.0)
     found = plan(slow, at="frames")
-    assert found.settings.events.lag_variance == pytest.approx(found.lag.believed, abs=1e-3)
+    told = dict(plan_report(slow, found, PRESETS["default"]))
+    lag, steps = found.settings.events.lag_variance, dark_steps(found.settings.events.dark_steps)
+    assert lag == pytest.approx(found.lag.believed, abs=1e-3)
     assert found.lag.believed > 0.5
-    told = dict(plan_report(slow, found, PRESETS["default"]))["lag"]
+    assert told["lag"] == f"of slow pixels at a moment {lag:g} c^2 at 0.02 of white (measured)"
+    assert max(steps) > 0.3
     assert (
-        told
-        == f"of slow pixels at a moment {found.settings.events.lag_variance:g} c^2 at 0.02 of white (measured)"
+        told["dark steps"]
+        == f"variance of one event up to {max(steps):g} c^2 more below 0.32 of white (measured)"
     )
-    assert plan(slow, at="frames", lookahead=False).settings.events.lag_variance == 0.0
-    assert plan(slow, at="frames", preset="iccv2021").settings.events.lag_variance is None
-    given = altered(PRESETS["default"], "events", lag_variance=0.7)
+    causal = plan(slow, at="frames", lookahead=False).settings.events
+    assert (causal.lag_variance, causal.dark_steps) == (0.0, "none")
+    paper = plan(slow, at="frames", preset="iccv2021").settings.events
+    assert (paper.lag_variance, paper.dark_steps) == (None, "auto")
+    given = altered(PRESETS["default"], "events", lag_variance=0.7, dark_steps="0 0 0 0 1 2")
     kept = plan(slow, at="frames", settings=given)
     assert (kept.settings.events.lag_variance, kept.lag) == (0.7, None)
-    assert dict(plan_report(slow, kept, given))["lag"].endswith("0.7 c^2 at 0.02 of white (given)")
-
-
-def test_how_steps_vary_in_the_dark_comes_from_frames_and_can_be_given():
-    """None in causal mode, and of a filter that has no use for it."""
-    slow = slow_scene(200.0)
-    found = plan(slow, at="frames")
-    steps = dark_steps(found.settings.events.dark_steps)
-    assert max(steps) > 0.3
-    told = dict(plan_report(slow, found, PRESETS["default"]))["dark steps"]
-    assert told == f"variance of one event up to {max(steps):g} c^2 more below 0.32 of white (measured)"
-    assert plan(slow, at="frames", lookahead=False).settings.events.dark_steps == "none"
-    assert plan(slow, at="frames", preset="iccv2021").settings.events.dark_steps == "auto"
-    given = altered(PRESETS["default"], "events", dark_steps="0 0 0 0 1 2")
-    kept = plan(slow, at="frames", settings=given)
     assert kept.settings.events.dark_steps == "0 0 0 0 1 2"
-    assert dict(plan_report(slow, kept, given))["dark steps"].endswith(
-        "2 c^2 more below 0.32 of white (given)"
-    )
+    told = dict(plan_report(slow, kept, given))
+    assert told["lag"].endswith("0.7 c^2 at 0.02 of white (given)")
+    assert told["dark steps"].endswith("2 c^2 more below 0.32 of white (given)")
     without = altered(PRESETS["default"], "events", dark_steps="none")
     assert "dark steps" not in dict(plan_report(slow, plan(slow, at="frames", settings=without), without))
