@@ -461,7 +461,9 @@ def bridged(pixel, settings, times, on, off, scales):
         if crushed(k):
             shares = (np.arange(64) + 0.5) / 64
             variance = 3 * np.mean((np.log(most * shares ** pixel.dark[k] + i0) - black) ** 2)
-        variance += ev.deblur_variance * c2 * inside
+        error = ev.deblur_variance * c2 * (1 + inside / 12 + inside**2 / 20)
+        wrong = error / (error + 0.01 * c2 * inside**2) if error > 0 else 0.0
+        variance += (wrong * (middle - log_frame)) ** 2 + (1 - wrong) * error
         if late != 0:  # K19
             first, last = sorted((own_middle, pixel.middles[k]))
             middle -= np.sign(late) * event_sum(whole, first, last, a, b)
@@ -1158,10 +1160,37 @@ def averaged(level, variance, hears, rough, apart=1, more=None):
     return out, left
 
 
-def regularised(level, variance, moving, difference):
+def regularised(level, variance, moving, rough):
     """K12, of whole images: L and its variance."""
-    out, left = averaged(level, variance, moving, np.full(level.shape, difference**2))
+    out, left = averaged(level, variance, moving, rough)
     return out, 0.7 * variance + 0.3 * left
+
+
+def texture(pixels, shape, t, difference):
+    """K12: by how much neighbours differ, squared, on what the frames around show. Of a sensor of one part."""
+    usual = difference**2
+    middles = next(iter(pixels.values())).middles
+    latest = sum(m < t for m in middles) - 1
+    frames = [k for k in (latest, latest + 1) if 0 <= k < len(middles)]
+    more, sure = 6 / usual, 6 / usual**2
+    for k in frames:
+        for one, two in itertools.combinations(np.ndindex(shape), 2):
+            distance2 = (two[0] - one[0]) ** 2 + (two[1] - one[1]) ** 2
+            (before, v_before), (after, v_after) = pixels[one].latents[k], pixels[two].latents[k]
+            if distance2 <= 2 and max(v_before, v_after) < UNMEASURED:
+                expected = v_before + v_after + distance2 * usual
+                more += distance2 * ((after - before) ** 2 - v_before - v_after) / expected**2
+                sure += distance2**2 / expected**2
+    shown = np.clip(more / sure, usual / 100, usual)
+    return np.array(
+        [
+            [
+                shown if all(pixels[row, column].latents[k][1] < UNMEASURED for k in frames) else usual
+                for column in range(shape[1])
+            ]
+            for row in range(shape[0])
+        ]
+    )
 
 
 def is_surface(pixels):

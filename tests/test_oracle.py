@@ -244,7 +244,8 @@ def assert_agrees(name, events, frames, times):
         if chosen.filter.neighbours > 0:
             known = total + 1.6 * hidden[0, i]  # before neighbours are heard
             raised = value
-            value, total = naive.regularised(raised, known, moving[i], chosen.filter.neighbours)
+            rough = naive.texture(pixels, size, t, chosen.filter.neighbours)
+            value, total = naive.regularised(raised, known, moving[i], rough)
             surface = np.zeros(unshown.shape, bool)
             for place, pixel in pixels.items():
                 surface[place] = naive.is_unmeasured(pixel, t) and not unshown[place]

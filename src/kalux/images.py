@@ -134,6 +134,8 @@ class Estimate:
         Of what moves between the frames around (K16); None: not looked for, or nothing moves.
     share
         Of the way from the frame before to the one after; 0 where that is not known or not used.
+    texture
+        (H, W) float32: variance by which neighbours one apart differ (K12); None: `View.neighbours` squared.
     """
 
     t: int
@@ -153,6 +155,7 @@ class Estimate:
     signalled_variance: NDArray[np.floating[Any]] | None = None
     paths: Paths | None = None
     share: float = 0.0
+    texture: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True)
@@ -248,6 +251,7 @@ def make_image(estimate: Estimate, view: View, *, with_variance: bool = True) ->
         pitch=1 if view.mosaic is None else 2,  # to neighbours of the same colour
         unshown=None if unshown is None else unshown.pixels,
         unmeasured=estimate.unmeasured,
+        texture=estimate.texture,
         with_variance=needs_averaged,
     )
     if unshown is not None:

@@ -465,6 +465,7 @@ class Reconstructor:
             since=moment.since(self._frame_interval),
             paths=self._paths(progress, moment),
             share=moment.share,
+            texture=self._method.texture(progress.segment),
         )
         if final and t == progress.segment.end:
             self._at_boundary = estimate

@@ -188,7 +188,8 @@ class EventSettings:
         Variance, in c^2, of the changes below the threshold at both ends of a frame interval, which have produced no
         event yet: two uniform distributions one threshold wide, 2/12.
     deblur_variance
-        Variance, in c^2, that each event of an exposure adds to the deblurred frame. 0.05 (docs/tuning.md).
+        Variance, in c^2, of the correction that a few events of an exposure make to the frame; it grows with their
+        number (docs/equations.md, K3). 1/12: that of a uniform distribution one threshold wide.
     noise_rate
         Background noise, Hz per pixel, that makes isolated events doubtful. None: what is measured in the recording
         (`kalux.calibration.noise`), at least 0.5, in causal mode at least the usual; the usual in a live stream.
@@ -247,7 +248,7 @@ class EventSettings:
     refractory_period: int | None = None
     refractory_spread: float | None = None
     quantisation_variance: float = 1 / 6
-    deblur_variance: float = 0.05
+    deblur_variance: float = 1 / 12
     noise_rate: float | None = None
     leave_out_hot: bool = True
     mend_layout: bool = True

@@ -298,6 +298,7 @@ def combine(
         signalled_variance=signalled,
         paths=forward.paths,
         share=forward.share,
+        texture=forward.texture,
     )
 
 

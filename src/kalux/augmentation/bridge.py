@@ -257,6 +257,8 @@ class BridgedSegment(NamedTuple):
         The part of it that events would have told which have been lost (K18); None: none.
     untied
         What P grows by with each event of these pixels besides (`untied_steps`, K10). None: nothing.
+    texture
+        Variance by which neighbours one apart differ (`kalux.augmentation.texture`); None: by no more than usual.
     """
 
     start: int
@@ -288,6 +290,7 @@ class BridgedSegment(NamedTuple):
     untold: Array | None = None
     lost: Array | None = None
     untied: UntiedSteps | None = None
+    texture: Array | None = None
 
 
 def become_measured(first: Latent, second: Latent, events: Array) -> NDArray[np.int64]:

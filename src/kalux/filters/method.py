@@ -109,6 +109,10 @@ class Method(ABC):
         """(H, W): `kalux.augmentation.subthreshold.silent_change` of the segment, if known."""
         return None
 
+    def texture(self, segment: Any) -> Floats | None:
+        """(H, W): the variance by which neighbours one apart differ (K12); None: by no more than usual."""
+        return None
+
     def turns(self, segment: Any) -> float:
         """How often the intensity of a pixel with events reverses in a frame interval, on average."""
         return 0.0

@@ -247,6 +247,7 @@ def read_out(
     pitch: int = 1,
     unshown: NDArray[np.int64] | None = None,
     unmeasured: Unmeasured | None = None,
+    texture: NDArray[np.float32] | None = None,
     with_variance: bool = True,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """I of a state, and the variance of its logarithm, in one pass over the rows.
@@ -276,6 +277,8 @@ def read_out(
         Standard deviation of the difference of L between pixels one apart where there is no edge; 0: no averaging.
     pitch
         Distance of the neighbours: 2 in a Bayer mosaic, whose pixels repeat their colours.
+    texture
+        (H, W): the square of ``difference`` at each pixel; None: the same everywhere.
     unshown
         (N,) indices in the flattened image, ascending, of pixels that no frame has measured: their L is returned as
         well, and averaging does not reduce their variance, since their errors (K15) are the same.
@@ -312,6 +315,7 @@ def read_out(
         np.empty((0, 0), np.bool_) if moving is None else moving,
         change,
         (of_silent, of_moving),
+        np.empty((0, 0), np.float32) if texture is None else texture,
         difference > 0,
         pitch,
         *scalars,
@@ -420,6 +424,7 @@ def _read_out(  # type: ignore[no-untyped-def]
     moving,
     change,
     subthreshold,
+    texture,
     averages,
     pitch,
     prior,
@@ -467,6 +472,8 @@ def _read_out(  # type: ignore[no-untyped-def]
                 log_intensity, variance, moving, change, subthreshold, row + 2 * pitch, begin, count, states
             )
         if averages:
+            if texture.size > 0:
+                _load_texture(texture, row + 2 * pitch, begin, pitch, count, states, allowed)
             _mark_moving(moving, row + 3 * pitch, begin, marked, spans)
             for place in range(count):
                 first, last = smaller(first, spans[place, 0]), larger(last, spans[place, 1])
@@ -701,6 +708,16 @@ def _load_row(  # type: ignore[no-untyped-def]
         unsignalled = of_moving if moving[at, start + i] else of_silent * change[at, start + i]
         total = variance[at, start + i] + unsignalled
         states[into + _VARIANCE + i] = total if total < _UNKNOWN else _UNKNOWN
+
+
+@nb.njit(cache=True, inline="always")
+def _load_texture(texture, row, begin, pitch, count, states, allowed):  # type: ignore[no-untyped-def]
+    """Load by how much pixels of a row differ from neighbours."""
+    at, start, into, size = _part_of_row(texture, row, begin, count, states)
+    for i in range(size):
+        near = larger(texture[at, start + i] * np.float32(pitch * pitch), _LEAST_ALLOWED)
+        allowed[into + _STRAIGHT + i] = near
+        allowed[into + _DIAGONAL + i] = near + near
 
 
 @inner

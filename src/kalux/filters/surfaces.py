@@ -12,7 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.augmentation.parts import PART, between_parts, part_grid, parts_of, weighted_sums
+from kalux.augmentation.parts import PART, between_parts, part_grid, parts_of
+from kalux.augmentation.texture import Texture, neighbour_variance
 from kalux.compiled import ONE, empty, inner, loop, smaller
 from kalux.formulas import Number, Pixels, larger_of, row_formula, smaller_of, squared
 
@@ -22,13 +23,9 @@ _INDEPENDENT: Final = np.float32(0.7)
 _EDGE: Final = np.float32(4.0)
 """Squared differences count up to this many times their usual expectation: beyond, there is an edge between."""
 
-_PRIOR_PAIRS: Final = 6.0
-"""Pairs of pixels, one apart and exactly known, as which the usual roughness counts."""
-
-_LEAST: Final = 0.1
 _MOST: Final = 1.25
-"""Least and most standard deviation of neighbours' differences, in units of the usual one: of no surface is it known
-that it is even, and what differs by more is seldom texture."""
+"""Most standard deviation of neighbours' differences, in units of the usual one: what differs by more is seldom
+texture."""
 
 _BRIGHT: Final = 2.0
 _BRIGHTEST: Final = 4.0
@@ -36,9 +33,6 @@ _ROUGHER: Final = 0.4
 """Log intensity over white from which, and up to which, surfaces are rougher the brighter they are, and by which part
 of what it is for each unit: lamps are small. In the truth of 19 pans neighbours of pixels 2 to 3 beyond white differ
 from these by 0.15 (median), of those 3 to 4 beyond by 0.19, 4 to 5 by 0.59, 5 to 7 by 0.83 (docs/equations.md, K12)."""
-
-_FARTHEST: Final = 6
-"""Parts on one side, with the one itself, that count for each other: farther ones have less than 1e-7 of its weight."""
 
 _LEAST_PIXELS: Final = 16
 """Of a part that belongs to a surface: a quarter. Single pixels have no neighbours on it to be averaged with."""
@@ -185,11 +179,7 @@ def surface_variance(
     """
     excess, certainty = np.zeros((2, *part_grid(level.shape)))
     _compare_neighbours(level, variance, surface.pixels, surface.mask, usual, pitch, excess, certainty)
-    prior = _PRIOR_PAIRS / float(usual) ** 2
-    found = (weighted_sums(excess, _FARTHEST) + prior * float(usual)) / (
-        weighted_sums(certainty, _FARTHEST) + prior
-    )
-    limited = np.clip(found, _LEAST**2 * usual, _MOST**2 * usual).astype(np.float32)
+    limited = neighbour_variance([Texture(excess, certainty)], float(usual), _MOST)
     _spread(limited, surface.mask, surface.near, surface.seen, usual, out)
 
 
