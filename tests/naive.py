@@ -1173,15 +1173,16 @@ def texture(pixels, shape, t, difference):
     latest = sum(m < t for m in middles) - 1
     frames = [k for k in (latest, latest + 1) if 0 <= k < len(middles)]
     more, sure = 6 / usual, 6 / usual**2
-    for k in frames:
+    for k in [k for k in frames if k > 0]:
         for one, two in itertools.combinations(np.ndindex(shape), 2):
             distance2 = (two[0] - one[0]) ** 2 + (two[1] - one[1]) ** 2
             (before, v_before), (after, v_after) = pixels[one].latents[k], pixels[two].latents[k]
-            if distance2 <= 2 and max(v_before, v_after) < UNMEASURED:
+            moving = min(pixels[place].active[k - 1] for place in (one, two)) >= 0.5
+            if distance2 <= 2 and moving and max(v_before, v_after) < UNMEASURED:
                 expected = v_before + v_after + distance2 * usual
-                more += distance2 * ((after - before) ** 2 - v_before - v_after) / expected**2
+                more += distance2 * ((after - before) ** 2 - 0.7 * (v_before + v_after)) / expected**2
                 sure += distance2**2 / expected**2
-    shown = np.clip(more / sure, usual / 100, usual)
+    shown = np.sqrt(np.clip(more / sure, usual / 100, usual) * usual)
     return np.array(
         [
             [

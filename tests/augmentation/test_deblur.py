@@ -235,9 +235,13 @@ def test_only_blocks_with_an_event_are_looked_at():
             np.array([0.01]),
             exposure,
             duration=1000,
-            event_variance=0.001,
+            deblur_variance=0.1,
+            threshold2=0.04,
         )[:2]
         steps = (ON * thresholds[0], OFF * thresholds[1])
         whole = integrate_exposure(array, 1000, 2000, *steps)
         np.testing.assert_allclose(level, -1.0 - whole.log_mean + whole.to_middle, atol=1e-6)
-        np.testing.assert_allclose(variance, 0.01 + 0.001 * whole.events, rtol=1e-6)
+        error = 0.1 * 0.04 * (1 + whole.events / 12 + whole.events**2 / 20)
+        wrong = error / (error + 0.01 * 0.04 * whole.events**2)
+        moved = whole.to_middle - whole.log_mean
+        np.testing.assert_allclose(variance, 0.01 + (wrong * moved) ** 2 + (1 - wrong) * error, rtol=2e-5)

@@ -254,7 +254,8 @@ def test_pixels_that_no_frame_has_shown_are_told_as_they_are_read():
     ("shape", "moves"), [((3, 5), 0.6), ((7, 100), 0.02), ((6, 64), 0.5), ((5, 1283), 0.05)]
 )
 @pytest.mark.parametrize(("pitch", "gain"), [(1, 1.0), (2, 0.6)])
-def test_images_are_the_oracles(shape, moves, pitch, gain):
+@pytest.mark.parametrize("textured", [False, True])
+def test_images_are_the_oracles(shape, moves, pitch, gain, textured):
     """K6, K11 and K12 pixel by pixel, over images narrower and wider than what is looked at together."""
     rng = np.random.default_rng(1)
     value, variance = rng.normal(-0.5, 1.0, shape), np.exp(rng.normal(-3.0, 2.0, shape))
@@ -264,6 +265,9 @@ def test_images_are_the_oracles(shape, moves, pitch, gain):
         altered(preset("default"), "events", extrapolation_gain=gain, extrapolation_trust=0.8),
     )
     change = rng.uniform(0, 0.05, shape).astype(np.float32)
+    texture = np.full(shape, 0.3**2)
+    if textured:
+        texture = np.exp(rng.normal(-3.0, 1.0, shape))
     white, unknown_scale, offset = 0.8, 1.4, chosen.camera.offset
     prior = HighlightPrior(np.log(white + offset), chosen.filter.highlight_scale**2, unknown_scale, gain, 0.8)
     given = value.astype(np.float32), variance.astype(np.float32)
@@ -276,12 +280,15 @@ def test_images_are_the_oracles(shape, moves, pitch, gain):
         silent_change=change,
         difference=0.3,
         pitch=pitch,
+        texture=texture.astype(np.float32) if textured else None,
     )
     total = variance + np.where(moving, subthreshold.moving, subthreshold.silent * change)
     level = np.empty(shape)
     for part in np.ndindex(pitch, pitch):  # a mosaic's colours know nothing of each other
         own = np.s_[part[0] :: pitch, part[1] :: pitch]
-        level[own], total[own] = naive.regularised(value[own], total[own], moving[own], 0.3 * pitch)
+        level[own], total[own] = naive.regularised(
+            value[own], total[own], moving[own], texture[own] * pitch**2
+        )
     expected = np.vectorize(lambda v, p: naive.intensity(v, p, chosen, white, unknown_scale))(level, total)
     np.testing.assert_allclose(found[1], total, rtol=1e-5)
     np.testing.assert_allclose(found[0], expected, rtol=1e-5, atol=1e-6)

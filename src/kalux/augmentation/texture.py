@@ -22,6 +22,13 @@ _LEAST: Final = 0.1
 """Least standard deviation of neighbours' differences, in units of the usual one: of no surface is it known that it is
 even."""
 
+INDEPENDENT: Final = np.float32(0.7)
+"""Part of the variances of two neighbours that is in their difference: their errors have correlations of 0.1 to 0.5."""
+
+_MOVED: Final = np.float32(0.5)
+"""Events of a pixel since the frame before, as far as they are signal, from which on it has moved: what stands still
+may be of another texture than what passes before it."""
+
 _FARTHEST: Final = 6
 """Parts on one side, with the one itself, that count for each other: farther ones have less than 1e-7 of its weight."""
 
@@ -41,14 +48,25 @@ class Texture(NamedTuple):
     certainty: Floats
 
 
-def frame_texture(latent: Latent, usual: float, pitch: int) -> Texture:
-    """What the neighbours of a deblurred frame tell, ``pitch`` pixels apart; ``usual`` is the variance of most frames.
+def frame_texture(latent: Latent, events: Floats, usual: float, pitch: int) -> Texture:
+    """What the neighbours of a deblurred frame tell, ``pitch`` pixels apart, of which both move.
 
     With e the difference of two neighbours at distance d, V and V' their variances, and E = V + V' + d^2 ``usual``: the
-    sums of d^2 (e^2 - V - V') / E^2 and of d^4 / E^2. Clipped pixels are in neither.
+    sums of d^2 (e^2 - 0.7 (V + V')) / E^2 and of d^4 / E^2. Clipped pixels are in neither.
+
+    Parameters
+    ----------
+    latent
+        The frame.
+    events
+        (H, W) of every pixel since the frame before, as far as they are signal.
+    usual
+        Variance by which neighbours one apart usually differ, log intensity^2.
+    pitch
+        Distance of the neighbours, pixels.
     """
     excess, certainty = np.zeros((2, *part_grid(latent.value.shape)))
-    planes = (np.ascontiguousarray(plane, np.float32) for plane in latent[:2])
+    planes = (np.ascontiguousarray(plane, np.float32) for plane in (*latent[:2], events))
     _add_pairs(*planes, np.float32(usual), pitch, excess, certainty)
     return Texture(excess, certainty)
 
@@ -67,9 +85,10 @@ def neighbour_variance(textures: Sequence[Texture], usual: float, most: float = 
 def shown_texture(textures: Sequence[Texture], frames: Sequence[Latent], usual: float) -> NDArray[np.float32]:
     """(H, W) the variance by which neighbours one apart differ: by the ``textures`` of the ``frames`` around an image.
 
-    Of pixels that one of these does not measure the ``usual`` one: lamps are small, and no frame shows their texture.
+    It is the geometric mean of what these show and of the ``usual`` one. Of pixels that one of the frames does not
+    measure the latter alone: lamps are small, and no frame shows their texture.
     """
-    parts = neighbour_variance(textures, usual)
+    parts = np.sqrt(neighbour_variance(textures, usual) * np.float32(usual))
     height, width = frames[0].value.shape
     size = parts.shape[1] * PART, parts.shape[0] * PART
     whole = cv2.resize(parts, size, interpolation=cv2.INTER_LINEAR)  # from the middles of parts
@@ -80,7 +99,7 @@ def shown_texture(textures: Sequence[Texture], frames: Sequence[Latent], usual: 
 
 
 @loop
-def _add_pairs(value, variance, usual, pitch, excess, certainty):  # type: ignore[no-untyped-def]
+def _add_pairs(value, variance, events, usual, pitch, excess, certainty):  # type: ignore[no-untyped-def]
     height, width = value.shape
     more, sure = empty(width, np.float32), empty(width, np.float32)
     for row in range(height):
@@ -97,8 +116,9 @@ def _add_pairs(value, variance, usual, pitch, excess, certainty):  # type: ignor
                 explained = variance[at, one] + variance[beside, two]
                 expected = explained + usual * distance2
                 difference = value[beside, two] - value[at, one]
-                weight = distance2 / (expected * expected)
-                more[i] = weight * (difference * difference - explained)
+                moves = smaller(events[at, one], events[beside, two]) >= _MOVED
+                weight = distance2 / (expected * expected) if moves else np.float32(0.0)
+                more[i] = weight * (difference * difference - INDEPENDENT * explained)
                 sure[i] = weight * distance2
             for part in range(excess.shape[1]):
                 begin = larger(part * PART - first, 0)

@@ -142,7 +142,7 @@ class BridgeMemory(NamedTuple):
     usual
         What the latest intervals tell of silent pixels.
     texture
-        What the latest frame tells of how neighbours differ (K12); None: they are not averaged.
+        What the latest frame tells of how neighbours differ (K12); None: nothing, as the first one.
     """
 
     latent: Latent
@@ -336,7 +336,7 @@ class BridgedFrames(Method):
             silent_change=np.full(self.shape, UNKNOWN_CHANGE * self._threshold2, np.float32),
             latest_change=np.full(self.shape, np.nan, np.float32),
             usual=nothing_usual(self.shape),
-            texture=self._texture(latent, shot),
+            texture=None,
         )
         lead_in, value, variance = None, latent.value, latent.variance
         if not self.lookahead:
@@ -344,10 +344,7 @@ class BridgedFrames(Method):
         elif shot.middle > begin:
             lead_in = bridge.extend_backward(latent, on, off, thresholds, self.noise, begin, shot.middle)
             lead_in = lead_in._replace(
-                still_since=shot.start,
-                trail=self._lead_in_trail(shot, followed),
-                unshown=memory.unshown,
-                texture=self._shown_texture((memory.texture,), (latent,)),
+                still_since=shot.start, trail=self._lead_in_trail(shot, followed), unshown=memory.unshown
             )
             value = lead_in.augmented
             variance = lead_in.backward_variance + lead_in.step_variance * (on + off)
@@ -366,9 +363,11 @@ class BridgedFrames(Method):
         join = self._lookahead_segment if self.lookahead else self._causal_segment
         return join(memory, shot, following, second, events)
 
-    def _texture(self, latent: Latent, shot: Shot) -> Texture | None:
-        """What a frame tells of how neighbours differ (K12); None: they are not averaged."""
-        return frame_texture(latent, self._unlike, shot.pitch) if self._unlike > 0 else None
+    def _texture(self, latent: Latent, shot: Shot, steps: Counts) -> Texture | None:
+        """What a frame tells of how neighbours differ (K12), given the events before it; None: K12 is off."""
+        if self._unlike == 0:
+            return None
+        return frame_texture(latent, steps[0] + steps[1], self._unlike, shot.pitch)
 
     def _shown_texture(
         self, textures: Sequence[Texture | None], frames: Sequence[Latent]
@@ -456,7 +455,7 @@ class BridgedFrames(Method):
             followed=at_middle,
             at_middle=at_middle,
             unshown=unshown,
-            texture=self._texture(second, following),
+            texture=self._texture(second, following, steps),
         )
         frames = memory.latent, second
         assert joined.events is not None
@@ -512,7 +511,7 @@ class BridgedFrames(Method):
             at_middle=at_middle,
             unshown=self._follow_unshown(memory, second, following, behind.net, between),
             silent_change=memory.silent_change if lost is not None else self._silent_change(behind, between),
-            texture=self._texture(second, following),
+            texture=self._texture(second, following, between),
         )
         forward = bridge.extend(
             self._latent_at_end(memory, shot),

@@ -13,12 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.parts import PART, between_parts, part_grid, parts_of
-from kalux.augmentation.texture import Texture, neighbour_variance
+from kalux.augmentation.texture import INDEPENDENT, Texture, neighbour_variance
 from kalux.compiled import ONE, empty, inner, loop, smaller
 from kalux.formulas import Number, Pixels, larger_of, row_formula, smaller_of, squared
-
-_INDEPENDENT: Final = np.float32(0.7)
-"""Part of the variances of two neighbours that is in their difference: their errors have correlations of 0.1 to 0.5."""
 
 _EDGE: Final = np.float32(4.0)
 """Squared differences count up to this many times their usual expectation: beyond, there is an edge between."""
@@ -328,7 +325,7 @@ def _compare_neighbours(  # type: ignore[no-untyped-def]
             difference = level[other, beside] - one
             square = smaller(difference * difference, _EDGE * expected)
             weight = distance2 / (expected * expected)
-            more += np.float64(weight * (square - _INDEPENDENT * explained))
+            more += np.float64(weight * (square - INDEPENDENT * explained))
             sure += np.float64(weight * distance2)
         excess[row // PART, column // PART] += more
         certainty[row // PART, column // PART] += sure
