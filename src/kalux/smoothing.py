@@ -391,7 +391,9 @@ def reversed_settings(settings: Settings) -> Settings:
         trail=0.0,
     )
     camera = dataclasses.replace(settings.camera, row_time=-settings.camera.row_time)
-    filtered = dataclasses.replace(settings.filter, motion="off")  # the forward filter's images have it
+    filtered = dataclasses.replace(
+        settings.filter, motion="off", neighbours=0.0
+    )  # images have the forward one's
     return dataclasses.replace(settings, camera=camera, events=events, filter=filtered)
 
 

@@ -90,9 +90,8 @@ def test_nothing_tells_of_frames_that_clip_all():
 
 
 def test_nothing_tells_where_nothing_moves():
-    assert neighbour_variance([told(latent(np.zeros((16, 16)), 1e-4), events=0.4)], USUAL) == pytest.approx(
-        USUAL
-    )
+    still = told(latent(np.zeros((16, 16)), 1e-4), events=0.4)
+    assert neighbour_variance([still], USUAL) == pytest.approx(USUAL)
 
 
 def test_pixels_that_a_frame_does_not_measure_differ_as_usual():
@@ -104,9 +103,8 @@ def test_pixels_that_a_frame_does_not_measure_differ_as_usual():
     lamps = np.zeros(shown.shape, bool)
     lamps[3, 4] = lamps[5, 6] = True
     assert (shown[lamps] == np.float32(USUAL)).all()
-    np.testing.assert_allclose(
-        shown[~lamps], 0.1 * USUAL, rtol=0.01
-    )  # half-way, as logarithms are, to 0.01 of it
+    # Half-way, as logarithms are, from 0.01 of it.
+    np.testing.assert_allclose(shown[~lamps], 0.1 * USUAL, rtol=0.01)
 
 
 def test_it_goes_from_part_to_part_in_a_straight_line():

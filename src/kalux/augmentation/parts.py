@@ -44,6 +44,14 @@ def interpolated(parts: NDArray[np.float32], pixels: NDArray[np.int64], width: i
     return values
 
 
+def interpolated_plane(parts: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """(H, W) values of the ``parts`` at all pixels of an image of ``shape``, as `interpolated`."""
+    height, width = shape
+    size = parts.shape[1] * PART, parts.shape[0] * PART
+    whole = cv2.resize(parts, size, interpolation=cv2.INTER_LINEAR)
+    return np.ascontiguousarray(whole[:height, :width], np.float32)
+
+
 @loop
 def _at_pixels(pixels, width, parts, values):  # type: ignore[no-untyped-def]
     for i in range(len(pixels)):

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Final, NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.bridge import UNMEASURED, Latent
-from kalux.augmentation.parts import PART, part_grid, weighted_sums
+from kalux.augmentation.parts import PART, interpolated_plane, part_grid, weighted_sums
 from kalux.compiled import empty, larger, loop, smaller
 
 Floats = NDArray[np.floating[Any]]
@@ -89,10 +88,7 @@ def shown_texture(textures: Sequence[Texture], frames: Sequence[Latent], usual: 
     measure the latter alone: lamps are small, and no frame shows their texture.
     """
     parts = np.sqrt(neighbour_variance(textures, usual) * np.float32(usual))
-    height, width = frames[0].value.shape
-    size = parts.shape[1] * PART, parts.shape[0] * PART
-    whole = cv2.resize(parts, size, interpolation=cv2.INTER_LINEAR)  # from the middles of parts
-    shown = np.ascontiguousarray(whole[:height, :width], np.float32)
+    shown = interpolated_plane(parts, frames[0].value.shape)
     for frame in frames:
         _leave_usual(frame.variance.reshape(-1), np.float32(usual), shown.reshape(-1))
     return shown

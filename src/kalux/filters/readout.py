@@ -473,7 +473,8 @@ def _read_out(  # type: ignore[no-untyped-def]
             )
         if averages:
             if texture.size > 0:
-                _load_texture(texture, row + 2 * pitch, begin, pitch, count, states, allowed)
+                ahead, column, into, there = _part_of_row(texture, row + 2 * pitch, begin, count, states)
+                _load_rough(texture, ahead, column, there, ONE, pitch, allowed, into)
             _mark_moving(moving, row + 3 * pitch, begin, marked, spans)
             for place in range(count):
                 first, last = smaller(first, spans[place, 0]), larger(last, spans[place, 1])
@@ -680,10 +681,9 @@ def _load_surface(  # type: ignore[no-untyped-def]
             for i in range(smaller(size - first, np.uint64(BLOCK))):
                 states[place + _LEVEL + i] = level[at, column + i]
                 states[place + _VARIANCE + i] = variance[at, column + i]
-            for i in range(smaller(size - first, np.uint64(BLOCK))):
-                near = larger(allowed[at, column + i] * factor * np.float32(pitch * pitch), _LEAST_ALLOWED)
-                rough[place + _STRAIGHT + i] = near
-                rough[place + _DIAGONAL + i] = near + near
+            _load_rough(
+                allowed, at, column, smaller(size - first, np.uint64(BLOCK)), factor, pitch, rough, place
+            )
 
 
 @nb.njit(cache=True, inline="always")
@@ -711,13 +711,12 @@ def _load_row(  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, inline="always")
-def _load_texture(texture, row, begin, pitch, count, states, allowed):  # type: ignore[no-untyped-def]
-    """Load by how much pixels of a row differ from neighbours."""
-    at, start, into, size = _part_of_row(texture, row, begin, count, states)
+def _load_rough(plane, row, column, size, factor, pitch, rough, into):  # type: ignore[no-untyped-def]
+    """Load by how much some pixels of a row differ from neighbours, from the variance at a distance of one."""
     for i in range(size):
-        near = larger(texture[at, start + i] * np.float32(pitch * pitch), _LEAST_ALLOWED)
-        allowed[into + _STRAIGHT + i] = near
-        allowed[into + _DIAGONAL + i] = near + near
+        near = larger(plane[row, column + i] * factor * np.float32(pitch * pitch), _LEAST_ALLOWED)
+        rough[into + _STRAIGHT + i] = near
+        rough[into + _DIAGONAL + i] = near + near
 
 
 @inner
