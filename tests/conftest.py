@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import signal
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
+
+# As on the command line. Two processes with two threads each make small least squares take ten times as long.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 # The first call of a compiled function compiles it, which takes longer than any deadline.
 settings.register_profile("kalux", deadline=None)

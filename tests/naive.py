@@ -1110,10 +1110,9 @@ def with_pattern(variance, intensity, white, camera):
     response = Camera.named(chosen_response(camera.response, None), camera.clipped_from).response
     if response.is_linear:
         return variance + (0.005 * white / (intensity + camera.offset)) ** 2
-    slopes = []  # at the levels of the curve
-    for stored in response.response:
-        least, most = max(stored - 0.005, 0.5 / 255), min(stored + 0.005, 1.0)
-        slopes.append((response.inverse(most) - response.inverse(least)) / (most - least))
+    least = np.maximum(response.response - 0.005, 0.5 / 255)  # at the levels of the curve
+    most = np.minimum(response.response + 0.005, 1.0)
+    slopes = (response.inverse(most) - response.inverse(least)) / (most - least)
     given = variance.copy()
     for place in np.ndindex(variance.shape):
         slope = np.interp(intensity[place] / white, response.irradiance, slopes)
