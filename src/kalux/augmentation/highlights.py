@@ -439,8 +439,7 @@ def _limited(memory: UnshownMemory) -> NDArray[np.float32]:
         inverse = 1.0 / (_SLOPE_REACH * slope + _STEP_REACH * step)
     known = np.where(rim_slope > 0.0, inverse, 0.0).astype(np.float32)
     relative = memory.excess * interpolated(known, memory.pixels, width)
-    limited: NDArray[np.float32] = memory.excess / np.sqrt(np.float32(1.0) + np.square(relative))
-    return limited
+    return np.asarray(memory.excess / np.sqrt(np.float32(1.0) + np.square(relative)), np.float32)
 
 
 def _with_revealed(

@@ -388,7 +388,7 @@ def _joined(of_excess: Period, of_sums: Period) -> Period:
     if of_sums.spread > _ROUGH:
         return of_excess if errors[0] < errors[1] else of_sums
     information = 1 / np.square(errors)
-    length = np.exp(information @ np.log([of_excess.length, of_sums.length]) / information.sum())
+    length = float(np.exp(information @ np.log([of_excess.length, of_sums.length]) / information.sum()))
     return Period(round(length), float(information.sum() ** -0.5))
 
 

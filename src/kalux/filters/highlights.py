@@ -224,7 +224,8 @@ def smoothed_unshown(
     rise = np.maximum(np.maximum(*bounds) - mean, np.float32(0.0)).astype(np.float32)
     smoothed.reshape(-1)[memory.pixels] = mean + rise
     noise = np.where(rise > 0, np.where(bounds[0] > bounds[1], *noises), np.minimum(*noises))
-    return Unshown(memory.pixels, excess / (np.float32(1.0) + rise / scale), noise, doubt, memory)
+    left = np.asarray(excess / (np.float32(1.0) + rise / scale), np.float32)
+    return Unshown(memory.pixels, left, noise, doubt, memory)
 
 
 def obey_bounds(
