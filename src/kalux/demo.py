@@ -70,6 +70,8 @@ class Comparison:
         The last frame that was finished at each time.
     cf, akf
         Images of the complementary filter, and of the asynchronous Kalman filter.
+    pictured
+        That of either at the time of the picture.
     """
 
     simulation: Simulation
@@ -77,6 +79,7 @@ class Comparison:
     held: list[Float32]
     cf: list[Image]
     akf: list[Image]
+    pictured: tuple[Image, Image]
 
 
 def run_demo(
@@ -125,10 +128,10 @@ def run_demo(
         f"reconstructing it at {RATE_HZ:g} Hz from {len(simulation.events):,} events and "
         f"{len(simulation.frames)} frames ..."
     )
-    compared = compare(simulation, recording)
+    compared = compare(simulation, recording, moment)
     say(f"writing {out} ...")
     write_recording(out / RECORDING, recording)
-    write_picture(out / PICTURE, simulation, recording, moment)
+    write_picture(out / PICTURE, compared, moment)
     write_video(out / VIDEO, compared, overwrite=overwrite)
     return scores(compared)
 
@@ -149,16 +152,22 @@ def prepare(out: Path, *, overwrite: bool) -> None:
             )
 
 
-def compare(simulation: Simulation, recording: Recording) -> Comparison:
-    """Reconstruct with both filters, at times that both can tell."""
+def compare(simulation: Simulation, recording: Recording, moment: int) -> Comparison:
+    """Reconstruct with both filters, at times that both can tell, and at that of the picture (us)."""
     begin, end = simulation.frames[0].exposure_end, simulation.frames[-1].exposure_end
     times = np.arange(begin, end + 1, round(1e6 / RATE_HZ), dtype=np.int64)
+    # All at once: planning takes longer than the images.
+    cf, akf = (
+        {image.t: image for image in reconstruct(recording, times=np.union1d(times, moment), preset=preset)}
+        for preset in ("cf", "default")
+    )
     return Comparison(
         simulation,
         times,
         [held_frame(simulation.frames, int(t)) for t in times],
-        list(reconstruct(recording, times=times, preset="cf")),
-        list(reconstruct(recording, times=times)),
+        [cf[int(t)] for t in times],
+        [akf[int(t)] for t in times],
+        (cf[moment], akf[moment]),
     )
 
 
@@ -183,13 +192,11 @@ def write_recording(path: Path, recording: Recording) -> None:
     )
 
 
-def write_picture(path: Path, simulation: Simulation, recording: Recording, moment: int) -> None:
+def write_picture(path: Path, compared: Comparison, moment: int) -> None:
     """One moment by all methods, all through the truth's tone curve."""
-    times = np.array([moment], np.int64)
-    cf = next(reconstruct(recording, times=times, preset="cf"))
-    akf = next(reconstruct(recording, times=times))
+    simulation = compared.simulation
     frame = min(simulation.frames, key=lambda frame: abs(frame.middle - moment))
-    data = encoded(picture(frame, cf, akf, simulation.scene.at(float(moment))))
+    data = encoded(picture(frame, *compared.pictured, simulation.scene.at(float(moment))))
     with output_errors(path):
         write_whole(path, data)
 
