@@ -166,7 +166,6 @@ def quick_frames() -> Simulation:
 
 
 @lru_cache(maxsize=4)
-@lru_cache(maxsize=4)
 def slow_scene(cutoff: float, mismatch: float = 0.0) -> Recording:
     """A second with thresholds of 0.15; pixels are as fast as light (0), or slower by ``cutoff``, Hz at white."""
     sensor = SensorSettings(

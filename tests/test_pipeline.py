@@ -323,7 +323,7 @@ def test_peak_memory_does_not_grow_with_length(monkeypatch):
     for _ in reconstruct(long_recording(100), rate_hz=20):  # pays for what is compiled and cached
         pass
     peaks = []
-    for frames in (150, 450):  # estimates look at some hundred frames at most
+    for frames in (200, 800):  # estimates look at some hundred frames at most
         rec = long_recording(frames)
         tracemalloc.start()
         for _ in reconstruct(rec, rate_hz=20):

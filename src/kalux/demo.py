@@ -131,7 +131,7 @@ def run_demo(
     compared = compare(simulation, recording, moment)
     say(f"writing {out} ...")
     write_recording(out / RECORDING, recording)
-    write_picture(out / PICTURE, compared, moment)
+    write_picture(out / PICTURE, compared)
     write_video(out / VIDEO, compared, overwrite=overwrite)
     return scores(compared)
 
@@ -192,9 +192,9 @@ def write_recording(path: Path, recording: Recording) -> None:
     )
 
 
-def write_picture(path: Path, compared: Comparison, moment: int) -> None:
+def write_picture(path: Path, compared: Comparison) -> None:
     """One moment by all methods, all through the truth's tone curve."""
-    simulation = compared.simulation
+    simulation, moment = compared.simulation, compared.pictured[0].t
     frame = min(simulation.frames, key=lambda frame: abs(frame.middle - moment))
     data = encoded(picture(frame, *compared.pictured, simulation.scene.at(float(moment))))
     with output_errors(path):

@@ -391,9 +391,8 @@ def reversed_settings(settings: Settings) -> Settings:
         trail=0.0,
     )
     camera = dataclasses.replace(settings.camera, row_time=-settings.camera.row_time)
-    filtered = dataclasses.replace(
-        settings.filter, motion="off", neighbours=0.0
-    )  # images have the forward one's
+    # Images have the forward filter's.
+    filtered = dataclasses.replace(settings.filter, motion="off", neighbours=0.0)
     return dataclasses.replace(settings, camera=camera, events=events, filter=filtered)
 
 
