@@ -112,3 +112,23 @@ def test_colours_have_been_demosaiced():
     assert estimate_fixed_pattern(Recording.from_arrays(NOTHING, rgb, sensor_size=SIZE), CAMERA) is None
     three = CameraSettings(response="linear;gamma:2;linear")
     assert estimate_fixed_pattern(source, three) is None
+
+
+@pytest.mark.parametrize("name", ["linear", "srgb"])
+def test_edges_that_a_camera_shakes_over_the_same_pixels_are_none(name):
+    """Where dark and bright meet softly a pixel is on the dark side of the edge again and again, nearer and farther."""
+    rows = np.arange(400)[:, None]
+    edges = 0.03 + 0.4 * cv2.GaussianBlur(
+        (rows // 40 % 2 * np.ones((1, 300))).astype(np.float64), (0, 0), 2.5
+    )
+    made, rng = [], np.random.default_rng(4)
+    stored = Response.named(name)(edges)
+    for k in range(40):
+        down = 100 + (0, 1, 2, 3, 2, 1)[k % 6]
+        seen = stored[down : down + SIZE[0], :160] + 0.003 * rng.standard_normal(SIZE)
+        values = np.rint(255 * seen).astype(np.uint8)
+        made.append(Frame(values, 40_000 * k, 40_000 * k + 10_000))
+    recording = Recording.from_arrays(NOTHING, made, sensor_size=SIZE)
+    found = estimate_fixed_pattern(recording, CameraSettings(response=name, frame_noise=0.001))
+    assert found.variance > 6 * found.error
+    assert found.deviation == 0

@@ -231,6 +231,36 @@ def test_light_that_is_switched_on_is_no_gain(refractory):
     assert found.steps == ()
 
 
+BETWEEN = 1e6 / 48.0  # us from one of the frames below to the next
+
+
+@pytest.mark.parametrize(
+    ("motion", "threshold", "light"),
+    [
+        (still(), 0.15, lambda k: np.exp(-0.4 * (k > 10.3))),
+        (still(), 0.3, lambda k: np.exp(-0.1 * k)),
+        (still(), 0.15, lambda k: np.exp(0.6 * np.sin(k / 2))),
+        (still(), 0.3, lambda k: np.exp(0.2 * np.sin(k / 6))),
+        (pan(60.0), 0.3, lambda k: np.exp(-0.06 * k)),
+        (pan(60.0), 0.15, lambda k: np.exp(0.6 * np.sin(k / 2))),
+    ],
+    ids=["down at once", "down slowly", "up and down", "up and down slowly", "pan, down", "pan, up and down"],
+)
+def test_a_lamp_that_is_turned_down_or_up_is_no_gain(motion, threshold, light):
+    """All pixels have the same events then, which no regression tells from a change that none of them explains; where
+    the light turns, none has any. (k counts frames.)"""
+    events, frames = filmed(
+        motion,
+        light=lambda t: float(light(t / BETWEEN)),
+        exposures=[6_000] * 24,
+        frame_rate=48.0,
+        threshold_on=threshold,
+        threshold_off=threshold,
+        settled=True,
+    )
+    assert faults(events, frames).steps == ()
+
+
 def test_a_lamp_that_flickers_is_no_gain():
     found = faults(*filmed(light=lambda t: 1 + 0.3 * np.sin(2 * np.pi * 100e-6 * t), exposure=3_000))
     assert found.steps == ()

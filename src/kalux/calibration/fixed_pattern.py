@@ -40,8 +40,15 @@ _WHITE: Final = 1 + 1 / 8  # variance of white noise, and of what a pixel of it 
 _BELIEVED: Final = 6.0
 """Standard errors: 47 simulated scenes without a pattern say at most 4.3, with 0.005 at least 14."""
 
+_TEXTURED: Final = 0.25
+"""Share of the variance that pixels some away share, right or down of each other, from which it is texture, as where a
+camera shakes over the same pixels again and again: texture has an extent. Where there is a pattern they share 0 to 0.16
+(22 simulated DAVIS sensors; 0.04 for the neighbours that both are compared with), on a scene that shakes 0.38."""
+
+_AWAY: Final = 2  # of the distance of a pixel's neighbours
 _MOST_FRAMES: Final = 32  # evenly among the first: more pairs say little more
 _LEAST_PARTS: Final = 8
+_TINY: Final = 1e-300  # weights of which there are none
 
 
 class FixedPattern(NamedTuple):
@@ -72,7 +79,7 @@ def estimate_fixed_pattern(recording: Recording, camera: CameraSettings) -> Fixe
     With r what a pixel has beyond the mean of its eight neighbours, and s^2 the variance of these and of the frames'
     noise, the sum over pixels and pairs of frames j, k at least 3 apart, between which that mean changes by a third, of
     r_j r_k / (s_j^2 s_k^2) is 9/8 of the pattern's variance times that of 1 / (s_j^2 s_k^2). Standard errors are those
-    of a jackknife over 64 parts of the sensor.
+    of a jackknife over 64 parts of the sensor. Of texture r_j and the r_k of a pixel two further on have products, too.
 
     Parameters
     ----------
@@ -94,11 +101,13 @@ def estimate_fixed_pattern(recording: Recording, camera: CameraSettings) -> Fixe
         return None
     height, width = recording.sensor_size
     step = grid_step(recording.sensor_size, _MOST_PIXELS)
-    seen = []
+    seen, pitch = [], 1
     for frame in islice(recording.frames(), MAX_FRAMES):
         if frame.image.ndim == 3:
             return None
-        around = _around(take_shot(frame, model, float(frame.exposure)), camera.noise, step)
+        shot = take_shot(frame, model, float(frame.exposure))
+        pitch = shot.pitch
+        around = _around(shot, camera.noise, step)
         seen.append(around if model.response.is_linear else _stored(around, model.response))
     if not seen:
         return None
@@ -106,8 +115,11 @@ def estimate_fixed_pattern(recording: Recording, camera: CameraSettings) -> Fixe
     beyond, light, weight = (np.stack(values) for values in zip(*seen[::every], strict=True))
     part = parts((height, width))[::step, ::step].ravel()
     sums: Array = np.zeros((part.max() + 1, 2))
-    _add_products(beyond, light, weight, -(-_LEAST_APART // every), part, sums)
-    return _solved(sums)
+    beside: Array = np.zeros((2, 2))
+    away = -(-_AWAY * pitch // step)
+    shape = np.array([-(-length // step) for length in (height, width)])
+    _add_products(beyond, light, weight, -(-_LEAST_APART // every), part, shape, away, sums, beside)
+    return _solved(sums, beside)
 
 
 def _stored(around: Planes, response: Response) -> Planes:
@@ -166,9 +178,15 @@ def _look_around(  # type: ignore[no-untyped-def]
 
 
 @loop
-def _add_products(beyond, light, weight, apart, part, sums):  # type: ignore[no-untyped-def]
-    """Of all pairs of frames: per part of the sensor, the weighed products and the weights."""
+def _add_products(  # type: ignore[no-untyped-def]
+    beyond, light, weight, apart, part, shape, away, sums, beside
+):
+    """Of all pairs of frames: per part of the sensor, the weighed products and the weights.
+
+    And those of each pixel with the one that is ``away`` pixels to the right of it, and below.
+    """
     more, less = np.float32(_LEAST_CHANGE), np.float32(1 / _LEAST_CHANGE)
+    rows, columns = shape
     for first in range(len(beyond)):
         for second in range(first + apart, len(beyond)):
             for i in range(len(part)):
@@ -177,13 +195,23 @@ def _add_products(beyond, light, weight, apart, part, sums):  # type: ignore[no-
                 if both > 0 and (after > more * before or after < less * before):
                     sums[part[i], 0] += both * beyond[first, i] * beyond[second, i]
                     sums[part[i], 1] += both
+                    if i % columns + away < columns:
+                        both = weight[first, i] * weight[second, i + away]
+                        beside[0, 0] += both * beyond[first, i] * beyond[second, i + away]
+                        beside[0, 1] += both
+                    if i // columns + away < rows:
+                        below = i + away * columns
+                        both = weight[first, i] * weight[second, below]
+                        beside[1, 0] += both * beyond[first, i] * beyond[second, below]
+                        beside[1, 1] += both
 
 
-def _solved(sums: Array) -> FixedPattern:
+def _solved(sums: Array, beside: Array) -> FixedPattern:
     used = sums[sums[:, 1] > 0]
     if len(used) < _LEAST_PARTS:
         return FixedPattern(0.0, 0.0, np.inf)
     variance = float(used[:, 0].sum() / used[:, 1].sum()) / _WHITE
     error = ratio_error(used) / _WHITE
-    deviation = float(np.sqrt(variance)) if variance > _BELIEVED * error else 0.0
-    return FixedPattern(deviation, variance, error)
+    shared = float((beside[:, 0] / np.maximum(beside[:, 1], _TINY)).max()) / _WHITE
+    is_found = variance > _BELIEVED * error and shared < _TEXTURED * variance
+    return FixedPattern(float(np.sqrt(variance)) if is_found else 0.0, variance, error)

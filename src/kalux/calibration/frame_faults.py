@@ -62,6 +62,18 @@ _SEEN: Final = 0.4
 """Where the median pixel, or the mean quiet one, has events for more than this share of the step, it is the light that
 changes: so fast that most of it is lost in the pixels' refractory period, or by less than a threshold."""
 
+_UNIFORM: Final = 0.15
+"""Share of the pixels that brighten, less that of those that darken, from which the light of a part of the image
+changes, if most parts (`_MOST_PARTS`) have as much. Motion has both signs, and noise has them at random."""
+
+_LARGEST_THRESHOLD: Final = 0.5
+"""Where the light changes, pixels have events alike, and no regression tells by how much each of them changes it: as
+much as this, the largest threshold that is usual."""
+
+_UNSEEN: Final = 1.5
+"""Thresholds by which light that is seen to change may do so unseen: where it turns, no pixel has an event before it
+has gone back by a whole one."""
+
 _QUIET: Final = 1.0
 """Events of a pixel between two frames up to which it is quiet: it says by itself whether the light stayed."""
 
@@ -94,6 +106,11 @@ of 28 whose gain goes up and down by 13 or 25 % eleven have two to 34."""
 _LEAST_OFTEN: Final = 2
 _MUCH_QUIET: Final = 0.3
 _QUIET_ALIKE: Final = 0.25
+_MOVING_ALIKE: Final = 0.5
+"""Share of a step from which pixels with events may differ: half-way between what the gain does to them, all of the
+step, and the light, nothing, since events have told it. Quiet ones do not tell: light that goes by d before pixels of
+a threshold c makes events in d^2 / (2 c^2) of them."""
+
 
 _SLIGHT: Final = 0.02
 _MOST_SLIGHT: Final = 30
@@ -272,8 +289,9 @@ def find_frame_faults(recording: Recording, camera: CameraSettings, watch: Frame
             certain_empty.append(index)
     logs = np.zeros(watch.frames)
     rests = _rests(recording, compared, watch, {*watch.suspects, *watch.slight})
-    unsteady = sum(rest.is_unsteady for rest in rests.values()) >= _LEAST_OFTEN
-    suspects = {index: rests[index] for index in watch.suspects if index in rests}
+    unseen = _unseen(rests.values())
+    unsteady = unseen < _LEAST_STEP and sum(rest.is_unsteady for rest in rests.values()) >= _LEAST_OFTEN
+    suspects = {i: rests[i] for i in watch.suspects if i in rests and abs(rests[i].step) > unseen}
     if unsteady:
         others = set(range(1, watch.frames)) - {*rests}
         logs = _unsteady_log_gains(watch.frames, rests | _rests(recording, compared, watch, others))
@@ -287,6 +305,12 @@ def find_frame_faults(recording: Recording, camera: CameraSettings, watch: Frame
         gains=np.asarray(np.exp(logs - np.sort(logs)[watch.frames // 2]), np.float64),
         unsteady=unsteady,
     )
+
+
+def _unseen(rests: Iterable[_Rest]) -> float:
+    """Log intensity by which the light may change unseen; 0 where it is not seen to change between any two frames."""
+    thresholds = [abs(rest.lit.changed / rest.lit.net) for rest in rests if rest.lit.is_seen]
+    return _UNSEEN * float(np.median(thresholds)) if thresholds else 0.0
 
 
 def _intervals(
@@ -335,6 +359,30 @@ class _Quiet(NamedTuple):
     beyond: float = 0.0
 
 
+class _Lit(NamedTuple):
+    """Whether the light of the whole image changes.
+
+    Attributes
+    ----------
+    changed
+        Median change of the log intensity, by the frames.
+    net
+        ON less OFF events of a pixel, mean.
+    alike
+        Share of the pixels with more ON than OFF events, less that of the others: most parts of the image have as much
+        or more of it, with this sign. 0 where they differ in the sign.
+    """
+
+    changed: float
+    net: float
+    alike: float
+
+    @property
+    def is_seen(self) -> bool:
+        """Whether events show it to change, as frames do."""
+        return abs(self.alike) >= _UNIFORM and self.changed * self.alike > 0 and self.net * self.alike > 0
+
+
 class _Rest(NamedTuple):
     """What the second of two frames shows beyond what its events explain.
 
@@ -350,6 +398,10 @@ class _Rest(NamedTuple):
         Log intensity by which the light of the median pixel changes, and goes up and down again, by its events.
     quiet
         What quiet pixels show; all 0 where there are hardly any.
+    moving
+        What the median of the others shows beyond its events; 0 where there are hardly any.
+    lit
+        What events say of the light of the whole image.
     """
 
     step: float
@@ -358,6 +410,8 @@ class _Rest(NamedTuple):
     light: float
     back_and_forth: float
     quiet: _Quiet
+    moving: float
+    lit: _Lit
 
     def is_gain(self, step: float, flicker: float, at_least: float = _LEAST_STEP) -> bool:
         """Whether a step is the gain's and not the light's, which flickers by less than a share of the step."""
@@ -371,7 +425,9 @@ class _Rest(NamedTuple):
         if abs(step) >= _LEAST_STEP:
             return False
         alike = self.apart < _ALIKE * abs(step) and abs(quiet.beyond - step) < _QUIET_ALIKE * abs(step)
-        return alike and quiet.share >= _MUCH_QUIET and self.is_gain(step, _FLICKER, _LEAST_UNSTEADY)
+        moving = abs(self.moving - step) < _MOVING_ALIKE * abs(step)
+        many = quiet.share >= _MUCH_QUIET
+        return alike and moving and many and self.is_gain(step, _FLICKER, _LEAST_UNSTEADY)
 
     def is_certain(self, step: float) -> bool:
         """Whether a step is the gain's whatever other frames show: most of the image, and quiet pixels, have it."""
@@ -394,23 +450,32 @@ def _rest(interval: Interval, on: NDArray[Any], off: NDArray[Any]) -> _Rest | No
         return None
     thresholds = fit.solution[:-1].tolist()
     rest = change - sum(c * column for c, column in zip(thresholds, columns, strict=True))
-    middles = _middles(rest, _part(chosen, *interval.change.shape))
+    part = _part(chosen, *interval.change.shape)
+    middles = _middles(rest, part)
     if len(middles) < _LEAST_PARTS:
         return None
     step = float(np.median(middles))
     largest = max(thresholds, default=0.0)
+    net = ups - downs
+    lit = _Lit(float(np.median(change)), float(np.mean(net)), _most(_means(np.sign(net), part)))
+    if lit.is_seen:
+        largest = max(largest, _LARGEST_THRESHOLD)
     is_quiet = ups + downs <= _QUIET
-    quiet = _Quiet()
+    quiet, moving = _Quiet(), 0.0
     if np.count_nonzero(is_quiet) >= _LEAST_IN_PART:
-        light = float(np.mean((ups - downs)[is_quiet])) * largest
+        light = float(np.mean(net[is_quiet])) * largest
         quiet = _Quiet(float(np.mean(is_quiet)), light, float(np.median(rest[is_quiet])))
+    if np.count_nonzero(~is_quiet) >= _LEAST_IN_PART:
+        moving = float(np.median(rest[~is_quiet]))
     return _Rest(
         step=step,
         events=float(np.mean(ups + downs)),
         apart=float(np.sort(np.abs(middles - step))[math.ceil(_MOST_PARTS * len(middles)) - 1]),
-        light=float(np.median(ups - downs)) * largest,
+        light=float(np.median(net)) * largest,
         back_and_forth=float(np.median(np.minimum(ups, downs))) * largest,
         quiet=quiet,
+        moving=moving,
+        lit=lit,
     )
 
 
@@ -418,6 +483,19 @@ def _part(pixels: NDArray[np.int64], height: int, width: int) -> NDArray[np.int6
     """(N,) in which of the parts of an image each of its pixels lies, by their indices."""
     rows, across = np.divmod(pixels, width)
     return np.asarray((rows * _PARTS // height) * _PARTS + across * _PARTS // width, np.int64)
+
+
+def _means(values: Array, part: NDArray[np.int64]) -> Array:
+    """The mean of the values in each part that has enough of them."""
+    count = np.bincount(part, minlength=_PARTS**2)
+    many = count >= _LEAST_IN_PART
+    return np.asarray(np.bincount(part, values, _PARTS**2)[many] / count[many], np.float64)
+
+
+def _most(values: Array) -> float:
+    """What most of the values (`_MOST_PARTS`) are at least, away from 0; 0 where most have no one sign."""
+    low, high = np.quantile(values, (1 - _MOST_PARTS, _MOST_PARTS))
+    return float(max(low, 0.0) + min(high, 0.0))
 
 
 def _middles(values: Array, part: NDArray[np.int64]) -> Array:
