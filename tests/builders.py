@@ -192,6 +192,21 @@ def with_frame_noise(source: Recording, deviation: float) -> Recording:
     return Recording.from_arrays(np.concatenate([*source.events()]), frames, sensor_size=source.sensor_size)
 
 
+def with_noise_events(source: Recording, rate: float) -> Recording:
+    """A recording with ``rate`` more events a second in every pixel, of either polarity, that nothing makes."""
+    rng = np.random.default_rng(0)
+    own = np.concatenate([*source.events()])
+    begin, end = int(own["t"][0]), int(own["t"][-1])
+    height, width = source.sensor_size
+    noise = np.zeros(rng.poisson(rate * (end - begin) * 1e-6 * height * width), EVENT_DTYPE)
+    noise["t"] = rng.integers(begin, end, len(noise))
+    noise["x"], noise["y"] = rng.integers(0, width, len(noise)), rng.integers(0, height, len(noise))
+    noise["p"] = rng.random(len(noise)) < 0.5
+    both = np.concatenate([own, noise])
+    both = both[np.argsort(both["t"], kind="stable")]
+    return Recording.from_arrays(both, [*source.frames()], sensor_size=source.sensor_size)
+
+
 def without_any_events(source: Recording) -> Recording:
     """Its frames alone, before a sensor that has no events."""
     return Recording.from_arrays(events(), [*source.frames()], sensor_size=source.sensor_size)

@@ -11,7 +11,7 @@ from kalux.calibration.dark_steps import estimate_dark_steps
 from kalux.recording import Recording
 from kalux.settings import CameraSettings, EventSettings
 
-from builders import moving_blocks, slow_scene, with_frame_noise, without_any_events
+from builders import moving_blocks, slow_scene, with_frame_noise, with_noise_events, without_any_events
 
 THRESHOLD = 0.15
 CAMERA = CameraSettings(log_offset=0.004, frame_noise=0.002)
@@ -72,6 +72,14 @@ def test_noise_of_frames_is_not_the_events(fast):
     told = estimate_dark_steps(noisy, dataclasses.replace(CAMERA, frame_noise=3 / 255), EVENTS)
     assert max(untold) > 0.3
     assert told is None or max(told) < 0.3 * max(untold)
+
+
+def test_events_of_noise_are_not_slow_pixels(fast):
+    """They are taken off, too, as far as their rate is known."""
+    noisy = with_noise_events(fast, 20.0)
+    untold, told = (estimate_dark_steps(noisy, CAMERA, EVENTS, known) for known in (0.0, 20.0))
+    assert max(untold) > 0.3
+    assert told is None or max(told) < 0.5 * max(untold)
 
 
 def test_nothing_that_moves_tells_nothing():

@@ -14,6 +14,8 @@ from kalux.events import EVENT_DTYPE
 from kalux.planning import plan
 from kalux.settings import CameraSettings
 
+from builders import with_noise_events
+
 CAMERA = CameraSettings(log_offset=0.02)
 EVENTS = dataclasses.replace(
     PRESETS["default"].events, threshold_on=0.2, threshold_off=0.2, refractory_period=0, delay=0
@@ -124,6 +126,18 @@ def test_the_variance_of_steps_is_found(variance, spread):
         unsteady(variance, spread), camera, dataclasses.replace(EVENTS, quantisation_variance=0.0)
     )
     assert estimate.step_variance(spread) == pytest.approx(variance, rel=0.15, abs=0.01)
+
+
+def test_events_of_noise_are_not_the_steps():
+    """Each is a step that the light does not take, of which half is taken off as far as their rate is known."""
+    camera = dataclasses.replace(CAMERA, frame_noise=1e-4, shot_noise=0.0)
+    events = dataclasses.replace(EVENTS, quantisation_variance=0.0)
+    rate = 5.0
+    recording = with_noise_events(unsteady(0.1), rate)
+    untold, told = (estimate_mismatch(recording, camera, events, known) for known in (0.0, 2.0 * rate))
+    assert told.step_variance(0.0) == pytest.approx(0.1, rel=0.15)
+    assert untold.step_variance(0.0) > 1.3 * told.step_variance(0.0)
+    assert told.variance == untold.variance
 
 
 def test_the_reference_exposure_is_only_a_unit():

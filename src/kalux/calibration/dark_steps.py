@@ -51,7 +51,7 @@ _MOST: Final = 4.0
 
 
 def estimate_dark_steps(
-    recording: Recording, camera: CameraSettings, events: EventSettings
+    recording: Recording, camera: CameraSettings, events: EventSettings, noise_rate: float = 0.0
 ) -> DarkSteps | None:
     """Variance of an event's step beyond ``events.step_noise``, c^2, in six octaves below 0.32 of white.
 
@@ -68,6 +68,8 @@ def estimate_dark_steps(
         Response, saturation, I_0 and frame noise.
     events
         With both thresholds, their spread, and the variance of a step.
+    noise_rate
+        Events of a pixel without reason, Hz, whose variance is in Var' m, too.
 
     Returns None where no octave has more than 0.05.
 
@@ -76,7 +78,7 @@ def estimate_dark_steps(
     ExposureError
         If the frames' exposures are not known.
     """
-    seen = DarkSamples(camera, events)
+    seen = DarkSamples(camera, events, noise_rate)
     observe(recording, camera, events, seen)
     return seen.found
 
@@ -86,12 +88,12 @@ class DarkSamples:
 
     Parameters
     ----------
-    camera, events
+    camera, events, noise_rate
         As of `estimate_dark_steps`.
     """
 
-    def __init__(self, camera: CameraSettings, events: EventSettings) -> None:
-        self._camera, self._events = camera, events
+    def __init__(self, camera: CameraSettings, events: EventSettings, noise_rate: float = 0.0) -> None:
+        self._camera, self._events, self._noise_rate = camera, events, noise_rate
         self._model = ErrorModel(
             events.thresholds, camera.noise, events.mismatch, events.quantisation_variance
         )
@@ -132,6 +134,7 @@ class DarkSamples:
         mismatch, variance = mismatch_of(chosen, self._model, self._camera.offset, 0.0)
         values = np.stack([mismatch**2, variance, chosen.on + chosen.off])
         values[:2] /= float(np.prod(self._events.thresholds))
+        values[1] += self._noise_rate * (interval.end - interval.start) * 1e-6
         for k, seen in enumerate(self._octaves):
             seen.append(values[:, place[dark] == k])
         self._count += len(mismatch)

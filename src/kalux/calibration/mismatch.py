@@ -46,6 +46,11 @@ _FEWEST_EVENTS: Final = 2.0
 """Of a pixel in an interval whose steps count: single ones are noise more often, which has a variance of its own (K5),
 and changes below the threshold hide what they say."""
 
+_OF_NOISE: Final = 0.5
+"""Share of what events of noise make of the mean square that is not the steps'. With all of it variances and log-MSE
+are a little better, but steps beyond white, where noise has come for signal and no frame has told, are then believed
+more (docs/reasons.md, K9)."""
+
 _MIN_STEPS: Final = 1_000
 """Pixels and intervals from which the variance of steps is known within a tenth of c^2."""
 
@@ -82,7 +87,9 @@ class Mismatch(NamedTuple):
         return float(np.clip(self.per_event - spread**2 * self.by_spread, *BELIEVED_STEPS))
 
 
-def estimate_mismatch(recording: Recording, camera: CameraSettings, events: EventSettings) -> Mismatch | None:
+def estimate_mismatch(
+    recording: Recording, camera: CameraSettings, events: EventSettings, noise_rate: float = 0.0
+) -> Mismatch | None:
     """Spread of the contrast thresholds between pixels, from the first 80 frames.
 
     With m the mismatch of a frame interval (docs/equations.md, K1), n its weighed events of one polarity, c their
@@ -90,8 +97,8 @@ def estimate_mismatch(recording: Recording, camera: CameraSettings, events: Even
     is on average the squared spread times that of w_j w_k c n_j c n_k (c n_j c n_k + c' n'_j c' n'_k), primes for the
     other polarity. What is measured is drawn towards the usual spread as far as it is uncertain, and exceeds that only
     as far as it is certain. The variance of a step is what m^2 has, per event, beyond the variance Var' by frames,
-    changes below the threshold and the spread: over pixels with two events and more in an interval, the sum of
-    v (m^2 - Var' m) over that of v c c' (n + n'), with v = (n + n') w^2.
+    changes below the threshold and the spread, and half of that by events of noise: over pixels with two events and
+    more in an interval, the sum of v (m^2 - Var' m) over that of v c c' (n + n'), with v = (n + n') w^2.
 
     Parameters
     ----------
@@ -101,6 +108,9 @@ def estimate_mismatch(recording: Recording, camera: CameraSettings, events: Even
         Response, saturation, I_0 and frame noise.
     events
         With both thresholds.
+    noise_rate
+        Events of a pixel without reason, Hz: each is a step of a threshold that the light does not take. It has a
+        variance of its own in the filter (K5).
 
     Returns None where no pixel has events in two intervals that tell.
 
@@ -129,7 +139,9 @@ def estimate_mismatch(recording: Recording, camera: CameraSettings, events: Even
         usable = measured & bright & (on + off > 0)
         mismatch, variance = mismatch_of(seen, model, camera.offset, events.step_noise)
         _add(mismatch, variance, usable, threshold_on * on, threshold_off * off, products)
-        _add_steps(mismatch, variance, measured, (on, off), events.thresholds, of_steps, sums)
+        seconds = (interval.end - interval.start) * 1e-6
+        of_noise = _OF_NOISE * noise_rate * seconds * threshold_on * threshold_off
+        _add_steps(mismatch, variance, measured, (on, off), events.thresholds, (*of_steps, of_noise), sums)
         samples += int(np.count_nonzero(usable))
         if samples >= MAX_SAMPLES:
             break
@@ -169,10 +181,11 @@ def _with_steps(found: Mismatch, sums: _Sums, threshold2: float) -> Mismatch:
 def _add_steps(mismatches, variances, measured, events, thresholds, of_steps, sums):  # type: ignore[no-untyped-def]
     """Add one interval to the fields of `_Sums`, in place.
 
-    ``of_steps``: the squared spread and the variance of a step that ``variances`` count.
+    ``of_steps``: the squared spread and the variance of a step that ``variances`` count, and the variance of events of
+    noise, which they do not.
     """
     events_on, events_off = events
-    spread2, per_event = of_steps
+    spread2, per_event, of_noise = of_steps
     for row in range(measured.shape[0]):
         for column in range(measured.shape[1]):
             i = row, column
@@ -181,7 +194,7 @@ def _add_steps(mismatches, variances, measured, events, thresholds, of_steps, su
                 continue
             variance, on, off = variances[i], thresholds[0] * events_on[i], thresholds[1] * events_off[i]
             by_spread = on * on + off * off
-            of_frames = variance - spread2 * by_spread - per_event * count
+            of_frames = variance - spread2 * by_spread - per_event * count + of_noise
             square = smaller(mismatches[i] * mismatches[i], _CLIP * _CLIP * variance)
             weight = count / (variance * variance)
             sums[0] += weight * (square - of_frames)

@@ -209,10 +209,14 @@ def _planned(
         if times_found is not None:
             moved = moved._replace(times=times_found.of_all(seen.exposures, left_out))
             return _planned(as_stored, as_chosen, known, asked, moved)
-    chosen, mismatch = with_step_errors(recording, steps.settings, steps.threshold_error, known=chosen.events)
+    given = chosen.events
+    chosen, background = with_background(recording, steps.settings, known.pixels, lookahead=lookahead)
+    noise_rate = (given.noise_rate or 0.0) if background is None else background
+    chosen, mismatch = with_step_errors(
+        recording, chosen, steps.threshold_error, known=given, noise_rate=noise_rate
+    )
     chosen = with_dark_shares(recording, chosen)
-    chosen, lag = with_slow_pixels(recording, chosen, lookahead=lookahead)
-    chosen, background = with_background(recording, chosen, known.pixels, lookahead=lookahead)
+    chosen, lag = with_slow_pixels(recording, chosen, noise_rate=noise_rate, lookahead=lookahead)
     pixels = known.pixels_of(chosen.events.mismatch)
     origin = steps.origin
     if origin == "settings" and _are_calibrated(chosen, known):

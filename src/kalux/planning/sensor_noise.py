@@ -104,12 +104,17 @@ def with_dead_time(recording: Recording, settings: Settings) -> tuple[Settings, 
 
 
 def with_step_errors(
-    recording: Recording, settings: Settings, threshold_error: float, *, known: EventSettings
+    recording: Recording,
+    settings: Settings,
+    threshold_error: float,
+    *,
+    known: EventSettings,
+    noise_rate: float,
 ) -> tuple[Settings, Mismatch | None]:
     """Fill in the thresholds' spread between pixels and the variance of a step, as far as they are not ``known``.
 
     From an estimate, else what the settings have: the usual spread, and the variance that goes with I_0. The relative
-    error of estimated thresholds, 0 of others, is a part of the spread.
+    error of estimated thresholds, 0 of others, is a part of the spread. ``noise_rate``: what is known of it, Hz.
     """
     events = settings.events
     wanted = None in (known.threshold_spread, known.step_variance)
@@ -118,7 +123,7 @@ def with_step_errors(
     # Filled in before: as wide as thresholds are uncertain that nothing tells.
     if events.threshold_spread != known.threshold_spread:
         return settings, None
-    found = estimate_mismatch(recording, settings.camera, events)
+    found = estimate_mismatch(recording, settings.camera, events, noise_rate)
     spread = events.threshold_spread
     if spread is None:
         spread = float(np.hypot(events.mismatch if found is None else found.spread, threshold_error))
@@ -130,17 +135,17 @@ def with_step_errors(
 
 
 def with_slow_pixels(
-    recording: Recording, settings: Settings, *, lookahead: bool
+    recording: Recording, settings: Settings, *, noise_rate: float, lookahead: bool
 ) -> tuple[Settings, Lag | None]:
     """Fill in what slow pixels do: by how much more steps vary in the dark, and the variance of errors of the moment.
 
     Where frames are joined: from the settings, else an estimate. In causal mode there is none of either: nothing is
-    between two frames there.
+    between two frames there. ``noise_rate``: what is known of it, Hz.
     """
     camera, events = settings.camera, settings.events
     if not settings.filter.joins_frames:
         return settings, None
-    dark = DarkSamples(camera, events) if events.dark_steps == AUTO else None
+    dark = DarkSamples(camera, events, noise_rate) if events.dark_steps == AUTO else None
     lag = LagSums(recording.sensor_size, camera, events) if events.lag_variance is None else None
     wanted: list[Observer] = [one for one in (dark, lag) if one is not None]
     if lookahead and wanted:
