@@ -42,8 +42,8 @@ _BELIEVED: Final = 6.0
 
 _TEXTURED: Final = 0.25
 """Share of the variance that pixels some away share, right or down of each other, from which it is texture, as where a
-camera shakes over the same pixels again and again: texture has an extent. Where there is a pattern they share 0 to 0.16
-(22 simulated DAVIS sensors; 0.04 for the neighbours that both are compared with), on a scene that shakes 0.38."""
+camera shakes over the same pixels again and again: texture has an extent. Where there is a pattern they share 0 to 0.13
+(21 simulated DAVIS sensors; 0.04 for the neighbours that both are compared with), on a scene that shakes 0.38."""
 
 _AWAY: Final = 2  # of the distance of a pixel's neighbours
 _MOST_FRAMES: Final = 32  # evenly among the first: more pairs say little more

@@ -111,7 +111,6 @@ _MOVING_ALIKE: Final = 0.5
 step, and the light, nothing, since events have told it. Quiet ones do not tell: light that goes by d before pixels of
 a threshold c makes events in d^2 / (2 c^2) of them."""
 
-
 _SLIGHT: Final = 0.02
 _MOST_SLIGHT: Final = 30
 _EVERYWHERE: Final = 0.5
