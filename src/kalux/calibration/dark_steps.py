@@ -134,7 +134,7 @@ class DarkSamples:
         mismatch, variance = mismatch_of(chosen, self._model, self._camera.offset, 0.0)
         values = np.stack([mismatch**2, variance, chosen.on + chosen.off])
         values[:2] /= float(np.prod(self._events.thresholds))
-        values[1] += self._noise_rate * (interval.end - interval.start) * 1e-6
+        values[1] += self._noise_rate * interval.seconds
         for k, seen in enumerate(self._octaves):
             seen.append(values[:, place[dark] == k])
         self._count += len(mismatch)

@@ -112,13 +112,12 @@ def estimate_fixed_pattern(recording: Recording, camera: CameraSettings) -> Fixe
     if not seen:
         return None
     every = -(-len(seen) // _MOST_FRAMES)
-    beyond, light, weight = (np.stack(values) for values in zip(*seen[::every], strict=True))
-    part = parts((height, width))[::step, ::step].ravel()
+    part = parts((height, width))[::step, ::step]
+    planes = (np.stack(values).reshape(-1, *part.shape) for values in zip(*seen[::every], strict=True))
+    apart = -(-_LEAST_APART // every), -(-_AWAY * pitch // step)
     sums: Array = np.zeros((part.max() + 1, 2))
     beside: Array = np.zeros((2, 2))
-    away = -(-_AWAY * pitch // step)
-    shape = np.array([-(-length // step) for length in (height, width)])
-    _add_products(beyond, light, weight, -(-_LEAST_APART // every), part, shape, away, sums, beside)
+    _add_products(*planes, apart, part, sums, beside)
     return _solved(sums, beside)
 
 
@@ -178,32 +177,32 @@ def _look_around(  # type: ignore[no-untyped-def]
 
 
 @loop
-def _add_products(  # type: ignore[no-untyped-def]
-    beyond, light, weight, apart, part, shape, away, sums, beside
-):
+def _add_products(beyond, light, weight, apart, part, sums, beside):  # type: ignore[no-untyped-def]
     """Of all pairs of frames: per part of the sensor, the weighed products and the weights.
 
-    And those of each pixel with the one that is ``away`` pixels to the right of it, and below.
+    ``apart``: how many frames, at least. And how many pixels, of the products of each pixel with the one to the right
+    of it, and with the one below, which ``beside`` has.
     """
     more, less = np.float32(_LEAST_CHANGE), np.float32(1 / _LEAST_CHANGE)
-    rows, columns = shape
+    frames_apart, away = apart
+    rows, columns = part.shape
     for first in range(len(beyond)):
-        for second in range(first + apart, len(beyond)):
-            for i in range(len(part)):
-                before, after = light[first, i], light[second, i]
-                both = weight[first, i] * weight[second, i]
-                if both > 0 and (after > more * before or after < less * before):
-                    sums[part[i], 0] += both * beyond[first, i] * beyond[second, i]
+        for second in range(first + frames_apart, len(beyond)):
+            for row in range(rows):
+                for column in range(columns):
+                    i = row, column
+                    before, after = light[first][i], light[second][i]
+                    both = weight[first][i] * weight[second][i]
+                    if not both > 0 or less * before <= after <= more * before:
+                        continue
+                    sums[part[i], 0] += both * beyond[first][i] * beyond[second][i]
                     sums[part[i], 1] += both
-                    if i % columns + away < columns:
-                        both = weight[first, i] * weight[second, i + away]
-                        beside[0, 0] += both * beyond[first, i] * beyond[second, i + away]
-                        beside[0, 1] += both
-                    if i // columns + away < rows:
-                        below = i + away * columns
-                        both = weight[first, i] * weight[second, below]
-                        beside[1, 0] += both * beyond[first, i] * beyond[second, below]
-                        beside[1, 1] += both
+                    for k in range(2):
+                        other = row + k * away, column + (1 - k) * away
+                        if other[0] < rows and other[1] < columns:
+                            both = weight[first][i] * weight[second][other]
+                            beside[k, 0] += both * beyond[first][i] * beyond[second][other]
+                            beside[k, 1] += both
 
 
 def _solved(sums: Array, beside: Array) -> FixedPattern:

@@ -121,6 +121,11 @@ class Interval:
         return self.second.middle
 
     @property
+    def seconds(self) -> float:
+        """From the one middle to the other."""
+        return (self.end - self.start) * 1e-6
+
+    @property
     def has_one_exposure(self) -> bool:
         """Whether the exposure times of both frames are the same but for a tenth, so that their noise is, too."""
         return 0.9 < self.first.white / self.second.white < 1.1

@@ -139,8 +139,7 @@ def estimate_mismatch(
         usable = measured & bright & (on + off > 0)
         mismatch, variance = mismatch_of(seen, model, camera.offset, events.step_noise)
         _add(mismatch, variance, usable, threshold_on * on, threshold_off * off, products)
-        seconds = (interval.end - interval.start) * 1e-6
-        of_noise = _OF_NOISE * noise_rate * seconds * threshold_on * threshold_off
+        of_noise = _OF_NOISE * noise_rate * interval.seconds * threshold_on * threshold_off
         _add_steps(mismatch, variance, measured, (on, off), events.thresholds, (*of_steps, of_noise), sums)
         samples += int(np.count_nonzero(usable))
         if samples >= MAX_SAMPLES:
