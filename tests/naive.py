@@ -1475,7 +1475,8 @@ def joined_along(first, second, path, bend, unsure, share, level, variance, c2):
     across, down = (rows[:, 2:] - rows[:, :-2]) / 6, (wide[2:, 1:-1] - wide[:-2, 1:-1]) / 2
     strayed = (4 * share * (1 - share)) ** 2 * unsure * (across**2 + down**2)
     trust = 1 / ((doubt + strayed) * (1 + 0.4 * contradiction) ** 2)
-    return (level / variance + seen * believed) / (1 / variance + believed), 1 / (1 / variance + trust)
+    left = np.maximum(1 / (1 / variance + trust), 0.01 * variance)
+    return (level / variance + seen * believed) / (1 / variance + believed), left
 
 
 def resampled(value, variance, x, y):

@@ -153,6 +153,16 @@ def test_a_bend_that_is_not_known_leaves_slopes_less_known():
         assert (other[1] > 1.5 * one[1]).mean() > 0.5 if differs else np.array_equal(one[1], other[1])
 
 
+def test_even_frames_do_not_tell_that_a_path_is_right():
+    """They agree along any: a hundredth of the image's variance is left, however well they are known."""
+    even = Latent(np.full(SHAPE, -1.0, np.float32), np.full(SHAPE, 1e-7, np.float32))
+    variance = np.full(SHAPE, 0.01, np.float32)
+    level, left = whole(Along(moving_right(even, even), 0.5), np.full(SHAPE, -1.02, np.float32), variance)
+    inside = np.s_[:, 4:-4]  # beside these one of the frames shows nothing
+    np.testing.assert_allclose(left[inside], 0.01 * variance[inside], rtol=1e-6)
+    np.testing.assert_allclose(level[inside], -1.0, atol=1e-4)
+
+
 def test_windows_are_taken_with_their_margins_and_put_back_without():
     """Of two that lie beside each other the margins overlap, and end with the image."""
     image = np.arange(20 * 30, dtype=np.float32).reshape(20, 30)

@@ -18,6 +18,7 @@ from kalux.calibration.frame_noise import (
     estimate_frame_noise,
     flat_noise,
     photon_transfer,
+    quiet_noise,
     smooth_noise,
     trimmed_variance,
     typical_flat_noise,
@@ -210,6 +211,88 @@ def test_flat_parts_of_the_dark_tell_how_the_noise_of_bright_still_pixels_grows(
         light, 0.002, 1e-4, events=busy_on_the_right(light.shape), changes=0.03 * (light < 0.1) * RAMP
     )
     assert estimate_frame_noise(flickering, CAMERA).at(0.5) == pytest.approx(found.at(0.5), rel=0.1)
+
+
+def stored(light, noise, *, step=20):
+    """8 bits of a light behind a gamma of 2.2, with a noise of its values; a picture that goes on by ``step`` rows."""
+    rng = np.random.default_rng(5)
+    made = []
+    for k in range(12):
+        values = np.roll(light, step * k, axis=0) ** (1 / 2.2) + noise * rng.standard_normal(light.shape)
+        made.append(Frame(np.rint(255 * values.clip(0, 1)).astype(np.uint8), 40_000 * k, 40_000 * k + 10_000))
+    y, x = (i.ravel() for i in np.indices(light.shape))
+    t = np.arange(12).repeat(len(x)) * 40_000 + 20_000
+    moves = make_events(t, np.tile(x, 12), np.tile(y, 12), np.ones(len(t), np.int64)) if step else NOTHING
+    return Recording.from_arrays(moves, made, sensor_size=light.shape)
+
+
+def behind(noise, level):
+    """What a noise of stored values is of the light, behind a gamma of 2.2; and 8 bits."""
+    return np.hypot(noise, LEVEL) * 2.2 * level ** (1.2 / 2.2)
+
+
+GAMMA = CameraSettings(response="gamma:2.2")
+LEAST = 0.5 / 255 / np.sqrt(3)  # of the light in the dark: no more is believed of it
+
+
+@pytest.mark.parametrize(("darkest", "brightest"), [(0.3, 0.8), (0.03, 0.08)])
+def test_behind_a_response_that_bends_one_level_tells_all_others(darkest, brightest):
+    """Its noise is that of stored values: a tenth of it, or ten times as much, at another level."""
+    light = np.broadcast_to(np.linspace(darkest, brightest, 200), (150, 200))
+    found = estimate_frame_noise(stored(light, 0.01, step=0), GAMMA)
+    for level in (0.02, 0.05, 0.2, 0.7):
+        assert found.at(level) == pytest.approx(behind(0.01, level), rel=0.25), level
+
+
+@pytest.mark.parametrize("noise", [0.004, 0.012])
+def test_smooth_parts_of_what_moves_tell_the_noise_behind_a_response_that_bends(noise):
+    """Where what they have is as fine as noise: more than the usual, too. They have 0.83 of it."""
+    y, x = np.indices((120, 160))
+    light = 0.4 + 0.2 * np.sin(2 * np.pi * y / 120) * np.cos(x / 25)
+    found = usual_noise(stored(light, noise), GAMMA)
+    for level in (0.02, 0.1, 0.5):
+        told = np.sqrt(found.read**2 + found.shot * level)
+        assert told == pytest.approx(np.hypot(0.9 * behind(noise, level), LEAST), rel=0.2), level
+
+
+@pytest.mark.parametrize("darkest", [0.02, 0.3])
+def test_texture_is_no_noise_behind_a_response_that_bends(darkest):
+    """It is coarser: no more is believed than the usual at half of white, and at other levels what goes with it."""
+    rng = np.random.default_rng(6)
+    texture = 1 + 3 * cv2.GaussianBlur(rng.uniform(-1, 1, (120, 160)), (0, 0), 1.2)
+    found = usual_noise(stored(darkest * texture.clip(0.3), 0.002), GAMMA)
+    for level in (0.05, 0.5):
+        usual = np.hypot(CAMERA.usual_frame_noise * (2 * level) ** (1.2 / 2.2), LEAST)
+        assert np.sqrt(found.read**2 + found.shot * level) == pytest.approx(usual, rel=0.1), level
+
+
+def test_what_events_say_of_the_dark_is_the_same_of_all_stored_values_behind_a_response_that_bends():
+    made = stored(np.full((20, 20), 0.1), 0.0)
+    read, shot = quiet_noise(made, GAMMA, 0.0008)
+    assert read == pytest.approx(LEAST)
+    assert np.sqrt(read**2 + shot * 0.3) == pytest.approx(
+        np.hypot(0.0008 * 15 ** (1.2 / 2.2), LEAST), rel=0.1
+    )
+    _, most = quiet_noise(made, GAMMA, 0.02)
+    assert np.sqrt(most / 2) == pytest.approx(CAMERA.usual_frame_noise, rel=0.02)
+    assert quiet_noise(made, CAMERA, 0.002) == pytest.approx((0.002, (0.004**2 - 0.002**2) / 0.5))
+
+
+def test_parts_that_change_smoothly_bound_the_noise_of_bright_pixels_where_the_dark_is_told():
+    """A dark half with a texture of its own, and a smooth bright one, all of which moves."""
+    rng = np.random.default_rng(3)
+    made = []
+    for k in range(12):
+        light = np.where(np.arange(160) < 80, rng.uniform(0.015, 0.04, (120, 160)), 0.4 + 0.002 * k)
+        values = np.rint(255 * (light + 0.001 * rng.standard_normal(light.shape))).astype(np.uint8)
+        made.append(Frame(values, 40_000 * k, 40_000 * k + 10_000))
+    y, x = (i.ravel() for i in np.indices((120, 160)))
+    t = np.arange(12).repeat(len(x)) * 40_000 + 20_000
+    events = make_events(t, np.tile(x, 12), np.tile(y, 12), np.ones(len(t), np.int64))
+    found = usual_noise(Recording.from_arrays(events, made, sensor_size=(120, 160)), CAMERA)
+    at_half = np.sqrt(found.read**2 + found.shot / 2)
+    assert at_half < CAMERA.usual_frame_noise
+    assert at_half == pytest.approx(max(found.read, np.hypot(0.001, LEVEL)), rel=0.15)
 
 
 @pytest.mark.parametrize("texture", [0.0, 0.02])

@@ -98,13 +98,16 @@ def test_noise_that_is_new_in_each_interval_is_not_taken_for_it():
     assert found(0.08, noise_rate=2.0, read_noise=0.01).variance == pytest.approx(0.08**2, rel=0.4)
 
 
-def unsteady(variance, spread=0.0, frames=24, shape=(40, 50)):
-    """Frames that change by the events between them, whose steps have this variance, in units of c^2."""
+def unsteady(variance, spread=0.0, frames=24, shape=(40, 50), *, offset=CAMERA.offset, scale=1.0):
+    """Frames that change by the events between them, whose steps have this variance, in units of c^2.
+
+    Both may differ between pixels: the variance, and the ``scale`` of I + I_0, which is 0.03 to 0.95 otherwise.
+    """
     rng = np.random.default_rng(5)
     own = 1.0 + spread * rng.standard_normal(shape)
     level, shown, stream = rng.uniform(np.log(0.1), np.log(0.5), shape), [], []
     for k in range(frames):
-        image = np.rint(65535 * (np.exp(level) - CAMERA.offset)).astype(np.uint16)
+        image = np.rint(65535 * (scale * np.exp(level) - offset)).astype(np.uint16)
         shown.append(Frame(image, 40_000 * k, 40_000 * k + 100))
         upward = level < np.log(0.25)
         events = rng.integers(1, 8, shape)
@@ -126,6 +129,15 @@ def test_the_variance_of_steps_is_found(variance, spread):
         unsteady(variance, spread), camera, dataclasses.replace(EVENTS, quantisation_variance=0.0)
     )
     assert estimate.step_variance(spread) == pytest.approx(variance, rel=0.15, abs=0.01)
+
+
+def test_dark_pixels_do_not_tell_the_variance_of_steps():
+    """They have one of their own, K20; frames that show the dark finely would make it that of all."""
+    camera = dataclasses.replace(CAMERA, frame_noise=1e-5, shot_noise=0.0, log_offset=1e-4)
+    events = dataclasses.replace(EVENTS, quantisation_variance=0.0)
+    dark = np.arange(50) < 40
+    made = unsteady(np.where(dark, 1.5, 0.1), offset=1e-4, scale=np.where(dark, 0.01, 1.0))
+    assert estimate_mismatch(made, camera, events).step_variance(0.0) == pytest.approx(0.1, rel=0.15)
 
 
 def test_events_of_noise_are_not_the_steps():

@@ -140,7 +140,9 @@ def estimate_mismatch(
         mismatch, variance = mismatch_of(seen, model, camera.offset, events.step_noise)
         _add(mismatch, variance, usable, threshold_on * on, threshold_off * off, products)
         of_noise = _OF_NOISE * noise_rate * interval.seconds * threshold_on * threshold_off
-        _add_steps(mismatch, variance, measured, (on, off), events.thresholds, (*of_steps, of_noise), sums)
+        _add_steps(
+            mismatch, variance, measured & bright, (on, off), events.thresholds, (*of_steps, of_noise), sums
+        )
         samples += int(np.count_nonzero(usable))
         if samples >= MAX_SAMPLES:
             break
