@@ -16,6 +16,7 @@ from kalux.calibration.global_thresholds import (
     refine_thresholds,
     with_true_delay,
 )
+from kalux.calibration.refractory import intervals
 from kalux.datasets import SensorSettings, demo_scene, pan, photograph_scene, simulate, static
 from kalux.datasets.ahdr import ArtificialCamera, artificial_hdr
 from kalux.datasets.scenes import Scene
@@ -271,6 +272,21 @@ def test_what_is_wrongly_taken_for_a_delay_makes_the_period_no_longer(delay):
         textured(refractory=1_000.0), camera, known, delay=delay, refractory_period=None
     )
     assert 500 < found.refractory_period < 1_100
+
+
+def test_a_period_is_no_longer_than_light_leaves_possible(monkeypatch):
+    """Neither at first, nor with another I_0."""
+    known, camera = Usual(0.2, 0.2, 0.0), CameraSettings(log_offset=0.004)
+    lossy = textured(refractory=1_000.0)
+    found = estimate_thresholds(lossy, camera, known, delay=1_500, refractory_period=None)
+    assert 744 < found.refractory_period <= found.longest_period
+    monkeypatch.setattr(
+        "kalux.calibration.global_thresholds.intervals", lambda *of: intervals(*of)._replace(of_light=800)
+    )
+    bounded = estimate_thresholds(lossy, camera, known, delay=1_500, refractory_period=None)
+    assert bounded.refractory_period == bounded.longest_period == 744
+    refined = refine_thresholds(lossy, camera, known, bounded, refractory_period=None)
+    assert refined.refractory_period == 744
 
 
 def test_no_refractory_period_is_found_where_nothing_is_lost():

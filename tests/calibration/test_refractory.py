@@ -7,6 +7,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from kalux.calibration.refractory import (
     counted_period,
@@ -30,6 +32,48 @@ def test_the_shortest_interval_is_not_that_of_noise():
     recording = simulate(demo_scene(sensor_size=(90, 120), duration=600_000), sensor).recording()
     assert 400 <= shortest_interval(recording) < 900
     assert shortest_interval(recording, most_events=20_000) >= 400
+
+
+def trains(*, soonest, noise, seed=0, pixels=400, seconds=2.0):
+    """Events of edges that follow one another ever sooner, from ``soonest`` us on, and ``noise`` at any time, Hz."""
+    rng = np.random.default_rng(seed)
+    events = []
+    for pixel in range(pixels):
+        gaps = soonest * (1 + 3 * np.sqrt(rng.random((20, 8))))
+        begins = rng.uniform(0, 1e6 * seconds, 20)[:, None]
+        t = (begins + np.cumsum(gaps, axis=1)).ravel()
+        p = np.repeat(rng.random(20) < 0.5, 8)
+        more = rng.uniform(0, 1e6 * seconds, rng.poisson(noise * seconds))
+        t, p = np.append(t, more), np.append(p, rng.random(len(more)) < 0.5)
+        events.append(np.stack([t, np.full(len(t), pixel), p]))
+    t, pixel, p = np.concatenate(events, axis=1)
+    order = np.argsort(t, kind="stable")
+    x, y = (pixel[order] % 20).astype(int), (pixel[order] // 20).astype(int)
+    made = make_events(t[order].astype(np.int64), x, y, p[order] > 0)
+    return Recording.from_arrays(made, [], sensor_size=(20, pixels // 20))
+
+
+@given(
+    soonest=st.sampled_from([300, 1_000, 2_500]),
+    noise=st.sampled_from([0.0, 1.0, 20.0]),
+    seed=st.integers(0, 99),
+)
+@settings(max_examples=15, deadline=None)
+def test_the_shortest_interval_of_light_is_told_from_noise(soonest, noise, seed):
+    """Noise is as often of one polarity as of both, light of one."""
+    found = intervals(trains(soonest=soonest, noise=noise, seed=seed))
+    assert soonest <= found.of_light < 1.6 * soonest
+    assert found.longest_period == int(0.93 * found.of_light)
+
+
+@given(seed=st.integers(0, 999))
+@settings(max_examples=10, deadline=None)
+def test_noise_alone_has_no_shortest_interval_of_light(seed):
+    rng = np.random.default_rng(seed)
+    t = np.sort(rng.integers(0, 1_000_000, 60_000))
+    x, y = rng.integers(0, 20, (2, len(t)))
+    noise = make_events(t, x, y, rng.random(len(t)) < 0.5)
+    assert intervals(Recording.from_arrays(noise, [], sensor_size=(20, 20))).of_light == 0
 
 
 def test_times_may_be_negative():

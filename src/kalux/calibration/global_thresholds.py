@@ -165,6 +165,8 @@ class ThresholdEstimate(NamedTuple):
     shortest_interval
         How soon a pixel can follow one event by another, us (`kalux.calibration.refractory`); 0: not known, or not
         looked for, as where the refractory period is given or events pile up at its end.
+    longest_period
+        The longest refractory period that light leaves possible, us; 0: not known.
     """
 
     on: float
@@ -179,6 +181,7 @@ class ThresholdEstimate(NamedTuple):
     delay_found: bool
     doubt: float
     shortest_interval: int
+    longest_period: int
 
     @property
     def may_lose(self) -> bool:
@@ -244,9 +247,9 @@ def estimate_thresholds(
     ExposureError
         If the frames' exposures are not known.
     """
-    shortest = 0 if refractory_period is not None else _shortest_with_reset(recording)
+    shortest, longest = (0, 0) if refractory_period is not None else _possible_with_reset(recording)
     about_true = delay - _TRAILING[1]  # to begin with: trailing is mostly about so long
-    sampling = _Sampling(recording, camera, of_log_offset, about_true, False, shortest, (0.0, 0.0))
+    sampling = _Sampling(recording, camera, of_log_offset, about_true, False, shortest, longest, (0.0, 0.0))
     period = refractory_period or 0
     if usual.spread == 0:
         sampling = sampling._replace(thresholds=(usual.on, usual.off))
@@ -283,11 +286,11 @@ def with_true_delay(
     return apparent if found is None or not found.delay_found else apparent._replace(true=found.delay)
 
 
-def _shortest_with_reset(recording: Recording) -> int:
-    """Shortest interval between two events of a pixel, us; 0 where events wait for the end of the refractory period,
-    in which nothing is lost then."""
+def _possible_with_reset(recording: Recording) -> tuple[int, int]:
+    """Shortest interval between two events of a pixel, and the longest refractory period that light leaves possible,
+    us; 0 where events wait for the end of the refractory period, in which nothing is lost then."""
     found = intervals(recording, _SHORTEST_EVENTS)
-    return 0 if found.pile_up else found.shortest
+    return (0, 0) if found.pile_up else (found.shortest, found.longest_period)
 
 
 def refine_thresholds(
@@ -304,8 +307,9 @@ def refine_thresholds(
     Parameters are those of `estimate_thresholds`, by which ``rough`` was made with the same ``refractory_period``.
     """
     thresholds = rough.on, rough.off
+    possible = rough.shortest_interval, rough.longest_period
     sampling = _Sampling(
-        recording, camera, of_log_offset, rough.delay, rough.delay_found, rough.shortest_interval, thresholds
+        recording, camera, of_log_offset, rough.delay, rough.delay_found, *possible, thresholds
     )
     if refractory_period is not None or rough.refractory_period == 0:
         return _estimate(sampling, usual, refractory_period, MAX_SAMPLES, None) or rough
@@ -365,7 +369,7 @@ def _period(sampling: _Sampling, usual: Usual, *, by_excess: bool) -> Period | N
     """The refractory period; None where nothing speaks for one.
 
     By late events and those that follow soon, if they differ, ``by_excess``, and by what all events are worth where
-    thresholds are known; by both in proportion to what they tell.
+    thresholds are known; by both in proportion to what they tell. No longer than light leaves possible.
     """
     known = usual.spread == 0
     if not (by_excess or known):
@@ -374,9 +378,12 @@ def _period(sampling: _Sampling, usual: Usual, *, by_excess: bool) -> Period | N
     samples = sampling.samples(*periods, most=_PERIOD_SAMPLES)
     of_excess = _period_without_excess(samples, periods) if by_excess else None
     of_sums = _period_of_sums(sampling, samples, periods) if known else None
-    if of_excess is None or of_sums is None:
-        return of_excess or of_sums
-    return _joined(of_excess, of_sums)
+    found = of_excess or of_sums
+    if of_excess is not None and of_sums is not None:
+        found = _joined(of_excess, of_sums)
+    if found is None or not 0 < sampling.longest < found.length:
+        return found
+    return found._replace(length=sampling.longest)
 
 
 def _joined(of_excess: Period, of_sums: Period) -> Period:
@@ -403,6 +410,8 @@ class _Sampling(NamedTuple):
         Of the events, us, and whether it is known.
     shortest
         Shortest interval between two events of a pixel, us; 0 where the refractory period is not to be found.
+    longest
+        The longest refractory period that light leaves possible, us; 0: unknown.
     thresholds
         On and off, log intensity: by these the intensity moves within exposures.
     """
@@ -413,6 +422,7 @@ class _Sampling(NamedTuple):
     delay: int
     delay_found: bool
     shortest: int
+    longest: int
     thresholds: tuple[float, float]
 
     def samples(self, *periods: int, most: int) -> _Samples:
@@ -544,6 +554,7 @@ def _combined(
         delay_found=sampling.delay_found,
         doubt=doubt,
         shortest_interval=sampling.shortest,
+        longest_period=sampling.longest,
     )
 
 
