@@ -295,7 +295,8 @@ def _with_growth(
 def _of_stored(response: Response, told: list[tuple[float, float]]) -> tuple[float, float]:
     """Read and shot noise behind a response that bends, where noise is the same of all stored values.
 
-    ``told``: levels and the standard deviation at each, of which the least counts, as stored.
+    ``told``: levels and the standard deviation at each, of which the least counts, as stored. The variance of I is
+    nearly in proportion to the light behind gamma: the line is that through the dark and half of white.
     """
 
     def slope(level: float) -> float:
@@ -334,8 +335,9 @@ def usual_noise(recording: Recording, camera: CameraSettings, *, delay: int = 0)
     Whatever moves, pixels change by their noise at least: from 0.01 to 0.02 of white it is no more than those do that
     see no event, nor the four beside, or than all do where these are too few. And it is no more than in the flattest
     parts of the dark (`flat_noise`). Where nothing is so dark, it is what parts have that change smoothly
-    (`smooth_noise`), or the usual. Where nothing is still the rounding is another one in every frame, so that its
-    standard deviation is the least.
+    (`smooth_noise`), or the usual; where something is, such parts bound it at their level. Where nothing is still the
+    rounding is another one in every frame, so that its standard deviation is the least. Behind a response that bends
+    noise is the same of all stored values: that of smooth parts where it is as fine as noise, else the least of these.
 
     Parameters
     ----------
@@ -351,7 +353,64 @@ def usual_noise(recording: Recording, camera: CameraSettings, *, delay: int = 0)
     ExposureError
         If the frames' exposures are not known.
     """
-    usual, cross = camera.usual_frame_noise, _SURROUNDINGS[-1]
+    usual, seen = camera.usual_frame_noise, _see_what_moves(recording, camera, delay)
+    response = _response(recording, camera)
+    if not response.is_linear:
+        read, shot = _usual_of_stored(response, seen, usual)
+        return UsualNoise(_possible_read(recording, camera, read), shot, silent=seen.silent)
+    flat, smooth = seen.flat, seen.smooth
+    if smooth is not None and seen.is_of_smooth(usual):
+        black = smooth.in_the_dark(usual)
+        if flat is not None:
+            black = flat if _CUT * flat <= _DARK_PARTS[-1][0] else max(flat, black)
+        read = _possible_read(recording, camera, black)
+        return UsualNoise(read, smooth.shot(read, usual), silent=False)
+    most = seen.in_the_dark if flat is not None else [usual, *seen.in_the_dark]
+    read = _possible_read(recording, camera, min(most))
+    shot = _shot(read, usual)
+    if smooth is not None:
+        shot = min(shot, smooth.most_shot(read))
+    return UsualNoise(read, shot, silent=seen.silent)
+
+
+class _Seen(NamedTuple):
+    """What frames of which everything may move say of their noise, as standard deviations.
+
+    Attributes
+    ----------
+    flat
+        Of flat parts of the dark; None: there are none.
+    changed
+        Of pixels from 0.01 to 0.02 of white; None: too few, or black cuts too much of it off.
+    silent
+        Whether these have no events.
+    smooth
+        Of parts that change smoothly; None: there are none.
+    is_quiet
+        Whether flat parts of the dark of some frames have less than twice the usual.
+    """
+
+    flat: float | None
+    changed: float | None
+    silent: bool
+    smooth: SmoothNoise | None
+    is_quiet: bool
+
+    @property
+    def in_the_dark(self) -> list[float]:
+        """All that is known of the dark: each is what there is, or more."""
+        return [value for value in (self.flat, self.changed) if value is not None]
+
+    def is_of_smooth(self, usual: float) -> bool:
+        """Whether smooth parts have the noise: where the dark does not tell it, or it is far more than the usual."""
+        if self.smooth is None:
+            return False
+        alone = not self.in_the_dark and self.smooth.is_told(usual)
+        return alone or (self.smooth.is_all_noise(usual) and not self.is_quiet)
+
+
+def _see_what_moves(recording: Recording, camera: CameraSettings, delay: int) -> _Seen:
+    cross = _SURROUNDINGS[-1]
     of_silent: list[float] = []
     of_all: list[float] = []
     of_flat: list[list[float | None]] = []
@@ -370,48 +429,25 @@ def usual_noise(recording: Recording, camera: CameraSettings, *, delay: int = 0)
                 into.append(trimmed_variance(difference[chosen]) / 2)
         of_flat.append(flat_noise(change))
         of_smooth.append(smooth_noise(change))
-    flat, smooth = typical_flat_noise(of_flat), typical_smooth_noise(of_smooth)
-    changes = of_silent or of_all
+    flat, changes = typical_flat_noise(of_flat), of_silent or of_all
     if flat is not None and flat > 2 * _DARKEST:  # black cuts off half of what pixels have that are so dark
         changes = []
-    in_the_dark = [] if flat is None else [flat]
-    if changes:
-        in_the_dark.append(float(np.sqrt(np.median(changes))))
-    response, is_silent = _response(recording, camera), bool(of_silent and changes)
-    if not response.is_linear:
-        read, shot = _usual_of_stored(response, in_the_dark, smooth, usual)
-        return UsualNoise(_possible_read(recording, camera, read), shot, silent=is_silent)
-    is_told = any(found[0] is not None and found[0] < _MOST_USUAL * usual for found in of_flat)
-    if smooth is not None and _counts(smooth, usual, is_told=is_told, alone=not in_the_dark):
-        black = smooth.in_the_dark(usual)
-        if flat is not None:
-            black = flat if _CUT * flat <= _DARK_PARTS[-1][0] else max(flat, black)
-        read = _possible_read(recording, camera, black)
-        return UsualNoise(read, smooth.shot(read, usual), silent=False)
-    if flat is None:
-        in_the_dark.append(usual)
-    read = _possible_read(recording, camera, min(in_the_dark))
-    shot = _shot(read, usual)
-    if smooth is not None:
-        shot = min(shot, smooth.most_shot(read))
-    return UsualNoise(read, shot, silent=is_silent)
+    quiet = _MOST_USUAL * camera.usual_frame_noise
+    return _Seen(
+        flat,
+        float(np.sqrt(np.median(changes))) if changes else None,
+        bool(of_silent and changes),
+        typical_smooth_noise(of_smooth),
+        any(darkest is not None and darkest < quiet for darkest, *_ in of_flat),
+    )
 
 
-def _usual_of_stored(
-    response: Response, in_the_dark: list[float], smooth: SmoothNoise | None, usual: float
-) -> tuple[float, float]:
+def _usual_of_stored(response: Response, seen: _Seen, usual: float) -> tuple[float, float]:
     """Read and shot noise behind a response that bends: of smooth parts if that is as fine as noise, else the least."""
-    if smooth is not None and smooth.is_white:
-        return _of_stored(response, [(smooth.level, smooth.deviation)])
-    told = [(0.5, usual), *((2 * _DARKEST, deviation) for deviation in in_the_dark)]
-    if smooth is not None:
-        told.append((smooth.level, smooth.deviation))
+    told = [] if seen.smooth is None else [(seen.smooth.level, seen.smooth.deviation)]
+    if seen.smooth is None or not seen.smooth.is_white:
+        told += [(0.5, usual), *((2 * _DARKEST, deviation) for deviation in seen.in_the_dark)]
     return _of_stored(response, told)
-
-
-def _counts(smooth: SmoothNoise, usual: float, *, is_told: bool, alone: bool) -> bool:
-    """Whether what smooth parts have is the noise: where the dark does not tell it, or it is far more than usual."""
-    return (smooth.is_all_noise(usual) and not is_told) or (alone and smooth.is_told(usual))
 
 
 class SmoothNoise(NamedTuple):

@@ -97,8 +97,9 @@ def estimate_mismatch(
     is on average the squared spread times that of w_j w_k c n_j c n_k (c n_j c n_k + c' n'_j c' n'_k), primes for the
     other polarity. What is measured is drawn towards the usual spread as far as it is uncertain, and exceeds that only
     as far as it is certain. The variance of a step is what m^2 has, per event, beyond the variance Var' by frames,
-    changes below the threshold and the spread, and half of that by events of noise: over pixels with two events and
-    more in an interval, the sum of v (m^2 - Var' m) over that of v c c' (n + n'), with v = (n + n') w^2.
+    changes below the threshold and the spread, and half of that by events of noise: over pixels above 0.01 of white
+    with two events and more in an interval, the sum of v (m^2 - Var' m) over that of v c c' (n + n'), with v = (n + n')
+    w^2. Steps of darker ones have a variance of their own (K20).
 
     Parameters
     ----------

@@ -35,16 +35,15 @@ _OF_LIGHT: Final = 0.93
 """Refractory period at most, as a share of the shortest interval that is light's: on 46 simulated recordings of ideal
 sensors with 0.3 and 1 ms that is 1.07 times the period or more, 1.07 to 1.25 where edges are steep."""
 
-_LIGHT_SETS_IN: Final = (0.9, 1.1, 1.2)
-"""Windows in which there must be more than noise makes, from 0.9 of an interval on: in one alone is chance (0.3 of 1 ms
-on one of these recordings)."""
+_LIGHT_SETS_IN: Final = (0.9, 1.0, 1.1, 1.2)
+"""Edges of the windows, in units of that interval, in each of which there must be more than noise makes: in the first
+alone may be by chance (0.3 ms of 1 ms on one of these recordings)."""
 
 _MORE_THAN_NOISE: Final = (5.0, 4.0)  # intervals, and standard deviations of noise's number
 
-_LEAST_OF_LIGHT: Final = 50  # us: as the least dead time
-_LONGEST_OF_LIGHT: Final = (
-    10_000  # us: twice the longest of the shortest intervals with which a period is sought
-)
+_LIGHT_FOLLOWS: Final = (50, 10_000)
+"""Intervals between which it is sought, us: from the least dead time on, to twice the longest of the shortest ones with
+which a period is sought."""
 
 LATE: Final = 5.0
 """Shortest intervals after its predecessor from which an event has little information of the refractory period: at most
@@ -135,19 +134,20 @@ def intervals(recording: Recording, most_events: int = 3_000_000) -> Intervals:
     pixels, which keep no period that others have, do not decide.
     """
     histogram = np.zeros(len(_EDGE_BINS) - 1, np.int64)
-    count, turned = np.zeros((2, _LONGEST_OF_LIGHT), np.int64)
+    longest = _LIGHT_FOLLOWS[1]
+    like, turned = np.zeros((2, longest), np.int64)
     for found, turning in _of_first_events(recording, most_events):
         histogram += np.histogram(found, _EDGE_BINS)[0]
-        short = found < _LONGEST_OF_LIGHT
-        count += np.bincount(found[short], minlength=_LONGEST_OF_LIGHT)
-        turned += np.bincount(found[short & turning], minlength=_LONGEST_OF_LIGHT)
+        short = found < longest
+        like += np.bincount(found[short & ~turning], minlength=longest)
+        turned += np.bincount(found[short & turning], minlength=longest)
     if not histogram.any():
         return Intervals(0, pile_up=False)
     coarse = histogram.reshape(-1, _FINE).sum(1)
     first = int(np.argmax(coarse >= _EDGE * coarse.max())) * _FINE
     shortest = round(float(_EDGE_BINS[first]))
     piles_up = shortest >= _LEAST_PILE and _piles_up(histogram[first:])
-    return Intervals(shortest, piles_up, _first_of_light(count - turned, turned))
+    return Intervals(shortest, piles_up, _first_of_light(like, turned))
 
 
 def _first_of_light(like: NDArray[np.int64], turned: NDArray[np.int64]) -> int:
@@ -157,8 +157,8 @@ def _first_of_light(like: NDArray[np.int64], turned: NDArray[np.int64]) -> int:
     beyond. Light makes ever more, the longer they are. 0: nowhere.
     """
     shorter, turned_before = (np.concatenate([[0], np.cumsum(each)]) for each in (like, turned))
-    length = np.arange(_LEAST_OF_LIGHT, int(len(like) / _LIGHT_SETS_IN[-1]))
-    edges = [(share * length).astype(np.int64) for share in (*_LIGHT_SETS_IN[:1], 1.0, *_LIGHT_SETS_IN[1:])]
+    length = np.arange(_LIGHT_FOLLOWS[0], int(len(like) / _LIGHT_SETS_IN[-1]))
+    edges = [(share * length).astype(np.int64) for share in _LIGHT_SETS_IN]
     density = turned_before[edges[0]] / edges[0]
     least, deviations = _MORE_THAN_NOISE
     sets_in = np.ones(len(length), np.bool_)
