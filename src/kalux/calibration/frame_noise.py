@@ -130,7 +130,7 @@ _STORED: Final = 0.005
 
 _LEAST_BEHIND: Final = 0.5 / 255 / 3**0.5
 """Least read noise there: the rounding of 8 bits of light. Frames that bend show the dark finer than events tell how it
-goes on: believed more, they find steps to vary by several times as much (log-MSE of three scenes 0.94 to 1.5)."""
+goes on: with less, rms z of three scenes is 1.1 to 1.7 instead of 0.9 to 1.35."""
 
 _SPAN: Final = 3.0  # largest over smallest level, below which read and shot noise cannot be told apart
 _LARGEST_ERROR: Final = 0.3  # relative: beyond it the points are no photon transfer curve
