@@ -177,11 +177,15 @@ def test_levels_that_are_alike_do_not_tell_read_from_shot_noise():
     assert found.shot == 0.0
 
 
-def busy_on_the_right(shape, frames=12):
-    """Events of all pixels of the right half, between any two frames."""
-    y, x = (i.ravel() for i in np.indices((shape[0], shape[1] // 2)))
+def busy(where, frames=12):
+    """Events of the pixels of a mask, between any two frames."""
+    y, x = np.nonzero(where)
     t = np.arange(frames).repeat(len(x)) * 40_000 + 20_000
-    return make_events(t, np.tile(x + shape[1] // 2, frames), np.tile(y, frames), np.ones(len(t), np.int64))
+    return make_events(t, np.tile(x, frames), np.tile(y, frames), np.ones(len(t), np.int64))
+
+
+def busy_on_the_right(shape):
+    return busy(np.broadcast_to(np.arange(shape[1]) >= shape[1] // 2, shape))
 
 
 @pytest.mark.parametrize("electrons", [5_000, 20_000, np.inf])
@@ -220,10 +224,8 @@ def stored(light, noise, *, step=20):
     for k in range(12):
         values = np.roll(light, step * k, axis=0) ** (1 / 2.2) + noise * rng.standard_normal(light.shape)
         made.append(Frame(np.rint(255 * values.clip(0, 1)).astype(np.uint8), 40_000 * k, 40_000 * k + 10_000))
-    y, x = (i.ravel() for i in np.indices(light.shape))
-    t = np.arange(12).repeat(len(x)) * 40_000 + 20_000
-    moves = make_events(t, np.tile(x, 12), np.tile(y, 12), np.ones(len(t), np.int64)) if step else NOTHING
-    return Recording.from_arrays(moves, made, sensor_size=light.shape)
+    events = busy(np.full(light.shape, step > 0))
+    return Recording.from_arrays(events, made, sensor_size=light.shape)
 
 
 def behind(noise, level):
@@ -286,10 +288,8 @@ def test_parts_that_change_smoothly_bound_the_noise_of_bright_pixels_where_the_d
         light = np.where(np.arange(160) < 80, rng.uniform(0.015, 0.04, (120, 160)), 0.4 + 0.002 * k)
         values = np.rint(255 * (light + 0.001 * rng.standard_normal(light.shape))).astype(np.uint8)
         made.append(Frame(values, 40_000 * k, 40_000 * k + 10_000))
-    y, x = (i.ravel() for i in np.indices((120, 160)))
-    t = np.arange(12).repeat(len(x)) * 40_000 + 20_000
-    events = make_events(t, np.tile(x, 12), np.tile(y, 12), np.ones(len(t), np.int64))
-    found = usual_noise(Recording.from_arrays(events, made, sensor_size=(120, 160)), CAMERA)
+    moving = Recording.from_arrays(busy(np.ones((120, 160))), made, sensor_size=(120, 160))
+    found = usual_noise(moving, CAMERA)
     at_half = np.sqrt(found.read**2 + found.shot / 2)
     assert at_half < CAMERA.usual_frame_noise
     assert at_half == pytest.approx(max(found.read, np.hypot(0.001, LEVEL)), rel=0.15)
@@ -414,10 +414,7 @@ def all_moves(shape, noise, flat, *, frames=12):
         texture = np.where(np.arange(shape[1]) < flat, 0.02, rng.uniform(0.005, 0.045, shape))
         values = np.rint(255 * (texture + noise * rng.standard_normal(shape)).clip(0, 1)).astype(np.uint8)
         made.append(Frame(values, 40_000 * k, 40_000 * k + 10_000))
-    y, x = (i.ravel() for i in np.indices(shape))
-    t = np.arange(frames).repeat(len(x)) * 40_000 + 20_000
-    events = make_events(t, np.tile(x, frames), np.tile(y, frames), np.ones(len(t), np.int64))
-    return Recording.from_arrays(events, made, sensor_size=shape)
+    return Recording.from_arrays(busy(np.ones(shape), frames), made, sensor_size=shape)
 
 
 @pytest.mark.parametrize("noise", [0.003, 0.009])

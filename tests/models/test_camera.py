@@ -274,6 +274,7 @@ def test_errors_of_a_response_are_as_much_light_as_its_inverse_is_steep():
     """Of v^2 the slope within v -+ e is 2 v; at black and white only the side that there is counts."""
     response, light = Response.gamma(2.0), np.array([0.01, 0.25, 0.81])
     np.testing.assert_allclose(response.irradiance_error(light, 0.005), 2 * np.sqrt(light) * 0.005, rtol=1e-3)
+    np.testing.assert_allclose(response.slope(light, 0.005), 2 * np.sqrt(light), rtol=1e-3)
     assert 0 < response.irradiance_error(np.array([0.0]), 0.004)[0] < 3e-5
     assert response.irradiance_error(np.array([0.0]), 0.5 / 255)[0] > 0  # from half a level to a whole one
     crushed = Response.s_curve(0.2)

@@ -124,7 +124,7 @@ def estimate_fixed_pattern(recording: Recording, camera: CameraSettings) -> Fixe
 def _stored(around: Planes, response: Response) -> Planes:
     """What `_around` gives, with what pixels have beyond their neighbours, and its variance, of stored values."""
     beyond, light, weight = around
-    slope = response.irradiance_error(light, USUAL_PATTERN) / USUAL_PATTERN
+    slope = response.slope(light, USUAL_PATTERN)
     return (beyond / slope).astype(np.float32), light, (weight * slope**2).astype(np.float32)
 
 

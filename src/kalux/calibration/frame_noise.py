@@ -298,13 +298,10 @@ def _of_stored(response: Response, told: list[tuple[float, float]]) -> tuple[flo
     ``told``: levels and the standard deviation at each, of which the least counts, as stored. The variance of I is
     nearly in proportion to the light behind gamma: the line is that through the dark and half of white.
     """
-
-    def slope(level: float) -> float:
-        return float(response.irradiance_error(np.array([level]), _STORED)[0]) / _STORED
-
-    stored = min(deviation / slope(level) for level, deviation in told)
-    dark, half = ((stored * slope(level)) ** 2 for level in (_DARKEST, 0.5))
-    shot = max(half - dark, 0.0) / (0.5 - _DARKEST)
+    levels, deviations = np.array(told).T
+    stored = (deviations / response.slope(levels, _STORED)).min()
+    dark, half = (stored * response.slope(np.array([_DARKEST, 0.5]), _STORED)) ** 2
+    shot = float(max(half - dark, 0.0)) / (0.5 - _DARKEST)
     return max(float(np.sqrt(max(dark - shot * _DARKEST, 0.0))), _LEAST_BEHIND), shot
 
 

@@ -134,20 +134,17 @@ def intervals(recording: Recording, most_events: int = 3_000_000) -> Intervals:
     pixels, which keep no period that others have, do not decide.
     """
     histogram = np.zeros(len(_EDGE_BINS) - 1, np.int64)
-    longest = _LIGHT_FOLLOWS[1]
-    like, turned = np.zeros((2, longest), np.int64)
+    count, turned = counts = np.zeros((2, _LIGHT_FOLLOWS[1]), np.int64)
     for found, turning in _of_first_events(recording, most_events):
         histogram += np.histogram(found, _EDGE_BINS)[0]
-        short = found < longest
-        like += np.bincount(found[short & ~turning], minlength=longest)
-        turned += np.bincount(found[short & turning], minlength=longest)
+        _add_short(found, turning, counts)
     if not histogram.any():
         return Intervals(0, pile_up=False)
     coarse = histogram.reshape(-1, _FINE).sum(1)
     first = int(np.argmax(coarse >= _EDGE * coarse.max())) * _FINE
     shortest = round(float(_EDGE_BINS[first]))
     piles_up = shortest >= _LEAST_PILE and _piles_up(histogram[first:])
-    return Intervals(shortest, piles_up, _first_of_light(like, turned))
+    return Intervals(shortest, piles_up, _first_of_light(count - turned, turned))
 
 
 def _first_of_light(like: NDArray[np.int64], turned: NDArray[np.int64]) -> int:
@@ -178,11 +175,9 @@ def dead_time(recording: Recording) -> int:
     first 200 of each pixel.
     """
     longest = round((1 + 2 * max(_WINDOWS)) * int(_DEAD_TIMES[-1]))  # the window, and the next one
-    count, turned = np.zeros((2, longest), np.int64)
+    count, turned = counts = np.zeros((2, longest), np.int64)
     for found, turning in _of_first_events(recording, _DEAD_EVENTS):
-        short = found < longest
-        count += np.bincount(found[short], minlength=longest)
-        turned += np.bincount(found[short & turning], minlength=longest)
+        _add_short(found, turning, counts)
     return _onset(count, turned)
 
 
@@ -302,6 +297,14 @@ def _of_first_events(recording: Recording, most_events: int) -> Iterator[tuple[N
     seen = np.zeros(recording.sensor_size, np.int32)
     for part in first_events(recording.events(), most_events):
         yield _intervals_of(part["t"], part["x"], part["y"], part["p"], last, seen)
+
+
+def _add_short(found: NDArray[Any], turning: NDArray[Any], counts: NDArray[np.int64]) -> None:
+    """Add to ``counts``, (2, N), how many intervals are of each length below N us, and how many of these turn."""
+    longest = counts.shape[1]
+    short = found < longest
+    for total, chosen in zip(counts, (short, short & turning), strict=True):
+        total += np.bincount(found[chosen], minlength=longest)
 
 
 @loop

@@ -220,6 +220,13 @@ class Response:
         found: Array = np.interp(irradiance, self.irradiance, error * slope)
         return found
 
+    def slope(self, irradiance: NDArray[np.floating[Any]], within: float) -> Array:
+        """How much irradiance one of the response is: the mean slope of CRF^-1 ``within`` so much to either side.
+
+        At black and beyond white as in `irradiance_error`.
+        """
+        return self.irradiance_error(irradiance, within) / within
+
     def rounding(self, response: Array, half_level: float) -> Array:
         """What ``half_level`` of the response is in irradiance there: half of what is rounded to this response.
 
