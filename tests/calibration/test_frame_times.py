@@ -13,7 +13,7 @@ from kalux import Recording
 from kalux.calibration import frame_times
 from kalux.calibration.frame_times import FrameTimes, _in_order, find_frame_times
 from kalux.datasets import SensorSettings, simulate
-from kalux.datasets.motion import pan, still
+from kalux.datasets.motion import pan, shake, still
 from kalux.datasets.scenes import photograph_scene
 from kalux.pipeline import reconstruct
 from kalux.planning import plan
@@ -27,8 +27,8 @@ KNOWN = altered(PRESETS["default"], "events", threshold_on=0.2, threshold_off=0.
 OFF = np.array([0, 3_500, -4_000, 2_000, -1_500, 4_000, -3_000, 500, 3_000, -4_500, 1_000, 0])
 
 
-def filmed(motion=None, size=SIZE, **sensor):
-    seen = photograph_scene(blocks(), motion or pan(80.0), sensor_size=size, duration=500_000)
+def filmed(motion=None, size=SIZE, duration=500_000, **sensor):
+    seen = photograph_scene(blocks(), motion or pan(80.0), sensor_size=size, duration=duration)
     made = simulate(seen, SensorSettings(**{"threshold_on": 0.2, "threshold_off": 0.2, **sensor}), seed=1)
     return made.events, made.frames
 
@@ -39,8 +39,8 @@ def recorded(events, frames, off=None):
     return source if off is None else with_shifted_frames(source, -off[: len(frames)])
 
 
-def found(source):
-    return find_frame_times(source, KNOWN.camera, KNOWN.events)
+def found(source, known=KNOWN):
+    return find_frame_times(source, known.camera, known.events)
 
 
 def test_stamps_that_are_off_are_found():
@@ -72,6 +72,23 @@ def test_what_all_stamps_have_in_common_is_the_delay_of_the_events():
     late = events.copy()
     late["t"] += 5_000
     assert found(recorded(late, frames)) is None
+
+
+def test_thresholds_that_are_wrong_do_not_hide_them():
+    """Events that change 0.13 are taken for 0.2: what all intervals have in common is no error of times."""
+    events, frames = filmed(
+        pan(120.0), (96, 128), noise_rate=2.0, read_noise=0.005, threshold_on=0.13, threshold_off=0.13
+    )
+    times = found(recorded(events, frames, OFF))
+    assert times is not None
+    assert np.std((times.shifts - OFF[: len(frames)])[1:-1]) < 0.15 * np.std(OFF)
+
+
+def test_events_that_are_lost_where_a_camera_shakes_are_no_error_of_stamps():
+    """The faster it moves, the more events fall into the refractory period: a gain of each interval explains more."""
+    thresholds = {"threshold_on": 0.1, "threshold_off": 0.1}
+    made = filmed(shake(7, amplitude=5.0), (144, 192), 800_000, refractory=1_500, **thresholds)
+    assert found(recorded(*made), altered(KNOWN, "events", **thresholds)) is None
 
 
 def test_few_frames_tell_nothing():
