@@ -16,6 +16,7 @@ from kalux.calibration.event_model import Agreement
 from kalux.calibration.frame_faults import FrameFaults
 from kalux.calibration.frame_times import FrameTimes
 from kalux.calibration.levels import Ceiling, find_ceiling
+from kalux.calibration.moving_noise import MovingNoise
 from kalux.models.dark_levels import LIGHT_EDGES, dark_shares
 from kalux.models.dark_steps import BRIGHT, dark_steps
 from kalux.recording import Recording, less_black
@@ -358,6 +359,8 @@ def _refractory_origin(plan: Plan, asked: Settings) -> str:
 def _noise_origin(plan: Plan, asked: Settings) -> str:
     if asked.camera.frame_noise is not None:
         return _GIVEN
+    if isinstance(plan.frame_noise, MovingNoise):
+        return "estimated, of what moves"
     if plan.frame_noise is not None:
         return "estimated"
     by_events = plan.steps.model is not None and plan.steps.model.frame_noise is not None

@@ -134,23 +134,48 @@ def find_path(first: Latent, second: Latent, dark: float, white: float) -> Plane
     height, width = first.value.shape
     if min(height, width) < _LEAST_SIDE:
         return None
-    columns = _columns(width)
-    rows = max(round(columns * height / width), 1)
-    x, y = _centres(columns, width), _centres(rows, height)
-    points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 1, 2)
+    x, y = _grid(height, width)
     moved = np.square(first.value - second.value) / (first.variance + second.variance)
     followed = mean_around(moved, _WINDOW)[np.ix_(y.astype(int), x.astype(int))].reshape(-1) > _CHANGED
     if not followed.any():
         return None
     image, following = (_octets(frame.value, dark, white) for frame in (first, second))
+    flow = steady_flow(image, following, followed)
+    return flow if float(np.abs(flow).max()) >= _STILL else None
+
+
+def steady_flow(
+    image: NDArray[np.uint8], following: NDArray[np.uint8], followed: NDArray[np.bool_] | None = None
+) -> Plane:
+    """By how much what an image shows has moved in the following one, as of `find_path`.
+
+    Parameters
+    ----------
+    image, following
+        (H, W).
+    followed
+        (N,) which points of the grid are looked for, others being still; None: all.
+
+    Returns
+    -------
+    (2, H, W) in x and y, pixels.
+    """
+    height, width = image.shape
+    x, y = _grid(height, width)
+    points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 1, 2)
+    chosen = np.ones(len(points), np.bool_) if followed is None else followed
     flow = np.zeros_like(points)
-    flow[followed] = _flow(image, following, points[followed]) - _flow(following, image, points[followed])
-    grid = np.ascontiguousarray(np.moveaxis(flow.reshape(rows, columns, 2) / np.float32(2.0), -1, 0))
-    steady = [cv2.medianBlur(part, 5) for part in grid]
-    if float(np.abs(steady).max()) < _STILL:
-        return None
+    flow[chosen] = _flow(image, following, points[chosen]) - _flow(following, image, points[chosen])
+    grid = np.ascontiguousarray(np.moveaxis(flow.reshape(len(y), len(x), 2) / np.float32(2.0), -1, 0))
+    steady = (cv2.medianBlur(part, 5) for part in grid)
     parts = (cv2.resize(part, (width, height), interpolation=cv2.INTER_LINEAR) for part in steady)
     return np.stack([np.asarray(part, np.float32) for part in parts])
+
+
+def _grid(height: int, width: int) -> tuple[Plane, Plane]:
+    """The columns and the rows of the points whose flow is followed."""
+    columns = _columns(width)
+    return _centres(columns, width), _centres(max(round(columns * height / width), 1), height)
 
 
 def _columns(width: int) -> int:

@@ -70,11 +70,11 @@ _CONTRADICTED: Final = 1.5
 """Noise, in units of that of the flattest parts, which these contradict: they say 0.88 to 1.05 of what there is, or
 more."""
 
-_WITHOUT_SLOPES: Final = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]]) / 6
+WITHOUT_SLOPES: Final = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]]) / 6
 """What a pixel has beyond its row and its column, slopes included; white noise keeps its variance. J. Immerkaer, Fast
 noise variance estimation, Computer Vision and Image Understanding 64 (1996)."""
 
-_SMOOTH: Final = 10
+PART: Final = 10
 """Width of the parts of a frame by whose noise those that change smoothly are told, pixels."""
 
 _SMOOTHEST: Final = 0.1
@@ -169,7 +169,12 @@ class FrameNoise(NamedTuple):
 
     def at(self, level: float) -> float:
         """Standard deviation at a level of intensity, white = 1."""
-        return float(np.sqrt(self.read**2 + self.shot * level))
+        return noise_at(self.read, self.shot, level)
+
+
+def noise_at(read: float, shot: float, level: float) -> float:
+    """Standard deviation of noise with this read and shot part at a level of intensity, white = 1."""
+    return float(np.sqrt(read**2 + shot * level))
 
 
 def estimate_frame_noise(
@@ -215,7 +220,7 @@ def estimate_frame_noise(
     seen = [np.array(found) for found in points[chosen] if found]
     levels, variances = (np.array([np.median(found[:, i]) for found in seen]) for i in range(2))
     weights = np.array([np.sqrt(found[:, 2].sum()) for found in seen])
-    frame, response = next(iter(recording.frames())), _response(recording, camera)
+    frame, response = next(iter(recording.frames())), frame_response(recording, camera)
     rounding = common_rounding(frame, response)
     # Noise of much less than a level shows as none, or as any.
     least = _rounding(levels, frame, response)
@@ -247,7 +252,7 @@ def _rounding(levels: Array, frame: Frame, response: Response) -> Array:
 
 def _noise_of_parts(recording: Recording, camera: CameraSettings) -> tuple[float | None, SmoothNoise | None]:
     """That of flat parts of the dark, and that of parts that change smoothly where it is noise; None: nothing tells."""
-    changes = (_beyond_neighbours(i.first, i.second) for i in _comparable(recording, camera, _MIN_FRAMES))
+    changes = (_beyond_neighbours(i.first, i.second) for i in comparable(recording, camera, _MIN_FRAMES))
     seen = [(flat_noise(change), smooth_noise(change)) for change in changes]
     flat = typical_flat_noise([one for one, _ in seen])
     smooth = typical_smooth_noise([one for _, one in seen])
@@ -295,11 +300,18 @@ def _with_growth(
 def _of_stored(response: Response, told: list[tuple[float, float]]) -> tuple[float, float]:
     """Read and shot noise behind a response that bends, where noise is the same of all stored values.
 
-    ``told``: levels and the standard deviation at each, of which the least counts, as stored. The variance of I is
-    nearly in proportion to the light behind gamma: the line is that through the dark and half of white.
+    ``told``: levels and the standard deviation at each, of which the least counts, as stored.
     """
     levels, deviations = np.array(told).T
-    stored = (deviations / response.slope(levels, _STORED)).min()
+    return noise_behind(response, float((deviations / response.slope(levels, _STORED)).min()))
+
+
+def noise_behind(response: Response, stored: float) -> tuple[float, float]:
+    """Read and shot noise behind a ``response`` of noise with one standard deviation, as ``stored``, at all levels.
+
+    The variance of I is nearly in proportion to the light behind gamma: the line is that through the dark and half of
+    white.
+    """
     dark, half = (stored * response.slope(np.array([_DARKEST, 0.5]), _STORED)) ** 2
     shot = float(max(half - dark, 0.0)) / (0.5 - _DARKEST)
     return max(float(np.sqrt(max(dark - shot * _DARKEST, 0.0))), _LEAST_BEHIND), shot
@@ -351,19 +363,19 @@ def usual_noise(recording: Recording, camera: CameraSettings, *, delay: int = 0)
         If the frames' exposures are not known.
     """
     usual, seen = camera.usual_frame_noise, _see_what_moves(recording, camera, delay)
-    response = _response(recording, camera)
+    response = frame_response(recording, camera)
     if not response.is_linear:
         read, shot = _usual_of_stored(response, seen, usual)
-        return UsualNoise(_possible_read(recording, camera, read), shot, silent=seen.silent)
+        return UsualNoise(possible_read(recording, camera, read), shot, silent=seen.silent)
     flat, smooth = seen.flat, seen.smooth
     if smooth is not None and seen.is_of_smooth(usual):
         black = smooth.in_the_dark(usual)
         if flat is not None:
             black = flat if _CUT * flat <= _DARK_PARTS[-1][0] else max(flat, black)
-        read = _possible_read(recording, camera, black)
+        read = possible_read(recording, camera, black)
         return UsualNoise(read, smooth.shot(read, usual), silent=False)
     most = seen.in_the_dark if flat is not None else [usual, *seen.in_the_dark]
-    read = _possible_read(recording, camera, min(most))
+    read = possible_read(recording, camera, min(most))
     shot = _shot(read, usual)
     if smooth is not None:
         shot = min(shot, smooth.most_shot(read))
@@ -412,14 +424,14 @@ def _see_what_moves(recording: Recording, camera: CameraSettings, delay: int) ->
     of_all: list[float] = []
     of_flat: list[list[float | None]] = []
     of_smooth: list[SmoothNoise | None] = []
-    for interval in _comparable(recording, camera, _MIN_FRAMES, delay):
+    for interval in comparable(recording, camera, _MIN_FRAMES, delay):
         change = _beyond_neighbours(interval.first, interval.second)
         level, difference, usable, dark, *_ = change
         low = usable & ~dark & (level < 2 * _DARKEST)
         busy = _busy(interval, delay)
         silent = low & (cv2.dilate(busy, cross.shape) == 0)
         for chosen, least, into in (
-            (low & ~_near(dark), _LEAST, of_all),
+            (low & ~near(dark), _LEAST, of_all),
             (silent, cross.least, of_silent),
         ):
             if np.count_nonzero(chosen) >= least:
@@ -522,8 +534,8 @@ def smooth_noise(change: FrameChange) -> SmoothNoise | None:
     """
     if not change.is_own:
         return None
-    levels = _parts(change.level).mean(1)
-    whole = _parts(change.usable).all(1) & (levels > _DARK_PARTS[-1][-1])
+    levels = square_parts(change.level).mean(1)
+    whole = square_parts(change.usable).all(1) & (levels > _DARK_PARTS[-1][-1])
     if np.count_nonzero(whole) < _LEAST_SMOOTH:
         return None
     levels, fine, coarse = levels[whole], _beyond_slopes(change, 1)[whole], _beyond_slopes(change, 2)[whole]
@@ -536,10 +548,10 @@ def smooth_noise(change: FrameChange) -> SmoothNoise | None:
 
 
 def _beyond_slopes(change: FrameChange, apart: int) -> NDArray[Any]:
-    """(N,) noise of every part, a variance, by `_WITHOUT_SLOPES` over pixels of one colour, ``apart`` of its pitch."""
-    kernel = _of_one_colour(_WITHOUT_SLOPES, apart * change.pitch)
+    """(N,) noise of every part, a variance, by `WITHOUT_SLOPES` over pixels of one colour, ``apart`` of its pitch."""
+    kernel = _of_one_colour(WITHOUT_SLOPES, apart * change.pitch)
     beyond = cv2.filter2D(change.change, cv2.CV_64F, kernel)
-    return np.asarray(_parts(beyond * beyond).mean(1) / 2)
+    return np.asarray(square_parts(beyond * beyond).mean(1) / 2)
 
 
 def _growth(levels: Array, squares: Array) -> float:
@@ -559,11 +571,11 @@ def typical_smooth_noise(found: list[SmoothNoise | None]) -> SmoothNoise | None:
     return SmoothNoise(*np.median(np.array(known), axis=0).tolist()) if known else None
 
 
-def _parts(plane: NDArray[Any]) -> NDArray[Any]:
+def square_parts(plane: NDArray[Any]) -> NDArray[Any]:
     """(N, 100) the pixels of every part; what is left over on the right and below is in none."""
-    rows, columns = (length // _SMOOTH for length in plane.shape)
-    cut = plane[: rows * _SMOOTH, : columns * _SMOOTH].reshape(rows, _SMOOTH, columns, _SMOOTH)
-    return np.asarray(cut.swapaxes(1, 2).reshape(rows * columns, _SMOOTH**2))
+    rows, columns = (length // PART for length in plane.shape)
+    cut = plane[: rows * PART, : columns * PART].reshape(rows, PART, columns, PART)
+    return np.asarray(cut.swapaxes(1, 2).reshape(rows * columns, PART**2))
 
 
 def flat_noise(change: FrameChange) -> list[float | None]:
@@ -615,12 +627,12 @@ def quiet_noise(recording: Recording, camera: CameraSettings, dark: float) -> tu
     At half of white it is taken to be twice that, but no more than the usual: three DAVIS sensors have 1 to 1.85 times.
     Behind a response that bends it is the same of all stored values, no more than the usual at half of white.
     """
-    response = _response(recording, camera)
+    response = frame_response(recording, camera)
     if not response.is_linear:
         told = [(2 * _DARKEST, dark), (0.5, camera.usual_frame_noise)]
         read, shot = _of_stored(response, told)
-        return _possible_read(recording, camera, read), shot
-    read = _possible_read(recording, camera, dark)
+        return possible_read(recording, camera, read), shot
+    read = possible_read(recording, camera, dark)
     return read, _shot(read, _most_at_half(read, camera))
 
 
@@ -634,18 +646,18 @@ def _shot(read: float, at_half: float) -> float:
     return max(at_half**2 - read**2, 0.0) / 0.5
 
 
-def _possible_read(recording: Recording, camera: CameraSettings, dark: float) -> float:
+def possible_read(recording: Recording, camera: CameraSettings, dark: float) -> float:
     """Noise in the dark: no less than the standard deviation of rounding."""
-    rounding = common_rounding(next(iter(recording.frames())), _response(recording, camera)) / 3**0.5
+    rounding = common_rounding(next(iter(recording.frames())), frame_response(recording, camera)) / 3**0.5
     return max(dark, rounding, _LEAST_READ)
 
 
-def _response(recording: Recording, camera: CameraSettings) -> Response:
+def frame_response(recording: Recording, camera: CameraSettings) -> Response:
     """The camera's, or that of its green pixels."""
     return Camera.named(chosen_response(camera.response, recording.response), camera.clipped_from).response
 
 
-def _comparable(
+def comparable(
     recording: Recording, camera: CameraSettings, most_frames: int, delay: int = 0
 ) -> Iterator[Interval]:
     """The intervals whose frames differ by noise alone where there is no event.
@@ -706,10 +718,10 @@ def _points(
     Those of the smaller end where the larger are enough.
     """
     found: tuple[_Points, ...] = tuple([[] for _ in range(_BINS)] for _ in _SURROUNDINGS)
-    for interval in _comparable(recording, camera, most_frames, delay):
+    for interval in comparable(recording, camera, most_frames, delay):
         level, difference, usable, dark, *_ = _beyond_neighbours(interval.first, interval.second)
         busy = _busy(interval, delay)
-        near_dark = _near(dark)
+        near_dark = near(dark)
         for points, around in zip(found, _SURROUNDINGS, strict=True):
             still = cv2.dilate(busy, around.shape) == 0
             too_dark = dark if around.moves else near_dark  # of a neighbour's noise a quarter counts
@@ -734,7 +746,7 @@ def _mark(words, busy):  # type: ignore[no-untyped-def]
         busy[event_row(words[i, 1]), event_column(words[i, 1])] = 1
 
 
-def _near(dark: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def near(dark: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """(H, W): pixels with a marked one among the 3x3 around them."""
     return np.asarray(cv2.dilate(dark.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0, np.bool_)
 
@@ -775,14 +787,14 @@ def _beyond_neighbours(first: Shot, second: Shot) -> FrameChange:
     """The change from one frame to another."""
     level, change = np.empty((2, *first.levels.shape))
     bad = np.empty(level.shape, np.bool_)
-    _compare(*_by_level(first), *_by_level(second), level, change, bad)
+    _compare(*by_level(first), *by_level(second), level, change, bad)
     dark = level <= _DARKEST
     is_own = first.chroma is None
     beyond = _beyond_four(change, 1) if is_own else change
     for shot in (first, second):
         if shot.valid is not None:
             bad |= ~shot.valid
-    usable = ~_near(bad)
+    usable = ~near(bad)
     usable[[0, -1]] = False  # of pixels at the border a neighbour counts twice
     usable[:, [0, -1]] = False
     return FrameChange(level, beyond, usable, dark, first.pitch, is_own, change)
@@ -801,7 +813,7 @@ def _of_one_colour(kernel: Array, pitch: int) -> Array:
     return spread
 
 
-def _by_level(shot: Shot) -> tuple[NDArray[np.integer[Any]], Array, NDArray[np.bool_]]:
+def by_level(shot: Shot) -> tuple[NDArray[np.integer[Any]], Array, NDArray[np.bool_]]:
     """Levels of the pixels; of each level I in units of white, and whether it is clipped."""
     return shot.levels, shot.level_intensity / shot.white, shot.level_clipped
 

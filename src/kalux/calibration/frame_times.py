@@ -75,9 +75,9 @@ and 2.4 ms off, 0.6 to 1.3 of stamps that are, 0.02 to 0.4 of a clock that is fa
 
 
 _BEYOND_GAINS: Final = 1.5
-"""Least share of the misfit that errors explain, in units of what a gain of each interval does: events that are lost, or
-late, where a camera shakes faster. Of errors of 2 and 5 ms, known otherwise, 0.14 is left in the median of 112 recordings
-that have more, 0.64 in that of five that have less."""
+"""Least share of the misfit that errors explain, in units of what a gain of each interval does: events that are lost,
+or late, where a camera shakes faster. Of errors of 2 and 5 ms, known otherwise, 0.14 is left in the median of 112
+recordings that have more, 0.64 in that of five that have less."""
 
 
 class FrameTimes(NamedTuple):

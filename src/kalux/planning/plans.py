@@ -16,6 +16,7 @@ from kalux.calibration.frame_noise import FrameNoise
 from kalux.calibration.frame_times import find_frame_times
 from kalux.calibration.lag import Lag
 from kalux.calibration.mismatch import Mismatch
+from kalux.calibration.moving_noise import MovingNoise
 from kalux.calibration.values import Calibration, require_white
 from kalux.calibration.white_balance import grey_world
 from kalux.errors import InputError, require_type
@@ -37,6 +38,7 @@ from kalux.planning.sensor_noise import (
     with_dead_time,
     with_fixed_pattern,
     with_frame_noise,
+    with_moving_noise,
     with_slow_pixels,
     with_step_errors,
 )
@@ -82,7 +84,7 @@ class Plan:
     steps
         By what the size and the time of an event's step were estimated.
     frame_noise
-        The fit of the frames' noise, where there was one.
+        The fit of the frames' noise, of what stands still or of what moves, where there was one.
     fixed_pattern
         The fit of the frames' fixed pattern, where there was one.
     mismatch
@@ -105,7 +107,7 @@ class Plan:
     pixels: PixelCalibration | None
     mends: Mends
     steps: StepEstimates
-    frame_noise: FrameNoise | None
+    frame_noise: FrameNoise | MovingNoise | None
     fixed_pattern: FixedPattern | None
     mismatch: Mismatch | None
     lag: Lag | None
@@ -201,6 +203,8 @@ def _planned(
     chosen = _with_white_balance(recording, chosen)
     of_frames = with_frame_noise(recording, chosen, mended.mends.compression)
     chosen, pattern = with_fixed_pattern(recording, of_frames.settings)
+    of_frames = with_moving_noise(recording, of_frames, chosen, mended.mends.compression)
+    chosen = of_frames.settings
     chosen, dead_time = with_dead_time(recording, chosen)
     apparent_delay = _delay_of_black(mended.mends, chosen, seen.exposures)
     steps = with_event_steps(recording, chosen, apparent_delay, doubt_noise=of_frames.doubted)

@@ -13,6 +13,7 @@ from kalux.calibration.fixed_pattern import FixedPattern, estimate_fixed_pattern
 from kalux.calibration.frame_noise import FrameNoise, UsualNoise, estimate_frame_noise, usual_noise
 from kalux.calibration.lag import Lag, LagSums
 from kalux.calibration.mismatch import Mismatch, estimate_mismatch
+from kalux.calibration.moving_noise import MovingNoise, estimate_moving_noise
 from kalux.calibration.noise import event_noise
 from kalux.calibration.refractory import counted_period, dead_time
 from kalux.calibration.slow_pixels import Observer, observe
@@ -48,11 +49,14 @@ class FilledFrameNoise(NamedTuple):
         The fit of the noise, where there was one.
     doubted
         Whether the noise is more than pixels without events tell, so that events may contradict.
+    was_given
+        Whether a part of it is from the settings as they were.
     """
 
     settings: Settings
-    estimate: FrameNoise | None = None
+    estimate: FrameNoise | MovingNoise | None = None
     doubted: bool = False
+    was_given: bool = False
 
 
 _TYPICAL: Final = 0.65
@@ -69,7 +73,7 @@ def with_frame_noise(
     """
     camera = settings.camera
     if camera.frame_noise is not None or not settings.filter.joins_frames:
-        return FilledFrameNoise(settings)
+        return FilledFrameNoise(settings, was_given=True)
     delay = settings.events.lateness
     found = estimate_frame_noise(recording, camera, delay=delay)
     if found is not None and not found.is_reliable:
@@ -79,7 +83,28 @@ def with_frame_noise(
     of_blocks = 0.0 if compression is None else _TYPICAL * compression.error
     read = float(np.hypot(noise.read, of_blocks))
     filled = completed(settings, "camera", frame_noise=read, shot_noise=noise.shot)
-    return FilledFrameNoise(filled, found, doubted)
+    return FilledFrameNoise(filled, found, doubted, was_given=camera.shot_noise is not None)
+
+
+def with_moving_noise(
+    recording: Recording, of_frames: FilledFrameNoise, settings: Settings, compression: Compression | None
+) -> FilledFrameNoise:
+    """``settings``, which have the fixed pattern, too, with the noise that frames show of what moves.
+
+    It counts where nothing stands still that would tell the noise, and where it is far less than what seems to stand
+    still says. Not beside a pattern, which counts as noise of what moves, but not of what does not; nor of a
+    ``compression``, which leaves less of fine noise than of the rest.
+    """
+    filled, camera = of_frames._replace(settings=settings), settings.camera
+    if of_frames.was_given or compression is not None or camera.fixed_pattern != 0:
+        return filled
+    moving = estimate_moving_noise(recording, camera, delay=settings.events.lateness)
+    if moving is None or not moving.is_certain:
+        return filled
+    if of_frames.estimate is not None and not moving.contradicts(*camera.noise):
+        return filled
+    settings = altered(settings, "camera", frame_noise=moving.read, shot_noise=moving.shot)
+    return FilledFrameNoise(settings, moving)
 
 
 def with_fixed_pattern(recording: Recording, settings: Settings) -> tuple[Settings, FixedPattern | None]:
