@@ -12,9 +12,9 @@ from scipy.optimize import nnls
 from kalux import EVENT_DTYPE, Frame, Recording, reconstruct
 from kalux.calibration.frame_noise import (
     _beyond_neighbours,
+    _comparable,
     _enough_frames,
     _not_negative,
-    comparable,
     estimate_frame_noise,
     flat_noise,
     photon_transfer,
@@ -386,7 +386,7 @@ def test_smooth_parts_are_bright_but_not_clipped_and_not_in_rgb():
     """Parts of 10x10 pixels from 0.12 of white on, twenty at least; what clips or is masked is in none."""
 
     def told(level, **parts):
-        interval = next(comparable(still(level, 0.004, 0.0), CAMERA, 2))
+        interval = next(_comparable(still(level, 0.004, 0.0), CAMERA, 2))
         pair = (shot._replace(**parts) for shot in (interval.first, interval.second))
         return smooth_noise(_beyond_neighbours(*pair))
 
@@ -445,7 +445,7 @@ def test_what_moves_unseen_is_no_noise_where_flat_parts_have_less(flat, least, m
 
 def test_flat_parts_do_not_tell_the_noise_of_rgb():
     """Its neighbours share it. Those of a mosaic do not."""
-    interval = next(comparable(all_moves((90, 120), 0.004, 40), CAMERA, 2))
+    interval = next(_comparable(all_moves((90, 120), 0.004, 40), CAMERA, 2))
     first, second = interval.first, interval.second
     true, rgb = np.hypot(0.004, LEVEL), np.ones((90, 120, 3))
     assert flat_noise(_beyond_neighbours(first, second))[0] == pytest.approx(true, rel=0.2)
@@ -460,7 +460,7 @@ def test_pixels_of_a_mosaic_are_compared_with_those_of_their_own_colour(level, t
     """Every second column becomes brighter by a third, as where a red thing comes; noise is what it was."""
     columns = np.where(np.arange(120) % 2, level / 3, 0.0)
     recording = still(np.full((90, 120), level), 0.004, 0.0, changes=np.broadcast_to(columns, (90, 120)))
-    interval = next(comparable(recording, CAMERA, 2))
+    interval = next(_comparable(recording, CAMERA, 2))
     first, second = (shot._replace(pitch=2) for shot in (interval.first, interval.second))
     found = told(_beyond_neighbours(first, second))
     noise = found[0] if told is flat_noise else found.deviation / 0.83
@@ -492,7 +492,7 @@ def test_no_change_at_all_is_no_noise():
     changed[:, 60:] = np.where(rng.random((60, 20)) < 0.5, 5, 9)
     frames = [Frame((image, changed)[k % 2], 40_000 * k, 40_000 * k + 10_000) for k in range(6)]
     recording = Recording.from_arrays(NOTHING, frames, sensor_size=image.shape)
-    interval = next(comparable(recording, CAMERA, 2))
+    interval = next(_comparable(recording, CAMERA, 2))
     change = _beyond_neighbours(interval.first, interval.second)
     assert all(noise is None or noise >= 0.0 for noise in flat_noise(change))
 

@@ -220,7 +220,7 @@ def estimate_frame_noise(
     seen = [np.array(found) for found in points[chosen] if found]
     levels, variances = (np.array([np.median(found[:, i]) for found in seen]) for i in range(2))
     weights = np.array([np.sqrt(found[:, 2].sum()) for found in seen])
-    frame, response = next(iter(recording.frames())), frame_response(recording, camera)
+    frame, response = next(iter(recording.frames())), _response(recording, camera)
     rounding = common_rounding(frame, response)
     # Noise of much less than a level shows as none, or as any.
     least = _rounding(levels, frame, response)
@@ -252,7 +252,7 @@ def _rounding(levels: Array, frame: Frame, response: Response) -> Array:
 
 def _noise_of_parts(recording: Recording, camera: CameraSettings) -> tuple[float | None, SmoothNoise | None]:
     """That of flat parts of the dark, and that of parts that change smoothly where it is noise; None: nothing tells."""
-    changes = (_beyond_neighbours(i.first, i.second) for i in comparable(recording, camera, _MIN_FRAMES))
+    changes = (_beyond_neighbours(i.first, i.second) for i in _comparable(recording, camera, _MIN_FRAMES))
     seen = [(flat_noise(change), smooth_noise(change)) for change in changes]
     flat = typical_flat_noise([one for one, _ in seen])
     smooth = typical_smooth_noise([one for _, one in seen])
@@ -363,7 +363,7 @@ def usual_noise(recording: Recording, camera: CameraSettings, *, delay: int = 0)
         If the frames' exposures are not known.
     """
     usual, seen = camera.usual_frame_noise, _see_what_moves(recording, camera, delay)
-    response = frame_response(recording, camera)
+    response = _response(recording, camera)
     if not response.is_linear:
         read, shot = _usual_of_stored(response, seen, usual)
         return UsualNoise(possible_read(recording, camera, read), shot, silent=seen.silent)
@@ -424,7 +424,7 @@ def _see_what_moves(recording: Recording, camera: CameraSettings, delay: int) ->
     of_all: list[float] = []
     of_flat: list[list[float | None]] = []
     of_smooth: list[SmoothNoise | None] = []
-    for interval in comparable(recording, camera, _MIN_FRAMES, delay):
+    for interval in _comparable(recording, camera, _MIN_FRAMES, delay):
         change = _beyond_neighbours(interval.first, interval.second)
         level, difference, usable, dark, *_ = change
         low = usable & ~dark & (level < 2 * _DARKEST)
@@ -627,7 +627,7 @@ def quiet_noise(recording: Recording, camera: CameraSettings, dark: float) -> tu
     At half of white it is taken to be twice that, but no more than the usual: three DAVIS sensors have 1 to 1.85 times.
     Behind a response that bends it is the same of all stored values, no more than the usual at half of white.
     """
-    response = frame_response(recording, camera)
+    response = _response(recording, camera)
     if not response.is_linear:
         told = [(2 * _DARKEST, dark), (0.5, camera.usual_frame_noise)]
         read, shot = _of_stored(response, told)
@@ -648,16 +648,16 @@ def _shot(read: float, at_half: float) -> float:
 
 def possible_read(recording: Recording, camera: CameraSettings, dark: float) -> float:
     """Noise in the dark: no less than the standard deviation of rounding."""
-    rounding = common_rounding(next(iter(recording.frames())), frame_response(recording, camera)) / 3**0.5
+    rounding = common_rounding(next(iter(recording.frames())), _response(recording, camera)) / 3**0.5
     return max(dark, rounding, _LEAST_READ)
 
 
-def frame_response(recording: Recording, camera: CameraSettings) -> Response:
+def _response(recording: Recording, camera: CameraSettings) -> Response:
     """The camera's, or that of its green pixels."""
     return Camera.named(chosen_response(camera.response, recording.response), camera.clipped_from).response
 
 
-def comparable(
+def _comparable(
     recording: Recording, camera: CameraSettings, most_frames: int, delay: int = 0
 ) -> Iterator[Interval]:
     """The intervals whose frames differ by noise alone where there is no event.
@@ -718,7 +718,7 @@ def _points(
     Those of the smaller end where the larger are enough.
     """
     found: tuple[_Points, ...] = tuple([[] for _ in range(_BINS)] for _ in _SURROUNDINGS)
-    for interval in comparable(recording, camera, most_frames, delay):
+    for interval in _comparable(recording, camera, most_frames, delay):
         level, difference, usable, dark, *_ = _beyond_neighbours(interval.first, interval.second)
         busy = _busy(interval, delay)
         near_dark = near(dark)

@@ -26,8 +26,6 @@ from kalux.calibration.frame_noise import (
     PART,
     WITHOUT_SLOPES,
     by_level,
-    comparable,
-    frame_response,
     near,
     noise_at,
     noise_behind,
@@ -35,10 +33,11 @@ from kalux.calibration.frame_noise import (
     square_parts,
 )
 from kalux.calibration.regression import robust_deviation
-from kalux.filters.shots import Shot
-from kalux.models.camera import Response
+from kalux.filters.shots import Shot, take_shot
+from kalux.frames import Frame
+from kalux.models.camera import Camera, Response
 from kalux.recording import Recording
-from kalux.settings import CameraSettings
+from kalux.settings import CameraSettings, chosen_response
 
 Array = NDArray[np.float64]
 
@@ -106,22 +105,19 @@ class MovingNoise(NamedTuple):
         )
 
 
-def estimate_moving_noise(
-    recording: Recording, camera: CameraSettings, *, delay: int = 0
-) -> MovingNoise | None:
+def estimate_moving_noise(recording: Recording, camera: CameraSettings) -> MovingNoise | None:
     """Read and shot noise from frames that move, and the variance of the sensor's fixed pattern with it.
 
     Behind a response that bends, it is the same of all stored values. None: fewer than a hundred parts are well
-    exposed; the sensor has less than 32 rows or columns; or neighbouring pixels do not show the same light (colour).
+    exposed; the sensor has less than 32 rows or columns; or frames are in colour, whose neighbouring pixels do not show
+    the same light.
 
     Parameters
     ----------
     recording
-        With known exposures.
+        With frames and exposures, of which those that differ by less than a tenth are compared.
     camera
         Response and saturation.
-    delay
-        How late the events are known to be, us.
 
     Raises
     ------
@@ -129,20 +125,26 @@ def estimate_moving_noise(
         If the frames' exposures are not known.
     """
     height, width = recording.sensor_size
-    if min(height, width) < _LEAST_SIDE:
+    model = Camera.named(chosen_response(camera.response, recording.response), camera.clipped_from)
+    frames = [*itertools.islice(recording.frames(), _PAIRS[1] + 1)]
+    if min(height, width) < _LEAST_SIDE or model.colours is not None or not all(map(_is_grey, frames)):
         return None
-    response = frame_response(recording, camera)
     pairs = min(max(-(-_PARTS * PART**2 // (height * width)), _PAIRS[0]), _PAIRS[1])
-    seen = itertools.islice(comparable(recording, camera, _PAIRS[1], delay), 0, None, _PAIRS[1] // pairs)
-    found = [
-        _compare(interval.first, interval.second, response)
-        for interval in seen
-        if interval.first.chroma is None and interval.first.pitch == 1
-    ]
+    found = []
+    for frame, following in itertools.islice(itertools.pairwise(frames), 0, None, _PAIRS[1] // pairs):
+        if 0.9 < frame.amplified_exposure / following.amplified_exposure < 1.1:
+            first, second = (take_shot(each, model, float(each.exposure)) for each in (frame, following))
+            found.append(_compare(first, second, model.response))
     if not found:
         return None
-    noise = _fitted(_Parts(*(np.concatenate(values) for values in zip(*found, strict=True))), response)
+    parts = _Parts(*(np.concatenate(values) for values in zip(*found, strict=True)))
+    noise = _fitted(parts, model.response)
     return noise and noise._replace(read=possible_read(recording, camera, noise.read))
+
+
+def _is_grey(frame: Frame) -> bool:
+    """Whether all its pixels show light of one colour."""
+    return frame.image.ndim == 2 and frame.mosaic is None
 
 
 class _Parts(NamedTuple):

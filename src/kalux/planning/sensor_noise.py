@@ -98,7 +98,7 @@ def with_moving_noise(
     filled, camera = of_frames._replace(settings=settings), settings.camera
     if of_frames.was_given or compression is not None or camera.fixed_pattern != 0:
         return filled
-    moving = estimate_moving_noise(recording, camera, delay=settings.events.lateness)
+    moving = estimate_moving_noise(recording, camera)
     if moving is None or not moving.is_certain:
         return filled
     if of_frames.estimate is not None and not moving.contradicts(*camera.noise):
