@@ -139,7 +139,7 @@ def estimate_moving_noise(recording: Recording, camera: CameraSettings) -> Movin
         return None
     parts = _Parts(*(np.concatenate(values) for values in zip(*found, strict=True)))
     noise = _fitted(parts, model.response)
-    return noise and noise._replace(read=possible_read(recording, camera, noise.read))
+    return None if noise is None else noise._replace(read=possible_read(recording, camera, noise.read))
 
 
 def _is_grey(frame: Frame) -> bool:
