@@ -12,6 +12,7 @@ from kalux import EVENT_DTYPE, Frame, Recording
 from kalux.calibration import moving_noise
 from kalux.calibration.frame_noise import usual_noise
 from kalux.calibration.moving_noise import MovingNoise, estimate_moving_noise
+from kalux.calibration.noise import calibrate_noise
 from kalux.models.camera import Response
 from kalux.planning import plan
 from kalux.settings import PRESETS, CameraSettings, altered
@@ -149,6 +150,16 @@ def test_interpolation_is_that_of_opencv():
     np.testing.assert_allclose(seen[20, 5:30], made, atol=1e-5)
 
 
+def test_calibrate_noise_takes_it_where_nothing_stands_still():
+    moves = with_events(filmed(0.05, 0.012, 0.0, step=(5.3, 3.1)))
+    found = calibrate_noise(moves, CAMERA)
+    assert found.frames is None or not found.frames.is_reliable
+    told = found.calibration()
+    assert told.settings["camera"]["frame_noise"] == pytest.approx(0.012, rel=0.1)
+    assert told.measured["noise_at_half"] == pytest.approx(0.012, rel=0.1)
+    assert calibrate_noise(moves, CAMERA, is_compressed=True).moving is None
+
+
 def planned(recording, **camera):
     settings = altered(
         altered(PRESETS["default"], "camera", **camera), "events", threshold_on=0.2, threshold_off=0.2
@@ -158,16 +169,16 @@ def planned(recording, **camera):
 
 def test_a_plan_takes_it_where_nothing_stands_still_and_there_is_no_pattern():
     moves = filmed(0.15, 0.012, 0.0)
-    told = planned(_with_events(moves), fixed_pattern=0.0)
+    told = planned(with_events(moves), fixed_pattern=0.0)
     assert isinstance(told.frame_noise, MovingNoise)
     assert told.settings.camera.frame_noise == pytest.approx(0.012, rel=0.1)
-    assert not isinstance(planned(_with_events(moves), fixed_pattern=0.005).frame_noise, MovingNoise)
-    given = planned(_with_events(moves), fixed_pattern=0.0, frame_noise=0.02)
+    assert not isinstance(planned(with_events(moves), fixed_pattern=0.005).frame_noise, MovingNoise)
+    given = planned(with_events(moves), fixed_pattern=0.0, frame_noise=0.02)
     assert given.settings.camera.frame_noise == 0.02
     assert given.frame_noise is None
 
 
-def _with_events(recording):
+def with_events(recording):
     """One of every pixel in every interval, so that nothing stands still."""
     times = np.arange(20_000, 440_000, 20_000)
     height, width = recording.sensor_size

@@ -147,6 +147,20 @@ def _is_grey(frame: Frame) -> bool:
     return frame.image.ndim == 2 and frame.mosaic is None
 
 
+def told_by_motion(
+    recording: Recording, camera: CameraSettings, still: tuple[float, float] | None
+) -> MovingNoise | None:
+    """The noise of what moves, where it is certain, of a sensor without a fixed pattern.
+
+    ``still``: read and shot noise that what stands still seems to have, which is taken where it is not contradicted, so
+    that the answer is None; None: nothing does. Others as of `estimate_moving_noise`.
+    """
+    moving = estimate_moving_noise(recording, camera)
+    if moving is None or not moving.is_certain:
+        return None
+    return moving if still is None or moving.contradicts(*still) else None
+
+
 class _Parts(NamedTuple):
     """The well exposed parts of pairs of frames: (N,) intensity, and the variances x and y, of stored values."""
 

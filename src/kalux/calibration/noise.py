@@ -20,10 +20,11 @@ from numpy.typing import NDArray
 from kalux.calibration.black_level import with_known_black
 from kalux.calibration.delay import estimate_delay
 from kalux.calibration.fixed_pattern import FixedPattern, estimate_fixed_pattern
-from kalux.calibration.frame_noise import FrameNoise, estimate_frame_noise
+from kalux.calibration.frame_noise import FrameNoise, estimate_frame_noise, noise_at
 from kalux.calibration.global_thresholds import Usual, with_true_delay
 from kalux.calibration.hot_pixels import find_hot_pixels
 from kalux.calibration.levels import ClippingLevels, clipping_levels
+from kalux.calibration.moving_noise import MovingNoise, told_by_motion
 from kalux.calibration.refractory import dead_time, shortest_interval
 from kalux.calibration.region import Region, widened
 from kalux.calibration.regression import ratio_error
@@ -91,8 +92,9 @@ class NoiseCalibration:
         (H, W) bool: pixels that fire without reason (`kalux.calibration.hot_pixels`).
     events
         Background events of the others, dead pixels.
-    frames, pattern
-        Read and shot noise of frames, and their fixed pattern.
+    frames, moving, pattern
+        Read and shot noise of frames, of what stands still; of what moves, where that tells it instead; and their fixed
+        pattern.
     black_level
         What was taken off the frames, a share of white, given or found; None: nothing, or what they state themselves.
     levels
@@ -106,6 +108,7 @@ class NoiseCalibration:
     hot: NDArray[np.bool_]
     events: EventNoise | None
     frames: FrameNoise | None
+    moving: MovingNoise | None
     pattern: FixedPattern | None
     black_level: float | None
     levels: ClippingLevels
@@ -134,7 +137,10 @@ class NoiseCalibration:
             events["delay"] = self.delay
         if self.refractory_at_most is not None:
             measured["refractory_at_most"] = self.refractory_at_most
-        if self.frames is not None:
+        if self.moving is not None:
+            camera |= {"frame_noise": self.moving.read, "shot_noise": self.moving.shot}
+            measured["noise_at_half"] = noise_at(self.moving.read, self.moving.shot, 0.5)
+        elif self.frames is not None:
             if self.frames.is_reliable:
                 camera |= {"frame_noise": self.frames.read, "shot_noise": self.frames.shot}
                 errors |= {
@@ -157,7 +163,11 @@ class NoiseCalibration:
 
 
 def calibrate_noise(
-    recording: Recording, camera: CameraSettings, hot: NDArray[np.bool_] | None = None
+    recording: Recording,
+    camera: CameraSettings,
+    hot: NDArray[np.bool_] | None = None,
+    *,
+    is_compressed: bool = False,
 ) -> NoiseCalibration:
     """Measure the noise of a recording's sensor.
 
@@ -169,6 +179,8 @@ def calibrate_noise(
         Response, saturation and black level; where that is None and events show one, it is taken off.
     hot
         (H, W): pixels that are hot, whose events may be left out of the recording; None: they are looked for.
+    is_compressed
+        Whether frames have been compressed, so that what moves has less fine noise than there is.
 
     Raises
     ------
@@ -181,11 +193,18 @@ def calibrate_noise(
     if delay is not None:
         period = dead_time(recording)
         delay = with_true_delay(recording, camera, delay, Usual.of(EventSettings()), refractory_period=period)
+    frames = estimate_frame_noise(recording, camera, most_frames=MAX_FRAMES)
+    pattern = estimate_fixed_pattern(recording, camera)
+    moving = None
+    if pattern is not None and pattern.is_measured and pattern.deviation == 0 and not is_compressed:
+        still = None if frames is None or not frames.is_reliable else (frames.read, frames.shot)
+        moving = told_by_motion(recording, camera, still)
     return NoiseCalibration(
         hot=hot,
         events=event_noise(recording, known_hot=hot),
-        frames=estimate_frame_noise(recording, camera, most_frames=MAX_FRAMES),
-        pattern=estimate_fixed_pattern(recording, camera),
+        frames=frames,
+        moving=moving,
+        pattern=pattern,
         black_level=recording.black_level or camera.black_level,
         levels=clipping_levels(recording, MAX_FRAMES),
         delay=None if delay is None or delay.improvement < _LEAST_IMPROVEMENT else delay.delay,

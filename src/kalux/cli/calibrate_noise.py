@@ -79,7 +79,9 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
     stages = Stages(quiet=options.quiet)
     (recording, settings, mends), contents = mended_recording(opened, known.apply(preset("default")), stages)
     with stages.stage("measuring noise"):
-        found = calibrate_noise(recording, settings.camera, mends.hot).calibration()
+        is_compressed = mends.compression is not None
+        measured = calibrate_noise(recording, settings.camera, mends.hot, is_compressed=is_compressed)
+        found = measured.calibration()
     if mends.ceiling is not None:
         found = found.merged(Calibration({"camera": {"saturation": settings.camera.saturation}}))
     if options.fit:

@@ -13,7 +13,7 @@ from kalux.calibration.fixed_pattern import FixedPattern, estimate_fixed_pattern
 from kalux.calibration.frame_noise import FrameNoise, UsualNoise, estimate_frame_noise, usual_noise
 from kalux.calibration.lag import Lag, LagSums
 from kalux.calibration.mismatch import Mismatch, estimate_mismatch
-from kalux.calibration.moving_noise import MovingNoise, estimate_moving_noise
+from kalux.calibration.moving_noise import MovingNoise, told_by_motion
 from kalux.calibration.noise import event_noise
 from kalux.calibration.refractory import counted_period, dead_time
 from kalux.calibration.slow_pixels import Observer, observe
@@ -98,10 +98,8 @@ def with_moving_noise(
     filled, camera = of_frames._replace(settings=settings), settings.camera
     if of_frames.was_given or compression is not None or camera.fixed_pattern != 0:
         return filled
-    moving = estimate_moving_noise(recording, camera)
-    if moving is None or not moving.is_certain:
-        return filled
-    if of_frames.estimate is not None and not moving.contradicts(*camera.noise):
+    moving = told_by_motion(recording, camera, None if of_frames.estimate is None else camera.noise)
+    if moving is None:
         return filled
     settings = altered(settings, "camera", frame_noise=moving.read, shot_noise=moving.shot)
     return FilledFrameNoise(settings, moving)
