@@ -340,3 +340,10 @@ def unshown(pixels, excess, noise=0.0, doubt=0.0, shape=(1, 10)):
     )
     planes = (np.full(len(pixels), value, np.float32) for value in (noise, doubt))
     return Unshown(memory.pixels, expected, *planes, memory)
+
+
+def busy(where, frames=12):
+    """Events of the pixels of a mask, between any two frames."""
+    y, x = np.nonzero(where)
+    t = np.arange(frames).repeat(len(x)) * 40_000 + 20_000
+    return make_events(t, np.tile(x, frames), np.tile(y, frames), np.ones(len(t), np.int64))

@@ -29,7 +29,7 @@ from kalux.events import make_events
 from kalux.models.camera import Response
 from kalux.settings import CameraSettings
 
-from builders import unlabelled, without_events
+from builders import busy, unlabelled, without_events
 
 CAMERA = CameraSettings()
 NOTHING = np.empty(0, EVENT_DTYPE)
@@ -175,13 +175,6 @@ def test_levels_that_are_alike_do_not_tell_read_from_shot_noise():
     found = estimate_frame_noise(still(np.full((60, 80), 0.48), 0.01, 0.0), CAMERA)
     assert found.read == pytest.approx(np.hypot(0.01, LEVEL), rel=0.05)
     assert found.shot == 0.0
-
-
-def busy(where, frames=12):
-    """Events of the pixels of a mask, between any two frames."""
-    y, x = np.nonzero(where)
-    t = np.arange(frames).repeat(len(x)) * 40_000 + 20_000
-    return make_events(t, np.tile(x, frames), np.tile(y, frames), np.ones(len(t), np.int64))
 
 
 def busy_on_the_right(shape):

@@ -17,6 +17,8 @@ from kalux.models.camera import Response
 from kalux.planning import plan
 from kalux.settings import PRESETS, CameraSettings, altered
 
+from builders import busy
+
 CAMERA = CameraSettings()
 NOTHING = np.empty(0, EVENT_DTYPE)
 LEVEL = 1 / 255 / np.sqrt(12)
@@ -160,6 +162,12 @@ def test_calibrate_noise_takes_it_where_nothing_stands_still():
     assert calibrate_noise(moves, CAMERA, is_compressed=True).moving is None
 
 
+def with_events(recording):
+    """Of every pixel in every interval, so that nothing stands still."""
+    frames = [*recording.frames()]
+    return Recording.from_arrays(busy(np.ones(SIZE), len(frames)), frames, sensor_size=SIZE)
+
+
 def planned(recording, **camera):
     settings = altered(
         altered(PRESETS["default"], "camera", **camera), "events", threshold_on=0.2, threshold_off=0.2
@@ -176,16 +184,3 @@ def test_a_plan_takes_it_where_nothing_stands_still_and_there_is_no_pattern():
     given = planned(with_events(moves), fixed_pattern=0.0, frame_noise=0.02)
     assert given.settings.camera.frame_noise == 0.02
     assert given.frame_noise is None
-
-
-def with_events(recording):
-    """One of every pixel in every interval, so that nothing stands still."""
-    times = np.arange(20_000, 440_000, 20_000)
-    height, width = recording.sensor_size
-    events = np.zeros(len(times) * height * width, [("t", "i8"), ("x", "u2"), ("y", "u2"), ("p", "?")])
-    rows, columns = np.divmod(np.arange(height * width), width)
-    events["t"] = np.repeat(times, height * width)
-    events["x"], events["y"] = np.tile(columns, len(times)), np.tile(rows, len(times))
-    events["p"] = np.repeat(np.arange(len(times)) % 2 == 0, height * width)
-    frames = [*recording.frames()]
-    return Recording.from_arrays(events, frames, sensor_size=recording.sensor_size)

@@ -139,20 +139,21 @@ def find_path(first: Latent, second: Latent, dark: float, white: float) -> Plane
     followed = mean_around(moved, _WINDOW)[np.ix_(y.astype(int), x.astype(int))].reshape(-1) > _CHANGED
     if not followed.any():
         return None
-    image, following = (_octets(frame.value, dark, white) for frame in (first, second))
-    flow = steady_flow(image, following, followed)
+    flow = steady_flow(first.value, second.value, dark, white, followed)
     return flow if float(np.abs(flow).max()) >= _STILL else None
 
 
 def steady_flow(
-    image: NDArray[np.uint8], following: NDArray[np.uint8], followed: NDArray[np.bool_] | None = None
+    first: Floats, second: Floats, dark: float, white: float, followed: NDArray[np.bool_] | None = None
 ) -> Plane:
-    """By how much what an image shows has moved in the following one, as of `find_path`.
+    """By how much what a frame shows has moved in the second, as of `find_path`.
 
     Parameters
     ----------
-    image, following
-        (H, W).
+    first, second
+        (H, W) log intensities.
+    dark, white
+        Those of black and of white.
     followed
         (N,) which points of the grid are looked for, others being still; None: all.
 
@@ -160,8 +161,9 @@ def steady_flow(
     -------
     (2, H, W) in x and y, pixels.
     """
-    height, width = image.shape
+    height, width = first.shape
     x, y = _grid(height, width)
+    image, following = (_octets(value, dark, white) for value in (first, second))
     points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 1, 2)
     chosen = np.ones(len(points), np.bool_) if followed is None else followed
     flow = np.zeros_like(points)

@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.calibration.delay import DelayEstimate, estimate_delay
-from kalux.calibration.intervals import WELL_EXPOSED, compared_frames, intervals, spread
+from kalux.calibration.intervals import WELL_EXPOSED, camera_of, compared_frames, intervals, spread
 from kalux.calibration.levels import response_histogram
 from kalux.event_slices import between, count_events
-from kalux.models.camera import Camera, Response
+from kalux.models.camera import Response
 from kalux.recording import Recording, less_black
-from kalux.settings import CameraSettings, EventSettings, chosen_response
+from kalux.settings import CameraSettings, EventSettings
 
 Array = NDArray[np.float64]
 
@@ -177,9 +177,7 @@ def find_black_level(
         return None
     estimate = estimate_delay(recording, camera) if events.delay is None else None
     delay = (events.delay or 0) if estimate is None else estimate.apparent
-    response = Camera.named(
-        chosen_response(camera.response, recording.response), camera.clipped_from
-    ).response
+    response = camera_of(recording, camera).response
     return _decided(_samples(recording, camera, floor, delay), response, floor)._replace(delay=estimate)
 
 

@@ -17,12 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.calibration.frame_noise import MAX_FRAMES
+from kalux.calibration.intervals import camera_of
 from kalux.calibration.regression import grid_step, parts, ratio_error
 from kalux.compiled import larger, loop, smaller
 from kalux.filters.shots import Shot, take_shot
-from kalux.models.camera import Camera, Response
+from kalux.models.camera import Response
 from kalux.recording import Recording
-from kalux.settings import USUAL_PATTERN, CameraSettings, chosen_response
+from kalux.settings import USUAL_PATTERN, CameraSettings
 
 Array = NDArray[np.float64]
 Planes = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
@@ -95,8 +96,7 @@ def estimate_fixed_pattern(recording: Recording, camera: CameraSettings) -> Fixe
     ExposureError
         If the frames' exposures are not known.
     """
-    response = chosen_response(camera.response, recording.response)
-    model = Camera.named(response, camera.clipped_from)
+    model = camera_of(recording, camera)
     if model.colours is not None:
         return None
     height, width = recording.sensor_size

@@ -16,15 +16,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.calibration.intervals import Interval, intervals
+from kalux.calibration.intervals import Interval, camera_of, intervals
 from kalux.calibration.silences import find_silences, overlaps
 from kalux.compiled import empty, event_column, event_row, event_words, loop, smaller, zeros
 from kalux.event_slices import all_between
 from kalux.filters.shots import Shot
 from kalux.frames import Frame
-from kalux.models.camera import Camera, Response, common_rounding, rounding_error
+from kalux.models.camera import Response, common_rounding, rounding_error
 from kalux.recording import Recording
-from kalux.settings import CameraSettings, chosen_response
+from kalux.settings import CameraSettings
 
 Array = NDArray[np.float64]
 
@@ -654,7 +654,7 @@ def possible_read(recording: Recording, camera: CameraSettings, dark: float) -> 
 
 def _response(recording: Recording, camera: CameraSettings) -> Response:
     """The camera's, or that of its green pixels."""
-    return Camera.named(chosen_response(camera.response, recording.response), camera.clipped_from).response
+    return camera_of(recording, camera).response
 
 
 def _comparable(
@@ -794,10 +794,15 @@ def _beyond_neighbours(first: Shot, second: Shot) -> FrameChange:
     for shot in (first, second):
         if shot.valid is not None:
             bad |= ~shot.valid
-    usable = ~near(bad)
-    usable[[0, -1]] = False  # of pixels at the border a neighbour counts twice
-    usable[:, [0, -1]] = False
+    usable = inner_pixels(~near(bad))
     return FrameChange(level, beyond, usable, dark, first.pitch, is_own, change)
+
+
+def inner_pixels(usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(H, W): those that do not lie at the border, where a neighbour counts twice."""
+    inside = np.zeros_like(usable)
+    inside[1:-1, 1:-1] = usable[1:-1, 1:-1]
+    return inside
 
 
 def _beyond_four(change: Array, pitch: int) -> Array:

@@ -153,7 +153,7 @@ def find_frame_times(
     errors = found.errors
     if frames > _MOST_FRAMES:
         common = all_errors = np.full(frames, found.common)
-        with_gain = normal.with_gain(common[:_MOST_FRAMES])
+        with_gain = normal.with_gain(found.gain)
         for _ in range(_ROUNDS):
             all_errors = _moved(with_gain.at(all_errors), all_errors, common)
         errors = all_errors - common
@@ -169,6 +169,8 @@ class _Errors(NamedTuple):
         (K,) us, beside what they have in common:
     common
         us.
+    gain
+        Of the change by events, which all intervals have.
     left, left_by_gains
         Share of the misfit that is left with them, and with a gain of each interval in their place.
     spread, standard_error
@@ -177,6 +179,7 @@ class _Errors(NamedTuple):
 
     errors: Array
     common: float
+    gain: float
     left: float
     left_by_gains: float
     spread: float
@@ -208,11 +211,14 @@ class _Normals(NamedTuple):
         """Of as many frames as there are ``errors``, us."""
         return _joined([_equations(seen, scale) for seen, scale in self._seen(errors)])
 
-    def with_gain(self, errors: Array) -> _Normals:
-        """The same with thresholds of the gain that all intervals have, as the frames' ``errors`` are, us."""
+    def gain(self, errors: Array) -> float:
+        """That which all intervals have, as the frames' ``errors`` are, us."""
         sums = np.array([_gain_sums(seen, scale) for seen, scale in self._seen(errors)]).reshape(-1, 2)
         told, weight = sums.sum(axis=0)
-        gain = 1.0 + (told / weight if weight > 0 else 0.0)
+        return float(1.0 + (told / weight if weight > 0 else 0.0))
+
+    def with_gain(self, gain: float) -> _Normals:
+        """The same with thresholds that are ``gain`` times as large."""
         on, off = (gain * threshold for threshold in self.events.thresholds)
         return self._replace(events=replace(self.events, threshold_on=on, threshold_off=off))
 
@@ -239,11 +245,10 @@ def _first_errors(normal: _Normals) -> _Errors | None:
     if len(asked.right) < 3 or not _is_suspect(asked):
         return None
     common = np.zeros(min(frames, _MOST_FRAMES))
-    equations = normal.at(common)
     for _ in range(_COMMON_ROUNDS):
-        common += np.clip(_common(equations), -_LARGEST_STEP, _LARGEST_STEP)
-        equations = normal.at(common)
-    normal = normal.with_gain(common)
+        common += np.clip(_common(normal.at(common)), -_LARGEST_STEP, _LARGEST_STEP)
+    gain = normal.gain(common)
+    normal = normal.with_gain(gain)
     equations = normal.at(common)
     errors, without = common, equations.misfit
     for _ in range(_ROUNDS):
@@ -256,7 +261,7 @@ def _first_errors(normal: _Normals) -> _Errors | None:
     about = found - np.average(found, weights=known)
     spread = float(np.sqrt(np.average(np.square(about), weights=known)))
     left, by_gains = equations.misfit / without, normal.misfit_with_gains(common) / without
-    return _Errors(found, float(common[0]), left, by_gains, spread, 1.0 / np.sqrt(median))
+    return _Errors(found, float(common[0]), gain, left, by_gains, spread, 1.0 / np.sqrt(median))
 
 
 def _moved(equations: _Normal, errors: Array, common: Array) -> Array:

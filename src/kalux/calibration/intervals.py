@@ -85,6 +85,16 @@ class End:
         return usable & (self.intensity > low * self.shot.white) & self.shot.measured
 
 
+def camera_of(recording: Recording, camera: CameraSettings) -> Camera:
+    """The frame camera, with the response of the settings, or that which the recording states."""
+    return Camera.named(chosen_response(camera.response, recording.response), camera.clipped_from)
+
+
+def is_one_exposure(first: float, second: float) -> bool:
+    """Whether two exposure times, or what goes with them, are the same but for a tenth: then so is frames' noise."""
+    return 0.9 < first / second < 1.1
+
+
 @dataclass(frozen=True, eq=False)
 class Interval:
     """From the middle of one exposure to that of the next.
@@ -128,7 +138,7 @@ class Interval:
     @property
     def has_one_exposure(self) -> bool:
         """Whether the exposure times of both frames are the same but for a tenth, so that their noise is, too."""
-        return 0.9 < self.first.white / self.second.white < 1.1
+        return is_one_exposure(self.first.white, self.second.white)
 
     @cached_property
     def events(self) -> EventArray:
@@ -190,8 +200,7 @@ def intervals(
 
     Frames are those of `compared_frames`; all with an ``apart`` of 0.
     """
-    response = chosen_response(camera.response, recording.response)
-    model = Camera.named(response, camera.clipped_from)
+    model = camera_of(recording, camera)
     chunks = iter(recording.events())
     held: list[EventArray] = []
     previous: End | None = None

@@ -15,11 +15,11 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from kalux.calibration.intervals import compared_frames, counted_intervals
+from kalux.calibration.intervals import camera_of, compared_frames, counted_intervals
 from kalux.frames import Frame
 from kalux.models.camera import Camera, clipping_level
 from kalux.recording import Recording
-from kalux.settings import CameraSettings, EventSettings, chosen_response
+from kalux.settings import CameraSettings, EventSettings
 from kalux.white import BRIGHTEST, sharp_end
 
 Array = NDArray[np.float64]
@@ -112,7 +112,7 @@ def find_ceiling(
     ExposureError
         If the frames' exposures are not known.
     """
-    model = Camera.named(chosen_response(camera.response, recording.response), camera.clipped_from)
+    model = camera_of(recording, camera)
     brightest = _brightest(recording, model, most_frames)
     if brightest is None or brightest >= below:
         return None

@@ -13,6 +13,7 @@ k, though no part be smooth. The sensor's fixed pattern does not move, and count
 
 from __future__ import annotations
 
+import functools
 import itertools
 from typing import Final, NamedTuple
 
@@ -26,18 +27,20 @@ from kalux.calibration.frame_noise import (
     PART,
     WITHOUT_SLOPES,
     by_level,
+    inner_pixels,
     near,
     noise_at,
     noise_behind,
     possible_read,
     square_parts,
 )
+from kalux.calibration.intervals import camera_of, is_one_exposure
 from kalux.calibration.regression import robust_deviation
 from kalux.filters.shots import Shot, take_shot
 from kalux.frames import Frame
-from kalux.models.camera import Camera, Response
+from kalux.models.camera import Response
 from kalux.recording import Recording
-from kalux.settings import CameraSettings, chosen_response
+from kalux.settings import CameraSettings
 
 Array = NDArray[np.float64]
 
@@ -125,14 +128,16 @@ def estimate_moving_noise(recording: Recording, camera: CameraSettings) -> Movin
         If the frames' exposures are not known.
     """
     height, width = recording.sensor_size
-    model = Camera.named(chosen_response(camera.response, recording.response), camera.clipped_from)
+    model = camera_of(recording, camera)
+    if min(height, width) < _LEAST_SIDE or model.colours is not None:
+        return None
     frames = [*itertools.islice(recording.frames(), _PAIRS[1] + 1)]
-    if min(height, width) < _LEAST_SIDE or model.colours is not None or not all(map(_is_grey, frames)):
+    if not all(map(_is_grey, frames)):
         return None
     pairs = min(max(-(-_PARTS * PART**2 // (height * width)), _PAIRS[0]), _PAIRS[1])
     found = []
     for frame, following in itertools.islice(itertools.pairwise(frames), 0, None, _PAIRS[1] // pairs):
-        if 0.9 < frame.amplified_exposure / following.amplified_exposure < 1.1:
+        if is_one_exposure(frame.amplified_exposure, following.amplified_exposure):
             first, second = (take_shot(each, model, float(each.exposure)) for each in (frame, following))
             found.append(_compare(first, second, model.response))
     if not found:
@@ -178,16 +183,15 @@ def _compare(first: Shot, second: Shot, response: Response) -> _Parts:
     """The parts of a frame, in the place of which the second is put by its motion."""
     (intensity, bad), (following, bad_after) = _seen(first), _seen(second)
     stored, after = (np.asarray(response(light), np.float32) for light in (intensity, following))
-    moved_x, moved_y = steady_flow(_octets(intensity), _octets(following))
+    bent, bent_after = (np.log1p(light.clip(0.0, 1.0) / _BEND) for light in (intensity, following))
+    moved_x, moved_y = steady_flow(bent, bent_after, 0.0, float(np.log1p(1.0 / _BEND)))
     rows, columns = np.indices(stored.shape, np.float32)
     x, y = columns + moved_x, rows + moved_y
     put = np.asarray(cv2.remap(after, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE), np.float32)
     hidden = cv2.remap(
         bad_after.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=1.0
     )
-    usable = ~(bad | near(near(hidden > 0)))
-    usable[[0, -1]] = False  # of pixels at the border a neighbour counts twice
-    usable[:, [0, -1]] = False
+    usable = inner_pixels(~(bad | near(near(hidden > 0))))
     noise = 1.0 + square_parts(_noise_left(x) * _noise_left(y)).mean(1)
     whole = square_parts(usable).all(1)
     parts = _Parts(square_parts(intensity).mean(1), _fine(stored), _fine(put - stored) / noise)
@@ -201,12 +205,6 @@ def _seen(shot: Shot) -> tuple[Array, NDArray[np.bool_]]:
     return intensity[levels], near(bad)
 
 
-def _octets(intensity: Array) -> NDArray[np.uint8]:
-    """The image that is followed."""
-    values = np.log1p(np.clip(intensity, 0.0, 1.0) / _BEND) * (255.0 / np.log1p(1.0 / _BEND))
-    return np.asarray(values, np.uint8)
-
-
 def _fine(plane: NDArray[np.float32]) -> Array:
     """(N,) variance that parts have beyond rows, columns and slopes."""
     beyond = cv2.filter2D(plane, cv2.CV_32F, WITHOUT_SLOPES)
@@ -215,9 +213,15 @@ def _fine(plane: NDArray[np.float32]) -> Array:
 
 def _noise_left(places: NDArray[np.float32]) -> Array:
     """The variance of `_fine` that interpolation leaves of white noise at such places, in one direction."""
+    return np.asarray(np.interp(np.mod(places, 1.0), *_noise_of_steps()))
+
+
+@functools.cache
+def _noise_of_steps() -> tuple[Array, Array]:
+    """The same of the places between two pixels that interpolation tells apart."""
     steps = np.arange(_FRACTIONS + 1) / _FRACTIONS
     left = [np.square(np.convolve(_weights(step), WITHOUT_SLOPES[0])).sum() for step in steps]
-    return np.asarray(np.interp(np.mod(places, 1.0), steps, np.array(left) / left[0]))
+    return steps, np.array(left) / left[0]
 
 
 def _weights(fraction: float) -> Array:
