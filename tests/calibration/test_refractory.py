@@ -35,12 +35,15 @@ def test_the_shortest_interval_is_not_that_of_noise():
 
 
 def trains(*, soonest, noise, seed=0, pixels=400, seconds=2.0):
-    """Events of edges that follow one another ever sooner, from ``soonest`` us on, and ``noise`` at any time, Hz."""
+    """Events of edges that follow one another ever sooner, from ``soonest`` us on, and ``noise`` at any time, Hz.
+
+    One edge passes a pixel at a time: of two at once, events would follow sooner than those of either.
+    """
     rng = np.random.default_rng(seed)
     events = []
     for pixel in range(pixels):
         gaps = soonest * (1 + 3 * np.sqrt(rng.random((20, 8))))
-        begins = rng.uniform(0, 1e6 * seconds, 20)[:, None]
+        begins = ((np.arange(20) + rng.uniform(0, 0.2, 20)) * 1e6 * seconds / 20)[:, None]
         t = (begins + np.cumsum(gaps, axis=1)).ravel()
         p = np.repeat(rng.random(20) < 0.5, 8)
         more = rng.uniform(0, 1e6 * seconds, rng.poisson(noise * seconds))
