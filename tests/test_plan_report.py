@@ -34,7 +34,7 @@ def test_what_the_settings_state_is_given():
 
 def test_says_where_frames_end():
     rows = rows_of(passing_by(textured(1.2), 102))
-    told = r"from 0.39 of white \(frames end at 0.4, where events go on by \d+ %\)"
+    told = r"from 0.4 of white \(frames end at 0.4, where events go on by \d+ %\)"
     assert re.fullmatch(told, rows["saturation"])
     deep = passing_by(textured(1.2), 255)
     frames = [

@@ -195,14 +195,15 @@ def saturation_text(recording: Recording, plan: Plan, asked: Settings) -> str:
     """
     used = plan.settings.camera.clipped_from
     how = "the usual" if plan.mends.compression is None else "the usual, less what their compression does"
+    how = "all that is clipped is at the frames' last level" if used > asked.camera.usual_saturation else how
     how = how if asked.camera.saturation is None else _GIVEN
-    text = f"from {used:.2g} of white ({how}); "
+    text = f"from {used:.3g} of white ({how}); "
     source = less_black(recording, plan.settings.camera.black_level)
     ceiling = find_ceiling(source, plan.settings.camera, plan.settings.events)
     if ceiling is None:
         return text + "events do not go on where the frames end, or too few tell"
     text += ceiling_text(ceiling)
-    if ceiling.level < used:
+    if ceiling.level < min(used, asked.camera.usual_saturation):
         text += f": {saturation_hint(ceiling)}"
     return text
 

@@ -78,11 +78,12 @@ class CameraSettings:
         what frames state; where they state nothing and begin above 0, what the recording's events say
         (`kalux.calibration.black_level`); else 0.
     saturation
-        Response, 0 to 1, from which a pixel counts as clipped. None: where the recording's frames all end at one level
-        while events go on (`kalux.calibration.levels`), else the usual one.
+        Response, 0 to 1, from which a pixel counts as clipped. None: just below the one level at which all clipped
+        pixels are, if the recording's frames show it (below white, if events go on there, too), else the usual one
+        (`kalux.calibration.levels`).
     usual_saturation
-        The same where the recording does not tell it; of frames that end lower, the share of their end. 0.98: a few
-        levels below 255, for sensors with fixed pattern noise at the top.
+        The same where the recording does not tell it, and in a live stream; of frames that end lower, the share of
+        their end. 0.98: a few levels below 255, for sensors with fixed pattern noise at the top.
     reference_exposure
         Exposure time, us, at which a saturated pixel has intensity 1; None: the recording's median.
     row_time

@@ -23,7 +23,7 @@ BRIGHTEST: Final = 1e-3
 """Share of pixels that are at the brightest level where frames end there: fewer are broken ones, or glints."""
 
 
-def sharp_end(images: Iterable[tuple[NDArray[Any], float] | None], below: float) -> float | None:
+def sharp_end(images: Iterable[tuple[NDArray[Any], float] | None], below: float = np.inf) -> float | None:
     """The level that a thousandth of all pixels have and none exceeds: where a sensor may clip, or a scene ends.
 
     Parameters
@@ -31,7 +31,7 @@ def sharp_end(images: Iterable[tuple[NDArray[Any], float] | None], below: float)
     images
         Pixels of any shape, and what they are divided by; None: an image that cannot be compared.
     below
-        The level has to be less.
+        The level has to be less; default: it may be any.
 
     Returns
     -------

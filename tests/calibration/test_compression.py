@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from kalux import Recording
 from kalux.calibration.compression import OF_VIDEO, find_compression
+from kalux.calibration.levels import LAST_LEVEL
 from kalux.datasets import SensorSettings, simulate
 from kalux.datasets.motion import pan
 from kalux.datasets.scenes import photograph_scene
@@ -109,7 +110,7 @@ def test_pixels_count_as_clipped_from_a_lower_level():
     assert levels.settings.camera.saturation == pytest.approx(expected)
     raw = with_saturation(recorded([scene(seed) for seed in range(4)]), usual)
     assert raw.compression is None
-    assert raw.settings.camera.saturation == usual.camera.usual_saturation
+    assert raw.settings.camera.saturation == LAST_LEVEL  # and not of frames that JPEG has compressed
     given = with_saturation(recorded(made), altered(usual, "camera", saturation=0.9))
     assert given.compression is None
     assert given.settings.camera.saturation == 0.9

@@ -9,7 +9,7 @@ import pytest
 
 import kalux
 from kalux import EVENT_DTYPE, Frame, Recording
-from kalux.calibration.levels import clipping_levels, exact_end, find_ceiling
+from kalux.calibration.levels import clipping_levels, find_ceiling, frames_end
 from kalux.settings import PRESETS
 
 from builders import passing_by, sky, textured
@@ -65,34 +65,69 @@ def with_frames(*levels, white=None):
     return Recording.from_arrays(np.empty(0, EVENT_DTYPE), frames, sensor_size=(10, 10))
 
 
-def test_the_exact_end_is_that_of_all_frames():
-    assert exact_end(with_frames(100, 200, 90), 0.98) == pytest.approx(200 / 255)
-    assert exact_end(with_frames(100, 200, 90, white=210), 0.98) == pytest.approx(200 / 210)
-    assert exact_end(with_frames(100, 255, 90), 0.98) is None
-    assert exact_end(with_frames(0, 0), 0.98) is None
-    assert exact_end(with_frames(), 0.98) is None
+def level_of(recording):
+    end = frames_end(recording)
+    return None if end is None else end.level
+
+
+def test_the_end_is_that_of_all_frames():
+    assert level_of(with_frames(100, 200, 90)) == pytest.approx(200 / 255)
+    assert level_of(with_frames(100, 200, 90, white=210)) == pytest.approx(200 / 210)
+    assert level_of(with_frames(100, 255, 90)) == 1
+    assert level_of(with_frames(0, 0)) is None
+    assert level_of(with_frames()) is None
+
+
+def recorded(*images, **options):
+    frames = [Frame(image, 1000 * i, 1000 * i + 500, **options) for i, image in enumerate(images)]
+    return Recording.from_arrays(np.empty(0, EVENT_DTYPE), frames, sensor_size=images[0].shape[:2])
 
 
 def test_glints_are_no_end():
     """Fewer than a thousandth of the pixels are as bright as the brightest."""
-    few, enough = ([Frame(np.full((50, 50), 9, np.uint8), 0, 5)] * 2 for _ in range(2))
-    for frames, count in ((few, 4), (enough, 5)):
-        image = frames[0].image.copy()
-        image.flat[:count] = 99
-        frames[1] = Frame(image, 10, 15)
-    found = [
-        exact_end(Recording.from_arrays(np.empty(0, EVENT_DTYPE), frames, sensor_size=(50, 50)), 0.98)
-        for frames in (few, enough)
-    ]
-    assert found == [None, pytest.approx(99 / 255)]
+    dark = np.full((50, 50), 9, np.uint8)
+    few, enough = dark.copy(), dark.copy()
+    few.flat[:4], enough.flat[:5] = 99, 99
+    assert level_of(recorded(dark, few)) is None
+    assert level_of(recorded(dark, enough)) == pytest.approx(99 / 255)
 
 
 def test_pixels_that_a_frame_does_not_see_end_nowhere():
     image = np.full((10, 10), 90, np.uint8)
     image[0] = 255
-    frames = [Frame(image, 0, 500, valid=image < 255)]
-    recording = Recording.from_arrays(np.empty(0, EVENT_DTYPE), frames, sensor_size=(10, 10))
-    assert exact_end(recording, 0.98) == pytest.approx(90 / 255)
+    assert level_of(recorded(image, valid=image < 255)) == pytest.approx(90 / 255)
+
+
+def passing_white(white, ends=1.0, noise=0.0, seed=0):
+    """(80, 80) frames of light up to twice white that moves by, clipped where each pixel ends; in levels."""
+    rng = np.random.default_rng(seed)
+    x = np.arange(80) / 80
+    light = 2 * np.outer(0.2 + 0.8 * x, 0.2 + 0.8 * np.roll(x, 7 * seed))
+    clipped = np.minimum(light, ends) + noise * rng.standard_normal(light.shape)
+    return np.rint(white * np.clip(clipped, 0, 1)).astype(np.uint16)
+
+
+@pytest.mark.parametrize("white", [255, 1023, 4095])
+@pytest.mark.parametrize("end", [1.0, 0.94, 0.5])
+def test_pixels_that_all_end_at_one_level_end_cleanly(white, end):
+    """Also where that is below what frames can hold, or noise lies over the light before it is clipped."""
+    frames = [np.minimum(passing_white(white, 9, 0.003, k), int(end * white)) for k in range(6)]
+    found = frames_end(recorded(*frames, white=white))
+    assert found is not None
+    assert found.level == pytest.approx(int(end * white) / white)
+    assert found.is_clean
+
+
+@pytest.mark.parametrize(
+    ("mean", "spread", "noise"), [(1, 0.01, 0), (1, 0.004, 0), (1.005, 0.01, 0), (1, 0, 0.004)]
+)
+def test_pixels_that_end_a_little_unevenly_do_not(mean, spread, noise):
+    """Those that end below white are as clipped as those at it; noise that is added after clipping looks the same."""
+    ends = mean + spread * np.random.default_rng(9).standard_normal((80, 80))
+    found = frames_end(recorded(*(passing_white(255, ends, noise, k) for k in range(6)), white=255))
+    assert found is not None
+    assert found.level == 1
+    assert not found.is_clean
 
 
 def test_without_events_or_light_nothing_is_told():

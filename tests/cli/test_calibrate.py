@@ -54,7 +54,7 @@ def test_contrast_is_measured_written_and_used(cli, unlabelled_file, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("picture", "cut", "saturation"), [(sky(0.8), 255, None), (textured(2.4), 200, 0.98 * 200 / 255)]
+    ("picture", "cut", "saturation"), [(sky(0.8), 255, None), (textured(2.4), 200, 0.999 * 200 / 255)]
 )
 def test_a_saturation_is_written_only_if_events_go_on_there(cli, tmp_path, picture, cut, saturation):
     """Of a sky pixels pile up as of a sensor that clips."""

@@ -268,7 +268,7 @@ def test_images_are_clipped_where_a_camera_ends_below_full_scale():
     """At 102 of 255, which events tell: highlights beyond are no error of theirs."""
     recording = passing_by(textured(1.2), 102, noise_rate=0.0)
     end = end_of_frames(recording, "linear")
-    assert end == (pytest.approx(0.98 * 0.4), pytest.approx(0.4))
+    assert end == (pytest.approx(0.999 * 0.4), pytest.approx(0.4))
     held = hold_out_frames(recording)
     assert held.end == end
     bright = Method("bright", lambda rec, ts: (np.full(rec.sensor_size, 3.0) for _ in ts))

@@ -1,10 +1,14 @@
-"""Where frames are clipped: at full scale, unless events go on where they end."""
+"""Where frames are clipped: at full scale, or just below it, unless events go on where they end."""
 
 from __future__ import annotations
 
+import dataclasses
+
+import numpy as np
 import pytest
 
-from kalux import PRESETS
+from kalux import PRESETS, Recording
+from kalux.calibration.levels import LAST_LEVEL
 from kalux.planning import plan
 from kalux.settings import altered
 
@@ -17,7 +21,7 @@ def test_a_camera_that_ends_below_full_scale_saturates_there(cut, stated):
     source = passing_by(textured(3 * cut / 255), cut)
     settings = altered(PRESETS["default"], "events", threshold_on=0.2, threshold_off=0.2)
     made = plan(source, at="frames", settings=settings if stated else None)
-    assert made.settings.camera.saturation == pytest.approx(0.98 * cut / 255)
+    assert made.settings.camera.saturation == pytest.approx(LAST_LEVEL * cut / 255)
     assert made.mends.ceiling.level == pytest.approx(cut / 255)
     given = plan(source, at="frames", settings=altered(settings, "camera", saturation=0.9))
     assert (given.settings.camera.saturation, given.mends.ceiling) == (0.9, None)
@@ -30,3 +34,24 @@ def test_a_scene_that_ends_below_white_does_not_saturate(picture):
     assert (made.settings.camera.saturation, made.mends.ceiling) == (0.98, None)
     paper = plan(passing_by(textured(1.2), 102), at="frames", preset="iccv2021")
     assert (paper.settings.camera.saturation, paper.mends.ceiling) == (0.98, None)
+
+
+def unevenly(recording, spread):
+    """The frames where each pixel ends at a level of its own, around full scale."""
+    ends = 1 + spread * np.random.default_rng(3).standard_normal(recording.sensor_size)
+    frames = [
+        dataclasses.replace(
+            frame, image=np.rint(255 * np.minimum(frame.image / 255, ends)).clip(0, 255).astype(np.uint8)
+        )
+        for frame in recording.frames()
+    ]
+    return Recording.from_arrays(
+        np.concatenate(list(recording.events())), frames, sensor_size=recording.sensor_size
+    )
+
+
+def test_pixels_just_below_white_are_measured_where_all_end_at_white():
+    """Where each ends at a level of its own, those a little below white may be clipped."""
+    source = passing_by(textured(3.0))
+    assert plan(source, at="frames").settings.camera.saturation == LAST_LEVEL
+    assert plan(unevenly(source, 0.005), at="frames").settings.camera.saturation == 0.98

@@ -6,7 +6,7 @@ from typing import Final, NamedTuple
 
 from kalux.calibration.black_level import BlackLevel, with_known_black
 from kalux.calibration.compression import Compression, find_compression
-from kalux.calibration.levels import Ceiling, exact_end, find_ceiling
+from kalux.calibration.levels import LAST_LEVEL, Ceiling, find_ceiling, frames_end
 from kalux.planning.event_steps import with_event_steps
 from kalux.recording import Recording, less_black
 from kalux.settings import CameraSettings, Settings, altered
@@ -56,11 +56,12 @@ class Saturation(NamedTuple):
 
 
 def with_saturation(recording: Recording, settings: Settings) -> Saturation:
-    """Fill in the saturation: from the settings, else the level at which all frames end while events go on, else usual.
+    """Fill in the saturation: from the settings, else just below the level at which all frames end, else usual.
 
-    Frames also end where the scene has nothing brighter. Events tell which it is: pixels at that level are clipped if
-    events go on there, by thresholds that are estimated as if it were the saturation. JPEG leaves pixels below it which
-    were clipped; so of frames that it has compressed some more count as clipped.
+    Frames also end where the scene has nothing brighter. Below the usual saturation events tell which it is: pixels at
+    that level are clipped if events go on there, by thresholds that are estimated as if it were the saturation. Where
+    all clipped pixels are at the end, those below it are measured (`kalux.calibration.levels.frames_end`), but for
+    frames that JPEG has compressed: it leaves pixels below the end which were clipped, so that some more count as such.
     """
     camera = settings.camera
     if camera.saturation is not None or not settings.filter.joins_frames:
@@ -68,10 +69,13 @@ def with_saturation(recording: Recording, settings: Settings) -> Saturation:
     compression = find_compression(recording)
     level = usual_saturation(camera, compression)
     usual = Saturation(altered(settings, "camera", saturation=level), None, compression)
-    end = exact_end(recording, camera.usual_saturation)
+    end = frames_end(recording)
     if end is None:
         return usual
-    clipped = altered(settings, "camera", saturation=level * end)
+    is_clean = end.is_clean and compression is None
+    clipped = altered(settings, "camera", saturation=(LAST_LEVEL if is_clean else level) * end.level)
+    if end.level >= camera.usual_saturation:
+        return Saturation(clipped, None, compression) if is_clean else usual
     known = with_event_steps(recording, clipped).settings
     found = find_ceiling(recording, known.camera, known.events)
-    return Saturation(clipped, found, compression) if found is not None and found.is_at(end) else usual
+    return Saturation(clipped, found, compression) if found is not None and found.is_at(end.level) else usual
