@@ -41,6 +41,7 @@ def variants(ablation: bool) -> dict[str, Settings]:
             ("no deblurring", "filter", {"deblur": False}),
             ("deblur variance 0", "events", {"deblur_variance": 0.0}),
             ("deblur variance 0.2", "events", {"deblur_variance": 0.2}),
+            ("clipped from 0.98", "camera", {"saturation": 0.98}),
             ("no highlight prior", "filter", {"highlight_scale": 0.0}),
             ("no far highlights", "events", {"extrapolation_trust": 0.0}),
             ("unshown at their bounds", "filter", {"unshown_tail": 0.0}),
