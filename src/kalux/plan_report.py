@@ -195,7 +195,7 @@ def saturation_text(recording: Recording, plan: Plan, asked: Settings) -> str:
     """
     used = plan.settings.camera.clipped_from
     how = "the usual" if plan.mends.compression is None else "the usual, less what their compression does"
-    how = "all that is clipped is at the frames' last level" if used > asked.camera.usual_saturation else how
+    how = "all that is clipped is at the frames' last level" if plan.mends.is_clean_end else how
     how = how if asked.camera.saturation is None else _GIVEN
     text = f"from {used:.3g} of white ({how}); "
     source = less_black(recording, plan.settings.camera.black_level)

@@ -54,9 +54,10 @@ def test_contrast_is_measured_written_and_used(cli, unlabelled_file, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("picture", "cut", "saturation"), [(sky(0.8), 255, None), (textured(2.4), 200, 0.999 * 200 / 255)]
+    ("picture", "cut", "saturation"),
+    [(sky(0.8), 255, None), (textured(2.4), 200, 0.999 * 200 / 255), (textured(2.4), 255, 0.999)],
 )
-def test_a_saturation_is_written_only_if_events_go_on_there(cli, tmp_path, picture, cut, saturation):
+def test_a_saturation_is_written_only_if_frames_are_clipped_there(cli, tmp_path, picture, cut, saturation):
     """Of a sky pixels pile up as of a sensor that clips."""
     made = passing_by(picture, cut)
     recording, out = tmp_path / "rec.h5", tmp_path / "noise.toml"
@@ -73,7 +74,8 @@ def test_a_saturation_is_written_only_if_events_go_on_there(cli, tmp_path, pictu
     assert found.settings.get("camera", {}).get("saturation") == (
         None if saturation is None else pytest.approx(saturation)
     )
-    assert found.measured["white_level"] == pytest.approx((0.8 * 255 if cut == 255 else cut) / 255, abs=0.01)
+    white = 0.8 if saturation is None else cut / 255
+    assert found.measured["white_level"] == pytest.approx(white, abs=0.01)
 
 
 def test_thresholds_need_frames(cli, tmp_path):

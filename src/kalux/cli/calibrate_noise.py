@@ -82,7 +82,7 @@ def run(options: argparse.Namespace, command: list[str]) -> None:
         is_compressed = mends.compression is not None
         measured = calibrate_noise(recording, settings.camera, mends.hot, is_compressed=is_compressed)
         found = measured.calibration()
-    if mends.ceiling is not None:
+    if mends.ceiling is not None or mends.is_clean_end:
         found = found.merged(Calibration({"camera": {"saturation": settings.camera.saturation}}))
     if options.fit:
         from kalux.evaluation.fit import fit_settings

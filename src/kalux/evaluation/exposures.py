@@ -66,12 +66,10 @@ class End(NamedTuple):
 
 def end_of_frames(recording: Recording, response: str) -> End:
     """Where a recording's frames end, as `kalux.reconstruct` takes it by default; ``response`` as of `linear_frame`."""
-    settings, ceiling, _ = with_saturation(recording, altered(preset("default"), "camera", response=response))
-    curve = Camera.named(response, settings.camera.clipped_from).response
-    return End(
-        settings.camera.clipped_from,
-        1.0 if ceiling is None else float(curve.inverse(np.array(ceiling.level))),
-    )
+    levels = with_saturation(recording, altered(preset("default"), "camera", response=response))
+    clipped_from, ceiling = levels.settings.camera.clipped_from, levels.ceiling
+    curve = Camera.named(response, clipped_from).response
+    return End(clipped_from, 1.0 if ceiling is None else float(curve.inverse(np.array(ceiling.level))))
 
 
 def exposure_times(frame: Frame, reads: int) -> NDArray[np.int64]:

@@ -48,11 +48,14 @@ class Saturation(NamedTuple):
         The level at which frames are clipped below the usual saturation, if that was found.
     compression
         What JPEG or a video did to the frames, if that is known, and was asked for.
+    is_clean_end
+        Whether the saturation is just below the level at which all that is clipped is.
     """
 
     settings: Settings
     ceiling: Ceiling | None = None
     compression: Compression | None = None
+    is_clean_end: bool = False
 
 
 def with_saturation(recording: Recording, settings: Settings) -> Saturation:
@@ -75,7 +78,8 @@ def with_saturation(recording: Recording, settings: Settings) -> Saturation:
     is_clean = end.is_clean and compression is None
     clipped = altered(settings, "camera", saturation=(LAST_LEVEL if is_clean else level) * end.level)
     if end.level >= camera.usual_saturation:
-        return Saturation(clipped, None, compression) if is_clean else usual
+        return Saturation(clipped, None, compression, is_clean) if is_clean else usual
     known = with_event_steps(recording, clipped).settings
     found = find_ceiling(recording, known.camera, known.events)
-    return Saturation(clipped, found, compression) if found is not None and found.is_at(end.level) else usual
+    is_there = found is not None and found.is_at(end.level)
+    return Saturation(clipped, found, compression, is_clean) if is_there else usual

@@ -72,6 +72,8 @@ class Mends(NamedTuple):
         Where the frames end at one level below the usual saturation while events go on.
     compression
         What JPEG or a video did to the frames, if that is known.
+    is_clean_end
+        Whether frames end at a level at which all that is clipped is, so that what is just below it is measured.
     faults
         Frames that are left out, or whose gain is not that of others, and stuck pixels; None: none.
     corrections
@@ -85,6 +87,7 @@ class Mends(NamedTuple):
     black: BlackLevel | None = None
     ceiling: Ceiling | None = None
     compression: Compression | None = None
+    is_clean_end: bool = False
     faults: FrameFaults | None = None
     corrections: FrameCorrections = UNCHANGED
     moved: Moved = Moved()
@@ -146,7 +149,7 @@ def mend_events_and_levels(recording: Recording, settings: Settings) -> Mended:
         recording = without_events_of(recording, hot)
     recording, settings, black = without_black(recording, settings)
     levels = with_saturation(recording, settings)
-    found = Mends(layout, hot, black, levels.ceiling, compression=levels.compression)
+    found = Mends(layout, hot, black, levels.ceiling, levels.compression, levels.is_clean_end)
     return Mended(with_frames_of(recording, whole), levels.settings, found)
 
 
