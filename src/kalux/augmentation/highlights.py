@@ -41,7 +41,7 @@ from kalux.compiled import larger, loop
 Floats = NDArray[np.floating[Any]]
 
 _NEAR: Final = 0.2
-"""Log intensity below white up to which a pixel counts as just below it: levels of 0.8 to 0.98."""
+"""Log intensity below white up to which a pixel counts as just below it: levels of 0.8 and more that are measured."""
 
 _WHOLE: Final = 0.1
 """Share of a neighbourhood's pixels as which the whole image counts: it decides where nothing else is near."""
