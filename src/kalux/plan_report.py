@@ -203,7 +203,7 @@ def saturation_text(recording: Recording, plan: Plan, asked: Settings) -> str:
     if ceiling is None:
         return text + "events do not go on where the frames end, or too few tell"
     text += ceiling_text(ceiling)
-    if ceiling.level < min(used, asked.camera.usual_saturation):
+    if ceiling.level < used and not plan.mends.is_clean_end:
         text += f": {saturation_hint(ceiling)}"
     return text
 
