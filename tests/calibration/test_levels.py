@@ -58,11 +58,15 @@ def test_a_scene_that_ends_below_white_is_no_camera_that_clips(picture, wrong):
     assert find_ceiling(passing_by(picture), SETTINGS.camera, events) is None
 
 
+def recorded(*images, **options):
+    frames = [Frame(image, 1000 * i, 1000 * i + 500, **options) for i, image in enumerate(images)]
+    size = images[0].shape if images else (10, 10)
+    return Recording.from_arrays(np.empty(0, EVENT_DTYPE), frames, sensor_size=size)
+
+
 def with_frames(*levels, white=None):
     """(10, 10) frames of one level each."""
-    images = [np.full((10, 10), level, np.uint8) for level in levels]
-    frames = [Frame(image, 1000 * i, 1000 * i + 500, white) for i, image in enumerate(images)]
-    return Recording.from_arrays(np.empty(0, EVENT_DTYPE), frames, sensor_size=(10, 10))
+    return recorded(*(np.full((10, 10), level, np.uint8) for level in levels), white=white)
 
 
 def level_of(recording):
@@ -76,11 +80,6 @@ def test_the_end_is_that_of_all_frames():
     assert level_of(with_frames(100, 255, 90)) == 1
     assert level_of(with_frames(0, 0)) is None
     assert level_of(with_frames()) is None
-
-
-def recorded(*images, **options):
-    frames = [Frame(image, 1000 * i, 1000 * i + 500, **options) for i, image in enumerate(images)]
-    return Recording.from_arrays(np.empty(0, EVENT_DTYPE), frames, sensor_size=images[0].shape[:2])
 
 
 def test_glints_are_no_end():

@@ -39,11 +39,9 @@ def test_a_scene_that_ends_below_white_does_not_saturate(picture):
 def unevenly(recording, spread):
     """The frames where each pixel ends at a level of its own, around full scale."""
     ends = 1 + spread * np.random.default_rng(3).standard_normal(recording.sensor_size)
+    levels = np.rint(255 * ends.clip(0, 1)).astype(np.uint8)
     frames = [
-        dataclasses.replace(
-            frame, image=np.rint(255 * np.minimum(frame.image / 255, ends)).clip(0, 255).astype(np.uint8)
-        )
-        for frame in recording.frames()
+        dataclasses.replace(frame, image=np.minimum(frame.image, levels)) for frame in recording.frames()
     ]
     return Recording.from_arrays(
         np.concatenate(list(recording.events())), frames, sensor_size=recording.sensor_size

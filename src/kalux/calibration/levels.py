@@ -176,13 +176,11 @@ def _changes(
 LAST_LEVEL: Final = 0.999
 """Share of a clean end from which a pixel is at it: the last level of 8 bits, two of 10, five of 12."""
 
-_NEAR_END: Final = 0.98
-"""Share of the end of the frames from which pixels may be clipped where sensors end a little unevenly."""
-
 _LEAST_ODDS: Final = 0.1
-"""Least ratio of pixels near the end to those at it, among pixels between four at it, by which pixels end unevenly. Of
-862 simulated scenes that end cleanly most have 0 to 0.01, skies of about white up to 0.09, four real and long ones up
-to 0.05. It is 0.4 to 1 where half of the clipped pixels are a little below the end, 0.08 to 0.2 where 16 % are."""
+"""Least ratio of pixels from the usual saturation on to those at the end, among pixels between four at it, by which
+pixels end unevenly. Of 863 simulated scenes that end cleanly most have 0 to 0.01, skies of about white up to 0.09, four
+real and long ones up to 0.05. It is 0.4 to 1 where half of the clipped pixels are a little below the end, 0.08 to 0.2
+where 16 % are."""
 
 
 class FramesEnd(NamedTuple):
@@ -209,22 +207,21 @@ def frames_end(recording: Recording) -> FramesEnd | None:
     end = sharp_end(_measured(frame) for frame in _first_frames(recording))
     if end is None:
         return None
-    near, at_end = 0, 0
-    for frame in _first_frames(recording):
-        near_now, at_end_now = _between_clipped(frame, end)
-        near, at_end = near + near_now, at_end + at_end_now
-    return FramesEnd(end, at_end >= _LEAST_PIXELS and near < _LEAST_ODDS * at_end)
+    near, at_end = np.sum([_between_clipped(frame, end) for frame in _first_frames(recording)], axis=0)
+    return FramesEnd(end, bool(at_end >= _LEAST_PIXELS and near < _LEAST_ODDS * at_end))
 
 
 def _between_clipped(frame: Frame, end: float) -> tuple[int, int]:
     """How many pixels between four at the ``end`` are a little below it, and at it."""
-    image = frame.image - frame.black if frame.black > 0 else frame.image
-    seen = np.True_ if frame.valid is None else frame.valid if image.ndim == 2 else frame.valid[..., None]
-    at_end = (image >= LAST_LEVEL * end * frame.full_scale) & seen
+    image = _above_black(frame)
+    seen = True if frame.valid is None else frame.valid.reshape(frame.valid.shape + (1,) * (image.ndim - 2))
+    at_end, close = (
+        (image >= share * end * frame.full_scale) & seen
+        for share in (LAST_LEVEL, CameraSettings.usual_saturation)
+    )
     between = at_end[:-2, 1:-1] & at_end[2:, 1:-1] & at_end[1:-1, :-2] & at_end[1:-1, 2:]
-    near = ((image >= _NEAR_END * end * frame.full_scale) & seen)[1:-1, 1:-1] & between
-    both = int(np.count_nonzero(at_end[1:-1, 1:-1] & between))
-    return int(np.count_nonzero(near)) - both, both
+    clipped, of_both = (int(np.count_nonzero(pixels[1:-1, 1:-1] & between)) for pixels in (at_end, close))
+    return of_both - clipped, clipped
 
 
 def _first_frames(recording: Recording) -> Iterator[Frame]:
@@ -233,8 +230,12 @@ def _first_frames(recording: Recording) -> Iterator[Frame]:
 
 def _measured(frame: Frame) -> tuple[NDArray[Any], float]:
     """Valid pixels above black, and what they are divided by."""
-    image = frame.image if frame.valid is None else frame.image[frame.valid]
-    return (image - frame.black if frame.black > 0 else image), frame.full_scale
+    image = _above_black(frame)
+    return (image if frame.valid is None else image[frame.valid]), frame.full_scale
+
+
+def _above_black(frame: Frame) -> NDArray[Any]:
+    return frame.image - frame.black if frame.black > 0 else frame.image
 
 
 class ClippingLevels(NamedTuple):
