@@ -13,7 +13,7 @@ from functools import lru_cache
 from math import erf
 
 import numpy as np
-from scipy.special import lambertw
+from scipy.special import lambertw, log_ndtr
 
 from kalux.models.camera import Camera
 from kalux.settings import chosen_response
@@ -33,8 +33,9 @@ class Pixel:
     Changes, of frame intervals, K11: whether both frames measure it, whether it is silent, how much its L changed,
     squared, as far as frames tell (told), without what noise makes of that, and the variances of both frames; and how
     likely it has an event that is signal (active). Untold: variance of what no event tells of it (K1). Forgotten: what
-    comes to P after each. Lost: variance of what events would have told that are missing (K18); None: none are.
-    Before: events before the first exposure, of which frames alone know (K19). Late: how much later than a frame's
+    comes to P after each. Around: mean square change of the silent pixels around (K11); expected: how far above white
+    it is by the frame after each (K7). Lost: variance of what events would have told that are missing (K18); None: none
+    are. Before: events before the first exposure, of which frames alone know (K19). Late: how much later than a frame's
     middle its row is exposed; reach: the same of the row that is exposed last.
     Signal: probability that its on and its off events of every frame interval are no noise (K5); none: by their age.
     """
@@ -61,6 +62,8 @@ class Pixel:
     told: list[float] = field(default_factory=list)
     active: list[float] = field(default_factory=list)
     untold: list[float] = field(default_factory=list)
+    around: list[float] = field(default_factory=list)
+    expected: list[float] = field(default_factory=list)
     lost: list[float | None] = field(default_factory=list)
     latents: list[tuple[float, float]] = field(default_factory=list)
     forgotten: list[float] = field(default_factory=list)
@@ -562,6 +565,33 @@ def bridged(pixel, settings, times, on, off, scales):
                 break
             pixel.raised.append(right[0] > bound + 1e-4)
             bounds.append(max(bound, right[0]))
+
+    def follow_beyond():  # K7: by how much more than events, and bounds, say L rises beyond white in every interval
+        risen = None  # the level to which events have led, how far above it L is, and the variance of that
+        most = ev.quantisation_variance * c2
+        for k, interval in enumerate(intervals[1:-1], 1):
+            a, b, left, right, *_, gain, _ = interval
+            if right[1] < UNMEASURED or most == 0 or pixel.lost[k - 1] is not None or not pixel.around:
+                risen = None
+                continue
+            change, scale = max(min(pixel.around[k - 1], most), 1e-6), max(pixel.expected[k - 1], 1e-3)
+            told = added(interval, k)
+            if left[1] < UNMEASURED:
+                short = gain * untold_from[a]
+                beyond_from[a] = mean_beyond(short, change, scale) if short > 0 else 0.0
+                at_bound = augmented(interval, b, b) + grown(k, b)
+                total = max(short, 0) + beyond_from[a]
+                risen = at_bound - max(short, 0) - beyond_from[a], total, change
+            elif risen is not None:
+                level, above, change = risen[0], risen[1], min(risen[2] + change, most)
+                level += told + max(right[0] - told - level - above, 0.0)
+                heard = sum(counts(a, b)) > 0
+                level, above = (level + above / 2, above / 2) if heard else (level, above)
+                after = max(right[0] + mean_beyond(right[0] - level, change, scale) - level, 0.0)
+                after = min(after, above) if heard else after
+                beyond_from[a] = after - above
+                risen = level, after, change
+
     last = (pixel.middles[-1], None, first, None, scale_on, scale_off, var_on, var_off, 0.0, SURE)
     intervals.append(last)
 
@@ -606,6 +636,7 @@ def bridged(pixel, settings, times, on, off, scales):
             yield max(after - before + unseen, 0.0)
 
     drifts = list(drift())
+    beyond_from = {}
 
     def augmented(interval, t, known_until):  # K1: posterior mean of the level at t, given both frames
         a, b, left, right, s_on, s_off, v_on, v_off, gain, (f_on, f_off) = interval
@@ -619,7 +650,7 @@ def bridged(pixel, settings, times, on, off, scales):
         shared += v_on * (f_on * on) ** 2 * t_on * n_on + v_off * (f_off * off) ** 2 * t_off * n_off
         shared += c2 * (step_noise(f_on, slow_from[a]) * t_on + step_noise(f_off, slow_from[a]) * t_off)
         shared += untold_from[a] * (t - a) / (b - a)
-        return prior + shared * gain
+        return prior + shared * gain + beyond_from.get(a, 0.0) * (t - a) / (b - a)
 
     def rate(interval, known_until):  # K4
         a, b, left, right, *_ = interval
@@ -639,6 +670,7 @@ def bridged(pixel, settings, times, on, off, scales):
             backward += 0.1 * wrong * (coming / (n_on + n_off)) ** 2
         return 0.5 / ((b - a) * US) * (1 / forward + 1 / backward)
 
+    follow_beyond()
     value = augmented(intervals[0], begin, begin)
     variance = first_variance(intervals[0], counts, ev, c2, settings)
     state = (value, variance)
@@ -710,6 +742,13 @@ def bridged(pixel, settings, times, on, off, scales):
         step_to(t)
         out.append(bounded(t))
     return np.array(out)
+
+
+def mean_beyond(short, variance, scale):
+    """K7: mean of a normal distribution times an exponential one, above a bound that is ``short`` above its middle."""
+    deviation = np.sqrt(variance)
+    cut = short / deviation + deviation / scale
+    return deviation * (np.exp(-(cut**2) / 2 - np.log(2 * np.pi) / 2 - log_ndtr(-cut)) - cut)
 
 
 def step_noise(signal, ev):
@@ -852,9 +891,7 @@ def silent_change(pixels, place, interval, c2):
         for (i, j), q in pixels.items()
         if abs(i - row) <= 2 and abs(j - column) <= 2 and all(q.changes[interval][:2])
     ]
-    if not pixels[place].changes[interval][0] or not near:
-        return usual(place)
-    return max(sum(near) / len(near), 0.0)
+    return max(sum(near) / len(near), 0.0) if near else usual(place)
 
 
 def untold(pixels, place, c2, q0):
@@ -1305,22 +1342,31 @@ def limited(excess, told, hard):
     return excess / np.sqrt(1 + (excess / (10 * slope + 2 * 0.05 * hard / (1 - hard))) ** 2)
 
 
-def beyond_rims(split, settings, frames, k):
-    """K15: how far above white pixels are that frame ``k`` clips, from those around. Of a sensor of one part."""
+def inside_whites(split, settings, frames, k, tail=1.0, of_all=None):
+    """K15: how far above white pixels are that frame ``k`` clips, not beside others. Of a sensor of one part.
+
+    ``of_all``: numbers of pixels just below white and of clipped ones, in all frames that count; else of this one.
+    """
     camera = Camera.named(chosen_response(settings.camera.response, None), settings.camera.clipped_from)
     edges = camera.response(np.array([0.475, 0.95]))
     half, white = (np.count_nonzero(frames[0].image / 255 >= edge) for edge in edges)
     fall = np.log(max(half, white) / white) if white else np.inf
     most = min(min(max(np.log(2) / max(fall, 1e-3), 0.3), 2.0) - 0.275, 0.5)
+    found, darker = below_white(split, settings, k)
+    below, area = sum(value < 0.2 for value in darker.values()), len(split)
+    near, clipped = (below, len(found)) if of_all is None else of_all
+    share = 0.1 * near / max(clipped, 1) + 1e-4
+    scale = 0.2 * (len(found) + 0.1 * area) / (below + share * area)
+    return most * (1 - np.exp(-tail * scale / most)) * mean_hardness(found, darker)
+
+
+def beyond_rims(split, settings, frames, k):
+    """K15: how far above white pixels are that frame ``k`` clips, from those around. Of a sensor of one part."""
     near = clipped = 0
     for j in range(k + 1):
         found, darker = below_white(split, settings, j)
-        below = sum(value < 0.2 for value in darker.values())
-        near, clipped = near + below, clipped + len(found)
-    area = len(split)
-    share = 0.1 * near / max(clipped, 1) + 1e-4
-    scale = 0.2 * (len(found) + 0.1 * area) / (below + share * area)
-    level = most * (1 - np.exp(-settings.filter.unshown_tail * scale / most)) * mean_hardness(found, darker)
+        near, clipped = near + sum(value < 0.2 for value in darker.values()), clipped + len(found)
+    level = inside_whites(split, settings, frames, k, settings.filter.unshown_tail, (near, clipped))
     size = sum(frames[k].image.shape)  # where all is clipped
     far = {p: min((steps(p[0] - q[0], p[1] - q[1]) for q in darker), default=size) for p in found}
     return {p: level * (1 - np.exp(-distance)) for p, distance in far.items()}
@@ -1437,6 +1483,8 @@ def reconstruct(events, frames, sensor_size, settings, times):
     for place, pixel in every.items():  # of which nothing depends on it but P and L
         pixel.untold = list(untold(every, place, on * off, settings.events.quantisation_variance * on * off))
         pixel.forgotten = list(forgotten(every, place, on * off))
+        pixel.around = [silent_change(every, place, k, on * off) for k in range(len(frames) - 1)]
+        pixel.expected = [inside_whites(every, settings, frames, k) for k in range(1, len(frames))]
     for (row, column), pixel in every.items():
         out[:2, :, row, column] = method(pixel, settings, times, on, off, *more).T
     for (row, column), pixel in every.items():

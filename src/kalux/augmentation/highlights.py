@@ -332,17 +332,28 @@ def excess_from_surroundings(
     near
         Number of pixels just below white over that of clipped ones, of all frames until now.
     """
-    clipped, below = (
-        weighted_sums(part_sums(plane)) for plane in (highlights.clipped, highlights.just_below)
-    )
-    area = weighted_area(highlights.darker.shape)
-    scale = _NEAR * (clipped + _WHOLE * area) / (below + (_WHOLE * near + _LEAST) * area)
-    level = tail.most * -np.expm1(-tail.share * scale / tail.most) * hardness
+    level = excess_around(highlights, hardness, tail, near)
     inside = -np.expm1(-_distance(highlights).reshape(-1)[pixels])
     excess: NDArray[np.float32] = (
         interpolated(level.astype(np.float32), pixels, highlights.darker.shape[1]) * inside
     )
     return excess
+
+
+def excess_around(
+    highlights: FrameHighlights, hardness: Floats, tail: Tail, near: float | None = None
+) -> Floats:
+    """The same inside the clipped areas, of every part of the image; ``near`` None: of this frame."""
+    if near is None:
+        just_below, all_clipped = _counts(highlights)
+        near = just_below / max(all_clipped, 1)
+    clipped, below = (
+        weighted_sums(part_sums(plane)) for plane in (highlights.clipped, highlights.just_below)
+    )
+    area = weighted_area(highlights.darker.shape)
+    scale = _NEAR * (clipped + _WHOLE * area) / (below + (_WHOLE * near + _LEAST) * area)
+    level: Floats = tail.most * -np.expm1(-tail.share * scale / tail.most) * hardness
+    return level
 
 
 def _counts(highlights: FrameHighlights) -> tuple[int, int]:

@@ -85,8 +85,8 @@ def silent_change(
 
     The mean is over the pixels of 5 x 5 that have no event in the segment and are measured by both frames, of their
     squared changes by the frames (``segment.slope``), at most c^2, since larger changes cause events, less the variance
-    of the frames' noise. As far as noise hides a pixel's change, and where no such pixel is near or a frame does not
-    measure the pixel itself, what is usual among so many events takes its place.
+    of the frames' noise. As far as noise hides a pixel's change, and where no such pixel is near, what is usual among
+    so many events takes its place.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ def silent_change(
     usual = usual_change(active, threshold2)
     given = tuple(plane.reshape(-1) for plane in (segment.slope, *variances, segment.events, usual))
     _squared_changes(given, seconds, q0, most, change.reshape(-1), silent.reshape(-1))
-    _mean(_sum_around(change), _sum_around(silent), *variances, usual, mean)
+    _mean(_sum_around(change), _sum_around(silent), usual, mean)
     return mean
 
 
@@ -415,15 +415,13 @@ def _squared_changes(given, seconds, q0, most, change, silent):  # type: ignore[
 
 
 @loop
-def _mean(total, count, forward, backward, usual, mean):  # type: ignore[no-untyped-def]
+def _mean(total, count, usual, mean):  # type: ignore[no-untyped-def]
     zero, one = np.float32(0.0), np.float32(1.0)
-    unmeasured = np.float32(UNMEASURED)
     for row in range(total.shape[0]):
         for column in range(total.shape[1]):
             i = row, column
-            measured = np.float32(forward[i]) + np.float32(backward[i]) < unmeasured
             told = larger(total[i], zero) / larger(np.float32(count[i]), one)
-            mean[i] = told if measured and count[i] > 0 else usual[i]
+            mean[i] = told if count[i] > 0 else usual[i]
 
 
 def mean_around(values: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from kalux.augmentation import bridge, deblur
 from kalux.augmentation.background import doubt, signal_shares
+from kalux.augmentation.beyond import Beyond, follow_beyond, nothing_beyond
 from kalux.augmentation.bridge import BridgedSegment, BridgeNoise, Latent, Thresholds, UnshownMemory
 from kalux.augmentation.deblur import EXPOSED, EXPOSURE_FIELDS, Exposure, relative_levels
 from kalux.augmentation.highlights import (
@@ -143,6 +145,8 @@ class BridgeMemory(NamedTuple):
         What the latest intervals tell of silent pixels.
     texture
         What the latest frame tells of how neighbours differ (K12); None: nothing, as the first one.
+    beyond
+        Pixels that it clips, and that one before has measured (K7).
     """
 
     latent: Latent
@@ -159,6 +163,7 @@ class BridgeMemory(NamedTuple):
     latest_change: Floats
     usual: Usual
     texture: Texture | None
+    beyond: Beyond
 
 
 class BridgedFrames(Method):
@@ -337,6 +342,7 @@ class BridgedFrames(Method):
             latest_change=np.full(self.shape, np.nan, np.float32),
             usual=nothing_usual(self.shape),
             texture=None,
+            beyond=nothing_beyond(),
         )
         lead_in, value, variance = None, latent.value, latent.variance
         if not self.lookahead:
@@ -377,16 +383,37 @@ class BridgedFrames(Method):
         return shown_texture(told, frames, self._unlike) if told else None
 
     def _follow_unshown(
-        self, memory: BridgeMemory, second: Latent, following: Shot, net: Floats, steps: Counts
+        self,
+        memory: BridgeMemory,
+        second: Latent,
+        following: Shot,
+        net: Floats,
+        steps: Counts,
+        seen: Callable[[], FrameHighlights],
     ) -> UnshownMemory:
         if len(memory.unshown.pixels) == 0:
             return memory.unshown
         levels = following.levels.reshape(-1)[memory.unshown.pixels]
         noise = self.level_variance(following)[levels]
         moved = self.off / 2
-        return follow_unshown(
-            memory.unshown, second, frame_highlights(following), noise, net, steps, moved, memory.tail
-        )
+        return follow_unshown(memory.unshown, second, seen(), noise, net, steps, moved, memory.tail)
+
+    def _beyond_bounds(
+        self,
+        segment: BridgedSegment,
+        memory: BridgeMemory,
+        second: Latent,
+        change: Floats,
+        seen: Callable[[], FrameHighlights],
+    ) -> tuple[BridgedSegment, Beyond]:
+        """The segment, in which L goes on beyond the bounds of the second frame (K7), and what later ones need of it.
+
+        Where events are missing, nothing says how little an unheard change is.
+        """
+        if segment.lost is not None:
+            return segment, nothing_beyond()
+        q0 = self.noise.quantisation_variance
+        return follow_beyond(memory.beyond, segment, memory.latent, second, change, q0, seen, memory.tail)
 
     def _open_segment(self, memory: BridgeMemory, shot: Shot) -> BridgedSegment:
         """The segment from the latest frame on, while there is no next one."""
@@ -435,6 +462,8 @@ class BridgedFrames(Method):
             of_steps = doubt(signal, self.noise.step_variance, self._threshold2, dark)
             joined = joined._replace(doubt=of_steps, signal=signal)
         joined, change, remembered = self._with_silent(joined._replace(lost=lost), memory, second, steps)
+        seen = functools.cache(functools.partial(frame_highlights, following))
+        joined, beyond = self._beyond_bounds(joined, memory, second, change, seen)
         by_period = self._by_period(events, start, end, signal)
         # Where the second frame measures a pixel L^A is led back from it, also at the first frame, which bounds it.
         far = self._since_measured(memory, joined, memory.latent.value)
@@ -446,7 +475,7 @@ class BridgedFrames(Method):
             joined._replace(untied=untied), memory, second, (on, off), change, steps, far, by_period
         )
         assert joined.net is not None
-        unshown = self._follow_unshown(memory, second, following, joined.net, steps)
+        unshown = self._follow_unshown(memory, second, following, joined.net, steps, seen)
         after = remembered._replace(
             latent=second,
             thresholds=learned,
@@ -456,6 +485,7 @@ class BridgedFrames(Method):
             at_middle=at_middle,
             unshown=unshown,
             texture=self._texture(second, following, steps),
+            beyond=beyond,
         )
         frames = memory.latent, second
         assert joined.events is not None
@@ -509,7 +539,9 @@ class BridgedFrames(Method):
             since_middle=(tail_on, tail_off),
             followed=followed,
             at_middle=at_middle,
-            unshown=self._follow_unshown(memory, second, following, behind.net, between),
+            unshown=self._follow_unshown(
+                memory, second, following, behind.net, between, lambda: frame_highlights(following)
+            ),
             silent_change=memory.silent_change if lost is not None else self._silent_change(behind, between),
             texture=self._texture(second, following, between),
         )
