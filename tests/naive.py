@@ -568,7 +568,7 @@ def bridged(pixel, settings, times, on, off, scales):
 
     def follow_beyond():  # K7: by how much more than events, and bounds, say L rises beyond white in every interval
         risen = None  # the level to which events have led, how far above it L is, and the variance of that
-        most = ev.quantisation_variance * c2
+        most = ev.quantisation_variance * c2 if settings.filter.unshown_tail > 0 else 0
         for k, interval in enumerate(intervals[1:-1], 1):
             a, b, left, right, *_, gain, _ = interval
             if right[1] < UNMEASURED or most == 0 or pixel.lost[k - 1] is not None or not pixel.around:
@@ -1336,13 +1336,13 @@ def told_by_events(split, settings, k):
 def limited(excess, told, hard):
     """K15: what frames make expect, limited by what events tell; ``told``: from `told_by_events`, of all intervals."""
     events, count, rim_events, rim_slope = 1.3 * told
-    if rim_events == 0 or rim_slope == 0 or hard == 1:
+    if count == 0 or rim_events == 0 or rim_slope == 0 or hard == 1:
         return excess
     slope = (events + 3) / (count * rim_events / rim_slope)
     return excess / np.sqrt(1 + (excess / (10 * slope + 2 * 0.05 * hard / (1 - hard))) ** 2)
 
 
-def inside_whites(split, settings, frames, k, tail=1.0, of_all=None):
+def inside_whites(split, settings, frames, k, of_all=None):
     """K15: how far above white pixels are that frame ``k`` clips, not beside others. Of a sensor of one part.
 
     ``of_all``: numbers of pixels just below white and of clipped ones, in all frames that count; else of this one.
@@ -1357,7 +1357,7 @@ def inside_whites(split, settings, frames, k, tail=1.0, of_all=None):
     near, clipped = (below, len(found)) if of_all is None else of_all
     share = 0.1 * near / max(clipped, 1) + 1e-4
     scale = 0.2 * (len(found) + 0.1 * area) / (below + share * area)
-    return most * (1 - np.exp(-tail * scale / most)) * mean_hardness(found, darker)
+    return most * (1 - np.exp(-settings.filter.unshown_tail * scale / most)) * mean_hardness(found, darker)
 
 
 def beyond_rims(split, settings, frames, k):
@@ -1366,24 +1366,20 @@ def beyond_rims(split, settings, frames, k):
     for j in range(k + 1):
         found, darker = below_white(split, settings, j)
         near, clipped = near + sum(value < 0.2 for value in darker.values()), clipped + len(found)
-    level = inside_whites(split, settings, frames, k, settings.filter.unshown_tail, (near, clipped))
+    level = inside_whites(split, settings, frames, k, (near, clipped))
     size = sum(frames[k].image.shape)  # where all is clipped
     far = {p: min((steps(p[0] - q[0], p[1] - q[1]) for q in darker), default=size) for p in found}
     return {p: level * (1 - np.exp(-distance)) for p, distance in far.items()}
 
 
-def unshown(split, settings, frames, t):
-    """K15: (2, H, W) how far above their bounds pixels are expected that no frame has shown, and the variance of that.
-
-    nan where a frame has. Of a sensor no larger than one part.
-    """
-    looked = min(sum(f.middle < t for f in frames), len(frames) - 1)  # the newest frame that is used
+def known_of_unshown(split, settings, frames, looked):
+    """K15, after the frame ``looked``: what is expected of every pixel, and what makes more or less of that."""
     excess, likely, by_events = {}, {}, np.zeros(4)
     for k in range(looked + 1):
         for place, level in beyond_rims(split, settings, frames, k).items():
             if split[place].shown > k and (k == 0 or split[place].raised[k - 1]):
                 excess[place] = min(excess.get(place, np.inf), level)
-        if k > 0:
+        if k > 0 and any(p.shown > k - 1 for p in split.values()):
             by_events += told_by_events(split, settings, k)
         hard = mean_hardness(*below_white(split, settings, k))
         for place, level in excess.items():
@@ -1398,14 +1394,34 @@ def unshown(split, settings, frames, t):
     of_all *= settings.filter.believed_unshown_scale ** (1 - told_of_all)
     left = [(p.excess, e) for p, e in told if p.left]
     total, foretold = sum(p for p, _ in left), of_all * sum(e for _, e in left)
+
+    def corrected(level):
+        usual = of_all * level
+        scaled = usual * (total + 5) / (foretold + 5)
+        return min(scaled, usual + max(total - foretold, 0.0) / (len(left) + 10))
+
+    return likely, corrected, by_events, lambda level: (3 * of_all * level) ** 2 * 5 / (foretold + 5)
+
+
+def unshown(split, settings, frames, t):
+    """K15: (2, H, W) how far above their bounds pixels are expected that no frame has shown, and the variance of that.
+
+    nan where a frame has. Of a sensor no larger than one part.
+    """
+    looked = min(sum(f.middle < t for f in frames), len(frames) - 1)  # the newest frame that is used
+    likely, corrected, _, doubt = known_of_unshown(split, settings, frames, looked)
     out = np.full((2, *frames[0].image.shape), np.nan)
     for place, pixel in split.items():
         if pixel.shown > looked:
-            usual = of_all * likely[place]
-            scaled = usual * (total + 5) / (foretold + 5)
-            out[0][place] = min(scaled, usual + max(total - foretold, 0.0) / (len(left) + 10))
-            out[1][place] = (3 * usual) ** 2 * 5 / (foretold + 5)
+            out[0][place], out[1][place] = corrected(likely[place]), doubt(likely[place])
     return out
+
+
+def expected_of_shown(split, settings, frames, k):
+    """K7: how far above white a pixel is expected that frame ``k`` clips and that one has measured."""
+    _, corrected, by_events, _ = known_of_unshown(split, settings, frames, k - 1)
+    hard = mean_hardness(*below_white(split, settings, k))
+    return corrected(limited(inside_whites(split, settings, frames, k), by_events, hard))
 
 
 def lifted(level, variance, excess, settings, top):
@@ -1484,7 +1500,9 @@ def reconstruct(events, frames, sensor_size, settings, times):
         pixel.untold = list(untold(every, place, on * off, settings.events.quantisation_variance * on * off))
         pixel.forgotten = list(forgotten(every, place, on * off))
         pixel.around = [silent_change(every, place, k, on * off) for k in range(len(frames) - 1)]
-        pixel.expected = [inside_whites(every, settings, frames, k) for k in range(1, len(frames))]
+    beyond = [expected_of_shown(every, settings, frames, k) for k in range(1, len(frames))]
+    for pixel in every.values():
+        pixel.expected = beyond
     for (row, column), pixel in every.items():
         out[:2, :, row, column] = method(pixel, settings, times, on, off, *more).T
     for (row, column), pixel in every.items():

@@ -8,14 +8,12 @@ from scipy.integrate import quad
 
 from kalux.augmentation.beyond import Beyond, follow_beyond, mean_beyond, nothing_beyond
 from kalux.augmentation.bridge import MASKED, UNMEASURED, BridgeNoise, Latent, bridge, nominal_thresholds
-from kalux.augmentation.highlights import FrameHighlights, Tail
 
 SHAPE = (16, 20)
 C = 0.2
 Q0 = C**2 / 6
 NOISE = BridgeNoise(C, C, 0.2 * C**2, Q0)
 SECOND = 1_000_000
-TAIL = Tail(0.5, 0.5)
 MIDDLE = (8, 10)
 
 
@@ -32,12 +30,7 @@ def window():
     return clipped
 
 
-def highlights(clipped, darker=0.5):
-    """What a frame shows whose other pixels are ``darker`` than white."""
-    return FrameHighlights(clipped, np.where(clipped, 0.0, darker).astype(np.float32), ~clipped)
-
-
-def follow(before, first, second, *, on=0, off=0, change=Q0, darker=0.5, q0=Q0):
+def follow(before, first, second, *, on=0, off=0, change=Q0, expected=0.5, q0=Q0):
     """`follow_beyond` from one frame to the next, between which every pixel has ``on`` and ``off`` events.
 
     Also by how much L has changed in the middle of the image.
@@ -46,10 +39,12 @@ def follow(before, first, second, *, on=0, off=0, change=Q0, darker=0.5, q0=Q0):
     noise = NOISE._replace(quantisation_variance=q0)
     thresholds = nominal_thresholds(SHAPE, 0.1, np.float32)
     segment, _ = bridge(first, second, counts, thresholds, noise, 0, SECOND)
-    clipped = (second.variance >= UNMEASURED) & (second.variance < MASKED)
     plane = np.full(SHAPE, change, np.float32)
-    seen = highlights(clipped, darker)
-    segment, after = follow_beyond(before, segment, first, second, plane, q0, lambda: seen, TAIL)
+
+    def scale(pixels):
+        return np.full(len(pixels), expected, np.float32)
+
+    segment, after = follow_beyond(before, segment, first, second, plane, q0, scale)
     changed = segment.augmented + segment.net + segment.slope - first.value
     return segment, after, float(changed[MIDDLE])
 
@@ -109,10 +104,10 @@ def test_more_is_not_unheard_than_a_threshold_leaves():
     assert risen(change=Q0)[2] == risen(change=1.0)[2]
 
 
-def test_less_where_little_lies_beyond_white():
-    """Where borders are soft the scene goes on slowly."""
-    soft, hard = (risen(0.02, darker=darker)[2] for darker in (0.01, 2.0))
-    assert soft < 0.8 * hard
+def test_less_where_less_is_expected_beyond_white():
+    little, much = (risen(0.02, expected=expected)[2] for expected in (0.02, 2.0))
+    assert 0.02 < little < 0.8 * much
+    assert risen(0.02, expected=0.0)[2] == pytest.approx(0.02, abs=2e-3)
 
 
 def test_events_that_lead_beyond_white_say_it_themselves():
@@ -178,14 +173,14 @@ def test_what_cannot_be_unheard_is_not():
     assert np.all(segment.slope == 0)
 
 
-def test_highlights_are_looked_at_only_where_a_frame_is_clipped():
+def test_what_is_expected_is_asked_only_where_a_frame_is_clipped():
     first, second = frame(-0.05), frame(-0.05)
     counts = (np.zeros(SHAPE, np.float32),) * 2
     thresholds = nominal_thresholds(SHAPE, 0.1, np.float32)
     segment, _ = bridge(first, second, counts, thresholds, NOISE, 0, SECOND)
 
-    def seen():
+    def expected(_):
         raise AssertionError
 
     change = np.full(SHAPE, Q0, np.float32)
-    assert follow_beyond(nothing_beyond(), segment, first, second, change, Q0, seen, TAIL)[0] is segment
+    assert follow_beyond(nothing_beyond(), segment, first, second, change, Q0, expected)[0] is segment

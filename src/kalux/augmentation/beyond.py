@@ -15,8 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kalux.augmentation.bridge import MASKED, UNMEASURED, BridgedSegment, Latent
-from kalux.augmentation.highlights import FrameHighlights, Tail, border_hardness, excess_around
-from kalux.augmentation.parts import interpolated
 
 Floats = NDArray[np.floating[Any]]
 
@@ -29,9 +27,6 @@ _LEAST_SCALE: Final = np.float32(1e-3)
 _TOLD: Final = np.float32(0.5)
 """Share of an unheard rise that the next event tells: the rest of it came before the pixel's last event had been told,
 and stays (docs/equations.md, K7)."""
-
-_WHOLE_SHARE: Final = 1.0
-"""`Tail.share` here: where the light rises past white in sight of a frame, half of it would be too little."""
 
 
 class Beyond(NamedTuple):
@@ -106,8 +101,7 @@ def follow_beyond(
     second: Latent,
     change: Floats,
     quantisation_variance: float,
-    seen: Callable[[], FrameHighlights],
-    tail: Tail,
+    expected: Callable[[NDArray[np.int64]], Floats],
 ) -> tuple[BridgedSegment, Beyond]:
     """The segment in which L goes on beyond the bounds at its end, and the pixels of which later frames say more.
 
@@ -123,10 +117,8 @@ def follow_beyond(
         (H, W) mean square change of silent pixels around each (`subthreshold.silent_change`).
     quantisation_variance
         q_0, log intensity^2: no more is unheard.
-    seen
-        What the second frame shows of highlights; called once, if at all.
-    tail
-        How far highlights go beyond white.
+    expected
+        Of pixels, (N,), how far above white they are expected (`highlights.expected_of_shown`); called once, if at all.
     """
     bounded = ((second.variance >= UNMEASURED) & (second.variance < MASKED)).reshape(-1)
     rising = np.flatnonzero((first.variance.reshape(-1) < UNMEASURED) & bounded)
@@ -136,9 +128,8 @@ def follow_beyond(
 
     assert segment.net is not None
     assert segment.events is not None
-    highlights = seen()
-    expected = excess_around(highlights, border_hardness(highlights), tail._replace(share=_WHOLE_SHARE))
     staying = before.where(kept)
+    scale = np.maximum(expected(np.concatenate((rising, staying.pixels))), _LEAST_SCALE)
     seconds = np.float32((segment.end - segment.start) * 1e-6)
     slope = segment.slope.astype(np.float32, copy=True)
     flat = slope.reshape(-1)
@@ -148,14 +139,10 @@ def follow_beyond(
     def unheard_at(pixels: NDArray[np.int64]) -> NDArray[np.float32]:
         return np.clip(unheard[pixels], _LEAST_CHANGE, quantisation_variance).astype(np.float32)
 
-    def expected_at(pixels: NDArray[np.int64]) -> Floats:
-        scale = interpolated(expected.astype(np.float32), pixels, slope.shape[1])
-        return np.maximum(scale, _LEAST_SCALE)
-
     # What rises has been led to its bound, and no further, where events fall short of it.
     told, short = augmented[rising] + net[rising], flat[rising] * seconds
     variance = unheard_at(rising)
-    more = np.where(short > 0, mean_beyond(short, variance, expected_at(rising)), 0.0)
+    more = np.where(short > 0, mean_beyond(short, variance, scale[: len(rising)]), 0.0)
     flat[rising] += (more / seconds).astype(np.float32)
     untold = np.where(short > 0, short + more, 0.0)
     risen = Beyond(rising, told.astype(np.float32), untold.astype(np.float32), variance)
@@ -166,7 +153,7 @@ def follow_beyond(
         events[staying.pixels] > 0,
         bound[staying.pixels],
         np.minimum(staying.variance + unheard_at(staying.pixels), np.float32(quantisation_variance)),
-        expected_at(staying.pixels),
+        scale[len(rising) :],
     )
     flat[staying.pixels] += stayed.grown / seconds
     return segment._replace(slope=slope), risen.and_of(stayed.after)

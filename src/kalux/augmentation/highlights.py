@@ -332,7 +332,7 @@ def excess_from_surroundings(
     near
         Number of pixels just below white over that of clipped ones, of all frames until now.
     """
-    level = excess_around(highlights, hardness, tail, near)
+    level = _excess_around(highlights, hardness, near, tail)
     inside = -np.expm1(-_distance(highlights).reshape(-1)[pixels])
     excess: NDArray[np.float32] = (
         interpolated(level.astype(np.float32), pixels, highlights.darker.shape[1]) * inside
@@ -340,13 +340,23 @@ def excess_from_surroundings(
     return excess
 
 
-def excess_around(
-    highlights: FrameHighlights, hardness: Floats, tail: Tail, near: float | None = None
-) -> Floats:
-    """The same inside the clipped areas, of every part of the image; ``near`` None: of this frame."""
-    if near is None:
-        just_below, all_clipped = _counts(highlights)
-        near = just_below / max(all_clipped, 1)
+def expected_of_shown(
+    memory: UnshownMemory, highlights: FrameHighlights, pixels: NDArray[np.int64], tail: Tail
+) -> NDArray[np.float32]:
+    """(N,) how far above white ``pixels`` are expected that a frame clips and an earlier one has measured (K7).
+
+    As far as those that none has measured (``memory``, before that frame), but for being beside a border, since it is
+    known from where they have come.
+    """
+    hardness = border_hardness(highlights)
+    below, clipped = _counts(highlights)
+    level = _excess_around(highlights, hardness, below / max(clipped, 1), tail)
+    excess = interpolated(level.astype(np.float32), pixels, memory.shape[1])
+    return _with_expectation(memory._replace(pixels=pixels, excess=excess, hardness=hardness)).expected
+
+
+def _excess_around(highlights: FrameHighlights, hardness: Floats, near: float, tail: Tail) -> Floats:
+    """Of every part: `excess_from_surroundings` inside the clipped areas."""
     clipped, below = (
         weighted_sums(part_sums(plane)) for plane in (highlights.clipped, highlights.just_below)
     )

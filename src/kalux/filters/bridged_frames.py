@@ -21,6 +21,7 @@ from kalux.augmentation.highlights import (
     above_frames,
     begin_unshown,
     expected_excess,
+    expected_of_shown,
     follow_unshown,
 )
 from kalux.augmentation.lost import add_lost_change, loss_between, lost_change, unheard_change
@@ -410,10 +411,18 @@ class BridgedFrames(Method):
 
         Where events are missing, nothing says how little an unheard change is.
         """
-        if segment.lost is not None:
+        if segment.lost is not None or memory.tail.share == 0:
             return segment, nothing_beyond()
         q0 = self.noise.quantisation_variance
-        return follow_beyond(memory.beyond, segment, memory.latent, second, change, q0, seen, memory.tail)
+        return follow_beyond(
+            memory.beyond,
+            segment,
+            memory.latent,
+            second,
+            change,
+            q0,
+            lambda pixels: expected_of_shown(memory.unshown, seen(), pixels, memory.tail),
+        )
 
     def _open_segment(self, memory: BridgeMemory, shot: Shot) -> BridgedSegment:
         """The segment from the latest frame on, while there is no next one."""
