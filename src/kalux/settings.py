@@ -384,8 +384,8 @@ class FilterSettings:
         not go far beyond white. 6 (docs/tuning.md).
     unshown_tail
         How far pixels that every frame so far has clipped are expected to lie above their lower bounds, as a share of
-        the scale of the pixels just below white around them (docs/equations.md, K15); twice that of those that one has
-        measured (K7). 0 leaves all at their bounds. 0.5 (docs/tuning.md).
+        the scale of the pixels just below white around them (docs/equations.md, K15); likewise those that a frame has
+        seen rise past white (K7). 0 leaves all at their bounds. 0.5 (docs/tuning.md).
     unshown_scale
         How many times as far above their lower bounds such pixels lie as frames make expect (R_0 of K15); None: as
         pixels that leave saturation in the first frames of a recording tell, 1 in a live stream.
